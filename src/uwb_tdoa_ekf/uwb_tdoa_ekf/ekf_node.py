@@ -363,7 +363,7 @@ class EkfNode(StreamNode):
         return troubles
 
     def _receive(self, stream: str, *part: Any) -> None:
-        """Pass messages of a stream to the filter, or keep them until anchors arrive (see Streams)."""
+        """Pass messages of a stream to the filter, or keep them until anchors arrive."""
         n = len(part[1])
         self._health.received[stream] += n
         if self._estimator is not None:
@@ -452,13 +452,13 @@ class EkfNode(StreamNode):
             self.outputs.publish_residuals(residuals)
 
     def _arrived(self, arrival: np.ndarray) -> np.ndarray:
-        """Return the arrival times of messages on the node's clock, (n,) s; NaN while it has none."""
+        """Return the arrival times of messages on the node's clock, (n,) s; NaN without a time."""
         if not self._ros_clock.ros_time_is_active:
             return arrival
         return np.full(len(arrival), 1e-9 * self._ros_clock.now().nanoseconds or math.nan)
 
     def _stream_findings(self) -> list[Finding]:
-        """Return the findings of the rules over streams, the most severe first; [] without anchors."""
+        """Return the findings of the rules over streams, most severe first; [] without anchors."""
         if self._estimator is None:
             return []
         estimator = self._estimator
@@ -487,7 +487,7 @@ class EkfNode(StreamNode):
         return [self._pose.refusals, *self._anchors.refusals, *self._frames.refusals]
 
     def _behind(self) -> float | None:
-        """Return the age of the newest odometry on the node's clock, in s; None without odometry."""
+        """Return the age of the newest odometry on the node's clock, s; None without odometry."""
         if not self.outputs.published:
             return None
         return 1e-9 * (
@@ -526,7 +526,7 @@ class EkfNode(StreamNode):
         return counts
 
     def _yaw_std(self) -> float:
-        """Return the standard deviation of the yaw in the world frame, rad; NaN without odometry."""
+        """Return the standard deviation of the yaw in the world frame, rad, or NaN."""
         if self._estimator is None or not self._estimator.running or self._attitude is None:
             return math.nan
         return rotation_std(*self._attitude)[0, 2]

@@ -239,7 +239,7 @@ class Estimator:
 
     @property
     def without_imu(self) -> Finding | None:
-        """Return the Finding that makes the filter ignore the IMU, or None while it uses the IMU."""
+        """Return the Finding that makes the filter ignore the IMU, or None while it is used."""
         ekf = self._ekf
         return next(
             iter(self._steady([implausible(ekf.imu_fault_detector)] if ekf.imu_faulty else [])),
@@ -268,7 +268,7 @@ class Estimator:
 
     @property
     def waiting(self) -> tuple[int, ...]:
-        """Return the number of messages that are neither used nor refused yet, for each of STREAMS."""
+        """Return the number of messages neither used nor refused yet, for each of STREAMS."""
         return self._buffer.waiting
 
     def add_imu(self, t: ArrayLike, gyro: ArrayLike, accel: ArrayLike) -> None:

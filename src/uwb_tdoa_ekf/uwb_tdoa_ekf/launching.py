@@ -248,7 +248,7 @@ def start(
     files: Sequence[str] = (),
     log_level: str = "info",
 ) -> Start:
-    """Return the Start of an executable with its share of {name: value}, and with parameter files."""
+    """Return the Start of an executable with its share of {name: value} and its files."""
     package, names = NODES[executable]
     own = {name: value for name, value in values.items() if name in names}
     return Start(package, executable, namespace, [*files, *([own] if own else [])], log_level)

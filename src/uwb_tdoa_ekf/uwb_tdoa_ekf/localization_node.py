@@ -174,7 +174,7 @@ class Tag:
             node.on_failure = self._fail
 
     def take(self) -> bool:
-        """Let the nodes take a turn, if they run; return whether there was, or is, anything to do."""
+        """Let the nodes take a turn, if they run; return whether there was or is work."""
         if self._failure is not None:
             self._end(self._failure)
         if self._pair is None:
@@ -249,7 +249,7 @@ class Pair:
         bias.streams.wait_for("uwb/tdoa", ekf.due)
 
     def take(self) -> bool:
-        """Let both nodes process all messages that arrived; return whether there was, or is, any."""
+        """Let both nodes process all messages that arrived; return whether there was or is any."""
         busy = [self.bias.streams.take(), self.ekf.streams.take()]
         while self.bias.holds and len(self._odometry):  # poses for which TDOAs wait
             self.bias.streams.take(at_once=True)

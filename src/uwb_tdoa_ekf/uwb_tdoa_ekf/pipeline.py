@@ -110,7 +110,7 @@ class RadioCorrections:
         return np.isin(aids["kind"], list(KINDS))
 
     def _unchanged(self, measured: Measurements) -> Measurements:
-        """Return Measurements without distances unchanged and store the number of their last slice."""
+        """Return Measurements without distances unchanged and store their last slice."""
         number = max(float(np.floor(part["t"][-1] / SLICE)) for part in measured if len(part))
         if number != self._slice:
             self._slice, self._pose, self._together = number, self._latest, True
@@ -274,7 +274,7 @@ class Pipeline:
         return [] if self.monitor is None else self.monitor.alarms
 
     def set_pose(self, pose: np.ndarray) -> None:
-        """Set the filter to a pose, (1,) of POSE, whose stamp is not before the measurements used."""
+        """Set the filter to a pose, (1,) of POSE, not older than the measurements used."""
         set_pose(self.state, self._parameters, pose)
 
     def _feed(self, measured: Measurements) -> list[PipelineOutput]:
@@ -293,7 +293,7 @@ class Pipeline:
         return parts
 
     def residuals(self, parts: Sequence[PipelineOutput]) -> Residuals:
-        """Return the Residuals of the TDOAs of several PipelineOutputs, in the order of their use."""
+        """Return the Residuals of the TDOAs of several PipelineOutputs, in order of use."""
         tdoa, rows = (
             joined(TDOA, [part.measured.tdoa for part in parts]),
             joined(RESIDUAL, [part.tdoas for part in parts]),

@@ -1,4 +1,4 @@
-"""Put the measurements of all streams in the order of their stamps and check each stream's clock."""
+"""Sort the measurements of all streams by stamp and check the clock of each stream."""
 
 from __future__ import annotations
 
@@ -411,7 +411,7 @@ class ReorderBuffer:
             stream.merge(row)
 
     def _reached(self, place: int) -> list[float]:
-        """Return the stamps, in s, that other leading streams have reached or are about to jump to."""
+        """Return the stamps, in s, that other leading streams have reached or may jump to."""
         others = [self._streams[other].gate for other in self._leading if other != place]
         return [t for gate in others for t in (gate.newest, gate.held) if math.isfinite(t)]
 

@@ -73,7 +73,7 @@ def smooth(
 
 
 def _smoothed_run(flight: Flight, config: FilterConfig, corrector: Corrector | None) -> Run:
-    """Return the smoothed Run for a known yaw and a config without the features of auxiliary.NONE."""
+    """Return the smoothed Run for a known yaw and a config changed by auxiliary.NONE."""
     records: list[np.ndarray] = []
     result = run_offline(flight, config, corrector, records)
     records = [part for part in records if len(part)]

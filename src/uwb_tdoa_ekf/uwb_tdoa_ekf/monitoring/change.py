@@ -186,7 +186,7 @@ class ChangeDetector:
         return Change(int(self._rows[column]), float(since), size, slope, best, rival, float(left))
 
     def refined(self, change: Change) -> Change | None:
-        """Return the last compensated step with its new size, or None, and compensate that instead."""
+        """Return the last compensated step with its new size, or None, and compensate that."""
         first = self._first(change.since)
         if (
             change.slope

@@ -158,7 +158,7 @@ def innovations(
 
 
 def _numbers(t: np.ndarray) -> np.ndarray:
-    """Return the block numbers of ascending stamps t (n,), in s; negative before the first block."""
+    """Return the block numbers of ascending stamps t (n,) s; negative before the first block."""
     return np.floor((t - t[:1] - SETTLE) / BLOCK).astype(np.int64)
 
 

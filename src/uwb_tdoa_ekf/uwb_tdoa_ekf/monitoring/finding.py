@@ -117,7 +117,7 @@ class Steady:
         ] = {}  # {(rule, severity): Finding with the first text}
 
     def __call__(self, findings: Iterable[Finding]) -> list[Finding]:
-        """Return the findings, each with its first text while its deciding number changes little."""
+        """Return the findings, each with its first text while its number changes little."""
         out = []
         for finding in findings:
             said = self._said.get((finding.rule, finding.severity), finding)

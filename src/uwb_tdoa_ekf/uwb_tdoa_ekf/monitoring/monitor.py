@@ -254,7 +254,7 @@ class Monitor:
             self._keep_one_slice()
 
     def _keep_one_slice(self) -> None:
-        """Drop odometry from before the current slice, or before the slice that a TDOA would start now."""
+        """Drop odometry from before the current slice, or before the slice of a TDOA that came now."""
         odometry = [np.concatenate(columns) for columns in zip(*self._odometry)]
         if len(odometry[0]):
             begin = (
@@ -265,7 +265,7 @@ class Monitor:
             self._odometry = [[column[odometry[0] >= begin] for column in odometry]]
 
     def update(self, until: float) -> None:
-        """Test all slices that end at or before `until`, in s; all data up to then must be added."""
+        """Test all slices that end by `until`, in s; all data up to then must be added."""
         if self._end is None or until < self._end:
             return
         residuals, odometry = (
@@ -331,7 +331,7 @@ class Monitor:
             piece = replace(piece, vector=piece.vector - piece.information @ delays)
         if (
             self._compared % YOUNG == 0 and self._calibrated is not None
-            # a moved anchor was right for long before: a comparison of recent slices finds it earlier
+            # an anchor moved in flight was right before: recent slices find it sooner
         ):
             self._comparisons = [
                 self._comparisons[0],

@@ -281,7 +281,7 @@ def _find(counters: TdoaCounters, a: int, b: int) -> int:
 
 @compiled
 def _place(counters: TdoaCounters, a: int, b: int) -> int:
-    """Return the place of a pair of rows; a new pair replaces the pair that was silent the longest."""
+    """Return the place of a pair of rows; a new pair replaces the oldest pair."""
     place = _find(counters, a, b)
     if place >= 0:
         return place

@@ -125,7 +125,7 @@ class _Cell:
 
     @property
     def parts(self) -> list[Part]:
-        """Return a Part of the delays for each of ERROR_STDS; the cell's errors are marginalized."""
+        """Return a Part of the delays for each of ERROR_STDS, without the cell's errors."""
         if not self._parts:
             gram, vector, n = (
                 np.tile(self._information, (2, 2)),
