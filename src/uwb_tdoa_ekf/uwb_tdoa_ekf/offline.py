@@ -154,8 +154,8 @@ def run_offline(
 
 def may_have_offset(flight: Flight, config: FilterConfig) -> bool:
     """Return whether the filter will estimate a common offset of all ranges of a Flight."""
-    # type: ignore[attr-defined]  # fields of SENSORS
-    looked_for = config.use_range and config.range_offset_std > 0.0
+    # FilterConfig takes in the parameters of SENSORS, so mypy does not find these fields.
+    looked_for = config.use_range and config.range_offset_std > 0.0  # type: ignore[attr-defined]
     return looked_for and flight.range is not None and len(flight.range) > 0
 
 

@@ -254,7 +254,7 @@ class Monitor:
             self._keep_one_slice()
 
     def _keep_one_slice(self) -> None:
-        """Drop odometry from before the current slice, or before the slice of a TDOA that came now."""
+        """Drop odometry older than the current slice, or than the slice of a TDOA that came now."""
         odometry = [np.concatenate(columns) for columns in zip(*self._odometry)]
         if len(odometry[0]):
             begin = (
