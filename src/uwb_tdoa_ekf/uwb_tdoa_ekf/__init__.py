@@ -1,4 +1,4 @@
-"""The estimation side: error-state filter, robust weights, start-up, time ordering.
+"""Estimate the state of a tag: error-state filter, robust weights, initialization, time ordering.
 
-No ROS outside the nodes.
+Only the nodes use ROS.
 """

@@ -1,5 +1,6 @@
-"""Anchors that come and go while a filter runs: each has a row of its own, and whatever is
-remembered by rows stays right.
+"""Keep track of anchors that appear and disappear while a filter runs.
+
+Each anchor has its own row. State that is stored by row stays valid after a change of anchors.
 """
 
 from __future__ import annotations
@@ -17,32 +18,39 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.effects.base import SensorFunction
 
-# twice as many as a message may hold: after so many changes the filter starts anew
+# Twice the anchors that one message may hold. Beyond this number of rows the filter restarts.
 MOST_ROWS = 20_000
 
 
 class AnchorTable:
-    """The anchors that a filter has had so far, by rows, and which of them are there now.
+    """Store all anchors that a filter has had so far, one row each, and which are present now.
 
-    anchors : Anchors that are there; ids (M,), positions (M, 3) m: of all rows. An anchor that is
-        moved gets another row, with nothing
-    known of it.
+    An anchor that is moved gets a new row without any stored state.
+
+    Attributes
+    ----------
+    anchors : Anchors
+        Present anchors.
+    ids : (M,) array
+        Ids of all rows, present or not.
+    positions : (M, 3) array
+        Positions of all rows in the world frame, in m.
     """
 
     def __init__(self, anchors: Anchors) -> None:
         self.anchors, self.ids, self.positions = anchors, anchors.ids, anchors.positions
-        self._rows = np.arange(len(anchors))  # of `anchors`
+        self._rows = np.arange(len(anchors))  # row of each of `anchors`
 
     def __len__(self) -> int:
         return len(self.ids)
 
     @property
     def present(self) -> np.ndarray:
-        """Rows of those that are there: (N,)."""
+        """Return the rows of the present anchors, (N,) int."""
         return self._rows
 
     def index(self, ids: np.ndarray) -> np.ndarray:
-        """Row of each of some ids, -1 for those that are not there."""
+        """Return the row of each id, (n,) int; -1 for an id that is not present."""
         places = self.anchors.index(ids)
         return (
             places
@@ -51,7 +59,7 @@ class AnchorTable:
         )
 
     def stay(self, anchors: Anchors) -> np.ndarray:
-        """Which of other Anchors are there already, within SAME_PLACE: (n,) bool."""
+        """Return which of other Anchors are already present within SAME_PLACE, (n,) bool."""
         places = self.anchors.index(anchors.ids)
         return (places >= 0) & (
             np.linalg.norm(self.positions[self._rows[places]] - anchors.positions, axis=1)
@@ -59,7 +67,7 @@ class AnchorTable:
         )
 
     def change(self, anchors: Anchors) -> np.ndarray:
-        """Go on with other Anchors; returns the rows of those that are gone, or stand elsewhere."""
+        """Replace the present anchors and return the rows of anchors that are gone or moved."""
         stay, before = self.stay(anchors), self._rows
         rows = self._rows[self.anchors.index(anchors.ids)]
         rows[~stay] = len(self.ids) + np.arange(np.count_nonzero(~stay))
@@ -72,8 +80,18 @@ class AnchorTable:
 def new_state_of(
     anchor_table: AnchorTable, functions: Sequence[SensorFunction], floor: Floor | None
 ) -> FilterState:
-    """`new_state` with a row for each row of AnchorTable; functions, floor : of the anchors that are
-    there. No TDOA comes of the other rows.
+    """Return `new_state` with one row for each row of an AnchorTable.
+
+    Rows of absent anchors are placeholders: no TDOA refers to them.
+
+    Parameters
+    ----------
+    anchor_table : AnchorTable
+        Anchors and their rows.
+    functions : sequence of SensorFunction
+        State-dependent errors of the IMU.
+    floor : Floor or None
+        Excess delays near the floor, of the present anchors.
     """
     state, places = (
         new_state(anchor_table.anchors.positions, functions, floor),
@@ -84,14 +102,20 @@ def new_state_of(
 
 
 def forget(state: FilterState, gone: np.ndarray) -> None:
-    """Have the state of a filter without what was received of anchors in rows (k,), which are not
-    there any more.
+    """Remove from the state of a filter all measurements of anchors that are gone.
+
+    Parameters
+    ----------
+    state : FilterState
+        Changed in place.
+    gone : (k,) int array
+        Rows of the anchors.
     """
     state.anchors["heard"][gone] = -np.inf
     ekf = state.ekf[0]
     window = ekf["window"][: ekf["kept"]]
     others = window[~(np.isin(window["a"], gone) | np.isin(window["b"], gone))]
-    if len(others):  # an empty window has no stamps
+    if len(others):  # an empty window has no stamps to keep
         ekf["window"][: len(others)], ekf["kept"] = others, len(others)
     if ekf["ranged"]["anchor"][0] in gone:
         ekf["ranged"]["t"] = -np.inf

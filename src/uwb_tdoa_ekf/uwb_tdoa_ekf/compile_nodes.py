@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 @cache
 def warm_up() -> None:
-    """Compile, or load from numba's cache, what the first messages would."""
+    """Compile, or load from numba's cache, the functions that the first messages need."""
     estimator = Estimator(Anchors.from_positions([[0, 0, 0], [5, 0, 1], [0, 5, 2], [5, 5, 0]]))
     watch, steps = StreamWatch(estimator.anchors, 0.25), np.arange(400)
     watch.add_imu(
@@ -88,7 +88,7 @@ pass
 
 
 def parser() -> ArgumentParser:
-    """Its options: none."""
+    """Return the command line parser; the program has no options."""
     layout = argparse.RawDescriptionHelpFormatter
     examples = "examples:\n  compile_nodes"
     return argparse.ArgumentParser(
@@ -97,15 +97,15 @@ def parser() -> ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Compile what is not compiled yet; returns the exit code."""
+    """Compile all functions that are not in the cache and return the exit code."""
     try:
         parser().parse_args(argv)
-    except SystemExit as ended:  # argparse has said it already
+    except SystemExit as ended:  # argparse has printed the error
         return int(ended.code or 0)
     began = time.monotonic()
     warm_up()
     corrector.warm_up(EffectSet(), None)
-    # a frame on /tf_static brings one, while the node runs
+    # A transform on /tf_static adds this effect while the node runs.
     corrector.warm_up(EffectSet((TagLeverArm(values={"z": 0.1}),)), None)
     print(f"both nodes are compiled; {time.monotonic() - began:.0f} s")
     return 0

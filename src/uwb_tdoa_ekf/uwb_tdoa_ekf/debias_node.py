@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.common.anchors import Anchors
 
-LARGEST_OUTSIDE = 0.5  # share of positions outside of the map, before it becomes a warning
+LARGEST_OUTSIDE = 0.5  # share of positions outside the map that raises a warning
 # in the order of config/debias_node.yaml
 PARAMETERS = {
     "map": Parameter("", "file that `debias` wrote; must be given"),
@@ -49,14 +49,21 @@ PARAMETERS = {
 
 
 class DebiasNode(StreamNode):
-    """Converts messages for a BiasMap and keeps the accounts: received = corrected + faded +
-    outside + refused + invalid.
+    """Convert messages for a BiasMap and count them.
+
+    Each message has one result: received = corrected + faded + outside + refused + invalid.
     """
 
     NAME = "debias_node"
 
     def __init__(self, arguments: Sequence[str] = ()) -> None:
-        """arguments : of the process."""
+        """Load the map, subscribe to odometry and anchors, and advertise the corrected odometry.
+
+        Parameters
+        ----------
+        arguments : sequence of str
+            Command line arguments of the process.
+        """
         super().__init__(self.NAME)
         own = declare_all(self, PARAMETERS)
         refuse_unknown(self)
@@ -66,7 +73,8 @@ class DebiasNode(StreamNode):
         self._map, self._rate = BiasMap.load(file), Rate()
         self._counts: Counter[str] = Counter()
         self._counts_before: Counter[str] = Counter()
-        self._map.correct(np.zeros((1, 3)), np.zeros((1, 3, 3)))  # what the first call prepares
+        # the first call builds the interpolator
+        self._map.correct(np.zeros((1, 3)), np.zeros((1, 3, 3)))
         self._publisher = publish_stream(self, Odometry, "odometry/debiased")
         self._input = Input(
             self,
@@ -76,7 +84,7 @@ class DebiasNode(StreamNode):
             copy(STREAM_QOS),
             qos_overriding_options=OVERRIDES,
         )
-        self._belongs: bool | None = None  # until there are anchors
+        self._belongs: bool | None = None  # None until anchors arrive
         self._anchors = AnchorsInput(self, self._on_anchors, own["anchors_file"])
         self._anchors.start()
         say_unused([self], files_of(arguments))
@@ -157,7 +165,7 @@ class DebiasNode(StreamNode):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the node; returns the exit code."""
+    """Run the node and return the exit code."""
     return process.run(DebiasNode, __doc__, argv)
 
 

@@ -65,7 +65,7 @@ if TYPE_CHECKING:
     from .monitoring.finding import Finding
     from .results import Odometry
 
-# Of each stream: topic, type and the fields of its messages that are read.
+# Topic, message type and fields to read, for each stream.
 TOPICS = {
     "imu": [
         (
@@ -95,23 +95,34 @@ TOPICS = {
     name: [(topic, message_class(kind), *sensor.fields) for topic, kind in sensor.topics]
     for name, sensor in SENSORS.items()
 }
-MOST_FRAMES = 100  # of the IMU that are remembered: names on a topic may be anything
-MOST_NAMED = 3  # of them in a sentence
-MAST = 0.1  # m, of an antenna over the body, from which on its height is not that of the body
-EARLY = 5000  # messages kept while there are no anchors
+MOST_FRAMES = 100  # frames of the IMU to remember; a topic may carry any number of names
+MOST_NAMED = 3  # frames that one message names
+MAST = 0.1  # m, height of an antenna over the body from which the two heights differ visibly
+EARLY = 5000  # messages kept until anchors arrive
 
 
 class EkfNode(StreamNode):
-    """Converts messages for an Estimator and publishes what it says. The filter is all in there."""
+    """Convert messages for an Estimator and publish its results.
+
+    The node contains no filter code.
+    """
 
     NAME = "ekf_node"
 
     def __init__(
         self, arguments: Sequence[str] = (), member: set[str] | None = None, **options: Any
     ) -> None:
-        """arguments : of the process; member : of a localization_node, which has it take its turns
-        and hands it the corrected TDOAs: names of parameters that are for others, too; options : of
-        Node.
+        """Declare parameters, compile the filter, and connect all topics.
+
+        Parameters
+        ----------
+        arguments : sequence of str
+            Command line arguments of the process.
+        member : set of str or None
+            Given by a localization_node: names of parameters that may belong to its other nodes.
+            The node then takes turns from its owner and receives corrected TDOAs in memory.
+        **options
+            Options of rclpy's Node.
         """
         super().__init__(self.NAME, **options)
         self._config, own = declare_parameters(self)
@@ -126,29 +137,30 @@ class EkfNode(StreamNode):
         volume, effects_file = own["flyable_volume"], own["effects_file"]
         self._effects = EffectSet.from_yaml(effects_file) if effects_file else EffectSet()
         self._aid_corrector = AidCorrector(self._effects.effects)
-        self._estimator: Estimator = None  # type: ignore[assignment]  # until there are anchors
+        self._estimator: Estimator = None  # type: ignore[assignment]  # None until anchors arrive
         self._said_restart: Finding | None = None
         self._epoch, self._ros_clock = Epoch(), cast("ROSClock", self.get_clock())
         # quaternion and covariance of the newest odometry
         self._attitude: tuple[np.ndarray, np.ndarray] | None = None
-        self._findings: list[Finding] = []  # of the last report
+        self._findings: list[Finding] = []  # findings of the last report
         self._assumed: dict[
             str, tuple[str, ...]
-        ] = {}  # parameters that count for deviations which messages do not state, by sensor
-        self._fault = False  # one of these, or the use of TDOAs, makes the position wrong
-        self._received_before: dict[str, int] = {}  # messages by topic, by the last report
-        # what came while there were no anchors: (stream, (frame, stamps, rows, arrivals)), one
-        # message each
+        ] = {}  # by sensor: parameters that replace deviations which its messages do not state
+        # True while a finding, or the use of TDOAs, makes the position unreliable
+        self._fault = False
+        self._received_before: dict[str, int] = {}  # messages by topic at the last report
+        # Messages that arrived before the anchors, as (stream, (frame, stamps, rows, arrivals))
+        # with one message each.
         self._early: deque[tuple[str, tuple[Any, ...]]] = deque()
-        # accounts of estimators that were replaced, and of messages that none received
+        # counts of earlier estimators, and of messages that no estimator received
         self._past: Counter[str] = Counter()
         self._lately: list[
             str
-        ] = []  # frames of the IMU since the last report, and the last one before it
+        ] = []  # frames of the IMU since the last report, and the last frame before it
         self._placed: dict[
             str, tuple[ImuMount | None, str | None]
-            # (ImuMount, or None for the body, and what is wrong) by frame of the IMU, in the order of
-            # coming
+            # by frame of the IMU, in order of arrival: ImuMount (None for the body frame), and the
+            # problem with it
         ] = {}
         self._remark_height()
         self._health = Health(
@@ -186,7 +198,7 @@ class EkfNode(StreamNode):
         self.ready = "ready"
 
     def _remark_height(self) -> None:
-        """Log that fixed_height seems to be that of the antenna."""
+        """Log a warning if fixed_height seems to be the height of the antenna."""
         arm = sum(
             effect.values.get("z", 0.0)
             for effect in self._effects.effects
@@ -204,8 +216,12 @@ class EkfNode(StreamNode):
             )
 
     def _subscribe(self, handed: Collection[str]) -> Streams:
-        """Streams of everything that the filter takes. handed : topics that a node of this process
-        hands over.
+        """Return Streams of all measurements that the filter takes.
+
+        Parameters
+        ----------
+        handed : collection of str
+            Topics that another node of this process delivers in memory.
         """
         streams = Streams(self, self._epoch, self._advance)
         self._takers = {"imu": self._take_imu, "tdoa": self._take_tdoa} | {
@@ -222,7 +238,7 @@ class EkfNode(StreamNode):
         return streams
 
     def due(self) -> float:
-        """Stamp, s since 1970, up to which no odometry will come."""
+        """Return the stamp, in s since 1970, up to which no odometry will come."""
         return (
             -math.inf
             if self._estimator is None
@@ -230,6 +246,8 @@ class EkfNode(StreamNode):
         )
 
     def _on_anchors(self, anchors: Anchors) -> None:
+        # Keep the filter if some anchors stay, else start a new filter with the messages kept so
+        # far.
         if self._estimator is not None and self._estimator.stay(anchors):
             self._estimator.change_anchors(anchors)
             self._watch = self._new_watch(anchors)
@@ -289,21 +307,27 @@ class EkfNode(StreamNode):
             self.get_logger().warning(f"initialpose: not taken: {error}")
 
     def _on_frames(self) -> None:
-        """A constant transform is new, or another."""
+        """Place all IMU frames again after a static transform was added or changed."""
         before, self._placed = self._placed, {}
         for frame in before:
             self._place_imu(frame, say=False)
         moved = [frame for frame in before if before[frame] != self._placed[frame]]
         self._placed |= {
             frame: before[frame] for frame in before if frame not in moved
-        }  # it goes on where it was
+        }  # an IMU that did not move keeps its state
         if moved and self._estimator is not None:
             self.get_logger().warning(f"the transform of '{moved[0]}' is new: starting over")
             self._start_over()
 
     def _place_imu(self, frame: str, say: bool = True) -> ImuMount | None:
-        """ImuMount of an IMU of this frame, None for one that is taken as the body's; say : log
-        what is wrong, once for each.
+        """Return the ImuMount of an IMU frame, or None if it is the body frame or unknown.
+
+        Parameters
+        ----------
+        frame : str
+            Frame of the IMU.
+        say : bool
+            Log a problem, once for each frame.
         """
         if frame in self._placed:
             return self._placed[frame][0]
@@ -322,7 +346,7 @@ class EkfNode(StreamNode):
         return mount
 
     def _frame_troubles(self) -> list[str]:
-        """What is wrong with the frames of the IMU, a list of sentences."""
+        """Return sentences on problems with the frames of the IMU."""
         lately, self._lately = self._lately, self._lately[-1:]
         troubles = [
             *filter(None, (self._placed[frame][1] for frame in lately if frame in self._placed))
@@ -339,7 +363,7 @@ class EkfNode(StreamNode):
         return troubles
 
     def _receive(self, stream: str, *part: Any) -> None:
-        """Messages of a stream, see Streams."""
+        """Pass messages of a stream to the filter, or keep them until anchors arrive."""
         n = len(part[1])
         self._health.received[stream] += n
         if self._estimator is not None:
@@ -367,7 +391,7 @@ class EkfNode(StreamNode):
         mount = self._place_imu(frame)
         if frame not in self._lately and len(self._lately) < MOST_FRAMES:
             self._lately.append(frame)
-        # the specific force, says REP 145
+        # REP 145: linear_acceleration is the specific force
         gyro, accel = (rows["angular_velocity"].copy(), rows["linear_acceleration"].copy())
         unmeasured = (rows["angular_velocity_covariance"][:, 0] == -1.0) | (
             rows["linear_acceleration_covariance"][:, 0] == -1.0
@@ -380,7 +404,7 @@ class EkfNode(StreamNode):
                 "samples are not used; without a whole IMU set use_imu to false",
             )
             gyro[unmeasured] = math.nan
-        if mount is not None:  # first: effects are of axes of the body, as diagnose sees them
+        if mount is not None:  # before effects: these have the body axes, as in `diagnose`
             gyro, accel = mount.in_body(t, gyro, accel)
         if not self._imu_corrector.idle:
             gyro, accel = self._imu_corrector.correct(t, gyro, accel)
@@ -398,7 +422,7 @@ class EkfNode(StreamNode):
     def _take_sensor(
         self, name: str, frame: str, t: np.ndarray, rows: np.ndarray, arrival: np.ndarray
     ) -> None:
-        """Messages of one of the SENSORS."""
+        """Pass messages of a sensor in SENSORS to the filter."""
         sensor = SENSORS[name]
         stream = sensor.read(t, {field: rows[field] for field in sensor.fields})
         if sensor.assumed is not None:
@@ -406,13 +430,15 @@ class EkfNode(StreamNode):
         self._estimator.add(name, self._aid_corrector.correct(name, stream))
 
     def _say_restart(self) -> None:
-        """Log why the filter has started anew, once for each time."""
+        """Log why the filter has restarted, once per restart."""
         restarted = self._estimator.restarted
         if restarted != self._said_restart and restarted is not None:
             self.warn_at_times("restarted", restarted.sentence)
         self._said_restart = restarted
 
     def _publish(self, odometry: Odometry, residuals: Residuals) -> None:
+        # Publish odometry and residuals. While a fault holds, the covariance is that of an unknown
+        # pose.
         if len(odometry.t):
             if self._fault:
                 odometry = doubted(odometry, self._estimator.workspace)
@@ -426,13 +452,13 @@ class EkfNode(StreamNode):
             self.outputs.publish_residuals(residuals)
 
     def _arrived(self, arrival: np.ndarray) -> np.ndarray:
-        """When messages arrived on the clock of the node, (n,) s; NaN while it has none."""
+        """Return the arrival times of messages on the node's clock, (n,) s; NaN without a time."""
         if not self._ros_clock.ros_time_is_active:
             return arrival
         return np.full(len(arrival), 1e-9 * self._ros_clock.now().nanoseconds or math.nan)
 
     def _stream_findings(self) -> list[Finding]:
-        """What the rules over streams find; [] without anchors."""
+        """Return the findings of the rules over streams, most severe first; [] without anchors."""
         if self._estimator is None:
             return []
         estimator = self._estimator
@@ -443,7 +469,7 @@ class EkfNode(StreamNode):
         return most_severe_first([*found, *estimator.findings])
 
     def _wiring(self) -> list[str]:
-        """What is wrong with who publishes what to whom, a list of sentences."""
+        """Return sentences on topics that are connected wrongly."""
         received = {
             topics[0][0]: self._health.received[stream] for stream, topics in TOPICS.items()
         }
@@ -457,13 +483,11 @@ class EkfNode(StreamNode):
 
     @property
     def _single(self) -> list[Refusals]:
-        """Refusals of what comes one at a time."""
+        """Return the Refusals of inputs that are not streams."""
         return [self._pose.refusals, *self._anchors.refusals, *self._frames.refusals]
 
     def _behind(self) -> float | None:
-        """s from the stamp of the newest odometry to now, by the clock of the node; None without
-        odometry.
-        """
+        """Return the age of the newest odometry on the node's clock, s; None without odometry."""
         if not self.outputs.published:
             return None
         return 1e-9 * (
@@ -471,8 +495,9 @@ class EkfNode(StreamNode):
         )
 
     def _tell_status(self) -> None:
-        """Say on `status` whether the odometry may be flown by; not while simulated time stands
-        still: then nothing can come.
+        """Publish on `status` whether a vehicle may fly by the odometry.
+
+        Nothing is published while simulated time stands still, because no measurement can arrive.
         """
         if self._diagnostics.paused:
             return
@@ -482,7 +507,7 @@ class EkfNode(StreamNode):
         self._status.publish(status, yaw_std, self._health.use.tdoa_age, stamp, self.outputs.world)
 
     def _judge(self) -> Status:
-        """Whether the odometry may be flown by, from what is known now."""
+        """Return the current Status: whether a vehicle may fly by the odometry."""
         last = self._health.last_odometry
         age = math.inf if last is None else time.monotonic() - last
         status = status_of(self._estimator, self._yaw_std(), age, self._health.use, self._findings)
@@ -490,7 +515,7 @@ class EkfNode(StreamNode):
         return status
 
     def _counts(self) -> Counter[str]:
-        """Totals of all estimators so far, by what became of messages."""
+        """Return the totals over all estimators so far, by result of a message."""
         counts = Counter(self._past)
         if self._estimator is not None:
             counts.update(
@@ -501,15 +526,13 @@ class EkfNode(StreamNode):
         return counts
 
     def _yaw_std(self) -> float:
-        """Standard deviation of the rotation about the world's z axis, rad; NaN unless there is
-        odometry.
-        """
+        """Return the standard deviation of the yaw in the world frame, rad, or NaN."""
         if self._estimator is None or not self._estimator.running or self._attitude is None:
             return math.nan
         return rotation_std(*self._attitude)[0, 2]
 
     def _report(self) -> Report:
-        self._frames.catch_up()  # where there is no odometry
+        self._frames.catch_up()  # without odometry, no other call reads /tf
         counts, estimator = self._counts(), self._estimator
         waiting = Counter(stream for stream, _ in self._early)
         if estimator is not None:
@@ -571,7 +594,7 @@ class EkfNode(StreamNode):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the node; returns the exit code."""
+    """Run the node and return the exit code."""
     topics = (
         f"{topic} ({kind.replace('/msg', '')})"
         for sensor in SENSORS.values()

@@ -1,4 +1,4 @@
-"""The parameters of ekf_node: those of FilterConfig, and what is the node's own."""
+"""Declare the parameters of ekf_node: FilterConfig, and the node's own."""
 
 from __future__ import annotations
 
@@ -75,12 +75,12 @@ PARAMETERS = {  # in the order of config/ekf_node.yaml
 
 
 def names_of_parameters() -> set[str]:
-    """Names of all."""
+    """Return the names of all parameters."""
     return {field.name for field in fields(FilterConfig)} | {*PARAMETERS}
 
 
 def declare_parameters(node: ParameterNode) -> tuple[FilterConfig, dict[str, Any]]:
-    """Declare all; returns (FilterConfig, {name: value} of the others)."""
+    """Declare all parameters and return (FilterConfig, {name: value} of the node's own)."""
     values = {}
     for field in fields(FilterConfig):
         limits = field.metadata
@@ -99,8 +99,16 @@ def declare_parameters(node: ParameterNode) -> tuple[FilterConfig, dict[str, Any
 def follow_changes(
     node: Node, config: Callable[[], FilterConfig], on_change: Callable[[FilterConfig], None]
 ) -> None:
-    """Let the parameters of FilterConfig that are not fixed be set in flight. config() : the
-    present one; on_change(config) is called with another.
+    """Let the user change the parameters of FilterConfig that are not fixed while the node runs.
+
+    Parameters
+    ----------
+    node : Node
+        Node that declared the parameters.
+    config : callable
+        `config()` returns the current FilterConfig.
+    on_change : callable
+        `on_change(config)` receives the new FilterConfig.
     """
 
     def changed(parameters: list[RosParameter]) -> FilterConfig:

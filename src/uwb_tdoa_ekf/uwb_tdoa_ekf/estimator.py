@@ -1,6 +1,4 @@
-"""The filter for live streams: messages in any order in, odometry that depends on their stamps
-alone out.
-"""
+"""Run the filter on live streams; the odometry depends on stamps, not on the order of arrival."""
 
 from __future__ import annotations
 
@@ -50,10 +48,11 @@ if TYPE_CHECKING:
     from .pipeline import PipelineOutput
     from .reorder_buffer import Restart
 
-RATE_SAMPLES = 10  # inertial samples from whose stamps their rate is known
-LARGEST_POSE_AHEAD = 10.0  # s of a pose that is set, from the newest measurement
-RESTART_NAMED = 10.0  # s of stamps for which a restart is named
-MOST_POSES = 100  # that were set and wait for their time
+RATE_SAMPLES = 10  # inertial samples over which their rate is averaged
+# s, largest lead of a pose that the user sets over the newest measurement
+LARGEST_POSE_AHEAD = 10.0
+RESTART_NAMED = 10.0  # s of stamps for which /diagnostics reports a restart
+MOST_POSES = 100  # poses that may wait for their stamp
 NOTHING = (
     Odometry.from_rows(np.empty(0, ODOMETRY)),
     Residuals.refused(np.empty(0), np.empty(0), np.empty(0), INVALID),
@@ -61,10 +60,10 @@ NOTHING = (
 
 
 class Estimator:
-    """Time-ordered buffer, filter and accounts.
+    """Put measurements in order, run the filter on them, and count the result of each message.
 
-    A ReorderBuffer, the Pipeline that `run_offline` has too, poses that are set from outside, and
-    accounts of every message.
+    The Estimator combines a ReorderBuffer, the Pipeline that `run_offline` also uses, and poses
+    that the user sets.
     """
 
     def __init__(
@@ -75,9 +74,21 @@ class Estimator:
         lag: float = 0.25,
         effects: EffectSet = EffectSet(),
     ) -> None:
-        """anchors : Anchors; config : FilterConfig; reorder, lag : s, see ReorderBuffer; effects :
-        EffectSet that is known, as of a Pipeline; streams that are added are free of the rest
-        (ImuCorrector, AidCorrector, bias_node).
+        """Create an estimator without measurements.
+
+        Streams that are added must already be corrected for all other effects (ImuCorrector,
+        AidCorrector, bias_node).
+
+        Parameters
+        ----------
+        anchors : Anchors
+            Anchors in the world frame.
+        config : FilterConfig or None
+            Parameters of the filter; defaults if None.
+        reorder, lag : float
+            In s; see ReorderBuffer.
+        effects : EffectSet
+            Known effects that the Pipeline corrects.
         """
         self._anchor_table, self._effects = AnchorTable(anchors), effects
         self.config = config or FilterConfig()
@@ -87,26 +98,27 @@ class Estimator:
         names = [*VERDICTS.values(), "imu_used", "imu_late", "imu_invalid", "restarts", *of_aids]
         self.counts = dict.fromkeys(names, 0)
         self._refused: list[Residuals] = []
-        # the inertial samples that were used last, and RATE_SAMPLES before them
+        # the inertial samples used last, and RATE_SAMPLES before them
         self._sensed = np.empty(0, IMU_SAMPLE)
         self._wheels = np.empty(0, AID)  # yaw rates of wheels that were used last
         self._buffer = ReorderBuffer(
             reorder, lag, self.config.use_imu, self._refuse, self._start_anew
         )
-        self._restart: Restart | None = None  # the last one
+        self._restart: Restart | None = None  # the last restart
         self._steady = Steady()
         self._clear()
 
     def _clear(self) -> None:
         self._pipeline = Pipeline(self._anchor_table, self.config, self._effects)
-        self._poses: list[np.ndarray] = []  # (1,) of POSE, set and not reached yet
-        self._begun = False  # there was a measurement
-        # sentence on a pose that was set before the first measurement, and is of another time
+        # each (1,) of POSE: poses that are set but whose stamp is not reached
+        self._poses: list[np.ndarray] = []
+        self._begun = False  # True after the first measurement
+        # Message about a pose that was set before the first measurement and has another time.
         self.refused_pose: str | None = None
 
     @property
     def anchors(self) -> Anchors:
-        """Anchors that are there."""
+        """Return the present anchors."""
         return self._anchor_table.anchors
 
     @property
@@ -115,13 +127,15 @@ class Estimator:
 
     @property
     def running(self) -> bool:
-        """True once a start position was found."""
+        """Return whether the initialization has found a position."""
         return bool(self._ekf["running"])
 
     @property
     def lost(self) -> str | None:
-        """Why there is no odometry any more, a sentence, until the tag is found anew; None while it
-        is not lost, and before it was found. Depends on stamps alone.
+        """Return a sentence on why the filter has lost the tag, or None.
+
+        It is None before the first initialization and while the filter runs. The result depends on
+        stamps only.
         """
         ekf = self._ekf
         if ekf["running"] or ekf["t"] == -math.inf:
@@ -134,9 +148,10 @@ class Estimator:
 
     @property
     def side_unknown(self) -> str | None:
-        """Why nobody knows on which side of its anchors the tag is, a sentence; None where that is
-        known, or does not matter. Anchors that are heard lie in a plane, and the place is uncertain
-        across it.
+        """Return a sentence on an unresolved mirror ambiguity of the anchors, or None.
+
+        The ambiguity exists if all anchors that are heard lie in a plane and the position across it
+        is uncertain. It is ignored where the height is known.
         """
         ekf = self._ekf
         if not ekf.running:
@@ -162,9 +177,9 @@ class Estimator:
 
     @property
     def unsure(self) -> str | None:
-        """Why the tag may be elsewhere, a sentence; None while nothing says so.
+        """Return a sentence on why the tag may be at another position, or None.
 
-        Depends on stamps alone.
+        The result depends on stamps only.
         """
         ekf = self._ekf
         if not ekf.running or ekf.t >= ekf.rival_until:
@@ -177,57 +192,54 @@ class Estimator:
 
     @property
     def workspace(self) -> np.ndarray:
-        """Size of the box in which the tag is expected, (3,) m."""
+        """Return the size of the box in which the tag is expected, (3,) m, world frame."""
         low, high = self._ekf["workspace"]
         return np.asarray(high - low)
 
     @property
     def newest(self) -> float:
-        """Stamp that the time of the streams has reached, s; -inf before the first TDOA, range or
-        inertial sample.
+        """Return the stamp that the streams have reached, in s; -inf before the first measurement.
+
+        Only TDOAs, ranges and inertial samples count.
         """
         return self._buffer.newest
 
     @property
     def next_odometry(self) -> float:
-        """Stamp, s, up to which no odometry will come."""
+        """Return the stamp, in s, up to which no odometry will come."""
         return float(self._ekf["next_odometry"])
 
     @property
     def recoveries(self) -> int:
-        """How often the filter found that it had lost the tag, and found it again."""
+        """Return how often the filter detected divergence and initialized again."""
         return int(self._ekf.recoveries)
 
     @property
     def alarms(self) -> list[str]:
-        """Sentences on what has changed since the flight began."""
+        """Return sentences on changes since the start of the flight."""
         return self._pipeline.alarms
 
     @property
     def sign_turns(self) -> int:
-        """How often the signs of all TDOAs have turned since the filter began."""
+        """Return how often the signs of all TDOAs have flipped since the filter started."""
         monitor = self._pipeline.monitor
         return 0 if monitor is None else monitor.turns
 
     @property
     def findings(self) -> list[Finding]:
-        """What the filter, the clocks of its streams, and who watches its residuals, have found:
-        Findings.
-        """
+        """Return the Findings of the filter, of the clocks of its streams, and of the Monitor."""
         monitor = self._pipeline.monitor
         exchanged = None if monitor is None else monitor.exchanged
         return [*filter(None, [self.without_imu, exchanged, self.restarted]), *self.clocks]
 
     @property
     def yaw_doubts(self) -> int:
-        """How often the yaw was found to be wrong, and opened again."""
+        """Return how often the filter found its yaw wrong and restarted the yaw hypotheses."""
         return int(self._ekf.yaw_test["count"])
 
     @property
     def without_imu(self) -> Finding | None:
-        """Finding by which the filter goes without inertial samples, because they cannot be right;
-        None while it uses them.
-        """
+        """Return the Finding that makes the filter ignore the IMU, or None while it is used."""
         ekf = self._ekf
         return next(
             iter(self._steady([implausible(ekf.imu_fault_detector)] if ekf.imu_faulty else [])),
@@ -236,7 +248,7 @@ class Estimator:
 
     @property
     def restarted(self) -> Finding | None:
-        """Finding on why the filter started anew, for RESTART_NAMED seconds of stamps after it did."""
+        """Return the Finding on the last restart, for RESTART_NAMED s of stamps; else None."""
         cause = self._restart
         return (
             restarted(cause)
@@ -246,7 +258,7 @@ class Estimator:
 
     @property
     def clocks(self) -> list[Finding]:
-        """Findings on streams whose clocks are wrong at present."""
+        """Return Findings on streams whose clocks are wrong now."""
         of_streams = zip(STREAMS, self._buffer.leads)
         return [
             clock_ahead(name, lead, self.counts["invalid" if name == "tdoa" else f"{name}_invalid"])
@@ -256,12 +268,22 @@ class Estimator:
 
     @property
     def waiting(self) -> tuple[int, ...]:
-        """Messages received and neither used nor refused yet, for each of STREAMS."""
+        """Return the number of messages neither used nor refused yet, for each of STREAMS."""
         return self._buffer.waiting
 
     def add_imu(self, t: ArrayLike, gyro: ArrayLike, accel: ArrayLike) -> None:
-        """Take inertial samples in the order of their arrival: t (n,) s; gyro (n, 3) rad/s; accel
-        (n, 3) m/s^2, specific force; body frame. Or one: a number, (3,), (3,).
+        """Add inertial samples in the order of their arrival.
+
+        A single sample may be given without its first dimension.
+
+        Parameters
+        ----------
+        t : (n,) array
+            Stamps, in s.
+        gyro : (n, 3) array
+            Angular velocity in the body frame, in rad/s.
+        accel : (n, 3) array
+            Specific force in the body frame, in m/s^2.
         """
         self._add(
             IMU_STREAM, *imu_rows(np.atleast_1d(t), np.atleast_2d(gyro), np.atleast_2d(accel))
@@ -277,9 +299,22 @@ class Estimator:
         slope: ArrayLike = 0.0,
         state: ArrayLike = 0.0,
     ) -> None:
-        """Take corrected TDOAs in the order of their arrival: t (n,) s; a, b (n,) anchor ids; d
-        (n,) m; variance (n,) m^2, of what is known beyond tdoa_std; slope, state (n, 6), as of a
-        Correction. Or one: numbers.
+        """Add corrected TDOAs in the order of their arrival.
+
+        A single TDOA may be given as numbers.
+
+        Parameters
+        ----------
+        t : (n,) array
+            Stamps, in s.
+        a, b : (n,) int array
+            Anchor ids.
+        d : (n,) array
+            Distance difference, in m.
+        variance : (n,) array
+            Variance in addition to tdoa_std^2, in m^2.
+        slope, state : (n, 6) array
+            Jacobian of the bias and its linearization point, as in Correction.
         """
         t, a, b, d = map(np.atleast_1d, (t, a, b, d))
         rows = structured(
@@ -298,7 +333,7 @@ class Estimator:
         self._buffer.add(TDOA_STREAM, rows, usable)
 
     def add(self, name: str, stream: Stream) -> None:
-        """Take a Stream of one of the SENSORS, its rows in the order of their arrival."""
+        """Add a Stream of a sensor in SENSORS, its rows in the order of their arrival."""
         if getattr(self.config, f"use_{name}"):
             self._add(STREAMS.index(name), *aid_rows(name, stream, self._anchor_table))
 
@@ -314,13 +349,27 @@ class Estimator:
         yaw: float = math.nan,
         yaw_std: float = math.nan,
     ) -> None:
-        """Take a pose that is known from outside: t s; p (3,) m, NaN where it is not known;
-        covariance (3, 3) m^2; yaw and yaw_std rad, or NaN. It holds from its stamp on; if the
-        filter has passed that, from the next measurement on.
+        """Set a pose that the user knows.
 
-        Raises InputError for a stamp that is not of the time of the streams, and when too many
-        wait. One that is set before there is any measurement is judged by the first, and dropped if
-        it is not of its time: `refused_pose`.
+        The pose takes effect at its stamp. If the filter is already past that stamp, the pose takes
+        effect at the next measurement. A pose that is set before any measurement is compared with
+        the first stamp. It is dropped if the two differ too much (`refused_pose`).
+
+        Parameters
+        ----------
+        t : float
+            Stamp, in s.
+        p : (3,) array
+            Position in the world frame, in m; NaN for an unknown coordinate.
+        covariance : (3, 3) array
+            Covariance of the position, in m^2.
+        yaw, yaw_std : float
+            Yaw and its standard deviation, in rad; NaN if unknown.
+
+        Raises
+        ------
+        InputError
+            If the stamp is too far from the streams, or too many poses wait.
         """
         self.refused_pose = None
         newest = self.newest
@@ -341,15 +390,14 @@ class Estimator:
         self._poses.sort(key=lambda pose: pose["t"][0])
 
     def configure(self, config: FilterConfig) -> None:
-        """Go on with another FilterConfig, which differs in nothing that is fixed (see
-        FilterConfig).
-        """
+        """Replace the FilterConfig; parameters that are fixed must be equal (see FilterConfig)."""
         self.config = config
         self._pipeline.configure(config)
 
     def stay(self, anchors: Anchors) -> bool:
-        """Whether it can go on among other Anchors: some of its own are there still, in the same
-        frame.
+        """Return whether the filter can keep its state with other Anchors.
+
+        This needs at least one common anchor, the same frame, and enough rows in the AnchorTable.
         """
         stay = self._anchor_table.stay(anchors)
         return (
@@ -359,41 +407,57 @@ class Estimator:
         )
 
     def change_anchors(self, anchors: Anchors) -> None:
-        """Go on among other Anchors: those that are new are used from now on, those that are gone
-        no more, and one that stands elsewhere as a new one. Nothing is forgotten of those that
-        stay. TDOAs that wait are used, as far as their anchors were there when they came.
+        """Replace the anchors and keep the state of the filter.
+
+        New anchors are used from now on, and anchors that are gone are not. A moved anchor counts
+        as a new one. Everything that is stored about the other anchors is kept. TDOAs that wait are
+        used if both anchors were present when they arrived.
         """
         self._pipeline.change_anchors(self._anchor_table.change(anchors))
 
     def reset(self) -> tuple[Odometry, Residuals]:
-        """Use everything that still waits, and forget it: what comes next starts the filter anew.
-        Returns (Odometry, Residuals).
+        """Process all measurements that wait, then clear the filter; return (Odometry, Residuals).
+
+        The next measurement starts a new initialization.
         """
         out = self.finish()
         self._buffer.clear()
-        self._anchor_table = AnchorTable(self.anchors)  # no row waits any more
+        self._anchor_table = AnchorTable(self.anchors)  # no TDOA waits that refers to an old row
         self.counts["restarts"] += 1
         self._clear()
         return out
 
     def advance(self) -> tuple[Odometry, Residuals]:
-        """Use every message that nothing earlier can precede any more.
+        """Process every measurement that no earlier one can precede; return (Odometry, Residuals).
 
-        Returns (Odometry, Residuals), possibly empty.
+        Both may be empty.
         """
         return self._use(self._buffer.watermark)
 
     def finish(self) -> tuple[Odometry, Residuals]:
-        """Use everything that still waits. Returns (Odometry, Residuals)."""
+        """Process all measurements that wait; return (Odometry, Residuals)."""
         self._buffer.finish()
         return self._use(math.inf)
 
     def rates_at(self, odometry: Odometry) -> tuple[np.ndarray, np.ndarray]:
-        """(angular velocity in the body frame, (n, 3) rad/s, its variances, (n, 3) rad^2/s^2) at
-        the stamps of the Odometry returned last; NaN where nothing near measures it. Of the
-        gyroscope less its bias; of wheels, where no inertial sample is used, the rate about z.
-        White noise of density gyro_noise has, in samples that are dt apart, the variance
-        gyro_noise^2 / dt; dt is the mean of the last RATE_SAMPLES.
+        """Return angular velocities at the stamps of the Odometry that was returned last.
+
+        The rate is the measured angular velocity minus the estimated gyroscope bias. Where no
+        inertial sample is used, wheels give the rate about z. White noise of density gyro_noise has
+        the variance gyro_noise^2 / dt in samples dt apart. Here dt is the mean over the last
+        RATE_SAMPLES.
+
+        Parameters
+        ----------
+        odometry : Odometry
+            n estimates, as returned last.
+
+        Returns
+        -------
+        rates : (n, 3) array
+            Angular velocity in the body frame, in rad/s; NaN without a recent measurement.
+        variances : (n, 3) array
+            Their variances, in rad^2/s^2.
         """
         t = np.ascontiguousarray(odometry.t)
         rates, variance = np.empty((len(t), 3)), np.empty(len(t))
@@ -410,7 +474,7 @@ class Estimator:
         return rates, variances
 
     def _refuse(self, stream: int, rows: np.ndarray, verdict: int) -> None:
-        """Account for rows that will not be used."""
+        """Count rows that the filter will not use."""
         if stream == TDOA_STREAM:
             a, b = (self._anchor_table.ids[rows[side]] for side in "ab")
             self._refused.append(Residuals.refused(rows["t"], a, b, verdict))
@@ -418,13 +482,13 @@ class Estimator:
             self.counts[f"{STREAMS[stream]}_{VERDICTS[verdict]}"] += len(rows)
 
     def _start_anew(self, cause: Restart) -> None:
-        """Go on in the time to which the streams have fallen back."""
+        """Restart the filter at the time to which the streams have jumped back."""
         self.counts["restarts"] += 1
         self._restart = cause
         self._clear()
 
     def _use(self, until: float) -> tuple[Odometry, Residuals]:
-        """Use what is stamped up to `until`, s, and between it what poses were set."""
+        """Process measurements and poses that the user set, up to the stamp `until`, in s."""
         self._check_early_poses()
         parts: list[PipelineOutput] = []
         while self._poses and self._poses[0]["t"][0] <= until and self._has_begun():
@@ -437,7 +501,7 @@ class Estimator:
         return self._account(parts) if parts or self._refused else NOTHING
 
     def _account(self, parts: list[PipelineOutput]) -> tuple[Odometry, Residuals]:
-        """Count what was used in parts, and what was refused; returns what is said of it."""
+        """Count the measurements that were used or refused and return (Odometry, Residuals)."""
         for part in parts:
             self.counts["imu_used"] += len(part.measured.imu)
             for kind, verdict in zip(
@@ -455,7 +519,7 @@ class Estimator:
         return odometry_of(parts), residuals
 
     def _check_early_poses(self) -> None:
-        """Drop what was set before the first measurement and is of another time than that."""
+        """Drop poses that were set before the first measurement and are too far from its stamp."""
         if self._begun or not self._has_begun():
             return
         self._begun = True
@@ -477,7 +541,7 @@ class Estimator:
 
 
 def _of_wheels(part: PipelineOutput) -> np.ndarray:
-    """Of what was fed, (n,) of AID: velocities with a yaw rate that were used."""
+    """Return the velocities with a yaw rate that the filter used, (n,) of AID."""
     rows = part.measured.aids
     used = (rows["kind"] == aids.VELOCITY) & (part.aids["verdict"] == USED)
     out: np.ndarray = rows[used & (rows["std"][:, YAW_RATE] <= LONGEST_STD)]
@@ -493,8 +557,22 @@ def _look_up(
     rates: np.ndarray,
     variances: np.ndarray,
 ) -> None:
-    """Rates of the last of `sensed`, (m,) of IMU_SAMPLE, up to each of t (n,) s, and their
-    variances; NaN where it is older than timeout, s.
+    """Write the rate and variance of the last inertial sample up to each stamp.
+
+    Parameters
+    ----------
+    t : (n,) array
+        Stamps, in s.
+    sensed : (m,) array of IMU_SAMPLE
+        Inertial samples in the order of their stamps.
+    timeout : float
+        Largest age of a sample, in s; beyond it the result is NaN.
+    noise : float
+        Noise density of the gyroscope, in rad/s/sqrt(Hz).
+    rates : (n, 3) array
+        Filled with angular velocities, in rad/s.
+    variances : (n,) array
+        Filled with their variances, in rad^2/s^2.
     """
     k = len(sensed) - 1
     for i in range(len(t) - 1, -1, -1):

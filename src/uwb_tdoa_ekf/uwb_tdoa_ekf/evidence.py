@@ -1,9 +1,10 @@
-"""What is known of positions and delays of anchors, and which of them have changed: by evidence.
+"""Find which anchor positions and delays have changed since the last calibration, by evidence.
 
-The last calibration holds where nothing has changed since. What has, an anchor that was moved, a
-module that was replaced, is found by evidence (MacKay, Bayesian interpolation, Neural Computation
-1992), one change after the other, as long as each makes the data more probable by a given factor.
-`survey` asks once, of whole flights; the monitor of ekf_node asks while it flies.
+A calibration holds until an anchor is moved or a module is replaced. The search adds one change at
+a time. It stops when no further change raises the evidence by a given factor (MacKay, Bayesian
+interpolation, Neural Computation 1992).
+
+`survey` runs the search once, on whole flights. The monitor of ekf_node runs it in flight.
 """
 
 from __future__ import annotations
@@ -23,15 +24,26 @@ if TYPE_CHECKING:
     ChangeKey = tuple[str, int]  # effect, number of an anchor
     Change = tuple[np.ndarray, float]  # places (m,) among the unknowns, m, standard deviation
 
-DRIFT = 0.005  # m, by which anything may be off since the last calibration without having changed
-MOVED, LATER = 0.3, 0.2  # m, standard deviations of changes: of each coordinate, of a delay
-ODDS = 100.0  # by how much more probable a change must make flights
+# m, standard deviation of the drift that every coordinate and delay may have without a change
+DRIFT = 0.005
+MOVED, LATER = 0.3, 0.2  # m, standard deviation of a change: of each coordinate, of a delay
+ODDS = 100.0  # factor by which a change must raise the probability of the data
 OF_ANCHORS = POSITION, DELAY = "anchor_position", "anchor_delay"
 
 
 class Part(NamedTuple):
-    """Normal equations about the mean of a prior: gram (n, n), vector (n,); rest : logarithm of the
-    evidence of what was integrated out; std : m, of that.
+    """Store normal equations about the mean of a prior.
+
+    Attributes
+    ----------
+    gram : (n, n) array
+        Information matrix, in 1/m^2.
+    vector : (n,) array
+        Right-hand side, in 1/m.
+    rest : float
+        Logarithm of the evidence of the unknowns that were marginalized.
+    std : float
+        Standard deviation of these unknowns, in m.
     """
 
     gram: np.ndarray
@@ -41,10 +53,18 @@ class Part(NamedTuple):
 
 
 class Changes(NamedTuple):
-    """found : {key: (logarithm of the odds of that change, keys of other changes that the data
-    cannot tell from it, of its anchor or of others that are not found themselves, the most probable
-    first)}; covariance (n, n) m^2 : of the prior with them; number : of the Part with the largest
-    evidence.
+    """Store the changes that the evidence supports.
+
+    Attributes
+    ----------
+    found : dict
+        {key: (log odds of the change, rivals)}. Rivals are keys of other changes that the data do
+        not distinguish from it, the most probable first. They belong to the same anchor, or to
+        anchors without a change in `found`.
+    covariance : (n, n) array
+        Covariance of the prior with these changes, in m^2.
+    number : int
+        Number of the Part with the largest evidence.
     """
 
     found: dict[ChangeKey, tuple[float, list[ChangeKey]]]
@@ -53,7 +73,7 @@ class Changes(NamedTuple):
 
 
 def keys_of(ids: Iterable[Any]) -> tuple[tuple[str, str], ...]:
-    """((effect, parameter), ...) of all coordinates and delays of anchors."""
+    """Return ((effect, parameter), ...) of all anchor coordinates, then of all anchor delays."""
     return (
         *((POSITION, f"{i}.{axis}") for i in ids for axis in "xyz"),
         *((DELAY, str(i)) for i in ids),
@@ -63,9 +83,23 @@ def keys_of(ids: Iterable[Any]) -> tuple[tuple[str, str], ...]:
 def known_before(
     ids: Iterable[Any], variance: np.ndarray, last: Covariance | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(covariance (4N, 4N) m^2 of coordinates, anchor by anchor, and of delays; which of them the
-    last calibration states, (4N,) bool).
-    variance : (4N,) m^2, of those that it does not; last : Covariance of it, or None.
+    """Return the prior covariance of coordinates and delays, and which the calibration states.
+
+    Parameters
+    ----------
+    ids : iterable
+        Ids of N anchors.
+    variance : (4N,) array
+        Variance of each unknown without a calibration, in m^2.
+    last : Covariance or None
+        Covariance of the last calibration.
+
+    Returns
+    -------
+    covariance : (4N, 4N) array
+        In m^2; coordinates anchor by anchor, then delays.
+    known : (4N,) bool array
+        True for unknowns that the last calibration states.
     """
     covariance, known = np.diag(variance), np.zeros(len(variance), dtype=bool)
     if last is not None:
@@ -76,7 +110,7 @@ def known_before(
 
 
 def changes_of(n: int) -> dict[ChangeKey, Change]:
-    """{key: Change} of what may have changed of n anchors."""
+    """Return {key: Change} of every possible change of n anchors."""
     out: dict[ChangeKey, Change] = {}
     for k in range(n):
         out[POSITION, k] = np.arange(3 * k, 3 * k + 3), MOVED
@@ -87,11 +121,29 @@ def changes_of(n: int) -> dict[ChangeKey, Change]:
 def eliminated(
     gram: np.ndarray, vector: np.ndarray, n: int, sizes: ArrayLike
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """(gram (n, n), vector (n,), logarithm of the evidence of the rest): normal equations with what
-    comes after the first n unknowns integrated out, whose standard deviations are `sizes`, a number
-    or one for each.
+    """Return normal equations of the first n unknowns, with all later unknowns marginalized.
+
+    Parameters
+    ----------
+    gram : (m, m) array
+        Information matrix of all unknowns, m >= n.
+    vector : (m,) array
+        Right-hand side.
+    n : int
+        Number of unknowns to keep.
+    sizes : float or (m - n,) array
+        Prior standard deviation of each marginalized unknown.
+
+    Returns
+    -------
+    gram : (n, n) array
+        Information matrix of the kept unknowns.
+    vector : (n,) array
+        Right-hand side of the kept unknowns.
+    evidence : float
+        Logarithm of the evidence of the marginalized unknowns.
     """
-    informed = n + np.flatnonzero(np.diagonal(gram)[n:] > 0.0)  # the others add nothing
+    informed = n + np.flatnonzero(np.diagonal(gram)[n:] > 0.0)  # unknowns without data add nothing
     sizes, cross = np.broadcast_to(sizes, len(gram) - n)[informed - n], gram[:n, informed]
     root = np.linalg.cholesky(gram[np.ix_(informed, informed)] + np.diag(sizes**-2.0))
     solved = solve_triangular(
@@ -107,9 +159,18 @@ def eliminated(
 
 
 def log_evidence(part: Part, prior: np.ndarray, size: float, offset: np.ndarray) -> float:
-    """Logarithm of the evidence of a Part whose prior has the inverse covariance `prior` (n, n) and
-    the logarithm of its determinant `size`; offset (n,) m : where the equations were made, from the
-    mean of the prior.
+    """Return the logarithm of the evidence of a Part.
+
+    Parameters
+    ----------
+    part : Part
+        Normal equations.
+    prior : (n, n) array
+        Inverse covariance of the prior, in 1/m^2.
+    size : float
+        Logarithm of the determinant of the prior covariance.
+    offset : (n,) array
+        Linearization point minus mean of the prior, in m.
     """
     right, root = part.vector - prior @ offset, np.linalg.cholesky(part.gram + prior)
     solved = solve_triangular(root, right, lower=True, check_finite=False)
@@ -121,8 +182,16 @@ def log_evidence(part: Part, prior: np.ndarray, size: float, offset: np.ndarray)
 def most_probable(
     parts: Sequence[Part], covariance: np.ndarray, offset: np.ndarray
 ) -> tuple[float, int]:
-    """(logarithm of the evidence, number) of the Part with the largest, with a prior of some
-    covariance (n, n) m^2.
+    """Return (log evidence, number) of the Part with the largest evidence.
+
+    Parameters
+    ----------
+    parts : sequence of Part
+        Normal equations to compare.
+    covariance : (n, n) array
+        Covariance of the prior, in m^2.
+    offset : (n,) array
+        Linearization point minus mean of the prior, in m.
     """
     known = np.linalg.inv(covariance), float(np.linalg.slogdet(covariance)[1])
     return max((log_evidence(part, *known, offset), k) for k, part in enumerate(parts))
@@ -134,8 +203,21 @@ def with_each_change(
     offset: np.ndarray,
     changes: Mapping[ChangeKey, Change],
 ) -> dict[ChangeKey, float]:
-    """{key: the largest evidence with that change of `changes` more}: in closed form, by what the
-    data say of a shift of the prior's mean.
+    """Return {key: largest log evidence over the Parts} with each change added to the prior.
+
+    The result is closed form: a change acts as a shift of the prior mean, and the data determine
+    that shift.
+
+    Parameters
+    ----------
+    parts : sequence of Part
+        Normal equations.
+    covariance : (n, n) array
+        Covariance of the prior without the change, in m^2.
+    offset : (n,) array
+        Linearization point minus mean of the prior, in m.
+    changes : mapping
+        {key: Change} to try.
     """
     prior, size, out = (
         np.linalg.inv(covariance),
@@ -166,9 +248,27 @@ def most_likely_changes(
     possible: Mapping[ChangeKey, Change],
     odds: float = ODDS,
 ) -> Changes:
-    """Changes, one after the other, as long as each makes the data `odds` times as probable.
-    unchanged (n, n) m^2 : covariance without any;
-    possible : {key: Change}.
+    """Return the changes that the data support, found one at a time.
+
+    A change is added while it makes the data `odds` times more probable.
+
+    Parameters
+    ----------
+    parts : sequence of Part
+        Normal equations.
+    unchanged : (n, n) array
+        Covariance of the prior without any change, in m^2.
+    offset : (n,) array
+        Linearization point minus mean of the prior, in m.
+    possible : mapping
+        {key: Change} of the changes to consider.
+    odds : float
+        Factor that a change must reach.
+
+    Returns
+    -------
+    changes : Changes
+        Changes found, and the prior that includes them.
     """
     covariance = unchanged
     found: dict[ChangeKey, tuple[float, list[ChangeKey]]] = {}
@@ -193,7 +293,7 @@ def most_likely_changes(
 def _without_named(
     found: Mapping[ChangeKey, tuple[float, list[ChangeKey]]],
 ) -> dict[ChangeKey, tuple[float, list[ChangeKey]]]:
-    """Return Changes.found without rivals of other anchors that are found themselves."""
+    """Return Changes.found without rivals on other anchors that have a change of their own."""
     rows = {row for _, row in found}
     return {
         key: (odds, [one for one in rivals if one[1] == key[1] or one[1] not in rows])

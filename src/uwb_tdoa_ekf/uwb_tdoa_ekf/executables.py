@@ -1,4 +1,4 @@
-"""The entry points that setup.py names."""
+"""Define the entry points that setup.py names."""
 
 from uwb_tdoa_bias.common.executable import node_executable
 

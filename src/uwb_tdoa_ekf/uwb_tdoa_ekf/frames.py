@@ -1,6 +1,6 @@
-"""Convert between the conventions of the filter, of ROS messages, and of a turned IMU.
+"""Convert between the conventions of the filter, of ROS messages, and of a rotated IMU.
 
-nav_msgs/Odometry: REP-105, and the comments of its definition.
+nav_msgs/Odometry follows REP 105 and the comments in its message definition.
 """
 
 from __future__ import annotations
@@ -33,13 +33,26 @@ POSE, TWIST = 3 + 4 + 36, 3 + 3 + 36  # numbers in a PoseWithCovariance and in a
 def to_odometry(
     q: np.ndarray, v: np.ndarray, covariance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Velocity in the body frame, and the covariance of what an Odometry holds.
+    """Return the velocity in the body frame and the covariance as in nav_msgs/Odometry.
 
-    q : (n, 4) x y z w, body to world; v : (n, 3) m/s, world; covariance : (n, 9, 9) of [p, v,
-        attitude], the attitude
-    in the body frame. Returns u = R(q)' v, (n, 3) m/s, and (n, 9, 9) of [position, rotation about
-    the world's axes, u]. An attitude error dtheta is R dtheta in the world; with an error dv, u
-    changes by R' dv + u x dtheta.
+    The velocity is u = R(q)' v. An attitude error dtheta in the body frame is R dtheta in the world
+    frame. With a velocity error dv, the error of u is R' dv + u x dtheta.
+
+    Parameters
+    ----------
+    q : (n, 4) array
+        Quaternions x y z w, body to world.
+    v : (n, 3) array
+        Velocity in the world frame, in m/s.
+    covariance : (n, 9, 9) array
+        Covariance of [p, v, attitude], the attitude error in the body frame.
+
+    Returns
+    -------
+    u : (n, 3) array
+        Velocity in the body frame, in m/s.
+    covariance : (n, 9, 9) array
+        Covariance of [position, rotation about the world axes, u].
     """
     u, out = np.empty((len(q), 3)), np.empty((len(q), 9, 9))
     _to_odometry(
@@ -52,6 +65,7 @@ def to_odometry(
 def _to_odometry(
     q: np.ndarray, v: np.ndarray, covariance: np.ndarray, u: np.ndarray, out: np.ndarray
 ) -> None:
+    # Fill u and out of to_odometry. The Jacobian maps [p, v, attitude] to [p, rotation, u].
     R, jacobian, half = np.empty((3, 3)), np.zeros((9, 9)), np.empty((9, 9))
     for n in range(len(q)):
         rotation(q[n, 0], q[n, 1], q[n, 2], q[n, 3], R)
@@ -70,6 +84,7 @@ def _to_odometry(
 
 @compiled
 def _multiply(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
+    # Write the product of two (9, 9) matrices to out.
     for i in range(9):
         for j in range(9):
             total = 0.0
@@ -79,8 +94,9 @@ def _multiply(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
 
 
 def rotation_std(q: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Standard deviations of the rotation about the world's axes, (n, 3) rad: those of to_odometry.
-    Arguments as there, without v.
+    """Return standard deviations of the rotation about the world axes, (n, 3) rad.
+
+    They equal the diagonal of the covariance from to_odometry, which describes the parameters.
     """
     out = np.empty((len(q), 3))
     _rotation_std(np.ascontiguousarray(q), np.ascontiguousarray(covariance), out)
@@ -89,6 +105,7 @@ def rotation_std(q: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 @compiled
 def _rotation_std(q: np.ndarray, covariance: np.ndarray, out: np.ndarray) -> None:
+    # Fill out, (n, 3) rad, with the roots of the diagonal of R P R'.
     R = np.empty((3, 3))
     for n in range(len(q)):
         rotation(q[n, 0], q[n, 1], q[n, 2], q[n, 3], R)
@@ -103,8 +120,20 @@ def _rotation_std(q: np.ndarray, covariance: np.ndarray, out: np.ndarray) -> Non
 def poses_of(
     odometry: Odometry,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """What a Corrector takes of an Odometry, as bias_node gets it: (t (n,) s, p (n, 3) m, q (n, 4),
-    v (n, 3) m/s, yaw_std (n,) rad).
+    """Return the poses that a Corrector needs of an Odometry, as bias_node receives them.
+
+    Returns
+    -------
+    t : (n,) array
+        Stamps, in s.
+    p : (n, 3) array
+        Position in the world frame, in m.
+    q : (n, 4) array
+        Quaternions x y z w, body to world.
+    v : (n, 3) array
+        Velocity in the world frame, in m/s.
+    yaw_std : (n,) array
+        Standard deviation of the yaw, in rad.
     """
     return (
         odometry.t,
@@ -118,8 +147,16 @@ def poses_of(
 def pose_and_twist(
     odometry: Odometry, rates: np.ndarray, rate_variances: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The numbers of PoseWithCovariance, (n, POSE), and of TwistWithCovariance, (n, TWIST), of
-    Odometry messages.
+    """Return the numbers of PoseWithCovariance, (n, POSE), and of TwistWithCovariance, (n, TWIST).
+
+    Parameters
+    ----------
+    odometry : Odometry
+        n estimates.
+    rates : (n, 3) array
+        Angular velocity in the body frame, in rad/s; NaN if unknown.
+    rate_variances : (n, 3) array
+        Their variances, in rad^2/s^2.
     """
     velocity, covariance = to_odometry(odometry.q, odometry.v, odometry.covariance)
     pose, twist = np.empty((len(odometry), POSE)), np.zeros((len(odometry), TWIST))
@@ -136,6 +173,8 @@ def _fill(
     pose: np.ndarray,
     twist: np.ndarray,
 ) -> None:
+    # Fill the covariances of pose and twist, (6, 6) by rows, and the angular rates. Unknown rates
+    # are 0 with UNKNOWN_VARIANCE, as the message has no other mark for them.
     for n in range(len(pose)):
         for i in range(6):
             for j in range(6):
@@ -148,28 +187,35 @@ def _fill(
                 twist[n, 6 + 6 * i + j] = covariance[n, 6 + i, 6 + j]
 
 
-# s; angular acceleration is the slope of the rate after a low pass of this time constant
+# s, time constant of the low-pass filter whose slope is the angular acceleration
 SLOW = 0.02
-LONGEST_STEP = 0.1  # s between samples, above which there is no slope
+LONGEST_STEP = 0.1  # s between samples above which the angular acceleration is taken as 0
 
 
 class ImuMount:
-    """rotation : Rotation, IMU to body; arm (3,) m, of the IMU in the body.
+    """Convert samples of a rotated, off-center IMU to the origin and axes of the body.
 
-    Specific force of the origin: f - dw/dt x arm - w x (w x arm), with everything in the body frame
-    (rigid body kinematics, e.g. Groves, Principles of GNSS, Inertial, and Multisensor Integrated
-    Navigation Systems, 2013, section 2.3).
+    The specific force at the origin is f - dw/dt x arm - w x (w x arm). All vectors are in the body
+    frame. This is rigid body kinematics (e.g. Groves, Principles of GNSS, Inertial, and Multisensor
+    Integrated Navigation Systems, 2013, section 2.3).
+
+    Parameters
+    ----------
+    rotation : Rotation
+        Rotation from the IMU frame to the body frame.
+    arm : (3,) array
+        Lever arm: position of the IMU in the body frame, in m.
     """
 
     def __init__(self, rotation: Rotation, arm: ArrayLike) -> None:
         self._matrix, self._arm = rotation.as_matrix(), np.asarray(arm, dtype=float)
         self._centred = not self._arm.any()
         self._t: float | None = None
-        # s, stamp of the last sample, and slow part of its rate, rad/s
+        # s, stamp of the last sample; rad/s, low-pass filtered rate
         self._slow: np.ndarray = np.zeros(3)
 
     def __eq__(self, other: object) -> bool:
-        """Whether it sits in the same place."""
+        """Return whether rotation and lever arm are equal."""
         return (
             isinstance(other, ImuMount)
             and (self._matrix == other._matrix).all()
@@ -179,9 +225,16 @@ class ImuMount:
     def in_body(
         self, t: np.ndarray, gyro: np.ndarray, accel: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """gyro (n, 3) rad/s and accel (n, 3) m/s^2 in the body frame, of samples at t (n,) s.
+        """Return (gyro, accel) in the body frame, in rad/s and m/s^2.
 
-        Stamps rise, but for outliers.
+        Parameters
+        ----------
+        t : (n,) array
+            Stamps, in s, ascending except for outliers.
+        gyro : (n, 3) array
+            Angular velocity in the IMU frame, in rad/s.
+        accel : (n, 3) array
+            Specific force in the IMU frame, in m/s^2.
         """
         gyro, accel = gyro @ self._matrix.T, accel @ self._matrix.T
         if not self._centred:
@@ -192,7 +245,7 @@ class ImuMount:
         return gyro, accel
 
     def _angular_acceleration(self, t: float, gyro: np.ndarray) -> np.ndarray:
-        """rad/s^2, (3,): slope of the slow part."""
+        """Return the slope of the low-pass filtered rate, (3,) rad/s^2."""
         dt = np.inf if self._t is None else t - self._t
         if dt <= 0.0:
             return np.zeros(3)
@@ -204,19 +257,42 @@ class ImuMount:
         return (self._slow - before) / dt
 
 
-LARGEST = 1e16  # the square of what is far for an anchor, m^2
+LARGEST = 1e16  # m^2, square of a distance that no anchor has
 
 
 def pose_from_message(
     message: PoseWithCovarianceStamped, world: str, epoch: Epoch, newest: float
 ) -> tuple[float, np.ndarray, np.ndarray, float, float]:
-    """(t s, p (3,) m, covariance (3, 3) m^2, yaw rad, its standard deviation rad) of a
-    PoseWithCovarianceStamped.
+    """Return the pose and covariance of a PoseWithCovarianceStamped.
 
-    world : name of the world frame; epoch : Epoch; newest : s, stamp of the newest measurement,
-        which a pose without
-    stamp has. A coordinate, or the yaw, whose variance is 0 is not given, and NaN. Raises
-    InputError.
+    A coordinate, or the yaw, with variance 0 counts as unknown and is returned as NaN.
+
+    Parameters
+    ----------
+    message : PoseWithCovarianceStamped
+        Message from `initialpose`.
+    world : str
+        Name of the world frame.
+    epoch : Epoch
+        Conversion from stamps to seconds.
+    newest : float
+        Stamp of the newest measurement, in s. A pose without stamp gets this stamp.
+
+    Returns
+    -------
+    t : float
+        Stamp, in s.
+    p : (3,) array
+        Position in the world frame, in m.
+    covariance : (3, 3) array
+        Covariance of the position, in m^2.
+    yaw, yaw_std : float
+        Yaw in the world frame and its standard deviation, in rad.
+
+    Raises
+    ------
+    InputError
+        If the frame, the stamp, or a number cannot be used.
     """
     frame = message.header.frame_id
     if frame not in ("", world):

@@ -1,6 +1,6 @@
-"""What the launch files start: which node, in which namespace, with which of the values.
+"""Decide which nodes the launch files start, in which namespace and with which parameters.
 
-Without launch itself.
+This module does not import launch.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ NODES = {  # {executable: (package, names of its parameters)}
     "anchors_node": ("uwb_tdoa_bias", {*anchors_node.PARAMETERS} | EVERYWHERE),
 }
 PATHS = "anchors_file", "effects_file", "map", "flyable_volume"  # parameters that are paths
-OF_FILES = {"params_file"}  # a parameter file for both nodes of a tag, which the values override
-RESPAWN = {  # arguments of the launch files: (default, text, choices)
+OF_FILES = {"params_file"}  # a parameter file for both nodes of a tag; launch arguments override it
+RESPAWN = {  # launch arguments: (default, text, choices)
     "respawn": (
         "true",
         "start a node again that has crashed, after 1 s, 2 s, 4 s ... 30 s",
@@ -52,7 +52,7 @@ RESPAWN = {  # arguments of the launch files: (default, text, choices)
     ),
 }
 RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
-NETWORK = {  # another argument of the launch files
+NETWORK = {  # one more launch argument
     "discovery_range": (
         "",
         f"who discovers the nodes; default: {RANGE}, or LOCALHOST where that is not set",
@@ -71,24 +71,35 @@ WHO = {
     ),
     "SYSTEM_DEFAULT": "whom the settings of the middleware let through",
 }
-AUTO = "auto"  # processes: one for each core
-# s, until a node that has crashed is started again: twice as long each time
+AUTO = "auto"  # value of `processes`: one process for each core
+# s until a node is started again after a crash; doubled each time
 FIRST, LONGEST = (1.0, 30.0)
-SOUND = 60.0  # s; a node that lived for so long has crashed for the first time again
+SOUND = 60.0  # s; after so long without a crash, the waiting time is FIRST again
 ENDING = signal.SIGINT, signal.SIGTERM
-REFUSED = 2  # exit code of a node that cannot use what it is given
+REFUSED = 2  # exit code of a node that cannot use its input
 IN_ORDER = (
     0,
     *(-number for number in ENDING),
     *(128 + number for number in ENDING),
-)  # exit codes of a node that was asked to end
+)  # exit codes of a node that ended on request
 
 
 @dataclass(frozen=True)
 class Start:
-    """One node. parameters : paths of files and {name: value}, of which later ones count; name : of
-    the node, if it is another than the executable's; remaps : {name of a topic: the name it has
-    here}.
+    """Describe one node to start.
+
+    Attributes
+    ----------
+    package, executable, namespace : str
+        What to start, and where.
+    parameters : list
+        Paths of parameter files, and dicts {name: value}. Later entries override earlier ones.
+    log_level : str
+        Log level of the node.
+    name : str or None
+        Name of the node if it differs from that of the executable.
+    remaps : mapping
+        {topic: name of the topic here}.
     """
 
     package: str
@@ -101,12 +112,12 @@ class Start:
 
     @property
     def label(self) -> str:
-        """What it is called in messages."""
+        """Return the name of the node in messages."""
         return f"{self.namespace.strip('/')}/{self.name or self.executable}".lstrip("/")
 
     @property
     def words(self) -> list[str]:
-        """Its parameters, remaps and log level, as arguments after --ros-args."""
+        """Return parameters, remaps and log level as arguments after --ros-args."""
         words = [
             "--log-level",
             self.log_level,
@@ -126,9 +137,16 @@ class Start:
 
 @dataclass(frozen=True)
 class Ended:
-    """What is done when a node has ended. again : s after which it is started again, or None; text
-    : what is said, or None;
-    everything : whether the others end, too.
+    """Describe what happens after a node has ended.
+
+    Attributes
+    ----------
+    again : float or None
+        Time until the node is started again, in s.
+    text : str or None
+        Message to log.
+    everything : bool
+        True to end all other nodes too.
     """
 
     again: float | None = None
@@ -137,22 +155,38 @@ class Ended:
 
 
 class Lives:
-    """Those of one node: whether it is started again."""
+    """Decide whether one node is started again after it has ended."""
 
     def __init__(self, label: str, respawn: bool, on_exit: str) -> None:
-        """respawn : bool; on_exit : "shutdown" or "stay"."""
+        """Store the launch arguments and count no crash.
+
+        Parameters
+        ----------
+        label : str
+            Name of the node in messages.
+        respawn : bool
+            Start the node again after a crash.
+        on_exit : str
+            "shutdown" or "stay": what happens to the other nodes.
+        """
         self._label, self._respawn, self._on_exit = label, respawn, on_exit
-        self._crashes = 0  # in a row
+        self._crashes = 0  # consecutive crashes
 
     def ended(self, code: int, alive: float) -> Ended:
-        """Ended, of a node that has ended by itself with this exit code, or by minus this signal,
-        after so many seconds.
+        """Return the Ended of a node.
+
+        Parameters
+        ----------
+        code : int
+            Exit code, or minus the number of the signal that ended the node.
+        alive : float
+            Lifetime of the node, in s.
         """
         if code in IN_ORDER:
             return Ended()
         if (
             code == REFUSED and not self._crashes and alive < SOUND
-        ):  # later its files may just be being written: again, then
+        ):  # a later refusal may come from a file that is being written: start again
             what = (
                 f"{self._label} refuses what it is given (see its message above), and is not "
                 "started again"
@@ -173,18 +207,32 @@ class Lives:
 
 
 def discovery(environment: Mapping[str, str], given: str = "") -> dict[str, str]:
-    """Variables with which nodes are started: this machine alone discovers them, unless the user
-    says otherwise. environment : variables; given : the argument discovery_range.
+    """Return environment variables that limit which machines discover the nodes.
+
+    Without another setting of the user, only this machine discovers them.
+
+    Parameters
+    ----------
+    environment : mapping
+        Environment variables.
+    given : str
+        Launch argument discovery_range.
     """
     return {RANGE: given or environment.get(RANGE) or "LOCALHOST"}
 
 
 def network(environment: Mapping[str, str]) -> str:
-    """Who can hear the nodes, and command them, in a sentence. environment : variables."""
+    """Return a sentence on which machines can hear and command the nodes.
+
+    Parameters
+    ----------
+    environment : mapping
+        Environment variables of the nodes.
+    """
     found, peers = environment.get(RANGE) or "SUBNET", environment.get("ROS_STATIC_PEERS")
-    if environment.get("ROS_LOCALHOST_ONLY") == "1":  # old, and counts
+    if environment.get("ROS_LOCALHOST_ONLY") == "1":  # an old variable that rcl still obeys
         found, peers = "LOCALHOST", None
-    elif found not in WHO:  # rcl says so
+    elif found not in WHO:  # rcl falls back to LOCALHOST for an unknown value
         found = "LOCALHOST"
     also = f" and of ROS_STATIC_PEERS={peers}" if peers else ""
     return (
@@ -200,7 +248,7 @@ def start(
     files: Sequence[str] = (),
     log_level: str = "info",
 ) -> Start:
-    """Start of an executable with those of {name: value} that it has, and with the parameter files."""
+    """Return the Start of an executable with its share of {name: value} and its files."""
     package, names = NODES[executable]
     own = {name: value for name, value in values.items() if name in names}
     return Start(package, executable, namespace, [*files, *([own] if own else [])], log_level)
@@ -212,10 +260,23 @@ def tag(
     files: dict | None = None,
     log_level: str = "info",
 ) -> list[Start]:
-    """[Start] of bias_node and ekf_node of one tag; with a `map` of debias_node too. files :
-    {executable: [paths]}.
+    """Return the Starts of bias_node and ekf_node of one tag; with a `map`, of debias_node too.
 
-    Raises InputError for a value that none of them has.
+    Parameters
+    ----------
+    namespace : str
+        Namespace of the tag.
+    values : dict
+        {parameter: value} for all nodes.
+    files : dict or None
+        {executable: [paths of parameter files]}.
+    log_level : str
+        Log level of the nodes.
+
+    Raises
+    ------
+    InputError
+        If no node has one of the parameters.
     """
     refuse_unknown(values, "bias_node", "ekf_node", "debias_node")
     nodes = ["bias_node", "ekf_node"] + ["debias_node"] * bool(values.get("map"))
@@ -226,13 +287,23 @@ def tag(
 
 @dataclass(frozen=True)
 class Fleet:
-    """What a YAML file of tags says: `tags: {NAMESPACE: {parameter: value, host: HOST, remaps:
-    {topic: name}}}`, and beside `tags` what all of them share.
+    """Store the content of a YAML file of tags.
 
-    path : of the file; tags : {namespace: {parameter: value}}; hosts : {namespace: name of the
-        machine that runs its nodes, None where the
-    file names none}; remaps : {namespace: {topic: name}}; processes : text, "" where the file does
-    not say.
+    The file has the form `tags: {NAMESPACE: {parameter: value, host: HOST, remaps: {topic:
+    name}}}`. Keys next to `tags` hold for all tags.
+
+    Attributes
+    ----------
+    path : str
+        Path of the file.
+    tags : dict
+        {namespace: {parameter: value}}.
+    hosts : dict
+        {namespace: name of the machine that runs its nodes, or None if the file gives no host}.
+    remaps : dict
+        {namespace: {topic: name}}.
+    processes : str
+        Number of processes, or "" if the file does not give it.
     """
 
     path: str
@@ -243,7 +314,7 @@ class Fleet:
 
     @classmethod
     def read(cls, path: str) -> Fleet:
-        """Raises InputError."""
+        """Read a YAML file of tags; raise InputError if it cannot be used."""
         content = read_yaml(path)
         listed = content.pop("tags", None) if isinstance(content, dict) else None
         if not isinstance(listed, dict) or not listed:
@@ -276,9 +347,9 @@ class Fleet:
         return cls(str(path), merged, hosts, remaps, str(processes))
 
     def at(self, host: str) -> Fleet:
-        """The tags whose nodes this machine runs: all, where the file names no host.
+        """Return the tags whose nodes the machine `host` runs: all, if the file names no host.
 
-        Raises InputError if there is none.
+        Raise InputError if there is none.
         """
         if set(self.hosts.values()) == {None}:
             return self
@@ -302,8 +373,21 @@ class Fleet:
         )
 
     def starts(self, values: Mapping, log_level: str = "info") -> list[Start]:
-        """bias_node and ekf_node of each tag, each with a frame of its own, NAMESPACE/base_link,
-        unless it names another; values : override the file's. Raises InputError.
+        """Return the Starts of bias_node and ekf_node of each tag.
+
+        Each tag has its own body frame NAMESPACE/base_link, unless the file names another.
+
+        Parameters
+        ----------
+        values : mapping
+            {parameter: value} that overrides the file.
+        log_level : str
+            Log level of the nodes.
+
+        Raises
+        ------
+        InputError
+            If a value is wrong.
         """
         starts = []
         try:
@@ -332,13 +416,23 @@ class Fleet:
 def tags(
     path: str, values: Mapping, log_level: str = "info", processes: str = "", host: str = ""
 ) -> list[Start]:
-    """What this machine starts of a YAML file of tags (Fleet): their nodes, and anchors_node if all
-    name the same anchors_file. Of a file that names hosts, the host of the first tag alone starts
-    anchors_node.
+    """Return the Starts of this machine for a YAML file of tags (Fleet); raise InputError if wrong.
 
-    values : override the file's; processes : overrides the file's, see `pooled`; host : what this
-        machine is called, default: its name.
-    Raises InputError.
+    If all tags name the same anchors_file, one anchors_node starts too. If the file names hosts,
+    only the host of the first tag starts it.
+
+    Parameters
+    ----------
+    path : str
+        Path of the file.
+    values : mapping
+        {parameter: value} that overrides the file.
+    log_level : str
+        Log level of the nodes.
+    processes : str
+        Overrides the value of the file; see `pooled`.
+    host : str
+        Name of this machine; default: its host name.
     """
     fleet = Fleet.read(path)
     here = fleet.at(host or socket.gethostname())
@@ -357,9 +451,26 @@ def tags(
 
 
 def pooled(starts: list[Start], processes: int | str) -> list[Start]:
-    """The same of `tags` with so many localization_nodes instead of bias_nodes and ekf_nodes; their
-    parameters are in a file that is written for them. processes : number, or its text, or "auto":
-    one for each core. Raises InputError if it is none, or a tag has a parameter file of its own.
+    """Replace all bias_nodes and ekf_nodes of `tags` by a number of localization_nodes.
+
+    Their parameters go into a temporary file.
+
+    Parameters
+    ----------
+    starts : list of Start
+        Result of `tags`.
+    processes : int or str
+        Number of processes, or "auto" for one per core.
+
+    Returns
+    -------
+    starts : list of Start
+        The localization_nodes and all other nodes.
+
+    Raises
+    ------
+    InputError
+        If the number is wrong, or a tag has its own parameter file or remaps.
     """
     if processes == AUTO:
         processes = len(os.sched_getaffinity(0))
@@ -381,8 +492,9 @@ def pooled(starts: list[Start], processes: int | str) -> list[Start]:
         f"/**/{each.label}": {"ros__parameters": each.parameters[-1]}
         for each in members
         if each.parameters
-    }  # in any namespace
-    file = folder_of_process() / "tags.yaml"  # a node that is started again reads it again
+    }  # the key matches the node in any namespace
+    # the file stays, because a restarted node reads it again
+    file = folder_of_process() / "tags.yaml"
     write_text(file, yaml.safe_dump(by_node, allow_unicode=True))
     frozen = all(each.parameters and each.parameters[-1].get("frozen") for each in members)
     namespaces, out = (
@@ -399,7 +511,7 @@ def pooled(starts: list[Start], processes: int | str) -> list[Start]:
 
 
 def refuse_unknown(values: dict[str, bool | str | float], *executables: str) -> None:
-    """Raise InputError for a value that none of the executables has, or that is none."""
+    """Raise InputError for a parameter that no executable has, or whose value is missing."""
     known = set().union(*(NODES[name][1] for name in executables))
     for name, value in values.items():
         if name not in known:
@@ -416,13 +528,13 @@ def refuse_unknown(values: dict[str, bool | str | float], *executables: str) -> 
 
 
 def typed(texts: dict[str, str]) -> dict[str, bool | str]:
-    """{name: value} of {name: text} as they come on a command line; empty ones are left out."""
+    """Return {name: value} of {name: text} from a command line, without empty texts."""
     kinds = {"true": True, "false": False}
     return {name: kinds.get(text, text) for name, text in texts.items() if text != ""}
 
 
 def _remaps(path: str, given: object) -> dict[str, str]:
-    """{topic: name} of what a file of tags says. Raises InputError."""
+    """Return {topic: name} of an entry in a file of tags; raise InputError if it is wrong."""
     entries = {} if given is None else given
     texts = (
         [text for pair in entries.items() for text in pair] if isinstance(entries, dict) else [None]
@@ -438,7 +550,7 @@ def _remaps(path: str, given: object) -> dict[str, str]:
 
 
 def _beside(path: str | Path, file: object) -> str:
-    """A path that a file names, relative to that file. Raises InputError."""
+    """Return a path that a file names, relative to that file; raise InputError if it is no text."""
     if not isinstance(file, str):
         raise InputError(f"{file!r} is no path; write a text.")
     return str(Path(path).parent / file)

@@ -1,4 +1,4 @@
-"""What launching.py says, as actions of launch."""
+"""Turn the decisions of launching.py into actions of launch."""
 
 from __future__ import annotations
 
@@ -34,10 +34,16 @@ def actions(
     rviz: str,
     use_sim_time: str = "false",
 ) -> list[Action]:
-    """Of [Start]s, as texts of launch arguments say: what is printed of the network, the nodes, and
-    RViz if rviz is "true".
+    """Return the launch actions of several Starts: a message on the network, the nodes, and RViz.
+
+    Parameters
+    ----------
+    starts : iterable of Start
+        Nodes to start.
+    respawn, on_exit, discovery_range, rviz, use_sim_time : str
+        Values of the launch arguments with these names. RViz starts if `rviz` is "true".
     """
-    leave_present_folder_out()  # what is launched inherits it
+    leave_present_folder_out()  # launched processes inherit this environment
     of_nodes = discovery(os.environ, discovery_range)
     nodes = [
         _node(each, Lives(each.label, respawn == "true", on_exit), of_nodes) for each in starts
@@ -50,9 +56,9 @@ def actions(
 
 
 def _node(start: Start, lives: Lives, variables: Mapping[str, str]) -> Node:
-    """The action of a Start, which its Lives may have started again.
+    """Return the launch action of a Start; its Lives decide whether it starts again.
 
-    Nothing is given to it by a file that launch_ros would leave.
+    Parameters go on the command line, because launch_ros does not delete its parameter files.
     """
     began = time.monotonic()
 
@@ -61,7 +67,7 @@ def _node(start: Start, lives: Lives, variables: Mapping[str, str]) -> Node:
             return None
         then = lives.ended(event.returncode, time.monotonic() - began)
         if then.everything:
-            raise InputError(then.text)  # ends the launch, which then ends with code 1
+            raise InputError(then.text)  # ends the launch with exit code 1
         if then.text:
             launch.logging.get_logger("launch.user").error(then.text)
         again = OpaqueFunction(function=lambda _: [_node(start, lives, variables)])
@@ -80,7 +86,7 @@ def _node(start: Start, lives: Lives, variables: Mapping[str, str]) -> Node:
 
 
 def _rviz(use_sim_time: str) -> Node:
-    """RViz with our layout."""
+    """Return the launch action of RViz with the layout of this package."""
     layout = f"{get_package_share_directory('uwb_tdoa_ekf')}/rviz/tdoa.rviz"
     parameters = ["-p", f"use_sim_time:={str(use_sim_time).lower()}"]
     return Node(

@@ -51,19 +51,25 @@ PARAMETERS = {
     ),
     "frozen": FROZEN,
 }
-OF_PROCESS = "__ns", "__node", "__name"  # of this node, not of all
-# s, until the nodes of a tag that have failed are started again: twice as long each time
+OF_PROCESS = "__ns", "__node", "__name"  # remappings that hold for this node only
+# s until the nodes of a tag are started again after a failure; doubled each time
 FIRST, LONGEST = (1.0, 30.0)
-SOUND = 60.0  # s; nodes that lived for so long have failed for the first time again
+SOUND = 60.0  # s; after so long without a failure, the waiting time is FIRST again
 
 
 class LocalizationNode(StreamNode):
-    """Starts the nodes of the tags, and has them take their turns."""
+    """Start the nodes of all tags and let them take turns."""
 
     NAME = "localization_node"
 
     def __init__(self, arguments: Sequence[str] = ()) -> None:
-        """arguments : of the process."""
+        """Start the nodes of each tag.
+
+        Parameters
+        ----------
+        arguments : sequence of str
+            Command line arguments of the process.
+        """
         super().__init__(self.NAME)
         tags = declare_all(self, PARAMETERS)["tags"]
         if not tags or len(set(tags)) < len(tags):
@@ -93,7 +99,7 @@ class LocalizationNode(StreamNode):
         return level, text, {"tags": len(self._tags), "not served": "; ".join(troubles) or "none"}
 
     def _start(self, tag: str, arguments: list[str]) -> Pair:
-        """Pair of a tag."""
+        """Create the Pair of nodes of a tag and return it."""
         namespace = f"{self.get_namespace().rstrip('/')}/{tag}".rstrip("/") or "/"
         given = [
             "--ros-args",
@@ -116,29 +122,45 @@ class LocalizationNode(StreamNode):
 
 
 class Tag:
-    """A tag, whose nodes are started again when they fail. refused : InputError with which they
-    were not started at all; trouble : a sentence while they are not there, or None.
+    """Own the nodes of one tag and start them again when they fail.
+
+    Attributes
+    ----------
+    refused : InputError or None
+        Reason why the nodes refused to start the first time.
+    trouble : str or None
+        Message while the nodes do not run.
     """
 
     def __init__(self, node: LocalizationNode, name: str, start: Callable[[], Pair]) -> None:
-        """node : LocalizationNode; start() : Pair of the tag, anew; raises InputError."""
+        """Prepare a tag without starting its nodes.
+
+        Parameters
+        ----------
+        node : LocalizationNode
+            Node that owns this tag.
+        name : str
+            Namespace of the tag.
+        start : callable
+            Creates and returns the Pair of the tag; raises InputError.
+        """
         self.refused: InputError | None = None
         self.trouble: str | None = None
         self._pair: Pair | None = None
         self._failure: Exception | None = None
         self._node, self._name, self._start = node, name, start
-        self._began, self._due, self._wait = 0.0, math.inf, 0.0  # s of time.monotonic(); s
+        # two times of time.monotonic(), and a duration, in s
+        self._began, self._due, self._wait = 0.0, math.inf, 0.0
 
     @property
     def members(self) -> list[StreamNode]:
-        """Nodes that are there."""
+        """Return the nodes that run."""
         return [] if self._pair is None else [self._pair.bias, self._pair.ekf]
 
     def begin(self) -> None:
-        """Start its nodes.
+        """Start the nodes of this tag.
 
-        What they refuse at their first start is not tried again. Whatever else is raised concerns
-        this tag alone.
+        An InputError at the first start is final. Any other exception affects this tag only.
         """
         try:
             self._pair = self._start()
@@ -152,7 +174,7 @@ class Tag:
             node.on_failure = self._fail
 
     def take(self) -> bool:
-        """A turn of its Pair, if it is there. Returns whether there was anything, or is."""
+        """Let the nodes take a turn, if they run; return whether there was or is work."""
         if self._failure is not None:
             self._end(self._failure)
         if self._pair is None:
@@ -170,9 +192,7 @@ class Tag:
             return False
 
     def _fail(self, error: Exception) -> None:
-        """Note what was raised; the nodes end with the next turn, when none of their callbacks is
-        under way.
-        """
+        """Store an exception; the nodes end at the next turn, when none of their callbacks runs."""
         self._failure = error
 
     def _end(self, error: Exception) -> None:
@@ -187,12 +207,12 @@ class Tag:
             node.destroy_node()
 
     def _replace(self, gone: list[StreamNode]) -> None:
-        """Have those nodes served that are there, instead of others."""
-        assert self._node.spinner is not None  # who takes a turn is spun
+        """Let the executor serve the nodes that run now and drop the nodes that are gone."""
+        assert self._node.spinner is not None  # a node that takes turns has a spinner
         self._node.spinner.replace(gone, self.members)
 
     def _again(self, error: Exception) -> None:
-        """Say why its nodes are not there, and until when."""
+        """Log why the nodes do not run and when they are started again."""
         then = "is not started again"
         if self.refused is None:
             self._wait = min(LONGEST, 2.0 * self._wait) or FIRST
@@ -203,10 +223,18 @@ class Tag:
 
 
 class Pair:
-    """The nodes of a tag, which hand over to each other."""
+    """Connect bias_node and ekf_node of one tag in memory."""
 
     def __init__(self, bias: BiasNode, ekf: EkfNode) -> None:
-        """bias : BiasNode; ekf : EkfNode."""
+        """Connect the outputs of each node with the inputs of the other.
+
+        Parameters
+        ----------
+        bias : BiasNode
+            Node that corrects TDOAs.
+        ekf : EkfNode
+            Node that runs the filter.
+        """
         self.bias, self.ekf = bias, ekf
         corrected, odometry = (
             ekf.streams.inputs["uwb/tdoa_corrected"],
@@ -214,26 +242,23 @@ class Pair:
         )
         assert isinstance(corrected, InMemoryReceiver) and isinstance(
             odometry, InMemoryReceiver
-        )  # as of members
+        )  # members receive these topics in memory
         self._odometry = odometry
         bias.output.deliver_to(corrected)
         ekf.outputs.odometry.deliver_to(odometry)
         bias.streams.wait_for("uwb/tdoa", ekf.due)
 
     def take(self) -> bool:
-        """Give everything that has arrived to those that take it.
-
-        Returns whether there was anything, or is.
-        """
+        """Let both nodes process all messages that arrived; return whether there was or is any."""
         busy = [self.bias.streams.take(), self.ekf.streams.take()]
-        while self.bias.holds and len(self._odometry):  # poses that TDOAs wait for
+        while self.bias.holds and len(self._odometry):  # poses for which TDOAs wait
             self.bias.streams.take(at_once=True)
             self.ekf.streams.take(at_once=True)
         return any(busy)
 
 
 def _for_all(arguments: list[str]) -> list[str]:
-    """The arguments of a process without the name and the namespace of its node."""
+    """Return command line arguments without those that name this node or its namespace."""
     flags = [k for k, word in enumerate(arguments) if word in ("-r", "--remap")]
     names = [
         k
@@ -245,7 +270,7 @@ def _for_all(arguments: list[str]) -> list[str]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the node; returns the exit code."""
+    """Run the node and return the exit code."""
     return process.run(LocalizationNode, __doc__, argv)
 
 

@@ -1,4 +1,4 @@
-"""The whole path on a recording, without ROS: what the two nodes give, in one call."""
+"""Run bias correction and filter on a recording without ROS, with the results of the two nodes."""
 
 from __future__ import annotations
 
@@ -29,20 +29,32 @@ if TYPE_CHECKING:
 
     from .pipeline import PipelineOutput
 
-# TDOAs that are used together while a history is recorded: its room is for the worst case
+# TDOAs per call of the filter while a history is recorded; memory is reserved for the worst case
 RECORDED_AT_ONCE = 256
 
 
 @dataclass(frozen=True)
 class Run:
-    """Result of one recording. odometry : Odometry; residuals : Residuals, one per TDOA of the
-    flight, in its order;
-    bias, bias_std : (n,) m, what was taken from each raw TDOA; recoveries : how often the filter
-        lost and found the
-    tag; yaw_offset : rad, from initial_yaw to the start of the yaw hypothesis that was right; aids
-    : {stream: (m,) of RESIDUAL, one per measurement}, for those of the SENSORS that the flight has;
-    range_offset : (m, m), by how much all ranges are too long, where the filter knew it best, and
-    its standard deviation, of noise alone; None if it did not look for that.
+    """Store the result of one recording.
+
+    Attributes
+    ----------
+    odometry : Odometry
+        Estimates.
+    residuals : Residuals
+        One row per TDOA of the flight, in its order.
+    bias, bias_std : (n,) array
+        Bias that was subtracted from each raw TDOA and its standard deviation, in m.
+    recoveries : int
+        How often the filter detected divergence and initialized again.
+    yaw_offset : float
+        Start of the correct yaw hypothesis minus initial_yaw, in rad.
+    aids : dict
+        {stream: (m,) of RESIDUAL}, one row per measurement, for the SENSORS in the flight.
+    range_offset : (float, float) or None
+        Common offset of all ranges and its standard deviation, in m, when its variance was
+        smallest. Positive means that ranges are too long. The standard deviation covers noise
+        alone. None if the filter did not estimate the offset.
     """
 
     odometry: Odometry
@@ -56,7 +68,7 @@ class Run:
 
     @property
     def counts(self) -> dict[str, int]:
-        """TDOAs by verdict."""
+        """Return {verdict: number of TDOAs}."""
         return {
             name: int(np.sum(self.residuals.verdict == value)) for value, name in VERDICTS.items()
         }
@@ -68,13 +80,21 @@ def run_offline(
     corrector: Corrector | None = None,
     records: list[np.ndarray] | None = None,
 ) -> Run:
-    """Run a Flight through bias correction and filter.
+    """Run bias correction and filter on a Flight and return a Run.
 
-    flight : Flight; config : FilterConfig; corrector : Corrector, whose poses are forgotten first,
-        or None for no
-    correction; records : list to which the history of the run is appended (see engine.feed), or
-    None. Returns a Run. A measurement uses only what was stamped before it, as on line. The filter
-    starts anew at each of the restarts of the Flight.
+    Each measurement is corrected with earlier data only, as in the nodes. The filter restarts at
+    each of the restarts of the Flight.
+
+    Parameters
+    ----------
+    flight : Flight
+        Recording.
+    config : FilterConfig or None
+        Parameters of the filter; defaults if None.
+    corrector : Corrector or None
+        Its stored poses are cleared first. None applies no correction.
+    records : list or None
+        Receives the history of the filter (see engine.feed).
     """
     config = config or FilterConfig()
     corrector = corrector or Corrector(flight.anchors)
@@ -90,12 +110,12 @@ def run_offline(
     parts: list[PipelineOutput] = []
     of_tdoas: list[
         np.ndarray
-    ] = []  # places in the flight of those that can be measurements, in the order of their stamps
+    ] = []  # places in the flight of usable TDOAs, in the order of their stamps
     recoveries = 0
     for batch, until, anew in _batches(
         *raw, corrector, len(tdoa) if records is None else RECORDED_AT_ONCE, flight.restarts
     ):
-        if anew:  # as on line, when the stamps fall back
+        if anew:  # as in the nodes when stamps jump back
             recoveries += int(pipeline.state.record.recoveries)
             pipeline = Pipeline(anchor_table, config, effects, watched=False, records=records)
             corrector.reset()
@@ -133,21 +153,23 @@ def run_offline(
 
 
 def may_have_offset(flight: Flight, config: FilterConfig) -> bool:
-    """Whether a FilterConfig makes the filter look for an offset of all ranges of a Flight."""
-    looked_for = config.use_range and config.range_offset_std > 0.0  # type: ignore[attr-defined]  # as of SENSORS
+    """Return whether the filter will estimate a common offset of all ranges of a Flight."""
+    # FilterConfig takes in the parameters of SENSORS, so mypy does not find these fields.
+    looked_for = config.use_range and config.range_offset_std > 0.0  # type: ignore[attr-defined]
     return looked_for and flight.range is not None and len(flight.range) > 0
 
 
 def without_offset(flight: Flight, offset: float) -> Flight:
-    """The Flight with ranges that are shorter by an offset, m."""
+    """Return a Flight whose ranges are shorter by `offset`, in m."""
     return flight.replaced(range=replace(flight.range, d=flight.range.d - offset))
 
 
 def without_unknown_offset(
     flight: Flight, config: FilterConfig, corrector: Corrector | None = None
 ) -> Flight:
-    """The Flight without the offset of all ranges that the filter finds, where a FilterConfig makes
-    it look for one. Takes what run_offline takes.
+    """Return a Flight without the common range offset that the filter estimates, if it does.
+
+    The parameters are as for run_offline.
     """
     offset = (
         run_offline(flight, config, corrector).range_offset
@@ -160,9 +182,22 @@ def without_unknown_offset(
 def loaded(
     flight: Flight, config: FilterConfig
 ) -> tuple[ReorderBuffer, dict[str, tuple[int, np.ndarray, np.ndarray]]]:
-    """ReorderBuffer with the inertial samples and the SENSORS of a Flight, and of each of these how
-    many there are, the places of those that can be measurements, in the order of their stamps, and
-    their ranks among all that leave the buffer.
+    """Return a ReorderBuffer with the inertial samples and SENSORS of a Flight, and their places.
+
+    Parameters
+    ----------
+    flight : Flight
+        Recording with corrected streams.
+    config : FilterConfig
+        Selects the streams that are used.
+
+    Returns
+    -------
+    buffer : ReorderBuffer
+        Contains all rows that can be measurements.
+    places : dict
+        {stream: (number of rows, places of usable rows, their ranks)}. The places are in the order
+        of their stamps. The ranks are among all rows of SENSORS that leave the buffer.
     """
     buffer = ReorderBuffer.of_recording()
     if flight.imu is not None and config.use_imu:
@@ -177,7 +212,7 @@ def loaded(
             kept = kept[np.argsort(rows["t"][kept], kind="stable")]
             felt.append(rows[kept])
             kept_of[name] = len(rows), kept
-    together = joined(AID, felt)  # as one stream, whose order is found once
+    together = joined(AID, felt)  # merge into one stream, because one sort is faster than many
     together = together[np.lexsort((together["kind"], together["t"]))]
     buffer.load(FIRST_AID, together)
     return buffer, {
@@ -187,9 +222,7 @@ def loaded(
 
 
 def _verdicts(n: int, places: np.ndarray, outcomes: list[np.ndarray]) -> np.ndarray:
-    """(n,) of RESIDUAL: what became of those that were used, at their places; the others are
-    invalid.
-    """
+    """Return (n,) of RESIDUAL with the outcomes at their places; all other rows are invalid."""
     out = np.zeros(n, RESIDUAL)
     out["innovation"] = out["variance"] = np.nan
     out["verdict"] = INVALID
@@ -206,16 +239,34 @@ def _batches(
     longest: int,
     restarts: Sequence[float],
 ) -> Iterator[tuple[np.ndarray, float, bool]]:
-    """What can be corrected and used together, at most `longest` TDOAs: (their places, in the order
-    of their stamps, the stamp, s, up to which everything may be used then, and whether the clock
-    began anew before them), at least one for each time of the clock.
+    """Yield batches of TDOAs that can be corrected and used together.
 
-    Corrections need poses that are `lag` old: measurements less than that apart can be corrected as
-    one batch.
+    A correction needs a pose that is `lag` old. TDOAs less than that apart can be corrected in one
+    batch. Each time of the clock has at least one batch.
+
+    Parameters
+    ----------
+    t, a, b, d : (n,) array
+        Stamps in s, rows of both anchors, distance differences in m.
+    corrector : Corrector
+        Gives the lag.
+    longest : int
+        Largest number of TDOAs per batch.
+    restarts : sequence of float
+        Stamps at which the clock restarts, in s.
+
+    Yields
+    ------
+    places : int array
+        Places of the TDOAs, in the order of their stamps.
+    until : float
+        Stamp up to which everything may be used afterwards, in s.
+    anew : bool
+        True if the clock restarts before this batch.
     """
     known = np.flatnonzero((a >= 0) & (b >= 0) & np.isfinite(d) & np.isfinite(t))
     if not (np.diff(t[known]) > 0.0).all():
-        # siblings of one stamp as on line
+        # TDOAs of one stamp are in the same order as in the nodes
         known = known[np.lexsort((d[known], b[known], a[known], t[known]))]
     stamps, lag, first = t[known], math.inf if corrector.idle else corrector.lag, 0
     for number, bound in enumerate([*sorted(restarts), math.inf]):

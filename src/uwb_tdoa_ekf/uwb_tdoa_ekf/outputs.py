@@ -1,4 +1,4 @@
-"""What ekf_node publishes: odometry, transforms, residuals."""
+"""Publish the results of ekf_node: odometry, transforms, residuals and status."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ if TYPE_CHECKING:
     from .monitoring.status import Status
     from .results import Residuals
 
-STATUS_PERIOD = 0.95  # s; it is looked at five times a second
+STATUS_PERIOD = 0.95  # s; the node checks five times a second
 ODOMETRY = "pose", "twist"
 RESIDUAL = "anchor_a", "anchor_b", "innovation", "innovation_variance", "weight", "verdict"
-UNPLACED = 100  # odometries in a row without odom -> body on /tf, before it is a trouble
+UNPLACED = 100  # consecutive odometry messages without odom -> body on /tf before a warning
 
 
 class StatusOutput:
-    """Publishes EstimatorStatus on `status`: each second, and at once when it changes."""
+    """Publish EstimatorStatus on `status` once per second, and at once after a change."""
 
     def __init__(self, node: StreamNode) -> None:
         self._publisher = node.create_publisher(EstimatorStatus, "status", STATUS_QOS)
@@ -48,8 +48,20 @@ class StatusOutput:
     def publish(
         self, status: Status, yaw_std: float, tdoa_age: float, stamp: Time, frame: str
     ) -> None:
-        """Publish if it is due. status : monitoring.status.Status; yaw_std : rad; tdoa_age : s;
-        stamp : builtin_interfaces/Time.
+        """Publish the status if it is due.
+
+        Parameters
+        ----------
+        status : monitoring.status.Status
+            Current status.
+        yaw_std : float
+            Standard deviation of the yaw, in rad.
+        tdoa_age : float
+            Time since a TDOA was used, in s.
+        stamp : builtin_interfaces/Time
+            Stamp of the message.
+        frame : str
+            World frame.
         """
         now = time.monotonic()
         if status == self._said and now < self._due:
@@ -64,8 +76,18 @@ class StatusOutput:
 
 
 class Outputs:
-    """published : number of messages on odometry; stamp : of the newest; world : name of its frame;
-    odometry, residual : StreamOutputs.
+    """Publish odometry, transforms and residuals.
+
+    Attributes
+    ----------
+    published : int
+        Number of odometry messages so far.
+    stamp : builtin_interfaces/Time
+        Stamp of the newest odometry.
+    world : str
+        Name of the world frame.
+    odometry, residual : StreamOutput
+        Outputs on `odometry` and `uwb/residual`.
     """
 
     def __init__(
@@ -78,19 +100,33 @@ class Outputs:
         odom: str,
         planar: bool = False,
     ) -> None:
-        """epoch : Epoch; frames : transforms.Frames; body, odom : names of frames; publish_tf : of
-        PUBLISH_TF; planar : world -> odom is to turn about the vertical alone.
+        """Create the publishers.
+
+        Parameters
+        ----------
+        node : StreamNode
+            Node that publishes.
+        epoch : Epoch
+            Conversion from seconds to stamps.
+        frames : transforms.Frames
+            Transforms from /tf.
+        body, odom : str
+            Names of the body frame and of the odom frame.
+        publish_tf : str
+            Value from PUBLISH_TF.
+        planar : bool
+            Let world -> odom rotate about the vertical axis only.
         """
         self._epoch, self._frames, self._body, self._planar = epoch, frames, body, planar
         self._odom = odom if publish_tf == ODOM else None
-        # messages; those in a row for which /tf had no odom -> body
+        # messages; consecutive messages without odom -> body on /tf
         self.published = self._unplaced = 0
-        self._placed = False  # a transform was published
+        self._placed = False  # True after the first transform
         self._wires = CdrCodec(Odometry, *ODOMETRY), CdrCodec(TdoaResidual, *RESIDUAL)
         self._transform = TransformStamped(child_frame_id=self._odom or body)
-        # one for all: what is published is copied
+        # one message for all, because publishing copies it
         self._tf = TFMessage(transforms=[self._transform])
-        self.stamp = Time()  # of the newest odometry
+        self.stamp = Time()  # stamp of the newest odometry
         self.set_world("")
         self.odometry = StreamOutput(node, Odometry, "odometry")
         self.residual = StreamOutput(node, TdoaResidual, "uwb/residual")
@@ -99,7 +135,7 @@ class Outputs:
         )
 
     def set_world(self, frame: str) -> None:
-        """Name the world frame."""
+        """Set the name of the world frame."""
         self.world = self._transform.header.frame_id = frame
         messages = Odometry(child_frame_id=self._body), TdoaResidual()
         for message in messages:
@@ -110,7 +146,7 @@ class Outputs:
 
     @property
     def trouble(self) -> str | None:
-        """What keeps a transform from being published, or None."""
+        """Return a sentence on why the transform cannot be published, or None."""
         if self._unplaced < UNPLACED:
             return None
         return (
@@ -120,9 +156,9 @@ class Outputs:
         )
 
     def publish_residuals(self, residuals: Residuals) -> None:
-        """Publish Residuals."""
+        """Publish Residuals if there is a subscriber."""
         if not self.residual.publisher.get_subscription_count():
-            return  # nobody can come and ask for them later
+            return  # the topic is volatile: a later subscriber cannot get old residuals
         rows = self._residual.rows(len(residuals.t))
         rows["sec"], rows["nanosec"] = self._epoch.parts(residuals.t)
         columns = (
@@ -140,8 +176,18 @@ class Outputs:
     def publish_odometry(
         self, odometry: Odometry, rates: np.ndarray, rate_variances: np.ndarray, held: bool = False
     ) -> None:
-        """Publish Odometry. rates (n, 3) rad/s and their variances (n, 3) rad^2/s^2, NaN where not
-        known; held : world -> odom stays what it was last.
+        """Publish Odometry and its transforms.
+
+        Parameters
+        ----------
+        odometry : Odometry
+            n estimates.
+        rates : (n, 3) array
+            Angular velocity in the body frame, in rad/s; NaN if unknown.
+        rate_variances : (n, 3) array
+            Their variances, in rad^2/s^2.
+        held : bool
+            Keep the last world -> odom transform.
         """
         n = len(odometry)
         rows = self._odometry.rows(n)
@@ -161,8 +207,10 @@ class Outputs:
         self.published += n
 
     def _publish_transform(self, t: float, p: np.ndarray, q: np.ndarray, held: bool) -> None:
-        """World -> body, or world -> odom such that odom -> body of /tf leads to the same; or,
-        held, world -> odom as it was last.
+        """Publish world -> body, or world -> odom.
+
+        With odom -> body of /tf, the transform world -> odom leads to the same pose of the body. If
+        `held` is true, the last world -> odom is published again.
         """
         if self._odom and not (held and self._placed):
             between = self._frames.between(self._odom, self._body, t)
@@ -179,5 +227,5 @@ class Outputs:
             out.translation.x, out.translation.y, out.translation.z = p
             out.rotation.x, out.rotation.y, out.rotation.z, out.rotation.w = q
         self._placed = True
-        assert self._tf_publisher is not None  # or nobody calls this
+        assert self._tf_publisher is not None  # the caller checks this
         self._tf_publisher.publish(self._tf)

@@ -1,6 +1,4 @@
-"""From measurements in the order of their stamps to odometry: the filter, and the watch for
-changes, live and off line.
-"""
+"""Run the filter and the Monitor on measurements in the order of their stamps, live and offline."""
 
 from __future__ import annotations
 
@@ -32,7 +30,7 @@ if TYPE_CHECKING:
     from .reorder_buffer import ReorderBuffer
 
 
-SLICE = 0.05  # s; what is measured in a slice is corrected at the last pose of those before
+SLICE = 0.05  # s; ranges in a slice are corrected at the last pose of earlier slices
 _NOWHERE = np.zeros(1, ODOMETRY)
 _NOWHERE["x"] = np.nan
 KINDS = {
@@ -41,29 +39,42 @@ KINDS = {
 
 
 class RadioCorrections:
-    """What bias_node is for TDOAs, for those of the SENSORS that measure distances to anchors:
-    these come to the filter as they are.
+    """Correct distances to anchors, as bias_node corrects TDOAs.
+
+    Distances come from SENSORS, and these reach the filter uncorrected.
     """
 
     def __init__(self, effects: EffectSet, anchor_table: AnchorTable) -> None:
-        """effects : EffectSet; installed : AnchorTable, which may change."""
+        """Create a Corrector for each kind of distance on which an effect acts.
+
+        Parameters
+        ----------
+        effects : EffectSet
+            Known effects.
+        anchor_table : AnchorTable
+            Anchors, which may change later.
+        """
         acting = ((kind, effects.acting_on(samples.channel)) for kind, samples in KINDS.items())
         self._correctors = {
             kind: Corrector(anchor_table.anchors, mine) for kind, mine in acting if len(mine)
         }
         self._anchor_table, self._slice, self._start = anchor_table, -math.inf, math.nan
-        # (1,) of ODOMETRY, of which nothing is computed before there are distances
+        # (1,) of ODOMETRY; its position is NaN until there is odometry
         self._pose = self._latest = _NOWHERE
-        self._together = False  # whether the last part may hold several slices
+        self._together = False  # True if the last part may hold several slices
 
     @property
     def idle(self) -> bool:
-        """True if there is nothing to correct with."""
+        """Return whether no effect needs correction."""
         return not self._correctors
 
     def add_odometry(self, rows: np.ndarray) -> None:
-        """Tell where the tag was: (n,) of ODOMETRY that came of the last part, in the order of
-        their stamps.
+        """Store the pose for the next correction.
+
+        Parameters
+        ----------
+        rows : (n,) array of ODOMETRY
+            Odometry of the last part, in the order of its stamps.
         """
         if not len(rows):
             return
@@ -75,9 +86,10 @@ class RadioCorrections:
         self._latest, self._together = rows[-1:], False
 
     def slices(self, measured: Measurements) -> Iterator[Measurements]:
-        """Measurements in parts, corrected. What comes of each is to be given to `add_odometry`
-        before the next is asked for. What holds no distances, as all of a recording without any, is
-        one part.
+        """Yield Measurements in corrected parts.
+
+        The caller must pass the odometry of each part to `add_odometry` before it asks for the
+        next. Measurements without distances are one part, even a whole recording.
         """
         if not len(measured.aids) or not self._ranged(measured.aids).any():
             yield self._unchanged(measured)
@@ -94,11 +106,11 @@ class RadioCorrections:
 
     @staticmethod
     def _ranged(aids: np.ndarray) -> np.ndarray:
-        """(m,) bool: which of (m,) of AID are distances to anchors."""
+        """Return which of (m,) of AID are distances to anchors, (m,) bool."""
         return np.isin(aids["kind"], list(KINDS))
 
     def _unchanged(self, measured: Measurements) -> Measurements:
-        """Measurements without distances; the slice that they end in goes on."""
+        """Return Measurements without distances unchanged and store their last slice."""
         number = max(float(np.floor(part["t"][-1] / SLICE)) for part in measured if len(part))
         if number != self._slice:
             self._slice, self._pose, self._together = number, self._latest, True
@@ -106,14 +118,20 @@ class RadioCorrections:
         return measured
 
     def _begin(self, measured: Measurements, ranged: np.ndarray) -> None:
-        """The stamp of the first TDOA or distance counts as the start of the recording. ranged (m,)
-        bool : as of `_ranged`.
+        """Store the stamp of the first TDOA or distance as the start of the recording.
+
+        Parameters
+        ----------
+        measured : Measurements
+            Measurements of one part.
+        ranged : (m,) bool array
+            Result of `_ranged`.
         """
         if math.isnan(self._start) and (len(measured.tdoa) or ranged.any()):
             self._start = float(min([*measured.tdoa["t"][:1], *measured.aids["t"][ranged][:1]]))
 
     def _corrected(self, measured: Measurements) -> np.ndarray:
-        """The (m,) of AID in Measurements of a slice, without what is known to be wrong with them."""
+        """Return the (m,) of AID of one slice, with the distances corrected."""
         aids = measured.aids
         self._begin(measured, self._ranged(aids))
         _, p, q, _, yaw_std = poses_of(Odometry.from_rows(self._pose))
@@ -139,8 +157,16 @@ pass
 
 
 class PipelineOutput(NamedTuple):
-    """measured : Measurements that were used at once; odometry : (n,) of ODOMETRY that came of
-    them; tdoas, aids : (k,) and (m,) of RESIDUAL, what became of them.
+    """Store the result of one call of the filter.
+
+    Attributes
+    ----------
+    measured : Measurements
+        Measurements that were used.
+    odometry : (n,) array of ODOMETRY
+        Odometry from these measurements.
+    tdoas, aids : (k,) and (m,) array of RESIDUAL
+        Outcome of each TDOA and of each measurement of SENSORS.
     """
 
     measured: Measurements
@@ -150,8 +176,14 @@ class PipelineOutput(NamedTuple):
 
 
 class Pipeline:
-    """Takes what a ReorderBuffer releases. state : FilterState; monitor : Monitor, or None, if
-    nobody asks what has changed.
+    """Feed the measurements that a ReorderBuffer releases to the filter.
+
+    Attributes
+    ----------
+    state : FilterState
+        State of the filter.
+    monitor : Monitor or None
+        Search for changes; None if it is not needed.
     """
 
     def __init__(
@@ -162,10 +194,21 @@ class Pipeline:
         watched: bool = True,
         records: list[np.ndarray] | None = None,
     ) -> None:
-        """anchors : AnchorTable; config : FilterConfig; effects : EffectSet that is known, of which
-        the filter itself is told, or that is taken out of distances to anchors; watched : have a
-        Monitor in any case; records : list to which the history is appended (see engine.feed), or
-        None.
+        """Create a filter without measurements.
+
+        Parameters
+        ----------
+        anchors : AnchorTable
+            Anchors and their rows.
+        config : FilterConfig
+            Parameters of the filter.
+        effects : EffectSet
+            Known effects that the filter models itself, or that are subtracted from distances to
+            anchors.
+        watched : bool
+            Create a Monitor even if no delay is compensated.
+        records : list or None
+            Receives the history of the filter (see engine.feed).
         """
         self._anchors, self._effects, self._records = anchors, effects, records
         self.state = self._new_state()
@@ -176,7 +219,7 @@ class Pipeline:
         self.configure(config)
 
     def configure(self, config: FilterConfig) -> None:
-        """Go on with a FilterConfig."""
+        """Replace the FilterConfig."""
         self._config, self._parameters = config, config.parameters()
         if not config.compensate_changes:
             self.state.anchors["delay"] = self.state.anchors["delay_variance"] = 0.0
@@ -189,8 +232,12 @@ class Pipeline:
         )
 
     def change_anchors(self, gone: np.ndarray) -> None:
-        """Go on after a change of the AnchorTable: with what is known of its new rows, and without
-        the rows `gone` (k,).
+        """Adapt the filter to a changed AnchorTable.
+
+        Parameters
+        ----------
+        gone : (k,) int array
+            Rows of the anchors that are no longer present.
         """
         more, first = self._new_state(), len(self.state.anchors)
         self.state = self.state._replace(
@@ -202,8 +249,10 @@ class Pipeline:
             self.monitor.forget(gone)
 
     def run(self, buffer: ReorderBuffer, until: float) -> list[PipelineOutput]:
-        """Use what a ReorderBuffer holds up to `until`, s; where delays are taken out, from the
-        stamps on at which the monitor finds them.
+        """Process the rows that a ReorderBuffer holds up to the stamp `until`, in s.
+
+        With compensate_changes, each delay is compensated from the stamp at which the Monitor finds
+        it.
         """
         parts = []
         while self._config.compensate_changes and self.monitor is not None and len(buffer):
@@ -221,14 +270,15 @@ class Pipeline:
 
     @property
     def alarms(self) -> list[str]:
-        """Sentences on what has changed since the flight began."""
+        """Return sentences on changes since the start of the flight."""
         return [] if self.monitor is None else self.monitor.alarms
 
     def set_pose(self, pose: np.ndarray) -> None:
-        """Put the filter at a pose, (1,) of POSE, that is not before what was used."""
+        """Set the filter to a pose, (1,) of POSE, not older than the measurements used."""
         set_pose(self.state, self._parameters, pose)
 
     def _feed(self, measured: Measurements) -> list[PipelineOutput]:
+        # Run the filter on measurements, slice by slice if ranges are corrected.
         if not any(map(len, measured)):
             return []
         parts = []
@@ -243,7 +293,7 @@ class Pipeline:
         return parts
 
     def residuals(self, parts: Sequence[PipelineOutput]) -> Residuals:
-        """What became of the TDOAs of several PipelineOutput, in the order in which they were used."""
+        """Return the Residuals of the TDOAs of several PipelineOutputs, in order of use."""
         tdoa, rows = (
             joined(TDOA, [part.measured.tdoa for part in parts]),
             joined(RESIDUAL, [part.tdoas for part in parts]),
@@ -253,5 +303,5 @@ class Pipeline:
 
 
 def odometry_of(parts: Sequence[PipelineOutput]) -> Odometry:
-    """What came of several PipelineOutput."""
+    """Return the Odometry of several PipelineOutputs."""
     return Odometry.from_rows(joined(ODOMETRY, [part.odometry for part in parts]))

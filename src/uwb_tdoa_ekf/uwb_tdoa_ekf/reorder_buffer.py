@@ -1,4 +1,4 @@
-"""Put what arrives of all streams in order of stamps, and judge the clock of each stream on entry."""
+"""Sort the measurements of all streams by stamp and check the clock of each stream."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ if TYPE_CHECKING:
 STREAMS = "imu", "tdoa", *aids.STREAMS
 KINDS = IMU_SAMPLE, TDOA, *[AID] * len(aids.STREAMS)
 IMU_STREAM, TDOA_STREAM, FIRST_AID = range(3)  # places in STREAMS
-# one of these is the reference: its stamps are the time
+# the reference is among these streams; its stamps define the time
 LOCATING_STREAMS = (TDOA_STREAM, *map(STREAMS.index, LOCATING))
 VELOCITY_STREAM = STREAMS.index("velocity")
-ROOM = 256  # rows of a stream, to begin with
-# messages of a stream: 2 s at 1 kHz; of one that stands still the first ones leave
+ROOM = 256  # initial capacity of a stream, in rows
+# messages of a stream that may wait: 2 s at 1 kHz; beyond that, the oldest leave
 MOST_WAITING = 2000
-# s of stamps for which a stream counts as ahead after a row of it was refused for that
+# s of stamps for which a stream counts as ahead after a refused row
 LATELY = 2.0
-SILENT = 1.0  # s of stamps after which a stream is not waited for any more, until it is back
-# share of `lag` for which sensors are waited for: bias_node's `hold` must outlast that by far
+SILENT = 1.0  # s of stamps after which the buffer stops waiting for a silent stream
+# share of `lag` for which the buffer waits for SENSORS; `hold` of bias_node must be much longer
 OF_AIDS = 0.5
-TRIAL = 2.0  # s of stamps in order, after which a stream is trusted to go on so
-# s by which each stream may be ahead of those that it is compared with. TDOAs that arrive 2 s after
-# the inertial samples of their time are
-# still used; other sensors are compared with the inertial samples, too.
+TRIAL = 2.0  # s of stamps in order after which the buffer assumes that a stream stays in order
+# s, largest lead of each stream over the streams it is compared with. TDOAs that arrive 2 s after
+# inertial samples of the same time are still used. Other sensors are compared with inertial samples
+# too.
 LARGEST_LEADS = tuple(
     2.0 if place in (IMU_STREAM, *LOCATING_STREAMS) else 0.5 for place in range(len(STREAMS))
 )
@@ -48,9 +48,18 @@ NO_AIDS = np.empty(0, AID)
 
 
 class Restart(NamedTuple):
-    """Why the filter starts anew. stream : name of the stream whose stamps fell back; step : s, by
-    how much, below 0; at : s, stamp with which the new time begins; overtaken : another stream had
-    moved the time ahead, and the stream itself did not jump.
+    """Describe why the filter restarts.
+
+    Attributes
+    ----------
+    stream : str
+        Name of the stream whose stamps jumped back.
+    step : float
+        Size of the jump, in s, below 0.
+    at : float
+        First stamp of the new time, in s.
+    overtaken : bool
+        True if another stream had moved the time ahead, and this stream itself did not jump.
     """
 
     stream: str
@@ -60,20 +69,22 @@ class Restart(NamedTuple):
 
 
 class ReorderBuffer:
-    """Streams of STREAMS. Rows, (n,) of their type in KINDS, come in any order and leave in the
-    order of their stamps.
+    """Sort rows of all STREAMS by their stamps.
 
-    Live, rows wait until every stream has passed them. A stream that is silent is waited for for
-    `lag` seconds of stamps, one of the SENSORS for half of that, and after SILENT seconds not at
-    all. `reorder` is waited for late siblings, unless they have come in order so far
-    (LatenessPolicy). A row that is older than what was used is refused as late.
+    Rows are (n,) arrays of the type in KINDS. A live row waits until every stream has passed its
+    stamp. The buffer waits `lag` s of stamps for a silent stream, and half of that for a sensor in
+    SENSORS. After SILENT s it stops waiting. It waits `reorder` s for rows out of order, unless a
+    stream has been in order so far (LatenessPolicy). A row older than the rows already used is
+    refused as late.
 
-    The reference is the stream that locates the tag: TDOAs, or ranges without them. Its stamps are
-    the time; while it is silent, those of inertial samples are, or without an IMU those of
-    velocities. Only the reference can start the filter anew: when its clock falls back, or when
-    another stream has moved the time ahead of it. Any other stream is judged by its lead over the
-    reference: one that is too far ahead is refused as invalid, one that is behind as late, and
-    neither moves the time. A recording is there as a whole: `load`.
+    The reference is the stream that locates the tag: TDOAs, or ranges without TDOAs. Its stamps
+    define the time. While the reference is silent, inertial samples define the time, or velocities
+    without an IMU.
+
+    Only the reference can restart the filter. The filter restarts if the reference clock jumps
+    back, or if another stream has moved the time ahead. Every other stream is compared with the
+    reference. Rows too far ahead are refused as invalid, rows behind as late, and neither moves the
+    time. A recording is added with `load`.
     """
 
     def __init__(
@@ -84,13 +95,22 @@ class ReorderBuffer:
         refuse: Callable[[int, np.ndarray, int], None],
         restart: Callable[[Restart], None],
     ) -> None:
-        """reorder, lag : s; use_imu : inertial samples are waited for; refuse(stream, rows,
-        verdict) is called with what will not be used, restart(cause) when the filter has to start
-        anew.
+        """Create an empty buffer.
+
+        Parameters
+        ----------
+        reorder, lag : float
+            Waiting times, in s of stamps.
+        use_imu : bool
+            Wait for inertial samples.
+        refuse : callable
+            `refuse(stream, rows, verdict)` receives rows that will not be used.
+        restart : callable
+            `restart(cause)` is called when the filter must restart.
         """
         self.reorder, self.lag = reorder, lag
         self._awaited = TDOA_STREAM, *([IMU_STREAM] if use_imu else [])
-        # by which time goes on while nothing locates
+        # stream that defines the time while no stream locates the tag
         self._moving = IMU_STREAM if use_imu else VELOCITY_STREAM
         self._leading = self._moving, *LOCATING_STREAMS
         self._refuse, self._restart = refuse, restart
@@ -98,31 +118,32 @@ class ReorderBuffer:
 
     @classmethod
     def of_recording(cls) -> ReorderBuffer:
-        """For what is there as a whole: nothing is late."""
+        """Return a buffer for a recording, in which no row is late."""
         return cls(0.0, 0.0, False, lambda stream, rows, verdict: None, lambda cause: None)
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Remove all rows and reset the clocks of all streams."""
         self._streams = [_Stream(kind) for kind in KINDS]
         self._reference = TDOA_STREAM
         self.began = math.inf  # s, stamp of the first row of a leading stream
-        # s: stamps of the first reference row that is overtaken, and of the IMU then
+        # s: stamp of the first reference row behind the time, and of the IMU then
         self._overtaken: tuple[float, float] | None = None
         self.used_until = -math.inf  # s, stamp of the last row that was taken
 
     def __len__(self) -> int:
-        """Rows that wait in order."""
+        """Return the number of rows that wait in order."""
         return sum(map(len, self._streams))
 
     @property
     def waiting(self) -> tuple[int, ...]:
-        """Rows of each stream that neither left nor were refused yet."""
+        """Return the number of rows of each stream that were neither taken nor refused yet."""
         return tuple(len(stream) + len(stream.gate) for stream in self._streams)
 
     @property
     def leads(self) -> tuple[float, ...]:
-        """s by which each stream is ahead of the others, if rows of it have been refused for that
-        lately; else 0.
+        """Return the lead of each stream over the others, in s.
+
+        The lead is 0 unless rows of the stream were refused for it within the last LATELY s.
         """
         newest = self.newest
         return tuple(
@@ -132,7 +153,7 @@ class ReorderBuffer:
 
     @property
     def newest(self) -> float:
-        """Stamp that the time has reached, s; -inf before the first row of a leading stream."""
+        """Return the stamp that the time has reached, in s; -inf before the first leading row."""
         moving = self._streams[self._moving]
         return max(
             self._streams[self._reference].gate.newest,
@@ -141,7 +162,7 @@ class ReorderBuffer:
 
     @property
     def first(self) -> float:
-        """Stamp of the oldest row that waits, s; inf if there is none."""
+        """Return the stamp of the oldest waiting row, in s; inf if no row waits."""
         return min(
             (float(stream.rows["t"][0]) for stream in self._streams if len(stream)),
             default=math.inf,
@@ -149,8 +170,9 @@ class ReorderBuffer:
 
     @property
     def watermark(self) -> float:
-        """Stamp, s, up to which no row is to be expected any more; of more than MOST_WAITING of a
-        leading stream the first may leave anyway.
+        """Return the stamp, in s, up to which no further row is expected.
+
+        If more than MOST_WAITING rows of a leading stream wait, the oldest may leave anyway.
         """
         newest, passed = self.newest, []
         for place in self._awaited:
@@ -172,8 +194,17 @@ class ReorderBuffer:
         return max(min(passed, default=newest), *too_many, -math.inf)
 
     def add(self, place: int, rows: np.ndarray, usable: np.ndarray) -> None:
-        """Take rows (n,) of a stream in the order of their arrival; usable (n,) bool: of the others
-        only the stamps count, and whoever adds them accounts for them.
+        """Add rows of a stream in the order of their arrival.
+
+        Parameters
+        ----------
+        place : int
+            Place of the stream in STREAMS.
+        rows : (n,) array
+            Rows of the type in KINDS.
+        usable : (n,) bool array
+            Rows that can be measurements. Only the stamps of the others count, and the caller
+            counts these rows as invalid.
         """
         if not len(rows):
             return
@@ -188,7 +219,7 @@ class ReorderBuffer:
                 if good:
                     self._take_in(place, t, rows[k : k + 1])
                 elif t <= self._limit(place):
-                    # or whoever waits for our pose of this time waits for the next one
+                    # pass the time on: bias_node may wait for the pose of this stamp
                     self._streams[place].gate.pass_time(t, self._reached(place))
         if place in self._leading:
             self._judge(place)
@@ -196,15 +227,23 @@ class ReorderBuffer:
             self._refuse_too_many(place)
 
     def load(self, place: int, rows: np.ndarray) -> None:
-        """Take rows (n,) of a stream of a recording, in the order of their stamps and not before
-        those that came before. Those of all SENSORS may come as one, in the order of stamps and
-        kinds.
+        """Add rows of a recorded stream, sorted by stamp and not before earlier rows.
+
+        Rows of all SENSORS may be merged, sorted by stamp and kind.
+
+        Parameters
+        ----------
+        place : int
+            Place of the stream in STREAMS.
+        rows : (n,) array
+            Rows of the type in KINDS.
         """
         self._streams[place].extend(rows)
 
     def take(self, until: float) -> Measurements:
-        """Remove and return the rows stamped up to `until`, s; those of the SENSORS in the order of
-        their stamps, then of STREAMS.
+        """Remove and return the rows with stamps up to `until`, in s.
+
+        Rows of SENSORS are merged and sorted by stamp, then by kind.
         """
         imu, tdoa, *parts = (stream.take(until) for stream in self._streams)
         parts = [part for part in parts if len(part)]
@@ -216,13 +255,15 @@ class ReorderBuffer:
         return Measurements(imu, tdoa, felt)
 
     def finish(self) -> None:
-        """Nothing follows: refuse what waits for a neighbour of its stamp."""
+        """Refuse rows that wait for a neighbour with a similar stamp, because no row follows."""
         for place, stream in enumerate(self._streams):
             self._refuse_outliers(place, stream.gate.finish())
 
     def _limit(self, place: int) -> float:
-        """Stamp, s, up to which rows of a stream are taken. It is infinite for a stream that agrees
-        with the others: when these are silent, it goes on.
+        """Return the largest stamp, in s, that a stream may have.
+
+        The limit is infinite for a stream that agrees with the others, because it may continue
+        while they are silent.
         """
         stream = self._streams[place]
         if place in (TDOA_STREAM, self._reference) or not (
@@ -233,8 +274,9 @@ class ReorderBuffer:
         return math.inf if compared == -math.inf else compared + LARGEST_LEADS[place]
 
     def _compared(self, place: int) -> float:
-        """Stamp, s, of those streams by which another one is judged: the reference, for sensors the
-        inertial samples, too.
+        """Return the stamp, in s, with which a stream is compared.
+
+        It is the stamp of the reference. Sensors are compared with inertial samples too.
         """
         times = [self._streams[self._reference].gate.newest]
         moving = self._streams[self._moving]
@@ -243,7 +285,7 @@ class ReorderBuffer:
         return max(times)
 
     def _judge(self, place: int) -> None:
-        """Compare the other streams with a leading one, of which rows were added."""
+        """Compare the other streams with a leading stream to which rows were added."""
         if place in LOCATING_STREAMS and place != self._reference:
             stream, reference = self._streams[place], self._streams[self._reference]
             if (
@@ -261,7 +303,7 @@ class ReorderBuffer:
             ):
                 continue
             if stream.ahead:
-                continue  # its lead is that of the last row that was refused
+                continue  # keep the lead of the last row that was refused
             compared = self._compared(other)
             stream.lead = stream.gate.newest - compared
             if stream.lead > LARGEST_LEADS[other]:
@@ -269,14 +311,22 @@ class ReorderBuffer:
                 self._refuse(other, stream.drop_after(compared + LARGEST_LEADS[other]), INVALID)
 
     def _refuse_too_many(self, place: int) -> None:
-        """Bound what waits of a sensor while the streams that lead are silent."""
+        """Limit the number of waiting rows of a sensor while the leading streams are silent."""
         stream = self._streams[place]
         if len(stream) > MOST_WAITING:
             self._refuse(place, stream.take_first(len(stream) - MOST_WAITING), LATE)
 
     def _take_in(self, place: int, t: float, row: np.ndarray) -> None:
-        """Keep a row stamped t, s, and those that were held because of their stamps, if their
-        stamps are accepted.
+        """Add one row if its stamp is accepted, with rows that were held because of their stamps.
+
+        Parameters
+        ----------
+        place : int
+            Place of the stream in STREAMS.
+        t : float
+            Stamp of the row, in s.
+        row : (1,) array
+            Row of the type in KINDS.
         """
         stream, limit = self._streams[place], self._limit(place)
         if t > limit:
@@ -306,19 +356,28 @@ class ReorderBuffer:
             newest = max(newest, t)
 
     def _refuse_ahead(self, place: int, t: float, row: np.ndarray) -> None:
-        """Refuse a row stamped t, s, of a stream that is too far ahead."""
+        """Refuse a row with stamp t, in s, of a stream that is too far ahead."""
         stream, compared = self._streams[place], self._compared(place)
         stream.ahead, stream.lead, stream.refused = True, t - compared, compared
         self._refuse(place, row, INVALID)
 
     def _is_heard(self, newest: float) -> bool:
-        """Whether the reference goes on at a stamp that another stream has reached, s."""
+        """Return whether the reference has reached the stamp `newest`, in s, within SILENT."""
         return self._streams[self._reference].gate.newest > newest - SILENT
 
     def _jump(self, place: int, accepted: list[tuple[float, np.ndarray]], newest: float) -> None:
-        """Go on with a stream whose clock has jumped while that of the reference has not. newest :
-        its newest stamp before, s. The time is that of the reference: a stream that is ahead does
-        not move it.
+        """Add rows of a stream whose clock has jumped while the clock of the reference has not.
+
+        The reference defines the time. A stream that is ahead does not move it.
+
+        Parameters
+        ----------
+        place : int
+            Place of the stream in STREAMS.
+        accepted : list of (float, (1,) array)
+            Stamps, in s, and rows after the jump.
+        newest : float
+            Newest stamp of the stream before the jump, in s.
         """
         stream, compared = self._streams[place], self._compared(place)
         stream.lead = max(0.0, accepted[-1][0] - compared)
@@ -332,8 +391,18 @@ class ReorderBuffer:
             newest = max(newest, t)
 
     def _merge(self, place: int, t: float, row: np.ndarray, newest: float) -> None:
-        """Put a row stamped t, s, among those that wait, unless it is late. newest : stamp of its
-        stream before it, s.
+        """Sort one row into the waiting rows, unless it is late.
+
+        Parameters
+        ----------
+        place : int
+            Place of the stream in STREAMS.
+        t : float
+            Stamp of the row, in s.
+        row : (1,) array
+            Row of the type in KINDS.
+        newest : float
+            Newest stamp of the stream before this row, in s.
         """
         stream = self._streams[place]
         if stream.policy.is_late(t, newest) or t < self.used_until:
@@ -342,14 +411,22 @@ class ReorderBuffer:
             stream.merge(row)
 
     def _reached(self, place: int) -> list[float]:
-        """Stamps, s, that other leading streams have reached, or are about to jump to."""
+        """Return the stamps, in s, that other leading streams have reached or may jump to."""
         others = [self._streams[other].gate for other in self._leading if other != place]
         return [t for gate in others for t in (gate.newest, gate.held) if math.isfinite(t)]
 
     def _is_overtaken(self, place: int, t: float) -> bool:
-        """Whether rows of the reference, of which the last is stamped t, s, have been far behind
-        what was used for a while. Rows that were kept back and come all at once are not: time has
-        not gone on meanwhile.
+        """Return whether the reference has been far behind the used rows for a while.
+
+        Rows that were delayed and arrive all at once do not count, because the time has not
+        advanced meanwhile.
+
+        Parameters
+        ----------
+        place : int
+            Place of the stream in STREAMS.
+        t : float
+            Stamp of the last row, in s.
         """
         if place != self._reference or t >= self.used_until - LARGEST_STEP_BACK:
             if place == self._reference:
@@ -362,12 +439,12 @@ class ReorderBuffer:
         return t - since >= CONTRADICTED and (seen - then >= CONTRADICTED or seen == then)
 
     def _refuse_outliers(self, place: int, outliers: Sequence[tuple[float, np.ndarray]]) -> None:
-        """Refuse rows whose stamps are far from those of their neighbours."""
+        """Refuse rows whose stamps are far from the neighbouring stamps."""
         for t, row in outliers:
             self._refuse(place, row, INVALID if t > self._streams[place].gate.newest else LATE)
 
     def _start_anew(self, place: int, cause: Restart) -> None:
-        """Forget everything but the time that a stream has fallen back to."""
+        """Clear the buffer and keep only the new time of one stream."""
         for k, stream in enumerate(self._streams):
             if len(stream):
                 self._refuse(k, stream.rows, LATE)
@@ -381,43 +458,57 @@ class ReorderBuffer:
         self.clear()
         self._streams[place].gate, self._reference = gate, place
         self._restart(cause)
-        for k, t, row in held:  # was not plausible in the time that is over
+        for k, t, row in held:  # these rows were not plausible in the old time
             self._take_in(k, t, row)
 
 
 class LatenessPolicy:
-    """What of one stream is late. It is judged by the order of its messages alone, which is their
-    sender's, never by when they arrive.
+    """Decide which messages of one stream are late.
 
-    The first message that breaks the order of a trusted stream counts as late, even if nothing
-    newer has been used yet. From then on the stream is not trusted any more. If no stamp has come
-    twice, none is waited for a second time: then the first that does counts as late, and from then
-    on they are waited for.
+    The decision depends only on the order of messages, which the sender determines. It does not
+    depend on arrival times.
+
+    The first message that breaks the order of a trusted stream is late, even if nothing newer was
+    used yet. After that the stream is not trusted. If no stamp has occurred twice so far, the
+    buffer does not wait for a second message of a stamp. The first such message is late. After that
+    the buffer waits for them.
     """
 
     def __init__(self) -> None:
         self._first, self._sorted, self._rising, self._closed = math.nan, True, True, -math.inf
 
     def trusted(self, newest: float) -> bool:
-        """Whether nothing older than `newest`, s, the newest stamp so far, is to be expected."""
+        """Return whether no message older than the newest stamp `newest`, in s, is expected."""
         return self._sorted and newest - self._first >= TRIAL
 
     def watermark(self, newest: float, reorder: float) -> float:
-        """Stamp, s, up to which nothing is to be expected any more; newest : s, so far; reorder : s
-        by which messages of a stream that is not trusted may be out of order.
+        """Return the stamp, in s, up to which no further message is expected.
+
+        Parameters
+        ----------
+        newest : float
+            Newest stamp so far, in s.
+        reorder : float
+            Waiting time for messages of an untrusted stream, in s.
         """
         if not self.trusted(newest):
             return math.nextafter(newest - reorder, -math.inf)
         return newest if self._rising else math.nextafter(newest, -math.inf)
 
     def begin(self, t: float) -> None:
-        """A message stamped t, s, has come in order."""
+        """Register a message with stamp t, in s, that is in order."""
         if self._first != self._first:
             self._first = t
 
     def is_late(self, t: float, newest: float) -> bool:
-        """Whether a message stamped t, s, comes too late to be used; newest : s, before it, -inf
-        for the first.
+        """Return whether a message is too late to be used.
+
+        Parameters
+        ----------
+        t : float
+            Stamp of the message, in s.
+        newest : float
+            Newest stamp before this message, in s; -inf for the first message.
         """
         self.begin(t)
         if t > newest:
@@ -429,12 +520,24 @@ class LatenessPolicy:
 
 
 class _Stream:
-    """Rows of one structured type with a field t, in the order of their stamps. They come a few at
-    a time, nearly always in order: then they are appended. gate : StampGate; policy :
-    LatenessPolicy; lead : s, by which it was ahead of the streams it is compared with when these
-    went on last; ahead : the last row was refused for that; refused : s, stamp of the others when
-    that was;
-    seen : s, stamp of the last row that came, whatever became of it.
+    """Store rows of one structured type with a field t, sorted by stamp.
+
+    Rows arrive a few at a time and nearly always in order. Then they are appended.
+
+    Attributes
+    ----------
+    gate : StampGate
+        Check of the stamps.
+    policy : LatenessPolicy
+        Decision which rows are late.
+    lead : float
+        Lead over the compared streams when these last advanced, in s.
+    ahead : bool
+        True if the last row was refused because of its lead.
+    refused : float
+        Stamp of the compared streams at that refusal, in s.
+    seen : float
+        Stamp of the last row, used or not, in s.
     """
 
     def __init__(self, kind: np.dtype) -> None:
@@ -448,17 +551,23 @@ class _Stream:
 
     @property
     def rows(self) -> np.ndarray:
-        """(n,) of them, which the next call may change."""
+        """Return a view of the waiting rows, (n,), which the next call may change."""
         return self._room[self._first : self._end]
 
     def watermark(self, reorder: float) -> float:
-        """Stamp, s, up to which nothing is to be expected any more."""
+        """Return the stamp, in s, up to which no further row is expected."""
         return self.policy.watermark(self.gate.newest, reorder)
 
     def append(self, rows: np.ndarray, after: float, limit: float) -> bool:
-        """Append rows (k,), k > 0, if their stamps rise, are not before `after`, s, nor after
-        `limit`, s, but after the newest stamp of the stream, and plausible for it (see StampGate).
-        Returns whether they were appended.
+        """Append rows if they are in order and plausible; return whether they were appended.
+
+        Parameters
+        ----------
+        rows : (k,) array
+            At least one row. Stamps must rise, follow the newest stamp of the stream, and pass the
+            StampGate.
+        after, limit : float
+            Smallest and largest stamp that is allowed, in s.
         """
         if len(self.gate) or self.ahead:
             return False
@@ -480,7 +589,7 @@ class _Stream:
         return True
 
     def extend(self, rows: np.ndarray) -> None:
-        """Append rows (k,) whatever their stamps are; where there are none they become the room."""
+        """Append rows (k,) without any check; an empty stream uses their memory."""
         if self._first == self._end:
             self._room, self._first, self._end = rows, 0, len(rows)
             return
@@ -489,8 +598,9 @@ class _Stream:
         self._end += len(rows)
 
     def merge(self, rows: np.ndarray) -> None:
-        """Put rows among the others: by stamp, and by everything else where stamps are equal, not
-        by when they came.
+        """Sort rows into the waiting rows by stamp, then by all other fields.
+
+        The order of arrival does not matter.
         """
         both = np.concatenate([self.rows, rows])
         columns = [
@@ -500,19 +610,19 @@ class _Stream:
         self.extend(both[np.lexsort(columns[::-1])])
 
     def take(self, until: float) -> np.ndarray:
-        """Remove and return the rows stamped up to `until`, s."""
+        """Remove and return the rows with stamps up to `until`, in s."""
         if self._first == self._end:
             return self._none
         stamps, n, step = self._room["t"][self._first : self._end], 0, ROOM
         while (
             n < len(stamps) and stamps[n] <= until
-        ):  # a few at a time: numpy copies what it searches
+        ):  # search a few at a time, because numpy copies the array that it searches
             n += int(stamps[n : n + step].searchsorted(until, side="right"))
             step *= 2
         if not n:
             return self._none
         self._first += n
-        return self._room[self._first - n : self._first]  # nothing is written there any more
+        return self._room[self._first - n : self._first]  # these rows are never overwritten
 
     def take_first(self, n: int) -> np.ndarray:
         """Remove and return the first n rows."""
@@ -520,9 +630,9 @@ class _Stream:
         return self._room[self._first - n : self._first]
 
     def drop_after(self, t: float) -> np.ndarray:
-        """Remove and return the rows stamped after t, s, and those that are held.
+        """Remove and return the rows with stamps after t, in s, and the rows that are held.
 
-        The stream goes on from the last row that is left.
+        The stream continues from its last remaining row.
         """
         kept = int(self.rows["t"].searchsorted(t, side="right"))
         dropped = np.concatenate([self.rows[kept:], *(row for _, row in self.gate.finish())])
@@ -548,6 +658,8 @@ def _append(
     after: float,
     limit: float,
 ) -> tuple[float, float]:
+    # Copy rows to room[end:] if all their stamps pass, see _Stream.append. Return the newest stamp
+    # and the usual step of the clock, in s; the stamp is NaN if a row fails.
     newest, usual = clock[0], clock[1]
     last = max(newest, room[end - 1].t) if end > first else newest
     if newest == -np.inf:

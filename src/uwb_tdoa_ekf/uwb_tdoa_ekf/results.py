@@ -1,4 +1,4 @@
-"""What the filter says: estimates, and what became of each TDOA."""
+"""Define the results of the filter: estimates, and the outcome of each TDOA."""
 
 from __future__ import annotations
 
@@ -20,14 +20,27 @@ VERDICTS = {
     COMPENSATED: "compensated",
     REPEATED: "repeated",
 }
-OF_ROW = "innovation", "variance", "weight", "verdict"  # of memory.RESIDUAL
+OF_ROW = "innovation", "variance", "weight", "verdict"  # fields of memory.RESIDUAL
 
 
 @dataclass(frozen=True)
 class Residuals:
-    """What became of each TDOA. t (n,) s; a, b (n,) anchor ids; innovation (n,) m and variance (n,)
-    m^2, NaN unless used, rejected or compensated by the filter; weight (n,) 0 to 1; verdict (n,) a
-    key of VERDICTS.
+    """Store the outcome of each TDOA.
+
+    Attributes
+    ----------
+    t : (n,) array
+        Stamps, in s.
+    a, b : (n,) array
+        Anchor ids.
+    innovation : (n,) array
+        Innovation, in m. NaN unless the filter used, rejected or compensated the TDOA.
+    variance : (n,) array
+        Variance of the innovation, in m^2, NaN where the innovation is.
+    weight : (n,) array
+        Robust weight, 0 to 1.
+    verdict : (n,) array
+        Keys of VERDICTS.
     """
 
     t: np.ndarray
@@ -40,8 +53,16 @@ class Residuals:
 
     @classmethod
     def from_rows(cls, t: np.ndarray, a: np.ndarray, b: np.ndarray, rows: np.ndarray) -> Residuals:
-        """Of TDOAs stamped t (n,) s, between anchors a and b (n,), and what became of them, (n,) of
-        memory.RESIDUAL.
+        """Return the Residuals of TDOAs from (n,) of memory.RESIDUAL.
+
+        Parameters
+        ----------
+        t : (n,) array
+            Stamps, in s.
+        a, b : (n,) array
+            Anchor ids.
+        rows : (n,) array of memory.RESIDUAL
+            Outcomes.
         """
         return cls(t, a, b, *(rows[name] for name in OF_ROW))
 
@@ -49,8 +70,16 @@ class Residuals:
     def refused(
         cls, t: np.ndarray, a: np.ndarray, b: np.ndarray, verdict: int | np.ndarray
     ) -> Residuals:
-        """Of TDOAs that the filter did not get: t (n,) s; a, b (n,) ids; verdict : that of all, or
-        (n,).
+        """Return the Residuals of TDOAs that did not reach the filter.
+
+        Parameters
+        ----------
+        t : (n,) array
+            Stamps, in s.
+        a, b : (n,) array
+            Anchor ids.
+        verdict : int or (n,) array
+            Verdict of all, or of each.
         """
         n = len(t)
         unknown = np.full(n, math.nan)
@@ -62,10 +91,26 @@ class Residuals:
 
 @dataclass(frozen=True)
 class Odometry:
-    """Estimates. t (n,) s; p (n, 3) m; v (n, 3) m/s, world; q (n, 4) x y z w, body to world;
-    accel_bias (n, 3) m/s^2 and gyro_bias (n, 3) rad/s, body; covariance (n, 9, 9) of [p, v,
-    attitude], the attitude's in the body frame, rad; persistent (n, 3, 3) m^2, what of the
-    position's covariance errors that do not average out make.
+    """Store estimates of the filter.
+
+    Attributes
+    ----------
+    t : (n,) array
+        Stamps, in s.
+    p : (n, 3) array
+        Position in the world frame, in m.
+    v : (n, 3) array
+        Velocity in the world frame, in m/s.
+    q : (n, 4) array
+        Quaternions x y z w, body to world.
+    accel_bias : (n, 3) array
+        Accelerometer bias in the body frame, in m/s^2.
+    gyro_bias : (n, 3) array
+        Gyroscope bias in the body frame, in rad/s.
+    covariance : (n, 9, 9) array
+        Covariance of [p, v, attitude], the attitude error in the body frame, in rad.
+    consider_covariance : (n, 3, 3) array
+        Part of the position covariance from errors that do not average out, in m^2.
     """
 
     t: np.ndarray
@@ -79,7 +124,7 @@ class Odometry:
 
     @classmethod
     def from_rows(cls, rows: np.ndarray) -> Odometry:
-        """From (n,) of memory.ODOMETRY."""
+        """Return the Odometry of (n,) of memory.ODOMETRY."""
         x = rows["x"]
         return cls(
             rows["t"],
@@ -96,17 +141,17 @@ class Odometry:
         return len(self.t)
 
 
-# a dataclass of arrays of one length: Odometry, Residuals, a stream of a Flight
+# a dataclass of arrays of equal length: Odometry, Residuals, a stream of a Flight
 Arrays = TypeVar("Arrays", bound=Sized)
 
 
 def rows_of(part: Arrays, rows: np.ndarray | slice) -> Arrays:
-    """Some rows of a dataclass of arrays of one length."""
+    """Return selected rows of a dataclass of arrays of equal length."""
     return type(part)(*(column[rows] for column in vars(part).values()))
 
 
 def concatenated(parts: Sequence[Arrays]) -> Arrays:
-    """One dataclass of arrays of several, at least one."""
+    """Return the concatenation of several dataclasses of arrays, at least one."""
     parts = [part for part in parts if len(part)] or parts[:1]
     return (
         parts[0]

@@ -1,10 +1,9 @@
-"""What constant errors of TDOAs, and of distances to anchors, would have done to the innovations of
-a run: the path integrated out.
+"""Compute how constant errors of TDOAs and ranges change the innovations of a run.
 
-The derivative of the state by every parameter goes through the recorded transitions and gains as
-the state itself does (B. Friedland, Treatment of bias in recursive filtering, IEEE Trans. Automatic
-Control 14, 1969). A fit of innovations to these derivatives knows of the path whatever the filter
-knew: the inertial sensor, the motion, every other measurement.
+The path is marginalized. The derivative of the state by each parameter follows the recorded
+transitions and gains, as the state does (B. Friedland, Treatment of bias in recursive filtering,
+IEEE Trans. Automatic Control 14, 1969). A fit of innovations to these derivatives therefore uses
+all that the filter used: IMU, process noise, and every other measurement.
 """
 
 from __future__ import annotations
@@ -34,22 +33,38 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.common.flight import Flight
 
-# streams: that of TDOAs, which is none of the SENSORS, and that of ranges
+# names of streams: TDOAs, which are not in SENSORS, and ranges
 TDOAS, RANGES = ("tdoa", "range")
-NEEDED = "t", "kind", "transition", "row", "gain", "innovation"  # of a record of the history
-# s after which a parameter that no measurement depends on any more has left the estimate
+NEEDED = "t", "kind", "transition", "row", "gain", "innovation"  # fields of a history record
+# s after which a parameter without further measurements no longer affects the estimate
 FORGOTTEN = 10.0
 
 
 @dataclass(frozen=True, eq=False)
 class Innovations:
-    """Those of one run, of some streams.
+    """Store the innovations of some streams of one run.
 
-    streams : their names; stream (n,) int, which of them, and rows (n,) places in it of the
-        measurements that were used, in the order of
-    their stamps t (n,) s; value (n,) m; variance (n,) m^2, prior and one measurement; run : Run;
-    records, of : history of the run, and for each record its place in `rows`, -1 for what is not of
-    these streams.
+    Attributes
+    ----------
+    streams : tuple of str
+        Names of the streams.
+    stream : (n,) int array
+        Stream of each innovation, as a place in `streams`.
+    rows : (n,) int array
+        Row of the measurement in its stream. Only used measurements are listed, in the order of
+        their stamps.
+    t : (n,) array
+        Stamps, in s.
+    value : (n,) array
+        Innovations, in m.
+    variance : (n,) array
+        Variance of the innovation, in m^2: of the prediction plus one measurement.
+    run : Run
+        Result of the filter.
+    records : list of arrays
+        History of the run.
+    of : list of (m,) int arrays
+        For each record the place in `rows`, or -1 for other records.
     """
 
     streams: tuple[str, ...]
@@ -63,22 +78,32 @@ class Innovations:
     of: list
 
     def places(self, stream: str) -> np.ndarray:
-        """(m,) places, among all, of those of one of the streams."""
+        """Return the places of the innovations of one stream, (m,) int."""
         return np.flatnonzero(self.stream == self.streams.index(stream))
 
     def by_bias(self, regressors: np.ndarray) -> np.ndarray:
-        """Derivative of minus the innovations by parameters: (n, k).
+        """Return the derivative of the negative innovations by parameters, (n, k).
 
-        regressors (n, k): derivative of what was measured by the parameters, of which the run knew
-        nothing. A bias that the position can follow leaves no trace.
+        A bias that the position can follow does not change the innovations.
+
+        Parameters
+        ----------
+        regressors : (n, k) array
+            Derivative of the measured values by parameters that the run did not model.
         """
         return self.and_positions(regressors, ())[0]
 
     def and_positions(
         self, regressors: np.ndarray, stamps: ArrayLike
     ) -> tuple[np.ndarray, np.ndarray]:
-        """What `by_bias` gives, and the derivative of the estimated position at stamps (m,), s,
-        ascending: (m, 3, k).
+        """Return the result of `by_bias` and the derivative of the estimated position, (m, 3, k).
+
+        Parameters
+        ----------
+        regressors : (n, k) array
+            As for `by_bias`.
+        stamps : (m,) array
+            Ascending stamps of the positions, in s.
         """
         regressors, stamps = (
             np.ascontiguousarray(regressors, dtype=float),
@@ -97,13 +122,30 @@ class Innovations:
         stamps: ArrayLike = (),
         positions: np.ndarray | None = None,
     ) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
-        """What `by_bias` gives, a block of measurements at a time, at the cost of those parameters
-        that matter there: yields (rows, a slice; columns (c,); derivative (rows, c)).
+        """Yield the result of `by_bias` for one block of measurements at a time.
 
-        regressors : sparse, in rows, (n, k); block (n,) int, rising: number of the block of each
-            row. A parameter matters until FORGOTTEN s
-        after the last measurement that depends on it. positions (m, 3, k) : filled with what
-        `and_positions` gives at stamps (m,).
+        Each block costs only as much as the parameters that matter there. A parameter matters until
+        FORGOTTEN s after the last measurement that depends on it.
+
+        Parameters
+        ----------
+        regressors : (n, k) sparse array
+            Stored by rows; as for `by_bias`.
+        block : (n,) int array
+            Ascending block number of each row.
+        stamps : (m,) array
+            Ascending stamps of positions, in s.
+        positions : (m, 3, k) array or None
+            Filled with the position derivatives of `and_positions`.
+
+        Yields
+        ------
+        rows : slice
+            Rows of the block.
+        columns : (c,) int array
+            Parameters that matter in the block.
+        derivative : (rows, c) array
+            Derivative of the negative innovations.
         """
         stamps, t = np.asarray(stamps, dtype=float), self.t
         ends = np.append(np.flatnonzero(np.diff(block)) + 1, len(block))
@@ -143,8 +185,16 @@ class Innovations:
 def _pieces(
     records: Sequence[np.ndarray], of: Sequence[np.ndarray], ends: np.ndarray
 ) -> list[list[tuple[np.ndarray, np.ndarray]]]:
-    """[[(records, of)]] of each block of rows, which end before `ends` (b,): whatever comes before
-    the first row of the next block.
+    """Return [[(records, of)]] for each block of rows.
+
+    A block includes all records before the first row of the next block.
+
+    Parameters
+    ----------
+    records, of : sequence of arrays
+        As in Innovations.
+    ends : (b,) int array
+        End of each block of rows, exclusive.
     """
     out: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in ends]
     now = 0
@@ -160,8 +210,9 @@ def _pieces(
 
 
 class _Needed(list):
-    """Arrays of a history, of each of which only the fields that `_through` reads are kept: less
-    than half.
+    """Collect arrays of a history, reduced to the fields that `_through` reads.
+
+    This saves more than half of the memory.
     """
 
     def append(self, records: np.ndarray) -> None:
@@ -174,11 +225,22 @@ def record_innovations(
     corrector: Corrector | None = None,
     streams: Sequence[str] = (TDOAS,),
 ) -> Innovations:
-    """Run a Flight through bias correction and filter, without its pressure, and keep what
-    `Innovations` need of the TDOAS, and of those SENSORS among `streams` that the flight has and
-    the filter uses. Takes what run_offline takes. An unknown offset of all ranges
-    (`range_offset_std`) is found first and taken out of them, unless ranges are among `streams`:
-    then it is among the parameters.
+    """Run bias correction and filter on a Flight without its pressure and return Innovations.
+
+    An unknown common offset of all ranges (`range_offset_std`) is estimated first and subtracted.
+    If ranges are among `streams`, the offset stays a parameter instead.
+
+    Parameters
+    ----------
+    flight : Flight
+        Recording.
+    config : FilterConfig or None
+        As for run_offline.
+    corrector : Corrector or None
+        As for run_offline.
+    streams : sequence of str
+        TDOAS, and names of SENSORS. Streams that the flight lacks or the filter does not use are
+        ignored.
     """
     corrector = corrector or Corrector(flight.anchors)
     config = replace(config or FilterConfig(), **auxiliary.NO_PRESSURE)
@@ -232,9 +294,24 @@ def _through(
     path: tuple[np.ndarray, np.ndarray],
     passed: int,
 ) -> int:
-    """states (2, 15, k): derivative of the error state by the parameters, and room for the next
-    one. path: stamps (m,) of which `passed` lie behind, and positions (m, 3, k); returns how many
-    do then, and fills their positions.
+    """Propagate derivatives through records and return how many of the stamps are passed.
+
+    Parameters
+    ----------
+    records : (r,) array
+        Records of the history.
+    of : (r,) int array
+        Row of `regressors` for each record, or -1.
+    regressors : (n, k) array
+        Derivative of the measured values by the parameters.
+    states : (2, 15, k) array
+        Derivative of the error state by the parameters, and room for the next one.
+    out : (n, k) array
+        Filled with derivatives of the negative innovations.
+    path : ((m,) array, (m, 3, k) array)
+        Stamps, in s, and position derivatives to fill.
+    passed : int
+        Number of stamps that are already passed.
     """
     stamps, positions = path[0], path[1]
     before, after = states[0], states[1]

@@ -1,9 +1,8 @@
-"""Fixed-interval smoother over the filter's own run: every estimate from all measurements, before
-and after it.
+"""Smooth the filter's own run with a fixed-interval smoother: each estimate uses all measurements.
 
-Modified Bryson-Frazier recursion (Bierman, Fixed interval smoothing with discrete measurements,
-Int. J. Control 1973): backwards through the scalar updates of the filter's history, with its robust
-weights, inverting no covariance.
+The smoother is the modified Bryson-Frazier recursion (Bierman, Fixed interval smoothing with
+discrete measurements, Int. J. Control 1973). It runs backwards through the scalar updates in the
+filter's history with the filter's robust weights. It inverts no covariance.
 """
 
 from __future__ import annotations
@@ -36,12 +35,21 @@ if TYPE_CHECKING:
 def smooth(
     flight: Flight, config: FilterConfig | None = None, corrector: Corrector | None = None
 ) -> Run:
-    """Run a Flight through bias correction, filter and smoother.
+    """Run bias correction, filter and smoother on a Flight and return the smoothed Run.
 
-    Takes what run_offline takes and returns its Run with the odometry smoothed: at the stamps of
-    updates, thinned to odometry_rate. Pressures are not used. If the yaw is unknown, the direction
-    that the filter follows in the end counts from the beginning; so does the offset of all ranges,
-    if it is unknown (`range_offset_std`): that takes a second smoothing. Memory: 3.5 kB per update.
+    The odometry has the stamps of updates, thinned to odometry_rate. Pressures are not used. If the
+    yaw is unknown, the smoother uses the final yaw hypothesis from the start. An unknown common
+    range offset (`range_offset_std`) is treated the same way and needs a second smoothing run. The
+    memory is 3.5 kB per update.
+
+    Parameters
+    ----------
+    flight : Flight
+        Recording.
+    config : FilterConfig or None
+        As for run_offline.
+    corrector : Corrector or None
+        As for run_offline.
     """
     config, offset = replace(config or FilterConfig(), **auxiliary.NO_PRESSURE), None
     unknown_yaw = config.use_imu and config.initial_yaw_std > YAW_STD
@@ -65,13 +73,13 @@ def smooth(
 
 
 def _smoothed_run(flight: Flight, config: FilterConfig, corrector: Corrector | None) -> Run:
-    """`smooth` where the yaw is known, and nothing of what `auxiliary.NONE` switches off is used."""
+    """Return the smoothed Run for a known yaw and a config changed by auxiliary.NONE."""
     records: list[np.ndarray] = []
     result = run_offline(flight, config, corrector, records)
     records = [part for part in records if len(part)]
     before = [-math.inf] + [
         part["t"][-1] for part in records
-    ]  # stamp of the record before each array of them
+    ]  # stamp of the record before each array of records
     adjoint, information = np.zeros(ERROR_STATES), np.zeros((ERROR_STATES, ERROR_STATES))
     rows = [np.empty(0, ODOMETRY)]
     for k in reversed(range(len(records))):
@@ -85,9 +93,10 @@ def _smoothed_run(flight: Flight, config: FilterConfig, corrector: Corrector | N
 
 
 def _with_persistent(smoothed: Odometry, online: Odometry) -> Odometry:
-    """The smoothed Odometry with what errors that do not average out make of its covariance:
-    smoothing averages no more of them out than the filter does, so that it is the same as on line,
-    at the last stamp before.
+    """Return the smoothed Odometry with the covariance of errors that do not average out.
+
+    The smoother does not average these errors out any more than the filter does. The covariance is
+    therefore taken from the online estimate at the last stamp before.
     """
     if not len(online):
         return smoothed
@@ -100,8 +109,14 @@ def _with_persistent(smoothed: Odometry, online: Odometry) -> Odometry:
 
 
 def _with_common_error(smoothed: Odometry, beside: Odometry) -> Odometry:
-    """The smoothed Odometry with what an error that is the same all the time makes of its
-    covariance; beside : Odometry with one standard deviation of that error more.
+    """Return the smoothed Odometry with the covariance of an error that is constant in time.
+
+    Parameters
+    ----------
+    smoothed : Odometry
+        Smoothed estimates.
+    beside : Odometry
+        Smoothed estimates with the error larger by one standard deviation.
     """
     if not len(smoothed) or not len(beside):
         return smoothed
@@ -125,11 +140,22 @@ def _backward(
     information: np.ndarray,
     rows: np.ndarray,
 ) -> int:
-    """Through (n,) of RECORD from the end on; `before` : s, stamp of the record in front of them.
+    """Run the smoother backwards through records and return the number of rows written.
 
-    adjoint (15,), information (15, 15): Bierman's lambda and Lambda, those behind the records,
-    which become those in front of them. Fills (n,) of ODOMETRY from the end on, and returns how
-    many.
+    Parameters
+    ----------
+    records : (n,) array of RECORD
+        History in the order of stamps.
+    before : float
+        Stamp of the record before these, in s.
+    rate : float
+        Output rate, in Hz.
+    adjoint : (15,) array
+        Bierman's lambda after the records; replaced by the value before them.
+    information : (15, 15) array
+        Bierman's Lambda; replaced likewise.
+    rows : (n,) array of ODOMETRY
+        Filled from its end.
     """
     count = 0
     for i in range(len(records) - 1, -1, -1):
@@ -149,7 +175,7 @@ def _backward(
 
 @compiled
 def _smoothed(record: Record, adjoint: np.ndarray, information: np.ndarray, row: Record) -> None:
-    """Write x - P lambda and P - P Lambda P to one of ODOMETRY."""
+    """Write x - P lambda and P - P Lambda P to a row of ODOMETRY."""
     P = record.P
     correction = np.zeros(ERROR_STATES)  # -P lambda
     product = np.zeros((9, ERROR_STATES))  # upper rows of P Lambda
@@ -173,8 +199,10 @@ def _smoothed(record: Record, adjoint: np.ndarray, information: np.ndarray, row:
 
 @compiled
 def _through_update(record: Record, adjoint: np.ndarray, information: np.ndarray) -> None:
-    """lambda <- C' lambda - h' y / S, Lambda <- C' Lambda C + h' h / S; C = I - K h, innovation y
-    of variance S.
+    """Step lambda and Lambda backwards through one scalar update.
+
+    The equations are lambda <- C' lambda - h' y / S and Lambda <- C' Lambda C + h' h / S. Here C =
+    I - K h, and the innovation y has the variance S.
     """
     h, gain = record.row, record.gain
     information_gain = np.zeros(ERROR_STATES)  # Lambda K
@@ -198,8 +226,10 @@ def _through_update(record: Record, adjoint: np.ndarray, information: np.ndarray
 def _through_prediction(
     transition: np.ndarray, adjoint: np.ndarray, information: np.ndarray
 ) -> None:
-    """lambda <- Phi' lambda, Lambda <- Phi' Lambda Phi; the lower rows of Phi are those of the
-    identity.
+    """Step lambda and Lambda backwards through one prediction.
+
+    The equations are lambda <- Phi' lambda and Lambda <- Phi' Lambda Phi. The lower rows of Phi
+    equal the identity.
     """
     before = adjoint.copy()
     product = np.zeros((ERROR_STATES, ERROR_STATES))  # Lambda Phi

@@ -1,5 +1,6 @@
-"""The map from a measured position to its bias, after Grasso et al. (Sensors 2022, 22, 9136), eqs.
-20 and 21; and its file.
+"""Store, apply and save the map from a measured position to its bias.
+
+The map follows Grasso et al. (Sensors 2022, 22, 9136), eqs. 20 and 21.
 """
 
 from __future__ import annotations
@@ -29,10 +30,10 @@ UNITS = (
     "true"
 )
 INTERPOLATORS = ("thin_plate", "network")
-SMOOTHING = 0.3  # of the thin plate, at a marker of median count; see docs/debiasing.md
-# m beyond the known region over which the correction goes to nothing; see docs/debiasing.md
+SMOOTHING = 0.3  # smoothing of the thin plate at a marker of median count; see docs/debiasing.md
+# m beyond the known region over which the correction fades to 0; see docs/debiasing.md
 FADE = 1.0
-LARGEST = 1e5  # m; more is a mistake
+LARGEST = 1e5  # m; a larger place or bias is an error
 _ARRAYS = {
     "cell": int,
     "at": float,
@@ -47,22 +48,37 @@ _ARRAYS = {
 
 @dataclass(frozen=True)
 class BiasMap:
-    """Biases at n markers in d = 2 or 3 dimensions, and what lies between them.
+    """Store biases at n markers in d = 2 or 3 dimensions and interpolate between them.
 
-    cell : (n, d) int, place in the grid of `step` m; at : (n, d) m, where the markers are measured,
-        eq. 19
-    bias : (n, d) m, b* of eqs. 17 and 18; std : (n, d) m, scatter of the measurements; count : (n,)
-        measurements
-    added : (d, d) m^2, to be added to the covariance of a position that is corrected; see `fit`
-    interpolator : "thin_plate" (scipy's RBFInterpolator: passes near all markers, the nearer the
-        more was measured
-        there) or "network" (Grasso et al., appendix A)
-    frame : name of the world frame; source : where it came from, free text
-    ids : (N,), positions : (N, 3) m of the anchors that it was made for; without any it belongs to
-        none
+    A position is known inside the convex hull of the markers and within one step of the nearest
+    marker. Beyond that region, the correction fades to 0 over FADE.
 
-    A position is known inside the convex hull of the markers and no further than one step from the
-    next of them. Beyond, the correction fades to nothing over FADE.
+    Attributes
+    ----------
+    cell : (n, d) int array
+        Place in the grid of `step`.
+    at : (n, d) array
+        Measured places of the markers in the world frame, in m, eq. 19.
+    bias : (n, d) array
+        Bias b*, measured minus true, in m, eqs. 17 and 18.
+    std : (n, d) array
+        Standard deviation of the measurements, in m.
+    count : (n,) int array
+        Number of measurements.
+    added : (d, d) array
+        Covariance to add to that of a corrected position, in m^2; see `fit`.
+    step : float
+        Cell size of the grid, in m.
+    interpolator : str
+        "thin_plate" (scipy's RBFInterpolator, closer to markers with more measurements) or
+        "network" (Grasso et al., appendix A).
+    frame : str
+        Name of the world frame.
+    source : str
+        Origin of the map, free text.
+    ids, positions : (N,) and (N, 3) array
+        Ids and positions, in m, of the anchors of the map. Without any, the map belongs to no
+        anchors.
     """
 
     cell: np.ndarray
@@ -151,16 +167,17 @@ class BiasMap:
 
     @property
     def planar(self) -> bool:
-        """Whether it knows x and y only; z is then left as it is."""
+        """Return whether the map has x and y only; z is then not corrected."""
         return self.at.shape[1] == 2
 
     def belongs_to(self, anchors: Anchors) -> bool:
-        """Whether it was made for these Anchors."""
+        """Return whether the map was made for these Anchors."""
         return bool(len(self.ids)) and anchors.stand_at(self.ids, self.positions, self.frame)
 
     def scaled(self, share: float) -> BiasMap:
-        """The BiasMap of a share, 0 ... 1, of all biases; the rest, which is not taken out, is in
-        `added`.
+        """Return a BiasMap with all biases scaled by `share`, 0 to 1.
+
+        The uncorrected part of the bias is included in `added`.
         """
         return replace(
             self,
@@ -169,8 +186,9 @@ class BiasMap:
         )
 
     def validity(self, p: np.ndarray) -> np.ndarray:
-        """How far the map is valid at positions p (m, 3), m: (m,), 1 inside of the known region, 0
-        from FADE beyond it.
+        """Return the validity of the map at positions p (m, 3), in m: (m,), 0 to 1.
+
+        The validity is 1 in the known region and 0 from a distance of FADE.
         """
         p = p[:, : self.at.shape[1]]
         normals, offsets = self._hull
@@ -179,12 +197,14 @@ class BiasMap:
         return np.clip(1.0 - np.maximum(outside, far_from_markers) / FADE, 0.0, 1.0)
 
     def bias_at(self, p: np.ndarray) -> np.ndarray:
-        """beta of eq. 20 at measured positions p (m, 3), m: (m, 3) m, already faded; 0 in z if the
-        map is planar.
+        """Return the faded bias beta of eq. 20 at measured positions p (m, 3), in m: (m, 3) m.
+
+        The z component is 0 if the map is planar.
         """
         return self._faded(p, self.validity(p))
 
     def _faded(self, p: np.ndarray, validity: np.ndarray) -> np.ndarray:
+        # Return the interpolated bias times its validity, (m, 3) m.
         out = np.zeros((len(p), 3))
         known = validity > 0.0
         if known.any():
@@ -195,12 +215,26 @@ class BiasMap:
     def correct(
         self, p: np.ndarray, covariance: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Positions without their bias (eq. 21) and the covariance of what is left.
+        """Return positions without their bias (eq. 21) and the covariance of the remaining error.
 
-        p : (m, 3) m; covariance : (m, 3, 3) m^2. Returns (p, covariance, validity). With validity
-            w, what is added to
-        the covariance is w^2 `added` for what the map does not know, and (1 - w)^2 of the mean
-        square of all biases, for one that was not taken out.
+        At validity w, the covariance increases by two terms. The term w^2 `added` covers errors of
+        the map. The term (1 - w)^2 times the mean square of all biases covers the uncorrected bias.
+
+        Parameters
+        ----------
+        p : (m, 3) array
+            Positions in the world frame, in m.
+        covariance : (m, 3, 3) array
+            Their covariance, in m^2.
+
+        Returns
+        -------
+        p : (m, 3) array
+            Corrected positions, in m.
+        covariance : (m, 3, 3) array
+            Their covariance, in m^2.
+        validity : (m,) array
+            Validity of the map, 0 to 1.
         """
         validity, d = self.validity(p), self.at.shape[1]
         covariance = covariance.copy()
@@ -209,7 +243,7 @@ class BiasMap:
         return p - self._faded(p, validity), covariance, validity
 
     def save(self, path: Path) -> None:
-        """Write what `load` reads: a numpy .npz file that names its format, version and units."""
+        """Write the map to a numpy .npz file that states its format, version and units."""
         about: dict[str, Any] = {
             "format": FORMAT,
             "version": VERSION,
@@ -226,7 +260,7 @@ class BiasMap:
 
     @classmethod
     def load(cls, path: str | Path) -> BiasMap:
-        """Read a file that `save` wrote; raises InputError."""
+        """Read a file that `save` wrote; raise InputError if it is wrong."""
         what, remedy = f"position bias map of version {VERSION}", "make one with `debias`"
         kinds = {name: "i" if kind is int else "f" for name, kind in _ARRAYS.items()}
         texts = ("format", "units", "frame", "source", "interpolator")

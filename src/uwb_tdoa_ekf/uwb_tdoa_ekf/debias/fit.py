@@ -1,4 +1,4 @@
-"""Making a BiasMap out of measured and true positions, and saying how precise it is elsewhere."""
+"""Fit a BiasMap to measured and true positions and estimate its precision at other places."""
 
 from __future__ import annotations
 
@@ -18,17 +18,22 @@ if TYPE_CHECKING:
 
     from .markers import Markers
 
-FOLDS = 5  # into which parts are shared out, if there are more
-LOST = 1.0  # m; what is further off is no measurement of a bias
-LARGEST = 1e4  # times the map's own error that may be added to a covariance
+FOLDS = 5  # folds for cross-validation, if there are more parts
+LOST = 1.0  # m; a pair with a larger error does not measure a bias
+LARGEST = 1e4  # largest factor of `added`
 
 
 class Part:
-    """What was measured in one go: a flight, or the stay at one point of a grid.
+    """Store the measurements of one flight, or of one point of a grid.
 
-    measured, true : (N, 3) m, world frame; covariance : (N, 3, 3) m^2 of measured, or None where
-        nobody knows it. Pairs
-    that are more than LOST apart, or not finite, are left out.
+    Pairs that are not finite, or more than LOST apart, are dropped.
+
+    Parameters
+    ----------
+    measured, true : (N, 3) array
+        Positions in the world frame, in m.
+    covariance : (N, 3, 3) array or None
+        Covariance of `measured`, in m^2; None if unknown.
     """
 
     def __init__(
@@ -43,7 +48,7 @@ class Part:
 
 
 class _Options(NamedTuple):
-    """Arguments of `fit`."""
+    """Store the arguments of `fit`."""
 
     step: float
     least: int
@@ -62,15 +67,30 @@ def fit(
     anchors: Anchors | None = None,
     source: str = "",
 ) -> BiasMap:
-    """BiasMap of a list of Part. Raises InputError where they hold too little.
+    """Return the BiasMap of several Parts; raise InputError if they hold too few measurements.
 
-    step : m, of the grid; least : measurements that make a marker; planar : map x and y only;
-        anchors : Anchors that
-    the map is for. `added` comes from maps that were fitted without some of the parts and asked
-    about them (without stretches of it, if there is one part only): their mean squared error at
-    markers. If the covariances of the measured positions are known, as much of it is added as makes
-    the normalised squared error of the corrected positions d on average there, nothing if they are
-    honest as they are; else all of it.
+    The covariance `added` comes from cross-validation. Maps are fitted without some of the parts,
+    or without stretches of a single part. `added` is their mean squared error at the held-out
+    markers. If the covariances of the positions are known, `added` is scaled. The scale makes the
+    normalised squared error of the held-out positions d on average. It is 0 if the covariances
+    alone are large enough.
+
+    Parameters
+    ----------
+    parts : list of Part
+        Measurements.
+    step : float
+        Cell size of the grid, in m.
+    least : int
+        Smallest number of measurements of a marker.
+    planar : bool
+        Map x and y only.
+    interpolator : str
+        One of INTERPOLATORS.
+    anchors : Anchors or None
+        Anchors of the map.
+    source : str
+        Origin of the map, free text.
     """
     options = _Options(step, least, planar, interpolator, anchors, source)
     whole = _fit(parts, options, np.zeros((2, 2) if planar else (3, 3)))
@@ -80,7 +100,7 @@ def fit(
         others = [part for i, fold in enumerate(folds) if i != k for part in fold]
         try:
             bias_map = _fit(others, options, whole.added)
-        except InputError:  # the rest alone makes no map
+        except InputError:  # the remaining parts are too few for a map
             continue
         bias_errors.append(_bias_errors(bias_map, held_out, options))
         for part in held_out:
@@ -88,7 +108,8 @@ def fit(
             errors.append(error)
             covariances.append(covariance)
     deviations = np.concatenate(bias_errors)
-    if len(deviations) == 0:  # nothing was known elsewhere: as unsure as without a map
+    # no held-out marker is in a known region: assume the error without a map
+    if len(deviations) == 0:
         return _fit(parts, options, whole.bias.T @ whole.bias / len(whole.bias))
     added = deviations.T @ deviations / len(deviations)
     known = [covariance for covariance in covariances if covariance is not None]
@@ -98,9 +119,7 @@ def fit(
 
 
 def _bias_errors(bias_map: BiasMap, parts: list[Part], options: _Options) -> np.ndarray:
-    """Biases of the markers that parts make, less what a map of others says where it is valid: (n,
-    d) m.
-    """
+    """Return marker biases of held-out parts minus the map, where it is valid, (n, d) m."""
     markers = _markers(parts, options)
     at = _in_space(measured_places(markers, markers.bias))
     error = markers.bias - bias_map.bias_at(at)[:, : markers.bias.shape[1]]
@@ -108,8 +127,14 @@ def _bias_errors(bias_map: BiasMap, parts: list[Part], options: _Options) -> np.
 
 
 def _position_errors(bias_map: BiasMap, part: Part) -> tuple[np.ndarray, np.ndarray | None]:
-    """What a map of others leaves of the errors of a Part where it is valid, (n, d) m; their
-    covariances or None.
+    """Return the corrected errors of a held-out Part where the map is valid, and their covariances.
+
+    Returns
+    -------
+    error : (n, d) array
+        Errors, in m.
+    covariance : (n, d, d) array or None
+        Stated covariances, in m^2.
     """
     d, valid = bias_map.at.shape[1], bias_map.validity(part.measured) == 1.0
     p = part.measured[valid]
@@ -118,8 +143,9 @@ def _position_errors(bias_map: BiasMap, part: Part) -> tuple[np.ndarray, np.ndar
 
 
 def _needed(error: np.ndarray, covariance: np.ndarray, added: np.ndarray) -> float:
-    """The factor of `added` with which the mean of e' (P + factor added)^-1 e is d, the number of
-    dimensions; 0 or more.
+    """Return the factor, at least 0, that makes the normalised squared error d on average.
+
+    The normalised squared error is e' (P + factor added)^-1 e, and d is the number of dimensions.
     """
 
     def excess(factor: float) -> float:
@@ -132,6 +158,7 @@ def _needed(error: np.ndarray, covariance: np.ndarray, added: np.ndarray) -> flo
 
 
 def _fit(parts: list[Part], options: _Options, added: np.ndarray) -> BiasMap:
+    # Return the BiasMap of parts with a given `added`.
     markers = _markers(parts, options)
     bias = corrected_bias(markers)
     at = measured_places(markers, bias)
@@ -155,6 +182,7 @@ def _fit(parts: list[Part], options: _Options, added: np.ndarray) -> BiasMap:
 
 
 def _markers(parts: list[Part], options: _Options) -> Markers:
+    # Return the Markers of parts; raise InputError if there are none.
     parts = [part for part in parts if len(part)]
     if not parts:
         raise InputError(
@@ -176,7 +204,7 @@ def _markers(parts: list[Part], options: _Options) -> Markers:
 
 
 def _folds(parts: list[Part]) -> list[list[Part]]:
-    """Lists of parts to be left out together; stretches of it, if there is only one."""
+    """Return lists of parts that are held out together; stretches if there is one part only."""
     if len(parts) > 1:
         return [parts[k::FOLDS] for k in range(min(FOLDS, len(parts)))]
     columns = [np.array_split(column, FOLDS) for column in (parts[0].measured, parts[0].true)]
@@ -186,5 +214,5 @@ def _folds(parts: list[Part]) -> list[list[Part]]:
 
 
 def _in_space(p: np.ndarray) -> np.ndarray:
-    """(n, 3) of (n, 2) or (n, 3)."""
+    """Return (n, 3) of (n, 2) or (n, 3), with z = 0 if missing."""
     return np.pad(p, ((0, 0), (0, 3 - p.shape[1])))

@@ -1,8 +1,10 @@
-"""From pairs of measured and true positions to a cloud of markers with a bias each: Grasso et al.
-(Sensors 2022, 22, 9136), eqs. 15 - 19 and 22, in two dimensions as published or in three.
+"""Compute markers with a bias each from pairs of measured and true positions.
 
-Static data (many measurements at each point of a grid) and dynamic data (one at each instant of a
-path) go the same way: the markers of a path are the means of what was measured in each cell of a
+The method is Grasso et al. (Sensors 2022, 22, 9136), eqs. 15 - 19 and 22, in two dimensions as
+published or in three.
+
+Static data have many measurements at each point of a grid. Dynamic data have one at each instant of
+a path. Both are treated the same way: a marker is the mean of the measurements in one cell of a
 grid.
 """
 
@@ -13,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-COVERAGE = 3.0  # standard deviations to each side that the integrals of eqs. 17 and 18 cover
+COVERAGE = 3.0  # standard deviations on each side in the integrals of eqs. 17 and 18
 _ABSCISSAE = np.linspace(-COVERAGE, COVERAGE, 61)
 _WEIGHTS = np.exp(-0.5 * _ABSCISSAE**2)
 _WEIGHTS[[0, -1]] *= 0.5  # trapezoidal rule
@@ -22,11 +24,20 @@ _WEIGHTS /= _WEIGHTS.sum()
 
 @dataclass(frozen=True)
 class Markers:
-    """n markers in d = 2 or 3 dimensions, world frame.
+    """Store n markers in d = 2 or 3 dimensions, in the world frame.
 
-    cell : (n, d) int, place in a grid; true : (n, d) m, where they are; bias : (n, d) m, mean of
-        measured minus true;
-    std : (n, d) m, its standard deviation; count : (n,) measurements.
+    Attributes
+    ----------
+    cell : (n, d) int array
+        Place in a grid.
+    true : (n, d) array
+        True places, in m.
+    bias : (n, d) array
+        Mean of measured minus true, in m.
+    std : (n, d) array
+        Standard deviation of measured minus true, in m.
+    count : (n,) int array
+        Number of measurements.
     """
 
     cell: np.ndarray
@@ -40,12 +51,19 @@ class Markers:
 
 
 def collect(measured: np.ndarray, true: np.ndarray, step: float, least: int = 1) -> Markers:
-    """Markers of N pairs of positions: one for each cell of a grid of `step` m that holds at least
-    `least` pairs.
+    """Return the Markers of N pairs of positions, one for each cell with enough pairs.
 
-    measured, true : (N, d) m. The grid starts at the smallest true coordinates, so that points
-        surveyed on a grid of
-    this step keep a cell each. bias b, standard deviation and mean square as in eq. 22.
+    The grid starts at the smallest true coordinates. Points that were surveyed on a grid of this
+    step therefore have a cell each. Bias b, standard deviation and mean square follow eq. 22.
+
+    Parameters
+    ----------
+    measured, true : (N, d) array
+        Positions, in m.
+    step : float
+        Cell size of the grid, in m.
+    least : int
+        Smallest number of pairs of a marker.
     """
     cell = np.floor((true - true.min(axis=0)) / step + 0.5).astype(int)
     cells, of, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
@@ -62,14 +80,15 @@ def collect(measured: np.ndarray, true: np.ndarray, step: float, least: int = 1)
 
 
 def corrected_bias(markers: Markers) -> np.ndarray:
-    """b*, (n, d) m: the bias to expect where a marker was measured, eqs. 17 and 18.
+    """Return b*, (n, d) m: the bias expected where a marker was measured, eqs. 17 and 18.
 
-    Along each axis through a marker, cubic splines through the biases of the markers on that line
-    are averaged with the Gaussian of the marker's standard deviation along that axis over +-3 of
-    them; b* is the mean over the axes (the two of the plane as published, or all three). Here the
-    Gaussian's weights add up to one, where the published integral over +-3 standard deviations
-    leaves out 0.3 %, and beyond the last marker of a line the spline keeps its value there, of
-    which the paper does not speak.
+    Cubic splines interpolate the biases of the markers on each axis-parallel line. A Gaussian with
+    the marker's standard deviation along that axis averages the spline over +-3 standard
+    deviations. b* is the mean over the axes: the two of the plane as published, or all three.
+
+    Two details differ from the paper. The weights of the Gaussian sum to 1 here, whereas the
+    published integral omits 0.3 %. Beyond the last marker of a line the spline keeps its last
+    value, a case that the paper does not define.
     """
     d = markers.true.shape[1]
     total = np.zeros_like(markers.bias)
@@ -90,5 +109,5 @@ def corrected_bias(markers: Markers) -> np.ndarray:
 
 
 def measured_places(markers: Markers, bias: np.ndarray) -> np.ndarray:
-    """Where the markers are measured, (n, d) m: the deformed grid of eq. 19, X + b*."""
+    """Return where the markers are measured, (n, d) m: the deformed grid X + b* of eq. 19."""
     return markers.true + bias

@@ -1,6 +1,6 @@
-"""The radial-basis-function network of Grasso et al.
+"""Interpolate with the radial-basis-function network of Grasso et al., extended to 3D.
 
-(Sensors 2022, 22, 9136), appendix A, and its extension to 3D.
+The source is Sensors 2022, 22, 9136, appendix A.
 """
 
 from __future__ import annotations
@@ -9,33 +9,46 @@ from itertools import product
 
 import numpy as np
 
-SHARE = 0.5  # c1: what a node contributes to the value at its own place (eq. A7)
-SMALLEST_RATIO = 1e-6  # of a neighbour's value to a node's, in the logarithm of eq. A5
-CHUNK = 2000  # places at a time
+SHARE = 0.5  # c1: share of a node in the value at its own place (eq. A7)
+# smallest ratio of a neighbour's value to a node's in the logarithm of eq. A5
+SMALLEST_RATIO = 1e-6
+CHUNK = 2000  # places per call, which limits the memory
 
 
 class AngularNetwork:
-    """One Gaussian at every node, whose width depends on the direction in which one looks from
-    there (eqs. A1 - A8).
+    """Interpolate with one Gaussian per node, whose width depends on the direction (eqs. A1 - A8).
 
-    A width is chosen so that the Gaussian has fallen to its neighbour's share of the neighbour's
-    value where that neighbour is (A3 - A5), and interpolated over the direction (A6). The value at
-    a node with all its neighbours is then its own, but for the tails of nodes further off.
+    At the place of a neighbour, the Gaussian has fallen to the neighbour's share of the neighbour's
+    value (A3 - A5). This determines the width in the direction of the neighbour. Between
+    neighbours, the width is interpolated over the direction (A6). At a node with all its
+    neighbours, the result is the node's value plus the tails of more distant nodes.
 
-    The neighbours are the 8 around a node of a plane, linearly over the angle as published; in
-    space the 26 around it, and over the direction by the inverse of one minus the cosine (Shepard),
-    which takes a neighbour's width in its own direction.
+    In a plane a node has 8 neighbours, and the width is linear in the angle, as published. In space
+    it has 26 neighbours. The weight of each is the inverse of one minus the cosine (Shepard). In
+    the direction of a neighbour, the width is that of this neighbour.
 
-    Where eq. A5 has no real positive width, it is repaired as little as possible: c2 is not
-    negative (it would be where a neighbour's value exceeds 8 times the node's, 26 times in space,
-    and the "Gaussian" would then grow with distance), and a neighbour of no value counts as
-    SMALLEST_RATIO of the node's. The number of neighbours in eq. A3 stays 8 (26) at the rim, where
-    there are fewer, as published: values there come out too close to the smallest one.
+    Where eq. A5 has no real positive width, two minimal repairs apply. First, c2 is not negative.
+    It would be negative if a neighbour's value exceeds 8 times the node's, or 26 times in space.
+    The "Gaussian" would then grow with distance. Second, a neighbour of value 0 counts as
+    SMALLEST_RATIO of the node's value.
+
+    The number of neighbours in eq. A3 stays 8 (26) at the rim, as published. Values at the rim are
+    therefore too close to the smallest value.
     """
 
     def __init__(self, cell: np.ndarray, at: np.ndarray, values: np.ndarray, step: float) -> None:
-        """cell : (n, d) int, place in the grid; at : (n, d) m; values : (n, k); step : of the grid,
-        m.
+        """Compute the widths of all nodes.
+
+        Parameters
+        ----------
+        cell : (n, d) int array
+            Place in the grid.
+        at : (n, d) array
+            Places of the nodes, in m.
+        values : (n, k) array
+            Values at the nodes.
+        step : float
+            Cell size of the grid, in m.
         """
         self._at, d = np.asarray(at, dtype=float), at.shape[1]
         self._cutoff = 2.0 * step  # the 1 m of eq. A8, on the paper's grid of 0.5 m
@@ -55,18 +68,20 @@ class AngularNetwork:
         self._widths[~there] = 0.0
         self._there = there
         self._alone = ~there.any(axis=1)
-        self._width_alone = -np.log(c3) / step**2  # as if all neighbours were alike
+        self._width_alone = -np.log(c3) / step**2  # as if all neighbours had the value of the node
         self._width_of = _over_angle if d == 2 else _over_direction
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
-        """Values at places x (m, d), m: (m, k). Far from every node: the smallest value, or 0 if
-        none is negative (A8).
+        """Return the values at places x (m, d), in m: (m, k).
+
+        Far from every node the result is the smallest value, or 0 if no value is negative (A8).
         """
         return np.concatenate(
             [self._at_places(part) for part in np.array_split(x, len(x) // CHUNK + 1)]
         )
 
     def _at_places(self, x: np.ndarray) -> np.ndarray:
+        # Sum the Gaussians of all nodes within the cutoff, eq. A7.
         away = x[:, None] - self._at
         squared = np.einsum("mnd,mnd->mn", away, away)
         place, node = np.nonzero(squared < self._cutoff**2)
@@ -81,8 +96,21 @@ class AngularNetwork:
 
 
 def _neighbours(cell: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of the nodes in the cells at `offsets` from each node, (n, K), and whether there is one,
-    (n, K) bool.
+    """Return the neighbours of each node.
+
+    Parameters
+    ----------
+    cell : (n, d) int array
+        Place of each node in the grid.
+    offsets : (K, d) int array
+        Steps to the K neighbours.
+
+    Returns
+    -------
+    rows : (n, K) int array
+        Rows of the neighbours.
+    there : (n, K) bool array
+        Whether the neighbour exists.
     """
     shifted = cell - cell.min(axis=0) + 1
     shape = tuple(shifted.max(axis=0) + 2)
@@ -97,8 +125,18 @@ def _neighbours(cell: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.n
 def _over_angle(
     away: np.ndarray, towards: np.ndarray, there: np.ndarray, widths: np.ndarray
 ) -> np.ndarray:
-    """Widths (P, k) in the directions `away` (P, 2), linear over the angle between the neighbours
-    to the left and right.
+    """Return widths (P, k) in the directions `away` (P, 2), linear in the angle between neighbours.
+
+    Parameters
+    ----------
+    away : (P, 2) array
+        Directions, of any length.
+    towards : (P, K, 2) array
+        Unit vectors to the neighbours.
+    there : (P, K) bool array
+        Whether the neighbour exists.
+    widths : (P, K, k) array
+        Widths in the directions of the neighbours.
     """
     full = 2.0 * np.pi
     angle = np.arctan2(away[:, 1], away[:, 0])[:, None] - np.arctan2(
@@ -119,7 +157,10 @@ def _over_angle(
 def _over_direction(
     away: np.ndarray, towards: np.ndarray, there: np.ndarray, widths: np.ndarray
 ) -> np.ndarray:
-    """Widths (P, k) in the directions `away` (P, 3)."""
+    """Return widths (P, k) in the directions `away` (P, 3), weighted by the cosine (Shepard).
+
+    The other parameters are as for `_over_angle`, in three dimensions.
+    """
     length = np.linalg.norm(away, axis=1, keepdims=True)
     cosine = np.einsum("pd,pkd->pk", away / np.maximum(length, 1e-12), towards)
     weight = np.where(there, 1.0 / (1.0 - np.minimum(cosine, 1.0) + 1e-9), 0.0)

@@ -1,1 +1,1 @@
-"""What ekf_node says about itself and about what it receives."""
+"""Check the input of ekf_node and its own state."""

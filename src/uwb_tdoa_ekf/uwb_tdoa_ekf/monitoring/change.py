@@ -1,17 +1,18 @@
-"""Has one anchor changed? A sequential test over Slices.
+"""Test sequentially over Slices whether one anchor has changed.
 
-The delays of the anchors depend on the place: antennas, reflections, a survey that is off. A
-Gaussian process of the place (kernel below) learns them while flying; its whitened one-step errors
-are what is new. For every anchor and every onset within the last seconds a generalised likelihood
-ratio (Willsky and Jones, IEEE Trans. Automatic Control 21, 1976) compares a delay that began then,
-as a step or as a ramp, with none: what a delay would make of the same errors, whitened likewise,
-against them. The ratio is counted in units of the mean square of the errors before the onset, so
-that a flight with worse errors than the kernel expects needs a larger change.
+The delays of the anchors depend on the place, because of antennas, reflections and survey errors. A
+Gaussian process over the place (kernel below) learns the delays in flight. Its whitened one-step
+prediction errors contain the new information.
 
-Memory and time go with the anchors that are heard, not with those that are installed: an anchor has
-a column from the first slice in which it is heard to the last one that is remembered. What a delay
-does to a slice is kept for the anchors that were heard in it, and for the slices in which an onset
-is looked for.
+The test considers each anchor and each onset within the last seconds. It is a generalized
+likelihood ratio (Willsky and Jones, IEEE Trans. Automatic Control 21, 1976). It compares a delay
+that begins at the onset, as a step or a ramp, with no delay. The response to the delay is whitened
+like the errors. The ratio is divided by the mean square of the errors before the onset. A flight
+with larger errors than the kernel expects therefore needs a larger change.
+
+Memory and time grow with the anchors that are heard, not with those that are installed. An anchor
+has a column while any stored slice contains it. Responses are stored only for anchors heard in a
+slice, and only for slices that may hold an onset.
 """
 
 from __future__ import annotations
@@ -31,28 +32,47 @@ if TYPE_CHECKING:
 
     from .slices import Slice
 
-MEAN_STD = 0.15  # m, of a delay that is the same everywhere,
-PLACE_STD, PLACE_LENGTH = 0.2, 0.9  # m, of one that depends on the place, and how far it is alike,
-# m, m, s, of one that lasts while the tag stays,
+MEAN_STD = 0.15  # m, standard deviation of the constant part of a delay
+# m, standard deviation of the place-dependent part, and its correlation length
+PLACE_STD, PLACE_LENGTH = 0.2, 0.9
+# m, m, s, standard deviation, length and time of the part that lasts while the tag stays
 LOCAL_STD, LOCAL_LENGTH, LOCAL_TIME = (0.05, 0.3, 2.0)
-NOISE_STD = 0.1  # m, and of what is new in every slice
-# normalised square of a slice's error, above which its variance is raised until it is this
+NOISE_STD = 0.1  # m, standard deviation of independent noise in each slice
+# normalised square of a slice's error above which its variance is raised until the square is this
 OUTLIER = 3.0
-# normalised square that a slice counts as at most when the scale of the flight is learned
+# largest normalised square of a slice for the scale of the flight
 LARGEST_ERROR = 8.0
-SMALLEST_SCALE = 1.0  # mean normalised square below which no flight counts as better
-# mean normalised square before there are any slices, and how many slices that is worth
+# smallest scale; a flight with smaller errors is treated as if it had this scale
+SMALLEST_SCALE = 1.0
+# prior scale (mean normalised square), and its weight in slices
 SCALE, SCALE_SLICES = (2.0, 20)
-WINDOW, YOUNGEST = 24, 4  # slices in which an onset is looked for, and that it must have lasted
-FASTEST_DRIFT, CLEARLY = 0.1, 1.5  # m/s, of a clock; how much better than all steps a ramp must be
-CAPACITY = 240  # slices that are remembered
+# slices in which the test searches for an onset, and smallest age of an onset in slices
+WINDOW, YOUNGEST = 24, 4
+# m/s, largest drift of a clock; factor by which a ramp must be better than all steps
+FASTEST_DRIFT, CLEARLY = 0.1, 1.5
+CAPACITY = 240  # slices that are stored
 
 
 @dataclass(frozen=True)
 class Change:
-    """row : of the anchor; since : s, stamp of the onset; size : m, at the onset; slope : m/s;
-    ratio : the test; rival : the same of the best change of any other anchor; left : mean square of
-    the errors since then that it does not explain, over that of those before.
+    """Describe a delay of one anchor that began in flight.
+
+    Attributes
+    ----------
+    row : int
+        Row of the anchor.
+    since : float
+        Stamp of the onset, in s.
+    size : float
+        Delay at the onset, in m.
+    slope : float
+        Drift, in m/s.
+    ratio : float
+        Likelihood ratio of the change.
+    rival : float
+        Likelihood ratio of the best change of any other anchor.
+    left : float
+        Mean square of the unexplained errors since the onset over that before it.
     """
 
     row: int
@@ -64,37 +84,38 @@ class Change:
     left: float
 
     def at(self, t: float) -> np.ndarray:
-        """The delay, m, at stamps t, s."""
+        """Return the delay, in m, at stamps t, in s."""
         return np.where(t > self.since, self.size + self.slope * (t - self.since), 0.0)
 
 
 class ChangeDetector:
-    """Takes Slices in the order of their stamps; `find` tests them; what it found is subtracted by
-    `compensate`.
+    """Test Slices in the order of their stamps for a change of one anchor.
+
+    `find` searches for a Change, and `compensate` subtracts it from all later results.
     """
 
     def __init__(self) -> None:
         room = CAPACITY
-        # of the anchors with a column, and the column of each row
+        # rows of the anchors with a column, and the column of each row
         self._rows: np.ndarray = np.empty(0, int)
         self._columns: dict[int, int] = {}
         self._t, self._p = np.zeros(room), np.zeros((room, 3))
         self._delays: np.ndarray
         self._white: np.ndarray
-        # without what was taken out; combinations measured
+        # delays minus compensated changes; number of independent combinations measured
         self._delays, self._freedom = (np.zeros((room, 0)), np.zeros(room))
         # Cholesky factor; whitened errors
         self._factor, self._white = (np.zeros((room, room)), np.zeros((room, 0)))
         self._squares = np.zeros(room)  # normalised squares
-        # of the latest slices, in turn, for the anchors that were heard,
+        # ring buffer over the latest slices: responses of the anchors that were heard
         self._response: np.ndarray = np.zeros((WINDOW, 0, 0))
-        # and where the anchor of a column is among them
+        # ring buffer: place of each column's anchor among those that were heard
         self._place: np.ndarray = np.full((WINDOW, 0), -1)
         self._known: list[Change] = []
         self._count = self._added = 0
 
     def add(self, piece: Slice) -> None:
-        """Take a Slice."""
+        """Add a Slice."""
         if self._count == CAPACITY:
             self._forget_oldest(CAPACITY // 4)
         k, n, columns = self._count, len(piece.rows), self._columns_of(piece.rows)
@@ -111,15 +132,16 @@ class ChangeDetector:
         self._whiten(k)
 
     def delays_at(self, t: float, rows: Sequence[int] | np.ndarray) -> np.ndarray:
-        """(k,) m: what was taken out of the anchors in rows (k,), at stamp t, s."""
+        """Return the compensated delays of the anchors in rows (k,) at stamp t, in s: (k,) m."""
         total = np.zeros(len(rows))
         for change in self._known:
             total[np.asarray(rows) == change.row] += change.at(t)
         return total
 
     def _columns_of(self, rows: np.ndarray) -> np.ndarray:
-        """(k,) columns of anchors, by their rows (k,), with new ones for those that have none; room
-        for so many in a slice.
+        """Return the columns of anchors by their rows (k,), with new columns where needed.
+
+        The room of a slice grows with the number of rows.
         """
         new = [row for row in rows.tolist() if row not in self._columns]
         if new:
@@ -134,8 +156,12 @@ class ChangeDetector:
         return np.array([self._columns[row] for row in rows.tolist()], int)
 
     def find(self, after: float) -> Change | None:
-        """The Change that explains the latest slices best, of onsets later than `after`, s; None
-        without enough of them.
+        """Return the Change that explains the latest slices best, or None for too few slices.
+
+        Parameters
+        ----------
+        after : float
+            Earliest stamp of an onset, in s.
         """
         first = self._first(after)
         onsets = self._count - first - YOUNGEST
@@ -160,9 +186,7 @@ class ChangeDetector:
         return Change(int(self._rows[column]), float(since), size, slope, best, rival, float(left))
 
     def refined(self, change: Change) -> Change | None:
-        """The step that was taken out last, with the size that it has by now, or None; takes that
-        out instead.
-        """
+        """Return the last compensated step with its new size, or None, and compensate that."""
         first = self._first(change.since)
         if (
             change.slope
@@ -178,15 +202,16 @@ class ChangeDetector:
         return better
 
     def compensate(self, change: Change) -> None:
-        """Go on as if an anchor had not changed; what it does beyond that is a Change again."""
+        """Subtract a Change; a further change of the same anchor is then found as a new Change."""
         self._known.append(change)
         self._subtract(change)
 
     def _subtract(self, change: Change) -> None:
+        # Subtract a Change from the stored slices since its onset and whiten them again.
         column = self._columns[change.row]
         for k in range(
             self._first(change.since), self._count
-        ):  # later than any onset that is found
+        ):  # the window holds all slices since any onset that `find` returns
             place, response = self._place[self._turn(k)], self._response[self._turn(k)]
             if place[column] >= 0:
                 heard = np.flatnonzero(place >= 0)
@@ -196,25 +221,32 @@ class ChangeDetector:
             self._whiten(k)
 
     def _turn(self, k: int | np.ndarray) -> int | np.ndarray:
-        """Where the response of slice k is, one of the latest; or of several."""
+        """Return the place of slice k in the ring buffer; k may be an array."""
         return (self._added - self._count + k) % WINDOW
 
     def _first(self, after: float) -> int:
-        """Place of the first slice of the window that is later than `after`, s."""
+        """Return the first slice of the window that is later than `after`, in s."""
         return max(0, self._count - WINDOW, int(np.searchsorted(self._t[: self._count], after)))
 
     def _compare(self, first: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Steps (m), then ramps (m/s), that began with each slice from `first` on but the youngest:
-        their most likely values and their ratios, (2 k, N), and the mean square of the errors
-        before each, (2 k,).
+        """Compare steps and ramps that begin with each slice from `first`, except the youngest.
+
+        Returns
+        -------
+        value : (2 k, N) array
+            Most likely steps, in m, then ramps, in m/s.
+        ratio : (2 k, N) array
+            Likelihood ratios.
+        scale : (2 k,) array
+            Mean square of the errors before each onset.
         """
         n, turns = self._count - first, self._turn(np.arange(first, self._count))
         some = np.flatnonzero((self._place[turns] >= 0).any(axis=0))  # anchors that were heard
         inverse, white = _inverse(self._factor, first, n), self._white[first : self._count, some]
-        # or it is compiled anew in flight
+        # contiguous, or numba compiles a second version in flight
         of_slices = (np.ascontiguousarray(self._place[turns][:, some]), self._response[turns])
         scores, information = _seen(*of_slices, inverse.T @ white, inverse.T @ inverse)
-        # of slices (columns) since each onset (rows)
+        # age of slices (columns) since each onset (rows)
         age = np.arange(n) - np.arange(n - YOUNGEST)[:, None]
         shapes = np.concatenate([(age >= 0).astype(float), LENGTH * np.maximum(age + 0.5, 0.0)])
         score = shapes @ scores
@@ -230,7 +262,7 @@ class ChangeDetector:
         return value, ratio, scale
 
     def _whiten(self, k: int) -> None:
-        """Row k of the factor, and its whitened error."""
+        """Compute row k of the Cholesky factor and its whitened error."""
         _whiten(
             k,
             self._t,
@@ -241,6 +273,7 @@ class ChangeDetector:
         )
 
     def _forget_oldest(self, n: int) -> None:
+        # Drop the n oldest slices, and columns of anchors that no stored slice contains.
         for array in (self._t, self._p, self._delays, self._freedom):
             array[: CAPACITY - n] = array[n:].copy()
         self._count = CAPACITY - n
@@ -268,8 +301,22 @@ def _whiten(
     freedom: np.ndarray,
     whitened: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> None:
-    """Row k of the Cholesky factor (m, m), of the whitened errors (m, N), and of their normalised
-    squares (m,).
+    """Write row k of the Cholesky factor and its whitened error and normalised square.
+
+    Parameters
+    ----------
+    k : int
+        Row.
+    t : (m,) array
+        Stamps of the slices, in s.
+    p : (m, 3) array
+        Positions of the tag, in m.
+    delays : (m, N) array
+        Delays of the anchors, in m.
+    freedom : (m,) array
+        Number of independent combinations measured in each slice.
+    whitened : tuple of arrays
+        Cholesky factor (m, m), whitened errors (m, N), normalised squares (m,).
     """
     factor, white, squares = whitened[0], whitened[1], whitened[2]
     row, error = factor[k], delays[k].copy()
@@ -294,9 +341,7 @@ def _whiten(
 
 @compiled
 def _inverse(factor: np.ndarray, first: int, n: int) -> np.ndarray:
-    """(n, n): inverse of the part of a lower triangular matrix that begins with row and column
-    `first`.
-    """
+    """Return the inverse, (n, n), of the block of a lower triangular matrix from row `first` on."""
     out = np.zeros((n, n))
     for i in range(n):
         out[i, i] = 1.0
@@ -310,9 +355,25 @@ def _inverse(factor: np.ndarray, first: int, n: int) -> np.ndarray:
 def _seen(
     place: np.ndarray, response: np.ndarray, errors: np.ndarray, weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Of n slices what a delay of each anchor makes of whitened errors (n, M) that are there, (n,
-    M), and how much of it any two of them would see, weighted (n, n): (n, n, M). place : (n, M), of
-    an anchor in the response (H, H) of each slice, or -1.
+    """Return the response of whitened errors to a delay of each anchor, and its information.
+
+    Parameters
+    ----------
+    place : (n, M) int array
+        Place of each anchor in the response of each slice, or -1.
+    response : (n, H, H) array
+        Response of the estimate in each slice to the delays.
+    errors : (n, M) array
+        Weighted whitened errors.
+    weights : (n, n) array
+        Weights of pairs of slices.
+
+    Returns
+    -------
+    scores : (n, M) array
+        Correlation of the errors with a delay of each anchor.
+    information : (n, n, M) array
+        Information of each pair of slices on that delay.
     """
     n, anchors = errors.shape
     scores, information = np.zeros((n, anchors)), np.zeros((n, n, anchors))

@@ -1,9 +1,8 @@
-"""How well can any motion explain a stream of TDOAs? A filter without inertial sensor says so by
-its innovations.
+"""Measure how well any motion explains a stream of TDOAs, by the innovations of an IMU-free filter.
 
-Two hypotheses about one stream, e.g. that its signs are right or all wrong, are compared by what
-they leave unexplained, block by block: systematic errors disturb both alike, so that their
-difference tells more than either.
+Two hypotheses about one stream, for example right and wrong signs, are compared block by block by
+their unexplained loss. Systematic errors affect both, so the difference is more significant than
+either loss.
 """
 
 from __future__ import annotations
@@ -22,26 +21,37 @@ from ..core.memory import IMU_SAMPLE, Measurements, new_state
 if TYPE_CHECKING:
     from ..core.memory import FilterState
 
-SCALE = 0.5  # m, of the Geman-McClure loss: an innovation of that size leaves a half unexplained
-BLOCK = 2.0  # s
-SETTLE = 2.0  # s from the first TDOA on that do not count: the start is being found
-FEW, LEAST = 10, 4  # TDOAs of a block that say nothing, and blocks that do
+SCALE = 0.5  # m, scale of the Geman-McClure loss: an innovation of this size has a loss of one half
+BLOCK = 2.0  # s, length of a block
+SETTLE = 2.0  # s after the first TDOA that do not count, because the filter initializes
+# a block with this many TDOAs or fewer does not count; smallest number of blocks
+FEW, LEAST = 10, 4
 CONFIG = FilterConfig(use_imu=False)
 NO_IMU = np.empty(0, IMU_SAMPLE)
 
 
 @dataclass(frozen=True)
 class Unexplained:
-    """blocks : {number: mean loss, 0 to 1} of the blocks of stamps in which more than next to
-    nothing was heard.
+    """Store the mean loss of each block of a stream.
+
+    Attributes
+    ----------
+    blocks : dict
+        {number of the block: mean loss, 0 to 1}, for blocks with more than FEW TDOAs.
     """
 
     blocks: dict
 
     @classmethod
     def of(cls, t: np.ndarray, innovation: np.ndarray) -> Unexplained:
-        """t (n,) s, rising; innovation (n,) m, not finite where the TDOA was of no use: that
-        explains nothing.
+        """Return the Unexplained of innovations.
+
+        Parameters
+        ----------
+        t : (n,) array
+            Ascending stamps, in s.
+        innovation : (n,) array
+            Innovations, in m. A value that is not finite marks an unusable TDOA and has the loss 1.
         """
         if not len(t):
             return cls({})
@@ -54,14 +64,24 @@ class Unexplained:
 
     @property
     def mean(self) -> float:
-        """Mean loss; NaN without a block."""
+        """Return the mean loss over all blocks; NaN without a block."""
         return float(np.mean(list(self.blocks.values()))) if self.blocks else math.nan
 
 
 def compare(one: Unexplained, other: Unexplained) -> tuple[float, float]:
-    """(ratio, z): the mean loss of Unexplained `other` over that of `one`, and by how many standard
-    errors `other` leaves less unexplained; over the blocks that both have. (NaN, 0) with fewer than
-    four of them.
+    """Return (ratio, z) of two Unexplained over their common blocks; (NaN, 0) for too few blocks.
+
+    Parameters
+    ----------
+    one, other : Unexplained
+        Losses of two hypotheses on the same stream.
+
+    Returns
+    -------
+    ratio : float
+        Mean loss of `other` over the mean loss of `one`.
+    z : float
+        Number of standard errors by which the loss of `other` is smaller.
     """
     both = one.blocks.keys() & other.blocks.keys()
     if len(both) < LEAST:
@@ -81,16 +101,27 @@ def unexplained(
     config: FilterConfig = CONFIG,
     limit: float = math.inf,
 ) -> Unexplained:
-    """Unexplained of (n,) of TDOA between anchors at (N, 3) m, by a filter with a FilterConfig. imu
-    : (m,) of IMU_SAMPLE that it uses, too. Both in the order of their stamps. limit : as soon as it
-    is certain that the mean loss is above it, Unexplained without a block.
+    """Return the Unexplained of TDOAs, computed with a filter.
+
+    Parameters
+    ----------
+    tdoa : (n,) array of TDOA
+        In the order of their stamps.
+    positions : (N, 3) array
+        Anchor positions in the world frame, in m.
+    imu : (m,) array of IMU_SAMPLE
+        Inertial samples for the filter, in the order of their stamps.
+    config : FilterConfig
+        Parameters of the filter.
+    limit : float
+        If the mean loss is certain to exceed this limit, return an Unexplained without blocks.
     """
     t, state, parameters = tdoa["t"], new_state(positions), config.parameters()
     number = _numbers(t)
-    # of blocks, and of what is before the first one
+    # first row of each block, and of the rows before the first block
     edges = np.append(np.unique(number, return_index=True)[1], len(t))
     counted = (np.diff(edges) > FEW) & (number[edges[:-1]] >= 0)
-    # those before the first TDOA of each
+    # number of inertial samples before the first TDOA of each block
     of_imu = (0, *imu["t"].searchsorted(t[edges[1:-1]]), len(imu))
     most, loss, out = limit * (1.0 + 1e-9) * np.count_nonzero(counted), 0.0, np.empty(len(t))
     for k, (first, end) in enumerate(zip(edges, edges[1:])):
@@ -110,9 +141,16 @@ def innovations(
     imu: np.ndarray = NO_IMU,
     parameters: np.ndarray = CONFIG.parameters(),
 ) -> np.ndarray:
-    """(n,) m of TDOAs as for `unexplained`, NaN where one is of no use, by the filter of a
-    FilterState, which goes on from there.
-    parameters : (1,) of config.PARAMETERS.
+    """Return the innovations of TDOAs, (n,) m, NaN for unusable TDOAs, and advance the filter.
+
+    Parameters
+    ----------
+    state : FilterState
+        Changed in place.
+    tdoa, positions, imu
+        As for `unexplained`.
+    parameters : (1,) array of config.PARAMETERS
+        Parameters of the filter.
     """
     out, good = np.full(len(tdoa), np.nan), usable_tdoas(tdoa, positions)
     out[good] = feed(state, parameters, Measurements(imu, tdoa[good]))[1]["innovation"]
@@ -120,13 +158,11 @@ def innovations(
 
 
 def _numbers(t: np.ndarray) -> np.ndarray:
-    """(n,) numbers of the blocks in which stamps t (n,) s, rising, are; negative before the first
-    one.
-    """
+    """Return the block numbers of ascending stamps t (n,) s; negative before the first block."""
     return np.floor((t - t[:1] - SETTLE) / BLOCK).astype(np.int64)
 
 
 def _loss(innovation: np.ndarray) -> np.ndarray:
-    """(n,), 0 to 1, of innovations (n,) m; not finite: 1."""
+    """Return the Geman-McClure loss of innovations (n,), in m: (n,), 0 to 1; not finite gives 1."""
     square = np.where(np.isfinite(innovation), innovation, np.inf) ** 2
     return 1.0 - SCALE**2 / (SCALE**2 + square)

@@ -1,4 +1,4 @@
-"""Findings of the estimator itself: clocks of streams, and implausible inertial samples."""
+"""Make Findings of the estimator itself: clocks of streams, and implausible inertial samples."""
 
 from __future__ import annotations
 
@@ -17,15 +17,23 @@ if TYPE_CHECKING:
 
 TOPICS = {"imu": "imu/data", "tdoa": "uwb/tdoa"} | {
     name: sensor.topics[0][0] for name, sensor in SENSORS.items()
-}  # by stream
+}  # topic by stream
 STAMP_LINE = (
     "message.header.stamp = ...  # when the sample was measured, by the clock of the other streams"
 )
 
 
 def clock_ahead(stream: str, lead: float, count: int) -> Finding:
-    """Return the finding for a stream of STREAMS that is ahead of the others by `lead`, s; count :
-    its invalid messages so far.
+    """Return the Finding on a stream whose clock is ahead.
+
+    Parameters
+    ----------
+    stream : str
+        Name from STREAMS.
+    lead : float
+        Lead over the other streams, in s.
+    count : int
+        Invalid messages of the stream so far.
     """
     what = (
         f"the stamps of {TOPICS[stream]} are {lead:.3g} s ahead of those of the other streams; "
@@ -37,7 +45,7 @@ def clock_ahead(stream: str, lead: float, count: int) -> Finding:
 
 
 def restarted(cause: Restart) -> Finding:
-    """Return the finding for a Restart of the filter."""
+    """Return the Finding for a Restart of the filter."""
     topic = TOPICS[cause.stream]
     how = "are before the time of the other streams" if cause.overtaken else "fell back"
     evidence = f"the new time begins at {cause.at:.3f} s after the first stamp"
@@ -79,8 +87,8 @@ SAID = {
 
 
 def implausible(check: Record) -> Finding:
-    """The Finding of a PLAUSIBILITY by which inertial samples are left out."""
+    """Return the Finding for the imu_fault_detector of a filter that ignores the IMU."""
     cause, evidence, remedy = SAID[int(check.reason)]
     cause = f"{cause}: the filter goes without the IMU"
-    size = float(check["size"])  # of a numpy record, `.size` is how many it is
+    size = float(check["size"])  # `.size` of a numpy record is its number of elements
     return Finding("imu_left_out", ERROR, cause, evidence.format(size), remedy, size)

@@ -1,4 +1,4 @@
-"""What a rule says when it finds something wrong."""
+"""Define the Finding, the result of a rule that detects a problem."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-# the estimate is wrong; it may be worse than it could be; good to know
+# ERROR: the estimate is wrong. WARNING: it may be worse than possible. NOTE: information.
 ERROR, WARNING, NOTE = "error", "warning", "note"
 SEVERITIES = (ERROR, WARNING, NOTE)
-# ERRORs by which the position is wrong, and its stated deviation too small; rules over a survey are
-# among them whatever they are called
+# ERRORs that make the position wrong and its stated covariance too small. Rules whose names begin
+# with SURVEY also belong to these.
 POSITION_WRONG = frozenset(
     [
         "tdoa_sign",
@@ -30,7 +30,7 @@ POSITION_WRONG = frozenset(
     ]
 )
 SURVEY = "survey"
-WRONG_WITH_IMU = frozenset(  # the same while the filter uses the IMU
+WRONG_WITH_IMU = frozenset(  # ERRORs that make the position wrong while the filter uses the IMU
     [
         "imu_force_unit",
         "imu_no_gravity",
@@ -42,17 +42,31 @@ WRONG_WITH_IMU = frozenset(  # the same while the filter uses the IMU
         "stamps_apart",
     ]
 )
-# share by which the number that decided may change until a finding that goes on is said anew
+# relative change of the deciding number up to which a persistent finding keeps its text
 SAME = 0.3
-# share of TDOAs with unknown ids, which are not used: below it the others determine the position
+# share of TDOAs with unknown ids, which are not used; below it the other TDOAs determine the
+# position
 FEW_UNKNOWN = 0.5
 
 
 @dataclass(frozen=True)
 class Finding:
-    """rule : its name, for machines; severity : of SEVERITIES; cause : what is wrong, a clause;
-    evidence : the numbers that show it; remedy : a line to copy; value : the number that decided,
-    in SI units.
+    """Describe one detected problem.
+
+    Attributes
+    ----------
+    rule : str
+        Name of the rule, for machines.
+    severity : str
+        Value from SEVERITIES.
+    cause : str
+        The problem, as a clause.
+    evidence : str
+        The numbers that show it.
+    remedy : str
+        A line to copy.
+    value : float
+        The number that decided, in SI units.
     """
 
     rule: str
@@ -64,16 +78,22 @@ class Finding:
 
     @property
     def sentence(self) -> str:
-        """All of it in one line, for /diagnostics."""
+        """Return cause, evidence and remedy in one line for /diagnostics."""
         return f"{self.cause} ({self.evidence}): {' '.join(self.remedy.split())}"
 
     @property
     def brief(self) -> str:
-        """The same without the evidence."""
+        """Return cause and remedy in one line."""
         return f"{self.cause}: {' '.join(self.remedy.split())}"
 
     def position_wrong(self, imu_used: bool = True) -> bool:
-        """Return whether it makes the position wrong. imu_used : whether the filter uses the IMU."""
+        """Return whether this problem makes the position wrong.
+
+        Parameters
+        ----------
+        imu_used : bool
+            Whether the filter uses the IMU.
+        """
         if self.severity != ERROR or (self.rule == "ids_unknown" and self.value < FEW_UNKNOWN):
             return False
         return (
@@ -84,22 +104,20 @@ class Finding:
 
 
 def most_severe_first(findings: Iterable[Finding]) -> list[Finding]:
-    """The findings in order of severity; within one in the order in which they came."""
+    """Return the findings in order of severity, and in the given order within one severity."""
     return sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity))
 
 
 class Steady:
-    """Keeps the text of each finding that goes on: numbers in it would be others each second."""
+    """Keep the text of a finding that persists, because its numbers would change every second."""
 
     def __init__(self) -> None:
         self._said: dict[
             tuple[str, str], Finding
-        ] = {}  # by rule and severity, as it was found first
+        ] = {}  # {(rule, severity): Finding with the first text}
 
     def __call__(self, findings: Iterable[Finding]) -> list[Finding]:
-        """The findings, each as it was first said, as long as it goes on and the number that
-        decided is much the same.
-        """
+        """Return the findings, each with its first text while its number changes little."""
         out = []
         for finding in findings:
             said = self._said.get((finding.rule, finding.severity), finding)

@@ -1,4 +1,4 @@
-"""What ekf_node says about itself on /diagnostics, and what to do about it."""
+"""Decide what ekf_node publishes on /diagnostics about itself, with the remedy."""
 
 from __future__ import annotations
 
@@ -25,50 +25,67 @@ if TYPE_CHECKING:
     from ..estimator import Estimator
     from .finding import Finding
 
-START_TIMEOUT = 5.0  # s of data without a start position before it becomes a warning
-BEHIND = 1.0, 60.0  # s that the newest odometry is old: less is good, and more is of another time
-STOPPED = 2.0  # s without a message of an aid that was there, before it becomes a warning
-MOST_SAID = 3  # sentences in one text; all of them are among the values
-# reports in a row in which that is so of an aid; optical flow contradicts everything else for a
-# second at times
+START_TIMEOUT = 5.0  # s of data without an initialization before a warning
+# s, age of the newest odometry: below the first it is normal, above the second the clocks are
+# unrelated
+BEHIND = 1.0, 60.0
+STOPPED = 2.0  # s without a message of a sensor that was received before, before a warning
+MOST_SAID = 3  # sentences in the status text; the values contain all sentences
+# consecutive reports with mostly unused messages of a sensor before a warning; optical flow at
+# times contradicts all other sensors for 1 s
 REPEATS = 2
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
 
 class Health:
-    """Looks once a second, by the wall clock."""
+    """Check the state of the filter once per second of wall time."""
 
     def __init__(
         self, config: FilterConfig, lag: float, volume: FlyableVolume | None = None
     ) -> None:
-        """config : FilterConfig; lag : s; volume : FlyableVolume, or None."""
-        # messages of each stream: imu, tdoa, and those of aids
+        """Store the parameters and reset all counts.
+
+        Parameters
+        ----------
+        config : FilterConfig
+            Parameters of the filter.
+        lag : float
+            Time for which the filter waits for a silent stream, in s.
+        volume : FlyableVolume or None
+            Volume in which the tag may fly.
+        """
+        # messages of each stream: imu, tdoa, and the SENSORS
         self.received: Counter[str] = Counter()
         self.last_odometry: float | None = None  # time.monotonic(), s
-        # (3,) m and its covariance (3, 3) m^2
+        # (3,) m, and its covariance (3, 3) m^2
         self.last_position: tuple[np.ndarray, np.ndarray] | None = None
-        # s from the stamp of the newest odometry to the present time of ROS
+        # s from the stamp of the newest odometry to the current ROS time
         self.behind: float | None = None
         self._use_imu, self._lag = config.use_imu, lag
         self._volume = VolumeCheck(volume)
         self._imu_rate, self._tdoa_rate, self._located_rate = Rate(), Rate(), Rate()
         self._aids_before: dict[
             str, dict[str, int]
-        ] = {}  # messages of each, received and not used, by the last report
+        ] = {}  # by sensor: messages received and not used at the last report
         self._aids_bad: dict[
             tuple[str, str], int
-        ] = {}  # reports in a row in which most messages of an aid were not used for a reason
+        ] = {}  # consecutive reports in which most messages of a sensor were not used, by reason
         self._aids_heard: dict[
             str, tuple[int, float]
-        ] = {}  # messages of each so far, and since when no more of them, time.monotonic(), s
+        ] = {}  # by sensor: messages so far, and time.monotonic() of the last change, s
         self._starting: float | None = None  # time.monotonic(), s
         self.use = Use(lag)
 
     def look(self, estimator: Estimator | None, counts: Mapping[str, int]) -> None:
-        """See what became of what was received.
+        """Update the use of measurements; call this several times per second.
 
-        Call it several times a second with totals by verdict.
+        Parameters
+        ----------
+        estimator : Estimator or None
+            None before the anchors arrive.
+        counts : mapping
+            Totals by verdict.
         """
         self.use.look(
             time.monotonic(), self.received, counts, estimator is not None and estimator.running
@@ -82,12 +99,22 @@ class Health:
         wiring: Sequence[str] = (),
         findings: Sequence[Finding] = (),
     ) -> Report:
-        """Returns (level, text, values).
+        """Return (level, text, values) for /diagnostics.
 
-        refused : what was wrong with the last anchors, or None; estimator : Estimator or None;
-        counts : totals by verdict; wiring : sentences, what is wrong with who publishes what;
-            findings : Findings of the
-        rules over streams. What is wrong with the streams is said before what comes of it.
+        Problems of the input come before their consequences.
+
+        Parameters
+        ----------
+        refused : str or None
+            Problem with the last anchors.
+        estimator : Estimator or None
+            None before the anchors arrive.
+        counts : mapping
+            Totals by verdict.
+        wiring : sequence of str
+            Sentences on topics that are connected wrongly.
+        findings : sequence of Finding
+            Findings of the rules over streams, the most severe first.
         """
         now = time.monotonic()
         self.look(estimator, counts)
@@ -181,7 +208,7 @@ class Health:
         return *status, values | at_position
 
     def _status_of_aids(self, now: float, counts: Mapping[str, int]) -> tuple[bytes, str]:
-        """Whether sensors that were there still are, and are used."""
+        """Return the status of sensors that went silent or whose messages are mostly not used."""
         status = OK, "running"
         for aid, sensor in SENSORS.items():
             received = self.received[aid]
@@ -225,7 +252,7 @@ class Health:
         return status
 
     def _no_start(self) -> str:
-        """Why no start position is found."""
+        """Return a sentence on why the filter does not initialize."""
         if self.use.restart_age < START_TIMEOUT:
             return (
                 "the filter starts anew again and again, because stamps of a stream fall back: "
@@ -238,7 +265,7 @@ class Health:
 
 
 def _worst(wiring: Sequence[str], findings: Sequence[Finding]) -> tuple[bytes, str]:
-    """(level, text) of what is wrong, the worst first; findings come most severe first."""
+    """Return (level, text) of all problems, the most severe first."""
     severe = [finding for finding in findings if finding.severity == SEVERE]
     said = [
         *(f.sentence for f in severe),
@@ -249,7 +276,7 @@ def _worst(wiring: Sequence[str], findings: Sequence[Finding]) -> tuple[bytes, s
 
 
 def together(sentences: Sequence[str]) -> str:
-    """One text of several sentences, the first MOST_SAID of them."""
+    """Return one text with the first MOST_SAID of several sentences."""
     more = len(sentences) - MOST_SAID
     return " | ".join([*sentences[:MOST_SAID], *([f"and {more} more"] if more > 0 else [])])
 

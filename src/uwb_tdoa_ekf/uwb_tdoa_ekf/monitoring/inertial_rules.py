@@ -1,4 +1,4 @@
-"""Count the values of an inertial stream over windows of a second, and judge the windows."""
+"""Count the values of an inertial stream over windows of 1 s and check the windows."""
 
 from __future__ import annotations
 
@@ -22,16 +22,26 @@ from .stamp_rules import (
     stamp_window,
 )
 
-ABSURD = 1e9  # in any unit: no number that a sensor gives
+ABSURD = 1e9  # no sensor returns this, in any unit
 
-# places in the counters of one channel; the first two outlive a window
+# places in the counters of one channel; the first two are kept between windows
 VALUE, SLOW, SUM, SQUARES, FAST, SAME, LOW, LOW_HITS, HIGH, HIGH_HITS = range(10)
-# places in the counters of all six together
+# places in the counters of all six channels together
 TAKEN, REPEATED, INVALID = range(3)
 
 
 class ImuCounters(NamedTuple):
-    """stamps : see stamps.py; channels (6, 10) : gyroscope x y z, accelerometer x y z; whole (3,)."""
+    """Store the counters of the current window.
+
+    Attributes
+    ----------
+    stamps : (20,) array
+        Counters of stamp_rules.
+    channels : (6, 10) array
+        Counters of gyroscope x y z and accelerometer x y z.
+    whole : (3,) array
+        Counters of all channels together.
+    """
 
     stamps: np.ndarray
     channels: np.ndarray
@@ -39,15 +49,29 @@ class ImuCounters(NamedTuple):
 
 
 class ImuWindow(NamedTuple):
-    """One window of inertial samples. Rates in rad/s and specific force in m/s^2 if the driver is
-    right.
+    """Store the statistics of one window of inertial samples.
 
-    mean, deviation, vibration (6,) : of gyroscope x y z and accelerometer x y z; vibration is the
-    rms of what is faster than VIBRATION_CORNER; still (6,) : share of samples that equal the one
-    before, per channel;
-    repeated : share of samples in which all six do; clipped (6,) : samples at the same far end of
-        what the channel
-    showed, and limit (6,) that end; invalid : share of samples that are no numbers.
+    Rates are in rad/s and the specific force in m/s^2 if the driver is correct. Arrays of 6 are
+    gyroscope x y z, then accelerometer x y z.
+
+    Attributes
+    ----------
+    stamps : StampWindow
+        Statistics of the stamps.
+    mean, deviation : (6,) array
+        Mean and standard deviation.
+    vibration : (6,) array
+        RMS of the part faster than VIBRATION_CORNER.
+    still : (6,) array
+        Share of samples equal to the one before, per channel.
+    repeated : float
+        Share of samples in which all six channels equal the one before.
+    clipped : (6,) array
+        Number of samples at the farther end of the range of the channel.
+    limit : (6,) array
+        Value at that end.
+    invalid : float
+        Share of samples that are not finite.
     """
 
     stamps: StampWindow
@@ -62,7 +86,7 @@ class ImuWindow(NamedTuple):
 
 
 def new_imu() -> ImuCounters:
-    """ImuCounters of a stream of which nothing was received."""
+    """Return the ImuCounters of a stream without messages."""
     counters = ImuCounters(new_stamps(), np.zeros((6, 10)), np.zeros(3))
     counters.channels[:, :2] = np.nan
     restart_imu(counters)
@@ -71,7 +95,7 @@ def new_imu() -> ImuCounters:
 
 @compiled
 def restart_imu(counters: ImuCounters) -> None:
-    """Begin a new window."""
+    """Reset the counters for a new window."""
     restart_stamps(counters.stamps)
     counters.channels[:, SUM:] = 0.0
     counters.channels[:, LOW], counters.channels[:, HIGH] = np.inf, -np.inf
@@ -82,8 +106,16 @@ def restart_imu(counters: ImuCounters) -> None:
 def count_imu(
     counters: ImuCounters, t: float, arrival: float, gyro: np.ndarray, force: np.ndarray
 ) -> bool:
-    """Take one sample: stamp and arrival, s (NaN: not known); rates and specific force as the
-    message has them. Returns whether the window is complete.
+    """Count one sample and return whether the window is complete.
+
+    Parameters
+    ----------
+    counters : ImuCounters
+        Changed in place.
+    t, arrival : float
+        Stamp and arrival time, in s; NaN if unknown.
+    gyro, force : (3,) array
+        Angular velocity and specific force as in the message.
     """
     s, whole = counters.stamps, counters.whole
     dt = t - s[LAST]
@@ -129,8 +161,14 @@ def feed_imu(
     force: np.ndarray,
     first: int,
 ) -> tuple[int, bool]:
-    """`count_imu` for the rows of arrays from `first` on, until a window is complete: (row after
-    the last, whether it is).
+    """Count rows of arrays from `first` on until a window is complete.
+
+    Returns
+    -------
+    row : int
+        Row after the last counted one.
+    complete : bool
+        Whether the window is complete.
     """
     for i in range(first, len(t)):
         if count_imu(counters, t[i], arrival[i], gyro[i], force[i]):
@@ -139,7 +177,7 @@ def feed_imu(
 
 
 def imu_window(counters: ImuCounters) -> ImuWindow:
-    """ImuWindow of what was counted since the window began."""
+    """Return the ImuWindow of the samples since the window began."""
     c, whole = counters.channels, counters.whole
     n = max(whole[TAKEN], 1.0)
     mean = c[:, SUM] / n
@@ -158,29 +196,31 @@ def imu_window(counters: ImuCounters) -> ImuWindow:
 
 
 GRAVITY = 9.81
-FORCE_RANGE = 7.0, 14.0  # m/s^2, median length of the mean specific force; healthy 9.7 - 10.5
+# m/s^2, limits of the median length of the mean specific force; healthy 9.7 - 10.5
+FORCE_RANGE = 7.0, 14.0
 FORCE_UNITS = {
     "g": (GRAVITY, 0.7, 1.5),
     "mg": (1e-3 * GRAVITY, 700.0, 1500.0),
     "mm/s^2": (1e-3, 7e3, 14e3),
 }
-# of the deviation over the mean, m/s^2 over m/s^2: no gravity in it; healthy 0.41 at most
+# standard deviation over mean of the specific force above which it has no gravity; healthy 0.41 at
+# most
 WEIGHTLESS = 0.65
 # length of the mean specific force over the mean of its lengths; healthy 0.96 at least
 STEADY = 0.8
-# Without gravity 29 measured and simulated flights deviate by 0.74 at least, or are steady to 0.64
-# at most.
-# rad/s of turning that gravity does not follow; healthy 0.02 at most, in degrees/s 0.7 at least
+# On 29 measured and simulated flights without gravity, the deviation is 0.74 at least or the
+# steadiness 0.64 at most.
 TURN_EXCESS = 0.35
-# of the specific force: its deviation in a window, and rad of its direction, of a tag at rest
+# limits of a tag at rest: relative deviation of the specific force, and change of its direction in
+# rad
 REST_SHAKES, REST_TURNS = (0.02, 0.02)
-# healthy: 22 degrees, from vibration, at most
+# cosines of 35 and 25 degrees; healthy, with vibration, 22 degrees at most
 UPRIGHT, AXIS = (np.cos(np.deg2rad(35.0)), np.cos(np.deg2rad(25.0)))
-# m/s^2 rms of what is faster than 50 ms; healthy 0.6; where the accelerometer rectifies 1.4 at
-# least
+# m/s^2 rms of the part faster than 50 ms; healthy 0.6; 1.4 at least where the accelerometer
+# rectifies
 SHAKING = 1.0
-REPEATS, DEAD = 0.2, 0.95  # shares; healthy 0
-# samples at one end in a window, which is that far, m/s^2 and rad/s, off the mean
+REPEATS, DEAD = 0.2, 0.95  # shares of samples that equal the one before; healthy 0
+# samples at one end in a window, and distance of that end from the mean, m/s^2 and rad/s
 CLIPPED, FAR_FORCE, FAR_RATE = 8, 8.0, 2.0
 AXES = (
     "gyroscope x",
@@ -193,20 +233,22 @@ AXES = (
 
 
 def force_of(windows: list[ImuWindow]) -> np.ndarray:
-    """Median of the mean specific force, (3,)."""
+    """Return the median over windows of the mean specific force, (3,) m/s^2."""
     return np.median([window.mean[3:] for window in windows], axis=0)
 
 
 def weight(windows: list[ImuWindow]) -> float:
-    """Median length of the mean specific force: gravity, whatever the tag does, as long as it does
-    not fly away.
+    """Return the median length of the mean specific force, in m/s^2.
+
+    It equals gravity for any motion within a room, because the mean acceleration is small.
     """
     return median(float(np.linalg.norm(window.mean[3:])) for window in windows)
 
 
 def steadiness(windows: list[ImuWindow]) -> float:
-    """Length of the mean of the windows' specific forces over the mean of their lengths: 1 where it
-    always points one way.
+    """Return the length of the mean specific force divided by the mean of its lengths.
+
+    The value is 1 if the specific force always has the same direction.
     """
     forces = np.array([window.mean[3:] for window in windows])
     return float(
@@ -215,7 +257,7 @@ def steadiness(windows: list[ImuWindow]) -> float:
 
 
 def silent(windows: list[ImuWindow]) -> Finding | None:
-    """Every sample the same: nobody measures."""
+    """Return a Finding if all samples are equal, because then the sensor is not read."""
     share = median(window.repeated for window in windows)
     if share < DEAD:
         return None
@@ -286,7 +328,10 @@ def invalid(windows: list[ImuWindow]) -> Finding | None:
 
 
 def no_gravity(windows: list[ImuWindow]) -> Finding | None:
-    """Little mean, and what there is does not outweigh the motion: gravity was taken out."""
+    """Return a Finding if the driver has subtracted gravity from the acceleration.
+
+    The mean specific force is then small, and the motion outweighs it.
+    """
     length = weight(windows)
     motion = median(float(np.linalg.norm(window.deviation[3:])) for window in windows)
     if (
@@ -307,7 +352,7 @@ def no_gravity(windows: list[ImuWindow]) -> Finding | None:
 
 
 def force_unit(windows: list[ImuWindow]) -> Finding | None:
-    """Gravity is 9.81 m/s^2, in whatever direction."""
+    """Return a Finding if the mean specific force is not 9.81 m/s^2 long."""
     length = weight(windows)
     if FORCE_RANGE[0] <= length <= FORCE_RANGE[1] or silent(windows) or no_gravity(windows):
         return None
@@ -341,8 +386,10 @@ def force_unit(windows: list[ImuWindow]) -> Finding | None:
 
 
 def rate_unit(windows: list[ImuWindow]) -> Finding | None:
-    """What turns about a horizontal axis turns gravity with it: a gyroscope that says otherwise is
-    not in rad/s.
+    """Return a Finding if gravity does not rotate as the gyroscope does.
+
+    A rotation about a horizontal axis rotates gravity in the body frame. A gyroscope that
+    contradicts this is not in rad/s.
     """
     excess = turn_excess(windows)
     if not excess > TURN_EXCESS:
@@ -373,8 +420,9 @@ def rate_unit(windows: list[ImuWindow]) -> Finding | None:
 
 
 def resting(windows: list[ImuWindow]) -> bool:
-    """Whether the specific force neither changes nor turns: nothing of a gyroscope but its bias can
-    be judged.
+    """Return whether the specific force neither changes nor rotates.
+
+    At rest, the data determine only the bias of a gyroscope.
     """
     shakes = median(float(np.linalg.norm(window.deviation[3:])) for window in windows)
     ups = np.array(
@@ -386,8 +434,10 @@ def resting(windows: list[ImuWindow]) -> bool:
 
 
 def turn_excess(windows: list[ImuWindow]) -> float:
-    """Median, over pairs of windows that follow each other, of the turn rate about the horizontal,
-    less what the direction of the specific force turned, rad/s; NaN where there are no such pairs.
+    """Return the rotation rate that the specific force does not follow, in rad/s.
+
+    For each pair of successive windows, it is the rate about horizontal axes minus the rotation
+    rate of the specific force. The result is the median over pairs, or NaN without pairs.
     """
     values = []
     for one, two in zip(windows, windows[1:]):
@@ -401,10 +451,14 @@ def turn_excess(windows: list[ImuWindow]) -> float:
 
 
 def upright(windows: list[ImuWindow]) -> Finding | None:
-    """At rest, and on average in the air, the accelerometer reads +9.81 m/s^2 upwards: on z."""
+    """Return a Finding if the mean specific force does not point along +z.
+
+    At rest, and on average in flight, the accelerometer of an upright tag reads +9.81 m/s^2 on z.
+    """
     force = force_of(windows)
     length = np.linalg.norm(force)
-    if length < 0.5 * weight(windows) or silent(windows) or no_gravity(windows):  # or it tumbles
+    # a short mean also means that the tag tumbles
+    if length < 0.5 * weight(windows) or silent(windows) or no_gravity(windows):
         return None
     up = force / length
     if up[2] >= UPRIGHT:
@@ -437,7 +491,7 @@ TURNS = {"-z": "x, -y, -z", "+x": "-z, y, x", "-x": "z, y, -x", "+y": "x, -z, y"
 
 
 def shaking(windows: list[ImuWindow]) -> Finding | None:
-    """A vibrating accelerometer rectifies: it reads a mean that is not there."""
+    """Return a Finding if vibration makes the accelerometer rectify, which shifts its mean."""
     rms = np.median([window.vibration[3:] for window in windows], axis=0)
     k = int(np.argmax(rms))
     if rms[k] < SHAKING:
@@ -453,7 +507,7 @@ def shaking(windows: list[ImuWindow]) -> Finding | None:
 
 
 def clipped(windows: list[ImuWindow]) -> Finding | None:
-    """Many samples at one far end of the range."""
+    """Return a Finding if many samples are at one far end of the range."""
     far = np.array([FAR_RATE] * 3 + [FAR_FORCE] * 3)
     hits = np.array(
         [np.where(abs(w.limit - w.mean) > far, w.clipped * (1.0 - w.still), 0.0) for w in windows]

@@ -1,10 +1,11 @@
-"""Watches the residuals, live and of recordings: what is not as it was when the flight began, or as
-the survey has it? An anchor that is late or early, whose clock drifts, that is silent, was
-exchanged with another or moved; an axis of the IMU.
+"""Watch the residuals for changes since the start of the flight and deviations from the survey.
 
-The innovations of half a second become a Slice. A ChangeDetector compares slices with those before,
-a SurveyComparison with the survey and the calibration. What they find is named until it has gone,
-and stays in the history.
+The Monitor works live and on recordings. It detects an anchor that is late or early, drifts, is
+silent, was exchanged with another, or was moved. It also detects a changed bias of an IMU axis.
+
+The innovations of half a second become a Slice. A ChangeDetector compares each slice with earlier
+slices. A SurveyComparison compares the slices with the survey and the calibration. Each finding is
+reported until it no longer holds, and stays in the history.
 """
 
 from __future__ import annotations
@@ -39,52 +40,63 @@ if TYPE_CHECKING:
     from .slices import Slice
     from .swap import Residuals as SwapResiduals
 
-MOVING = 0.3  # m/s; on the floor, residuals are not those of the air
-SETTLE = 8.0  # s in motion before an onset is looked for
+# m/s, speed above which the tag is in motion; on the floor, residuals differ from those in the air
+MOVING = 0.3
+SETTLE = 8.0  # s in motion before the search for an onset starts
 GAP = 30.0  # s without TDOAs after which a new flight begins
-# ratio above which an anchor has changed: a tenth above the largest of sound flights of two days,
-# see docs/reliability.md
+# likelihood ratio above which an anchor has changed: a tenth above the largest of sound flights of
+# two days, see docs/reliability.md
 LIMIT = 16.3
-CLEARLY = 1.4  # how much larger it must be than that of any other anchor,
-# and of the errors since then, over those before, what it may leave: else something else has
-# happened too, as on a floor
+CLEARLY = 1.4  # factor by which this ratio must exceed the ratio of any other anchor
+# largest mean square of the unexplained errors since the onset, over that before. If more is left,
+# something else has happened too, as on a floor.
 MOST_LEFT = 1.0
-# Share of the TDOAs of a slice; where the filter rejects more, as on a floor, it is no single
-# anchor that has changed
+# smallest share of accepted TDOAs in a slice. If the filter rejects more, as on a floor, the cause
+# is no change of a single anchor.
 FEWEST_ACCEPTED = 1 / 3
-SMALLEST_CHANGE = 0.15  # m; less does not matter, and what has come back to that has gone
-SILENT, FEWEST = 4, 40  # slices without an anchor, and the TDOAs of the others in them
-OFTEN = 0.5  # share of the slices in which it was heard before
-FORGET = 60  # slices between two looks at which of the anchors were passed long ago
-# share of the distance of the farthest anchor that is heard, within which another must be
+# m; a smaller change is negligible, and a change that returns below it is over
+SMALLEST_CHANGE = 0.15
+SILENT, FEWEST = 4, 40  # slices without an anchor, and TDOAs of the other anchors in them
+OFTEN = 0.5  # smallest share of slices in which the anchor was heard before
+FORGET = 60  # slices between two checks which anchors the tag passed long ago
+# share of the distance of the farthest anchor that is heard, within which a silent anchor must be
 NEARER = 0.8
-TOGETHER = 4  # slices in which a swap is looked for
-# slices or comparisons in a row that must say so until it is named, and something else until a swap
-# is no longer
+TOGETHER = 4  # slices in which the search for an exchange looks
+# consecutive slices or comparisons until a finding is reported, and until a reported exchange is
+# over
 NAMED, HELD = (4, 8)
-# slices between two comparisons with the survey; and of a comparison with the latest, at least
+# slices between two comparisons with the survey, and fewest slices of a comparison with recent data
 LOOK, YOUNG = (4, 40)
-SURE = 2.0  # standard deviations by which an anchor must be off the survey, beside SMALLEST_CHANGE
-TURN_APART = 3.0  # s of stamps between two turns of all signs
-# Share of the TDOAs of a slice that the filter accepts where it is right, and s since then, within
-# which signs turn: it is an event. Near a
-# floor, TDOAs that are metres too long may all the time look as if they had the other sign.
+# standard deviations by which an anchor must differ from the survey, in addition to SMALLEST_CHANGE
+SURE = 2.0
+TURN_APART = 3.0  # s of stamps between two sign flips of all TDOAs
+# share of accepted TDOAs of a slice where the filter is right, and s since then within which a sign
+# flip must occur, because it is an event. Near a floor, TDOAs that are metres too long may
+# permanently look as if they had the other sign.
 MOST, AGREED = 0.5, 1.1
-MOST_EVENTS = 1000  # that are remembered
-CALIBRATE = 15.0  # s in motion that count as calibration of the IMU
-# rad/s and m/s^2, by which an estimated bias must have moved
+MOST_EVENTS = 1000  # events that are stored
+CALIBRATE = 15.0  # s in motion over which the reference for the IMU biases is averaged
+# rad/s and m/s^2 by which an estimated bias must have changed
 BIAS_LIMITS = {"gyroscope": 0.03, "accelerometer": 0.6}
 
-SURVEYING = "survey RECORDING"  # the command that says where it stands
+SURVEYING = "survey RECORDING"  # command that estimates anchor positions
 
 NO_ODOMETRY = [np.empty(0), *[np.empty((0, 3))] * 4]  # t, p, v, gyro_bias, accel_bias
-# t, a, b, innovation, whether it was accepted
+# t, a, b, innovation, accepted
 NO_RESIDUALS = [np.empty(0), *[np.empty(0, int)] * 2, np.empty(0), np.empty(0, bool)]
 
 
 class Heard(NamedTuple):
-    """slices : in which an anchor was heard; last : number of the last one; farthest : m, of the
-    tag when it was.
+    """Store when an anchor was heard.
+
+    Attributes
+    ----------
+    slices : int
+        Number of slices in which the anchor was heard.
+    last : int
+        Number of the last such slice.
+    farthest : float
+        Largest distance of the tag when the anchor was heard, in m.
     """
 
     slices: int = 0
@@ -93,7 +105,15 @@ class Heard(NamedTuple):
 
 
 class Event(NamedTuple):
-    """finding : Finding, as it was last; since, until : s, stamps between which it stood."""
+    """Store a finding with its time.
+
+    Attributes
+    ----------
+    finding : Finding
+        Latest form of the finding.
+    since, until : float
+        Stamps between which the finding held, in s.
+    """
 
     finding: Finding
     since: float
@@ -101,61 +121,76 @@ class Event(NamedTuple):
 
 
 class Monitor:
-    """Feed it odometry and residuals, say until which stamp they are complete, ask for `alarms` and
-    `delays`.
+    """Search odometry and residuals for changes.
+
+    Call `add` with data and `update` with the stamp up to which they are complete. Then read
+    `alarms` and `delays`.
     """
 
     def __init__(
         self, anchors: Anchors | AnchorTable, calibrated: Covariance | None = None
     ) -> None:
-        """anchors : Anchors, or AnchorTable, of which others may be there later; calibrated :
-        Covariance of their positions and delays, as of their last calibration, or None.
+        """Create a monitor without data.
+
+        Parameters
+        ----------
+        anchors : Anchors or AnchorTable
+            Anchors; an AnchorTable may change later.
+        calibrated : Covariance or None
+            Covariance of anchor positions and delays from the last calibration.
         """
         self._anchors, self._calibrated = anchors, calibrated
         self._past: deque[Event] = deque(maxlen=MOST_EVENTS)
-        self._standing: dict[str, Event] = {}  # what stands at present, by its key
-        # of the signs of all TDOAs in flight, and the stamp of the last, s
+        self._standing: dict[str, Event] = {}  # events that hold now, by key
+        # number of sign flips of all TDOAs, and the stamp of the last, in s
         self.turns, self._turned = (0, -math.inf)
         self._agreed = -math.inf  # s, end of the last slice in which the filter accepted most TDOAs
         self._forget()
 
     def _forget(self) -> None:
-        self._odometry: list[list[np.ndarray]] = [NO_ODOMETRY]  # of the present slice and later
+        # Reset everything that belongs to one flight; the history stays.
+        # data of the current slice and later
+        self._odometry: list[list[np.ndarray]] = [NO_ODOMETRY]
         self._residuals: list[list[np.ndarray]] = [NO_RESIDUALS]
         self._past += self._standing.values()
         self._standing = {}
-        self._end: float | None = None  # s, stamps: at which the present slice ends,
-        self._last = -math.inf  # and of what was added last
+        self._end: float | None = None  # s, stamp of the end of the current slice
+        self._last = -math.inf  # s, stamp of the newest TDOA
         self._detector = ChangeDetector()
         self._displaced: dict[
             int, Displaced
-        ] = {}  # of anchors that are not as surveyed and calibrated, by row,
-        self._suspected: dict[int, int] = {}  # and comparisons in a row that say so
+        ] = {}  # {row: anchor that differs from the survey or calibration}
+        # {row: consecutive comparisons that found this anchor}
+        self._suspected: dict[int, int] = {}
         self._comparisons: list[SurveyComparison] = []
-        self._compared = 0  # slices
+        self._compared = 0  # slices compared since the last restart
         self._compare_anew()
         self._changes: dict[
             int, list[Change]
-        ] = {}  # row: Changes of an anchor that is not what it was
-        self._ever_changed: set[int] = set()  # rows
-        self._latest_change: Change | None = None  # while its size is still found out
-        self._latest: list[SwapResiduals] = []  # of the last slices in which something was far off
-        self._slices = 0  # of all
-        self._heard: dict[int, Heard] = {}  # by row
+        ] = {}  # {row: Changes of an anchor in flight that still hold}
+        self._ever_changed: set[int] = set()  # rows of anchors that changed at any time
+        self._latest_change: Change | None = None  # the newest change, whose size is refined
+        self._latest: list[SwapResiduals] = []  # residuals of the last slices with large errors
+        self._slices = 0  # slices so far
+        self._heard: dict[int, Heard] = {}  # by row of the anchor
         self._counts: list[int] = []  # TDOAs of the last slices
-        self._swapped: tuple[int, ...] = ()  # rows
+        self._swapped: tuple[int, ...] = ()  # rows of two exchanged anchors, or ()
         self._silent: tuple[int, ...] = ()
-        # rows of another swap, or of none, and slices in a row that say so
+        # another exchange, or none, that slices suggest instead, and how many consecutive ones
         self._instead: tuple[tuple[int, ...], int] = ((), 0)
-        self._moving_since = math.nan  # s, stamp
+        self._moving_since = math.nan  # s, stamp of the first motion
         self._bias: np.ndarray | None = None
-        # (6,): gyroscope, accelerometer; as calibrated, and the latest
+        # (6,) gyroscope, accelerometer: reference, and the latest
         self._bias_now: np.ndarray | None = None
         self._bias_calibration: list[np.ndarray] = []
 
     def forget(self, gone: np.ndarray) -> None:
-        """Anchors, by their rows (k,), are not there any more: nothing is said of them, nor what
-        their last TDOAs show used.
+        """Remove anchors that are gone from all results and stored data.
+
+        Parameters
+        ----------
+        gone : (k,) int array
+            Rows of the anchors.
         """
         rows, ids = set(gone.tolist()), self._anchors.ids[gone]
         kept = [~(np.isin(part[1], ids) | np.isin(part[2], ids)) for part in self._residuals]
@@ -177,14 +212,12 @@ class Monitor:
 
     @property
     def end(self) -> float:
-        """Stamp, s, at which the present slice ends; inf before the first TDOA."""
+        """Return the end of the current slice as a stamp, in s; inf before the first TDOA."""
         return math.inf if self._end is None else self._end
 
     @property
     def delays(self) -> tuple[np.ndarray, np.ndarray]:
-        """Of the anchors that are not what they were, at the present stamp: (N,) m, and their
-        variances (N,) m^2.
-        """
+        """Return the delays of changed anchors now, (N,) m, and their variances, (N,) m^2."""
         delays, variances = np.zeros((2, len(self._anchors)))
         changed = [*self._changes]
         delays[changed] = self._detector.delays_at(self.end, changed)
@@ -194,15 +227,16 @@ class Monitor:
         return delays, variances
 
     def add(self, odometry: Odometry, residuals: Residuals) -> None:
-        """Take Odometry and the Residuals that came with it."""
+        """Add Odometry and the Residuals that belong to it."""
         if self._end is not None and len(residuals.t) and residuals.t[0] > self._last + GAP:
-            # of the flight before; no slice is tested for each half second of a gap
+            # finish the flight before, so that no empty slices of the gap are tested
             self.update(math.inf)
         if len(odometry):
             self._odometry.append(
                 [odometry.t, odometry.p, odometry.v, odometry.gyro_bias, odometry.accel_bias]
             )
-        began, reached = self._end is not None, np.isfinite(residuals.innovation)  # the filter
+        # True if the filter computed an innovation
+        began, reached = self._end is not None, np.isfinite(residuals.innovation)
         if reached.any():
             columns = (
                 residuals.t,
@@ -220,9 +254,7 @@ class Monitor:
             self._keep_one_slice()
 
     def _keep_one_slice(self) -> None:
-        """Forget the odometry before the first slice, or before the one that it would be in if it
-        began now.
-        """
+        """Drop odometry older than the current slice, or than the slice of a TDOA that came now."""
         odometry = [np.concatenate(columns) for columns in zip(*self._odometry)]
         if len(odometry[0]):
             begin = (
@@ -233,9 +265,7 @@ class Monitor:
             self._odometry = [[column[odometry[0] >= begin] for column in odometry]]
 
     def update(self, until: float) -> None:
-        """Everything stamped before `until`, s, was added: test the slices that end there or
-        earlier.
-        """
+        """Test all slices that end by `until`, in s; all data up to then must be added."""
         if self._end is None or until < self._end:
             return
         residuals, odometry = (
@@ -252,17 +282,18 @@ class Monitor:
             residuals, odometry = [c[~now] for c in residuals], [c[~of_now] for c in odometry]
             self._end += LENGTH
         self._residuals, self._odometry = [residuals], [odometry]
-        if self._end <= until:  # nothing came for too long
+        if self._end <= until:  # no TDOA came for too long
             self._forget()
             self._odometry = [odometry]
             self._keep_one_slice()
 
     def _test(self, end: float, residuals: list[np.ndarray], odometry: list[np.ndarray]) -> None:
-        """One slice that ends at `end`, s: its columns."""
+        """Test the slice that ends at `end`, in s, given its columns."""
         self._judge(end, residuals, odometry)
         self._keep_history(end)
 
     def _judge(self, end: float, residuals: list[np.ndarray], odometry: list[np.ndarray]) -> None:
+        # Test one slice for exchanges, changes and deviations, and update the IMU biases.
         _, a, b, innovation, accepted = residuals
         a, b = self._anchors.index(a), self._anchors.index(b)
         t, p, v, gyro_bias, accel_bias = odometry
@@ -291,15 +322,17 @@ class Monitor:
                 self._compare(piece)
 
     def _compare(self, piece: Slice) -> None:
-        """Compare the flight, with a Slice more, with the survey; an anchor that has changed in
-        flight is named by that alone.
+        """Add a Slice to the comparison with the survey and repeat the comparison at times.
+
+        An anchor that has changed in flight is reported for that change only.
         """
         delays = self._detector.delays_at(piece.t, piece.rows)
         if delays.any():
             piece = replace(piece, vector=piece.vector - piece.information @ delays)
         if (
             self._compared % YOUNG == 0 and self._calibrated is not None
-        ):  # what moved on the way stood right for long
+            # an anchor moved in flight was right before: recent slices find it sooner
+        ):
             self._comparisons = [
                 self._comparisons[0],
                 *self._comparisons[1:][-1:],
@@ -321,6 +354,7 @@ class Monitor:
         self._displaced = {row: one for row, one in found.items() if self._suspected[row] >= NAMED}
 
     def _look_for_change(self, end: float) -> None:
+        # Find a new Change or refine the last, and drop changes that are over.
         change = self._detector.find(self._moving_since + SETTLE)
         if change is not None and _is_clear(change) and abs(change.at(end)) > SMALLEST_CHANGE:
             self._detector.compensate(change)
@@ -338,8 +372,8 @@ class Monitor:
         }
 
     def _compare_anew(self) -> None:
-        """What was not as it is now says nothing of the survey."""
-        # with all slices, and with the last YOUNG to 2 YOUNG, and YOUNG at most
+        """Restart the comparison with the survey, because earlier slices are no longer valid."""
+        # comparisons of all slices, of the last YOUNG to 2 YOUNG, and of at most YOUNG
         self._comparisons = [self._new_comparison()]
         self._displaced, self._suspected, self._compared = {}, {}, 0
 
@@ -349,8 +383,19 @@ class Monitor:
     def _look_for_swap(
         self, a: np.ndarray, b: np.ndarray, innovation: np.ndarray, place: np.ndarray
     ) -> bool:
-        """Whether this slice looks like one: it is named once several do, and until others say in a
-        row that it is not.
+        """Return whether this slice suggests that two anchors are exchanged.
+
+        An exchange is reported after several such slices. It is reported until several consecutive
+        slices contradict it.
+
+        Parameters
+        ----------
+        a, b : (n,) int array
+            Rows of the anchors of each TDOA.
+        innovation : (n,) array
+            Innovations, in m.
+        place : (3,) array
+            Position of the filter in the world frame, in m.
         """
         positions, named = self._anchors.positions, self._swapped
         left = residuals_of(
@@ -376,9 +421,18 @@ class Monitor:
         return bool(found)
 
     def _listen(self, a: np.ndarray, b: np.ndarray, place: np.ndarray | None) -> None:
-        """Which anchors are not heard any more, while others are? Not those that the tag has left
-        behind: one must be nearer to its place (3,), m, None: not known, than where the anchor was
-        heard, or than those that are.
+        """Find anchors that the tag no longer hears although it hears other anchors.
+
+        Anchors that the tag has left behind do not count. An anchor counts if it was heard at this
+        distance before. It also counts if it is clearly closer than the farthest anchor that is
+        heard.
+
+        Parameters
+        ----------
+        a, b : (n,) int array
+            Rows of the anchors of each TDOA.
+        place : (3,) array or None
+            Position of the tag, in m; None if unknown.
         """
         rows = np.unique(np.concatenate([a, b])).tolist()
         self._slices += 1
@@ -395,7 +449,7 @@ class Monitor:
             for row, was in self._heard.items()
             if self._is_silent(was, away.get(row, 0.0), reach)
         ]
-        if self._slices % FORGET == 0:  # of a hall, those that were passed
+        if self._slices % FORGET == 0:  # in a hall: drop anchors that the tag has passed
             self._heard = {
                 row: was
                 for row, was in self._heard.items()
@@ -419,6 +473,7 @@ class Monitor:
         )
 
     def _follow_biases(self, end: float, bias: np.ndarray) -> None:
+        # Average the biases in the second half of CALIBRATE as reference, and keep the latest.
         if end < self._moving_since + CALIBRATE:
             self._bias_calibration.append(bias)
         elif self._bias is None and self._bias_calibration:
@@ -427,16 +482,16 @@ class Monitor:
 
     @property
     def alarms(self) -> list[str]:
-        """Sentences on what has changed, and on what is not as surveyed; empty while nothing is."""
+        """Return sentences on changes and on deviations from the survey."""
         return [*(finding.brief for finding in self._found().values()), *self._axis_alarms()]
 
     @property
     def exchanged(self) -> Finding | None:
-        """Finding on two anchors that were exchanged, or None."""
+        """Return the Finding on two exchanged anchors, or None."""
         return self._swap() if self._swapped else None
 
     def _found(self) -> dict[str, Finding]:
-        """{key: Finding} of anchors, of what stands at present."""
+        """Return {key: Finding} of all findings on anchors that hold now."""
         found = {f"exchanged {self._swapped}": self._swap()} if self._swapped else {}
         found |= {
             f"changed {row}": self._change(row, changes) for row, changes in self._changes.items()
@@ -448,11 +503,11 @@ class Monitor:
 
     @property
     def history(self) -> list[Event]:
-        """All Events of anchors, in the order in which they began."""
+        """Return all Events of anchors, sorted by their start."""
         return sorted([*self._past, *self._standing.values()], key=lambda event: event.since)
 
     def _keep_history(self, end: float) -> None:
-        """Enter what stands at a stamp, s."""
+        """Update the history with the findings that hold at the stamp `end`, in s."""
         before, found = self._standing, self._found()
         self._past += [event for key, event in before.items() if key not in found]
         self._standing = {
@@ -486,7 +541,7 @@ class Monitor:
         size = float(self._detector.delays_at(end, [row])[0])
         again = [
             change for change in found if change.at(end) * size > 0.0
-        ]  # further in the same direction
+        ]  # changes in the same direction
         if found[-1].slope or len(again) > 1:
             what = f"its clock drifts ({size / (end - again[0].since):+.3f} m/s)"
         elif size > 0.0:
@@ -524,6 +579,7 @@ class Monitor:
         return Finding("anchor_displaced", WARNING, what, evidence, remedy, off)
 
     def _axis_alarms(self) -> list:
+        # Return sentences on IMU axes whose bias differs from the reference.
         if self._bias is None or self._bias_now is None:
             return []
         change, out = self._bias_now - self._bias, []
@@ -539,7 +595,7 @@ class Monitor:
 
 
 def _surest(displaced: Iterable[Displaced]) -> dict[int, Displaced]:
-    """Return {row: Displaced} of several comparisons, without the doubts that another settles."""
+    """Return {row: Displaced} of several comparisons, without doubts that another one resolves."""
     found: dict[int, Displaced] = {}
     for one in sorted(displaced, key=lambda one: len(one.others)):
         if found.keys().isdisjoint((one.row, *one.others)):
@@ -548,7 +604,7 @@ def _surest(displaced: Iterable[Displaced]) -> dict[int, Displaced]:
 
 
 def _matters(one: Displaced) -> bool:
-    """Whether an anchor is off by more than does not matter, and more than by chance."""
+    """Return whether the deviation of an anchor is relevant and statistically significant."""
     off = float(np.linalg.norm(one.shift))
     return max(off, abs(one.later)) > SMALLEST_CHANGE and (
         bool(one.later) or off > SURE * float(np.linalg.norm(one.std)) / math.sqrt(3.0)
@@ -556,5 +612,5 @@ def _matters(one: Displaced) -> bool:
 
 
 def _is_clear(change: Change) -> bool:
-    """Whether a Change is large, of one anchor alone, and all that has happened."""
+    """Return whether a Change is large, clearly of one anchor, and explains most of the errors."""
     return change.ratio > max(LIMIT, CLEARLY * change.rival) and change.left < MOST_LEFT

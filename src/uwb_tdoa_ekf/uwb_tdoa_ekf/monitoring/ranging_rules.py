@@ -1,4 +1,7 @@
-"""Rules for the values of a stream of TDOAs. A rule takes windows and returns a Finding or None."""
+"""Check windows of a TDOA stream for wrong values.
+
+Each rule takes windows and returns a Finding or None.
+"""
 
 from __future__ import annotations
 
@@ -13,30 +16,30 @@ from .stamp_rules import median
 if TYPE_CHECKING:
     from .ranging_windows import TdoaWindow
 
-LARGE = 0.2  # share of TDOAs longer than their anchors are apart; healthy 0.008 at most
+LARGE = 0.2  # share of TDOAs longer than the distance of their anchors; healthy 0.008 at most
 OUTLIERS = 0.05
-DUPLICATES = 0.02  # share; healthy 0
-REPEATS = 0.15  # share; healthy 0.026
-RETURNS = 0.08  # share of TDOAs that leap by more than 0.5 m and back; healthy 0.04 at most
-EVEN = 0.6  # share of the pairs, heard in both orders, that have one sign; healthy 0.1
-ON_GRID = 0.95  # share; healthy 0.005
-CLIPPED = 0.02  # share at the largest value
-# m, median leap; share of the leaps within NEAR, m, of that; leaps
+DUPLICATES = 0.02  # share of TDOAs that come twice; healthy 0
+REPEATS = 0.15  # share of TDOAs that repeat the value of their pair; healthy 0.026
+RETURNS = 0.08  # share of TDOAs that jump by more than 0.5 m and back; healthy 0.04 at most
+EVEN = 0.6  # share of the pairs, heard in both orders, with equal signs; healthy 0.1
+ON_GRID = 0.95  # share of TDOAs on a grid; healthy 0.005
+CLIPPED = 0.02  # share of TDOAs at the largest value
+# m, median jump; share of jumps that differ from it by less than NEAR, in m; number of jumps
 STEP, ALIKE, NEAR, FEWEST = (5.0, 0.6, 0.5, 10)
-TICK = 299792458.0 / (128 * 499.2e6)  # m, of the clock of a DW1000
+TICK = 299792458.0 / (128 * 499.2e6)  # m, clock tick of a DW1000
 WRAPS = {
     f"2^{bits} ticks of a DW1000": 2.0**bits * TICK for bits in (8, 16, 24, 31, 32, 39, 40)
 } | {f"2^{bits} ns": 2.0**bits * 0.299792458 for bits in (16, 31, 32)}
-FEW = 3.9  # anchors heard in a second, below which there is no position
+FEW = 3.9  # anchors heard in 1 s below which there is no position
 
 
 def share_of(windows: list[TdoaWindow], field: str, among: str = "known") -> float:
-    """Sum of one count over the windows divided by that of another."""
+    """Return the sum of one count over the windows divided by the sum of another."""
     return sum(getattr(w, field) for w in windows) / max(sum(getattr(w, among) for w in windows), 1)
 
 
 def fixed_step(windows: list[TdoaWindow]) -> Finding | None:
-    """Leaps of one size: a time stamp that wraps, or is truncated."""
+    """Return a Finding if jumps have one size, because a time stamp wraps or is truncated."""
     steps = np.concatenate([w.steps for w in windows])
     step = float(np.median(steps)) if len(steps) >= FEWEST else 0.0
     if step < STEP:
@@ -65,9 +68,7 @@ def fixed_step(windows: list[TdoaWindow]) -> Finding | None:
 
 
 def share_beside_known(windows: list[TdoaWindow], field: str) -> float:
-    """Share of TDOAs that `field` counts because they cannot be used, among these and the known
-    ones, 0 to 1.
-    """
+    """Return the share of unusable TDOAs of one kind among these and the known TDOAs, 0 to 1."""
     count = sum(getattr(w, field) for w in windows)
     return count / max(count + sum(w.known for w in windows), 1)
 
@@ -219,7 +220,7 @@ def clipped(windows: list[TdoaWindow]) -> Finding | None:
 
 
 def heard(windows: list[TdoaWindow]) -> Finding | None:
-    """Anchors heard in a window, on average."""
+    """Return a Finding if too few anchors are heard in a window."""
     count = median(np.count_nonzero(w.heard) for w in windows)
     if count < FEW:
         evidence = f"{count:.0f} anchors in a second; four are needed, five or more are good"

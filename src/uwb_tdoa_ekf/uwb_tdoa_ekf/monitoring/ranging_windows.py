@@ -1,4 +1,4 @@
-"""Counters of the values of a stream of TDOAs, and what they amount to over a window."""
+"""Count the values of a TDOA stream over windows of 1 s and compute the statistics of a window."""
 
 from __future__ import annotations
 
@@ -22,22 +22,23 @@ from .stamp_rules import (
 if TYPE_CHECKING:
     from uwb_tdoa_bias.common.anchors import Anchors
 
-ABSURD = 1e15  # in any unit: no number that a radio gives
-FOLLOWING = 0.1  # s between two TDOAs of a pair that count as successive
-LEAP = 0.5  # m between successive TDOAs of a pair that no tag flies in that time
-# m by which a TDOA may exceed the distance of its anchors before it counts as impossible
+ABSURD = 1e15  # no radio returns this, in any unit
+FOLLOWING = 0.1  # s between two TDOAs of a pair below which they are successive
+LEAP = 0.5  # m between successive TDOAs of a pair that no flying tag reaches in that time
+# m by which a TDOA may exceed the distance of its anchors before it is impossible
 BEYOND = 1.0
-# m, to which a driver might round; the radio's tick is 4.69 mm
+# m, resolutions to which a driver might round; the radio's tick is 4.69 mm
 GRIDS = np.array([1.0, 0.5, 0.25, 0.1, 0.05, 0.02, 0.01])
-ON_GRID = 1e-6  # m
-# Pairs that are remembered, of all that a tag hears in a minute; places that one may have, of which
-# it takes the oldest
+ON_GRID = 1e-6  # m, largest distance from a multiple
+# capacity for pairs of anchors, enough for all that a tag hears in 1 min; number of places for a
+# pair, whose oldest entry is replaced
 PAIRS, PROBES = 4096, 16
-# s before the end of a window, whose TDOAs belong together: no tag gets far in that time
+# s before the end of a window; TDOAs within it belong together, because no tag moves far in that
+# time
 FRESH = 0.3
-STEPS = 64  # leaps of a window whose size is kept
+STEPS = 64  # jumps of a window whose size is stored
 
-# places in the counters; those of the grids come after
+# places in the counters; the grids follow
 (
     KNOWN,
     UNKNOWN,
@@ -59,9 +60,26 @@ GRID = 15
 
 
 class TdoaCounters(NamedTuple):
-    """stamps : see stamps.py; counts; heard (N,) per anchor; steps (STEPS,) m : sizes of the latest
-    leaps; pair, d, before, t (PAIRS,) : of each pair of anchors heard lately the number, last
-    value, the one before and the last stamp, which outlive a window; positions (N, 3) : m.
+    """Store the counters of the current window.
+
+    The arrays of pairs are kept between windows.
+
+    Attributes
+    ----------
+    stamps : (20,) array
+        Counters of stamp_rules.
+    counts : array
+        Counters of this module.
+    heard : (N,) array
+        Number of TDOAs per anchor.
+    steps : (STEPS,) array
+        Sizes of the latest jumps, in m.
+    pair : (PAIRS,) int array
+        Number of each pair of anchors heard lately.
+    d, before, t : (PAIRS,) array
+        Last value and the value before, in m, and last stamp, in s, of each pair.
+    positions : (N, 3) array
+        Anchor positions in the world frame, in m.
     """
 
     stamps: np.ndarray
@@ -76,19 +94,49 @@ class TdoaCounters(NamedTuple):
 
 
 class TdoaWindow(NamedTuple):
-    """One window of TDOAs. Counts, unless it says otherwise.
+    """Store the statistics of one window of TDOAs; integers are numbers of TDOAs.
 
-    known : finite and between two known anchors; unknown : with an anchor that the survey does not
-        have; of_one : of
-    one anchor with itself; invalid : no number; impossible : longer than the anchors are apart;
-    duplicates : same pair, stamp and value as the one before of its pair; successive : that follow
-    one of their pair within FOLLOWING; repeated : of those, with the same value; leaps : of those,
-    by more than LEAP; returns : leaps that go back to the value before; opposed : pairs that came
-    in both orders, one soon after the other; even : of those, with the same sign in both; size :
-    mean |d|, m; ceiling, hits : largest |d|, m, and how many have it; grids (7,) : share of the
-    values on multiples of GRIDS; heard (N,) : TDOAs in which an anchor takes part; steps (k,) : m,
-    sizes of leaps; latest (k, 3) : rows of the anchors and value, m, of the last TDOA of each pair,
-    FRESH at most before the end.
+    Attributes
+    ----------
+    stamps : StampWindow
+        Statistics of the stamps.
+    known : int
+        Finite and between two known anchors.
+    unknown : int
+        With an anchor that is not in the survey.
+    of_one : int
+        From an anchor to itself.
+    invalid : int
+        Not finite.
+    impossible : int
+        Longer than the distance of the anchors.
+    duplicates : int
+        With pair, stamp and value equal to those before.
+    successive : int
+        Within FOLLOWING of the last one of the pair.
+    repeated : int
+        Successive, with an equal value.
+    leaps : int
+        Successive, with a jump of more than LEAP.
+    returns : int
+        Jumps back to the value before.
+    opposed : int
+        Pairs that came in both orders in quick succession.
+    even : int
+        Opposed, with equal signs in both orders.
+    size : float
+        Mean |d|, in m.
+    ceiling, hits : float, int
+        Largest |d|, in m, and how many TDOAs have it.
+    grids : (7,) array
+        Share of the values that are multiples of GRIDS.
+    heard : (N,) array
+        Number of TDOAs of each anchor.
+    steps : (k,) array
+        Sizes of jumps, in m.
+    latest : (k, 3) array
+        Rows of both anchors and value, in m, of the last TDOA of each pair, at most FRESH before
+        the end.
     """
 
     stamps: StampWindow
@@ -114,7 +162,7 @@ class TdoaWindow(NamedTuple):
 
 
 def new_tdoa(anchors: Anchors) -> TdoaCounters:
-    """TdoaCounters of a stream of which nothing was received; anchors : Anchors."""
+    """Return the TdoaCounters of a stream without messages, for some Anchors."""
     d, before, t = np.full((3, PAIRS), np.nan)
     counts, heard = np.zeros(GRID + len(GRIDS)), np.zeros(len(anchors))
     return TdoaCounters(
@@ -132,7 +180,7 @@ def new_tdoa(anchors: Anchors) -> TdoaCounters:
 
 @compiled
 def restart_tdoa(counters: TdoaCounters) -> None:
-    """Begin a new window."""
+    """Reset the counters for a new window."""
     restart_stamps(counters.stamps)
     counters.counts[:] = 0.0
     counters.heard[:] = 0.0
@@ -140,8 +188,18 @@ def restart_tdoa(counters: TdoaCounters) -> None:
 
 @compiled
 def count_tdoa(counters: TdoaCounters, t: float, arrival: float, a: int, b: int, d: float) -> bool:
-    """Take one TDOA: stamp and arrival, s (NaN: not known); a, b rows of its anchors, negative if
-    unknown; d as received. Returns whether the window is complete.
+    """Count one TDOA and return whether the window is complete.
+
+    Parameters
+    ----------
+    counters : TdoaCounters
+        Changed in place.
+    t, arrival : float
+        Stamp and arrival time, in s; NaN if unknown.
+    a, b : int
+        Rows of the anchors, negative if unknown.
+    d : float
+        Value as received.
     """
     count_stamp(counters.stamps, t, arrival)
     _count(counters, t, a, b, d)
@@ -150,6 +208,7 @@ def count_tdoa(counters: TdoaCounters, t: float, arrival: float, a: int, b: int,
 
 @compiled
 def _count(counters: TdoaCounters, t: float, a: int, b: int, d: float) -> None:
+    # Count one TDOA, see count_tdoa. Unusable TDOAs count as their kind only.
     c = counters.counts
     if a < 0 or b < 0:
         c[UNKNOWN] += 1.0
@@ -181,7 +240,7 @@ def _count(counters: TdoaCounters, t: float, a: int, b: int, d: float) -> None:
 
 @compiled
 def _compare(counters: TdoaCounters, t: float, a: int, b: int, d: float) -> None:
-    """Against what was received of this pair before, and of the same in the other order."""
+    """Compare a TDOA with the last TDOA of its pair, and with the pair in the other order."""
     c, pair, other = counters.counts, _place(counters, a, b), _find(counters, b, a)
     since = t - counters.t[pair]
     if since == 0.0 and d == counters.d[pair]:
@@ -206,12 +265,13 @@ def _compare(counters: TdoaCounters, t: float, a: int, b: int, d: float) -> None
 
 @compiled
 def _slot(number: int, probe: int) -> int:
+    # Return the place number `probe` of a pair in the hash table (multiplicative hash).
     return ((number * 2654435761) % 4294967296 // (4294967296 // PAIRS) + probe) % PAIRS
 
 
 @compiled
 def _find(counters: TdoaCounters, a: int, b: int) -> int:
-    """Place of a pair of rows, -1 if it is not remembered."""
+    """Return the place of a pair of rows, or -1 if the pair is not stored."""
     number = a * len(counters.heard) + b
     for probe in range(PROBES):
         if counters.pair[_slot(number, probe)] == number:
@@ -221,9 +281,7 @@ def _find(counters: TdoaCounters, a: int, b: int) -> int:
 
 @compiled
 def _place(counters: TdoaCounters, a: int, b: int) -> int:
-    """Place of a pair of rows; one that is not remembered takes that of the pair that was heard the
-    longest ago.
-    """
+    """Return the place of a pair of rows; a new pair replaces the oldest pair."""
     place = _find(counters, a, b)
     if place >= 0:
         return place
@@ -251,8 +309,14 @@ def feed_tdoa(
     d: np.ndarray,
     first: int,
 ) -> tuple[int, bool]:
-    """`count_tdoa` for the rows of arrays from `first` on, until a window is complete: (row after
-    the last, whether it is).
+    """Count rows of arrays from `first` on until a window is complete.
+
+    Returns
+    -------
+    row : int
+        Row after the last counted one.
+    complete : bool
+        Whether the window is complete.
     """
     for i in range(first, len(t)):
         if count_tdoa(counters, t[i], arrival[i], a[i], b[i], d[i]):
@@ -261,7 +325,7 @@ def feed_tdoa(
 
 
 def tdoa_window(counters: TdoaCounters) -> TdoaWindow:
-    """TdoaWindow of what was counted since the window began."""
+    """Return the TdoaWindow of the TDOAs since the window began."""
     c = counters.counts
     known = max(c[KNOWN], 1.0)
     whole = dict(zip(TdoaWindow._fields[1 : 1 + SUM], (int(value) for value in c[:SUM])))
@@ -279,6 +343,7 @@ def tdoa_window(counters: TdoaCounters) -> TdoaWindow:
 
 
 def _latest(counters: TdoaCounters) -> np.ndarray:
+    # Return TdoaWindow.latest.
     kept = np.flatnonzero(
         (counters.pair >= 0) & (np.abs(counters.stamps[LAST] - counters.t) < FRESH)
     )

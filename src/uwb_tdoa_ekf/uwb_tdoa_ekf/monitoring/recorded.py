@@ -1,4 +1,4 @@
-"""What the Monitor finds in a recording: the same that ekf_node does, with times."""
+"""Run the Monitor on a recording, with the results of ekf_node and their times."""
 
 from __future__ import annotations
 
@@ -27,9 +27,20 @@ def watched(
     calibrated: Covariance | None = None,
     restarts: Sequence[float] = (),
 ) -> list[Event]:
-    """Return the Events of the Odometry and the Residuals of a recording.
+    """Return the Events of a recording.
 
-    calibrated : as of a Monitor; restarts : s, stamps at which the filter starts anew.
+    Parameters
+    ----------
+    anchors : Anchors
+        Anchors in the world frame.
+    odometry : Odometry
+        Estimates.
+    residuals : Residuals
+        Outcome of each TDOA.
+    calibrated : Covariance or None
+        As for Monitor.
+    restarts : sequence of float
+        Stamps at which the filter restarts, in s.
     """
     events: list[Event] = []
     for low, high in pairwise([-math.inf, *restarts, math.inf]):
@@ -46,6 +57,6 @@ def watched(
 
 
 def _between(t: np.ndarray, low: float, high: float) -> np.ndarray:
-    """Places of the stamps t (n,) s from one on and before another, in order."""
+    """Return the places of stamps t (n,), in s, with low <= t < high, sorted by stamp."""
     order = np.argsort(t, kind="stable")
     return np.asarray(order[(t[order] >= low) & (t[order] < high)])

@@ -1,11 +1,11 @@
-"""Does each anchor stand where the survey has it, and is it as late as it was calibrated? A
-Bayesian test over Slices.
+"""Test whether anchors differ from the survey or calibration, with a Bayesian test over Slices.
 
-The survey may be off by the standard deviations that it states. Each anchor is late by something
-that depends on the place: antennas, reflections. Slices of one cell of the room share that error,
-so that many of them count as little more than one. A part of it is a slope over all cells. The
-evidence chooses how large such errors are. A change of one anchor is named if it makes the flight
-ODDS times as probable, then the next (`..evidence`).
+The prior of an anchor position has the standard deviations of the survey. Each anchor also has a
+delay that depends on the place, because of antennas and reflections. Slices in one cell of the room
+share this error. Many slices of a cell therefore count little more than a single slice. A part of
+the error is a slope over all cells. The evidence selects the size of such errors. A change of an
+anchor is reported if it makes the flight ODDS times more probable. Then the search continues with
+the next change (`..evidence`).
 """
 
 from __future__ import annotations
@@ -38,26 +38,38 @@ if TYPE_CHECKING:
     from ..evidence import ChangeKey
     from .slices import Slice
 
-CELL = 0.7  # m
-# that are compared, those where the tag was last; and the anchors that are heard in them
+CELL = 0.7  # m, size of a cell of the room
+# cells in a comparison, the latest ones; and anchors that are heard in them
 MOST_CELLS, MOST_ANCHORS = (150, 24)
-TDOA_STD = 0.1  # m, of one TDOA beside these
-# m, of errors of an anchor that last in a cell, of which the evidence chooses
+TDOA_STD = 0.1  # m, standard deviation of one TDOA without these errors
+# m, standard deviations of errors that are constant in a cell; the evidence selects one
 ERROR_STDS = (0.02, 0.05, 0.1, 0.15, 0.22, 0.32, 0.45, 0.65)
-# m, of coordinates and of delays of anchors, where no calibration states them
+# m, prior standard deviations of coordinates and of delays without a calibration
 SURVEY_STD, DELAY_STD = (0.05, 0.15)
-ODDS = 1e3  # by how much more probable a change must make the flight
-FEWEST_CELLS, FEWEST_SLICES = 12, 40  # that must be compared
-SLOPES = 0.5  # 1/m, of such errors that go on from cell to cell
+ODDS = 1e3  # factor by which a change must raise the probability of the flight
+FEWEST_CELLS, FEWEST_SLICES = 12, 40  # fewest cells and slices of a comparison
+SLOPES = 0.5  # 1/m, standard deviation of the slope of errors over cells, relative to their size
 MORE = TDOA_VARIANCE / TDOA_STD**2
 
 
 @dataclass(frozen=True)
 class Displaced:
-    """row : of an anchor; shift, std : (3,) m, by how much it stands elsewhere than surveyed; later
-    : m, by how much it is later than calibrated; odds : logarithm of those of the change; either :
-    whether its being later explains as much as its standing elsewhere; others : rows of anchors
-    whose change explains about as much, the most probable first.
+    """Describe an anchor that differs from the survey or calibration.
+
+    Attributes
+    ----------
+    row : int
+        Row of the anchor.
+    shift, std : (3,) array
+        Position minus surveyed position and its standard deviation, in m.
+    later : float
+        Delay minus calibrated delay, in m.
+    odds : float
+        Logarithm of the odds of the change.
+    either : bool
+        True if a delay explains about as much as a shift.
+    others : tuple of int
+        Rows of anchors whose change explains about as much, the most probable first.
     """
 
     row: int
@@ -69,13 +81,23 @@ class Displaced:
     others: tuple[int, ...] = ()
 
     def without(self, rows: set[int]) -> Displaced:
-        """Return this one without some rows among the others."""
+        """Return a copy without some rows in `others`."""
         return replace(self, others=tuple(row for row in self.others if row not in rows))
 
 
 class _Cell:
-    """What the slices of a cell tell of the delays of anchors in rows (H,): information (H, H) and
-    vector (H,); place : (3,) m, the mean of the tag's; slices : how many there are.
+    """Accumulate the information on anchor delays from all slices in one cell.
+
+    The information has the shape (H, H) and its vector (H,), for the H anchors in `rows`.
+
+    Attributes
+    ----------
+    rows : (H,) int array
+        Rows of the anchors.
+    place : (3,) array
+        Mean position of the tag in the world frame, in m.
+    slices : int
+        Number of slices.
     """
 
     def __init__(self) -> None:
@@ -87,7 +109,7 @@ class _Cell:
         self._parts: list[Part] = []
 
     def add(self, piece: Slice) -> None:
-        """Take a Slice."""
+        """Add a Slice."""
         rows = np.union1d(self.rows, piece.rows)
         if len(rows) > len(self.rows):
             old, information = np.searchsorted(rows, self.rows), np.zeros((len(rows),) * 2)
@@ -103,7 +125,7 @@ class _Cell:
 
     @property
     def parts(self) -> list[Part]:
-        """Part of the delays beside errors that last, for each of ERROR_STDS."""
+        """Return a Part of the delays for each of ERROR_STDS, without the cell's errors."""
         if not self._parts:
             gram, vector, n = (
                 np.tile(self._information, (2, 2)),
@@ -115,21 +137,27 @@ class _Cell:
 
 
 class SurveyComparison:
-    """Takes Slices; `find` says which anchors do not stand where they should."""
+    """Collect Slices and find anchors that differ from the survey or calibration."""
 
     def __init__(
         self, anchors: Anchors | AnchorTable, calibrated: Covariance | None = None
     ) -> None:
-        """anchors : Anchors, or AnchorTable; calibrated : Covariance of their positions and delays,
-        or None.
+        """Create a comparison without slices.
+
+        Parameters
+        ----------
+        anchors : Anchors or AnchorTable
+            Surveyed anchors.
+        calibrated : Covariance or None
+            Covariance of their positions and delays.
         """
         self._anchors, self._calibrated = anchors, calibrated
         self._cells: dict[
             tuple[int, ...], _Cell
-        ] = {}  # the one that the tag was in last is the last
+        ] = {}  # the cell that the tag visited last is at the end
 
     def add(self, piece: Slice) -> None:
-        """Take a Slice."""
+        """Add a Slice."""
         key = tuple(np.floor(piece.p / CELL).astype(int).tolist())
         cell = self._cells.pop(key, None) or _Cell()
         cell.add(piece)
@@ -138,13 +166,13 @@ class SurveyComparison:
             del self._cells[next(iter(self._cells))]
 
     def forget(self, rows: set[int]) -> None:
-        """Anchors, by their rows, are not there any more."""
+        """Drop all cells with anchors in `rows`, which are gone."""
         self._cells = {
             key: cell for key, cell in self._cells.items() if not rows & set(cell.rows.tolist())
         }
 
     def find(self) -> list[Displaced]:
-        """The anchors that are elsewhere or later than they should be, the clearest first."""
+        """Return anchors that differ from the survey or calibration, the clearest first."""
         rows, cells = self._latest()
         if len(cells) < FEWEST_CELLS or sum(cell.slices for cell in cells) < FEWEST_SLICES:
             return []
@@ -167,7 +195,7 @@ class SurveyComparison:
             named[POSITION if (POSITION, k) in rivals else what, k] = odds, either, others
         for some, size in (
             possible[key] for key in named
-        ):  # who cannot be told from a late anchor has rather been moved
+        ):  # a shift is assumed if the data do not distinguish it from a delay
             covariance[some, some] += size**2
         part, prior = parts[changes.number], np.linalg.inv(covariance)
         inverse = np.linalg.inv(part.gram + prior)
@@ -183,7 +211,7 @@ class SurveyComparison:
         return list(out.values())
 
     def _latest(self) -> tuple[np.ndarray, list[_Cell]]:
-        """(rows of the anchors, cells) that are compared."""
+        """Return (rows of the anchors, cells) of the comparison."""
         rows: set[int] = set()
         cells: list[_Cell] = []
         for cell in reversed(self._cells.values()):
@@ -194,8 +222,16 @@ class SurveyComparison:
         return np.array(sorted(rows), int), cells
 
     def _parts(self, rows: np.ndarray, positions: np.ndarray, cells: Sequence[_Cell]) -> list[Part]:
-        """Part of the coordinates and delays of anchors in rows (n,), at positions (n, 3) m, for
-        each of ERROR_STDS.
+        """Return a Part of coordinates and delays for each of ERROR_STDS.
+
+        Parameters
+        ----------
+        rows : (n,) int array
+            Rows of the anchors.
+        positions : (n, 3) array
+            Their positions in the world frame, in m.
+        cells : sequence of _Cell
+            Cells of the comparison.
         """
         n, middle = len(rows), np.mean([cell.place for cell in cells], axis=0)
         grams, vectors, rests = (

@@ -1,5 +1,7 @@
-"""Are the signs of all TDOAs the wrong way round? No counter shows that: a second filter, without
-the IMU, is fed with both signs, and what each leaves unexplained is compared, as `check` does.
+"""Detect whether the signs of all TDOAs are wrong.
+
+No counter shows this. Two filters without IMU process the TDOAs with both signs. Their unexplained
+losses are compared, as in `check`.
 """
 
 from __future__ import annotations
@@ -16,67 +18,75 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.common.anchors import Anchors
 
 
-LARGE = 0.75  # m, by which a TDOA changes with its sign, below which it shows nothing
-GAIN = 0.35  # share of that change that may be left with the other sign
-# Shares of the TDOAs that show something: those that the other sign must explain, and those that
-# the present one may explain. After a
-# turn these were 0.66 to 1.0 and 0.0 in simulated flights; near a floor, where anchors are metres
-# late, 0.67 and 0.3
+LARGE = 0.75  # m, change of a TDOA with its sign below which it shows nothing
+GAIN = 0.35  # largest share of that change that the other sign may leave
+# Shares of the significant TDOAs: smallest share that the other sign must explain, and largest
+# share that the present sign may explain. After a flip these were 0.66 to 1.0 and 0.0 in simulated
+# flights. Near a floor, where anchors are metres late, they were 0.67 and 0.3.
 SHARE, PRESENT = 0.6, 0.1
-FEWEST = 10  # TDOAs that show something
+FEWEST = 10  # fewest significant TDOAs
 
 
 def turned(innovation: np.ndarray, predicted: np.ndarray) -> bool:
-    """Return whether the other sign explains the innovations (n,), m; predicted : (n,) m, at the
-    place of the filter.
+    """Return whether the other sign explains the innovations of a slice.
 
-    All TDOAs that are far from zero are asked, those that the filter explains, too. Where a few
-    anchors are late, as near a floor, most TDOAs contradict a turn.
+    All TDOAs far from zero count, including those that the filter explains. If a few anchors are
+    late, as near a floor, most TDOAs therefore contradict a flip.
+
+    Parameters
+    ----------
+    innovation : (n,) array
+        Innovations, in m.
+    predicted : (n,) array
+        TDOAs predicted at the position of the filter, in m.
     """
     change = np.abs(2.0 * predicted)
     asked = change > LARGE
     if np.count_nonzero(asked) < FEWEST:
         return False
     small = GAIN * change[asked]
-    left = np.abs(2.0 * predicted[asked] + innovation[asked])  # -d - predicted, of a measured d
+    left = np.abs(2.0 * predicted[asked] + innovation[asked])  # -(-d - predicted) for a measured d
     return bool(
         np.mean(left < small) > SHARE and np.mean(np.abs(innovation[asked]) < small) < PRESENT
     )
 
 
-# What must stay unexplained less, and by how many standard errors. On 37 measured flights, of any
-# 10 to 40 s from the start or
-# in the air: healthy ones 0.98 and 0.2, those with the other sign 0.81 and 2.5 after 30 s in the
-# air, most after 12.
+# Largest ratio of the losses, and smallest number of standard errors. On 37 measured flights, over
+# any 10 to 40 s from the start or in the air: healthy flights have 0.98 and 0.2. Flights with the
+# other sign have 0.81 and 2.5 after 30 s in the air, most of them after 12 s.
 RATIO, DEVIATIONS = 0.85, 3.0
-TURNED = -1.0  # value of a Finding on signs that have turned in flight
-LONGEST = 40.0  # s of stamps, after which it begins anew
+TURNED = -1.0  # value of a Finding on signs that flipped in flight
+LONGEST = 40.0  # s of stamps after which an undecided comparison restarts
 
 
 class SignWatch:
-    """Compares until it is certain that the signs are right, and again once they are doubted; of
-    wrong ones it goes on to see when they are right again.
+    """Compare both signs until the right sign is certain, and again after a doubt.
 
-    finding : Finding, or None.
+    After it finds wrong signs, the comparison continues and detects when they are right again.
+
+    Attributes
+    ----------
+    finding : Finding or None
+        Present result.
     """
 
     def __init__(self, anchors: Anchors) -> None:
-        """anchors : Anchors."""
+        """Start a comparison for some Anchors."""
         self._anchors = anchors
         self.finding: Finding | None = None
         self._certain = False
         self._begin()
 
     def doubt(self) -> None:
-        """Compare again, from the next TDOA on, where it was certain."""
+        """Restart the comparison with the next TDOA if the signs were certain."""
         if self._certain:
             self._certain = False
             self._begin()
 
     def turn(self) -> None:
-        """The signs of all TDOAs have turned in flight: name that at once, or its end.
+        """Report at once that all signs have flipped in flight, or that an earlier flip is over.
 
-        The comparison begins again, and decides.
+        The comparison restarts and decides.
         """
         line = (
             "message.distance_difference = distance_to_b - distance_to_a  # always, not only in "
@@ -106,9 +116,18 @@ class SignWatch:
         self._innovations: tuple[list[np.ndarray], list[np.ndarray]] = [], []
 
     def feed(self, t: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray) -> None:
-        """Take raw TDOAs (n,) of about a second: stamps, s; ids; m.
+        """Add raw TDOAs of about one second.
 
-        Those that came too late for this are left out.
+        TDOAs older than the newest ones of earlier calls are ignored.
+
+        Parameters
+        ----------
+        t : (n,) array
+            Stamps, in s.
+        a, b : (n,) array
+            Anchor ids.
+        d : (n,) array
+            TDOAs, in m.
         """
         if self._certain:
             return
@@ -126,6 +145,7 @@ class SignWatch:
         self._test()
 
     def _test(self) -> None:
+        # Decide between both signs, or restart the comparison after LONGEST.
         t = np.concatenate(self._stamps)
         right, wrong = (Unexplained.of(t, np.concatenate(kept)) for kept in self._innovations)
         if _better(right, wrong):
@@ -147,6 +167,6 @@ class SignWatch:
 
 
 def _better(one: Unexplained, other: Unexplained) -> bool:
-    """Whether one Unexplained certainly leaves less than the other."""
+    """Return whether one Unexplained is significantly smaller than the other."""
     ratio, z = compare(other, one)
     return ratio < RATIO and z > DEVIATIONS

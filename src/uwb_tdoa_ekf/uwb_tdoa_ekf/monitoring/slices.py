@@ -1,9 +1,9 @@
-"""Residuals of half a second, reduced to one delay for each anchor.
+"""Reduce the residuals of half a second to one delay for each anchor.
 
-A TDOA whose anchors are late by delay_a and delay_b, predicted for a place that is off by e, has
-the innovation delay_b - delay_a + (u_b - u_a) e, with u the directions from the anchors to the tag.
-The place is solved for and thrown away: what is left are the combinations of delays that no place
-explains.
+A TDOA has anchors with the delays delay_a and delay_b. Its prediction uses a position with the
+error e. Its innovation is delay_b - delay_a + (u_b - u_a) e. Here u is the unit vector from an
+anchor to the tag. The position error is marginalized. The result contains the combinations of
+delays that no position error explains.
 """
 
 from __future__ import annotations
@@ -14,23 +14,35 @@ import numpy as np
 
 from uwb_tdoa_bias.common.geometry import ranges
 
-LENGTH = 0.5  # s of stamps
-CLIP = 1.5  # m; a larger innovation counts as this
-TDOA_VARIANCE = 0.02  # m^2, noise of one TDOA about the errors that last
-PLACE_STD = 0.5  # m, by which the filter may be off
-DELAY_STD = 0.15  # m, of a delay, before anything is measured
-# anchors of a slice; where more are heard, those that are heard least are left out of it
+LENGTH = 0.5  # s of stamps of one slice
+CLIP = 1.5  # m; larger innovations are clipped to this
+TDOA_VARIANCE = 0.02  # m^2, noise variance of one TDOA without its constant errors
+PLACE_STD = 0.5  # m, standard deviation of the position of the filter
+DELAY_STD = 0.15  # m, prior standard deviation of a delay
+# largest number of anchors in a slice; the anchors with the fewest TDOAs are left out
 MOST = 100
 
 
 @dataclass(frozen=True)
 class Slice:
-    """t : s, its middle; p : (3,) m, where the filter had the tag; rows : (H,) of the anchors that
-    were heard, MOST at most;
-    delays : (H,) m, their least mean square estimate; response : (H, H), what a metre of delay of
-        each anchor (column) makes of
-    the estimate. An anchor that was not heard has neither. information (H, H) 1/m^2, vector (H,)
-    1/m : what the TDOAs alone tell of the delays, at whatever place.
+    """Store the delays of all anchors that are heard in half a second.
+
+    Attributes
+    ----------
+    t : float
+        Stamp of the middle, in s.
+    p : (3,) array
+        Position of the filter in the world frame, in m.
+    rows : (H,) int array
+        Rows of the anchors, at most MOST.
+    delays : (H,) array
+        Minimum mean square error estimate of their delays, in m.
+    response : (H, H) array
+        Change of the estimate (row) per metre of delay of each anchor (column).
+    information : (H, H) array
+        Information of the TDOAs alone on the delays, with the position marginalized, in 1/m^2.
+    vector : (H,) array
+        Information vector, in 1/m.
     """
 
     t: float
@@ -50,8 +62,20 @@ def reduced(
     b: np.ndarray,
     innovation: np.ndarray,
 ) -> Slice:
-    """The Slice of TDOAs between the anchors (rows) a and b (n,), with innovations (n,) m;
-    positions : (N, 3) m.
+    """Return the Slice of TDOAs.
+
+    Parameters
+    ----------
+    t : float
+        Stamp of the middle, in s.
+    p : (3,) array
+        Position of the filter in the world frame, in m.
+    positions : (N, 3) array
+        Anchor positions in the world frame, in m.
+    a, b : (n,) int array
+        Rows of the anchors of each TDOA.
+    innovation : (n,) array
+        Innovations, in m.
     """
     value = np.clip(innovation, -CLIP, CLIP)
     rows, a, b, value = _heard_most(a, b, value)
@@ -74,8 +98,16 @@ def reduced(
 def _heard_most(
     a: np.ndarray, b: np.ndarray, value: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """(rows, a, b, value): the anchors that are heard, MOST at most, and the TDOAs between them,
-    with places among these rows.
+    """Return the anchors with the most TDOAs, at most MOST, and the TDOAs between them.
+
+    Returns
+    -------
+    rows : (H,) int array
+        Rows of the anchors.
+    a, b : (k,) int array
+        Anchors of each TDOA as places in `rows`.
+    value : (k,) array
+        Innovations, in m.
     """
     rows, both = np.unique(np.concatenate([a, b]), return_inverse=True)
     often = np.sort(np.argsort(-np.bincount(both, minlength=len(rows)), kind="stable")[:MOST])

@@ -1,4 +1,4 @@
-"""Count the stamps of a stream over windows of a second, and judge the windows."""
+"""Count the stamps of a stream over windows of 1 s and check the windows."""
 
 from __future__ import annotations
 
@@ -17,19 +17,23 @@ if TYPE_CHECKING:
 
 
 def median(values: Iterable[float]) -> float:
-    """Float; NaN if there are none or one is NaN. numpy takes thirty times as long for so few."""
+    """Return the median; NaN for no values or if any value is NaN.
+
+    For so few values, numpy takes thirty times as long.
+    """
     values = [float(value) for value in values]
     return math.nan if not values or any(map(math.isnan, values)) else statistics.median(values)
 
 
-LENGTH = 1.0  # s of a window
-# s by which a stamp is ahead of what the arrival allows, or behind the newest: no late packet
+LENGTH = 1.0  # s, length of a window
+# s by which a stamp is ahead of its arrival, or behind the newest stamp; a late packet stays below
+# this
 JUMP_LIMIT = 1.0
-ABSURD = 1e12  # s; no clock says that
-MINIMUM = 10  # messages of a window
-MAXIMUM = 5000  # messages of a window, for streams whose stamps stand still
+ABSURD = 1e12  # s; no clock has this value
+MINIMUM = 10  # messages of a window at least
+MAXIMUM = 5000  # messages of a window at most, for streams whose stamps stand still
 
-# places in the counters; the first three outlive a window
+# places in the counters; the first three are kept between windows
 (
     NEWEST,
     LAST,
@@ -55,21 +59,37 @@ MAXIMUM = 5000  # messages of a window, for streams whose stamps stand still
 
 
 class StampWindow(NamedTuple):
-    """The stamps of one window of messages, in the order of their arrival.
+    """Store the statistics of the stamps in one window, in the order of arrival.
 
-    count : messages; begin, end : s, arrival (or stamp, where the arrival is not known) of the
-        first and the last;
-    falls : messages stamped before the newest, and depth, s, by how much at most; jumps : stamps
-        that leapt by more
-    than JUMP_LIMIT, and jump, s, the farthest; gap : s, longest step forward; same : messages with
-    the stamp of the one before; zeros : stamps of 0; step : s, mean step forward; scatter :
-    standard deviation of the steps over their mean;
-    latency, spread : s, smallest arrival minus stamp, and largest minus smallest, NaN where the
-        arrival is not known;
-    pace : seconds of stamps per second of arrival.
+    Attributes
+    ----------
+    count : int
+        Number of messages.
+    begin, end : float
+        Arrival (or stamp, if the arrival is unknown) of the first and last message, in s.
+    falls, depth : int, float
+        Messages older than the newest stamp, and the largest such age, in s.
+    jumps, jump : int, float
+        Stamps that jump by more than JUMP_LIMIT, and the largest jump, in s.
+    gap : float
+        Longest step forward, in s.
+    same : int
+        Messages with the stamp of the one before.
+    zeros : int
+        Messages with stamp 0.
+    step : float
+        Mean step forward, in s.
+    scatter : float
+        Standard deviation of the steps divided by their mean.
+    latency : float
+        Smallest arrival minus stamp, in s; NaN if the arrival is unknown.
+    spread : float
+        Largest minus smallest arrival minus stamp, in s; NaN if the arrival is unknown.
+    pace : float
+        Seconds of stamps per second of arrival.
     """
 
-    count: int  # type: ignore[assignment]  # hides tuple.count, which nobody asks for
+    count: int  # type: ignore[assignment]  # hides tuple.count, which is not needed
     begin: float
     end: float
     falls: int
@@ -87,7 +107,7 @@ class StampWindow(NamedTuple):
 
 
 def new_stamps() -> np.ndarray:
-    """Counters (20,) of a stream of which nothing was received."""
+    """Return the counters (20,) of a stream without messages."""
     s = np.zeros(20)
     s[NEWEST], s[LAST], s[LAST_ARRIVAL] = -np.inf, np.nan, np.nan
     restart_stamps(s)
@@ -96,7 +116,7 @@ def new_stamps() -> np.ndarray:
 
 @compiled
 def restart_stamps(s: np.ndarray) -> None:
-    """Begin a new window."""
+    """Reset the counters for a new window."""
     s[COUNT:] = 0.0
     s[BEGIN] = s[NOW] = np.nan
     s[LATENCY_MIN], s[LATENCY_MAX] = np.inf, -np.inf
@@ -104,7 +124,7 @@ def restart_stamps(s: np.ndarray) -> None:
 
 @compiled
 def count_stamp(s: np.ndarray, t: float, arrival: float) -> None:
-    """Take the stamp t of one message, s, and when it arrived, s, or NaN."""
+    """Count the stamp t of one message, in s, and its arrival time, in s or NaN."""
     if not abs(arrival) < ABSURD:
         arrival = np.nan
     if not abs(t) < ABSURD:
@@ -123,7 +143,8 @@ def count_stamp(s: np.ndarray, t: float, arrival: float) -> None:
     if s[NEWEST] > -np.inf:
         step = t - s[NEWEST]
         waited = arrival - s[LAST_ARRIVAL]
-        if step < -JUMP_LIMIT or step - waited > JUMP_LIMIT:  # never where the arrival is not known
+        # the second test is false if the arrival is unknown
+        if step < -JUMP_LIMIT or step - waited > JUMP_LIMIT:
             s[JUMPS] += 1.0
             if abs(step) > abs(s[JUMP]):
                 s[JUMP] = step
@@ -149,12 +170,12 @@ def count_stamp(s: np.ndarray, t: float, arrival: float) -> None:
 
 @compiled
 def complete(s: np.ndarray) -> bool:
-    """True if the window is LENGTH long, and of some messages."""
+    """Return whether the window is LENGTH long and has enough messages."""
     return (s[COUNT] >= MINIMUM and abs(s[NOW] - s[BEGIN]) >= LENGTH) or s[COUNT] >= MAXIMUM
 
 
 def stamp_window(s: np.ndarray) -> StampWindow:
-    """StampWindow of what was counted since the window began."""
+    """Return the StampWindow of the messages since the window began."""
     steps = max(s[STEPS], 1.0)
     step = s[STEP_SUM] / steps
     variance = max(s[STEP_SQUARES] / steps - step * step, 0.0)
@@ -188,35 +209,37 @@ STAMP_LINE = (
     "nanoseconds"
 )
 SLOWEST = {"imu/data": 50.0, "uwb/tdoa": 20.0}  # Hz; healthy 946 and 191 at least
-LONGEST_GAP = {"imu/data": 0.1, "uwb/tdoa": 0.5}  # s; healthy 0.012 and 0.116 at most
+# s between stamps; healthy 0.012 and 0.116 at most
+LONGEST_GAP = {"imu/data": 0.1, "uwb/tdoa": 0.5}
 SCATTER = 3.0  # standard deviation of the steps over their mean; healthy 1.4 at most
-# share of stamps that equal the one before, healthy 0, and s between those that do not
+# share of stamps that equal the one before, healthy 0; s between different stamps
 REPEATED, LEAP = (0.3, 0.01)
-PACE = 0.05  # by which the pace of the stamps may differ from that of the clock
-BLOCK = 0.1  # s between the soonest and the latest arrival of a window, beyond the lag of the first
-APART = 0.1  # s between two streams
-LATEST = 5.0  # s that TDOAs may come late; what is more is another clock
-DRIFT, DRIFTED = 3e-4, 0.03  # s/s, and s over the recording
-# s: what ekf_node waits for, as its parameters of these names say by default
+PACE = 0.05  # largest difference between the pace of the stamps and of the clock
+BLOCK = 0.1  # s between the earliest and the latest arrival of a window, relative to the stamps
+APART = 0.1  # s between two streams that counts as a difference
+LATEST = 5.0  # s that TDOAs may be late; a larger value means another clock
+DRIFT, DRIFTED = 3e-4, 0.03  # s/s, and s over the recording, above which a drift is reported
+# s, default waiting times of ekf_node
 LAG, REORDER = (0.25, 0.003)
 UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
 
 
 def total(windows: list[StampWindow], field: str) -> int:
-    """Sum of a field of StampWindow over windows."""
+    """Return the sum of a field of StampWindow over windows."""
     return sum(getattr(window, field) for window in windows)
 
 
 def usual(windows: list[StampWindow], field: str) -> float:
-    """Median of a field of StampWindow over windows, NaN left out; NaN if there is none."""
+    """Return the median of the finite values of a field of StampWindow; NaN without any."""
     return median(value for window in windows if math.isfinite(value := getattr(window, field)))
 
 
 def pace_of(windows: list[StampWindow]) -> float:
-    """Seconds of stamps per second of arrival; NaN where arrivals are not known.
+    """Return the seconds of stamps per second of arrival; NaN if arrivals are unknown.
 
-    From the first to the last message of a window, which blocks upset, or by the smallest latencies
-    of successive windows, which leaps of the stamps upset: the one of both that is nearer to 1.
+    There are two estimates, and the one closer to 1 is returned. The first compares the first and
+    last message of a window, and blocks of messages disturb it. The second compares the smallest
+    latencies of successive windows, and jumps of the stamps disturb it.
     """
     known = [(window.end, window.latency) for window in windows if math.isfinite(window.latency)]
     ratios = [usual(windows, "pace")]
@@ -229,8 +252,9 @@ def pace_of(windows: list[StampWindow]) -> float:
 
 
 def orderly(windows: list[StampWindow]) -> bool:
-    """False for stamps with which nothing else can be determined: of 0, standing still, leaping, or
-    of another unit.
+    """Return False for stamps that make all other checks meaningless.
+
+    Such stamps are 0, stand still, jump, or have another unit.
     """
     count, ratio = total(windows, "count"), pace_of(windows)
     broken = (
@@ -250,7 +274,7 @@ def zeros(name: str, windows: list[StampWindow]) -> Finding | None:
 
 
 def standing(name: str, windows: list[StampWindow]) -> Finding | None:
-    """One stamp for many messages, or many stamps in a short time and then none."""
+    """Return a Finding if many messages share one stamp, or stamps come in bursts."""
     share = total(windows, "same") / total(windows, "count")
     if total(windows, "zeros") > 0.01 * total(windows, "count"):
         return None
@@ -335,7 +359,7 @@ def gaps(name: str, windows: list[StampWindow]) -> Finding | None:
 
 
 def rate(name: str, windows: list[StampWindow]) -> Finding | None:
-    """Too few per second of stamps; far too few: the stamps are in another unit."""
+    """Return a Finding if the rate by stamps is too low; a very low rate indicates another unit."""
     step = usual(windows, "step")
     if not step > 1.0 / SLOWEST[name]:
         return None
@@ -356,7 +380,7 @@ def rate(name: str, windows: list[StampWindow]) -> Finding | None:
 
 
 def pace(name: str, windows: list[StampWindow]) -> Finding | None:
-    """Seconds of stamps per second of arrival."""
+    """Return a Finding if a second of stamps is not a second of arrival."""
     ratio = pace_of(windows)
     if (
         not abs(ratio - 1.0) > PACE
@@ -372,7 +396,7 @@ def pace(name: str, windows: list[StampWindow]) -> Finding | None:
 
 
 def blocks(name: str, windows: list[StampWindow]) -> Finding | None:
-    """Late by very different times: kept together and sent in blocks."""
+    """Return a Finding if the latency varies strongly, because messages are sent in blocks."""
     spread = usual(windows, "spread")
     if not spread > BLOCK or usual(windows, "scatter") > SCATTER or not orderly(windows):
         return None
@@ -390,8 +414,9 @@ def blocks(name: str, windows: list[StampWindow]) -> Finding | None:
 
 
 def drift(name: str, windows: list[StampWindow]) -> Finding | None:
-    """A clock that is slower or faster than that of the arrivals (Theil-Sen slope of the smallest
-    latencies).
+    """Return a Finding if the clock of the stamps drifts against the clock of the arrivals.
+
+    The drift is the Theil-Sen slope of the smallest latencies.
     """
     known = [(window.begin, window.latency) for window in windows if math.isfinite(window.latency)]
     if len(known) < 10 or not orderly(windows):
@@ -417,8 +442,10 @@ OF_ONE = (zeros, standing, falls, jumps, gaps, rate, pace, blocks, drift)
 
 
 def offset(imu: list[StampWindow], tdoa: list[StampWindow]) -> Finding | None:
-    """The streams against each other: by their latencies where arrivals are known, else by where
-    they begin and end.
+    """Return a Finding if the clocks of the IMU and the TDOAs differ.
+
+    The latencies are compared if arrivals are known. Otherwise the beginnings and ends are
+    compared.
     """
     if not (orderly(imu) and orderly(tdoa)):
         return None
@@ -433,7 +460,7 @@ def offset(imu: list[StampWindow], tdoa: list[StampWindow]) -> Finding | None:
         begin, end = imu[0].begin - tdoa[0].begin, imu[-1].end - tdoa[-1].end
         ahead = 0.5 * (begin + end)
         evidence = f"the IMU begins {begin:+.3f} s and ends {end:+.3f} s after the TDOAs"
-        # no sample is of the time of the TDOAs
+        # the streams do not overlap
         outside = imu[0].begin > tdoa[-1].end or imu[-1].end < tdoa[0].begin
         alike = (
             min(abs(begin), abs(end)) >= APART
@@ -467,8 +494,14 @@ def offset(imu: list[StampWindow], tdoa: list[StampWindow]) -> Finding | None:
 
 
 def _late(by_arrival: float, tdoa: float, imu: float) -> bool:
-    """Whether TDOAs come late, by latencies, s, of streams that have the clock of the arrivals: no
-    stamp is ahead of that.
+    """Return whether TDOAs are late although both streams use the clock of the arrivals.
+
+    Parameters
+    ----------
+    by_arrival : float
+        Latency of the TDOAs minus latency of the IMU, in s.
+    tdoa, imu : float
+        Latencies, in s. With a common clock, no stamp is ahead of its arrival.
     """
     return (
         math.isfinite(by_arrival) and by_arrival > APART and -APART < imu < APART and tdoa < LATEST
@@ -476,7 +509,7 @@ def _late(by_arrival: float, tdoa: float, imu: float) -> bool:
 
 
 def other_clock(imu: list[StampWindow], tdoa: list[StampWindow]) -> Finding | None:
-    """Both streams of one clock, but not of the recorder's."""
+    """Return a Finding if both streams share a clock that differs from the recorder's."""
     latency = usual(tdoa, "latency")
     if not (orderly(imu) and orderly(tdoa)):
         return None

@@ -1,6 +1,4 @@
-"""Whether the odometry may be flown by, for who does: one decision, from what the Estimator says of
-itself, and from what is found.
-"""
+"""Decide whether a vehicle may fly by the odometry, from the Estimator and from all findings."""
 
 from __future__ import annotations
 
@@ -25,17 +23,15 @@ if TYPE_CHECKING:
     from .finding import Finding
 
 
-SILENT = 1.0  # s without a measurement that was used, before it is said
-WINDOW = 1.5  # s over which shares are judged
-# s, the same for TDOAs that contradict the filter: 46 % at most in 22 measured flights, of which
-# some land
+SILENT = 1.0  # s without a used measurement before it is reported
+WINDOW = 1.5  # s over which shares of TDOAs are computed
+# s, the same for rejected TDOAs: 46 % at most in 22 measured flights, some of which land
 WINDOW_OF_REJECTED = 4.0
-# s after a start, before which it is not said that TDOAs contradict the filter: on the floor, 85 %
-# for 3 s
+# s after initialization before rejected TDOAs are reported: on the floor, 85 % for 3 s
 SETTLED = 5.0
-EARLY = 0.05  # s by which a look may come early
-LARGEST_UNUSED = 0.5  # share of TDOAs that are not used for one reason, before it is said
-FEWEST = 10  # TDOAs of a window that say something
+EARLY = 0.05  # s by which a check may come early
+LARGEST_UNUSED = 0.5  # share of TDOAs that are not used for one reason, before it is reported
+FEWEST = 10  # fewest TDOAs of a window
 REASONS = "late", "invalid", "rejected"
 USED = (
     "used",
@@ -45,29 +41,42 @@ USED = (
 
 
 class Use:
-    """Looks at the counts of an Estimator several times a second.
+    """Track which measurements the filter uses; `look` is called several times per second.
 
-    tdoa_age, imu_age : s since a TDOA or distance, or an inertial sample, was seen to be used; inf
-        before the first. arrival_age : s since
-    a TDOA or distance was seen to arrive.
+    Attributes
+    ----------
+    tdoa_age, imu_age : float
+        Time since a TDOA or distance, or an inertial sample, was used, in s; inf before the first.
+    arrival_age : float
+        Time since a TDOA or distance arrived, in s.
     """
 
     def __init__(self, lag: float) -> None:
-        """lag : s, for which the filter waits."""
+        """Store the time `lag`, in s, for which the filter waits for a silent stream."""
         self._lag = lag
         # (time.monotonic(), counts) of the last seconds
         self._looks: deque[tuple[float, dict[str, int]]] = deque()
         self._since: dict[
             str, float
-        ] = {}  # time.monotonic() of the last look at which there was more, by kind
+        ] = {}  # by kind: time.monotonic() of the last look that found more messages
         self._running_since = math.inf  # time.monotonic()
         self._now = -math.inf
 
     def look(
         self, now: float, received: Mapping[str, int], counts: Mapping[str, int], running: bool
     ) -> None:
-        """Take totals at time.monotonic() `now`, s. received : messages by stream; counts : by
-        verdict; running : there is a position.
+        """Store totals at one time.
+
+        Parameters
+        ----------
+        now : float
+            time.monotonic(), in s.
+        received : mapping
+            Messages by stream.
+        counts : mapping
+            Totals by verdict.
+        running : bool
+            Whether the filter has a position.
         """
         totals = {
             "arrival": received["tdoa"] + sum(received[name] for name in LOCATING),
@@ -110,23 +119,21 @@ class Use:
 
     @property
     def restart_age(self) -> float:
-        """s since the filter was seen to start anew."""
+        """Return the time since the filter restarted, in s."""
         return self._age("restarts")
 
     @property
     def imu_used(self) -> bool:
-        """Whether inertial samples were used lately."""
+        """Return whether inertial samples were used lately."""
         return self.imu_age < SILENT
 
     @property
     def velocity_used(self) -> bool:
-        """Whether velocities were used lately."""
+        """Return whether velocities were used lately."""
         return self._age("velocity") < SILENT
 
     def _shares(self, window: float) -> dict[str, float]:
-        """Shares of the TDOAs of the last `window`, s, by what became of them, 0 to 1; empty for
-        too few.
-        """
+        """Return {result: share of the TDOAs, 0 to 1} over the last `window` s; {} for too few."""
         until = self._now - window + EARLY
         first = next((totals for at, totals in reversed(self._looks) if at <= until), None)
         if first is None:
@@ -138,13 +145,13 @@ class Use:
 
     @property
     def contradicted(self) -> bool:
-        """Whether most TDOAs contradict a filter that has run for a while."""
+        """Return whether the filter rejects most TDOAs although it has run for a while."""
         settled = self._now - self._running_since > SETTLED
         return settled and self._shares(WINDOW_OF_REJECTED).get("rejected", 0.0) > LARGEST_UNUSED
 
     @property
     def trouble(self) -> str | None:
-        """Why most TDOAs are not used, a sentence, or None."""
+        """Return a sentence on why most TDOAs are not used, or None."""
         shares = self._shares(WINDOW)
         for name in ("late", "invalid"):
             if shares.get(name, 0.0) > LARGEST_UNUSED:
@@ -169,7 +176,7 @@ class Use:
 
 
 class VolumeCheck:
-    """Checks positions against a FlyableVolume, or says nothing without one."""
+    """Check positions against a FlyableVolume, if there is one."""
 
     def __init__(self, volume: FlyableVolume | None = None) -> None:
         self._volume = volume
@@ -177,12 +184,20 @@ class VolumeCheck:
     def trouble_at(
         self, anchors: Anchors, position: np.ndarray, covariance: np.ndarray
     ) -> tuple[str | None, dict[str, str]]:
-        """(what is wrong, or None; {key: text}). anchors : Anchors; position (3,) m; covariance (3,
-        3) m^2 of it.
+        """Return a sentence on the position, or None, and {key: text} for /diagnostics.
 
-        Efficiency is the variance of the bound of one round of TDOAs over that which the filter
-        claims. The filter also uses earlier rounds and the inertial sensor: n says "as good as n
-        independent rounds".
+        The efficiency is the bound's variance for one round of TDOAs divided by the filter's stated
+        variance. The filter also uses earlier rounds and the IMU. An efficiency of n means the
+        precision of n independent rounds.
+
+        Parameters
+        ----------
+        anchors : Anchors
+            Present anchors.
+        position : (3,) array
+            Position in the world frame, in m.
+        covariance : (3, 3) array
+            Covariance of the position, in m^2.
         """
         if self._volume is None:
             return None, {}
@@ -214,16 +229,25 @@ class VolumeCheck:
 pass
 
 
-# rad; while four yaws are followed it is 100 degrees, with one left below 20: docs/reliability.md
+# rad; with four yaw hypotheses the deviation is 100 degrees, with one below 20: docs/reliability.md
 YAW_KNOWN = math.radians(20.0)
-ANY_YAW, ANY_SPEED = math.pi, 2.0  # rad and m/s, stated while a fault makes everything wrong
-WAITING, STARTING, RUNNING, LOST, FAULT = range(5)  # as in EstimatorStatus
+# rad and m/s, standard deviations that are published while a fault makes the estimate wrong
+ANY_YAW, ANY_SPEED = math.pi, 2.0
+WAITING, STARTING, RUNNING, LOST, FAULT = range(5)  # values of EstimatorStatus
 
 
 @dataclass(frozen=True)
 class Status:
-    """status : one of the above; why : what keeps it from being flown by, a sentence, "" if nothing
-    does.
+    """Store whether a vehicle may fly by the odometry.
+
+    Attributes
+    ----------
+    status : int
+        WAITING, STARTING, RUNNING, LOST or FAULT.
+    yaw_known : bool
+        Whether the yaw is known.
+    why : str
+        Reason against flying by the odometry; "" without one.
     """
 
     status: int
@@ -232,20 +256,28 @@ class Status:
 
     @property
     def lost(self) -> bool:
-        """Whether it ran, and does not know any more where the tag is."""
+        """Return whether the filter ran and has lost the tag."""
         return self.status == LOST
 
 
 def yaw_in_words(std: float) -> str:
-    """Text on a yaw of a standard deviation, rad, NaN without odometry."""
+    """Return a text on a yaw with a standard deviation in rad; NaN means no odometry."""
     if math.isnan(std):
         return "unknown: there is no odometry"
     return f"{'known' if std <= YAW_KNOWN else 'not known yet'}: +-{math.degrees(std):.0f} degrees"
 
 
 def fault_of(findings: Sequence[Finding], use: Use, left_out: Finding | None) -> Finding | None:
-    """The most severe of Findings that makes the position wrong, or None. left_out : by which the
-    filter goes without the IMU, or None.
+    """Return the most severe Finding that makes the position wrong, or None.
+
+    Parameters
+    ----------
+    findings : sequence of Finding
+        The most severe first.
+    use : Use
+        Measurements that the filter uses.
+    left_out : Finding or None
+        Reason why the filter ignores the IMU.
     """
     imu_used = use.imu_used and left_out is None
     return next((finding for finding in findings if finding.position_wrong(imu_used)), None)
@@ -258,8 +290,20 @@ def status_of(
     use: Use,
     findings: Sequence[Finding] = (),
 ) -> Status:
-    """Status of an Estimator, None without anchors. yaw_std : rad, NaN without odometry;
-    odometry_age : s since there was one; findings : what stands, most severe first.
+    """Return the Status of an Estimator.
+
+    Parameters
+    ----------
+    estimator : Estimator or None
+        None before the anchors arrive.
+    yaw_std : float
+        Standard deviation of the yaw, in rad; NaN without odometry.
+    odometry_age : float
+        Time since the last odometry, in s.
+    use : Use
+        Measurements that the filter uses.
+    findings : sequence of Finding
+        Findings that hold now, the most severe first.
     """
     if estimator is None:
         return Status(
@@ -293,7 +337,7 @@ def status_of(
 
 
 def _why(estimator: Estimator, use: Use, known: bool, findings: Sequence[Finding]) -> str:
-    """What keeps a filter that runs, and has no fault, from being flown by."""
+    """Return the reason against flying by a filter that runs without a fault; "" without one."""
     left_out = estimator.without_imu
     if estimator.unsure:
         return estimator.unsure
@@ -332,12 +376,18 @@ def _why(estimator: Estimator, use: Use, known: bool, findings: Sequence[Finding
 
 
 def doubted(odometry: Odometry, size: np.ndarray) -> Odometry:
-    """Return Odometry with a covariance of a tag that may be anywhere in its workspace and have any
-    yaw. size : (3,) m, of that.
+    """Return Odometry with a covariance for a tag anywhere in its workspace and with any yaw.
+
+    Parameters
+    ----------
+    odometry : Odometry
+        Estimates.
+    size : (3,) array
+        Size of the workspace, in m.
     """
     covariance = odometry.covariance.copy()
     x, y, z, w = odometry.q.T
-    # of the world, in the body
+    # world z axis in the body frame
     up = np.stack([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x**2 + y**2)], axis=1)
     covariance[:, :3, :3] += np.diag(size**2)
     covariance[:, 3:6, 3:6] += ANY_SPEED**2 * np.eye(3)

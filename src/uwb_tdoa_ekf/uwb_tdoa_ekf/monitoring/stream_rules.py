@@ -1,4 +1,4 @@
-"""StreamRules: counters of both streams, their windows, and all rules over them."""
+"""Count both streams of a tag in windows and apply all rules to the windows."""
 
 from __future__ import annotations
 
@@ -20,29 +20,47 @@ if TYPE_CHECKING:
 Window = TypeVar("Window", "ImuWindow", "TdoaWindow")
 
 LOOKS_LIKE = {"tdoa_large", "tdoa_outliers"}
-FULL = 20  # messages without which a window says little of values
+FULL = 20  # fewest messages of a window with reliable statistics
 
 
 class StreamRules:
-    """Checks the inertial samples and the TDOAs of one tag by themselves.
+    """Check the inertial samples and the TDOAs of one tag without a filter.
 
-    Windows of a second of arrival (of stamps, where the arrival is not known) are counted as they
-    come; the rules judge windows.
+    A window is one second of arrival, or of stamps if the arrival is unknown. Messages are counted
+    as they come, and the rules check windows.
     """
 
     def __init__(self, anchors: Anchors, kept: int | None = None) -> None:
-        """anchors : Anchors; kept : windows of each stream that are kept, the latest; None: all."""
+        """Create the counters.
+
+        Parameters
+        ----------
+        anchors : Anchors
+            Surveyed anchors.
+        kept : int or None
+            Number of latest windows to keep for each stream; None keeps all.
+        """
         self.anchors, self._kept = anchors, kept
         self.imu: list[ImuWindow] = []
         self.tdoa: list[TdoaWindow] = []
-        self.unknown: Counter[int] = Counter()  # ids that the survey does not have
+        self.unknown: Counter[int] = Counter()  # ids that are not in the survey
         self._imu, self._tdoa = inertial_rules.new_imu(), ranging_windows.new_tdoa(anchors)
         self._scale = SurveyScale(anchors, kept and KEPT)
 
     def feed_imu(
         self, t: np.ndarray, arrival: np.ndarray, gyro: np.ndarray, force: np.ndarray
     ) -> None:
-        """Take many samples in the order of their arrival: t, arrival (n,), gyro, force (n, 3)."""
+        """Add samples in the order of their arrival.
+
+        Parameters
+        ----------
+        t, arrival : (n,) array
+            Stamps and arrival times, in s; NaN if unknown.
+        gyro : (n, 3) array
+            Angular velocity in the body frame, in rad/s.
+        force : (n, 3) array
+            Specific force in the body frame, in m/s^2.
+        """
         t, arrival, gyro, force = (
             np.ascontiguousarray(column, dtype=float) for column in (t, arrival, gyro, force)
         )
@@ -55,7 +73,17 @@ class StreamRules:
     def feed_tdoa(
         self, t: np.ndarray, arrival: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray
     ) -> None:
-        """Take many TDOAs in the order of their arrival: all (n,), a and b ids."""
+        """Add TDOAs in the order of their arrival.
+
+        Parameters
+        ----------
+        t, arrival : (n,) array
+            Stamps and arrival times, in s; NaN if unknown.
+        a, b : (n,) array
+            Anchor ids.
+        d : (n,) array
+            Raw TDOAs, in m.
+        """
         row_a, row_b = self.anchors.index(a), self.anchors.index(b)
         for ids, known in ((a, row_a), (b, row_b)):
             values, counts = np.unique(np.asarray(ids)[known < 0], return_counts=True)
@@ -68,14 +96,18 @@ class StreamRules:
                 self._close_tdoa()
 
     def finish(self) -> None:
-        """Close the windows at the end of a recording, unless they hold next to nothing."""
+        """Close the windows at the end of a recording, unless they are almost empty."""
         for counters, close in ((self._imu, self._close_imu), (self._tdoa, self._close_tdoa)):
             if counters.stamps[stamp_rules.COUNT] >= FULL:
                 close()
 
     def findings(self, latest: int = 0) -> list[Finding]:
-        """What stands: a list of Finding, most severe first. latest : of how many windows of each
-        stream; 0: of all.
+        """Return the Findings that hold, the most severe first.
+
+        Parameters
+        ----------
+        latest : int
+            Number of latest windows of each stream to check; 0 checks all.
         """
         imu, tdoa = self.imu[-latest:], self.tdoa[-latest:]
         of_imu, of_tdoa = [window.stamps for window in imu], [window.stamps for window in tdoa]
@@ -92,7 +124,7 @@ class StreamRules:
             found += [rule(of_imu, of_tdoa) for rule in stamp_rules.OF_BOTH]
         if (
             scale := self._scale.finding
-        ) is not None:  # of which impossible TDOAs are what it looks like
+        ) is not None:  # a wrong scale also makes TDOAs impossible: report the cause only
             found = [
                 scale,
                 *(

@@ -1,6 +1,4 @@
-"""The rules over streams in flight: over the last seconds, and without those that say nothing
-there.
-"""
+"""Apply the rules over streams in flight, to the last seconds and without rules for recordings."""
 
 from __future__ import annotations
 
@@ -20,54 +18,86 @@ if TYPE_CHECKING:
 
     from .finding import Finding
 
-KEPT = 4  # windows of a second that are checked together
-FEWEST = 3  # of them, below which nothing is said
-LATEST = 2  # of them, which must say it too, or it is over
-# Said by `check`, and no warning in flight: the filter knows what a shaking accelerometer is worth.
+KEPT = 4  # windows of 1 s that are checked together
+FEWEST = 3  # fewest windows for a finding
+LATEST = 2  # latest windows that must show a finding too, or it is over
+# Reported by `check` only: in flight, the filter already weights a vibrating accelerometer less.
 NOT_IN_FLIGHT = {"imu_shaking"}
-FEW_ANCHORS = "few_anchors"  # a tag with a fixed height needs three
-SMALLEST_UNIT = 100.0  # of another unit of stamps: what is less is the pace of a replay
-# share of the swing of one stream's latency that the other has too, when it is we who are not
-# scheduled
+# rule that does not hold for a tag with a fixed height, which needs three anchors
+FEW_ANCHORS = "few_anchors"
+SMALLEST_UNIT = 100.0  # smallest ratio of units of stamps; a smaller one is the rate of a replay
+# ratio of the latency variations of both streams above which this process was not scheduled
 ALIKE = 0.5
 
 
 class StreamWatch:
-    """Keeps what arrives and checks it when it is asked, once a second."""
+    """Collect messages and check them once per second."""
 
     def __init__(self, anchors: Anchors, lag: float, ignored: Sequence[str] = ()) -> None:
-        """anchors : Anchors; lag : s, what the node waits for; ignored : names of rules that do not
-        hold for this tag.
+        """Start without messages.
+
+        Parameters
+        ----------
+        anchors : Anchors
+            Surveyed anchors.
+        lag : float
+            Time for which the node waits, in s.
+        ignored : sequence of str
+            Names of rules that do not hold for this tag.
         """
         self._anchors, self._lag, self._ignored = anchors, lag, NOT_IN_FLIGHT | set(ignored)
         self.restart()
 
     def restart(self) -> None:
-        """Forget everything: another time has begun."""
+        """Drop all messages and findings, because a new time begins."""
         self._rules = StreamRules(self._anchors, KEPT)
         self._imu: list[tuple[np.ndarray, ...]] = []
         self._tdoa: list[tuple[np.ndarray, ...]] = []
         self._sign = SignWatch(self._anchors)
-        self._turns: int | None = None  # as of Monitor, at the last look
+        self._turns: int | None = None  # sign flips counted by the Monitor at the last check
         self._steady = Steady()
 
     def add_imu(
         self, t: np.ndarray, arrival: np.ndarray, gyro: np.ndarray, accel: np.ndarray
     ) -> None:
-        """Take samples: stamps and arrivals, (n,) s, of one clock if possible; gyro (n, 3) rad/s;
-        accel (n, 3) m/s^2.
+        """Add inertial samples.
+
+        Parameters
+        ----------
+        t, arrival : (n,) array
+            Stamps and arrival times, in s, of one clock if possible.
+        gyro : (n, 3) array
+            Angular velocity in the body frame, in rad/s.
+        accel : (n, 3) array
+            Specific force in the body frame, in m/s^2.
         """
         self._imu.append((t, arrival, gyro, accel))
 
     def add_tdoa(
         self, t: np.ndarray, arrival: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray
     ) -> None:
-        """Take raw TDOAs: stamps and arrivals, (n,) s; a, b (n,) ids; d (n,) m."""
+        """Add raw TDOAs.
+
+        Parameters
+        ----------
+        t, arrival : (n,) array
+            Stamps and arrival times, in s.
+        a, b : (n,) array
+            Anchor ids.
+        d : (n,) array
+            TDOAs, in m.
+        """
         self._tdoa.append((t, arrival, a, b, d))
 
     def findings(self, turns: int = 0, doubted: bool = False) -> list[Finding]:
-        """What stands: a list of Finding, most severe first. turns : of the signs of all TDOAs so
-        far, as of Monitor; doubted : most TDOAs contradict the filter.
+        """Return the Findings that hold, the most severe first.
+
+        Parameters
+        ----------
+        turns : int
+            Sign flips of all TDOAs so far, from the Monitor.
+        doubted : bool
+            Whether the filter rejects most TDOAs.
         """
         imu, self._imu = self._imu, []
         tdoa, self._tdoa = self._tdoa, []
@@ -95,6 +125,7 @@ class StreamWatch:
         return most_severe_first(self._steady([*found, *filter(None, [self._sign.finding])]))
 
     def _counts(self, finding: Finding) -> bool:
+        # Return whether a finding matters in flight.
         if finding.severity == NOTE or finding.rule in self._ignored:
             return False
         if finding.rule == "stamps_unit":
@@ -104,7 +135,7 @@ class StreamWatch:
         return True
 
     def _starved(self) -> bool:
-        """Whether both streams arrive in blocks: then it is this node that was not scheduled."""
+        """Return whether both streams arrive in blocks, because this process was not scheduled."""
         spreads = [
             usual([window.stamps for window in windows], "spread")
             for windows in (self._rules.imu, self._rules.tdoa)

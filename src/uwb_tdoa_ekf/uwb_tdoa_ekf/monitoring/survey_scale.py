@@ -1,9 +1,9 @@
-"""Is the survey in another unit, or one anchor of it? The TDOAs that are heard together are located
-in surveys of every scale.
+"""Detect whether the survey, or a single anchor, has another unit.
 
-TDOAs in metres have a scale of their own: where the tag is among more than four anchors, one scale
-of the survey fits, and no other. The same measurements are located with other mistakes undone. The
-scale is named only if it explains more than each of these.
+TDOAs that are heard together locate the tag in surveys of every scale. TDOAs in metres have an
+absolute scale: with the tag among more than four anchors, only one scale of the survey fits. The
+same TDOAs also locate the tag with other errors corrected. A scale is reported only if it explains
+more than every other correction.
 """
 
 from __future__ import annotations
@@ -23,47 +23,55 @@ from .finding import ERROR, Finding
 if TYPE_CHECKING:
     from uwb_tdoa_bias.common.anchors import Anchors
 
-# pairs of a snapshot at most; anchors at least: three coordinates and a scale take four differences
+# most pairs of a snapshot; fewest anchors: three coordinates and a scale need four differences
 PAIRS, HEARD = (32, 5)
 SMALL = 0.05  # m, median size of TDOAs below which they are not in metres themselves
-# snapshots that say something clear, and anything, and that are kept in flight
+# fewest snapshots of a clear and of any result; snapshots that are kept in flight
 FEWEST, MANY, KEPT = (4, 20, 60)
-# anchors at most, of which each by itself, and any two, are tried: the work has a bound
+# most anchors for tests of each anchor and of each pair; it limits the work
 SINGLE = 12
-# least factor that counts, ratio of successive ones, and the largest
+# smallest factor, ratio of successive factors, largest factor
 SMALLEST, RATIO, LARGEST = (1.5, 1.25, 1500.0)
-# m, scale of the Geman-McClure loss; Gauss-Newton steps; of the size of the room, the longest of
-# them
+# m, scale of the Geman-McClure loss; number of Gauss-Newton steps; longest step relative to the
+# room
 LOSS, STEPS, NEAR = (0.5, 8, 0.3)
 STARTS = np.array(
     [[0.0, 0.0, 0.0], [0.6, 0.6, 0.6], [-0.6, -0.6, 0.6], [0.6, -0.6, -0.6], [-0.6, 0.6, -0.6]]
 )
-# Share of the loss that may be left, and standard errors by which it is less than that of the
-# survey as it is. Another scale, or another
-# place of one anchor, explains some of any mistake: 0.84 of a tape with errors of 0.1 m. In feet
-# 0.50 is left on measured flights.
+# Largest share of the loss that may remain, and smallest number of standard errors of the
+# reduction. Another scale, or another place of one anchor, explains a part of any error: 0.84 of
+# the loss remains for a tape with errors of 0.1 m. With a survey in feet, 0.50 remains on measured
+# flights.
 LEFT, DEVIATIONS = 0.65, 3.5
-GOOD = 0.35  # loss of a survey that fits; healthy flights of three days have 0.10 to 0.25
-# m by which the tag must have moved; share of the loss that shows it after few seconds and at rest,
-# too
+GOOD = 0.35  # largest loss of a survey that fits; healthy flights of three days have 0.10 to 0.25
+# m by which the tag must have moved; share of the loss that is clear even after a few seconds and
+# at rest
 MOVED, CLEARLY = (0.3, 0.5)
-# m; TDOAs in this unit, and in feet, look like a survey that is too small by this factor
+# m per nanosecond; TDOAs in nanoseconds or feet look like a survey that is too small by this factor
 NANOSECONDS = 0.299792458
 AS_IT_IS, SCALED, SIGN, EXCHANGED, ALONE = range(5)  # kinds of hypotheses
 
 
 class SurveyScale:
-    """Losses of the hypotheses about the scale of Anchors, snapshot by snapshot."""
+    """Store the loss of each hypothesis on the scale of Anchors, for each snapshot."""
 
     def __init__(self, anchors: Anchors, kept: int | None = KEPT) -> None:
-        """anchors : Anchors; kept : snapshots that are kept, the latest; None: all."""
+        """Create all hypotheses.
+
+        Parameters
+        ----------
+        anchors : Anchors
+            Surveyed anchors.
+        kept : int or None
+            Number of latest snapshots to keep; None keeps all.
+        """
         self._anchors = anchors
         self._names, self._factors, self._table = _hypotheses(len(anchors))
-        self._losses: deque[np.ndarray] = deque(maxlen=kept)  # (h,) of each
-        self._places: deque[np.ndarray] = deque(maxlen=kept)  # (h, 3) m
+        self._losses: deque[np.ndarray] = deque(maxlen=kept)  # (h,) losses of each snapshot
+        self._places: deque[np.ndarray] = deque(maxlen=kept)  # (h, 3) positions of the tag, in m
 
     def add(self, snapshot: np.ndarray) -> None:
-        """Take TDOAs that were heard together, (k, 3): rows of both anchors, and m."""
+        """Add TDOAs that were heard together, (k, 3): rows of both anchors, and value in m."""
         if len(np.unique(snapshot[:, :2])) < HEARD or not np.median(np.abs(snapshot[:, 2])) > SMALL:
             return
         some = snapshot[
@@ -85,7 +93,7 @@ class SurveyScale:
 
     @property
     def finding(self) -> Finding | None:
-        """Finding, or None."""
+        """Return the Finding on a wrong scale, or None."""
         if len(self._losses) < FEWEST:
             return None
         losses = np.array(self._losses)
@@ -115,7 +123,7 @@ class SurveyScale:
         return self._found(named, self._factors[named], evidence)
 
     def _near(self, one: int, other: int) -> bool:
-        """Whether two hypotheses are as near in scale as can be told."""
+        """Return whether the data do not distinguish the scales of two hypotheses."""
         return abs(math.log(self._factors[one] / self._factors[other])) < 0.7 * math.log(RATIO)
 
     def _found(self, k: int, factor: float, evidence: str) -> Finding | None:
@@ -152,8 +160,16 @@ class SurveyScale:
 
 
 def _hypotheses(count: int) -> tuple[list[str], list[float], np.ndarray]:
-    """(names of units or "", factors, (h, 5): kind, factor of all, sign, and two rows) of what is
-    tried with so many anchors.
+    """Return the hypotheses for a number of anchors.
+
+    Returns
+    -------
+    names : list of str
+        Names of the units, or "".
+    factors : list of float
+        Scale factors.
+    table : (h, 5) array
+        Kind, factor of all anchors, sign of the TDOAs, and two rows of anchors.
     """
     out: list[tuple[str, float, tuple[float, ...]]] = [
         ("", 1.0, (AS_IT_IS, 1.0, 1.0, 0, 0)),
@@ -181,8 +197,9 @@ def _hypotheses(count: int) -> tuple[list[str], list[float], np.ndarray]:
 
 
 def _compared(one: np.ndarray, other: np.ndarray) -> tuple[float, float]:
-    """(mean of `other` over that of `one`, standard errors by which it is less), of losses (n,) of
-    the same snapshots.
+    """Return (mean of `other` over mean of `one`, standard errors of the reduction).
+
+    Both are losses (n,) of the same snapshots.
     """
     error = float(np.std(one - other, ddof=1)) / math.sqrt(len(one))
     return float(np.mean(other) / max(np.mean(one), 1e-9)), float(np.mean(one - other)) / max(
@@ -191,7 +208,7 @@ def _compared(one: np.ndarray, other: np.ndarray) -> tuple[float, float]:
 
 
 def _spread(places: np.ndarray) -> float:
-    """m, root mean square distance of places (n, 3) from their median."""
+    """Return the root mean square distance of places (n, 3) from their median, in m."""
     return float(np.sqrt(np.mean(np.sum((places - np.median(places, axis=0)) ** 2, axis=1))))
 
 
@@ -204,14 +221,25 @@ def locate(
     starts: np.ndarray,
     place: np.ndarray,
 ) -> float:
-    """Return the mean Geman-McClure loss, 0 to 1, of TDOAs d (k,) m where the tag fits them best;
-    write that to place (3,) m.
+    """Return the mean Geman-McClure loss, 0 to 1, at the best position of the tag.
 
-    positions : (N, 3) m, of anchors; rows : (k, 2), of both anchors of each TDOA.
+    The search is a robust Gauss-Newton iteration from several starts, during which the scale of the
+    loss decreases.
 
-    hypothesis : (5,), see `_hypotheses`. A robust Gauss-Newton search from starts (s, 3), in units
-        of half the room, while
-    the loss narrows.
+    Parameters
+    ----------
+    positions : (N, 3) array
+        Anchor positions, in m.
+    hypothesis : (5,) array
+        Row of the table of `_hypotheses`.
+    rows : (k, 2) int array
+        Rows of both anchors of each TDOA.
+    d : (k,) array
+        TDOAs, in m.
+    starts : (s, 3) array
+        Start positions, in half sizes of the room.
+    place : (3,) array
+        Filled with the best position, in m.
     """
     n = len(d)
     ends, low, high = np.empty((n, 2, 3)), np.full(3, np.inf), np.full(3, -np.inf)
@@ -273,8 +301,9 @@ def locate(
 
 @compiled
 def _go(p: np.ndarray, system: np.ndarray, longest: float) -> None:
-    """One step of p (3,) by normal equations (3, 4), which are overwritten, no longer than
-    `longest`, m.
+    """Step p (3,) by the solution of normal equations, at most `longest` m far.
+
+    The normal equations (3, 4) are overwritten.
     """
     for j in range(3):
         system[j, j] += 1e-6

@@ -1,7 +1,7 @@
-"""Two anchors that were exchanged: each sends from where the other is said to be.
+"""Detect two exchanged anchors: each transmits from the surveyed position of the other.
 
-The place of the filter may be wrong by then. So each exchange gets the place, about that of the
-filter, at which it explains a slice best, and so does the survey as it is.
+The position of the filter may be wrong by then. Each hypothesis of an exchange therefore gets its
+own best position near the filter's position. The survey without an exchange gets one too.
 """
 
 from __future__ import annotations
@@ -16,20 +16,22 @@ from uwb_tdoa_bias.common.geometry import ranges, tdoa
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    # m, mean absolute residual by the rows of two exchanged anchors; () : of none
+    # m, mean absolute residual by rows of two exchanged anchors; () without an exchange
     Residuals = dict[tuple[int, ...], float]
 
-SUSPECTS = 8  # anchors with the largest innovations, whose exchanges are tried,
-LARGE = 0.3  # m, if the largest is as large as that
-PLACE_STD = 1.0  # m, by which the filter may be off
-# m, of one TDOA; m, scale of the Geman-McClure weight; solutions for the place
+SUSPECTS = 8  # number of anchors with the largest innovations, whose exchanges are tested
+LARGE = 0.3  # m, smallest largest mean innovation at which exchanges are tested
+PLACE_STD = 1.0  # m, standard deviation of the position of the filter
+# m, standard deviation of one TDOA; m, scale of the Geman-McClure weight; iterations for the
+# position
 STD, ROBUST, STEPS = (0.15, 0.4, 3)
-CLIP = 1.5  # m; a larger residual counts as this
-FEWEST = 10  # TDOAs of a slice
-# of the residuals that an exchange may leave, of those as surveyed and of those of any other
-# exchange;
+CLIP = 1.5  # m; larger residuals are clipped to this
+FEWEST = 10  # fewest TDOAs of a slice
+# largest ratio of the residual of an exchange to the residual of the survey, and to that of any
+# other exchange
 SHARE, OF_OTHERS = (0.4, 0.8)
-# or more, if it explains so much, m, and so many times as much as any other
+# alternative: largest ratio to the survey if the reduction exceeds the second value, in m, and the
+# reduction by any other exchange times the third value
 MOST_LEFT, LEAST, ALONE = (0.65, 0.1, 2.5)
 
 
@@ -41,15 +43,25 @@ def residuals(
     p: np.ndarray,
     named: Sequence[int] = (),
 ) -> Residuals:
-    """Residuals of a slice with each exchange of two suspects, and with none; {} where nothing is
-    far off, and no exchange is named.
+    """Return the Residuals of a slice with each exchange of two suspects, and with none.
 
-    positions : (N, 3) m; a, b : (n,) rows; d : (n,) m, measured; p : (3,) m, where the filter had
-        the tag; named : rows of two anchors
-    that are tried in any case.
+    The result is {} if all innovations are small and no exchange is already reported.
+
+    Parameters
+    ----------
+    positions : (N, 3) array
+        Surveyed positions in the world frame, in m.
+    a, b : (n,) int array
+        Rows of the anchors of each TDOA.
+    d : (n,) array
+        Measured TDOAs, in m.
+    p : (3,) array
+        Position of the filter in the world frame, in m.
+    named : sequence of int
+        Rows of two anchors that are tested in any case.
     """
     rows, both = np.unique(np.concatenate([a, b]), return_inverse=True)
-    # of those that are heard
+    # keep only the anchors that are heard
     a, b, positions, n = (both[: len(a)], both[len(a) :], positions[rows], len(rows))
     if len(a) < FEWEST:
         return {}
@@ -73,8 +85,18 @@ def residuals(
 def _left(
     positions: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray, p: np.ndarray
 ) -> np.ndarray:
-    """(m,) m: mean absolute residual with each of several positions (m, N, 3) m of the anchors, at
-    the place that fits best.
+    """Return the mean absolute residual of each anchor arrangement at its best position, (m,) m.
+
+    Parameters
+    ----------
+    positions : (m, N, 3) array
+        Arrangements of the anchors, in m.
+    a, b : (n,) int array
+        Anchors of each TDOA.
+    d : (n,) array
+        Measured TDOAs, in m.
+    p : (3,) array
+        Position of the filter, in m.
     """
     place = np.tile(p, (len(positions), 1))
     for _ in range(STEPS):
@@ -89,7 +111,7 @@ def _left(
 
 
 def mean_of(slices: Sequence[Residuals]) -> Residuals:
-    """Mean of the Residuals of several slices, of the exchanges that were tried in all."""
+    """Return the mean of the Residuals of several slices, for exchanges that all slices tested."""
     return {
         key: sum(one[key] for one in slices) / len(slices)
         for key in slices[0]
@@ -98,7 +120,7 @@ def mean_of(slices: Sequence[Residuals]) -> Residuals:
 
 
 def clear_exchange(left: Residuals) -> tuple[int, ...]:
-    """Rows of the two anchors, exchanged, that explain what is wrong, and no other two; () of none."""
+    """Return the rows of the two exchanged anchors if one exchange is clearly best, else ()."""
     if len(left) < 2:
         return ()
     best, *others = sorted((key for key in left if key), key=left.__getitem__)
