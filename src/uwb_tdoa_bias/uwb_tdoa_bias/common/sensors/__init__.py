@@ -1,5 +1,6 @@
-"""The registry of the sensors that a tag may have beside inertia and UWB: one sensor, one file, one
-line here.
+"""The registry of the sensors beside IMU and TDOAs.
+
+A new sensor is one file in this folder and one line here.
 """
 
 from __future__ import annotations
@@ -37,14 +38,14 @@ BY_POSE = tuple(
 
 
 def measured_on(flight: Any, channel: str) -> Stream | None:
-    """What a Flight holds of a channel of the diagnosis; None if nothing."""
+    """Return the Stream of a channel of the diagnosis in a Flight; None without data."""
     name = STREAM_OF[channel]
     stream: Stream | None = getattr(flight, name)
     return stream if stream is None or channel == name else stream.parts.get(channel)
 
 
 def with_measured(flight: Any, channel: str, part: Stream) -> Any:
-    """The Flight with another Stream of a channel."""
+    """Return the Flight with another Stream of a channel of the diagnosis."""
     name = STREAM_OF[channel]
     whole = part if channel == name else getattr(flight, name).with_part(channel, part)
     return replace(flight, **{name: whole})

@@ -9,14 +9,15 @@ import numpy as np
 
 from .sensor import Compared, Sensor, Stream, parameter
 
-# a kind; rad, m: typical, and a bound that bounds nothing
+# Fields of the messages: kind, typical angle in rad, and a range in m beyond any measurement.
 INFRARED, FIELD_OF_VIEW, LONGEST_RANGE = (1, 0.47, 1000.0)
 
 
 @dataclass(frozen=True)
 class Height(Stream):
-    """Ranges along the body's -z. t : (n,) s; range : (n,) m; inf or NaN where there was none (REP
-    117).
+    """Ranges along the body's -z.
+
+    t : (n,) s; range : (n,) m, inf or NaN where nothing was in range (REP 117)
     """
 
     t: np.ndarray

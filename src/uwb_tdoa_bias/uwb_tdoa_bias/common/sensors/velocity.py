@@ -17,9 +17,10 @@ TURN_TIME = 0.1  # s over which the yaw rate at an instant is taken from attitud
 
 @dataclass(frozen=True)
 class YawRate(Stream):
-    """The yaw rates of some Velocity.
+    """Yaw rates of the messages of a Velocity.
 
-    t : (n,) s; rate : (n, 1) rad/s; std : (n, 1) rad/s, inf and 0 as in its std.
+    t : (n,) s; rate : (n, 1) rad/s, about the body's z
+    std : (n, 1) rad/s, inf where not measured, 0 where the driver states none
     """
 
     t: np.ndarray
@@ -38,11 +39,11 @@ class YawRate(Stream):
 class Velocity(Stream):
     """Velocities in the body frame.
 
-    t : (n,) s; v : (n, 3) m/s; std : (n, 3) m/s, inf for a component that is not measured, 0 where
-        the driver states none.
-    yaw_rate : (n,) rad/s about the body's z, as of wheels, NaN where it is not measured, which is
-        everywhere unless it is given;
-    yaw_rate_std : (n,) rad/s, inf and 0 as in std.
+    t : (n,) s
+    v : (n, 3) m/s, body
+    std : (n, 3) m/s, inf for a component that is not measured, 0 where the driver states none
+    yaw_rate : (n,) rad/s about the body's z, as of wheels, NaN where not measured (default: NaN)
+    yaw_rate_std : (n,) rad/s, inf and 0 as in std
     """
 
     t: np.ndarray
@@ -74,8 +75,10 @@ class Velocity(Stream):
 
 
 def _columns(fields: dict) -> tuple:
-    """Variances of 0 are those of a driver that states none; the yaw rate of one that states some
-    for the velocity alone, and turns nowhere, is not measured.
+    """Return v (n, 3) m/s, its std, the yaw rate (n,) rad/s, and its std.
+
+    A variance of 0 means that the driver states none. A yaw rate counts as not measured if its value
+    and variance are 0 while the velocity has a variance.
     """
     variance, rate = (
         fields["twist.covariance"][:, [0, 7, 14, 35]],
@@ -142,7 +145,7 @@ def _simulated(config: Any, room: Any, motion: Any, turn: Any, noise: Any) -> tu
 
 
 def _turning(track: Any, t: np.ndarray) -> np.ndarray:
-    """Rates about the body's z, (n, 1) rad/s, of a Track at stamps t (n,) s."""
+    """Return rates about the body's z, (n, 1) rad/s, of a Track at stamps t (n,) s."""
     before, after = (
         rotations.Rotation.from_quat(track.attitudes(t + late))
         for late in (-0.5 * TURN_TIME, 0.5 * TURN_TIME)
