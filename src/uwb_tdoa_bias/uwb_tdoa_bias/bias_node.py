@@ -110,11 +110,13 @@ STATUS = {PASSED: "passed", EFFECTS: "effects", NETWORK: "network", FADED: "fade
 
 @dataclass
 class Antenna:
-    """What is known of the antenna of a frame. effects : EffectSet, with its place on the body;
-    models : what to call each status's bias;
-    trouble : why its place is not known, or None; corrector : Corrector, once there are anchors;
-        heard, reported : TDOAs so far, and by
-    the last report.
+    """Corrections for the TDOAs of one frame.
+
+    effects : EffectSet, including the antenna's place on the body
+    models : {status: name of the bias model in messages}
+    trouble : why the place of the antenna is unknown, or None
+    corrector : Corrector, once there are anchors
+    heard, reported : number of TDOAs so far, and at the last report
     """
 
     effects: EffectSet
@@ -126,8 +128,9 @@ class Antenna:
 
 
 class BiasNode(StreamNode):
-    """Converts messages for a Corrector and keeps the accounts: received = published + waiting +
-    dropped.
+    """Node around a Corrector: converts messages and counts them.
+
+    Every TDOA is counted: received = published + waiting + dropped.
     """
 
     NAME = "bias_node"
@@ -135,8 +138,12 @@ class BiasNode(StreamNode):
     def __init__(
         self, arguments: Sequence[str] = (), member: Collection[str] | None = None, **options: Any
     ) -> None:
-        """arguments : of the process; member : of a localization_node, which has it take its turns
-        and hands it the odometry: names of parameters that are for others, too; options : of Node.
+        """Start the node.
+
+        arguments : of the process
+        member : names of the parameters of the other nodes of a localization_node, which calls the turns
+            of this node and hands it the odometry; None for a node of its own
+        options : of Node
         """
         super().__init__(self.NAME, **options)
         own = declare_all(self, PARAMETERS)
@@ -178,12 +185,12 @@ class BiasNode(StreamNode):
 
     @property
     def holds(self) -> int:
-        """How many TDOAs wait for their pose."""
+        """Number of TDOAs that wait for their pose."""
         return len(self._hold)
 
     @property
     def _model(self) -> str:
-        """What TDOAs are corrected with."""
+        """Name of the bias model that corrects the TDOAs."""
         return next(iter((*self._antennas.values(), self._body_antenna))).models[NETWORK]
 
     @property
@@ -194,12 +201,12 @@ class BiasNode(StreamNode):
         )
 
     def _models(self, effects: EffectSet) -> dict[int, str]:
-        """Compile what an EffectSet needs, and return what to call each status's bias."""
+        """Compile the functions of an EffectSet, and return {status: name of the bias model}."""
         name = warm_up(effects, self._network, self._lag).model
         return {PASSED: "none", EFFECTS: effects.name, NETWORK: name, FADED: name}
 
     def _start_over(self) -> None:
-        """Forget poses and whatever waits for one."""
+        """Delete the poses and all TDOAs that wait for one."""
         self._counts["dropped"] += len(self._hold)
         self._hold = PoseQueue(self._limit)
         self._corrector = self._body_antenna.corrector = self._new_corrector(self._effects)
@@ -211,7 +218,7 @@ class BiasNode(StreamNode):
         return Corrector(anchors, effects, self._network, self._lag)
 
     def _give_corrector(self, antenna: Antenna) -> None:
-        """Have the TDOAs of an Antenna corrected at the poses that are known."""
+        """Give an Antenna a Corrector with the known poses."""
         if self._corrector is not None:
             antenna.corrector = self._new_corrector(antenna.effects)
             antenna.corrector.share_poses(self._corrector)
@@ -230,12 +237,12 @@ class BiasNode(StreamNode):
         self._release()
 
     def _on_frames(self) -> None:
-        """A constant transform is new, or another."""
+        """Update all antennas after a new or changed constant transform."""
         for frame in [*self._antennas]:
             self._place_antenna(frame)
 
     def _antenna(self, frame: str) -> Antenna:
-        """Antenna of TDOAs of this frame."""
+        """Return the Antenna of TDOAs of a frame."""
         if (
             frame in ("", self._body)
             or frame not in self._antennas
@@ -247,8 +254,9 @@ class BiasNode(StreamNode):
         return self._antennas[frame]
 
     def _place_antenna(self, frame: str) -> None:
-        """Find where the antenna of this frame, another than the body's, is on the body, and remove
-        what that does to its TDOAs.
+        """Find the place of an antenna on the body, and set its effects.
+
+        frame : of its TDOAs, not the body frame
         """
         trouble, effects, known = None, self._effects, self._antennas.get(frame)
         between = self._frames.frames.between(self._body, frame)
@@ -311,7 +319,7 @@ class BiasNode(StreamNode):
                 self._take_pose(stamp, rows[k : k + 1])
 
     def _take_pose(self, t: float, row: np.ndarray) -> None:
-        """One pose, after the gate has judged its stamp."""
+        """Take one pose, after the gate has judged its stamp; t : s; row : (1,)."""
         accepted, _, jumped_back = self._poses.take(t, row, [self._tdoas.newest, self._tdoas.held])
         if jumped_back:
             self._start_over()
@@ -343,7 +351,7 @@ class BiasNode(StreamNode):
             self._take(t.tolist(), items)
 
     def _relabelled(self, rows: np.ndarray) -> np.ndarray:
-        """Rows of TDOAs with their ids and signs put right."""
+        """Return rows of TDOAs with corrected ids and signs."""
         rows, names = rows.copy(), MEASURED[:3]
         for name, column in zip(names, self._labels.correct(*(rows[name] for name in names))):
             rows[name] = column
@@ -354,8 +362,9 @@ class BiasNode(StreamNode):
         return self._epoch.seconds(Time(sec=sec, nanosec=nanosec))
 
     def _take(self, stamps: Sequence[float], items: Iterable[Item | None]) -> None:
-        """Have TDOAs wait for their poses: stamps, s, as received; items : (frame, sec, nanosec, a,
-        b, d, variance).
+        """Queue TDOAs for their poses.
+
+        stamps : s, as received; items : (frame, sec, nanosec, a, b, d, variance)
         """
         stamps = [t - self._late for t in stamps]
         if stamps and self._tdoas.take_all(stamps):
@@ -382,12 +391,12 @@ class BiasNode(StreamNode):
                     self._hold.add(stamp, kept)
 
     def _pass(self, item: Item | None) -> None:
-        """Publish a TDOA as it came, unless that was done."""
+        """Publish a TDOA uncorrected, unless it is already published."""
         if item is not None:
             self._publish([item], Correction.none(np.array(item[5:6])))
 
     def _release(self) -> None:
-        """Publish what need not wait any longer."""
+        """Publish all TDOAs that need not wait longer."""
         released = self._hold.take(self._is_ready) if self._corrector is not None else []
         if not released:
             return
@@ -400,7 +409,10 @@ class BiasNode(StreamNode):
     def _release_alike(
         self, stamps: Sequence[float], items: Sequence[Item], ready: Sequence[bool]
     ) -> None:
-        """Correct and publish TDOAs of one frame."""
+        """Correct and publish TDOAs of one frame.
+
+        stamps : s; items : as in `_take`; ready : whether the pose of each is known
+        """
         corrector: Any = self._antenna(
             items[0][0]
         ).corrector  # there is one as soon as there are anchors
@@ -422,8 +434,10 @@ class BiasNode(StreamNode):
         correction: Correction,
         stamps: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> None:
-        """Publish corrected TDOAs: items as in `_take`; their Correction; stamps : seconds and
-        nanoseconds, (n,) each, instead of their own.
+        """Publish corrected TDOAs.
+
+        items : as in `_take`; correction : of these
+        stamps : seconds and nanoseconds, (n,) each, that replace their own
         """
         columns = [np.array(column) for column in list(zip(*items))[1:]]
         measured = columns if stamps is None else (*stamps, *columns[2:])  # up to the variance
@@ -542,7 +556,7 @@ class BiasNode(StreamNode):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the node; returns the exit code."""
+    """Run the node, and return the exit code."""
     return process.run(BiasNode, __doc__, argv)
 
 

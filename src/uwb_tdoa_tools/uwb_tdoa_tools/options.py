@@ -106,7 +106,7 @@ def add_filter(
 
 
 def add_parameters(parser: ArgumentParser) -> None:
-    """-p, beside --config."""
+    """Add -p, an option beside --config."""
     parser.add_argument(
         "-p",
         dest="parameters",
@@ -118,7 +118,10 @@ def add_parameters(parser: ArgumentParser) -> None:
 
 
 def filter_of(args: Namespace) -> tuple[FilterConfig, EffectSet | None]:
-    """(FilterConfig, EffectSet or None) that --config, -p and --effects name. Raises InputError."""
+    """Return the FilterConfig and the EffectSet or None of --config, -p and --effects.
+
+    Raises InputError.
+    """
     config = FilterConfig.from_yaml(args.config) if args.config else FilterConfig()
     config = with_parameters(config, getattr(args, "parameters", ()))
     return config, EffectSet.from_yaml(args.effects) if args.effects else None
@@ -299,7 +302,7 @@ def add_align(parser: ArgumentParser, judges: bool = False) -> None:
 
 
 def add_rerun(parser: ArgumentParser) -> None:
-    """--rerun: a recording for the viewer Rerun."""
+    """Add --rerun: a recording for the viewer Rerun."""
     parser.add_argument("--rerun", metavar="FILE", type=OutputFile, help=pictures.RERUN_HELP)
 
 

@@ -1,4 +1,4 @@
-"""Run the nodes of a process until Ctrl-C, and serve their streams in turn with the rest of the graph."""
+"""Run the nodes of a process until Ctrl-C; serve their streams and the rest of the graph."""
 
 from __future__ import annotations
 
@@ -36,28 +36,31 @@ except ImportError:
     EventsExecutor = None  # type: ignore[assignment]  # says that there is none
 
 LONGEST_SLEEP = 0.2  # s, until a process without streams sees a signal
-# s without a message of a stream, after which it is looked for each LOOK s, and not each
-# millisecond
+# s without a message of a stream, after which the process checks streams each LOOK s instead of
+# each millisecond.
 QUIET, LOOK = (1.0, 0.05)
 SERVED = 0.005  # s from one service of the graph to the next, while streams flow
 LONGEST_SERVICE = 0.05  # s; only with a SingleThreadedExecutor
 
 
 class Spinner:
-    """The life of the nodes of a process. Messages of streams, and those of /clock and /tf, which
-    may come a thousand times a second, wait in the middleware until a turn takes and computes them
-    together: a callback for each costs a fifth more in all, and a call of the filter for each more
-    than that. Then the process rests as long as the turn took, at least a millisecond. Every SERVED
-    s everything else of the graph, requests, timers, transforms, is served by an executor of rclpy,
-    in the order in which it came, and nothing can be passed over: a mark is put at the end of its
-    queue, and it is run until the mark comes. Where no stream has said anything for a while, the
-    process sleeps in the executor. (`docs/measured.md` has what was measured.)
+    """Serves the nodes of a process.
 
-    longest_wait : s, the longest that anything has waited since this was set to 0.0.
+    Messages of streams, /clock and /tf may come 1000 times per second. They wait in the middleware
+    until a turn takes and computes them together. A callback for each message costs a fifth more in
+    all, and a call of the filter for each costs even more. After a turn the process rests as long as
+    the turn took, at least 1 ms.
+
+    Every SERVED s an executor of rclpy serves the rest of the graph (requests, timers, transforms) in
+    the order of arrival. A mark at the end of its queue ensures completeness: the executor runs until
+    it reaches the mark. While no stream has messages, the process sleeps in the executor.
+    `docs/measured.md` has the measurements.
+
+    longest_wait : s, longest wait of any request since this was set to 0.0
     """
 
     def __init__(self, nodes: list[StreamNode], turns: StreamPoller | None = None) -> None:
-        """nodes : a list that is kept up to date."""
+        """Start to serve nodes; `nodes` is a list that stays up to date."""
         self.longest_wait = 0.0
         self._nodes, self._turns = nodes, turns
         self._executor = SingleThreadedExecutor() if EventsExecutor is None else EventsExecutor()
@@ -66,7 +69,7 @@ class Spinner:
             self._serve_node(node)
 
     def replace(self, gone: Iterable[StreamNode], new: Iterable[StreamNode]) -> None:
-        """Leave some nodes, and serve others."""
+        """Stop serving some nodes, and serve others."""
         for node in gone:
             self._executor.remove_node(node)
             self._nodes.remove(node)
@@ -79,7 +82,7 @@ class Spinner:
         self._executor.add_node(node)
 
     def spin(self, stop: Future) -> None:
-        """Live until the future `stop` is done, or the context ends."""
+        """Serve the nodes until the future `stop` is done, or the context ends."""
         # taken : when a turn last took anything
         taken, sleep, quiet = (-math.inf, LONGEST_SLEEP if self._turns is None else LOOK, True)
         while not stop.done() and self._nodes[0].context.ok():
@@ -95,13 +98,13 @@ class Spinner:
                 time.sleep(rest or self._turns.PERIOD)  # type: ignore[union-attr]  # without turns it is quiet
 
     def close(self) -> None:
-        """Leave the nodes."""
+        """Stop serving the nodes."""
         for node in self._nodes:
             self._executor.remove_node(node)
         self._executor.shutdown()
 
     def _serve(self) -> None:
-        """Everything that has come so far."""
+        """Serve everything that arrived so far."""
         if EventsExecutor is None:
             self._serve_each()
         else:
@@ -115,8 +118,9 @@ class Spinner:
             node.take_clock()
 
     def _serve_each(self) -> None:
-        """With the SingleThreadedExecutor, which has no queue: one of everything that waits, until
-        nothing does, or for a while.
+        """Serve one waiting item at a time until none waits, at most LONGEST_SERVICE s.
+
+        For the SingleThreadedExecutor, which has no queue for a mark.
         """
         until, found = time.monotonic() + LONGEST_SERVICE, True
         while found and time.monotonic() < until:
@@ -131,7 +135,7 @@ class Spinner:
                 pass
 
     def _guarded(self, serve: Callable[..., None], **arguments: Any) -> None:
-        """Requests to services are decoded by rclpy, which raises what cannot be."""
+        """Call `serve`, and log requests that rclpy cannot decode."""
         try:
             serve(**arguments)
         except implementation.RCLError as error:
@@ -139,18 +143,20 @@ class Spinner:
 
 
 def _nothing() -> None:
-    """What a mark does."""
+    """Do nothing: the task of a mark."""
 
 
 def run(
     node_class: type[StreamNode], description: str | None, argv: Sequence[str] | None = None
 ) -> int:
-    """Live as a node until SIGINT or SIGTERM. Returns the exit code: 0, 2 for bad usage or an
-    InputError, or 128 and the number of a signal that came before the node was ready.
+    """Run a node until SIGINT or SIGTERM, and return the exit code.
 
-    node_class(arguments) makes the StreamNode, in an initialised rclpy, of the arguments of the
-    process; it has the executable's NAME, and may have `members` and `turns`,
-    StreamPoller. description : for --help.
+    The code is 0, or 2 for bad usage or an InputError. It is 128 plus the signal's number if the
+    signal came before the node was ready.
+
+    node_class(arguments) : makes the StreamNode in an initialised rclpy, from the arguments of the
+        process. It has the executable's NAME, and may have `members` and `turns`, a StreamPoller.
+    description : for --help
     """
     name = node_class.NAME
     arguments = [name, *(sys.argv[1:] if argv is None else argv)]
