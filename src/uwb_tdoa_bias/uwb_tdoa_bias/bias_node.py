@@ -88,9 +88,9 @@ PARAMETERS = {  # in the order of config/bias_node.yaml
     ),
     "frozen": FROZEN,
 }
-POSE = "pose", "twist"  # what is read of an Odometry, its numbers,
-MEASURED = "anchor_a", "anchor_b", "distance_difference", "variance"  # and of a Tdoa
-CORRECTED = (  # what is written of a TdoaCorrected
+POSE = "pose", "twist"  # fields read of an Odometry: numbers
+MEASURED = "anchor_a", "anchor_b", "distance_difference", "variance"  # fields read of a Tdoa
+CORRECTED = (  # fields written of a TdoaCorrected
     "anchor_a",
     "anchor_b",
     "raw",
@@ -102,9 +102,9 @@ CORRECTED = (  # what is written of a TdoaCorrected
     "bias_slope",
     "bias_state",
 )
-MOST_FRAMES = 100  # that are remembered: names on a topic may be anything
-EARLY, EARLY_POSES = 2000, 500  # TDOAs and poses kept while there are no anchors
-Item = tuple[Any, ...]  # of a TDOA: frame, sec, nanosec, and MEASURED
+MOST_FRAMES = 100  # limit, since a topic may carry any number of names
+EARLY, EARLY_POSES = 2000, 500  # TDOAs and poses kept until anchors arrive
+Item = tuple[Any, ...]  # one TDOA: frame, sec, nanosec, and MEASURED
 STATUS = {PASSED: "passed", EFFECTS: "effects", NETWORK: "network", FADED: "faded"}
 
 
@@ -112,6 +112,8 @@ STATUS = {PASSED: "passed", EFFECTS: "effects", NETWORK: "network", FADED: "fade
 class Antenna:
     """Corrections for the TDOAs of one frame.
 
+    Attributes
+    ----------
     effects : EffectSet, including the antenna's place on the body
     models : {status: name of the bias model in messages}
     trouble : why the place of the antenna is unknown, or None
@@ -140,9 +142,11 @@ class BiasNode(StreamNode):
     ) -> None:
         """Start the node.
 
+        Parameters
+        ----------
         arguments : of the process
-        member : names of the parameters of the other nodes of a localization_node, which calls the turns
-            of this node and hands it the odometry; None for a node of its own
+        member : None for a separate node. In a localization_node: names of parameters of its other nodes;
+            it calls the turns of this node and hands over the odometry.
         options : of Node
         """
         super().__init__(self.NAME, **options)
@@ -154,19 +158,19 @@ class BiasNode(StreamNode):
         self._late = self._effects.stamp_offset("tdoa")  # s
         self._labels = LabelCorrector(self._effects.effects)
         self._network = load_network(model_file)
-        self._corrector: Corrector = None  # type: ignore[assignment]  # of the body, with the poses of all; until there are anchors
+        self._corrector: Corrector = None  # type: ignore[assignment]  # of the body, owns all poses; None until anchors arrive
         self._antennas: dict[str, Antenna] = {}  # by frame of the TDOAs
         self._body_antenna = Antenna(self._effects, self._models(self._effects))
         self._epoch, self._rate = Epoch(), Rate()
         self._counts: Counter[str] = Counter()
         self._early: deque[Item] = deque()
-        # as of `_take_poses`
+        # Arguments of `_take_poses`.
         self._early_poses: deque[tuple[str, np.ndarray, np.ndarray]] = deque()
         self._hold = PoseQueue(self._limit)
         self._tdoas, self._poses = StampGate(), StampGate()
         self._reported_unready = self._reported_received = self._reported_poses = 0
         self._codec = CdrCodec(TdoaCorrected, *CORRECTED)
-        self._templates: dict[tuple[str, str], CdrTemplate] = {}  # by frame and model, the latest
+        self._templates: dict[tuple[str, str], CdrTemplate] = {}  # latest, by frame and model
         self._frames_said: set[str] = set()
         self.output = StreamOutput(self, TdoaCorrected, "uwb/tdoa_corrected")
         self._frames = FramesInput(self, self._epoch.seconds, self._on_frames)
@@ -214,7 +218,7 @@ class BiasNode(StreamNode):
             self._give_corrector(antenna)
 
     def _new_corrector(self, effects: EffectSet) -> Corrector:
-        anchors: Any = self._anchors.anchors  # there are some when this is called
+        anchors: Any = self._anchors.anchors  # called only after anchors arrived
         return Corrector(anchors, effects, self._network, self._lag)
 
     def _give_corrector(self, antenna: Antenna) -> None:
@@ -325,7 +329,7 @@ class BiasNode(StreamNode):
             self._start_over()
             held, self._tdoas = self._tdoas.finish(), StampGate()
             for stamp, item in held:
-                if item is not None:  # else it was published as it came
+                if item is not None:  # else it is already published
                     self._take([stamp], [item])
         for stamp, row in accepted:
             self._add_poses(np.array([stamp]), row)
@@ -374,11 +378,11 @@ class BiasNode(StreamNode):
         for t, item in zip(stamps, items):
             if (
                 t < self._tdoas.newest - LARGEST_STEP_BACK
-            ):  # it needs no pose; ekf_node decides whether another time begins with it
+            ):  # published at once; ekf_node decides whether time restarts
                 self._pass(item)
                 item = None
             accepted, outliers, jumped_back = self._tdoas.take(t, item, [self._poses.newest])
-            for _, outlier in outliers:  # ekf_node says of it that its stamp is wrong
+            for _, outlier in outliers:  # ekf_node reports its wrong stamp
                 self._pass(outlier)
             if jumped_back:
                 self.get_logger().info("time has gone back: starting over")
@@ -413,9 +417,7 @@ class BiasNode(StreamNode):
 
         stamps : s; items : as in `_take`; ready : whether the pose of each is known
         """
-        corrector: Any = self._antenna(
-            items[0][0]
-        ).corrector  # there is one as soon as there are anchors
+        corrector: Any = self._antenna(items[0][0]).corrector  # exists once anchors arrived
         t, d = np.array(stamps), np.array([item[5] for item in items])
         a, b = (corrector.anchors.index([item[side] for item in items]) for side in (3, 4))
         valid = (a >= 0) & (b >= 0) & (a != b) & np.isfinite(d)

@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from geometry_msgs.msg import Point, Quaternion
     from numpy.typing import ArrayLike
 
-SAME_PLACE = 0.01  # m; an anchor that is sent again with less of a change is at the same place
+SAME_PLACE = 0.01  # m; a smaller change of a repeated anchor is no change
 # m. Data made for other anchors, e.g. a flyable volume, hold only if every anchor moved less.
 CONSTELLATION = 0.1
-MOST = 10_000  # anchors, as many as a message holds
+MOST = 10_000  # anchors, limit of a message
 # m along each axis. Grid coordinates of a country fit, and their squares do not overflow.
 FARTHEST = 1e8
 
@@ -88,7 +88,7 @@ class Anchors:
         for name, value in (("ids", ids), ("positions", positions), ("orientations", orientations)):
             value.setflags(write=False)
             object.__setattr__(self, name, value)
-        rows = np.full(ids.max() + 3, -1)  # of the ids from -1 on, and of those beyond
+        rows = np.full(ids.max() + 3, -1)  # one entry per id from -1 to one beyond the largest
         rows[ids + 1] = np.arange(n)
         object.__setattr__(self, "_rows", rows)
 
@@ -101,7 +101,7 @@ class Anchors:
 
     def index(self, ids: ArrayLike) -> np.ndarray:
         """Return the rows of some ids: int array of the shape of `ids`, -1 for an unknown id."""
-        rows = self._rows  # type: ignore[attr-defined]  # __post_init__ puts it there: it is no field
+        rows = self._rows  # type: ignore[attr-defined]  # set by __post_init__, no field
         return rows.take(np.asarray(ids, dtype=np.int64) + 1, mode="clip")
 
     def stand_at(self, ids: np.ndarray, positions: np.ndarray, frame: str) -> bool:
@@ -224,7 +224,7 @@ def _numbers(message: Point | Quaternion, names: str) -> list[float]:
 
 
 def _entry(key: Any, entry: Any) -> tuple[int, list[float], list[float]]:
-    """(id, position, orientation) of one entry of a file. Raises ValueError with what is wrong."""
+    """Return (id, position, orientation) of one entry of a file; raise ValueError with the fault."""
     if isinstance(key, bool) or not str(key).isascii() or not str(key).isdigit():
         raise ValueError(f"the id is {key!r}, not a whole number 0 ... 65535")
     if not isinstance(entry, dict):

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 def _hidden(*names: str) -> Iterator[None]:
     """Let packages that are not imported yet appear as not installed inside the block."""
     hidden = [name for name in names if name not in sys.modules]
-    sys.modules.update(dict.fromkeys(hidden))  # type: ignore[arg-type]  # None says that it is not there
+    sys.modules.update(dict.fromkeys(hidden))  # type: ignore[arg-type]  # None marks a missing module
     try:
         yield
     finally:
@@ -36,15 +36,15 @@ def _hidden(*names: str) -> Iterator[None]:
             del sys.modules[name]
 
 
-# numba imports these packages only to test whether they exist. That takes 0.2 s of a node's start.
-# It needs scipy for matrix products in compiled code, which this project does not use, and coverage
-# for measuring compiled code.
+# numba imports these packages only to test whether they exist, 0.2 s of a node's start. It needs
+# scipy for matrix products in compiled code, and coverage to measure compiled code. The project
+# does neither.
 with _hidden("scipy", "coverage"):
     from numba import config, njit
     from numba.core import event
     import numba.np.arraymath  # noqa: F401
 
-_FUNCTIONS: list[Any] = []  # all that are compiled when they are first called
+_FUNCTIONS: list[Any] = []  # all compiled functions; numba compiles at the first call
 SAY_EVERY = 4.0  # s
 # One row of a structured array. Compiled code reads and writes its fields as attributes. Python
 # has no type for it.
@@ -61,7 +61,7 @@ def compiled(function: Function) -> Function:
     The function may call compiled functions below its own folder and in common/. The cache is keyed
     by the sources of both.
     """
-    before = config.CACHE_DIR  # type: ignore[attr-defined]  # numba puts its settings there while it is imported
+    before = config.CACHE_DIR  # type: ignore[attr-defined]  # numba adds its settings at import
     place = _place(_digest(Path(function.__code__.co_filename).parent))
     config.CACHE_DIR = str(place)  # type: ignore[attr-defined]  # as above
     try:

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from types import FrameType, ModuleType
 
 INTERRUPTED = 130  # exit code, as a shell gives it: 128 + SIGINT
-SOON = 0.05  # s, until an interrupt that was lost comes again
-SAID = 1.5  # s of importing after which it is said that something goes on
+SOON = 0.05  # s, until a lost interrupt is repeated
+SAID = 1.5  # s of importing until a line reports it
 # Path variables in which an empty entry or a dot means the present folder. `.dev/paths.sh` has the
 # same list, for programs that a shell starts.
 PATHS = (
@@ -79,7 +79,7 @@ def outside_present_folder() -> Iterator[None]:
 
     The present folder may hold settings, and modules that `python -m` would import.
     """
-    here = os.open(".", os.O_PATH | os.O_DIRECTORY)  # also where its name is gone
+    here = os.open(".", os.O_PATH | os.O_DIRECTORY)  # works even if the folder was removed
     try:
         os.chdir("/")
         yield
@@ -136,7 +136,7 @@ def _run(module: str, *arguments: Any) -> Any:
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
         if package.startswith("uwb_tdoa_") and package != "uwb_tdoa_msgs":
-            raise  # ours is not whole: a defect, which needs its traceback
+            raise  # our package is incomplete: a defect, keep the traceback
         print(
             f"{name}: error: the Python package {package} is missing; {_remedy(package)}.",
             file=sys.stderr,
@@ -159,7 +159,7 @@ def _imported(module: str) -> ModuleType:
     KeyboardInterrupt with a traceback or ignore it, and there is nothing to clean up yet.
     """
     before = signal.getsignal(signal.SIGINT)
-    if before is not signal.SIG_IGN:  # as in a job that a shell script put in the background
+    if before is not signal.SIG_IGN:  # ignored in a background job of a shell script
         signal.signal(signal.SIGINT, lambda number, frame: os._exit(INTERRUPTED))
     slow = Timer(
         SAID, lambda: print(f"{module.rpartition('.')[2]}: starting", file=sys.stderr, flush=True)

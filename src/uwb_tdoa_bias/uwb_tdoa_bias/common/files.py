@@ -29,12 +29,12 @@ if TYPE_CHECKING:
     from zipfile import ZipInfo
 
 
-TEMPORARY = "uwb_tdoa_temporary_"  # what the names of our temporary folders begin with
-STREAMS = "/dev/stdout", "/dev/stderr"  # links to what the user has chosen
-SETTLED = 60.0  # s after which a temporary folder that nobody holds is no longer needed
+TEMPORARY = "uwb_tdoa_temporary_"  # prefix of the project's temporary folders
+STREAMS = "/dev/stdout", "/dev/stderr"  # links that the user redirects
+SETTLED = 60.0  # s; older temporary folders without a lock are removed
 _KEPT: list[
     tuple[Path, Path, os.stat_result, bool]
-] = []  # see `keeping`: path, the same without links, state, whether it is a bag
+] = []  # of `keeping`: path, resolved path, state, whether it is a bag
 
 
 def read_bytes(path: str | Path, most: int = RECORDING_BYTES) -> bytes:
@@ -64,12 +64,12 @@ def read_head(path: str | Path, size: int) -> bytes:
 def write_text(path: str | Path, text: str) -> None:
     """Write a text file in UTF-8, in every locale; otherwise as `write_bytes`.
 
-    Bytes that Python could not decode in an argument or a file name are written unchanged. Bytes that
-    are not UTF-8 are written as U+FFFD.
+    Some arguments and file names hold bytes that Python could not decode. They are written unchanged
+    if they are UTF-8, else as U+FFFD.
     """
     try:
         content = text.encode("utf-8", "surrogateescape")
-    except UnicodeEncodeError:  # halves of characters that come from no file name
+    except UnicodeEncodeError:  # lone surrogates that come from no file name
         content = text.encode("utf-8", "replace")
     write_bytes(path, content.decode("utf-8", "replace").encode("utf-8"))
 
@@ -168,7 +168,7 @@ def temporary_folder() -> Iterator[Path]:
     If this process is killed, the next process of this project removes the folder.
     """
     for old in Path(tempfile.gettempdir()).glob(f"{TEMPORARY}*"):
-        with suppress(OSError):  # of another user, in use, or gone
+        with suppress(OSError):  # owned by another user, in use, or gone
             if time.time() - old.lstat().st_mtime > SETTLED:
                 with _held(old, fcntl.LOCK_EX):
                     shutil.rmtree(old)
@@ -270,7 +270,7 @@ def _array(name: str, file: ZipFile, member: ZipInfo, kinds: str) -> np.ndarray:
         raise ValueError(f"{name} is of format {version}")
     try:
         shape, fortran, dtype = read_header[version](stream)
-    except Exception as error:  # it is parsed as Python, which fails in many ways
+    except Exception as error:  # numpy parses it as Python, with many exceptions
         raise ValueError(f"{name} has a header that cannot be read ({error})") from error
     if dtype.hasobject or dtype.kind not in kinds:
         raise ValueError(f"{name} holds {dtype}")

@@ -11,14 +11,18 @@ from .anchors import Anchors
 from .sensors import LOCATING, SENSORS
 from .text import sanitize
 
-AIDS = tuple(SENSORS)  # streams of a Flight that the filter can do without
+AIDS = tuple(SENSORS)  # optional streams of a Flight
 
 
 @dataclass(frozen=True)
 class Imu:
     """Inertial samples in the body frame (x forward, y left, z up: REP-103).
 
-    t : (n,) s; gyro : (n, 3) rad/s; accel : (n, 3) m/s^2, specific force (+9.81 on z at rest).
+    Attributes
+    ----------
+    t : (n,) s
+    gyro : (n, 3) rad/s
+    accel : (n, 3) m/s^2, specific force (+9.81 on z at rest).
     """
 
     t: np.ndarray
@@ -33,7 +37,10 @@ class Imu:
 class Tdoas:
     """Raw TDOA measurements.
 
-    t : (n,) s; a, b : (n,) anchor ids
+    Attributes
+    ----------
+    t : (n,) s
+    a, b : (n,) anchor ids
     d : (n,) m, d_ab = |p - b| - |p - a|
     variance : (n,) m^2, of the noise as the tag reports it; 0 where it reports none. Default: 0.
     """
@@ -42,7 +49,7 @@ class Tdoas:
     a: np.ndarray
     b: np.ndarray
     d: np.ndarray
-    variance: np.ndarray = None  # type: ignore[assignment]  # __post_init__ puts zeros there
+    variance: np.ndarray = None  # type: ignore[assignment]  # __post_init__ sets zeros
 
     def __post_init__(self) -> None:
         if self.variance is None:
@@ -56,7 +63,11 @@ class Tdoas:
 class Truth:
     """Ground truth.
 
-    t : (n,) s; p : (n, 3) m, world; q : (n, 4) x y z w, body to world, NaN where not recorded
+    Attributes
+    ----------
+    t : (n,) s
+    p : (n, 3) m, world
+    q : (n, 4) x y z w, body to world, NaN where not recorded
     """
 
     t: np.ndarray
@@ -67,7 +78,7 @@ class Truth:
         return len(self.t)
 
 
-_SensorStreams: Any = make_dataclass(  # the names of its attributes are those of SENSORS
+_SensorStreams: Any = make_dataclass(  # attribute names: SENSORS
     "_SensorStreams",
     [(name, sensor.stream | None, None) for name, sensor in SENSORS.items()],
     frozen=True,
@@ -81,6 +92,8 @@ class Flight(_SensorStreams):
 
     All stamps are in s, of one clock. Each stream keeps its own stamps; they never fall.
 
+    Attributes
+    ----------
     name : short and unique, e.g. "0425-traj1"; `sanitize` is applied to it
     anchors : Anchors
     tdoa : Tdoas

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from .anchors import Anchors
 
-_FIELDS = {  # of the file, and the kinds of their numbers
+_FIELDS = {  # fields of the file, and their dtype kinds
     "frame": "U",
     "lower": "f",
     "step": "f",

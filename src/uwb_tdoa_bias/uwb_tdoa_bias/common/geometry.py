@@ -12,7 +12,7 @@ import numpy as np
 
 from .compiled import compiled
 
-_ON_ANTENNA = 1e-9  # m; closer than that, an antenna is in no direction
+_ON_ANTENNA = 1e-9  # m; closer, the direction of an antenna is undefined
 
 
 def ranges(p: np.ndarray, anchors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -86,7 +86,10 @@ def linearized_tdoa(p: np.ndarray, a: np.ndarray, b: np.ndarray, jacobian: np.nd
 def rotate(q: np.ndarray, v: np.ndarray, out: np.ndarray) -> None:
     """Write R(q) v to out (3,); compiled.
 
-    q : (4,) unit quaternion x y z w, body to world; v : (3,), body
+    Parameters
+    ----------
+    q : (4,) unit quaternion x y z w, body to world
+    v : (3,), body
     """
     x, y, z, w = q[0], q[1], q[2], q[3]
     tx = 2.0 * (y * v[2] - z * v[1])
@@ -101,7 +104,10 @@ def rotate(q: np.ndarray, v: np.ndarray, out: np.ndarray) -> None:
 def rotate_each(q: np.ndarray, v: np.ndarray, out: np.ndarray) -> None:
     """Write R(q) v for n quaternions and one vector to out (n, 3); NaN where q is zero or not finite.
 
-    q : (n, 4) x y z w, of any length; v : (3,)
+    Parameters
+    ----------
+    q : (n, 4) x y z w, of any length
+    v : (3,)
     """
     unit = np.empty(4)
     for i in range(len(q)):

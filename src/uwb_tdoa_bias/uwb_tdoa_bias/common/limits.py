@@ -1,8 +1,9 @@
-"""Limits of what readers read of a file, and the exception that names the exceeded limit.
+"""Limits of reading, and the exception that names the exceeded limit.
 
 The limits hold for files from any source. A reader compares the claims of a header with these
-limits, and with the file, before it takes memory or does work. The limits are far above the need:
-a log of an hour has 300 MB, the project's YAML files have some kB, models of `train` 60 kB.
+limits, and with the file. It does so before it takes memory or does work. The limits are far above
+the need: a log of an hour has 300 MB, the project's YAML files have some kB, models of `train`
+60 kB.
 """
 
 from __future__ import annotations
@@ -16,54 +17,54 @@ from .errors import InputError
 if TYPE_CHECKING:
     from pathlib import Path
 
-# s, and s per byte: processor time for one file. The slowest reader finishes in time on a machine
-# that is four times slower than the one where this was set.
+# s, and s per byte: processor time for one file. The limit suffices for the slowest reader on a
+# machine four times slower than the development machine.
 SECONDS, SECONDS_PER_BYTE = 4.0, 2e-6
 
 # Whole files, bytes.
-RECORDING_BYTES = 1 << 30  # micro-SD log, or CSV as it lies on the disc
+RECORDING_BYTES = 1 << 30  # micro-SD log, or CSV on the disc
 CSV_BYTES = 200_000_000  # text of a recording; ten minutes of the full UTIL schema
-CSV_CELLS = 16_000_000  # of it
+CSV_CELLS = 16_000_000  # cells of such a text
 TABLE_BYTES = 50_000_000  # CSV of other tools
-TABLE_CELLS = 8_000_000  # of a recording in it: a quarter of an hour at 1 kHz
+TABLE_CELLS = 8_000_000  # of a recording in such a CSV: 15 min at 1 kHz
 SMALL_TABLE_CELLS = 400_000  # of other tables, whose rows become objects
-ROW_CHARACTERS = 100_000  # of one row of any CSV
-SURVEY_BYTES = YAML_BYTES = 2_000_000  # 10 000 anchors with their orientations have 1 200 000
+ROW_CHARACTERS = 100_000  # one row of any CSV
+SURVEY_BYTES = YAML_BYTES = 2_000_000  # 10 000 anchors with orientations have 1 200 000
 MODEL_BYTES = 4_000_000  # ONNX: a million weights
-ARRAYS_BYTES = 100_000_000  # of all arrays of an .npz file, unpacked; four million cells have 20 MB
+ARRAYS_BYTES = 100_000_000  # all arrays of an .npz file, unpacked; 4 million cells have 20 MB
 
-MAP_MARKERS = 5_000  # of a position bias map: memory takes their number squared, time cubed
+MAP_MARKERS = 5_000  # of a position bias map: memory grows quadratically, time cubically
 
 NAME_LENGTH = 100  # characters of a flight, a model, ...
 LINE_LENGTH = 2_000  # characters of a sentence that is printed or logged
 
-# Of a micro-SD log: event types, and variables of all of them. The firmware has some 20 and 100.
+# Micro-SD log: event types, and variables of all types. The firmware has some 20 and 100.
 USD_TYPES, USD_VARIABLES = (1_000, 10_000)
-FOLDER_ENTRIES, FOLDER_DEPTH = 100_000, 20  # that are looked at for recordings
+FOLDER_ENTRIES, FOLDER_DEPTH = 100_000, 20  # searched for recordings
 
 # YAML.
 YAML_NODES, YAML_DEPTH = 200_000, 20
 
-# ONNX: limits of the process that tests a model, beside the needs of its libraries. A model of
-# `train` takes 0.02 s and 3 MB.
+# ONNX: limits of the process that tests a model, in addition to the needs of its libraries. A model
+# of `train` takes 0.02 s and 3 MB.
 MODEL_SECONDS, MODEL_MEMORY = 3, 256 << 20  # processor time; bytes
-MODEL_WAIT = 60.0  # s until its end, on a busy machine too
-MODEL_ROW_SECONDS = 0.005  # of processor time for a row that comes alone
+MODEL_WAIT = 60.0  # s until its end, even on a busy machine
+MODEL_ROW_SECONDS = 0.005  # processor time of a single row
 # Executed operators. onnxruntime takes 0.2 s to load 2000 operators, and 4 s for 10 000.
 MODEL_NODES = 2_000
 
 # Bags.
-CHUNK_BYTES = 256 << 20  # of MCAP, unpacked; rosbag2 makes chunks of 0.75 MB
-MESSAGE_BYTES = 64 << 20  # of any topic: an image, a cloud of points
-READ_BYTES = 2 << 20  # of a message that is taken apart: 10 000 anchors
+CHUNK_BYTES = 256 << 20  # MCAP chunk, unpacked; rosbag2 writes 0.75 MB
+MESSAGE_BYTES = 64 << 20  # any topic, e.g. an image or a point cloud
+READ_BYTES = 2 << 20  # a decoded message: 10 000 anchors
 # Of the text that defines a message type. The texts of ROS have up to 15 kB.
 DEFINITION_BYTES = 64 << 10
-FILE_BYTES = 8 << 30  # of all data files that are unpacked
+FILE_BYTES = 8 << 30  # all unpacked data files
 UNPACKED_FREE, UNPACKED_RATIO = 16 << 20, 100  # see `most_unpacked`
 
 
 class TooMuch(InputError):
-    """A file or folder that holds more than is read of it. The message names the limit."""
+    """A file or folder that exceeds a limit of reading. The message names the limit."""
 
 
 class Budget:
@@ -76,7 +77,10 @@ class Budget:
     def __init__(self, path: str | Path, size: int = 0) -> None:
         """Start the budget of a file.
 
-        path : for messages; size : bytes of the file; the time limit grows with them
+        Parameters
+        ----------
+        path : for messages
+        size : bytes of the file; the time limit grows with them
         """
         self._path, self._spent, self._seconds = (
             path,

@@ -25,17 +25,17 @@ if TYPE_CHECKING:
 
 
 # Gain in dBi every 30 degrees around the full circle, of a DWM1000-like module near 4 GHz. These
-# are not measured values. Their shape follows the plots in the DWM1000 data sheet: an uneven
-# doughnut with 3 dB of ripple around the upright module, and two nulls of unequal depth along its
-# axis. The deeper null is where the board shadows the antenna. Their level is the one that
-# Decawave's support quotes for the upright module (-2 to -5 dB).
-# from +x through +y
+# are not measured values. Their shape follows the plots in the DWM1000 data sheet, an uneven
+# doughnut. The ripple around the upright module is 3 dB. The two nulls along its axis have unequal
+# depth; the deeper one is where the board shadows the antenna. Decawave's support quotes their level
+# for the upright module (-2 to -5 dB).
+# Azimuth cut, from +x through +y.
 DWM1000_AZIMUTH = (-2.0, -2.2, -3.0, -4.0, -3.6, -2.8, -3.0, -4.2, -5.0, -4.4, -3.2, -2.3)
-# from +x through +z
+# Elevation cut from +x through +z.
 DWM1000_ELEVATION_1 = (-2.0, -2.5, -5.0, -11.0, -6.5, -3.5, -3.0, -4.5, -9.0, -20.0, -8.0, -3.0)
-# from +y through +z
+# Elevation cut from +y through +z.
 DWM1000_ELEVATION_2 = (-4.0, -3.5, -5.5, -11.0, -7.0, -5.0, -4.4, -5.5, -10.0, -20.0, -9.0, -5.0)
-LARGEST_GAIN = 200.0  # dB, in magnitude; more is a mistake
+LARGEST_GAIN = 200.0  # dB, magnitude; larger gains are input errors
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Antenna:
     delay_span: float = 0.15
 
     def __post_init__(self) -> None:
-        cuts = []  # their gains on the axes
+        cuts = []  # gains of each cut on the axes
         for name, most in (("gain_offset", LARGEST_GAIN), ("delay_span", 10.0)):
             value = getattr(self, name)
             if (
@@ -175,7 +175,7 @@ APS011_BIAS_MM = np.array(
     [-110, -105, -100, -93, -82, -69, -51, -27, 0, 21, 35, 42, 49, 62, 71, 76, 81, 86.0]
 )
 
-NOMINAL_GAIN = -3.3  # dBi, mean gain of the default antenna, for one whose attitude is not known
+NOMINAL_GAIN = -3.3  # dBi, mean gain of the default antenna, for an unknown attitude
 
 # An assumption: the tag's module lies flat on the vehicle. Its front (antenna x) is up, its null
 # axis (antenna z) is along body x.
@@ -279,7 +279,10 @@ def _gains(
 def into_frame(q: ArrayLike, v: ArrayLike) -> np.ndarray:
     """Return R(q)^T v: world vectors in the frame of orientation q.
 
-    q : (..., 4) x y z w, frame to world; v : (..., 3), world
+    Parameters
+    ----------
+    q : (..., 4) x y z w, frame to world
+    v : (..., 3), world
     """
     q, v = np.asarray(q, dtype=float), np.asarray(v, dtype=float)
     x, y, z, w = -q[..., 0], -q[..., 1], -q[..., 2], q[..., 3]

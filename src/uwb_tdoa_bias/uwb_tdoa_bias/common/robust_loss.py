@@ -1,8 +1,8 @@
 """Robust losses: they reduce the weight of large residuals.
 
-A loss rho(e) of the normalised residual e gives iteratively re-weighted least squares with the
-weight rho'(e) / e, 1 at e = 0. Source: MacTavish and Barfoot, At all costs: a comparison of
-robust cost functions for camera correspondence outliers, 2015, table I.
+A loss rho(e) of the normalised residual e gives iteratively re-weighted least squares. The weight
+is rho'(e) / e, 1 at e = 0. Source: MacTavish and Barfoot, At all costs: a comparison of robust cost
+functions for camera correspondence outliers, 2015, table I.
 """
 
 from __future__ import annotations
@@ -19,7 +19,11 @@ GEMAN_MCCLURE, HUBER, CAUCHY = range(3)  # places in LOSSES
 def weight(loss: int, e: float, scale: float) -> float:
     """Return the weight rho'(e) / e of a residual, 0 to 1; compiled.
 
-    loss : place in LOSSES; e : normalised residual; scale : residual where the loss bends, unit of e
+    Parameters
+    ----------
+    loss : place in LOSSES
+    e : normalised residual
+    scale : residual where the loss bends, unit of e
     """
     u = (e / scale) ** 2
     if loss == GEMAN_MCCLURE:

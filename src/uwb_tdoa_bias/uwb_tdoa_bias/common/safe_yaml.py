@@ -1,8 +1,8 @@
 """A safe subset of YAML: anything ambiguous is refused with its line.
 
-It reads mappings, lists, texts, finite numbers, true, false and null (core schema of YAML 1.2,
-with yes, no, on and off as in ROS). It refuses tags, aliases (as ROS does), repeated keys, a
-second document, and numbers that are not finite.
+It reads mappings, lists, texts, finite numbers, true, false and null. The rules are those of the
+core schema of YAML 1.2, with yes, no, on and off as in ROS. It refuses tags, aliases (as ROS does),
+repeated keys, a second document, and numbers that are not finite.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def parse_yaml(data: bytes | str, name: str | Path) -> Any:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         said = " ".join(part for part in (error.context, error.problem) if part)
-        line = min(mark.line, text.count("\n")) + 1  # of the end libyaml says the next
+        line = min(mark.line, text.count("\n")) + 1  # libyaml reports the end one line too late
         raise InputError(f"{name}: line {line}: is no YAML ({said}); correct it there.") from error
     except yaml.YAMLError as error:
         raise InputError(
@@ -98,7 +98,7 @@ _Base: Any = _WithLibyaml if yaml.__with_libyaml__ else yaml.SafeLoader
 
 
 class _Loader(_Base):
-    yaml_implicit_resolvers: dict = {}  # those of YAML 1.1 take 1:30 for 90, and 1e-3 for a text
+    yaml_implicit_resolvers: dict = {}  # YAML 1.1 would read 1:30 as 90, and 1e-3 as text
 
     def __init__(self, text: str, budget: Budget) -> None:
         super().__init__(text)

@@ -17,12 +17,12 @@ STEP_AHEAD, LARGEST_STEP_AHEAD = (0.25, 2.0)
 # Multiple of the usual step that a stream may make at once. One lost message makes two steps, three
 # lost messages make four.
 USUAL = 4.0
-FORGETTING = 0.1  # share of the usual step that the latest one makes
+FORGETTING = 0.1  # weight of the latest step in the usual step
 NEAR = 0.25  # s between stamps of two streams that confirm each other
 # s. A jump that no other stream confirms must persist so long: where another stream continues in
 # the old time, and where none does.
 CONTRADICTED, UNCONTRADICTED = 0.3, 0.05
-MOST_HELD = 1000  # messages of a stream that stands still at another time
+MOST_HELD = 1000  # held messages of a stream with a stopped clock
 
 
 class StampGate:
@@ -35,8 +35,8 @@ class StampGate:
     """
 
     def __init__(self) -> None:
-        self.newest = -math.inf  # s, of the stamps accepted
-        self.usual = LARGEST_STEP_AHEAD / USUAL  # s, the usual step from one stamp to a later one
+        self.newest = -math.inf  # s, newest accepted stamp
+        self.usual = LARGEST_STEP_AHEAD / USUAL  # s, mean step between stamps
         self._held: list[tuple[float, Any]] = []
 
     def __len__(self) -> int:

@@ -22,27 +22,32 @@ if TYPE_CHECKING:
     from .anchors import Anchors
 
 
-SAME_PLACE = 0.001  # m; two antennas are some centimetres apart at least
+SAME_PLACE = 0.001  # m; two antennas are at least some cm apart
 # m. A UWB radio reaches at most 300 m, and a tag must receive several anchors at once. An anchor
 # farther than this from all others has no neighbours.
 LONELY = 500.0
-NEIGHBOURS = 2  # that an anchor must have within that; fewer where there are fewer
-USUAL = 6.0  # m between neighbours of usual installations: the unit that comes nearest is named
+NEIGHBOURS = 2  # required within LONELY; fewer if there are fewer anchors
+USUAL = 6.0  # m between neighbours, typical; the unit that gives the nearest value is named
 UNITS = {
     "millimetres": 1000.0,
     "centimetres": 100.0,
     "inches": 1.0 / 0.0254,
     "decimetres": 10.0,
     "feet": 1.0 / 0.3048,
-}  # in 1 m
-FARTHEST_OFF = 200  # anchors, those farthest off the middle, of which neighbours are looked for
+}  # units per metre
+FARTHEST_OFF = 200  # anchors farthest from the median whose neighbours are searched
 MOST_NAMED = 10  # anchors in a sentence
 
 
 class SurveyFault(NamedTuple):
     """A fault of a survey.
 
-    rule : its name; cause : what is wrong, a clause; evidence : numbers; remedy : what to do
+    Attributes
+    ----------
+    rule : its name
+    cause : what is wrong, a clause
+    evidence : numbers
+    remedy : what to do
     value : the number that decided
     """
 
@@ -166,10 +171,10 @@ def _listed(ids: np.ndarray) -> str:
 # arm 3 forward (x). Arm 2 points to -y: "left" for a person who looks at the stand from the front.
 # Only this sign makes the frame right-handed. The fit cannot determine it, since three points are
 # flat. With +y, every stand tilts by some 60 degrees. With -y, stands on the floor have z up to
-# within 1 degree. Then in all stands the antenna is 11 mm forward, 26 mm to -y and 49 mm up of the
-# point where the arms meet.
+# within 1 degree. In all stands the antenna is then 11 mm forward, 26 mm to -y and 49 mm up. These
+# distances count from the point where the arms meet.
 ARM_TIPS = np.array([[0.0, 0.0, 0.110], [0.0, -0.121, 0.0], [0.080, 0.0, 0.0]])
-MAX_TIP_RESIDUAL = 0.010  # metres RMS; measured: 0.5 ... 2.2 mm
+MAX_TIP_RESIDUAL = 0.010  # m RMS; measured: 0.5 ... 2.2 mm
 
 _ANTENNA = re.compile(r"anchorAnt_?([0-9]{1,9})$")
 _TIP = re.compile(r"anchor_?([0-9]{1,9})_([123])$")
@@ -253,8 +258,14 @@ def orientation_from_tips(tips: np.ndarray) -> tuple[np.ndarray, float]:
 
     Source: Kabsch, Acta Cryst. A 32, 1976 (as implemented by scipy).
 
+    Parameters
+    ----------
     tips : (3, 3) m, positions of tips 1, 2, 3, world
-    Returns (quaternion x y z w, stand to world; m)
+
+    Returns
+    -------
+    orientation : quaternion x y z w, stand to world
+    residual : m
     """
     surveyed, nominal = tips - tips.mean(axis=0), ARM_TIPS - ARM_TIPS.mean(axis=0)
     rotation, _ = rotations.Rotation.align_vectors(surveyed, nominal)

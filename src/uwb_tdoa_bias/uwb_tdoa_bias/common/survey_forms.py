@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 Lines = list[tuple[int, list[str]]]  # numbers of lines, and their cells
 
-NOT_SURVEYED = [math.nan] * 4  # the orientation of such an anchor
+NOT_SURVEYED = [math.nan] * 4  # orientation without a survey
 IDS = (
     "id",
     "anchor",
@@ -64,8 +64,12 @@ _OPENCV = re.compile(r"^%YAML:1\.0\s*$", re.MULTILINE)
 class Entry(NamedTuple):
     """One anchor of a file.
 
-    name : its id as text, or a name; position : (3,) m
-    orientation : (4,) x y z w, NaN if not surveyed; where : the line or key, for messages
+    Attributes
+    ----------
+    name : its id as text, or a name
+    position : (3,) m
+    orientation : (4,) x y z w, NaN if not surveyed
+    where : the line or key, for messages
     """
 
     name: str
@@ -77,8 +81,12 @@ class Entry(NamedTuple):
 class Columns(NamedTuple):
     """Meaning of the cells of a table.
 
-    name : place of the id or name, or None; axes : places of x, y and z
-    lengths : units of x, y and z, m; turn : places of the quaternion x, y, z, w, or ()
+    Attributes
+    ----------
+    name : place of the id or name, or None
+    axes : places of x, y and z
+    lengths : units of x, y and z, m
+    turn : places of the quaternion x, y, z, w, or ()
     """
 
     name: int | None
@@ -283,7 +291,7 @@ def read_tree(text: str, path: str | Path) -> tuple[list[Entry], str]:
         _OPENCV.sub("", text).replace("!!opencv-matrix", "") if opencv else text, path
     )
     frame = "map"
-    for _ in range(8):  # the levels around the anchors: those of a parameter file, and "anchors"
+    for _ in range(8):  # levels around the anchors: parameter file, and "anchors"
         if not isinstance(content, dict):
             break
         given = content.get("frame", content.get("frame_id", frame))

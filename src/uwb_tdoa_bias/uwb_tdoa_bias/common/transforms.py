@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
     from scipy.spatial.transform import Rotation
 
-KEPT = 1000  # transforms of a frame that moves
-HELD = 0.5  # s for which the last transform of a frame that moves holds
-DEEPEST = 100  # frames between a frame and its root
-MOST, MOST_MOVING = 1000, 200  # frames that do not move, and that do
-SHORTEST, LONGEST = 1e-3, 1e3  # of a quaternion, which should be 1
+KEPT = 1000  # transforms kept per moving frame
+HELD = 0.5  # s, validity of the last transform of a moving frame
+DEEPEST = 100  # frames up to the root
+MOST, MOST_MOVING = 1000, 200  # constant frames, and moving frames
+SHORTEST, LONGEST = 1e-3, 1e3  # norm of a quaternion, nominally 1
 # m and rad. A constant transform that is sent again with a smaller change counts as the same.
 SAME_PLACE, SAME_TURN = (1e-3, 1e-3)
-FARTHEST = 1e8  # m; squares of what is off by more, and is turned by a gyroscope, may overflow
+FARTHEST = 1e8  # m; squares of larger offsets times rates may overflow
 
 _Moved = tuple[float, tuple[float, ...], tuple[float, ...]]  # t, q and p
 
@@ -35,15 +35,21 @@ class Frames:
     def __init__(self) -> None:
         self._static: dict[
             str, tuple[str, Rotation, np.ndarray]
-        ] = {}  # parent, turn and p of each frame
-        self._moving: dict[str, tuple[str, deque[_Moved]]] = {}  # parent, and the last transforms
+        ] = {}  # {frame: (parent, Rotation, p)}
+        self._moving: dict[
+            str, tuple[str, deque[_Moved]]
+        ] = {}  # {frame: (parent, last transforms)}
 
     def set(self, parent: str, child: str, q: Sequence[float], p: Sequence[float]) -> bool:
         """Set a constant transform, and return whether it is new.
 
         x_parent = R(q) x_child + p. Raises InputError for an invalid transform.
 
-        parent, child : names of frames; q : (4,) x y z w; p : (3,) m
+        Parameters
+        ----------
+        parent, child : names of frames
+        q : (4,) x y z w
+        p : (3,) m
         """
         new = self.differs(parent, child, q, p)
         if new:

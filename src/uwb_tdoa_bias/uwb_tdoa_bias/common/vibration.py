@@ -9,15 +9,19 @@ from .compiled import compiled
 if TYPE_CHECKING:
     import numpy as np
 
-VIBRATION_CORNER = 0.05  # s; what is faster is vibration
-VIBRATION_AVERAGE = 0.3  # s over which its power is averaged
+VIBRATION_CORNER = 0.05  # s, time constant; faster motion counts as vibration
+VIBRATION_AVERAGE = 0.3  # s, time constant of the mean power
 
 
 @compiled
 def low_pass(value: float, sample: float, dt: float, time_constant: float) -> float:
     """Return the output of a first-order low pass after a step of dt, s; compiled.
 
-    value : output before; sample : input during the step; time_constant : s
+    Parameters
+    ----------
+    value : output before
+    sample : input during the step
+    time_constant : s
     """
     return value + min(1.0, dt / time_constant) * (sample - value)
 
@@ -26,7 +30,10 @@ def low_pass(value: float, sample: float, dt: float, time_constant: float) -> fl
 def track_vibration(slow: np.ndarray, power: np.ndarray, accel: np.ndarray, dt: float) -> None:
     """Update the vibration with one sample of specific force; compiled.
 
-    accel : (3,) m/s^2, body; dt : s since the sample before
+    Parameters
+    ----------
+    accel : (3,) m/s^2, body
+    dt : s since the sample before
     slow : (3,) m/s^2, low pass of the specific force, updated
     power : (3,) m^2/s^4, mean square of the faster part per axis, updated
     """

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 # status of one correction; the values of TdoaCorrected.STATUS_*
 PASSED, EFFECTS, NETWORK, FADED = range(4)
-# s after the first pose. Earlier TDOAs are not corrected, which costs accuracy.
+# s after the first pose. Earlier TDOAs are corrected without a pose, which costs accuracy.
 START = 0.2
 # rad. A yaw with a larger standard deviation is unknown: then the filter follows four yaws,
 # 90 degrees apart.
@@ -39,6 +39,8 @@ FADED_BELOW = 0.5
 class Correction:
     """Corrections of n TDOAs.
 
+    Attributes
+    ----------
     bias, std : (n,) m
     corrected : (n,) m, d - bias
     status : (n,) of PASSED, EFFECTS, NETWORK, FADED
@@ -92,10 +94,14 @@ class Corrector:
     ) -> None:
         """Set the bias model.
 
+        Parameters
+        ----------
         anchors : Anchors
         effects : EffectSet or None; hypotheses, which the filter weighs, are not corrected: see `weighed`
         network : Network or None
-        lag : s; history : number of poses kept; start : s
+        lag : s
+        history : number of poses kept
+        start : s
         """
         self.anchors = anchors
         effects = EffectSet() if effects is None else effects
@@ -175,7 +181,11 @@ class Corrector:
 
         Where no pose is known, only effects that need none contribute.
 
-        t : (n,) s; a, b : (n,) rows of `anchors`; d : (n,) m, raw d_ab
+        Parameters
+        ----------
+        t : (n,) s
+        a, b : (n,) rows of `anchors`
+        d : (n,) m, raw d_ab
         """
         if self.idle or len(t) == 0:
             return Correction.none(d)
@@ -283,7 +293,7 @@ pass
 class FixedPoseCorrector(Corrector):
     """Corrects a recording at the poses of an earlier run with another model."""
 
-    idle = True  # nothing of this run is waited for
+    idle = True  # no waiting for poses
 
     def __init__(
         self, anchors: Anchors, effects: EffectSet | None, poses: Sequence[np.ndarray]

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 
     from ..effects.samples import Samples
 
-# rad: azimuth (about z, from x) and elevation (above the xy plane). A: of the tag in the antenna
-# frame of each anchor. T: of each anchor in the tag's body frame. m: positions of the anchors
-# relative to the tag, world axes.
+# d*: position of both anchors relative to the tag, m, world axes. Azimuth (about z, from x) and
+# elevation (above the xy plane), rad. *_A: of the tag in the antenna frame of each anchor. *_T: of
+# each anchor in the tag's body frame.
 FEATURES = (
     "dx_a",
     "dy_a",
@@ -38,8 +38,8 @@ FEATURES = (
     "elevation_T_b",
 )
 
-# m: position of the tag, world; ids and positions of both anchors, world. Without unit: horizontal
-# parts of the body's x and z axes. With these features a model recognizes a place.
+# Position of the tag, m, world; horizontal parts of the body's x and z axes; ids and positions,
+# m, world, of both anchors. With these features a model recognizes a place.
 PLACE = (
     "x",
     "y",

@@ -50,7 +50,10 @@ def load_network(name: str | Path | None) -> Network | None:
 class Validity(NamedTuple):
     """The ranges of the features outside of which a network fades.
 
-    columns : (k,) of NAMES; lower, upper : (k,), full validity between them
+    Attributes
+    ----------
+    columns : (k,) of NAMES
+    lower, upper : (k,), full validity between them
     margin : (k,), distance from this range to no validity; units of the features
     """
 
@@ -63,6 +66,8 @@ class Validity(NamedTuple):
 class Network:
     """An ONNX bias model.
 
+    Attributes
+    ----------
     meta : all its metadata, dict of str
     trained_with : names of the effects that were corrected before the training; they must be
         corrected in use, too

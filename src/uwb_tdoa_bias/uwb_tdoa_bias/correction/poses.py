@@ -18,13 +18,18 @@ if TYPE_CHECKING:
 
 
 POSE_NUMBERS, TWIST_NUMBERS = 3 + 4 + 36, 6 + 36  # of PoseWithCovariance and TwistWithCovariance
-TILT = 0.5  # rad; a filter that does not know the tilt better estimates no attitude
+TILT = 0.5  # rad; with a larger tilt std the filter estimates no attitude
 
 
 class Columns(NamedTuple):
     """Poses as arrays.
 
-    t : (m,) s; p : (m, 3) m, world; q : (m, 4) x y z w, body to world; v : (m, 3) m/s, world
+    Attributes
+    ----------
+    t : (m,) s
+    p : (m, 3) m, world
+    q : (m, 4) x y z w, body to world
+    v : (m, 3) m/s, world
     yaw_std : (m,) rad
     """
 
@@ -77,7 +82,13 @@ class Poses:
     ) -> None:
         """Append one pose, or k poses; poses not later than all before them are ignored.
 
-        t : (k,) s; p : (k, 3) m; q : (k, 4) x y z w; v : (k, 3) m/s; yaw_std : (k,) rad
+        Parameters
+        ----------
+        t : (k,) s
+        p : (k, 3) m
+        q : (k, 4) x y z w
+        v : (k, 3) m/s
+        yaw_std : (k,) rad
         """
         parts: Any = (t, p, q, v, yaw_std) if np.ndim(t) else ([t], [p], [q], [v], [yaw_std])
         new = Columns(*(np.ascontiguousarray(part, dtype=float) for part in parts))
@@ -222,14 +233,14 @@ def rotated_in_yaw(q: np.ndarray, quarters: int) -> np.ndarray:
     return np.stack([c * x - s * y, c * y + s * x, c * z + s * w, c * w - s * z], axis=1)
 
 
-MOST = 10_000  # items: what has one stamp for ever would never have waited too long
+MOST = 10_000  # items; limits a queue whose stamps stand still
 
 
 class PoseQueue:
     """A queue in order of arrival; its first item leaves when it is ready, or has waited too long.
 
     Whether an item is ready depends on the stamp of the item before it. An item has waited too long
-    if a newer item is stamped more than `limit` s later, or if more than MOST items wait.
+    if a newer item is stamped more than `limit` s later. The same holds if more than MOST items wait.
     """
 
     def __init__(self, limit: float) -> None:

@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 import onnxruntime
 
-PACKED = 4  # rows to whose multiples a batch is filled up
-BATCH = 64  # rows at most that are played together: what they hold stays in the cache
+PACKED = 4  # rows; batches are filled up to a multiple
+BATCH = 64  # rows per run at most; their data fit into the cache
 
 
 class Unplayable(ValueError):
@@ -19,7 +19,10 @@ class Unplayable(ValueError):
 class Session:
     """A model on one thread; each row of the input gives the same bits in any batch.
 
-    width, outputs : columns of the input and of the output; meta : {key: text} of the file
+    Attributes
+    ----------
+    width, outputs : columns of the input and of the output
+    meta : {key: text} of the file
     alone : whether each row is run separately
     """
 
@@ -33,12 +36,12 @@ class Session:
         """
         options = options or onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
-        options.log_severity_level = 4  # what goes wrong is reported by who calls
+        options.log_severity_level = 4  # the caller reports errors
         try:
             self._session = onnxruntime.InferenceSession(
                 content, options, providers=["CPUExecutionProvider"], enable_fallback=0
             )
-        except Exception as error:  # of its own family, with no common public base
+        except Exception as error:  # onnxruntime's exceptions have no public base class
             raise Unplayable(f"onnxruntime: {str(error).splitlines()[0][:200]}") from error
         inputs = self._session.get_inputs()
         if len(inputs) != 1 or len(self._session.get_outputs()) != 1 or len(inputs[0].shape) != 2:

@@ -50,7 +50,7 @@ def tried_out(content: bytes) -> bool:
     """
     path = [
         entry for entry in sys.path if os.path.isabs(entry)
-    ]  # the present folder of the process is an empty one
+    ]  # the process runs in an empty folder
     with temporary_folder() as folder:
         try:
             done = subprocess.run(
@@ -91,14 +91,14 @@ def judge(content: bytes) -> tuple[bool, str]:
         session = Session(content)
         _refuse_slow(session)
         session.alone |= not _is_the_same_in_any_batch(session)
-    except Exception as error:  # whatever a library makes of a model, or of too little memory
+    except Exception as error:  # any exception of a library, also for lack of memory
         return False, str(error) if isinstance(error, Unplayable) else repr(error)[:200]
     return session.alone, ""
 
 
 def _limit_this_process() -> None:
     """Limit time and memory of this process; from now on it opens no file and leaves no dump."""
-    memory = int(re.search(r"VmSize:\s+(\d+)", Path("/proc/self/status").read_text())[1]) << 10  # type: ignore[index]  # it is there
+    memory = int(re.search(r"VmSize:\s+(\d+)", Path("/proc/self/status").read_text())[1]) << 10  # type: ignore[index]  # found on Linux
     seconds = int(time.process_time()) + 1 + MODEL_SECONDS
     for limit, most in (
         ("AS", memory + MODEL_MEMORY),

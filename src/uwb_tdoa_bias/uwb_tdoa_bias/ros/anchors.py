@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 ANCHORS_QOS = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
-MOST_NAMED = 10  # anchors that a sentence names
-SAME_TURN = 1e-3  # of a quaternion, by which orientations of the same anchor may differ
+MOST_NAMED = 10  # anchors named in a sentence
+SAME_TURN = 1e-3  # largest difference of quaternions of the same anchor
 # Best effort and volatile: such a subscription receives messages from every publisher.
 ANY_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 ANCHORS_FILE = Parameter(
@@ -91,7 +91,10 @@ def in_words(before: Anchors, after: Anchors) -> str:
 class AnchorsInput:
     """Input of anchors from a file or from uwb/anchors, latched or repeated.
 
-    anchors : Anchors or None; refused : the fault of the last message, or None
+    Attributes
+    ----------
+    anchors : Anchors or None
+    refused : the fault of the last message, or None
     """
 
     def __init__(
@@ -106,7 +109,7 @@ class AnchorsInput:
         self.refused: str | None = None
         self._node, self._on_change, self._file = node, on_change, file
         self._of_file = refuse_faulty(read_survey(file), file) if file else None
-        self._repeated: Input | None = None  # the subscription to volatile ones
+        self._repeated: Input | None = None  # subscription to volatile publishers
         events = SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible)
         self._latched = Input(
             node, AnchorArray, "uwb/anchors", self._on_message, ANCHORS_QOS, event_callbacks=events

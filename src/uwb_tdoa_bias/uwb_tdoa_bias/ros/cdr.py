@@ -2,9 +2,9 @@
 
 A message object takes tens of microseconds to make and to read, mostly for fields without use
 here. In this module a field is a place in the bytes. All fields behind the strings of a message
-have the places that the definition gives, and strings (frame ids) rarely change. The layout is
-that of OMG Data Distribution Service Interoperability (DDSI-RTPS): CDR with 4 bytes of
-encapsulation, and every number aligned to its size. A message with known numbers tests this.
+have the places that the definition gives. Strings (frame ids) rarely change. The layout follows
+OMG Data Distribution Service Interoperability (DDSI-RTPS): CDR with 4 bytes of encapsulation, and
+every number aligned to its size. A message with known numbers tests this.
 
 A topic may carry anything: another version of the type, another encoding, noise. Therefore
 lengths, texts and element counts are checked before memory is allocated. A message that fails is
@@ -31,11 +31,11 @@ ENCAPSULATION = b"\x00\x01\x00\x00"  # plain CDR, little endian
 # Plain CDR in big and little endian. The fourth byte holds options.
 KNOWN_ENCAPSULATIONS = (b"\x00\x00\x00", b"\x00\x01\x00")
 LONGEST_TEXT = 4096  # bytes of a frame_id, or of another text
-MOST_ELEMENTS = 10_000  # in a message that is a list: anchors, transforms
-LARGEST_ELEMENT = 512  # bytes, on the average
+MOST_ELEMENTS = 10_000  # in a list message: anchors, transforms
+LARGEST_ELEMENT = 512  # bytes, on average
 ANOTHER = "another version of the type"
 LENGTH = struct.Struct("<I")
-PADDING = 3  # bytes that some middlewares add at the end
+PADDING = 3  # bytes; some middlewares pad the end
 TEXT = "text"
 CODES = {
     "double": "f8",
@@ -74,6 +74,8 @@ class CdrCodec:
     def __init__(self, kind: type, *fields: str) -> None:
         """Prepare the fields.
 
+        Parameters
+        ----------
         kind : class of the messages
         fields : names of fields that are numbers, or contain only numbers of one type
         """
@@ -92,7 +94,7 @@ class CdrCodec:
             code, count = spaces[leaves[0]][0], sum(spaces[leaf][1] for leaf in leaves)
             columns.append((name, code, count) if count > 1 else (name, code))
         self.dtype = np.dtype(columns)
-        self._known: _Layout | None = None  # of the messages of late
+        self._known: _Layout | None = None  # layout of the latest messages
         self.fits = self._agrees()
 
     def read(
@@ -177,7 +179,7 @@ class CdrCodec:
         for name, leaves in self._paths.items():
             row[name] = np.concatenate([np.atleast_1d(_get(message, leaf)) for leaf in leaves])
         frame = message.header.frame_id
-        if "\ufffd" in frame:  # what the type support puts where it is no UTF-8
+        if "\ufffd" in frame:  # the type support's replacement of bytes that are not UTF-8
             raise Unreadable(f"{FRAME} is no UTF-8")
         return frame, row
 
@@ -213,7 +215,7 @@ class CdrTemplate:
         """Return (n,) rows, to be filled in."""
         return np.frombuffer(
             bytearray(self._data * n), self._dtype
-        )  # a copy of rows is none of what is between the fields
+        )  # do not copy the rows: a copy loses the bytes between fields
 
     def messages(self, rows: np.ndarray) -> Iterator[Any]:
         """Yield the input of a publisher for each of the rows that `rows` returned."""
@@ -254,7 +256,7 @@ class _Layout:
 
 
 def decode(data: bytes, kind: type) -> Any:
-    """Return the message of a serialized one of any type, by the middleware; raise Unreadable."""
+    """Return the decoded message of any type, by the middleware; raise Unreadable."""
     if data[:3] not in KNOWN_ENCAPSULATIONS:
         raise Unreadable("it is not plain CDR" if len(data) >= 4 else f"it has {len(data)} bytes")
     _check_size(data, kind)
@@ -270,7 +272,10 @@ def decode(data: bytes, kind: type) -> Any:
 def read_text(data: bytes, place: int, what: str) -> tuple[str, int]:
     """Return (text, place behind it) of plain little-endian CDR; raise Unreadable.
 
-    place : of the length of the text; what : name of the text, for messages
+    Parameters
+    ----------
+    place : of the length of the text
+    what : name of the text, for messages
     """
     if place + 4 > len(data):
         raise Unreadable(f"it ends after {len(data)} bytes, before {what}")
@@ -377,7 +382,7 @@ def _set(message: Any, path: str, values: np.ndarray) -> None:
     *above, name = path.split(".")
     holder = reduce(getattr, above, message)
     before = getattr(holder, name)
-    if isinstance(before, bytes):  # octet
+    if isinstance(before, bytes):  # octet: bytes in Python
         setattr(holder, name, bytes([int(values[0])]))
     elif isinstance(before, np.ndarray):
         setattr(holder, name, np.asarray(values, dtype=before.dtype))

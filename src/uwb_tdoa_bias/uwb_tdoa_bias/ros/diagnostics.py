@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
     from .node import StreamNode
 
-BEHIND = 0.5  # s that something may wait until this process serves it
-AGAIN = 30.0  # s after which the log says what it has said before
+BEHIND = 0.5  # s, longest wait of a request without a warning
+AGAIN = 30.0  # s until a sentence may be logged again
 # Match each number as a whole. A pattern with backtracking at each digit takes 8 s for 20 000 digits.
 NUMBER = re.compile(
     r"([-+]?)\d+(\.\d+)?(?=(\s*(?:%|s\b|ms\b|m\b|Hz|messages|samples|TDOAs|times))?)"
@@ -78,7 +78,7 @@ class Diagnostics:
         spinner = self._node.spinner
         if spinner is not None:
             late = spinner.longest_wait
-            spinner.longest_wait = 0.0  # of the process: the first of its nodes that asks says it
+            spinner.longest_wait = 0.0  # one value per process: the first node reports it
             values |= {"longest wait of a request": f"{late:.3f} s"}
             if late > BEHIND and level == DiagnosticStatus.OK:
                 level, text = (
@@ -97,7 +97,7 @@ class Diagnostics:
             logger = self._node.get_logger()
             if level == DiagnosticStatus.OK:
                 logger.info(text)
-            else:  # a statement of its own: rclpy allows one severity per line
+            else:  # separate line: rclpy allows one severity per line
                 logger.warning(text)
         name = self._node.get_fully_qualified_name()
         entries = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
@@ -146,12 +146,12 @@ class SimulatedClock:
 
     def __init__(self, node: Node, now: Callable[[], float] = time.monotonic) -> None:
         self._node, self._now = node, now
-        self._time: int | None = None  # the last one, ns
-        self._since, self._period = now(), 0.0  # since when, s from one to the next lately
+        self._time: int | None = None  # last time, ns
+        self._since, self._period = now(), 0.0  # s: time of the last change; recent period
 
     def status(self) -> tuple[bytes, str] | None:
         """Return (level, text) while simulated time stands still, else None."""
-        clock: ROSClock = self._node.get_clock()  # type: ignore[assignment]  # a node has such a clock
+        clock: ROSClock = self._node.get_clock()  # type: ignore[assignment]  # nodes have this class of clock
         now = self._now()
         if not clock.ros_time_is_active:
             self._time = None

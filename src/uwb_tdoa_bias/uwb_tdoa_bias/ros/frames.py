@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
     from .node import StreamNode
 
-TF_QOS = QoSProfile(depth=100)  # what tf2 uses
-MOVING_QOS = QoSProfile(depth=1000)  # 2 s of a robot that publishes it at 500 Hz
+TF_QOS = QoSProfile(depth=100)  # as in tf2
+MOVING_QOS = QoSProfile(depth=1000)  # 2 s at 500 Hz
 STAMP, NUMBERS = struct.Struct("<iI"), struct.Struct("<7d")  # of a TransformStamped: p, then q
 TF_STATIC_QOS = QoSProfile(
     depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
@@ -48,7 +48,10 @@ class FramesInput:
     Messages of /tf wait until `catch_up`. In a frozen node the first constant transform of a frame is
     final.
 
-    trouble : fault of the last invalid transform, or None; refusals : Refusals
+    Attributes
+    ----------
+    trouble : fault of the last invalid transform, or None
+    refusals : Refusals
     """
 
     def __init__(
@@ -58,8 +61,10 @@ class FramesInput:
         on_new: Callable[[], None],
         moving: bool = False,
     ) -> None:
-        """Subscribe.
+        """Subscribe to /tf_static, and to /tf on request.
 
+        Parameters
+        ----------
         seconds(stamp) : s of a builtin_interfaces/Time
         on_new() : called after a new constant transform
         moving : whether to read /tf

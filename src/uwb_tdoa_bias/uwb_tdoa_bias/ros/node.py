@@ -31,9 +31,9 @@ if TYPE_CHECKING:
     from rclpy.timer import Timer
 
 
-PERIOD = 0.001  # s, at least, of rest after a turn
-LONGEST_WAIT = 0.02  # s without a turn in which anything is taken, whatever it waits for
-ROUNDING = 1e-6  # s by which two ways to compute a stamp since 1970 may differ
+PERIOD = 0.001  # s, smallest rest after a turn
+LONGEST_WAIT = 0.02  # s; longest time that `wait_for` delays the streams
+ROUNDING = 1e-6  # s; two computations of a stamp since 1970 differ by less
 # s. After a turn the process rests as long as the turn took, at most so long: then a busy process
 # takes more messages per turn.
 LONGEST_REST = 0.01
@@ -73,12 +73,14 @@ class Streams:
         """Start without streams; on_taken() is called after messages were delivered."""
         self.inputs: dict[
             str, StreamInput | InMemoryReceiver
-        ] = {}  # by topic, in the order in which they are taken
+        ] = {}  # by topic, in the order of taking
         self._node, self._epoch, self._on_taken = node, epoch, on_taken
         self._streams: list[_Stream] = []
         self._by_topic: dict[str, _Stream] = {}
         self._awaited: _Stream | None = None
-        self._due: Callable[[], float] = lambda: -np.inf  # of what is awaited
+        self._due: Callable[[], float] = lambda: (
+            -np.inf
+        )  # stamp of the awaited message, s since 1970
         self._until = -np.inf
 
     @property
@@ -130,7 +132,9 @@ class Streams:
         ]
         if not parts:
             return False
-        if any(stream.fell for stream in self._streams):  # then it matters which stream was first
+        if any(
+            stream.fell for stream in self._streams
+        ):  # then the order of arrival across streams matters
             parts = sorted(
                 (piece for part in parts for piece in _pieces(part)), key=lambda piece: piece[-1][0]
             )
@@ -148,14 +152,14 @@ class StreamOutput:
         self._receiver: InMemoryReceiver | None = None
 
     def deliver_to(self, receiver: InMemoryReceiver) -> None:
-        """Also deliver all rows to an InMemoryReceiver."""
+        """Set an InMemoryReceiver that also gets all rows."""
         self._receiver = receiver
 
     def publish(self, frame: str, template: CdrTemplate, rows: np.ndarray) -> None:
         """Publish rows (n,) of a CdrTemplate, all of one frame."""
         if self._receiver is not None:
             self._receiver.hand(frame, rows)
-        if self.publisher.get_subscription_count():  # nobody can come and ask for them later
+        if self.publisher.get_subscription_count():  # late subscribers cannot request them
             for message in template.messages(rows):
                 self.publisher.publish(message)
 
@@ -166,7 +170,7 @@ class InMemoryReceiver:
     lost = 0
 
     def __init__(self, node: StreamNode, kind: type, topic: str) -> None:
-        self.refusals = Refusals(node, topic, kind)  # of none
+        self.refusals = Refusals(node, topic, kind)  # stays empty
         self._node, self._topic = node, topic
         self._parts: list[Part] = []
 
@@ -260,6 +264,8 @@ class Serving(Protocol):
 class StreamNode(ParameterNode):
     """A node whose streams and /clock no executor serves (see Spinner).
 
+    Attributes
+    ----------
     members : nodes that start and end with it
     spinner : the Spinner that serves it, once there is one
     ready : the log line at the start of service
@@ -312,7 +318,7 @@ class StreamNode(ParameterNode):
     def _warning(self, kind: str, text: str) -> Callable[[Any], None]:
         return lambda _: self.warn_at_times(kind, text)
 
-    def create_timer(  # type: ignore[override]  # its further arguments are handed on by their names
+    def create_timer(  # type: ignore[override]  # options are passed by name
         self, timer_period_sec: float, callback: Callable[[], None], **options: Any
     ) -> Timer:
         """Make a timer as rclpy does."""
@@ -354,5 +360,5 @@ class StreamNode(ParameterNode):
                 continue
             try:
                 clock.callback(decode(newest, Clock))
-            except (ValueError, OverflowError) as error:  # no time at all, or before 1970
+            except (ValueError, OverflowError) as error:  # an invalid time, or before 1970
                 self.warn_at_times("/clock", f"/clock: passed over: {error}")

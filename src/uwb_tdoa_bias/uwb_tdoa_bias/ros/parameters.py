@@ -41,8 +41,8 @@ KINDS = {
     list: "a list",
 }
 QOS = "qos_overrides."
-SAY_AGAIN = 10.0  # s from one warning to the next of the same kind
-LONGEST_NAME = 100  # letters of what a stranger wrote, in a sentence
+SAY_AGAIN = 10.0  # s between warnings of the same kind
+LONGEST_NAME = 100  # characters quoted from another node
 # Parameters per request, 0.1 ms each, and waiting requests. Streams wait until all are answered.
 MOST_ASKED, MOST_REQUESTS = (100, 20)
 
@@ -51,14 +51,19 @@ MOST_ASKED, MOST_REQUESTS = (100, 20)
 class Parameter:
     """A parameter of a node.
 
-    default : its value and type; text : unit and meaning, as in the parameter file
-    low, high : range of a number; choices : permitted texts
-    constraint : further limits, in words; settable : whether it can change while the node runs
+    Attributes
+    ----------
+    default : its value and type
+    text : unit and meaning, as in the parameter file
+    low, high : range of a number
+    choices : permitted texts
+    constraint : further limits, in words
+    settable : whether it can change while the node runs
     """
 
     default: Any
     text: str
-    low: float = None  # type: ignore[assignment]  # numbers have both
+    low: float = None  # type: ignore[assignment]  # set for numbers
     high: float = None  # type: ignore[assignment]  # as low
     choices: tuple[str, ...] = ()
     constraint: str = ""
@@ -97,7 +102,10 @@ class ParameterNode(Node):
     load everything that `ros2 param dump` wrote. If its parameter FROZEN is true, it refuses all
     changes. Requests for parameters that rclpy cannot read do not end it.
 
-    refused : number of refusals because the node is frozen; frozen : whether it is
+    Attributes
+    ----------
+    refused : number of refusals because the node is frozen
+    frozen : whether it is
     """
 
     refused, _refused_before, _refusal = 0, 0, ""
@@ -107,7 +115,7 @@ class ParameterNode(Node):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         self._warned: dict[
             str, float
-        ] = {}  # {kind: s of time.monotonic() from which on it may be said again}
+        ] = {}  # {kind: s of time.monotonic() of the next permitted warning}
         super().__init__(*arguments, **options)
 
     def get_logger(self) -> Log:
@@ -195,7 +203,7 @@ class ParameterNode(Node):
                 reason=self.refuse(f"parameter {others[0].name!r:.{LONGEST_NAME}}"),
             )
         unknown = [each.name for each in others if not self.has_parameter(each.name)]
-        if unknown:  # rclpy says of which only [], for lack of a copy
+        if unknown:  # rclpy would name no parameter: it reports an empty list
             return SetParametersResult(successful=False, reason=self._unknown(unknown[0]))
         return super().set_parameters_atomically(others)
 
@@ -290,7 +298,7 @@ def _names(file: str) -> set[str]:
     rcl has validated the file. Values and their tags are ignored, since launch_ros gives lists the
     tag !!python/tuple.
     """
-    if not Path(file).is_file():  # a pipe, which rcl has emptied
+    if not Path(file).is_file():  # rcl has already emptied a pipe
         return set()
     try:
         with open(file, "rb") as opened:

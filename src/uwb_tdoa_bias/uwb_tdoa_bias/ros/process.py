@@ -30,16 +30,16 @@ if TYPE_CHECKING:
     from .node import StreamNode, StreamPoller
 
 
-try:  # not in rclpy before 7.1.4; a message costs a quarter
+try:  # since rclpy 7.1.4; a message takes a quarter of the time
     from rclpy.experimental import EventsExecutor
 except ImportError:
-    EventsExecutor = None  # type: ignore[assignment]  # says that there is none
+    EventsExecutor = None  # type: ignore[assignment]  # None marks an older rclpy
 
-LONGEST_SLEEP = 0.2  # s, until a process without streams sees a signal
+LONGEST_SLEEP = 0.2  # s, until a process without streams reacts to a signal
 # s without a message of a stream, after which the process checks streams each LOOK s instead of
 # each millisecond.
 QUIET, LOOK = (1.0, 0.05)
-SERVED = 0.005  # s from one service of the graph to the next, while streams flow
+SERVED = 0.005  # s between services of the graph while streams have messages
 LONGEST_SERVICE = 0.05  # s; only with a SingleThreadedExecutor
 
 
@@ -47,12 +47,12 @@ class Spinner:
     """Serves the nodes of a process.
 
     Messages of streams, /clock and /tf may come 1000 times per second. They wait in the middleware
-    until a turn takes and computes them together. A callback for each message costs a fifth more in
-    all, and a call of the filter for each costs even more. After a turn the process rests as long as
-    the turn took, at least 1 ms.
+    until a turn takes and computes them together. A callback for each message would cost a fifth more
+    in all. A call of the filter for each would cost even more. After a turn the process rests as long
+    as the turn took, at least 1 ms.
 
-    Every SERVED s an executor of rclpy serves the rest of the graph (requests, timers, transforms) in
-    the order of arrival. A mark at the end of its queue ensures completeness: the executor runs until
+    Every SERVED s an executor of rclpy serves the rest of the graph in the order of arrival: requests,
+    timers, transforms. A mark at the end of its queue ensures completeness: the executor runs until
     it reaches the mark. While no stream has messages, the process sleeps in the executor.
     `docs/measured.md` has the measurements.
 
@@ -83,7 +83,7 @@ class Spinner:
 
     def spin(self, stop: Future) -> None:
         """Serve the nodes until the future `stop` is done, or the context ends."""
-        # taken : when a turn last took anything
+        # taken : s, time of the last turn with messages
         taken, sleep, quiet = (-math.inf, LONGEST_SLEEP if self._turns is None else LOOK, True)
         while not stop.done() and self._nodes[0].context.ok():
             if quiet or time.monotonic() >= self._served + SERVED:
@@ -95,7 +95,7 @@ class Spinner:
                 self._guarded(self._executor.spin_once, timeout_sec=sleep)
                 self._served = time.monotonic()
             else:
-                time.sleep(rest or self._turns.PERIOD)  # type: ignore[union-attr]  # without turns it is quiet
+                time.sleep(rest or self._turns.PERIOD)  # type: ignore[union-attr]  # not None: without turns the process is quiet
 
     def close(self) -> None:
         """Stop serving the nodes."""
@@ -108,7 +108,7 @@ class Spinner:
         if EventsExecutor is None:
             self._serve_each()
         else:
-            # tasks wait in the same queue as everything else
+            # Tasks wait in the same queue as everything else.
             mark = self._executor.create_task(_nothing)
             while not mark.done():
                 self._executor.spin_once(timeout_sec=0.0)
@@ -154,6 +154,8 @@ def run(
     The code is 0, or 2 for bad usage or an InputError. It is 128 plus the signal's number if the
     signal came before the node was ready.
 
+    Parameters
+    ----------
     node_class(arguments) : makes the StreamNode in an initialised rclpy, from the arguments of the
         process. It has the executable's NAME, and may have `members` and `turns`, a StreamPoller.
     description : for --help
@@ -164,7 +166,7 @@ def run(
         prog=name, description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     interruptible = True
-    stop: Future = Future()  # of the number of a signal
+    stop: Future = Future()  # holds the number of the signal
 
     # rclpy's own handler would end the context while a callback still publishes
     def on_signal(number: int, frame: FrameType | None) -> None:
@@ -183,16 +185,16 @@ def run(
         nodes = [node, *node.members]
         spinner = Spinner(nodes, getattr(node, "turns", None))
         gc.collect()
-        gc.freeze()  # what numba holds is never garbage, and searching it takes a tenth of a second
+        gc.freeze()  # numba's objects are never garbage; searching them takes 0.1 s
         gc.enable()
         interruptible = False
         if stop.done():
             raise KeyboardInterrupt
-        for each in reversed(nodes):  # from here on a signal ends it in good order
+        for each in reversed(nodes):  # from here on, signals end the node in good order
             each.say_ready()
         spinner.spin(stop)
-    except SystemExit as ended:  # argparse has said it already
-        return ended.code or 0  # type: ignore[return-value]  # argparse ends with a number
+    except SystemExit as ended:  # argparse has printed the error or the help
+        return ended.code or 0  # type: ignore[return-value]  # argparse exits with a number
     except InputError as error:
         print(f"{name}: error: {line_of(error)}", file=sys.stderr)
         return 2

@@ -36,7 +36,7 @@ class Epoch:
     """
 
     def __init__(self) -> None:
-        self._second: int = None  # type: ignore[assignment]  # of the first stamp, once there is one
+        self._second: int = None  # type: ignore[assignment]  # s since 1970, of the first stamp; None before it
 
     def seconds(self, stamp: Time) -> float:
         """Return float s of a builtin_interfaces/Time."""
@@ -81,7 +81,7 @@ def orientation_of(q: Quaternion) -> tuple[float, float, float, float]:
 # subscriber receives them; RViz and most others request it.
 STREAM_QOS = QoSProfile(depth=10_000, reliability=ReliabilityPolicy.BEST_EFFORT)
 OUTPUT_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
-LARGEST_LOSS = 0.01  # share of the messages of a second
+LARGEST_LOSS = 0.01  # largest lost share of messages per second
 # rclpy writes these into the given profile.
 OVERRIDES = QoSOverridingOptions([QoSPolicyKind.RELIABILITY, QoSPolicyKind.DEPTH])
 
@@ -108,7 +108,11 @@ def waiting(subscription: Subscription) -> Iterator[tuple[bytes, dict[str, Any]]
 class Refusals:
     """Unreadable messages of a topic.
 
-    count : their number; reason : of the last one; topic : its name
+    Attributes
+    ----------
+    count : their number
+    reason : of the last one
+    topic : its name
     """
 
     def __init__(self, node: ParameterNode, topic: str, kind: type) -> None:
@@ -162,7 +166,10 @@ class Input:
     callback(message) is called by an executor, or by `take_all` if the subscription is not served.
     Unreadable messages are refused.
 
-    refusals : Refusals; options : of Node.create_subscription
+    Attributes
+    ----------
+    refusals : Refusals
+    options : of Node.create_subscription
     """
 
     def __init__(
@@ -176,7 +183,7 @@ class Input:
         served: bool = True,
         **options: Any,
     ) -> None:
-        """Subscribe.
+        """Subscribe to the topic.
 
         read(bytes) : argument of the callback, default: the message; raises Unreadable
         """
@@ -205,7 +212,10 @@ class StreamInput:
 
     QoS by parameter: qos_overrides.<topic>.subscription.reliability and .depth.
 
-    lost : messages that DDS reports as sent and not delivered; refusals : Refusals
+    Attributes
+    ----------
+    lost : messages that DDS reports as sent and not delivered
+    refusals : Refusals
     """
 
     def __init__(self, node: ParameterNode, kind: type, topic: str) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-ROS_2 = b"\x89MCAP0\r\n", b"SQLite format 3\0"  # what a file of a bag begins with
+ROS_2 = b"\x89MCAP0\r\n", b"SQLite format 3\0"  # first bytes of the files of a bag
 
 
 def is_bag(path: str | Path) -> bool:

@@ -50,6 +50,8 @@ STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 class BagReader(Reader):
     """A Reader that records which parts of a bag cannot be read.
 
+    Attributes
+    ----------
     remarks : sentences on the missing parts of a damaged bag
     data : its data files
     packed : whether each message is compressed
@@ -70,14 +72,17 @@ class BagReader(Reader):
 def new_bag(out: str | Path, storage: str = "mcap", force: bool = False) -> Iterator[Writer]:
     """Give a rosbags Writer; the bag appears at `out` only if the block ends without an exception.
 
-    storage : "mcap" or "sqlite3"; force : whether to replace an existing bag. Raises InputError.
+    Parameters
+    ----------
+    storage : "mcap" or "sqlite3"
+    force : whether to replace an existing bag. Raises InputError.
     """
     out = Path(out)
     if storage not in STORAGES:
         raise InputError(f"storage: {storage!r} is not known; choose one of {', '.join(STORAGES)}.")
     check_output(out, force)
     out.parent.mkdir(parents=True, exist_ok=True)
-    # A folder beside `out`, so the last step is a rename. The bag in it has its final name, because
+    # A folder next to `out`, so the last step is a rename. The bag in it has its final name, because
     # rosbags names the data file after it.
     scratch = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".partial", dir=out.parent))
     try:
@@ -136,7 +141,7 @@ def open_bag(path: str | Path, salvage: bool = False) -> Iterator[BagReader]:
         try:
             yield reader
         finally:
-            with suppress(Exception):  # of what rosbags has believed
+            with suppress(Exception):  # errors of rosbags on faulty content
                 reader.close()
 
 
@@ -213,7 +218,7 @@ def _take_qos_of_metadata(reader: Reader) -> None:
     rosbags skips messages of topics whose QoS differs.
     """
     recorded = {
-        (one.topic, one.msgtype): one.ext.offered_qos_profiles  # type: ignore[union-attr]  # a bag of ROS 2
+        (one.topic, one.msgtype): one.ext.offered_qos_profiles  # type: ignore[union-attr]  # always a bag of ROS 2
         for one in reader.connections
     }
     for file in getattr(reader.storage, "storages", ()):
@@ -260,8 +265,8 @@ def messages(
     """Yield (connection, stamp ns, bytes) of the given connections.
 
     The bytes are converted to the present version of their type. Messages that do not fit their type
-    are left out and counted in `reader.unreadable`. Raises InputError if the number of messages
-    differs from the bag's own count, or if they hold more bytes than `reader.most`.
+    are left out and counted in `reader.unreadable`. Raises InputError for another number of messages
+    than the bag states, or for more bytes than `reader.most`.
 
     written : use the order of writing if the times fall back; default: the bag's order
     """
@@ -314,7 +319,7 @@ def readable(
     """Yield (connection, stamp ns, message) of the given connections.
 
     Messages that cannot be decoded, e.g. of a faulty publisher, are counted too. If the times of the
-    bag fall back, the order is that of writing.
+    bag fall back, the order of writing holds.
     """
     for connection, stamp, data in messages(path, reader, connections, written=True):
         try:
@@ -342,7 +347,7 @@ def connections_of(
 
 
 def remarks_of(reader: BagReader) -> list[str]:
-    """Return sentences on missing parts of what was read so far."""
+    """Return sentences on all missing parts found so far."""
     return [
         *reader.remarks,
         *(

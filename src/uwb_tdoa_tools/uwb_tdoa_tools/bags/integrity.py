@@ -83,7 +83,7 @@ def is_compressed(information: dict[str, Any]) -> bool:
 
 
 def decompress(path: Path, folder: Path) -> None:
-    """Decompress a bag whose files are compressed as a whole into an empty folder.
+    """Decompress a bag into an empty folder; its files are compressed as a whole.
 
     Raises
     ------

@@ -277,7 +277,10 @@ def _check_index(
 
 
 def _check_sum(file: BinaryIO, record: Record, starts: tuple[int, ...], last: int, at: int) -> None:
-    """Raise Damaged unless the checksum at `at` is 0 or that of the file from one of the starts to `last`."""
+    """Raise Damaged for a wrong checksum at `at`.
+
+    It must be 0, or belong to the file from one of the starts to `last`.
+    """
     (stored,) = struct.unpack("<I", _read(file, record.content + at, 4))
     if stored and not any(
         _checksum(file, first, last) == stored for first in starts if first <= last

@@ -33,8 +33,8 @@ OUR_TYPES = (
         if of.message.startswith(OUR_PACKAGE)
     ),
 )
-# Fields that our types were given since they were first recorded, the latest last, and what is
-# meant where they lack.
+# Fields added to the project's types since their first recording, latest last, and the value of a
+# missing field.
 ADDED: dict[str, tuple[dict[str, Any], ...]] = {
     f"{OUR_PACKAGE}/msg/Tdoa": ({"variance": 0.0},),
     f"{OUR_PACKAGE}/msg/TdoaCorrected": (

@@ -15,8 +15,8 @@ from .sensor import Compared, Sensor, Stream, finite, parameter
 SEA_LEVEL = 101325.0  # Pa
 SCALE = 44330.77  # m, temperature at sea level over its lapse rate: 288.15 K / 6.5 K/km
 EXPONENT = 5.25588  # g M / (R lapse rate)
-LOWEST, HIGHEST = 3e4, 1.2e5  # Pa, of air in which something flies or rolls
-SITE = 200.0  # m above the sea, of z = 0 in simulations
+LOWEST, HIGHEST = 3e4, 1.2e5  # Pa, air in which vehicles move
+SITE = 200.0  # m, altitude of z = 0 in simulations
 
 
 def pressure_at(altitude: np.ndarray) -> np.ndarray:

@@ -11,8 +11,8 @@ from ..anchors import Anchors
 from .sensor import Compared, Mistake, Sensor, Stream, finite, parameter
 
 FARTHEST = 1000.0  # m
-BEYOND = 5.0  # times the extent of the anchors that most distances are at most
-MOST, SOME = 0.5, 0.01  # share of the distances
+BEYOND = 5.0  # largest median distance, multiples of the anchors' extent
+MOST, SOME = 0.5, 0.01  # share of impossible distances: error, and warning
 MOST_NAMED = 8  # anchors in a sentence
 
 
@@ -20,7 +20,11 @@ MOST_NAMED = 8  # anchors in a sentence
 class Ranges(Stream):
     """Distances to anchors by two-way ranging.
 
-    t : (n,) s; anchor : (n,) ids; d : (n,) m
+    Attributes
+    ----------
+    t : (n,) s
+    anchor : (n,) ids
+    d : (n,) m
     variance : (n,) m^2, of the noise as the tag reports it; 0 where it reports none
     """
 

@@ -1,4 +1,4 @@
-"""Description of a sensor beside IMU and TDOAs: all its properties outside of the filter."""
+"""Description of a sensor other than IMU and TDOAs: all its properties outside of the filter."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 # Variance in a message, in its unit squared; components at or above it were not measured. Messages
 # need finite covariances.
 UNKNOWN_VARIANCE = 1e6
-UNKNOWN_STD = 1e6  # that stands for an infinite one where it is computed with
+UNKNOWN_STD = 1e6  # replaces an infinite deviation in computations
 RATE = 25.0  # Hz, of simulated sensors
 # Limit of all numbers of a recording, in their unit; results computed from them stay finite.
 LARGEST_NUMBER = 1e30
@@ -63,6 +63,8 @@ class Compared:
 
     `diagnosis/channels/aid.py` and `radio.py` of uwb_tdoa_tools use it.
 
+    Attributes
+    ----------
     reading : callable of (Track, t (n,)) -> (n, k), the reading expected at the poses; None for
         distances to anchors
     needs : the data that a flight must have, in words
@@ -87,8 +89,13 @@ class Compared:
 class Mistake:
     """A finding of a rule of `check`.
 
-    rule : its name; cause : what is wrong; evidence : the numbers that show it
-    remedy : a line to copy; value : the number that decided
+    Attributes
+    ----------
+    rule : its name
+    cause : what is wrong
+    evidence : the numbers that show it
+    remedy : a line to copy
+    value : the number that decided
     """
 
     rule: str
@@ -96,7 +103,7 @@ class Mistake:
     evidence: str
     remedy: str
     value: float
-    severe: bool = True  # or a warning
+    severe: bool = True  # False: a warning
 
 
 @dataclass(frozen=True)
@@ -106,6 +113,8 @@ class Sensor:
     `name` names its stream in a Flight, its counters on /diagnostics, its parameter use_<name>, and
     its value of `--without`. core/ of uwb_tdoa_ekf has its update of the filter.
 
+    Attributes
+    ----------
     plural : words for several measurements
     stream : class of its Stream
     message, fields : type of its messages, and {field: count of numbers} of the fields that are read
@@ -117,7 +126,9 @@ class Sensor:
     measured : callable of a Stream -> ({field of an AID: (n,) or (n, k)}, usable (n,) bool); AID:
         core/memory.py of uwb_tdoa_ekf
     simulated : callable of (SimulationConfig, Room, motion, turn, noise) -> columns, without stamps:
-        true values and white noise. motion : of the body; turn : its Rotations; noise(...) : standard
+        true values and white noise. motion : of the body
+    turn : its Rotations
+    noise(...) : standard
         normal numbers (n, ...)
     noise : (unit, words) of the standard deviation of that noise, for the options of `simulate`
     parameters : {name: `parameter`} of the filter; use_<name> is the first
@@ -125,7 +136,8 @@ class Sensor:
         all other data
     compared : Compared; None: the sensor is not diagnosed
     parts : {channel of the diagnosis: Compared} of the `parts` of its Stream
-    topic : "" for its name; rate : Hz, of the simulation
+    topic : "" for its name
+    rate : Hz, of the simulation
     locates : whether the filter can start from it alone
     rules : of `check`: callables of (Stream, Anchors) -> Mistake or None
     others : ((topic, message), ...) of other topics with the same fields
@@ -183,6 +195,8 @@ def parameter(
 ) -> Any:
     """Return a field of FilterConfig.
 
+    Parameters
+    ----------
     text : unit and meaning, as in ekf_node.yaml
     low, high : a number must be above `low` and at most `high`
     with_low : whether `low` itself is permitted
@@ -194,4 +208,6 @@ def parameter(
 
 def finite(fields: dict) -> dict:
     """Return {field: bool}: which numbers are finite, at most LARGEST_NUMBER."""
-    return {name: np.abs(values) <= LARGEST_NUMBER for name, values in fields.items()}  # NaN is not
+    return {
+        name: np.abs(values) <= LARGEST_NUMBER for name, values in fields.items()
+    }  # False for NaN

@@ -11,15 +11,18 @@ from ..lazy import rotations
 from .sensor import UNKNOWN_STD, UNKNOWN_VARIANCE, Compared, Sensor, Stream, finite, parameter
 
 FASTEST = 100.0  # m/s, and rad/s
-LEAST_STD = 0.01  # m/s, that a simulated velocity says of itself
-TURN_TIME = 0.1  # s over which the yaw rate at an instant is taken from attitudes
+LEAST_STD = 0.01  # m/s, smallest stated deviation of a simulated velocity
+TURN_TIME = 0.1  # s, interval of the difference that gives the yaw rate
 
 
 @dataclass(frozen=True)
 class YawRate(Stream):
     """Yaw rates of the messages of a Velocity.
 
-    t : (n,) s; rate : (n, 1) rad/s, about the body's z
+    Attributes
+    ----------
+    t : (n,) s
+    rate : (n, 1) rad/s, about the body's z
     std : (n, 1) rad/s, inf where not measured, 0 where the driver states none
     """
 
@@ -39,6 +42,8 @@ class YawRate(Stream):
 class Velocity(Stream):
     """Velocities in the body frame.
 
+    Attributes
+    ----------
     t : (n,) s
     v : (n, 3) m/s, body
     std : (n, 3) m/s, inf for a component that is not measured, 0 where the driver states none
@@ -49,8 +54,8 @@ class Velocity(Stream):
     t: np.ndarray
     v: np.ndarray
     std: np.ndarray
-    yaw_rate: np.ndarray = None  # type: ignore[assignment]  # __post_init__ puts NaN there,
-    yaw_rate_std: np.ndarray = None  # type: ignore[assignment]  # and inf there
+    yaw_rate: np.ndarray = None  # type: ignore[assignment]  # __post_init__ sets NaN
+    yaw_rate_std: np.ndarray = None  # type: ignore[assignment]  # __post_init__ sets inf or 0
 
     def __post_init__(self) -> None:
         if self.yaw_rate is None:
@@ -114,7 +119,7 @@ def _content(velocity: Velocity) -> dict:
 def _sound(fields: dict) -> dict:
     _, std, _, rate_std = _columns(fields)
     linear, angular, covariance = sound = finite(fields)
-    of_rates = np.ones(sound[angular].shape, dtype=bool)  # those about x and y are not read
+    of_rates = np.ones(sound[angular].shape, dtype=bool)  # rates about x and y are not read
     of_rates[:, 2] = sound[angular][:, 2] | np.isinf(rate_std)
     return {
         linear: sound[linear] | np.isinf(std),
