@@ -311,8 +311,8 @@ class _Stream:
     def _sure(self, last: int, first: int, following: int | None, ends: Sequence[float]) -> bool:
         """Return whether a step between two messages certainly comes from the clock.
 
-        That is so by the arrivals, if the stamps fall back soon, or if the stream ends with others only
-        without the step.
+        Three cases are certain: the arrivals show it, the stamps fall back soon, or the stream ends with
+        others only without the step.
         """
         step = float(self.t[first] - self.t[last])
         if self.arrived is not None or step < 0.0 or self._falls(first, following):
@@ -467,8 +467,8 @@ def _long(seconds: float) -> str:
 def apart(stamps: Mapping[str, np.ndarray]) -> Iterator[tuple[str, float, int]]:
     """Yield the streams whose stamps miss the time of the TDOAs.
 
-    No message lies within the time of the TDOAs, or the stream begins and ends later, or earlier, by
-    about as much.
+    Either no message lies within the time of the TDOAs. Or the stream begins and ends later, or
+    earlier, by about the same time.
 
     Parameters
     ----------

@@ -106,7 +106,7 @@ def add_filter(
 
 
 def add_parameters(parser: ArgumentParser) -> None:
-    """Add -p, an option beside --config."""
+    """Add -p; it overrides --config."""
     parser.add_argument(
         "-p",
         dest="parameters",

@@ -1,10 +1,11 @@
 """The radio link of a tag and an anchor: antennas, received power, and late arrivals.
 
-Antenna frame: z along the null axis of the doughnut (the long side of an upright module), x out of
-its front face. Azimuth runs from +x through +y, elevation from the xy plane towards +z.
+Antenna frame: z along the null axis of the doughnut, x out of its front face. The null axis is the
+long side of an upright module. Azimuth runs from +x through +y, elevation from the xy plane
+towards +z.
 
-The functions broadcast: one anchor per sample as (n, 3) with (n, 3), or all anchors for all
-samples as (m, 3) with (n, 1, 3).
+The functions broadcast. One anchor per sample has the shapes (n, 3) and (n, 3). All anchors for
+all samples have the shapes (m, 3) and (n, 1, 3).
 """
 
 from __future__ import annotations

@@ -298,10 +298,9 @@ class FixedPoseCorrector(Corrector):
     def __init__(
         self, anchors: Anchors, effects: EffectSet | None, poses: Sequence[np.ndarray]
     ) -> None:
-        """Set the poses.
+        """Set the poses of the earlier run.
 
-        poses : (t (k,) s, p (k, 3) m, q (k, 4), v (k, 3) m/s, yaw_std (k,) rad) of the earlier run, as
-            for `add_pose`
+        poses : (t (k,) s, p (k, 3) m, q (k, 4), v (k, 3) m/s, yaw_std (k,) rad), as for `add_pose`
         """
         self._known = poses
         super().__init__(anchors, effects, history=max(len(poses[0]), 1))

@@ -40,8 +40,10 @@ class Diagnostics:
 
     It publishes at once if simulated time stops or continues. It logs a status that is new by Saying.
 
-    report() -> (level, text, {key: value}), level: DiagnosticStatus.OK, WARN or ERROR
-    look() : called LOOKS times per second
+    Parameters
+    ----------
+    report : callable of () -> (level, text, {key: value}), level: DiagnosticStatus.OK, WARN or ERROR
+    look : callable of (), called LOOKS times per second
     """
 
     def __init__(

@@ -65,8 +65,8 @@ class FramesInput:
 
         Parameters
         ----------
-        seconds(stamp) : s of a builtin_interfaces/Time
-        on_new() : called after a new constant transform
+        seconds : callable of a builtin_interfaces/Time -> s
+        on_new : callable of (), called after a new constant transform
         moving : whether to read /tf
         """
         self.frames = Frames()
@@ -131,8 +131,8 @@ class FramesInput:
 def read_transforms(data: bytes) -> list[Transform]:
     """Return [(sec, nanosec, parent, child, q, p)] of a serialized tf2_msgs/TFMessage.
 
-    q : x y z w; p : m. Raises Unreadable. A robot publishes hundreds per second, and a message object
-    takes ten times as long.
+    The quaternion q is x y z w, the translation p is in m. Raises Unreadable. A robot publishes
+    hundreds per second, and a message object takes ten times as long.
     """
     if data[:4] != ENCAPSULATION:
         return [_of(transform) for transform in decode(data, TFMessage).transforms]

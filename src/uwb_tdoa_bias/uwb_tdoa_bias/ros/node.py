@@ -269,7 +269,7 @@ class StreamNode(ParameterNode):
     members : nodes that start and end with it
     spinner : the Spinner that serves it, once there is one
     ready : the log line at the start of service
-    on_failure(error) : called with exceptions of callbacks, instead of raising them
+    on_failure : callable of an exception; called with exceptions of callbacks, instead of raising them
     """
 
     members: Sequence[StreamNode] = ()

@@ -156,9 +156,10 @@ def run(
 
     Parameters
     ----------
-    node_class(arguments) : makes the StreamNode in an initialised rclpy, from the arguments of the
-        process. It has the executable's NAME, and may have `members` and `turns`, a StreamPoller.
+    node_class : callable of the arguments of the process -> StreamNode, in an initialised rclpy. It has
+        the executable's NAME, and may have `members` and `turns`, a StreamPoller.
     description : for --help
+    argv : arguments, default: sys.argv[1:]
     """
     name = node_class.NAME
     arguments = [name, *(sys.argv[1:] if argv is None else argv)]

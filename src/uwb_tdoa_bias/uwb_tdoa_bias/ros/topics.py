@@ -185,7 +185,7 @@ class Input:
     ) -> None:
         """Subscribe to the topic.
 
-        read(bytes) : argument of the callback, default: the message; raises Unreadable
+        read : callable of bytes -> argument of the callback, default: the message; raises Unreadable
         """
         self.refusals = Refusals(node, topic, kind)
         self._read, self._callback = read or (lambda data: decode(data, kind)), callback

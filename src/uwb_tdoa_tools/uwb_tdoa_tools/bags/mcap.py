@@ -1,8 +1,8 @@
 """Check and repair MCAP files record by record (https://mcap.dev/spec).
 
-Sizes are compared with the file, or limited, before data are read or unpacked. The package `mcap` (1.6)
-unpacks a chunk of any size, does not compare the index with the chunks, and cannot add the checksums
-that rosbags leaves out.
+Sizes are compared with the file, or limited, before data are read or unpacked. The package `mcap`
+(1.6) unpacks a chunk of any size, and does not compare the index with the chunks. It cannot add
+the checksums that rosbags leaves out.
 """
 
 from __future__ import annotations

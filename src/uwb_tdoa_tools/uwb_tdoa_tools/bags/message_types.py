@@ -111,7 +111,7 @@ def upgraded(data: bytes, msgtype: str, store: Typestore) -> bytes:
 
 @cache
 def _earlier(msgtype: str) -> tuple[Typestore, ...]:
-    """Return the types before each addition of fields to one of them."""
+    """Return the types as they were before each addition of fields."""
     out, added = [], ADDED.get(msgtype, ())
     for k in range(len(added)):
         lacking, store = (

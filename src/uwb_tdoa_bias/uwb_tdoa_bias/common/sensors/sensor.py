@@ -126,14 +126,12 @@ class Sensor:
     measured : callable of a Stream -> ({field of an AID: (n,) or (n, k)}, usable (n,) bool); AID:
         core/memory.py of uwb_tdoa_ekf
     simulated : callable of (SimulationConfig, Room, motion, turn, noise) -> columns, without stamps:
-        true values and white noise. motion : of the body
-    turn : its Rotations
-    noise(...) : standard
-        normal numbers (n, ...)
+        true values and white noise. The motion is of the body, turn holds its Rotations, and
+        noise(...) gives standard normal numbers (n, ...).
     noise : (unit, words) of the standard deviation of that noise, for the options of `simulate`
     parameters : {name: `parameter`} of the filter; use_<name> is the first
-    invalid, remedy : the content that messages need; what to check if the measurements contradict
-        all other data
+    invalid : the content that messages need
+    remedy : what to check if the measurements contradict all other data
     compared : Compared; None: the sensor is not diagnosed
     parts : {channel of the diagnosis: Compared} of the `parts` of its Stream
     topic : "" for its name
