@@ -233,7 +233,10 @@ OF_TAPE = "std", "height_std", "trusted", "trusted_std"
 
 
 def add_tape(parser: ArgumentParser) -> None:
-    """Add --std, --height-std, --trusted, --trusted-std and --unknown: how well anchors are known."""
+    """Add --std, --height-std, --trusted, --trusted-std and --unknown.
+
+    They state how well anchors are known.
+    """
     add = parser.add_argument
     add(
         "--std",
@@ -287,7 +290,10 @@ def tape_of(args: Namespace, effects: EffectSet | None) -> Tape:
 
 
 def add_align(parser: ArgumentParser, judges: bool = False) -> None:
-    """Add --align. judges : for a tool that evaluates by ground truth, and may move its frame too."""
+    """Add --align.
+
+    judges : for a tool that evaluates by ground truth, and may move its frame too
+    """
     words = (
         "ground truth on another clock (another epoch): none refuses it (default), time estimates "
         "the offset"

@@ -224,7 +224,7 @@ def _numbers(message: Point | Quaternion, names: str) -> list[float]:
 
 
 def _entry(key: Any, entry: Any) -> tuple[int, list[float], list[float]]:
-    """Return (id, position, orientation) of one entry of a file; raise ValueError with the fault."""
+    """Return (id, position, orientation) of an entry; raise ValueError with the reason."""
     if isinstance(key, bool) or not str(key).isascii() or not str(key).isdigit():
         raise ValueError(f"the id is {key!r}, not a whole number 0 ... 65535")
     if not isinstance(entry, dict):

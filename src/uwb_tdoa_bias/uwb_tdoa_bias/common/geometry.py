@@ -1,7 +1,8 @@
 """Geometry of a TDOA without systematic effects, and rotations.
 
 The numpy functions take arrays of any shape. The compiled functions do the same for single TDOAs
-and short arrays, since the filter needs 1000 TDOAs per second. A test requires equal bits.
+and short arrays, since the filter needs them a thousand times per second. A test requires equal
+bits.
 """
 
 from __future__ import annotations
@@ -37,7 +38,10 @@ def tdoa(p: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
     Source: eq. 2 of Zhao et al. (RA-L 2021), with the sign that the Crazyflie firmware logs.
 
-    p, a, b : (..., 3) m, positions of the tag and of both anchors, one frame
+    Parameters
+    ----------
+    p : (..., 3) m, tag
+    a, b : (..., 3) m, both anchors, in the frame of p
     """
     return np.linalg.norm(p - b, axis=-1) - np.linalg.norm(p - a, axis=-1)
 
@@ -102,7 +106,9 @@ def rotate(q: np.ndarray, v: np.ndarray, out: np.ndarray) -> None:
 
 @compiled
 def rotate_each(q: np.ndarray, v: np.ndarray, out: np.ndarray) -> None:
-    """Write R(q) v for n quaternions and one vector to out (n, 3); NaN where q is zero or not finite.
+    """Write R(q) v for n quaternions and one vector to out (n, 3).
+
+    The result is NaN where q is zero or not finite. Compiled.
 
     Parameters
     ----------

@@ -203,7 +203,7 @@ class RadioLink:
     frequency: float = 3.9936e9
 
     def path_loss_db(self, distance: np.ndarray) -> np.ndarray:
-        """Return the free-space loss over `distance` m, dB; below 1 cm the distance counts as 1 cm."""
+        """Return the free-space loss over `distance` m, dB; shorter distances count as 1 cm."""
         return 20.0 * np.log10(
             4.0 * np.pi * self.frequency * np.maximum(distance, 0.01) / SPEED_OF_LIGHT
         )

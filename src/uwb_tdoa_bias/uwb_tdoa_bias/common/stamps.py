@@ -60,7 +60,8 @@ class StampGate:
 
         Parameters
         ----------
-        t : stamp, s; item : anything
+        t : stamp, s
+        item : any object
         reached : stamps that other streams have reached, s
 
         Returns

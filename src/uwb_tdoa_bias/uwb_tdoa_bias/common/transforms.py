@@ -61,7 +61,7 @@ class Frames:
         return child in self._static
 
     def differs(self, parent: str, child: str, q: Sequence[float], p: Sequence[float]) -> bool:
-        """Return whether a constant transform is new, or differs by more than SAME_PLACE or SAME_TURN.
+        """Return whether a constant transform is new, or differs by SAME_PLACE or SAME_TURN.
 
         Parameters as for `set`. Raises InputError as `set`.
         """

@@ -59,7 +59,7 @@ class Correction:
     def flat(
         cls, d: np.ndarray, bias: np.ndarray, std: np.ndarray, status: np.ndarray
     ) -> Correction:
-        """Return the Correction of raw d (n,) m by a bias (n,) m that is constant over the state."""
+        """Return the Correction of raw d (n,) m by a bias (n,) m that is constant in the state."""
         return cls(bias, std, d - bias, status, *np.zeros((2, len(d), N_STATES)))
 
     @classmethod

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from ..effects.samples import Samples
 
 # d*: position of both anchors relative to the tag, m, world axes. Azimuth (about z, from x) and
-# elevation (above the xy plane), rad. *_A: of the tag in the antenna frame of each anchor. *_T: of
-# each anchor in the tag's body frame.
+# elevation (above the xy plane), rad. A: of the tag in the antenna frame of each anchor. T: of each
+# anchor in the tag's body frame.
 FEATURES = (
     "dx_a",
     "dy_a",

@@ -1,4 +1,4 @@
-"""EffectSet and effects.yaml: the effects of a model with their values, and how well they are known.
+"""EffectSet and effects.yaml: the effects of a model with their values and covariance.
 
 EFFECTS lists all declared effects.
 """

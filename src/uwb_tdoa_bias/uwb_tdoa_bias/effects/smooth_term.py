@@ -214,7 +214,10 @@ class SmoothTerm(Effect):
         return tuple(f"{part}.c{k}".lstrip(".") for part in parts for k in range(self.count))
 
     def basis(self, values: ArrayLike) -> np.ndarray:
-        """Return the basis functions of c0, c1, ... at covariate values (n,), (n, k); NaN of NaN."""
+        """Return the basis functions of c0, c1, ... at values (n,) of the covariate, (n, k).
+
+        They are NaN for NaN.
+        """
         values = np.asarray(values, dtype=float)
         if self.shape != "spline":
             return shape_basis(self.shape, self.knots, values)
@@ -253,7 +256,7 @@ class SmoothTerm(Effect):
         return len(self.knots) if self.covariate in CATEGORIES else len(self.knots) + DEGREE - 1
 
     def _functions(self, values: np.ndarray, weights: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Return values (n,) of functions with weights (m, k), each value by the function of its row (n,)."""
+        """Return the values (n,) of functions with weights (m, k); function rows (n,)."""
         if self.shape != "spline" or self.covariate in CATEGORIES:
             return np.einsum("nk,nk->n", self.basis(values), weights[rows])
         out = np.empty(len(values))

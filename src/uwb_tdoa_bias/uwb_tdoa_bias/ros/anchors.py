@@ -66,7 +66,7 @@ def same_anchors(one: Anchors, other: Anchors) -> bool:
 
 
 def in_words(before: Anchors, after: Anchors) -> str:
-    """Return a sentence on the change between two Anchors: new, gone, moved, and the consequence."""
+    """Return a sentence on the change between two Anchors: new, gone, moved, and what follows."""
     if before.frame != after.frame:
         return f"they are in frame '{after.frame}', and were in '{before.frame}': starting over"
     places = before.index(after.ids)

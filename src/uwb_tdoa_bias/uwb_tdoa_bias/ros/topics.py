@@ -51,7 +51,7 @@ class Epoch:
         return (sec.astype(np.int64) - self._second) + 1e-9 * nanosec
 
     def parts(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return seconds and nanoseconds of t (n,) s; the inverse of `seconds_of`, exact to 1 ns."""
+        """Return seconds and nanoseconds of t (n,) s, to 1 ns; the inverse of `seconds_of`."""
         second, nanosecond = np.divmod(np.round(t * 1e9).astype(np.int64), 10**9)
         return self._second + second, nanosecond
 

@@ -44,7 +44,7 @@ class Stream:
         raise NotImplementedError
 
     def sensed(self, values: np.ndarray) -> Stream:
-        """Return the Stream with other values (n, k), limited to values that the sensor can give."""
+        """Return the Stream with other values (n, k), limited to the range of the sensor."""
         return self.with_values(values)
 
     @property
