@@ -36,9 +36,7 @@ class Frames:
         self._static: dict[
             str, tuple[str, Rotation, np.ndarray]
         ] = {}  # {frame: (parent, Rotation, p)}
-        self._moving: dict[
-            str, tuple[str, deque[_Moved]]
-        ] = {}  # {frame: (parent, last transforms)}
+        self._moving: dict[str, tuple[str, deque[_Moved]]] = {}  # {frame: (parent, last ones)}
 
     def set(self, parent: str, child: str, q: Sequence[float], p: Sequence[float]) -> bool:
         """Set a constant transform, and return whether it is new.
@@ -61,9 +59,10 @@ class Frames:
         return child in self._static
 
     def differs(self, parent: str, child: str, q: Sequence[float], p: Sequence[float]) -> bool:
-        """Return whether a constant transform is new, or differs by SAME_PLACE or SAME_TURN.
+        """Return whether a constant transform is new, or differs from the known one.
 
-        Parameters as for `set`. Raises InputError as `set`.
+        It differs by more than SAME_PLACE or SAME_TURN. Parameters as for `set`. Raises InputError as
+        `set`.
         """
         self._check(self._static, MOST, parent, child, q, p)
         known = self._static.get(child)

@@ -78,9 +78,7 @@ class Streams:
         self._streams: list[_Stream] = []
         self._by_topic: dict[str, _Stream] = {}
         self._awaited: _Stream | None = None
-        self._due: Callable[[], float] = lambda: (
-            -np.inf
-        )  # stamp of the awaited message, s since 1970
+        self._due: Callable[[], float] = lambda: -np.inf  # of the message, s since 1970
         self._until = -np.inf
 
     @property
@@ -132,9 +130,7 @@ class Streams:
         ]
         if not parts:
             return False
-        if any(
-            stream.fell for stream in self._streams
-        ):  # then the order of arrival across streams matters
+        if any(stream.fell for stream in self._streams):  # then the order of arrival matters
             parts = sorted(
                 (piece for part in parts for piece in _pieces(part)), key=lambda piece: piece[-1][0]
             )
