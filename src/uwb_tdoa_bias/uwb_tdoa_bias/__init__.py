@@ -1,4 +1,4 @@
-"""The measurement side: anchors, TDOA geometry, features, effects and the network.
+"""Measurement side: anchors, TDOA geometry, features, effects and the network.
 
-No ROS outside the nodes and ros*.py.
+Only the nodes and `ros/` use ROS.
 """

@@ -49,12 +49,12 @@ LEVEL = Quaternion(w=1.0)  # of an anchor whose orientation was not surveyed
 
 
 class AnchorsNode(StreamNode):
-    """Publishes once, and stays for who comes later."""
+    """A node that publishes the anchors once, latched, and keeps running for late subscribers."""
 
     NAME = "anchors_node"
 
     def __init__(self, arguments: Sequence[str] = ()) -> None:
-        """arguments : of the process."""
+        """Publish the anchors; arguments : of the process."""
         super().__init__(self.NAME)
         own = declare_all(self, PARAMETERS)
         refuse_unknown(self)
@@ -77,8 +77,9 @@ class AnchorsNode(StreamNode):
 
 
 def transforms(message: AnchorArray) -> TFMessage:
-    """TFMessage of an AnchorArray: a frame anchor_<id> for each, level where its orientation is not
-    known.
+    """Return the TFMessage of an AnchorArray: a frame anchor_<id> for each anchor.
+
+    Anchors with unknown orientation are level.
     """
     out = TFMessage()
     for anchor in message.anchors:
@@ -95,7 +96,10 @@ def transforms(message: AnchorArray) -> TFMessage:
 
 
 def markers(message: AnchorArray, size: float) -> MarkerArray:
-    """MarkerArray of an AnchorArray: a cube and a number for each; size : m."""
+    """Return the MarkerArray of an AnchorArray: a cube and a number for each anchor.
+
+    size : m, edge of a cube
+    """
     out = MarkerArray()
     for anchor in message.anchors:
         for kind, name in ((Marker.CUBE, "anchors"), (Marker.TEXT_VIEW_FACING, "numbers")):
@@ -117,7 +121,7 @@ def _known(q: Quaternion) -> bool:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the node; returns the exit code."""
+    """Run the node, and return the exit code."""
     return process.run(AnchorsNode, __doc__, argv)
 
 

@@ -88,9 +88,9 @@ PARAMETERS = {  # in the order of config/bias_node.yaml
     ),
     "frozen": FROZEN,
 }
-POSE = "pose", "twist"  # what is read of an Odometry, its numbers,
-MEASURED = "anchor_a", "anchor_b", "distance_difference", "variance"  # and of a Tdoa
-CORRECTED = (  # what is written of a TdoaCorrected
+POSE = "pose", "twist"  # fields read of an Odometry: numbers
+MEASURED = "anchor_a", "anchor_b", "distance_difference", "variance"  # fields read of a Tdoa
+CORRECTED = (  # fields written of a TdoaCorrected
     "anchor_a",
     "anchor_b",
     "raw",
@@ -102,19 +102,23 @@ CORRECTED = (  # what is written of a TdoaCorrected
     "bias_slope",
     "bias_state",
 )
-MOST_FRAMES = 100  # that are remembered: names on a topic may be anything
-EARLY, EARLY_POSES = 2000, 500  # TDOAs and poses kept while there are no anchors
-Item = tuple[Any, ...]  # of a TDOA: frame, sec, nanosec, and MEASURED
+MOST_FRAMES = 100  # limit, since a topic may carry any number of names
+EARLY, EARLY_POSES = 2000, 500  # TDOAs and poses kept until anchors arrive
+Item = tuple[Any, ...]  # one TDOA: frame, sec, nanosec, and MEASURED
 STATUS = {PASSED: "passed", EFFECTS: "effects", NETWORK: "network", FADED: "faded"}
 
 
 @dataclass
 class Antenna:
-    """What is known of the antenna of a frame. effects : EffectSet, with its place on the body;
-    models : what to call each status's bias;
-    trouble : why its place is not known, or None; corrector : Corrector, once there are anchors;
-        heard, reported : TDOAs so far, and by
-    the last report.
+    """Corrections for the TDOAs of one frame.
+
+    Attributes
+    ----------
+    effects : EffectSet, including the antenna's place on the body
+    models : {status: name of the bias model in messages}
+    trouble : why the place of the antenna is unknown, or None
+    corrector : Corrector, once there are anchors
+    heard, reported : number of TDOAs so far, and at the last report
     """
 
     effects: EffectSet
@@ -126,8 +130,9 @@ class Antenna:
 
 
 class BiasNode(StreamNode):
-    """Converts messages for a Corrector and keeps the accounts: received = published + waiting +
-    dropped.
+    """Node around a Corrector: converts messages and counts them.
+
+    Every TDOA is counted: received = published + waiting + dropped.
     """
 
     NAME = "bias_node"
@@ -135,8 +140,14 @@ class BiasNode(StreamNode):
     def __init__(
         self, arguments: Sequence[str] = (), member: Collection[str] | None = None, **options: Any
     ) -> None:
-        """arguments : of the process; member : of a localization_node, which has it take its turns
-        and hands it the odometry: names of parameters that are for others, too; options : of Node.
+        """Start the node.
+
+        Parameters
+        ----------
+        arguments : of the process
+        member : None for a separate node. In a localization_node: names of parameters of its other nodes;
+            it calls the turns of this node and hands over the odometry.
+        options : of Node
         """
         super().__init__(self.NAME, **options)
         own = declare_all(self, PARAMETERS)
@@ -147,19 +158,19 @@ class BiasNode(StreamNode):
         self._late = self._effects.stamp_offset("tdoa")  # s
         self._labels = LabelCorrector(self._effects.effects)
         self._network = load_network(model_file)
-        self._corrector: Corrector = None  # type: ignore[assignment]  # of the body, with the poses of all; until there are anchors
+        self._corrector: Corrector = None  # type: ignore[assignment]  # of the body, owns all poses; None until anchors arrive
         self._antennas: dict[str, Antenna] = {}  # by frame of the TDOAs
         self._body_antenna = Antenna(self._effects, self._models(self._effects))
         self._epoch, self._rate = Epoch(), Rate()
         self._counts: Counter[str] = Counter()
         self._early: deque[Item] = deque()
-        # as of `_take_poses`
+        # Arguments of `_take_poses`.
         self._early_poses: deque[tuple[str, np.ndarray, np.ndarray]] = deque()
         self._hold = PoseQueue(self._limit)
         self._tdoas, self._poses = StampGate(), StampGate()
         self._reported_unready = self._reported_received = self._reported_poses = 0
         self._codec = CdrCodec(TdoaCorrected, *CORRECTED)
-        self._templates: dict[tuple[str, str], CdrTemplate] = {}  # by frame and model, the latest
+        self._templates: dict[tuple[str, str], CdrTemplate] = {}  # latest, by frame and model
         self._frames_said: set[str] = set()
         self.output = StreamOutput(self, TdoaCorrected, "uwb/tdoa_corrected")
         self._frames = FramesInput(self, self._epoch.seconds, self._on_frames)
@@ -178,12 +189,12 @@ class BiasNode(StreamNode):
 
     @property
     def holds(self) -> int:
-        """How many TDOAs wait for their pose."""
+        """Number of TDOAs that wait for their pose."""
         return len(self._hold)
 
     @property
     def _model(self) -> str:
-        """What TDOAs are corrected with."""
+        """Name of the bias model that corrects the TDOAs."""
         return next(iter((*self._antennas.values(), self._body_antenna))).models[NETWORK]
 
     @property
@@ -194,12 +205,12 @@ class BiasNode(StreamNode):
         )
 
     def _models(self, effects: EffectSet) -> dict[int, str]:
-        """Compile what an EffectSet needs, and return what to call each status's bias."""
+        """Compile the functions of an EffectSet, and return {status: name of the bias model}."""
         name = warm_up(effects, self._network, self._lag).model
         return {PASSED: "none", EFFECTS: effects.name, NETWORK: name, FADED: name}
 
     def _start_over(self) -> None:
-        """Forget poses and whatever waits for one."""
+        """Delete the poses and all TDOAs that wait for one."""
         self._counts["dropped"] += len(self._hold)
         self._hold = PoseQueue(self._limit)
         self._corrector = self._body_antenna.corrector = self._new_corrector(self._effects)
@@ -207,11 +218,11 @@ class BiasNode(StreamNode):
             self._give_corrector(antenna)
 
     def _new_corrector(self, effects: EffectSet) -> Corrector:
-        anchors: Any = self._anchors.anchors  # there are some when this is called
+        anchors: Any = self._anchors.anchors  # called only after anchors arrived
         return Corrector(anchors, effects, self._network, self._lag)
 
     def _give_corrector(self, antenna: Antenna) -> None:
-        """Have the TDOAs of an Antenna corrected at the poses that are known."""
+        """Give an Antenna a Corrector with the known poses."""
         if self._corrector is not None:
             antenna.corrector = self._new_corrector(antenna.effects)
             antenna.corrector.share_poses(self._corrector)
@@ -230,12 +241,12 @@ class BiasNode(StreamNode):
         self._release()
 
     def _on_frames(self) -> None:
-        """A constant transform is new, or another."""
+        """Update all antennas after a new or changed constant transform."""
         for frame in [*self._antennas]:
             self._place_antenna(frame)
 
     def _antenna(self, frame: str) -> Antenna:
-        """Antenna of TDOAs of this frame."""
+        """Return the Antenna of TDOAs of a frame."""
         if (
             frame in ("", self._body)
             or frame not in self._antennas
@@ -247,8 +258,9 @@ class BiasNode(StreamNode):
         return self._antennas[frame]
 
     def _place_antenna(self, frame: str) -> None:
-        """Find where the antenna of this frame, another than the body's, is on the body, and remove
-        what that does to its TDOAs.
+        """Find the place of an antenna on the body, and set its effects.
+
+        frame : of its TDOAs, not the body frame
         """
         trouble, effects, known = None, self._effects, self._antennas.get(frame)
         between = self._frames.frames.between(self._body, frame)
@@ -311,13 +323,13 @@ class BiasNode(StreamNode):
                 self._take_pose(stamp, rows[k : k + 1])
 
     def _take_pose(self, t: float, row: np.ndarray) -> None:
-        """One pose, after the gate has judged its stamp."""
+        """Take one pose, after the gate has judged its stamp; t : s; row : (1,)."""
         accepted, _, jumped_back = self._poses.take(t, row, [self._tdoas.newest, self._tdoas.held])
         if jumped_back:
             self._start_over()
             held, self._tdoas = self._tdoas.finish(), StampGate()
             for stamp, item in held:
-                if item is not None:  # else it was published as it came
+                if item is not None:  # else it is already published
                     self._take([stamp], [item])
         for stamp, row in accepted:
             self._add_poses(np.array([stamp]), row)
@@ -343,7 +355,7 @@ class BiasNode(StreamNode):
             self._take(t.tolist(), items)
 
     def _relabelled(self, rows: np.ndarray) -> np.ndarray:
-        """Rows of TDOAs with their ids and signs put right."""
+        """Return rows of TDOAs with corrected ids and signs."""
         rows, names = rows.copy(), MEASURED[:3]
         for name, column in zip(names, self._labels.correct(*(rows[name] for name in names))):
             rows[name] = column
@@ -354,8 +366,9 @@ class BiasNode(StreamNode):
         return self._epoch.seconds(Time(sec=sec, nanosec=nanosec))
 
     def _take(self, stamps: Sequence[float], items: Iterable[Item | None]) -> None:
-        """Have TDOAs wait for their poses: stamps, s, as received; items : (frame, sec, nanosec, a,
-        b, d, variance).
+        """Queue TDOAs for their poses.
+
+        stamps : s, as received; items : (frame, sec, nanosec, a, b, d, variance)
         """
         stamps = [t - self._late for t in stamps]
         if stamps and self._tdoas.take_all(stamps):
@@ -365,11 +378,11 @@ class BiasNode(StreamNode):
         for t, item in zip(stamps, items):
             if (
                 t < self._tdoas.newest - LARGEST_STEP_BACK
-            ):  # it needs no pose; ekf_node decides whether another time begins with it
+            ):  # published at once; ekf_node decides whether time restarts
                 self._pass(item)
                 item = None
             accepted, outliers, jumped_back = self._tdoas.take(t, item, [self._poses.newest])
-            for _, outlier in outliers:  # ekf_node says of it that its stamp is wrong
+            for _, outlier in outliers:  # ekf_node reports its wrong stamp
                 self._pass(outlier)
             if jumped_back:
                 self.get_logger().info("time has gone back: starting over")
@@ -382,12 +395,12 @@ class BiasNode(StreamNode):
                     self._hold.add(stamp, kept)
 
     def _pass(self, item: Item | None) -> None:
-        """Publish a TDOA as it came, unless that was done."""
+        """Publish a TDOA uncorrected, unless it is already published."""
         if item is not None:
             self._publish([item], Correction.none(np.array(item[5:6])))
 
     def _release(self) -> None:
-        """Publish what need not wait any longer."""
+        """Publish all TDOAs that need not wait longer."""
         released = self._hold.take(self._is_ready) if self._corrector is not None else []
         if not released:
             return
@@ -400,10 +413,11 @@ class BiasNode(StreamNode):
     def _release_alike(
         self, stamps: Sequence[float], items: Sequence[Item], ready: Sequence[bool]
     ) -> None:
-        """Correct and publish TDOAs of one frame."""
-        corrector: Any = self._antenna(
-            items[0][0]
-        ).corrector  # there is one as soon as there are anchors
+        """Correct and publish TDOAs of one frame.
+
+        stamps : s; items : as in `_take`; ready : whether the pose of each is known
+        """
+        corrector: Any = self._antenna(items[0][0]).corrector  # exists once anchors arrived
         t, d = np.array(stamps), np.array([item[5] for item in items])
         a, b = (corrector.anchors.index([item[side] for item in items]) for side in (3, 4))
         valid = (a >= 0) & (b >= 0) & (a != b) & np.isfinite(d)
@@ -422,8 +436,10 @@ class BiasNode(StreamNode):
         correction: Correction,
         stamps: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> None:
-        """Publish corrected TDOAs: items as in `_take`; their Correction; stamps : seconds and
-        nanoseconds, (n,) each, instead of their own.
+        """Publish corrected TDOAs.
+
+        items : as in `_take`; correction : of these
+        stamps : seconds and nanoseconds, (n,) each, that replace their own
         """
         columns = [np.array(column) for column in list(zip(*items))[1:]]
         measured = columns if stamps is None else (*stamps, *columns[2:])  # up to the variance
@@ -542,7 +558,7 @@ class BiasNode(StreamNode):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the node; returns the exit code."""
+    """Run the node, and return the exit code."""
     return process.run(BiasNode, __doc__, argv)
 
 

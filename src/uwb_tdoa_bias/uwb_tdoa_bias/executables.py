@@ -1,4 +1,4 @@
-"""The entry points that setup.py names."""
+"""The entry points of setup.py."""
 
 from .common.executable import node_executable
 

@@ -1,1 +1,1 @@
-"""Tools: read, convert, simulate, replay, record and evaluate flights, and a demo that runs it all."""
+"""Tools: read, convert, simulate, replay, record and evaluate flights; a demo of all parts."""

@@ -135,7 +135,10 @@ def _full(error: Exception) -> str | None:
 
 
 def without_ros_arguments(arguments: Iterable[str]) -> list[str]:
-    """Return a command line without the part for ROS: from each --ros-args to the next -- or the end."""
+    """Return a command line without the arguments for ROS.
+
+    They reach from each --ros-args to the next -- or the end.
+    """
     own, ours = [], True
     for argument in arguments:
         if argument == "--ros-args":
@@ -159,7 +162,10 @@ def say(name: str, sentence: object) -> None:
 
 
 def show(*lines: str) -> None:
-    """Print lines of a result on stdout, each made `printable`, above a progress bar if there is one."""
+    """Print lines of a result on stdout, each made `printable`.
+
+    A progress bar, if there is one, stays below them.
+    """
     tqdm.write("\n".join(printable(line) for text in lines for line in text.split("\n")))
     sys.stdout.flush()
 

@@ -213,7 +213,10 @@ class _Stream:
         return float(self.t[self.finite[-1]])
 
     def cut(self, ends: Sequence[float]) -> None:
-        """Find the breaks and the outliers. ends : s, last stamps of other streams that are steady."""
+        """Find the breaks and the outliers.
+
+        ends : s, last stamps of other streams that are steady
+        """
         few = min(FEW, max(2, len(self.finite) // 20))
         pieces = list(zip(self._edges[:-1].tolist(), self._edges[1:].tolist()))
         if len(pieces) == 1:
@@ -250,7 +253,7 @@ class _Stream:
         self.breaks, self.kept = breaks, kept
 
     def _follows(self, before: int, after: int) -> bool:
-        """Return whether the message at place `after` of `finite` may follow the one at `before`."""
+        """Return whether the message at place `after` of `finite` may follow that at `before`."""
         return bool(
             -LARGEST_STEP_BACK
             <= self.t[self.finite[after]] - self.t[self.finite[before]]
@@ -311,8 +314,8 @@ class _Stream:
     def _sure(self, last: int, first: int, following: int | None, ends: Sequence[float]) -> bool:
         """Return whether a step between two messages certainly comes from the clock.
 
-        That is so by the arrivals, if the stamps fall back soon, or if the stream ends with others only
-        without the step.
+        Three cases are certain: the arrivals show it, the stamps fall back soon, or the stream ends with
+        others only without the step.
         """
         step = float(self.t[first] - self.t[last])
         if self.arrived is not None or step < 0.0 or self._falls(first, following):
@@ -357,7 +360,10 @@ class _Stream:
 
 
 def _groups(streams: list[_Stream]) -> Iterator[list[tuple[_Stream, _Break]]]:
-    """Yield the breaks of several streams that are one jump of their clock, the quickest stream first."""
+    """Yield the breaks of several streams that are one jump of their clock.
+
+    The first stream is the quickest.
+    """
     left = {stream.name: list(stream.breaks) for stream in streams}
     for stream in sorted(streams, key=lambda stream: (stream.name not in LEADING, stream.usual)):
         while left[stream.name]:
@@ -380,7 +386,7 @@ def _groups(streams: list[_Stream]) -> Iterator[list[tuple[_Stream, _Break]]]:
 def _of_group(
     group: list[tuple[_Stream, _Break]], every: Mapping[str, _Stream]
 ) -> tuple[Jump, list[tuple[_Stream, _Break]]] | None:
-    """Return the Jump of one clock, and shift its streams; None if only some streams were silent."""
+    """Return the Jump of one clock, and shift its streams; None for a silence of some streams."""
     by = min(one.by for _, one in group)
     known = [(stream, one) for stream, one in group if stream.arrived is not None]
     if known:
@@ -467,8 +473,8 @@ def _long(seconds: float) -> str:
 def apart(stamps: Mapping[str, np.ndarray]) -> Iterator[tuple[str, float, int]]:
     """Yield the streams whose stamps miss the time of the TDOAs.
 
-    No message lies within the time of the TDOAs, or the stream begins and ends later, or earlier, by
-    about as much.
+    Either no message lies within the time of the TDOAs. Or the stream begins and ends later, or
+    earlier, by about the same time.
 
     Parameters
     ----------

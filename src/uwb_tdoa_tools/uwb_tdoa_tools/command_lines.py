@@ -84,7 +84,7 @@ def evaluate_line(
 def survey_line(
     recording: str | Path, survey: str | Path | None = None, effects: str | Path | None = None
 ) -> str:
-    """Return the line that surveys anchors with a recording; None for a file that does not exist."""
+    """Return the line that surveys anchors with a recording; None for a missing file."""
     options = {"--survey": survey, "--effects": effects}
     words = [
         recording,
@@ -98,7 +98,7 @@ def node_lines(
     effects: str | Path | None = None,
     config: str | Path | None = None,
 ) -> tuple[str, str]:
-    """Return the two lines that start the nodes with the files of a calibration; None for no file."""
+    """Return the two lines that start the nodes with the files of a calibration, or None."""
     parameters = {
         name: file for name, file in (("anchors_file", anchors), ("effects_file", effects)) if file
     }

@@ -76,7 +76,10 @@ class LogBlock:
 
 
 class VehicleClock:
-    """The vehicle's clock relative to ours: the smallest delay of a message determines the offset."""
+    """The vehicle's clock relative to ours.
+
+    The smallest delay of a message determines the offset.
+    """
 
     def __init__(self) -> None:
         self._offset, self._at = np.inf, 0.0

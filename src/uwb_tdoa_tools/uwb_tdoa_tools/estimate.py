@@ -49,7 +49,7 @@ class FlightEstimator:
 
 
 def with_antenna(effects: EffectSet | None, flight: Flight) -> EffectSet | None:
-    """Return an EffectSet with the lever arm of the antenna from the recording, unless it has one."""
+    """Return the EffectSet; without a lever arm of the antenna, add that of the recording."""
     arm, known = flight.meta.get("antenna"), effects.effects if effects else ()
     if not arm or not any(arm) or any(effect.name == TagLeverArm.name for effect in known):
         return effects

@@ -106,7 +106,7 @@ def add_filter(
 
 
 def add_parameters(parser: ArgumentParser) -> None:
-    """-p, beside --config."""
+    """Add -p; it overrides --config."""
     parser.add_argument(
         "-p",
         dest="parameters",
@@ -118,7 +118,10 @@ def add_parameters(parser: ArgumentParser) -> None:
 
 
 def filter_of(args: Namespace) -> tuple[FilterConfig, EffectSet | None]:
-    """(FilterConfig, EffectSet or None) that --config, -p and --effects name. Raises InputError."""
+    """Return the FilterConfig and the EffectSet or None of --config, -p and --effects.
+
+    Raises InputError.
+    """
     config = FilterConfig.from_yaml(args.config) if args.config else FilterConfig()
     config = with_parameters(config, getattr(args, "parameters", ()))
     return config, EffectSet.from_yaml(args.effects) if args.effects else None
@@ -230,7 +233,10 @@ OF_TAPE = "std", "height_std", "trusted", "trusted_std"
 
 
 def add_tape(parser: ArgumentParser) -> None:
-    """Add --std, --height-std, --trusted, --trusted-std and --unknown: how well anchors are known."""
+    """Add --std, --height-std, --trusted, --trusted-std and --unknown.
+
+    They state how well anchors are known.
+    """
     add = parser.add_argument
     add(
         "--std",
@@ -284,7 +290,10 @@ def tape_of(args: Namespace, effects: EffectSet | None) -> Tape:
 
 
 def add_align(parser: ArgumentParser, judges: bool = False) -> None:
-    """Add --align. judges : for a tool that evaluates by ground truth, and may move its frame too."""
+    """Add --align.
+
+    judges : for a tool that evaluates by ground truth, and may move its frame too
+    """
     words = (
         "ground truth on another clock (another epoch): none refuses it (default), time estimates "
         "the offset"
@@ -299,7 +308,7 @@ def add_align(parser: ArgumentParser, judges: bool = False) -> None:
 
 
 def add_rerun(parser: ArgumentParser) -> None:
-    """--rerun: a recording for the viewer Rerun."""
+    """Add --rerun: a recording for the viewer Rerun."""
     parser.add_argument("--rerun", metavar="FILE", type=OutputFile, help=pictures.RERUN_HELP)
 
 

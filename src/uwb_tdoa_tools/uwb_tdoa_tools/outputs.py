@@ -120,7 +120,10 @@ def _check_writable(path: Path, folder: Path) -> None:
 
 
 def as_json(value: Any) -> Any:
-    """Convert a value, or nested dicts and sequences, to JSON: NaN and infinity are null, arrays lists."""
+    """Convert a value, or nested dicts and sequences, to JSON.
+
+    NaN and infinity become null, arrays become lists.
+    """
     if isinstance(value, dict):
         return {str(key): as_json(item) for key, item in value.items()}
     if isinstance(value, (list, tuple, np.ndarray)):

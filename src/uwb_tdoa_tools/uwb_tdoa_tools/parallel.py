@@ -136,7 +136,10 @@ Made = TypeVar("Made")
 
 
 class MapFunction(Protocol):
-    """Compute function(item) of every item, in order, as `map` does; elsewhere or at the same time."""
+    """Compute function(item) of every item, in order, as `map` does.
+
+    The work may run elsewhere or at the same time.
+    """
 
     def __call__(
         self, function: Callable[[Item], Made], items: Iterable[Item], /
@@ -246,7 +249,10 @@ def _results(
 
 
 def _import(function: Callable[..., object]) -> None:
-    """Import `function` by unpickling it, in a process that starts while the first item runs here."""
+    """Import `function` by unpickling it, in a process that starts with the first item.
+
+    The first item runs in the parent process meanwhile.
+    """
 
 
 @contextmanager
@@ -276,7 +282,10 @@ def _attempt(
 
 @contextmanager
 def _children_ignore_interrupts() -> Iterator[None]:
-    """Start processes that ignore Ctrl-C. This process handles it, and ends them without tracebacks."""
+    """Start processes that ignore Ctrl-C.
+
+    This process handles it, and ends them without tracebacks.
+    """
     # Children inherit this; joblib would clear a mask.
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
@@ -314,7 +323,10 @@ def _cluster(address: str | None) -> Iterator[dict[str, Any]]:
 
 @cache  # once
 def _say_whom_it_trusts(address: str) -> None:
-    """Warn that a connection is not encrypted: Dask sends pickles, which run code where they are read."""
+    """Warn that a connection is not encrypted.
+
+    Dask sends pickles, which run code where they are read.
+    """
     if not address.startswith(("tls://", "wss://")):
         print(
             f"--dask: {address} is not encrypted: whoever reaches it, or can change what is "

@@ -113,7 +113,10 @@ class ResultsFile:
         return self._parsed(self._file.readline())["result"]
 
     def read(self, key: str, parse: Callable[[Any], Made]) -> Made:
-        """Return parse(result). Raises InputError if that fails: anybody may have written the file."""
+        """Return parse(result); raise InputError if that fails.
+
+        Anybody may have written the file.
+        """
         try:
             return parse(self[key])
         except (

@@ -120,7 +120,7 @@ class VehicleNode(StreamNode):
         )
 
     def take(self) -> bool:
-        """A turn, if it may come. Returns True: another one is to come."""
+        """Run one turn if it is due, and return True: another one follows."""
         self._topics.receive()
         if self._starts is None and self._topics.is_connected():
             self._topics.wait_for_anchors()
@@ -140,7 +140,10 @@ class VehicleNode(StreamNode):
         return True
 
     def _report_verdict(self) -> None:
-        """Say what became of the mission under way; of the standard one with the exit code."""
+        """Publish and log the verdict of the mission under way.
+
+        After the standard mission, exit with the code of the verdict.
+        """
         verdict, self._reported = verdict_of(self._trial.result), len(self._trial.missions)
         self._verdict.publish(String(data=json.dumps(verdict)))
         self.get_logger().info(sentence(verdict))
@@ -186,7 +189,7 @@ def _seconds(duration: Any) -> float:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the node; returns the exit code."""
+    """Run the node, and return the exit code."""
     return process.run(VehicleNode, __doc__, argv)
 
 

@@ -1,1 +1,4 @@
-"""Types that all packages share: flights, anchors, geometry, radio, surveys, stamps, errors, files."""
+"""Types that all packages share: flights, anchors, geometry, radio, surveys, stamps, files.
+
+This folder uses no ROS.
+"""

@@ -1,4 +1,4 @@
-"""Anchors: where the fixed radios are and which way they point."""
+"""Anchors of an installation: ids, positions and orientations of the fixed radios."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from geometry_msgs.msg import Point, Quaternion
     from numpy.typing import ArrayLike
 
-SAME_PLACE = 0.01  # m; an anchor that is sent again with less of a change is at the same place
-# m within which each anchor must stand, for what was made for others to hold for these
+SAME_PLACE = 0.01  # m; a smaller change of a repeated anchor is no change
+# m. Data made for other anchors, e.g. a flyable volume, hold only if every anchor moved less.
 CONSTELLATION = 0.1
-MOST = 10_000  # anchors, as many as a message holds
-# m along each axis: grid coordinates of a country fit, and their squares do not overflow
+MOST = 10_000  # anchors, limit of a message
+# m along each axis. Grid coordinates of a country fit, and their squares do not overflow.
 FARTHEST = 1e8
 
 
@@ -32,11 +32,10 @@ class Anchors:
 
     Attributes
     ----------
-    ids : (N,) int array, each id once
-    positions : (N, 3) float array, antenna centres, metres
-    orientations : (N, 4) float array, quaternions x y z w, antenna to world, normalised; a row of
-        NaN where the
-        orientation was not surveyed
+    ids : (N,) int array, each id once, 0 ... 65535
+    positions : (N, 3) float array, antenna centres, m, world
+    orientations : (N, 4) float array, quaternions x y z w, antenna to world, normalised;
+        a row of NaN if the orientation was not surveyed
     frame : name of the world frame
     """
 
@@ -89,7 +88,7 @@ class Anchors:
         for name, value in (("ids", ids), ("positions", positions), ("orientations", orientations)):
             value.setflags(write=False)
             object.__setattr__(self, name, value)
-        rows = np.full(ids.max() + 3, -1)  # of the ids from -1 on, and of those beyond
+        rows = np.full(ids.max() + 3, -1)  # one entry per id from -1 to one beyond the largest
         rows[ids + 1] = np.arange(n)
         object.__setattr__(self, "_rows", rows)
 
@@ -97,17 +96,22 @@ class Anchors:
         return len(self.ids)
 
     def row(self, anchor: int) -> int:
-        """Row of one id, -1 if it is unknown."""
+        """Return the row of one id, -1 for an unknown id."""
         return int(self.index(anchor))
 
     def index(self, ids: ArrayLike) -> np.ndarray:
-        """Rows of the given ids: int array of the shape of `ids`, -1 where an id is unknown."""
-        rows = self._rows  # type: ignore[attr-defined]  # __post_init__ puts it there: it is no field
+        """Return the rows of some ids: int array of the shape of `ids`, -1 for an unknown id."""
+        rows = self._rows  # type: ignore[attr-defined]  # set by __post_init__, no field
         return rows.take(np.asarray(ids, dtype=np.int64) + 1, mode="clip")
 
     def stand_at(self, ids: np.ndarray, positions: np.ndarray, frame: str) -> bool:
-        """Return whether these are the anchors with such ids (n,), positions (n, 3) m and frame,
-        each within CONSTELLATION.
+        """Return whether these anchors stand at some positions, each within CONSTELLATION.
+
+        Parameters
+        ----------
+        ids : (n,) anchor ids; all ids of this object and no other
+        positions : (n, 3) m, world
+        frame : name of the world frame; it must be the same
         """
         rows = self.index(ids)
         if frame != self.frame or len(ids) != len(self) or (rows < 0).any():
@@ -117,18 +121,18 @@ class Anchors:
         )
 
     def at(self, positions: np.ndarray) -> Anchors:
-        """The same Anchors at other positions, (N, 3) m."""
+        """Return these Anchors at other positions, (N, 3) m, world."""
         return Anchors(self.ids, positions, self.orientations, self.frame)
 
     def only(self, rows: np.ndarray) -> Anchors:
-        """Those of some rows."""
+        """Return the Anchors of some rows."""
         return Anchors(self.ids[rows], self.positions[rows], self.orientations[rows], self.frame)
 
     @classmethod
     def from_positions(
         cls, positions: ArrayLike, ids: ArrayLike | None = None, frame: str = "map"
     ) -> Anchors:
-        """Anchors at (N, 3) positions in metres whose orientations are not known.
+        """Return Anchors without orientations at (N, 3) positions, m, world.
 
         Default ids: 0 ... N-1.
         """
@@ -138,8 +142,9 @@ class Anchors:
 
     @classmethod
     def from_message(cls, message: Any) -> Anchors:
-        """Anchors of a uwb_tdoa_msgs/AnchorArray, of rclpy or out of a bag. An orientation of (0,
-        0, 0, 0) is not known; without a frame_id the frame is "map". Raises InputError.
+        """Return the Anchors of a uwb_tdoa_msgs/AnchorArray, from rclpy or from a bag.
+
+        The orientation (0, 0, 0, 0) means unknown. An empty frame_id means "map". Raises InputError.
         """
         poses = [anchor.pose for anchor in message.anchors]
         return cls(
@@ -151,8 +156,11 @@ class Anchors:
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> Anchors:
-        """Read `frame` and `anchors: {id: {position: [x, y, z], orientation: [x, y, z, w]}}`;
-        raises InputError.
+        """Read Anchors from a YAML file.
+
+        The file holds `frame` and
+        `anchors: {id: {position: [x, y, z], orientation: [x, y, z, w]}}`, positions in m.
+        Raises InputError.
         """
         content = read_yaml(path)
         entries = content.get("anchors") if isinstance(content, dict) else None
@@ -188,7 +196,7 @@ class Anchors:
             raise InputError(f"{path}: {error}") from error
 
     def to_yaml(self, path: str | Path) -> None:
-        """Write what `from_yaml` reads."""
+        """Write a YAML file that `from_yaml` reads."""
         entries = {}
         for i, p, q in zip(self.ids.tolist(), self.positions.tolist(), self.orientations.tolist()):
             entries[i] = {"position": p, **({"orientation": q} if np.isfinite(q).all() else {})}
@@ -199,7 +207,7 @@ class Anchors:
 
 
 def _whole(ids: ArrayLike) -> np.ndarray:
-    """(N,) int64. Raises InputError for what is no whole number 0 ... 65535."""
+    """Return ids as (N,) int64; raise InputError unless all are whole numbers 0 ... 65535."""
     values = np.asarray(ids).reshape(-1)
     bad = [
         value
@@ -216,7 +224,7 @@ def _numbers(message: Point | Quaternion, names: str) -> list[float]:
 
 
 def _entry(key: Any, entry: Any) -> tuple[int, list[float], list[float]]:
-    """(id, position, orientation) of one entry of a file. Raises ValueError with what is wrong."""
+    """Return (id, position, orientation) of an entry; raise ValueError with the reason."""
     if isinstance(key, bool) or not str(key).isascii() or not str(key).isdigit():
         raise ValueError(f"the id is {key!r}, not a whole number 0 ... 65535")
     if not isinstance(entry, dict):

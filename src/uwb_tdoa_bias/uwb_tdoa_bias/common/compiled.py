@@ -1,7 +1,7 @@
-"""numba's njit with an on-disk cache that never runs yesterday's code.
+"""numba's njit with an on-disk cache that follows every change of the sources.
 
-numba's own cache notices a change in the file of a compiled function, but not in the files of the
-functions it calls. Here every state of the sources has a cache folder of its own.
+numba's own cache notices a change in the file of a compiled function. It does not notice changes
+in the files of the functions that it calls. Here every state of the sources has its own folder.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 
 @contextmanager
 def _hidden(*names: str) -> Iterator[None]:
-    """Packages that are not imported yet seem not to be installed."""
+    """Let packages that are not imported yet appear as not installed inside the block."""
     hidden = [name for name in names if name not in sys.modules]
-    sys.modules.update(dict.fromkeys(hidden))  # type: ignore[arg-type]  # None says that it is not there
+    sys.modules.update(dict.fromkeys(hidden))  # type: ignore[arg-type]  # None marks a missing module
     try:
         yield
     finally:
@@ -36,30 +36,32 @@ def _hidden(*names: str) -> Iterator[None]:
             del sys.modules[name]
 
 
-# numba imports these only to see whether they are there, which takes a fifth of a second of a
-# node's start: for products of matrices
-# in compiled code, of which there are none here, and for coverage of it.
+# numba imports these packages only to test whether they exist, 0.2 s of a node's start. It needs
+# scipy for matrix products in compiled code, and coverage to measure compiled code. The project
+# does neither.
 with _hidden("scipy", "coverage"):
     from numba import config, njit
     from numba.core import event
     import numba.np.arraymath  # noqa: F401
 
-_FUNCTIONS: list[Any] = []  # all that are compiled when they are first called
+_FUNCTIONS: list[Any] = []  # all compiled functions; numba compiles at the first call
 SAY_EVERY = 4.0  # s
-# one row of a structured array, whose fields compiled code reads and writes as attributes: Python
-# knows no type of it
+# One row of a structured array. Compiled code reads and writes its fields as attributes. Python
+# has no type for it.
 Record = Any
 Function = TypeVar("Function", bound="Callable[..., Any]")
 
-# numba would look into the present folder before it compiles anything
+# numba would otherwise look for settings in the present folder before each compilation.
 config._config_fname = "/dev/null/.numba_config.yaml"
 
 
 def compiled(function: Function) -> Function:
-    """Decorator: compile `function`, which may call others below its folder and of common/,
-    and cache it.
+    """Compile a function with numba and cache it on disk; a decorator.
+
+    The function may call compiled functions below its own folder and in common/. The cache is keyed
+    by the sources of both.
     """
-    before = config.CACHE_DIR  # type: ignore[attr-defined]  # numba puts its settings there while it is imported
+    before = config.CACHE_DIR  # type: ignore[attr-defined]  # numba adds its settings at import
     place = _place(_digest(Path(function.__code__.co_filename).parent))
     config.CACHE_DIR = str(place)  # type: ignore[attr-defined]  # as above
     try:
@@ -70,9 +72,10 @@ def compiled(function: Function) -> Function:
 
 
 class _Listener(event.Listener):
-    """Says on stderr, every few seconds, how much is compiled: where nothing is in the cache that
-    takes a minute or two. The share is of the functions of all modules that are imported, nearly
-    all of which the filter needs.
+    """Print the progress of compilation to stderr every SAY_EVERY seconds.
+
+    With an empty cache, compilation takes one to two minutes. The printed share counts the functions
+    of all imported modules; the filter needs nearly all of them.
     """
 
     def __init__(self) -> None:
@@ -104,8 +107,10 @@ event.register("numba:compile", _Listener())
 
 @cache
 def _place(name: str) -> Path:
-    """The folder `name` in NUMBA_CACHE_DIR, by default in the user's cache folder; a temporary one
-    where others may have put compiled code there, which would be run.
+    """Return the cache folder `name`.
+
+    It lies in NUMBA_CACHE_DIR, by default in the user's cache folder. If other users may write there,
+    they could plant code that this process runs. Then a temporary folder is returned.
     """
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     place = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(home, "uwb_tdoa")) / name
@@ -129,14 +134,14 @@ def _place(name: str) -> Path:
 
 
 def _is_ours_alone(folder: Path) -> bool:
-    """Whether a folder belongs to the user, who alone gets into it."""
+    """Return whether a folder belongs to the user and gives access to no other user."""
     found = folder.stat()
     return found.st_uid == os.getuid() and not found.st_mode & 0o077
 
 
 @cache
 def _digest(folder: Path) -> str:
-    """Name of the present state of the sources below `folder` and beside this file."""
+    """Return a name for the present state of the sources below `folder` and beside this file."""
     digest = hashlib.sha256()
     for source in sorted({*folder.rglob("*.py"), *Path(__file__).parent.glob("*.py")}):
         digest.update(source.name.encode() + b"\0" + source.read_bytes())

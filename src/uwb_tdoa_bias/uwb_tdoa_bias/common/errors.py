@@ -1,5 +1,6 @@
-"""The two exceptions that are reported to the user in one sentence; every other one is a defect and
-keeps its traceback.
+"""The two exceptions that programs report to the user in one sentence.
+
+Every other exception is a defect and keeps its traceback.
 """
 
 
@@ -11,6 +12,7 @@ class InputError(ValueError):
 
 
 class Failure(Exception):
-    """What was asked for could not be done with good input. The message says what failed and where
-    to look. Exit code 1.
+    """A task that failed with good input.
+
+    The message names what failed and where to look. Exit code 1.
     """

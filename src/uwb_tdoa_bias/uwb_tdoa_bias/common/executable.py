@@ -1,10 +1,12 @@
-"""How every executable starts: Ctrl-C ends it quietly, whenever it comes, and the present folder
-has no say in what it does.
+"""Start of every executable: quiet Ctrl-C, and no influence of the present folder.
+
+Ctrl-C ends an executable quietly at any moment. Files in the present folder do not change what it
+does.
 
     evaluate = executable("uwb_tdoa_tools.commands.evaluate")        # an entry point; the module has a main()
     ekf_node = node_executable("uwb_tdoa_ekf.ekf_node")
 
-Nothing but the standard library is imported here.
+This module imports only the standard library.
 """
 
 from __future__ import annotations
@@ -26,10 +28,10 @@ if TYPE_CHECKING:
     from types import FrameType, ModuleType
 
 INTERRUPTED = 130  # exit code, as a shell gives it: 128 + SIGINT
-SOON = 0.05  # s, until an interrupt that was lost comes again
-SAID = 1.5  # s of importing after which it is said that something goes on
-# Paths in which an empty entry, as a dot, is the present folder. `.dev/paths.sh` has the same list,
-# for what a shell starts.
+SOON = 0.05  # s, until a lost interrupt is repeated
+SAID = 1.5  # s of importing until a line reports it
+# Path variables in which an empty entry or a dot means the present folder. `.dev/paths.sh` has the
+# same list, for programs that a shell starts.
 PATHS = (
     "PATH LD_LIBRARY_PATH PYTHONPATH AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_PREFIX_PATH "
     "PKG_CONFIG_PATH"
@@ -37,25 +39,27 @@ PATHS = (
 
 
 def executable(module: str) -> Callable[..., Any]:
-    """The entry point of a module with a main(): imports the module when it is called, returns what
-    main returns. Its linear algebra, of small matrices, takes one thread: several would wait for
-    each other by spinning. That is set in the environment, where libraries that are loaded later
-    read it; a user's own setting stays.
+    """Return the entry point of a module with a main().
+
+    The entry point imports the module when it is called and returns the result of main. It sets
+    OMP_NUM_THREADS to 1 unless the user has set it: the matrices are small, and several threads of
+    linear algebra would wait for each other by spinning. Libraries that are loaded later read it.
     """
     return partial(_run, module)
 
 
 def node_executable(module: str) -> Callable[..., Any]:
-    """The same of a node."""
+    """Return the entry point of a node; otherwise as `executable`."""
     return partial(_run_node, module)
 
 
 def leave_present_folder_out() -> None:
-    """Change the environment of this process, and of those that it starts, so that a file of the
-    present folder is no library, module, program or setting of any. To be called before rclpy is
-    imported. A folder of recordings may hold anything.
+    """Remove the present folder from all search paths of this process and its children.
+
+    A folder of recordings may hold any file. Afterwards no such file is loaded as a library, module,
+    program or setting. Call this before rclpy is imported.
     """
-    # or Fast DDS reads DEFAULT_FASTRTPS_PROFILES.xml there
+    # Otherwise Fast DDS reads DEFAULT_FASTRTPS_PROFILES.xml in the present folder.
     os.environ["SKIP_DEFAULT_XML_FILE"] = "1"
     for name in PATHS:
         entries = os.environ.get(name, "").split(os.pathsep)
@@ -71,10 +75,11 @@ def leave_present_folder_out() -> None:
 
 @contextmanager
 def outside_present_folder() -> Iterator[None]:
-    """In the root folder while the block lasts: the present folder may hold modules for `python
-    -m`, and settings.
+    """Change to the root folder while the block runs.
+
+    The present folder may hold settings, and modules that `python -m` would import.
     """
-    here = os.open(".", os.O_PATH | os.O_DIRECTORY)  # also where its name is gone
+    here = os.open(".", os.O_PATH | os.O_DIRECTORY)  # works even if the folder was removed
     try:
         os.chdir("/")
         yield
@@ -84,13 +89,14 @@ def outside_present_folder() -> Iterator[None]:
 
 
 class _ImportedElsewhere:
-    """Finder of modules that read settings of the present folder (matplotlibrc, .numba_config.yaml)
-    when they are imported. They are imported in the root folder, whoever imports them.
+    """Finder that imports matplotlib and numba in the root folder.
+
+    On import, both read settings of the present folder: matplotlibrc and .numba_config.yaml.
     """
 
     @staticmethod
     def find_spec(name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
-        """The ModuleSpec of such a module; None for all others."""
+        """Return the ModuleSpec of matplotlib or numba; None for all other modules."""
         spec = PathFinder.find_spec(name, path) if name in ("matplotlib", "numba") else None
         if spec is not None and spec.loader is not None:
             spec.loader.exec_module = outside_present_folder()(spec.loader.exec_module)  # type: ignore[method-assign]  # of this one loader
@@ -101,12 +107,12 @@ sys.meta_path.insert(0, _ImportedElsewhere)
 
 
 def interrupt(number: int, frame: FrameType | None) -> None:
-    """Signal handler: raises KeyboardInterrupt, for good.
+    """Raise KeyboardInterrupt for a signal, and repeat SIGINT until the exception arrives.
 
-    What C code calls back cannot raise, and a destructor cannot either: Python prints such an
-    exception on stderr and goes on (the compiler of numba has both). From now on nothing of that
-    kind is printed, objects that are half made included, and where it was the KeyboardInterrupt
-    that was lost, SIGINT comes again in a moment.
+    Callbacks from C code and destructors cannot raise. Python prints such an exception on stderr and
+    continues; numba's compiler has both. From now on Python prints no such exception, including
+    those of half-made objects. If the lost exception is a KeyboardInterrupt, SIGINT comes again
+    after SOON seconds.
     """
 
     def on_lost(lost: sys.UnraisableHookArgs) -> None:
@@ -130,7 +136,7 @@ def _run(module: str, *arguments: Any) -> Any:
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
         if package.startswith("uwb_tdoa_") and package != "uwb_tdoa_msgs":
-            raise  # ours is not whole: a defect, which needs its traceback
+            raise  # our package is incomplete: a defect, keep the traceback
         print(
             f"{name}: error: the Python package {package} is missing; {_remedy(package)}.",
             file=sys.stderr,
@@ -141,19 +147,19 @@ def _run(module: str, *arguments: Any) -> Any:
 
 
 def _run_node(module: str, *arguments: Any) -> Any:
-    # until the node runs: nothing that is imported is garbage, and searching it is a tenth of a
-    # start
+    # Imported objects are no garbage until the node runs. Searching them takes a tenth of a start.
     gc.disable()
     return _run(module, *arguments)
 
 
 def _imported(module: str) -> ModuleType:
-    """Import a module, and say that it takes its time where it does. Meanwhile SIGINT ends the
-    process at once: some of what is imported answers a KeyboardInterrupt with a traceback or not at
-    all, and there is nothing yet to clean up.
+    """Return an imported module; report on stderr if the import takes longer than SAID seconds.
+
+    During the import, SIGINT ends the process at once. Some imported packages answer a
+    KeyboardInterrupt with a traceback or ignore it, and there is nothing to clean up yet.
     """
     before = signal.getsignal(signal.SIGINT)
-    if before is not signal.SIG_IGN:  # as in a job that a shell script put in the background
+    if before is not signal.SIG_IGN:  # ignored in a background job of a shell script
         signal.signal(signal.SIGINT, lambda number, frame: os._exit(INTERRUPTED))
     slow = Timer(
         SAID, lambda: print(f"{module.rpartition('.')[2]}: starting", file=sys.stderr, flush=True)

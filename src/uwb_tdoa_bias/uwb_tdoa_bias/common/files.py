@@ -1,4 +1,4 @@
-"""Read and write files: with limits, whole or not at all; arrays in .npz files; temporary folders."""
+"""Read and write files safely: size limits, atomic writes, .npz arrays, temporary folders."""
 
 from __future__ import annotations
 
@@ -29,17 +29,18 @@ if TYPE_CHECKING:
     from zipfile import ZipInfo
 
 
-TEMPORARY = "uwb_tdoa_temporary_"  # what the names of our temporary folders begin with
-STREAMS = "/dev/stdout", "/dev/stderr"  # links to what the user has chosen
-SETTLED = 60.0  # s after which a temporary folder that nobody holds is no longer needed
+TEMPORARY = "uwb_tdoa_temporary_"  # prefix of the project's temporary folders
+STREAMS = "/dev/stdout", "/dev/stderr"  # links that the user redirects
+SETTLED = 60.0  # s; older temporary folders without a lock are removed
 _KEPT: list[
     tuple[Path, Path, os.stat_result, bool]
-] = []  # see `keeping`: path, the same without links, state, whether it is a bag
+] = []  # of `keeping`: path, resolved path, state, whether it is a bag
 
 
 def read_bytes(path: str | Path, most: int = RECORDING_BYTES) -> bytes:
-    """The content of a file; raises InputError if it cannot be read, is empty or has more than
-    `most` bytes.
+    """Return the content of a file.
+
+    Raises InputError if it cannot be read, is empty, or has more than `most` bytes.
     """
     content = read_head(path, most + 1)
     Budget(path).spend("bytes", len(content), most)
@@ -47,7 +48,7 @@ def read_bytes(path: str | Path, most: int = RECORDING_BYTES) -> bytes:
 
 
 def read_head(path: str | Path, size: int) -> bytes:
-    """The first bytes of a file; raises InputError as `read_bytes`."""
+    """Return the first `size` bytes of a file; raise InputError if it is unreadable or empty."""
     try:
         with open_file(path) as file:
             content = b"".join(_blocks(file, size))
@@ -61,31 +62,35 @@ def read_head(path: str | Path, size: int) -> bytes:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text file in UTF-8, whatever the locale, as `write_bytes` does.
+    """Write a text file in UTF-8, in every locale; otherwise as `write_bytes`.
 
-    Bytes that Python could not decode in an argument or a file name are written as they were, or as
-    U+FFFD if they are no UTF-8.
+    Some arguments and file names hold bytes that Python could not decode. They are written unchanged
+    if they are UTF-8, else as U+FFFD.
     """
     try:
         content = text.encode("utf-8", "surrogateescape")
-    except UnicodeEncodeError:  # halves of characters that come from no file name
+    except UnicodeEncodeError:  # lone surrogates that come from no file name
         content = text.encode("utf-8", "replace")
     write_bytes(path, content.decode("utf-8", "replace").encode("utf-8"))
 
 
 def write_filled(path: str | Path, fill: Callable[[BinaryIO], object]) -> None:
-    """Write what `fill` writes to the binary file that it is given, as `write_bytes` does."""
+    """Write a binary file that `fill` fills; otherwise as `write_bytes`.
+
+    fill : callable of a binary file
+    """
     buffer = io.BytesIO()
     fill(buffer)
     write_bytes(path, buffer.getvalue())
 
 
 def write_bytes(path: str | Path, content: bytes) -> None:
-    """Write a file whole: readers see the old content or the new one, never a part. Raises OSError.
+    """Write a file atomically: readers see the old content or the new one, never a part.
 
-    The content goes to a temporary sibling, which then takes the name. A file that is replaced
-    passes on its permissions. What is no regular file, as /dev/stdout, and a file whose folder
-    takes no other, are written in place. Raises InputError as `refuse_output`.
+    The content goes to a temporary file in the same folder, which then takes the name. The new file
+    keeps the permissions of a replaced one. Two kinds are written in place: paths that are no regular
+    file, e.g. /dev/stdout, and files in a folder that is not writable.
+    Raises OSError, and InputError as `refuse_output`.
     """
     refuse_output(path)
     path = Path(path)
@@ -108,7 +113,7 @@ def write_bytes(path: str | Path, content: bytes) -> None:
 
 @contextmanager
 def keeping(inputs: Iterable[Path]) -> Iterator[None]:
-    """While the block lasts, `refuse_output` refuses these files and folders, and what is in them."""
+    """Let `refuse_output` refuse some files and folders, and their content, inside the block."""
     before = _KEPT[:]
     _KEPT.extend(
         (path, path.resolve(), path.stat(), (path / "metadata.yaml").exists()) for path in inputs
@@ -120,8 +125,9 @@ def keeping(inputs: Iterable[Path]) -> Iterator[None]:
 
 
 def refuse_output(path: str | Path) -> None:
-    """Raise InputError where writing to a path would follow a link, which may lead to any file, or
-    change what is read or a bag.
+    """Raise InputError if writing to a path would follow a link, or change an input or a bag.
+
+    A link may lead to any file. STREAMS are exempt. `keeping` sets the inputs.
     """
     path = Path(path)
     if path.is_symlink() and str(path) not in STREAMS:
@@ -144,9 +150,9 @@ def _write_in_place(path: Path, content: bytes) -> None:
 
 
 def open_file(path: str | Path) -> BinaryIO:
-    """An open file, to be read.
+    """Return a file opened for reading.
 
-    Raises InputError for a pipe or a device, at which reading would wait for ever, and OSError.
+    Raises OSError, and InputError for a pipe or a device, where reading would block forever.
     """
     file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
     if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
@@ -157,12 +163,12 @@ def open_file(path: str | Path) -> BinaryIO:
 
 @contextmanager
 def temporary_folder() -> Iterator[Path]:
-    """A folder that is removed when the block ends.
+    """Give a folder that is removed when the block ends.
 
-    If this process is killed, the next one of ours removes it.
+    If this process is killed, the next process of this project removes the folder.
     """
     for old in Path(tempfile.gettempdir()).glob(f"{TEMPORARY}*"):
-        with suppress(OSError):  # of another user, in use, or gone
+        with suppress(OSError):  # owned by another user, in use, or gone
             if time.time() - old.lstat().st_mtime > SETTLED:
                 with _held(old, fcntl.LOCK_EX):
                     shutil.rmtree(old)
@@ -171,7 +177,7 @@ def temporary_folder() -> Iterator[Path]:
 
 
 def folder_of_process() -> Path:
-    """Such a folder that is removed when this process ends."""
+    """Return a temporary folder that is removed when this process ends."""
     stack = ExitStack()
     atexit.register(stack.close)
     return stack.enter_context(temporary_folder())
@@ -179,7 +185,10 @@ def folder_of_process() -> Path:
 
 @contextmanager
 def _held(folder: Path, kind: int) -> Iterator[None]:
-    """A lock on a folder of the user while the block lasts. Raises OSError."""
+    """Hold a lock on a folder of the user inside the block; raise OSError.
+
+    kind : fcntl.LOCK_SH or fcntl.LOCK_EX
+    """
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     try:
         if os.fstat(descriptor).st_uid != os.getuid():
@@ -191,8 +200,9 @@ def _held(folder: Path, kind: int) -> Iterator[None]:
 
 
 def _blocks(file: BinaryIO, size: int) -> Iterator[bytes]:
-    """The first bytes of an open file, block by block: one read would take the memory of `size` at
-    once.
+    """Yield the first `size` bytes of an open file in blocks.
+
+    A single read would allocate `size` bytes at once.
     """
     while size > 0 and (block := file.read(min(size, 1 << 24))):
         size -= len(block)
@@ -202,11 +212,15 @@ def _blocks(file: BinaryIO, size: int) -> Iterator[bytes]:
 def read_arrays(
     path: str | Path, kinds: dict[str, str], what: str, remedy: str
 ) -> dict[str, np.ndarray]:
-    """{name: array} of an .npz file that `numpy.savez` wrote. Nothing is unpickled.
+    """Return {name: array} of an .npz file that `numpy.savez` wrote; nothing is unpickled.
 
-    kinds : {name: letters of `dtype.kind` that are right}; what, remedy : what the file should be,
-        and how it is made.
-    Raises InputError, also for floating-point numbers that are NaN.
+    Raises InputError, also if a floating-point array holds NaN.
+
+    Parameters
+    ----------
+    kinds : {name: permitted letters of `dtype.kind`}
+    what : words for the expected file, for messages
+    remedy : words on how to make such a file, for messages
     """
     try:
         with open_file(path) as opened, ZipFile(opened) as file:
@@ -256,7 +270,7 @@ def _array(name: str, file: ZipFile, member: ZipInfo, kinds: str) -> np.ndarray:
         raise ValueError(f"{name} is of format {version}")
     try:
         shape, fortran, dtype = read_header[version](stream)
-    except Exception as error:  # it is parsed as Python, which fails in many ways
+    except Exception as error:  # numpy parses it as Python, with many exceptions
         raise ValueError(f"{name} has a header that cannot be read ({error})") from error
     if dtype.hasobject or dtype.kind not in kinds:
         raise ValueError(f"{name} holds {dtype}")

@@ -1,4 +1,4 @@
-"""Flight: the numpy arrays of one recording. Every reader returns one, every tool takes one."""
+"""Flight: the numpy arrays of one recording. All readers return it and all tools take it."""
 
 from __future__ import annotations
 
@@ -11,14 +11,18 @@ from .anchors import Anchors
 from .sensors import LOCATING, SENSORS
 from .text import sanitize
 
-AIDS = tuple(SENSORS)  # streams of a Flight that the filter can do without
+AIDS = tuple(SENSORS)  # optional streams of a Flight
 
 
 @dataclass(frozen=True)
 class Imu:
     """Inertial samples in the body frame (x forward, y left, z up: REP-103).
 
-    t : (n,) s; gyro : (n, 3) rad/s; accel : (n, 3) m/s^2, specific force (+9.81 on z at rest).
+    Attributes
+    ----------
+    t : (n,) s
+    gyro : (n, 3) rad/s
+    accel : (n, 3) m/s^2, specific force (+9.81 on z at rest).
     """
 
     t: np.ndarray
@@ -31,16 +35,21 @@ class Imu:
 
 @dataclass(frozen=True)
 class Tdoas:
-    """Raw measurements. t : (n,) s; a, b : (n,) anchor ids; d : (n,) metres, d_ab = |p - b| - |p -
-    a|; variance : (n,) m^2, of the noise as the tag knows it, 0 where it does not, which is
-    everywhere unless it is given.
+    """Raw TDOA measurements.
+
+    Attributes
+    ----------
+    t : (n,) s
+    a, b : (n,) anchor ids
+    d : (n,) m, d_ab = |p - b| - |p - a|
+    variance : (n,) m^2, of the noise as the tag reports it; 0 where it reports none. Default: 0.
     """
 
     t: np.ndarray
     a: np.ndarray
     b: np.ndarray
     d: np.ndarray
-    variance: np.ndarray = None  # type: ignore[assignment]  # __post_init__ puts zeros there
+    variance: np.ndarray = None  # type: ignore[assignment]  # __post_init__ sets zeros
 
     def __post_init__(self) -> None:
         if self.variance is None:
@@ -52,8 +61,13 @@ class Tdoas:
 
 @dataclass(frozen=True)
 class Truth:
-    """Ground truth. t : (n,) s; p : (n, 3) m, world; q : (n, 4) x y z w, body to world, NaN where
-    not recorded.
+    """Ground truth.
+
+    Attributes
+    ----------
+    t : (n,) s
+    p : (n, 3) m, world
+    q : (n, 4) x y z w, body to world, NaN where not recorded
     """
 
     t: np.ndarray
@@ -64,7 +78,7 @@ class Truth:
         return len(self.t)
 
 
-_SensorStreams: Any = make_dataclass(  # the names of its attributes are those of SENSORS
+_SensorStreams: Any = make_dataclass(  # attribute names: SENSORS
     "_SensorStreams",
     [(name, sensor.stream | None, None) for name, sensor in SENSORS.items()],
     frozen=True,
@@ -74,19 +88,22 @@ _SensorStreams: Any = make_dataclass(  # the names of its attributes are those o
 
 @dataclass(frozen=True)
 class Flight(_SensorStreams):
-    """One recording. All stamps are of one clock, in s; every stream keeps its own; within a stream
-    stamps never fall.
+    """One recording.
 
-    name : short and unique, e.g. "0425-traj1"; whatever is given, it is `sanitize`
+    All stamps are in s, of one clock. Each stream keeps its own stamps; they never fall.
+
+    Attributes
+    ----------
+    name : short and unique, e.g. "0425-traj1"; `sanitize` is applied to it
     anchors : Anchors
     tdoa : Tdoas
     imu : Imu or None
     truth : Truth or None
-    extra : other streams of the log by name, each a dict of column name to (n,) array with a "t"
-        among them, file units
-    meta : where it came from: source file, format, protocol ("tdoa2", "tdoa3"), ...
-    restarts : stamps, s, at which the clock of the recording began anew: nothing before tells where
-        the tag is after it
+    extra : other streams of the log by name, each a dict of column name to (n,) array; one column is
+        "t"; units of the file
+    meta : origin of the recording: source file, format, protocol ("tdoa2", "tdoa3"), ...
+    restarts : stamps, s, at which the clock of the recording restarted; data before a restart do not
+        determine the position after it
     for each of SENSORS, by name : its Stream or None
     """
 
@@ -104,32 +121,33 @@ class Flight(_SensorStreams):
 
     @property
     def start(self) -> float:
-        """Stamp from which slow changes count, s: of the first TDOA; without any, of what else
-        locates first; 0 without anything.
+        """Stamp of the first TDOA, s; the origin of slow changes.
+
+        Without TDOAs, the first stamp of the other streams that locate the tag; 0 without any.
         """
         return float(min((part.t[0] for part in self._located), default=0.0))
 
     @property
     def end(self) -> float:
-        """Stamp of the last of these, s; 0 without any."""
+        """Stamp of the last TDOA, s; otherwise as `start`."""
         return float(max((part.t[-1] for part in self._located), default=0.0))
 
     @property
     def _located(self) -> list[Any]:
-        """The TDOAs; without any, the other streams that locate."""
+        """TDOAs; without any, the other streams that locate the tag."""
         streams = [self.tdoa] if len(self.tdoa) else [getattr(self, name) for name in LOCATING]
         return [stream for stream in streams if stream is not None and len(stream)]
 
     def replaced(self, **streams: Any) -> Flight:
-        """The Flight with other streams, by their names, or with None instead of these."""
+        """Return the Flight with other streams, given by name; None removes a stream."""
         return replace(self, **streams)
 
     def without(self, *streams: str) -> Flight:
-        """The Flight without some of the streams that may be missing, by their names, e.g. AIDS."""
+        """Return the Flight without some optional streams, given by name, e.g. AIDS."""
         return self.replaced(**dict.fromkeys(streams))
 
     def among(self, rows: np.ndarray) -> Flight:
-        """The Flight among its anchors of some rows alone, with the TDOAs that are between them."""
+        """Return the Flight with the anchors of some rows and the TDOAs between them."""
         anchors, tdoa = self.anchors.only(rows), self.tdoa
         kept = np.isin(tdoa.a, anchors.ids) & np.isin(tdoa.b, anchors.ids)
         return replace(

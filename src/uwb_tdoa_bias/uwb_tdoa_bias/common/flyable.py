@@ -1,4 +1,4 @@
-"""The volume in which a tag can be trusted, as `plan` saves it and the filter's node asks for it."""
+"""The volume in which a tag can be located reliably; `plan` saves it and `ekf_node` reads it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from .anchors import Anchors
 
-_FIELDS = {  # of the file, and the kinds of their numbers
+_FIELDS = {  # fields of the file, and their dtype kinds
     "frame": "U",
     "lower": "f",
     "step": "f",
@@ -32,18 +32,18 @@ _REMEDY = "make one with `plan ... --volume`"
 
 @dataclass(frozen=True)
 class FlyableVolume:
-    """A box of cells, each flyable or not, in the world frame of the anchors it was computed for.
+    """A box of cells, each flyable or not, in the world frame of its anchors.
 
     Attributes
     ----------
-    lower : (3,) corner of the first cell, m; step : (3,) size of a cell, m
+    lower : (3,) corner of the first cell, m, world
+    step : (3,) size of a cell, m
     flyable : (nx, ny, nz) bool
-    bound : (nx, ny, nz) m, the smallest error that one round of TDOAs allows: root of the summed
-        variances along x, y
-        and, unless planar, z; inf where there is none
+    bound : (nx, ny, nz) m, the smallest position error that one round of TDOAs allows: root of the
+        summed variances along x, y and, unless planar, z; inf where the position is undetermined
     ids, positions : (N,) and (N, 3) m, the anchors
     frame : name of the world frame
-    planar : the tag's height is known and does not matter here; nz is 1
+    planar : True if the height of the tag is known and does not matter here; then nz is 1
     """
 
     lower: np.ndarray
@@ -90,19 +90,20 @@ class FlyableVolume:
             )
 
     def contains(self, p: ArrayLike) -> np.ndarray:
-        """Whether positions p (..., 3), m, are flyable: (...) bool. Nothing is outside of the box
-        or where not finite.
+        """Return whether positions p (..., 3), m, world, are flyable: (...) bool.
+
+        Positions outside of the box and positions that are not finite are not flyable.
         """
         inside, cell = self._cells(p)
         return inside & self.flyable[cell]
 
     def bound_at(self, p: ArrayLike) -> np.ndarray:
-        """The bound at positions p (..., 3), m: (...) m, NaN outside of the box."""
+        """Return the bound at positions p (..., 3), m, world: (...) m, NaN outside of the box."""
         inside, cell = self._cells(p)
         return np.where(inside, self.bound[cell], np.nan)
 
     def _cells(self, p: ArrayLike) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
-        """Whether positions are inside of the box, and the indexes of their cells."""
+        """Return whether positions are inside of the box, and the indexes of their cells."""
         p = np.asarray(p, dtype=float)
         at = np.where(np.isfinite(p), (p - self.lower) / self.step, -1.0)
         if self.planar:
@@ -112,11 +113,11 @@ class FlyableVolume:
         return inside, tuple(np.moveaxis(np.where(inside[..., None], cell, 0), -1, 0))
 
     def belongs_to(self, anchors: Anchors) -> bool:
-        """Whether it was computed for these Anchors."""
+        """Return whether the volume was computed for these Anchors."""
         return anchors.stand_at(self.ids, self.positions, self.frame)
 
     def save(self, path: str | Path) -> None:
-        """Write what `load` reads: a numpy .npz file."""
+        """Write a numpy .npz file that `load` reads."""
         fields = {name: getattr(self, name) for name in _FIELDS}
         write_filled(path, lambda file: np.savez_compressed(file, **fields))
 

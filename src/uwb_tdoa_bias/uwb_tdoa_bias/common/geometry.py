@@ -1,7 +1,8 @@
-"""What a TDOA is when nothing is wrong with it.
+"""Geometry of a TDOA without systematic effects, and rotations.
 
-For arrays of any shape with numpy, and once more for a single TDOA in compiled code, where the
-filter needs it a thousand times a second; a test holds them to the same bits.
+The numpy functions take arrays of any shape. The compiled functions do the same for single TDOAs
+and short arrays, since the filter needs them a thousand times per second. A test requires equal
+bits.
 """
 
 from __future__ import annotations
@@ -12,15 +13,20 @@ import numpy as np
 
 from .compiled import compiled
 
-_ON_ANTENNA = 1e-9  # m; closer than that, an antenna is in no direction
+_ON_ANTENNA = 1e-9  # m; closer, the direction of an antenna is undefined
 
 
 def ranges(p: np.ndarray, anchors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distances between tag and anchors, and their derivatives with respect to the tag's position.
+    """Return the distances between tag and anchors, and their derivatives by the tag's position.
 
-    p, anchors : (..., 3) m, one frame. Returns (...) m, and (..., 3) unit vectors from anchor to
-        tag, zero where the
-    tag sits on the antenna.
+    Parameters
+    ----------
+    p, anchors : (..., 3) m, one frame
+
+    Returns
+    -------
+    distance : (...) m
+    direction : (..., 3) unit vectors from anchor to tag; zero where the tag sits on the antenna
     """
     delta = p - anchors
     distance = np.linalg.norm(delta, axis=-1)
@@ -28,27 +34,33 @@ def ranges(p: np.ndarray, anchors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def tdoa(p: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Difference of the distances to two anchors, d_ab = |p - b| - |p - a|.
+    """Return the difference of the distances to two anchors, d_ab = |p - b| - |p - a|: (...) m.
 
-    Parameters: p, a, b : (..., 3) positions of tag and anchors in one frame, metres. Returns (...)
-    metres. Source: eq. 2 of Zhao et al. (RA-L 2021), with the sign that the Crazyflie firmware
-    logs.
+    Source: eq. 2 of Zhao et al. (RA-L 2021), with the sign that the Crazyflie firmware logs.
+
+    Parameters
+    ----------
+    p : (..., 3) m, tag
+    a, b : (..., 3) m, both anchors, in the frame of p
     """
     return np.linalg.norm(p - b, axis=-1) - np.linalg.norm(p - a, axis=-1)
 
 
 def tdoa_jacobian(p: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Derivative of `tdoa` with respect to p: (..., 3), no unit.
+    """Return the derivative of `tdoa` with respect to p: (..., 3), no unit.
 
-    Zero where the tag sits on an antenna.
+    It is zero where the tag sits on an antenna.
     """
     return ranges(p, b)[1] - ranges(p, a)[1]
 
 
 @compiled
 def tdoa_each(p: np.ndarray, a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
-    """`tdoa` (n,) m of p, a, b (n, 3), compiled: for arrays so short that what numpy takes for each
-    operation is most of it.
+    """Write `tdoa` of n measurements to out (n,), m; compiled.
+
+    For arrays so short that the overhead of each numpy operation dominates.
+
+    p, a, b : (n, 3) m, one frame
     """
     for i in range(len(p)):
         ax, ay, az = p[i, 0] - a[i, 0], p[i, 1] - a[i, 1], p[i, 2] - a[i, 2]
@@ -58,7 +70,10 @@ def tdoa_each(p: np.ndarray, a: np.ndarray, b: np.ndarray, out: np.ndarray) -> N
 
 @compiled
 def linearized_tdoa(p: np.ndarray, a: np.ndarray, b: np.ndarray, jacobian: np.ndarray) -> float:
-    """`tdoa` (m) of p, a, b (3,), compiled; writes `tdoa_jacobian` to `jacobian` (3,)."""
+    """Return `tdoa`, m, and write `tdoa_jacobian` to `jacobian` (3,), no unit; compiled.
+
+    p, a, b : (3,) m, one frame
+    """
     ax, ay, az = p[0] - a[0], p[1] - a[1], p[2] - a[2]
     bx, by, bz = p[0] - b[0], p[1] - b[1], p[2] - b[2]
     range_a = math.sqrt(ax * ax + ay * ay + az * az)
@@ -73,7 +88,13 @@ def linearized_tdoa(p: np.ndarray, a: np.ndarray, b: np.ndarray, jacobian: np.nd
 
 @compiled
 def rotate(q: np.ndarray, v: np.ndarray, out: np.ndarray) -> None:
-    """out = R(q) v for a unit quaternion q = x y z w (body to world); all (k,) arrays."""
+    """Write R(q) v to out (3,); compiled.
+
+    Parameters
+    ----------
+    q : (4,) unit quaternion x y z w, body to world
+    v : (3,), body
+    """
     x, y, z, w = q[0], q[1], q[2], q[3]
     tx = 2.0 * (y * v[2] - z * v[1])
     ty = 2.0 * (z * v[0] - x * v[2])
@@ -85,8 +106,14 @@ def rotate(q: np.ndarray, v: np.ndarray, out: np.ndarray) -> None:
 
 @compiled
 def rotate_each(q: np.ndarray, v: np.ndarray, out: np.ndarray) -> None:
-    """out = R(q) v for quaternions q (n, 4) x y z w, of any length, and one v (3,): (n, 3); NaN
-    where q is not finite, or zero.
+    """Write R(q) v for n quaternions and one vector to out (n, 3).
+
+    The result is NaN where q is zero or not finite. Compiled.
+
+    Parameters
+    ----------
+    q : (n, 4) x y z w, of any length
+    v : (3,)
     """
     unit = np.empty(4)
     for i in range(len(q)):

@@ -1,5 +1,6 @@
-"""Parts of scipy that take long to import and that a node hardly ever needs: imported when
-something of them is used.
+"""Parts of scipy that are imported at their first use.
+
+They take long to import, and nodes rarely need them.
 """
 
 from __future__ import annotations
@@ -12,10 +13,10 @@ if TYPE_CHECKING:
 
 
 class LazyModule:
-    """Stands for a module."""
+    """A stand-in for a module that is imported when an attribute is used."""
 
     def __init__(self, load: Callable[[], ModuleType]) -> None:
-        """load() imports and returns it."""
+        """Set `load`, a function that imports and returns the module."""
         self._load = load
 
     def __getattr__(self, name: str) -> Any:
@@ -24,7 +25,7 @@ class LazyModule:
 
 @LazyModule
 def interpolate() -> ModuleType:
-    """scipy.interpolate"""
+    """Import scipy.interpolate."""
     from scipy import interpolate as module
 
     return module
@@ -32,7 +33,7 @@ def interpolate() -> ModuleType:
 
 @LazyModule
 def rotations() -> ModuleType:
-    """scipy.spatial.transform"""
+    """Import scipy.spatial.transform."""
     from scipy.spatial import transform as module
 
     return module

@@ -1,10 +1,11 @@
 """The radio link of a tag and an anchor: antennas, received power, and late arrivals.
 
-Antenna frame: z along the null axis of the doughnut (the long side of an upright module), x out of
-its front face. Azimuth runs from +x through +y, elevation from the xy plane towards +z.
+Antenna frame: z along the null axis of the doughnut, x out of its front face. The null axis is the
+long side of an upright module. Azimuth runs from +x through +y, elevation from the xy plane
+towards +z.
 
-The functions broadcast: give one anchor for each sample as (n, 3) beside (n, 3), or all anchors for
-all samples as (m, 3) beside (n, 1, 3).
+The functions broadcast. One anchor per sample has the shapes (n, 3) and (n, 3). All anchors for
+all samples have the shapes (m, 3) and (n, 1, 3).
 """
 
 from __future__ import annotations
@@ -25,24 +26,22 @@ if TYPE_CHECKING:
 
 
 # Gain in dBi every 30 degrees around the full circle, of a DWM1000-like module near 4 GHz. These
-# are not measured
-# numbers: they are drawn in the shape of the plots in the DWM1000 data sheet (an uneven doughnut: 3
-# dB of ripple around
-# the upright module, two nulls of unequal depth along its axis, the deeper one where the board is
-# in the way), at the
-# level that Decawave's support quotes for the upright module (-2 to -5 dB).
-# from +x through +y
+# are not measured values. Their shape follows the plots in the DWM1000 data sheet, an uneven
+# doughnut. The ripple around the upright module is 3 dB. The two nulls along its axis have unequal
+# depth; the deeper one is where the board shadows the antenna. Decawave's support quotes their level
+# for the upright module (-2 to -5 dB).
+# Azimuth cut, from +x through +y.
 DWM1000_AZIMUTH = (-2.0, -2.2, -3.0, -4.0, -3.6, -2.8, -3.0, -4.2, -5.0, -4.4, -3.2, -2.3)
-# from +x through +z
+# Elevation cut from +x through +z.
 DWM1000_ELEVATION_1 = (-2.0, -2.5, -5.0, -11.0, -6.5, -3.5, -3.0, -4.5, -9.0, -20.0, -8.0, -3.0)
-# from +y through +z
+# Elevation cut from +y through +z.
 DWM1000_ELEVATION_2 = (-4.0, -3.5, -5.5, -11.0, -7.0, -5.0, -4.4, -5.5, -10.0, -20.0, -9.0, -5.0)
-LARGEST_GAIN = 200.0  # dB, in magnitude; more is a mistake
+LARGEST_GAIN = 200.0  # dB, magnitude; larger gains are input errors
 
 
 @dataclass(frozen=True)
 class Antenna:
-    """A 3-D radiation pattern built from three cuts, and the group delay that goes with it.
+    """A 3-D radiation pattern built from three cuts, and its group delay.
 
     Attributes
     ----------
@@ -50,11 +49,10 @@ class Antenna:
     elevation_1 : gains around the xz plane from +x through +z, dBi
     elevation_2 : gains around the yz plane from +y through +z, dBi
     gain_offset : added to all gains, dB (default 0)
-    delay_span : group delay of a direction in which nothing is radiated directly, metres (default
-        0.15: 10 - 15 cm is
-        what is reported for modules, 20 cm and more for poor antennas)
+    delay_span : group delay of a direction without direct radiation, m (default 0.15: reports give
+        10 - 15 cm for modules, 20 cm and more for poor antennas)
 
-    Where two cuts cross they must agree (to 0.01 dB), or the pattern would jump.
+    Where two cuts cross they must agree to 0.01 dB; otherwise the pattern would jump.
     """
 
     azimuth: tuple[float, ...] = DWM1000_AZIMUTH
@@ -64,7 +62,7 @@ class Antenna:
     delay_span: float = 0.15
 
     def __post_init__(self) -> None:
-        cuts = []  # their gains on the axes
+        cuts = []  # gains of each cut on the axes
         for name, most in (("gain_offset", LARGEST_GAIN), ("delay_span", 10.0)):
             value = getattr(self, name)
             if (
@@ -107,9 +105,9 @@ class Antenna:
 
     @cached_property
     def _cuts(self) -> tuple[Callable[..., np.ndarray], ...]:
-        """Gain around each of the cuts, functions of the angle, rad.
+        """Gain around each of the three cuts, dBi: functions of the angle, rad.
 
-        Not made before they are asked: scipy takes long to load.
+        Computed at the first use, because scipy takes long to load.
         """
         out = []
         for gains in map(np.asarray, (self.azimuth, self.elevation_1, self.elevation_2)):
@@ -130,11 +128,13 @@ class Antenna:
         return self._peak + self.gain_offset
 
     def gain(self, direction: ArrayLike) -> np.ndarray:
-        """Gain towards `direction`, (..., 3) in the antenna frame, any length: (...) dBi.
+        """Return the gain towards a direction, (...) dBi.
 
-        Source: eq. 14 of Grasso et al. (Sensors 2022, 22, 9136). Of each elevation cut the side of
-        the direction's own quadrant is used. The azimuth cut is met exactly; the elevation cuts
-        where cos(elevation)^40 has died out, and where they cross the others.
+        Source: eq. 14 of Grasso et al. (Sensors 2022, 22, 9136). Each elevation cut is read on the side
+        of the quadrant of the direction. The pattern equals the azimuth cut exactly. It equals the
+        elevation cuts where cos(elevation)^40 vanishes, and where they cross the other cuts.
+
+        direction : (..., 3), antenna frame, any length
         """
         direction = np.asarray(direction, dtype=float)
         x, y, z = direction[..., 0], direction[..., 1], direction[..., 2]
@@ -150,50 +150,49 @@ class Antenna:
         return (1.0 - near_plane) * elevation + near_plane * gain_theta + self.gain_offset
 
     def group_delay(self, direction: ArrayLike) -> np.ndarray:
-        """How late the antenna is in `direction`, (..., 3) in its frame: (...) metres, 0 ...
-        delay_span.
+        """Return the group delay in a direction: (...) m, 0 ... delay_span.
 
-        Own model: of the field that arrives, the share g = 10^((gain - peak gain) / 20) came
-        straight from the antenna and the rest, 1 - g, came over the board by a path that is
-        `delay_span` longer; the centroid of the two is late by delay_span (1 - g). So the best
-        direction is not delayed, and a null is late by nearly all of delay_span.
+        Own model. The share g = 10^((gain - peak gain) / 20) of the arriving field comes straight from
+        the antenna. The rest, 1 - g, comes over the board by a path that is `delay_span` longer. The
+        centroid of the two is late by delay_span (1 - g). Hence the best direction has no delay, and a
+        null is late by nearly delay_span.
+
+        direction : (..., 3), antenna frame, any length
         """
         return self.delay_at(self.gain(direction))
 
     def delay_at(self, gain: np.ndarray) -> np.ndarray:
-        """`group_delay` of directions with gains (...), dBi: (...) metres."""
+        """Return the `group_delay` of directions with gains (...), dBi: (...) m."""
         amplitude = 10.0 ** ((gain - self.peak_gain) / 20.0)
         return self.delay_span * np.maximum(1.0 - amplitude, 0.0)
 
 
 SPEED_OF_LIGHT = 299792458.0  # m/s
 
-# Range error of the DW1000 over received power, 500 MHz channels, 64 MHz PRF: Decawave APS011,
-# table 2.
+# Range error of the DW1000 over received power, 500 MHz channels, 64 MHz PRF. Source: Decawave
+# APS011, table 2.
 APS011_POWER_DBM = np.arange(-61.0, -97.0, -2.0)
 APS011_BIAS_MM = np.array(
     [-110, -105, -100, -93, -82, -69, -51, -27, 0, 21, 35, 42, 49, 62, 71, 76, 81, 86.0]
 )
 
-NOMINAL_GAIN = -3.3  # dBi, mean gain of the default antenna, for one whose attitude is not known
+NOMINAL_GAIN = -3.3  # dBi, mean gain of the default antenna, for an unknown attitude
 
-# An assumption: the tag's module lies flat on the vehicle, front (antenna x) up, null axis (antenna
-# z) along body x.
+# An assumption: the tag's module lies flat on the vehicle. Its front (antenna x) is up, its null
+# axis (antenna z) is along body x.
 FLAT_MOUNT = (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)
 
 
 @dataclass(frozen=True)
 class RadioLink:
-    """What a link is made of besides the poses.
+    """Properties of a link that do not depend on the poses.
 
     Attributes
     ----------
     anchor_antenna, tag_antenna : Antenna (default DWM1000-like)
-    tag_mount : quaternion x y z w, tag antenna to body (default: lying flat, null axis along body
-        x)
-    tx_power_dbm : power into the transmitting antenna, dBm (default -8.3: the legal mean of -41.3
-        dBm/MHz over
-        500 MHz, and 6 dB that the chip's smart power adds to frames this short)
+    tag_mount : quaternion x y z w, tag antenna to body (default: lying flat, null axis along body x)
+    tx_power_dbm : power into the transmitting antenna, dBm (default -8.3: the legal mean of
+        -41.3 dBm/MHz over 500 MHz, and 6 dB that the chip's smart power adds to frames this short)
     frequency : centre of the channel, Hz (default channel 2)
     """
 
@@ -204,13 +203,13 @@ class RadioLink:
     frequency: float = 3.9936e9
 
     def path_loss_db(self, distance: np.ndarray) -> np.ndarray:
-        """Free-space loss over `distance` m (not nearer than 1 cm), dB."""
+        """Return the free-space loss over `distance` m, dB; shorter distances count as 1 cm."""
         return 20.0 * np.log10(
             4.0 * np.pi * self.frequency * np.maximum(distance, 0.01) / SPEED_OF_LIGHT
         )
 
     def received_dbm(self, gains: np.ndarray, distance: np.ndarray) -> np.ndarray:
-        """What arrives over `distance` m with the `gains` of both antennas together, dBi: dBm."""
+        """Return the power, dBm, received over `distance` m; gains : sum of both antennas, dBi."""
         return self.tx_power_dbm + gains - self.path_loss_db(distance)
 
 
@@ -221,20 +220,27 @@ def received_power_dbm(
     q_anchor: ArrayLike,
     link: RadioLink = RadioLink(),
 ) -> np.ndarray:
-    """Power that arrives at the tag, dBm, with the shape the arguments broadcast to.
+    """Return the power that arrives at the tag, dBm, with the broadcast shape of the arguments.
 
-    p_tag (..., 3) tag antenna and p_anchor (..., 3) anchor antenna, world, metres; q_tag (..., 4)
-    body to world; q_anchor (..., 4) anchor antenna to world; quaternions x y z w. Source: Friis,
-    eq. 11 of Grasso et al. (Sensors 2022, 22, 9136), in dB, with the losses inside the gains.
-    Polarisation is not modelled, and nearer than 1 cm the distance counts as 1 cm.
+    Source: Friis, eq. 11 of Grasso et al. (Sensors 2022, 22, 9136), in dB, with the losses inside the
+    gains. Polarisation is not modelled. Below 1 cm the distance counts as 1 cm.
+
+    Parameters
+    ----------
+    p_tag : (..., 3) m, tag antenna, world
+    q_tag : (..., 4) x y z w, body to world
+    p_anchor : (..., 3) m, anchor antenna, world
+    q_anchor : (..., 4) x y z w, anchor antenna to world
+    link : RadioLink
     """
     of_tag, of_anchor, distance = _gains(p_tag, q_tag, p_anchor, q_anchor, link)
     return link.received_dbm(of_anchor + of_tag, distance)
 
 
 def power_bias(power_dbm: np.ndarray) -> np.ndarray:
-    """Range error of the DW1000 at a received power in dBm: metres, linear in the table of APS011,
-    constant beyond.
+    """Return the range error of the DW1000, m, at a received power, dBm.
+
+    Linear between the entries of the table of APS011, constant beyond.
     """
     return 1e-3 * np.interp(power_dbm, APS011_POWER_DBM[::-1], APS011_BIAS_MM[::-1])
 
@@ -246,11 +252,10 @@ def arrival_bias(
     q_anchor: ArrayLike,
     link: RadioLink = RadioLink(),
 ) -> np.ndarray:
-    """By how much the signal of an anchor seems to come from farther away: metres; arguments as
-    `received_power_dbm`.
+    """Return the range error of the signal of an anchor, m, positive for a late arrival.
 
-    The sum of the chip's error over received power (APS011) and of the group delays of both
-    antennas.
+    The sum of the chip's error over received power (APS011) and the group delays of both antennas.
+    Parameters as for `received_power_dbm`.
     """
     of_tag, of_anchor, distance = _gains(p_tag, q_tag, p_anchor, q_anchor, link)
     return power_bias(link.received_dbm(of_anchor + of_tag, distance)) + (
@@ -261,9 +266,7 @@ def arrival_bias(
 def _gains(
     p_tag: ArrayLike, q_tag: ArrayLike, p_anchor: ArrayLike, q_anchor: ArrayLike, link: RadioLink
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Gain of the tag's antenna towards the anchor, that of the anchor's towards the tag, dBi, and
-    their distance, m.
-    """
+    """Return the gains of the tag's and the anchor's antenna, dBi, and the distance, m."""
     to_anchor = np.asarray(p_anchor, dtype=float) - np.asarray(p_tag, dtype=float)
     seen_from_tag = into_frame(link.tag_mount, into_frame(q_tag, to_anchor))
     seen_from_anchor = into_frame(q_anchor, -to_anchor)
@@ -275,8 +278,12 @@ def _gains(
 
 
 def into_frame(q: ArrayLike, v: ArrayLike) -> np.ndarray:
-    """R(q)^T v: world vectors (..., 3) in the frame whose orientation is q (..., 4), x y z w, frame
-    to world.
+    """Return R(q)^T v: world vectors in the frame of orientation q.
+
+    Parameters
+    ----------
+    q : (..., 4) x y z w, frame to world
+    v : (..., 3), world
     """
     q, v = np.asarray(q, dtype=float), np.asarray(v, dtype=float)
     x, y, z, w = -q[..., 0], -q[..., 1], -q[..., 2], q[..., 3]

@@ -1,8 +1,8 @@
-"""Robust losses: how little a residual counts that is larger than it should be.
+"""Robust losses: they reduce the weight of large residuals.
 
-A loss rho(e) of the normalised residual e gives iteratively re-weighted least squares with the
-weight rho'(e) / e, 1 at e = 0 (MacTavish and Barfoot, At all costs: a comparison of robust cost
-functions for camera correspondence outliers, 2015, table I).
+A loss rho(e) of the normalised residual e gives iteratively re-weighted least squares. The weight
+is rho'(e) / e, 1 at e = 0. Source: MacTavish and Barfoot, At all costs: a comparison of robust cost
+functions for camera correspondence outliers, 2015, table I.
 """
 
 from __future__ import annotations
@@ -17,8 +17,13 @@ GEMAN_MCCLURE, HUBER, CAUCHY = range(3)  # places in LOSSES
 
 @compiled
 def weight(loss: int, e: float, scale: float) -> float:
-    """rho'(e) / e, 0 to 1. loss : place in LOSSES; e : normalised residual; scale : where the loss
-    bends, same unit.
+    """Return the weight rho'(e) / e of a residual, 0 to 1; compiled.
+
+    Parameters
+    ----------
+    loss : place in LOSSES
+    e : normalised residual
+    scale : residual where the loss bends, unit of e
     """
     u = (e / scale) ** 2
     if loss == GEMAN_MCCLURE:
@@ -30,6 +35,9 @@ def weight(loss: int, e: float, scale: float) -> float:
 
 @compiled
 def geman_mcclure_loss(e: float, scale: float) -> float:
-    """2 rho(e) / scale^2 of Geman and McClure, 0 to 1. e, scale : as for `weight`."""
+    """Return 2 rho(e) / scale^2 of Geman and McClure, 0 to 1; compiled.
+
+    e, scale : as for `weight`
+    """
     u = (e / scale) ** 2
     return u / (1.0 + u)

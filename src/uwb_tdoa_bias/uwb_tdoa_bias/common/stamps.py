@@ -10,55 +10,64 @@ from .compiled import compiled
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-# s behind the newest stamp of a stream; messages of one clock are not out of order by more
+# s behind the newest stamp of a stream. With one clock, messages are out of order by less.
 LARGEST_STEP_BACK = 1.0
-# s ahead of the newest stamp, that any stream and that a slow one may go at once
+# s ahead of the newest stamp: the step that any stream, and a slow stream, may make at once.
 STEP_AHEAD, LARGEST_STEP_AHEAD = (0.25, 2.0)
-# times the usual step of a stream, that it may go at once; one lost message is twice, three are
-# four times
+# Multiple of the usual step that a stream may make at once. One lost message makes two steps, three
+# lost messages make four.
 USUAL = 4.0
-FORGETTING = 0.1  # share of the usual step that the latest one makes
+FORGETTING = 0.1  # weight of the latest step in the usual step
 NEAR = 0.25  # s between stamps of two streams that confirm each other
-# s over which a jump must persist that no other stream confirms: where another one goes on in the
-# time before, and where none does
+# s. A jump that no other stream confirms must persist so long: where another stream continues in
+# the old time, and where none does.
 CONTRADICTED, UNCONTRADICTED = 0.3, 0.05
-MOST_HELD = 1000  # messages of a stream that stands still at another time
+MOST_HELD = 1000  # held messages of a stream with a stopped clock
 
 
 class StampGate:
     """Let through the items of one stream whose stamps are plausible.
 
-    An item with another stamp is held. If the next stamp is plausible again, the held item is an
-    outlier. If the following stamps agree with it, the clock has jumped: the items are accepted.
-    They agree at once when another stream has reached the same time, else when they have gone on
-    for a while. A gap in a stream looks like a jump ahead and is treated alike.
+    An item with an implausible stamp is held. If the next stamp is plausible, the held item is an
+    outlier. If the following stamps agree with the held one, the clock has jumped, and the items are
+    accepted. They agree at once if another stream has reached the same time. Otherwise the jump must
+    persist for CONTRADICTED or UNCONTRADICTED seconds. A gap in a stream is treated like a jump ahead.
     """
 
     def __init__(self) -> None:
-        self.newest = -math.inf  # s, of the stamps accepted
-        self.usual = LARGEST_STEP_AHEAD / USUAL  # s, the usual step from one stamp to a later one
+        self.newest = -math.inf  # s, newest accepted stamp
+        self.usual = LARGEST_STEP_AHEAD / USUAL  # s, mean step between stamps
         self._held: list[tuple[float, Any]] = []
 
     def __len__(self) -> int:
-        """Items held."""
+        """Return the number of held items."""
         return len(self._held)
 
     @property
     def held(self) -> float:
-        """Stamp of the last of two or more items that are held, s; NaN if there are fewer."""
+        """Stamp of the last held item, s; NaN for fewer than two held items."""
         return self._held[-1][0] if len(self._held) > 1 else math.nan
 
     @property
     def limit(self) -> float:
-        """Stamp, s, up to which the stream may go at once."""
+        """Latest plausible stamp of the next item, s."""
         return self.newest + allowed_step(self.usual)
 
     def take(
         self, t: float, item: Any, reached: Iterable[float] = ()
     ) -> tuple[list[tuple[float, Any]], list[tuple[float, Any]], bool]:
-        """Take an item stamped t, s. reached : stamps, s, that other streams have reached. Returns
-        (accepted, outliers, jumped_back): lists of (t, item), and whether the accepted ones are the
-        first of an earlier time.
+        """Take one item, and return the items that this decides.
+
+        Parameters
+        ----------
+        t : stamp, s
+        item : any object
+        reached : stamps that other streams have reached, s
+
+        Returns
+        -------
+        accepted, outliers : lists of (t, item)
+        jumped_back : whether the accepted items are the first of an earlier time
         """
         if self.newest == -math.inf or self._is_plausible(t):
             outliers, self._held = self._held, []
@@ -80,8 +89,9 @@ class StampGate:
         return accepted, outliers, jumped_back
 
     def take_all(self, stamps: Sequence[float]) -> bool:
-        """Whether items stamped so, a list of s in the order of their arrival, are all plausible;
-        then they are accepted.
+        """Accept items if all their stamps are plausible, and return whether they are.
+
+        stamps : s, in order of arrival
         """
         if self._held:
             return False
@@ -94,7 +104,7 @@ class StampGate:
         return True
 
     def pass_time(self, t: float, reached: Iterable[float] = ()) -> None:
-        """Note the time t, s, of an item that is good for nothing else. reached : as of `take`."""
+        """Note the time t, s, of an item that is not used otherwise; `reached` as in `take`."""
         if (
             self._is_plausible(t)
             or t > self.newest
@@ -103,7 +113,7 @@ class StampGate:
             self._go_on(t)
 
     def finish(self) -> list[tuple[float, Any]]:
-        """What is held when nothing follows, a list of (t, item): outliers."""
+        """Return the held items when the stream ends, a list of (t, item); they are outliers."""
         held, self._held = self._held, []
         return held
 
@@ -127,15 +137,19 @@ class StampGate:
 
 @compiled
 def allowed_step(usual: float) -> float:
-    """Return by how much, s, the next stamp may be ahead of the newest one of a stream with this
-    usual step, s.
+    """Return the largest plausible step, s, from the newest stamp to the next; compiled.
+
+    usual : usual step of the stream, s
     """
     return min(max(STEP_AHEAD, USUAL * usual), LARGEST_STEP_AHEAD)
 
 
 @compiled
 def usual_step(usual: float, step: float) -> float:
-    """Return the usual step after another step, both in s. Only steps ahead count."""
+    """Return the usual step, s, after another step; compiled. Only steps ahead count.
+
+    usual, step : s
+    """
     if not step > 0.0:
         return usual
     return usual + FORGETTING * (min(step, LARGEST_STEP_AHEAD) - usual)

@@ -1,4 +1,4 @@
-"""Read anchor surveys, and find the faults that a survey shows by itself."""
+"""Read anchor surveys, and find faults that a survey alone shows."""
 
 from __future__ import annotations
 
@@ -22,26 +22,33 @@ if TYPE_CHECKING:
     from .anchors import Anchors
 
 
-SAME_PLACE = 0.001  # m; two antennas are some centimetres apart at least
-# m. A UWB radio reaches some 300 m at most, and a tag must hear several anchors at once: beyond
-# this an anchor has no neighbours.
+SAME_PLACE = 0.001  # m; two antennas are at least some cm apart
+# m. A UWB radio reaches at most 300 m, and a tag must receive several anchors at once. An anchor
+# farther than this from all others has no neighbours.
 LONELY = 500.0
-NEIGHBOURS = 2  # that an anchor must have within that; fewer where there are fewer
-USUAL = 6.0  # m between neighbours of usual installations: the unit that comes nearest is named
+NEIGHBOURS = 2  # required within LONELY; fewer if there are fewer anchors
+USUAL = 6.0  # m between neighbours, typical; the unit that gives the nearest value is named
 UNITS = {
     "millimetres": 1000.0,
     "centimetres": 100.0,
     "inches": 1.0 / 0.0254,
     "decimetres": 10.0,
     "feet": 1.0 / 0.3048,
-}  # in 1 m
-FARTHEST_OFF = 200  # anchors, those farthest off the middle, of which neighbours are looked for
+}  # units per metre
+FARTHEST_OFF = 200  # anchors farthest from the median whose neighbours are searched
 MOST_NAMED = 10  # anchors in a sentence
 
 
 class SurveyFault(NamedTuple):
-    """rule : its name; cause : what is wrong, a clause; evidence : numbers; remedy : what to do;
-    value : the number that decided.
+    """A fault of a survey.
+
+    Attributes
+    ----------
+    rule : its name
+    cause : what is wrong, a clause
+    evidence : numbers
+    remedy : what to do
+    value : the number that decided
     """
 
     rule: str
@@ -52,12 +59,12 @@ class SurveyFault(NamedTuple):
 
     @property
     def sentence(self) -> str:
-        """All of it in one line."""
+        """Cause, evidence and remedy in one line."""
         return f"{self.cause} ({self.evidence}); {self.remedy}."
 
 
 def survey_faults(anchors: Anchors) -> list[SurveyFault]:
-    """Return what is certainly wrong with Anchors: list of SurveyFault, empty for a usable survey."""
+    """Return the certain faults of Anchors: list of SurveyFault, empty for a usable survey."""
     if len(anchors) < 2:
         return []
     together = _together(anchors)
@@ -70,9 +77,9 @@ def survey_faults(anchors: Anchors) -> list[SurveyFault]:
 
 
 def refuse_faulty(anchors: Anchors, source: str = "anchors") -> Anchors:
-    """Return the Anchors unchanged. source : where they are from, for the message.
+    """Return the Anchors unchanged; raise InputError for a survey that is certainly wrong.
 
-    Raises InputError for a survey that is certainly wrong.
+    source : origin of the anchors, for the message
     """
     faults = survey_faults(anchors)
     if faults:
@@ -81,7 +88,7 @@ def refuse_faulty(anchors: Anchors, source: str = "anchors") -> Anchors:
 
 
 def _together(anchors: Anchors) -> list[np.ndarray]:
-    """Groups of rows (k,) that are at one place."""
+    """Return groups of rows (k,) of anchors at one place."""
     cells = np.round(anchors.positions / SAME_PLACE)
     _, group, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     return [np.flatnonzero(group.reshape(-1) == number) for number in np.flatnonzero(counts > 1)]
@@ -104,7 +111,7 @@ def _same_place(anchors: Anchors, together: list[np.ndarray]) -> list[SurveyFaul
 
 
 def _far(anchors: Anchors) -> list[SurveyFault]:
-    """Anchors without neighbours within the reach of a radio: all of them, or single ones."""
+    """Return faults of anchors without neighbours within radio reach: all, or single anchors."""
     positions = anchors.positions
     off = np.abs(positions - np.median(positions, axis=0)).max(axis=1)
     rows = np.argsort(off)[-FARTHEST_OFF:]
@@ -160,27 +167,24 @@ def _listed(ids: np.ndarray) -> str:
     return named[0] if len(named) == 1 else f"{', '.join(named[:-1])} and {named[-1]}"
 
 
-# The tips of the three marker arms of a stand in the stand's own frame, metres. Arm 1 points up
-# (z), arm 3 forward (x).
-# Arm 2, "left" for somebody who looks at the stand from the front, points to -y: only this makes a
-# right-handed frame
-# of the three. (With +y the fit is as good, for three points are flat, but every stand tilts by
-# some 60 degrees. With
-# -y those on the floor have z up to within 1 degree, and in all of them the antenna is 11 mm
-# forward, 26 mm to -y and
-# 49 mm up of where the arms meet.)
+# The tips of the three marker arms of a stand, m, in the frame of the stand. Arm 1 points up (z),
+# arm 3 forward (x). Arm 2 points to -y: "left" for a person who looks at the stand from the front.
+# Only this sign makes the frame right-handed. The fit cannot determine it, since three points are
+# flat. With +y, every stand tilts by some 60 degrees. With -y, stands on the floor have z up to
+# within 1 degree. In all stands the antenna is then 11 mm forward, 26 mm to -y and 49 mm up. These
+# distances count from the point where the arms meet.
 ARM_TIPS = np.array([[0.0, 0.0, 0.110], [0.0, -0.121, 0.0], [0.080, 0.0, 0.0]])
-MAX_TIP_RESIDUAL = 0.010  # metres RMS; measured: 0.5 ... 2.2 mm
+MAX_TIP_RESIDUAL = 0.010  # m RMS; measured: 0.5 ... 2.2 mm
 
 _ANTENNA = re.compile(r"anchorAnt_?([0-9]{1,9})$")
 _TIP = re.compile(r"anchor_?([0-9]{1,9})_([123])$")
 
 
 def read_survey(path: str | Path) -> Anchors:
-    """Anchors of a survey file: of a total station, or of any form of `read_entries` whose anchors
-    are called by numbers.
+    """Return the Anchors of a survey file, in the frame of the survey.
 
-    Positions stay in the frame of the survey. Raises InputError with line or key, value and remedy.
+    The file is of a total station, or of any form of `read_entries` whose anchors have numbers as
+    names. Raises InputError with line or key, value and remedy.
     """
     entries, frame = read_entries(path)
     for entry in entries:
@@ -194,7 +198,7 @@ def read_survey(path: str | Path) -> Anchors:
 def anchors_of(
     path: str | Path, entries: Sequence[Entry], ids: Sequence[int], frame: str
 ) -> Anchors:
-    """Return Anchors of entries of a file, under these ids. Raises InputError."""
+    """Return the Anchors of entries of a file, with these ids; raise InputError."""
     positions, orientations = (
         np.array([entry.position for entry in entries]),
         np.array([entry.orientation for entry in entries]),
@@ -206,25 +210,23 @@ def anchors_of(
 
 
 def is_id(name: str) -> bool:
-    """Return whether a name is a whole number, as messages have it."""
+    """Return whether a name is a whole number, as ids in messages are."""
     return re.fullmatch("[0-9]{1,9}", name) is not None
 
 
 def read_entries(path: str | Path) -> tuple[list[Entry], str]:
-    """Anchors of a survey file as they stand there, and the name of the world frame. The form is
-    told by content:
+    """Return the entries of a survey file in its own order, and the name of the world frame.
+
+    The content determines the form:
 
     - total station: lines `name,x,y,z` in metres; `anchorAntN` is the antenna of anchor N,
-      `anchorN_1/_2/_3` the arm
-      tips of its stand (up, left, forward), from which the orientation follows; other names are
-      ignored;
-    - a table: commas, semicolons, tabs or blanks between its cells; a header names id, x, y and z
-      in any usual way, with or without
-      units; without a header each line is an id and three numbers;
-    - YAML or JSON: `anchors: {0: {position: [x, y, z], orientation: [x, y, z, w]}}`, that as a
-      list, `0: {x:, y:, z:}` of the Crazyflie
-      client, `anchor0_pos: [x, y, z]` of lps-ros, parameter files of ROS, an OpenCV matrix of a row
-      for each anchor.
+      `anchorN_1/_2/_3` are the arm tips of its stand (up, left, forward), which give the
+      orientation; other names are ignored;
+    - a table: commas, semicolons, tabs or blanks between its cells; a header names id, x, y and z in
+      any usual way, with or without units; without a header each line is an id and three numbers;
+    - YAML or JSON: `anchors: {0: {position: [x, y, z], orientation: [x, y, z, w]}}`, the same as a
+      list, `0: {x:, y:, z:}` of the Crazyflie client, `anchor0_pos: [x, y, z]` of lps-ros, parameter
+      files of ROS, an OpenCV matrix with a row for each anchor.
 
     Orientation: antenna stand to world; x forward, z up the stand, y completes a right-handed
     frame. NaN if not surveyed. Raises InputError.
@@ -252,12 +254,18 @@ def read_entries(path: str | Path) -> tuple[list[Entry], str]:
 
 
 def orientation_from_tips(tips: np.ndarray) -> tuple[np.ndarray, float]:
-    """Rotation that best turns `ARM_TIPS` into the surveyed tips, and the RMS distance that
-    remains.
+    """Return the rotation that best turns `ARM_TIPS` into the surveyed tips, and its RMS residual.
 
-    tips : (3, 3) world positions of tips 1, 2, 3, metres. Returns (quaternion x y z w stand to
-        world, metres).
     Source: Kabsch, Acta Cryst. A 32, 1976 (as implemented by scipy).
+
+    Parameters
+    ----------
+    tips : (3, 3) m, positions of tips 1, 2, 3, world
+
+    Returns
+    -------
+    orientation : quaternion x y z w, stand to world
+    residual : m
     """
     surveyed, nominal = tips - tips.mean(axis=0), ARM_TIPS - ARM_TIPS.mean(axis=0)
     rotation, _ = rotations.Rotation.align_vectors(surveyed, nominal)

@@ -1,6 +1,4 @@
-"""The usual forms of anchor files: tables with any header or none, and mappings or lists in YAML or
-JSON.
-"""
+"""The usual forms of anchor files: tables, and mappings or lists in YAML or JSON."""
 
 from __future__ import annotations
 
@@ -19,7 +17,7 @@ if TYPE_CHECKING:
 
 Lines = list[tuple[int, list[str]]]  # numbers of lines, and their cells
 
-NOT_SURVEYED = [math.nan] * 4  # the orientation of such an anchor
+NOT_SURVEYED = [math.nan] * 4  # orientation without a survey
 IDS = (
     "id",
     "anchor",
@@ -64,8 +62,14 @@ _OPENCV = re.compile(r"^%YAML:1\.0\s*$", re.MULTILINE)
 
 
 class Entry(NamedTuple):
-    """One anchor of a file. name : its id as text, or a name; position : (3,) m; orientation : (4,)
-    x y z w, NaN if not surveyed; where : the line or key, for messages.
+    """One anchor of a file.
+
+    Attributes
+    ----------
+    name : its id as text, or a name
+    position : (3,) m
+    orientation : (4,) x y z w, NaN if not surveyed
+    where : the line or key, for messages
     """
 
     name: str
@@ -75,9 +79,14 @@ class Entry(NamedTuple):
 
 
 class Columns(NamedTuple):
-    """What the cells of a header are. name : place of the id or name, or None; axes : places of x,
-    y and z; lengths : m, unit of each;
-    turn : places of the quaternion x, y, z, w, or ().
+    """Meaning of the cells of a table.
+
+    Attributes
+    ----------
+    name : place of the id or name, or None
+    axes : places of x, y and z
+    lengths : units of x, y and z, m
+    turn : places of the quaternion x, y, z, w, or ()
     """
 
     name: int | None
@@ -87,8 +96,9 @@ class Columns(NamedTuple):
 
 
 def columns_of(header: Sequence[str]) -> Columns | None:
-    """Return the Columns that names of a header mean, in upper or lower case, with or without a
-    unit; None without x, y and z.
+    """Return the Columns of a header; None without x, y and z.
+
+    Names may be in upper or lower case, with or without a unit.
     """
     roles: dict[str, int] = {}
     lengths: dict[str, float] = {}
@@ -109,7 +119,7 @@ def columns_of(header: Sequence[str]) -> Columns | None:
 
 
 def _role(cell: str) -> tuple[str, float]:
-    """("x", "y", "z", "name", "qx" ... or "", m of its unit) of a column."""
+    """Return ("x", "y", "z", "name", "qx" ... or "", unit in m) of a header cell."""
     text = " ".join(re.split(r"[\s_.]+", cell.strip().lower())).strip()
     found = _UNIT.match(text)
     text, unit = (found[1].strip(), found[2]) if found else (text, "")
@@ -125,13 +135,13 @@ def _role(cell: str) -> tuple[str, float]:
 
 
 def is_table(text: str) -> bool:
-    """Return whether a text is a table: no YAML and no JSON."""
+    """Return whether a text is a table, not YAML or JSON."""
     lines = [
         line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")
     ]
     if not lines:
         return True
-    # a table may begin with -3.1
+    # A table may begin with a negative number, e.g. -3.1.
     begins_tree = lines[0].lstrip()[0] in "{[%-" and not _is_number(cells_of(lines[0])[0])
     return not begins_tree and not any(map(_KEY.match, lines))
 
@@ -140,7 +150,7 @@ _KEY = re.compile(r"^\s*(?:- *)?[{\s]*[\"']?[\w /*.-]+[\"']?\s*:(?:\s|$)")
 
 
 def cells_of(line: str, delimiter: str | None = None) -> list[str]:
-    """Return the cells of a line, stripped. delimiter : default: what `delimiter_of` finds in it."""
+    """Return the stripped cells of a line; delimiter : default by `delimiter_of`."""
     delimiter = delimiter or delimiter_of(line)
     return (
         line.split()
@@ -150,7 +160,7 @@ def cells_of(line: str, delimiter: str | None = None) -> list[str]:
 
 
 def lines_of(text: str) -> Lines:
-    """Return the lines of a table that are neither empty nor comments; a comment may be the header."""
+    """Return the lines of a table without comments and empty lines; a comment may be the header."""
     texts = [
         (number, line) for number, line in enumerate(text.splitlines(), start=1) if line.strip()
     ]
@@ -168,7 +178,7 @@ def lines_of(text: str) -> Lines:
 
 
 def delimiter_of(line: str) -> str:
-    """Return what stands between the cells of a line: ";", tab, "," or " "."""
+    """Return the delimiter of a line: ";", tab, "," or " "."""
     return next(
         (
             each
@@ -180,9 +190,7 @@ def delimiter_of(line: str) -> str:
 
 
 def _all_commas_decimal(line: str) -> bool:
-    """Whether each comma of a line is one within a number of a table whose cells stand apart by
-    blanks.
-    """
+    """Return whether all commas of a line are decimal commas of cells separated by blanks."""
     cells = line.split()
     return (
         len(cells) >= 3
@@ -196,7 +204,7 @@ def _is_number(cell: str) -> bool:
 
 
 def _number(value: Any) -> float:
-    """A finite number of a cell or value, a decimal comma allowed; NaN for anything else."""
+    """Return the finite number of a cell or value, else NaN; a decimal comma is permitted."""
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
         return math.nan
     text = (
@@ -212,8 +220,11 @@ def _number(value: Any) -> float:
 
 
 def read_table(lines: Lines) -> list[Entry] | None:
-    """Return the entries of a table, numbers of lines and their cells; None if it has neither a
-    header that is understood, nor an id and three numbers in each line. Raises InputError.
+    """Return the entries of a table; None for an unknown header or form.
+
+    A table without a header needs an id and three numbers in each line. Raises InputError.
+
+    lines : line numbers and cells
     """
     (number, header), rest = lines[0], lines[1:]
     columns = columns_of(header)
@@ -280,7 +291,7 @@ def read_tree(text: str, path: str | Path) -> tuple[list[Entry], str]:
         _OPENCV.sub("", text).replace("!!opencv-matrix", "") if opencv else text, path
     )
     frame = "map"
-    for _ in range(8):  # the levels around the anchors: those of a parameter file, and "anchors"
+    for _ in range(8):  # levels around the anchors: parameter file, and "anchors"
         if not isinstance(content, dict):
             break
         given = content.get("frame", content.get("frame_id", frame))
@@ -314,7 +325,7 @@ WRITE = "write 'anchors: {0: {position: [x, y, z]}, 1: ...}', in metres"
 
 
 def _entries(content: Any) -> Iterator[Entry]:
-    """Raises ValueError with key, value and remedy."""
+    """Yield the entries of a list or mapping; raise ValueError with key, value and remedy."""
     if isinstance(content, list):
         for place, item in enumerate(content):
             yield _of_list(item, f"anchors[{place}]")
@@ -351,7 +362,7 @@ def _entries(content: Any) -> Iterator[Entry]:
 
 
 def _of_matrix(key: Any, value: dict[str, Any]) -> Iterator[Entry]:
-    """Rows of an OpenCV matrix are the anchors 0, 1, 2, ...: it has no place for ids."""
+    """Yield the rows of an OpenCV matrix as anchors 0, 1, 2, ...; it has no place for ids."""
     rows, columns, data = value["rows"], value["cols"], value["data"]
     if (
         columns != 3
@@ -404,8 +415,9 @@ def _text(name: Any) -> str:
 
 
 def _of_value(name: str, value: Any, where: str) -> Entry:
-    """The anchor `name` of a list of three numbers, or a mapping with a position, or with x, y and
-    z.
+    """Return the anchor `name` of its value.
+
+    value : list of three numbers, or mapping with a position, or with x, y and z
     """
     if isinstance(value, list):
         return Entry(name, _three(value, where), NOT_SURVEYED, where)

@@ -7,14 +7,16 @@ import re
 
 from .limits import LINE_LENGTH, NAME_LENGTH
 
-# Other characters may be a command to Markdown, HTML, a shell, a file system or the mathematics of
+# Other characters can be commands to Markdown, HTML, a shell, a file system or the mathematics of
 # matplotlib.
 _OTHERS = re.compile(r"[^\w .,:;+=()#-]")
 
 
 def printable(text: object) -> str:
-    r"""The text with what is no character to see (line ends, escape sequences, marks that turn the direction of writing, halves of
-    characters) written out, as \x1b: a terminal shows it and does nothing else.
+    r"""Return a text in which all invisible characters are escaped, e.g. as \x1b.
+
+    Invisible are line ends, escape sequences, marks that turn the writing direction, and halves of
+    characters. A terminal displays the result and does nothing else.
     """
     return "".join(
         one if one.isprintable() else one.encode("unicode_escape", "surrogatepass").decode()
@@ -23,7 +25,7 @@ def printable(text: object) -> str:
 
 
 def line_of(text: object) -> str:
-    """One printable line of a bounded length: the middle of a longer text is left out."""
+    """Return one printable line of at most LINE_LENGTH characters; the middle is left out."""
     whole, half = str(text), LINE_LENGTH // 2
     line = printable(
         whole[:LINE_LENGTH] + whole[-LINE_LENGTH:] if len(whole) > 2 * LINE_LENGTH else whole
@@ -32,16 +34,18 @@ def line_of(text: object) -> str:
 
 
 def sanitize(text: object) -> str:
-    """A name that means nothing anywhere: what is no letter, digit, space or one of .,:;+=()#-
-    becomes _, and its end is cut.
+    """Return a name without special meaning in any program.
+
+    Characters other than letters, digits, space and .,:;+=()#- become _. The name is cut to
+    NAME_LENGTH.
     """
     return _OTHERS.sub("_", str(text))[:NAME_LENGTH]
 
 
 @cache
 def version() -> str:
-    """Its version, e.g. "0.1.0"; "unknown" where the packages are not installed."""
-    from importlib import metadata  # takes a twentieth of a second
+    """Return the version of the packages, e.g. "0.1.0"; "unknown" if they are not installed."""
+    from importlib import metadata  # the import takes 0.05 s
 
     try:
         return metadata.version("uwb_tdoa_bias")
@@ -50,5 +54,5 @@ def version() -> str:
 
 
 def written_by() -> str:
-    """For the files that we write: "uwb_tdoa 0.1.0"."""
+    """Return the program and version for the head of written files: "uwb_tdoa 0.1.0"."""
     return f"uwb_tdoa {version()}"

@@ -1,4 +1,4 @@
-"""Frames and how they lie to each other: what TF says, without ROS."""
+"""A tree of frames and the transforms between them: the content of TF, without ROS."""
 
 from __future__ import annotations
 
@@ -17,30 +17,37 @@ if TYPE_CHECKING:
 
     from scipy.spatial.transform import Rotation
 
-KEPT = 1000  # transforms of a frame that moves
-HELD = 0.5  # s for which the last transform of a frame that moves holds
-DEEPEST = 100  # frames between a frame and its root
-MOST, MOST_MOVING = 1000, 200  # frames that do not move, and that do
-SHORTEST, LONGEST = 1e-3, 1e3  # of a quaternion, which should be 1
-# m and rad; a constant transform that is sent again with less of a change is the same
+KEPT = 1000  # transforms kept per moving frame
+HELD = 0.5  # s, validity of the last transform of a moving frame
+DEEPEST = 100  # frames up to the root
+MOST, MOST_MOVING = 1000, 200  # constant frames, and moving frames
+SHORTEST, LONGEST = 1e-3, 1e3  # norm of a quaternion, nominally 1
+# m and rad. A constant transform that is sent again with a smaller change counts as the same.
 SAME_PLACE, SAME_TURN = (1e-3, 1e-3)
-FARTHEST = 1e8  # m; squares of what is off by more, and is turned by a gyroscope, may overflow
+FARTHEST = 1e8  # m; squares of larger offsets times rates may overflow
 
 _Moved = tuple[float, tuple[float, ...], tuple[float, ...]]  # t, q and p
 
 
 class Frames:
-    """A tree of frames, each with a transform to its parent that is constant, or a course in time."""
+    """A tree of frames; the transform of each to its parent is constant or moves with time."""
 
     def __init__(self) -> None:
         self._static: dict[
             str, tuple[str, Rotation, np.ndarray]
-        ] = {}  # parent, turn and p of each frame
-        self._moving: dict[str, tuple[str, deque[_Moved]]] = {}  # parent, and the last transforms
+        ] = {}  # {frame: (parent, Rotation, p)}
+        self._moving: dict[str, tuple[str, deque[_Moved]]] = {}  # {frame: (parent, last ones)}
 
     def set(self, parent: str, child: str, q: Sequence[float], p: Sequence[float]) -> bool:
-        """Set a constant transform, unless that is known: x_parent = R(q) x_child + p; q (4,) x y z
-        w, p (3,) m. Returns whether it is new. Raises InputError for what is no transform.
+        """Set a constant transform, and return whether it is new.
+
+        x_parent = R(q) x_child + p. Raises InputError for an invalid transform.
+
+        Parameters
+        ----------
+        parent, child : names of frames
+        q : (4,) x y z w
+        p : (3,) m
         """
         new = self.differs(parent, child, q, p)
         if new:
@@ -48,12 +55,14 @@ class Frames:
         return new
 
     def knows(self, child: str) -> bool:
-        """Whether a frame has a constant transform."""
+        """Return whether a frame has a constant transform."""
         return child in self._static
 
     def differs(self, parent: str, child: str, q: Sequence[float], p: Sequence[float]) -> bool:
-        """Whether this is the first constant transform of that frame, or differs from it by more
-        than SAME_PLACE or SAME_TURN. Raises InputError as `set` does.
+        """Return whether a constant transform is new, or differs from the known one.
+
+        It differs by more than SAME_PLACE or SAME_TURN. Parameters as for `set`. Raises InputError as
+        `set`.
         """
         self._check(self._static, MOST, parent, child, q, p)
         known = self._static.get(child)
@@ -64,8 +73,10 @@ class Frames:
     def move(
         self, parent: str, child: str, q: Sequence[float], p: Sequence[float], t: float
     ) -> None:
-        """The transform at stamp t, s. One that is not later than the last is passed over; another
-        parent starts anew. Raises InputError for what is no transform.
+        """Add the transform at stamp t, s, of a moving frame; the other parameters as for `set`.
+
+        A transform that is not later than the last one is ignored. Another parent, or a stamp more than
+        1 s before the last one, deletes the earlier transforms. Raises InputError for an invalid transform.
         """
         self._check(self._moving, MOST_MOVING, parent, child, q, p)
         known = self._moving.get(child)
@@ -108,8 +119,9 @@ class Frames:
     def between(
         self, target: str, source: str, t: float | None = None
     ) -> tuple[Rotation, np.ndarray] | None:
-        """(Rotation, p (3,) m) with x_target = R x_source + p, at stamp t, s, for frames that move;
-        None if not known.
+        """Return (Rotation, p (3,) m) with x_target = R x_source + p; None if unknown.
+
+        t : stamp, s, for frames that move
         """
         ours, theirs = self._to_root(source, t), self._to_root(target, t)
         common = next((frame for frame in ours if frame in theirs), None)
@@ -119,7 +131,7 @@ class Frames:
         return other_turn.inv() * turn, other_turn.inv().apply(p - other_p)
 
     def _to_root(self, frame: str, t: float | None) -> dict[str, tuple[Rotation, np.ndarray]]:
-        """{ancestor: (Rotation, p)} of a frame, itself first."""
+        """Return {ancestor: (Rotation, p (3,) m)} of a frame, itself first."""
         turn, p = rotations.Rotation.identity(), np.zeros(3)
         found = {frame: (turn, p)}
         for _ in range(DEEPEST):
@@ -132,7 +144,7 @@ class Frames:
         return found
 
     def _at(self, frame: str, t: float | None) -> tuple[str, Rotation, np.ndarray] | None:
-        """(parent, Rotation, p) of a frame that moves, interpolated; None where it is not known."""
+        """Return (parent, Rotation, p (3,) m) of a moving frame, interpolated; None if unknown."""
         if t is None or frame not in self._moving:
             return None
         parent, course = self._moving[frame]

@@ -1,3 +1,1 @@
-"""From raw TDOAs to corrected ones: effects and network together, at the poses that the filter
-reports.
-"""
+"""Correction of TDOAs by effects and network, at poses that the filter reports."""

@@ -1,4 +1,4 @@
-"""From raw TDOAs to corrected ones: the core of bias_node and of the offline engine."""
+"""Correct raw TDOAs: the core of bias_node and of the offline filter."""
 
 from __future__ import annotations
 
@@ -26,20 +26,26 @@ if TYPE_CHECKING:
 
 # status of one correction; the values of TdoaCorrected.STATUS_*
 PASSED, EFFECTS, NETWORK, FADED = range(4)
-# s after the first pose, before which no TDOA is corrected: what is not corrected there costs
-# accuracy
+# s after the first pose. Earlier TDOAs are corrected without a pose, which costs accuracy.
 START = 0.2
-# rad; a yaw that is less certain is unknown: the filter follows four, 90 degrees apart
+# rad. A yaw with a larger standard deviation is unknown: then the filter follows four yaws,
+# 90 degrees apart.
 LARGEST_YAW_STD = 1.0
-# share of what can be known that a network's prediction has at least, or it counts as faded
+# Share of the possible knowledge; a prediction with less counts as faded.
 FADED_BELOW = 0.5
 
 
 @dataclass(frozen=True)
 class Correction:
-    """bias, std : (n,) m; corrected = d - bias, (n,) m; status : (n,) one of PASSED, EFFECTS,
-    NETWORK, FADED; slope : (n, 6) change of the bias, m, with position, m, and velocity, m/s, of
-    the tag, world axes, about state (n, 6), where the bias is that.
+    """Corrections of n TDOAs.
+
+    Attributes
+    ----------
+    bias, std : (n,) m
+    corrected : (n,) m, d - bias
+    status : (n,) of PASSED, EFFECTS, NETWORK, FADED
+    slope : (n, 6), Jacobian of the bias by position and velocity of the tag, world; 1 and s
+    state : (n, 6), position, m, and velocity, m/s, of the tag, world, at which bias and slope hold
     """
 
     bias: np.ndarray
@@ -53,26 +59,28 @@ class Correction:
     def flat(
         cls, d: np.ndarray, bias: np.ndarray, std: np.ndarray, status: np.ndarray
     ) -> Correction:
-        """Of raw d (n,) m with a bias that nobody knows to change with the state."""
+        """Return the Correction of raw d (n,) m by a bias (n,) m that is constant in the state."""
         return cls(bias, std, d - bias, status, *np.zeros((2, len(d), N_STATES)))
 
     @classmethod
     def none(cls, d: np.ndarray) -> Correction:
-        """Of raw d (n,) m that nothing is known to be wrong with."""
+        """Return the Correction of raw d (n,) m without any known bias."""
         bias, std = np.zeros((2, len(d)))
         return cls.flat(d, bias, std, np.full(len(d), PASSED, dtype=np.uint8))
 
 
 class Corrector:
-    """Predicts the systematic error of each TDOA at the pose the tag had a little earlier, and
-    removes it.
+    """Predict the bias of each TDOA at an earlier pose of the tag, and remove it.
 
-    The pose used for a measurement is the newest one stamped no later than `lag` before the
-    measurement that preceded it. It depends on stamps alone, so that a recording gives the same
-    result at any speed; it leaves the filter `lag` seconds to report that pose; and the filter can:
-    it needs nothing later than the preceding measurement, after a gap neither. In the first `start`
-    seconds after the first pose no pose is used: it may arrive so much later than it is stamped,
-    and changes nothing.
+    The pose of a measurement is the newest one stamped at least `lag` s before the preceding
+    measurement. This choice has three advantages:
+
+    - It depends on stamps alone, so a recording gives the same result at any speed.
+    - The filter has `lag` s to report the pose.
+    - The filter needs nothing later than the preceding measurement for it, even after a gap.
+
+    No pose is used in the first `start` s after the first pose. The first pose may arrive that much
+    later than its stamp without changing a result.
     """
 
     def __init__(
@@ -84,9 +92,16 @@ class Corrector:
         history: int = 4096,
         start: float = START,
     ) -> None:
-        """anchors : Anchors; effects : EffectSet or None, of which those that the filter weighs
-        stay in, as `weighed`; network : Network or None;
-        lag : s; history : poses kept; start : s.
+        """Set the bias model.
+
+        Parameters
+        ----------
+        anchors : Anchors
+        effects : EffectSet or None; hypotheses, which the filter weighs, are not corrected: see `weighed`
+        network : Network or None
+        lag : s
+        history : number of poses kept
+        start : s
         """
         self.anchors = anchors
         effects = EffectSet() if effects is None else effects
@@ -100,7 +115,7 @@ class Corrector:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all poses."""
+        """Delete all poses."""
         self._poses = Poses(self._history, self._start)
         self._latest: Samples | None = None  # of the latest TDOAs
         self._newest: float = None  # type: ignore[assignment]  # latest stamp of a TDOA, once there is one
@@ -108,18 +123,19 @@ class Corrector:
         self._last: tuple[float, int] | None = None  # stamp and later anchor of the last one
 
     def change_anchors(self, anchors: Anchors) -> None:
-        """Go on among other Anchors, with the poses that are known."""
+        """Continue with other Anchors and the known poses."""
         self.anchors, self._latest, self._last = anchors, None, None
 
     @property
     def idle(self) -> bool:
-        """True if there is nothing to correct with."""
+        """True without effects and network."""
         return not len(self.effects) and self.network is None
 
     @property
     def outside(self) -> list[str]:
-        """Phrases on those effects of which less than half was taken out of some of the latest
-        TDOAs, because they were not seen where those were.
+        """Phrases on effects that faded by more than half for some of the latest TDOAs.
+
+        Such TDOAs were measured outside of the domain of the effect.
         """
         return [] if self._latest is None else self.effects.outside(self._latest)
 
@@ -131,17 +147,24 @@ class Corrector:
         v: ArrayLike = np.nan,
         yaw_std: ArrayLike = 0.0,
     ) -> None:
-        """Tell where the tag was: t s, p (3,) m, q (4,) x y z w body to world, v (3,) m/s, world,
-        NaN for an unknown one, yaw_std rad: deviation of its rotation about the vertical; or
-        several: (k,), (k, 3), (k, 4), (k, 3), (k,). Stamps must rise; others are ignored.
+        """Add one pose of the tag, or k poses; stamps must rise, others are ignored.
+
+        Parameters
+        ----------
+        t : s, or (k,)
+        p : (3,) m, world, or (k, 3)
+        q : (4,) x y z w, body to world, or (k, 4)
+        v : (3,) m/s, world, or (k, 3); NaN if unknown
+        yaw_std : rad, or (k,); standard deviation of the rotation about the vertical
         """
         self._poses.add(
             t, p, q, np.broadcast_to(v, np.shape(p)), np.broadcast_to(yaw_std, np.shape(t))
         )
 
     def ready(self, before: float) -> bool:
-        """True if no pose that is still to come can change the correction of a measurement that
-        follows one stamped so.
+        """Return whether no future pose can change the correction of a TDOA.
+
+        before : stamp of the TDOA that precedes it, s
         """
         return (
             self.idle
@@ -150,15 +173,19 @@ class Corrector:
         )
 
     def share_poses(self, other: Corrector) -> None:
-        """Use the poses of another Corrector, which alone is given them from now on."""
+        """Use the poses of another Corrector; from now on only that one gets new poses."""
         self._poses = other._poses
 
     def correct(self, t: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray) -> Correction:
-        """Correct a batch.
+        """Return the Correction of a batch.
 
-        t : (n,) s; a, b : (n,) anchor rows (of `anchors`); d : (n,) raw d_ab, m. Returns a
-            Correction. Where no pose is
-        known yet, only effects that need none contribute.
+        Where no pose is known, only effects that need none contribute.
+
+        Parameters
+        ----------
+        t : (n,) s
+        a, b : (n,) rows of `anchors`
+        d : (n,) m, raw d_ab
         """
         if self.idle or len(t) == 0:
             return Correction.none(d)
@@ -172,9 +199,10 @@ class Corrector:
     def contribution(
         self, samples: Samples
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """(bias (n,) m, its standard deviation (n,) m, slope (n, 6), state (n, 6)), as of a
-        Correction, of the effects in Samples; while the yaw is unknown the mean over four headings,
-        and its scatter, without the slope of those that depend on it.
+        """Return bias (n,) m, its std (n,) m, slope (n, 6) and state (n, 6) of the effects.
+
+        Units as in Correction. While the yaw is unknown, bias and std are mean and scatter over four
+        headings. Then effects that use the attitude have no slope.
         """
         slope = state = np.zeros((len(samples), N_STATES))
         if not len(self.effects):
@@ -207,7 +235,7 @@ class Corrector:
         return bias, noise, slope, state
 
     def samples(self, t: np.ndarray, a: np.ndarray, b: np.ndarray) -> Samples:
-        """Samples of a batch at the poses that are known by now."""
+        """Return the Samples of a batch at the poses known so far; parameters as for `correct`."""
         if self._newest is None:
             self._first = self._newest = t[0]
         places, p, q, yaw_std = self._poses.before(t, self._newest, self.lag)
@@ -226,8 +254,9 @@ class Corrector:
 
 
 def warm_up(effects: EffectSet, network: Network | None, lag: float = POSE_LAG) -> Corrector:
-    """A Corrector, after compiling, or loading from numba's cache, whatever its first correction
-    needs.
+    """Return a Corrector after one correction.
+
+    The first correction compiles the functions, or loads them from numba's cache.
     """
     corrector = Corrector(Anchors.from_positions(np.eye(3)), effects, network, lag)
     corrector.add_pose(
@@ -246,8 +275,9 @@ def _add_learned(
     std: np.ndarray,
     status: np.ndarray,
 ) -> None:
-    """Put what a network predicts, three (n,) arrays, on top of bias and std (n,) m of effects,
-    where it is known.
+    """Add the prediction of a network to bias and std (n,) m where it is finite; compiled.
+
+    learned, deviation : (n,) m; known : (n,) 0 ... 1; status : (n,), updated
     """
     for i in range(len(bias)):
         if math.isfinite(learned[i]):
@@ -261,15 +291,16 @@ pass
 
 
 class FixedPoseCorrector(Corrector):
-    """Corrects a recording at the poses that a run with another model has had."""
+    """Corrects a recording at the poses of an earlier run with another model."""
 
-    idle = True  # nothing of this run is waited for
+    idle = True  # no waiting for poses
 
     def __init__(
         self, anchors: Anchors, effects: EffectSet | None, poses: Sequence[np.ndarray]
     ) -> None:
-        """poses : (t (k,) s, p (k, 3) m, q (k, 4), v (k, 3) m/s, yaw_std (k,) rad) of the other
-        run, as `add_pose` takes them.
+        """Set the poses of the earlier run.
+
+        poses : (t (k,) s, p (k, 3) m, q (k, 4), v (k, 3) m/s, yaw_std (k,) rad), as for `add_pose`
         """
         self._known = poses
         super().__init__(anchors, effects, history=max(len(poses[0]), 1))

@@ -1,6 +1,6 @@
-"""What a network may ask for: the 14 features of Zhao et al.
+"""Input features of a network: the 14 features of Zhao et al., and places.
 
-(RA-L 2021, section III), and where everything is.
+Source: Zhao et al. (RA-L 2021), section III.
 """
 
 from __future__ import annotations
@@ -18,10 +18,9 @@ if TYPE_CHECKING:
 
     from ..effects.samples import Samples
 
-# Azimuth (about z, from x) and elevation (above the x-y plane) of the tag seen from the antenna
-# frame of each anchor (A),
-# and of each anchor seen from the tag's body frame (T), rad; positions of the anchors relative to
-# the tag, world axes, m.
+# d*: position of both anchors relative to the tag, m, world axes. Azimuth (about z, from x) and
+# elevation (above the xy plane), rad. A: of the tag in the antenna frame of each anchor. T: of each
+# anchor in the tag's body frame.
 FEATURES = (
     "dx_a",
     "dy_a",
@@ -39,8 +38,8 @@ FEATURES = (
     "elevation_T_b",
 )
 
-# Position of the tag, world, m; horizontal parts of the body's x and z axes; ids
-# and positions, world, m, of both anchors. With these a model knows a place when it is there again.
+# Position of the tag, m, world; horizontal parts of the body's x and z axes; ids and positions,
+# m, world, of both anchors. With these features a model recognizes a place.
 PLACE = (
     "x",
     "y",
@@ -64,15 +63,17 @@ NAMES = FEATURES + PLACE
 
 
 def columns(samples: Samples, names: Iterable[str]) -> np.ndarray:
-    """The named features (of NAMES) of a batch: Samples -> (n, len(names)) float, NaN where
-    unknown.
+    """Return some features of a batch, (n, len(names)) float; NaN where unknown.
+
+    names : out of NAMES
     """
     return everything(samples)[:, [NAMES.index(name) for name in names]]
 
 
 def everything(samples: Samples) -> np.ndarray:
-    """All features of a batch, in the order of NAMES: Samples -> (n, 29) float, NaN where a pose it
-    needs is unknown.
+    """Return all features of a batch, (n, 29) float, in the order of NAMES.
+
+    They are NaN where they need an unknown pose.
     """
     out = np.empty((len(samples), len(NAMES)))
     anchors = samples.anchors

@@ -1,21 +1,21 @@
-"""A bias network in an ONNX file that says itself what it wants and how far it can be trusted.
+"""A bias network in an ONNX file with its own inputs, limits and validity.
 
 Metadata of the model (all values JSON text):
     features  list of names out of features.FEATURES and features.PLACE: the input columns
-    offset, scale  lists as long as features: the network is fed (feature - offset) / scale
+    offset, scale  lists as long as features: the network input is (feature - offset) / scale
     clip      number, metres: the output is limited to +-clip
     name      short name, goes into every message
-    validity  optional: {feature: [lowest, highest, margin]}, in the units of the features. Inside, the network is
-              believed; beyond by `margin` or more, not at all; linearly in between, the worst
+    validity  optional: {feature: [lowest, highest, margin]}, in the units of the features. Inside, the output
+              counts fully; beyond by `margin` or more, not at all; linearly in between, the worst
               feature counting.
-    fade_std  number, metres, with validity: standard deviation of the bias where the network is not believed
-    largest_yaw_std  optional: number, radians; where the yaw is less certain, the bias is not taken out, but counts as
-              uncertainty
-    share     optional: number 0 ... 1: how much of the prediction is taken out, found by cross-validation over the
+    fade_std  number, metres, with validity: standard deviation of the bias where the output does not count
+    largest_yaw_std  optional: number, radians; where the yaw is less certain, the bias is not corrected, but counts
+              as uncertainty
+    share     optional: number 0 ... 1: share of the prediction that is corrected, found by cross-validation over the
               flights of the training; the rest counts as uncertainty
-Input: one float tensor (n, number of features), of any name. Output: one float tensor (n, 1), bias
-in metres; (n, 2), bias and its standard deviation in metres; or (n, 3), with the share 0 ... 1 of
-what can be known that the network knows there: it has already faded bias and deviation itself.
+Input: one float tensor (n, number of features), of any name. Output: one float tensor. (n, 1): bias
+in metres. (n, 2): bias and its standard deviation in metres. (n, 3): in addition the share 0 ... 1
+of the possible knowledge that the network has; then bias and deviation are already faded.
 """
 
 from __future__ import annotations
@@ -43,13 +43,18 @@ _COLUMN = {name: column for column, name in enumerate(NAMES)}
 
 
 def load_network(name: str | Path | None) -> Network | None:
-    """Return the Network of a file, or None for an empty name. Raises InputError."""
+    """Return the Network of a file, or None for an empty name; raise InputError."""
     return Network(name) if name else None
 
 
 class Validity(NamedTuple):
-    """The features, columns (k,) of NAMES, that a network fades by: between lower and upper (k,) it
-    is right, margin (k,) beyond it says nothing.
+    """The ranges of the features outside of which a network fades.
+
+    Attributes
+    ----------
+    columns : (k,) of NAMES
+    lower, upper : (k,), full validity between them
+    margin : (k,), distance from this range to no validity; units of the features
     """
 
     columns: np.ndarray
@@ -59,13 +64,18 @@ class Validity(NamedTuple):
 
 
 class Network:
-    """An ONNX bias model. meta : all its metadata, dict of str; trained_with : names of the effects
-    that were taken out before it was trained, and have to be corrected beside it; share : how much
-    of its prediction is taken out, 0 ... 1.
+    """An ONNX bias model.
+
+    Attributes
+    ----------
+    meta : all its metadata, dict of str
+    trained_with : names of the effects that were corrected before the training; they must be
+        corrected in use, too
+    share : share of its prediction that is corrected, 0 ... 1
     """
 
     def __init__(self, path: str | Path) -> None:
-        """Load `path`; raises InputError if it is no model or its metadata do not fit."""
+        """Load a file; raise InputError if it is no model or has unsuitable metadata."""
         self._path = Path(path).absolute()
         if not Path(path).is_file():
             raise InputError(
@@ -99,9 +109,9 @@ class Network:
         self._ask(path)
 
     def _ask(self, path: str | Path) -> None:
-        """Ask it for the mean of all features.
+        """Run the model on the mean of all features.
 
-        Raises InputError unless it gives up to three finite numbers for each row.
+        Raises InputError unless it returns one to three finite numbers per row.
         """
         out = self._model.run(np.zeros((1, len(self._inputs))))
         if out.shape[1] > 3 or not np.isfinite(out).all():
@@ -111,7 +121,7 @@ class Network:
             )
 
     def __reduce__(self) -> tuple[type[Network], tuple[Path]]:
-        """Pickled as the path of its file: a session cannot be."""
+        """Return the path of the file for pickle, which cannot store a session."""
         return Network, (self._path,)
 
     def _read(self, meta: dict[str, str]) -> None:
@@ -146,9 +156,9 @@ class Network:
             raise ValueError("share must be between 0 and 1")
 
     def predict(self, samples: Samples) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Bias and its standard deviation, metres, and how much of what can be known is known
-        there, 0 ... 1: three (n,) arrays. The first two are NaN where a feature that is needed is
-        unknown.
+        """Return bias (n,) m, its std (n,) m, and the share (n,) 0 ... 1 of the possible knowledge.
+
+        Bias and std are NaN where a required feature is unknown.
         """
         yaw_std = (
             NO_NUMBERS
@@ -166,7 +176,7 @@ class Network:
 
 
 def _session(path: str | Path) -> Session:
-    """The Session of a file whose content has stood its trial. Raises InputError."""
+    """Return the Session of a file whose content passed its trial; raise InputError."""
     content = read_bytes(path, MODEL_BYTES)
     from .trial import Session, Unplayable, tried_out  # imports onnxruntime
 
@@ -197,7 +207,11 @@ def _limit(
     yaw_std: np.ndarray,
     found: np.ndarray,
 ) -> None:
-    """What the network says, (n, 1 to 3), becomes bias, std and known, (3, n)."""
+    """Write bias, m, std, m, and known share, (3, n), to found; compiled.
+
+    out : (n, 1 to 3), output of the network; table : (n, 29), as of `everything`
+    limits : clip, m, fade_std, m, share, largest_yaw_std, rad; yaw_std : (n,) rad, or empty
+    """
     columns, lower, upper, margin = (
         validity.columns,
         validity.lower,

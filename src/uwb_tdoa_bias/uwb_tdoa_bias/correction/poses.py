@@ -1,4 +1,4 @@
-"""The poses of the last seconds, and how fast they change."""
+"""The poses of the last seconds, and a queue of measurements that wait for a pose."""
 
 from __future__ import annotations
 
@@ -18,12 +18,19 @@ if TYPE_CHECKING:
 
 
 POSE_NUMBERS, TWIST_NUMBERS = 3 + 4 + 36, 6 + 36  # of PoseWithCovariance and TwistWithCovariance
-TILT = 0.5  # rad; a filter that does not know the tilt better estimates no attitude
+TILT = 0.5  # rad; with a larger tilt std the filter estimates no attitude
 
 
 class Columns(NamedTuple):
-    """Stamps t (m,) s, positions p (m, 3) m, attitudes q (m, 4) x y z w, body to world, velocities
-    v (m, 3) m/s, world, and standard deviations of the yaw (m,) rad.
+    """Poses as arrays.
+
+    Attributes
+    ----------
+    t : (m,) s
+    p : (m, 3) m, world
+    q : (m, 4) x y z w, body to world
+    v : (m, 3) m/s, world
+    yaw_std : (m,) rad
     """
 
     t: np.ndarray
@@ -34,9 +41,9 @@ class Columns(NamedTuple):
 
 
 class Poses:
-    """Poses in the order of their stamps, of which at least the last `history` are kept. begin :
-    stamp, s, of the first pose and `start` later, from which on poses are used; inf before there is
-    one.
+    """Poses in the order of their stamps; at least the last `history` are kept.
+
+    begin : stamp, s, from which poses are used: `start` s after the first pose; inf before it
     """
 
     def __init__(self, history: int, start: float) -> None:
@@ -73,8 +80,15 @@ class Poses:
     def add(
         self, t: ArrayLike, p: ArrayLike, q: ArrayLike, v: ArrayLike, yaw_std: ArrayLike
     ) -> None:
-        """Append one pose, or several: t (k,), p (k, 3), q (k, 4), v (k, 3), yaw_std (k,) rad.
-        Those not later than all before them are ignored.
+        """Append one pose, or k poses; poses not later than all before them are ignored.
+
+        Parameters
+        ----------
+        t : (k,) s
+        p : (k, 3) m
+        q : (k, 4) x y z w
+        v : (k, 3) m/s
+        yaw_std : (k,) rad
         """
         parts: Any = (t, p, q, v, yaw_std) if np.ndim(t) else ([t], [p], [q], [v], [yaw_std])
         new = Columns(*(np.ascontiguousarray(part, dtype=float) for part in parts))
@@ -85,9 +99,18 @@ class Poses:
     def before(
         self, t: np.ndarray, newest: float, lag: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Of the newest poses stamped no later than `lag` s before the TDOA that precedes each of t
-        (n,) s, as `preceding` says: numbers (n,), p (n, 3), q (n, 4), yaw_std (n,); -1 and NaN
-        where there is none, and before `begin`.
+        """Return the newest pose at least `lag` s before the TDOA that precedes each TDOA.
+
+        Parameters
+        ----------
+        t : (n,) s, of the TDOAs; `preceding` gives the TDOA before each
+        newest : latest stamp of earlier TDOAs, s
+        lag : s
+
+        Returns
+        -------
+        places, p, q, yaw_std : (n,) int, (n, 3) m, (n, 4), (n,) rad; -1 and NaN where there is no pose,
+            and before `begin`
         """
         n = len(t)
         out = np.empty(n, dtype=np.int64), np.empty((n, 3)), np.empty((n, 4)), np.empty(n)
@@ -97,9 +120,9 @@ class Poses:
 
 @compiled
 def _append(count: int, kept: Columns, new: Columns) -> int:
-    """Append what is later than all before it, and returns how many there are.
+    """Append poses that are later than all before them, and return the new count; compiled.
 
-    Once there is no room, only the last half is kept.
+    A full array keeps its last half.
     """
     history = len(kept.t) // 2
     for i in range(len(new.t)):
@@ -145,11 +168,11 @@ def _look_up(
 
 
 def known_yaw_std(std: np.ndarray) -> np.ndarray:
-    """Standard deviation of the yaw, (n,) rad, of attitudes with deviations std (n, 3) rad about
-    the axes of the world.
+    """Return the standard deviation of the yaw, (n,) rad.
 
-    It is 0 where the tilt is not known either: then no attitude is estimated, and level at yaw 0 is
-    what is meant.
+    It is 0 where the tilt is unknown: such a filter estimates no attitude, and means level at yaw 0.
+
+    std : (n, 3) rad, of the attitude about the axes of the world
     """
     return np.where(np.maximum(std[:, 0], std[:, 1]) < TILT, std[:, 2], 0.0)
 
@@ -157,12 +180,17 @@ def known_yaw_std(std: np.ndarray) -> np.ndarray:
 def parts_of(
     poses: np.ndarray, twists: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """What a Corrector takes of nav_msgs/Odometry: (p (n, 3) m, q (n, 4) x y z w, v (n, 3) m/s,
-    world, yaw_std (n,) rad).
+    """Return the input of a Corrector from numbers of nav_msgs/Odometry.
 
-    poses, twists : PoseWithCovariance (n, 43) and TwistWithCovariance (n, 42), body frame, their
-        numbers in their order. An orientation of
-    (0, 0, 0, 0) says that it is not known: NaN.
+    Parameters
+    ----------
+    poses : (n, 43), PoseWithCovariance, in the order of the message
+    twists : (n, 42), TwistWithCovariance, body, in the order of the message
+
+    Returns
+    -------
+    p, q, v, yaw_std : (n, 3) m, (n, 4) x y z w, (n, 3) m/s, world, (n,) rad; q is NaN for the
+        orientation (0, 0, 0, 0), which means unknown
     """
     p, q, v, std = (np.empty((len(poses), k)) for k in (3, 4, 3, 3))
     _part(poses, twists, p, q, v, std)
@@ -184,7 +212,7 @@ def _part(
             q[n] = np.nan
         x, y, z, w = q[n]
         a, b, c = twists[n, :3]
-        # v + w d + (x, y, z) x d
+        # R(q) v = v + w d + (x, y, z) x d, with d = 2 (x, y, z) x v
         d, e, f = (2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a))
         v[n, 0], v[n, 1], v[n, 2] = (
             a + w * d + y * f - z * e,
@@ -196,25 +224,27 @@ def _part(
 
 
 def rotated_in_yaw(q: np.ndarray, quarters: int) -> np.ndarray:
-    """Attitudes q (n, 4) x y z w, turned about the vertical by some quarters of a turn."""
+    """Return attitudes turned about the vertical by some quarters of a turn.
+
+    q : (n, 4) x y z w
+    """
     s, c = np.sin(0.25 * np.pi * quarters), np.cos(0.25 * np.pi * quarters)
     x, y, z, w = q.T
     return np.stack([c * x - s * y, c * y + s * x, c * z + s * w, c * w - s * z], axis=1)
 
 
-MOST = 10_000  # items: what has one stamp for ever would never have waited too long
+MOST = 10_000  # items; limits a queue whose stamps stand still
 
 
 class PoseQueue:
-    """A queue in order of arrival. Its first item leaves when it is ready, or when it has been
-    waited for too long.
+    """A queue in order of arrival; its first item leaves when it is ready, or has waited too long.
 
-    What makes an item ready depends on the stamp of the item before it. Too long is counted in
-    stamps: a newer item is stamped more than `limit` seconds later, or MOST wait.
+    Whether an item is ready depends on the stamp of the item before it. An item has waited too long
+    if a newer item is stamped more than `limit` s later. The same holds if more than MOST items wait.
     """
 
     def __init__(self, limit: float) -> None:
-        """limit : s."""
+        """Set the limit of the wait, s."""
         self.limit = limit
         self._items: deque[tuple[float, float, Any]] = deque()
         self._newest: float = None  # type: ignore[assignment]  # latest stamp so far, s, once there is one
@@ -229,8 +259,9 @@ class PoseQueue:
         self._newest = max(newest, t)
 
     def take(self, ready: Callable[[float], bool]) -> list[tuple[float, Any, bool]]:
-        """Remove and return what may leave: a list of (t, item, ready(before)), `before` being the
-        latest stamp added before the item, at most t; t for the first.
+        """Remove and return the items that may leave: a list of (t, item, ready(before)).
+
+        before : s, the latest stamp added before the item, at most t; t for the first item
         """
         out = []
         while self._items:

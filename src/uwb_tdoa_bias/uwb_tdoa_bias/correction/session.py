@@ -1,40 +1,47 @@
-"""A model in onnxruntime. Importing that takes 60 ms, and is left to those who have a model."""
+"""A model in onnxruntime.
+
+The import of onnxruntime takes 60 ms; only users of a model import this module.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 import onnxruntime
 
-PACKED = 4  # rows to whose multiples a batch is filled up
-BATCH = 64  # rows at most that are played together: what they hold stays in the cache
+PACKED = 4  # rows; batches are filled up to a multiple
+BATCH = 64  # rows per run at most; their data fit into the cache
 
 
 class Unplayable(ValueError):
-    """The file is no model, has an operator that is not played here, or is too large."""
+    """The file is no model, is too large, or has an operator that is not permitted."""
 
 
 class Session:
-    """A model on one thread, which gives each row of the input the same bits, whatever comes with
-    it.
+    """A model on one thread; each row of the input gives the same bits in any batch.
 
-    width, outputs : columns of the input and of the output; meta : {key: text} of the file; alone :
-        whether each row is played by itself.
+    Attributes
+    ----------
+    width, outputs : columns of the input and of the output
+    meta : {key: text} of the file
+    alone : whether each row is run separately
     """
 
     def __init__(
         self, content: bytes, alone: bool = False, options: onnxruntime.SessionOptions | None = None
     ) -> None:
-        """Load the content of an ONNX file, as `options` say. Raises Unplayable where onnxruntime
-        does not take it, or it has not one input (n, width) and one output (n, outputs).
+        """Load the content of an ONNX file.
+
+        Raises Unplayable if onnxruntime refuses it, or unless it has one input (n, width) and one output
+        (n, outputs).
         """
         options = options or onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
-        options.log_severity_level = 4  # what goes wrong is reported by who calls
+        options.log_severity_level = 4  # the caller reports errors
         try:
             self._session = onnxruntime.InferenceSession(
                 content, options, providers=["CPUExecutionProvider"], enable_fallback=0
             )
-        except Exception as error:  # of its own family, with no common public base
+        except Exception as error:  # onnxruntime's exceptions have no public base class
             raise Unplayable(f"onnxruntime: {str(error).splitlines()[0][:200]}") from error
         inputs = self._session.get_inputs()
         if len(inputs) != 1 or len(self._session.get_outputs()) != 1 or len(inputs[0].shape) != 2:
@@ -49,9 +56,10 @@ class Session:
         self.outputs = self._play(np.zeros((1, self.width), np.float32)).shape[1]
 
     def run(self, x: np.ndarray) -> np.ndarray:
-        """x (n, width) float -> (n, outputs) float. Rows are filled up to whole packets: other
-        kernels play the rest of one, and a single row. Each batch begins at an address of its own,
-        which is a multiple of 16 bytes.
+        """Return the output (n, outputs) float of an input x (n, width) float.
+
+        Rows are filled up to whole packets, since onnxruntime has other kernels for incomplete packets
+        and single rows. Each batch begins at its own address, a multiple of 16 bytes.
         """
         out, most = np.empty((len(x), self.outputs)), 1 if self.alone else BATCH
         for first in range(0, len(x), most):
@@ -59,11 +67,11 @@ class Session:
         return out
 
     def end_profiling(self) -> str:
-        """Name of the file that says what was executed, where the options ask for it."""
+        """Return the name of the profile, where the options ask for one."""
         return str(self._session.end_profiling())
 
     def _play(self, some: np.ndarray) -> np.ndarray:
-        """One batch. Raises Unplayable."""
+        """Return the output of one batch; raise Unplayable."""
         padded = np.zeros(
             (len(some) + (0 if self.alone else -len(some) % PACKED), self.width), np.float32
         )

@@ -1,11 +1,10 @@
-"""Play a model first where it does no harm: in a process with little time and memory, which opens
-no file.
+"""Run a model first in a process with little time and memory that opens no file.
 
-A model comes from anywhere, and a kilobyte of it may unfold to terabytes. So `tried_out` starts a
-process that gets the bytes and limits itself, loads them with onnxruntime, and plays them. Only
-bytes that stand the trial are loaded here. No trial can find what a model does with other numbers.
-So the operators that onnxruntime executes, by its own profile, are those of a list: none of them
-loops, branches, or makes a shape out of numbers.
+A model may come from anywhere, and 1 kB of it may unfold to terabytes. `tried_out` starts a
+process that gets the bytes, limits itself, loads them with onnxruntime, and runs them. Only bytes
+that pass this trial are loaded elsewhere. No trial covers all inputs of a model. Therefore all
+operators that onnxruntime executes, by its own profile, must be in OPERATORS. None of them loops,
+branches, or makes a shape out of numbers.
 """
 
 from __future__ import annotations
@@ -45,12 +44,13 @@ START = (
 
 @lru_cache(maxsize=4)
 def tried_out(content: bytes) -> bool:
-    """Whether each row of a model has to be played by itself to get the same bits whatever comes
-    with it. Raises Unplayable where the content of an ONNX file is none that is played here.
+    """Return whether rows of a model must be run separately to give the same bits in any batch.
+
+    Raises Unplayable if the content of an ONNX file fails the trial.
     """
     path = [
         entry for entry in sys.path if os.path.isabs(entry)
-    ]  # the present folder of the process is an empty one
+    ]  # the process runs in an empty folder
     with temporary_folder() as folder:
         try:
             done = subprocess.run(
@@ -76,14 +76,14 @@ def tried_out(content: bytes) -> bool:
 
 
 def main() -> None:
-    """Judge the model on the standard input, and write the judgement to the standard output."""
+    """Judge the model on standard input, and write the result to standard output."""
     print(json.dumps(judge(sys.stdin.buffer.read())))
 
 
 def judge(content: bytes) -> tuple[bool, str]:
-    """(whether rows are to be played alone, why the model is refused, or "").
+    """Return (whether rows must be run separately, reason for refusal or "").
 
-    Limits this process for good, and writes to the present folder.
+    Limits this process permanently, and writes to the present folder.
     """
     _limit_this_process()
     try:
@@ -91,14 +91,14 @@ def judge(content: bytes) -> tuple[bool, str]:
         session = Session(content)
         _refuse_slow(session)
         session.alone |= not _is_the_same_in_any_batch(session)
-    except Exception as error:  # whatever a library makes of a model, or of too little memory
+    except Exception as error:  # any exception of a library, also for lack of memory
         return False, str(error) if isinstance(error, Unplayable) else repr(error)[:200]
     return session.alone, ""
 
 
 def _limit_this_process() -> None:
-    """From now on it has so much more time and memory, opens no file, and leaves no dump."""
-    memory = int(re.search(r"VmSize:\s+(\d+)", Path("/proc/self/status").read_text())[1]) << 10  # type: ignore[index]  # it is there
+    """Limit time and memory of this process; from now on it opens no file and leaves no dump."""
+    memory = int(re.search(r"VmSize:\s+(\d+)", Path("/proc/self/status").read_text())[1]) << 10  # type: ignore[index]  # found on Linux
     seconds = int(time.process_time()) + 1 + MODEL_SECONDS
     for limit, most in (
         ("AS", memory + MODEL_MEMORY),
@@ -111,7 +111,7 @@ def _limit_this_process() -> None:
 
 
 def _let_open(count: int) -> None:
-    """Allow this process so many files that are not open yet."""
+    """Allow this process to open `count` more files."""
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
     free = os.open("/", os.O_PATH)
@@ -120,13 +120,11 @@ def _let_open(count: int) -> None:
 
 
 def _refuse_operators(content: bytes) -> None:
-    """Raise Unplayable unless all operators that onnxruntime executes are OPERATORS, each as it
-    stands in the file.
-    """
+    """Raise Unplayable unless all executed operators are in OPERATORS, without optimization."""
     options = onnxruntime.SessionOptions()
     options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
     options.enable_profiling, options.profile_file_prefix = True, "profile"
-    # the profile, which is opened first; a model whose weights are in another file finds no more
+    # One file: the profile, which is opened first. A model with weights in another file finds none.
     _let_open(1)
     session = Session(content, options=options)
     profile = session.end_profiling()
@@ -143,9 +141,10 @@ def _refuse_operators(content: bytes) -> None:
 
 
 def _is_the_same_in_any_batch(session: Session) -> bool:
-    """Whether each row of random numbers comes out as by itself, to the bit. A sum over columns may
-    not: in which order onnxruntime adds up depends on where in memory the row begins. Rows that
-    mix, and batches of one size, do not either.
+    """Return whether random rows give the same bits in all batches as separately.
+
+    A sum over columns may not: onnxruntime adds in an order that depends on the address of the row.
+    Models that mix rows, and models of one batch size, do not either.
     """
     x = np.random.default_rng(0).normal(size=(BATCH, session.width))
     try:
@@ -162,7 +161,7 @@ def _is_the_same_in_any_batch(session: Session) -> bool:
 
 
 def _refuse_slow(session: Session) -> None:
-    """Raise Unplayable where a row that comes alone takes too long."""
+    """Raise Unplayable if a single row takes more than MODEL_ROW_SECONDS."""
     row = np.ones((1, session.width))
     began = time.process_time()
     for _ in range(PACKED):

@@ -358,7 +358,7 @@ class Effect:
         return np.zeros((len(samples), len(keys)))
 
     def uncorrected(self, samples: Any) -> np.ndarray | float:
-        """Return the part that nodes cannot remove from ImuSamples, (n, 3), or AidSamples, (n, k)."""
+        """Return the part that nodes cannot correct: of ImuSamples (n, 3), of AidSamples (n, k)."""
         return 0.0
 
     @property

@@ -194,7 +194,7 @@ class ImuFeatures:
         self._state[0, :2] = np.nan
 
     def __call__(self, t: np.ndarray, gyro: np.ndarray, accel: np.ndarray) -> np.ndarray:
-        """Return features (n, len(OF_IMU)) of t (n,) s, gyro (n, 3) rad/s and accel (n, 3) m/s^2."""
+        """Return features (n, len(OF_IMU)) of t (n,) s, gyro (n, 3) rad/s, accel (n, 3) m/s^2."""
         out = np.empty((len(t), len(OF_IMU)))
         t, gyro, accel = (np.ascontiguousarray(column) for column in (t, gyro, accel))
         _features(self._state, t, gyro, accel, out)

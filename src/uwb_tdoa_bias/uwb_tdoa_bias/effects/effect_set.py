@@ -1,4 +1,4 @@
-"""EffectSet and effects.yaml: the effects of a model with their values, and how well they are known.
+"""EffectSet and effects.yaml: the effects of a model with their values and covariance.
 
 EFFECTS lists all declared effects.
 """
@@ -249,7 +249,7 @@ class EffectSet:
     def bias(self, samples: Samples) -> np.ndarray:
         """Return the sum of all biases of `samples.channel`, (n,) m, faded beyond their domains.
 
-        An effect of unknown size, for want of an attitude, adds nothing.
+        An effect adds nothing if its size is unknown without an attitude.
         """
         total = np.zeros(len(samples))
         for effect in self.effects:
@@ -454,7 +454,7 @@ def _finite_or_zero(bias: np.ndarray) -> np.ndarray:
 
 
 def _moved(samples: Samples, states: tuple[int, ...]) -> Samples:
-    """Return the Samples, then all of them for each state lowered and raised by REACH."""
+    """Return the Samples, followed by copies with each state lowered and raised by REACH."""
     n, out = len(samples), samples.repeated(1 + 2 * len(states))
     position = out.p.copy()
     velocity = np.zeros_like(position) if out.motion is None else out.motion.velocity.copy()

@@ -26,9 +26,9 @@ MAIN_SHARE = 0.5  # of the largest delay; advice names anchors with a larger del
 class FloorMultipath(SearchedDelay):
     """Anchor i is "i.delay" metres late while the tag is lower than "i.height" metres above z = 0.
 
-    Below two thirds of the height it is always late, above one and a half times the height never,
-    and in between less often with height. At a distance d, m, from the place ("x", "y") where it
-    was observed, the bias fades as exp(-d^2 / (2 m^2)). Whether an anchor is late counts as noise.
+    Below two thirds of the height it is always late. Above one and a half times the height it is never
+    late. In between it is late less often with height. At a distance d, m, from the place ("x", "y") of
+    the observation, the bias fades as exp(-d^2 / (2 m^2)). Whether an anchor is late counts as noise.
     "i.noise" metres are added to this noise if several echoes alternate.
     """
 

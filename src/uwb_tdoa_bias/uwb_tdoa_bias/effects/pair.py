@@ -44,7 +44,7 @@ class PairEffect(Effect):
 
 
 class PairOffset(PairEffect):
-    """d_ab of the ordered pair "a-b" is `values["a-b"]` metres too large, d_ba as much too small."""
+    """d_ab of the ordered pair "a-b" is `values["a-b"]` metres too large, d_ba too small."""
 
     row = Row(
         name="pair_offset",

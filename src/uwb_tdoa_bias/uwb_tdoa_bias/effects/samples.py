@@ -164,7 +164,7 @@ class Samples:
 
     @property
     def rows(self) -> np.ndarray:
-        """Return the rows of the anchors of all arrivals, (ends * n,): first anchors, then second."""
+        """Return the rows of the anchors of all arrivals, (ends * n,): first ones, then second."""
         return np.concatenate([self.a, self.b])
 
     def difference(self, of_arrivals: np.ndarray) -> np.ndarray:

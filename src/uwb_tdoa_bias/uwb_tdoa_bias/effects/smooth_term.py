@@ -60,8 +60,8 @@ OF_LINKS = ("pair", "direction")  # forms with one function per pair of anchors
 # Prior standard deviations of functions with few coefficients: m, rad/s and m/s^2
 RADIO_PRIOR_STD, PRIOR_STD = 0.3, {"gyro": 0.1, "accel": 0.5}
 MOST_PARTS = 3  # anchors or pairs whose functions are described
-# {shape: (knots, coefficients)}. Knots are the ends, and between them where a part begins or ends;
-# those of a wave are one period apart.
+# {shape: (knots, coefficients)}. Knots are the ends, and points between them where a part begins or
+# ends. The knots of a wave are one period apart.
 SHAPES = {
     "line": (2, 2),
     "beyond": (3, 2),
@@ -206,7 +206,7 @@ class SmoothTerm(Effect):
         return self.channel in IMU_CHANNELS and self.covariate in (*OF_IMU, *OF_STATE)
 
     def keys(self, anchors: Anchors | None = None) -> tuple[str, ...]:
-        """Return all coefficients, for the form "anchor" those of every anchor."""
+        """Return all coefficients; for the form "anchor" of every anchor."""
         return self.keys_of(id_texts(anchors) if self.form == "anchor" else ("",))
 
     def keys_of(self, parts: Iterable[str]) -> tuple[str, ...]:
@@ -214,7 +214,10 @@ class SmoothTerm(Effect):
         return tuple(f"{part}.c{k}".lstrip(".") for part in parts for k in range(self.count))
 
     def basis(self, values: ArrayLike) -> np.ndarray:
-        """Return the basis functions of c0, c1, ... at covariate values (n,), (n, k); NaN of NaN."""
+        """Return the basis functions of c0, c1, ... at values (n,) of the covariate, (n, k).
+
+        They are NaN for NaN.
+        """
         values = np.asarray(values, dtype=float)
         if self.shape != "spline":
             return shape_basis(self.shape, self.knots, values)
@@ -253,7 +256,7 @@ class SmoothTerm(Effect):
         return len(self.knots) if self.covariate in CATEGORIES else len(self.knots) + DEGREE - 1
 
     def _functions(self, values: np.ndarray, weights: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Return functions of weights (m, k), for each value (n,) that of its row (n,), (n,)."""
+        """Return the values (n,) of functions with weights (m, k); function rows (n,)."""
         if self.shape != "spline" or self.covariate in CATEGORIES:
             return np.einsum("nk,nk->n", self.basis(values), weights[rows])
         out = np.empty(len(values))

@@ -207,7 +207,7 @@ class ReceivedPowerBias(ArrivalEffect):
 class AntennaPattern(ArrivalEffect):
     """The delay is `tag` and `anchor`, m, times the group delay of an antenna over direction.
 
-    The shape is that of a DWM1000-like module, 0 to 1.
+    The shape, 0 to 1, belongs to a DWM1000-like module.
     """
 
     row = Row(

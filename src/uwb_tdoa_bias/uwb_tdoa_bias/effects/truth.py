@@ -27,7 +27,7 @@ ANGLE_BOUND, ANGLE_PRIOR_STD = 0.5, 0.03  # rad
 class TruthFrame(GeometryEffect):
     """In the frame of the truth, an anchor surveyed at A is at R A + (x, y, z).
 
-    R is that of the rotation vector (roll, pitch, yaw). The data do not determine which of the two
+    R turns by the rotation vector (roll, pitch, yaw). The data do not determine which of the two
     frames is right: `diagnose` gives this effect to no node. In an effects.yaml it moves the
     anchors, and estimates are in the frame of the truth.
     """

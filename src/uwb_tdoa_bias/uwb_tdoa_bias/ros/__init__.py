@@ -1,1 +1,1 @@
-"""Nodes, topics, parameters, frames and diagnostics: all that touches ROS."""
+"""Nodes, topics, parameters, frames and diagnostics: all code that uses ROS."""

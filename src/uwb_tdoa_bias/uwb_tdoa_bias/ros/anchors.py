@@ -1,4 +1,4 @@
-"""Anchors as messages and frames, and where a node gets them from: a file, or uwb/anchors."""
+"""Anchors as messages, and their input into a node: a file or the topic uwb/anchors."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 ANCHORS_QOS = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
-MOST_NAMED = 10  # anchors that a sentence names
-SAME_TURN = 1e-3  # of a quaternion, by which orientations of the same anchor may differ
-# gets from every publisher what is repeated
+MOST_NAMED = 10  # anchors named in a sentence
+SAME_TURN = 1e-3  # largest difference of quaternions of the same anchor
+# Best effort and volatile: such a subscription receives messages from every publisher.
 ANY_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 ANCHORS_FILE = Parameter(
     "",
@@ -41,7 +41,7 @@ ANCHORS_FILE = Parameter(
 
 
 def anchors_to_message(anchors: Anchors) -> AnchorArray:
-    """AnchorArray of Anchors, with a stamp of 0: anchors do not age."""
+    """Return the AnchorArray of Anchors, with a stamp of 0, since anchors do not age."""
     message = AnchorArray()
     message.header.frame_id = anchors.frame
     known = np.where(np.isfinite(anchors.orientations), anchors.orientations, 0.0)
@@ -54,9 +54,7 @@ def anchors_to_message(anchors: Anchors) -> AnchorArray:
 
 
 def same_anchors(one: Anchors, other: Anchors) -> bool:
-    """Return whether two Anchors are the same but for jitter: each anchor within SAME_PLACE and
-    SAME_TURN.
-    """
+    """Return whether two Anchors agree within SAME_PLACE and SAME_TURN for each anchor."""
     return (
         one.frame == other.frame
         and np.array_equal(one.ids, other.ids)
@@ -68,7 +66,7 @@ def same_anchors(one: Anchors, other: Anchors) -> bool:
 
 
 def in_words(before: Anchors, after: Anchors) -> str:
-    """What has changed between two Anchors: which are new, gone, or elsewhere, and what that means."""
+    """Return a sentence on the change between two Anchors: new, gone, moved, and what follows."""
     if before.frame != after.frame:
         return f"they are in frame '{after.frame}', and were in '{before.frame}': starting over"
     places = before.index(after.ids)
@@ -91,36 +89,41 @@ def in_words(before: Anchors, after: Anchors) -> str:
 
 
 class AnchorsInput:
-    """Anchors of a file, or of uwb/anchors: latched, or volatile when they are repeated.
+    """Input of anchors from a file or from uwb/anchors, latched or repeated.
 
-    anchors : Anchors or None; refused : what is wrong with what came on the topic, or None.
+    Attributes
+    ----------
+    anchors : Anchors or None
+    refused : the fault of the last message, or None
     """
 
     def __init__(
         self, node: StreamNode, on_change: Callable[[Anchors], None], file: str = ""
     ) -> None:
-        """on_change(anchors) is called with the first Anchors, and with others that differ; those
-        of a file are the only ones, and are given by `start`. Raises InputError for the file.
+        """Read the file, or subscribe; raise InputError for a faulty file.
+
+        on_change(anchors) is called with the first Anchors, and with changed ones. The anchors of a file
+        are final; `start` delivers them.
         """
         self.anchors: Anchors | None = None
         self.refused: str | None = None
         self._node, self._on_change, self._file = node, on_change, file
         self._of_file = refuse_faulty(read_survey(file), file) if file else None
-        self._repeated: Input | None = None  # the subscription to volatile ones
+        self._repeated: Input | None = None  # subscription to volatile publishers
         events = SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible)
         self._latched = Input(
             node, AnchorArray, "uwb/anchors", self._on_message, ANCHORS_QOS, event_callbacks=events
         )
 
     def start(self) -> None:
-        """Give the anchors of the file, if there is one."""
+        """Deliver the anchors of the file, if there is one."""
         if self._of_file is not None:
             self.anchors = self._of_file
             self._on_change(self.anchors)
 
     @property
     def refusals(self) -> list[Refusals]:
-        """Those of each subscription."""
+        """Refusals of each subscription."""
         return [end.refusals for end in (self._latched, self._repeated) if end is not None]
 
     def _on_incompatible(self, _: QoSRequestedIncompatibleQoSInfo) -> None:

@@ -1,14 +1,14 @@
-"""Serialized messages (CDR) to rows of numbers and back, by the definition of their type.
+"""Convert serialized messages (CDR) to rows of numbers and back, by the definition of the type.
 
-A message object costs tens of microseconds to make and to read, most of it for fields that nobody
-asks for. Here a field is a place in the bytes: everything behind the strings of a message lies
-where the definition says, and strings (frame ids) hardly ever change. The layout is that of OMG
-Data Distribution Service Interoperability (DDSI-RTPS), CDR with 4 bytes of encapsulation and every
-number aligned to its size. Whether that is so is tried on a message with known numbers.
+A message object takes tens of microseconds to make and to read, mostly for fields without use
+here. In this module a field is a place in the bytes. All fields behind the strings of a message
+have the places that the definition gives. Strings (frame ids) rarely change. The layout follows
+OMG Data Distribution Service Interoperability (DDSI-RTPS): CDR with 4 bytes of encapsulation, and
+every number aligned to its size. A message with known numbers tests this.
 
-What comes over a topic may be anything: a driver that was built with another version of a type,
-another encoding, noise. So lengths, texts and numbers of elements are checked before anything is
-made of them, and what cannot be read is Unreadable, with the reason.
+A topic may carry anything: another version of the type, another encoding, noise. Therefore
+lengths, texts and element counts are checked before memory is allocated. A message that fails is
+Unreadable, with the reason.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ if TYPE_CHECKING:
 
 STAMP, FRAME = ("sec", "nanosec"), "header.frame_id"
 ENCAPSULATION = b"\x00\x01\x00\x00"  # plain CDR, little endian
-# plain CDR in big and little endian; options are in the last byte
+# Plain CDR in big and little endian. The fourth byte holds options.
 KNOWN_ENCAPSULATIONS = (b"\x00\x00\x00", b"\x00\x01\x00")
 LONGEST_TEXT = 4096  # bytes of a frame_id, or of another text
-MOST_ELEMENTS = 10_000  # in a message that is a list: anchors, transforms
-LARGEST_ELEMENT = 512  # bytes, on the average
+MOST_ELEMENTS = 10_000  # in a list message: anchors, transforms
+LARGEST_ELEMENT = 512  # bytes, on average
 ANOTHER = "another version of the type"
 LENGTH = struct.Struct("<I")
-PADDING = 3  # bytes that some middlewares add at the end
+PADDING = 3  # bytes; some middlewares pad the end
 TEXT = "text"
 CODES = {
     "double": "f8",
@@ -55,26 +55,29 @@ CODES = {
 
 
 def message_class(kind: str) -> Any:
-    """Class of a type of ours like "pkg/msg/Name"."""
+    """Return the class of a message type like "pkg/msg/Name"."""
     package, _, name = kind.partition("/msg/")
     return getattr(import_module(f"{package}.msg"), name)
 
 
 class Unreadable(ValueError):
-    """A message cannot be read; the text says why."""
+    """A message that cannot be read; the text gives the reason."""
 
 
 class CdrCodec:
-    """Some fields of the messages of one type, which begin with a std_msgs/Header.
+    """Reads and writes some fields of messages of one type that begins with a std_msgs/Header.
 
-    dtype : of the rows: "sec" and "nanosec" of the stamp, then the fields by their names in the
-        message, dots in between
-    ("pose.pose.position": (3,) of float, as "pose.covariance" is (36,)).
+    dtype : of the rows: "sec" and "nanosec" of the stamp, then the fields under their names in the
+        message, e.g. "pose.pose.position": (3,) of float, "pose.covariance": (36,)
     """
 
     def __init__(self, kind: type, *fields: str) -> None:
-        """kind : class of the messages; fields : their names, of numbers or of what holds only
-        numbers of one type.
+        """Prepare the fields.
+
+        Parameters
+        ----------
+        kind : class of the messages
+        fields : names of fields that are numbers, or contain only numbers of one type
         """
         self.kind = kind
         paths = {name: f"header.stamp.{name}" for name in STAMP} | {
@@ -91,15 +94,16 @@ class CdrCodec:
             code, count = spaces[leaves[0]][0], sum(spaces[leaf][1] for leaf in leaves)
             columns.append((name, code, count) if count > 1 else (name, code))
         self.dtype = np.dtype(columns)
-        self._known: _Layout | None = None  # of the messages of late
+        self._known: _Layout | None = None  # layout of the latest messages
         self.fits = self._agrees()
 
     def read(
         self, messages: Sequence[bytes], refuse: Callable[[Unreadable], None] | None = None
     ) -> list[tuple[str, np.ndarray, slice]]:
-        """Serialized messages in their order, a list of bytes: a list of (frame_id, rows, slice),
-        each of successive messages of one frame, and which they are. What cannot be read is left
-        out: refuse(Unreadable), without which it is raised.
+        """Return the content of serialized messages as a list of (frame_id, rows, slice).
+
+        Each entry holds successive messages of one frame; slice : their places in `messages`. Unreadable
+        messages are left out and given to refuse(Unreadable); without `refuse` they are raised.
         """
         out, first = [], 0
         while first < len(messages):
@@ -124,13 +128,13 @@ class CdrCodec:
         return out
 
     def template(self, message: Any) -> CdrTemplate:
-        """Template of messages which are all like this one, but for the fields."""
+        """Return a CdrTemplate of messages that equal this one except for the fields."""
         return CdrTemplate(self, message)
 
     def layout(self, data: bytes) -> _Layout:
-        """Where the fields are in this serialized message, and in those that have the same texts.
+        """Return the places of the fields in a serialized message; raise Unreadable.
 
-        Raises Unreadable.
+        They hold for all messages with the same texts.
         """
         if data[:4] != ENCAPSULATION:
             raise Unreadable("it is not plain CDR in little endian")
@@ -166,23 +170,21 @@ class CdrCodec:
         return self._known
 
     def _is_foreign(self, data: bytes) -> bool:
-        """Whether only the type support of the middleware can read it: another byte order, or
-        options.
-        """
+        """Return whether only the middleware can read a message: other byte order, or options."""
         return not self.fits or (data[:4] != ENCAPSULATION and data[:3] in KNOWN_ENCAPSULATIONS)
 
     def _convert(self, data: bytes) -> tuple[str, np.ndarray]:
-        """The same of one message by way of a message object."""
+        """Return (frame_id, rows (1,)) of one message, read through a message object."""
         message, row = decode(data, self.kind), np.empty(1, self.dtype)
         for name, leaves in self._paths.items():
             row[name] = np.concatenate([np.atleast_1d(_get(message, leaf)) for leaf in leaves])
         frame = message.header.frame_id
-        if "\ufffd" in frame:  # what the type support puts where it is no UTF-8
+        if "\ufffd" in frame:  # the type support's replacement of bytes that are not UTF-8
             raise Unreadable(f"{FRAME} is no UTF-8")
         return frame, row
 
     def _agrees(self) -> bool:
-        """Whether messages are laid out as their definition says."""
+        """Return whether the middleware lays messages out as the definition says."""
         message = self.kind()
         message.header.frame_id = "a frame"
         for k, (leaf, code, count) in enumerate(self._leaves):
@@ -199,7 +201,7 @@ class CdrCodec:
 
 
 class CdrTemplate:
-    """Messages that differ in the fields of a CdrCodec and in nothing else."""
+    """Messages that differ only in the fields of a CdrCodec."""
 
     def __init__(self, codec: CdrCodec, message: Any) -> None:
         self._codec, self._message = codec, message
@@ -210,13 +212,13 @@ class CdrTemplate:
             self._data, self._dtype = codec._convert(data)[1].tobytes(), codec.dtype
 
     def rows(self, n: int) -> np.ndarray:
-        """(n,) of them, whose fields are to be filled in."""
+        """Return (n,) rows, to be filled in."""
         return np.frombuffer(
             bytearray(self._data * n), self._dtype
-        )  # a copy of rows is none of what is between the fields
+        )  # do not copy the rows: a copy loses the bytes between fields
 
     def messages(self, rows: np.ndarray) -> Iterator[Any]:
-        """Generator of what to give to a publisher, for each of the rows that `rows` made."""
+        """Yield the input of a publisher for each of the rows that `rows` returned."""
         data, size = rows.tobytes(), self._dtype.itemsize
         for k in range(len(rows)):
             yield data[k * size : (k + 1) * size] if self._codec.fits else self._filled(rows[k])
@@ -232,16 +234,19 @@ class CdrTemplate:
 
 
 class _Layout:
-    """frame : frame_id; dtype : of a whole message."""
+    """Places of the fields in a message.
+
+    frame : frame_id; dtype : of a whole message
+    """
 
     def __init__(self, frame: str, dtype: np.dtype, texts: list[tuple[int, int, bytes]]) -> None:
         self.frame, self.dtype = frame, dtype
         self._size = dtype.itemsize
-        # the strings follow each other in most types
+        # (begin, end, bytes) of each string. In most types the strings are adjacent.
         self._texts = texts
 
     def holds(self, data: bytes) -> bool:
-        """Whether a message is laid out so, and of the same frame."""
+        """Return whether a message has this layout and this frame."""
         if len(data) != self._size or data[:4] != ENCAPSULATION:
             return False
         for begin, end, text in self._texts:
@@ -251,10 +256,7 @@ class _Layout:
 
 
 def decode(data: bytes, kind: type) -> Any:
-    """Message of a serialized one, of any type, by the type support of the middleware.
-
-    Raises Unreadable.
-    """
+    """Return the decoded message of any type, by the middleware; raise Unreadable."""
     if data[:3] not in KNOWN_ENCAPSULATIONS:
         raise Unreadable("it is not plain CDR" if len(data) >= 4 else f"it has {len(data)} bytes")
     _check_size(data, kind)
@@ -268,9 +270,12 @@ def decode(data: bytes, kind: type) -> Any:
 
 
 def read_text(data: bytes, place: int, what: str) -> tuple[str, int]:
-    """(text, place behind it) of a text in plain little-endian CDR, whose length is at `place`.
+    """Return (text, place behind it) of plain little-endian CDR; raise Unreadable.
 
-    Raises Unreadable.
+    Parameters
+    ----------
+    place : of the length of the text
+    what : name of the text, for messages
     """
     if place + 4 > len(data):
         raise Unreadable(f"it ends after {len(data)} bytes, before {what}")
@@ -288,9 +293,7 @@ def read_text(data: bytes, place: int, what: str) -> tuple[str, int]:
 
 
 def check_length(data: bytes, length: int, kind: type, exactly: bool = True) -> None:
-    """Raise Unreadable for a message that is shorter than so many bytes, or, with `exactly`,
-    longer.
-    """
+    """Raise Unreadable for a message shorter than `length` bytes, or, with `exactly`, longer."""
     if length > len(data):
         raise Unreadable(
             f"{len(data)} bytes are {length - len(data)} too few for {name_of(kind)}: cut "
@@ -303,8 +306,9 @@ def check_length(data: bytes, length: int, kind: type, exactly: bool = True) -> 
 
 
 def _check_size(data: bytes, kind: type) -> None:
-    """Raise Unreadable for more than may be allocated: long messages, lists that say that they are
-    longer than they are.
+    """Raise Unreadable before too much memory is allocated.
+
+    This concerns long messages, and lists that claim more elements than they have.
     """
     leaves, whole = _leaves(kind)
     texts = sum(code == TEXT for _, code, _ in leaves)
@@ -333,15 +337,16 @@ def _check_size(data: bytes, kind: type) -> None:
 
 
 def name_of(kind: type) -> str:
-    """Like sensor_msgs/Imu."""
+    """Return the name of a message class, like sensor_msgs/Imu."""
     return f"{kind.__module__.partition('.')[0]}/{kind.__name__}"
 
 
 @cache
 def _leaves(kind: Any) -> tuple[list[tuple[str, str, int]], bool]:
-    """Of a message class up to the first field that has no fixed size: ([(name of a number, an
-    array of numbers or a string, its code in CODES, or TEXT, and how many)], whether that is all of
-    it).
+    """Return the leaves of a message class up to the first field without fixed size.
+
+    Returns ([(name of a number, an array of numbers or a string; code out of CODES, or TEXT; count)],
+    whether these are all fields).
     """
     out: list[tuple[str, str, int]] = []
     for name, slot in zip(kind.get_fields_and_field_types(), kind.SLOT_TYPES):
@@ -365,7 +370,7 @@ def _is_in(leaf: str, path: str) -> bool:
 
 
 def aligned(place: int, size: int) -> int:
-    """Numbers are aligned as counted from behind the encapsulation."""
+    """Return the next place aligned to `size`, counted from the end of the encapsulation."""
     return place + (4 - place) % size
 
 
@@ -377,7 +382,7 @@ def _set(message: Any, path: str, values: np.ndarray) -> None:
     *above, name = path.split(".")
     holder = reduce(getattr, above, message)
     before = getattr(holder, name)
-    if isinstance(before, bytes):  # octet
+    if isinstance(before, bytes):  # octet: bytes in Python
         setattr(holder, name, bytes([int(values[0])]))
     elif isinstance(before, np.ndarray):
         setattr(holder, name, np.asarray(values, dtype=before.dtype))

@@ -1,6 +1,4 @@
-"""What a node says of itself: its status on /diagnostics and on the log, also of simulated time
-that stands still.
-"""
+"""Status of a node on /diagnostics and in the log, including paused simulated time."""
 
 from __future__ import annotations
 
@@ -22,16 +20,15 @@ if TYPE_CHECKING:
 
     from .node import StreamNode
 
-BEHIND = 0.5  # s that something may wait until this process serves it
-AGAIN = 30.0  # s after which the log says what it has said before
-# Each number whole, whatever follows: a pattern that tries again at each digit takes 8 s for 20 000
-# of them.
+BEHIND = 0.5  # s, longest wait of a request without a warning
+AGAIN = 30.0  # s until a sentence may be logged again
+# Match each number as a whole. A pattern with backtracking at each digit takes 8 s for 20 000 digits.
 NUMBER = re.compile(
     r"([-+]?)\d+(\.\d+)?(?=(\s*(?:%|s\b|ms\b|m\b|Hz|messages|samples|TDOAs|times))?)"
 )
-# s from one report to the next, and looks in between at what is to be reported at once
+# s between reports, and number of checks per report for urgent changes.
 REPORT_PERIOD, LOOKS = (1.0, 5)
-# s without a new time on /clock; s from one time to the next of a clock that runs
+# s without a new time on /clock; longest period of a running clock, s.
 PAUSED, SLOWEST_CLOCK = (0.5, 2.0)
 DIAGNOSTICS_QOS = QoSProfile(depth=10)
 
@@ -39,11 +36,14 @@ Report = tuple[bytes, str, dict[str, Any]]  # level of a DiagnosticStatus, text,
 
 
 class Diagnostics:
-    """Publishes one status on /diagnostics each second of the wall clock, and at once when
-    simulated time stops or goes on; logs it when it says something else than before (see Saying).
+    """Publishes one status on /diagnostics each second of the wall clock.
 
-    report() -> (level, text, {key: value}), with level one of DiagnosticStatus.OK, WARN, ERROR;
-    look() : called LOOKS times a second.
+    It publishes at once if simulated time stops or continues. It logs a status that is new by Saying.
+
+    Parameters
+    ----------
+    report : callable of () -> (level, text, {key: value}), level: DiagnosticStatus.OK, WARN or ERROR
+    look : callable of (), called LOOKS times per second
     """
 
     def __init__(
@@ -75,12 +75,12 @@ class Diagnostics:
         return self._clock_status is not None
 
     def publish(self) -> None:
-        """Publish now."""
+        """Publish the status now."""
         level, text, values = self._report()
         spinner = self._node.spinner
         if spinner is not None:
             late = spinner.longest_wait
-            spinner.longest_wait = 0.0  # of the process: the first of its nodes that asks says it
+            spinner.longest_wait = 0.0  # one value per process: the first node reports it
             values |= {"longest wait of a request": f"{late:.3f} s"}
             if late > BEHIND and level == DiagnosticStatus.OK:
                 level, text = (
@@ -99,7 +99,7 @@ class Diagnostics:
             logger = self._node.get_logger()
             if level == DiagnosticStatus.OK:
                 logger.info(text)
-            else:  # a statement of its own: rclpy allows one severity per line
+            else:  # separate line: rclpy allows one severity per line
                 logger.warning(text)
         name = self._node.get_fully_qualified_name()
         entries = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
@@ -112,9 +112,11 @@ class Diagnostics:
 
 
 class Saying:
-    """What is worth a line of the log: a sentence of another kind than the last one. Sentences that
-    differ in measured numbers alone, not in the anchors that they name, are of one kind, and each
-    kind is said once in AGAIN seconds.
+    """Decides which sentences are worth a line in the log.
+
+    Sentences that differ only in measured numbers are of one kind; ids of anchors are no measured
+    numbers. A sentence is logged if its kind differs from the last one and was not logged within
+    AGAIN seconds.
     """
 
     def __init__(self) -> None:
@@ -122,7 +124,7 @@ class Saying:
         self._when: dict[str, float] = {}
 
     def anew(self, text: str, now: float) -> bool:
-        """Whether to say a text now, s; then it counts as said."""
+        """Return whether to log a text now, and count it as logged; now : s."""
         kind = NUMBER.sub(_unless_id, text)
         if kind == self._last or now - self._when.get(kind, -math.inf) < AGAIN:
             return False
@@ -134,7 +136,7 @@ class Saying:
 
 
 def _unless_id(number: re.Match[str]) -> str:
-    """ "#" for what is measured: a number with a sign, a decimal point or a unit.
+    """Return "#" for a measured number: one with a sign, a decimal point or a unit.
 
     The id of an anchor has none of these, and stays.
     """
@@ -142,16 +144,16 @@ def _unless_id(number: re.Match[str]) -> str:
 
 
 class SimulatedClock:
-    """Whether simulated time goes on; of the clock of a node, asked a few times a second."""
+    """Detects whether simulated time of a node stands still; asked a few times per second."""
 
     def __init__(self, node: Node, now: Callable[[], float] = time.monotonic) -> None:
         self._node, self._now = node, now
-        self._time: int | None = None  # the last one, ns
-        self._since, self._period = now(), 0.0  # since when, s from one to the next lately
+        self._time: int | None = None  # last time, ns
+        self._since, self._period = now(), 0.0  # s: time of the last change; recent period
 
     def status(self) -> tuple[bytes, str] | None:
-        """(level, text) while nothing else can be said, because time stands still; None otherwise."""
-        clock: ROSClock = self._node.get_clock()  # type: ignore[assignment]  # a node has such a clock
+        """Return (level, text) while simulated time stands still, else None."""
+        clock: ROSClock = self._node.get_clock()  # type: ignore[assignment]  # nodes have this class of clock
         now = self._now()
         if not clock.ros_time_is_active:
             self._time = None
@@ -173,13 +175,13 @@ class SimulatedClock:
 
 
 class Rate:
-    """How often something happened per second of the wall clock, since it was last asked."""
+    """Rate of events per second of the wall clock."""
 
     def __init__(self) -> None:
         self._count, self._since = 0, time.monotonic()
 
     def of(self, count: int) -> float:
-        """Hz, from a running total."""
+        """Return the rate since the last call, Hz; count : running total."""
         now = time.monotonic()
         rate = (count - self._count) / max(now - self._since, 1e-3)
         self._count, self._since = count, now

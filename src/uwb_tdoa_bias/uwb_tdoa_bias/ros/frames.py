@@ -1,4 +1,4 @@
-"""What TF says, as far as a node needs it: constant transforms, and on request those that move."""
+"""Input of TF into a node: constant transforms, and on request moving ones."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
     from .node import StreamNode
 
-TF_QOS = QoSProfile(depth=100)  # what tf2 uses
-MOVING_QOS = QoSProfile(depth=1000)  # 2 s of a robot that publishes it at 500 Hz
+TF_QOS = QoSProfile(depth=100)  # as in tf2
+MOVING_QOS = QoSProfile(depth=1000)  # 2 s at 500 Hz
 STAMP, NUMBERS = struct.Struct("<iI"), struct.Struct("<7d")  # of a TransformStamped: p, then q
 TF_STATIC_QOS = QoSProfile(
     depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
@@ -43,9 +43,15 @@ Transform = tuple[int, int, str, str, tuple[float, ...], tuple[float, ...]]
 
 
 class FramesInput:
-    """Frames of /tf_static, and of /tf if they may move: its messages wait until `catch_up`. Of a
-    node that is frozen, the first constant transform of a frame counts. trouble : a transform that
-    is none, or None; refusals : Refusals.
+    """Frames of /tf_static, and of /tf on request.
+
+    Messages of /tf wait until `catch_up`. In a frozen node the first constant transform of a frame is
+    final.
+
+    Attributes
+    ----------
+    trouble : fault of the last invalid transform, or None
+    refusals : Refusals
     """
 
     def __init__(
@@ -55,8 +61,13 @@ class FramesInput:
         on_new: Callable[[], None],
         moving: bool = False,
     ) -> None:
-        """seconds(stamp) : s of a builtin_interfaces/Time; on_new() is called when a constant
-        transform is new.
+        """Subscribe to /tf_static, and to /tf on request.
+
+        Parameters
+        ----------
+        seconds : callable of a builtin_interfaces/Time -> s
+        on_new : callable of (), called after a new constant transform
+        moving : whether to read /tf
         """
         self.frames = Frames()
         self.trouble: str | None = None
@@ -82,7 +93,7 @@ class FramesInput:
         self.refusals = [end.refusals for end in (static, *self._moving)]
 
     def catch_up(self) -> None:
-        """Take what waits on /tf."""
+        """Read all waiting messages of /tf."""
         for end in self._moving:
             end.take_all()
 
@@ -118,10 +129,10 @@ class FramesInput:
 
 
 def read_transforms(data: bytes) -> list[Transform]:
-    """[(sec, nanosec, parent, child, q, p)] of a serialized tf2_msgs/TFMessage: q x y z w, p m.
-    Raises Unreadable.
+    """Return [(sec, nanosec, parent, child, q, p)] of a serialized tf2_msgs/TFMessage.
 
-    A robot publishes hundreds a second, and a message object takes ten times as long as this.
+    The quaternion q is x y z w, the translation p is in m. Raises Unreadable. A robot publishes
+    hundreds per second, and a message object takes ten times as long.
     """
     if data[:4] != ENCAPSULATION:
         return [_of(transform) for transform in decode(data, TFMessage).transforms]
@@ -146,14 +157,14 @@ def read_transforms(data: bytes) -> list[Transform]:
 
 
 def _of(message: TransformStamped) -> Transform:
-    """The same of a TransformStamped."""
+    """Return (sec, nanosec, parent, child, q, p) of a TransformStamped."""
     q, p, stamp = message.transform.rotation, message.transform.translation, message.header.stamp
     names = message.header.frame_id.lstrip("/"), message.child_frame_id.lstrip("/")
     return stamp.sec, stamp.nanosec, *names, (q.x, q.y, q.z, q.w), (p.x, p.y, p.z)
 
 
 def unknown_frame(topic: str, frame: str, body: str) -> str:
-    """The sentence for a sensor whose place on the robot nobody says."""
+    """Return the sentence for a sensor whose place on the robot is unknown."""
     return (
         f"{topic} is in frame '{frame}', which /tf_static does not connect with '{body}': "
         f"taken as '{body}'; publish it: "

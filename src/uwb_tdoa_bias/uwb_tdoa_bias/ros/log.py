@@ -1,4 +1,4 @@
-"""The log of a node, which no peer can fill."""
+"""The log of a node, with a limit that no peer can exceed."""
 
 from __future__ import annotations
 
@@ -13,34 +13,34 @@ if TYPE_CHECKING:
 
     from rclpy.impl.rcutils_logger import RcutilsLogger
 
-# lines that one statement of the program may write at once, and s until it may write one more
+# Lines that one statement of the program may write at once, and s until it may write one more.
 BURST, REFILL = (200, 10.0)
 
 
 class Log:
-    """A logger of rclpy whose lines are printable and of a bounded length. Each statement of the
-    program writes BURST of them at once, then one in REFILL seconds: whoever makes one statement
-    write hides no other.
+    """A logger of rclpy with printable lines of bounded length, and a limit per statement.
+
+    Each statement of the program writes BURST lines at once, then one per REFILL seconds. A peer that
+    triggers one statement often cannot hide the others.
     """
 
     def __init__(self, logger: RcutilsLogger) -> None:
         self._logger = logger
-        # Of each statement: the lines that it may write, since when (s), and how many were left out
-        # before.
+        # {statement: (lines left, s of the last line, lines left out since)}
         self._left: dict[tuple[CodeType, int], tuple[float, float, int]] = {}
 
     def info(self, text: str) -> None:
-        """Of rclpy, which allows one severity for each line of code; so do these."""
+        """Log as rclpy does; each severity needs its own line of code there."""
         if line := self._line(text):
             self._logger.info(line)
 
     def warning(self, text: str) -> None:
-        """Of rclpy."""
+        """Log as rclpy does."""
         if line := self._line(text):
             self._logger.warning(line)
 
     def error(self, text: str) -> None:
-        """Of rclpy."""
+        """Log as rclpy does."""
         if line := self._line(text):
             self._logger.error(line)
 
@@ -48,7 +48,7 @@ class Log:
         return getattr(self._logger, name)
 
     def _line(self, text: str) -> str | None:
-        """What is written of a text, or None."""
+        """Return the line to write for a text, or None."""
         frame, now = sys._getframe(2), time.monotonic()
         key = frame.f_code, frame.f_lineno
         left, when, hidden = self._left.get(key, (BURST, now, 0))

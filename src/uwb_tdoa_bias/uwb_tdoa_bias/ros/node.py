@@ -1,4 +1,4 @@
-"""A node whose streams and /clock wait until it takes them, all that has arrived at once."""
+"""A node whose streams and /clock wait until it takes all arrived messages together."""
 
 from __future__ import annotations
 
@@ -31,34 +31,35 @@ if TYPE_CHECKING:
     from rclpy.timer import Timer
 
 
-PERIOD = 0.001  # s, at least, of rest after a turn
-LONGEST_WAIT = 0.02  # s without a turn in which anything is taken, whatever it waits for
-ROUNDING = 1e-6  # s by which two ways to compute a stamp since 1970 may differ
-# s; after a turn there is a rest as long as it took, at most so long: more is then taken at a time
+PERIOD = 0.001  # s, smallest rest after a turn
+LONGEST_WAIT = 0.02  # s; longest time that `wait_for` delays the streams
+ROUNDING = 1e-6  # s; two computations of a stamp since 1970 differ by less
+# s. After a turn the process rests as long as the turn took, at most so long: then a busy process
+# takes more messages per turn.
 LONGEST_REST = 0.01
 Part = tuple[str, np.ndarray, np.ndarray]  # frame, rows and arrivals of successive messages
 
 
 class Taking(Protocol):
-    """Takes what has arrived; returns whether there was anything, or is."""
+    """Takes arrived messages; `take` returns whether any arrived or still wait."""
 
     def take(self) -> bool: ...
 
 
 class StreamPoller:
-    """Has nodes take what has arrived for them, one after the other.
+    """Lets nodes take their arrived messages, one node after the other.
 
-    A node that has `turns` is given them by ros.run.
+    ros.run calls the `turns` of a node, which is a StreamPoller.
     """
 
     PERIOD = PERIOD
 
     def __init__(self, streams: Collection[Taking]) -> None:
-        """streams : Streams, or what else has take()."""
+        """Set the streams: Streams, or other objects with take()."""
         self._streams = streams
 
     def take(self) -> float | None:
-        """One turn; returns the s of rest after it; None if nothing has arrived."""
+        """Run one turn, and return the rest after it, s; None if nothing arrived."""
         began = time.monotonic()
         if not any([streams.take() for streams in self._streams]):
             return None
@@ -66,35 +67,44 @@ class StreamPoller:
 
 
 class Streams:
-    """Streams of a StreamNode: they hold what arrives until it is taken."""
+    """The streams of a StreamNode; messages wait until they are taken."""
 
     def __init__(self, node: StreamNode, epoch: Epoch, on_taken: Callable[[], None]) -> None:
-        """epoch : Epoch; on_taken() is called after anything was given to those that take it."""
+        """Start without streams; on_taken() is called after messages were delivered."""
         self.inputs: dict[
             str, StreamInput | InMemoryReceiver
-        ] = {}  # by topic, in the order in which they are taken
+        ] = {}  # by topic, in the order of taking
         self._node, self._epoch, self._on_taken = node, epoch, on_taken
         self._streams: list[_Stream] = []
         self._by_topic: dict[str, _Stream] = {}
         self._awaited: _Stream | None = None
-        self._due: Callable[[], float] = lambda: -np.inf  # of what is awaited
+        self._due: Callable[[], float] = lambda: -np.inf  # of the message, s since 1970
         self._until = -np.inf
 
     @property
     def refusals(self) -> list[Refusals]:
-        """Those of each."""
+        """Refusals of each stream."""
         return [end.refusals for end in self.inputs.values()]
 
     def wait_for(self, topic: str, due: Callable[[], float]) -> None:
-        """Take nothing before a message of this topic is stamped due(), s since 1970, or later, for
-        LONGEST_WAIT: less could not be done with it yet.
+        """Let all streams wait for a message of one topic that is stamped due() or later.
+
+        Before it, nothing could be computed with the other messages. The wait ends after LONGEST_WAIT.
+
+        due : callable -> s since 1970
         """
         self._awaited, self._due = self._by_topic[topic], due
 
     def add(self, codec: CdrCodec, topic: str, take: Take, handed: bool = False) -> None:
-        """Subscribe. wire : CdrCodec; take(frame, t, rows, arrival) gets successive messages of one
-        frame: their stamps (n,) s, rows (n,) of the CdrCodec, and when they arrived, (n,) s since
-        1970. handed : a node of this process hands them over.
+        """Subscribe to a stream.
+
+        Parameters
+        ----------
+        codec : CdrCodec of its messages
+        topic : its name
+        take : callable of (frame, t, rows, arrival) for successive messages of one frame: stamps (n,) s,
+            rows (n,) of the codec, arrivals (n,) s since 1970
+        handed : whether a node of this process hands the messages over in memory
         """
         kind = InMemoryReceiver if handed else StreamInput
         self.inputs[topic] = kind(self._node, codec.kind, topic)
@@ -102,8 +112,9 @@ class Streams:
         self._streams.append(stream)
 
     def take(self, at_once: bool = False) -> bool:
-        """Give everything that has arrived to those that take it; at_once : whatever they wait for.
-        Returns whether there was anything, or is.
+        """Deliver all arrived messages, and return whether any arrived or still wait.
+
+        at_once : do not wait as `wait_for` says
         """
         if self._awaited is not None and not at_once:
             arrived, now = self._awaited.fetch(), time.monotonic()
@@ -119,7 +130,7 @@ class Streams:
         ]
         if not parts:
             return False
-        if any(stream.fell for stream in self._streams):  # then it matters which stream was first
+        if any(stream.fell for stream in self._streams):  # then the order of arrival matters
             parts = sorted(
                 (piece for part in parts for piece in _pieces(part)), key=lambda piece: piece[-1][0]
             )
@@ -130,60 +141,61 @@ class Streams:
 
 
 class StreamOutput:
-    """Publisher of a stream of messages that templates make."""
+    """Publisher of a stream of messages made by templates."""
 
     def __init__(self, node: StreamNode, kind: type, topic: str) -> None:
         self.publisher = publish_stream(node, kind, topic)
         self._receiver: InMemoryReceiver | None = None
 
     def deliver_to(self, receiver: InMemoryReceiver) -> None:
-        """Give everything to InMemoryReceiver, too."""
+        """Set an InMemoryReceiver that also gets all rows."""
         self._receiver = receiver
 
     def publish(self, frame: str, template: CdrTemplate, rows: np.ndarray) -> None:
-        """Publish rows (n,) of a Template, whose messages are of this frame."""
+        """Publish rows (n,) of a CdrTemplate, all of one frame."""
         if self._receiver is not None:
             self._receiver.hand(frame, rows)
-        if self.publisher.get_subscription_count():  # nobody can come and ask for them later
+        if self.publisher.get_subscription_count():  # late subscribers cannot request them
             for message in template.messages(rows):
                 self.publisher.publish(message)
 
 
 class InMemoryReceiver:
-    """Stands for the subscription of a stream that a node of this process hands over in memory."""
+    """Replaces the subscription of a stream that another node of this process hands over."""
 
     lost = 0
 
     def __init__(self, node: StreamNode, kind: type, topic: str) -> None:
-        self.refusals = Refusals(node, topic, kind)  # of none
+        self.refusals = Refusals(node, topic, kind)  # stays empty
         self._node, self._topic = node, topic
         self._parts: list[Part] = []
 
     def hand(self, frame: str, rows: np.ndarray) -> None:
-        """Take rows (n,) with the fields of a CdrCodec, all of one frame."""
+        """Append rows (n,) with the fields of a CdrCodec, all of one frame."""
         self._parts.append((frame, rows, np.full(len(rows), 1e-9 * time.time_ns())))
 
     def __len__(self) -> int:
-        """Parts that wait."""
+        """Return the number of waiting parts."""
         return len(self._parts)
 
     def fetch(self, codec: CdrCodec) -> list[Part]:
-        """[(frame, rows, arrivals)] since the last time."""
+        """Return [(frame, rows, arrivals, s since 1970)] since the last call."""
         parts, self._parts = self._parts, []
         return parts
 
     def get_publisher_count(self) -> int:
-        """How many publish it."""
+        """Return the number of publishers of the topic."""
         return self._node.count_publishers(self._topic)
 
     def trouble(self, received: int) -> str | None:
-        """What is wrong with the stream as ROS sees it, or None."""
+        """Return a sentence on the fault of the stream in ROS, or None."""
         return several_publishers(self._node, self._topic)
 
 
 class _Stream:
-    """What has arrived on one of them. waiting : parts; fell : the stamps of what was taken last
-    have fallen back.
+    """Arrived messages of one stream.
+
+    waiting : parts; fell : whether stamps of the last taken messages fell back
     """
 
     def __init__(self, codec: CdrCodec, take: Take, source: StreamInput | InMemoryReceiver) -> None:
@@ -192,7 +204,7 @@ class _Stream:
         self._codec, self._take, self._source, self._newest = codec, take, source, -np.inf
 
     def fetch(self) -> bool:
-        """Returns whether anything has arrived since the last time."""
+        """Fetch messages, and return whether any arrived since the last call."""
         parts = self._source.fetch(self._codec)
         if not parts:
             return False
@@ -201,14 +213,14 @@ class _Stream:
 
     @property
     def newest_waiting(self) -> float:
-        """Stamp, s since 1970, of what was fetched last; -inf if nothing waits."""
+        """Stamp of the last fetched message, s since 1970; -inf if none waits."""
         if not self.waiting:
             return -np.inf
         rows = self.waiting[-1][1]
         return rows["sec"][-1] + 1e-9 * rows["nanosec"][-1]
 
     def parts(self, epoch: Epoch) -> list[tuple[Any, ...]]:
-        """What was fetched, as [(take, frame, stamps, rows, arrivals)]."""
+        """Return the fetched messages as [(take, frame, stamps, rows, arrivals)]."""
         self.fell, parts = False, []
         for frame, rows, arrivals in self.waiting:
             t = epoch.seconds_of(rows["sec"], rows["nanosec"])
@@ -223,7 +235,7 @@ class _Stream:
 
 
 def _pieces(part: tuple[Any, ...]) -> list[tuple[Any, ...]]:
-    """The messages of a part one by one."""
+    """Return the messages of a part one by one."""
     take, frame, *columns = part
     return [
         (take, frame, *(column[k : k + 1] for column in columns)) for k in range(len(columns[0]))
@@ -234,22 +246,26 @@ Events = TypeVar("Events", SubscriptionEventCallbacks, PublisherEventCallbacks)
 
 
 class Serving(Protocol):
-    """Serves nodes, see Spinner. longest_wait : s, the longest that anything has waited since this
-    was set to 0.0.
+    """Serves nodes, see Spinner.
+
+    longest_wait : s, longest wait of any request since this was set to 0.0
     """
 
     longest_wait: float
 
     def replace(self, gone: Iterable[StreamNode], new: Iterable[StreamNode]) -> None:
-        """Leave some nodes, and serve others."""
+        """Stop serving some nodes, and serve others."""
 
 
 class StreamNode(ParameterNode):
-    """A node whose streams and /clock are not served by an executor (see Spinner). members : nodes
-    that live and end with it;
-    spinner : the Spinner that serves it, once there is one; ready : what it says on the log when it
-        begins to be served;
-    on_failure(error) : is called with what a callback raises, instead of raising it.
+    """A node whose streams and /clock no executor serves (see Spinner).
+
+    Attributes
+    ----------
+    members : nodes that start and end with it
+    spinner : the Spinner that serves it, once there is one
+    ready : the log line at the start of service
+    on_failure : callable of an exception; called with exceptions of callbacks, instead of raising them
     """
 
     members: Sequence[StreamNode] = ()
@@ -265,7 +281,7 @@ class StreamNode(ParameterNode):
         qos_profile: QoSProfile | int,
         **options: Any,
     ) -> Subscription:
-        """Of rclpy."""
+        """Subscribe as rclpy does."""
         callback = callback if callback is unserved else self._contained(callback)
         options["event_callbacks"] = self._quiet(
             topic, options.get("event_callbacks") or SubscriptionEventCallbacks()
@@ -275,15 +291,16 @@ class StreamNode(ParameterNode):
     def create_publisher(
         self, msg_type: type, topic: str, qos_profile: QoSProfile | int, **options: Any
     ) -> Publisher:
-        """Of rclpy."""
+        """Make a publisher as rclpy does."""
         options["event_callbacks"] = self._quiet(
             topic, options.get("event_callbacks") or PublisherEventCallbacks()
         )
         return super().create_publisher(msg_type, topic, qos_profile, **options)
 
     def _quiet(self, topic: str, events: Events) -> Events:
-        """The event callbacks of a topic, which warn of peers with another QoS or type at times:
-        rclpy writes a line for each peer.
+        """Return event callbacks that limit the warnings on peers with another QoS or type.
+
+        rclpy would write one line per peer.
         """
         for event in ("incompatible_qos", "incompatible_type"):
             if getattr(events, event) is None:
@@ -297,14 +314,14 @@ class StreamNode(ParameterNode):
     def _warning(self, kind: str, text: str) -> Callable[[Any], None]:
         return lambda _: self.warn_at_times(kind, text)
 
-    def create_timer(  # type: ignore[override]  # its further arguments are handed on by their names
+    def create_timer(  # type: ignore[override]  # options are passed by name
         self, timer_period_sec: float, callback: Callable[[], None], **options: Any
     ) -> Timer:
-        """Of rclpy."""
+        """Make a timer as rclpy does."""
         return super().create_timer(timer_period_sec, self._contained(callback), **options)
 
     def say_ready(self) -> None:
-        """Say on the log that it is served from now on, and ends in good order."""
+        """Log that the node is served, and that signals now end it in good order."""
         if self.ready:
             self.get_logger().info(self.ready)
 
@@ -322,7 +339,7 @@ class StreamNode(ParameterNode):
 
     @property
     def subscriptions(self) -> Iterator[Subscription]:
-        """Those that an executor serves."""
+        """Subscriptions that an executor serves."""
         yield from (
             one
             for one in super().subscriptions
@@ -330,7 +347,7 @@ class StreamNode(ParameterNode):
         )
 
     def take_clock(self) -> None:
-        """Set the clock of the node to the newest of /clock."""
+        """Set the clock of the node to the newest time on /clock."""
         for clock in [one for one in super().subscriptions if one.msg_type is Clock]:
             newest = None
             for newest, _ in waiting(clock):
@@ -339,5 +356,5 @@ class StreamNode(ParameterNode):
                 continue
             try:
                 clock.callback(decode(newest, Clock))
-            except (ValueError, OverflowError) as error:  # no time at all, or before 1970
+            except (ValueError, OverflowError) as error:  # an invalid time, or before 1970
                 self.warn_at_times("/clock", f"/clock: passed over: {error}")

@@ -1,6 +1,4 @@
-"""Parameters of a node: each with text, unit and range; what a node does not know is refused or
-said.
-"""
+"""Parameters of a node with text, unit and range; unknown parameters are refused or reported."""
 
 from __future__ import annotations
 
@@ -43,30 +41,36 @@ KINDS = {
     list: "a list",
 }
 QOS = "qos_overrides."
-SAY_AGAIN = 10.0  # s from one warning to the next of the same kind
-LONGEST_NAME = 100  # letters of what a stranger wrote, in a sentence
-# parameters in a request, 0.1 ms each, and requests that wait: streams wait for all of them
+SAY_AGAIN = 10.0  # s between warnings of the same kind
+LONGEST_NAME = 100  # characters quoted from another node
+# Parameters per request, 0.1 ms each, and waiting requests. Streams wait until all are answered.
 MOST_ASKED, MOST_REQUESTS = (100, 20)
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """default : its value and type; text : unit and meaning, as in the parameter file; low, high :
-    its range, for a number;
-    choices : the texts that it may be; constraint : in words, what cannot be said by these;
-        settable : in flight.
+    """A parameter of a node.
+
+    Attributes
+    ----------
+    default : its value and type
+    text : unit and meaning, as in the parameter file
+    low, high : range of a number
+    choices : permitted texts
+    constraint : further limits, in words
+    settable : whether it can change while the node runs
     """
 
     default: Any
     text: str
-    low: float = None  # type: ignore[assignment]  # numbers have both
+    low: float = None  # type: ignore[assignment]  # set for numbers
     high: float = None  # type: ignore[assignment]  # as low
     choices: tuple[str, ...] = ()
     constraint: str = ""
     settable: bool = False
 
     def descriptor(self) -> ParameterDescriptor:
-        """ParameterDescriptor for ROS."""
+        """Return the ParameterDescriptor for ROS."""
         constraint = f"one of {', '.join(self.choices)}" if self.choices else self.constraint
         out = ParameterDescriptor(
             description=self.text, read_only=not self.settable, additional_constraints=constraint
@@ -92,11 +96,16 @@ FROZEN = Parameter(
 
 
 class ParameterNode(Node):
-    """A Node that takes a read-only parameter which is set to what it is: `ros2 param load` sets
-    all that `ros2 param dump` wrote. One with the parameter FROZEN that is true takes no other.
-    What asks for parameters in a way that rclpy cannot read ends nothing.
+    """A Node with checked parameters.
 
-    refused : how often something was refused because the node is frozen; frozen : whether it is.
+    It accepts a read-only parameter that is set to its present value. Hence `ros2 param load` can
+    load everything that `ros2 param dump` wrote. If its parameter FROZEN is true, it refuses all
+    changes. Requests for parameters that rclpy cannot read do not end it.
+
+    Attributes
+    ----------
+    refused : number of refusals because the node is frozen
+    frozen : whether it is
     """
 
     refused, _refused_before, _refusal = 0, 0, ""
@@ -106,18 +115,19 @@ class ParameterNode(Node):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         self._warned: dict[
             str, float
-        ] = {}  # {kind: s of time.monotonic() from which on it may be said again}
+        ] = {}  # {kind: s of time.monotonic() of the next permitted warning}
         super().__init__(*arguments, **options)
 
     def get_logger(self) -> Log:
-        """Of rclpy; a Log."""
+        """Return the Log of the node."""
         if self._log is None:
             self._log = Log(super().get_logger())
         return self._log
 
     def warn_at_times(self, kind: str, text: str) -> None:
-        """Log a warning, unless one of this kind was logged less than SAY_AGAIN ago. (rclpy's own
-        throttle takes half a millisecond to find out, which is more than most messages take.)
+        """Log a warning, unless one of its kind was logged less than SAY_AGAIN s ago.
+
+        The throttle of rclpy takes 0.5 ms per call, more than most messages take.
         """
         now = time.monotonic()
         if now >= self._warned.get(kind, now):
@@ -126,12 +136,13 @@ class ParameterNode(Node):
 
     @property
     def frozen(self) -> bool:
-        """Whether nobody may change what was given at the start."""
+        """Whether the settings of the start are final."""
         return self.has_parameter("frozen") and self.get_parameter("frozen").value
 
     def refuse(self, what: str) -> str:
-        """Count and say that something is refused because the node is frozen; returns the sentence.
-        what : it, and who asked for it.
+        """Count and log a refusal because the node is frozen, and return the sentence.
+
+        what : the refused change, and who asked for it
         """
         self.refused += 1
         self._refusal = (
@@ -141,15 +152,17 @@ class ParameterNode(Node):
         return self._refusal
 
     def refused_lately(self) -> str | None:
-        """The sentence of the last that was refused since this was asked last, or None."""
+        """Return the sentence of the last refusal since the last call, or None."""
         new, self._refused_before = self.refused - self._refused_before, self.refused
         return self._refusal if new else None
 
     def create_service(
         self, srv_type: type, srv_name: str, callback: Callable[[Any, Any], Any], **options: Any
     ) -> Service:
-        """Of rclpy, which makes those of the parameters by it; they raise what they cannot read,
-        and take 1000 requests at a time.
+        """Make a service as rclpy does.
+
+        rclpy makes the parameter services by this method. They raise exceptions for unreadable requests,
+        and queue 1000 requests. Here they log such requests, and queue MOST_REQUESTS.
         """
         if not srv_type.__module__.startswith("rcl_interfaces."):
             return super().create_service(srv_type, srv_name, callback, **options)
@@ -180,7 +193,7 @@ class ParameterNode(Node):
         return super().create_service(srv_type, srv_name, answer, **options)
 
     def set_parameters_atomically(self, parameter_list: list[RosParameter]) -> SetParametersResult:
-        """Of rclpy; what the parameter services of the node call."""
+        """Set parameters as rclpy does; the parameter services call this."""
         others = [each for each in parameter_list if not self._is_so_for_good(each)]
         if not others and parameter_list:
             return SetParametersResult(successful=True)
@@ -190,12 +203,12 @@ class ParameterNode(Node):
                 reason=self.refuse(f"parameter {others[0].name!r:.{LONGEST_NAME}}"),
             )
         unknown = [each.name for each in others if not self.has_parameter(each.name)]
-        if unknown:  # rclpy says of which only [], for lack of a copy
+        if unknown:  # rclpy would name no parameter: it reports an empty list
             return SetParametersResult(successful=False, reason=self._unknown(unknown[0]))
         return super().set_parameters_atomically(others)
 
     def _unknown(self, name: str) -> str:
-        """That there is no such parameter, and which one was probably meant."""
+        """Return a sentence on an unknown parameter, with the most similar name."""
         near = get_close_matches(name, self._parameters, n=1, cutoff=0.5)
         return f"{self.get_name()} has no parameter {name!r:.{LONGEST_NAME}}; " + (
             f"set {near[0]}." if near else "see `ros2 param list`."
@@ -211,7 +224,7 @@ class ParameterNode(Node):
 
 
 def declare(node: ParameterNode, name: str, parameter: Parameter) -> Any:
-    """Declare a Parameter and return its value; raises InputError."""
+    """Declare a Parameter, and return its value; raise InputError."""
     kind = KINDS.get(type(parameter.default), "text")
     try:
         value = node.declare_parameter(name, parameter.default, parameter.descriptor()).value
@@ -230,14 +243,14 @@ def declare(node: ParameterNode, name: str, parameter: Parameter) -> Any:
 
 
 def declare_all(node: ParameterNode, parameters: dict[str, Parameter]) -> dict[str, Any]:
-    """Declare {name: Parameter}; returns {name: value}."""
+    """Declare {name: Parameter}, and return {name: value}."""
     return {name: declare(node, name, parameter) for name, parameter in parameters.items()}
 
 
 def refuse_unknown(node: ParameterNode, others: Collection[str] = ()) -> None:
-    """Raise InputError for a parameter that was given and that the node, which has declared its
-    own, does not have.
-    others : names that are for somebody else.
+    """Raise InputError for a given parameter that the node does not have.
+
+    Call it after the node has declared its parameters. others : names for other nodes
     """
     for name in sorted(node._parameter_overrides):
         if name.startswith(QOS) or name in others or node.has_parameter(name):
@@ -251,8 +264,9 @@ def refuse_unknown(node: ParameterNode, others: Collection[str] = ()) -> None:
 
 
 def say_unused(nodes: Sequence[Node], files: Iterable[str]) -> None:
-    """Say which QoS overrides, and which of the parameter files given, change nothing. To be called
-    when the nodes of a process have all of their topics. files : their paths.
+    """Log which QoS overrides and which given parameter files have no effect.
+
+    Call it when the nodes of a process have all topics. files : paths
     """
     given, logger = (
         {name for node in nodes for name in node._parameter_overrides},
@@ -274,16 +288,17 @@ def say_unused(nodes: Sequence[Node], files: Iterable[str]) -> None:
 
 
 def files_of(arguments: Sequence[str]) -> list[str]:
-    """Paths after --params-file in the arguments of a process."""
+    """Return the paths after --params-file in the arguments of a process."""
     return [file for word, file in zip(arguments, arguments[1:]) if word == "--params-file"]
 
 
 def _names(file: str) -> set[str]:
-    """Names of all parameters in a parameter file, of whatever node. rcl has read it before and
-    validates it: here no value is looked at, nor the tag of one (launch_ros gives lists the tag
-    !!python/tuple).
+    """Return the names of all parameters in a parameter file, of any node.
+
+    rcl has validated the file. Values and their tags are ignored, since launch_ros gives lists the
+    tag !!python/tuple.
     """
-    if not Path(file).is_file():  # a pipe, which rcl has emptied
+    if not Path(file).is_file():  # rcl has already emptied a pipe
         return set()
     try:
         with open(file, "rb") as opened:
@@ -293,13 +308,13 @@ def _names(file: str) -> set[str]:
 
 
 def _below_nodes(part: MappingNode) -> Iterator[str]:
-    """Yields the names below each ros__parameters in a part of a file, as yaml.compose gives it."""
+    """Yield the names below each ros__parameters in a part of a file, as yaml.compose gives it."""
     for key, value in part.value if isinstance(part, yaml.MappingNode) else ():
         yield from _flat(value) if key.value == "ros__parameters" else _below_nodes(value)
 
 
 def _flat(part: MappingNode, prefix: str = "") -> Iterator[str]:
-    """Yields the names in a mapping of parameters, whose mappings are prefixes."""
+    """Yield the names in a mapping of parameters; nested mappings are prefixes."""
     for key, value in part.value if isinstance(part, yaml.MappingNode) else ():
         name = f"{prefix}{key.value}"
         if isinstance(value, yaml.MappingNode):

@@ -1,4 +1,4 @@
-"""Run the nodes of a process until Ctrl-C, and serve their streams in turn with the rest of the graph."""
+"""Run the nodes of a process until Ctrl-C; serve their streams and the rest of the graph."""
 
 from __future__ import annotations
 
@@ -30,34 +30,37 @@ if TYPE_CHECKING:
     from .node import StreamNode, StreamPoller
 
 
-try:  # not in rclpy before 7.1.4; a message costs a quarter
+try:  # since rclpy 7.1.4; a message takes a quarter of the time
     from rclpy.experimental import EventsExecutor
 except ImportError:
-    EventsExecutor = None  # type: ignore[assignment]  # says that there is none
+    EventsExecutor = None  # type: ignore[assignment]  # None marks an older rclpy
 
-LONGEST_SLEEP = 0.2  # s, until a process without streams sees a signal
-# s without a message of a stream, after which it is looked for each LOOK s, and not each
-# millisecond
+LONGEST_SLEEP = 0.2  # s, until a process without streams reacts to a signal
+# s without a message of a stream, after which the process checks streams each LOOK s instead of
+# each millisecond.
 QUIET, LOOK = (1.0, 0.05)
-SERVED = 0.005  # s from one service of the graph to the next, while streams flow
+SERVED = 0.005  # s between services of the graph while streams have messages
 LONGEST_SERVICE = 0.05  # s; only with a SingleThreadedExecutor
 
 
 class Spinner:
-    """The life of the nodes of a process. Messages of streams, and those of /clock and /tf, which
-    may come a thousand times a second, wait in the middleware until a turn takes and computes them
-    together: a callback for each costs a fifth more in all, and a call of the filter for each more
-    than that. Then the process rests as long as the turn took, at least a millisecond. Every SERVED
-    s everything else of the graph, requests, timers, transforms, is served by an executor of rclpy,
-    in the order in which it came, and nothing can be passed over: a mark is put at the end of its
-    queue, and it is run until the mark comes. Where no stream has said anything for a while, the
-    process sleeps in the executor. (`docs/measured.md` has what was measured.)
+    """Serves the nodes of a process.
 
-    longest_wait : s, the longest that anything has waited since this was set to 0.0.
+    Messages of streams, /clock and /tf may come 1000 times per second. They wait in the middleware
+    until a turn takes and computes them together. A callback for each message would cost a fifth more
+    in all. A call of the filter for each would cost even more. After a turn the process rests as long
+    as the turn took, at least 1 ms.
+
+    Every SERVED s an executor of rclpy serves the rest of the graph in the order of arrival: requests,
+    timers, transforms. A mark at the end of its queue ensures completeness: the executor runs until
+    it reaches the mark. While no stream has messages, the process sleeps in the executor.
+    `docs/measured.md` has the measurements.
+
+    longest_wait : s, longest wait of any request since this was set to 0.0
     """
 
     def __init__(self, nodes: list[StreamNode], turns: StreamPoller | None = None) -> None:
-        """nodes : a list that is kept up to date."""
+        """Start to serve nodes; `nodes` is a list that stays up to date."""
         self.longest_wait = 0.0
         self._nodes, self._turns = nodes, turns
         self._executor = SingleThreadedExecutor() if EventsExecutor is None else EventsExecutor()
@@ -66,7 +69,7 @@ class Spinner:
             self._serve_node(node)
 
     def replace(self, gone: Iterable[StreamNode], new: Iterable[StreamNode]) -> None:
-        """Leave some nodes, and serve others."""
+        """Stop serving some nodes, and serve others."""
         for node in gone:
             self._executor.remove_node(node)
             self._nodes.remove(node)
@@ -79,8 +82,8 @@ class Spinner:
         self._executor.add_node(node)
 
     def spin(self, stop: Future) -> None:
-        """Live until the future `stop` is done, or the context ends."""
-        # taken : when a turn last took anything
+        """Serve the nodes until the future `stop` is done, or the context ends."""
+        # taken : s, time of the last turn with messages
         taken, sleep, quiet = (-math.inf, LONGEST_SLEEP if self._turns is None else LOOK, True)
         while not stop.done() and self._nodes[0].context.ok():
             if quiet or time.monotonic() >= self._served + SERVED:
@@ -92,20 +95,20 @@ class Spinner:
                 self._guarded(self._executor.spin_once, timeout_sec=sleep)
                 self._served = time.monotonic()
             else:
-                time.sleep(rest or self._turns.PERIOD)  # type: ignore[union-attr]  # without turns it is quiet
+                time.sleep(rest or self._turns.PERIOD)  # type: ignore[union-attr]  # not None: without turns the process is quiet
 
     def close(self) -> None:
-        """Leave the nodes."""
+        """Stop serving the nodes."""
         for node in self._nodes:
             self._executor.remove_node(node)
         self._executor.shutdown()
 
     def _serve(self) -> None:
-        """Everything that has come so far."""
+        """Serve everything that arrived so far."""
         if EventsExecutor is None:
             self._serve_each()
         else:
-            # tasks wait in the same queue as everything else
+            # Tasks wait in the same queue as everything else.
             mark = self._executor.create_task(_nothing)
             while not mark.done():
                 self._executor.spin_once(timeout_sec=0.0)
@@ -115,8 +118,9 @@ class Spinner:
             node.take_clock()
 
     def _serve_each(self) -> None:
-        """With the SingleThreadedExecutor, which has no queue: one of everything that waits, until
-        nothing does, or for a while.
+        """Serve one waiting item at a time until none waits, at most LONGEST_SERVICE s.
+
+        For the SingleThreadedExecutor, which has no queue for a mark.
         """
         until, found = time.monotonic() + LONGEST_SERVICE, True
         while found and time.monotonic() < until:
@@ -131,7 +135,7 @@ class Spinner:
                 pass
 
     def _guarded(self, serve: Callable[..., None], **arguments: Any) -> None:
-        """Requests to services are decoded by rclpy, which raises what cannot be."""
+        """Call `serve`, and log requests that rclpy cannot decode."""
         try:
             serve(**arguments)
         except implementation.RCLError as error:
@@ -139,18 +143,23 @@ class Spinner:
 
 
 def _nothing() -> None:
-    """What a mark does."""
+    """Do nothing: the task of a mark."""
 
 
 def run(
     node_class: type[StreamNode], description: str | None, argv: Sequence[str] | None = None
 ) -> int:
-    """Live as a node until SIGINT or SIGTERM. Returns the exit code: 0, 2 for bad usage or an
-    InputError, or 128 and the number of a signal that came before the node was ready.
+    """Run a node until SIGINT or SIGTERM, and return the exit code.
 
-    node_class(arguments) makes the StreamNode, in an initialised rclpy, of the arguments of the
-    process; it has the executable's NAME, and may have `members` and `turns`,
-    StreamPoller. description : for --help.
+    The code is 0, or 2 for bad usage or an InputError. It is 128 plus the signal's number if the
+    signal came before the node was ready.
+
+    Parameters
+    ----------
+    node_class : callable of the arguments of the process -> StreamNode, in an initialised rclpy. It has
+        the executable's NAME, and may have `members` and `turns`, a StreamPoller.
+    description : for --help
+    argv : arguments, default: sys.argv[1:]
     """
     name = node_class.NAME
     arguments = [name, *(sys.argv[1:] if argv is None else argv)]
@@ -158,7 +167,7 @@ def run(
         prog=name, description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     interruptible = True
-    stop: Future = Future()  # of the number of a signal
+    stop: Future = Future()  # holds the number of the signal
 
     # rclpy's own handler would end the context while a callback still publishes
     def on_signal(number: int, frame: FrameType | None) -> None:
@@ -177,16 +186,16 @@ def run(
         nodes = [node, *node.members]
         spinner = Spinner(nodes, getattr(node, "turns", None))
         gc.collect()
-        gc.freeze()  # what numba holds is never garbage, and searching it takes a tenth of a second
+        gc.freeze()  # numba's objects are never garbage; searching them takes 0.1 s
         gc.enable()
         interruptible = False
         if stop.done():
             raise KeyboardInterrupt
-        for each in reversed(nodes):  # from here on a signal ends it in good order
+        for each in reversed(nodes):  # from here on, signals end the node in good order
             each.say_ready()
         spinner.spin(stop)
-    except SystemExit as ended:  # argparse has said it already
-        return ended.code or 0  # type: ignore[return-value]  # argparse ends with a number
+    except SystemExit as ended:  # argparse has printed the error or the help
+        return ended.code or 0  # type: ignore[return-value]  # argparse exits with a number
     except InputError as error:
         print(f"{name}: error: {line_of(error)}", file=sys.stderr)
         return 2

@@ -1,4 +1,4 @@
-"""Publishers, subscriptions and stamps: QoS, messages that are read as bytes, faults of topics."""
+"""Publishers, subscriptions and stamps: QoS, messages read as bytes, faults of topics."""
 
 from __future__ import annotations
 
@@ -29,85 +29,90 @@ if TYPE_CHECKING:
 
 
 class Epoch:
-    """Stamps as float seconds, exact to the nanosecond: counted from the whole second of the first
-    stamp.
+    """Stamps as float seconds, counted from the whole second of the first stamp.
 
-    Seconds since 1970 in a float64 are only good to 2e-7 s. Exact for 48 days before and after the
-    first stamp.
+    They are exact to 1 ns within 48 days of the first stamp. Seconds since 1970 in a float64 would be
+    exact to 2e-7 s only.
     """
 
     def __init__(self) -> None:
-        self._second: int = None  # type: ignore[assignment]  # of the first stamp, once there is one
+        self._second: int = None  # type: ignore[assignment]  # s since 1970, of the first stamp; None before it
 
     def seconds(self, stamp: Time) -> float:
-        """Float s of a builtin_interfaces/Time."""
+        """Return float s of a builtin_interfaces/Time."""
         if self._second is None:
             self._second = stamp.sec
         return (stamp.sec - self._second) + 1e-9 * stamp.nanosec
 
     def seconds_of(self, sec: np.ndarray, nanosec: np.ndarray) -> np.ndarray:
-        """Float s, (n,), of the two parts of stamps, (n,) each."""
+        """Return float s, (n,), of the two parts of stamps, (n,) each."""
         if self._second is None:
             self._second = int(sec[0])
         return (sec.astype(np.int64) - self._second) + 1e-9 * nanosec
 
     def parts(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What `seconds_of` was given, to the nanosecond, of t (n,) s."""
+        """Return seconds and nanoseconds of t (n,) s, to 1 ns; the inverse of `seconds_of`."""
         second, nanosecond = np.divmod(np.round(t * 1e9).astype(np.int64), 10**9)
         return self._second + second, nanosecond
 
     @property
     def begin(self) -> int:
-        """Stamp, s, of what `seconds` gives as 0."""
+        """Stamp of the origin of `seconds`, s since 1970."""
         return self._second or 0
 
     def stamp(self, t: float) -> Time:
-        """builtin_interfaces/Time of float s: what `seconds` was given, to the nanosecond."""
+        """Return the builtin_interfaces/Time of t s; the inverse of `seconds`, exact to 1 ns."""
         second, nanosecond = divmod(round(t * 1e9), 10**9)
         return Time(sec=self._second + second, nanosec=nanosecond)
 
 
 def orientation_of(q: Quaternion) -> tuple[float, float, float, float]:
-    """Tuple x y z w of a geometry_msgs/Quaternion; NaN for (0, 0, 0, 0), which says: not known."""
+    """Return the tuple x y z w of a geometry_msgs/Quaternion.
+
+    NaN for (0, 0, 0, 0), which means unknown.
+    """
     values = (q.x, q.y, q.z, q.w)
     return values if any(values) else (np.nan, np.nan, np.nan, np.nan)
 
 
-# What comes in is sensor data: best effort, which hears every publisher. Deep, because a node that
-# was not scheduled for a
-# moment must find all of it: 10 s of a 1 kHz IMU, or 2.5 s of it replayed four times as fast. Takes
-# memory only where it
-# is used. What goes out is reliable, which every subscriber hears: RViz and most others ask for it.
+# Inputs are best effort: such subscriptions receive from every publisher. They are deep, since a
+# node that was not scheduled for a moment must find all messages: 10 s of a 1 kHz IMU, or 2.5 s of
+# it replayed at 4x speed. Memory is taken only where it is used. Outputs are reliable, since every
+# subscriber receives them; RViz and most others request it.
 STREAM_QOS = QoSProfile(depth=10_000, reliability=ReliabilityPolicy.BEST_EFFORT)
 OUTPUT_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
-LARGEST_LOSS = 0.01  # share of the messages of a second
-# written into the given profile
+LARGEST_LOSS = 0.01  # largest lost share of messages per second
+# rclpy writes these into the given profile.
 OVERRIDES = QoSOverridingOptions([QoSPolicyKind.RELIABILITY, QoSPolicyKind.DEPTH])
 
 
 def publish_stream(node: Node, kind: type, topic: str) -> Publisher:
-    """Publisher of a stream; QoS by parameter: qos_overrides.<topic>.publisher.reliability and
-    .depth.
+    """Return a publisher of a stream.
+
+    QoS by parameter: qos_overrides.<topic>.publisher.reliability and .depth.
     """
     return node.create_publisher(kind, topic, copy(OUTPUT_QOS), qos_overriding_options=OVERRIDES)
 
 
 def unserved(_: Any) -> None:
-    """Callback of a subscription that no executor serves."""
+    """Mark a subscription that no executor serves; a callback without effect."""
 
 
 def waiting(subscription: Subscription) -> Iterator[tuple[bytes, dict[str, Any]]]:
-    """Generator of what waits at a subscription that no executor serves: (bytes, information) of
-    each message, which is taken.
-    """
+    """Take and yield (bytes, information) of each message at an unserved subscription."""
     kind, take = subscription.msg_type, subscription.handle.take_message
     while (taken := take(kind, True)) is not None:
         yield taken
 
 
 class Refusals:
-    """Messages of a topic that could not be read. count : of them; reason : of the last; topic :
-    its name.
+    """Unreadable messages of a topic.
+
+    Attributes
+    ----------
+    count : their number
+    reason : of the last one
+    topic : its name
     """
 
     def __init__(self, node: ParameterNode, topic: str, kind: type) -> None:
@@ -115,7 +120,7 @@ class Refusals:
         self.topic, self._node, self._kind, self._before = topic, node, kind, 0
 
     def add(self, error: Unreadable) -> None:
-        """Count one."""
+        """Count one unreadable message."""
         self.count, self.reason = self.count + 1, str(error)
         self._node.warn_at_times(
             f"unreadable {self.topic}",
@@ -123,7 +128,7 @@ class Refusals:
         )
 
     def trouble(self) -> str | None:
-        """The sentence for those since this was asked last, or None."""
+        """Return the sentence on unreadable messages since the last call, or None."""
         new, self._before = self.count - self._before, self.count
         if not new:
             return None
@@ -136,7 +141,7 @@ class Refusals:
         return f"{new} messages on {self.topic} cannot be read ({self.reason}): {remedy}"
 
     def _others(self) -> str:
-        """Who publishes another definition of the type than ours, as text."""
+        """Return the names of publishers with another definition of the type, as text."""
         name = self._node.resolve_topic_name(self.topic)
         own = {
             _hash(end)
@@ -156,10 +161,15 @@ def _hash(end: TopicEndpointInfo) -> str:
 
 
 class Input:
-    """Subscription of messages that come one at a time, not in streams: callback(message), by an
-    executor, or in `take_all` if it is not served. What cannot be read is refused.
+    """Subscription of single messages, not of a stream.
 
-    refusals : Refusals; options : of Node.create_subscription.
+    callback(message) is called by an executor, or by `take_all` if the subscription is not served.
+    Unreadable messages are refused.
+
+    Attributes
+    ----------
+    refusals : Refusals
+    options : of Node.create_subscription
     """
 
     def __init__(
@@ -173,7 +183,10 @@ class Input:
         served: bool = True,
         **options: Any,
     ) -> None:
-        """read(bytes) : what is given to the callback; default the message; raises Unreadable."""
+        """Subscribe to the topic.
+
+        read : callable of bytes -> argument of the callback, default: the message; raises Unreadable
+        """
         self.refusals = Refusals(node, topic, kind)
         self._read, self._callback = read or (lambda data: decode(data, kind)), callback
         self.subscription = node.create_subscription(
@@ -181,7 +194,7 @@ class Input:
         )
 
     def take_all(self) -> None:
-        """Take what waits."""
+        """Read all waiting messages."""
         for data, _ in waiting(self.subscription):
             self._take(data)
 
@@ -195,11 +208,14 @@ class Input:
 
 
 class StreamInput:
-    """Subscription of a stream, of which what arrives waits in the middleware until it is fetched.
+    """Subscription of a stream; messages wait in the middleware until `fetch`.
+
     QoS by parameter: qos_overrides.<topic>.subscription.reliability and .depth.
 
-    lost : messages that were sent and that DDS did not deliver, as far as it knows; refusals :
-        Refusals.
+    Attributes
+    ----------
+    lost : messages that DDS reports as sent and not delivered
+    refusals : Refusals
     """
 
     def __init__(self, node: ParameterNode, kind: type, topic: str) -> None:
@@ -218,8 +234,9 @@ class StreamInput:
         )
 
     def fetch(self, codec: CdrCodec) -> list[tuple[str, np.ndarray, np.ndarray]]:
-        """What has arrived, by a CdrCodec: [(frame, rows (n,), arrivals (n,) s since 1970)], each
-        of successive messages of one frame.
+        """Return the arrived messages as [(frame, rows (n,), arrivals (n,) s since 1970)].
+
+        Each entry holds successive messages of one frame; codec : CdrCodec
         """
         messages, stamps = [], []
         for data, information in waiting(self._subscription):
@@ -237,12 +254,13 @@ class StreamInput:
         self.lost += status.total_count_change
 
     def get_publisher_count(self) -> int:
-        """How many publish it."""
+        """Return the number of publishers of the topic."""
         return self._subscription.get_publisher_count()
 
     def trouble(self, received: int) -> str | None:
-        """What is wrong with the stream as ROS sees it, or None. received : messages since this was
-        asked last.
+        """Return a sentence on the fault of the stream in ROS, or None.
+
+        received : messages since the last call
         """
         lost, self._before = self.lost - self._before, self.lost
         refused = self.refusals.trouble()
@@ -261,7 +279,7 @@ class StreamInput:
 
 
 def several_publishers(node: ParameterNode, topic: str) -> str | None:
-    """The sentence for a topic on which more than one publishes, or None."""
+    """Return the sentence on a topic with several publishers, or None."""
     ends = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
     if len(ends) < 2:
         return None

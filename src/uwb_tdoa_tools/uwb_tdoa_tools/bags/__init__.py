@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-ROS_2 = b"\x89MCAP0\r\n", b"SQLite format 3\0"  # what a file of a bag begins with
+ROS_2 = b"\x89MCAP0\r\n", b"SQLite format 3\0"  # first bytes of the files of a bag
 
 
 def is_bag(path: str | Path) -> bool:
-    """Return whether a path is a bag: a .mcap or .db3 file, or a directory with one or metadata.yaml."""
+    """Return whether a path is a bag.
+
+    A bag is a .mcap or .db3 file, or a directory with such a file or metadata.yaml.
+    """
     path = Path(path)
     if path.is_dir():
         return (

@@ -231,9 +231,9 @@ def read_bag(
     topics: dict[str, str] | None = None,
     truth: bool = True,
 ) -> Flight:
-    """Read the Flight in a bag from `ros2 bag record` or from these tools; other topics are ignored.
+    """Read the Flight in a bag from `ros2 bag record` or from these tools.
 
-    Stamps are header stamps on a continuous time (`meta["clock"]`: [Jump] and {stream: outliers},
+    Other topics are ignored. Stamps are header stamps on a continuous time (`meta["clock"]`: [Jump] and {stream: outliers},
     see `clock.straightened`). Messages are sorted by stamp (`meta["reordered"]`). IMU samples are
     transformed to the body frame with /tf_static. `meta["antenna"]` is the position of the antenna
     in the body, (3,) m.

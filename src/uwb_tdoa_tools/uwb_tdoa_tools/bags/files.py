@@ -1,6 +1,4 @@
-"""Bags as files: opening them, going through their messages, and making new ones that are never
-half-written.
-"""
+"""Bags as files: open them, iterate over their messages, and write new ones atomically."""
 
 from __future__ import annotations
 
@@ -50,13 +48,16 @@ STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 
 
 class BagReader(Reader):
-    """A Reader that knows what of a bag cannot be read.
+    """A Reader that records which parts of a bag cannot be read.
 
-    remarks : sentences on what is missing in a damaged one; unreadable : {topic: messages that are
-        none of its type};
-    most : bytes that its messages may hold together; data : its files; packed : whether each
-        message is compressed; falls_back : whether
-    the times of its messages do, in the order in which they were written.
+    Attributes
+    ----------
+    remarks : sentences on the missing parts of a damaged bag
+    data : its data files
+    packed : whether each message is compressed
+    falls_back : whether the times of the messages fall back, in the order of writing
+    unreadable : {topic: number of messages that do not fit its type}
+    most : limit of the bytes of all messages together
     """
 
     remarks: list[str]
@@ -69,14 +70,20 @@ class BagReader(Reader):
 
 @contextmanager
 def new_bag(out: str | Path, storage: str = "mcap", force: bool = False) -> Iterator[Writer]:
-    """A rosbags Writer whose bag appears at `out` only if the block ends without an exception."""
+    """Give a rosbags Writer; the bag appears at `out` only if the block ends without an exception.
+
+    Parameters
+    ----------
+    storage : "mcap" or "sqlite3"
+    force : whether to replace an existing bag. Raises InputError.
+    """
     out = Path(out)
     if storage not in STORAGES:
         raise InputError(f"storage: {storage!r} is not known; choose one of {', '.join(STORAGES)}.")
     check_output(out, force)
     out.parent.mkdir(parents=True, exist_ok=True)
-    # A sibling, so that the last step is a rename. In it the bag's own name: rosbags names the data
-    # file after it.
+    # A folder next to `out`, so the last step is a rename. The bag in it has its final name, because
+    # rosbags names the data file after it.
     scratch = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".partial", dir=out.parent))
     try:
         with Writer(
@@ -94,8 +101,9 @@ def new_bag(out: str | Path, storage: str = "mcap", force: bool = False) -> Iter
 
 
 def check_output(out: str | Path, force: bool = False) -> None:
-    """Raise InputError if a new bag cannot be put at `out`: something is there that force may not
-    replace.
+    """Raise InputError if a new bag cannot be written to `out`.
+
+    force : whether an existing bag may be replaced; other files never are
     """
     out = Path(out)
     if not out.name:
@@ -113,11 +121,9 @@ def check_output(out: str | Path, force: bool = False) -> None:
 
 @contextmanager
 def open_bag(path: str | Path, salvage: bool = False) -> Iterator[BagReader]:
-    """An open rosbags Reader of a bag directory or data file; raises InputError with what is wrong
-    with it.
+    """Give an open BagReader of a bag directory or data file; raise InputError for a faulty one.
 
-    salvage : read what is sound of a cut or damaged one; the Reader's `remarks` are sentences on
-        what is missing.
+    salvage : read the sound part of a cut or damaged bag; `remarks` lists the missing parts
     """
     path = Path(path)
     if not is_bag(path):
@@ -135,7 +141,7 @@ def open_bag(path: str | Path, salvage: bool = False) -> Iterator[BagReader]:
         try:
             yield reader
         finally:
-            with suppress(Exception):  # of what rosbags has believed
+            with suppress(Exception):  # errors of rosbags on faulty content
                 reader.close()
 
 
@@ -186,8 +192,9 @@ def _opened(path: Path, folder: Path, salvage: bool) -> BagReader:
 
 @contextmanager
 def _closing_second_connections(reader: Reader) -> Iterator[None]:
-    """rosbags opens each SQLite file twice, and closes it once: each file that was read would stay
-    open.
+    """Close the second connection of rosbags to each SQLite file.
+
+    rosbags opens each file twice and closes it once. Otherwise every file would stay open.
     """
     before = {*map(id, _connections())}
     yield
@@ -201,16 +208,17 @@ def _closing_second_connections(reader: Reader) -> Iterator[None]:
 
 
 def _connections() -> list[Any]:
-    """All that are open to SQLite files of rosbags."""
+    """Return all open connections to SQLite files of rosbags."""
     return sys.modules["apsw"].connections() if "apsw" in sys.modules else []
 
 
 def _take_qos_of_metadata(reader: Reader) -> None:
-    """Have data files offer each topic as metadata.yaml says: rosbags skips the messages of a topic
-    of which they say another QoS.
+    """Set the QoS of each topic in the data files to that in metadata.yaml.
+
+    rosbags skips messages of topics whose QoS differs.
     """
     recorded = {
-        (one.topic, one.msgtype): one.ext.offered_qos_profiles  # type: ignore[union-attr]  # a bag of ROS 2
+        (one.topic, one.msgtype): one.ext.offered_qos_profiles  # type: ignore[union-attr]  # always a bag of ROS 2
         for one in reader.connections
     }
     for file in getattr(reader.storage, "storages", ()):
@@ -222,9 +230,7 @@ def _take_qos_of_metadata(reader: Reader) -> None:
 def _as_written(
     reader: BagReader, connections: list[Connection]
 ) -> Iterator[tuple[Connection, int, bytes]]:
-    """(connection, stamp ns, bytes) of the given connections in the order in which they were
-    written.
-    """
+    """Yield (connection, stamp ns, bytes) of the given connections in the order of writing."""
     wanted = {(connection.topic, connection.msgtype): connection for connection in connections}
     for file in reader.data:
         for written, stamp, data in as_written(file, Counter()):
@@ -233,8 +239,9 @@ def _as_written(
 
 
 def _falls_back(file: Path) -> bool:
-    """Whether the times of the messages of a data file fall by more than a message can be late: the
-    clock of the recorder, or of what is recorded, was set.
+    """Return whether the times of a data file fall by more than LARGEST_STEP_BACK.
+
+    Then the clock of the recorder, or of the recorded system, was set.
     """
     newest = -math.inf
     if is_mcap(file):
@@ -255,10 +262,13 @@ def _falls_back(file: Path) -> bool:
 def messages(
     path: str | Path, reader: BagReader, connections: list[Connection], written: bool = False
 ) -> Iterator[tuple[Connection, int, bytes]]:
-    """Yield (connection, stamp ns, bytes) of the given connections in the bag's order (written : if
-    its times fall back, in the order in which they were written), as their types are now, without
-    those that cannot be read as such, which are counted in `reader.unreadable`; raises InputError,
-    also if there are more or fewer than the bag says, or they hold more bytes than its files.
+    """Yield (connection, stamp ns, bytes) of the given connections.
+
+    The bytes are converted to the present version of their type. Messages that do not fit their type
+    are left out and counted in `reader.unreadable`. Raises InputError for another number of messages
+    than the bag states, or for more bytes than `reader.most`.
+
+    written : use the order of writing if the times fall back; default: the bag's order
     """
     found: Iterator[tuple[Connection, int, bytes]] = iter(())
     if connections:
@@ -306,10 +316,10 @@ def messages(
 def readable(
     path: str | Path, reader: BagReader, connections: list[Connection]
 ) -> Iterator[tuple[Connection, int, Any]]:
-    """The same as (connection, stamp ns, message): what are no such messages, as a faulty publisher
-    sends them, is counted too.
+    """Yield (connection, stamp ns, message) of the given connections.
 
-    Where the times of a bag fall back, in the order in which they were written.
+    Messages that cannot be decoded, e.g. of a faulty publisher, are counted too. If the times of the
+    bag fall back, the order of writing holds.
     """
     for connection, stamp, data in messages(path, reader, connections, written=True):
         try:
@@ -325,7 +335,7 @@ def readable(
 def connections_of(
     path: str | Path, reader: BagReader, topic: str, msgtype: str | None = None
 ) -> list[Connection]:
-    """The connections of a topic; raises InputError if their type is another, or not known."""
+    """Return the connections of a topic; raise InputError for another or unknown type."""
     found = [connection for connection in reader.connections if connection.topic == topic]
     for connection in found:
         if msgtype is not None and connection.msgtype != msgtype:
@@ -337,7 +347,7 @@ def connections_of(
 
 
 def remarks_of(reader: BagReader) -> list[str]:
-    """Sentences on what is missing in what was read so far."""
+    """Return sentences on all missing parts found so far."""
     return [
         *reader.remarks,
         *(

@@ -40,9 +40,9 @@ _TYPES = (  # columns of an SQLite bag and their types
 def check(path: str | Path) -> None:
     """Check the files of a bag.
 
-    The check covers the checksums in MCAP files and in metadata.yaml (`write_checksums`), the structure of
-    SQLite files, and the entries of metadata.yaml. Files that rosbag2 has compressed as a whole only have
-    to exist.
+    The check covers the checksums in MCAP files and in metadata.yaml (`write_checksums`). It also
+    covers the structure of SQLite files, and the entries of metadata.yaml. Files that rosbag2 has
+    compressed as a whole only have to exist.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def is_compressed(information: dict[str, Any]) -> bool:
 
 
 def decompress(path: Path, folder: Path) -> None:
-    """Decompress a bag whose files are compressed as a whole into an empty folder.
+    """Decompress a bag into an empty folder; its files are compressed as a whole.
 
     Raises
     ------

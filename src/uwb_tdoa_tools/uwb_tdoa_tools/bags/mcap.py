@@ -1,8 +1,8 @@
 """Check and repair MCAP files record by record (https://mcap.dev/spec).
 
-Sizes are compared with the file, or limited, before data are read or unpacked. The package `mcap` (1.6)
-unpacks a chunk of any size, does not compare the index with the chunks, and cannot add the checksums
-that rosbags leaves out.
+Sizes are compared with the file, or limited, before data are read or unpacked. The package `mcap`
+(1.6) unpacks a chunk of any size, and does not compare the index with the chunks. It cannot add
+the checksums that rosbags leaves out.
 """
 
 from __future__ import annotations
@@ -277,7 +277,10 @@ def _check_index(
 
 
 def _check_sum(file: BinaryIO, record: Record, starts: tuple[int, ...], last: int, at: int) -> None:
-    """Raise Damaged unless the checksum at `at` is 0 or that of the file from one of the starts to `last`."""
+    """Raise Damaged for a wrong checksum at `at`.
+
+    It must be 0, or belong to the file from one of the starts to `last`.
+    """
     (stored,) = struct.unpack("<I", _read(file, record.content + at, 4))
     if stored and not any(
         _checksum(file, first, last) == stored for first in starts if first <= last

@@ -33,8 +33,8 @@ OUR_TYPES = (
         if of.message.startswith(OUR_PACKAGE)
     ),
 )
-# Fields that our types were given since they were first recorded, the latest last, and what is
-# meant where they lack.
+# Fields added to the project's types since their first recording, latest last, and the value of a
+# missing field.
 ADDED: dict[str, tuple[dict[str, Any], ...]] = {
     f"{OUR_PACKAGE}/msg/Tdoa": ({"variance": 0.0},),
     f"{OUR_PACKAGE}/msg/TdoaCorrected": (
@@ -111,7 +111,7 @@ def upgraded(data: bytes, msgtype: str, store: Typestore) -> bytes:
 
 @cache
 def _earlier(msgtype: str) -> tuple[Typestore, ...]:
-    """Return the types before each addition of fields to one of them."""
+    """Return the types as they were before each addition of fields."""
     out, added = [], ADDED.get(msgtype, ())
     for k in range(len(added)):
         lacking, store = (

@@ -98,7 +98,7 @@ class Names:
         self._namespace, self._topics = namespace.strip("/"), topics or {}
 
     def __call__(self, topic: str) -> str:
-        """Return the absolute name of one of our topics, e.g. "uwb/tdoa"."""
+        """Return the absolute name of a topic of this project, e.g. "uwb/tdoa"."""
         name = self._topics.get(topic, topic)
         absolute = name.startswith("/") or not self._namespace
         return f"/{name.strip('/')}" if absolute else f"/{self._namespace}/{name.strip('/')}"
@@ -127,7 +127,7 @@ class TopicMessages:
 
 
 def arrivals(found: Mapping[str, TopicMessages]) -> dict[str, np.ndarray]:
-    """Return {stream: (n,) s, times of recording}; NaN if all of them equal the stamps."""
+    """Return {stream: (n,) s, times of recording}; NaN if they equal the stamps."""
     known = any(bool((of.stamps != of.arrived).any()) for of in found.values())
     return {
         name: of.arrived / 1e9 if known else np.full(len(of.arrived), np.nan)

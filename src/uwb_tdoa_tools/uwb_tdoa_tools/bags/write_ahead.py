@@ -15,12 +15,15 @@ from .mcap import Damaged
 if TYPE_CHECKING:
     from pathlib import Path
 
-LOG, INDEX, JOURNAL = "-wal", "-shm", "-journal"  # beside a file, with its name before it
+LOG, INDEX, JOURNAL = "-wal", "-shm", "-journal"  # suffixes of files next to the database file
 BESIDE = LOG, INDEX, JOURNAL
 
 
 def unclosed(path: Path) -> list[Path]:
-    """Return the SQLite files of a bag, a directory or a file, with a log or a journal that is not empty."""
+    """Return the SQLite files of a bag with a log or a journal that is not empty.
+
+    path : directory or file
+    """
     files = [path] if path.is_file() else sorted(path.glob("*.db3"))
     return [file for file in files if _left(file)]
 

@@ -112,8 +112,8 @@ def read_paths(
 
     Parameters
     ----------
-    source : CSV file with the columns flight, t (s, clock of the recording), x, y, z (m), or the
-        name of a nav_msgs/Odometry topic in the bags.
+    source : CSV file, or the name of a nav_msgs/Odometry topic in the bags. The columns of the file
+        are flight, t (s, clock of the recording), x, y, z (m).
     drift : m per square root of a second.
 
     Raises InputError.

@@ -1,5 +1,6 @@
-"""The registry of the sensors that a tag may have beside inertia and UWB: one sensor, one file, one
-line here.
+"""The registry of all sensors except IMU and TDOAs.
+
+A new sensor is one file in this folder and one line here.
 """
 
 from __future__ import annotations
@@ -16,35 +17,35 @@ from .velocity import Velocity
 
 SENSORS = {
     each.SENSOR.name: each.SENSOR for each in (height, pressure, velocity, ranges)
-}  # by name, in the order of their kinds in the filter
+}  # by name, in the filter's order of kinds
 
 LOCATING = tuple(
     name for name, sensor in SENSORS.items() if sensor.locates
-)  # from which alone the filter can start
+)  # each alone suffices to start the filter
 COMPARED = {
     channel: compared
     for name, sensor in SENSORS.items()
     for channel, compared in {name: sensor.compared, **sensor.parts}.items()
     if compared is not None
-}  # by channel of the diagnosis: that of a sensor, and those of its parts
+}  # {channel of the diagnosis: Compared} of sensors and their parts
 STREAM_OF = {
     channel: name for name, sensor in SENSORS.items() for channel in (name, *sensor.parts)
-}  # a Flight has the stream
-DIAGNOSED = tuple(COMPARED)  # channels of the diagnosis, of which
+}  # {channel of the diagnosis: stream of a Flight}
+DIAGNOSED = tuple(COMPARED)  # channels of the diagnosis
 BY_POSE = tuple(
     channel for channel, compared in COMPARED.items() if compared.reading
-)  # these are compared with poses, others with anchors too
+)  # channels compared with poses alone, without anchors
 
 
 def measured_on(flight: Any, channel: str) -> Stream | None:
-    """What a Flight holds of a channel of the diagnosis; None if nothing."""
+    """Return the Stream of a channel of the diagnosis in a Flight; None without data."""
     name = STREAM_OF[channel]
     stream: Stream | None = getattr(flight, name)
     return stream if stream is None or channel == name else stream.parts.get(channel)
 
 
 def with_measured(flight: Any, channel: str, part: Stream) -> Any:
-    """The Flight with another Stream of a channel."""
+    """Return the Flight with another Stream of a channel of the diagnosis."""
     name = STREAM_OF[channel]
     whole = part if channel == name else getattr(flight, name).with_part(channel, part)
     return replace(flight, **{name: whole})

@@ -9,14 +9,18 @@ import numpy as np
 
 from .sensor import Compared, Sensor, Stream, parameter
 
-# a kind; rad, m: typical, and a bound that bounds nothing
+# Fields of the messages: kind, typical angle in rad, and a range in m beyond any measurement.
 INFRARED, FIELD_OF_VIEW, LONGEST_RANGE = (1, 0.47, 1000.0)
 
 
 @dataclass(frozen=True)
 class Height(Stream):
-    """Ranges along the body's -z. t : (n,) s; range : (n,) m; inf or NaN where there was none (REP
-    117).
+    """Ranges along the body's -z.
+
+    Attributes
+    ----------
+    t : (n,) s
+    range : (n,) m, inf or NaN where nothing was in range (REP 117)
     """
 
     t: np.ndarray
@@ -38,7 +42,7 @@ def _columns(fields: dict) -> tuple:
     inside = (fields["min_range"] <= distance) & (distance <= fields["max_range"])
     return (
         np.where(np.isfinite(distance) & ~inside, np.inf, distance),
-    )  # out of range, says REP 117
+    )  # inf: out of range (REP 117)
 
 
 def _content(height: Height) -> dict:
@@ -59,7 +63,7 @@ def _reading(track: Any, t: np.ndarray) -> np.ndarray:
     q = track.attitudes(t)
     return (track.positions(t)[:, 2] / (1.0 - 2.0 * (q[:, 0] ** 2 + q[:, 1] ** 2)))[
         :, None
-    ]  # over the ground at z = 0
+    ]  # height over the ground at z = 0
 
 
 SENSOR = Sensor(
@@ -72,7 +76,7 @@ SENSOR = Sensor(
     content=_content,
     sound=lambda fields: {
         name: np.ones(values.shape, dtype=bool) for name, values in fields.items()
-    },  # REP 117: what is not finite says that nothing was in range
+    },  # REP 117: inf and NaN mean that nothing was in range
     measured=lambda height: (
         {"value": height.range[:, None]},
         np.isfinite(height.range) & (height.range >= 0.0),

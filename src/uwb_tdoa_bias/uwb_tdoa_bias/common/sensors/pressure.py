@@ -1,4 +1,7 @@
-"""A barometer, and altitudes of the international standard atmosphere (ICAO Doc 7488, troposphere)."""
+"""A barometer, and altitudes of the international standard atmosphere.
+
+Source: ICAO Doc 7488, troposphere.
+"""
 
 from __future__ import annotations
 
@@ -12,17 +15,17 @@ from .sensor import Compared, Sensor, Stream, finite, parameter
 SEA_LEVEL = 101325.0  # Pa
 SCALE = 44330.77  # m, temperature at sea level over its lapse rate: 288.15 K / 6.5 K/km
 EXPONENT = 5.25588  # g M / (R lapse rate)
-LOWEST, HIGHEST = 3e4, 1.2e5  # Pa, of air in which something flies or rolls
-SITE = 200.0  # m above the sea, of z = 0 in simulations
+LOWEST, HIGHEST = 3e4, 1.2e5  # Pa, air in which vehicles move
+SITE = 200.0  # m, altitude of z = 0 in simulations
 
 
 def pressure_at(altitude: np.ndarray) -> np.ndarray:
-    """Pa at an altitude above the sea, m; numbers or arrays."""
+    """Return the pressure, Pa, at an altitude above the sea, m; numbers or arrays."""
     return SEA_LEVEL * (1.0 - altitude / SCALE) ** EXPONENT
 
 
 def altitude_of(pressure: np.ndarray) -> np.ndarray:
-    """m above the sea of a pressure, Pa; numbers or arrays."""
+    """Return the altitude above the sea, m, of a pressure, Pa; numbers or arrays."""
     return SCALE * (1.0 - (pressure / SEA_LEVEL) ** (1.0 / EXPONENT))
 
 

@@ -11,15 +11,21 @@ from ..anchors import Anchors
 from .sensor import Compared, Mistake, Sensor, Stream, finite, parameter
 
 FARTHEST = 1000.0  # m
-BEYOND = 5.0  # times the extent of the anchors that most distances are at most
-MOST, SOME = 0.5, 0.01  # share of the distances
+BEYOND = 5.0  # largest median distance, multiples of the anchors' extent
+MOST, SOME = 0.5, 0.01  # share of impossible distances: error, and warning
 MOST_NAMED = 8  # anchors in a sentence
 
 
 @dataclass(frozen=True)
 class Ranges(Stream):
-    """Distances to anchors. t : (n,) s; anchor : (n,) ids; d : (n,) m; variance : (n,) m^2, of the
-    noise as the tag knows it, 0 where it does not.
+    """Distances to anchors by two-way ranging.
+
+    Attributes
+    ----------
+    t : (n,) s
+    anchor : (n,) ids
+    d : (n,) m
+    variance : (n,) m^2, of the noise as the tag reports it; 0 where it reports none
     """
 
     t: np.ndarray
@@ -47,7 +53,7 @@ def _measured(ranges: Ranges) -> tuple[dict, np.ndarray]:
 
 
 def _simulated(config: Any, room: Any, motion: Any, turn: Any, noise: Any) -> tuple:
-    """Each anchor in its turn."""
+    """Return ids, distances, m, and variances, m^2, (n,) each; the anchors take turns."""
     row = np.arange(len(motion.p)) % len(config.anchors)
     antenna = motion.p + turn.apply(config.tag_lever_arm)
     d = (
@@ -58,7 +64,7 @@ def _simulated(config: Any, room: Any, motion: Any, turn: Any, noise: Any) -> tu
 
 
 def _unknown(ranges: Ranges, anchors: Anchors) -> Mistake | None:
-    """Ids that the survey does not list."""
+    """Return a Mistake if ids are missing in the survey, else None."""
     share = np.mean(~np.isin(ranges.anchor, anchors.ids))
     if share > 0.0:
         strange = np.setdiff1d(ranges.anchor, anchors.ids)
@@ -80,7 +86,7 @@ def _unknown(ranges: Ranges, anchors: Anchors) -> Mistake | None:
 
 
 def _unit(ranges: Ranges, anchors: Anchors) -> Mistake | None:
-    """Another unit than metres."""
+    """Return a Mistake if the unit is not metres, else None."""
     extent, middle = (
         float(np.linalg.norm(np.ptp(anchors.positions, axis=0))),
         float(np.median(ranges.d)),
@@ -97,7 +103,7 @@ def _unit(ranges: Ranges, anchors: Anchors) -> Mistake | None:
 
 
 def _impossible(ranges: Ranges, anchors: Anchors) -> Mistake | None:
-    """Values that are no distances."""
+    """Return a Mistake if more than the share SOME of the values cannot be distances, else None."""
     share = float(np.mean(~_measured(ranges)[1] | (ranges.d == 0.0)))
     if share > SOME:
         evidence = (

@@ -1,6 +1,4 @@
-"""What a sensor is, beside inertia and TDOAs: everything that is not its mathematics in the filter,
-said once.
-"""
+"""Description of a sensor other than IMU and TDOAs: all its properties outside of the filter."""
 
 from __future__ import annotations
 
@@ -10,18 +8,20 @@ from typing import Any
 
 import numpy as np
 
-# in a message, whose covariances are to be finite: at which and above nothing was measured
+# Variance in a message, in its unit squared; components at or above it were not measured. Messages
+# need finite covariances.
 UNKNOWN_VARIANCE = 1e6
-UNKNOWN_STD = 1e6  # that stands for an infinite one where it is computed with
+UNKNOWN_STD = 1e6  # replaces an infinite deviation in computations
 RATE = 25.0  # Hz, of simulated sensors
-# of anything in a recording, in whatever unit: what is computed of it stays finite
+# Limit of all numbers of a recording, in their unit; results computed from them stay finite.
 LARGEST_NUMBER = 1e30
 
 
 @dataclass(frozen=True)
 class Stream:
-    """Measurements of one sensor: a frozen dataclass of arrays of one length, the first of which is
-    t (n,), s.
+    """Measurements of one sensor: a frozen dataclass of arrays of one length.
+
+    The first array is t (n,), s.
     """
 
     t: np.ndarray
@@ -31,45 +31,48 @@ class Stream:
 
     @property
     def columns(self) -> list:
-        """Its arrays, stamps first."""
+        """All arrays, stamps first."""
         return [getattr(self, each.name) for each in fields(self)]
 
     @property
     def values(self) -> np.ndarray:
-        """What was measured as effects see it, (n, k)."""
+        """Measured values as effects see them, (n, k)."""
         raise NotImplementedError
 
     def with_values(self, values: np.ndarray) -> Stream:
-        """The same with other values (n, k)."""
+        """Return the Stream with other values (n, k)."""
         raise NotImplementedError
 
     def sensed(self, values: np.ndarray) -> Stream:
-        """The same with other values (n, k) as the sensor would give them."""
+        """Return the Stream with other values (n, k), limited to the range of the sensor."""
         return self.with_values(values)
 
     @property
     def parts(self) -> dict[str, Stream]:
-        """{channel of the diagnosis: Stream} of what its messages measure besides, if they do."""
+        """{channel of the diagnosis: Stream} of further quantities in the same messages."""
         return {}
 
     def with_part(self, channel: str, part: Stream) -> Stream:
-        """The same with another one of its `parts`."""
+        """Return the Stream with another one of its `parts`."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True)
 class Compared:
-    """How the diagnosis compares a sensor with poses; see diagnosis/channels/aid.py and radio.py of
-    uwb_tdoa_tools.
+    """How the diagnosis compares a sensor with poses.
 
-    reading : callable of (Track, t (n,)) -> (n, k), what should have been read; None for distances
-        to anchors
-    needs : what a flight must have for it, words
-    negligible : unit of the stream, a constant error below it is nothing
-    floating : a constant tells nothing
-    of_attitude : the attitude must be known
-    axes : what is added to its name in labels
-    positions : coordinates that the reference must know
+    `diagnosis/channels/aid.py` and `radio.py` of uwb_tdoa_tools use it.
+
+    Attributes
+    ----------
+    reading : callable of (Track, t (n,)) -> (n, k), the reading expected at the poses; None for
+        distances to anchors
+    needs : the data that a flight must have, in words
+    negligible : a smaller constant error is ignored, unit of the stream
+    floating : whether a constant error carries no information
+    of_attitude : whether the attitude must be known
+    axes : suffixes of its name in labels
+    positions : coordinates that the reference must contain
     """
 
     reading: Callable | None
@@ -84,8 +87,15 @@ class Compared:
 
 @dataclass(frozen=True)
 class Mistake:
-    """What a rule of `check` finds: its name, what is wrong, the numbers that show it, a line to
-    copy, and the number that decided.
+    """A finding of a rule of `check`.
+
+    Attributes
+    ----------
+    rule : its name
+    cause : what is wrong
+    evidence : the numbers that show it
+    remedy : a line to copy
+    value : the number that decided
     """
 
     rule: str
@@ -93,41 +103,44 @@ class Mistake:
     evidence: str
     remedy: str
     value: float
-    severe: bool = True  # or a warning
+    severe: bool = True  # False: a warning
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """A kind of measurement. `name` is that of its stream in a Flight, of its counters on
-    /diagnostics, of its use_<name> and of `--without`; core/ of uwb_tdoa_ekf has its update of the
-    filter.
+    """A kind of measurement.
 
+    `name` names its stream in a Flight, its counters on /diagnostics, its parameter use_<name>, and
+    its value of `--without`. core/ of uwb_tdoa_ekf has its update of the filter.
+
+    Attributes
+    ----------
     plural : words for several measurements
     stream : class of its Stream
-    message, fields : type of its messages, and {field: how many numbers} of what is read of them
+    message, fields : type of its messages, and {field: count of numbers} of the fields that are read
     columns : callable of {field: (n,) or (n, k)} -> columns of the Stream, without stamps
-    content : callable of a Stream -> {field: value, (n,) or (n, k)} of its messages; what is not
-        among them is 0
-    sound : callable of {field: (n,) or (n, k)} -> the same of bool: which of these numbers a
-        recording may hold
+    content : callable of a Stream -> {field: value, (n,) or (n, k)} of its messages; missing fields
+        are 0
+    sound : callable of {field: (n,) or (n, k)} -> the same of bool: the numbers that a recording may
+        hold
     measured : callable of a Stream -> ({field of an AID: (n,) or (n, k)}, usable (n,) bool); AID:
-        core/memory.py of
-        uwb_tdoa_ekf
-    simulated : callable of (SimulationConfig, Room, motion, turn, noise) -> columns, without
-        stamps: what it says in truth,
-        and white noise. motion : of the body; turn : its Rotations; noise(...) : standard normal
-        numbers (n, ...)
-    noise : (unit, words) of the std of that, for the options of `simulate`
+        core/memory.py of uwb_tdoa_ekf
+    simulated : callable of (SimulationConfig, Room, motion, turn, noise) -> columns, without stamps:
+        true values and white noise. The motion is of the body, turn holds its Rotations, and
+        noise(...) gives standard normal numbers (n, ...).
+    noise : (unit, words) of the standard deviation of that noise, for the options of `simulate`
     parameters : {name: `parameter`} of the filter; use_<name> is the first
-    invalid, remedy : what a message must hold; what to check where it contradicts everything else
-    compared : Compared, or None: it is not diagnosed
+    invalid : the content that messages need
+    remedy : what to check if the measurements contradict all other data
+    compared : Compared; None: the sensor is not diagnosed
     parts : {channel of the diagnosis: Compared} of the `parts` of its Stream
-    topic : "" for its name; rate : Hz, when it is simulated; locates : the filter can start from it
-        alone
+    topic : "" for its name
+    rate : Hz, of the simulation
+    locates : whether the filter can start from it alone
     rules : of `check`: callables of (Stream, Anchors) -> Mistake or None
-    others : ((topic, message), ...) with the same fields that serve as well
-    assumed : callable of a Stream -> names of the parameters that count where its messages state no
-        deviation; None: all state theirs
+    others : ((topic, message), ...) of other topics with the same fields
+    assumed : callable of a Stream -> names of the parameters used for messages that state no standard
+        deviation; None: all messages state one
     """
 
     name: str
@@ -159,14 +172,14 @@ class Sensor:
         return ((self.topic or self.name, self.message), *self.others)
 
     def split(self, rows: np.ndarray) -> dict:
-        """{field: (n,) or (n, k)} of all fields side by side, (n, m)."""
+        """Return {field: (n,) or (n, k)} of an array (n, m) with all fields side by side."""
         ends, parts = np.cumsum(list(self.fields.values())), {}
         for (name, width), end in zip(self.fields.items(), ends):
             parts[name] = rows[:, end - width : end] if width > 1 else rows[:, end - 1]
         return parts
 
     def read(self, t: np.ndarray, fields: dict) -> Stream:
-        """The Stream of messages with stamps t (n,), s, and these fields."""
+        """Return the Stream of messages; t : (n,) stamps, s; fields : {field: (n,) or (n, k)}."""
         return self.stream(t, *self.columns(fields))
 
 
@@ -178,13 +191,21 @@ def parameter(
     with_low: bool = False,
     fixed: bool = False,
 ) -> Any:
-    """A field of FilterConfig. text : unit and meaning, as in ekf_node.yaml; a number must be above
-    `low`, or may be that too, and at most `high`; fixed : cannot change while the filter runs.
+    """Return a field of FilterConfig.
+
+    Parameters
+    ----------
+    text : unit and meaning, as in ekf_node.yaml
+    low, high : a number must be above `low` and at most `high`
+    with_low : whether `low` itself is permitted
+    fixed : whether it is constant while the filter runs
     """
     limits = {"low": low, "high": high, "with_low": with_low}
     return field(default=default, metadata={"text": text, "fixed": fixed, **limits})
 
 
 def finite(fields: dict) -> dict:
-    """{field: bool}: every number of a recording is to be one."""
-    return {name: np.abs(values) <= LARGEST_NUMBER for name, values in fields.items()}  # NaN is not
+    """Return {field: bool}: which numbers are finite, at most LARGEST_NUMBER."""
+    return {
+        name: np.abs(values) <= LARGEST_NUMBER for name, values in fields.items()
+    }  # False for NaN

@@ -11,15 +11,19 @@ from ..lazy import rotations
 from .sensor import UNKNOWN_STD, UNKNOWN_VARIANCE, Compared, Sensor, Stream, finite, parameter
 
 FASTEST = 100.0  # m/s, and rad/s
-LEAST_STD = 0.01  # m/s, that a simulated velocity says of itself
-TURN_TIME = 0.1  # s over which the yaw rate at an instant is taken from attitudes
+LEAST_STD = 0.01  # m/s, smallest stated deviation of a simulated velocity
+TURN_TIME = 0.1  # s, interval of the difference that gives the yaw rate
 
 
 @dataclass(frozen=True)
 class YawRate(Stream):
-    """The yaw rates of some Velocity.
+    """Yaw rates of the messages of a Velocity.
 
-    t : (n,) s; rate : (n, 1) rad/s; std : (n, 1) rad/s, inf and 0 as in its std.
+    Attributes
+    ----------
+    t : (n,) s
+    rate : (n, 1) rad/s, about the body's z
+    std : (n, 1) rad/s, inf where not measured, 0 where the driver states none
     """
 
     t: np.ndarray
@@ -38,18 +42,20 @@ class YawRate(Stream):
 class Velocity(Stream):
     """Velocities in the body frame.
 
-    t : (n,) s; v : (n, 3) m/s; std : (n, 3) m/s, inf for a component that is not measured, 0 where
-        the driver states none.
-    yaw_rate : (n,) rad/s about the body's z, as of wheels, NaN where it is not measured, which is
-        everywhere unless it is given;
-    yaw_rate_std : (n,) rad/s, inf and 0 as in std.
+    Attributes
+    ----------
+    t : (n,) s
+    v : (n, 3) m/s, body
+    std : (n, 3) m/s, inf for a component that is not measured, 0 where the driver states none
+    yaw_rate : (n,) rad/s about the body's z, as of wheels, NaN where not measured (default: NaN)
+    yaw_rate_std : (n,) rad/s, inf and 0 as in std
     """
 
     t: np.ndarray
     v: np.ndarray
     std: np.ndarray
-    yaw_rate: np.ndarray = None  # type: ignore[assignment]  # __post_init__ puts NaN there,
-    yaw_rate_std: np.ndarray = None  # type: ignore[assignment]  # and inf there
+    yaw_rate: np.ndarray = None  # type: ignore[assignment]  # __post_init__ sets NaN
+    yaw_rate_std: np.ndarray = None  # type: ignore[assignment]  # __post_init__ sets inf or 0
 
     def __post_init__(self) -> None:
         if self.yaw_rate is None:
@@ -74,8 +80,10 @@ class Velocity(Stream):
 
 
 def _columns(fields: dict) -> tuple:
-    """Variances of 0 are those of a driver that states none; the yaw rate of one that states some
-    for the velocity alone, and turns nowhere, is not measured.
+    """Return v (n, 3) m/s, its std, the yaw rate (n,) rad/s, and its std.
+
+    A variance of 0 means that the driver states none. A yaw rate counts as not measured if its value
+    and variance are 0 while the velocity has a variance.
     """
     variance, rate = (
         fields["twist.covariance"][:, [0, 7, 14, 35]],
@@ -111,7 +119,7 @@ def _content(velocity: Velocity) -> dict:
 def _sound(fields: dict) -> dict:
     _, std, _, rate_std = _columns(fields)
     linear, angular, covariance = sound = finite(fields)
-    of_rates = np.ones(sound[angular].shape, dtype=bool)  # those about x and y are not read
+    of_rates = np.ones(sound[angular].shape, dtype=bool)  # rates about x and y are not read
     of_rates[:, 2] = sound[angular][:, 2] | np.isinf(rate_std)
     return {
         linear: sound[linear] | np.isinf(std),
@@ -142,7 +150,7 @@ def _simulated(config: Any, room: Any, motion: Any, turn: Any, noise: Any) -> tu
 
 
 def _turning(track: Any, t: np.ndarray) -> np.ndarray:
-    """Rates about the body's z, (n, 1) rad/s, of a Track at stamps t (n,) s."""
+    """Return rates about the body's z, (n, 1) rad/s, of a Track at stamps t (n,) s."""
     before, after = (
         rotations.Rotation.from_quat(track.attitudes(t + late))
         for late in (-0.5 * TURN_TIME, 0.5 * TURN_TIME)
