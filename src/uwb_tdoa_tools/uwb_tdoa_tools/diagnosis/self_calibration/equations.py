@@ -383,7 +383,7 @@ def _equations(
         _add(gram, columns, more)
         vector[columns] += right
         last = np.searchsorted(columns, n)
-        # the whole of `more` takes megabytes
+        # a copy, since a view would keep all of `more` in memory: megabytes
         blocks.append(_BlockEquations(columns[:last], more[:last, :last].copy(), right[:last]))
     return gram, vector, blocks, _known(constraints, stamps, moved, innovations.run.odometry)
 

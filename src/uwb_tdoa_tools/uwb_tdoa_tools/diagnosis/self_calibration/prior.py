@@ -1,8 +1,8 @@
 """Combine the prior of the anchors, a tape or the last calibration, with the normal equations.
 
 The evidence selects changes since the last calibration (`uwb_tdoa_ekf.evidence`). It also selects
-the size of unknown delays. The smallest size wins unless a larger one is ODDS times more probable,
-because delays absorb otherwise unexplained errors.
+the size of unknown delays: the smallest size with at least 1 / ODDS of the largest probability. A
+small size matters, because delays absorb otherwise unexplained errors.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class Prior:
         return np.concatenate([std[: 3 * n], np.full(n, np.hypot(LOOSE, self.common))])
 
     def changes(self) -> dict[ChangeKey, Change]:
-        """Return {(effect, row of an anchor): Change} of possible changes since the last calibration.
+        """Return the possible changes since the last calibration, {(effect, row of an anchor): Change}.
 
         Without a last calibration an anchor can stand elsewhere than the tape states. Above MANY
         anchors,

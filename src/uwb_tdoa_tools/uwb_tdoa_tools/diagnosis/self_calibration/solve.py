@@ -39,8 +39,8 @@ SAME_PLACE = 0.05  # m, largest difference of an anchor between flights of one i
 NOTHING_KNOWN = 1e3  # m, reported standard deviation of a coordinate of an unknown anchor
 IMPROVED = 0.7  # largest ratio of the new to the given standard deviation that counts as improved
 LEFT = 0.055  # m, largest scale of the remaining slow innovations
-# Ratio of slow innovations, given to remaining anchors' errors; above it the tape is worse than the
-# other errors.
+# Ratio of the slow innovations with given and with estimated anchors. Above it the tape errs more
+# than everything else, and the result may be used.
 CLEARLY = 2.6
 PLAINLY = 5.0  # smallest shift, in standard deviations, of an anchor that moved alone
 WELL_PLACED = 0.08  # m, 3D standard deviation of a moved anchor below which no advice is given
@@ -188,9 +188,10 @@ class SelfCalibration:
 
     @property
     def tag_delay(self) -> tuple[float, float] | None:
-        """Return the antenna delay of the tag and its standard deviation, (m, m); None without ranges.
+        """Return the antenna delay of the tag and its standard deviation, (m, m).
 
-        It lengthens all ranges, and the delays of all anchors include it.
+        It lengthens all ranges, and the delays of all anchors include it. It is None without
+        ranges.
         """
         if not self.prior.common:
             return None
