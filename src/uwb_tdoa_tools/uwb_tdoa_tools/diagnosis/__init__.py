@@ -1,8 +1,9 @@
 """Find missing systematic effects in residuals.
 
 from uwb_tdoa_tools.diagnosis import diagnose
-diagnosis = diagnose(flights, holdout)   # diagnosis.findings, diagnosis.effects, diagnosis.before,
-diagnosis.after, ...
+diagnosis = diagnose(flights, holdout)
+
+The result has findings, effects, and validation figures before and after.
 
 The package has four concepts, each with a folder or module and a small interface. A *reference* is
 the path that a flight is compared with. A *channel* is one kind of measurement, with its residual.

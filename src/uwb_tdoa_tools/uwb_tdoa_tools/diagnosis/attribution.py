@@ -131,7 +131,10 @@ class Attribution:
         return to_keep(tuple((str(column.effect[0]), column.key) for column in columns), covariance)
 
     def findings(self) -> list[EffectFinding]:
-        """Return the EffectFindings: from regression, from detectors, near the floor, then single flights."""
+        """Return the EffectFindings.
+
+        The order is: from regression, from detectors, near the floor, in single flights.
+        """
         out = _findings(self.selection, self.candidates, self.names)
         out += map(_of_detection, self.detections)
         if self.floor:
@@ -176,7 +179,12 @@ def attribute(
     known: list[tuple[tuple[Effect, ...], list[ChannelResiduals]]] = []
 
     def at(model: Sequence[Effect]) -> list[ChannelResiduals]:
-        """Return the residuals under a model; results of the last and of the empty model are cached."""
+        """Return the residuals under a model.
+
+        Residuals of the last and of the empty model are kept, since computing them runs the filter
+        if the
+        path is unknown.
+        """
         again = [residuals for other, residuals in known if other == tuple(model)]
         if not again:
             again = [

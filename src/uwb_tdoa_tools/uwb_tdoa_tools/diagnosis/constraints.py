@@ -2,8 +2,8 @@
 
 A constraint of a flight (`flight` is its name) has `stamps(begin)`, s, ascending, at which it needs
 the estimate, and `equations(t, estimate, covariance, moved)`. A constraint of anchors (`flight` is
-None) has `equations(anchors, columns)`. Both return (gram (k, k), vector (k,)) of normal equations
-of the errors of the coordinates of the anchors, anchor by anchor, of the delays and of further
+None) has `equations(anchors, columns)`. Both return (gram (k, k), vector (k,)) of normal equations.
+The unknowns are the errors of the anchor coordinates, anchor by anchor, then delays, then further
 parameters.
 """
 

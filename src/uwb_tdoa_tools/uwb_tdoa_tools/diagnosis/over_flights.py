@@ -184,7 +184,10 @@ def _selection(
 def _elsewhere(
     selection: Selection, candidate: Candidate, remaining: list[ChannelResiduals], number: int
 ) -> bool:
-    """Return whether another flight shows a Candidate of flight `number` too, by a share above ALIKE."""
+    """Return whether another flight shows a Candidate of flight `number` too.
+
+    Its determined share there must exceed ALIKE.
+    """
     fit = selection.fit
     for other in remaining[:number] + remaining[number + 1 :]:
         table = table_of([other]).with_terms(candidate.terms)

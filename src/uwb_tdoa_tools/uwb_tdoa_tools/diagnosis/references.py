@@ -121,7 +121,7 @@ class GroundTruth(Reference):
         constraints: Sequence[Constraint | OdometryPath] = (),
         align: str = NONE,
     ) -> None:
-        """Take `align` as in `scoring.evaluation.align_truth`; a known pose needs no more."""
+        """Take `align`, as of `scoring.evaluation.align_truth`; the other arguments are not used."""
         self._align = align
 
     def prepare(self, flight: Flight) -> Flight:
@@ -179,7 +179,7 @@ class Nothing(Reference):
         return without_truth(flight)
 
     def on_floor(self, poses: Truth) -> bool:
-        """Return whether estimated poses are those of a vehicle that never leaves the floor.
+        """Return whether estimated poses belong to a vehicle that never leaves the floor.
 
         The estimated height of such a vehicle exceeds AIRBORNE now and then, but not for long.
         """

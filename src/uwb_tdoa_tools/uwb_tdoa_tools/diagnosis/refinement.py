@@ -199,7 +199,7 @@ def _simpler(after: Selection, anew: Selection, choices: int) -> Selection:
 def with_maps(
     selection: Selection, smooth: Sequence[Candidate], refused: list[Refused]
 ) -> Selection:
-    """Return the Selection with functions of the place of each anchor, if hold-out data support them.
+    """Return the Selection with functions of the place of each anchor, if hold-out data agree.
 
     Each function alone is too weak to be selected; together they must gain clearly.
     """

@@ -75,7 +75,7 @@ class AidResidual(ChannelResidual):
 
 
 class Aid(Channel[AidResidual]):
-    """The channel of an auxiliary sensor or a part of it, with the fields of its Compared."""
+    """Channel of an auxiliary sensor or a part of it, with the fields of its Compared."""
 
     axes: tuple[str, ...]
     positions: tuple[int, ...]

@@ -91,7 +91,7 @@ class Prior:
         return np.concatenate([std[: 3 * n], np.full(n, np.hypot(LOOSE, self.common))])
 
     def changes(self) -> dict[ChangeKey, Change]:
-        """Return the possible changes since the last calibration, {(effect, row of an anchor): Change}.
+        """Return possible changes since the last calibration, {(effect, row of an anchor): Change}.
 
         Without a last calibration an anchor can stand elsewhere than the tape states. Above MANY
         anchors,
