@@ -277,7 +277,7 @@ def attribute(
 
 
 def near_floor(residuals: ChannelResiduals) -> ChannelResiduals:
-    """Return the residuals of a flight near the floor, {channel: ChannelResidual}; {} without any."""
+    """Return the residuals of a flight near the floor, by channel; {} without any."""
     parts = {name: part.of_floor() for name, part in residuals.items()}
     return {name: part for name, part in parts.items() if part is not None}
 

@@ -2,11 +2,11 @@
 
 The covariance of a fit assumes a correct model. Positions and delays of anchors absorb other
 systematic errors, equally at each place, so no scatter between blocks of time shows them. A second
-fit counts errors that last as long as the flight. It marginalizes parameters that can replace
-anchor errors. These are a smooth function of the place for each anchor (an antenna's directional
-error), and coordinates and delays that the fit sets to 0. The evidence selects the size of the
-functions. Unfitted coordinates have standard deviations COORDINATE_STDS, weighted by evidence;
-delays have UNSAID. The difference between both fits counts as an error.
+fit uses the information that remains if errors last as long as the flight. It marginalizes
+parameters that can replace anchor errors. These are a smooth function of the place for each anchor
+(an antenna's directional error), and coordinates and delays that the fit sets to 0. The evidence
+selects the size of the functions. Unfitted coordinates have standard deviations COORDINATE_STDS,
+weighted by evidence; delays have UNSAID. The difference between both fits counts as an error.
 """
 
 from __future__ import annotations

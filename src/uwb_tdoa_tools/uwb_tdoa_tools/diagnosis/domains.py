@@ -52,7 +52,7 @@ class Seen:
         return out
 
     def _range(self, number: int, channel: str, covariate: str) -> tuple[float, float] | None:
-        """Return (least, largest) of a covariate in a channel of a flight; None if it is unknown."""
+        """Return (least, largest) of a covariate in a channel of a flight; None if unknown."""
         key = number, channel, covariate
         if key not in self._ranges:
             part = self._residuals[number].get(channel)

@@ -1,4 +1,4 @@
-"""References: the paths that flights are compared with, and which of their coordinates are known."""
+"""References: the paths that flights are compared with, and their known coordinates."""
 
 from __future__ import annotations
 
@@ -121,7 +121,10 @@ class GroundTruth(Reference):
         constraints: Sequence[Constraint | OdometryPath] = (),
         align: str = NONE,
     ) -> None:
-        """Take `align`, as of `scoring.evaluation.align_truth`; the other arguments are not used."""
+        """Take `align`, as of `scoring.evaluation.align_truth`.
+
+        The other arguments are not used.
+        """
         self._align = align
 
     def prepare(self, flight: Flight) -> Flight:
@@ -152,8 +155,10 @@ class Nothing(Reference):
     """No reference: the residuals are the innovations of the filter.
 
     They are of TDOAs, or of ranges in a flight without TDOAs. The estimate follows an effect in
-    part, so regressors are computed for innovations. A common offset of all ranges is corrected first,
-    because it bends the path; `self_calibrate` estimates it.
+    part, so
+    regressors are computed for innovations. A common offset of all ranges is corrected first,
+    because it
+    bends the path; `self_calibrate` estimates it.
     """
 
     positions_known = (False, False, False)

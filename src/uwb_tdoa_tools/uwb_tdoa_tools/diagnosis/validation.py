@@ -44,10 +44,10 @@ Made = TypeVar("Made")
 TRIAL_FLIGHTS = 3  # largest number of flights, or halves of one, in trials
 # shapes of a function of the time that can recur, like the warm-up of a clock
 DRIFTS = ("line", "beyond", "below", "parabola")
-# smallest relative decrease of the error without an effect that drops the effect
+# An effect is dropped if the error falls by at least this share without it.
 WORSE = 0.005
-# smallest relative increase of the error without an effect that keeps it, in a single flight:
-# flights differ
+# In a single flight an effect stays only if the error grows by this share without it, because
+# flights differ.
 WORTH_OF_ONE = 0.05
 SELECTED_ON = ", chosen on all of them (--holdout judges the choice too)"
 HELD_OUT = "flights that took no part in the fit"
@@ -333,7 +333,7 @@ def _error_and_poses(
 ) -> tuple[float, Poses]:
     """Return the 3D RMSE, m, and the poses of the run of a trial.
 
-    trial : ValidationCase, and the poses for corrections, None for those of the run itself
+    trial : ValidationCase, and the poses for corrections, None to use the poses of the run
     """
     error, run = _judged(config, trial)
     return error, poses_of(run.odometry)

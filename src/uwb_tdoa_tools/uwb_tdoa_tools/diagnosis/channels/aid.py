@@ -75,7 +75,7 @@ class AidResidual(ChannelResidual):
 
 
 class Aid(Channel[AidResidual]):
-    """Channel of an auxiliary sensor or a part of it, with the fields of its Compared."""
+    """Channel of an auxiliary sensor, or of a part, with the fields of its Compared."""
 
     axes: tuple[str, ...]
     positions: tuple[int, ...]

@@ -1,8 +1,8 @@
 """Channels of TDOAs and of distances to anchors: residuals, averaged over cells.
 
-Successive TDOAs of a pair have correlated errors. They are averaged, pair by pair, over cells of half a second
-without outliers. Near the floor a cell has similar heights. The fit counts the correlation that
-remains between cells.
+Successive TDOAs of a pair have correlated errors. They are averaged, pair by pair, over cells of
+half a second without outliers. Near the floor a cell has similar heights. The fit counts the
+correlation that remains between cells.
 """
 
 from __future__ import annotations
@@ -73,7 +73,10 @@ class RadioResidual(ChannelResidual):
     innovations: Innovations | None = None
 
     def of_floor(self: Radio) -> Radio | None:
-        """Return the residual near the floor; None if the path is unknown there, or TDOAs are few."""
+        """Return the residual near the floor.
+
+        It is None if the path is unknown there, or TDOAs are few.
+        """
         near = ~self.airborne & (np.abs(self.residual) < WILD)
         if not self.floor_known or near.sum() < FEWEST_ON_FLOOR:
             return None
@@ -156,7 +159,8 @@ class Cells:
     def means(self, values: np.ndarray, rows: np.ndarray | None = None) -> Matrix:
         """Return means of values (n, k) over the cells, (m, k).
 
-        rows : (r,) of the TDOAs that values (r, k) belong to; other values are zero, and the result is sparse
+        rows : (r,) of the TDOAs that values (r, k) belong to; other values are zero, and the result
+            is sparse
         """
         if rows is None:
             return np.stack([self.mean(column) for column in values.T], axis=1)
@@ -176,7 +180,10 @@ class Cells:
 
 
 def compared(comparison: Comparison, kind: type[Samples], made: type[Radio]) -> Radio | None:
-    """Return the residual of measurements of a kind in a Comparison; None without any in the air."""
+    """Return the residual of measurements of a kind in a Comparison.
+
+    It is None without any in the air.
+    """
     flight, anchors, poses = comparison.flight, comparison.flight.anchors, comparison.poses
     innovations = comparison.view.innovations
     if innovations is not None and kind.channel not in innovations.streams:

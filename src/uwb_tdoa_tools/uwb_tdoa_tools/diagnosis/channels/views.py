@@ -1,4 +1,4 @@
-"""Covariates of a channel: views of its rows over one covariate, knots, and further columns of logs."""
+"""Covariates of a channel: views of its rows over one covariate, knots, and columns of logs."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 BINS = 16  # number of bins; steps, intervals and rises begin and end at their edges
 # numbers of waves over the range of the covariate
 PERIODS = (0.8, 1.0, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 3.0)
-WIDEST = 10  # bins, longest interval; a longer one is two steps
+WIDEST = 10  # bins, longest interval; a longer interval equals two steps
 # Smallest bin, share of the range. Narrower bins would follow noise of the covariate, and the
 # residual may share that noise.
 CROWDED = 0.02
@@ -136,7 +136,10 @@ class Scan:
         return [self._candidate(*item[1:]) for item in _various(found)]
 
     def _refined(self, held: _Held, item: _Item) -> _Item:
-        """Return an item of `gains` with inner knots moved within their bins, if that gains more."""
+        """Return an item of `gains` with inner knots moved within their bins.
+
+        It stays unchanged if no move gains.
+        """
         gain, shapes, shape, knots, tried = item
         if len(knots) < 3 or shapes.view.covariate in CATEGORIES:
             return item

@@ -31,7 +31,7 @@ AT_ONCE = 128
 
 @dataclass(frozen=True, eq=False)
 class Gain:
-    """The gain of a candidate beside a base.
+    """The gain of a candidate added to a base.
 
     beta : (k,) values of the candidate's columns
     determined : effective number of parameters that the data determine beyond the base
@@ -44,7 +44,7 @@ class Gain:
 
 
 class Scorer:
-    """Compute gains of sets of Columns beside a base.
+    """Compute gains of sets of Columns added to a base.
 
     Weights, scales and inflation are fixed to one Fit.
     """
@@ -126,7 +126,7 @@ class Scorer:
         return float(sum(self._alone[self._place[column]] for column in columns)) > NOTHING
 
     def gain(self, columns: Sequence[Column]) -> Gain | None:
-        """Return the Gain of adding some Columns; None if the base contains all of them."""
+        """Return the Gain of adding some Columns; None if the base has all columns."""
         all_places = np.array([self._place[column] for column in columns])
         new = np.unique(all_places[all_places >= len(self._base)])
         if not len(new):

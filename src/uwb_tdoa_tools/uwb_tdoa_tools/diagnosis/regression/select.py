@@ -178,7 +178,7 @@ def select(
 
 
 def _sparse_first(ranked: list[tuple[float, Candidate]]) -> Candidate:
-    """Return the best Candidate, or a small one that explains a good part of a large group.
+    """Return the best Candidate, or a small Candidate with a good part of the gain of a large group.
 
     Later steps show whether the rest of the group is needed.
     """
@@ -255,7 +255,10 @@ def rank(
 
 
 def acceptable(table: RegressionTable, candidate: Candidate, beta: np.ndarray) -> bool:
-    """Return whether values beta (k,) of a Candidate are possible and not negligible on a channel."""
+    """Return whether values beta (k,) of a Candidate are possible, and large enough on a channel.
+
+    A contribution is large enough if its RMS exceeds `Channel.negligible`.
+    """
     if not (candidate.sizable(beta) and candidate.plausible(beta)):
         return False
     part = table.matrix(candidate.columns) @ beta
@@ -287,7 +290,7 @@ def _backward(
 def _losses(
     table: RegressionTable, chosen: list[Candidate], model: Fit, choices: int
 ) -> list[float]:
-    """Return the criterion of each chosen Candidate beside the others, twice a log-likelihood."""
+    """Return the criterion of each chosen Candidate given the others, twice a log-likelihood."""
     out = []
     for k, candidate in enumerate(chosen):
         scorer = Scorer(table, columns_of(chosen[:k] + chosen[k + 1 :]), model, candidate.columns)

@@ -96,7 +96,7 @@ class RegressionTable:
 
     @property
     def radio_rows(self) -> np.ndarray:
-        """Return the rows of measurements between the tag and anchors, (m,), channel after channel."""
+        """Return the rows of measurements between tag and anchors, (m,), channel after channel."""
         return np.flatnonzero(np.isin(self.channel, [self.channels.index(name) for name in RADIO]))
 
     def rows_of(self, channel: str) -> slice:
@@ -144,7 +144,7 @@ class RegressionTable:
         return replace(self, columns=columns)
 
     def _values(self, effect: Effect, keys: tuple[str, ...]) -> Any:
-        """Return regressors of parameters of an Effect, in the form of `columns`, as an iterable."""
+        """Return regressors of parameters of an Effect, an iterable in the form of `columns`."""
         made = (
             (row, part.columns(effect, keys))
             for _, channel, row, part in self.parts

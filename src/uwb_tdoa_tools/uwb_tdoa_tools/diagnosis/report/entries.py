@@ -28,7 +28,7 @@ LEAST_WORTH = 0.0005  # m, smallest difference
 WORTH_DOING = 0.005  # m, smallest gain in position that is worth an action
 DEGREES = float(np.degrees(1.0))  # degrees per radian
 FORMS = {"arrival": " (of each arrival)", "anchor": " (by anchor)"}
-SHOWN = 6  # values
+SHOWN = 6  # largest number of shown values
 LONGEST = 8.0  # em, longest bar
 
 
@@ -102,7 +102,7 @@ class Entry:
 def entries(diagnosis: Diagnosis) -> list[Entry]:
     """Return the entries of a Diagnosis, the most prominent first.
 
-    Effects common to all anchors follow after effects of single anchors.
+    Entries of several findings, such as maps of all anchors, come last.
     """
     groups: dict[Hashable, list[EffectFinding]] = {}
     for finding in diagnosis.findings:

@@ -198,7 +198,7 @@ def _anchors(ax: Axes, diagnosis: Diagnosis, view: list[int], enlarged: int) -> 
 
 
 def _names(ax: Axes, places: Mapping[int, np.ndarray], shifts: Mapping[int, np.ndarray]) -> None:
-    """Write ids beside anchors, opposite to their arrows.
+    """Write ids next to anchors, opposite to their arrows.
 
     Anchors behind each other share a label.
     """

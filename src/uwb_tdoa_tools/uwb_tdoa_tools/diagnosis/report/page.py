@@ -36,7 +36,7 @@ def html(diagnosis: Diagnosis, template: str = "page") -> str:
     It shows verdict, advice, worth of each effect, map, errors, undetermined parameters, and
     details.
 
-    template : name in the folder `templates`, the page or one of its parts
+    template : name in the folder `templates`: the page or a part
     """
     names = ", ".join(flight.name for flight in diagnosis.flights)
     found = entries.entries(diagnosis)

@@ -130,7 +130,7 @@ class Equations:
     flights: list[FlightEquations]
 
     def tdoa_std(self, config: FilterConfig) -> float:
-        """Return the tdoa_std, m, with which the filter's information matches the inflated noise."""
+        """Return the tdoa_std, m, at which the filter's information matches the inflated noise."""
         return config.tdoa_std * float(np.sqrt(self.inflation / config.tdoa_correlation_length))
 
 
@@ -510,7 +510,8 @@ def _inflation(
 ) -> float:
     """Return the variance of score sums over blocks, relative to independent errors.
 
-    It is the mean over the eigenvectors of `gram` that the data determine.
+    Independent errors give score sums with covariance `gram`. The result is the mean ratio over the
+    eigenvectors of `gram` that the data determine.
 
     gram : (k, k), vector : (k,) sums over the blocks; sizes : (k,) prior standard deviations
     """

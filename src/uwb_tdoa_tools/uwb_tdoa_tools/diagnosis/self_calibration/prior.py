@@ -175,8 +175,8 @@ def with_calibration(
 def solve(gram: np.ndarray, vector: np.ndarray, prior: Prior, offset: np.ndarray) -> Solution:
     """Return the Solution of normal equations with the largest evidence.
 
-    gram : (k, k), vector : (k,) normal equations; the first 4N parameters are those of the Prior,
-        the others functions of the place
+    gram : (k, k), vector : (k,) normal equations. The first 4N parameters belong to the Prior. The
+        others are functions of the place.
     offset : (4N,) m, point of linearization minus prior mean
     """
     parts, unchanged, delay_std = _parts(gram, vector, prior, offset), prior.covariance, DELAY_STD

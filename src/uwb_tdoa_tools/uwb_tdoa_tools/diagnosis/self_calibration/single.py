@@ -66,7 +66,10 @@ class Misfit:
         return float(0.5 * (NU + 1.0) * self.count * np.mean(np.log1p(value**2 / NU)))
 
     def suspects(self, effects: EffectSet) -> list[int]:
-        """Return the rows of the TRIED anchors with the best likelihood after placing, best first."""
+        """Return the rows of the TRIED anchors with the best likelihood after placing.
+
+        The best comes first.
+        """
         misfits = {}
         for row in range(len(self.flights[0].anchors)):
             try:

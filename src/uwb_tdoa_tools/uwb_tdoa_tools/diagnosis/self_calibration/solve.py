@@ -38,9 +38,9 @@ LEAST = 30.0  # s in the air, fewest; fewer do not show how correlated errors ar
 SAME_PLACE = 0.05  # m, largest difference of an anchor between flights of one installation
 NOTHING_KNOWN = 1e3  # m, reported standard deviation of a coordinate of an unknown anchor
 IMPROVED = 0.7  # largest ratio of the new to the given standard deviation that counts as improved
-LEFT = 0.055  # m, largest scale of the remaining slow innovations
-# Ratio of the slow innovations with given and with estimated anchors. Above it the tape errs more
-# than everything else, and the result may be used.
+LEFT = 0.055  # m, largest scale of the remaining slow innovations, set on measured flights
+# Ratio of the slow innovations with given and with estimated anchors, set on measured flights.
+# Above it the tape errs more than everything else, and the result may be used.
 CLEARLY = 2.6
 PLAINLY = 5.0  # smallest shift, in standard deviations, of an anchor that moved alone
 WELL_PLACED = 0.08  # m, 3D standard deviation of a moved anchor below which no advice is given
@@ -106,7 +106,7 @@ class SelfCalibration:
         of marks at which it falls; each mark is left out of its fit. None without marks.
     grounded : number of marks left out on the floor, where estimates err by metres without showing
         it
-    shares : {effect: (Share, ...)}, amount of it in each flight; inflation : as of Equations
+    shares : {effect: (Share, ...)}, its amount in each flight; inflation : as of Equations
     blocked : sentences on blocked anchors, filled by `surveying/blocked.py`
     """
 
@@ -472,7 +472,10 @@ def _of_positions(covariance: np.ndarray) -> np.ndarray:
 
 
 def _left_out(equations: Equations, prior: Prior) -> tuple[float, float, float] | None:
-    """Return SelfCalibration.marks, with each mark left out of Equations about the given anchors."""
+    """Return SelfCalibration.marks: each mark is left out of the Equations once.
+
+    equations : linearized at the given anchors
+    """
     if not equations.marks:
         return None
     n, off = len(prior.covariance), []
@@ -510,7 +513,7 @@ def _shares(
 ) -> dict[str, tuple[Share, ...]]:
     """Return SelfCalibration.shares: per flight, a fit of one factor to its equations.
 
-    The information is that of `over_flights`: errors that last a flight do not reduce it.
+    The information is defined as in `over_flights`: errors that last a flight do not reduce it.
 
     offset : (4N,) m, point of linearization minus prior mean
     """
