@@ -182,8 +182,7 @@ def attribute(
         """Return the residuals under a model.
 
         Residuals of the last and of the empty model are kept, since computing them runs the filter
-        if the
-        path is unknown.
+        if the path is unknown.
         """
         again = [residuals for other, residuals in known if other == tuple(model)]
         if not again:
@@ -292,9 +291,8 @@ def on_floor(
     """Select effects near the floor: declared effects, else functions of the height.
 
     Only functions of the height are tried, because take-off and landing at one place do not
-    distinguish
-    other covariates. These few seconds are fitted separately, because their errors are metres. In a
-    common fit they would count as outliers, or bias effects in the air.
+    distinguish other covariates. These few seconds are fitted separately, because their errors are
+    metres. In a common fit they would count as outliers, or bias effects in the air.
 
     residuals : [{channel: ChannelResidual}] near the floor
     """

@@ -99,12 +99,9 @@ def compare(
     """Run the filter on ValidationCases before and after, and return both sides.
 
     A side is {"runs": [...], "pooled": {...}, "scores": [Score]}. Keys are those of evaluate,
-    phases
-    included. Further keys are residual_spread (m, 1.48 MAD of the innovations) and rmse_3d_ci (95
-    %,
-    bootstrap over blocks of 5 s). rmse_3d_gain_ci includes errors of the references that are common
-    to
-    a flight.
+    phases included. Further keys are residual_spread (m, 1.48 MAD of the innovations) and
+    rmse_3d_ci (95 %, bootstrap over blocks of 5 s). rmse_3d_gain_ci includes errors of the
+    references that are common to a flight.
 
     shift_std : as of a Reference; map_function : as of `attribute`
     """

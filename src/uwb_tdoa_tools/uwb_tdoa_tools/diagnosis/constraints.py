@@ -121,8 +121,7 @@ class OdometryPath:
         """Return the path at stamps `wanted`, (k, 3) m, world, and the std of its common shift, m.
 
         The path is turned about the vertical and shifted to fit the estimate. Then its start and
-        its drift
-        are corrected by the mean of a random walk, given the estimate and the marks.
+        its drift are corrected by the mean of a random walk, given the estimate and the marks.
 
         t : (m,) s; estimate : (m, 3) m, world, at t; begin : stamp of the first TDOA, s
         """

@@ -121,8 +121,7 @@ def _common_delay(table: RegressionTable, columns: Sequence[Column], n: int) -> 
     """Return the row that gives the mean of the unfitted delays, (k,).
 
     A fitted delay is the difference from this mean. The row is 0 if the fit has no delay or all
-    delays,
-    or if a common delay does not cancel.
+    delays, or if a common delay does not cancel.
 
     columns : k Columns; n : number of fitted ones, which come first
     """

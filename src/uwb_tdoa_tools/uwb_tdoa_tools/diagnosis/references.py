@@ -155,10 +155,8 @@ class Nothing(Reference):
     """No reference: the residuals are the innovations of the filter.
 
     They are of TDOAs, or of ranges in a flight without TDOAs. The estimate follows an effect in
-    part, so
-    regressors are computed for innovations. A common offset of all ranges is corrected first,
-    because it
-    bends the path; `self_calibrate` estimates it.
+    part, so regressors are computed for innovations. A common offset of all ranges is corrected
+    first, because it bends the path; `self_calibrate` estimates it.
     """
 
     positions_known = (False, False, False)
@@ -251,8 +249,8 @@ class Heights(GroundTruth):
 class OdometryReference(GroundTruth):
     """The path of another odometry, fitted to the path of the filter and to marks.
 
-    Without marks a common shift and yaw of a flight are not observable: the filter sets
-    them. Marks at take-off and landing are enough.
+    Without marks a common shift and yaw of a flight are not observable: the filter sets them. Marks
+    at take-off and landing are enough.
     """
 
     attitude_known = False

@@ -66,10 +66,8 @@ def written(selection: Selection, declared: Sequence[Candidate]) -> Selection:
     """Return the Selection that effects.yaml can hold.
 
     Functions of covariates that nodes lack are dropped. Declared Candidates can replace them, and
-    the
-    fit is repeated. Errors of the ground truth, and properties that the filter estimates, stay:
-    they do
-    not affect nodes.
+    the fit is repeated. Errors of the ground truth, and properties that the filter estimates, stay:
+    they do not affect nodes.
     """
     kept = selection.where(lambda effect: effect.usable or not isinstance(effect, SmoothTerm))
     if kept is selection:

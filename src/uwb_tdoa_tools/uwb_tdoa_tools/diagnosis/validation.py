@@ -89,8 +89,7 @@ def cross_fitted(
     """Return ValidationCases with effects of `candidates` fitted to the other flights.
 
     A single flight is divided into two halves of alternating blocks. Each half is judged with
-    effects
-    fitted to the other half.
+    effects fitted to the other half.
 
     most : largest number of cases, evenly taken; None for all
     """
@@ -145,15 +144,13 @@ def select_by_error(
     """Return the ValidatedSelection of effects that do not make the filter worse on hold-out data.
 
     Candidates are dropped one by one if the error falls without them. In a single flight they are
-    also
-    dropped if the error hardly grows. Detections stay only if the error falls with them. At most
-    TRIAL_FLIGHTS flights are judged. Trials correct measurements at the poses of a run with all
-    effects.
+    also dropped if the error hardly grows. Detections stay only if the error falls with them. At
+    most TRIAL_FLIGHTS flights are judged. Trials correct measurements at the poses of a run with
+    all effects.
 
     After a drop, the other candidates that seemed harmful are tried again first. At the end all
     candidates are tried with the final model. If trials are costly, several candidates are dropped
-    at
-    once. Events at a time of a single flight are tried for their worth, but not kept.
+    at once. Events at a time of a single flight are tried for their worth, but not kept.
 
     map_function : as of `attribute`
     """
@@ -268,8 +265,7 @@ class _Trials:
     """Mean 3D RMSE, m, of cross-fitted models.
 
     The first model runs like the nodes. Later models use the poses of that run, which takes a tenth
-    of
-    the time.
+    of the time.
     """
 
     def __init__(

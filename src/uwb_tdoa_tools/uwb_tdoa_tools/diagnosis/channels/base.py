@@ -148,7 +148,7 @@ class Channel(Generic[Own]):
 
     name: str
     unit: str
-    negligible: float  # root mean square, in `unit`, of a contribution that deserves no term
+    negligible: float  # RMS, in `unit`, below which a contribution gets no term
     needs: str  # streams and truth that it needs, in words
     stream: str = ""  # field of a Flight; "" for its name
     maps: ClassVar[

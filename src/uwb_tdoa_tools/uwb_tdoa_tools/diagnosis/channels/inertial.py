@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from .base import Comparison, Figures
     from .views import CovariateView
 
-CELL = 0.25  # s, over which both sides of a residual are averaged
+CELL = 0.25  # s, length of a cell; both sides of a residual are averaged over it
 # s, half the step of time derivatives of measured rates: true rates are noisy, and noise in
 # a regressor shrinks the estimate
 SHIFT = 0.05

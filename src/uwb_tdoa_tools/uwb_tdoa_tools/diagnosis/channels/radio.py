@@ -36,13 +36,13 @@ if TYPE_CHECKING:
     from .base import Comparison, Figures
     from .views import CovariateView
 
-CELL = 0.5  # s
+CELL = 0.5  # s, length of a cell
 LOWEST, LEVEL = 0.02, 0.5  # m, and span of the logarithm of the height of a cell near the floor
-OUTLIER = 4.0  # spreads within a cell
+OUTLIER = 4.0  # spreads from the median of a cell, beyond which a measurement is left out
 # Effects with parameters that act on TDOAs of one or two anchors only
 OF_ANCHORS = "anchor_delay", "anchor_position", "anchor_clock_drift", "pair_offset", "nlos"
-WILD = 20.0  # m; a larger residual is no measurement
-FEWEST_ON_FLOOR = 50  # TDOAs
+WILD = 20.0  # m, largest residual of a valid measurement
+FEWEST_ON_FLOOR = 50  # TDOAs near the floor; fewer are not fitted
 QUICK = ("interval", *CATEGORIES)  # covariates that change from one TDOA to the next
 # Covariates of ranges: a node corrects them without a history of the motion
 OF_RANGE = tuple(name for name in OF_TDOA if name not in OF_MOTION)

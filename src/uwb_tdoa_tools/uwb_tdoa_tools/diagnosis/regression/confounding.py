@@ -65,8 +65,7 @@ def alternatives(
     """Return the Alternatives of a chosen Candidate, the nearest first.
 
     They are rivals with a similar criterion, and declared effects that explain at least ALIKE of
-    its
-    contribution beyond the rest of the model.
+    its contribution beyond the rest of the model.
 
     candidates : all declared Candidates
     """

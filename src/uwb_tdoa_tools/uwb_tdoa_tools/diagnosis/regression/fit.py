@@ -202,8 +202,7 @@ def in_common(table: RegressionTable, columns: Sequence[Column]) -> np.ndarray:
     """Return the projection onto means of parameters that cancel in every row, (k, k).
 
     Example: a common delay of all anchors cancels in every TDOA. The fit leaves this mean at 0, and
-    its
-    standard deviation would be the prior's. Effects without such a mean have entries 0.
+    its standard deviation would be the prior's. Effects without such a mean have entries 0.
     """
     out = np.zeros((len(columns), len(columns)))
     for effect in dict.fromkeys(column.effect for column in columns):
@@ -252,8 +251,7 @@ def measure_inflation(
     It is the larger of two measures. The first is 1 + 2 sum(rho) over the autocorrelation of each
     series up to 3 s. The second is the ratio of the variance of block sums of scores to independent
     rows, averaged over the columns. It includes correlation between series. All axes of a channel
-    get
-    their median: an excess on one axis only is an effect.
+    get their median: an excess on one axis only is an effect.
 
     residual : (n,) of a fit with all columns, because effects that are left count as noise
     weight : (n,) robust weights; scale : (groups,)

@@ -123,8 +123,7 @@ class Scan:
         """Return the best Candidates for the residual of a Fit of the chosen Candidates.
 
         Rows that the fit treats as outliers get a larger weight (Huber): an effect can act on few
-        rows
-        only. Noisy series get a smaller weight.
+        rows only. Noisy series get a smaller weight.
         """
         scale = HUBER * model.scale[table.group] / np.sqrt(self.even)
         weight = np.minimum(1.0, scale / np.maximum(np.abs(model.residual), 1e-12)) * self.even
@@ -159,8 +158,7 @@ class Scan:
         """Return [(gain, _Shapes, shape, knots, number tried)], the best first.
 
         The gain is twice a log-likelihood, at the weights of the Fit. The order counts the price of
-        the
-        coefficients and of the search.
+        the coefficients and of the search.
 
         held : as of `_held`
         """
@@ -181,8 +179,7 @@ def _noise_of_series(table: RegressionTable) -> np.ndarray:
     """Return the noise of the series of each row, (n,), at least 1.
 
     It is relative to NOISY times the median of its group. Differences of successive rows measure
-    it,
-    because steps and trends contribute little to them.
+    it, because steps and trends contribute little to them.
     """
     order = np.lexsort((table.t, table.series, table.flight, table.channel))
     label = np.unique(

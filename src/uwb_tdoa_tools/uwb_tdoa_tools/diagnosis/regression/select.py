@@ -145,8 +145,7 @@ def select(
         search(table, fit, chosen) returns more Candidates for the present residual.
     scan : Scan, optional
         It proposes functions. The first FITTED are scored by fits of their own, because the weights
-        of
-        the present fit treat their contribution as outliers.
+        of the present fit treat their contribution as outliers.
     start : Candidates
         The initial model; backward elimination can drop them.
     progress : function
@@ -178,9 +177,10 @@ def select(
 
 
 def _sparse_first(ranked: list[tuple[float, Candidate]]) -> Candidate:
-    """Return the best Candidate, or a small Candidate with a good part of the gain of a large group.
+    """Return the best Candidate, or a small Candidate that gains nearly as much as a large one.
 
-    Later steps show whether the rest of the group is needed.
+    Small means at most FEW columns, large more than LARGE, nearly at least GOOD_PART. Later steps
+    show whether the rest of the large group is needed.
     """
     criterion, best = ranked[0]
     few = (
@@ -201,8 +201,7 @@ def _fitted(
 
     The first score is the likelihood ratio of both fits; chance in noisy series can inflate it. The
     second is least squares with the weights `even`; outliers can inflate it. An unacceptable
-    candidate
-    scores minus infinity.
+    candidate scores minus infinity.
 
     choices : number of candidates; even : (n,) weights
     """

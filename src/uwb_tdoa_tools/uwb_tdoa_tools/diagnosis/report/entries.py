@@ -197,8 +197,7 @@ def by_anchor(effect: Effect) -> dict[int, dict[str, tuple[float, float | None]]
     """Return the significant values of an Effect per anchor, in the order of anchors.
 
     The form is {anchor: {"x", "y", "z" or "": (value, std or None)}}. It is {} if a value is not of
-    one
-    anchor.
+    one anchor.
     """
     out: dict[int, dict[str, tuple[float, float | None]]] = {}
     for key in effect.significant():

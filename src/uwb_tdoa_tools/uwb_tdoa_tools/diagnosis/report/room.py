@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from ..result import Diagnosis
 
 VIEWS = ([0, 1], [0, 2])  # x and y from above, x and z from the side
-CELL = 1.0  # m
+CELL = 1.0  # m, size of a cell of mean errors
 FEWEST = 0.5  # s, shortest time in a cell with a mean error
 
 

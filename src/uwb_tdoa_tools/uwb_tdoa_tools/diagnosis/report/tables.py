@@ -158,8 +158,7 @@ def phases(diagnosis: Diagnosis) -> tuple[Table, Table]:
     """Return the errors in each phase of a recording, before and after, as two tables.
 
     With few runs the first holds them and the second is empty. Else the first holds the total and
-    the
-    second each run.
+    the second each run.
     """
     sides = [[*side["runs"], side["pooled"]] for side in (diagnosis.before, diagnosis.after)]
     found = [[row.get("phases", {}) for row in side] for side in sides]

@@ -34,8 +34,7 @@ def place(
 
     Each TDOA between the new anchor and a known anchor defines a hyperboloid at the tag's position.
     Robust least squares over all TDOAs starts at the corners of the room. Raises InputError if
-    fewer
-    than FEWEST TDOAs determine the anchor.
+    fewer than FEWEST TDOAs determine the anchor.
     """
     anchors = flights[0].anchors
     known = np.setdiff1d(np.arange(len(anchors)), rows)

@@ -94,8 +94,7 @@ class Prior:
         """Return possible changes since the last calibration, {(effect, row of an anchor): Change}.
 
         Without a last calibration an anchor can stand elsewhere than the tape states. Above MANY
-        anchors,
-        a single anchor can also have a delay.
+        anchors, a single anchor can also have a delay.
         """
         unknown, many = not self.known.any(), len(self.ids) > MANY
         return {

@@ -133,8 +133,7 @@ class SelfCalibration:
         """Return why the result must not be used; None if it may be used.
 
         If another systematic error exists, positions and delays absorb it, and the position error
-        grows.
-        Large remaining slow innovations, or errors at marks, show that.
+        grows. Large remaining slow innovations, or errors at marks, show that.
         """
         if self.marks:
             before, after, nearer = self.marks
@@ -238,9 +237,8 @@ def self_calibrate(
     """Return the SelfCalibration of Flights. Ground truth is not used.
 
     The coordinates with the smallest std define the frame. Each anchor is also tried as the only
-    moved
-    one, as with `Tape.unknown`, before its error is spread. Raises InputError for flights with
-    different anchors, flights that are too short, and a Tape that does not fit.
+    moved one, as with `Tape.unknown`, before its error is spread. Raises InputError for flights
+    with different anchors, flights that are too short, and a Tape that does not fit.
 
     Parameters
     ----------
@@ -380,8 +378,7 @@ def _most_probable(found: dict[int | None, SelfCalibration], misfit: Misfit) -> 
     """Return the most probable of several SelfCalibrations.
 
     A single moved anchor must be ODDS times more probable than the error spread over all anchors.
-    Its
-    shift must be significant.
+    Its shift must be significant.
 
     found : {row of the anchor tried alone, None for the spread solution: SelfCalibration}
     """
