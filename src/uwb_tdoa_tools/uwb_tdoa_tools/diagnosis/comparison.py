@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     Spans = tuple[tuple[float, float], ...]  # (first, last) s
 
-BOOTSTRAPS = 400
+BOOTSTRAPS = 400  # number of bootstrap samples
 Z95 = 1.96  # standard deviations, half of a 95 % interval
 # Standard deviations by which a gain must exceed 0 if the reference itself has errors. Fitted
 # effects follow the common error of the references in any direction: chi distribution with three
@@ -315,6 +315,7 @@ def _gain_interval(
         [np.repeat(off[name][:, None], len(some), axis=1) for name, some in zip(names, before)],
         axis=1,
     )
+    # The same random seed draws the same blocks for both sides.
     gain = 1.0 - _draws(others, shifts) / np.maximum(_draws(blocks, shifts), 1e-12)
     return (
         [float(x) for x in np.quantile(gain, [0.025, 0.975])] if np.isfinite(gain).all() else None

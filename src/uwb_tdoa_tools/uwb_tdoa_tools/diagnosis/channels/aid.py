@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from .base import Comparison, Figures
 
-FEWEST_CELLS = 8
+FEWEST_CELLS = 8  # fewest cells of a residual
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ..regression.algebra import Matrix
     from .views import CovariateView
 
-FEWEST_ATTITUDES = 10
+FEWEST_ATTITUDES = 10  # fewest poses with an attitude, for a reference with known attitude
 # of the health of channels: {"pairs", "anchors", "axes", ...: rows}
 Figures = dict[str, list[dict[str, Any]]]
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from ..regression.table import RegressionTable
 
 RADII = (0.6, 1.0, 1.5)  # m, radii of spheres that are tried
-CENTRES = 60
+CENTRES = 60  # approximate number of centres of spheres
 PRIOR = 4.0  # information, 1/m^2, of the prior of a delay
 
 

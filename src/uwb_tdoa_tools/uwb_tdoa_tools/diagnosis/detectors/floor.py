@@ -30,7 +30,7 @@ ONE_PLACE = 0.5  # m, radius of a single place of take-off and landing
 LEAST, GOOD_PART = 0.5, 0.5
 # scale in m and degrees of freedom of Student's t: an anchor with several echoes has heavy tails
 SCALE, NU = 0.2, 4.0
-ITERATIONS = 8
+ITERATIONS = 8  # of the re-weighted least squares
 LITTLE = 1e-3  # information, 1/m^2, of a delay of 0: TDOAs do not show a common delay
 # m: noise below the first is normal, a residual beyond the second is an outlier
 LEAST_NOISE, WILD = 0.2, 3.0

@@ -29,7 +29,7 @@ TIMES = np.geomspace(0.05, 5.0, 60)  # s, correlation times that are tried
 FEWEST, FEWEST_BLOCKS = 50, 4  # fewest products in a bin of lags, and fewest blocks of time
 # noise_level
 NEAR = 0.3  # s, two TDOAs of a pair that are nearer share their slow error
-FEWEST_STEPS, FEWEST_LINKS = 30, 3
+FEWEST_STEPS, FEWEST_LINKS = 30, 3  # fewest steps of a pair, and fewest pairs
 # smallest noise of a noisy pair: ratio to the median of all pairs, and standard errors above it
 RATIO, SURE_LEVEL = 1.25, 5.0
 MOST = 0.4  # share of noisy pairs; if there are more, no pair is an exception

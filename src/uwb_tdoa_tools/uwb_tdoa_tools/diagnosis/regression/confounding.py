@@ -111,6 +111,7 @@ def _shares(
             gram = gram - held @ (2.0 * np.eye(len(held.T)) - basis.T @ basis) @ held.T
             vector = vector - held @ (basis.T @ part)
         solution = np.linalg.solve(gram + np.diag(1.0 / sizes**2), vector)
+        # Explained power of the regularized projection of the contribution on the other effect.
         share = (2.0 * vector @ solution - solution @ gram @ solution) / power
         if share >= ALIKE:
             out[name] = round(float(share), 3)

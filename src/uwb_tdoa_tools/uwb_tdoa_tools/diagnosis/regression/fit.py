@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from .terms import Column
 
 CANCELS = 1e-9  # smallest sum of regressors of an effect that does not cancel, in the unit of a row
-NU = 4.0
-ITERATIONS = 12
-MIN_BLOCKS = 6
+NU = 4.0  # degrees of freedom of Student's t
+ITERATIONS = 12  # largest number of re-weighted least squares
+MIN_BLOCKS = 6  # fewest blocks for a sandwich covariance and for the correlation within blocks
 LONGEST_MEMORY = 3.0  # s, longest lag of the autocorrelation of a series
 # share of rows in which a column is not 0; fewer do not show correlation between blocks
 LASTING = 0.1
@@ -133,6 +133,7 @@ def fit(
     residual = table.y.copy() if near is None or not table.sparse else near.residual.copy()
     for step in range(ITERATIONS):
         scale = _scales(table, residual)
+        # Weights of Student's t likelihood (Lange, Little and Taylor 1989).
         weight = (NU + 1.0) / (NU + (residual / scale[group]) ** 2)
         if not columns:
             if step:
@@ -232,6 +233,7 @@ def _covariance(
     if blocks < MIN_BLOCKS:
         return bread
     sums = sums_by(table.block, weighted(x, root * residual), blocks)
+    # Few blocks underestimate the variance: blocks / (blocks - columns) corrects for that.
     half = sums @ bread * np.sqrt(blocks / max(blocks - min(x.shape[1], blocks // 2), 1))
     sandwich = half.T @ half  # a square has no negative diagonal
     informed = np.diag(sandwich) > 1e-300

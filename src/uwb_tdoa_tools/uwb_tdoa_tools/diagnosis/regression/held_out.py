@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from .table import RegressionTable
     from .terms import Column
 
-FOLDS = 4
+FOLDS = 4  # folds of the cross-validation over blocks of time
 CLIP = 5.0  # spreads, limit of a residual
 
 

@@ -246,12 +246,14 @@ class _Group:
         level, cross = vector[:, :n].sum(axis=1)[:, None], own[:, :, :n].sum(axis=2)
         power = cross[:, :n].sum(axis=1)[:, None] + prior
 
+        # Gain of a level and one column: least squares with the prior, in closed form.
         def of_one(first: np.ndarray, crossed: np.ndarray, square: np.ndarray) -> np.ndarray:
             rest = square + prior - crossed**2 / power
             return level**2 / power + (first - crossed * level / power) ** 2 / np.maximum(
                 rest, 1e-9 * (square + prior)
             )
 
+        # Gain of a level and two columns, as of a wave or a parabola: a 3 x 3 system.
         def of_two(first: np.ndarray, second: np.ndarray) -> np.ndarray:
             small = np.empty((len(vector), len(first), 3, 3))
             some = np.empty((len(vector), len(first), 3))
@@ -267,6 +269,7 @@ class _Group:
         single = of_one(vector[:, n:], cross[:, n:], np.diagonal(own, axis1=1, axis2=2)[:, n:])
         at = n + len(_ENDS) + 2 * bends + np.arange(waves)
         lines = n + np.arange(len(_ENDS))
+        # Cumulative sums over bins give the products of every step and interval.
         square = np.zeros((len(vector), n + 1, n + 1))
         square[:, 1:, 1:] = own[:, :n, :n].cumsum(axis=1).cumsum(axis=2)
         i, j = self._from, self._to

@@ -136,6 +136,7 @@ class Scorer:
         cross = sum(part.cross[:, new] for part in self._parts) * np.outer(sizes[base], sizes[new])
         own = [part.gram(new) for part in self._parts]
         vector = sum(part.vector[both] for part in self._parts) * sizes[both]
+        # Block inverse of the posterior information of base and new columns, in units of the prior.
         half = self._inverse @ cross
         schur = np.linalg.inv(
             sum(own) * np.outer(sizes[new], sizes[new]) + np.eye(len(new)) - cross.T @ half
@@ -146,6 +147,7 @@ class Scorer:
             len(both) - np.trace(self._inverse) - np.trace(schur) - np.sum((half @ schur) * half)
         )
         beta, gain = z * sizes[both], self._penalty - float(z @ z)
+        # A group with unknown noise variance gains size * log(squares before / squares after).
         for size, part, gram, before in zip(self._group_sizes, self._parts, own, self._squares):
             gain += size * np.log(before / part.squares(beta, both, gram))
         values = dict(zip(both.tolist(), beta.tolist()))

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from .scan import Scan
     from .terms import Candidate
 
-MAX_STEPS = 14
+MAX_STEPS = 14  # largest number of forward steps
 FITTED = 6  # proposals of a scan that are scored by a fit of their own
 # Columns of a small and of a large candidate; share of the criterion that the small one must reach.
 FEW, LARGE, GOOD_PART = (3, 6, 0.5)
@@ -156,6 +156,7 @@ def select(
     for _ in range(MAX_STEPS):
         scanned, even = (scan(table, model, chosen), scan.even) if scan else ([], np.empty(0))
         found = (search(table, model, chosen) if search else []) + scanned[FITTED:]
+        # Forward step: score all candidates, and add the best one if it gains more than its price.
         wider = table.with_terms([term for candidate in found for term in candidate.terms])
         ranked = rank(wider, candidates + found, chosen, model)
         ranked += [

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 # smallest RMS residual of a named pair over BLOCK s: m, and relative to the RMS of all rows
 LARGE, ABOVE = (0.15, 3.0)
-NAMED = 3
+NAMED = 3  # largest number of named places
 NEAR = 0.999  # share of that limit above which a pair is checked exactly
 
 

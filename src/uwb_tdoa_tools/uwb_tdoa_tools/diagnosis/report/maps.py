@@ -31,8 +31,8 @@ BESIDE = 0.7  # m, largest distance of anchors with a common label
 MARGIN = 1.0  # m around anchors and paths
 LONGEST = 0.16  # longest arrow, share of the room
 AWAY = 11.0  # points between an anchor and the middle of its label
-KEYS = (1, 2, 5, 10, 20, 50, 100, 200)  # cm
-ENLARGED = (1, 2, 3, 5, 10, 20, 50, 100)
+KEYS = (1, 2, 5, 10, 20, 50, 100, 200)  # cm, possible lengths of the arrow in the key
+ENLARGED = (1, 2, 3, 5, 10, 20, 50, 100)  # possible factors on the length of arrows
 # quantile of the errors at the end of the colour scale, and for the scale of arrows
 BRIGHT = 0.95
 COLOURS = LinearSegmentedColormap.from_list(

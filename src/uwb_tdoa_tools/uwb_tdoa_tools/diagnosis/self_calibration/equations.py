@@ -515,6 +515,7 @@ def _inflation(
 
     gram : (k, k), vector : (k,) sums over the blocks; sizes : (k,) prior standard deviations
     """
+    # Scores at the preliminary solution, where the mean score is near 0.
     step = np.linalg.solve(gram / PRELIMINARY + np.diag(sizes**-2.0), vector / PRELIMINARY)
     scores = np.zeros((len(blocks), len(vector)))
     for score, block in zip(scores, blocks):

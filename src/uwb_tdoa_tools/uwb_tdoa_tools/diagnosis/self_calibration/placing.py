@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_ekf.results import Odometry
 
 MOST = 3000  # largest number of TDOAs of a flight that are used
-FEWEST = 200
+FEWEST = 200  # fewest TDOAs that place an anchor
 SCALE = 0.3  # m, scale of the robust loss
 BEYOND = 1.0  # m, distance of the starting points beyond the box of the known anchors
 # m, prior standard deviation of a placed coordinate in the calibration that follows

@@ -419,6 +419,7 @@ def _log_evidence(found: SelfCalibration, alone: int | None) -> float:
         prior[places], prior[:, places] = 0.0, 0.0
         prior[places, places] = ANYWHERE**2 * np.eye(3)
     offset = np.concatenate([found.shifts.ravel(), found.delays])
+    # Laplace: half of log|posterior| - log|prior| - squared distance from the prior mean.
     volumes = [np.linalg.slogdet(one)[1] for one in (found.solution.covariance, prior)]
     return float(0.5 * (volumes[0] - volumes[1] - offset @ np.linalg.solve(prior, offset)))
 
