@@ -1,12 +1,13 @@
 """Compute realistic standard deviations of anchor parameters fitted with ground truth.
 
 The covariance of a fit assumes a correct model. Positions and delays of anchors absorb other
-systematic errors, equally at each place, so no scatter between blocks of time shows them. A second
-fit uses the information that remains if errors last as long as the flight. It marginalizes
-parameters that can replace anchor errors. These are a smooth function of the place for each anchor
-(an antenna's directional error), and coordinates and delays that the fit sets to 0. The evidence
-selects the size of the functions. Unfitted coordinates have standard deviations COORDINATE_STDS,
-weighted by evidence; delays have UNSAID. The difference between both fits counts as an error.
+systematic errors. These errors are equal at each place, so no scatter between blocks of time shows
+them. A second fit uses the information that remains if errors last as long as the flight. It
+marginalizes parameters that can replace anchor errors. One kind is a smooth function of the place
+for each anchor, such as an antenna's directional error. The other kind are coordinates and delays
+that the fit sets to 0. The evidence selects the size of the functions. Unfitted coordinates have
+standard deviations COORDINATE_STDS, weighted by evidence; delays have UNSAID. The difference
+between both fits counts as an error.
 """
 
 from __future__ import annotations
@@ -120,8 +121,7 @@ def _beside_others(table: RegressionTable, model: Fit) -> tuple[np.ndarray, np.n
 def _common_delay(table: RegressionTable, columns: Sequence[Column], n: int) -> np.ndarray:
     """Return the row that gives the mean of the unfitted delays, (k,).
 
-    A fitted delay is the difference from this mean. The row is 0 if the fit has no delay or all
-    delays, or if a common delay does not cancel.
+    A fitted delay is the difference from this mean. The row is 0 if the fit has no delay, or all delays. It is also 0 if a common delay does not cancel.
 
     columns : k Columns; n : number of fitted ones, which come first
     """

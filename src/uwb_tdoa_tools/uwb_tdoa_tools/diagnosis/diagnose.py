@@ -235,8 +235,8 @@ def _by_self_calibration(
     """Return the _Outcome if the position errors are unknown: anchors are calibrated, or nothing.
 
     Smaller innovations do not prove a correct model, because the estimate can follow a wrong model.
-    On measured flights, functions of the place fitted to some flights reduced the innovations of
-    others and doubled the position error.
+    On measured flights, functions of the place were fitted to some flights. They reduced the
+    innovations of other flights and doubled the position error.
     """
     (fitted, sound), effects, baseline = (
         flights,

@@ -1,10 +1,11 @@
 """Scan thousands of undeclared functions of one anchor, pair, direction or axis over one covariate.
 
 Each function is a level and one simple shape: a line, a rise beyond or below a point, a step, an
-interval, a parabola or a wave. The gain of each is a score test on the residual of a fit. Products
-of a few columns with the residual and with each other give the gains of all shapes in closed form.
-The columns of the model are projected out of these products (Schur complement). The best functions
-become candidates. Their price includes the number of functions that were tried.
+interval, a parabola or a wave. The gain of each is a score test on the residual of a fit. A few
+columns are multiplied with the residual and with each other. These products give the gains of all
+shapes in closed form. The columns of the model are projected out of these products (Schur
+complement). The best functions become candidates. Their price includes the number of functions that
+were tried.
 """
 
 from __future__ import annotations

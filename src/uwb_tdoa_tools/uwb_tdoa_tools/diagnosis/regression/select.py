@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from .terms import Candidate
 
 MAX_STEPS = 14  # largest number of forward steps
-FITTED = 6  # proposals of a scan that are scored by a fit of their own
+FITTED = 6  # proposals of a scan that separate fits score
 # Columns of a small and of a large candidate; share of the criterion that the small one must reach.
 FEW, LARGE, GOOD_PART = (3, 6, 0.5)
 LEAST_DETERMINED = 0.3  # smallest effective number of parameters of a candidate
@@ -144,8 +144,7 @@ def select(
     search : Search, optional
         search(table, fit, chosen) returns more Candidates for the present residual.
     scan : Scan, optional
-        It proposes functions. The first FITTED are scored by fits of their own, because the weights
-        of the present fit treat their contribution as outliers.
+        It proposes functions. Separate fits score the first FITTED, because the present weights treat their contribution as outliers.
     start : Candidates
         The initial model; backward elimination can drop them.
     progress : function
