@@ -181,7 +181,8 @@ def attribute(
     def at(model: Sequence[Effect]) -> list[ChannelResiduals]:
         """Return the residuals under a model.
 
-        Residuals of the last and of the empty model are kept. If the path is unknown, computing them runs the filter.
+        Residuals of the last and of the empty model are kept. If the path is unknown, computing
+        them runs the filter.
         """
         again = [residuals for other, residuals in known if other == tuple(model)]
         if not again:

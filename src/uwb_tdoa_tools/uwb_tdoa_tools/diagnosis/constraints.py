@@ -120,7 +120,9 @@ class OdometryPath:
     ) -> tuple[np.ndarray, float]:
         """Return the path at stamps `wanted`, (k, 3) m, world, and the std of its common shift, m.
 
-        The path is turned about the vertical and shifted to fit the estimate. Then its start and drift are corrected by the posterior mean of a random walk. The estimate and the marks are its data.
+        The path is turned about the vertical and shifted to fit the estimate. Then its start and
+        drift are corrected by the posterior mean of a random walk. The estimate and the marks are
+        its data.
 
         t : (m,) s; estimate : (m, 3) m, world, at t; begin : stamp of the first TDOA, s
         """

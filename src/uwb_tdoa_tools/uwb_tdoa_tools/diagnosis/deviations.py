@@ -121,7 +121,8 @@ def _beside_others(table: RegressionTable, model: Fit) -> tuple[np.ndarray, np.n
 def _common_delay(table: RegressionTable, columns: Sequence[Column], n: int) -> np.ndarray:
     """Return the row that gives the mean of the unfitted delays, (k,).
 
-    A fitted delay is the difference from this mean. The row is 0 if the fit has no delay, or all delays. It is also 0 if a common delay does not cancel.
+    A fitted delay is the difference from this mean. The row is 0 if the fit has no delay, or all
+    delays. It is also 0 if a common delay does not cancel.
 
     columns : k Columns; n : number of fitted ones, which come first
     """

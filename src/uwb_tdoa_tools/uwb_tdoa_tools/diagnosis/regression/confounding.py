@@ -64,7 +64,8 @@ def alternatives(
 ) -> list[Alternative]:
     """Return the Alternatives of a chosen Candidate, the nearest first.
 
-    Rivals with a similar criterion are alternatives. So are declared effects that explain at least ALIKE of its contribution beyond the rest of the model.
+    Rivals with a similar criterion are alternatives. So are declared effects that explain at least
+    ALIKE of its contribution beyond the rest of the model.
 
     candidates : all declared Candidates
     """

@@ -1,6 +1,8 @@
 """Compute the gain in likelihood of sets of columns in closed form.
 
-Products of all columns with the base of the model are computed once per group. A group is an axis of a channel. The gain of a candidate then follows from a small system of equations (Schur complement).
+Products of all columns with the base of the model are computed once per group. A group is an axis
+of a channel. The gain of a candidate then follows from a small system of equations (Schur
+complement).
 """
 
 from __future__ import annotations

@@ -144,7 +144,8 @@ def select(
     search : Search, optional
         search(table, fit, chosen) returns more Candidates for the present residual.
     scan : Scan, optional
-        It proposes functions. Separate fits score the first FITTED, because the present weights treat their contribution as outliers.
+        It proposes functions. Separate fits score the first FITTED, because the present weights
+        treat their contribution as outliers.
     start : Candidates
         The initial model; backward elimination can drop them.
     progress : function
