@@ -1,12 +1,15 @@
-"""From residuals to missing effects.
+"""Find missing systematic effects in residuals.
 
 from uwb_tdoa_tools.diagnosis import diagnose
-diagnosis = diagnose(flights, holdout)   # diagnosis.findings, diagnosis.effects, diagnosis.before, diagnosis.after, ...
+diagnosis = diagnose(flights, holdout)
 
-Four ideas, each with a folder and a small interface: a *reference* is what a flight is compared
-with; a *channel* is one kind of measurement, with its residual; an *effect* (uwb_tdoa_bias.effects)
-is what may be wrong with channels; a *detector* searches for an effect that no regression finds.
-The rest knows none of them by name.
+The result has findings, effects, and validation figures before and after.
+
+The package has five concepts, each with a folder or module and a small interface. A *reference* is
+the path that a flight is compared with. A *constraint* is knowledge besides TDOAs for a calibration
+without ground truth. A *channel* is one kind of measurement, with its residual. An *effect*
+(uwb_tdoa_bias.effects) is a systematic error of channels. A *detector* searches for an effect that
+no regression finds. The other modules use these interfaces only.
 """
 
 from .diagnose import diagnose

@@ -1,4 +1,4 @@
-"""From flights to a model: which effects are there, how large, how sure, and what else it could be."""
+"""Attribute residuals of flights to effects, with values, uncertainty and alternatives."""
 
 from __future__ import annotations
 
@@ -55,23 +55,25 @@ if TYPE_CHECKING:
     from .regression.fit import Fit
     from .regression.table import RegressionTable
 
-# flights: a map of fewer is of their paths, and misleads others; two with like paths validate each
-# other
+# Flights, fewest for a map. With fewer, the map depends on their paths and does not generalize; two
+# similar paths validate each other.
 FOR_MAPS = 3
-ON_FLOOR = 0.5  # m by which a function of UPWARDS changes at least near the floor, to be reported
+ON_FLOOR = 0.5  # m, smallest change of a reported function of UPWARDS near the floor
 RANGED = tuple(
     name for name, kind in RADIO.items() if kind.ends == 1
-)  # streams of distances to anchors
+)  # names of streams of distances to anchors
 
 
 @dataclass(frozen=True, eq=False)
 class Attribution:
-    """residuals : [{channel: ChannelResidual}] under the base model; selection : Selection;
-    detections : (Detection, ...); candidates : all declared Candidates; refused : (Refused, ...);
-        names : of the flights; alone :
-    ((name of a flight, Selection), ...) of what one flight shows and the others do not; floor :
-    Selection of what there is near the floor, beside what is found in the air; None if nobody
-    knows; floor_names : of the flights of its RegressionTable.
+    """The effects that explain the residuals of some flights.
+
+    residuals : [{channel: ChannelResidual}] under the base model, one per flight
+    selection : Selection; detections : (Detection, ...); candidates : all declared Candidates
+    refused : (Refused, ...); names : of the flights
+    alone : ((name of a flight, Selection), ...), effects in one flight only
+    floor : Selection near the floor, beyond effects in the air; None without data there
+    floor_names : names of the flights with data near the floor
     """
 
     residuals: list[ChannelResiduals]
@@ -86,12 +88,12 @@ class Attribution:
 
     @cached_property
     def seen(self) -> Seen:
-        """Seen, of what the residuals hold."""
+        """Return the ranges of covariates in the residuals."""
         return Seen(self.residuals)
 
     @property
     def effects(self) -> tuple[Effect, ...]:
-        """All Effects found that may be taken out: tuple."""
+        """Return all found Effects that can be corrected."""
         in_the_air = self.seen.limited(
             (*effects_of(self.selection), *(detection.effect for detection in self.detections))
         )
@@ -99,9 +101,9 @@ class Attribution:
 
     @property
     def of_floor(self) -> tuple[Effect, ...]:
-        """Effects found near the floor that the filter may get: tuple.
+        """Return the Effects near the floor that the filter may use.
 
-        Functions without a name would go on in the air.
+        Functions without a name are left out, because they would also act in the air.
         """
         return (
             effects_of(self.floor.where(lambda effect: effect.is_hypothesis)) if self.floor else ()
@@ -109,8 +111,9 @@ class Attribution:
 
     @property
     def covariance(self) -> Covariance | None:
-        """Of the positions and delays of anchors in the selection: the prior of the next
-        calibration; None without any.
+        """Return the Covariance of selected positions and delays of anchors; None without any.
+
+        It is the prior of the next calibration.
         """
         columns = [
             column
@@ -124,11 +127,14 @@ class Attribution:
         covariance = self.selection.fit.cov[np.ix_(places, places)]
         covariance = (
             covariance + in_common(self.selection.table, columns) * prior_sizes(columns) ** 2.0
-        )  # nothing is known of that
+        )  # the data do not determine common means
         return to_keep(tuple((str(column.effect[0]), column.key) for column in columns), covariance)
 
     def findings(self) -> list[EffectFinding]:
-        """[EffectFinding], those by regression first, those of one flight alone last."""
+        """Return the EffectFindings.
+
+        The order is: from regression, from detectors, near the floor, in single flights.
+        """
         out = _findings(self.selection, self.candidates, self.names)
         out += map(_of_detection, self.detections)
         if self.floor:
@@ -152,18 +158,32 @@ def attribute(
     progress: Callable[[], object] = lambda: None,
     map_function: MapFunction = map,
 ) -> Attribution:
-    """Attribution of the residuals of Flights, which the Reference has prepared, to effects beyond
-    `base`.
+    """Attribute the residuals of prepared Flights to effects beyond `base`.
 
-    kinds : names of the declared effects to look for, None for all; undeclared : look for functions
-        without a name too;
-    progress() is called now and then; map_function(function, items) : as map, but for the time and
-    the process in which each is done.
+    Parameters
+    ----------
+    flights : sequence of Flight
+        Flights after `Reference.prepare`.
+    reference : Reference
+    base : EffectSet
+        Effects in the model.
+    kinds : names, optional
+        Declared effects to search for; all by default.
+    undeclared : bool
+        Whether to search for functions without a name too.
+    progress : function
+        It is called every few seconds.
+    map_function : function
+        Like map(function, items), possibly in parallel processes.
     """
     known: list[tuple[tuple[Effect, ...], list[ChannelResiduals]]] = []
 
     def at(model: Sequence[Effect]) -> list[ChannelResiduals]:
-        """Those beside a model; of the last one, and of none, they are kept."""
+        """Return the residuals under a model.
+
+        Residuals of the last and of the empty model are kept. If the path is unknown, computing
+        them runs the filter.
+        """
         again = [residuals for other, residuals in known if other == tuple(model)]
         if not again:
             again = [
@@ -207,7 +227,7 @@ def attribute(
 
     def scan_of(
         table: RegressionTable,
-    ) -> Scan:  # one for each number of rows, which other stamps can change
+    ) -> Scan:  # one per number of rows, because stamp offsets change it
         if len(table.y) not in scans:
             scans[len(table.y)] = Scan(table, _views(table))
         return scans[len(table.y)]
@@ -256,9 +276,7 @@ def attribute(
 
 
 def near_floor(residuals: ChannelResiduals) -> ChannelResiduals:
-    """{channel: ChannelResidual} of what is near the floor in the residuals of a flight; {} of
-    nothing.
-    """
+    """Return the residuals of a flight near the floor, by channel; {} without any."""
     parts = {name: part.of_floor() for name, part in residuals.items()}
     return {name: part for name, part in parts.items() if part is not None}
 
@@ -270,12 +288,13 @@ def on_floor(
     refused: list[Refused],
     progress: Callable[[], object] = lambda: None,
 ) -> Selection:
-    """Selection of what [{channel: ChannelResidual}] near the floor show: effects with a name, or,
-    where there is none, functions of what changes with the height: at one place all else is the
-    same.
+    """Select effects near the floor: declared effects, else functions of the height.
 
-    A few seconds, of errors of metres, are looked at by themselves: among all that is in the air
-    they would pass for outliers, or pull at what is fitted there.
+    Only functions of the height are tried, because take-off and landing at one place do not
+    distinguish other covariates. These few seconds are fitted separately, because their errors are
+    metres. In a common fit they would count as outliers, or bias effects in the air.
+
+    residuals : [{channel: ChannelResidual}] near the floor
     """
     table = table_of(residuals)
     found = select(
@@ -304,9 +323,12 @@ def residuals_of(
     progress: Callable[[], object] = lambda: None,
     map_function: MapFunction = map,
 ) -> list[ChannelResiduals]:
-    """[`channels.residuals`] of Flights. progress, map_function : as of `attribute`."""
+    """Return the residuals of each Flight, as of `channels.residuals`.
+
+    progress, map_function : as of `attribute`
+    """
     if not all(reference.positions_known):
-        # with all that the filter knows of the path, they take as long to send as to find
+        # sending these residuals between processes takes longer than computing them
         map_function = map
     out = []
     for of_flight in map_function(
@@ -326,8 +348,9 @@ def _search(
 
 
 def _installation(flights: Sequence[Flight]) -> tuple[Anchors, np.ndarray]:
-    """(Anchors with every id that the flights have heard, each at the first of its places; (m, 2)
-    ids of the MOST_LINKS pairs that were heard most, the most frequent first).
+    """Return the Anchors of all flights, and the MOST_LINKS most frequent pairs of ids, (m, 2).
+
+    An anchor that moved between flights has its first position.
     """
     several = [flight.anchors for flight in flights]
     ids, positions, orientations = (
@@ -356,8 +379,9 @@ def _declared(
     kinds: Collection[str] | None,
     installation: tuple[Anchors, np.ndarray],
 ) -> list[Candidate]:
-    """[Candidate] of the catalogue, of effects that a channel shows, and that are observable with
-    the reference.
+    """Return Candidates of declared effects that the channels and the reference can show.
+
+    installation : Anchors, and pairs (m, 2)
     """
     shown = {name for flight in found for name in flight}
     effects = [
@@ -376,8 +400,9 @@ def _declared(
 def _smooth(
     found: Sequence[ChannelResiduals], installation: tuple[Anchors, np.ndarray]
 ) -> list[Candidate]:
-    """[Candidate] of functions of whatever each channel may depend on, of all anchors alike or each
-    with its own.
+    """Return Candidates of functions of the covariates of each channel.
+
+    A function is common to all anchors, or each anchor has its function.
     """
     out = []
     for name, channel in CHANNELS.items():
@@ -388,7 +413,7 @@ def _smooth(
 
 
 def _views(table: RegressionTable) -> dict[str, list[CovariateView]]:
-    """{channel: [CovariateView]} of what a part of each channel of a RegressionTable may depend on."""
+    """Return {channel: [CovariateView]} of the channels in a RegressionTable."""
     parts: dict[str, list[ChannelResidual]] = {}
     for _, name, _, part in table.parts:
         parts.setdefault(name, []).append(part)
@@ -396,8 +421,9 @@ def _views(table: RegressionTable) -> dict[str, list[CovariateView]]:
 
 
 def _is_large(candidate: Candidate, selection: Selection) -> bool:
-    """Whether a chosen Candidate moves what it moves by ON_FLOOR: less is of the place, of which a
-    few seconds tell nothing.
+    """Return whether the contribution of a chosen Candidate varies by more than ON_FLOOR.
+
+    A smaller contribution can depend on the place, and a few seconds do not determine that.
     """
     part = selection.table.matrix(candidate.columns) @ selection.fit.values(candidate.columns)
     return np.ptp(part) > ON_FLOOR
@@ -438,7 +464,7 @@ def _findings(
 
 
 def _merged(finding: EffectFinding, other: EffectFinding) -> EffectFinding:
-    """One EffectFinding of two of one effect."""
+    """Return one EffectFinding of two of the same effect."""
     evidence = {
         key: round(finding.evidence[key] + other.evidence[key], 1) for key in other.evidence
     }
@@ -456,7 +482,7 @@ def _merged(finding: EffectFinding, other: EffectFinding) -> EffectFinding:
 
 
 def _shown_on(candidate: Candidate, selection: Selection) -> str:
-    """The first of the channels on which a Candidate acts that there is."""
+    """Return the first channel of a Candidate that the table contains."""
     return next(name for name in candidate.channels if name in selection.table.present)
 
 

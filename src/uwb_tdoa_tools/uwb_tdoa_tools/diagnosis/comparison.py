@@ -1,5 +1,6 @@
-"""The filter with the model before and after, on flights: errors, or innovations where nobody knows
-these, and how sure a gain is.
+"""Run the filter with the model before and after, and compare errors with their uncertainty.
+
+Where errors are unknown, it compares innovations.
 """
 
 from __future__ import annotations
@@ -34,21 +35,21 @@ if TYPE_CHECKING:
 
     Spans = tuple[tuple[float, float], ...]  # (first, last) s
 
-BOOTSTRAPS = 400
-Z95 = 1.96  # standard deviations from the middle of a 95 % interval to its ends
-# Standard deviations by which a gain must be above zero where the reference itself may be off. What
-# is fitted follows what the
-# references have in common, in whatever direction that is: chi with three degrees of freedom, 99.9
-# %.
+BOOTSTRAPS = 400  # number of bootstrap samples
+Z95 = 1.96  # standard deviations, half of a 95 % interval
+# Standard deviations by which a gain must exceed 0 if the reference itself has errors. Fitted
+# effects follow the common error of the references in any direction: chi distribution with three
+# degrees of freedom, 99.9 %.
 SURE = 4.0
 USED = next(value for value, name in VERDICTS.items() if name == "used")
 
 
 @dataclass(frozen=True, eq=False)
 class ValidationCase:
-    """A flight to judge on, and an EffectSet that it took no part in fitting. spans : ((first,
-    last), ...) s, None for all; reach : the same for phases, which those at either end of the
-    flight go on to its begin and its end for.
+    """A flight, and an EffectSet that was not fitted to its judged part.
+
+    spans : ((first, last), ...) s that are judged, None for all
+    reach : the same for phases; spans at the ends of the flight extend to its begin and end
     """
 
     flight: Flight
@@ -58,15 +59,15 @@ class ValidationCase:
 
 
 class Baseline:
-    """The model before: runs of the filter with it, one for each flight."""
+    """The model before: runs of the filter with it, one per flight."""
 
     def __init__(self, base: EffectSet, config: FilterConfig | None = None) -> None:
-        """base : EffectSet; config : FilterConfig."""
+        """Take the EffectSet before, and the FilterConfig."""
         self.base, self.config = base, config
         self._runs: dict[int, tuple[Flight, Run]] = {}
 
     def run(self, flight: Flight) -> Run:
-        """Run of a Flight, the same one whenever it is asked for."""
+        """Return the Run of a Flight, computed once."""
         self.prepare([flight])
         return self._runs[id(flight)][1]
 
@@ -76,12 +77,15 @@ class Baseline:
         progress: Callable[[], object] = lambda: None,
         map_function: MapFunction = map,
     ) -> None:
-        """Make the runs of Flights that there are none of yet. map_function : as of `attribute`."""
+        """Compute the missing runs of Flights.
+
+        map_function : as of `attribute`
+        """
         missing = [flight for flight in flights if id(flight) not in self._runs]
         missing = list({id(flight): flight for flight in missing}.values())
         cases = [ValidationCase(flight, self.base) for flight in missing]
         for run, flight in zip(map_function(partial(_run, self.config), cases), missing):
-            self._runs[id(flight)] = flight, run  # the flight, so that its id stays
+            self._runs[id(flight)] = flight, run  # the flight is kept, because its id is the key
             progress()
 
 
@@ -92,10 +96,14 @@ def compare(
     shift_std: Callable[[str], np.ndarray] = lambda name: np.zeros(3),
     map_function: MapFunction = map,
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """(before, after) of Cases: {"runs": [...], "pooled": {...}, "scores": [Score]}, keys as in
-    evaluate, phases too, besides residual_spread (m, 1.48 MAD of the innovations) and rmse_3d_ci
-    (95 %, bootstrap over blocks of 5 s); rmse_3d_gain_ci counts what the references of whole
-    flights may be off by too. shift_std : of a Reference; map_function : as of `attribute`.
+    """Run the filter on ValidationCases before and after, and return both sides.
+
+    A side is {"runs": [...], "pooled": {...}, "scores": [Score]}. Keys are those of evaluate,
+    phases included. Further keys are residual_spread (m, 1.48 MAD of the innovations) and
+    rmse_3d_ci (95 %, bootstrap over blocks of 5 s). rmse_3d_gain_ci includes errors of the
+    references that are common to a flight.
+
+    shift_std : as of a Reference; map_function : as of `attribute`
     """
     sides: list[dict[str, Any]] = []
     draws = []
@@ -132,8 +140,9 @@ def innovations(
     progress: Callable[[], object] = lambda: None,
     map_function: MapFunction = map,
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """What `compare` gives, where nobody knows the errors: figures of the filter's own innovations
-    alone.
+    """Return (before, after) as `compare` does, with figures of innovations only.
+
+    It is used where errors are unknown.
     """
     sides = []
     for runs in _both_sides(cases, baseline, progress, map_function):
@@ -153,9 +162,9 @@ def innovations(
 
 
 def score(case: ValidationCase, run: Run) -> Score:
-    """Score of a Run on a ValidationCase. Raises InputError where there is no estimate."""
+    """Return the Score of a Run on a ValidationCase; raise InputError without an estimate."""
     truth = shifted(case.flight, "truth", -case.effects.stamp_offset("truth")).truth
-    assert truth is not None  # of a Reference that tells errors
+    assert truth is not None  # the Reference knows the errors
     out = Score(
         case.flight.name,
         run.odometry,
@@ -174,9 +183,10 @@ def score(case: ValidationCase, run: Run) -> Score:
 
 
 def why_not(before: dict[str, Any], after: dict[str, Any], shift_std: float) -> str | None:
-    """Why what was found must not be applied, after `compare`; None if it may. shift_std : m, what
-    a reference may be off by in all of a flight; the gain must be SURE standard deviations of what
-    that can feign.
+    """Return why the result of `compare` must not be applied; None if it may.
+
+    shift_std : m, standard deviation of a reference error common to a flight; the gain must exceed
+        SURE standard deviations of its effect
     """
     gain, interval = (
         after["pooled"]["rmse_3d"] < before["pooled"]["rmse_3d"],
@@ -208,7 +218,7 @@ def _both_sides(
     progress: Callable[[], object],
     map_function: MapFunction,
 ) -> Iterator[Iterator[tuple[ValidationCase, Run]]]:
-    """Cases with the runs of a baseline, then with their own, each run made when it is asked for."""
+    """Yield the cases with runs of the baseline, then with their own runs, computed on demand."""
     baseline.prepare([case.flight for case in cases], progress, map_function)
     yield ((replace(case, effects=baseline.base), baseline.run(case.flight)) for case in cases)
 
@@ -234,7 +244,7 @@ def _scale(innovation: np.ndarray) -> float:
 
 
 def _used(run: Run) -> np.ndarray:
-    """Innovations (n,) m of the TDOAs that a Run used, or, without any TDOAs, of its ranges."""
+    """Return innovations of the used TDOAs of a Run, or of its ranges without TDOAs, (n,) m."""
     residuals, ranges = run.residuals, run.aids.get(RANGES)
     rows = (
         {name: getattr(residuals, name) for name in OF_ROW}
@@ -245,7 +255,7 @@ def _used(run: Run) -> np.ndarray:
 
 
 def _blocks(judged: Score) -> np.ndarray:
-    """(b, 5) per block of 5 s: sums of squared 3D errors, counts, sums of errors."""
+    """Return sums per block of 5 s, (b, 5): squared 3D errors m^2, counts, errors x, y, z m."""
     if not len(judged.t):
         return np.zeros((1, 5))
     block = numbered(judged.t, BLOCK)
@@ -261,7 +271,7 @@ def _blocks(judged: Score) -> np.ndarray:
 
 
 def _interval(blocks: Sequence[np.ndarray]) -> list[float] | None:
-    """95 % interval of the 3D RMSE: [low, high], m."""
+    """Return the 95 % interval of the 3D RMSE, [low, high] m."""
     together = np.concatenate(blocks)
     draws = _draws(together, np.zeros((BOOTSTRAPS, len(together), 3)))
     return (
@@ -270,8 +280,9 @@ def _interval(blocks: Sequence[np.ndarray]) -> list[float] | None:
 
 
 def _draws(blocks: np.ndarray, shifts: np.ndarray) -> np.ndarray:
-    """(BOOTSTRAPS,) m: the 3D RMSE of blocks (b, 5) drawn at random, whose errors are all off by
-    shifts (BOOTSTRAPS, b, 3), m.
+    """Return the 3D RMSE of bootstrap samples of blocks, (BOOTSTRAPS,) m.
+
+    blocks : (b, 5), as of `_blocks`; shifts : (BOOTSTRAPS, b, 3) m, added to the errors
     """
     chosen = np.random.default_rng(0).integers(0, len(blocks), (BOOTSTRAPS, len(blocks)))
     power, count, error = blocks[chosen, 0], blocks[chosen, 1], blocks[chosen, 2:]
@@ -286,9 +297,11 @@ def _gain_interval(
     names: Sequence[str],
     shift_std: Callable[[str], np.ndarray],
 ) -> list[float] | None:
-    """95 % interval of the share of the 3D RMSE that is gone, the same blocks drawn for both, with
-    references that are off by what they may be, alike in all of a flight. before, after : [(b, 5)],
-    blocks of each case; names : of their flights.
+    """Return the 95 % interval of the relative decrease of the 3D RMSE.
+
+    Both sides use the same bootstrap samples. Each sample shifts the reference of each flight.
+
+    before, after : [(b, 5)], blocks of each case; names : of their flights
     """
     blocks, others = np.concatenate(before), np.concatenate(after)
     if len(blocks) != len(others):
@@ -302,6 +315,7 @@ def _gain_interval(
         [np.repeat(off[name][:, None], len(some), axis=1) for name, some in zip(names, before)],
         axis=1,
     )
+    # The same random seed draws the same blocks for both sides.
     gain = 1.0 - _draws(others, shifts) / np.maximum(_draws(blocks, shifts), 1e-12)
     return (
         [float(x) for x in np.quantile(gain, [0.025, 0.975])] if np.isfinite(gain).all() else None

@@ -1,10 +1,10 @@
 """Constraints: knowledge besides TDOAs and IMU for a calibration without ground truth.
 
-A constraint of a flight (`flight` is its name) has `stamps(begin)`, s, ascending, at which it needs
-the estimate, and `equations(t, estimate, covariance, moved)`. A constraint of anchors (`flight` is
-None) has `equations(anchors, columns)`. Both return (gram (k, k), vector (k,)) of normal equations
-of the errors of the coordinates of the anchors, anchor by anchor, of the delays and of further
-parameters.
+A constraint of a flight (`flight` is its name) has `stamps(begin)` and `equations(t, estimate,
+covariance, moved)`. It needs the estimate at these ascending stamps, s. A constraint of anchors
+(`flight` is None) has `equations(anchors, columns)`. Both return (gram (k, k), vector (k,)) of
+normal equations. The unknowns are the errors of the anchor coordinates, anchor by anchor, then
+delays, then further parameters.
 """
 
 from __future__ import annotations
@@ -120,8 +120,9 @@ class OdometryPath:
     ) -> tuple[np.ndarray, float]:
         """Return the path at stamps `wanted`, (k, 3) m, world, and the std of its common shift, m.
 
-        The path is turned about the vertical and shifted to fit the estimate. Then its start and its
-        drift are corrected by the mean of a random walk, given the estimate and the marks.
+        The path is turned about the vertical and shifted to fit the estimate. Then its start and
+        drift are corrected by the posterior mean of a random walk. The estimate and the marks are
+        its data.
 
         t : (m,) s; estimate : (m, 3) m, world, at t; begin : stamp of the first TDOA, s
         """

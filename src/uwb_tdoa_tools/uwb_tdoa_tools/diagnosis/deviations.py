@@ -1,13 +1,13 @@
-"""How far anchors may be from where a fit with ground truth puts them: deviations that hold.
+"""Compute realistic standard deviations of anchor parameters fitted with ground truth.
 
-A fit states how well the data determine its values, if its model is the right one. Positions and
-delays of anchors take what other systematic errors leave unexplained, in the same way at every
-place, so that no scatter between blocks of time shows it. So they are fitted once more, with the
-information that errors leave which last as long as the flight, beside what can take their place: a
-smooth function of the place for every anchor, as large as the evidence says, as what an antenna
-adds in each direction is; and coordinates and delays of anchors that the fit takes for zero.
-Coordinates may be off by COORDINATE_STDS, each as probable as the data make it, delays by UNSAID.
-All these are integrated out. What a value is away from that counts as its error.
+The covariance of a fit assumes a correct model. Positions and delays of anchors absorb other
+systematic errors. These errors are equal at each place, so no scatter between blocks of time shows
+them. A second fit uses the information that remains if errors last as long as the flight. It
+marginalizes parameters that can replace anchor errors. One kind is a smooth function of the place
+for each anchor, such as an antenna's directional error. The other kind are coordinates and delays
+that the fit sets to 0. The evidence selects the size of the functions. Unfitted coordinates have
+standard deviations COORDINATE_STDS, weighted by evidence; delays have UNSAID. The difference
+between both fits counts as an error.
 """
 
 from __future__ import annotations
@@ -34,20 +34,23 @@ if TYPE_CHECKING:
     from .regression.terms import Column
     from .self_calibration.prior import Solution
 
-# m over which functions of the place change; the shift of an anchor makes errors that change as
-# slowly
+# m, length scale of functions of the place; the error of an anchor shift varies equally slowly
 LENGTH = 4.0
-UNSAID = 0.03  # m, that coordinates and delays may be off by, of which no anchor has any in the fit
-COORDINATE_STDS = 0.001, 0.003, 0.01, UNSAID  # m, the same of coordinates: the data show how much
-SAME = 1e-4  # m, by which that mean may differ from zero
-# take what other errors leave that last as long as the flight
+# m, prior standard deviation of coordinates and delays if the fit has none of that kind
+UNSAID = 0.03
+# m, the same for coordinates; the evidence weights them
+COORDINATE_STDS = 0.001, 0.003, 0.01, UNSAID
+SAME = 1e-4  # m, prior standard deviation of the mean of the delays
+# effects that absorb errors as long as the flight
 LASTS = (*OF_ANCHORS, "tag_lever_arm")
-LASTING = 14.0  # by which errors that are alike for a while are alike for longer than blocks tell
+# factor on the excess inflation: errors correlated within a block last longer than blocks show
+LASTING = 14.0
 
 
 def with_deviations(selection: Selection) -> Selection:
-    """The Selection with standard deviations of positions and delays of anchors, and of the place
-    of the antenna, that hold; as it is where there are none, or where the path is not known.
+    """Return the Selection with realistic standard deviations of anchors and of the lever arm.
+
+    It stays unchanged without such parameters, or if the path is unknown.
     """
     table, model = selection.table, selection.fit
     places = [k for k, column in enumerate(model.columns) if column.effect[0] in LASTS]
@@ -62,8 +65,9 @@ def with_deviations(selection: Selection) -> Selection:
 
 
 def _beside_others(table: RegressionTable, model: Fit) -> tuple[np.ndarray, np.ndarray]:
-    """(by how much the values are others (k,), their covariance (k, k)) of the columns of a Fit,
-    with what can take the place of anchors integrated out.
+    """Return the change of the values of a Fit (k,), and their covariance (k, k).
+
+    Parameters that can replace anchor errors are marginalized.
     """
     rows, known, near = (
         table.radio_rows,
@@ -82,7 +86,7 @@ def _beside_others(table: RegressionTable, model: Fit) -> tuple[np.ndarray, np.n
     )
     sizes = np.array([column.typical if column.effect in known else UNSAID for column in others])
     late = table.matrix([column for column in beside if column.effect == (DELAY,)], rows)
-    if table.sparse:  # other rows have nothing to do with these anchors
+    if table.sparse:  # other rows do not depend on these anchors
         ends = np.array([RADIO[name].ends if name in RADIO else 0 for name in table.channels])
         inside = np.flatnonzero(counts(late, 1) == ends[table.channel[rows]])
         rows, late, mine = rows[inside], late[inside], mine[inside]
@@ -115,9 +119,12 @@ def _beside_others(table: RegressionTable, model: Fit) -> tuple[np.ndarray, np.n
 
 
 def _common_delay(table: RegressionTable, columns: Sequence[Column], n: int) -> np.ndarray:
-    """(k,), what makes of values of Columns the mean of the delays beyond the first n, those that a
-    fit takes for zero; 0 where the fit has none or all delays, or where what all have in common
-    does not cancel. A delay in the fit is the difference from this mean.
+    """Return the row that gives the mean of the unfitted delays, (k,).
+
+    A fitted delay is the difference from this mean. The row is 0 if the fit has no delay, or all
+    delays. It is also 0 if a common delay does not cancel.
+
+    columns : k Columns; n : number of fitted ones, which come first
     """
     late = np.array([column.effect == (DELAY,) for column in columns])
     beyond = late & (np.arange(len(columns)) >= n)
@@ -126,14 +133,14 @@ def _common_delay(table: RegressionTable, columns: Sequence[Column], n: int) -> 
 
 
 def _anchor(column: Column) -> str:
-    """Id of the anchor that a Column of a position or a delay is of: text."""
+    """Return the id, as text, of the anchor of a position or delay."""
     return column.key.partition(".")[0]
 
 
 def _heard_with(table: RegressionTable, model: Fit) -> set[str] | None:
-    """Ids of the anchors whose positions or delays a Fit determines, and of all that are heard in
-    the same blocks as any of them: set of texts. None for all anchors: of few, or of several
-    installations.
+    """Return ids of anchors with fitted positions or delays, and of anchors in the same blocks.
+
+    None means all anchors: with few anchors, or several installations.
     """
     parts = table.radio_parts
     ids = parts[0].samples.anchors.ids

@@ -1,4 +1,4 @@
-"""The whole loop in one call."""
+"""Run the complete diagnosis in one call."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
     Flights = tuple[Flight, ...]
 
-# share of the slow innovations that a self-calibration must explain, to be a finding
+# smallest share of the power of slow innovations that a self-calibration must explain
 EXPLAINED = 0.1
 CANNOT_JUDGE = "without ground truth nobody can tell whether taking it out helps the position"
 
@@ -54,15 +54,29 @@ def diagnose(
     progress: Callable[[str], object] = lambda what: None,
     map_function: MapFunction = map,
 ) -> Diagnosis:
-    """Diagnosis of Flights.
+    """Diagnose Flights: find effects, validate them, and return a Diagnosis.
 
-    holdout : Flights to judge on; base : EffectSet that is in the model already; config :
-        FilterConfig; reference :
-    Reference, by default the recorded ground truth; progress(what) is called every few seconds at
-    least;
-    map_function : as of `attribute`, of work on single flights.
-    Raises InputError where a flight cannot be used: flights of different anchors, or without the
-    reference.
+    Parameters
+    ----------
+    flights : sequence of Flight
+        Flights to fit, all with the same anchors.
+    holdout : sequence of Flight
+        Flights for validation only.
+    base : EffectSet
+        Effects that are already in the model.
+    config : FilterConfig, optional
+        Configuration of the filter.
+    reference : Reference, optional
+        The recorded ground truth by default.
+    progress : function
+        progress(text) is called every few seconds.
+    map_function : function
+        As of `attribute`, for work on single flights.
+
+    Raises
+    ------
+    InputError
+        If flights have different anchors, or a flight lacks the reference.
     """
     reference = reference or GroundTruth()
     same_anchors([*flights, *holdout])
@@ -129,7 +143,7 @@ def diagnose(
 
 
 class _Work(NamedTuple):
-    """What a diagnosis was asked for, as `diagnose` takes it."""
+    """The arguments of `diagnose`."""
 
     reference: Reference
     base: EffectSet
@@ -138,16 +152,18 @@ class _Work(NamedTuple):
     map_function: MapFunction
 
     def saying(self, what: str) -> Callable[[], object]:
-        """A function that tells `progress` what goes on."""
+        """Return a function that passes a text to `progress`."""
         return lambda: self.progress(what)
 
 
 @dataclass(frozen=True, eq=False)
 class _Outcome:
-    """What becomes of an Attribution: findings : [EffectFinding]; effects : EffectSet, the base and
-    what is added; refused : [Refused];
-    sides : (before, after), as of Diagnosis; judged_on; attribution : with what was known beside;
-        baseline : Baseline; changes.
+    """The validated result of an Attribution.
+
+    effects : EffectSet, the base and the added effects; refused : [Refused]
+    sides : (before, after) and judged_on, as of Diagnosis
+    attribution : Attribution with repairs of ids and signs; baseline : Baseline; changes :
+        sentences
     """
 
     findings: list[EffectFinding]
@@ -168,12 +184,14 @@ def _by_error(
     rest: EffectSet,
     repairs: dict[Detection, float],
 ) -> _Outcome:
-    """_Outcome where the reference tells errors of the position: what makes them smaller. flights :
-    as they are, and without wrong ids and signs, whose effects are not in `rest`, but in `repairs`.
+    """Return the _Outcome if the position errors are known: effects are added if errors fall.
+
+    flights : as recorded, and with correct ids and signs
+    rest : EffectSet of the base without effects on ids and signs; repairs : {Detection: worth, m}
     """
     (fitted, sound), base, config, map_function = flights, work.base, work.config, work.map_function
     trying = work.saying("running the filter without each")
-    # A finding stays one even if the filter does without it; it is only not added.
+    # The report keeps a finding that does not help the filter, but it is not added.
     model = replace(found, selection=written(found.selection, found.candidates))
     selected = validation.select_by_error(
         model, sound, comparison.Baseline(rest, config), trying, map_function
@@ -194,7 +212,7 @@ def _by_error(
     why_not = comparison.why_not(before, after, shift_std)
     if why_not and len(effects) > len(base) + len(
         attribution.of_floor
-    ):  # of those it tells nothing
+    ):  # errors in the air do not judge effects near the floor
         refused.append(Refused("all", why_not))
         selected = validation.ValidatedSelection(
             attribution.selection.only(()), (), (), selected.worth
@@ -214,12 +232,11 @@ def _by_self_calibration(
     held_out: Flights,
     rest: EffectSet,
 ) -> _Outcome:
-    """_Outcome where nobody knows errors of the position: positions and delays of anchors together,
-    or nothing.
+    """Return the _Outcome if the position errors are unknown: anchors are calibrated, or nothing.
 
-    A model that is wrong makes innovations smaller too, by pushing the path to where they are. On
-    measured flights functions of the place, fitted to some, made innovations of others smaller and
-    doubled the error of the position.
+    Smaller innovations do not prove a correct model, because the estimate can follow a wrong model.
+    On measured flights, functions of the place were fitted to some flights. They reduced the
+    innovations of other flights and doubled the position error.
     """
     (fitted, sound), effects, baseline = (
         flights,
@@ -233,7 +250,7 @@ def _by_self_calibration(
     config = work.config or FilterConfig()
     ranged = any(
         may_have_offset(flight, config) for flight in sound
-    )  # then the delay of the tag was taken out of the innovations
+    )  # then the innovations are already free of the antenna delay of the tag
     if chosen or ranged or rest.covariance is not None or work.reference.constraints:
         calibration = _calibrated(work, sound, rest)
         if isinstance(calibration, str):
@@ -288,13 +305,11 @@ def _by_self_calibration(
 
 
 def _calibrated(work: _Work, flights: Flights, base: EffectSet) -> SelfCalibration | str:
-    """SelfCalibration of Flights beside the EffectSet `base`, or why nothing of one is to be
-    applied.
-    """
+    """Return the SelfCalibration of Flights with the EffectSet `base`, or why it is not applied."""
     known, trying = work.reference.constraints, work.saying("calibrating anchors")
     try:
         found = self_calibrate(flights, Tape(), base, work.config, known, trying, work.map_function)
-    except InputError as error:  # flights that are too short for that alone
+    except InputError as error:  # flights too short for a self-calibration
         return str(error).rstrip(".")
     if found.why_not is None and found.explained < EXPLAINED:
         return (
@@ -310,8 +325,10 @@ def _findings(
     detections: Sequence[Detection],
     worth: dict[Candidate | Detection, float],
 ) -> list[EffectFinding]:
-    """[EffectFinding]: those of the model that is written, with the values that are written, then
-    others that were found. worth : as of ValidatedSelection, of candidates and of detections.
+    """Return the EffectFindings: first those in the written model, then the others.
+
+    model : findings with the written values; others : all findings
+    worth : as of ValidatedSelection, of candidates and detections
     """
     detected = {detection.effect.name: detection for detection in detections}
 

@@ -1,4 +1,4 @@
-"""Where effects were seen: the ranges of their covariates in the flights that they were fitted to."""
+"""Domains of effects: the ranges of their covariates in the fitted flights."""
 
 from __future__ import annotations
 
@@ -16,18 +16,21 @@ if TYPE_CHECKING:
 
 
 class Seen:
-    """Ranges of covariates in the residuals of some flights, each found once."""
+    """Ranges of covariates in the residuals of some flights, computed on demand."""
 
     def __init__(self, residuals: Sequence[ChannelResiduals]) -> None:
-        """residuals : [{channel: ChannelResidual}], one for each flight."""
+        """Take [{channel: ChannelResidual}], one dict per flight."""
         self._residuals = residuals
         self._ranges: dict[tuple[int, str, str], tuple[float, float] | None] = {}
 
     def limited(
         self, effects: Iterable[Effect], flights: Sequence[int] | None = None
     ) -> list[Effect]:
-        """Effects with the domain in which some flights, by their numbers, saw them; default: all.
-        What is not a function of anything, and what has a domain already, stays as it is: list.
+        """Return Effects with their domain: the range of each covariate in some flights.
+
+        Effects without covariates, and effects with a domain, stay unchanged.
+
+        flights : their numbers; all by default
         """
         numbers = range(len(self._residuals)) if flights is None else flights
         return [
@@ -49,7 +52,7 @@ class Seen:
         return out
 
     def _range(self, number: int, channel: str, covariate: str) -> tuple[float, float] | None:
-        """(least, largest) of a covariate in a channel of a flight; None where it is not known."""
+        """Return (least, largest) of a covariate in a channel of a flight; None if unknown."""
         key = number, channel, covariate
         if key not in self._ranges:
             part = self._residuals[number].get(channel)

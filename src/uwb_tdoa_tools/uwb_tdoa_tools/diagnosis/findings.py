@@ -1,4 +1,4 @@
-"""What a diagnosis says."""
+"""Findings of a diagnosis."""
 
 from __future__ import annotations
 
@@ -15,22 +15,24 @@ if TYPE_CHECKING:
     from .regression.terms import Candidate
 
 
-LEAST_WORTH = 0.005  # m that a finding may be worth, to come before one that is surer
+# m, added to the worth of a finding, so that a certain finding precedes an uncertain worthless one
+LEAST_WORTH = 0.005
 
 
 @dataclass(frozen=True, eq=False)
 class EffectFinding:
-    """An effect that was found.
+    """An effect that the diagnosis found.
 
-    effect : Effect with values and std; channel : where it shows most; evidence : {figure: number};
-        explained : share of
-    the channel's variance on held-out rows; alternatives : (Alternative, ...); candidates : the
-    (Candidate, ...) it was, () for what a detector found in what is left; added : is in the model
-    that is written; worth : m by which the filter's 3D RMSE is larger without it, None if nobody
-    tried; together_with : covariates of the same candidate; shares : (Share, ...) of
-    `over_flights`, how much of it each flight shows; flight : name of the only flight that shows
-    it, None for what was fitted to all; on_floor : was found near the floor, beside all that was
-    found in the air.
+    effect : Effect with values and standard deviations; channel : the channel that shows it most
+    evidence : {figure: number}; explained : explained share of the variance of hold-out rows of the
+        channel
+    alternatives : (Alternative, ...); candidates : its (Candidate, ...), () for a detector's
+        finding
+    added : whether the written model contains it
+    worth : m, increase of the filter's 3D RMSE without it; None if not tried
+    together_with : covariates of the same candidate; shares : (Share, ...), amount in each flight
+    flight : name of the only flight with it; None for a fit to all flights
+    on_floor : whether it was found near the floor, beyond effects in the air
     """
 
     effect: Effect
@@ -48,35 +50,33 @@ class EffectFinding:
 
     @property
     def declared(self) -> bool:
-        """Whether it is in the catalogue, not a function without a name."""
+        """Return whether it is in the catalogue, not a function without a name."""
         return self.function is None
 
     @property
     def function(self) -> SmoothTerm | None:
-        """Its Effect, if that is a function without a name."""
+        """Return its Effect if that is a function without a name, else None."""
         return self.effect if isinstance(self.effect, SmoothTerm) else None
 
     @property
     def prominence(self) -> float:
-        """How sure and how large it is, to put findings in order: what it gains in likelihood,
-        times what it is worth.
-        """
+        """Return the key that orders findings: gain in likelihood times worth."""
         return self.evidence.get("criterion", 1.0) * (max(self.worth or 0.0, 0.0) + LEAST_WORTH)
 
     @property
     def key(self) -> tuple[Hashable, str | None]:
-        """Hashable: equal for findings of one effect."""
+        """Return a key that is equal for findings of one effect."""
         return (self.effect.name if self.declared else self.effect.merge_key), self.flight
 
 
 @dataclass(frozen=True)
 class Refused:
-    """Something that was looked at and is not in the model: what, and why not."""
+    """A candidate that is not in the model, and the reason."""
 
     what: str
     why: str
 
 
 def usable(effects: Iterable[Effect]) -> EffectSet:
-    """EffectSet of those of some Effects that nodes can take out."""
+    """Return the EffectSet of the Effects that nodes can correct."""
     return EffectSet(tuple(effect for effect in effects if effect.usable))

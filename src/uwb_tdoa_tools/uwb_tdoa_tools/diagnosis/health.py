@@ -1,4 +1,4 @@
-"""Health of every channel, and of the filter."""
+"""Health figures of each channel and of the filter."""
 
 from __future__ import annotations
 
@@ -15,13 +15,16 @@ if TYPE_CHECKING:
     from .channels import ChannelResiduals
     from .channels.base import Figures
 
-KEYS = ("pairs", "anchors", "axes", "cross_correlation")  # of what channels tell
+KEYS = ("pairs", "anchors", "axes", "cross_correlation")  # figures of channels
 
 
 def health(residuals: Sequence[ChannelResiduals], scores: Sequence[Score] = ()) -> Figures:
-    """What [{channel: ChannelResidual}] look like: {"pairs", "anchors", "axes",
-    "cross_correlation", "filter"}, each a list of dicts. scores : Score of each flight, for NIS (1
-    is honest) and NEES (3 is honest).
+    """Return figures of residuals and of the filter, each a list of dicts.
+
+    The keys are "pairs", "anchors", "axes", "cross_correlation" and "filter".
+
+    residuals : [{channel: ChannelResidual}], one per flight
+    scores : Score of each flight, for NIS (expected 1) and NEES (expected 3)
     """
     out: Figures = {key: [] for key in KEYS}
     for name, channel in CHANNELS.items():
@@ -35,7 +38,7 @@ def _filter(score: Score) -> dict[str, Any]:
     return {
         "flight": score.name,
         "nis_mean": float(score.nis.mean()),
-        "nis_below_3.84": float(np.mean(score.nis < 3.84)),  # 95 % of an honest one
+        "nis_below_3.84": float(np.mean(score.nis < 3.84)),  # 95 % if the filter is consistent
         "nees_mean": float(np.mean(score.nees)),
         "nees_below_7.81": float(np.mean(score.nees < 7.81)),
     }

@@ -1,4 +1,4 @@
-"""What noise the filter should assume beside a calibration: a parameter file for ekf_node."""
+"""Write a parameter file for ekf_node with the measured noise."""
 
 from __future__ import annotations
 
@@ -21,9 +21,12 @@ PARAMETERS = """/**:
 def write_parameters(
     path: Path, tdoa_std: float | None, config: FilterConfig | None = None
 ) -> Path | None:
-    """Write the parameters of ekf_node, and return the path. tdoa_std : m; where that is None
-    nothing is written, and what was there is removed; config : of the filter that it was measured
-    with, whose parameters that are not the default are written too.
+    """Write parameters of ekf_node, and return the path, or None.
+
+    Parameters of the filter that differ from the default are written too.
+
+    path : of the file; tdoa_std : m, None removes the file
+    config : FilterConfig with which tdoa_std was measured
     """
     if tdoa_std is None:
         path.unlink(missing_ok=True)

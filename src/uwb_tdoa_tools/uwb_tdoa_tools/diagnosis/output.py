@@ -1,4 +1,4 @@
-"""A diagnosis for machines, and in a few lines. Both say what the report says, in its order."""
+"""Write a Diagnosis as JSON and as text for the screen. Both follow the order of the report."""
 
 from __future__ import annotations
 
@@ -22,11 +22,14 @@ if TYPE_CHECKING:
     from .findings import EffectFinding
     from .result import Diagnosis
 
-WIDTH, LABEL = 120, 10  # columns of the screen, and of them for what a line is
+WIDTH, LABEL = 120, 10  # characters of a line on the screen, and of its label
 
 
 def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
-    """What diagnosis.json holds: plain values. Its keys are described in docs/diagnosis.md."""
+    """Return the content of diagnosis.json as plain values.
+
+    docs/diagnosis.md describes its keys.
+    """
     return outputs.as_json(
         {
             "verdict": verdict(diagnosis).sentences,
@@ -61,8 +64,9 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
 
 
 def as_text(diagnosis: Diagnosis) -> str:
-    """Lines for the screen: verdict, what to do, what was found and its worth, what was not
-    determined, what to run.
+    """Return the lines for the screen.
+
+    They are the verdict, advice, findings with their worth, undetermined parameters, and commands.
     """
     found = entries(diagnosis)
     lines = [
@@ -177,7 +181,7 @@ def _alternatives(finding: EffectFinding) -> list[dict[str, Any]]:
 
 
 def _ambiguous(diagnosis: Diagnosis) -> list[dict[str, Any]]:
-    """Findings that another effect would explain nearly as well."""
+    """Return findings that another effect explains nearly equally well."""
     return [
         {
             "found": entry.title,

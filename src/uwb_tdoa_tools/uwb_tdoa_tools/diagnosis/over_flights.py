@@ -1,6 +1,4 @@
-"""Several flights: whether a finding is the same in all, differs, grows from one to the next, or
-belongs to one alone.
-"""
+"""Compare a finding between flights: equal, different, growing, or in one flight only."""
 
 from __future__ import annotations
 
@@ -24,19 +22,21 @@ if TYPE_CHECKING:
     from .regression.table import RegressionTable
     from .regression.terms import Candidate
 
-DETERMINED = 0.25  # standard deviation of a share, below which the flight determines it
-SURE = 4.0  # standard deviations
-# share by which flights may differ and count as the same: models are never right to less
+DETERMINED = 0.25  # largest standard deviation of a share that a flight determines
+SURE = 4.0  # standard deviations of a significant difference
+# largest difference of equal shares; no model is more accurate
 ALIKE = 0.3
-GROWN = 0.5  # share by which the last flight must be beyond the first, to call it growing
+GROWN = 0.5  # smallest growth of the share, from the first flight to the last
 
 ALL, ALONE, GROWS, DIFFERS = "all", "alone", "grows", "differs"
 
 
 @dataclass(frozen=True)
 class Share:
-    """How much of a finding a flight shows. flight : its name; share, std : 1 is what all flights
-    together show; std is infinite where it shows nothing.
+    """The amount of a finding in one flight.
+
+    flight : name; share : 1 is the value of the fit to all flights; std : infinite without
+        information
     """
 
     flight: str
@@ -45,8 +45,10 @@ class Share:
 
     @classmethod
     def fitted(cls, flight: str, power: float, score: float) -> Share:
-        """Of a fit of one factor. power, score : second and first derivative of the log-likelihood
-        by it, at 0.
+        """Return the Share of a fit of one factor.
+
+        power : minus the second derivative of the log-likelihood by the factor; score : the first,
+            at 0
         """
         return (
             cls(flight, float(score / power), float(power**-0.5))
@@ -56,13 +58,14 @@ class Share:
 
     @property
     def determined(self) -> bool:
-        """Whether the flight determines it."""
+        """Return whether the flight determines the share."""
         return self.std < DETERMINED
 
 
 def shares(selection: Selection, candidate: Candidate, names: Sequence[str]) -> tuple[Share, ...]:
-    """(Share, ...) of a chosen Candidate, one for each flight of its RegressionTable, which has
-    `names`: a fit of one factor to the rows of each.
+    """Return the Share of a chosen Candidate in each flight: a fit of one factor to its rows.
+
+    names : of the flights of the RegressionTable
     """
     table, model = selection.table, selection.fit
     part = table.matrix(candidate.columns) @ model.values(candidate.columns)
@@ -90,8 +93,9 @@ def _shares(
 
 
 def course(several: Sequence[Share]) -> str | None:
-    """ALL, ALONE, GROWS or DIFFERS of (Share, ...) in the order of the flights; None where fewer
-    than two determine it.
+    """Return ALL, ALONE, GROWS or DIFFERS; None if fewer than two flights determine a share.
+
+    several : Shares in the order of the flights
     """
     determined = [each for each in several if each.determined]
     if len(determined) < 2:
@@ -122,7 +126,7 @@ def course(several: Sequence[Share]) -> str | None:
 
 
 def in_words(several: Sequence[Share]) -> str:
-    """A sentence on (Share, ...); "" where flights do not determine it."""
+    """Return a sentence on Shares; "" if the flights do not determine them."""
     kind, determined = course(several), [each for each in several if each.determined]
     if kind is None:
         return ""
@@ -141,12 +145,13 @@ def of_one(
     search: Search,
     map_function: MapFunction = map,
 ) -> list[tuple[int, Selection]]:
-    """[(flight, Selection)] of what each flight alone shows of its own, of [{channel:
-    ChannelResidual}] that a model of all leaves.
+    """Return [(flight, Selection)]: effects in one flight only, which a common model leaves.
 
-    inflation : of the fit of all; views(table) -> {channel: [CovariateView]}; search : as `select`
-        takes it;
-    map_function : as of `attribute`. What another flight shows too is not of one alone.
+    An effect that another flight shows too is left out.
+
+    remaining : [{channel: ChannelResidual}] under the common model; inflation : of the common fit
+    views : views(table) returns {channel: [CovariateView]}; search : as of `select`
+    map_function : as of `attribute`
     """
     out = []
     for number, selection in enumerate(
@@ -170,7 +175,7 @@ def _selection(
     search: Search,
     residuals: ChannelResiduals,
 ) -> Selection | None:
-    """Selection of what the residuals of a flight show; None if that is nothing."""
+    """Return the Selection for the residuals of one flight; None if it is empty."""
     table = table_of([residuals])
     selection = select(table, [], inflation, search, Scan(table, views(table)))
     return selection if selection.chosen else None
@@ -179,7 +184,10 @@ def _selection(
 def _elsewhere(
     selection: Selection, candidate: Candidate, remaining: list[ChannelResiduals], number: int
 ) -> bool:
-    """Whether another flight shows a good part of a Candidate that was found in flight `number`."""
+    """Return whether another flight shows a Candidate of flight `number` too.
+
+    Its determined share there must exceed ALIKE.
+    """
     fit = selection.fit
     for other in remaining[:number] + remaining[number + 1 :]:
         table = table_of([other]).with_terms(candidate.terms)

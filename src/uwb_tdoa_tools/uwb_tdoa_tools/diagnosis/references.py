@@ -1,4 +1,4 @@
-"""References: the paths that flights are compared with, and which of their coordinates are known."""
+"""References: the paths that flights are compared with, and their known coordinates."""
 
 from __future__ import annotations
 
@@ -121,7 +121,10 @@ class GroundTruth(Reference):
         constraints: Sequence[Constraint | OdometryPath] = (),
         align: str = NONE,
     ) -> None:
-        """Take `align` as in `scoring.evaluation.align_truth`; a known pose needs no more."""
+        """Take `align`, as of `scoring.evaluation.align_truth`.
+
+        The other arguments are not used.
+        """
         self._align = align
 
     def prepare(self, flight: Flight) -> Flight:
@@ -152,8 +155,8 @@ class Nothing(Reference):
     """No reference: the residuals are the innovations of the filter.
 
     They are of TDOAs, or of ranges in a flight without TDOAs. The estimate follows an effect in
-    part, so regressors are computed for innovations. A common offset of all ranges is corrected first,
-    because it bends the path; `self_calibrate` estimates it.
+    part, so regressors are computed for innovations. A common offset of all ranges is corrected
+    first, because it bends the path; `self_calibrate` estimates it.
     """
 
     positions_known = (False, False, False)
@@ -179,7 +182,7 @@ class Nothing(Reference):
         return without_truth(flight)
 
     def on_floor(self, poses: Truth) -> bool:
-        """Return whether estimated poses are those of a vehicle that never leaves the floor.
+        """Return whether estimated poses belong to a vehicle that never leaves the floor.
 
         The estimated height of such a vehicle exceeds AIRBORNE now and then, but not for long.
         """
@@ -246,8 +249,8 @@ class Heights(GroundTruth):
 class OdometryReference(GroundTruth):
     """The path of another odometry, fitted to the path of the filter and to marks.
 
-    Without marks a common shift and yaw of a flight are not observable: the filter sets
-    them. Marks at take-off and landing are enough.
+    Without marks a common shift and yaw of a flight are not observable: the filter sets them. Marks
+    at take-off and landing are enough.
     """
 
     attitude_known = False

@@ -1,6 +1,4 @@
-"""A selection refined: about its own values, with functions without a name, and without what does
-not hold on other data.
-"""
+"""Refine a selection: relinearize, add functions without a name, and cross-validate."""
 
 from __future__ import annotations
 
@@ -29,18 +27,19 @@ if TYPE_CHECKING:
     from .regression.select import Search, Selection
     from .regression.table import RegressionTable
 
-ROUNDS = 2  # of linearising about what was found
-LINEARITY_LIMIT = 0.1  # of the channel's scale: root mean square by which a linear model may be off
-# held-out log-likelihood, twice, and its t value over blocks, that maps must bring
+ROUNDS = 2  # number of linearizations
+LINEARITY_LIMIT = 0.1  # largest RMS error of linearization, relative to the channel's scale
+# smallest gain of maps on hold-out data (twice a log-likelihood), and its t value over blocks
 MAPS_GAIN, MAPS_SURE = (20.0, 3.0)
-DISGUISED = 4  # times that what disguises itself as noise is searched for before noise is measured
-SAME_STORY = 0.05  # share of what a model explains that a simpler one may explain less
-MIN_GAIN = 2.0  # held-out log-likelihood, twice, that a term must bring
+DISGUISED = 4  # searches for effects that look like noise, before the noise is measured
+SAME_STORY = 0.05  # largest share of a model's gain that a simpler model may lack
+MIN_GAIN = 2.0  # smallest gain of a term on hold-out data, twice a log-likelihood
 
 
 def effects_of(selection: Selection) -> tuple[Effect, ...]:
-    """The chosen Candidates with the values of the fit, parameters of one effect together, within
-    the bounds of the effect: tuple of Effects.
+    """Return the Effects of the chosen Candidates with fitted values, clipped to their bounds.
+
+    Parameters of one effect are merged.
     """
     values: dict[Hashable, dict[str, float]] = {}
     std: dict[Hashable, dict[str, float]] = {}
@@ -64,10 +63,11 @@ def effects_of(selection: Selection) -> tuple[Effect, ...]:
 
 
 def written(selection: Selection, declared: Sequence[Candidate]) -> Selection:
-    """The Selection that effects.yaml can hold: without functions of what no node has, with the
-    Candidates of the catalogue that are worth it in their place, and fitted anew, so that each
-    value is that of this model. Errors of the ground truth, and what the filter judges itself,
-    stay: no node meets them.
+    """Return the Selection that effects.yaml can hold.
+
+    Functions of covariates that nodes lack are dropped. Declared Candidates can replace them, and
+    the fit is repeated. Errors of the ground truth, and properties that the filter estimates, stay:
+    they do not affect nodes.
     """
     kept = selection.where(lambda effect: effect.usable or not isinstance(effect, SmoothTerm))
     if kept is selection:
@@ -76,15 +76,16 @@ def written(selection: Selection, declared: Sequence[Candidate]) -> Selection:
 
 
 def entry_of(effect: Effect) -> Hashable:
-    """Equal for Effects that are one entry of effects.yaml."""
+    """Return a key that is equal for Effects of one entry in effects.yaml."""
     return effect.merge_key if isinstance(effect, SmoothTerm) else effect.name
 
 
 def linearised(
     found: Sequence[ChannelResiduals], candidates: Sequence[Candidate], model: Sequence[Effect]
 ) -> RegressionTable:
-    """RegressionTable with the columns of all candidates about `model`, whose contribution is put
-    back: a fit gives whole values, not increments.
+    """Return a RegressionTable of all candidates, linearized at `model`.
+
+    The contribution of `model` is added to y. A fit then gives whole values, not increments.
     """
     here = {effect.merge_key: effect for effect in model}
     terms = [term for candidate in candidates for term in candidate.terms]
@@ -97,8 +98,10 @@ def linearised(
 def inflation_of(
     table: RegressionTable, declared: Sequence[Candidate], search: Search
 ) -> np.ndarray:
-    """(groups,) loss of independence, on the residual of a fit with all that is declared, and with
-    what `search`, as of `select`, finds.
+    """Return the variance inflation of each group, (groups,).
+
+    It is measured on the residual of a fit with all declared effects and effects that `search`
+    finds.
     """
     known, model = list(declared), fit(table, columns_of(declared), covariance=False)
     for _ in range(DISGUISED):
@@ -117,9 +120,12 @@ def relinearised(
     at: Callable[[Sequence[Effect]], list[ChannelResiduals]],
     candidates: Sequence[Candidate],
 ) -> Selection:
-    """The selection fitted anew in a RegressionTable about its own values, with the columns of
-    `candidates`, where it is not as linear as the RegressionTable that it was found in says:
-    positions of anchors that are far off are not.
+    """Return the Selection refitted at its own values, if its linearization error is too large.
+
+    Large shifts of anchors need that.
+
+    at : at(effects) returns residuals under these effects; candidates : whose columns the table
+        gets
     """
     for _ in range(ROUNDS):
         model = effects_of(selection)
@@ -145,9 +151,13 @@ def with_smooth(
     scan_of: Callable[[RegressionTable], Scan],
     progress: Callable[[], object],
 ) -> Selection:
-    """The selection carried on with functions without a name; or begun anew with them in the
-    RegressionTable `unmoved`, about nothing, if that explains more: the declared effect, or the
-    large group of parameters, was a stopgap.
+    """Return the Selection after a search that includes functions without a name.
+
+    The search runs twice: from the present selection, and from an empty one. A declared effect or a
+    large group can otherwise stand in for a function.
+
+    unmoved : RegressionTable linearized at no effects; smooth : Candidates of functions
+    scan_of : scan_of(table) returns its Scan
     """
     everything = [*smooth, *declared]
     terms = [term for candidate in smooth for term in candidate.terms]
@@ -169,9 +179,11 @@ def with_smooth(
 
 
 def _simpler(after: Selection, anew: Selection, choices: int) -> Selection:
-    """Of two Selections the one that is worth more; or, if they tell of other things, the one with
-    fewer parameters where it is hardly worth less: how far a function is off grows with its size,
-    and many parameters can be anything.
+    """Return the better of two Selections, or the simpler one if it explains nearly as much.
+
+    Linearization errors of a function grow with its size, and many parameters fit anything.
+
+    choices : number of candidates
     """
     fewer, more = sorted((after, anew), key=lambda each: len(each.fit.beta))
     nothing = fit(after.table, [], after.fit.inflation).likelihood(after.table)
@@ -185,13 +197,14 @@ def _simpler(after: Selection, anew: Selection, choices: int) -> Selection:
 def with_maps(
     selection: Selection, smooth: Sequence[Candidate], refused: list[Refused]
 ) -> Selection:
-    """Add functions of the place for every anchor, each too weak alone, if together they are
-    plainly worth it on data that they were not fitted to.
+    """Return the Selection with functions of the place of each anchor, if hold-out data agree.
+
+    Each function alone is too weak to be selected; together they must gain clearly.
     """
     taken = {term.effect.merge_key for candidate in selection.chosen for term in candidate.terms}
     for channel in CHANNELS.values():
         terms: dict[Hashable, Term] = {}
-        for candidate in smooth:  # the first of a function is that of all anchors
+        for candidate in smooth:  # the first candidate of a function is common to all anchors
             term = candidate.terms[0]
             function = term.function if channel.name in candidate.channels else None
             if function and function.form == "anchor" and function.covariate in channel.maps:
@@ -220,7 +233,7 @@ def with_maps(
 
 
 def cross_validated(selection: Selection, refused: list[Refused]) -> Selection:
-    """Drop, one by one, what does not help rows that it was not fitted to."""
+    """Return the Selection without terms that do not improve hold-out rows, dropped one by one."""
     while selection.chosen:
         scores = held_out(selection)
         if selection.table.flights >= 3:
@@ -240,7 +253,7 @@ def cross_validated(selection: Selection, refused: list[Refused]) -> Selection:
 
 
 def recurs(candidate: Candidate) -> bool:
-    """Whether it should hold on other flights too: not what happened at a time."""
+    """Return whether a Candidate applies to other flights too: it has no start or end time."""
     return not any(
         key.endswith((".start", ".end")) for term in candidate.terms for key in term.effect.values
     )

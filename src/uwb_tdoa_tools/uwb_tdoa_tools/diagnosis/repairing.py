@@ -1,4 +1,4 @@
-"""Wrong ids and signs, which come before physics: undone, and judged like any other effect."""
+"""Correct wrong ids and signs before the fit, and validate them like any other effect."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ def repaired(
     config: FilterConfig | None = None,
     progress: Callable[[], object] = lambda: None,
 ) -> dict[Detection, float]:
-    """{Detection: m by which the mean 3D RMSE of the filter is larger without it, and those before
-    it} of the LabelEffects that all Flights need beyond the EffectSet `base`, and that make the
-    filter better.
+    """Return the LabelEffects that all Flights need beyond `base`, and that improve the filter.
+
+    The result is {Detection: increase of the mean 3D RMSE without it, m, given the earlier ones}.
     """
     out, effects, error = {}, base.effects, None
     for effect in _common([repairs(base.correct_streams(flight)) for flight in flights]):
@@ -51,8 +51,10 @@ def repaired(
 def sound(
     flights: Sequence[Flight], base: EffectSet, found: Iterable[Detection]
 ) -> tuple[tuple[Flight, ...], EffectSet]:
-    """(Flights without wrong ids and signs, EffectSet of the rest): what `base` and Detections have
-    of these is taken out of the flights, so that pairs and anchors are called by their names.
+    """Return (Flights with correct ids and signs, EffectSet of the other effects of `base`).
+
+    Corrections by `base` and the Detections are applied to the flights, so pairs and anchors have
+    correct names.
     """
     labels = [effect for effect in base.effects if isinstance(effect, LabelEffect)]
     undo = EffectSet((*labels, *(detection.effect for detection in found)))
@@ -63,7 +65,7 @@ def sound(
 def before_others(
     attribution: Attribution, validated: ValidatedSelection, found: dict[Detection, float]
 ) -> tuple[Attribution, ValidatedSelection]:
-    """(Attribution, ValidatedSelection) with Detections and what they are worth, as of `repaired`."""
+    """Return the Attribution and ValidatedSelection with Detections of `repaired` first."""
     worth: dict[Candidate | Detection, float] = dict(found.items())
     return (
         replace(attribution, detections=(*found, *attribution.detections)),
@@ -74,9 +76,7 @@ def before_others(
 
 
 def _common(several: Sequence[Sequence[LabelEffect]]) -> list[LabelEffect]:
-    """Effects with the values that those of every flight have; ids that are not the same in all are
-    left.
-    """
+    """Return Effects with the values on which all flights agree; other values are dropped."""
     out = []
     for effect in several[0]:
         same = [
@@ -103,7 +103,7 @@ def _error(
     config: FilterConfig | None,
     progress: Callable[[], object],
 ) -> float:
-    """Mean 3D RMSE, m, of some of the flights."""
+    """Return the mean 3D RMSE, m, of at most TRIAL_FLIGHTS flights."""
     errors = []
     for flight in flights[:: -(-len(flights) // TRIAL_FLIGHTS)]:
         errors.append(error_of(config, (ValidationCase(flight, EffectSet(tuple(effects))), None)))
@@ -112,7 +112,10 @@ def _error(
 
 
 def _evidence(flight: Flight, effects: Iterable[Effect], effect: LabelEffect) -> dict[str, float]:
-    """Median error, m, at the true place of the TDOAs that the effect changes, with it and without."""
+    """Return the median error, m, of TDOAs that the effect changes, with it and without it.
+
+    The errors are relative to the ground truth.
+    """
     one = KnownPath(EffectSet(tuple(effects)).correct_streams(flight))
     other = one.without(effect)
     with_it, without = one.d - one.true, other.d - other.true

@@ -1,4 +1,4 @@
-"""What a diagnosis says; `output` and `report` write it for machines and for people."""
+"""The result of a diagnosis; `output` and `report` write it."""
 
 from __future__ import annotations
 
@@ -21,18 +21,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """What was found in some flights, and what it is worth.
+    """The effects found in some flights, and their validation.
 
-    flights : (Flight, ...), as the reference leaves them; reference : Reference; findings :
-        [EffectFinding]; effects :
-    EffectSet, the base and what is added; refused : [Refused]; unobservable : [Unobservable];
-    before, after : dicts of `comparison.compare`; judged_on : sentence; health : dict; attribution
-    : Attribution; remaining : [{channel: ChannelResidual}] under `effects`; numbers : {name of a
-    flight: [Finding of checking]}, what is wrong with its numbers; changes : sentences, what is not
-    as in the last calibration;
-    applying : ((command line, what it does), ...), how the effects are put to use;
-    judge_truth : {name of a flight: sentences}, what was wrong with the clock or the frame of its
-        ground truth.
+    flights : (Flight, ...), prepared by the reference; reference : Reference
+    findings : [EffectFinding]; effects : EffectSet, the base and the added effects
+    refused : [Refused]; unobservable : [Unobservable]
+    before, after : results of `comparison.compare`, without and with the added effects; judged_on :
+        sentence, the validation data
+    health : figures of the channels and the filter; attribution : Attribution
+    remaining : [{channel: ChannelResidual}] under `effects`, one per flight
+    numbers : {name of a flight: [Finding of checking]}, errors of a driver, survey or clock
+    changes : sentences, changes since the last calibration
+    applying : ((command line, its purpose), ...), commands that apply the effects
+    judge_truth : {name of a flight: sentences}, clock or frame errors of its ground truth
     """
 
     flights: tuple[Flight, ...]

@@ -1,4 +1,4 @@
-"""The loop closed: the filter with and without the effects, on data that they were not fitted to."""
+"""Validate effects: run the filter with and without them, on data that they were not fitted to."""
 
 from __future__ import annotations
 
@@ -37,18 +37,17 @@ if TYPE_CHECKING:
     from .regression.terms import Candidate
 
     Model = tuple[Sequence[Candidate], Sequence[Detection]]
-    Poses = tuple[np.ndarray, ...]  # as `poses_of` gives them
+    Poses = tuple[np.ndarray, ...]  # return value of `poses_of`
 
 Made = TypeVar("Made")
 
-TRIAL_FLIGHTS = 3  # flights, or halves of one, on which trials are judged
-# shapes of a function of the time that may come again, as a clock warms up
+TRIAL_FLIGHTS = 3  # largest number of flights, or halves of one, in trials
+# shapes of a function of the time that can recur, like the warm-up of a clock
 DRIFTS = ("line", "beyond", "below", "parabola")
-# share of the error by which leaving an effect out must make it smaller, for the effect to be left
-# out
+# An effect is dropped if the error falls by at least this share without it.
 WORSE = 0.005
-# share of the error by which it must grow, for the effect to stay, if a single flight shows it:
-# others differ
+# In a single flight an effect stays only if the error grows by this share without it, because
+# flights differ.
 WORTH_OF_ONE = 0.05
 SELECTED_ON = ", chosen on all of them (--holdout judges the choice too)"
 HELD_OUT = "flights that took no part in the fit"
@@ -57,9 +56,11 @@ SECOND = "give a second flight with this one"
 
 @dataclass(frozen=True, eq=False)
 class ValidatedSelection:
-    """What makes the filter no worse: selection : Selection; detections; refused : (Refused, ...)
-    of the others; worth : {candidate or detection: m by which the mean 3D RMSE is larger without
-    it, of others when they were left out}.
+    """The effects that do not make the filter worse.
+
+    refused : (Refused, ...) of the others
+    worth : {candidate or detection: increase of the mean 3D RMSE without it, m}; for dropped ones,
+        at the time they were dropped
     """
 
     selection: Selection
@@ -68,7 +69,7 @@ class ValidatedSelection:
     worth: dict[Candidate | Detection, float]
 
     def applied(self, attribution: Attribution) -> Attribution:
-        """The Attribution with what was selected alone."""
+        """Return the Attribution with the selected effects only."""
         return replace(
             attribution,
             selection=with_deviations(self.selection),
@@ -85,9 +86,12 @@ def cross_fitted(
     detections: Sequence[Detection],
     most: int | None = None,
 ) -> list[ValidationCase]:
-    """[ValidationCase]: each flight, or each half of a single one, every other block, with the
-    effects of `candidates` fitted to the others alone; `most` of them, evenly taken, if there are
-    more.
+    """Return ValidationCases with effects of `candidates` fitted to the other flights.
+
+    A single flight is divided into two halves of alternating blocks. Each half is judged with
+    effects fitted to the other half.
+
+    most : largest number of cases, evenly taken; None for all
     """
     table, selection = attribution.selection.table, attribution.selection
     if len(flights) > 1:
@@ -95,7 +99,7 @@ def cross_fitted(
             (ValidationCase(flights[k], base), k, table.flight != k) for k in range(len(flights))
         ]
     else:
-        # in turns, so that both parts are of all of the flight
+        # alternating, so both parts cover the whole flight
         start, since = flights[0].start, table.t - table.t.min()
         length = min(BLOCK, 0.5 * since.max())
         number = np.minimum((since / length).astype(int), int(since.max() / length) - 1)
@@ -137,15 +141,18 @@ def select_by_error(
     progress: Callable[[], object] = lambda: None,
     map_function: MapFunction = map,
 ) -> ValidatedSelection:
-    """ValidatedSelection of what makes the filter no worse where it was not fitted.
+    """Return the ValidatedSelection of effects that do not make the filter worse on hold-out data.
 
-    Candidates go, one by one, if the error is smaller without, or of a single flight hardly larger;
-    detections stay only if it is smaller with them. At most TRIAL_FLIGHTS flights are judged.
-    Trials run the filter with the corrections that it would get at the poses of a run with all.
-    After one has gone, those that seemed to do harm too are tried again first; in the end all are
-    tried beside what is kept. Where a trial is costly, as many go at once as may together. What
-    happened at a time of a single flight is tried, so that its worth is known, and not kept.
-    map_function : as of `attribute`.
+    Candidates are dropped one by one if the error falls without them. In a single flight they are
+    also dropped if the error hardly grows. Detections stay only if the error falls with them. At
+    most TRIAL_FLIGHTS flights are judged. Trials correct measurements at the poses of a run with
+    all effects.
+
+    After a drop, the other candidates that seemed harmful are tried again first. At the end all
+    candidates are tried with the final model. If trials are costly, several candidates are dropped
+    at once. Events at a time of a single flight are tried for their worth, but not kept.
+
+    map_function : as of `attribute`
     """
     candidates, refused = list(attribution.selection.chosen), []
     detections: list[Detection] = []
@@ -201,16 +208,18 @@ def select_by_error(
             )
         )
         candidates = [one for one in candidates if one is not momentary]
-    selection = attribution.selection.kept(candidates)  # fitted as in the trials
+    selection = attribution.selection.kept(candidates)  # with the weights of the trials
     return ValidatedSelection(selection, tuple(detections), tuple(refused), worth)
 
 
 def _gone(
     trials: _Trials, model: Model, harmful: Sequence[Candidate], limit: float
 ) -> Sequence[Candidate]:
-    """Of Candidates of a model, the least worth first, those that may go together: without all of
-    them the error, m, is at most a limit, as it is without each. They are tried together; if that
-    is too many, one half after the other, and so on.
+    """Return the Candidates that can be dropped together with an error of at most `limit`, m.
+
+    They are tried together. If the error is too large, each half is tried separately, and so on.
+
+    harmful : Candidates of the model, the least worth first
     """
     candidates, detections = model
     gone: list[Candidate] = []
@@ -226,12 +235,12 @@ def _gone(
 
 
 def _applicable(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Those of some Candidates that a node can take out, at least in part."""
+    """Return the Candidates that a node can correct, at least in part."""
     return [one for one in candidates if any(term.effect.usable for term in one.terms)]
 
 
 def _why_without(error: float, without: float) -> str:
-    """Why an effect is not applied, by the errors with and without it, m."""
+    """Return why an effect is not applied, given the errors with and without it, m."""
     figures = f"{error:.3f} m with, {without:.3f} m without"
     if without <= error * (1.0 - WORSE):
         return f"the filter does better without it: {figures}"
@@ -242,8 +251,9 @@ def _why_without(error: float, without: float) -> str:
 
 
 def _momentary(candidate: Candidate) -> bool:
-    """Whether it is what happened at a time of one flight: a delay for a while, or a function of
-    the time that is no drift.
+    """Return whether a Candidate is an event at a time of one flight.
+
+    It is a temporary delay, or a function of the time that is not a drift.
     """
     functions = [term.function for term in candidate.terms if term.function]
     return not recurs(candidate) or any(
@@ -252,8 +262,10 @@ def _momentary(candidate: Candidate) -> bool:
 
 
 class _Trials:
-    """Mean 3D RMSE, m, of cross-fitted models. The first is run as the nodes would; then each at
-    the poses of a run with nearly the same model, which takes a tenth of the time.
+    """Mean 3D RMSE, m, of cross-fitted models.
+
+    The first model runs like the nodes. Later models use the poses of that run, which takes a tenth
+    of the time.
     """
 
     def __init__(
@@ -275,19 +287,17 @@ class _Trials:
 
     @property
     def costly(self) -> bool:
-        """Whether to make as few trials as will do: of a single flight, among MANY anchors, which
-        is long if it has heard them all.
-        """
+        """Return whether trials are costly: a single flight with MANY anchors is long."""
         return len(self._flights) == 1 and self._attribution.selection.table.sparse
 
     def start(self, candidates: Sequence[Candidate], detections: Sequence[Detection]) -> float:
-        """The error of a model; later trials take the poses of its runs."""
+        """Return the error of a model, m, and keep the poses of its runs for later trials."""
         (results,) = self._tried(_error_and_poses, [(candidates, detections)])
         self._poses = [poses for _, poses in results]
         return float(np.mean([error for error, _ in results]))
 
     def errors(self, models: Sequence[Model]) -> list[float]:
-        """The errors of other models, [(candidates, detections)]: [m]."""
+        """Return the errors of models [(candidates, detections)], in m."""
         return [float(np.mean(errors)) for errors in self._tried(error_of, models)]
 
     def _tried(
@@ -295,7 +305,7 @@ class _Trials:
         function: Callable[[FilterConfig | None, tuple[ValidationCase, Poses | None]], Made],
         models: Sequence[Model],
     ) -> list[list[Made]]:
-        """[[function of each trial] of each model], all at once."""
+        """Return [[function of each trial] of each model], computed in one map."""
         attribution, flights, base = self._attribution, self._flights, self._baseline.base
         fitted = [
             cross_fitted(attribution, flights, base, candidates, detections, TRIAL_FLIGHTS)
@@ -310,15 +320,16 @@ class _Trials:
 
 
 def error_of(config: FilterConfig | None, trial: tuple[ValidationCase, Poses | None]) -> float:
-    """3D RMSE, m, of a trial."""
+    """Return the 3D RMSE of a trial, m."""
     return _judged(config, trial)[0]
 
 
 def _error_and_poses(
     config: FilterConfig | None, trial: tuple[ValidationCase, Poses | None]
 ) -> tuple[float, Poses]:
-    """(3D RMSE, m, poses of the run) of a trial: a ValidationCase, and the poses that it is
-    corrected at, None for those of the run itself.
+    """Return the 3D RMSE, m, and the poses of the run of a trial.
+
+    trial : ValidationCase, and the poses for corrections, None to use the poses of the run
     """
     error, run = _judged(config, trial)
     return error, poses_of(run.odometry)
@@ -327,7 +338,7 @@ def _error_and_poses(
 def _judged(
     config: FilterConfig | None, trial: tuple[ValidationCase, Poses | None]
 ) -> tuple[float, Run]:
-    """(3D RMSE, m, Run) of a trial."""
+    """Return the 3D RMSE, m, and the Run of a trial."""
     case, poses = trial
     anchors, effects = case.flight.anchors, case.effects
     corrector = (
@@ -346,9 +357,11 @@ def validation_cases(
     base: EffectSet,
     effects: EffectSet,
 ) -> tuple[list[ValidationCase], str]:
-    """(cases, on what, in words) to validate an Attribution on: the hold-out Flights if there are
-    any; or those it was fitted to, cross-fitted. base : EffectSet that was in the model; effects :
-    EffectSet with what was found.
+    """Return the cases that validate an Attribution, and a description of the data.
+
+    They are the hold-out Flights, or without any, cross-fitted cases of the fitted flights.
+
+    base : EffectSet before; effects : EffectSet with the found effects
     """
     if holdout:
         return [ValidationCase(flight, effects) for flight in holdout], HELD_OUT

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from .base import Comparison, Figures
 
-FEWEST_CELLS = 8
+FEWEST_CELLS = 8  # fewest cells of a residual
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class AidResidual(ChannelResidual):
 
 
 class Aid(Channel[AidResidual]):
-    """The channel of an auxiliary sensor or a part of it, with the fields of its Compared."""
+    """Channel of an auxiliary sensor, or of a part, with the fields of its Compared."""
 
     axes: tuple[str, ...]
     positions: tuple[int, ...]

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ..regression.algebra import Matrix
     from .views import CovariateView
 
-FEWEST_ATTITUDES = 10
+FEWEST_ATTITUDES = 10  # fewest poses with an attitude, for a reference with known attitude
 # of the health of channels: {"pairs", "anchors", "axes", ...: rows}
 Figures = dict[str, list[dict[str, Any]]]
 
@@ -148,7 +148,7 @@ class Channel(Generic[Own]):
 
     name: str
     unit: str
-    negligible: float  # root mean square, in `unit`, of a contribution that deserves no term
+    negligible: float  # RMS, in `unit`, below which a contribution gets no term
     needs: str  # streams and truth that it needs, in words
     stream: str = ""  # field of a Flight; "" for its name
     maps: ClassVar[
@@ -168,5 +168,8 @@ class Channel(Generic[Own]):
         return []
 
     def health(self, residuals: Sequence[Own]) -> Figures:
-        """Return figures of some flights: {"pairs", "anchors", "axes" or "cross_correlation": rows}."""
+        """Return figures of health of some flights.
+
+        They are {"pairs", "anchors", "axes" or "cross_correlation": rows}.
+        """
         return {}

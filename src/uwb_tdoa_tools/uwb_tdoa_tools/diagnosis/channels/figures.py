@@ -14,11 +14,11 @@ if TYPE_CHECKING:
 
     from .base import Figures
 
-APART = 1e4  # s between the stamps of two flights, which must not correlate
-LAG_TIMES = (0.1, 0.5, 1.0, 2.0)  # s
-TAIL = 4.0  # spreads
-FEWEST = 20  # pairs of samples of a correlation
-STRONGEST = 10  # correlations between pairs of anchors
+APART = 1e4  # s, gap between the stamps of two flights, so that they do not correlate
+LAG_TIMES = (0.1, 0.5, 1.0, 2.0)  # s, lags of the autocorrelation
+TAIL = 4.0  # spreads, beyond which a residual belongs to the tails
+FEWEST = 20  # fewest pairs of samples for a correlation
+STRONGEST = 10  # largest number of reported correlations between pairs of anchors
 
 
 class RadioLike(Protocol):

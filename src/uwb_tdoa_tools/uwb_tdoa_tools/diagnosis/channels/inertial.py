@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from .base import Comparison, Figures
     from .views import CovariateView
 
-CELL = 0.25  # s, over which both sides of a residual are averaged
+CELL = 0.25  # s, length of a cell; both sides of a residual are averaged over it
 # s, half the step of time derivatives of measured rates: true rates are noisy, and noise in
 # a regressor shrinks the estimate
 SHIFT = 0.05
@@ -35,7 +35,7 @@ BEGINNING = 2  # cells before a motion that do not count as rest
 RATES = [column for column, name in enumerate(OF_IMU) if name.startswith("rate_")]
 TURNING = [OF_IMU.index("turning_rate"), *RATES]
 TRUE_SHARE = 0.5  # of the variance of a measured rate; with a smaller true share it does not turn
-FEWEST_CELLS = 4
+FEWEST_CELLS = 4  # cells at the start that define the rate at rest; fewest cells at rest
 OF_POSE = ("x", "y", "height", "speed", "climb_rate", "acceleration")  # covariates of TDOAs too
 
 

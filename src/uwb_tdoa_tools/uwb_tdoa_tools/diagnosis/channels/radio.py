@@ -1,8 +1,8 @@
 """Channels of TDOAs and of distances to anchors: residuals, averaged over cells.
 
-Successive TDOAs of a pair have correlated errors. They are averaged, pair by pair, over cells of half a second
-without outliers. Near the floor a cell has similar heights. The fit counts the correlation that
-remains between cells.
+Successive TDOAs of a pair have correlated errors. They are averaged, pair by pair, over cells of
+half a second without outliers. Near the floor a cell has similar heights. The fit counts the
+correlation that remains between cells.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ if TYPE_CHECKING:
     from .base import Comparison, Figures
     from .views import CovariateView
 
-CELL = 0.5  # s
+CELL = 0.5  # s, length of a cell
 LOWEST, LEVEL = 0.02, 0.5  # m, and span of the logarithm of the height of a cell near the floor
-OUTLIER = 4.0  # spreads within a cell
+OUTLIER = 4.0  # spreads from the median of a cell, beyond which a measurement is left out
 # Effects with parameters that act on TDOAs of one or two anchors only
 OF_ANCHORS = "anchor_delay", "anchor_position", "anchor_clock_drift", "pair_offset", "nlos"
-WILD = 20.0  # m; a larger residual is no measurement
-FEWEST_ON_FLOOR = 50  # TDOAs
+WILD = 20.0  # m, largest residual of a valid measurement
+FEWEST_ON_FLOOR = 50  # TDOAs near the floor; fewer are not fitted
 QUICK = ("interval", *CATEGORIES)  # covariates that change from one TDOA to the next
 # Covariates of ranges: a node corrects them without a history of the motion
 OF_RANGE = tuple(name for name in OF_TDOA if name not in OF_MOTION)
@@ -73,7 +73,10 @@ class RadioResidual(ChannelResidual):
     innovations: Innovations | None = None
 
     def of_floor(self: Radio) -> Radio | None:
-        """Return the residual near the floor; None if the path is unknown there, or TDOAs are few."""
+        """Return the residual near the floor.
+
+        It is None if the path is unknown there, or TDOAs are few.
+        """
         near = ~self.airborne & (np.abs(self.residual) < WILD)
         if not self.floor_known or near.sum() < FEWEST_ON_FLOOR:
             return None
@@ -156,7 +159,8 @@ class Cells:
     def means(self, values: np.ndarray, rows: np.ndarray | None = None) -> Matrix:
         """Return means of values (n, k) over the cells, (m, k).
 
-        rows : (r,) of the TDOAs that values (r, k) belong to; other values are zero, and the result is sparse
+        rows : (r,) of the TDOAs that values (r, k) belong to; other values are zero, and the result
+            is sparse
         """
         if rows is None:
             return np.stack([self.mean(column) for column in values.T], axis=1)
@@ -176,7 +180,10 @@ class Cells:
 
 
 def compared(comparison: Comparison, kind: type[Samples], made: type[Radio]) -> Radio | None:
-    """Return the residual of measurements of a kind in a Comparison; None without any in the air."""
+    """Return the residual of measurements of a kind in a Comparison.
+
+    It is None without any in the air.
+    """
     flight, anchors, poses = comparison.flight, comparison.flight.anchors, comparison.poses
     innovations = comparison.view.innovations
     if innovations is not None and kind.channel not in innovations.streams:

@@ -1,4 +1,4 @@
-"""Covariates of a channel: views of its rows over one covariate, knots, and further columns of logs."""
+"""Covariates of a channel: views of its rows over one covariate, knots, and columns of logs."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
 MOST_LINKS = 400  # pairs, both directions, whose functions are searched: as of 20 anchors
 OF_EACH = "time", "range"  # covariates of single anchors if there are many anchors
-PIECES = 4  # of a spline
-FEWEST_VALUES = 100  # of a covariate with knots
-MOST_NAMES = 64  # of a covariate of names
-FEWEST_SAMPLES = 10  # of a further stream of a log
+PIECES = 4  # pieces of a spline
+FEWEST_VALUES = 100  # fewest values of a covariate with knots
+MOST_NAMES = 64  # largest number of names of a covariate of names
+FEWEST_SAMPLES = 10  # fewest samples of a further stream of a log
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,7 +194,8 @@ def knots_of(name: str, parts: Sequence[np.ndarray | None]) -> tuple[float, ...]
     if high - low < 1e-3 * max(abs(low), abs(high), 1e-3):
         return None
     knots = np.quantile(values, np.linspace(0.005, 0.995, PIECES + 1))
-    if np.min(np.diff(knots)) < 0.02 * (high - low):  # crowded
+    # knots too close to each other to be determined
+    if np.min(np.diff(knots)) < 0.02 * (high - low):
         knots = np.linspace(low, high, PIECES + 1)
     return tuple(float(f"{knot:.6g}") for knot in knots)
 

@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from ..regression.fit import Fit
     from ..regression.table import RegressionTable
 
-BIN = 1.0  # s
-SHORTEST = 2  # bins
+BIN = 1.0  # s, resolution of the limits of an interval
+SHORTEST = 2  # bins, shortest interval
 LONGEST = 0.7  # share of a flight; a longer effect counts as constant
 WHOLE = 0.95  # share of the information on an anchor; more counts as constant
-LEAST_GAIN = 10.0  # twice a log-likelihood
+LEAST_GAIN = 10.0  # smallest gain, twice a log-likelihood
 
 
 def best_interval(

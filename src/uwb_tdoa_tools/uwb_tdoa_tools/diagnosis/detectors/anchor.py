@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from ..regression.fit import Fit
     from ..regression.table import RegressionTable
 
-RADII = (0.6, 1.0, 1.5)  # m
-CENTRES = 60
+RADII = (0.6, 1.0, 1.5)  # m, radii of spheres that are tried
+CENTRES = 60  # approximate number of centres of spheres
 PRIOR = 4.0  # information, 1/m^2, of the prior of a delay
 
 

@@ -22,15 +22,19 @@ if TYPE_CHECKING:
 
 NEAR = 0.4  # m above z = 0; no flight showed the effect above
 HEIGHTS = np.geomspace(0.05, 0.3, 12)  # m, limits that are tried
-SWEEPS = 2  # over the anchors, to find one height per anchor
-FEWEST, FEWEST_ROWS = 2, 20  # late anchors (a single anchor is blocked); rows near the floor
+SWEEPS = 2  # sweeps over the anchors, to find one height per anchor
+# fewest late anchors (a single anchor counts as blocked), and fewest rows near the floor
+FEWEST, FEWEST_ROWS = 2, 20
 ONE_PLACE = 0.5  # m, radius of a single place of take-off and landing
-LEAST, GOOD_PART = 0.5, 0.5  # m, and share of the largest delay, of the first anchors in a model
-SCALE, NU = 0.2, 4.0  # m and 1, Student's t of the residual of an anchor with several echoes
-ITERATIONS = 8
+# smallest delay of the first anchors in a model: m, and share of the largest delay
+LEAST, GOOD_PART = 0.5, 0.5
+# scale in m and degrees of freedom of Student's t: an anchor with several echoes has heavy tails
+SCALE, NU = 0.2, 4.0
+ITERATIONS = 8  # of the re-weighted least squares
 LITTLE = 1e-3  # information, 1/m^2, of a delay of 0: TDOAs do not show a common delay
-LEAST_NOISE, WILD = 0.2, 3.0  # m: every anchor has less, an outlier has more
-ENOUGH = 5.0  # TDOAs of a row; more count as so many
+# m: noise below the first is normal, a residual beyond the second is an outlier
+LEAST_NOISE, WILD = 0.2, 3.0
+ENOUGH = 5.0  # largest weight of a row, in TDOAs
 
 
 class FloorMultipathDetector(Detector):

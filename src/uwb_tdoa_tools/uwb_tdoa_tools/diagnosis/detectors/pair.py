@@ -26,16 +26,18 @@ SURE_CORRELATION = 4.0  # standard errors of the autocovariance at the shortest 
 LAGS = np.array([0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5])  # s, edges of bins of lags
 CLIP = 5.0  # spreads, limit of a residual
 TIMES = np.geomspace(0.05, 5.0, 60)  # s, correlation times that are tried
-FEWEST, FEWEST_BLOCKS = 50, 4  # products in a bin, blocks of time
+FEWEST, FEWEST_BLOCKS = 50, 4  # fewest products in a bin of lags, and fewest blocks of time
 # noise_level
 NEAR = 0.3  # s, two TDOAs of a pair that are nearer share their slow error
-FEWEST_STEPS, FEWEST_LINKS = 30, 3
-RATIO, SURE_LEVEL = 1.25, 5.0  # to the median of all pairs, and standard errors above it
+FEWEST_STEPS, FEWEST_LINKS = 30, 3  # fewest steps of a pair, and fewest pairs
+# smallest noise of a noisy pair: ratio to the median of all pairs, and standard errors above it
+RATIO, SURE_LEVEL = 1.25, 5.0
 MOST = 0.4  # share of noisy pairs; if there are more, no pair is an exception
 # outlier_rate
 LEAST = 0.3  # m, smallest outlier
-SPREADS = 5.0  # of a pair about the median of its neighbours in time
-AROUND = (-4, -3, -2, -1, 1, 2, 3, 4)  # neighbours
+# smallest outlier in spreads of the pair; deviation from the median of neighbours in time
+SPREADS = 5.0
+AROUND = (-4, -3, -2, -1, 1, 2, 3, 4)  # offsets of the neighbours in time
 
 
 @dataclass(frozen=True)

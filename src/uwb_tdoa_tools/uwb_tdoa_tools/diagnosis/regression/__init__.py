@@ -1,3 +1,1 @@
-"""Linear regression of residuals on effects: tables, robust fits, selection, held-out checks,
-confounding.
-"""
+"""Regress residuals on effects: tables, robust fits, selection, hold-out checks, confounding."""

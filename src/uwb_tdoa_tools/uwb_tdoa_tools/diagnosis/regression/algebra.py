@@ -1,6 +1,4 @@
-"""Products of matrices of columns: dense, or scipy's sparse ones where most of what they hold is
-zero.
-"""
+"""Products of dense matrices, or of scipy's sparse matrices if most entries are 0."""
 
 from __future__ import annotations
 
@@ -12,11 +10,11 @@ from scipy.sparse import csc_array, csr_array, hstack, issparse
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-Matrix = Any  # an array, or a sparse one of scipy
+Matrix = Any  # np.ndarray, or a sparse array of scipy
 
 
 def stacked(columns: Sequence[Any], n: int) -> Matrix:
-    """Sparse matrix (n, k) of columns, each a pair (rows, values) or an array (n,)."""
+    """Return a sparse matrix (n, k) of columns, each a pair (rows, values) or an array (n,)."""
     pairs = [
         column if isinstance(column, tuple) else (np.flatnonzero(column), column[column != 0.0])
         for column in columns
@@ -30,27 +28,30 @@ def stacked(columns: Sequence[Any], n: int) -> Matrix:
 
 
 def dense(x: Matrix) -> np.ndarray:
-    """A matrix as an array."""
+    """Return a matrix as an array."""
     return x.toarray() if issparse(x) else x
 
 
 def weighted(x: Matrix, weights: np.ndarray) -> Matrix:
-    """Rows of x (n, k) times weights (n,)."""
+    """Return the rows of x (n, k) times weights (n,)."""
     return x.multiply(weights[:, None]).tocsc() if issparse(x) else x * weights[:, None]
 
 
 def product(x: Matrix, y: Matrix) -> np.ndarray:
-    """x' y of two matrices (n, k) and (n, m): array (k, m)."""
+    """Return x' y of two matrices (n, k) and (n, m), as an array (k, m)."""
     return dense(x.T @ y)
 
 
 def counts(x: Matrix, axis: int) -> np.ndarray:
-    """How many entries of x along an axis are not zero."""
+    """Return the number of nonzero entries of x along an axis."""
     return (x != 0.0).sum(axis=axis)
 
 
 def sums_by(label: np.ndarray, x: Matrix, labels: int) -> np.ndarray:
-    """Sums of the rows of x (n, k) that have each label (n,) of 0 ... labels - 1: (labels, k)."""
+    """Return the sums of the rows of x (n, k) by label, (labels, k).
+
+    label : (n,) int, 0 to labels - 1
+    """
     if issparse(x):
         members = csr_array(
             (np.ones(len(label)), (label, np.arange(len(label)))), shape=(labels, len(label))
@@ -60,7 +61,7 @@ def sums_by(label: np.ndarray, x: Matrix, labels: int) -> np.ndarray:
 
 
 def beside_each_other(several: Sequence[Matrix]) -> Matrix:
-    """One matrix of the columns of several."""
+    """Return several matrices joined by columns."""
     return (
         hstack(several, format="csc")
         if any(map(issparse, several))
@@ -69,7 +70,7 @@ def beside_each_other(several: Sequence[Matrix]) -> Matrix:
 
 
 def each_times(x: Matrix, functions: np.ndarray) -> Matrix:
-    """Every column of x (n, k) times every one of `functions` (n, m): (n, k m)."""
+    """Return each column of x (n, k) times each of `functions` (n, m), (n, k m)."""
     if issparse(x):
         return beside_each_other([weighted(x, function) for function in functions.T])
     return (x[:, :, None] * functions[:, None, :]).reshape(len(x), -1)

@@ -1,6 +1,4 @@
-"""What a finding could be mistaken for in these very flights, and what is not observable in the
-flights at all.
-"""
+"""Find effects that a finding can be confounded with, and parameters that are not observable."""
 
 from __future__ import annotations
 
@@ -21,16 +19,18 @@ if TYPE_CHECKING:
     from .select import Selection
     from .terms import Candidate, Column
 
-ALIKE = 0.9  # share of a finding's contribution that another effect would explain as well
-DISTINCT = 0.4  # smallest weight that is worth naming in a direction
+ALIKE = 0.9  # smallest explained share of a finding's contribution, for an alternative
+DISTINCT = 0.4  # smallest named weight of a combination, relative to the largest
 ANY_FLIGHT = "a flight on which the two contributions differ: other places, headings and speeds"
 
 
 @dataclass(frozen=True)
 class Alternative:
-    """An effect that a finding could as well be. share : of the finding's contribution that it
-    would explain, None if less than ALIKE; gap : by how much its criterion is worse, None if more
-    than undecided; tell_apart : which flight would tell.
+    """An effect that explains a finding nearly equally well.
+
+    share : explained share of the finding's contribution, None if below ALIKE
+    gap : by how much its criterion is worse, None if the data reject it
+    tell_apart : a flight that distinguishes both
     """
 
     effect: str
@@ -41,8 +41,9 @@ class Alternative:
 
 @dataclass(frozen=True)
 class Unobservable:
-    """A combination of parameters, {key: weight}, of an effect that leaves no trace in the flights;
-    None: the effect has no channel there.
+    """A combination of parameters that the flights do not determine.
+
+    direction : {key: weight} of parameters of the effect; None if the flights lack its channel
     """
 
     effect: str
@@ -50,7 +51,7 @@ class Unobservable:
 
 
 def flight_to_tell(effect: str, other: str) -> str:
-    """Which flight would tell two effects apart, by name: a sentence."""
+    """Return a sentence: the flight that distinguishes two effects, given by name."""
     for name, opposite in ((effect, other), (other, effect)):
         sentence = EFFECTS[name].distinguished_by.get(opposite) if name in EFFECTS else None
         if sentence:
@@ -61,9 +62,12 @@ def flight_to_tell(effect: str, other: str) -> str:
 def alternatives(
     selection: Selection, candidate: Candidate, candidates: Sequence[Candidate]
 ) -> list[Alternative]:
-    """[Alternative] of a chosen Candidate, the nearest first: `candidates`, all declared ones, that
-    explain at least ALIKE of what it contributes beyond the rest of the model, and rivals whose
-    criterion is as good.
+    """Return the Alternatives of a chosen Candidate, the nearest first.
+
+    Rivals with a similar criterion are alternatives. So are declared effects that explain at least
+    ALIKE of its contribution beyond the rest of the model.
+
+    candidates : all declared Candidates
     """
     rivals = selection.rivals[selection.chosen.index(candidate)]
     gaps = {rival.candidate.title: rival.gap for rival in rivals}
@@ -102,13 +106,12 @@ def _shares(
             continue
         x, sizes = weighted(table.matrix(columns), root), prior_sizes(columns)
         gram, vector = product(x, x), x.T @ part
-        if (
-            basis is not None
-        ):  # of what the basis leaves of them, without making a dense matrix of it
+        if basis is not None:  # project the basis out without a dense copy of x
             held = x.T @ basis
             gram = gram - held @ (2.0 * np.eye(len(held.T)) - basis.T @ basis) @ held.T
             vector = vector - held @ (basis.T @ part)
         solution = np.linalg.solve(gram + np.diag(1.0 / sizes**2), vector)
+        # Explained power of the regularized projection of the contribution on the other effect.
         share = (2.0 * vector @ solution - solution @ gram @ solution) / power
         if share >= ALIKE:
             out[name] = round(float(share), 3)
@@ -116,7 +119,7 @@ def _shares(
 
 
 def _whole(candidates: Sequence[Candidate]) -> dict[str, Sequence[Column]]:
-    """{effect: all its Columns}: the first set of an effect is all of it."""
+    """Return {effect: all its Columns}; the first set of an effect is the full set."""
     out: dict[str, Sequence[Column]] = {}
     for candidate in candidates:
         out.setdefault(candidate.name, candidate.columns)
@@ -124,9 +127,10 @@ def _whole(candidates: Sequence[Candidate]) -> dict[str, Sequence[Column]]:
 
 
 def unobservable(selection: Selection, candidates: Sequence[Candidate]) -> list[Unobservable]:
-    """[Unobservable]: combinations of parameters of a declared effect that the flights determine
-    less than plausibility does, by the eigenvectors of the information of a fit of that effect
-    alone.
+    """Return combinations of parameters of declared effects that the flights do not determine.
+
+    They are eigenvectors of the information of a fit of one effect alone, scaled by the prior. An
+    eigenvalue below 1 means that the prior determines the combination more than the data do.
     """
     table, out = selection.table, []
     root, whole = selection.fit.information(table), _whole(candidates)

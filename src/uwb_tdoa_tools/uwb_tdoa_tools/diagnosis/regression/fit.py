@@ -1,9 +1,9 @@
-"""Robust linear fits of a RegressionTable, and what one is worth.
+"""Fit a RegressionTable robustly, and compute the likelihood of a fit.
 
-Noise is Student's t with NU degrees of freedom, fitted by iteratively re-weighted least squares
-(Lange, Little and Taylor, JASA 1989). Rows are not independent: each axis of a channel has a scale,
-and the information of every channel is divided by an inflation that is measured on the residuals of
-blocks.
+Noise is Student's t with NU degrees of freedom. The fit uses iteratively re-weighted least squares
+(Lange, Little and Taylor, JASA 1989). Rows are not independent. Each axis of a channel has its
+scale. The information of each channel is divided by an inflation, measured on residuals of blocks
+of time.
 """
 
 from __future__ import annotations
@@ -23,19 +23,25 @@ if TYPE_CHECKING:
     from .table import RegressionTable
     from .terms import Column
 
-CANCELS = 1e-9  # sum of regressors of one effect, in the unit of a row, which is nothing
-NU = 4.0
-ITERATIONS = 12
-MIN_BLOCKS = 6
-LONGEST_MEMORY = 3.0  # s over which rows of a series may be alike
-LASTING = 0.1  # share of the rows in which a column must be, to tell what they have in common
+CANCELS = 1e-9  # smallest sum of regressors of an effect that does not cancel, in the unit of a row
+NU = 4.0  # degrees of freedom of Student's t
+ITERATIONS = 12  # largest number of re-weighted least squares
+MIN_BLOCKS = 6  # fewest blocks for a sandwich covariance and for the correlation within blocks
+LONGEST_MEMORY = 3.0  # s, longest lag of the autocorrelation of a series
+# share of rows in which a column is not 0; fewer do not show correlation between blocks
+LASTING = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """columns, beta (k,), cov (k, k): block sandwich, not below the model's; residual (n,), weight
-    (n,) 0 to 1.25; scale, inflation, size (groups,): spread of a row, loss of independence,
-    effective number of rows.
+    """A robust linear fit.
+
+    columns : k Columns; beta : (k,) their values, in the units of the parameters
+    cov : (k, k) sandwich covariance over blocks of time, at least the covariance of the model
+    residual : (n,) in the unit of each row; weight : (n,) robust weight, 0 to 1.25
+    scale : (groups,) scale of Student's t of a row; inflation : (groups,) variance inflation, 1 for
+        independent rows
+    size : (groups,) effective number of rows
     """
 
     columns: tuple[Column, ...]
@@ -48,14 +54,17 @@ class Fit:
     size: np.ndarray
 
     def information(self, table: RegressionTable) -> np.ndarray:
-        """What each row of the RegressionTable counts for, (n,), in independent rows per squared
-        unit.
+        """Return the information of each row of the RegressionTable, (n,).
+
+        It is the number of independent rows per squared unit of the row.
         """
         return self.weight / (self.scale**2 * self.inflation)[table.group]
 
     def likelihood(self, table: RegressionTable) -> float:
-        """Twice the log-likelihood of Student's t, in independent rows, less what the prior says of
-        beta.
+        """Return twice the log-posterior of the fit, up to a constant.
+
+        It is Student's t likelihood of the rows and the Gaussian prior of beta. Each row counts as
+        1 / inflation independent rows.
         """
         scale = self.scale[table.group]
         rows = 2.0 * np.log(scale) + (NU + 1.0) * np.log1p((self.residual / scale) ** 2 / NU)
@@ -65,7 +74,7 @@ class Fit:
         )
 
     def values(self, columns: Sequence[Column]) -> np.ndarray:
-        """beta of some Columns, (k,)."""
+        """Return beta of some Columns, (k,)."""
         place = {column: k for k, column in enumerate(self.columns)}
         return self.beta[[place[column] for column in columns]]
 
@@ -73,9 +82,13 @@ class Fit:
 def solve(
     gram: np.ndarray, vector: np.ndarray, sizes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Solution of normal equations with a Gaussian prior of standard deviations `sizes`: (beta,
-    covariance, number of parameters that the data determine: each counts by how little the prior
-    says of it). What the data do not determine stays 0.
+    """Solve normal equations with a Gaussian prior of mean 0.
+
+    A direction that the data do not determine stays at 0.
+
+    gram : (k, k) information; vector : (k,); sizes : (k,) standard deviations of the prior
+    returns : beta (k,), covariance (k, k), and the effective number of parameters (trace of the
+        resolution matrix)
     """
     if len(vector) == 0:
         return vector, np.zeros((0, 0)), 0.0
@@ -86,7 +99,7 @@ def solve(
 
 
 def _solution(gram: np.ndarray, vector: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """The first of `solve`, in a third of the time."""
+    """Return beta of `solve` by a Cholesky factor, in a third of the time."""
     return sizes * cho_solve(
         cho_factor(
             gram * np.outer(sizes, sizes) + np.eye(len(vector)),
@@ -98,7 +111,7 @@ def _solution(gram: np.ndarray, vector: np.ndarray, sizes: np.ndarray) -> np.nda
 
 
 def prior_sizes(columns: Sequence[Column]) -> np.ndarray:
-    """Plausible sizes of Columns: (k,)."""
+    """Return the standard deviations of the priors of Columns, (k,), in their units."""
     return np.array([column.typical for column in columns])
 
 
@@ -109,15 +122,18 @@ def fit(
     covariance: bool = True,
     near: Fit | None = None,
 ) -> Fit:
-    """Fit of some Columns of a RegressionTable. inflation : (groups,), measured on this very fit if
-    None; covariance : whether somebody asks for it; near : Fit of nearly the same Columns, from
-    which that of a sparse RegressionTable begins.
+    """Fit some Columns to a RegressionTable by iteratively re-weighted least squares.
+
+    inflation : (groups,) variance inflation; None measures it on the residual of this fit
+    covariance : whether to compute the covariance
+    near : Fit of nearly the same Columns; a sparse fit starts at its residual
     """
     x, group, sizes = table.matrix(columns), table.group, prior_sizes(columns)
     weight, beta = np.ones(len(table.y)), np.zeros(len(columns))
     residual = table.y.copy() if near is None or not table.sparse else near.residual.copy()
     for step in range(ITERATIONS):
         scale = _scales(table, residual)
+        # Weights of Student's t likelihood (Lange, Little and Taylor 1989).
         weight = (NU + 1.0) / (NU + (residual / scale[group]) ** 2)
         if not columns:
             if step:
@@ -143,8 +159,10 @@ def fit(
 def refit(
     table: RegressionTable, columns: Sequence[Column], model: Fit, rows: np.ndarray | None = None
 ) -> Fit:
-    """Fit of some Columns with the weights and scales of another Fit; rows : (n,) bool, those that
-    it is made to alone, with the covariance of the model.
+    """Fit some Columns with the weights and scales of another Fit.
+
+    rows : (n,) bool, rows that determine beta; None for all. With rows, the covariance is the
+        covariance of the model.
     """
     x, sizes, root = table.matrix(columns), prior_sizes(columns), model.information(table)
     some = slice(None) if rows is None else rows
@@ -160,7 +178,7 @@ def refit(
 
 
 def _scales(table: RegressionTable, residual: np.ndarray) -> np.ndarray:
-    """Scale of Student's t per group, by the fixed point of its likelihood."""
+    """Return the scale of Student's t per group by the fixed point of its likelihood, (groups,)."""
     out = _one_each(table)
     for k, rows in table.groups:
         out[k] = student_scale(residual[rows])
@@ -168,12 +186,12 @@ def _scales(table: RegressionTable, residual: np.ndarray) -> np.ndarray:
 
 
 def _one_each(table: RegressionTable) -> np.ndarray:
-    """(groups,) of 1, of all channels whether they have rows or not."""
+    """Return ones for all groups, with or without rows, (groups,)."""
     return np.ones(AXES * len(table.channels))
 
 
 def student_scale(r: np.ndarray) -> float:
-    """Scale of Student's t for residuals r (n,)."""
+    """Return the scale of Student's t for residuals r (n,), in their unit."""
     scale = max(1.4826 * np.median(np.abs(r)), 1e-9)
     for _ in range(15):
         w = (NU + 1.0) / (NU + (r / scale) ** 2)
@@ -182,9 +200,10 @@ def student_scale(r: np.ndarray) -> float:
 
 
 def in_common(table: RegressionTable, columns: Sequence[Column]) -> np.ndarray:
-    """(k, k), what makes of the values of one effect among some Columns the mean of all, where that
-    cancels in every row, as that of the delays of all anchors does in TDOAs; 0 elsewhere. A fit
-    leaves that mean at 0, and its deviation would be that of the prior.
+    """Return the projection onto means of parameters that cancel in every row, (k, k).
+
+    Example: a common delay of all anchors cancels in every TDOA. The fit leaves this mean at 0, and
+    its standard deviation would be the prior's. Effects without such a mean have entries 0.
     """
     out = np.zeros((len(columns), len(columns)))
     for effect in dict.fromkeys(column.effect for column in columns):
@@ -200,8 +219,11 @@ def in_common(table: RegressionTable, columns: Sequence[Column]) -> np.ndarray:
 def _covariance(
     table: RegressionTable, columns: Sequence[Column], residual: np.ndarray, root: np.ndarray
 ) -> np.ndarray:
-    """Sandwich over blocks, at least the model's own; of delays apart from what all have
-    `in_common`.
+    """Return the sandwich covariance over blocks of time, at least the model covariance, (k, k).
+
+    Common means of parameters (`in_common`) are projected out.
+
+    residual : (n,); root : (n,) information of each row
     """
     x, sizes = table.matrix(columns), prior_sizes(columns)
     _, bread, _ = solve(product(weighted(x, root), x), np.zeros(x.shape[1]), sizes)
@@ -211,8 +233,9 @@ def _covariance(
     if blocks < MIN_BLOCKS:
         return bread
     sums = sums_by(table.block, weighted(x, root * residual), blocks)
+    # Few blocks underestimate the variance: blocks / (blocks - columns) corrects for that.
     half = sums @ bread * np.sqrt(blocks / max(blocks - min(x.shape[1], blocks // 2), 1))
-    sandwich = half.T @ half  # squares, so that none of its diagonal is below zero
+    sandwich = half.T @ half  # a square has no negative diagonal
     informed = np.diag(sandwich) > 1e-300
     grow = np.sqrt(np.maximum(np.diag(bread) / np.where(informed, np.diag(sandwich), np.inf), 1.0))
     return np.where(np.diag(~informed), bread, sandwich * np.outer(grow, grow))
@@ -225,13 +248,15 @@ def measure_inflation(
     scale: np.ndarray,
     columns: Sequence[Column],
 ) -> np.ndarray:
-    """By how much fewer the independent rows of each channel are: (groups,), at least 1. Of its
-    axes the median: what one has that the others have not is an effect.
+    """Return the variance inflation of each group, (groups,), at least 1.
 
-    The larger of two: 1 + 2 sum(rho) over the autocorrelation of each series up to 3 s, and how
-    much larger sums of scores over blocks are than those of independent rows would be, averaged
-    over the columns. The second sees what series have in common. The residual should be that of a
-    fit with all columns, or effects count as noise.
+    It is the larger of two measures. The first is 1 + 2 sum(rho) over the autocorrelation of each
+    series up to 3 s. The second is the ratio of the variance of block sums of scores to independent
+    rows, averaged over the columns. It includes correlation between series. All axes of a channel
+    get their median: an excess on one axis only is an effect.
+
+    residual : (n,) of a fit with all columns, because effects that are left count as noise
+    weight : (n,) robust weights; scale : (groups,)
     """
     out = _one_each(table)
     x = table.matrix(columns)
@@ -239,9 +264,9 @@ def measure_inflation(
         r = weight[rows] * residual[rows] / scale[k]
         raw = max(1.0, _temporal(table, rows, r), _clustered(table.block[rows], x[rows], r))
         spent = np.count_nonzero(counts(x[rows], 0)) * raw / len(r)
-        # the fit has followed some of the noise
+        # The fit absorbs part of the noise.
         raw = raw / (1.0 - min(spent, 0.6)) if raw > 1.2 else raw
-        # blocks are independent
+        # Blocks are independent, so at most a block's rows count as one.
         out[k] = max(1.0, min(raw, len(r) / len(np.unique(table.block[rows]))))
     for name in table.present:
         axes = np.unique(table.group[table.rows_of(name)])

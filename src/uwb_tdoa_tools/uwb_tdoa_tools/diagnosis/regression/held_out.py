@@ -1,4 +1,4 @@
-"""What a term is worth on data that did not take part in fitting it."""
+"""Score terms on hold-out data."""
 
 from __future__ import annotations
 
@@ -19,15 +19,17 @@ if TYPE_CHECKING:
     from .table import RegressionTable
     from .terms import Column
 
-FOLDS = 4
-CLIP = 5.0  # spreads that an outlier counts as
+FOLDS = 4  # folds of the cross-validation over blocks of time
+CLIP = 5.0  # spreads, limit of a residual
 
 
 @dataclass(frozen=True, order=True)
 class HeldOut:
-    """gain : twice the log-likelihood, in independent rows, that a Candidate brings on rows that it
-    was not fitted to; t : its t value over blocks; explained : share of the variance of the axis or
-    channel that gains most.
+    """The hold-out score of a Candidate.
+
+    gain : increase of twice the log-likelihood of hold-out rows, in independent rows
+    t : t value of the gain over blocks of time
+    explained : explained share of the variance, of the axis or channel that gains most
     """
 
     gain: float
@@ -36,9 +38,12 @@ class HeldOut:
 
 
 def held_out(selection: Selection, by_flight: bool = False) -> list[HeldOut]:
-    """[HeldOut] of every chosen Candidate: fitted with and without it on the other folds, with the
-    weights and scales of the whole fit. by_flight : a fold is a flight; else blocks are dealt out
-    in turn.
+    """Return the hold-out score of each chosen Candidate by cross-validation.
+
+    Each fold is predicted by fits to the other folds, with and without the candidate. Weights and
+    scales are fixed to the fit of all rows.
+
+    by_flight : True makes each flight a fold; False deals blocks of time in turn to FOLDS folds
     """
     table, model, chosen = selection.table, selection.fit, selection.chosen
     folds = _Folds(
@@ -81,7 +86,7 @@ class _Folds:
         self._gram, self._vector = (sum(part[k] for part in self._parts.values()) for k in range(2))
 
     def residual(self, columns: Sequence[Column]) -> np.ndarray:
-        """Residual of every row under the fit of the other folds: (n,)."""
+        """Return the residual of each row under the fit of the other folds, (n,)."""
         out = self.table.y.copy()
         if not columns:
             return out
@@ -96,15 +101,21 @@ class _Folds:
 
 
 def _loss(table: RegressionTable, model: Fit, residual: np.ndarray) -> np.ndarray:
-    """Minus twice the log-likelihood of Student's t, row by row."""
+    """Return minus twice the log-likelihood of Student's t of each row, (n,).
+
+    residual : (n,)
+    """
     return (NU + 1.0) * np.log1p((residual / model.scale[table.group]) ** 2 / NU)
 
 
 def _explained(
     table: RegressionTable, model: Fit, before: np.ndarray, after: np.ndarray, touched: np.ndarray
 ) -> float:
-    """Share of the variance, with outliers at CLIP spreads, that goes from `before` to `after` in
-    the group that gains most, over the rows (n,) bool that are touched.
+    """Return the explained share of the variance of the group that gains most.
+
+    Residuals are clipped at CLIP spreads.
+
+    before, after : (n,) residuals; touched : (n,) bool, rows on which the candidate acts
     """
     best = 0.0
     for k in np.unique(table.group[touched]):

@@ -1,11 +1,11 @@
-"""A fast look at thousands of functions that nobody has declared: of one anchor, pair, direction or
-axis, over one covariate.
+"""Scan thousands of undeclared functions of one anchor, pair, direction or axis over one covariate.
 
-Each is a level and one simple shape: a line, a rise beyond or below a point, a step, an interval, a
-wave. What the residual of a fit would gain by each is a score test: the products of a few columns
-with the residual and with each other, free of what the model holds already (Schur complement), give
-all shapes of a subset and a covariate in closed form. The best few become candidates and are judged
-like all others; they pay for the number that was looked at.
+Each function is a level and one simple shape: a line, a rise beyond or below a point, a step, an
+interval, a parabola or a wave. The gain of each is a score test on the residual of a fit. A few
+columns are multiplied with the residual and with each other. These products give the gains of all
+shapes in closed form. The columns of the model are projected out of these products (Schur
+complement). The best functions become candidates. Their price includes the number of functions that
+were tried.
 """
 
 from __future__ import annotations
@@ -31,26 +31,27 @@ if TYPE_CHECKING:
     from .fit import Fit
     from .table import RegressionTable
 
-    _Held = tuple[np.ndarray, np.ndarray, np.ndarray]  # as `_held` gives it
-    # gain, shapes, shape, knots, how many were tried
+    _Held = tuple[np.ndarray, np.ndarray, np.ndarray]  # return value of `_held`
+    # gain, shapes, shape, knots, number tried
     _Item = tuple[float, "_Shapes", str, tuple[float, ...], int]
 
-BINS = 16  # between whose edges steps, intervals and rises begin and end
-PERIODS = (0.8, 1.0, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 3.0)  # of a wave between the ends
-WIDEST = 10  # bins of an interval; a longer one is two steps
-# of the range; bins that are narrower would tell noise of the covariate, which the residual may
-# share
+BINS = 16  # number of bins; steps, intervals and rises begin and end at their edges
+# numbers of waves over the range of the covariate
+PERIODS = (0.8, 1.0, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 3.0)
+WIDEST = 10  # bins, longest interval; a longer interval equals two steps
+# Smallest bin, share of the range. Narrower bins would follow noise of the covariate, and the
+# residual may share that noise.
 CROWDED = 0.02
-NOISY = 1.5  # times the noise of most series that any may have
-FINER = 9  # places between two bins where a knot is tried again
-FEWEST = 12  # values of a subset
-# of more values levels are told apart, where there are MANY anchors
+NOISY = 1.5  # noise of a series that keeps full weight, relative to its group's median
+FINER = 9  # places around a knot that are tried in the refinement
+FEWEST = 12  # smallest number of values of a subset
+# With more values than the first, the covariate is divided into levels, above MANY anchors.
 MANY_VALUES, LEVELS = (4096, 256)
-PROPOSED = 16  # functions
-SHAPES_FIRST = 3  # of one CovariateView
-# scales; a larger residual counts as that of a heavy tail, but more than in Student's t
+PROPOSED = 16  # functions that a call returns at most
+SHAPES_FIRST = 3  # shapes of one CovariateView that come first
+# Scales, limit of Huber's loss: outliers count more than in Student's t.
 HUBER = 3.0
-LEAST_GAIN = 20.0  # twice a log-likelihood
+LEAST_GAIN = 20.0  # smallest gain, twice a log-likelihood
 _ENDS = np.array(
     [(first, last) for first in range(3) for last in (-1, -2, -3)]
 )  # edges between which a line rises
@@ -58,14 +59,18 @@ ANGLES = ("bearing", "bearing_in_tag", "bearing_in_anchor")
 
 
 class _Shapes:
-    """A CovariateView as columns x (k, columns) at `rows` of a RegressionTable; edges (bins + 1,).
-    Of many values: x (levels, columns), of every one of some levels of the covariate, and a sparse
-    matrix `levels` (k, levels), whose product with x are the columns.
+    """A CovariateView as columns x of a RegressionTable.
+
+    x : (k, columns) at `rows` of the table; edges : (bins + 1,) in the unit of the covariate
+    levels : (k, levels) sparse, or None. If there are many values, x is (levels, columns): one row
+        per level of the covariate. The columns are levels @ x.
     """
 
     def __init__(self, view: CovariateView, offset: int, edges: np.ndarray, many: bool) -> None:
-        """offset : first row of the channel; many : whether the RegressionTable has so many rows
-        that values which are nearly the same count as the same.
+        """Compute the columns.
+
+        offset : first row of the channel; many : whether nearly equal values share a level, for
+            tables with many rows
         """
         self.view, self.offset, self.edges, self.many, rows = view, offset, edges, many, view.rows
         self.levels: csr_array | None = None
@@ -83,17 +88,21 @@ class _Shapes:
                 np.stack([np.bincount(cell, column) for column in x.T], axis=1)
                 / np.bincount(cell)[:, None]
             )
-        self.x = x.astype(np.float32)  # of all views together the most that a diagnosis holds
+        # float32, because these arrays take most of the memory of a diagnosis
+        self.x = x.astype(np.float32)
         self.rows = rows + offset
 
 
 class Scan:
-    """All shapes of all views of a RegressionTable's channels: called as `search` of `select`."""
+    """Search all shapes of all views of a RegressionTable's channels; the `search` of `select`."""
 
     def __init__(
         self, table: RegressionTable, views: Mapping[str, Sequence[CovariateView]]
     ) -> None:
-        """views : {channel: [CovariateView]}, of the rows of each channel."""
+        """Compute the columns of all views.
+
+        views : {channel: [CovariateView]}, of the rows of each channel
+        """
         groups: dict[tuple[int, bool, bool], list[_Shapes]] = {}
         for channel, some in views.items():
             for view, edges in ((view, _edges(view)) for view in some):
@@ -103,7 +112,7 @@ class Scan:
                         _Shapes(view, table.rows_of(channel).start, edges, table.sparse)
                     )
         self._groups = [_Group(several, WIDEST) for several in groups.values()]
-        # weights (n,) that are fair to noisy series, and know no outliers
+        # Weights (n,) by the noise of each series, without robust weights.
         self.even = _noise_of_series(table) ** -2.0
         self._price = SmoothTerm.penalty + 2.0 * np.log(
             max(sum(len(several) for several in groups.values()), 1)
@@ -112,9 +121,10 @@ class Scan:
     def __call__(
         self, table: RegressionTable, model: Fit, chosen: Sequence[Candidate]
     ) -> list[Candidate]:
-        """[Candidate], the best of what the residual of a Fit of the chosen Candidates shows. What
-        looks like outliers to the fit counts for more: it may be what acts on a few rows alone.
-        Series that are noisier than others count for less.
+        """Return the best Candidates for the residual of a Fit of the chosen Candidates.
+
+        Rows that the fit treats as outliers get a larger weight (Huber): an effect can act on few
+        rows only. Noisy series get a smaller weight.
         """
         scale = HUBER * model.scale[table.group] / np.sqrt(self.even)
         weight = np.minimum(1.0, scale / np.maximum(np.abs(model.residual), 1e-12)) * self.even
@@ -126,7 +136,10 @@ class Scan:
         return [self._candidate(*item[1:]) for item in _various(found)]
 
     def _refined(self, held: _Held, item: _Item) -> _Item:
-        """An item of `gains` with its inner knots moved by parts of a bin, if that gains more."""
+        """Return an item of `gains` with inner knots moved within their bins.
+
+        It stays unchanged if no move gains.
+        """
         gain, shapes, shape, knots, tried = item
         if len(knots) < 3 or shapes.view.covariate in CATEGORIES:
             return item
@@ -143,9 +156,12 @@ class Scan:
         return (*best[:4], tried * FINER) if best[0] > gain else item
 
     def gains(self, table: RegressionTable, held: _Held) -> list[_Item]:
-        """[(gain, _Shapes, shape, knots, how many were tried)], the best first after what its
-        coefficients and its search cost: what a Fit would gain, twice a log-likelihood, with the
-        weights that it has.
+        """Return [(gain, _Shapes, shape, knots, number tried)], the best first.
+
+        The gain is twice a log-likelihood, at the weights of the Fit. The order counts the price of
+        the coefficients and of the search.
+
+        held : as of `_held`
         """
         return _best_first(table, [item for group in self._groups for item in group.best(*held)])
 
@@ -161,8 +177,10 @@ class Scan:
 
 
 def _noise_of_series(table: RegressionTable) -> np.ndarray:
-    """How much noisier the series of each row is than most of its group, (n,), at least 1: by
-    differences of successive rows, of which steps and trends are a small part.
+    """Return the noise of the series of each row, (n,), at least 1.
+
+    It is relative to NOISY times the median of its group. Differences of successive rows measure
+    it, because steps and trends contribute little to them.
     """
     order = np.lexsort((table.t, table.series, table.flight, table.channel))
     label = np.unique(
@@ -181,8 +199,9 @@ def _noise_of_series(table: RegressionTable) -> np.ndarray:
 
 
 def _various(found: Iterable[_Item]) -> list[_Item]:
-    """Items of `gains` in their order, but of one CovariateView no more than SHAPES_FIRST before
-    those of others: a dozen shapes of one function are one idea.
+    """Return items of `gains` in their order, but at most SHAPES_FIRST of one CovariateView first.
+
+    Many shapes of one function carry little extra information.
     """
     early: list[_Item] = []
     late: list[_Item] = []
@@ -199,10 +218,13 @@ def _best_first(table: RegressionTable, found: Iterable[_Item]) -> list[_Item]:
 
 
 class _Group:
-    """Shapes with as many columns, judged together."""
+    """Shapes with equally many columns, scored together."""
 
     def __init__(self, several: list[_Shapes], widest: int) -> None:
-        """several : [_Shapes]; widest : bins of an interval."""
+        """Take [_Shapes].
+
+        widest : largest number of bins of an interval
+        """
         view, edges = several[0].view, several[0].edges
         self._several, n = several, len(edges) - 1
         self._bins, self._waves, self._bends = n, len(_periods(edges, view.covariate)), n - 3
@@ -212,10 +234,12 @@ class _Group:
         self._from, self._to = i[good], j[good]
 
     def best(self, held: np.ndarray, information: np.ndarray, residual: np.ndarray) -> list[_Item]:
-        """[(gain, _Shapes, shape, knots, tried)]: the best of each shape of each view, with how
-        many were tried.
+        """Return the best item of each shape of each view.
 
-        held (n, k): an orthonormal base, weighted, of what the model holds.
+        An item is (gain, _Shapes, shape, knots, number tried).
+
+        held : (n, k) orthonormal base of the model's columns, weighted by `information`
+        information : (n,) of each row; residual : (n,)
         """
         products = [_products(shapes, held, information, residual) for shapes in self._several]
         vector, own = (np.stack([product[k] for product in products]) for k in range(2))
@@ -223,12 +247,14 @@ class _Group:
         level, cross = vector[:, :n].sum(axis=1)[:, None], own[:, :, :n].sum(axis=2)
         power = cross[:, :n].sum(axis=1)[:, None] + prior
 
+        # Gain of a level and one column: least squares with the prior, in closed form.
         def of_one(first: np.ndarray, crossed: np.ndarray, square: np.ndarray) -> np.ndarray:
             rest = square + prior - crossed**2 / power
             return level**2 / power + (first - crossed * level / power) ** 2 / np.maximum(
                 rest, 1e-9 * (square + prior)
             )
 
+        # Gain of a level and two columns, as of a wave or a parabola: a 3 x 3 system.
         def of_two(first: np.ndarray, second: np.ndarray) -> np.ndarray:
             small = np.empty((len(vector), len(first), 3, 3))
             some = np.empty((len(vector), len(first), 3))
@@ -244,6 +270,7 @@ class _Group:
         single = of_one(vector[:, n:], cross[:, n:], np.diagonal(own, axis1=1, axis2=2)[:, n:])
         at = n + len(_ENDS) + 2 * bends + np.arange(waves)
         lines = n + np.arange(len(_ENDS))
+        # Cumulative sums over bins give the products of every step and interval.
         square = np.zeros((len(vector), n + 1, n + 1))
         square[:, 1:, 1:] = own[:, :n, :n].cumsum(axis=1).cumsum(axis=2)
         i, j = self._from, self._to
@@ -291,7 +318,10 @@ class _Group:
         gains: np.ndarray,
         knots: Callable[[np.ndarray, int], Iterable[float]] | None,
     ) -> Iterator[_Item]:
-        """The best of the gains (views, tried) of each view."""
+        """Return the best item of each view.
+
+        gains : (views, tried)
+        """
         if not gains.shape[1]:
             return
         best = np.argmax(gains, axis=1)
@@ -306,7 +336,7 @@ class _Group:
 
 
 def _prior(view: CovariateView) -> float:
-    """Information that stands for plausible sizes of its functions."""
+    """Return the information of the prior of the functions of a view."""
     line = SmoothTerm(
         channel=view.channel,
         covariate=view.covariate,
@@ -320,8 +350,12 @@ def _prior(view: CovariateView) -> float:
 def _products(
     shapes: _Shapes, held: np.ndarray, information: np.ndarray, residual: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Of the columns with the residual (columns,), and with each other (columns, columns) free of
-    what is held.
+    """Return products of the columns with the residual, and with each other.
+
+    The first are (columns,). The second are (columns, columns), with the base of the model
+    projected out.
+
+    held : (n, k); information, residual : (n,)
     """
     if shapes.levels is not None:
         of_levels = shapes.levels.multiply(information[shapes.rows, None]).T.tocsr()
@@ -335,8 +369,10 @@ def _products(
 
 
 def _held(table: RegressionTable, model: Fit, chosen: Sequence[Candidate]) -> _Held:
-    """(orthonormal base, weighted, of what the chosen Candidates hold (n, k), information (n,),
-    residual (n,)).
+    """Return (base, information (n,), residual (n,)) of a Fit of the chosen Candidates.
+
+    The base (n, k) spans the columns of the model. It is orthonormal under the information and the
+    prior.
     """
     information, base = model.information(table), columns_of(chosen)
     b = dense(table.matrix(base))
@@ -345,7 +381,7 @@ def _held(table: RegressionTable, model: Fit, chosen: Sequence[Candidate]) -> _H
 
 
 def _edges(view: CovariateView) -> np.ndarray | None:
-    """Edges of its bins, quantiles of the covariate; None where it hardly varies."""
+    """Return the edges of the bins, quantiles of the covariate; None if it hardly varies."""
     counted = np.concatenate([values[signs != 0.0] for signs, values in view.sides])
     counted = counted[np.isfinite(counted)]
     if len(counted) < FEWEST:
@@ -362,8 +398,12 @@ def _edges(view: CovariateView) -> np.ndarray | None:
 
 
 def _levels(view: CovariateView, edges: np.ndarray) -> tuple[np.ndarray, csr_array, np.ndarray]:
-    """(values (l,) of a covariate, each of which stands for those of its level, whose levels lie
-    between the edges; sums of signs of each level (k, l); rows (k,) of a view).
+    """Return the levels of a covariate with many values.
+
+    Each level lies between two edges.
+
+    returns : values (l,), one per level; sums of signs of each row and level (k, l), sparse; rows
+        (k,) of the view
     """
     signs, values = (np.concatenate(each) for each in zip(*view.sides))
     known = np.isfinite(values) & (signs != 0.0)
@@ -381,8 +421,9 @@ def _levels(view: CovariateView, edges: np.ndarray) -> tuple[np.ndarray, csr_arr
 
 
 def _columns(v: np.ndarray, edges: np.ndarray, covariate: str) -> np.ndarray:
-    """Bins, lines, rises beyond and below the inner edges, sines, cosines, squares of the lines:
-    (n, columns).
+    """Return columns of all shapes at values v (n,), (n, columns).
+
+    They are bins, lines, rises beyond and below the inner edges, sines, cosines, and squared lines.
     """
     low, high = edges[0], edges[-1]
     held = np.clip(v, low, high)

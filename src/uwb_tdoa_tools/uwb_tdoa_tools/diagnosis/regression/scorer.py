@@ -1,8 +1,8 @@
-"""What sets of columns would gain, in closed form.
+"""Compute the gain in likelihood of sets of columns in closed form.
 
-All that candidates need of the rows is computed for all of them at once: products with the base of
-the model, group by group (an axis of a channel). A candidate is then a small system of equations on
-top of that of the base (Schur complement).
+Products of all columns with the base of the model are computed once per group. A group is an axis
+of a channel. The gain of a candidate then follows from a small system of equations (Schur
+complement).
 """
 
 from __future__ import annotations
@@ -23,17 +23,20 @@ if TYPE_CHECKING:
     from .table import RegressionTable
     from .terms import Candidate, Column
 
-# columns, and what they gain together, each alone, twice a log-likelihood, that is worth no price
+# Largest set that may be skipped, and the gain of its columns alone (twice a log-likelihood) below
+# which it is.
 FEW, NOTHING = (3, 3.0)
-# columns whose products with the base are made together, so that a copy of all of them is never
-# held
+# Columns per product with the base: limits memory, since all columns are never copied at once.
 AT_ONCE = 128
 
 
 @dataclass(frozen=True, eq=False)
 class Gain:
-    """beta (k,) of the candidate's columns; determined : parameters that the data determine beyond
-    the base; gain : twice what the likelihood gains.
+    """The gain of a candidate added to a base.
+
+    beta : (k,) values of the candidate's columns
+    determined : effective number of parameters that the data determine beyond the base
+    gain : increase of twice the log-likelihood
     """
 
     beta: np.ndarray
@@ -42,13 +45,17 @@ class Gain:
 
 
 class Scorer:
-    """Gains of sets of Columns on top of a base, with the weights, scales and inflation of one Fit."""
+    """Compute gains of sets of Columns added to a base.
+
+    Weights, scales and inflation are fixed to one Fit.
+    """
 
     def __init__(
         self, table: RegressionTable, base: Sequence[Column], model: Fit, others: Sequence[Column]
     ) -> None:
-        """base : Columns that are in the model already; model : Fit, whose weights count; others :
-        Columns that may be judged.
+        """Compute the products of all columns with the base.
+
+        base : Columns in the model; model : Fit that gives the weights; others : Columns to score
         """
         self._place = {column: k for k, column in enumerate(dict.fromkeys([*base, *others]))}
         self._base = np.arange(len(base))
@@ -94,7 +101,10 @@ class Scorer:
         return _Part(table, columns, rows, root, cross, vector, float(root @ y**2))
 
     def _gains_alone(self, beta: np.ndarray) -> np.ndarray:
-        """What every column would gain alone, by least squares: (columns,)."""
+        """Return the least-squares gain of each column alone, (columns,), twice a log-likelihood.
+
+        beta : (base,) values of the base
+        """
         base, sizes = self._base, self._sizes
         cross = sum((part.cross for part in self._parts), start=np.zeros(()))
         left = (sum(part.vector for part in self._parts) - cross.T @ beta) * sizes
@@ -107,15 +117,17 @@ class Scorer:
         return left**2 / np.maximum(own, 1e-9)
 
     def may_gain(self, columns: Sequence[Column]) -> bool:
-        """Whether to judge some Columns; of few parameters among thousands most gain nothing, which
-        is seen at a glance.
+        """Return whether some Columns can gain enough to be scored.
+
+        Among thousands of anchors most small sets gain nothing; the gains of single columns show
+        it.
         """
         if self._alone is None or len(columns) > FEW:
             return True
         return float(sum(self._alone[self._place[column]] for column in columns)) > NOTHING
 
     def gain(self, columns: Sequence[Column]) -> Gain | None:
-        """Gain of having some Columns too; None if all are there already."""
+        """Return the Gain of adding some Columns; None if the base has all columns."""
         all_places = np.array([self._place[column] for column in columns])
         new = np.unique(all_places[all_places >= len(self._base)])
         if not len(new):
@@ -125,6 +137,7 @@ class Scorer:
         cross = sum(part.cross[:, new] for part in self._parts) * np.outer(sizes[base], sizes[new])
         own = [part.gram(new) for part in self._parts]
         vector = sum(part.vector[both] for part in self._parts) * sizes[both]
+        # Block inverse of the posterior information of base and new columns, in units of the prior.
         half = self._inverse @ cross
         schur = np.linalg.inv(
             sum(own) * np.outer(sizes[new], sizes[new]) + np.eye(len(new)) - cross.T @ half
@@ -135,6 +148,7 @@ class Scorer:
             len(both) - np.trace(self._inverse) - np.trace(schur) - np.sum((half @ schur) * half)
         )
         beta, gain = z * sizes[both], self._penalty - float(z @ z)
+        # A group with unknown noise variance gains size * log(squares before / squares after).
         for size, part, gram, before in zip(self._group_sizes, self._parts, own, self._squares):
             gain += size * np.log(before / part.squares(beta, both, gram))
         values = dict(zip(both.tolist(), beta.tolist()))
@@ -145,8 +159,9 @@ class Scorer:
         )
 
     def price(self, candidate: Candidate, determined: float, choices: int) -> float:
-        """What the parameters of a Candidate, `determined` of them by the data, must at least gain,
-        if it is one of `choices`.
+        """Return the gain that a Candidate must exceed, twice a log-likelihood.
+
+        determined : its effective number of parameters; choices : number of candidates
         """
         rows = sum(
             size
@@ -160,9 +175,11 @@ class Scorer:
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """One group: its rows in a RegressionTable of some columns, with weights root (n,); cross
-    (base, k) and vector (k,): X' W X and X' W y;
-    power : y' W y; products : of columns of one effect, where they are sparse.
+    """Products of columns with the base, for the rows of one group.
+
+    root : (n,) weights of the rows; power : y' W y
+    cross : (base, k) X_base' W X; vector : (k,) X' W y
+    products : products between columns of one effect, for sparse columns only
     """
 
     table: RegressionTable
@@ -181,8 +198,10 @@ class _Part:
         return x.T @ (x * self.root[:, None])
 
     def squares(self, beta: np.ndarray, places: np.ndarray, own: np.ndarray | None = None) -> float:
-        """Weighted sum of squares that beta (k,) of the columns at `places`, those of the base
-        first, leaves. own : gram of those after the base.
+        """Return the weighted sum of squared residuals for beta.
+
+        beta : (k,) values of the columns at `places`, the columns of the base first
+        own : gram of the columns after the base
         """
         base = self.cross.shape[0]
         first, last = beta[:base], beta[base:]
@@ -197,7 +216,7 @@ class _Part:
 
 
 def _effects(columns: Sequence[Column], base: int) -> list[np.ndarray]:
-    """Places of the columns of each effect, those of the base left out."""
+    """Return the places of the columns of each effect, without the base."""
     places: dict[Hashable, list[int]] = {}
     for place, column in enumerate(columns[base:], start=base):
         places.setdefault(column.effect, []).append(place)
@@ -206,9 +225,11 @@ def _effects(columns: Sequence[Column], base: int) -> list[np.ndarray]:
 
 @dataclass(frozen=True, eq=False)
 class _Products:
-    """X' W X of sparse columns x (n, k), with weights (n,), made once for what is asked of many
-    candidates: squares (k,), its diagonal; effect, number (k,) : of each column that of its effect,
-    and its own among these; grams : of every effect of several columns.
+    """X' W X of sparse columns, computed once for many candidates.
+
+    x : (n, k); weights : (n,); squares : (k,) diagonal
+    effect, number : (k,) index of the effect of a column, and of the column within that effect
+    grams : {effect: gram of its columns}, for effects with several columns
     """
 
     x: Matrix
@@ -230,7 +251,7 @@ class _Products:
         return cls(x, weights, squares, effect, number, grams)
 
     def gram(self, places: np.ndarray) -> np.ndarray:
-        """Those of the columns at some places."""
+        """Return X' W X of the columns at some places."""
         first = int(self.effect[places[0]])
         if len(places) == 1:
             return self.squares[places][:, None]
@@ -241,8 +262,8 @@ class _Products:
 
 
 def _gram(x: Matrix, weights: np.ndarray) -> np.ndarray:
-    """X' W X of a sparse matrix (n, k), (k, k)."""
-    # most columns are of TDOAs, or of an axis of another sensor
+    """Return X' W X of a sparse matrix (n, k), (k, k)."""
+    # Most columns are 0 here: they belong to TDOAs or to an axis of another sensor.
     filled = np.flatnonzero(np.diff(x.indptr))
     out = np.zeros((x.shape[1], x.shape[1]))
     if len(filled):
@@ -259,14 +280,15 @@ def _sparse_part(
     root: np.ndarray,
     rows: np.ndarray | slice,
 ) -> _Part:
-    """The _Part of some rows of a sparse RegressionTable, of all columns, the first `base` those of
-    the base. effects : places of the columns of each effect: of those of two effects products are
-    made when they are asked for.
+    """Return the _Part of some rows of a sparse RegressionTable.
+
+    Products between two effects are computed on demand.
+
+    effects : places of the columns of each effect; base : number of leading columns in the base
+    root : (n,) weights of all rows
     """
     root, y, x = root[rows], table.y[rows], table.matrix(columns, rows)
-    cross = product(
-        x, weighted(x[:, :base], root)
-    ).T  # in this order x is multiplied as it lies in memory
+    cross = product(x, weighted(x[:, :base], root)).T  # this order multiplies x as stored in memory
     return _Part(
         table,
         columns,

@@ -1,9 +1,9 @@
-"""Which effects explain the residuals: forward and backward steps with a price on every parameter.
+"""Select effects that explain the residuals, by forward and backward steps.
 
-The statistic of a candidate is what it gains in log-likelihood, twice, over all channels together
-and counted in independent rows. A parameter costs log(rows) as in the Bayesian information
-criterion, and choosing among C candidates costs 2 log C (Chen and Chen, Biometrika 2008, extended
-BIC): that holds the false-alarm rate of the whole catalogue.
+The statistic of a candidate is its gain in twice the log-likelihood over all channels, counted in
+independent rows. Each parameter costs log(rows), as in the Bayesian information criterion. A choice
+among C candidates costs 2 log C (extended BIC: Chen and Chen, Biometrika 2008). This price bounds
+the false-alarm rate of the whole catalogue.
 """
 
 from __future__ import annotations
@@ -27,30 +27,31 @@ if TYPE_CHECKING:
     from .scan import Scan
     from .terms import Candidate
 
-MAX_STEPS = 14
-FITTED = 6  # of what a scan proposes
-# columns of one and of a group, and the share of its criterion that the one must reach
+MAX_STEPS = 14  # largest number of forward steps
+FITTED = 6  # proposals of a scan that separate fits score
+# Columns of a small and of a large candidate; share of the criterion that the small one must reach.
 FEW, LARGE, GOOD_PART = (3, 6, 0.5)
-LEAST_DETERMINED = 0.3  # parameters that the data must determine of a candidate
-AMBIGUOUS = 10.0  # less difference in the criterion is no decision
-# share of the criterion by which a function may be worse than another one that it is much like
+LEAST_DETERMINED = 0.3  # smallest effective number of parameters of a candidate
+AMBIGUOUS = 10.0  # smallest gap of the criterion that decides between two candidates
+# largest relative gap of the criterion of a rival function
 ALIKE = 0.1
 
 
 class Search(Protocol):
-    """What finds more Candidates for the residual of a Fit of the chosen ones to a RegressionTable."""
+    """A function that finds more Candidates in the residual of a Fit to a RegressionTable."""
 
     def __call__(
         self, table: RegressionTable, model: Fit, chosen: Sequence[Candidate], /
     ) -> list[Candidate]:
-        """They, none or several."""
+        """Return Candidates for the residual of a Fit of the chosen ones."""
         ...
 
 
 @dataclass(frozen=True)
 class Rival:
-    """A Candidate that could stand in the place of a chosen one, and by how much its criterion is
-    worse.
+    """A Candidate that can replace a chosen one.
+
+    gap : by how much its criterion is worse, twice a log-likelihood
     """
 
     gap: float
@@ -59,9 +60,11 @@ class Rival:
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """table : RegressionTable with the columns of all candidates; chosen : (Candidate, ...); fit :
-    Fit of all of them; loss : criterion that each is worth beside the others; rivals : for each,
-    (Rival, ...), once somebody has looked for them.
+    """The chosen Candidates and their Fit.
+
+    table : RegressionTable with the columns of all candidates; fit : Fit of the chosen ones
+    loss : decrease of the criterion without each chosen Candidate
+    rivals : (Rival, ...) of each chosen Candidate, filled by `with_rivals`
     """
 
     table: RegressionTable
@@ -71,15 +74,16 @@ class Selection:
     rivals: tuple[tuple[Rival, ...], ...]
 
     def only(self, candidates: Collection[Candidate]) -> Selection:
-        """Selection of some of the chosen Candidates, fitted anew."""
+        """Return the Selection of some of the chosen Candidates, with a new robust fit."""
         chosen = self._chosen_of(candidates)
         return replace(
             self, **chosen, fit=fit(self.table, columns_of(chosen["chosen"]), self.fit.inflation)
         )
 
     def kept(self, candidates: Collection[Candidate]) -> Selection:
-        """Selection of some of the chosen Candidates, fitted with the present weights: what the
-        others explain is not taken for outliers.
+        """Return the Selection of some of the chosen Candidates, with the present weights.
+
+        With these weights, contributions of the dropped candidates do not count as outliers.
         """
         chosen = self._chosen_of(candidates)
         return replace(
@@ -87,8 +91,9 @@ class Selection:
         )
 
     def where(self, keeps: Callable[[Effect], bool]) -> Selection:
-        """Selection of the terms alone whose Effects a function keeps, fitted with the present
-        weights: what is written without the others has the values of a model without them.
+        """Return the Selection of terms whose Effects `keeps` accepts, with the present weights.
+
+        The values are estimated without the dropped terms.
         """
         parts = [candidate.where(keeps) for candidate in self.chosen]
         if parts == list(self.chosen):
@@ -109,7 +114,7 @@ class Selection:
         }
 
     def plus(self, candidate: Candidate) -> Selection:
-        """Selection with one more Candidate, whose columns the table has."""
+        """Return the Selection with one more Candidate; the table has its columns."""
         chosen = (*self.chosen, candidate)
         model = fit(self.table, columns_of(chosen), self.fit.inflation)
         return replace(
@@ -126,18 +131,32 @@ def select(
     start: Iterable[Candidate] = (),
     progress: Callable[[], object] = lambda: None,
 ) -> Selection:
-    """Selection among `candidates`, whose columns the RegressionTable holds.
+    """Select from `candidates` by forward steps with backward elimination.
 
-    search(table, fit, chosen) -> more Candidates, found for this residual; scan : a Scan, of whose
-    Candidates the first few are fitted, because the weights of the present fit, which takes what
-    they explain for outliers, would not do them justice. start : Candidates that are in the model
-    to begin with, and may fall out again. progress() is called now and then.
+    Parameters
+    ----------
+    table : RegressionTable
+        It holds the columns of the candidates.
+    candidates : list of Candidate
+        Candidates that every step scores.
+    inflation : (groups,)
+        Variance inflation, at least 1.
+    search : Search, optional
+        search(table, fit, chosen) returns more Candidates for the present residual.
+    scan : Scan, optional
+        It proposes functions. Separate fits score the first FITTED, because the present weights
+        treat their contribution as outliers.
+    start : Candidates
+        The initial model; backward elimination can drop them.
+    progress : function
+        It is called every few seconds.
     """
     chosen = list(start)
     model = fit(table, columns_of(chosen), inflation)
     for _ in range(MAX_STEPS):
         scanned, even = (scan(table, model, chosen), scan.even) if scan else ([], np.empty(0))
         found = (search(table, model, chosen) if search else []) + scanned[FITTED:]
+        # Forward step: score all candidates, and add the best one if it gains more than its price.
         wider = table.with_terms([term for candidate in found for term in candidate.terms])
         ranked = rank(wider, candidates + found, chosen, model)
         ranked += [
@@ -159,8 +178,10 @@ def select(
 
 
 def _sparse_first(ranked: list[tuple[float, Candidate]]) -> Candidate:
-    """The best Candidate; if that is a large group, the best of few parameters that does a good
-    part of what it does: what the group is needed for besides will show.
+    """Return the best Candidate, or a small Candidate that gains nearly as much as a large one.
+
+    Small means at most FEW columns, large more than LARGE, nearly at least GOOD_PART. Later steps
+    show whether the rest of the large group is needed.
     """
     criterion, best = ranked[0]
     few = (
@@ -177,9 +198,13 @@ def _fitted(
     choices: int,
     even: np.ndarray,
 ) -> float:
-    """Criterion of one Candidate more, by the likelihoods of both fits, or by least squares with
-    the weights `even`, (n,), if that says less: the one believes what noisy series show by chance,
-    the other what outliers do. Minus infinity for what nobody would model.
+    """Return the criterion of one more Candidate, the smaller of two scores.
+
+    The first score is the likelihood ratio of both fits; chance in noisy series can inflate it. The
+    second is least squares with the weights `even`; outliers can inflate it. An unacceptable
+    candidate scores minus infinity.
+
+    choices : number of candidates; even : (n,) weights
     """
     table = table.with_terms(candidate.terms)
     wider = fit(
@@ -189,17 +214,20 @@ def _fitted(
         return -np.inf
     scorer = Scorer(table, columns_of(chosen), wider, candidate.columns)
     gained = scorer.gain(candidate.columns)
-    if gained is None:  # the model holds it
+    if gained is None:  # the model contains it
         return -np.inf
     even_scorer = Scorer(table, columns_of(chosen), replace(wider, weight=even), candidate.columns)
     least_squares = even_scorer.gain(candidate.columns)
-    assert least_squares is not None  # nor is it then
+    assert least_squares is not None  # the same columns are new
     gain = min(wider.likelihood(table) - model.likelihood(table), least_squares.gain)
     return gain - scorer.price(candidate, gained.determined, choices)
 
 
 def worth(selection: Selection, choices: int) -> float:
-    """Criterion of a whole Selection: what its fit explains, less the price of all that is chosen."""
+    """Return the criterion of a Selection: likelihood of its fit minus price of its candidates.
+
+    Both are in units of twice a log-likelihood.
+    """
     chosen, total = selection.chosen, selection.fit.likelihood(selection.table)
     for k, candidate in enumerate(chosen):
         scorer = Scorer(selection.table, columns_of(chosen[:k]), selection.fit, candidate.columns)
@@ -211,8 +239,9 @@ def worth(selection: Selection, choices: int) -> float:
 def rank(
     table: RegressionTable, candidates: Sequence[Candidate], chosen: Sequence[Candidate], model: Fit
 ) -> list[tuple[float, Candidate]]:
-    """[(criterion, Candidate)], best first; without those that are far from worth it, of negligible
-    or of impossible size.
+    """Return [(criterion, Candidate)], best first.
+
+    Candidates far below their price, and negligible or impossible values, are left out.
     """
     scorer, out = Scorer(table, columns_of(chosen), model, columns_of(candidates)), []
     for candidate in candidates:
@@ -226,8 +255,9 @@ def rank(
 
 
 def acceptable(table: RegressionTable, candidate: Candidate, beta: np.ndarray) -> bool:
-    """Whether values beta (k,) of a Candidate could be, and move a channel by more than what nobody
-    would model.
+    """Return whether values beta (k,) of a Candidate are possible, and large enough on a channel.
+
+    A contribution is large enough if its RMS exceeds `Channel.negligible`.
     """
     if not (candidate.sizable(beta) and candidate.plausible(beta)):
         return False
@@ -243,9 +273,7 @@ def acceptable(table: RegressionTable, candidate: Candidate, beta: np.ndarray) -
 def _backward(
     table: RegressionTable, chosen: list[Candidate], model: Fit, choices: int
 ) -> tuple[list[Candidate], Fit]:
-    """Drop what is no longer worth its price, once others are in, or has become negligible or
-    impossible.
-    """
+    """Drop candidates that fall below their price, or become negligible or impossible."""
     while len(chosen) > 1:
         losses = _losses(table, chosen, model, choices)
         for k, candidate in enumerate(chosen):
@@ -262,12 +290,12 @@ def _backward(
 def _losses(
     table: RegressionTable, chosen: list[Candidate], model: Fit, choices: int
 ) -> list[float]:
-    """Criterion that each chosen Candidate is worth beside the others."""
+    """Return the criterion of each chosen Candidate given the others, twice a log-likelihood."""
     out = []
     for k, candidate in enumerate(chosen):
         scorer = Scorer(table, columns_of(chosen[:k] + chosen[k + 1 :]), model, candidate.columns)
         gained = scorer.gain(candidate.columns)
-        if gained is None:  # others hold all of its columns
+        if gained is None:  # the others contain all of its columns
             out.append(-scorer.price(candidate, 0.0, choices))
         else:
             out.append(gained.gain - scorer.price(candidate, gained.determined, choices))
@@ -275,8 +303,9 @@ def _losses(
 
 
 def _beside(table: RegressionTable, candidate: Candidate, other: Candidate) -> bool:
-    """Whether another Candidate acts on any row that a Candidate acts on; where a RegressionTable
-    is not sparse most do.
+    """Return whether two Candidates act on a common row.
+
+    In a table that is not sparse, most do; the answer is then True.
     """
     if not table.sparse:
         return True
@@ -292,15 +321,18 @@ def with_rivals(
     scan: Scan | None,
     progress: Callable[[], object],
 ) -> Selection:
-    """Selection with, for each chosen Candidate, the other effects that could replace it, and
-    functions that would do nearly as much. scan : Scan of functions, or None.
+    """Return the Selection with the rivals of each chosen Candidate.
+
+    Rivals are other effects with a similar criterion, and functions that explain nearly as much.
+
+    scan : Scan of functions, or None
     """
     table, chosen, model, out = selection.table, list(selection.chosen), selection.fit, []
     for k, candidate in enumerate(chosen):
         others = chosen[:k] + chosen[k + 1 :]
         rest, found = fit(table, columns_of(others), model.inflation, near=model), []
         if scan and not candidate.declared:
-            # what it explains is measured, not outliers
+            # With these weights its contribution does not count as outliers.
             rest = replace(rest, weight=model.weight, scale=model.scale)
             found = scan(table, rest, others)
         wider = table.with_terms([term for one in found for term in one.terms])

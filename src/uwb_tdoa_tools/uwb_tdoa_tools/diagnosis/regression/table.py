@@ -1,6 +1,4 @@
-"""Residuals of several flights and channels, and regressors, as one immutable table of a linear
-fit.
-"""
+"""Residuals of flights and channels, and regressors, as one immutable table of a linear fit."""
 
 from __future__ import annotations
 
@@ -25,22 +23,27 @@ if TYPE_CHECKING:
     from ..channels import ChannelResidual, ChannelResiduals
     from .terms import Column, Term
 
-BLOCK = 5.0  # s, taken as independent of each other
-AXES = 3  # of a channel at most
-AT_ONCE = 32  # columns that are made together, where they are sparse
+BLOCK = 5.0  # s, length of a block; blocks count as independent
+AXES = 3  # largest number of axes of a channel
+AT_ONCE = 32  # sparse columns that are computed together
 
 
 @dataclass(frozen=True, eq=False)
 class RegressionTable:
-    """n rows of a linear model y = X beta + noise, those of one channel after the other.
+    """The n rows of a linear model y = X beta + noise, channel after channel.
 
-    channels : names; y (n,); channel (n,) place in `channels`; group (n,) number of an axis of a
-        channel, AXES of each, what is alike
-    in noise; series (n,) int, different in every flight; block (n,) number of an independent
-    block; flight (n,); t (n,) s since the start; count (n,) samples averaged; place (n, 3) m.
-    parts : ((flight, name of the channel, first row, ChannelResidual), ...); columns : {Column:
-        (n,)}, X, whose columns tables share;
-    sparse : whether they are kept as (rows, values), because of MANY anchors few are heard at once.
+    channels : names; channel : (n,) index into `channels`
+    y : (n,) residual, in the unit of its channel
+    group : (n,) number of an axis of a channel, AXES per channel; rows of a group share a noise
+        scale
+    series : (n,) int, time series of a row, distinct in each flight; block : (n,) number of its
+        independent block
+    flight : (n,) number; t : (n,) s since the start; count : (n,) averaged samples; place : (n, 3)
+        m, world
+    parts : ((flight, name of the channel, first row, ChannelResidual), ...)
+    columns : {Column: (n,)}, the columns of X, shared between tables
+    sparse : whether columns are pairs (rows, values); used above MANY anchors, since few are
+        measured at once
     """
 
     channels: tuple[str, ...]
@@ -59,18 +62,19 @@ class RegressionTable:
 
     @property
     def present(self) -> tuple[str, ...]:
-        """Names of the channels that have rows."""
+        """Return the names of the channels with rows."""
         return tuple(self.channels[place] for place in np.unique(self.channel))
 
     @property
     def tdoa_parts(self) -> list[TdoaResidual]:
-        """Of its parts those of TDOAs."""
+        """Return its residuals of TDOAs."""
         return [part for *_, part in self.parts if isinstance(part, TdoaResidual)]
 
     @cached_property
     def groups(self) -> list[tuple[int, slice | np.ndarray]]:
-        """[(number, rows)] of the groups that have rows: a slice, where they lie together, or bool
-        (n,).
+        """Return [(number, rows)] of the groups with rows.
+
+        rows : a slice if they are contiguous, else (n,) bool
         """
         return [(k, self._rows_of_group(k)) for k in np.unique(self.group).tolist()]
 
@@ -82,26 +86,26 @@ class RegressionTable:
 
     @property
     def flights(self) -> int:
-        """How many."""
+        """Return the number of flights."""
         return int(self.flight.max()) + 1
 
     @property
     def radio_parts(self) -> list[RadioResidual]:
-        """Of its parts those of what is measured between the tag and anchors."""
+        """Return its residuals of measurements between the tag and anchors."""
         return [part for *_, part in self.parts if isinstance(part, RadioResidual)]
 
     @property
     def radio_rows(self) -> np.ndarray:
-        """(m,) rows of these, of one channel after the other."""
+        """Return the rows of measurements between tag and anchors, (m,), channel after channel."""
         return np.flatnonzero(np.isin(self.channel, [self.channels.index(name) for name in RADIO]))
 
     def rows_of(self, channel: str) -> slice:
-        """Slice of the rows of a channel, by its name."""
+        """Return the slice of the rows of a channel, by name."""
         place = self.channels.index(channel)
         return slice(*np.searchsorted(self.channel, [place, place + 1]))
 
     def matrix(self, columns: Sequence[Column], rows: slice | np.ndarray = slice(None)) -> Any:
-        """X of some Columns, (n, k), or some of its rows; a sparse one if the RegressionTable is."""
+        """Return X of some Columns, (n, k), or some of its rows; sparse if the table is sparse."""
         if self.sparse and isinstance(rows, slice) and rows != slice(None):
             edges, several = (rows.start, rows.stop), [self.columns[column] for column in columns]
             parts = [(its, values, *np.searchsorted(its, edges)) for its, values in several]
@@ -118,8 +122,9 @@ class RegressionTable:
         return out
 
     def with_terms(self, terms: Iterable[Term]) -> RegressionTable:
-        """A RegressionTable that has the columns of some Terms too, at the values that their
-        effects have.
+        """Return a RegressionTable with the columns of some Terms too.
+
+        The columns are derivatives at the values that the effects have.
         """
         wanted: dict[Hashable, tuple[Effect, dict[str, Column]]] = {}
         for term in terms:
@@ -139,7 +144,7 @@ class RegressionTable:
         return replace(self, columns=columns)
 
     def _values(self, effect: Effect, keys: tuple[str, ...]) -> Any:
-        """What `columns` hold of parameters of an Effect: iterable."""
+        """Return regressors of parameters of an Effect, an iterable in the form of `columns`."""
         made = (
             (row, part.columns(effect, keys))
             for _, channel, row, part in self.parts
@@ -160,7 +165,7 @@ class RegressionTable:
         return x.T
 
     def rows(self, chosen: np.ndarray) -> RegressionTable:
-        """RegressionTable of some rows, (n,) bool, with the columns that it has."""
+        """Return the RegressionTable of some rows, (n,) bool, with its columns."""
         each = ("y", "channel", "group", "series", "block", "flight", "t", "count", "place")
         arrays = {name: getattr(self, name)[chosen] for name in each}
         if not self.sparse:
@@ -179,8 +184,9 @@ class RegressionTable:
     def with_contribution(
         self, effects: Iterable[tuple[Effect, Sequence[Column]]]
     ) -> RegressionTable:
-        """A RegressionTable whose y also holds what Effects, at their values, contribute; it has
-        their columns.
+        """Return a RegressionTable with the contribution of Effects, at their values, added to y.
+
+        effects : [(Effect, its Columns)]; the table has these columns
         """
         y = self.y.copy()
         for effect, columns in effects:
@@ -190,8 +196,9 @@ class RegressionTable:
 
 
 def _joined(parts: Sequence[tuple[int, Any]], k: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """(rows, values) of each of k columns, of sparse matrices that begin at some rows, [(row, (n,
-    k))].
+    """Return (rows, values) of each of k columns of stacked sparse matrices.
+
+    parts : [(first row, sparse matrix (n, k))]
     """
     for column in range(k):
         some = [(row, x, slice(*x.indptr[column : column + 2])) for row, x in parts]
@@ -203,8 +210,9 @@ def _joined(parts: Sequence[tuple[int, Any]], k: int) -> Iterator[tuple[np.ndarr
 
 
 def table_of(residuals: Sequence[ChannelResiduals]) -> RegressionTable:
-    """RegressionTable without columns of [{name of a channel: ChannelResidual}], one dict for each
-    flight.
+    """Return the RegressionTable of residuals, without columns.
+
+    residuals : [{channel: ChannelResidual}], one dict per flight
     """
     parts, each = [], ("y", "channel", "group", "series", "block", "flight", "t", "count", "place")
     pieces: dict[str, list[np.ndarray]] = {key: [] for key in each}

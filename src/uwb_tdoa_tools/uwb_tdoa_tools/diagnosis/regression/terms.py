@@ -1,4 +1,4 @@
-"""What a fit gives values: parameters of effects."""
+"""Parameters of effects as regressors: Column, Term and Candidate."""
 
 from __future__ import annotations
 
@@ -17,8 +17,10 @@ if TYPE_CHECKING:
 
 
 class Column(NamedTuple):
-    """A parameter of an effect, as a regressor. effect : identity of the Effect; key : name of the
-    parameter; typical : plausible size, in its unit: standard deviation of its prior.
+    """A parameter of an effect, as a regressor.
+
+    effect : identity of the Effect; key : name of the parameter
+    typical : standard deviation of its prior, in its unit
     """
 
     effect: tuple[Hashable, ...]
@@ -28,9 +30,9 @@ class Column(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """An Effect and those of its parameters, `keys`, that a fit gives values.
+    """An Effect and the parameters `keys` that a fit estimates.
 
-    Values that it has already are fixed.
+    Other values of the Effect are fixed.
     """
 
     effect: Effect
@@ -38,20 +40,21 @@ class Term:
 
     @cached_property
     def columns(self) -> tuple[Column, ...]:
-        """A Column for each of the keys."""
+        """Return one Column per key."""
         effect = self.effect
         return tuple(Column(effect.merge_key, key, effect.prior_std_of(key)) for key in self.keys)
 
     @property
     def function(self) -> SmoothTerm | None:
-        """Its Effect, if that is a function without a name."""
+        """Return the Effect if it is a function without a name, else None."""
         return self.effect if isinstance(self.effect, SmoothTerm) else None
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """Terms that come into a model together. price : of the search that found them, twice a
-    log-likelihood.
+    """Terms that enter a model together.
+
+    price : cost of the search that found them, twice a log-likelihood
     """
 
     terms: tuple[Term, ...]
@@ -59,44 +62,42 @@ class Candidate:
 
     @cached_property
     def columns(self) -> tuple[Column, ...]:
-        """The Columns of all terms."""
+        """Return the Columns of all terms."""
         return tuple(column for term in self.terms for column in term.columns)
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Names of the channels where it acts."""
+        """Return the names of the channels on which it acts."""
         return tuple(dict.fromkeys(name for term in self.terms for name in term.effect.channels))
 
     @property
     def name(self) -> str:
-        """Name of its effect."""
+        """Return the name of its effect."""
         return self.terms[0].effect.name
 
     @property
     def title(self) -> str:
-        """Name of its effect, or what a function without a name depends on."""
+        """Return the name of its effect, or the covariate of a function without a name."""
         return self.name if self.declared else self.label
 
     @property
     def declared(self) -> bool:
-        """Whether it is in the catalogue, not a function without a name."""
+        """Return whether the effect is in the catalogue, not a function without a name."""
         return self.terms[0].function is None
 
     @property
     def label(self) -> str:
-        """How it is called in reports."""
+        """Return its name in reports."""
         more = (f" + {term.function.covariate}" for term in self.terms[1:] if term.function)
         return "".join((self.terms[0].effect.label_of(self.terms[0].keys), *more))
 
     def where(self, keeps: Callable[[Effect], bool]) -> Candidate | None:
-        """The Candidate with those of its terms alone whose Effects a function keeps; None if that
-        is none.
-        """
+        """Return the Candidate with the terms whose Effects `keeps` accepts; None without any."""
         terms = tuple(term for term in self.terms if keeps(term.effect))
         return self if terms == self.terms else Candidate(terms, self.price) if terms else None
 
     def plausible(self, beta: np.ndarray) -> bool:
-        """Whether values of its columns, (k,), could be."""
+        """Return whether values of its columns, (k,), are within the bounds of its effects."""
         values = dict(zip(((column.effect, column.key) for column in self.columns), beta.tolist()))
         return all(
             term.effect.within_bounds(
@@ -106,8 +107,9 @@ class Candidate:
         )
 
     def sizable(self, beta: np.ndarray) -> bool:
-        """Whether the share of its effects of the values of its columns, (k,), is worth having; a
-        smaller group says as much.
+        """Return whether enough of the values of its columns, (k,), exceed the negligible size.
+
+        If few values are large, a smaller group of parameters suffices.
         """
         effects = [term.effect for term in self.terms for _ in term.keys]
         worth = [abs(value) >= one.negligible for value, one in zip(beta.tolist(), effects)]
@@ -115,14 +117,14 @@ class Candidate:
 
 
 def candidates_of(effect: Effect, anchors: Anchors, pairs: np.ndarray) -> list[Candidate]:
-    """A Candidate for every set of parameters of an Effect that makes sense, the full set first.
-    anchors : Anchors;
-    pairs : (m, 2) ids of the pairs that were heard.
+    """Return one Candidate per meaningful set of parameters of an Effect, the full set first.
+
+    anchors : Anchors; pairs : (m, 2) ids of the measured pairs
     """
     sets = [keys for keys in effect.groups(anchors, pairs) if keys]
     return [Candidate((Term(effect, tuple(keys)),), effect.penalty) for keys in sets]
 
 
 def columns_of(candidates: Iterable[Candidate]) -> list[Column]:
-    """All Columns of some Candidates, each once: list."""
+    """Return all Columns of some Candidates, each once."""
     return list(dict.fromkeys(column for candidate in candidates for column in candidate.columns))

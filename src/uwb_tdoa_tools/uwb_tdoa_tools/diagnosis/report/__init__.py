@@ -1,4 +1,5 @@
-"""What a diagnosis says to a person: verdict, what to do, what each effect is worth, what was not
-determined; and one page of HTML with all of it (`page.py`). The text for the screen and
-diagnosis.json say the same (`output.py`).
+"""Write a diagnosis for people: verdict, advice, worth of each effect, undetermined parameters.
+
+`page.py` writes one HTML page. The text for the screen and diagnosis.json (`output.py`) have the
+same content.
 """

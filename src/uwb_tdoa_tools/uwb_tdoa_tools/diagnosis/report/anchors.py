@@ -1,5 +1,6 @@
-"""Positions and delays of anchors that were found: values that make the data fit, which is not the
-same as a survey.
+"""List estimated positions and delays of anchors.
+
+The values fit the data. They do not replace a survey.
 """
 
 from __future__ import annotations
@@ -17,12 +18,13 @@ if TYPE_CHECKING:
 
 TITLE = "Values that make these data fit; measure again before you move an anchor"
 HEAD = ("anchor", "x, cm", "y, cm", "z, cm", "late by, cm")
-SURE = 2.0  # standard deviations from which a value is marked
+SURE = 2.0  # standard deviations of a value that is not marked with "?"
 
 
 def rows(diagnosis: Diagnosis) -> list[list[str]]:
-    """[[cell]] of a table, those of HEAD first that have any value, then a row for each anchor of
-    which a position or a delay was found; [] without any.
+    """Return the rows of a table, [[cell]]; [] without estimated positions or delays.
+
+    The first row holds the entries of HEAD with values. Each further row is an anchor.
     """
     found: dict[str, dict[str, tuple[float, float]]] = {}
     for finding in diagnosis.findings:
@@ -51,7 +53,7 @@ def _cell(known: tuple[float, float] | None) -> str:
 
 
 def lines(diagnosis: Diagnosis) -> list[str]:
-    """The same for the screen."""
+    """Return the table as lines for the screen."""
     several = rows(diagnosis)
     if not several:
         return []
@@ -62,6 +64,6 @@ def lines(diagnosis: Diagnosis) -> list[str]:
 
 
 def table(diagnosis: Diagnosis) -> Table:
-    """The same for the page."""
+    """Return the table for the page."""
     several = rows(diagnosis)
     return Table(several[0], several[1:], range(1, len(several[0]))) if several else Table()

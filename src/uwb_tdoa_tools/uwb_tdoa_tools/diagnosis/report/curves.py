@@ -1,4 +1,4 @@
-"""Curves: the error over time, what measurements leave, and functions without a name."""
+"""Draw curves: error over time, residuals, and functions without a name."""
 
 from __future__ import annotations
 
@@ -29,18 +29,19 @@ if TYPE_CHECKING:
 
     _Curve = tuple[str, str, Flown]  # title, colour
 
-BINS = 300  # of a curve over time; of each the largest is drawn
-MOST = 12  # flights whose errors are drawn
-PAIRS, FEWEST = 16, 20  # that are drawn, and measurements of each
+BINS = 300  # bins of a curve over time; the largest value of each is drawn
+MOST = 12  # largest number of drawn flights
+PAIRS, FEWEST = 16, 20  # largest number of drawn pairs, and fewest measurements of a pair
 FUNCTIONS = 12  # that are drawn
-POINTS = 3000  # of a series of residuals
-# of a legend
+POINTS = 3000  # largest number of drawn points of a residual series
+# position of a legend above the axes
 ABOVE = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "ncols": 2, "frameon": False}
 
 
 def errors_over_time(diagnosis: Diagnosis) -> tuple[list[Picture], int]:
-    """The 3D error of every judged flight before and after, the largest marked: (pictures, of how
-    many flights).
+    """Draw the 3D error of each judged run, before and after, and mark the maximum.
+
+    returns : pictures, number of runs
     """
     sides = (
         [("before", BEFORE, diagnosis.before), ("after", AFTER, diagnosis.after)]
@@ -64,7 +65,10 @@ def errors_over_time(diagnosis: Diagnosis) -> tuple[list[Picture], int]:
 
 
 def _errors(name: str, each: Sequence[_Curve], top: float) -> Picture:
-    """One picture; each : [(title, colour, Flown)]; top : cm, largest error that is to be seen."""
+    """Return the picture of one run.
+
+    each : [(title, colour, Flown)]; top : cm, largest error in any picture
+    """
     largest = listed(f"{CM * run.distance.max():.0f} cm ({title})" for title, _, run in each)
     wide, narrow = (_drawn_errors(name, each, top, width) for width in (FULL, WIDTH))
     return embedded(wide, f"Position error over time, {name}: at most {largest}", narrow=narrow)
@@ -86,7 +90,7 @@ def _drawn_errors(name: str, each: Sequence[_Curve], top: float, width: float) -
             and abs(other[0] - t) < 0.15 * each[0][2].t[-1]
             and abs(other[1] - distance) < 0.2 * top
         ]
-        below = any(other[1] > distance for other in near)  # of another label that would lie on it
+        below = any(other[1] > distance for other in near)  # the labels would overlap
         right = t > 0.5 * each[0][2].t[-1]
         place = {
             "xytext": (-6 if right else 6, -11 if below else 3),
@@ -103,7 +107,7 @@ def _drawn_errors(name: str, each: Sequence[_Curve], top: float, width: float) -
 
 
 def _peaks(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A series with the largest value of each of some bins."""
+    """Return a series reduced to the largest value of each of BINS bins."""
     if len(t) <= BINS:
         return t, values
     starts = np.linspace(0, len(t), BINS, endpoint=False).astype(int)
@@ -112,7 +116,7 @@ def _peaks(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def residual_series(diagnosis: Diagnosis) -> list[Picture]:
-    """What every channel leaves in the first flight, before and after."""
+    """Draw the residuals of each channel in the first flight, before and after."""
     before, after = (
         _series(found[0]) for found in (diagnosis.attribution.residuals, diagnosis.remaining)
     )
@@ -124,7 +128,7 @@ def residual_series(diagnosis: Diagnosis) -> list[Picture]:
 
 
 def _series(flight: ChannelResiduals) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """{channel: (stamps, residuals)} of {channel: ChannelResidual}."""
+    """Return {label: (stamps s, residuals)} of {channel: ChannelResidual}."""
     return {label: series for part in flight.values() for label, series in part.series().items()}
 
 
@@ -146,8 +150,9 @@ def _residuals(name: str, *sides: tuple[np.ndarray, np.ndarray]) -> Picture:
 
 
 def pairs(diagnosis: Diagnosis) -> list[Picture]:
-    """Offset and scatter of every pair of anchors, before and after, in one picture, if there is
-    any pair.
+    """Draw offset and scatter of the residual of each pair of anchors, before and after.
+
+    The list is empty without pairs.
     """
     after = {item["pair"]: item for item in health(diagnosis.remaining)["pairs"]}
     before = {
@@ -205,7 +210,7 @@ def _drawn_pairs(
 
 
 def functions(diagnosis: Diagnosis) -> list[Picture]:
-    """Functions without a name, in the model or not."""
+    """Draw the functions without a name, in the model or not."""
     return [_function(finding.function) for finding in diagnosis.findings if finding.function][
         :FUNCTIONS
     ]

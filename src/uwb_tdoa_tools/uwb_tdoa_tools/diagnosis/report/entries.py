@@ -1,6 +1,4 @@
-"""Findings as a reader wants them: what came into the model together is one entry, with its worth
-and its doubts.
-"""
+"""Group findings for a reader: candidates of one selection step form one entry."""
 
 from __future__ import annotations
 
@@ -24,23 +22,22 @@ if TYPE_CHECKING:
     from ..regression.confounding import Alternative
     from ..result import Diagnosis
 
-CM = 100.0  # in a metre
+CM = 100.0  # cm per metre
 OR = "or"
-LEAST_WORTH = 0.0005  # m; less is no difference
-WORTH_DOING = 0.005  # m of position: what gains less is not asked of anybody
-DEGREES = float(np.degrees(1.0))  # in a radian
+LEAST_WORTH = 0.0005  # m, smallest difference
+WORTH_DOING = 0.005  # m, smallest gain in position that is worth an action
+DEGREES = float(np.degrees(1.0))  # degrees per radian
 FORMS = {"arrival": " (of each arrival)", "anchor": " (by anchor)"}
-SHOWN = 6  # values
-LONGEST = 8.0  # em, of a bar
+SHOWN = 6  # largest number of shown values
+LONGEST = 8.0  # em, longest bar
 
 
 @dataclass(frozen=True)
 class Entry:
-    """Findings that came and went together.
+    """Findings that entered the model together.
 
-    title : of all of them; values : those that are significant, in words; why_not : reason for not
-        being in the model,
-    "" for what is added; alternatives : (Alternative, ...).
+    title : of all findings; values : significant values, in words
+    why_not : reason for not being in the model, "" if added; alternatives : (Alternative, ...)
     """
 
     findings: tuple[EffectFinding, ...]
@@ -51,32 +48,33 @@ class Entry:
 
     @property
     def added(self) -> bool:
-        """Whether it is in the model that is written."""
+        """Return whether the written model contains it."""
         return self.findings[0].added
 
     @property
     def worth(self) -> float | None:
-        """m by which the 3D RMSE is larger without it; None if nobody tried."""
+        """Return the increase of the 3D RMSE without it, m; None if not tried."""
         return self.findings[0].worth
 
     @property
     def advice(self) -> tuple[str, ...]:
-        """What a person can do about it: (sentence, ...)."""
+        """Return sentences with advice."""
         return tuple(sentence for finding in self.findings for sentence in finding.effect.advice())
 
     @property
     def matters(self) -> bool:
-        """Whether it is worth doing something about: a fault, or the position gains from taking it
-        out, as far as anybody knows.
+        """Return whether a user should act: for a fault, or if the position gains.
+
+        An unknown gain counts as a gain.
         """
         fault = any(
             isinstance(finding.effect, LabelEffect) for finding in self.findings
-        )  # a plain mistake, to be put right whatever it is worth
+        )  # a fault is corrected whatever its worth
         return self.added and (fault or self.worth is None or self.worth >= WORTH_DOING)
 
     @property
     def physics(self) -> str:
-        """Where it comes from, in words."""
+        """Return the physical cause, in words."""
         first = self.findings[0]
         return (
             first.effect.physics
@@ -86,24 +84,25 @@ class Entry:
 
     @property
     def over_flights(self) -> str:
-        """A sentence on how flights differ in it; "" for a single one."""
+        """Return a sentence on differences between flights; "" for a single flight."""
         return in_words(self.findings[0].shares)
 
     @property
     def undecided(self) -> list[Alternative]:
-        """Alternatives that fit nearly as well, the nearest first."""
+        """Return the alternatives that fit nearly equally well, the nearest first."""
         gaps = [(other.gap, other) for other in self.alternatives if other.gap is not None]
         return [other for _, other in sorted(gaps, key=lambda pair: pair[0])]
 
     @property
     def imitators(self) -> list[Alternative]:
-        """Alternatives that explain as much, but would need more, or less plausible, values."""
+        """Return the alternatives that explain as much with more, or less plausible, values."""
         return [other for other in self.alternatives if other.gap is None]
 
 
 def entries(diagnosis: Diagnosis) -> list[Entry]:
-    """[Entry] of a Diagnosis, the most prominent first; what all anchors share over the room after
-    what is known of some.
+    """Return the entries of a Diagnosis, the most prominent first.
+
+    Entries of several findings, such as maps of all anchors, come last.
     """
     groups: dict[Hashable, list[EffectFinding]] = {}
     for finding in diagnosis.findings:
@@ -114,7 +113,7 @@ def entries(diagnosis: Diagnosis) -> list[Entry]:
 
 
 def worth_in_words(entry: Entry) -> str:
-    """ "1.5 cm" """
+    """Return the worth in words, such as "1.5 cm"."""
     if entry.worth is None:
         return "not told by errors in the air" if entry.findings[0].on_floor else "not known"
     if abs(entry.worth) < LEAST_WORTH:
@@ -127,7 +126,7 @@ def worth_in_words(entry: Entry) -> str:
 
 
 def undecided_in_words(entry: Entry) -> list[str]:
-    """What it could as well be, and how to tell, one sentence each: list."""
+    """Return one sentence per flight that would decide between alternatives."""
     return [
         f"Could as well be {names}; to tell: {flight}."
         for names, flight in by_flight(entry.undecided)
@@ -135,7 +134,7 @@ def undecided_in_words(entry: Entry) -> list[str]:
 
 
 def doubt_in_words(entry: Entry) -> list[str]:
-    """What else it could be, and how to tell, one sentence each: list."""
+    """Return sentences on all alternatives, and flights that would decide."""
     imitated = by_flight(entry.imitators)
     return undecided_in_words(entry) + [
         f"Could be imitated by {names}, less plausibly; to tell: {flight}."
@@ -144,7 +143,7 @@ def doubt_in_words(entry: Entry) -> list[str]:
 
 
 def certainty_in_words(entry: Entry) -> str:
-    """What there is to say where nothing else is named: a sentence."""
+    """Return a sentence for an entry without alternatives."""
     first = entry.findings[0]
     if first.candidates:
         return "Nothing else in the catalogue explains as much."
@@ -156,7 +155,7 @@ def certainty_in_words(entry: Entry) -> str:
 
 
 def known_with(entry: Entry) -> list[str]:
-    """What has to be known with its advice: [sentence]."""
+    """Return sentences that qualify its advice: worth and doubt."""
     together = ", together" * (len(entry.advice) > 1)
     worth = [] if entry.worth is None else [f"Worth {worth_in_words(entry)} of position{together}."]
     doubt = " ".join(undecided_in_words(entry))
@@ -164,8 +163,9 @@ def known_with(entry: Entry) -> list[str]:
 
 
 def bar(entry: Entry, found: Iterable[Entry]) -> float:
-    """em, length of the bar that shows its worth beside the largest of those that are added; 0 for
-    none.
+    """Return the length of the bar of its worth, em; 0 for none.
+
+    The largest worth of the added entries has length LONGEST.
     """
     largest = max((other.worth or 0.0 for other in found if other.added), default=0.0)
     return (
@@ -176,7 +176,7 @@ def bar(entry: Entry, found: Iterable[Entry]) -> float:
 
 
 def by_flight(alternatives: Iterable[Alternative]) -> list[tuple[str, str]]:
-    """[(names in words, flight that tells)], one for each such flight."""
+    """Return [(names of effects, flight that decides between them)]."""
     groups: dict[str, list[str]] = {}
     for other in alternatives:
         groups.setdefault(other.tell_apart, []).append(other.effect)
@@ -184,9 +184,9 @@ def by_flight(alternatives: Iterable[Alternative]) -> list[tuple[str, str]]:
 
 
 def for_people(unit: str, key: str = "") -> tuple[str, float]:
-    """(unit, factor) of a value of an effect: angles in degrees.
+    """Return (unit, factor) that show a value of an effect: angles in degrees.
 
-    Of units of several kinds, that of the key.
+    key : parameter, which decides between several units
     """
     if unit == "m, rad":
         unit = "m" if key in ("x", "y", "z") else "rad"
@@ -194,8 +194,10 @@ def for_people(unit: str, key: str = "") -> tuple[str, float]:
 
 
 def by_anchor(effect: Effect) -> dict[int, dict[str, tuple[float, float | None]]]:
-    """{anchor: {"x", "y", "z" or "": (value, std or None)}} of those values of an Effect that are
-    significant, where each is of one anchor, in the order of anchors; {} of other effects.
+    """Return the significant values of an Effect per anchor, in the order of anchors.
+
+    The form is {anchor: {"x", "y", "z" or "": (value, std or None)}}. It is {} if a value is not of
+    one anchor.
     """
     out: dict[int, dict[str, tuple[float, float | None]]] = {}
     for key in effect.significant():
@@ -238,7 +240,7 @@ def _values(finding: EffectFinding) -> str:
     vague = len(effect.values) - len(significant)
     if not significant and vague > SHOWN:
         return f"{vague} values, none twice its standard deviation"
-    named = significant or effect.values  # a few values are named, however uncertain they are
+    named = significant or effect.values  # without significant values, all are named
     shown = [
         f"{key} = {measured(value * factors[key], (effect.std.get(key) or 0.0) * factors[key])}"
         for key, value in fitted_first

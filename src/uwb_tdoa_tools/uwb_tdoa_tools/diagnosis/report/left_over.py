@@ -1,4 +1,4 @@
-"""Where a model leaves most of the measurements unexplained: of which pairs, when and where."""
+"""Find pairs, times and places at which the model leaves the largest residuals."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ if TYPE_CHECKING:
     from ..channels import ChannelResidual
     from ..result import Diagnosis
 
-# m, and times the root mean square of all, that a pair may be off for BLOCK s before it is named
+# smallest RMS residual of a named pair over BLOCK s: m, and relative to the RMS of all rows
 LARGE, ABOVE = (0.15, 3.0)
-NAMED = 3
-NEAR = 0.999  # of that limit, from which on a pair is looked at closely
+NAMED = 3  # largest number of named places
+NEAR = 0.999  # share of that limit above which a pair is checked exactly
 
 
 def left_over(diagnosis: Diagnosis) -> tuple[str, ...]:
-    """(sentence, ...), the largest first; () where nothing stands out."""
+    """Return sentences on the largest remaining residuals; () if none stands out."""
     found: list[tuple[float, str]] = []
     for flight, residuals in zip(diagnosis.flights, diagnosis.remaining):
         for part in residuals.values():

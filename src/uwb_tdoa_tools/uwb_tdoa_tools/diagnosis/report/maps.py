@@ -1,6 +1,4 @@
-"""The room from above and from the side: anchors, what was found there, and where the estimate
-errs.
-"""
+"""Draw the room from above and from the side: anchors, findings, and position errors."""
 
 from __future__ import annotations
 
@@ -27,15 +25,15 @@ if TYPE_CHECKING:
     from ..result import Diagnosis
     from .room import Flown
 
-POINTS = 1500  # of all paths
-GAP = 1.0  # s without an estimate that breaks a path
-BESIDE = 0.7  # m between anchors that share a label
+POINTS = 1500  # points of all paths together
+GAP = 1.0  # s, gap in the estimate that breaks a line
+BESIDE = 0.7  # m, largest distance of anchors with a common label
 MARGIN = 1.0  # m around anchors and paths
-LONGEST = 0.16  # of the room, of an arrow
+LONGEST = 0.16  # longest arrow, share of the room
 AWAY = 11.0  # points between an anchor and the middle of its label
-KEYS = (1, 2, 5, 10, 20, 50, 100, 200)  # cm
-ENLARGED = (1, 2, 3, 5, 10, 20, 50, 100)
-# quantile of the errors at the end of the colours, and of arrows that are to be seen whole
+KEYS = (1, 2, 5, 10, 20, 50, 100, 200)  # cm, possible lengths of the arrow in the key
+ENLARGED = (1, 2, 3, 5, 10, 20, 50, 100)  # possible factors on the length of arrows
+# quantile of the errors at the end of the colour scale, and for the scale of arrows
 BRIGHT = 0.95
 COLOURS = LinearSegmentedColormap.from_list(
     "error", plt.get_cmap("viridis_r")(np.linspace(0.06, 1.0, 64))
@@ -44,8 +42,9 @@ ARROW = {"arrowstyle": "-|>", "color": FOUND, "lw": 1.8, "shrinkA": 0, "shrinkB"
 
 
 def maps(diagnosis: Diagnosis) -> tuple[str, list[Picture]]:
-    """(caption of all, pictures): one map before and one after; one alone if nothing has changed,
-    or nobody knows the errors.
+    """Return (common caption, pictures): a map before and a map after.
+
+    There is a single map if the model did not change or the errors are unknown.
     """
     sides = [
         (name, flown(side["scores"]))
@@ -59,14 +58,15 @@ def maps(diagnosis: Diagnosis) -> tuple[str, list[Picture]]:
     distances = np.concatenate([run.distance for _, runs in sides for run in runs])
     norm = Normalize(0.0, 100.0 * np.quantile(distances, BRIGHT))
     arrows = Arrows.of(diagnosis, [runs for _, runs in sides])
-    caption = _caption(diagnosis, sides[0][1], arrows.enlarged)  # once for both
+    caption = _caption(diagnosis, sides[0][1], arrows.enlarged)  # one caption for both maps
     return caption, [_drawn(diagnosis, title, runs, norm, arrows) for title, runs in sides]
 
 
 @dataclass(frozen=True)
 class Arrows:
-    """How arrows are drawn, the same on every map. enlarged : times what they are; key : cm, length
-    of the one that is explained.
+    """The scale of arrows on all maps.
+
+    enlarged : factor on their length; key : cm, length of the arrow in the key
     """
 
     enlarged: int
@@ -74,12 +74,16 @@ class Arrows:
 
     @classmethod
     def of(cls, diagnosis: Diagnosis, sides: Sequence[Sequence[Flown]]) -> Arrows:
-        """For a Diagnosis; sides : lists of Flown."""
+        """Return the scale for a Diagnosis.
+
+        sides : lists of Flown, before and after
+        """
         errors = [mean_errors(runs, view)[1] for runs in sides for view in VIEWS]
         lengths = np.concatenate(
             [np.zeros(1), *(np.linalg.norm(error, axis=1) for error in errors)]
         )
-        longest = np.quantile(lengths, BRIGHT)  # not that of a start gone wrong
+        # a quantile, because a wrong start can have huge errors
+        longest = np.quantile(lengths, BRIGHT)
         shifts = [np.linalg.norm(by) for by, _ in shifts_and_regions(diagnosis)[0].values()]
         room = np.ptp(diagnosis.flights[0].anchors.positions, axis=0).max()
         most = LONGEST * room / max(longest, *shifts, 1e-9)
@@ -97,7 +101,7 @@ def _drawn(
     tall = WIDTH * 0.87 * (size[1] + size[2]) / size[0]
     figure, axes = drawing(min(tall, 2.0 * WIDTH) + 1.6, nrows=2, height_ratios=size[1:])
     engine = figure.get_layout_engine()
-    assert isinstance(engine, ConstrainedLayoutEngine)  # as `drawing` asks for
+    assert isinstance(engine, ConstrainedLayoutEngine)  # `drawing` sets it
     engine.set(w_pad=0.1)
     for ax, view in zip(axes, VIEWS):
         _path(ax, diagnosis, runs, view, norm)
@@ -139,7 +143,7 @@ def _drawn(
 
 
 def _limits(diagnosis: Diagnosis, runs: Sequence[Flown]) -> tuple[np.ndarray, np.ndarray]:
-    """(lowest (3,), highest (3,)) m of what is drawn."""
+    """Return (lowest (3,), highest (3,)), m, of the drawn region."""
     paths = [run.p for run in runs] or list(map(estimated, diagnosis.remaining))
     places = [diagnosis.flights[0].anchors.positions, *paths]
     low, high = (getattr(np.concatenate(places), name)(axis=0) for name in ("min", "max"))
@@ -159,7 +163,7 @@ def _path(
         t, p, distance = run.t[::every], run.p[::every, view], 100.0 * run.distance[::every]
         near = np.diff(t) < max(GAP, 2.0 * np.median(np.diff(run.t)) * every)
         parts, colour = np.stack([p[:-1], p[1:]], axis=1)[near], distance[1:][near]
-        order = np.argsort(colour)  # the worst on top
+        order = np.argsort(colour)  # the largest errors on top
         lines = LineCollection(
             parts[order], array=colour[order], cmap=COLOURS, norm=norm, lw=1.8, rasterized=True
         )
@@ -194,8 +198,9 @@ def _anchors(ax: Axes, diagnosis: Diagnosis, view: list[int], enlarged: int) -> 
 
 
 def _names(ax: Axes, places: Mapping[int, np.ndarray], shifts: Mapping[int, np.ndarray]) -> None:
-    """Ids beside anchors, where their arrows do not point; those that stand one behind the other
-    share a label.
+    """Write ids next to anchors, opposite to their arrows.
+
+    Anchors behind each other share a label.
     """
     middle = np.mean(list(places.values()), axis=0)
     labels: dict[tuple[float, ...], list[int]] = {}
@@ -223,7 +228,7 @@ def _names(ax: Axes, places: Mapping[int, np.ndarray], shifts: Mapping[int, np.n
 
 
 def _arrows(ax: Axes, runs: Sequence[Flown], view: list[int], enlarged: int) -> Quiver | None:
-    """Quiver of the mean errors; None without any."""
+    """Draw arrows of mean errors, and return them; None without any."""
     places, errors = mean_errors(runs, view)
     if not len(places):
         return None

@@ -1,4 +1,4 @@
-"""The report: one page of HTML that holds everything itself."""
+"""Write the report: one HTML page without external files."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from . import anchors, curves, entries, maps, tables, verdict, words
 if TYPE_CHECKING:
     from ..result import Diagnosis
 
-# Names and texts of a recording are a stranger's: everything that is not markup of a template is
-# escaped.
+# Names and texts in a recording are not trusted, so everything except template markup is escaped.
 _TEMPLATES = Environment(
     loader=PackageLoader(__package__),
     autoescape=True,
@@ -32,10 +31,12 @@ _TEMPLATES.globals |= {
 
 
 def html(diagnosis: Diagnosis, template: str = "page") -> str:
-    """The page of a Diagnosis: verdict, what to do, what each effect is worth, map, errors, what
-    was not determined, and folded details.
+    """Return the HTML page of a Diagnosis.
 
-    template : of the folder `templates`, the page or one of its parts.
+    It shows verdict, advice, worth of each effect, map, errors, undetermined parameters, and
+    details.
+
+    template : name in the folder `templates`: the page or a part
     """
     names = ", ".join(flight.name for flight in diagnosis.flights)
     found = entries.entries(diagnosis)

@@ -1,4 +1,4 @@
-"""Pictures inside of a page. Importing this takes a second: it loads the drawing library."""
+"""Draw pictures for the page. The import takes a second, because it loads matplotlib."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ if TYPE_CHECKING:
 
     from matplotlib.figure import Figure
 
-# Told apart by colour-blind eyes (Okabe and Ito); the purple and the yellow are darker than theirs.
+# Distinct for colour-blind readers (Okabe and Ito); purple and yellow are darker than in the
+# original.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#a8437f", "#e69f00", "#56b4e9", "#000000", "#8c8c00")
 AFTER, FOUND, _, REGION, BEFORE = COLOURS[:5]
-# in, of one picture: so that its letters can be read on a phone; and of one as wide as the page
+# in, width of a picture with letters readable on a phone, and of a picture as wide as the page
 WIDTH, FULL = (4.4, 10.6)
-PIXELS = 96  # of a page in an inch
-LIGHT = 40_000  # bytes, of a picture that need not be smaller
-SHARP = 130  # dots in an inch of what is drawn as dots
+PIXELS = 96  # pixels per inch of a page
+LIGHT = 40_000  # bytes, size up to which SVG is always used
+SHARP = 130  # dots per inch of raster parts
 
 _FONT = {
     "font.family": "sans-serif",
@@ -39,16 +40,20 @@ _FONT = {
 
 
 def drawing(height: float, width: float = WIDTH, **options: Any) -> tuple[Figure, Any]:
-    """(Figure, axes), height and width in inches; options as of plt.subplots."""
+    """Return (Figure, axes).
+
+    height, width : in; options : as of plt.subplots
+    """
     with plt.rc_context(_FONT):
         return plt.subplots(figsize=(width, height), layout="constrained", **options)
 
 
 @dataclass(frozen=True)
 class Picture:
-    """alt : what it shows, for who cannot see it; source : data URL; width : pixels; caption : how
-    to read it, if nothing else says so;
-    narrow : data URL of the same for a narrow screen, or "".
+    """A picture embedded in the page.
+
+    alt : text alternative; source : data URL; width : pixels; caption : how to read it, or ""
+    narrow : data URL for a narrow screen, or ""
     """
 
     alt: str
@@ -59,19 +64,22 @@ class Picture:
 
 
 def embedded(figure: Figure, alt: str, caption: str = "", narrow: Figure | None = None) -> Picture:
-    """Picture of a drawn Figure, as SVG, or as PNG where that is smaller and it matters; the
-    Figures are closed. Arguments as of Picture.
+    """Return the Picture of a Figure, and close the Figure.
+
+    The format is SVG, or PNG if the SVG is large and the PNG is smaller.
+
+    alt, caption, narrow : as of Picture, with `narrow` as a Figure
     """
     return Picture(alt, *_source(figure), caption, "" if narrow is None else _source(narrow)[0])
 
 
 def _source(figure: Figure) -> tuple[str, int]:
-    """(data URL, pixels of width) of a Figure, which is closed."""
+    """Return (data URL, width in pixels) of a Figure, and close it."""
     with plt.rc_context(_FONT):
         layout = figure.get_layout_engine()
-        assert layout is not None  # of `drawing`
+        assert layout is not None  # `drawing` sets it
         layout.execute(figure)
-        figure.set_layout_engine("none")  # is laid out now, once for both kinds
+        figure.set_layout_engine("none")  # the layout above serves both formats
         kinds = {
             "svg+xml": _drawn(figure, FigureCanvasSVG(figure).print_svg, metadata={"Date": None})
         }
@@ -84,7 +92,10 @@ def _source(figure: Figure) -> tuple[str, int]:
 
 
 def _drawn(figure: Figure, draw: Callable[..., object], **options: Any) -> bytes:
-    """What `draw` of a canvas writes; Figure.savefig would draw all of it once before, for nothing."""
+    """Return the bytes that `draw`, a method of a canvas, writes.
+
+    Figure.savefig would draw twice.
+    """
     buffer = io.BytesIO()
     figure.set_dpi(SHARP)
     draw(buffer, **options)

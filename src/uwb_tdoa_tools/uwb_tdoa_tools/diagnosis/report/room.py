@@ -1,6 +1,4 @@
-"""What is known of places: where the estimate errs, where anchors seem to stand, from where they
-are blocked.
-"""
+"""Collect quantities over the place: position errors, anchor shifts, and blocked regions."""
 
 from __future__ import annotations
 
@@ -19,14 +17,16 @@ if TYPE_CHECKING:
     from ..result import Diagnosis
 
 VIEWS = ([0, 1], [0, 2])  # x and y from above, x and z from the side
-CELL = 1.0  # m
-FEWEST = 0.5  # s in a cell whose mean error is shown
+CELL = 1.0  # m, size of a cell of mean errors
+FEWEST = 0.5  # s, shortest time in a cell with a mean error
 
 
 @dataclass(frozen=True)
 class Flown:
-    """A judged run where its estimate is finite: t (n,) s in the air; p (n, 3) m, true; error (n,
-    3) m.
+    """A judged run, where its estimate is finite.
+
+    t : (n,) s in the air; p : (n, 3) m, true position, world; error : (n, 3) m, estimate minus
+        truth
     """
 
     t: np.ndarray
@@ -35,12 +35,12 @@ class Flown:
 
     @property
     def distance(self) -> np.ndarray:
-        """(n,) m, between estimate and truth."""
+        """Return the 3D position errors, (n,) m."""
         return np.linalg.norm(self.error, axis=1)
 
 
 def flown(scores: Iterable[Score]) -> list[Flown]:
-    """[Flown] of Scores; without those that hold no estimate."""
+    """Return the Flown of Scores; Scores without an estimate are left out."""
     out = []
     for score in scores:
         known = np.isfinite(score.error).all(axis=1)
@@ -50,8 +50,10 @@ def flown(scores: Iterable[Score]) -> list[Flown]:
 
 
 def mean_errors(runs: Sequence[Flown], view: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Mean errors of [Flown] in cells of a view, two axes: (true places (k, 2) m, mean errors (k,
-    2) m).
+    """Return mean errors of runs in cells of CELL m.
+
+    view : the two axes that are drawn
+    returns : true places (k, 2) m, mean errors (k, 2) m
     """
     if not runs:
         return np.empty((0, 2)), np.empty((0, 2))
@@ -71,8 +73,9 @@ def mean_errors(runs: Sequence[Flown], view: list[int]) -> tuple[np.ndarray, np.
 def shifts_and_regions(
     diagnosis: Diagnosis,
 ) -> tuple[dict[int, tuple[np.ndarray, np.ndarray]], list[Region]]:
-    """({anchor id: (by (3,), std (3,))} m, [Region]) of the model that is written, of anchors of
-    the flights.
+    """Return shifts and blocked regions of the flights' anchors in the written model.
+
+    returns : {anchor id: (shift (3,) m, std (3,) m)}, [Region]
     """
     anchors = diagnosis.flights[0].anchors
     shifts: dict[int, tuple[np.ndarray, np.ndarray]] = {}
@@ -89,15 +92,17 @@ def shifts_and_regions(
 
 
 def changed(diagnosis: Diagnosis) -> bool:
-    """Whether errors in the air differ before and after: something was added that does not act near
-    the floor alone.
+    """Return whether errors in the air differ between before and after.
+
+    They do if an effect was added that acts above the floor.
     """
     return any(finding.added and not finding.on_floor for finding in diagnosis.findings)
 
 
 def estimated(flight: ChannelResiduals) -> np.ndarray:
-    """(n, 3) m, the path in the air of {channel: ChannelResidual} as estimated, where nobody knows
-    better.
+    """Return the estimated path in the air, (n, 3) m, of {channel: ChannelResidual}.
+
+    It is used without ground truth.
     """
     rows = next(iter(flight.values())).rows()
     return rows.place[np.argsort(rows.t, kind="stable")]

@@ -1,4 +1,4 @@
-"""How runs of the filter are called, and their figures."""
+"""Names of filter runs in the report."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from ..result import Diagnosis
 
-CM = 100.0  # in a metre
+CM = 100.0  # cm per metre
 
 
 def labels(diagnosis: Diagnosis) -> list[str]:
-    """A name for each judged run: of its flight, with its time if a flight was judged in parts."""
+    """Return one name per judged run: its flight, plus its time if a flight was judged in parts."""
     runs = [run["flight"] for run in diagnosis.before["runs"]]
     if len(set(runs)) == len(runs):
         return runs

@@ -1,4 +1,4 @@
-"""The tables of the page: values, errors, health, and what was not determined."""
+"""Make the tables of the page: values, errors, health, and undetermined parameters."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from .entries import Entry
 
 UNITS = ", ".join(f"{channel.unit} for {name}" for name, channel in CHANNELS.items())
-MANY = 3  # anchors that a sentence names with their values
-SIDE_BY_SIDE = 2  # runs that a phone shows beside each other
+MANY = 3  # largest number of anchors whose values stand in a sentence
+SIDE_BY_SIDE = 2  # largest number of runs side by side on a phone
 EVIDENCE = {
     "criterion": "criterion",
     "held_out_gain": "gain on data held out",
@@ -47,7 +47,10 @@ FIGURES = (  # key, title, factor
 
 
 class Table(NamedTuple):
-    """head : names of columns; rows : of cells; numbers : places of columns of figures."""
+    """A table of the page.
+
+    head : names of columns; rows : cells; numbers : indices of numeric columns
+    """
 
     head: Sequence[str] = ()
     rows: Sequence[Sequence[object]] = ()
@@ -55,8 +58,9 @@ class Table(NamedTuple):
 
 
 def advice(effect: Effect) -> tuple[Sequence[str], Table]:
-    """(sentences, values of more than MANY anchors, lengths in cm) on what a person can do about an
-    Effect.
+    """Return (sentences, table) that advise what to do about an Effect.
+
+    With more than MANY anchors the table holds their values, lengths in cm.
     """
     anchors, sentences = by_anchor(effect), effect.advice()
     if len(anchors) <= MANY or not sentences:
@@ -76,7 +80,7 @@ def advice(effect: Effect) -> tuple[Sequence[str], Table]:
 
 
 def _signed(found: tuple[float, float | None] | None, factor: float) -> str:
-    """ "+12.3 ± 0.5" """
+    """Return a value with sign and deviation, such as "+12.3 ± 0.5"; "" for None."""
     if found is None:
         return ""
     value, std = found
@@ -85,13 +89,13 @@ def _signed(found: tuple[float, float | None] | None, factor: float) -> str:
 
 
 def remedies(diagnosis: Diagnosis) -> Table:
-    """What would determine what these data do not."""
+    """Return the data that would determine the undetermined effects."""
     rows = [(remedy, listed(what)) for remedy, what in by_remedy(undetermined(diagnosis)).items()]
     return Table(("what would tell", "effects that could be there unseen"), rows)
 
 
 def untraced(diagnosis: Diagnosis) -> Table:
-    """Every combination of parameters that leaves too little trace."""
+    """Return all combinations of parameters that the flights do not determine."""
     rows = [
         (item.effect, item.what or "all of it", item.remedy)
         for item in undetermined(diagnosis)
@@ -101,7 +105,7 @@ def untraced(diagnosis: Diagnosis) -> Table:
 
 
 def values(diagnosis: Diagnosis) -> Table:
-    """Of effects.yaml."""
+    """Return the values of effects.yaml."""
     rows = []
     for effect in (effect for effect in diagnosis.effects.effects if not effect.settings):
         known = effect.significant()
@@ -117,7 +121,7 @@ def values(diagnosis: Diagnosis) -> Table:
 
 
 def evidence(diagnosis: Diagnosis, found: Sequence[Entry]) -> Table:
-    """How sure each finding is."""
+    """Return the evidence of each finding."""
     used = [
         key for key in EVIDENCE if any(key in finding.evidence for finding in diagnosis.findings)
     ]
@@ -131,7 +135,7 @@ def evidence(diagnosis: Diagnosis, found: Sequence[Entry]) -> Table:
 
 
 def errors(diagnosis: Diagnosis) -> Table:
-    """Figures of every run, before and after."""
+    """Return the figures of each run, before and after."""
     before, after = diagnosis.before, diagnosis.after
     shown = [item for item in FIGURES if before["pooled"].get(item[0]) is not None]
     names = [*labels(diagnosis), "all"]
@@ -151,8 +155,10 @@ def errors(diagnosis: Diagnosis) -> Table:
 
 
 def phases(diagnosis: Diagnosis) -> tuple[Table, Table]:
-    """The error in each phase of a recording, before and after: (of all runs where there are many,
-    of each of these many).
+    """Return the errors in each phase of a recording, before and after, as two tables.
+
+    With few runs the first holds them and the second is empty. Else the first holds the total and
+    the second each run.
     """
     sides = [[*side["runs"], side["pooled"]] for side in (diagnosis.before, diagnosis.after)]
     found = [[row.get("phases", {}) for row in side] for side in sides]
@@ -171,7 +177,7 @@ def phases(diagnosis: Diagnosis) -> tuple[Table, Table]:
 
 
 def _of_phases(names: Sequence[str], columns: Mapping[str, Sequence[dict[str, Any]]]) -> Table:
-    """A row for each phase, a column for each run."""
+    """Return a table with a row per phase and a column per run."""
     rows = [
         (
             TITLES[name],
@@ -183,7 +189,7 @@ def _of_phases(names: Sequence[str], columns: Mapping[str, Sequence[dict[str, An
 
 
 def _phase(before: dict[str, Any] | None, after: dict[str, Any] | None) -> str:
-    """A cell of figures of one phase, before and after."""
+    """Return the cell of one phase, before and after."""
     if before is None or after is None:
         return ""
     errors, nees = (
@@ -203,7 +209,7 @@ def _interval(row: dict[str, Any]) -> str:
 
 
 def refused(diagnosis: Diagnosis) -> Table:
-    """What was looked at and not added."""
+    """Return the candidates that were not added, with the reason."""
     added = {finding.effect.label for finding in diagnosis.findings if finding.added}
     return Table(
         ("what", "why not"),
@@ -215,7 +221,7 @@ def refused(diagnosis: Diagnosis) -> Table:
 
 
 def health(figures: Figures) -> Iterator[Table]:
-    """Of every channel."""
+    """Yield the health figures of channels and of the filter."""
     for group, name in (("pairs", "pair"), ("anchors", "anchor"), ("axes", "axis")):
         head = (name, "samples", "offset", "scatter", "far off", "likeness")
         yield Table(head, [_of_channel(item, name) for item in figures[group]], range(1, 6))

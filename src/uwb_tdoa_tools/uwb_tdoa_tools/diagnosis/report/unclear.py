@@ -1,4 +1,4 @@
-"""What the data do not determine, and what would."""
+"""List parameters that the data do not determine, and data that would determine them."""
 
 from __future__ import annotations
 
@@ -18,20 +18,23 @@ if TYPE_CHECKING:
     from ..regression.confounding import Unobservable
     from ..result import Diagnosis
 
-# largest contribution, relative to those of its parts, of a combination that cancels
+# largest contribution of a combination that cancels, relative to its parts
 NOTHING = 1e-9
-NAMED = 6  # parameters of a combination that are named
+NAMED = 6  # largest number of named parameters of a combination
 GROUND_TRUTH = "ground truth, from motion capture for example"
 ATTITUDE = "ground truth of the attitude"
 ORIENTATIONS = "orientations of the anchors in the survey"
-AND = ", and "  # between the sensor and the ground truth that a channel needs
+AND = ", and "  # separates the sensor and the ground truth in `Channel.needs`
 CANCELS = "nothing: it cancels in every measurement, and hence does no harm"
 
 
 @dataclass(frozen=True)
 class Undetermined:
-    """effect : name; what : of it, in words, "" for all of it; remedy : which flight, mark or
-    sensor would determine it, in words; harmless : whether it cancels in every measurement.
+    """An undetermined effect or combination of its parameters.
+
+    effect : name; what : parameters, in words, "" for the whole effect
+    remedy : flight, mark or sensor that would determine it, in words
+    harmless : whether it cancels in every measurement
     """
 
     effect: str
@@ -41,7 +44,7 @@ class Undetermined:
 
 
 def undetermined(diagnosis: Diagnosis) -> list[Undetermined]:
-    """[Undetermined], one for each of diagnosis.unobservable."""
+    """Return one Undetermined per entry of diagnosis.unobservable."""
     out = []
     for item in diagnosis.unobservable:
         remedy = _remedy(item, diagnosis)
@@ -50,7 +53,7 @@ def undetermined(diagnosis: Diagnosis) -> list[Undetermined]:
 
 
 def by_remedy(items: Iterable[Undetermined]) -> dict[str, list[str]]:
-    """{remedy: [effect and what of it, in words]} of those of [Undetermined] that could do harm."""
+    """Return {remedy: [effect and parameters, in words]} of items that are not harmless."""
     groups: dict[str, dict[str, list[str]]] = {}
     for item in items:
         if not item.harmless:
@@ -105,7 +108,7 @@ def _remedy(item: Unobservable, diagnosis: Diagnosis) -> str:
 
 
 def _knows_attitude(diagnosis: Diagnosis) -> bool:
-    """Whether the reference has attitudes of each flight."""
+    """Return whether the reference has attitudes in each flight."""
     truths = [flight.truth for flight in diagnosis.flights]
     return diagnosis.reference.attitude_known and all(
         truth is not None and np.isfinite(truth.q).any() for truth in truths
@@ -113,7 +116,7 @@ def _knows_attitude(diagnosis: Diagnosis) -> bool:
 
 
 def _lacking(channel: str, diagnosis: Diagnosis) -> str:
-    """What the flights lack of what a channel needs: its sensor, the ground truth for it, or both."""
+    """Return the missing input of a channel: its sensor, its ground truth, or both."""
     sensor, _, truth = CHANNELS[channel].needs.partition(AND)
     stream = CHANNELS[channel].stream or channel
     if truth and _knows_attitude(diagnosis) and all(diagnosis.reference.positions_known):
@@ -126,8 +129,9 @@ def _lacking(channel: str, diagnosis: Diagnosis) -> str:
 def _contribution(
     effect: str, direction: dict[str, float], diagnosis: Diagnosis
 ) -> tuple[float, float]:
-    """Largest contribution of an effect to any row: of the combination of its parameters, {key:
-    weight}, and of its parts alone.
+    """Return the largest contributions of a combination and of its parts alone to any row.
+
+    direction : {key: weight}
     """
     table = diagnosis.attribution.selection.table
     columns = {(column.effect[0], column.key): column for column in table.columns}

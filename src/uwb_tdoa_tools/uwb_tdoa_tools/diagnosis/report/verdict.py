@@ -1,4 +1,4 @@
-"""The verdict: the error before and after, on which data, and how sure that is."""
+"""State the verdict: the error before and after, the data, and the uncertainty."""
 
 from __future__ import annotations
 
@@ -18,15 +18,17 @@ if TYPE_CHECKING:
 
     from ..result import Diagnosis
 
-CM = 100.0  # in a metre
+CM = 100.0  # cm per metre
 ERROR = "The position error (3D RMSE)"
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """headline : one sentence; more : (sentence, ...), what has to be known with it; kind :
-    "better", "unsure" (it may be chance), "same" (nothing is added, or on the floor alone),
-    "nothing" (nothing was found) or "unknown" (no ground truth).
+    """The verdict of a diagnosis.
+
+    headline : one sentence; more : sentences that qualify it
+    kind : "better", "unsure" (chance is possible), "same" (nothing added in the air), "nothing" (no
+        finding) or "unknown" (no ground truth)
     """
 
     headline: str
@@ -35,12 +37,12 @@ class Verdict:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """All of it: tuple."""
+        """Return the headline and the other sentences."""
         return (self.headline, *self.more)
 
 
 def verdict(diagnosis: Diagnosis) -> Verdict:
-    """Verdict of a Diagnosis."""
+    """Return the Verdict of a Diagnosis."""
     if diagnosis.after["pooled"].get("rmse_3d") is None:
         return _without_truth(diagnosis)
     if not any(finding.added for finding in diagnosis.findings):
@@ -49,8 +51,9 @@ def verdict(diagnosis: Diagnosis) -> Verdict:
 
 
 def faults_in_words(diagnosis: Diagnosis) -> list[str]:
-    """What is wrong with the numbers of the flights: a sentence for each, with the flights and the
-    evidence of the first.
+    """Return one sentence per driver, survey or clock error.
+
+    It names the flights, and the evidence of the first flight.
     """
     groups: dict[str, list[tuple[str, NumbersFinding]]] = {}
     for name, found in diagnosis.numbers.items():
@@ -66,19 +69,19 @@ def faults_in_words(diagnosis: Diagnosis) -> list[str]:
 
 
 def truth_in_words(diagnosis: Diagnosis) -> list[str]:
-    """What was wrong with clocks and frames of the ground truth: sentences."""
+    """Return sentences on clock and frame errors of the ground truth."""
     return [
         f"{name}: {sentence}." for name, said in diagnosis.judge_truth.items() for sentence in said
     ]
 
 
 def centimetres(value: float) -> str:
-    """ "20.2 cm" of metres."""
+    """Return a length in m as text, such as "20.2 cm"."""
     return f"{value * CM:.1f} cm"
 
 
 def percent(interval: Sequence[float]) -> str:
-    """ "66 to 72 %" of shares."""
+    """Return an interval of shares as text, such as "66 to 72 %"."""
     return f"{interval[0] * 100:.0f} to {interval[1] * 100:.0f} %"
 
 
@@ -202,14 +205,14 @@ _UNKNOWN = "Without ground truth nobody knows the position error, neither before
 
 
 def _names(diagnosis: Diagnosis) -> list[str]:
-    """Of the flights that were judged, each once."""
+    """Return the names of the judged flights, each once."""
     return list(dict.fromkeys(run["flight"] for run in diagnosis.before["runs"]))
 
 
 def _flights(diagnosis: Diagnosis) -> str:
     ends: dict[
         str, list[float]
-    ] = {}  # of each: parts of a flight that are judged by themselves lie within each other
+    ] = {}  # first and last stamp per flight, since judged parts of a flight alternate
     for score in diagnosis.before["scores"]:
         ends.setdefault(score.name, []).extend([score.first, score.last])
     count, seconds = len(_names(diagnosis)), sum(max(of) - min(of) for of in ends.values())
@@ -218,7 +221,7 @@ def _flights(diagnosis: Diagnosis) -> str:
 
 
 def _over_phases(diagnosis: Diagnosis) -> list[str]:
-    """The errors outside of the air, which those above do not hold."""
+    """Return a sentence on errors near the floor, which the verdict does not include."""
     before, after = (
         side["pooled"].get("phases", {}) for side in (diagnosis.before, diagnosis.after)
     )
@@ -230,7 +233,7 @@ def _over_phases(diagnosis: Diagnosis) -> list[str]:
 
 
 def _of_phase(figures: dict[str, Any]) -> str:
-    """The 3D RMSE and the NEES of a phase."""
+    """Return the 3D RMSE and the NEES of a phase, as text."""
     if figures["rmse_3d"] is None:
         return "unknown"
     return centimetres(figures["rmse_3d"]) + (
@@ -239,7 +242,7 @@ def _of_phase(figures: dict[str, Any]) -> str:
 
 
 def _shared(diagnosis: Diagnosis) -> list[str]:
-    """What errors against a reference that knows only a part do not tell."""
+    """Return a caveat if the reference knows only a part of the path."""
     if all(diagnosis.reference.positions_known):
         return []
     return [

@@ -1,4 +1,4 @@
-"""Words that a reader may not know, each spelled out once."""
+"""Explain terms that a reader may not know."""
 
 from __future__ import annotations
 
@@ -38,8 +38,9 @@ TERMS = {
 
 
 def used(text: str) -> dict[str, str]:
-    """{term: meaning} of the TERMS and effects that a text names; a plural is explained with its
-    singular.
+    """Return {term: meaning} of the TERMS and effects in a text.
+
+    A plural is explained by its singular.
     """
     effects = {
         name: f"{effect.physics}."

@@ -1,7 +1,7 @@
-"""Self-calibration: positions and delays of anchors from flights of which nobody knows the path.
+"""Self-calibration: positions and delays of anchors from flights without ground truth.
 
-One entrance, `self_calibrate`, whoever asks: `survey`, `calibrate`, and `diagnose` where no
-reference tells errors.
+`self_calibrate` is the only entry point. `survey`, `calibrate` and `diagnose` use it where the
+position errors are unknown.
 """
 
 from .solve import SelfCalibration, self_calibrate

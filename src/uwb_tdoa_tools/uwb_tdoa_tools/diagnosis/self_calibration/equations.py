@@ -1,12 +1,11 @@
-"""Normal equations of where anchors stand and how late they are, from flights of which nobody knows
-the path.
+"""Normal equations of anchor positions and delays, from flights without ground truth.
 
-A run of the filter gives innovations and their derivatives by every position and delay, with the
-path integrated out (`uwb_tdoa_ekf/sensitivity.py`). Whatever else is systematic, by antennas, metal
-or floors, is a smooth function of the place for every anchor, integrated out as well: a Gaussian
-process, by random Fourier features (Rahimi and Recht, Random features for large-scale kernel
-machines, NIPS 2007). How large delays and functions are, the evidence says (`prior.py`). Where
-functions explain what shifts would, shifts stay where the prior is.
+A filter run gives innovations and their derivatives by each position and delay, with the path
+marginalized (`uwb_tdoa_ekf/sensitivity.py`). Other systematic errors, from antennas, metal or
+floors, are a smooth function of the place for each anchor, also marginalized. It is a Gaussian
+process in random Fourier features (Rahimi and Recht, Random features for large-scale kernel
+machines, NIPS 2007). The evidence selects the sizes of delays and functions (`prior.py`). Where
+functions explain an error as well as shifts do, the shifts stay at the prior.
 """
 
 from __future__ import annotations
@@ -49,16 +48,17 @@ if TYPE_CHECKING:
     from ...parallel import MapFunction
     from ..constraints import Constraint
 
-BLOCK = 3.0  # s over which sums of scores show how alike errors are
-SYSTEMATIC = 12.0  # by which the information is divided beside that: errors that last are no noise
-PRELIMINARY = 20.0  # the same for the solution about which that is measured
-DETERMINED = 1e-4  # share of the largest eigenvalue that a direction must have to count there
-FEWEST = 4  # measurements in a cell; noise of fewer hides what is slow
+BLOCK = 3.0  # s, length of the blocks whose score sums measure the inflation
+# Divisor of the information in addition to the inflation: errors that last a flight are not noise.
+SYSTEMATIC = 12.0
+PRELIMINARY = 20.0  # the same, for the preliminary solution that measures the inflation
+DETERMINED = 1e-4  # smallest eigenvalue of a determined direction, relative to the largest
+FEWEST = 4  # fewest measurements in a cell; with fewer, noise hides slow errors
 RESIDUALS = {
     kind.channel: RangeResidual if kind.ends == 1 else TdoaResidual for kind in RADIO.values()
 }
-FEATURES, LENGTH = 20, 1.2  # of each function, and m over which it changes
-AT_ONCE = 32  # regressors that are made together
+FEATURES, LENGTH = 20, 1.2  # number of features of a function, and m, its length scale
+AT_ONCE = 32  # regressors that are computed together
 
 
 def tdoa_std_of(
@@ -67,8 +67,11 @@ def tdoa_std_of(
     config: FilterConfig | None = None,
     map_function: MapFunction = map,
 ) -> float:
-    """m, the tdoa_std that the innovations of Flights call for beside the EffectSet `effects`;
-    their ground truth is not used. map_function : as of `attribution.attribute`.
+    """Return the tdoa_std, m, that matches the innovations of Flights with the EffectSet `effects`.
+
+    Ground truth is not used.
+
+    map_function : as of `attribution.attribute`
     """
     config, anchors = config or FilterConfig(), flights[0].anchors
     loose = Prior.of(anchors, np.full((len(anchors), 3), MOVED)).loose
@@ -85,7 +88,7 @@ def measured_noise(
     map_function: MapFunction = map,
     say: Callable[[str], object] = lambda why: None,
 ) -> float | None:
-    """The same; None where the flights are too short to tell, and say(why)."""
+    """Return `tdoa_std_of`, or call say(reason) and return None if the flights are too short."""
     try:
         return tdoa_std_of(flights, effects, config, map_function)
     except InputError as error:
@@ -96,9 +99,10 @@ def measured_noise(
 def slow_innovations(
     flights: Sequence[Flight], effects: EffectSet, config: FilterConfig | None = None
 ) -> float:
-    """m, scale of the innovations of Flights that are slow, averaged over half a second, beside the
-    EffectSet `effects`: what anchors that are elsewhere or late make. Their ground truth is not
-    used. Raises InputError for a flight that is too short.
+    """Return the scale of the slow innovations of Flights with the EffectSet `effects`, m.
+
+    Innovations are averaged over half a second. Wrong anchor positions and delays leave slow
+    innovations. Ground truth is not used. Raises InputError for a flight that is too short.
     """
     anchors = flights[0].anchors
     return Runs(flights, effects, config or FilterConfig()).slow_innovations(
@@ -108,11 +112,13 @@ def slow_innovations(
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """Normal equations of all flights: gram (k, k), vector (k,); marks : [_Mark] that are in them;
-    slow : m, scale of the slow innovations; inflation : by how much larger sums of scores are than
-    those of independent errors;
-    seconds : s that tell; flights : [FlightEquations] of each, but for MANY anchors, of which they
-        would take gigabytes.
+    """Normal equations of all flights.
+
+    gram : (k, k); vector : (k,); marks : [_Mark] included in them
+    slow : m, scale of the slow innovations
+    inflation : variance of score sums over blocks, relative to independent errors
+    seconds : s of data used
+    flights : [FlightEquations]; empty above MANY anchors, where they would take gigabytes
     """
 
     gram: np.ndarray
@@ -124,13 +130,16 @@ class Equations:
     flights: list[FlightEquations]
 
     def tdoa_std(self, config: FilterConfig) -> float:
-        """m: as many independent TDOAs as there are tell as much as the filter then believes."""
+        """Return the tdoa_std, m, at which the filter's information matches the inflated noise."""
         return config.tdoa_std * float(np.sqrt(self.inflation / config.tdoa_correlation_length))
 
 
 @dataclass(frozen=True, eq=False)
 class FlightEquations:
-    """Those of one flight, as of Equations; slow (n,) m, the slow innovations."""
+    """Normal equations of one flight, with the fields of Equations.
+
+    slow : (n,) m, slow innovations; grounded : number of marks left out, on the floor
+    """
 
     gram: np.ndarray
     vector: np.ndarray
@@ -142,10 +151,12 @@ class FlightEquations:
 
 
 class Runs:
-    """Runs of Flights with anchors that are moved and late. spans : {flight: (first, last) s in the
-    air, or in motion on the floor}, as the first run of each says: other anchors may move the path
-    to the floor, but not the tag; grounded : how many marks of flights are on the floor, and left
-    out: those of a vehicle that never leaves it count.
+    """Filter runs of Flights under varied anchor positions and delays.
+
+    spans : {flight: (first, last) s} in the air, or in motion on the floor, from the first run.
+        Later runs keep it: other anchors can move the estimate to the floor, but not the tag.
+    grounded : number of marks left out because they are on the floor; marks of a ground vehicle
+        count
     """
 
     def __init__(
@@ -156,8 +167,10 @@ class Runs:
         constraints: Sequence[Constraint] = (),
         streams: Sequence[str] = tuple(RADIO),
     ) -> None:
-        """base : EffectSet that is in the model; config : FilterConfig; constraints : what else is
-        known; streams : of RADIO, that tell.
+        """Prepare Flights without their ground truth.
+
+        base : EffectSet of the model; config : FilterConfig
+        constraints : marks and distances; streams : names in RADIO that are used
         """
         self._base, self._config, self._reference = (
             base,
@@ -171,8 +184,11 @@ class Runs:
         self.grounded = 0
 
     def slow_innovations(self, anchors: Anchors, delays: np.ndarray) -> float:
-        """m, scale of the slow innovations of all flights with Anchors that are late by delays (N,)
-        m; beside the offset of all ranges, which the filter finds itself: nobody gains by it.
+        """Return the scale of the slow innovations of all flights under Anchors, m.
+
+        The offset of all ranges is corrected first, because the filter estimates it.
+
+        delays : (N,) m
         """
         about, by = (
             (self._base, self._reference, anchors, delays),
@@ -195,9 +211,10 @@ class Runs:
         map_function: MapFunction = map,
         functions: bool = True,
     ) -> Equations:
-        """Equations about Anchors and delays (N,) m. loose (4N,) m: standard deviations of what may
-        be; functions : whether to have those of the place, too, which the inflation does not ask
-        for.
+        """Return the Equations linearized at Anchors and delays.
+
+        delays : (N,) m; loose : (4N,) m, prior standard deviations of the preliminary solution
+        functions : whether to include functions of the place; the inflation does not need them
         """
         gram: np.ndarray = np.zeros(())
         vector: np.ndarray = np.zeros(())
@@ -235,7 +252,10 @@ class Runs:
 
 
 def _scale(slow: Sequence[np.ndarray]) -> float:
-    """m, scale of the slow innovations of flights. Raises InputError where there are none."""
+    """Return the scale of the slow innovations of flights, m.
+
+    Raises InputError without any.
+    """
     together = np.concatenate(slow)
     if not len(together):
         raise InputError(
@@ -253,8 +273,10 @@ def _residuals(
     flight: Flight,
     span: tuple[float, float] | None,
 ) -> tuple[Comparison, list[RadioResidual]]:
-    """(Comparison, [RadioResidual] of each stream in its span) of a Flight: the innovations of a
-    run with Anchors that are late by delays (N,) m.
+    """Return the Comparison and residuals of a Flight: the innovations under Anchors and delays.
+
+    delays : (N,) m; span : (first, last) s, None to compute it
+    returns : Comparison, [RadioResidual] of each stream
     """
     comparison = Comparison.of(
         replace(flight, anchors=anchors), reference, _with_delays(base, anchors, delays), span
@@ -279,8 +301,10 @@ def _of_flight(
     functions: bool,
     item: tuple[Flight, tuple[float, float] | None, list[Mark]],
 ) -> tuple[FlightEquations, tuple[float, float]]:
-    """(FlightEquations, span) of (Flight, span or None, marks of it). about : Anchors, and by how
-    much they are late, (N,) m; functions : as of `Runs.equations`.
+    """Return the FlightEquations and the span of one flight.
+
+    about : Anchors and their delays (N,) m; loose, functions : as of `Runs.equations`
+    item : Flight, span or None, its marks
     """
     flight, known_span, marks = item
     comparison, parts = _residuals(base, reference, *about, flight, known_span)
@@ -297,18 +321,19 @@ def _of_flight(
 
 
 def _with_delays(base: EffectSet, anchors: Anchors, delays: np.ndarray) -> EffectSet:
-    """The EffectSet `base` and delays (N,) m of Anchors, if there are any."""
+    """Return the EffectSet `base` plus delays (N,) m of Anchors, if any is not 0."""
     return EffectSet((*base.effects, delay_effect(anchors, delays))) if delays.any() else base
 
 
 def delay_effect(anchors: Anchors, delays: np.ndarray) -> Effect:
-    """The effect anchor_delay with delays (N,) m of Anchors."""
+    """Return the effect anchor_delay with delays (N,) m of Anchors."""
     return AnchorDelay({str(i): float(delay) for i, delay in zip(anchors.ids, delays)})
 
 
 def _slow(parts: Sequence[RadioResidual]) -> np.ndarray:
-    """Innovations averaged over cells of half a second, (n,) m, those of which hold enough to hide
-    the noise.
+    """Return innovations averaged over cells of half a second, (n,) m.
+
+    Cells with fewer than FEWEST measurements are left out, because noise dominates them.
     """
     rows = [part.rows() for part in parts]
     return np.concatenate([one.y[one.count >= FEWEST] for one in rows])
@@ -317,8 +342,10 @@ def _slow(parts: Sequence[RadioResidual]) -> np.ndarray:
 def _equations(
     parts: Sequence[RadioResidual], flight: Flight, constraints: Sequence[Mark], functions: bool
 ) -> tuple[np.ndarray, np.ndarray, list[_BlockEquations], list[_Mark]]:
-    """(gram (k, k), vector (k,), [_BlockEquations]) of the normal equations that the RadioResiduals
-    of a Flight give, and [_Mark] of constraints of it. functions : as of `Runs.equations`.
+    """Return the normal equations of the RadioResiduals of a Flight, and of its marks.
+
+    functions : as of `Runs.equations`
+    returns : gram (k, k), vector (k,), [_BlockEquations], [_Mark]
     """
     innovations = parts[0].innovations
     assert innovations is not None  # as of a Reference that does not know the path
@@ -356,15 +383,16 @@ def _equations(
         _add(gram, columns, more)
         vector[columns] += right
         last = np.searchsorted(columns, n)
-        # the whole of `more` takes megabytes
+        # a copy, since a view would keep all of `more` in memory: megabytes
         blocks.append(_BlockEquations(columns[:last], more[:last, :last].copy(), right[:last]))
     return gram, vector, blocks, _known(constraints, stamps, moved, innovations.run.odometry)
 
 
 @compiled
 def _add(gram: np.ndarray, columns: np.ndarray, more: np.ndarray) -> None:
-    """Add more (c, c) to the rows and columns (c,) of gram (k, k), row by row: as numpy does,
-    without copies of them.
+    """Add more (c, c) to the rows and columns (c,) of gram (k, k), in place.
+
+    It loops over entries, because numpy would copy submatrices.
     """
     for i in range(len(columns)):
         for j in range(len(columns)):
@@ -372,8 +400,9 @@ def _add(gram: np.ndarray, columns: np.ndarray, more: np.ndarray) -> None:
 
 
 def _regressors(samples: Samples, functions: bool) -> csr_array:
-    """Derivatives of TDOAs by coordinates and delays of anchors, and functions of the place of
-    each, if they are wanted: sparse, in rows, (n, 24 N) or (n, 4 N).
+    """Return derivatives of TDOAs by coordinates and delays of anchors, sparse, (n, 4 N).
+
+    With `functions`, features of the place of each anchor follow, (n, 24 N).
     """
     ids = [str(i) for i in samples.anchors.ids]
     late = _sparse(AnchorDelay(), samples, ids)
@@ -384,8 +413,9 @@ def _regressors(samples: Samples, functions: bool) -> csr_array:
 
 
 def _of_places(late: csr_array, p: np.ndarray) -> csr_array:
-    """Every entry of `late` (n, N) times all functions of the places p (n, 3) m: as many columns in
-    the place of one.
+    """Return each entry of `late` times all features of the place, sparse, (n, N FEATURES).
+
+    late : (n, N) derivatives by delays; p : (n, 3) m, world
     """
     values = np.nan_to_num(features(p))
     n, times = late.shape[0], values.shape[1]
@@ -400,16 +430,16 @@ def _of_places(late: csr_array, p: np.ndarray) -> csr_array:
 
 
 def _selection(places: np.ndarray, n: int) -> csr_array:
-    """What puts rows (m, ...) to places (m,) among n: (n, m)."""
+    """Return the sparse matrix that moves rows (m, ...) to `places` (m,) among n, (n, m)."""
     return csr_array(
         (np.ones(len(places)), (places, np.arange(len(places)))), shape=(n, len(places))
     )
 
 
 def _sparse(effect: Effect, samples: Samples, keys: list[str]) -> csr_array:
-    """Regressors of an Effect of single anchors, sparse, in rows: (n, keys).
+    """Return sparse regressors of an Effect of single anchors, (n, keys).
 
-    What is of other anchors is zero, and not asked for.
+    Rows without a named anchor are 0 and are not computed.
     """
     parts = []
     for first in range(0, len(keys), AT_ONCE):
@@ -430,8 +460,9 @@ def _sparse(effect: Effect, samples: Samples, keys: list[str]) -> csr_array:
 
 @dataclass(frozen=True, eq=False)
 class _BlockEquations:
-    """Normal equations of a block of TDOAs, of those coordinates and delays that matter there:
-    columns (c,); gram (c, c); vector (c,).
+    """Normal equations of a block of TDOAs, for the coordinates and delays that occur in it.
+
+    columns : (c,) indices; gram : (c, c); vector : (c,)
     """
 
     columns: np.ndarray
@@ -441,8 +472,9 @@ class _BlockEquations:
 
 @dataclass(frozen=True, eq=False)
 class _Mark:
-    """Normal equations of a constraint of a flight: gram (k, k), vector (k,); off (3,) m, columns
-    (3, k): as of Mark.off.
+    """Normal equations of a mark of a flight.
+
+    gram : (k, k); vector : (k,); off : (3,) m, columns : (3, k), as of Mark.off
     """
 
     gram: np.ndarray
@@ -454,8 +486,10 @@ class _Mark:
 def _known(
     constraints: Sequence[Mark], stamps: Sequence[np.ndarray], moved: np.ndarray, odometry: Odometry
 ) -> list[_Mark]:
-    """[_Mark] of constraints of a flight that ask for the estimate at stamps. moved (m, 3, k): its
-    derivative at all of them in turn.
+    """Return the [_Mark] of marks of a flight.
+
+    stamps : s, of the estimates that each mark needs
+    moved : (m, 3, k) derivatives of the estimate at all stamps, in order of time
     """
     order = np.argsort(np.concatenate([[], *stamps]), kind="stable")
     moved = moved[np.argsort(order, kind="stable")]
@@ -474,10 +508,14 @@ def _known(
 def _inflation(
     gram: np.ndarray, vector: np.ndarray, blocks: Sequence[_BlockEquations], sizes: np.ndarray
 ) -> float:
-    """By how much sums of scores over blocks, [_BlockEquations], whose sums are gram (k, k) and
-    vector (k,), are larger than those of independent errors, averaged over the directions that the
-    data determine. sizes (k,): prior standard deviations.
+    """Return the variance of score sums over blocks, relative to independent errors.
+
+    Independent errors give score sums with covariance `gram`. The result is the mean ratio over the
+    eigenvectors of `gram` that the data determine.
+
+    gram : (k, k), vector : (k,) sums over the blocks; sizes : (k,) prior standard deviations
     """
+    # Scores at the preliminary solution, where the mean score is near 0.
     step = np.linalg.solve(gram / PRELIMINARY + np.diag(sizes**-2.0), vector / PRELIMINARY)
     scores = np.zeros((len(blocks), len(vector)))
     for score, block in zip(scores, blocks):
@@ -490,8 +528,9 @@ def _inflation(
 
 
 def features(p: np.ndarray, length: float = LENGTH) -> np.ndarray:
-    """Random Fourier features of a Gaussian kernel of some length, m, at places p (n, 3) m: (n,
-    FEATURES).
+    """Return random Fourier features of a Gaussian kernel, (n, FEATURES).
+
+    p : (n, 3) m, places; length : m, length scale of the kernel
     """
     waves = np.random.default_rng(3).standard_normal((3, FEATURES // 2)) / length
     phase = p @ waves

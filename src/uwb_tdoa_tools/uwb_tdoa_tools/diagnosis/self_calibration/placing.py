@@ -1,4 +1,4 @@
-"""Anchors of which nothing is known: placed from where the others say that the tag flew."""
+"""Place anchors with unknown positions by TDOAs to known anchors along an estimated path."""
 
 from __future__ import annotations
 
@@ -19,21 +19,22 @@ if TYPE_CHECKING:
     from uwb_tdoa_ekf.core.config import FilterConfig
     from uwb_tdoa_ekf.results import Odometry
 
-MOST = 3000  # TDOAs of a flight that are used
-FEWEST = 200
-SCALE = 0.3  # m, beyond which a TDOA counts less
-BEYOND = 1.0  # m, of the starts beyond the box of the other anchors
-PLACED_STD = 0.5  # m, of what is found, for what follows
+MOST = 3000  # largest number of TDOAs of a flight that are used
+FEWEST = 200  # fewest TDOAs that place an anchor
+SCALE = 0.3  # m, scale of the robust loss
+BEYOND = 1.0  # m, distance of the starting points beyond the box of the known anchors
+# m, prior standard deviation of a placed coordinate in the calibration that follows
+PLACED_STD = 0.5
 
 
 def place(
     flights: Sequence[Flight], rows: Sequence[int], config: FilterConfig | None = None
 ) -> Anchors:
-    """Anchors of Flights with those of some rows placed, one after the other.
+    """Return the Anchors of Flights with some rows placed, one after the other.
 
-    Each TDOA between the anchor and one of the others is a hyperboloid about where the tag was;
-    robust least squares over all of them, started from the corners of the room. Raises InputError
-    where too few determine it.
+    Each TDOA between the new anchor and a known anchor defines a hyperboloid at the tag's position.
+    Robust least squares over all TDOAs starts at the corners of the room. Raises InputError if
+    fewer than FEWEST TDOAs determine the anchor.
     """
     anchors = flights[0].anchors
     known = np.setdiff1d(np.arange(len(anchors)), rows)
@@ -68,8 +69,12 @@ def place(
 def _distances(
     flight: Flight, path: Odometry, row: int, known: np.ndarray, positions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where the tag was, (n, 3) m, and how far from the anchor of a row, (n,) m, as its TDOAs with
-    known ones tell.
+    """Return positions of the tag, (n, 3) m, and measured distances to the anchor `row`, (n,) m.
+
+    The path comes from the filter. Each distance is a TDOA with a known anchor plus the distance to
+    that known anchor.
+
+    known : rows of the known anchors; positions : (N, 3) m, world
     """
     tdoa = flight.tdoa
     a, b = flight.anchors.index(tdoa.a), flight.anchors.index(tdoa.b)

@@ -1,9 +1,8 @@
-"""What a tape, or the last calibration, says of the anchors before some flights, and what the
-flights make of it.
+"""Combine the prior of the anchors, a tape or the last calibration, with the normal equations.
 
-What has changed since is found by evidence (`uwb_tdoa_ekf.evidence`). So are delays, where nothing
-is known of them: the smallest are taken that do not make the flights ODDS times less probable than
-larger ones, because delays take what nothing else explains.
+The evidence selects changes since the last calibration (`uwb_tdoa_ekf.evidence`). It also selects
+the size of unknown delays: the smallest size with at least 1 / ODDS of the largest probability. A
+small size matters, because delays absorb otherwise unexplained errors.
 """
 
 from __future__ import annotations
@@ -37,22 +36,26 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.effects import Effect
     from uwb_tdoa_ekf.evidence import Change, ChangeKey
 
-# m, that the evidence chooses from where nothing is known of delays
+# m, candidate standard deviations of unknown delays; the evidence selects
 DELAY_STDS = (0.02, 0.05, 0.1, 0.2, 0.4)
-DELAY_STD = 0.1  # m, of the delay of an anchor that the last calibration did not have
-# m, of what all ranges are too long by, the antenna delay of the tag: a TDOA does not know of it
+DELAY_STD = 0.1  # m, prior standard deviation of a delay that the last calibration lacks
+# m, prior standard deviation of the antenna delay of the tag, which lengthens all ranges and
+# cancels in TDOAs
 TAG_DELAY = 0.5
-FUNCTION_STDS = 0.003, 0.03, 0.06, 0.1, 0.15, 0.22, 0.3  # m, the same of functions of the place
-# m, standard deviation of a coordinate of an anchor that has moved, once that is plain
+# m, candidate standard deviations of functions of the place
+FUNCTION_STDS = 0.003, 0.03, 0.06, 0.1, 0.15, 0.22, 0.3
+# m, prior standard deviation of a coordinate of an anchor that has moved
 ANYWHERE = 1.0
 LOOSE = 0.05  # m, standard deviation of delays in a preliminary solution
 
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """covariance (4N, 4N) m^2: of coordinates, anchor by anchor, and delays; known (4N,) bool: what
-    the last calibration knows; ids (N,); common : m, standard deviation of what delays that nothing
-    is known of have in common.
+    """A Gaussian prior of anchor coordinates and delays.
+
+    covariance : (4N, 4N) m^2, coordinates x, y, z anchor by anchor, then N delays
+    known : (4N,) bool, parameters that the last calibration determined; ids : (N,)
+    common : m, standard deviation of the common part of unknown delays
     """
 
     covariance: np.ndarray
@@ -68,8 +71,10 @@ class Prior:
         last: Covariance | None = None,
         common: float = 0.0,
     ) -> Prior:
-        """position_std (N, 3) m : of Anchors; last : Covariance of the last calibration, or None;
-        common : as of a Prior.
+        """Return the Prior of Anchors.
+
+        position_std : (N, 3) m; last : Covariance of the last calibration, or None; common : as of
+            Prior
         """
         n = len(anchors)
         variance = np.concatenate([position_std.ravel(), np.full(n, DELAY_STD)]) ** 2.0
@@ -80,15 +85,16 @@ class Prior:
 
     @property
     def loose(self) -> np.ndarray:
-        """(4N,) m: standard deviations that forbid nothing which may have happened."""
+        """Return standard deviations that allow every plausible change, (4N,) m."""
         n = len(self.ids)
         std = np.hypot(np.sqrt(np.diag(self.covariance)), np.where(self.known, MOVED, 0.0))
         return np.concatenate([std[: 3 * n], np.full(n, np.hypot(LOOSE, self.common))])
 
     def changes(self) -> dict[ChangeKey, Change]:
-        """{(what, number of an anchor): Change} of what may have changed since the last
-        calibration. Without one, an anchor may stand elsewhere than the tape says; of MANY, one may
-        also be later than the others.
+        """Return possible changes since the last calibration, {(effect, row of an anchor): Change}.
+
+        Without a last calibration an anchor can stand elsewhere than the tape states. Above MANY
+        anchors, a single anchor can also have a delay.
         """
         unknown, many = not self.known.any(), len(self.ids) > MANY
         return {
@@ -98,8 +104,9 @@ class Prior:
         }
 
     def with_delays(self, std: float) -> np.ndarray:
-        """(4N, 4N) m^2, the covariance with another standard deviation of all delays, beside what
-        they have in common.
+        """Return the covariance with standard deviation `std`, m, of all delays, (4N, 4N) m^2.
+
+        The common part of the delays stays.
         """
         out, first = self.covariance.copy(), 3 * len(self.ids)
         out[first:, first:] = self.common**2 + std**2 * np.eye(len(self.ids))
@@ -108,8 +115,12 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """step (4N,), covariance (4N, 4N); changed : {key of `Prior.changes`: keys of others that
-    the flights cannot tell from it}; delay_std, function_std : m.
+    """The posterior of anchor coordinates and delays.
+
+    evidence : log-evidence; step : (4N,) m, from the point of linearization; covariance : (4N, 4N)
+        m^2
+    function_std, delay_std : m, selected sizes of functions of the place and of delays
+    changed : {key of `Prior.changes`: keys of changes that the flights do not distinguish from it}
     """
 
     evidence: float
@@ -121,8 +132,9 @@ class Solution:
 
 
 def to_keep(keys: tuple[tuple[str, ...], ...], matrix: np.ndarray) -> Covariance:
-    """Covariance to be the prior of the next calibration; of MANY anchors what it says of each of
-    them, or no file could hold it.
+    """Return the Covariance that is the prior of the next calibration.
+
+    Above MANY anchors only the block of each anchor is kept, to limit the file size.
     """
     out = Covariance(keys, matrix)
     return out.of_each_anchor() if len({key.partition(".")[0] for _, key in keys}) > MANY else out
@@ -131,8 +143,12 @@ def to_keep(keys: tuple[tuple[str, ...], ...], matrix: np.ndarray) -> Covariance
 def with_calibration(
     base: EffectSet, found: Iterable[Effect], covariance: Covariance | None
 ) -> EffectSet:
-    """The EffectSet `base` with other Effects: positions and delays of anchors are added to those
-    that it has. covariance : of these, for the next calibration; None where none are found.
+    """Return the EffectSet `base` with other Effects added.
+
+    Positions and delays of anchors add to the values in `base`.
+
+    covariance : of positions and delays, for the next calibration; None keeps the covariance of
+        `base`
     """
     effects = list(base.effects)
     for effect in found:
@@ -156,10 +172,11 @@ def with_calibration(
 
 
 def solve(gram: np.ndarray, vector: np.ndarray, prior: Prior, offset: np.ndarray) -> Solution:
-    """Solution of normal equations with the largest evidence.
+    """Return the Solution of normal equations with the largest evidence.
 
-    gram (k, k), vector (k,) : the first 4N columns those of a Prior, the others functions; offset
-    (4N,) m: where the equations were made, from the mean of the prior.
+    gram : (k, k), vector : (k,) normal equations. The first 4N parameters belong to the Prior. The
+        others are functions of the place.
+    offset : (4N,) m, point of linearization minus prior mean
     """
     parts, unchanged, delay_std = _parts(gram, vector, prior, offset), prior.covariance, DELAY_STD
     if not prior.known.any():
@@ -186,8 +203,10 @@ def solve(gram: np.ndarray, vector: np.ndarray, prior: Prior, offset: np.ndarray
 
 
 def _parts(gram: np.ndarray, vector: np.ndarray, prior: Prior, offset: np.ndarray) -> list[Part]:
-    """Parts, for each of FUNCTION_STDS; of MANY anchors, where each takes seconds, only up to those
-    that make the flights ODDS times less probable than smaller ones.
+    """Return one Part, the equations without functions, for each of FUNCTION_STDS.
+
+    Above MANY anchors each Part takes seconds. The list then ends when a size is ODDS times less
+    probable than a smaller one.
     """
     out: list[Part] = []
     evidences: list[float] = []
@@ -201,8 +220,9 @@ def _parts(gram: np.ndarray, vector: np.ndarray, prior: Prior, offset: np.ndarra
 
 
 def posterior(part: Part, covariance: np.ndarray, offset: np.ndarray) -> Solution:
-    """Solution of a Part, with a prior of some covariance whose mean is `offset` before the
-    equations.
+    """Return the Solution of a Part with a Gaussian prior.
+
+    covariance : (4N, 4N) m^2; offset : (4N,) m, point of linearization minus prior mean
     """
     prior = np.linalg.inv(covariance)
     inverse = np.linalg.inv(part.gram + prior)

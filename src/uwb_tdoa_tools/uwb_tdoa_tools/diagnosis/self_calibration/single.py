@@ -1,9 +1,9 @@
-"""One anchor that stands elsewhere, tried as such before its error is spread over all.
+"""Test the hypothesis that a single anchor has moved, before its error is spread over all anchors.
 
-The filter rejects TDOAs that it does not explain. Equations about the anchors as given then hold
-few TDOAs of a moved anchor, and the others share its shift. Each anchor is placed from the path
-that the others give. The filter runs anew with it there. All its innovations count, those that it
-rejects too.
+The filter rejects TDOAs with large innovations. Equations about the given anchors then hold few
+TDOAs of a moved anchor, and the other anchors absorb its shift. Therefore each anchor is placed
+from the path that the others give, and the filter runs again. All innovations count, also rejected
+ones.
 """
 
 from __future__ import annotations
@@ -29,15 +29,16 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.effects import EffectSet
     from uwb_tdoa_ekf.core.config import FilterConfig
 
-TRIED = 2  # anchors that explain the most once they are placed; each is then calibrated as unknown
+# number of anchors that are calibrated as unknown: those with the best likelihood after placing
+TRIED = 2
 
 
 @dataclass(frozen=True)
 class Misfit:
-    """How badly the filter explains Flights with some anchors.
+    """The negative log-likelihood of Flights under some anchors.
 
-    flights, config : as of `self_calibrate`; scale : m, of an innovation that is explained; count :
-    innovations that each sum stands for, since a lost filter has fewer.
+    flights, config : as of `self_calibrate`; scale : m, robust scale of the innovations
+    count : number of innovations in each sum, since a diverged filter has fewer
     """
 
     flights: Sequence[Flight]
@@ -49,16 +50,15 @@ class Misfit:
     def about(
         cls, flights: Sequence[Flight], config: FilterConfig, anchors: Anchors, effects: EffectSet
     ) -> Misfit:
-        """Take the scale from the innovations with Anchors and an EffectSet."""
+        """Return a Misfit with the scale of the innovations under Anchors and an EffectSet."""
         innovations = _innovations(flights, config, anchors, effects)
         scale = 1.4826 * float(np.median(np.abs(innovations))) if len(innovations) else 0.0
         return cls(flights, config, max(scale, 1e-3), len(innovations))
 
     def of(self, anchors: Anchors, effects: EffectSet) -> float:
-        """Return minus the logarithm of the likelihood of all innovations in the air (Student t).
+        """Return the negative log-likelihood (Student's t) of all innovations in the air.
 
-        Innovations of one filter are independent if the anchors are right; the caller divides by
-        how alike they are.
+        It assumes independent innovations. The caller divides it by their variance inflation.
         """
         value = _innovations(self.flights, self.config, anchors, effects) / self.scale
         if not len(value):
@@ -66,12 +66,15 @@ class Misfit:
         return float(0.5 * (NU + 1.0) * self.count * np.mean(np.log1p(value**2 / NU)))
 
     def suspects(self, effects: EffectSet) -> list[int]:
-        """Rows of the TRIED anchors that explain the most if they stand elsewhere, best first."""
+        """Return the rows of the TRIED anchors with the best likelihood after placing.
+
+        The best comes first.
+        """
         misfits = {}
         for row in range(len(self.flights[0].anchors)):
             try:
                 placed = place(self.flights, [row], self.config)
-            except InputError:  # too few TDOAs tell of it
+            except InputError:  # too few TDOAs determine its position
                 continue
             misfits[row] = self.of(placed, effects)
         return sorted(misfits, key=misfits.__getitem__)[:TRIED]
@@ -80,7 +83,7 @@ class Misfit:
 def _innovations(
     flights: Sequence[Flight], config: FilterConfig, anchors: Anchors, effects: EffectSet
 ) -> np.ndarray:
-    """Innovations of the TDOAs of Flights in the air, (n,) m, accepted or not."""
+    """Return innovations of all TDOAs of Flights in the air, accepted or rejected, (n,) m."""
     out = []
     for flight in flights:
         run = FlightEstimator(config, effects)(replace(flight, anchors=anchors))

@@ -1,6 +1,4 @@
-"""The one way from flights and what is known of their anchors to better anchors, and whether these
-may be used.
-"""
+"""Calibrate anchors from flights and prior knowledge, and decide whether to use the result."""
 
 from __future__ import annotations
 
@@ -35,25 +33,27 @@ if TYPE_CHECKING:
     from .equations import Equations
     from .prior import Solution
 
-ROUNDS = 2  # linear solutions, each about the last
-LEAST = 30.0  # s in the air; fewer do not tell how alike errors are
-SAME_PLACE = 0.05  # m by which an anchor may differ between flights of one installation
-NOTHING_KNOWN = 1e3  # m, standard deviation of a coordinate of which nothing is known
-IMPROVED = 0.7  # of the standard deviation as given; less is an improvement
-LEFT = 0.055  # m that may be left of slow innovations
-# slow innovations as given over those that are left, beyond which the tape was worse than what else
-# is wrong
+ROUNDS = 2  # linear solutions, each linearized at the previous one
+LEAST = 30.0  # s in the air, fewest; fewer do not show how correlated errors are
+SAME_PLACE = 0.05  # m, largest difference of an anchor between flights of one installation
+NOTHING_KNOWN = 1e3  # m, reported standard deviation of a coordinate of an unknown anchor
+IMPROVED = 0.7  # largest ratio of the new to the given standard deviation that counts as improved
+LEFT = 0.055  # m, largest scale of the remaining slow innovations, set on measured flights
+# Ratio of the slow innovations with given and with estimated anchors, set on measured flights.
+# Above it the tape errs more than everything else, and the result may be used.
 CLEARLY = 2.6
-PLAINLY = 5.0  # standard deviations that an anchor must be off by to be tried as the only one
-WELL_PLACED = 0.08  # m, 3D standard deviation of a moved anchor that leaves nothing to do
-NEARER = 0.75  # share of marks, each left out once, at which the estimate must come nearer
+PLAINLY = 5.0  # smallest shift, in standard deviations, of an anchor that moved alone
+WELL_PLACED = 0.08  # m, 3D standard deviation of a moved anchor below which no advice is given
+NEARER = 0.75  # smallest share of marks, each left out once, at which the estimate must improve
 
 
 @dataclass(frozen=True, eq=False)
 class AnchorChange:
-    """What is not as the last calibration had it: effect : name; anchor : id; values, std : (m,) m,
-    by how much; rivals : names of effects that the flights cannot tell from it; others : ids of
-    anchors, one of which may have moved instead.
+    """A change of one anchor since the last calibration.
+
+    effect : name; anchor : id; values, std : (m,) m, size of the change
+    rivals : names of effects that the flights do not distinguish from it
+    others : ids of anchors that can have changed instead
     """
 
     effect: str
@@ -64,7 +64,7 @@ class AnchorChange:
     others: tuple[str, ...] = ()
 
     def as_text(self) -> str:
-        """One sentence."""
+        """Return a sentence."""
         by = ", ".join(
             f"{100 * value:+.1f} +- {100 * std:.1f}" for value, std in zip(self.values, self.std)
         )
@@ -79,7 +79,7 @@ class AnchorChange:
 
     @property
     def _doubt(self) -> str:
-        """What to do where the flights hardly determine the place of the anchor."""
+        """Return advice for an anchor whose position the flights hardly determine, else ""."""
         off = float(np.linalg.norm(self.std))
         if off <= WELL_PLACED and not self.others:
             return ""
@@ -91,26 +91,23 @@ class AnchorChange:
 
 @dataclass(frozen=True, eq=False)
 class SelfCalibration:
-    """What flights tell of their anchors.
+    """Anchors estimated from flights, and their uncertainty.
 
-    given : Anchors; prior : Prior of them; flights : names; base : EffectSet that was in the model;
-    surveyed : Anchors where the flights put them; delays (N,) m; solution : Solution, whose
-        covariance is of positions, anchor by anchor,
-    and then of delays; seconds : s in the air that tell;
-    before, left : m, scale of the slow innovations with the anchors as given, and with these,
-        beside the offset of all ranges;
-    tdoa_std : m, for the filter: so that it believes in as many independent TDOAs as there are;
-        None without any;
-    changes : (AnchorChange, ...) since the last calibration;
-    marks : (before, after, nearer), root mean square of what estimates at marks in the air are off
-        by, m, and share of marks that they
-    come nearer to, each after a fit without it; None where there are none;
-    grounded : how many marks were left out, because they are on the floor: estimates there are
-        metres off and do not know it;
-    shares : {name of an effect: (Share, ...)}, how much of it each flight shows;
-    inflation : as of Equations;
-    blocked : sentences on what makes anchors late somewhere, once somebody has looked
-        (`surveying/blocked.py`).
+    given : Anchors; prior : their Prior; flights : names; base : EffectSet of the model
+    surveyed : estimated Anchors; delays : (N,) m
+    solution : Solution; its covariance holds positions, anchor by anchor, then delays
+    seconds : s in the air that were used
+    before, left : m, scale of the slow innovations with the given and with the estimated anchors,
+        without the common offset of ranges
+    tdoa_std : m, for the filter, so that its information matches the inflated noise; None without
+        TDOAs
+    changes : (AnchorChange, ...) since the last calibration
+    marks : (before, after, nearer): RMS error of the estimate at marks in the air, m, and the share
+        of marks at which it falls; each mark is left out of its fit. None without marks.
+    grounded : number of marks left out on the floor, where estimates err by metres without showing
+        it
+    shares : {effect: (Share, ...)}, its amount in each flight; inflation : as of Equations
+    blocked : sentences on blocked anchors, filled by `surveying/blocked.py`
     """
 
     given: Anchors
@@ -133,11 +130,10 @@ class SelfCalibration:
 
     @property
     def why_not(self) -> str | None:
-        """Why it must not be used instead of what was given; None if it may.
+        """Return why the result must not be used; None if it may be used.
 
-        Where something else is wrong as well, positions and delays take the place of what they look
-        like, and the position gets worse. That shows in what is left of the slow innovations, or at
-        marks.
+        If another systematic error exists, positions and delays absorb it, and the position error
+        grows. Large remaining slow innovations, or errors at marks, show that.
         """
         if self.marks:
             before, after, nearer = self.marks
@@ -160,25 +156,26 @@ class SelfCalibration:
 
     @property
     def explained(self) -> float:
-        """Share of the power of the slow innovations that is gone."""
+        """Return the explained share of the power of the slow innovations."""
         return 1.0 - (self.left / self.before) ** 2
 
     @property
     def anchors(self) -> Anchors:
-        """The Anchors to use."""
+        """Return the Anchors to use."""
         return self.surveyed if self.why_not is None else self.given
 
     @property
     def effects(self) -> EffectSet:
-        """The EffectSet to use with them, with what was in the model; its covariance is the prior
-        of the next calibration.
+        """Return the EffectSet to use with `anchors`, including the base.
+
+        Its covariance is the prior of the next calibration.
         """
         if self.why_not is not None:
             return self.base
         return with_calibration(self.base, self.found(np.zeros_like(self.shifts)), self.covariance)
 
     def found(self, shifts: np.ndarray) -> tuple[AnchorPosition, AnchorDelay]:
-        """The effects of positions that are off by shifts (N, 3) m, and of delays."""
+        """Return the effects of position errors `shifts`, (N, 3) m, and of the estimated delays."""
         n, keys = shifts.size, [key for _, key in keys_of(self.given.ids)]
         values = np.concatenate([shifts.ravel(), self.delays]).tolist()
         std = np.sqrt(np.diag(self.solution.covariance)).tolist()
@@ -190,8 +187,10 @@ class SelfCalibration:
 
     @property
     def tag_delay(self) -> tuple[float, float] | None:
-        """(m, m): what all ranges are too long by, which is in the delays of all anchors, and its
-        standard deviation. None without ranges.
+        """Return the antenna delay of the tag and its standard deviation, (m, m).
+
+        It lengthens all ranges, and the delays of all anchors include it. It is None without
+        ranges.
         """
         if not self.prior.common:
             return None
@@ -202,27 +201,27 @@ class SelfCalibration:
 
     @property
     def covariance(self) -> Covariance:
-        """What the next calibration starts from."""
+        """Return the Covariance that is the prior of the next calibration."""
         return to_keep(keys_of(self.given.ids), self.solution.covariance)
 
     @property
     def shifts(self) -> np.ndarray:
-        """(N, 3) m, from what was given."""
+        """Return the estimated minus the given positions, (N, 3) m, world."""
         return self.surveyed.positions - self.given.positions
 
     @property
     def given_std(self) -> np.ndarray:
-        """(N, 3) m, of the positions as given."""
+        """Return the standard deviations of the given positions, (N, 3) m."""
         return _of_positions(self.prior.covariance)
 
     @property
     def position_std(self) -> np.ndarray:
-        """(N, 3) m, of the positions as surveyed."""
+        """Return the standard deviations of the estimated positions, (N, 3) m."""
         return _of_positions(self.solution.covariance)
 
     @property
     def improved(self) -> np.ndarray:
-        """(N, 3) bool: coordinates that are known better than before."""
+        """Return whether each coordinate is determined better than before, (N, 3) bool."""
         return self.position_std < IMPROVED * self.given_std
 
 
@@ -235,15 +234,25 @@ def self_calibrate(
     progress: Callable[[], object] = lambda: None,
     map_function: MapFunction = map,
 ) -> SelfCalibration:
-    """SelfCalibration of Flights with the anchors that a Tape speaks of. Ground truth is not used.
+    """Return the SelfCalibration of Flights. Ground truth is not used.
 
-    base : EffectSet that is in the model already; its covariance, of the last calibration, counts
-        where there is one, not the
-    Tape; config : FilterConfig; constraints : what else is known (`diagnosis/constraints`);
-    map_function : as of `attribution.attribute`. The frame is that of the coordinates with the
-    smallest std. Each anchor is tried as the only one that has moved, as `Tape.unknown` has it,
-    before its error is spread. Raises InputError for flights of different anchors or that are too
-    short, and for a Tape that does not fit.
+    The coordinates with the smallest std define the frame. Each anchor is also tried as the only
+    moved one, as with `Tape.unknown`, before its error is spread. Raises InputError for flights
+    with different anchors, flights that are too short, and a Tape that does not fit.
+
+    Parameters
+    ----------
+    flights : sequence of Flight
+        All with the same anchors.
+    tape : Tape
+        Prior uncertainty of the anchors.
+    base : EffectSet
+        Effects in the model. Its covariance, of the last calibration, replaces the tape.
+    config : FilterConfig, optional
+    constraints : sequence of Constraint
+        Marks and distances (`diagnosis/constraints`).
+    map_function : function
+        As of `attribution.attribute`.
     """
     same_anchors(flights)
     config = config or FilterConfig()
@@ -266,7 +275,7 @@ def self_calibrate(
         progress()
         try:
             found[row] = _alone(spread, calibrated(replace(tape, unknown=(spread.prior.ids[row],))))
-        except InputError:  # too few TDOAs tell of it, or too few anchors are left
+        except InputError:  # too few TDOAs determine it, or too few anchors are left
             continue
     return _most_probable(found, misfit)
 
@@ -280,7 +289,7 @@ def _calibrated(
     progress: Callable[[], object],
     map_function: MapFunction,
 ) -> SelfCalibration:
-    """Return the SelfCalibration with one solution, about the anchors that a Tape speaks of."""
+    """Return the SelfCalibration for one Tape."""
     given, names = flights[0].anchors, tuple(flight.name for flight in flights)
     std, rows, tdoas = (
         tape.position_std(given),
@@ -354,12 +363,12 @@ def _calibrated(
 
 
 def _in_model(found: SelfCalibration) -> EffectSet:
-    """Return the EffectSet to use with the surveyed anchors, whether they are used or not."""
+    """Return the EffectSet for the surveyed anchors, whether they may be used or not."""
     return with_calibration(found.base, found.found(np.zeros_like(found.shifts)), None)
 
 
 def _alone(spread: SelfCalibration, found: SelfCalibration) -> SelfCalibration:
-    """Return the SelfCalibration of one unknown anchor as one of a tape that knew it."""
+    """Return a SelfCalibration of one unknown anchor, with the prior of the spread solution."""
     return replace(
         found, given=spread.given, prior=spread.prior, before=spread.before, base=spread.base
     )
@@ -368,9 +377,10 @@ def _alone(spread: SelfCalibration, found: SelfCalibration) -> SelfCalibration:
 def _most_probable(found: dict[int | None, SelfCalibration], misfit: Misfit) -> SelfCalibration:
     """Return the most probable of several SelfCalibrations.
 
-    found : {row of the anchor that was tried alone, None of none: SelfCalibration}. One anchor
-        alone must be ODDS times as probable as the error spread over all, and must stand plainly
-        elsewhere.
+    A single moved anchor must be ODDS times more probable than the error spread over all anchors.
+    Its shift must be significant.
+
+    found : {row of the anchor tried alone, None for the spread solution: SelfCalibration}
     """
     alike = SYSTEMATIC * max(1.0, min(one.inflation for one in found.values()))
     evidence = {
@@ -387,16 +397,16 @@ def _most_probable(found: dict[int | None, SelfCalibration], misfit: Misfit) -> 
 
 
 def _stands_elsewhere(found: SelfCalibration, row: int) -> bool:
-    """Whether a SelfCalibration puts an anchor plainly elsewhere than it was given."""
+    """Return whether the shift of an anchor exceeds PLAINLY standard deviations."""
     places = slice(3 * row, 3 * row + 3)
     covariance, shift = found.solution.covariance[places, places], found.shifts[row]
     return bool(shift @ np.linalg.solve(covariance, shift) > PLAINLY**2)
 
 
 def _log_evidence(found: SelfCalibration, alone: int | None) -> float:
-    """Return the logarithm of the evidence of a SelfCalibration beside the likelihood (Laplace).
+    """Return the log-evidence of a SelfCalibration without the likelihood (Laplace approximation).
 
-    alone : row of the anchor of which nothing was known.
+    alone : row of the anchor that was unknown, or None
     """
     prior = found.prior.covariance
     if not found.prior.known.any():
@@ -409,6 +419,7 @@ def _log_evidence(found: SelfCalibration, alone: int | None) -> float:
         prior[places], prior[:, places] = 0.0, 0.0
         prior[places, places] = ANYWHERE**2 * np.eye(3)
     offset = np.concatenate([found.shifts.ravel(), found.delays])
+    # Laplace: half of log|posterior| - log|prior| - squared distance from the prior mean.
     volumes = [np.linalg.slogdet(one)[1] for one in (found.solution.covariance, prior)]
     return float(0.5 * (volumes[0] - volumes[1] - offset @ np.linalg.solve(prior, offset)))
 
@@ -416,9 +427,11 @@ def _log_evidence(found: SelfCalibration, alone: int | None) -> float:
 def _with_rivals(
     found: dict[int | None, SelfCalibration], best: int, likely: dict[int, float]
 ) -> SelfCalibration:
-    """Return the best of several SelfCalibrations, with what the others leave open.
+    """Return the best of several SelfCalibrations, with its rivals.
 
-    likely : {row: logarithm of the evidence}. The covariance is that of all of them about the best.
+    The covariance is the mixture covariance of all likely ones about the best.
+
+    likely : {row: log-evidence}
     """
     one, total = found[best], 0.0
     covariance = np.zeros_like(one.solution.covariance)
@@ -436,9 +449,7 @@ def _with_rivals(
 
 
 def same_anchors(flights: Sequence[Flight]) -> None:
-    """Raises InputError unless all of some Flights, at least one, were flown among the same
-    anchors.
-    """
+    """Raise InputError unless all Flights, at least one, have the same anchors."""
     if not flights:
         raise InputError("give at least one flight.")
     first = flights[0]
@@ -454,12 +465,15 @@ def same_anchors(flights: Sequence[Flight]) -> None:
 
 
 def _of_positions(covariance: np.ndarray) -> np.ndarray:
-    """(N, 3) m, of a covariance (4N, 4N) m^2."""
+    """Return the standard deviations of positions, (N, 3) m, of a covariance (4N, 4N) m^2."""
     return np.sqrt(np.diag(covariance))[: 3 * (len(covariance) // 4)].reshape(-1, 3)
 
 
 def _left_out(equations: Equations, prior: Prior) -> tuple[float, float, float] | None:
-    """SelfCalibration.marks: each is left out of Equations about the anchors as given."""
+    """Return SelfCalibration.marks: each mark is left out of the Equations once.
+
+    equations : linearized at the given anchors
+    """
     if not equations.marks:
         return None
     n, off = len(prior.covariance), []
@@ -477,7 +491,10 @@ def _left_out(equations: Equations, prior: Prior) -> tuple[float, float, float] 
 
 
 def _changes(prior: Prior, found: Solution, offset: np.ndarray) -> tuple[AnchorChange, ...]:
-    """(AnchorChange, ...) of a Solution."""
+    """Return the (AnchorChange, ...) of a Solution.
+
+    offset : (4N,) m, point of linearization minus prior mean
+    """
     std, out = np.sqrt(np.diag(found.covariance)), []
     for (effect, anchor), others in found.changed.items():
         places, _ = prior.changes()[effect, anchor]
@@ -492,9 +509,11 @@ def _changes(prior: Prior, found: Solution, offset: np.ndarray) -> tuple[AnchorC
 def _shares(
     equations: Equations, offset: np.ndarray, found: Solution, names: Sequence[str]
 ) -> dict[str, tuple[Share, ...]]:
-    """SelfCalibration.shares: a fit of one factor to what each flight alone tells in Equations that
-    were made an offset (4N,) from the mean of the prior; with the information of `over_flights`,
-    which errors that last do not make less.
+    """Return SelfCalibration.shares: per flight, a fit of one factor to its equations.
+
+    The information is defined as in `over_flights`: errors that last a flight do not reduce it.
+
+    offset : (4N,) m, point of linearization minus prior mean
     """
     n, whole, out = len(offset), offset + found.step, {}
     reduced = [

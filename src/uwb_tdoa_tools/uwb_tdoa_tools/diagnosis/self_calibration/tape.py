@@ -1,4 +1,4 @@
-"""What somebody with a tape measure says of the anchors: how far off each coordinate may be."""
+"""Prior uncertainty of measured anchor coordinates."""
 
 from __future__ import annotations
 
@@ -17,9 +17,11 @@ AXES = "xyz"
 
 @dataclass(frozen=True)
 class Tape:
-    """std : m, of every coordinate; height_std : m, of z, None for std; trusted : names of anchors,
-    "3", or coordinates, "3.z", that are known within trusted_std, m; unknown : ids of anchors of
-    which nothing is known.
+    """Standard deviations of measured anchor coordinates.
+
+    std : m, of each coordinate; height_std : m, of z, None for std
+    trusted : anchors ("3") or coordinates ("3.z") with trusted_std, m
+    unknown : ids of anchors with unknown positions
     """
 
     std: float = 0.1
@@ -37,9 +39,9 @@ class Tape:
                 )
 
     def position_std(self, anchors: Anchors) -> np.ndarray:
-        """(N, 3) m for Anchors.
+        """Return the standard deviations of the coordinates of Anchors, (N, 3) m, world.
 
-        Raises InputError for a name that is no anchor, and where nothing tells the frame.
+        Raises InputError for a name that is not an anchor or axis.
         """
         out = np.full((len(anchors), 3), self.std)
         if self.height_std is not None:
@@ -56,7 +58,10 @@ class Tape:
         return out
 
     def unknown_rows(self, anchors: Anchors) -> list[int]:
-        """Rows of the unknown anchors. Raises InputError where fewer than four others are left."""
+        """Return the rows of the unknown anchors.
+
+        Raises InputError if fewer than four other anchors are left.
+        """
         rows = [self._row(anchors, anchor, f"--unknown {anchor}") for anchor in self.unknown]
         if len(anchors) - len(rows) < 4:
             raise InputError(
