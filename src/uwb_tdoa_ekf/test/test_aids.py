@@ -99,7 +99,7 @@ def test_an_update_reaches_the_auxiliary_states_as_the_textbook_says(seed, of):
     h = np.append(prior.h, np.zeros(3))
     if of is not None:
         h[15 + of] = 1.0
-        auxiliary.depend(prior.hypothesis, innovation, of)
+        auxiliary.add_offset_jacobian(prior.hypothesis, innovation, of)
         np.testing.assert_allclose(innovation.prior_variance, h @ joint @ h, rtol=1e-9)
     innovation.total_variance = innovation.prior_variance + innovation.noise_variance
     gain = joint @ h / (h @ joint @ h + innovation.noise_variance)

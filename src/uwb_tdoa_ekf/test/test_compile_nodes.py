@@ -15,13 +15,13 @@ IN_FLIGHT = """
 import sys
 from flights import fly
 import numpy as np
-from uwb_tdoa_ekf import estimator, warm_up
+from uwb_tdoa_ekf import compile_nodes, estimator
 
 def compiled():
     modules = [module for name, module in sys.modules.items() if name.startswith("uwb_tdoa_")]
     return {each.py_func: len(each.signatures) for module in modules for each in vars(module).values() if hasattr(each, "signatures")}
 
-warm_up.warm_up()
+compile_nodes.warm_up()
 before, flight = compiled(), fly(duration=20.0)
 tag, imu, tdoa = estimator.Estimator(flight.anchors), flight.imu, flight.tdoa
 for t in np.arange(0.0, 20.0, 0.02):

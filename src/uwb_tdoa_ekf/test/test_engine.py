@@ -20,6 +20,7 @@ from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
 from uwb_tdoa_ekf.core.engine import feed, most_records, run
 from uwb_tdoa_ekf.core.history import RECORD, RESET, UPDATE
 from uwb_tdoa_ekf.core.memory import ODOMETRY, RESIDUAL, STARTUP, USED, Output, new_state
+from uwb_tdoa_ekf.results import VERDICTS
 
 # --- engine ---
 MESSAGE = Path(__file__).resolve().parents[2] / "uwb_tdoa_msgs" / "msg" / "TdoaResidual.msg"
@@ -30,7 +31,8 @@ MESSAGE = Path(__file__).resolve().parents[2] / "uwb_tdoa_msgs" / "msg" / "TdoaR
 )
 def test_verdicts_are_those_of_the_message():
     declared = dict(re.findall(r"VERDICT_(\w+)=(\d)", MESSAGE.read_text()))
-    assert declared == {name: str(value) for name, value in vars(memory).items() if name.isupper()}
+    assert declared == {name: str(getattr(memory, name)) for name in declared}
+    assert {int(value) for value in declared.values()} == set(VERDICTS)
 
 
 def without_imu(flight, low=-np.inf, high=np.inf):

@@ -36,12 +36,12 @@ def test_a_converted_bag_has_no_arrivals(tmp_path):
 def test_ground_truth_is_not_read(tmp_path, monkeypatch):
     flight = small_flight()
     write_bag(flight, tmp_path / "f.bag")
-    from uwb_tdoa_tools.bags import bag
+    from uwb_tdoa_tools.bags import topics
 
     opened = []
-    original = bag.readable
+    original = topics.readable
     monkeypatch.setattr(
-        bag,
+        topics,
         "readable",
         lambda p, r, some: opened.extend(c.topic for c in some) or original(p, r, some),
     )

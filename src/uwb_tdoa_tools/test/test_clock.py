@@ -197,6 +197,9 @@ def test_every_message_is_counted_and_time_is_continuous(jumps, wild, far, drop,
     stamps = {name: true[name] + shift[name] for name in true}
     apart = sorted(place for place in wild if place < len(stamps["tdoa"]))
     apart = [place for k, place in enumerate(apart) if not k or place - apart[k - 1] > 3]
+    # Of the first messages nothing shows yet which of two times is right: if two of the first five
+    # are from one wrong time, the three between them are left out, too.
+    apart = [place for place in apart if place > 4]
     stamps["tdoa"] = stamps["tdoa"].copy()
     stamps["tdoa"][apart] += far
     found = straightened(stamps)
