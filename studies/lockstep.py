@@ -22,7 +22,7 @@ from uwb_tdoa_tools.scoring.metrics import Score
 
 def add_options(add):
     """The options of the study."""
-    add("log", metavar="LOG", help="recording")
+    add("flight", metavar="LOG", help="recording")
     add("survey", metavar="SURVEY", help="its survey")
     begin = "s after the first TDOA (default: %(default)s)"
     add("--from", dest="begin", metavar="S", type=float, default=0.0, help=begin)
@@ -37,7 +37,7 @@ def run(args):
     """Print the table."""
     with tempfile.TemporaryDirectory() as folder:
         bag = Path(folder) / "flight.bag"
-        flight = cut(read_flight(args.log, args.survey), args.begin, args.begin + args.seconds)
+        flight = cut(read_flight(args.flight, args.survey), args.begin, args.begin + args.seconds)
         judged = (flight.truth.t >= flight.tdoa.t[0]) & (flight.truth.t <= flight.tdoa.t[-1])
         write_bag(
             replace(

@@ -19,7 +19,8 @@ import subprocess
 import sys
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_tools.outputs import OutputFile
+from uwb_tdoa_bias.common.files import write_bytes
+from uwb_tdoa_tools.outputs import OutputFile, OutputFolder
 
 from . import tuned, watching, work
 from .worth import NOTICED, worth
@@ -35,7 +36,13 @@ def add_options(add: Callable) -> None:
         metavar="FILE",
         help="results line by line; what is there is not made again",
     )
-    add("--cache", type=Path, metavar="DIR", default=Path("rules"), help="copy and inputs go there")
+    add(
+        "--cache",
+        type=OutputFolder,
+        metavar="DIR",
+        default=Path("rules"),
+        help="copy and inputs go there",
+    )
     add("--full", action="store_true", help="all rows, not those of the screen alone")
     add("--watch", action="store_true", help="rules over streams and residuals instead")
     add("--only", nargs="+", metavar="WORD", default=[""], help="variants with one of these words")
@@ -46,7 +53,7 @@ def add_options(add: Callable) -> None:
 
 def run(args: Namespace) -> None:
     """Run what is missing, and print the table."""
-    cache = args.cache.absolute()
+    cache = Path(args.cache).absolute()
     cache.mkdir(parents=True, exist_ok=True)
     made = tuned.copy_to(cache)
     if not args.table:
@@ -70,7 +77,7 @@ def _work(args: Namespace, cache: Path, made: tuned.Tuned) -> None:
         "rows": args.rows,
     }
     path = cache / f"job {os.getpid()}.pickle"
-    path.write_bytes(pickle.dumps(job))
+    write_bytes(path, pickle.dumps(job))
     before = [str(made.folder), *sys.path]
     env = os.environ | {"PYTHONPATH": os.pathsep.join(part for part in before if part)}
     try:

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from studies import ranges, rover, situations
 from studies.faults.flown import FAULTS as FLOWN
+from uwb_tdoa_bias.common.files import write_bytes
 from uwb_tdoa_bias.common.flight import AIDS, Flight, Imu
 from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_bias.correction.corrector import Corrector
@@ -129,7 +130,7 @@ class Inputs:
             made = pickle.loads(path.read_bytes())
         else:
             made = make()
-            path.write_bytes(pickle.dumps(made))
+            write_bytes(path, pickle.dumps(made))
         self._kept[name] = made
         return made
 

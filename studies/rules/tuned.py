@@ -16,6 +16,7 @@ import mmap
 from pathlib import Path
 import shutil
 
+from uwb_tdoa_bias.common.files import write_text
 import uwb_tdoa_ekf
 
 from .catalogue import COUNTS, RULES, STRUCTURE, Rule
@@ -117,7 +118,7 @@ def copy_to(cache: Path, rules: tuple[Rule, ...] = RULES) -> Tuned:
         leave = shutil.ignore_patterns("__pycache__")
         shutil.copytree(source, part / PACKAGE, ignore=leave)
         for name, text in files.items():
-            (part / PACKAGE / "core" / name).write_text(text)
+            write_text(part / PACKAGE / "core" / name, text)
         part.rename(folder)
     return Tuned(folder, tuple(table.constants.values()), tuple(table.rules.values()))
 

@@ -34,13 +34,25 @@ FAULTY = ("0426-traj5",)
 EVERY = 1.0  # s between two looks
 UNTIL = 45.0  # s
 LEAST = 1.0  # s, by which a detection must come later to count
-PACKAGES = "streams", "monitoring"
+PACKAGE = "monitoring"
+KINDS = "streams", "monitoring"  # of what is watched
+# Modules whose rules judge streams by themselves
+OF_STREAMS = {
+    "stamp_rules",
+    "inertial_rules",
+    "ranging_rules",
+    "ranging_windows",
+    "stream_rules",
+    "stream_watch",
+    "survey_scale",
+    "explain",
+}
 NO_TUNING = {"inertial_rules.GRAVITY", "ranging_rules.TICK", "scale.NANOSECONDS"}
 LISTS = (  # of rules, by module
-    ("streams.stamp_rules", "OF_ONE"),
-    ("streams.stamp_rules", "OF_BOTH"),
-    ("streams.inertial_rules", "RULES"),
-    ("streams.ranging_rules", "RULES"),
+    ("monitoring.stamp_rules", "OF_ONE"),
+    ("monitoring.stamp_rules", "OF_BOTH"),
+    ("monitoring.inertial_rules", "RULES"),
+    ("monitoring.ranging_rules", "RULES"),
 )
 METHODS = {  # of the monitor: what takes their place
     "an anchor that changes": ("monitor.Monitor._look_for_change", None),
@@ -206,9 +218,7 @@ def patches() -> list[Patch]:
         of = "streams" if "watch." in path else "monitoring"
         instead = partial(_constant, value)
         made.append(Patch(f"without: {label}", (of,), {(owner, name): _method(instead)}))
-    for package in PACKAGES:
-        made += _constants(package)
-    return made
+    return made + list(_constants(PACKAGE))
 
 
 def _constant(value: Any, *_: object, **__: object) -> Any:
@@ -239,8 +249,7 @@ def _constants(package: str) -> Iterator[Patch]:
             where = [f"{package}.{module}"] + [
                 f"{package}.{other}" for other, its in trees.items() if _imports(its, module, name)
             ]
-            # Rules over streams are watched in flight, with constants of `monitoring`
-            of = ("streams",) if package == "streams" or "watch" in module else ("monitoring",)
+            of = ("streams",) if module in OF_STREAMS else ("monitoring",)
             for factor in (0.5, 2.0):
                 scaled = _scaled(found, factor)
                 if scaled != found:

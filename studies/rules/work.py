@@ -112,7 +112,7 @@ def _watch(job: dict[str, Any], inputs: Inputs) -> None:
     """The rules over streams and residuals, by the filter as it is."""
     rows = watching.rows(inputs)
     rows = [row for row in rows if not job["rows"] or any(word in row.name for word in job["rows"])]
-    chosen = [watching.Patch(BASE, watching.PACKAGES, {}), *watching.patches()]
+    chosen = [watching.Patch(BASE, watching.KINDS, {}), *watching.patches()]
     chosen = [
         one for one in chosen if one.name == BASE or any(word in one.name for word in job["only"])
     ]

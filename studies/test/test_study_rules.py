@@ -61,8 +61,8 @@ def test_a_rule_that_is_not_there_is_named(tmp_path):
 def test_the_constants_of_compiled_functions_are_in_the_table(made):
     known = {entry.name: entry for entry in made.constants}
     assert known["noise.LARGEST_OUTLIER"].values == (noise.LARGEST_OUTLIER,)
-    assert known["standing.LANDING_STD"].values == (0.2, 0.2, 0.5)
-    assert known["rest.LONG"].is_count and "state.GRAVITY" not in known
+    assert known["stationary_position.LANDING_STD"].values == (0.2, 0.2, 0.5)
+    assert known["stationarity.LONG"].is_count and "state.GRAVITY" not in known
     places = [entry.place + k for entry in made.constants for k in range(len(entry.values))]
     assert len(set(places)) == len(places) and max(places) < tuned.FIRST_RULE
 

@@ -13,10 +13,11 @@ PAGE = (ROOT / "docs" / "symptoms.md").read_text()
 def rules():
     """Names of all Findings, of the streams and of `check`."""
     found = set()
-    folders = "uwb_tdoa_ekf/uwb_tdoa_ekf/streams", "uwb_tdoa_tools/uwb_tdoa_tools/checking"
+    monitoring = SRC / "uwb_tdoa_ekf/uwb_tdoa_ekf/monitoring"
     for paths in (
-        [SRC / "uwb_tdoa_ekf/uwb_tdoa_ekf/monitoring/monitor.py"],
-        *((SRC / folder).rglob("*.py") for folder in folders),
+        [monitoring / "monitor.py", monitoring / "stream_rules.py", monitoring / "survey_scale.py"],
+        [monitoring / f"{kind}_rules.py" for kind in ("stamp", "inertial", "ranging")],
+        (SRC / "uwb_tdoa_tools/uwb_tdoa_tools/checking").rglob("*.py"),
     ):
         for path in paths:
             for node in ast.walk(ast.parse(path.read_text())):

@@ -31,7 +31,7 @@ from . import (
     update,
     velocity,
     workspace,
-    yaw_test,
+    yaw_check,
 )
 from .memory import (
     COMPENSATED,
@@ -345,11 +345,11 @@ def _after_update(
     opened = ekf.yaw_test.count > 0 or not parameters.use_imu
     if ekf.best // N_YAWS != followed // N_YAWS or (ekf.best != followed and opened):
         history.add_reset(ekf, t, records)
-    if alone and yaw_test.contradicts(ekf, t):
+    if alone and yaw_check.contradicts(ekf, t):
         initialization.open_yaw(ekf, parameters, records)
         alone = False
     if not alone:
-        yaw_test.clear(ekf.yaw_test)
+        yaw_check.clear(ekf.yaw_test)
     ekf.yaw_test.alone = alone
     if counts:
         ekf.consistency += min(1.0, (t - ekf.last_tdoa) / CONSISTENCY_TIME) * (
@@ -451,14 +451,14 @@ def _advance(ekf: Record, parameters: Record, t: float, records: np.ndarray) -> 
                 if h == ekf.best:
                     history.add_prediction(ekf, records)
                     if ekf.yaw_test.alone:
-                        yaw_test.predict(ekf, vx, vy)
+                        yaw_check.predict(ekf, vx, vy)
             else:
                 _coast(ekf, hypothesis, parameters, dt)
                 if auxiliary.present(hypothesis):
                     auxiliary.coast(hypothesis, dt)
                 if h == ekf.best:
                     history.add_coasting(ekf, dt, records)
-                    yaw_test.clear(ekf.yaw_test)
+                    yaw_check.clear(ekf.yaw_test)
         ekf.t = t if t - ekf.t <= MAX_STEP else ekf.t + dt
     if t >= ekf.next_floor and plane.is_given(parameters):
         plane.hold(ekf, parameters, t, records)
@@ -651,7 +651,7 @@ def _assimilate(
         residual.weight = innovation.weight
         residual.verdict = USED if innovation.weight > 0.0 else REJECTED
         if ekf.yaw_test.alone:
-            yaw_test.observe(
+            yaw_check.observe(
                 ekf, parameters.tdoa_correlation_length * innovation.variance_inflation, of_tdoa
             )
         if residual.verdict == USED:

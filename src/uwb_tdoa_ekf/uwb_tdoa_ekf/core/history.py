@@ -6,7 +6,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.compiled import Record, compiled
 
-from . import yaw_test
+from . import yaw_check
 from .state import ERROR_STATES, MOVING_STATES, NOMINAL_STATES, propagate
 
 UPDATE, RESET = (0, 1)  # kinds of records: a Kalman update, or a replaced state
@@ -79,7 +79,7 @@ def add_reset(ekf: Record, t: float, history: np.ndarray) -> None:
 
     The new state does not depend on the state before. Evidence against the yaw is cleared too.
     """
-    yaw_test.clear(ekf.yaw_test)
+    yaw_check.clear(ekf.yaw_test)
     if len(history) > 0:
         record = _next(ekf, t, RESET, history)
         record.innovation, record.variance = 0.0, 1.0

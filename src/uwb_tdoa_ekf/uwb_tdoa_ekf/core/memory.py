@@ -161,7 +161,7 @@ VELOCITY = _record(
     ("speed_variance", float),  # m^2/s^2, of the velocity of wheels
 )
 
-# State of the yaw test, see yaw_test.py.
+# State of the yaw test, see yaw_check.py.
 YAW_TEST = _record(
     # responses of the error state to cos(psi) - 1 and sin(psi), for a yaw error psi
     ("response", float, (2, ERROR_STATES)),
@@ -198,7 +198,7 @@ EKF = _record(
     ("rival_until", float),  # s, stamp until which the tag may be there
     ("imu_fault_detector", IMU_FAULT_DETECTOR),  # of the inertial samples
     ("imu_faulty", bool),  # inertial samples are not used, because they are implausible
-    ("yaw_test", YAW_TEST),  # see yaw_test.py
+    ("yaw_test", YAW_TEST),  # see yaw_check.py
     # s, stamp until which the first inertial samples of a running filter are averaged; -inf:
     # samples are used
     ("attitude_averaged_until", float),

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.memory import new_state
 from uwb_tdoa_ekf.core.state import ERROR_STATES
-from uwb_tdoa_ekf.core.yaw_test import evidence
+from uwb_tdoa_ekf.core.yaw_check import evidence
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.frames import rotation_std
 from uwb_tdoa_ekf.offline import run_offline
