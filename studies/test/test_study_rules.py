@@ -22,16 +22,16 @@ import numpy as np
 
 made = pickle.loads(Path(sys.argv[1]).read_bytes())
 from studies.rules.tuned import Live
-from uwb_tdoa_ekf.core import curvature
+from uwb_tdoa_ekf.core import update
 
 live = Live(made)
 P, x = np.eye(15), np.zeros(3)
 a, b = np.array([1.0, 0.2, 0.0]), np.array([0.0, 2.0, 1.0])
-(smallest,) = [one for one in made.constants if one.name == "curvature.SMALLEST"]
+(smallest,) = [one for one in made.constants if one.name == "update.SMALLEST"]
 
 
 def now():
-    return curvature.variance(x, P, a, b)
+    return update.variance(x, P, a, b)
 
 
 values = [now()]
@@ -39,7 +39,7 @@ live.scale(smallest, 10.0)
 values.append(now())
 live.restore()
 values.append(now())
-print(json.dumps([curvature.__file__, *values]))
+print(json.dumps([update.__file__, *values]))
 """
 
 
