@@ -22,7 +22,7 @@ from rclpy.time import Time
 from sensor_msgs.msg import Imu
 
 from uwb_tdoa_msgs.msg import Tdoa
-from uwb_tdoa_tools.crazyflie.log_blocks import LogBlock, VehicleClock
+from uwb_tdoa_tools.crazyflie import LogBlock, VehicleClock
 
 try:
     from crazyflie_interfaces.msg import LogDataGeneric
