@@ -287,9 +287,6 @@ def _add_learned(
             status[i] = FADED if known[i] < FADED_BELOW else NETWORK
 
 
-pass
-
-
 class FixedPoseCorrector(Corrector):
     """Corrects a recording at the poses of an earlier run with another model."""
 

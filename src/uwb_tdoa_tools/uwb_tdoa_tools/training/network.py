@@ -113,9 +113,6 @@ class GraphBuilder:
         return made
 
 
-pass
-
-
 LAYERS = (30, 30, 30)
 PATIENCE, MOST_EPOCHS = 5, 200
 BATCH, RATE = 64, 0.005
