@@ -53,9 +53,9 @@ class Restart(NamedTuple):
     Attributes
     ----------
     stream : str
-        Name of the stream whose stamps jumped back.
+        Name of the stream whose stamps are behind the time: they jumped back, or see `overtaken`.
     step : float
-        Size of the jump, in s, below 0.
+        First stamp of the new time minus the newest stamp before, in s, below 0.
     at : float
         First stamp of the new time, in s.
     overtaken : bool

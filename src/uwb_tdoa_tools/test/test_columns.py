@@ -71,6 +71,11 @@ def test_rows_of_several_sensors_in_one_file(files):
     assert np.isnan(flight.truth.q).all()
 
 
+def test_blanks_about_names_and_units_do_not_matter():
+    text = TDOA.replace("tdoa=diff:mm", " tdoa = diff : mm ")
+    assert parse_columns(text) == parse_columns(TDOA)
+
+
 @pytest.mark.parametrize(
     "text, said",
     [
@@ -79,6 +84,7 @@ def test_rows_of_several_sensors_in_one_file(files):
         ("range=r", "anchor is missing"),
         ("anchor=a,range=r", "range_time, or time, is missing"),
         ("time=t,time=u", "OURS, once"),
+        ("tdoa=:mm", "is not OURS=THEIRS"),
         ("tdoa=d:feet", "'feet' is no unit of tdoa"),
         ("anchor_a=a:m", "'m' is no unit of anchor_a; use none"),
         ("anchor_a=a,anchor_b=b", "tdoa is missing"),

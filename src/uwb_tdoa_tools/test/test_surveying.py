@@ -200,6 +200,8 @@ def test_words_name_what_is_better_and_what_is_not(result):
         ({"std": 0.0}, "--std: 0 must be above 0"),
         ({"trusted": ("77",)}, "there is no anchor '77'"),
         ({"trusted": ("1.w",)}, "has no axis 'w'"),
+        ({"trusted": ("1.xy",)}, "has no axis 'xy'"),
+        ({"trusted": ("1.",)}, "has no axis ''"),
         ({"unknown": tuple("01234")}, "3 of 8 anchors are left"),
     ],
 )

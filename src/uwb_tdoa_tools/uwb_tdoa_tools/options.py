@@ -290,21 +290,22 @@ def tape_of(args: Namespace, effects: EffectSet | None) -> Tape:
 
 
 def add_align(parser: ArgumentParser, judges: bool = False) -> None:
-    """Add --align.
+    """Add --align: none or time; for tools that judge by ground truth, frame too.
 
-    judges : for a tool that evaluates by ground truth, and may move its frame too
+    judges : whether the tool only scores with the ground truth; a tool that learns from it must not
+        move its frame
     """
-    words = (
+    text = (
         "ground truth on another clock (another epoch): none refuses it (default), time estimates "
         "the offset"
     )
     if judges:
-        words = (
+        text = (
             "move the ground truth onto the estimate before the evaluation: none (default); time, "
             "its stamps; frame, its frame too, rotated and shifted (as evo -a, without scale). "
             "The result is printed in any case, with the error of each"
         )
-    parser.add_argument("--align", choices=ALIGN if judges else ALIGN[:2], default=NONE, help=words)
+    parser.add_argument("--align", choices=ALIGN if judges else ALIGN[:2], default=NONE, help=text)
 
 
 def add_rerun(parser: ArgumentParser) -> None:

@@ -45,13 +45,18 @@ def clock_ahead(stream: str, lead: float, count: int) -> Finding:
 
 
 def restarted(cause: Restart) -> Finding:
-    """Return the Finding for a Restart of the filter."""
+    """Return the Finding for a Restart: the stamps fell back, or other streams had run ahead.
+
+    Its value is the step, s, below 0.
+    """
     topic = TOPICS[cause.stream]
-    how = "are before the time of the other streams" if cause.overtaken else "fell back"
-    evidence = f"the new time begins at {cause.at:.3f} s after the first stamp"
+    how = "are behind those of the other streams" if cause.overtaken else "fell back"
+    evidence = (
+        f"the new time begins at {cause.at:.3f} s, from the whole second of the first stamp on"
+    )
     remedy = (
-        "keep the clocks of all drivers in step (chronyc tracking); a recording that is played "
-        "again does this, too"
+        "keep the clocks of all drivers in step (chronyc tracking); replaying a recording also "
+        "causes this"
     )
     what = (
         f"the filter has started anew, because the stamps of {topic} {how} by {-cause.step:.3g} s"

@@ -109,7 +109,7 @@ class TdoaWindow(NamedTuple):
     invalid : int
         Not finite.
     impossible : int
-        Longer than the distance of the anchors.
+        Longer than the distance of the anchors by more than BEYOND.
     duplicates : int
         With pair, stamp and value equal to those before.
     successive : int
@@ -121,7 +121,7 @@ class TdoaWindow(NamedTuple):
     returns : int
         Jumps back to the value before.
     opposed : int
-        Pairs that came in both orders in quick succession.
+        TDOAs longer than LEAP whose pair came in the other order less than FOLLOWING before.
     even : int
         Opposed, with equal signs in both orders.
     size : float
@@ -135,8 +135,8 @@ class TdoaWindow(NamedTuple):
     steps : (k,) array
         Sizes of jumps, in m.
     latest : (k, 3) array
-        Rows of both anchors and value, in m, of the last TDOA of each pair, at most FRESH before
-        the end.
+        Rows of both anchors and value, in m, of the last TDOA of each pair whose stamp is within FRESH
+        of the stamp that arrived last.
     """
 
     stamps: StampWindow

@@ -165,35 +165,36 @@ def _hypotheses(count: int) -> tuple[list[str], list[float], np.ndarray]:
     Returns
     -------
     names : list of str
-        Names of the units, or "".
+        Units that the factors stand for, or "".
     factors : list of float
-        Scale factors.
+        Factors by which the survey is too large: positions / factor are in m.
     table : (h, 5) array
-        Kind, factor of all anchors, sign of the TDOAs, and two rows of anchors.
+        Kind; factor of all anchors, or of one (ALONE); sign of the TDOAs; rows of that anchor, or of
+        both (EXCHANGED), else 0.
     """
-    out: list[tuple[str, float, tuple[float, ...]]] = [
+    hypotheses: list[tuple[str, float, tuple[float, ...]]] = [
         ("", 1.0, (AS_IT_IS, 1.0, 1.0, 0, 0)),
         ("", 1.0, (SIGN, 1.0, -1.0, 0, 0)),
     ]
     scales = SMALLEST * RATIO ** np.arange(
         math.floor(math.log(LARGEST / SMALLEST) / math.log(RATIO)) + 1
     )
-    out += [
+    hypotheses += [
         ("", factor, (SCALED, factor, 1.0, 0, 0))
         for factor in [*scales.tolist(), *(1.0 / scales).tolist()]
     ]
-    out += [(name, factor, (SCALED, factor, 1.0, 0, 0)) for name, factor in UNITS.items()]
+    hypotheses += [(name, factor, (SCALED, factor, 1.0, 0, 0)) for name, factor in UNITS.items()]
     if count <= SINGLE:
-        out += [
+        hypotheses += [
             (name, factor, (ALONE, factor, 1.0, row, 0))
             for row in range(count)
             for name, factor in UNITS.items()
         ]
-        out += [
+        hypotheses += [
             ("", 1.0, (EXCHANGED, 1.0, 1.0, one, two)) for one, two in combinations(range(count), 2)
         ]
-    names, factors, rows = zip(*out)
-    return [*names], [*factors], np.array(rows, dtype=float)
+    names, factors, table = zip(*hypotheses)
+    return [*names], [*factors], np.array(table, dtype=float)
 
 
 def _compared(one: np.ndarray, other: np.ndarray) -> tuple[float, float]:

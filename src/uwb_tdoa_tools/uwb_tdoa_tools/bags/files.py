@@ -121,9 +121,12 @@ def check_output(out: str | Path, force: bool = False) -> None:
 
 @contextmanager
 def open_bag(path: str | Path, salvage: bool = False) -> Iterator[BagReader]:
-    """Give an open BagReader of a bag directory or data file; raise InputError for a faulty one.
+    """Yield an open BagReader of a bag directory or of one .mcap or .db3 file.
 
-    salvage : read the sound part of a cut or damaged bag; `remarks` lists the missing parts
+    Raises InputError if the path is no bag, or a damaged one without `salvage`. What must be
+    unpacked or repaired is copied to a temporary folder first.
+
+    salvage : read the intact messages of a cut or damaged bag; `remarks` lists what is missing
     """
     path = Path(path)
     if not is_bag(path):
@@ -150,12 +153,15 @@ def _opened(path: Path, folder: Path, salvage: bool) -> BagReader:
     try:
         if files := write_ahead.unclosed(path):
             (folder / "closed").mkdir()
-            path = write_ahead.merged_copy(path, folder / "closed")
+            path, lost = write_ahead.merged_copy(path, folder / "closed")
+            if lost and not salvage:
+                raise Damaged("; ".join(lost))
             names = " and ".join(file.name for file in files)
             remarks.append(
                 f"the recorder did not close {names}: what it left in the -wal or -journal file "
-                "beside it is read as far as SQLite can."
+                "beside it is read, too."
             )
+            remarks += [f"{sentence}." for sentence in lost]
         readable = path
         if salvage:
             readable = folder / "sound"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
+import struct
 from typing import TYPE_CHECKING
 
 from .mcap import Damaged
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
 LOG, INDEX, JOURNAL = "-wal", "-shm", "-journal"  # suffixes of files next to the database file
 BESIDE = LOG, INDEX, JOURNAL
+HEADER, FRAME_HEADER = 32, 24  # bytes, of a log and of each frame
 
 
 def unclosed(path: Path) -> list[Path]:
@@ -28,14 +30,21 @@ def unclosed(path: Path) -> list[Path]:
     return [file for file in files if _left(file)]
 
 
-def merged_copy(path: Path, folder: Path) -> Path:
-    """Copy a bag to a folder, merge its logs into the copy, and return its path.
+def merged_copy(path: Path, folder: Path) -> tuple[Path, list[str]]:
+    """Copy a bag to a folder and merge its logs into the copy.
 
     Parameters
     ----------
     path : Path
         Bag with `unclosed` files. It stays unchanged.
     folder : Path
+
+    Returns
+    -------
+    path : Path
+        The copy.
+    lost : list of str
+        What could not be merged, a sentence for each damaged log.
 
     Raises
     ------
@@ -50,9 +59,8 @@ def merged_copy(path: Path, folder: Path) -> Path:
         files = [path, *_left(path)]
     for file in files:  # without permissions: the copies are written
         shutil.copyfile(file, whole / file.name if path.is_dir() else folder / file.name)
-    for file in unclosed(whole):
-        _merge(file)
-    return whole
+    lost = [sentence for file in unclosed(whole) if (sentence := _merge(file))]
+    return whole, lost
 
 
 def _left(file: Path) -> list[Path]:
@@ -61,31 +69,58 @@ def _left(file: Path) -> list[Path]:
     return [one for one in beside if one.is_file() and one.stat().st_size]
 
 
-def _merge(file: Path) -> None:
+def _merge(file: Path) -> str:
     """Merge the readable part of the log into the file, and undo an unfinished transaction.
 
-    Raises
-    ------
-    Damaged
-        If the log is damaged.
+    Returns a sentence on finished transactions that are damaged, else "". Raises Damaged if SQLite
+    cannot merge.
     """
     size = sum(one.stat().st_size for one in (file, *_left(file)))
     try:
         connection = sqlite3.connect(file, isolation_level=None)
         try:
-            (pages,), (of_page,) = (
+            (pages,), (page_size,) = (
                 connection.execute(f"PRAGMA {what}").fetchone()
                 for what in ("page_count", "page_size")
             )
-            if pages * of_page > size:  # SQLite would create a file of that size
+            if (
+                pages * page_size > size
+            ):  # a damaged header; SQLite would create a file of that size
                 raise Damaged(
-                    f"{file.name} claims {pages} pages of {of_page} bytes, more than there are"
+                    f"{file.name} claims {pages} pages of {page_size} bytes, more than there are"
                 )
+            # both -1 without a log; SQLite takes a log to end before a damaged frame
             _, frames, merged = connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()
-            if merged < frames:
-                raise Damaged(f"{file.name}{LOG}: {frames - merged} of {frames} frames are lost")
-            connection.execute("PRAGMA journal_mode=DELETE")  # then no journal stays
+            written = max(frames, _written(file.with_name(file.name + LOG), page_size))
+            connection.execute("PRAGMA journal_mode=DELETE")  # then no log and no journal stays
         finally:
             connection.close()
     except sqlite3.Error as error:
-        raise Damaged(f"what lies beside {file.name} cannot be merged: {error}") from error
+        raise Damaged(f"the log or journal of {file.name} cannot be merged: {error}") from error
+    if merged >= written:
+        return ""
+    return (
+        f"{file.name}{LOG}: {written - merged} of {written} frames are damaged; what they held is "
+        "missing"
+    )
+
+
+def _written(log: Path, page_size: int) -> int:
+    """Return the number of frames of a log up to the last that ends a transaction, -1 without any.
+
+    Frames of a transaction that was not finished, and older ones, which have other salts, do not
+    count. Source: sqlite.org/walformat.html, sections 4.1 and 4.2.
+    """
+    if not log.is_file():
+        return -1
+    last = -1
+    with log.open("rb") as file:
+        salts = file.read(HEADER)[16:24]
+        for number in range(1, 1 + log.stat().st_size // (FRAME_HEADER + page_size)):
+            head = file.read(FRAME_HEADER)
+            if len(head) < FRAME_HEADER or head[8:16] != salts:
+                break
+            (pages_after,) = struct.unpack(">I", head[4:8])  # 0 within a transaction
+            last = number if pages_after else last
+            file.seek(page_size, 1)
+    return last

@@ -32,7 +32,8 @@ if TYPE_CHECKING:
     Arrangement = tuple[float, float, np.ndarray, np.ndarray]
 
 
-# samples at one end; factor over the mean count of the NEXT neighbouring values; healthy 1
+# Clipped: at least HITS samples have the extreme value, more than MORE times the mean count of the
+# NEXT values beside it. In healthy recordings it is about 1 time.
 HITS, MORE, NEXT = 20, 5.0, 5
 # s; limit of the mean square of a step, over the least that the change in FAR permits. Healthy: 2.9
 # at least, except a smooth log of 0607, which fits its ground truth. Behind a low pass of 50 ms: 2.4.
@@ -41,14 +42,15 @@ FEWEST = 10  # samples within FAR that a judgement needs
 
 
 def clipped_axes(flight: Flight) -> Iterator[Finding]:
-    """Yield a finding about an axis of a Flight with many samples at its largest or smallest value."""
+    """Yield the Finding on the first axis with many samples at its largest or smallest value, if any."""
     assert flight.imu is not None
     for name, column in zip(AXES, np.column_stack([flight.imu.gyro, flight.imu.accel]).T):
         values, counts = np.unique(column, return_counts=True)
+        unit = "rad/s" if name.startswith("gyro") else "m/s^2"
         for ends, hits in ((values, counts), (values[::-1], counts[::-1])):
             if len(ends) > NEXT and hits[0] >= HITS and hits[0] > MORE * hits[1 : 1 + NEXT].mean():
                 evidence = (
-                    f"{hits[0]} samples of {ends[0]:.2f}, {hits[1 : 1 + NEXT].mean():.0f} of each "
+                    f"{hits[0]} samples of {ends[0]:.2f} {unit}, {hits[1 : 1 + NEXT].mean():.0f} of each "
                     "of the next values"
                 )
                 remedy = "set the sensor to a larger range"

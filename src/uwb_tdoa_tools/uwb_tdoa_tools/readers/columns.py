@@ -80,25 +80,32 @@ HELP = (
 
 
 def parse_columns(text: str) -> dict[str, tuple[str, float]]:
-    """Return {our column: (their column, factor)} of "OURS=THEIRS[:UNIT],...". Raise InputError."""
+    """Return {our column: (their column, factor)} of "OURS=THEIRS[:UNIT],...".
+
+    A value times its factor is in m, s, degrees/s or g, as `make_flight` takes them. Without UNIT it
+    is in the first of UNITS. A name that holds a colon needs its unit. Raises InputError.
+    """
     columns = {}
     for entry in text.split(","):
-        ours, given, theirs = (part.strip() for part in entry.partition("="))
-        if not given or ours not in UNITS or not theirs or ours in columns:
+        ours, equals, theirs = (part.strip() for part in entry.partition("="))
+        name, colon, unit = (part.strip() for part in theirs.rpartition(":"))
+        if not colon:
+            name, unit = theirs, ""
+        if not equals or ours not in UNITS or not name or ours in columns:
             raise InputError(
                 f"--columns: {entry!r} is not OURS=THEIRS, where OURS, once, is one of "
                 f"{', '.join(UNITS)}."
             )
         units = UNITS[ours]
-        name, colon, unit = theirs.rpartition(":")
         if not colon:
-            name, unit = theirs, next(iter(units))
+            unit = next(iter(units))
         if unit not in units:
             usual = " or ".join(filter(None, units)) or "none"
             raise InputError(f"--columns: {entry!r}: {unit!r} is no unit of {ours}; use {usual}.")
         columns[ours] = name, units[unit]
-    wanted = [stream for stream, mine in STREAMS.items() if mine.keys() & columns.keys()]
-    for stream in wanted if {*RADIO} & {*wanted} else ["tdoa", *wanted]:
+    used = [stream for stream, names in STREAMS.items() if names.keys() & columns.keys()]
+    # without a column of a radio, the error names those of TDOAs
+    for stream in used if {*RADIO} & {*used} else ["tdoa", *used]:
         needed = [*(name for name in STREAMS[stream] if name not in OPTIONAL)]
         if missing := [name for name in needed if name not in columns]:
             raise InputError(

@@ -7,8 +7,8 @@ Together the phases are the whole recording. Some overlap.
     first_3_s         the first 3 s after the departure: lift-off
     to_0.3_m          from the departure to the first instant with z > 0.3 m
     in_the_air        from the first to the last instant with z > 0.3 m
-    moving            from the departure to the arrival, if the four phases around it leave a part
-    out
+    moving            from the departure to the arrival; only if first_3_s, in_the_air and
+                      last_3_s do not cover it, or nothing is in the air
     last_3_s          the last 3 s before the arrival: landing
     at_rest_after     from the arrival to the end
     whole             the whole ground truth
@@ -43,8 +43,8 @@ if TYPE_CHECKING:
 RISE = 0.07  # m above its height at rest: away, for a tag on the floor
 MOVED = 0.1  # m from its place at rest: away, for a tag without a floor
 REST_TIME = 0.5  # s at either end, whose median is the place at rest
-SHORTEST = 1.0  # s within MOVED that are rest
-BEFORE, ENDS = 2.0, 3.0  # s of the phases before the departure; after it, and before the arrival
+SHORTEST = 1.0  # s; a shorter stay within MOVED of the place of rest is no phase of rest
+BEFORE_DEPARTURE, IN_MOTION = 2.0, 3.0  # s, the latter after the departure and before the arrival
 
 TITLES = {
     "at_rest_earlier": "at rest, earlier",
@@ -93,21 +93,22 @@ def motion(truth: Truth) -> Span | None:
 def phases(truth: Truth) -> dict[str, Span]:
     """Return {name: (begin, end) s} of the phases that a Truth has, in the order of TITLES."""
     begin, end = float(truth.t[0]), float(truth.t[-1])
-    moving, flown = motion(truth), in_the_air(truth)
+    moving, flown = motion(truth), in_the_air(truth)  # (begin, end) s, or None
     if moving is None:
         found: dict[str, Span | None] = {"at_rest_before": (begin, end), "in_the_air": flown}
     else:
         departure, arrival = moving
         found = {
-            "at_rest_earlier": (begin, departure - BEFORE),
-            "at_rest_before": (max(begin, departure - BEFORE), departure),
-            "first_3_s": (departure, min(departure + ENDS, arrival)),
+            "at_rest_earlier": (begin, departure - BEFORE_DEPARTURE),
+            "at_rest_before": (max(begin, departure - BEFORE_DEPARTURE), departure),
+            "first_3_s": (departure, min(departure + IN_MOTION, arrival)),
             "to_0.3_m": flown and (departure, flown[0]),
             "in_the_air": flown,
-            "last_3_s": (max(arrival - ENDS, departure), arrival),
+            "last_3_s": (max(arrival - IN_MOTION, departure), arrival),
             "at_rest_after": (arrival, end),
         }
-        if flown is None or departure + ENDS < flown[0] or flown[1] < arrival - ENDS:
+        # a slow take-off or landing, or a tag that never leaves the floor
+        if flown is None or departure + IN_MOTION < flown[0] or flown[1] < arrival - IN_MOTION:
             found["moving"] = moving
     found["whole"] = begin, end
     return {name: span for name in TITLES if (span := found.get(name)) and span[1] > span[0]}

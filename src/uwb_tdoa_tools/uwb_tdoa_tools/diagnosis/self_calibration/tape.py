@@ -17,10 +17,10 @@ AXES = "xyz"
 
 @dataclass(frozen=True)
 class Tape:
-    """Standard deviations of measured anchor coordinates.
+    """Prior standard deviations of anchor coordinates that were measured, e.g. with a tape.
 
-    std : m, of each coordinate; height_std : m, of z, None for std
-    trusted : anchors ("3") or coordinates ("3.z") with trusted_std, m
+    std : m, of each coordinate; height_std : m, of z; None: as `std`
+    trusted : anchors ("3") or coordinates ("3.z") that are known better: to trusted_std, m
     unknown : ids of anchors with unknown positions
     """
 
@@ -47,14 +47,14 @@ class Tape:
         if self.height_std is not None:
             out[:, 2] = self.height_std
         for name in self.trusted:
-            anchor, _, axis = name.partition(".")
+            anchor, dot, axis = name.partition(".")
             row = self._row(anchors, anchor, f"--trusted {name}")
-            if axis and axis not in AXES:
+            if dot and axis not in tuple(AXES):
                 raise InputError(
                     f"--trusted: {name!r} has no axis {axis!r}; write {anchor} or {anchor}.x, "
                     f"{anchor}.y, {anchor}.z."
                 )
-            out[row, AXES.index(axis) if axis else slice(None)] = self.trusted_std
+            out[row, AXES.index(axis) if dot else slice(None)] = self.trusted_std
         return out
 
     def unknown_rows(self, anchors: Anchors) -> list[int]:
