@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from uwb_tdoa_bias.common.sensors import BY_POSE, COMPARED
+from uwb_tdoa_bias.common.sensors import BY_POSE, COMPARED, SENSORS
 from uwb_tdoa_bias.effects import EFFECTS, Track
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.constraints import Mark
