@@ -70,12 +70,12 @@ RULES = (
     Rule(
         "robust weight",
         "robust",
-        "update_innovation",
+        "by_innovation",
         "weight(parameters.loss, innovation.value / math.sqrt(prior + noise), "
         "parameters.measurement_scale)",
         "1.0",
     ),
-    Rule("a negligible weight is none", "robust", "update_innovation", "w < NEGLIGIBLE"),
+    Rule("a negligible weight is none", "robust", "by_innovation", "w < NEGLIGIBLE"),
     Rule(
         "a repeated TDOA is refused",
         "engine",
@@ -129,7 +129,7 @@ RULES = (
         "parameters.zero_velocity and continuous and not ekf.imu_faulty "
         "and inertial.is_quiet(ekf.imu)",
     ),
-    Rule("rest by TDOAs", "engine", "_before_update", "t >= ekf.next_look"),
+    Rule("rest by TDOAs", "engine", "_prepare", "t >= ekf.next_look"),
     Rule(
         "zero-velocity updates at samples",
         "engine",
@@ -140,7 +140,7 @@ RULES = (
     Rule(
         "zero-velocity updates without samples",
         "engine",
-        "_before_update",
+        "_prepare",
         "stationarity.update_zero_velocity(ekf, t, records)",
         "",
     ),
@@ -352,7 +352,7 @@ RULES = (
     Rule(
         "a wrong yaw is opened again",
         "engine",
-        "_after_update",
+        "_select",
         "alone and yaw_check.contradicts(ekf, t)",
     ),
     Rule("widen at a wrong yaw", "initialization", "open_yaw", "widen(ekf, history)", ""),
@@ -417,7 +417,7 @@ RULES = (
     Rule(
         "the workspace draws back",
         "engine",
-        "_after_update",
+        "_select",
         "_stay_in_workspace(ekf, t, records)",
         "",
     ),
@@ -433,7 +433,7 @@ RULES = (
         "set_bounds",
         "k < 2 and high - low < FLAT",
     ),
-    Rule("the surroundings follow the tag", "engine", "_before_update", "t >= ekf.next_bounds"),
+    Rule("the surroundings follow the tag", "engine", "_prepare", "t >= ekf.next_bounds"),
     # Start and recovery
     Rule(
         "weigh the ground at the start",
@@ -477,10 +477,10 @@ RULES = (
     Rule(
         "start anyhow after a while",
         "engine",
-        "_wait_for_start",
+        "_initialize",
         "waited > parameters.start_timeout",
     ),
-    Rule("start from few TDOAs", "engine", "_wait_for_start", "t >= ekf.next_search"),
+    Rule("start from few TDOAs", "engine", "_initialize", "t >= ekf.next_search"),
     Rule("no start over a gap", "initialization", "start_slowly", "gap > LONGEST_GAP * span"),
     Rule(
         "older TDOAs of a start count less",
@@ -526,7 +526,7 @@ RULES = (
     Rule(
         "recover",
         "engine",
-        "_after_update",
+        "_recover",
         "parameters.recover and (unsure or ekf.consistency < INCONSISTENT) "
         "and t >= ekf.next_search",
     ),
@@ -547,7 +547,7 @@ RULES = (
     Rule(
         "a lost tag is looked for anywhere",
         "engine",
-        "_before_update",
+        "_prepare",
         "t - ekf.last_tdoa > parameters.start_window and initialization.is_unsure(ekf)",
     ),
     Rule(
@@ -587,11 +587,11 @@ RULES = (
         "_update",
         "tdoa.t < ekf.rival_until and _is_of_rival(ekf, a, b, tdoa, known, residual)",
     ),
-    Rule("stop after a long pause", "engine", "_advance", "t - ekf.t > LOST_TIME"),
+    Rule("stop after a long pause", "engine", "_predict", "t - ekf.t > LOST_TIME"),
     Rule(
         "stop when the tag may be anywhere",
         "engine",
-        "_advance",
+        "_predict",
         "t - ekf.last_tdoa > LOST_TIME and workspace.is_filled(ekf.workspace, "
         "ekf.hypotheses[ekf.best].P)",
     ),

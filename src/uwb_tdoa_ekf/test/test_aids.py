@@ -3,6 +3,8 @@ with them in flights.
 """
 
 from dataclasses import replace
+import subprocess
+import sys
 
 from covariances import assert_covariance
 from flights import corners, fly, measurements, position_at, with_aids, with_ranges
@@ -14,6 +16,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.robust_loss import LOSSES
+from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_ekf.core import auxiliary, height, plane, update, velocity
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
 from uwb_tdoa_ekf.core.engine import feed
@@ -26,6 +29,12 @@ from uwb_tdoa_ekf.offline import run_offline
 
 seeds = st.integers(0, 2**32 - 1)
 STEP = 1e-6
+UNKNOWN_SENSOR = """
+from dataclasses import replace
+from uwb_tdoa_bias.common.sensors import SENSORS
+SENSORS["magnetometer"] = replace(SENSORS["velocity"], name="magnetometer")
+import uwb_tdoa_ekf.core.engine
+"""
 
 
 def tilted(seed):
@@ -285,6 +294,22 @@ def test_any_sensors_in_any_mode_leave_covariances(seed, robust, loss, names, sl
                 ]
             )
             assert_covariance(joint[np.ix_(there, there)], tolerance=1e-6)
+
+
+def test_a_sensor_without_a_branch_in_the_filter_is_refused_at_the_start():
+    run = subprocess.run([sys.executable, "-c", UNKNOWN_SENSOR], capture_output=True, text=True)
+    assert run.returncode == 1
+    assert "NotImplementedError: the filter has no branch for magnetometer of SENSORS" in run.stderr
+
+
+def test_a_kind_without_a_branch_raises():
+    flight = with_aids(fly(1, 3.0))
+    fed = measurements(flight)
+    rows, _ = aid_rows("velocity", flight.velocity, flight.anchors)
+    rows["kind"] = len(SENSORS)
+    state = new_state(flight.anchors.positions)
+    with pytest.raises(NotImplementedError, match="without a branch"):
+        feed(state, FilterConfig().parameters(), fed._replace(aids=rows))
 
 
 @pytest.mark.parametrize("followed", [0, 1])

@@ -11,14 +11,7 @@ import pytest
 from uwb_tdoa_bias.common.robust_loss import LOSSES, weight
 from uwb_tdoa_ekf.core.auxiliary import PRESSURE, RANGE, add_offset_jacobian
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
-from uwb_tdoa_ekf.core.robust import (
-    NEGLIGIBLE,
-    SMALLEST_WEIGHT,
-    update,
-    update_gate,
-    update_innovation,
-    update_m_estimation,
-)
+from uwb_tdoa_ekf.core.robust import NEGLIGIBLE, SMALLEST_WEIGHT, weigh
 from uwb_tdoa_ekf.core.update import LONGEST_ROW, kalman, update_state
 
 # --- update ---
@@ -67,6 +60,13 @@ def tuned(**config):
     return FilterConfig(**config).parameters()[0]
 
 
+def update(prior, parameters):
+    """Weigh the innovation, then update, as the engine does."""
+    weigh(prior.hypothesis, prior.innovation, parameters)
+    if prior.innovation.weight > 0.0:
+        kalman(prior.hypothesis, prior.innovation)
+
+
 def m_estimation(prior, noise, parameters):
     """Eqs. 8 - 13 of Zhao et al. (RA-L 2021) as they stand there, the Jacobian at the prior mean,
     no weight of the measurement below SMALLEST_WEIGHT: error, covariance, weight.
@@ -87,9 +87,7 @@ def m_estimation(prior, noise, parameters):
 def test_gate_that_is_open_gives_the_textbook_update(seed, length):
     prior = Prior(seed)
     expected = prior.textbook(prior.innovation.noise_variance * length)
-    update_gate(
-        prior.hypothesis, prior.innovation, tuned(gate=HUGE, tdoa_correlation_length=length)
-    )
+    update(prior, tuned(robust="gate", gate=HUGE, tdoa_correlation_length=length))
     assert prior.innovation.weight == 1.0
     prior.assert_is(*expected)
 
@@ -101,7 +99,7 @@ def test_gate_judges_with_the_variance_of_one_measurement_and_leaves_all_as_it_w
     passed = abs(innovation.value) <= gate * np.sqrt(
         innovation.prior_variance + innovation.noise_variance
     )
-    update_gate(prior.hypothesis, innovation, tuned(gate=gate, tdoa_correlation_length=length))
+    update(prior, tuned(robust="gate", gate=gate, tdoa_correlation_length=length))
     assert innovation.weight == passed
     assert passed or (prior.hypothesis == before and innovation.total_variance == np.inf)
 
@@ -114,7 +112,7 @@ def test_innovation_divides_the_variance_by_the_weight_of_what_is_whitened(seed,
     w = weight(LOSSES.index(loss), whitened, 2.5)
     expected = prior.textbook(innovation.noise_variance * length / w)
     parameters = tuned(loss=loss, measurement_scale=2.5, tdoa_correlation_length=length)
-    update_innovation(prior.hypothesis, innovation, parameters)
+    update(prior, parameters)
     assert innovation.weight == (w if w >= NEGLIGIBLE else 0.0)
     if w >= NEGLIGIBLE:
         prior.assert_is(*expected)
@@ -126,12 +124,12 @@ def test_innovation_divides_the_variance_by_the_weight_of_what_is_whitened(seed,
 def test_m_estimation_is_that_of_the_paper(seed, loss, length, iterations, state_scale, scale):
     prior = Prior(seed, surprise=2.0)
     scales = dict(measurement_scale=scale, state_scale=state_scale, iterations=iterations)
-    parameters = tuned(loss=loss, tdoa_correlation_length=length, **scales)
+    parameters = tuned(robust="m_estimation", loss=loss, tdoa_correlation_length=length, **scales)
     error, covariance, expected = m_estimation(
         prior, prior.innovation.noise_variance * length, parameters
     )
     posterior = prior.after(error, covariance)
-    update_m_estimation(prior.hypothesis, prior.innovation, parameters)
+    update(prior, parameters)
     assert prior.innovation.weight == pytest.approx(expected, rel=1e-6)
     prior.assert_is(*posterior, rtol=1e-6)
 
@@ -186,7 +184,7 @@ def test_whatever_is_measured_the_joint_covariance_stays_one(
     x = prior.hypothesis.offset.copy()
     if robust == "m_estimation":
         error, expected = joint_m_estimation(prior, joint, h, innovation.noise_variance, parameters)
-    update(prior.hypothesis, innovation, parameters)
+    update(prior, parameters)
     after = np.zeros((18, 18))
     after[:15, :15], after[15:, :15], after[15:, 15:] = (
         prior.hypothesis.P,

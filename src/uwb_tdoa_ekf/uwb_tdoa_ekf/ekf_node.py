@@ -293,7 +293,7 @@ class EkfNode(StreamNode):
         self._publish(*self._estimator.reset())
         self._watch.restart()
 
-    def _on_pose(self, message: Odometry) -> None:
+    def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
         if self.frozen and self.outputs.published:
             self.refuse("a pose on initialpose after the first odometry")
             return

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TransformStamped
-from nav_msgs.msg import Odometry
+from nav_msgs.msg import Odometry as OdometryMessage
 from tf2_msgs.msg import TFMessage
 
 from uwb_tdoa_bias.common.lazy import rotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.ros.topics import Epoch
 
     from .monitoring.status import Status
-    from .results import Residuals
+    from .results import Odometry, Residuals
 
 STATUS_PERIOD = 0.95  # s; the node checks five times a second
 ODOMETRY = "pose", "twist"
@@ -122,13 +122,13 @@ class Outputs:
         # messages; consecutive messages without odom -> body on /tf
         self.published = self._unplaced = 0
         self._placed = False  # True after the first transform
-        self._wires = CdrCodec(Odometry, *ODOMETRY), CdrCodec(TdoaResidual, *RESIDUAL)
+        self._wires = CdrCodec(OdometryMessage, *ODOMETRY), CdrCodec(TdoaResidual, *RESIDUAL)
         self._transform = TransformStamped(child_frame_id=self._odom or body)
         # one message for all, because publishing copies it
         self._tf = TFMessage(transforms=[self._transform])
         self.stamp = Time()  # stamp of the newest odometry
         self.set_world("")
-        self.odometry = StreamOutput(node, Odometry, "odometry")
+        self.odometry = StreamOutput(node, OdometryMessage, "odometry")
         self.residual = StreamOutput(node, TdoaResidual, "uwb/residual")
         self._tf_publisher = (
             node.create_publisher(TFMessage, "/tf", TF_QOS) if publish_tf != NONE else None
@@ -137,7 +137,7 @@ class Outputs:
     def set_world(self, frame: str) -> None:
         """Set the name of the world frame."""
         self.world = self._transform.header.frame_id = frame
-        messages = Odometry(child_frame_id=self._body), TdoaResidual()
+        messages = OdometryMessage(child_frame_id=self._body), TdoaResidual()
         for message in messages:
             message.header.frame_id = frame
         self._odometry, self._residual = (

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from uwb_tdoa_bias.common.sensors import BY_POSE, COMPARED
+from uwb_tdoa_bias.common.sensors import BY_POSE, COMPARED, SENSORS
 from uwb_tdoa_bias.effects import EFFECTS, Track
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.constraints import Mark
@@ -83,7 +83,8 @@ AIDED = tuple(
 # effects on ranges alone, of which `study diagnose-ranges` tells
 RANGED = ("range_offset", "range_delay")
 MARK_TIME, MARK_STD = 2.0, 0.05  # s, m
-NOISES = {"height_noise": 0.01, "pressure_noise": 0.1, "velocity_noise": 0.05}
+NOISES = {f"{name}_noise": 0.1 for name, sensor in SENSORS.items() if not sensor.locates}
+NOISES |= {"height_noise": 0.01, "pressure_noise": 0.1, "velocity_noise": 0.05}
 YAW_RATE_NOISE = 0.02  # rad/s
 
 

@@ -1,13 +1,59 @@
 """mypy, where it is installed, as .ci/mypy.ini says: the annotations of the packages and folders
-that it names.
+that it names, and messages by the stubs that .ci/stubs.py writes.
 """
 
 import configparser
+import re
+import subprocess
+import sys
 
 from documented import ROOT
 import pytest
 
-WRONG = "from uwb_tdoa_bias.common.text import version; version() + 1"
+# Each comment is the kind of error that mypy must find in its line.
+WRONG = """
+from nav_msgs.msg import Odometry
+from std_srvs.srv import Trigger
+from uwb_tdoa_bias.common.text import version
+from uwb_tdoa_bias.ros.cdr import decode
+from uwb_tdoa_bias.ros.frames import TFMessage, read_transforms
+from uwb_tdoa_bias.ros.node import StreamNode
+from uwb_tdoa_bias.ros.topics import Input, SubscribingNode
+from uwb_tdoa_msgs.msg import AnchorArray, Tdoa, TdoaCorrected
+
+version() + 1  # operator
+
+def take(message: Odometry) -> None:
+    message.pose.pose.positon  # attr-defined
+    message.header.stamp = 1.0  # assignment
+    message.pose.covariance[0].x
+    for pose in message.pose.covariance: ...
+
+def take_row(tdoa: Tdoa, data: bytes) -> float:
+    decode(data, TdoaCorrected).distance_difference  # attr-defined
+    return tdoa.header  # return-value
+
+def take_transforms(transforms: list[str]) -> None: ...
+
+def subscribe(node: StreamNode, other: SubscribingNode) -> None:
+    Input(node, Odometry, "odometry", take, 10)
+    Input(node, Tdoa, "odometry", take, 10)  # arg-type
+    Input(node, TFMessage, "/tf", take_transforms, 10, read_transforms)  # misc
+    node.create_subscription(Odometry, "odometry", take, 10)
+    node.create_subscription(Tdoa, "odometry", take, 10)  # arg-type
+    other.create_subscription(Odometry, "odometry", take, 10)
+    other.create_subscription(Tdoa, "odometry", take, 10)  # arg-type
+
+def answer(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    response.succes = True  # attr-defined
+    return response
+
+Tdoa(anchor_a=1, anchor_b=2, distance_difference=0.5)
+Tdoa(anchor_a="1")  # arg-type
+Tdoa(anchor=1)  # call-arg
+AnchorArray(anchors=[Tdoa()])  # list-item
+""".strip()
+ERROR = re.compile(r"<string>:(\d+): error: .*\[([\w-]+)\]$", re.MULTILINE)
 
 
 def annotated():
@@ -23,10 +69,14 @@ def annotated():
 @pytest.mark.slow
 def test_annotations(monkeypatch):
     run = pytest.importorskip("mypy.api").run
+    pytest.importorskip("rclpy")
     monkeypatch.chdir(ROOT)
+    subprocess.run([sys.executable, ".ci/stubs.py", "build/typings"], check=True)
     assert {"uwb_tdoa_bias", "uwb_tdoa_ekf", "uwb_tdoa_tools"} <= set(annotated())
     packages = [word for name in annotated() for word in ("-p", name)]
     report, failure, code = run(["--config-file", ".ci/mypy.ini", *packages])
     assert code == 0, report + failure
     report, failure, code = run(["--config-file", ".ci/mypy.ini", "-c", WRONG])
-    assert code == 1 and "[operator]" in report, report + failure
+    comments = (line.partition("  # ")[2] for line in WRONG.splitlines())
+    expected = {(k, kind) for k, kind in enumerate(comments, 1) if kind}
+    assert {(int(k), kind) for k, kind in ERROR.findall(report)} == expected, report + failure

@@ -15,7 +15,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeVar
 
 from rclpy.duration import Duration
 from std_msgs.msg import String
@@ -46,6 +46,9 @@ from .flying.world import WORLDS, world_of
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from builtin_interfaces.msg import Duration as DurationMessage
+
+Response = TypeVar("Response", Takeoff.Response, GoTo.Response, Land.Response)
 PARAMETERS = {  # in the order of config/vehicle_node.yaml
     "vehicle": Parameter(
         "quadrotor",
@@ -151,7 +154,9 @@ class VehicleNode(StreamNode):
             self._verdict.wait_for_all_acked(Duration(seconds=SETTLE))
             raise SystemExit(int(not reached(verdict)))
 
-    def _answer(self, response: Any, command: Callable[..., None], *values: object) -> Any:
+    def _answer(
+        self, response: Response, command: Callable[..., None], *values: object
+    ) -> Response:
         """Execute a request, or state why not in the response."""
         try:
             command(*values)
@@ -160,7 +165,7 @@ class VehicleNode(StreamNode):
             response.message = str(error)
         return response
 
-    def _on_takeoff(self, request: Any, response: Any) -> Any:
+    def _on_takeoff(self, request: Takeoff.Request, response: Takeoff.Response) -> Takeoff.Response:
         return self._answer(
             response,
             self._pilot.take_off,
@@ -169,12 +174,12 @@ class VehicleNode(StreamNode):
             _seconds(request.duration),
         )
 
-    def _on_go_to(self, request: Any, response: Any) -> Any:
+    def _on_go_to(self, request: GoTo.Request, response: GoTo.Response) -> GoTo.Response:
         goal = request.goal.x, request.goal.y, request.goal.z
         values = request.group_mask, request.relative, goal, request.yaw, _seconds(request.duration)
         return self._answer(response, self._pilot.go_to, *values)
 
-    def _on_land(self, request: Any, response: Any) -> Any:
+    def _on_land(self, request: Land.Request, response: Land.Response) -> Land.Response:
         return self._answer(
             response,
             self._pilot.land,
@@ -184,7 +189,7 @@ class VehicleNode(StreamNode):
         )
 
 
-def _seconds(duration: Any) -> float:
+def _seconds(duration: DurationMessage) -> float:
     return duration.sec + 1e-9 * duration.nanosec
 
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 from functools import cache, reduce
 from importlib import import_module
 import struct
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from rclpy.impl.implementation_singleton import rclpy_implementation as implementation
@@ -26,6 +26,7 @@ from rosidl_parser.definition import AbstractString, Array, BasicType, Namespace
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
+Message = TypeVar("Message")
 STAMP, FRAME = ("sec", "nanosec"), "header.frame_id"
 ENCAPSULATION = b"\x00\x01\x00\x00"  # plain CDR, little endian
 # Plain CDR in big and little endian. The fourth byte holds options.
@@ -175,7 +176,8 @@ class CdrCodec:
 
     def _convert(self, data: bytes) -> tuple[str, np.ndarray]:
         """Return (frame_id, rows (1,)) of one message, read through a message object."""
-        message, row = decode(data, self.kind), np.empty(1, self.dtype)
+        message: Any = decode(data, self.kind)
+        row = np.empty(1, self.dtype)
         for name, leaves in self._paths.items():
             row[name] = np.concatenate([np.atleast_1d(_get(message, leaf)) for leaf in leaves])
         frame = message.header.frame_id
@@ -255,7 +257,7 @@ class _Layout:
         return True
 
 
-def decode(data: bytes, kind: type) -> Any:
+def decode(data: bytes, kind: type[Message]) -> Message:
     """Return the decoded message of any type, by the middleware; raise Unreadable."""
     if data[:3] not in KNOWN_ENCAPSULATIONS:
         raise Unreadable("it is not plain CDR" if len(data) >= 4 else f"it has {len(data)} bytes")

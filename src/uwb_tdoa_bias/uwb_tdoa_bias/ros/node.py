@@ -18,7 +18,7 @@ from .topics import Refusals, StreamInput, publish_stream, several_publishers, u
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
 
-    from .cdr import CdrCodec, CdrTemplate
+    from .cdr import CdrCodec, CdrTemplate, Message
     from .topics import Epoch
 
     # frame, stamps, rows and arrivals
@@ -275,9 +275,9 @@ class StreamNode(ParameterNode):
 
     def create_subscription(
         self,
-        msg_type: type,
+        msg_type: type[Message],
         topic: str,
-        callback: Callable[..., None],
+        callback: Callable[[Message], None],
         qos_profile: QoSProfile | int,
         **options: Any,
     ) -> Subscription:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from copy import copy
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar, overload
 
 from builtin_interfaces.msg import Time
 import numpy as np
@@ -12,7 +12,7 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from .cdr import Unreadable, decode, name_of
+from .cdr import Message, Unreadable, decode, name_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -26,6 +26,21 @@ if TYPE_CHECKING:
 
     from .cdr import CdrCodec
     from .parameters import ParameterNode
+
+Content = TypeVar("Content")  # what is read of a message
+
+
+class SubscribingNode(Protocol):
+    """A node of rclpy. Type checkers compare its callbacks with the types of the messages."""
+
+    def create_subscription(
+        self,
+        msg_type: type[Message],
+        topic: str,
+        callback: Callable[[Message], None],
+        qos_profile: QoSProfile | int,
+    ) -> Subscription:
+        """Subscribe as rclpy does."""
 
 
 class Epoch:
@@ -171,6 +186,32 @@ class Input:
     refusals : Refusals
     options : of Node.create_subscription
     """
+
+    @overload
+    def __init__(
+        self,
+        node: ParameterNode,
+        kind: type[Message],
+        topic: str,
+        callback: Callable[[Message], None],
+        qos: int | QoSProfile,
+        read: None = None,
+        served: bool = True,
+        **options: Any,
+    ) -> None: ...
+
+    @overload
+    def __init__(
+        self,
+        node: ParameterNode,
+        kind: type,
+        topic: str,
+        callback: Callable[[Content], None],
+        qos: int | QoSProfile,
+        read: Callable[[bytes], Content],
+        served: bool = True,
+        **options: Any,
+    ) -> None: ...
 
     def __init__(
         self,

@@ -13,14 +13,22 @@ from uwb_tdoa_bias.common.sensors import SENSORS
 from . import barometer, height, velocity
 
 STREAMS = tuple(SENSORS)  # names of the sensors; AID.kind is an index into them
-HEIGHT, PRESSURE, VELOCITY, RANGE = map(STREAMS.index, ("height", "pressure", "velocity", "range"))
+# sensors with a branch in `observe`; engine.py has the branch of ranges
+BRANCHES = "height", "pressure", "velocity", "range"
+_missing = set(STREAMS) - set(BRANCHES)
+if _missing:
+    raise NotImplementedError(
+        f"the filter has no branch for {', '.join(sorted(_missing))} of SENSORS: add the name to "
+        f"BRANCHES in {__name__}, and a branch to `observe` there."
+    )
+HEIGHT, PRESSURE, VELOCITY, RANGE = map(STREAMS.index, BRANCHES)
 
 
 @compiled
 def observe(
     ekf: Record, parameters: Record, aid: Record, residual: Record, records: np.ndarray
 ) -> None:
-    """Update a running filter with a height, an altitude or a velocity.
+    """Update a running filter with a measurement of a sensor.
 
     Ranges are handled in engine.py. The filter must have been predicted to the stamp of the
     measurement.
@@ -37,13 +45,20 @@ def observe(
         Filled by this function.
     records : (n,) RECORD
         History for the smoother; empty for no recording.
+
+    Raises
+    ------
+    NotImplementedError
+        If no branch is for the kind of the measurement.
     """
     if aid.kind == HEIGHT:
         height.observe(ekf, parameters, aid, residual, records)
     elif aid.kind == PRESSURE:
         barometer.observe(ekf, parameters, aid, residual, records)
-    else:
+    elif aid.kind == VELOCITY:
         velocity.observe(ekf, parameters, aid, residual, records)
+    else:
+        raise NotImplementedError("a kind of measurement without a branch in aids.observe")
 
 
 @compiled

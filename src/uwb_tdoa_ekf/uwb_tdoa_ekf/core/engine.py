@@ -1,6 +1,14 @@
 """The compiled filter: events in stamp order in, odometry and residuals out.
 
-FilterState holds the entire state between two calls.
+FilterState holds the entire state between two calls. Each TDOA or range takes five steps:
+
+1. `_predict` to its stamp (state.predict), or `_initialize` a filter that does not run
+   (initialization.start).
+2. `_prepare`: detect rest (stationarity) and a position that is unknown after a silence.
+3. `_update` each hypothesis: innovation and Jacobian row (`_compare`, ranges.compare), weight
+   (robust.weigh), gain (update.kalman), probability (hypotheses.add_log_likelihood).
+4. `_select` the best hypothesis (hypotheses.select).
+5. `_recover` a filter that its TDOAs contradict (initialization.recover).
 """
 
 from __future__ import annotations
@@ -136,7 +144,7 @@ def _set_pose(
 ) -> None:
     ekf, pose = state.ekf[0], poses[0]
     if ekf.running:
-        _advance(ekf, parameters[0], pose.t, records)
+        _predict(ekf, parameters[0], pose.t, records)
     initialization.place(ekf, state.anchors, parameters[0], pose.t, pose, records)
 
 
@@ -184,7 +192,7 @@ def _on_imu(ekf: Record, parameters: Record, sample: Record, records: np.ndarray
         ekf.attitude_averaged_until = sample.t + AVERAGED
     elif averaged or not ekf.running:
         ekf.attitude_averaged_until = -np.inf
-    if ekf.running and _advance(ekf, parameters, sample.t, records):
+    if ekf.running and _predict(ekf, parameters, sample.t, records):
         if averaged and not ekf.imu_faulty:
             initialization.level_first(ekf, parameters, records)
         if continuous and not ekf.imu_faulty:
@@ -228,10 +236,10 @@ def _on_tdoa(
         return
     initialization.remember(ekf, tdoa, anchors)
     t = tdoa.t
-    if not _reach(ekf, anchors, parameters, t, records):
+    if not _predict_or_initialize(ekf, anchors, parameters, t, records):
         return
     before = ekf.position_unknown_until
-    _before_update(ekf, anchors, parameters, t, records)
+    _prepare(ekf, anchors, parameters, t, records)
     if parameters.recover and initialization.waits(
         ekf, anchors, parameters, t, ekf.position_unknown_until > before, records
     ):
@@ -240,9 +248,10 @@ def _on_tdoa(
     late = _update(ekf, anchors, parameters, tdoa, residual, records)
     initialization.relocate(ekf, anchors, parameters, t, records)
     known = anchors[tdoa.b].delay - anchors[tdoa.a].delay
-    _after_update(
-        ekf, anchors, parameters, t, not late, abs(residual.innovation - known) < INLIER, records
-    )
+    _select(ekf, parameters, t, records)
+    if not late:
+        _note_agreement(ekf, t, abs(residual.innovation - known) < INLIER)
+    _recover(ekf, anchors, parameters, t, records)
 
 
 @compiled
@@ -264,9 +273,9 @@ def _on_range(
     if ranges.pair(ekf, aid):
         initialization.remember(ekf, ekf.paired[0], anchors)
     t = aid.t
-    if not _reach(ekf, anchors, parameters, t, records):
+    if not _predict_or_initialize(ekf, anchors, parameters, t, records):
         return
-    _before_update(ekf, anchors, parameters, t, records)
+    _prepare(ekf, anchors, parameters, t, records)
     anchor, innovation = anchors[aid.anchor], ekf.innovation
     for h in range(HYPOTHESES):
         hypothesis = ekf.hypotheses[h]
@@ -274,15 +283,17 @@ def _on_range(
             continue
         ranges.compare(hypothesis, anchor.position, aid, parameters, innovation)
         innovation.variance_inflation, innovation.curvature = stationarity.repetition(ekf, t), 0.0
-        _assimilate(ekf, h, parameters, t, residual, records, False)
+        _update_hypothesis(ekf, h, parameters, t, residual, records, False)
         if h == ekf.best:
             ranges.keep_offset(ekf, hypothesis)
             noise.observe(ekf.information, anchor, anchor, innovation, t, ekf.last_tdoa)
-    _after_update(ekf, anchors, parameters, t, True, abs(residual.innovation) < INLIER, records)
+    _select(ekf, parameters, t, records)
+    _note_agreement(ekf, t, abs(residual.innovation) < INLIER)
+    _recover(ekf, anchors, parameters, t, records)
 
 
 @compiled
-def _before_update(
+def _prepare(
     ekf: Record, anchors: np.ndarray, parameters: Record, t: float, records: np.ndarray
 ) -> None:
     """Prepare an update stamped t (s): detect rest, heard anchors, and an unknown position.
@@ -308,34 +319,8 @@ def _before_update(
 
 
 @compiled
-def _after_update(
-    ekf: Record,
-    anchors: np.ndarray,
-    parameters: Record,
-    t: float,
-    counts: bool,
-    agrees: bool,
-    records: np.ndarray,
-) -> None:
-    """Complete an update: apply constraints, select the best hypothesis, recover a lost tag.
-
-    Parameters
-    ----------
-    ekf : EKF
-        State of the filter, updated in place.
-    anchors : (N,) ANCHOR
-        All anchors, by row.
-    parameters : PARAMETERS
-        Tuning of the filter.
-    t : float
-        Stamp, s.
-    counts : bool
-        Whether the measurement shows if the filter is consistent.
-    agrees : bool
-        Whether the measurement agrees with the best hypothesis.
-    records : (n,) RECORD
-        History for the smoother; empty for no recording.
-    """
+def _select(ekf: Record, parameters: Record, t: float, records: np.ndarray) -> None:
+    """Apply the constraints of the workspace, then select the best hypothesis at stamp t (s)."""
     _stay_in_workspace(ekf, t, records)
     followed = ekf.best
     alone = hypotheses.select(ekf, t) and parameters.use_imu and not (ekf.quiet or ekf.resting)
@@ -351,10 +336,20 @@ def _after_update(
     if not alone:
         yaw_check.clear(ekf.yaw_test)
     ekf.yaw_test.alone = alone
-    if counts:
-        ekf.consistency += min(1.0, (t - ekf.last_tdoa) / CONSISTENCY_TIME) * (
-            (1.0 if agrees else 0.0) - ekf.consistency
-        )
+
+
+@compiled
+def _note_agreement(ekf: Record, t: float, agrees: bool) -> None:
+    """Average the share of measurements that agree with the best hypothesis; t is a stamp (s)."""
+    share = min(1.0, (t - ekf.last_tdoa) / CONSISTENCY_TIME)
+    ekf.consistency += share * ((1.0 if agrees else 0.0) - ekf.consistency)
+
+
+@compiled
+def _recover(
+    ekf: Record, anchors: np.ndarray, parameters: Record, t: float, records: np.ndarray
+) -> None:
+    """Search for the tag elsewhere if recent TDOAs contradict the filter at stamp t (s)."""
     ekf.last_tdoa = t
     if ekf.consistency > initialization.AGREE:
         ekf.last_agreement = t
@@ -377,7 +372,7 @@ def _on_aid(
     residual.weight, residual.verdict = 0.0, STARTUP
     if aid.kind == aids.RANGE:
         _on_range(ekf, anchors, parameters, aid, residual, records)
-    elif ekf.running and _advance(ekf, parameters, aid.t, records):
+    elif ekf.running and _predict(ekf, parameters, aid.t, records):
         if aid.kind == aids.VELOCITY and not parameters.use_imu:
             initialization.open_unknown_yaw(ekf, parameters, records)
         aids.observe(ekf, parameters, aid, residual, records)
@@ -386,7 +381,7 @@ def _on_aid(
 
 
 @compiled
-def _reach(
+def _predict_or_initialize(
     ekf: Record, anchors: np.ndarray, parameters: Record, t: float, records: np.ndarray
 ) -> bool:
     """Predict a running filter to the stamp t (s) of a TDOA or range, or wait for its start.
@@ -394,13 +389,13 @@ def _reach(
     Return whether the filter runs at t.
     """
     if not ekf.running:
-        _wait_for_start(ekf, anchors, parameters, t, records)
+        _initialize(ekf, anchors, parameters, t, records)
         return False
-    return _advance(ekf, parameters, t, records)
+    return _predict(ekf, parameters, t, records)
 
 
 @compiled
-def _wait_for_start(
+def _initialize(
     ekf: Record, anchors: np.ndarray, parameters: Record, t: float, records: np.ndarray
 ) -> None:
     """Try to start the filter after a TDOA or range stamped t (s)."""
@@ -419,7 +414,7 @@ def _wait_for_start(
 
 
 @compiled
-def _advance(ekf: Record, parameters: Record, t: float, records: np.ndarray) -> bool:
+def _predict(ekf: Record, parameters: Record, t: float, records: np.ndarray) -> bool:
     """Predict every hypothesis to stamp t (s).
 
     The prediction uses the last inertial sample. If it is too old, it uses the last velocity of
@@ -552,7 +547,7 @@ def _update(
             continue
         _compare(hypothesis, a, b, tdoa, known, innovation)
         innovation.variance_inflation = stationarity.repetition(ekf, tdoa.t)
-        _assimilate(ekf, h, parameters, tdoa.t, residual, records, True)
+        _update_hypothesis(ekf, h, parameters, tdoa.t, residual, records, True)
         if h == ekf.best:
             noise.observe(ekf.information, a, b, innovation, tdoa.t, ekf.last_tdoa)
             height.update_pull(ekf.height, parameters, innovation, tdoa.t)
@@ -626,7 +621,7 @@ def _compare(
 
 
 @compiled
-def _assimilate(
+def _update_hypothesis(
     ekf: Record,
     h: int,
     parameters: Record,
@@ -644,7 +639,9 @@ def _assimilate(
     hypotheses.add_log_likelihood(
         hypothesis, innovation, parameters.tdoa_correlation_length * innovation.variance_inflation
     )
-    robust.update(hypothesis, innovation, parameters)
+    robust.weigh(hypothesis, innovation, parameters)
+    if innovation.weight > 0.0:
+        update.kalman(hypothesis, innovation)
     if h == ekf.best:
         residual.innovation = innovation.value
         residual.variance = innovation.prior_variance + innovation.noise_variance

@@ -1,10 +1,10 @@
-"""Three robust updates: weight from the whitened innovation, gate, and M-estimation.
+"""Three robust weights of a measurement: by the whitened innovation, by a gate, by M-estimation.
 
-Each takes a HYPOTHESIS and an INNOVATION after `update.project`. noise_variance is the variance of
+Each takes a HYPOTHESIS and an INNOVATION after `update.project`, and prepares `update.kalman`. noise_variance is the variance of
 a single measurement. Errors of successive measurements are correlated: `correlation_length`
 measurements give the information of a single independent one. The update therefore uses
-noise_variance times this length. `innovation` and `gate` compute the weight with noise_variance.
-`m_estimation` computes it with the variance that its update uses.
+noise_variance times this length. `by_innovation` and `by_gate` compute the weight with
+noise_variance. `by_m_estimation` computes it with the variance that its update uses.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from . import auxiliary
 from .auxiliary import OFFSET_STATES
 from .config import ROBUST
 from .state import ERROR_STATES
-from .update import kalman
 
 NEGLIGIBLE = 0.01  # weight below which a measurement is not used
 SMALLEST_WEIGHT = 1e-6  # least weight of a measurement in the M-estimation
@@ -28,23 +27,22 @@ _INNOVATION, _GATE = ROBUST.index("innovation"), ROBUST.index("gate")
 
 
 @compiled
-def update(hypothesis: Record, innovation: Record, parameters: Record) -> None:
-    """Update a HYPOTHESIS with the robust method that PARAMETERS selects.
+def weigh(hypothesis: Record, innovation: Record, parameters: Record) -> None:
+    """Set weight and total_variance of an INNOVATION with the method that PARAMETERS selects.
 
-    The function sets innovation.weight (0 if rejected) and innovation.total_variance (inf if
-    rejected).
+    The weight is 0 and the variance inf if the measurement is rejected.
     """
     if parameters.robust == _INNOVATION:
-        update_innovation(hypothesis, innovation, parameters)
+        by_innovation(innovation, parameters)
     elif parameters.robust == _GATE:
-        update_gate(hypothesis, innovation, parameters)
+        by_gate(innovation, parameters)
     else:
-        update_m_estimation(hypothesis, innovation, parameters)
+        by_m_estimation(hypothesis, innovation, parameters)
 
 
 @compiled
-def update_innovation(hypothesis: Record, innovation: Record, parameters: Record) -> None:
-    """Compute the weight from the whitened innovation, then apply a Kalman update.
+def by_innovation(innovation: Record, parameters: Record) -> None:
+    """Compute the weight from the whitened innovation.
 
     The measurement noise is divided by the weight. The covariance of the prediction contributes to
     the whitening. So an uncertain filter accepts large innovations, and the redescending weight
@@ -61,12 +59,11 @@ def update_innovation(hypothesis: Record, innovation: Record, parameters: Record
         w,
         prior + noise * parameters.tdoa_correlation_length * innovation.variance_inflation / w,
     )
-    kalman(hypothesis, innovation)
 
 
 @compiled
-def update_gate(hypothesis: Record, innovation: Record, parameters: Record) -> None:
-    """Apply a Kalman update if the innovation is within `gate` standard deviations."""
+def by_gate(innovation: Record, parameters: Record) -> None:
+    """Give the weight 1 to an innovation within `gate` standard deviations."""
     prior, noise = innovation.prior_variance, innovation.noise_variance
     if innovation.value**2 > parameters.gate**2 * (prior + noise):
         innovation.weight, innovation.total_variance = 0.0, np.inf
@@ -75,17 +72,16 @@ def update_gate(hypothesis: Record, innovation: Record, parameters: Record) -> N
         1.0,
         prior + noise * parameters.tdoa_correlation_length * innovation.variance_inflation,
     )
-    kalman(hypothesis, innovation)
 
 
 @compiled
-def update_m_estimation(hypothesis: Record, innovation: Record, parameters: Record) -> None:
-    """Apply an M-estimation update, Zhao et al. (RA-L 2021), eqs. 8 - 13.
+def by_m_estimation(hypothesis: Record, innovation: Record, parameters: Record) -> None:
+    """Compute weight and prior of an M-estimation, Zhao et al. (RA-L 2021), eqs. 8 - 13.
 
     The error state, followed by the auxiliary states, is scaled by the Cholesky factor S of the
-    prior (eq. 9). Prior and measurement are re-weighted `iterations` times (eq. 10). The posterior
-    follows from the weighted gain (eqs. 11 - 13). cross_covariance becomes the cross covariance of
-    the weighted prior.
+    prior (eq. 9). Prior and measurement are re-weighted `iterations` times (eq. 10). HYPOTHESIS and
+    cross_covariance become those of the weighted prior. `update.kalman` then gives the posterior
+    by the weighted gain (eqs. 11 - 13).
 
     A measurement moves only the scaled errors up to its last state. So that many columns of S
     suffice: three for a measurement of position. The Jacobian stays at the prior mean, because it
@@ -117,7 +113,6 @@ def update_m_estimation(hypothesis: Record, innovation: Record, parameters: Reco
             e[k] = y[k] / w[k] * (innovation.value / total)
     _weigh_prior(hypothesis, innovation, rows, columns)
     innovation.weight, innovation.total_variance = of_noise, total
-    kalman(hypothesis, innovation)
 
 
 @compiled

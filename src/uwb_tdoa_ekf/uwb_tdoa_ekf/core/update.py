@@ -2,7 +2,7 @@
 
 Each kind of measurement fills an INNOVATION: the Jacobian row with its error states, measured minus
 predicted value, and the variance of the measurement noise. `project` and `kalman` then work for all
-kinds. If the measurement may be an outlier, `robust.update` calls `kalman`.
+kinds. If the measurement may be an outlier, `robust.weigh` comes between the two.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ INNOVATION = np.dtype(
         # factor on the variance by repetition of the same error, in units of
         # tdoa_correlation_length; 1 unless the tag is at rest
         ("variance_inflation", float),
-        ("weight", float),  # 0 to 1, set by robust.update
+        ("weight", float),  # 0 to 1, set by robust.weigh
         ("total_variance", float),  # variance of the value, as the update used it
         # scratch of the M-estimation: S', whose rows are the columns of S
         ("factor", float, (JOINT_STATES, JOINT_STATES)),

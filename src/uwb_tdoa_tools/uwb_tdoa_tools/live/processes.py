@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
     from rclpy.node import Node
 
+    from uwb_tdoa_bias.ros.topics import SubscribingNode
+
     from .session import Stop
 
 STOP_LIMIT, PATIENCE = 10.0, 60.0  # s from SIGINT to SIGKILL; the latter if it must end well
@@ -116,7 +118,7 @@ def wait(
 class DiagnosticsListener:
     """Hold the newest status of each node on /diagnostics, and whether it still changes."""
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: SubscribingNode) -> None:
         self._newest: dict[str, dict[str, str]] = {}
         self._repeated: dict[str, int] = {}
         self._subscription = node.create_subscription(

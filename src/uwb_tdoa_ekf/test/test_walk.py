@@ -1,0 +1,106 @@
+"""The walk of docs/architecture.md: the files that one TDOA passes through both nodes."""
+
+from pathlib import Path
+import re
+import sys
+import time
+
+import pytest
+
+pytest.importorskip("rclpy")
+pytest.importorskip("uwb_tdoa_msgs.msg")
+
+import rclpy  # noqa: E402
+from rig import recording, stamp  # noqa: E402
+from sensor_msgs.msg import Imu  # noqa: E402
+
+from uwb_tdoa_bias.bias_node import BiasNode  # noqa: E402
+from uwb_tdoa_bias.effects import AnchorDelay, EffectSet  # noqa: E402
+from uwb_tdoa_ekf.core import engine  # noqa: E402
+from uwb_tdoa_ekf.ekf_node import EkfNode  # noqa: E402
+from uwb_tdoa_msgs.msg import Tdoa  # noqa: E402
+
+DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "architecture.md"
+FILE = re.compile(r"`([\w/]+\.py)`")
+OURS = re.compile(r".*/(?:uwb_tdoa_bias|uwb_tdoa_ekf)/(?!test/)(.*\.py)")
+MOST_FILES = 20  # of the walk
+SETTLED = 100  # odometry messages; then both nodes know the pose and correct TDOAs
+TRACED = 10  # TDOAs
+PATIENCE = 30.0  # s
+
+
+@pytest.fixture
+def nodes(tmp_path):
+    """Flight, BiasNode and EkfNode of its anchors, with an effect, and a node of the test."""
+    flight = recording(seconds=3.0)
+    flight.anchors.to_yaml(tmp_path / "anchors.yaml")
+    EffectSet((AnchorDelay({int(flight.anchors.ids[0]): 0.1}),)).to_yaml(tmp_path / "effects.yaml")
+    files = [f"{name}_file:={tmp_path / name}.yaml" for name in ("anchors", "effects")]
+    rclpy.init(args=["--ros-args", *(word for file in files for word in ("-p", file))])
+    own = [BiasNode(), EkfNode(), rclpy.create_node("source", use_global_arguments=False)]
+    yield flight, *own
+    for node in own:
+        node.destroy_node()
+    rclpy.shutdown()
+
+
+def messages(flight):
+    """The messages of a Flight in the order of their stamps: (is a TDOA, message)."""
+    imu, tdoa = flight.imu, flight.tdoa
+    out = []
+    for t, gyro, accel in zip(imu.t.tolist(), imu.gyro.tolist(), imu.accel.tolist()):
+        message = Imu()
+        message.header.stamp = stamp(t)
+        rate, force = message.angular_velocity, message.linear_acceleration
+        rate.x, rate.y, rate.z = gyro
+        force.x, force.y, force.z = accel
+        out.append((t, False, message))
+    for t, a, b, d in zip(*(column.tolist() for column in (tdoa.t, tdoa.a, tdoa.b, tdoa.d))):
+        message = Tdoa(anchor_a=a, anchor_b=b, distance_difference=d)
+        message.header.stamp = stamp(t)
+        out.append((t, True, message))
+    return [message for _, *message in sorted(out, key=lambda one: one[0])]
+
+
+def test_a_tdoa_passes_the_files_that_are_documented(nodes):
+    flight, bias, ekf, source = nodes
+    imu = source.create_publisher(Imu, "imu/data", 1000)
+    tdoa = source.create_publisher(Tdoa, "uwb/tdoa", 1000)
+    ends = imu, tdoa, bias.output.publisher, ekf.outputs.odometry.publisher
+    due = time.monotonic() + PATIENCE
+    while not all(end.get_subscription_count() for end in ends):
+        assert time.monotonic() < due, "the nodes do not find each other"
+        time.sleep(0.01)
+    passed, traced, before = set(), 0, 0
+
+    def note(frame, event, _):
+        found = OURS.fullmatch(frame.f_code.co_filename)
+        if event == "call" and found:
+            passed.add(found[1])
+
+    for is_tdoa, message in messages(flight):
+        (tdoa if is_tdoa else imu).publish(message)
+        if not is_tdoa:
+            continue
+        settled = ekf.outputs.published > SETTLED
+        before, due = ekf.outputs.published, time.monotonic() + 0.1
+        sys.setprofile(note if settled else None)
+        while ekf.outputs.published == before and time.monotonic() < due:
+            bias.streams.take()
+            ekf.streams.take()
+        sys.setprofile(None)
+        traced += settled and ekf.outputs.published > before
+        if traced == TRACED:
+            break
+    assert traced == TRACED
+    section = DOCUMENT.read_text().split("## One TDOA, from topic to odometry")[1].split("\n## ")[0]
+    table, beside = section.split("\nBeside the walk")
+    rows = [line for line in table.splitlines() if line.startswith("|")]
+    walk = set(FILE.findall("\n".join(rows)))
+    compiled = {file for file in walk - passed if file.startswith("core/")}
+    steps = Path(engine.__file__).read_text()  # names the modules of compiled code
+    assert all(re.search(rf"\b{Path(file).stem}\.", steps) for file in compiled)
+    watching = {file for file in passed if file.startswith("monitoring/")}  # some once a second
+    assert watching and "`monitoring/`" in beside
+    assert passed - watching == (walk - compiled) | set(FILE.findall(beside))
+    assert len(walk) <= MOST_FILES
