@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 from uwb_tdoa_bias.effects.base import listed
 
+from ...scoring.gains import difference
 from ...scoring.phases import NEAR_THE_FLOOR, TITLES
 from ..self_calibration.solve import CLEARLY, LEFT
 from .left_over import left_over
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from uwb_tdoa_ekf.monitoring.finding import Finding as NumbersFinding
 
@@ -230,6 +231,19 @@ def _over_phases(diagnosis: Diagnosis) -> list[str]:
         sides = [_of_phase(side[name]) for side in (before, after)]
         parts.append(f"{TITLES[name]} {' to '.join(dict.fromkeys(sides))}")
     return [f"Outside of that, before and after: {'; '.join(parts)}."] if parts else []
+
+
+def worse_phases(before: dict[str, Any], after: dict[str, Any]) -> Iterator[str]:
+    """Yield one clause per phase in which the error grows.
+
+    before, after : pooled figures of a side of `compare`
+    """
+    sides = before.get("phases", {}), after.get("phases", {})
+    for name in (name for name in TITLES if name in sides[0] and name in sides[1]):
+        first, second = (side[name] for side in sides)
+        known = first["rmse_3d"] is not None and second["rmse_3d"] is not None
+        if known and difference(first["rmse_3d"], second["rmse_3d"]) < 0:
+            yield f"{TITLES[name]} from {_of_phase(first)} to {_of_phase(second)}"
 
 
 def _of_phase(figures: dict[str, Any]) -> str:
