@@ -264,8 +264,8 @@ def _why_without(error: float, without: float) -> str:
     if without < error + min(LEAST_WORTH, LEAST_SHARE * error):
         return f"it is worth nothing for the position: {figures}"
     return (
-        f"of one flight, worth less than {WORTH_OF_ONE:.0%} of the error ({figures}), it may as "
-        f"well do harm to another: {SECOND}"
+        f"of one flight, worth less than {WORTH_OF_ONE:.0%} of the error, it may as well do harm to "
+        f"another; {SECOND}: {figures}"
     )
 
 
