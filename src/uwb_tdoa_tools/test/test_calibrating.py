@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,14 +15,27 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.monitoring.finding import ERROR, Finding
 from uwb_tdoa_ekf.offline import without_offset
 from uwb_tdoa_tools import calibrating as library
+from uwb_tdoa_tools import options
 from uwb_tdoa_tools.bags.bag import write_bag
-from uwb_tdoa_tools.calibrating import Calibration, between, prospect, split, without_truth
+from uwb_tdoa_tools.calibrating import (
+    Calibration,
+    Forecast,
+    Prospect,
+    between,
+    prospect,
+    split,
+    without_truth,
+)
+from uwb_tdoa_tools.checking.check import Report
 from uwb_tdoa_tools.checking.recording import of_flight
-from uwb_tdoa_tools.commands import calibrate
+from uwb_tdoa_tools.command_lines import evaluate_line, lines_of_use
+from uwb_tdoa_tools.commands import calibrate, diagnose, survey
+from uwb_tdoa_tools.commands import check as check_command
 from uwb_tdoa_tools.diagnosis.noise import write_parameters
 from uwb_tdoa_tools.diagnosis.references import Nothing
 from uwb_tdoa_tools.estimate import FlightEstimator
 from uwb_tdoa_tools.scoring.evaluation import score_of
+from uwb_tdoa_tools.scoring.gains import NO_DIFFERENCE
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 CLEAN = dict(
@@ -117,8 +131,7 @@ def test_what_makes_it_worse_where_it_took_no_part_is_not_to_be_used(flights, mo
         [replace(flight, truth=None) for flight in flights[:1]], [replace(flights[1], truth=None)]
     )
     assert (
-        "it makes things worse where it took no part: slow innovations 1.0 -> 2.0 cm (it "
-        "rises by 100 %) on flight2"
+        "it makes things worse: slow innovations 1.0 -> 2.0 cm (it rises by 100 %) on flight2"
     ) in made.why_not
 
 
@@ -133,14 +146,91 @@ def test_what_makes_it_worse_where_it_took_no_part_is_not_to_be_used(flights, mo
                 "something else is wrong too"
             ),
         ),
-        (0.05, 0.04, "it gains too little to be sure that it does no harm"),
+        # Noise is described alike in both directions.
+        (0.05, 0.04, f"it makes {NO_DIFFERENCE}: 3D RMSE 5.0 -> 4.0 cm"),
+        (0.04, 0.05, f"it makes {NO_DIFFERENCE}: 3D RMSE 4.0 -> 5.0 cm"),
+        (0.02, 0.05, "it makes things worse: 3D RMSE 2.0 -> 5.0 cm"),
         (0.055, 0.02, None),
         (0.08, 0.05, None),  # a tape that is good to 5 cm
     ],
 )
 def test_innovations_alone_must_speak_clearly(before, after, why):
-    told = library._reason_against_unverified(replace(GOOD, before=before, after=after))
-    assert told is why if why is None else why in told
+    against = library._reason_against_unverified(after, GOOD.judged_on)
+    blind = replace(GOOD, before=before, after=after, measure="slow innovations", why_not=against)
+    told = library._validated(blind, True).why_not
+    assert told is why if why is None else why.replace(GOOD.measure, blind.measure) in told
+
+
+@pytest.mark.parametrize(
+    ("after", "interval", "why"),
+    [
+        (0.199, (-0.02, 0.03), f"it makes {NO_DIFFERENCE}: 3D RMSE 20.0 -> 19.9 cm"),
+        (0.201, (-0.03, 0.02), f"it makes {NO_DIFFERENCE}: 3D RMSE 20.0 -> 20.1 cm"),
+        (0.25, (-0.4, -0.1), "it makes things worse: 3D RMSE 20.0 -> 25.0 cm"),
+        (0.15, (0.1, 0.4), None),
+    ],
+)
+def test_a_gain_within_the_noise_writes_nothing_in_either_direction(after, interval, why):
+    told = library._validated(replace(GOOD, after=after, interval=interval), True).why_not
+    assert told is None if why is None else told.startswith(why)
+
+
+@pytest.mark.parametrize(
+    ("better", "path", "sentence"),
+    [
+        (True, (5.0, 5.0, 2.0), "the flights are exciting enough"),
+        (
+            True,
+            (5.0, 5.0, 0.2),
+            (
+                "the flights determine most coordinates; for the others move farther along z, "
+                "where the tag moves by 0.2 m among anchors that are 3.0 m apart"
+            ),
+        ),
+        (
+            False,
+            (5.0, 5.0, 2.0),
+            (
+                "the flights are not exciting enough: move closer to anchors 0 and 1, on all "
+                "sides, high and low"
+            ),
+        ),
+    ],
+)
+def test_one_sentence_alone_judges_the_motion(better, path, sentence):
+    given = np.full((2, 3), 0.1)
+    expected = given * (0.1 if better else 1.0)
+    size, hall = np.array(path), np.array([6.0, 6.0, 3.0])
+    told = Prospect(60.0, 60.0, given, expected, 0.1, 0.05, size, hall, "xyz", (0, 1), None)
+    *others, last = told.sentences()
+    assert last == sentence
+    assert not any(word in " ".join(others) for word in ("enough", "farther", "closer", "fly more"))
+
+
+def test_with_ground_truth_quick_forecasts_what_a_diagnosis_gains(flights):
+    """Of one flight and of two, within seconds; the gain is that of flights that took no part."""
+    *fitted, other = flights
+    alone, several = library.forecast(fitted[:1]), library.forecast(fitted)
+    assert (alone.flights, several.flights) == (1, 2)
+    before = score_of(other, FlightEstimator())[0].row()["rmse_3d"]
+    for told in (alone, several):
+        assert told.before == pytest.approx(before, rel=0.3) and told.after < 0.5 * told.before
+        assert told.interval[0] > 0.0
+        assert told.sentences()[-1] == "a calibration with --out is likely to gain about as much"
+    assert "positions and delays of all anchors" in alone.sentences()[1]
+
+
+@pytest.mark.parametrize(
+    ("after", "interval", "last"),
+    [
+        (0.199, (-0.02, 0.03), f"that is {NO_DIFFERENCE}"),
+        (0.201, (-0.03, 0.02), f"that is {NO_DIFFERENCE}"),
+        (0.25, (-0.4, -0.1), "positions and delays of anchors do not describe these flights"),
+    ],
+)
+def test_a_forecast_without_a_gain_says_so(after, interval, last):
+    told = Forecast(60.0, 1, 0.2, after, interval).sentences()
+    assert told[-1].startswith(last)
 
 
 @pytest.mark.slow
@@ -203,7 +293,7 @@ def stub(monkeypatch, made, seen):
 
     monkeypatch.setattr(calibrate, "with_truth", instead)
     monkeypatch.setattr(calibrate, "without_truth", instead)
-    monkeypatch.setattr(calibrate, "_checked", lambda *_: True)
+    monkeypatch.setattr(calibrate, "check", lambda recording, *_: Report(recording.name, [], {}))
 
 
 @pytest.mark.parametrize(
@@ -247,10 +337,88 @@ def test_it_stops_where_check_finds_an_error(room, flights, monkeypatch, capsys)
     assert calibrate.main(["wrong.bag", "--out", "out"]) == 1
     printed = capsys.readouterr()
     assert (
-        "sign" in printed.out
-        and "check finds an error" in printed.err
-        and not (room / "out").exists()
+        "wrong: check finds an error: the sign of all TDOAs is wrong (tdoa_sign): it is left out; "
+        "put that right, or use it as it is with --keep."
+    ) in printed.err
+    assert "no flight is left to calibrate with" in printed.err and not (room / "out").exists()
+
+
+def faulty(monkeypatch, *names):
+    """Let check find an error in the flights of these names."""
+    error = Finding("tdoa_sign", ERROR, "the sign of all TDOAs is wrong", "seen", "turn it", 0.0)
+    monkeypatch.setattr(
+        calibrate,
+        "check",
+        lambda recording, *_: Report(
+            recording.name, [error] if recording.name in names else [], {}
+        ),
     )
+
+
+@pytest.mark.parametrize(
+    ("bad", "more", "seen"),
+    [
+        (("flight2",), (), (["flight1"], ["flight3"])),
+        (("flight3",), (), (["flight1"], ["flight2"])),
+        (("flight3",), ("--holdout", "flight3.bag"), (["flight1"], ["flight2"])),
+        (("flight2",), ("--keep",), (["flight1", "flight2"], ["flight3"])),
+    ],
+)
+def test_a_bad_flight_is_left_out_by_name_and_rule(room, monkeypatch, capsys, bad, more, seen):
+    calls = []
+    stub(monkeypatch, GOOD, calls)
+    faulty(monkeypatch, *bad)
+    flights = [f"flight{k}.bag" for k in (1, 2, 3) if f"flight{k}.bag" not in more]
+    assert calibrate.main([*flights, *more, "--out", "out"]) == 0
+    assert calls[0][:2] == seen
+    told = capsys.readouterr().err
+    assert f"{bad[0]}: check finds an error: the sign of all TDOAs is wrong (tdoa_sign)" in told
+    assert ("--keep asks for" if "--keep" in more else "it is left out") in told
+
+
+@pytest.mark.parametrize("more", [(), ("--no-truth",)])
+def test_quick_answers_of_one_flight_and_ends_with_0(room, monkeypatch, capsys, more):
+    told = SimpleNamespace(sentences=lambda: ["so it is"])
+    for name in ("prospect", "forecast"):
+        monkeypatch.setattr(calibrate, name, lambda flights, *_, name=name: told)
+    monkeypatch.setattr(calibrate, "prospect" if not more else "forecast", None)
+    monkeypatch.setattr(calibrate, "check", lambda recording, *_: Report(recording.name, [], {}))
+    assert calibrate.main(["flight1.bag", *more, "--quick"]) == 0
+    assert "so it is" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "parser", [calibrate.parser, diagnose.parser, survey.parser, check_command.parser]
+)
+def test_a_sensor_that_is_switched_off_is_off_in_every_command(parser):
+    args = parser().parse_args(
+        [
+            "a.bag",
+            "--without",
+            "height",
+            *["--out", "o"][: 2 * (parser is not check_command.parser)],
+        ]
+    )
+    config, _ = options.filter_of(args)
+    assert config == replace(FilterConfig(), use_height=False)
+
+
+@pytest.mark.parametrize("std", [None, 0.07])
+def test_a_sensor_that_is_switched_off_stays_off_in_what_is_written_and_printed(tmp_path, std):
+    config = FilterConfig(use_height=False)
+    file = write_parameters(tmp_path / "ekf_node.yaml", std, config)
+    expected = config if std is None else replace(config, tdoa_std=std)
+    assert FilterConfig.from_yaml(file) == expected
+    lines = [line for line, _ in lines_of_use(tmp_path, ["other.bag"], parameters=True)]
+    assert f"--config {file}" in lines[0] and f"--params-file {file}" in lines[2]
+    assert write_parameters(file, None, FilterConfig()) is None and not file.exists()
+
+
+def test_the_line_that_judges_reads_as_the_command_did():
+    words = ["a.bag", "--namespace", "tag1", "--topic", "uwb/tdoa=/my/tdoa", "--salvage"]
+    args = calibrate.parser().parse_args([*words, "--quick"])
+    line = evaluate_line(["a.bag"], more=options.words_of_reading(args))
+    assert line.endswith("evaluate a.bag --namespace tag1 --topic uwb/tdoa=/my/tdoa --salvage")
 
 
 def test_a_tape_that_is_off_does_not_stop_it_and_another_room_does(flights):

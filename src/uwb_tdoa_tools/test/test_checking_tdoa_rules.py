@@ -1,14 +1,18 @@
 """What is undone, and whether that explains more."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 from checking_flights import recording
 import numpy as np
 import pytest
 
 from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_ekf.results import rows_of
 from uwb_tdoa_tools.checking import tdoa_rules
 from uwb_tdoa_tools.checking.ordered import LONG, SPREAD, OrderedRecording, spread
+from uwb_tdoa_tools.checking.recording import read_recording
+from uwb_tdoa_tools.readers.inputs import Reading
 
 
 @pytest.fixture(scope="module")
@@ -114,3 +118,42 @@ def test_a_gain_within_systematic_errors_is_no_evidence(healthy, monkeypatch, ga
         monkeypatch.setattr(tdoa_rules, rule, lambda *_: iter(()))
     finding, _ = tdoa_rules.best_trial(flipped)
     assert (finding is not None and finding.rule == "tdoa_sign") == believed
+
+
+class _Fit(SimpleNamespace):
+    """A SurveyFit of enough windows."""
+
+    def __len__(self):
+        return tdoa_rules.FEWEST
+
+
+@pytest.mark.parametrize(
+    "seconds, gain, held, believed",
+    [(16.0, 0.098, 0.083, False), (45.0, 0.098, 0.083, True), (16.0, 0.11, 0.1, True)],
+)
+def test_a_piece_of_the_room_needs_more_evidence(seconds, gain, held, believed):
+    """In 16 s the tag sees a part of the room: other anchors describe the systematic errors there."""
+    fit = _Fit(before=0.2, all_moved=(0.2 - gain, None), held_out_gain=held, seconds=seconds)
+    assert (tdoa_rules.gained(fit) is not None) == believed
+
+
+@pytest.mark.parametrize(
+    "name, begin, seconds",
+    [
+        ("0422/0422-log02", 0.0, 16.0),
+        ("0425/TDOA2/0425-traj1", 0.0, 12.0),
+        ("0426/0426-traj1", 25.0, 25.0),
+        ("0426/0426-traj7", 32.0, 16.0),
+        ("0426/0426-traj11", 25.0, 25.0),
+    ],
+)
+def test_no_piece_of_a_measured_flight_has_the_survey_of_another_room(
+    shared_data, name, begin, seconds
+):
+    (found,) = Reading(shared_data / "surveys").find([shared_data / "flights" / name])
+    whole = OrderedRecording.of(read_recording(Reading(), *found))
+    start = whole.tdoa.t[0] + begin
+    rows = slice(*np.searchsorted(whole.tdoa.t, [start, start + seconds]))
+    piece = replace(whole, tdoa=rows_of(whole.tdoa, rows), imu=None)
+    assert tdoa_rules.apparent_gain(piece.survey_fit) > 0.065  # the limit before
+    assert tdoa_rules.gained(piece.survey_fit) is None

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from importlib import import_module
 import json
 
 from known_effects import clean_flight, effect_of
@@ -6,8 +7,10 @@ import pytest
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.sensors.height import Height
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_bias.effects.stamps import shifted
+from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands.diagnose import main
 from uwb_tdoa_tools.diagnosis import diagnose, output
@@ -29,6 +32,25 @@ def test_anchors_of_two_installations_are_refused(flight):
     )
     with pytest.raises(InputError, match="elsewhere: its anchors are not those"):
         diagnose([flight, other])
+
+
+def test_streams_that_the_filter_does_not_use_are_left_out_of_everything(flight, monkeypatch):
+    seen = []
+
+    def stop(flights, *_, **__):
+        seen.extend(flights)
+        raise InputError("seen")
+
+    module = import_module("uwb_tdoa_tools.diagnosis.diagnose")
+    monkeypatch.setattr(module, "attribute", stop)
+    height = Height(flight.truth.t, flight.truth.p[:, 2])
+    config = FilterConfig(use_height=False, use_imu=False)
+    with pytest.raises(InputError, match="seen"):
+        diagnose([flight.replaced(height=height)], config=config)
+    assert seen[0].height is None and seen[0].imu is None and len(seen[0].tdoa)
+    unused = module.unused_streams(config)
+    assert unused == ("imu", "height") and module.unused_streams(FilterConfig()) == ()
+    assert module._only_of(unused, "gyro_bias") and not module._only_of(unused, "anchor_delay")
 
 
 @pytest.mark.slow

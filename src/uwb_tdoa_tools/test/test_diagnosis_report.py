@@ -23,6 +23,7 @@ from uwb_tdoa_tools.diagnosis.report.page import html
 from uwb_tdoa_tools.diagnosis.report.unclear import by_remedy, undetermined
 from uwb_tdoa_tools.diagnosis.report.verdict import _flights, verdict
 from uwb_tdoa_tools.diagnosis.report.words import TERMS
+from uwb_tdoa_tools.scoring.gains import NO_DIFFERENCE
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
 STYLE = (Path(maps.__file__).parent / "templates" / "style.css").read_text()
@@ -119,9 +120,79 @@ def test_a_gain_that_may_be_chance_is_not_called_one(result, gain):
     found = verdict(judged(result, {"one": 0.3}, {"one": 0.25}, gain))
     assert (
         found.kind == "unsure"
-        and "not certain" in found.headline
+        and NO_DIFFERENCE in found.headline
         and "is gone" not in " ".join(found.sentences)
     )
+
+
+def test_noise_is_described_alike_in_both_directions(result):
+    better, worse = (
+        verdict(judged(result, {"one": 0.3}, {"one": after}, [-0.05, 0.04])).headline
+        for after in (0.298, 0.302)
+    )
+    assert better.replace("29.8", "30.2") == worse
+    assert worse.startswith(f"There is {NO_DIFFERENCE}")
+    larger = verdict(judged(result, {"one": 0.3}, {"one": 0.4}, [-0.4, -0.2]))
+    assert larger.headline == "The position error (3D RMSE) rises from 30.0 cm to 40.0 cm."
+
+
+def test_a_phase_that_becomes_worse_is_in_the_verdict_with_the_flights_by_name(result):
+    changed = judged(result, {"one": 0.3, "two": 0.3}, {"one": 0.2, "two": 0.2}, [0.2, 0.4])
+    for side, until, first in ((changed.before, 0.339, 0.2), (changed.after, 0.41, 0.1)):
+        side["pooled"]["phases"] = {
+            "first_3_s": {"rmse_3d": first, "nees_mean": 3.0},
+            "to_0.3_m": {"rmse_3d": until, "nees_mean": 4.1},
+        }
+    written = {"pooled": {**changed.after["pooled"], "rmse_3d": 0.19}}
+    more = verdict(replace(changed, written=written, tdoa_std=0.12)).more
+    worse = "until z > 0.3 m from 33.9 cm (NEES 4.1) to 41.0 cm (NEES 4.1)"
+    assert f"Worse: {worse}." in more
+    assert f"With tdoa_std 0.120 m of ekf_node.yaml too it is 19.0 cm; worse: {worse}." in more
+    assert "; one and two." in more[1]
+
+
+def test_the_verdict_says_why_in_words_of_the_field(result):
+    """How much, then why, for a function without a name with its largest part and its causes."""
+    functions = [
+        SmoothTerm(
+            {
+                f"{anchor}.c{k}": size * k
+                for anchor, size in (("3", 0.01), ("4", 0.3))
+                for k in (0, 1)
+            },
+            {},
+            covariate=name,
+            form="anchor",
+            knots=(0.0, 2.0),
+            shape="line",
+        )
+        for name in ("x", "height")
+    ]
+    together = Candidate(tuple(Term(term, tuple(term.values)) for term in functions))
+    maps = [
+        EffectFinding(term, "tdoa", {}, 0.2, (), (together,), True, 0.073) for term in functions
+    ]
+    shift = EFFECTS["anchor_position"]({"6.x": 0.25, "6.z": 0.1}, {"6.x": 0.01, "6.z": 0.01})
+    changed = judged(
+        result,
+        {"one": 0.304},
+        {"one": 0.218},
+        [0.2, 0.4],
+        findings=[finding(shift, worth=0.012), *maps, finding(delay(), worth=0.001)],
+    )
+    headline, _, _, first, second, *_ = verdict(changed).sentences
+    assert "falls from 30.4 cm to 21.8 cm" in headline
+    assert first.startswith(
+        "Mostly errors that depend on x and height, anchor by anchor; at most anchor 4 seems 0.15 m "
+        "farther for each m more of x"
+    )
+    assert "worth 7.3 of 8.6 cm. Likely causes: an obstacle or a reflector" in first
+    assert second == (
+        "Then the antenna of an anchor is not where the survey has it (anchor_position; largest "
+        "6.x = 0.25 ± 0.01 m), worth 1.2 cm."
+    )
+    titles = [entry.title for entry in entries(changed)]
+    assert titles == ["tdoa over x and height (by anchor)", "anchor_position", "anchor_delay"]
 
 
 def test_the_verdict_says_where_it_became_worse_and_what_diverged(result):
@@ -530,12 +601,53 @@ def test_a_row_is_either_worth_something_or_says_why_it_is_not_in_the_file(resul
         refused=[Refused("floor_multipath", "does not make the filter better")],
     )
     text = said(html(changed, "worth"))
-    assert "3.0 cm" in text and "not in effects.yaml: does not make the filter better" in text
+    assert "3.0 cm" in text
+    folded = "Found, and not in effects.yaml why not what does not make the filter better floor_multipath"
+    assert folded in text
     assert "yes" not in text.split() and "0 %" not in text
-    assert (
-        "Nothing else in the catalogue explains as much." in text
-    )  # of the delay, that nothing imitates
-    assert "Was not compared with others; may be confused with" in text
+
+
+def cells(page):
+    """Texts of the cells of each table of a page: [[text]]."""
+    for table in re.findall(r"<table.*?</table>", page, flags=re.S):
+        yield [said(cell) for cell in re.findall(r"<td.*?</td>", table, flags=re.S)]
+
+
+def test_no_sentence_repeats_in_a_table_and_what_was_refused_is_folded(result):
+    """With many effects that nothing imitates, that are alike in doubt, and that are refused."""
+    names = ("anchor_delay", "gyro_bias", "accel_bias", "range_scale", "tdoa_time_offset")
+    effects = [EFFECTS[name]({EFFECTS[name].row.example: 0.1}, {}) for name in names]
+    added = [finding(one, worth=0.01 * k) for k, one in enumerate(effects[:3])]
+    doubtful = [replace(one, alternatives=(AS_WELL, ELSEWHERE)) for one in added]
+    others = [finding(one, False, None) for one in effects[3:]]
+    refused = [
+        Refused(one.effect.label, f"it is worth nothing: 0.{k} m with")
+        for k, one in enumerate(others)
+    ]
+    refused += [Refused(f"other{k}", f"does not help held-out data ({k}.5)") for k in range(6)]
+    every = [
+        Unobservable(name, {"x": 1.0, "y": float(k)})
+        for k, name in enumerate(("accel_scale", "gyro_scale"))
+    ]
+    for some in (added, doubtful):
+        changed = replace(result, findings=[*some, *others], refused=refused, unobservable=every)
+        page = html(changed)
+        for table in cells(page):
+            sentences = [
+                sentence
+                for cell in table
+                for sentence in re.split(r"(?<=[.;])\s", cell)
+                if len(re.findall(r"[a-z]{2,}", sentence)) > 3
+            ]
+            assert len(sentences) == len(set(sentences)), table
+        for summary in ("Found, and not in effects.yaml", "Looked at and not added"):
+            assert f"<details><summary>{summary}" in page
+        worth = said(html(changed, "worth")).partition("Found, and not")[0]
+        assert "range_scale" not in worth
+        lines = output.as_text(changed).splitlines()
+        labels = [line[:10].strip() for line in lines if line[:10].strip()]
+        assert labels.index("found") < labels.index("apply") < labels.index("not added")
+        assert labels.count("not added") == 1
 
 
 def test_advice_on_what_is_not_added_is_less_urgent(result):

@@ -1,4 +1,5 @@
 from dataclasses import fields, replace
+from types import SimpleNamespace
 
 from known_effects import clean_flight, effect_of
 import numpy as np
@@ -23,6 +24,7 @@ from uwb_tdoa_tools.diagnosis.comparison import (
 from uwb_tdoa_tools.diagnosis.detectors import Detection
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.validation import cross_fitted, select_by_error, validation_cases
+from uwb_tdoa_tools.scoring.gains import NO_DIFFERENCE
 
 TRUTH = GroundTruth()
 NONE = EffectSet()
@@ -274,11 +276,64 @@ def test_a_gain_that_a_shift_of_the_reference_can_feign_is_none():
     sides[1]["pooled"]["rmse_3d_gain_ci"] = [0.02, 0.28]
     assert "may be 10 cm from where" in why_not(*sides, 0.1)
     sides[1]["pooled"]["rmse_3d_gain_ci"] = unsure
-    assert "may be chance" in why_not(*sides, 0.0) and "may be 10 cm from where" in why_not(
-        *sides, 0.1
-    )
-    sides[1]["pooled"]["rmse_3d"] = 0.16
-    assert "do not make the error smaller" in why_not(*sides, 0.0)
+    assert "may be 10 cm from where" in why_not(*sides, 0.1)
+
+
+@pytest.mark.parametrize(
+    "after, interval, sentence",
+    [
+        (0.148, [-0.05, 0.08], f"together they make {NO_DIFFERENCE} (15.0 -> 14.8 cm"),
+        (0.152, [-0.08, 0.05], f"together they make {NO_DIFFERENCE} (15.0 -> 15.2 cm"),
+        (0.15, None, f"together they make {NO_DIFFERENCE} (15.0 -> 15.0 cm"),
+        (0.18, [-0.3, -0.1], "together they make the error larger on held-out data (15.0 -> 18.0"),
+    ],
+)
+def test_noise_is_described_alike_in_both_directions(after, interval, sentence):
+    sides = [{"pooled": {"rmse_3d": 0.15}}, {"pooled": {"rmse_3d": after}}]
+    sides[1]["pooled"]["rmse_3d_gain_ci"] = interval
+    assert why_not(*sides, 0.0).startswith(sentence)
+
+
+class Some(str):
+    """The label of a candidate that nodes can take out."""
+
+    label = property(str)
+    terms = (SimpleNamespace(effect=SimpleNamespace(usable=True), function=None),)
+
+
+@pytest.mark.parametrize(
+    "worth, kept",
+    [
+        ({"a": 0.05, "b": -0.0001, "c": 0.0004}, "a"),
+        ({"a": 0.05, "b": 0.0006}, "ab"),
+        ({"a": 0.0}, ""),
+    ],
+)
+def test_what_is_worth_nothing_is_not_written(monkeypatch, worth, kept):
+    """Of several flights, too, where it does no harm either."""
+
+    class Trials(_Figures):
+        costly = False
+
+        def __init__(self, *_):
+            super().__init__({})
+
+        def errors(self, models):
+            return [
+                0.2 + sum(value for name, value in worth.items() if name not in candidates)
+                for candidates, _ in models
+            ]
+
+        def start(self, candidates, detections):
+            return self.errors([(candidates, detections)])[0]
+
+    monkeypatch.setattr(validation, "_Trials", Trials)
+    selection = SimpleNamespace(chosen=tuple(map(Some, worth)), kept=tuple)
+    attribution = SimpleNamespace(selection=selection, detections=())
+    found = select_by_error(attribution, [None, None], Baseline(NONE))
+    assert "".join(found.selection) == kept
+    assert {one.what for one in found.refused} == set(worth) - set(kept)
+    assert all("it is worth nothing for the position" in one.why for one in found.refused)
 
 
 class _Figures:

@@ -11,19 +11,22 @@ import numpy as np
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.flight import AIDS, Flight, Truth
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_bias.effects.base import listed
+from uwb_tdoa_bias.effects.base import counted
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.monitoring.finding import ERROR
 
 from .checking.ordered import OrderedRecording, displacement
-from .diagnosis import diagnose, output
-from .diagnosis.references import Nothing
+from .diagnosis import diagnose, output, with_noise
+from .diagnosis.attribution import first_fit
+from .diagnosis.comparison import Baseline, compare
+from .diagnosis.references import GroundTruth, Nothing
+from .diagnosis.report.verdict import percent, worse_phases
 from .diagnosis.self_calibration import SelfCalibration, Tape, self_calibrate
-from .diagnosis.self_calibration.equations import measured_noise, slow_innovations
+from .diagnosis.self_calibration.equations import slow_innovations
 from .diagnosis.self_calibration.solve import IMPROVED, LEFT
+from .diagnosis.validation import cross_fitted
 from .estimate import FlightEstimator
-from .scoring.evaluation import score_of
-from .scoring.gains import change_in_words
+from .scoring.gains import NO_DIFFERENCE, change_in_words, difference
 from .surveying.report import as_text
 
 if TYPE_CHECKING:
@@ -34,6 +37,7 @@ if TYPE_CHECKING:
     from .checking.recording import Recording
 
 
+RMSE = "3D RMSE"  # name of the figure with ground truth
 # the rule of `check` for a survey that does not fit without another mistake
 MISFIT = "survey_misfit"
 # largest median shift of the anchors, in standard deviations, that a calibration can correct
@@ -43,6 +47,7 @@ SMALLEST_RATIO = 1.5
 # share of the last flight that is fitted without a hold-out flight; the rest validates
 FITTED_SHARE = 2.0 / 3.0
 SECONDS = 60.0  # of a flight that are looked at
+FORECAST_FLIGHTS = 3  # largest number of flights that are looked at with ground truth
 SMALLEST_EXTENT = 0.25  # smallest extent of a path along an axis, relative to the anchors
 SMALLEST_IMPROVED_SHARE = 0.5  # share of the coordinates that must improve
 STREAMS = "tdoa", "imu", "truth", *AIDS
@@ -61,6 +66,8 @@ class Calibration:
     judged_on : names of the hold-out data.
     why_not : sentence on why it must not be used, or None.
     text : report of the step that found it.
+    interval : (low, high), 95 % interval of the gain, a share of `before`; None if unknown.
+    worse : sentences on phases of the hold-out data in which the error grows.
     """
 
     anchors: Anchors
@@ -72,6 +79,8 @@ class Calibration:
     judged_on: str
     why_not: str | None
     text: str
+    interval: tuple[float, float] | None = None
+    worse: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
         """Return the figures for JSON."""
@@ -81,16 +90,20 @@ class Calibration:
             "measure": self.measure,
             "before": self.before,
             "after": self.after,
+            "gain_interval": self.interval,
             "judged_on": self.judged_on,
+            "worse": list(self.worse),
             "tdoa_std": self.tdoa_std,
         }
 
     def as_text(self) -> str:
         """Return the gain as one line."""
-        change = f" (it {change_in_words(self.before, self.after)})" if self.before else ""
+        change = f"it {change_in_words(self.before, self.after)}" if self.before else ""
+        if self.interval is not None:
+            change += f", 95 % interval of the gain {percent(self.interval)}"
         return (
-            f"{self.measure} {100 * self.before:.1f} -> {100 * self.after:.1f} cm{change} on "
-            f"{self.judged_on}"
+            f"{self.measure} {100 * self.before:.1f} -> {100 * self.after:.1f} cm"
+            f"{change and f' ({change})'} on {self.judged_on}"
         )
 
 
@@ -116,29 +129,26 @@ def with_truth(
 ) -> Calibration:
     """Calibrate with ground truth, by `diagnose`.
 
-    It is validated on `holdout`, or on halves of a single flight.
+    It is validated on `holdout`, or on halves of a single flight, with what the files hold.
     """
     found = diagnose(flights, holdout, base, config, None, progress)
     progress("measuring the noise")
-    std = measured_noise(found.flights, found.effects, config)
+    found = with_noise(found, config)
+    before, after = found.before["pooled"], (found.written or found.after)["pooled"]
+    interval = after.get("rmse_3d_gain_ci")
     calibration = Calibration(
         flights[0].anchors,
         found.effects,
-        std,
-        "3D RMSE",
-        found.before["pooled"]["rmse_3d"],
-        found.after["pooled"]["rmse_3d"],
-        found.judged_on,
+        found.tdoa_std,
+        RMSE,
+        before["rmse_3d"],
+        after["rmse_3d"],
+        _names(holdout) if holdout else found.judged_on,
         None,
         output.as_text(found),
+        None if interval is None else (interval[0], interval[1]),
+        tuple(worse_phases(before, after)),
     )
-    if holdout:
-        progress("judging")
-        before, after = (
-            _rmse(holdout, *side)
-            for side in ((base, config), (found.effects, _with_noise(config, std)))
-        )
-        calibration = replace(calibration, before=before, after=after, judged_on=_names(holdout))
     return _validated(calibration, len(found.effects) > len(base))
 
 
@@ -177,32 +187,24 @@ def without_truth(
         before,
         after,
         on,
-        found.why_not,
+        found.why_not or _reason_against_unverified(after, on),
         as_text(found),
     )
-    calibration = _validated(calibration, True)
+    return _validated(calibration, True)
+
+
+def _reason_against_unverified(after: float, on: str) -> str | None:
+    """Return why a calibration may do harm although the innovations decrease, or None.
+
+    after : m, slow innovations with it; on : names of the hold-out data
+    """
+    if after <= LEFT:
+        return None
     return (
-        calibration
-        if calibration.why_not
-        else replace(calibration, why_not=_reason_against_unverified(calibration))
+        f"{100 * after:.1f} cm of the innovations are slow with it on {on}, more than "
+        f"{100 * LEFT:.1f} cm: something else is wrong too, of which anchors may take the place; "
+        "record ground truth, or give survey some --marks"
     )
-
-
-def _reason_against_unverified(calibration: Calibration) -> str | None:
-    """Return why a Calibration may do harm although the innovations decrease, or None."""
-    if calibration.after > LEFT:
-        return (
-            f"{100 * calibration.after:.1f} cm of the innovations are slow with it on "
-            f"{calibration.judged_on}, more than {100 * LEFT:.1f} cm: something "
-            "else is wrong too, of which anchors may take the place; record ground truth, or "
-            "give survey some --marks"
-        )
-    if calibration.before < SMALLEST_RATIO * calibration.after:
-        return (
-            f"it gains too little to be sure that it does no harm: {calibration.as_text()}; "
-            "record more, or keep what there is"
-        )
-    return None
 
 
 def _validated(calibration: Calibration, any_effect: bool) -> Calibration:
@@ -217,25 +219,15 @@ def _validated(calibration: Calibration, any_effect: bool) -> Calibration:
             calibration,
             why_not="nothing was found that makes the error smaller where it took no part",
         )
-    if not calibration.after <= calibration.before:
-        return replace(
-            calibration,
-            why_not=f"it makes things worse where it took no part: {calibration.as_text()}",
-        )
-    return calibration
-
-
-def _rmse(flights: Sequence[Flight], effects: EffectSet, config: FilterConfig | None) -> float:
-    """Return the 3D RMSE of all Flights together, m."""
-    errors = [score_of(flight, FlightEstimator(config, effects))[0].error for flight in flights]
-    return float(np.sqrt(np.mean(np.sum(np.concatenate(errors) ** 2, axis=1))))
-
-
-def _with_noise(config: FilterConfig | None, std: float | None) -> FilterConfig:
-    """Return the FilterConfig with tdoa_std, m, unless it is None."""
-    config = config or FilterConfig()
-    changed: dict[str, Any] = {} if std is None else {"tdoa_std": round(std, 3)}
-    return replace(config, **changed)
+    if calibration.interval is not None or calibration.measure == RMSE:
+        changed = difference(calibration.before, calibration.after, calibration.interval)
+    else:  # of innovations alone only a large change counts
+        sides = calibration.before, calibration.after
+        changed = int(np.sign(sides[0] - sides[1])) * int(max(sides) >= SMALLEST_RATIO * min(sides))
+    if changed > 0:
+        return calibration
+    why = f"it makes {NO_DIFFERENCE}" if changed == 0 else "it makes things worse"
+    return replace(calibration, why_not=f"{why}: {calibration.as_text()}")
 
 
 def _names(flights: Sequence[Flight]) -> str:
@@ -280,7 +272,7 @@ class Prospect:
         return bool(self.better.mean() >= SMALLEST_IMPROVED_SHARE)
 
     def sentences(self) -> list[str]:
-        """Return the prospect as sentences."""
+        """Return the prospect as sentences; the last one alone judges the motion."""
         lines = [
             f"from {self.seconds:.0f} s of {self.total:.0f} s in motion: of the innovations "
             f"{100 * self.before:.1f} cm are slow with the anchors as "
@@ -292,24 +284,115 @@ class Prospect:
         ]
         if self.why_not:
             lines.append(f"so far nothing would be applied: {self.why_not}")
+        lacking = self.lacking()
+        if not lacking:
+            lines.append("the flights are exciting enough")
+        elif self.exciting:
+            lines.append(f"the flights determine most coordinates; for the others {lacking}")
+        else:
+            lines.append(f"the flights are not exciting enough: {lacking}")
+        return lines
+
+    def lacking(self) -> str:
+        """Return which motion the flights lack, as clauses; "" if they lack none."""
         unseen = [str(i) for i, row in zip(self.ids, self.better) if not row.any()]
+        clauses = []
         if unseen:
-            lines.append(
-                f"the flights do not improve anchors {listed(unseen)}: move closer to them, on all "
-                "sides, high and low"
+            clauses.append(
+                f"move closer to {counted(unseen, 'anchor')}, on all sides, high and low"
             )
         for axis, size, room in zip(self.axes, self.path, self.hall):
             if size < SMALLEST_EXTENT * room:
-                lines.append(
-                    f"along {axis} the tag moves by {size:.1f} m among anchors that are "
-                    f"{room:.1f} m apart: move farther along it"
+                clauses.append(
+                    f"move farther along {axis}, where the tag moves by {size:.1f} m among anchors "
+                    f"that are {room:.1f} m apart"
                 )
-        lines.append(
-            "the flights are exciting enough"
-            if self.exciting
-            else "the flights are not exciting enough: move more, and elsewhere"
-        )
+        if not clauses and not self.exciting:
+            clauses.append("move more, and elsewhere")
+        return "; ".join(clauses)
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """Expected gain of a diagnosis with ground truth.
+
+    Attributes
+    ----------
+    seconds : s in the air, analysed.
+    flights : number of analysed flights.
+    before, after : m, 3D RMSE where a first fit took no part, without and with it.
+    interval : (low, high), 95 % interval of the gain, a share of `before`; None if unknown.
+    """
+
+    seconds: float
+    flights: int
+    before: float
+    after: float
+    interval: tuple[float, float] | None
+
+    @property
+    def fitted(self) -> str:
+        """Return what is fitted: maps need several flights."""
+        return "positions and delays" if self.flights == 1 else "positions, delays and maps"
+
+    def sentences(self) -> list[str]:
+        """Return the forecast as sentences."""
+        of = "1 flight" if self.flights == 1 else f"{self.flights} flights"
+        much = change_in_words(self.before, self.after)
+        if self.interval is not None:
+            much += f", 95 % interval of the gain {percent(self.interval)}"
+        lines = [
+            f"from {self.seconds:.0f} s of {of}, by ground truth: the position error (3D RMSE) is "
+            f"{100 * self.before:.1f} cm",
+            f"a first fit of {self.fitted} of all anchors leaves "
+            f"{100 * self.after:.1f} cm where it took no part ({much})",
+        ]
+        changed = difference(self.before, self.after, self.interval)
+        if changed > 0:
+            lines.append("a calibration with --out is likely to gain about as much")
+        elif changed == 0:
+            lines.append(f"that is {NO_DIFFERENCE}; a calibration may find other effects")
+        else:
+            lines.append(
+                f"{self.fitted} of anchors do not describe these flights; a calibration may find "
+                "other effects"
+            )
         return lines
+
+
+def forecast(
+    flights: Sequence[Flight],
+    base: EffectSet = EffectSet(),
+    config: FilterConfig | None = None,
+    progress: Callable[[], object] = lambda: None,
+) -> Forecast:
+    """Predict the gain of a calibration with ground truth from parts of a few flights.
+
+    Positions, delays and maps of anchors make most of the gain. They are fitted at once, without
+    the search of a diagnosis, and judged where they took no part (`first_fit`). Raises InputError
+    if the flights are too short.
+    """
+    count = min(len(flights), FORECAST_FLIGHTS)
+    chosen = [flights[k * len(flights) // count] for k in range(count)]
+    reference, parts = GroundTruth(config), []
+    for flight in chosen:
+        middle = 0.5 * (flight.start + flight.end)
+        part = between(flight, middle - 0.5 * SECONDS, middle + 0.5 * SECONDS)
+        parts.append(reference.settled(reference.prepare(part), base, config)[0])
+        progress()
+    fitted = first_fit(parts, reference, base)
+    progress()
+    cases = cross_fitted(fitted, parts, base, fitted.selection.chosen, ())
+    before, after = compare(cases, Baseline(base, config), progress)
+    interval = after["pooled"]["rmse_3d_gain_ci"]
+    spans = {score.name: (score.first, score.last) for score in before["scores"]}
+    return Forecast(
+        sum(last - first for first, last in spans.values()),
+        len(parts),
+        before["pooled"]["rmse_3d"],
+        after["pooled"]["rmse_3d"],
+        None if interval is None else (interval[0], interval[1]),
+    )
 
 
 def prospect(

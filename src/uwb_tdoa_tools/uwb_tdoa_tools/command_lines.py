@@ -68,15 +68,18 @@ def evaluate_line(
     effects: str | Path | None = None,
     config: str | Path | None = None,
     truth: bool = True,
+    more: Iterable[str] = (),
 ) -> str:
     """Return the line that evaluates recordings with the files of a calibration; None for no file.
 
-    Without ground truth (`truth`), `localize` states how far the estimate can be trusted.
+    Without ground truth (`truth`), `localize` states how far the estimate can be trusted. `more`
+    are further options, such as those of reading.
     """
     options = {"--survey": survey, "--effects": effects, "--config": config}
     words = [
         *recordings,
         *(word for option, file in options.items() if file for word in (option, file)),
+        *more,
     ]
     return tool("evaluate", *words) if truth else tool("localize", *words, "--out", "localized/")
 
@@ -112,6 +115,7 @@ def lines_of_use(
     anchors: str | Path | None = None,
     parameters: bool = False,
     truth: bool = True,
+    more: Iterable[str] = (),
 ) -> tuple[tuple[str, str], ...]:
     """Return ((command line, purpose), ...) for the use of the effects.yaml in a folder.
 
@@ -127,11 +131,13 @@ def lines_of_use(
         Whether the folder holds an ekf_node.yaml.
     truth : bool
         Whether the recordings hold ground truth.
+    more : iterable of str
+        Further options of the line that evaluates.
     """
     effects, config = folder / "effects.yaml", folder / "ekf_node.yaml" if parameters else None
     bias, ekf = node_lines(anchors, effects, config)
     return (
-        (evaluate_line(recordings, survey, effects, config, truth), "judges it"),
+        (evaluate_line(recordings, survey, effects, config, truth, more), "judges it"),
         (bias, "in flight: takes it out of TDOAs"),
         (ekf, "in flight: takes it out of the IMU, and assumes the noise that is left"),
     )

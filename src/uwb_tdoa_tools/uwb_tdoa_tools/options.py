@@ -1,8 +1,8 @@
 """Options that several commands share, and the values that they give.
 
 options.add_recordings(parser)                  # FLIGHT..., --survey, --namespace, --topic, --salvage
-options.add_filter(parser)                      # --effects, --config
-options.add_estimator(parser)                   # and --model, --no-bias, -p, --without, --smooth
+options.add_filter(parser)                      # --effects, --config, --without
+options.add_estimator(parser)                   # and --model, --no-bias, -p, --smooth
 options.add_most(parser, 10**6)                 # --most
 options.add_bag(parser)                         # --storage, --force
 options.add_holdout(parser)                     # --holdout
@@ -94,14 +94,29 @@ def reading_of(args: Namespace, truth: bool = True) -> inputs.Reading:
     return inputs.Reading(args.survey, args.namespace, topics, args.salvage, truth)
 
 
+def words_of_reading(args: Namespace) -> tuple[str, ...]:
+    """Return the words of a command line that read recordings as `reading_of`, without --survey."""
+    words = ["--namespace", args.namespace] if args.namespace else []
+    words += [word for topic in args.topics for word in ("--topic", topic)]
+    return (*words, *["--salvage"][: args.salvage])
+
+
 def add_filter(
     parser: ArgumentParser,
     effects: str = "effects.yaml to correct the TDOAs with, before the filter",
 ) -> None:
-    """Add --effects, with this help, and --config."""
+    """Add --effects, with this help, --config and --without."""
     parser.add_argument("--effects", metavar="FILE", help=effects)
     parser.add_argument(
         "--config", metavar="FILE", help="filter parameters, as for ekf_node (ekf_node.yaml)"
+    )
+    parser.add_argument(
+        "--without",
+        metavar="AID",
+        action="append",
+        default=[],
+        choices=tuple(SENSORS),
+        help=f"not to be used though it is there: {', '.join(SENSORS)}; may be repeated",
     )
 
 
@@ -118,30 +133,23 @@ def add_parameters(parser: ArgumentParser) -> None:
 
 
 def filter_of(args: Namespace) -> tuple[FilterConfig, EffectSet | None]:
-    """Return the FilterConfig and the EffectSet or None of --config, -p and --effects.
+    """Return the FilterConfig of --config, -p and --without, and the EffectSet of --effects or None.
 
     Raises InputError.
     """
     config = FilterConfig.from_yaml(args.config) if args.config else FilterConfig()
-    config = with_parameters(config, getattr(args, "parameters", ()))
+    switched_off = [f"use_{aid}:=false" for aid in args.without]
+    config = with_parameters(config, [*getattr(args, "parameters", ()), *switched_off])
     return config, EffectSet.from_yaml(args.effects) if args.effects else None
 
 
 def add_estimator(parser: ArgumentParser) -> None:
-    """Add --effects, --config, --model, --no-bias, -p, --without and --smooth."""
+    """Add --effects, --config, --without, --model, --no-bias, -p and --smooth."""
     add_filter(parser, "effects.yaml: systematic effects to correct for")
     add_model(parser)
     add = parser.add_argument
     add("--no-bias", action="store_true", help="correct for nothing, whatever else is given")
     add_parameters(parser)
-    add(
-        "--without",
-        metavar="AID",
-        action="append",
-        default=[],
-        choices=tuple(SENSORS),
-        help=f"not to be used though it is there: {', '.join(SENSORS)}; may be repeated",
-    )
     add(
         "--smooth", action="store_true", help="smooth: use later measurements for each estimate too"
     )
@@ -158,7 +166,6 @@ def estimator_of(args: Namespace, say: Callable[[str], object]) -> FlightEstimat
     say(sentence) is called if the network was trained with effects that --effects lacks.
     """
     config, effects = filter_of(args)
-    config = with_parameters(config, [f"use_{aid}:=false" for aid in args.without])
     if args.no_bias:
         return FlightEstimator(config, smoothed=args.smooth)
     network = load_network(args.model)

@@ -99,6 +99,11 @@ class SurveyFit:
         return len(self._windows)
 
     @property
+    def seconds(self) -> float:
+        """Return the time from the first to the last window, s; 0 without windows."""
+        return float(self._windows[-1][0][-1] - self._windows[0][0][0]) if self._windows else 0.0
+
+    @property
     def heard(self) -> list[int]:
         """Return the rows of the anchors with TDOAs in the windows."""
         ends = [end for _, a, b, _ in self._windows for end in (a, b)]

@@ -49,9 +49,12 @@ UNITS = {  # m in one
 NOISE, USUAL = (0.02, 0.2), 0.063
 WELL = 0.4  # loss below which a motion explains the TDOAs; healthy 0.31 at most
 BY_ERRORS = 0.1**2 / (0.1**2 + SCALE**2)  # loss that systematic errors of 0.1 m cause
-GAIN = 0.065  # fall of the loss by moving all anchors; measured healthy flights 0.056 at most
+GAIN = 0.07  # fall of the loss by moving all anchors; measured healthy flights 0.064 at most
 POOR = 0.33  # loss as surveyed beyond that of any healthy recording, which is 0.28 at most
-HELD = 0.5  # share of GAIN that must remain with anchors fitted to the other half
+# fall of the loss with anchors fitted to the other half; measured healthy flights 0.052 at most,
+# surveys of other rooms 0.063 at least. In a recording shorter than ENOUGH, s, the tag sees a part
+# of the room, and other anchors describe the systematic errors there: healthy pieces 0.083 at most.
+HELD, HELD_OF_SHORT, ENOUGH = 0.06, 0.09, 30.0
 ALONE = 0.85  # share of the gain that one anchor explains
 FEWEST = 10  # windows with a position; TDOAs of an anchor that may have the id of another
 APART = 1.0  # m, least error of such an anchor: anchors of a hall are farther from each other
@@ -333,10 +336,12 @@ def gained(fit: SurveyFit) -> float | None:
     """Return by how much the loss falls with all anchors moved, or None if the survey may be right.
 
     The survey may be right if the gain is no larger than in a healthy recording. Anchors fitted to one
-    half must also fit the other half, unless the loss exceeds that of any healthy recording.
+    half must also fit the other half, unless the loss exceeds that of any healthy recording. They
+    must fit it better if the recording is short.
     """
     gain = apparent_gain(fit)
-    return gain if gain > GAIN and (fit.before > POOR or fit.held_out_gain > HELD * GAIN) else None
+    least = HELD if fit.seconds >= ENOUGH else HELD_OF_SHORT
+    return gain if gain > GAIN and (fit.before > POOR or fit.held_out_gain > least) else None
 
 
 def apparent_gain(fit: SurveyFit) -> float:

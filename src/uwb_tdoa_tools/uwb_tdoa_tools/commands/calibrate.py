@@ -9,7 +9,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.effects import EffectSet
 
 from .. import cli, command_lines, options
-from ..calibrating import blocking_errors, prospect, with_truth, without_truth
+from ..calibrating import blocking_errors, forecast, prospect, with_truth, without_truth
 from ..checking import report
 from ..checking.check import check, different_surveys
 from ..checking.recording import read_recording
@@ -23,9 +23,12 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
+    from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_ekf.core.config import FilterConfig
 
-    from ..calibrating import Calibration
+    from ..calibrating import Calibration, Forecast, Prospect
+    from ..checking.check import NamedAnchors
+    from ..diagnosis.self_calibration import Tape
     from ..readers.inputs import Reading, Recording
 
 DESCRIPTION = """Calibrate a tag from recordings: check them, find systematic errors, and validate the correction on hold-out flights.
@@ -35,9 +38,10 @@ better anchors and delays from the flights alone. --holdout names the flights fo
 flights, or parts of a single one. Stops at a step that fails, and prints why. A correction that increases the error is not written.
 
 Writes to --out: anchors.yaml, effects.yaml and ekf_node.yaml, for evaluate and for both nodes, and calibration.json; prints the two
-lines that start the nodes. --quick predicts the gain within a minute, and writes nothing.
+lines that start the nodes. --quick predicts within a minute what that gains, with ground truth or without, and writes nothing.
+A flight in which `check` finds an error is left out, and named with the rule; --keep uses it all the same.
 
-Exit code: 0 calibrated (--quick: worth it), 1 stopped, 2 bad input."""
+Exit code: 0 calibrated, or predicted (--quick), 1 stopped, 2 bad input."""
 
 
 def parser() -> ArgumentParser:
@@ -51,7 +55,9 @@ def parser() -> ArgumentParser:
             "--out calibrated/"
         ),
         "calibrate flight.log --survey anchors.yaml --holdout other.log --out calibrated/",
+        "calibrate flight.bag --quick",
         "calibrate flight.bag --no-truth --quick",
+        "calibrate flights/ --survey anchors.yaml --without height --keep --out calibrated/",
         (
             "calibrate today.bag --no-truth --survey calibrated/anchors.yaml --effects "
             "calibrated/effects.yaml --out today/"
@@ -73,8 +79,9 @@ def parser() -> ArgumentParser:
     add(
         "--quick",
         action="store_true",
-        help="say within a minute what to expect, and whether the flights are exciting enough",
+        help="say within a minute what to expect of a calibration, and of more flights",
     )
+    add("--keep", action="store_true", help="use flights in which check finds an error, too")
     add("--out", metavar="DIR", type=OutputFolder, help="where to write; made if it is not there")
     return made
 
@@ -89,59 +96,76 @@ def _calibrate(args: Namespace) -> int:
     options.check_holdout(
         (path.resolve() for path, _ in found), (path.resolve() for path, _ in held)
     )
-    if not _checked(reading, found + held, tape.std, FlightEstimator(config, base), args.effects):
-        return _stop("check finds an error: put it right first, as said above")
-    flights, holdout = reading.flights(args.flights), reading.flights(args.holdout)
+    usable = _usable(reading, found + held, tape.std, FlightEstimator(config, base), args)
+    paths, judges = ([path for path, _ in some if path in usable] for some in (found, held))
+    if not paths:
+        return _stop("no flight is left to calibrate with")
+    if held and not judges:
+        cli.say("calibrate", "no flight of --holdout is left: the last of the others judges.")
+    for finding in different_surveys([usable[path] for path in (*paths, *judges)]):
+        cli.show(*report.lines(finding))
+        return _stop(f"{finding.cause} ({finding.rule})")
+    flights, holdout = (reading.flights(map(str, some)) for some in (paths, judges))
     known = [flight.truth is not None for flight in flights + holdout]
     if any(known) and not all(known):
         raise InputError(
             f"{(flights + holdout)[known.index(False)].name}: holds no ground truth, and "
             "others do; leave it out, or give --no-truth."
         )
+    if all(known):
+        because = "says how well anchors are known, and ground truth is there to tell"
+        options.refuse(args, options.OF_TAPE, f"{because}; give --no-truth, too")
     if args.quick:
-        with Progress("calibrate") as progress:
-            expected = prospect(
-                flights, tape, base, config, lambda: progress("looking at a part of the flights")
-            )
-        cli.show(*expected.sentences())
-        return int(not expected.exciting)
+        _show_expected(flights, all(known), (tape, base, config))
+        return 0
     if not holdout and len(flights) > 1:
         flights, holdout = flights[:-1], flights[-1:]
+        judges = paths[-1:]
     with Progress("calibrate") as progress:
         if all(known):
-            options.refuse(
-                args,
-                options.OF_TAPE,
-                (
-                    "says how well anchors are known, and ground truth is there to tell; give "
-                    "--no-truth, too"
-                ),
-            )
             made = with_truth(flights, holdout, base, config, progress)
         else:
             made = without_truth(flights, holdout, tape, base, config, progress)
     cli.show(made.text, made.as_text())
+    cli.show(*(f"the error grows {clause}" for clause in made.worse))
     out = args.out  # only --quick does without
     out.mkdir(parents=True, exist_ok=True)
     cli.write_json(
         out / "calibration.json", {"flights": [flight.name for flight in flights], **made.as_dict()}
     )
-    judges = args.holdout or [path for path, _ in found[-1:]]
-    return (
-        _stop(made.why_not)
-        if made.why_not is not None
-        else _write(made, config, out, judges, all(known))
-    )
+    if made.why_not is not None:
+        return _stop(made.why_not)
+    return _write(made, config, args, judges or paths, all(known))
 
 
-def _checked(
+def _show_expected(
+    flights: Sequence[Flight], truth: bool, model: tuple[Tape, EffectSet, FilterConfig]
+) -> None:
+    """Print what a calibration is likely to gain. model : Tape, EffectSet and FilterConfig."""
+    tape, *rest = model
+    with Progress("calibrate") as progress:
+
+        def looking() -> None:
+            progress("looking at a part of the flights")
+
+        expected: Forecast | Prospect
+        if truth:
+            expected = forecast(flights, *rest, looking)
+        else:
+            expected = prospect(flights, *model, looking)
+    cli.show(*expected.sentences())
+
+
+def _usable(
     reading: Reading,
     recordings: Sequence[Recording],
     std: float,
     estimator: FlightEstimator,
-    effects: str | None,
-) -> bool:
-    """Print what check finds, and return whether the recordings permit a calibration.
+    args: Namespace,
+) -> dict[Path, NamedAnchors]:
+    """Print what check finds, and return {path: Recording} of those that permit a calibration.
+
+    An error is named with its rule. With --keep its recording is used all the same.
 
     Parameters
     ----------
@@ -151,22 +175,28 @@ def _checked(
         Standard deviation of a coordinate of an anchor, m.
     estimator : FlightEstimator
         Estimator with the given effects.
-    effects : str or None
-        File of these effects.
+    args : Namespace
+        Options of the command.
     """
-    checked, usable = [], True
+    usable: dict[Path, NamedAnchors] = {}
     with Progress("calibrate", len(recordings), "recording") as progress:
         for path, survey in recordings:
-            checked.append(read_recording(reading, path, survey))
-            result = check(
-                checked[-1], (), estimator, command_lines.survey_line(path, survey, effects)
-            )
+            recording = read_recording(reading, path, survey)
+            line = command_lines.survey_line(path, survey, args.effects)
+            result = check(recording, (), estimator, line)
             cli.show(report.text(result))
-            usable = usable and not blocking_errors(checked[-1], result.findings, std)
+            errors = blocking_errors(recording, result.findings, std)
+            if errors:
+                named = "; ".join(f"{finding.cause} ({finding.rule})" for finding in errors)
+                what = (
+                    "it is used all the same, as --keep asks for"
+                    if args.keep
+                    else "it is left out; put that right, or use it as it is with --keep"
+                )
+                cli.say("calibrate", f"{recording.name}: check finds an error: {named}: {what}.")
+            if args.keep or not errors:
+                usable[path] = recording
             progress.update()
-    for finding in different_surveys(checked):
-        cli.show(*report.lines(finding))
-        usable = False
     return usable
 
 
@@ -178,10 +208,15 @@ def _stop(why: str) -> int:
 def _write(
     made: Calibration,
     config: FilterConfig,
-    out: Path,
+    args: Namespace,
     recordings: Sequence[str | Path],
     truth: bool,
 ) -> int:
+    """Write the files of a Calibration, and print the lines that use them.
+
+    recordings : hold-out data; truth : whether they have ground truth
+    """
+    out = args.out
     files = anchors, effects, parameters = (
         out / "anchors.yaml",
         out / "effects.yaml",
@@ -195,9 +230,9 @@ def _write(
         f"wrote {', '.join(file.name for file in files if file.exists())} and "
         f"calibration.json to {out}"
     )
-    cli.show(
-        f"judge it:   {command_lines.evaluate_line(recordings, survey, corrected, tuned, truth)}"
-    )
+    more = options.words_of_reading(args)
+    judging = command_lines.evaluate_line(recordings, survey, corrected, tuned, truth, more)
+    cli.show(f"judge it:   {judging}")
     cli.show("start the nodes with it:", *command_lines.node_lines(survey, corrected, tuned))
     return 0
 

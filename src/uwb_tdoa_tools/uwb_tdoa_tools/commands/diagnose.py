@@ -14,15 +14,15 @@ from uwb_tdoa_bias.effects import EffectSet
 from .. import cli, command_lines, options, parallel
 from ..checking.before_anchors import nothing_comes_first
 from ..checking.report import remarks_on
-from ..diagnosis import diagnose, output
+from ..diagnosis import diagnose, output, with_noise
 from ..diagnosis.noise import write_parameters
 from ..diagnosis.references import REFERENCES
-from ..diagnosis.self_calibration.equations import measured_noise
 from ..estimate import FlightEstimator
 from ..localizing.pictures import write_diagnosis
 from ..outputs import OutputFolder
 from ..parallel import Progress
 from ..readers import inputs
+from ..scoring.alignment import NONE
 from ..surveying.known import DRIFT, read_paths
 
 if TYPE_CHECKING:
@@ -169,31 +169,35 @@ def _diagnose(args: Namespace) -> int:
             flights, holdout, effects or EffectSet(), config, reference, progress, over
         )
         progress("measuring the noise")
-        tdoa_std = None  # of no TDOAs
-        if all(len(flight.tdoa) for flight in result.flights):
-            tdoa_std = measured_noise(
-                result.flights, result.effects, config, over, partial(cli.say, "diagnose")
-            )
+        result = with_noise(result, config, over, partial(cli.say, "diagnose"))
     from ..diagnosis.report.page import html  # here, because drawing takes a second to import
 
     out.mkdir(parents=True, exist_ok=True)
     (_, its_survey), *_ = found
+    parameters = write_parameters(out / "ekf_node.yaml", result.tdoa_std, config)
     truth = all(flight.truth is not None for flight in holdout or flights)
-    judged_on = args.holdout or args.flights
+    more = [*options.words_of_reading(args)]
+    more += [word for aid in reference.left_out for word in ("--without", aid)]
+    more += ["--align", args.align] if truth and args.align != NONE else []
     applying = command_lines.lines_of_use(
-        out, judged_on, args.survey, its_survey, tdoa_std is not None, truth
+        out,
+        args.holdout or args.flights,
+        args.survey,
+        its_survey,
+        parameters is not None,
+        truth,
+        more,
     )
     result = replace(result, applying=applying)
     cli.write_json(out / "diagnosis.json", output.as_json(result))
     result.effects.to_yaml(out / "effects.yaml")
     write_text(out / "report.html", html(result))
-    write_parameters(out / "ekf_node.yaml", tdoa_std, config)
     if rerun is not None:
         write_diagnosis(rerun, result, effects or EffectSet(), config)
     cli.show(output.as_text(result))
     cli.show(
         "wrote diagnosis.json, effects.yaml, "
-        f"{'ekf_node.yaml ' if tdoa_std is not None else ''}and report.html to {out}"
+        f"{'ekf_node.yaml ' if parameters is not None else ''}and report.html to {out}"
     )
     return 0
 

@@ -108,9 +108,10 @@ def _survey(args: Namespace) -> int:
     )
     if result.why_not is None:
         files = out / "anchors.yaml", out / "effects.yaml", config_file
+        truth = all(flight.truth is not None for flight in flights)
         cli.show(
             "next: "
-            f"{command_lines.evaluate_line(args.flights, *files, all(flight.truth is not None for flight in flights))}"
+            f"{command_lines.evaluate_line(args.flights, *files, truth, options.words_of_reading(args))}"
         )
     return 0 if result.why_not is None else 1
 

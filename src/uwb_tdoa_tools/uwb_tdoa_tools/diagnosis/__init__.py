@@ -12,7 +12,7 @@ without ground truth. A *channel* is one kind of measurement, with its residual.
 no regression finds. The other modules use these interfaces only.
 """
 
-from .diagnose import diagnose
+from .diagnose import diagnose, with_noise
 from .result import Diagnosis
 
-__all__ = ["Diagnosis", "diagnose"]
+__all__ = ["Diagnosis", "diagnose", "with_noise"]

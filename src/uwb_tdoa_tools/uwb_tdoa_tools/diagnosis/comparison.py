@@ -21,11 +21,12 @@ from uwb_tdoa_ekf.sensitivity import RANGES
 
 from ..clock import numbered
 from ..outputs import as_json
+from ..scoring.gains import NO_DIFFERENCE, difference
 from ..scoring.metrics import EVERYTHING, Score, nis, pooled, radio_residuals
 from .regression.table import BLOCK
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_ekf.core.config import FilterConfig
@@ -105,33 +106,51 @@ def compare(
 
     shift_std : as of a Reference; map_function : as of `attribute`
     """
-    sides: list[dict[str, Any]] = []
-    draws = []
-    for runs in _both_sides(cases, baseline, progress, map_function):
-        scores, rows, blocks = [], [], []
-        for case, run in runs:
-            scores.append(score(case, run))
-            blocks.append(_blocks(scores[-1]))
-            row = {**as_json(scores[-1].row()), "phases": as_json(scores[-1].phases())}
-            rows.append(
-                {**row, "residual_spread": _spread(run), "rmse_3d_ci": _interval(blocks[-1:])}
-            )
-        spreads = [row["residual_spread"] for row in rows if row["residual_spread"] is not None]
-        together = {
-            **as_json(pooled(scores)),
-            "residual_spread": float(np.mean(spreads)) if spreads else None,
-        }
-        sides.append(
-            {
-                "runs": rows,
-                "pooled": {**together, "rmse_3d_ci": _interval(blocks)},
-                "scores": scores,
-            }
-        )
-        draws.append(blocks)
-    names = [case.flight.name for case in cases]
-    sides[1]["pooled"]["rmse_3d_gain_ci"] = _gain_interval(draws[0], draws[1], names, shift_std)
-    return sides[0], sides[1]
+    before, after = (_side(runs) for runs in _both_sides(cases, baseline, progress, map_function))
+    _add_gain(before, after, shift_std)
+    return before, after
+
+
+def with_config(
+    cases: Sequence[ValidationCase],
+    before: dict[str, Any],
+    config: FilterConfig,
+    shift_std: Callable[[str], np.ndarray] = lambda name: np.zeros(3),
+    map_function: MapFunction = map,
+) -> dict[str, Any]:
+    """Return the side of ValidationCases that are run with another FilterConfig.
+
+    before : side of `compare` that the gain is counted from; shift_std, map_function : as there
+    """
+    after = _side(zip(cases, map_function(partial(_run, config), cases)))
+    _add_gain(before, after, shift_std)
+    return after
+
+
+def _side(runs: Iterable[tuple[ValidationCase, Run]]) -> dict[str, Any]:
+    """Return one side of `compare`, without the interval of the gain."""
+    scores, rows = [], []
+    for case, run in runs:
+        scores.append(score(case, run))
+        row = {**as_json(scores[-1].row()), "phases": as_json(scores[-1].phases())}
+        interval = _interval([_blocks(scores[-1])])
+        rows.append({**row, "residual_spread": _spread(run), "rmse_3d_ci": interval})
+    spreads = [row["residual_spread"] for row in rows if row["residual_spread"] is not None]
+    together = {
+        **as_json(pooled(scores)),
+        "residual_spread": float(np.mean(spreads)) if spreads else None,
+        "rmse_3d_ci": _interval([_blocks(one) for one in scores]),
+    }
+    return {"runs": rows, "pooled": together, "scores": scores}
+
+
+def _add_gain(
+    before: dict[str, Any], after: dict[str, Any], shift_std: Callable[[str], np.ndarray]
+) -> None:
+    """Add the interval of the gain to the side `after`."""
+    blocks, others = ([_blocks(one) for one in side["scores"]] for side in (before, after))
+    names = [one.name for one in before["scores"]]
+    after["pooled"]["rmse_3d_gain_ci"] = _gain_interval(blocks, others, names, shift_std)
 
 
 def innovations(
@@ -188,12 +207,14 @@ def why_not(before: dict[str, Any], after: dict[str, Any], shift_std: float) -> 
     shift_std : m, standard deviation of a reference error common to a flight; the gain must exceed
         SURE standard deviations of its effect
     """
-    gain, interval = (
-        after["pooled"]["rmse_3d"] < before["pooled"]["rmse_3d"],
-        after["pooled"]["rmse_3d_gain_ci"],
-    )
-    if not gain:
-        return "together they do not make the error smaller on held-out data"
+    sides = before["pooled"]["rmse_3d"], after["pooled"]["rmse_3d"]
+    interval = after["pooled"]["rmse_3d_gain_ci"]
+    changed = difference(*sides, interval)
+    much = f"{100 * sides[0]:.1f} -> {100 * sides[1]:.1f} cm"
+    if interval:
+        much += f", 95 % interval of the gain {100 * interval[0]:.0f} to {100 * interval[1]:.0f} %"
+    if changed < 0:
+        return f"together they make the error larger on held-out data ({much})"
     if shift_std > 0.0 and (
         interval is None or sum(interval) < SURE / Z95 * (interval[1] - interval[0])
     ):
@@ -202,13 +223,8 @@ def why_not(before: dict[str, Any], after: dict[str, Any], shift_std: float) -> 
             "on each axis, and the gain is less than that "
             "can feign; measure more marks, or better ones"
         )
-    if interval is not None and interval[0] <= 0.0:
-        share = 1.0 - after["pooled"]["rmse_3d"] / before["pooled"]["rmse_3d"]
-        return (
-            f"together they make the error {share:.0%} smaller on held-out data, which may be "
-            f"chance: the 95 % interval is {interval[0]:.0%} to "
-            f"{interval[1]:.0%}; fly more"
-        )
+    if changed == 0:
+        return f"together they make {NO_DIFFERENCE} ({much})"
     return None
 
 

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_bias.common.flight import AIDS
+from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.evidence import OF_ANCHORS
 from uwb_tdoa_ekf.offline import may_have_offset
@@ -18,13 +19,16 @@ from ..checking.flight_rules import judge_flight
 from ..scoring.metrics import Score, radio_residuals
 from . import comparison, repairing, validation
 from .attribution import Attribution, attribute, residuals_of
+from .channels import CHANNELS
 from .findings import EffectFinding, Refused, usable
 from .health import health
+from .noise import DECIMALS
 from .references import GroundTruth, Reference
 from .refinement import written
 from .regression.confounding import unobservable
 from .result import Diagnosis
 from .self_calibration import Tape, self_calibrate
+from .self_calibration.equations import measured_noise
 from .self_calibration.prior import with_calibration
 from .self_calibration.solve import same_anchors
 
@@ -65,7 +69,7 @@ def diagnose(
     base : EffectSet
         Effects that are already in the model.
     config : FilterConfig, optional
-        Configuration of the filter.
+        Configuration of the filter. Streams that it does not use are left out of everything.
     reference : Reference, optional
         The recorded ground truth by default.
     progress : function
@@ -85,8 +89,11 @@ def diagnose(
     work = _Work(reference, base, config, progress, map_function)
     looking = work.saying(f"looking at {reference.words}")
     settled = []
-    for one in map_function(partial(reference.settled, base=base, config=config), prepared):
-        settled.append(one)
+    unused = unused_streams(config or FilterConfig())
+    for flight, said in map_function(
+        partial(reference.settled, base=base, config=config), prepared
+    ):
+        settled.append((flight.without(*unused), said))
         looking()
     judge_truth = {flight.name: said for flight, said in settled if said}
     count = len(flights)
@@ -126,7 +133,11 @@ def diagnose(
         outcome.findings,
         outcome.effects,
         [*outcome.attribution.refused, *outcome.refused],
-        unobservable(found.selection, found.candidates),
+        [
+            item
+            for item in unobservable(found.selection, found.candidates)
+            if not _only_of(unused, item.effect)
+        ],
         *outcome.sides,
         outcome.judged_on,
         health(found.residuals, scores),
@@ -139,7 +150,45 @@ def diagnose(
         },
         outcome.changes,
         judge_truth=judge_truth,
+        cases=tuple(outcome.cases),
     )
+
+
+def with_noise(
+    diagnosis: Diagnosis,
+    config: FilterConfig | None = None,
+    map_function: MapFunction = map,
+    say: Callable[[str], object] = lambda why: None,
+) -> Diagnosis:
+    """Return the Diagnosis with the noise for the filter, judged as the files will hold it.
+
+    config : FilterConfig of the diagnosis; map_function : as of `attribute`
+    say : say(sentence) is called if the flights are too short to measure the noise
+    """
+    if not all(len(flight.tdoa) for flight in diagnosis.flights):
+        return diagnosis
+    std = measured_noise(diagnosis.flights, diagnosis.effects, config, map_function, say)
+    if std is None or not diagnosis.reference.tells_errors:
+        return replace(diagnosis, tdoa_std=std)
+    written = comparison.with_config(
+        diagnosis.cases,
+        diagnosis.before,
+        replace(config or FilterConfig(), tdoa_std=round(std, DECIMALS)),
+        diagnosis.reference.shift_std,
+        map_function,
+    )
+    return replace(diagnosis, tdoa_std=std, written=written)
+
+
+def unused_streams(config: FilterConfig) -> tuple[str, ...]:
+    """Return the names of the streams of a Flight that the filter does not use."""
+    return tuple(name for name in ("imu", *AIDS) if not getattr(config, f"use_{name}"))
+
+
+def _only_of(unused: Sequence[str], effect: str) -> bool:
+    """Return whether an effect shows in unused streams alone."""
+    channels = EFFECTS[effect].channels
+    return all((CHANNELS[name].stream or name) in unused for name in channels)
 
 
 class _Work(NamedTuple):
@@ -164,6 +213,7 @@ class _Outcome:
     sides : (before, after) and judged_on, as of Diagnosis
     attribution : Attribution with repairs of ids and signs; baseline : Baseline; changes :
         sentences
+    cases : the judged ValidationCases
     """
 
     findings: list[EffectFinding]
@@ -173,6 +223,7 @@ class _Outcome:
     judged_on: str
     attribution: Attribution
     baseline: comparison.Baseline
+    cases: Sequence[comparison.ValidationCase]
     changes: tuple[str, ...] = ()
 
 
@@ -219,10 +270,12 @@ def _by_error(
         )
         model, after = selected.applied(attribution), before
         effects = with_calibration(base, attribution.of_floor, None)
+        cases = [replace(case, effects=effects) for case in cases]
     findings = _findings(
         model.findings(), attribution.findings(), attribution.detections, selected.worth
     )
-    return _Outcome(findings, effects, refused, (before, after), judged_on, attribution, baseline)
+    sides = before, after
+    return _Outcome(findings, effects, refused, sides, judged_on, attribution, baseline, cases)
 
 
 def _by_self_calibration(
@@ -300,6 +353,7 @@ def _by_self_calibration(
         judged_on,
         found,
         baseline,
+        cases,
         changes,
     )
 

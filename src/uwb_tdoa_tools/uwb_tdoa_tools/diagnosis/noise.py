@@ -12,32 +12,35 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 if TYPE_CHECKING:
     from pathlib import Path
 
-PARAMETERS = """/**:
-  ros__parameters:
-    tdoa_std: {:.3f}  # m; measured: as many TDOAs count as independent as there are
-"""
+DECIMALS = 3  # of tdoa_std, m, in the file
+HEAD = "/**:\n  ros__parameters:\n"
+MEASURED = "m; measured: as many TDOAs count as independent as there are"
 
 
 def write_parameters(
     path: Path, tdoa_std: float | None, config: FilterConfig | None = None
 ) -> Path | None:
-    """Write parameters of ekf_node, and return the path, or None.
+    """Write parameters of ekf_node, and return the path, or None if all have their defaults.
 
-    Parameters of the filter that differ from the default are written too.
+    The file holds every parameter that differs from the default, so that it alone makes the nodes
+    and `evaluate` run the filter that was judged. An earlier file is removed if there is none.
 
-    path : of the file; tdoa_std : m, None removes the file
+    path : of the file; tdoa_std : m, measured, or None
     config : FilterConfig with which tdoa_std was measured
     """
-    if tdoa_std is None:
-        path.unlink(missing_ok=True)
-        return None
     default = FilterConfig()
     given = {one.name: getattr(config or default, one.name) for one in fields(FilterConfig)}
-    given.pop("tdoa_std")
-    lines = [
-        f"    {name}: {json.dumps(value)}  # as given\n"
+    lines = {
+        name: f"{json.dumps(value)}  # as given"
         for name, value in given.items()
         if value != getattr(default, name)
-    ]
-    write_text(path, "".join([PARAMETERS.format(tdoa_std), *lines]))
+    }
+    if tdoa_std is not None:
+        lines = {"tdoa_std": f"{tdoa_std:.{DECIMALS}f}  # {MEASURED}"} | {
+            name: line for name, line in lines.items() if name != "tdoa_std"
+        }
+    if not lines:
+        path.unlink(missing_ok=True)
+        return None
+    write_text(path, HEAD + "".join(f"    {name}: {line}\n" for name, line in lines.items()))
     return path

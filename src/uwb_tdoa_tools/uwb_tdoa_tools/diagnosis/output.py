@@ -12,7 +12,9 @@ from uwb_tdoa_bias.effects.base import listed
 from .. import outputs
 from .over_flights import course
 from .report import anchors
-from .report.entries import doubt_in_words, entries, worth_in_words
+from .report.entries import doubts, entries, worth_in_words
+from .report.reasons import cause
+from .report.tables import by_reason
 from .report.unclear import by_remedy, undetermined
 from .report.verdict import faults_in_words, truth_in_words, verdict
 
@@ -58,6 +60,9 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
             "before": {key: diagnosis.before[key] for key in ("runs", "pooled")},
             "after": {key: diagnosis.after[key] for key in ("runs", "pooled")},
             "judged_on": diagnosis.judged_on,
+            "tdoa_std": diagnosis.tdoa_std,
+            "written": diagnosis.written
+            and {key: diagnosis.written[key] for key in ("runs", "pooled")},
             "health": diagnosis.health,
         }
     )
@@ -79,23 +84,20 @@ def as_text(diagnosis: Diagnosis) -> str:
         ("changed", f"since the last calibration, {sentence}") for sentence in diagnosis.changes
     ]
     lines += [("do", sentence) for entry in found if entry.matters for sentence in entry.advice]
-    for entry in found:
-        judged = (
-            f"not added: {entry.why_not}" if entry.why_not else f"worth {worth_in_words(entry)}"
-        )
-        what = (
-            f"{entry.title}: {entry.values}; {judged}."
-            if entry.findings[0].declared
-            else f"{entry.title}; {judged}."
-        )
-        lines.append(("found" if entry.findings[0].declared else "no name", what))
-        lines += [
-            ("", sentence) for sentence in [entry.over_flights, *doubt_in_words(entry)] if sentence
-        ]
+    added = [entry for entry in found if entry.added]
+    others = doubts(added)
+    for entry in added:
+        what = f"{entry.title}: {entry.values}" if entry.findings[0].declared else cause(entry)
+        label = "found" if entry.findings[0].declared else "no name"
+        lines.append((label, f"{what}; worth {worth_in_words(entry)}."))
+        lines += [("", sentence) for sentence in [entry.shared, *others[entry.title]] if sentence]
     for remedy, several in by_remedy(undetermined(diagnosis)).items():
         lines.append(("not told", f"{listed(several)}; what would tell: {remedy}."))
-    if any(entry.added for entry in found):
+    if added:
         lines += [("apply", command) for command, _ in diagnosis.applying]
+    left_out = [(entry.title, entry.why_not) for entry in found if not entry.added]
+    for why, what in by_reason(left_out).rows:
+        lines.append(("not added", f"{what}: {why}."))
     return "\n".join([*(_wrapped(*line) for line in lines), *anchors.lines(diagnosis)])
 
 

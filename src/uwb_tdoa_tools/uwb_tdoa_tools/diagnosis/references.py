@@ -66,6 +66,7 @@ class Reference:
     knows_floor: ClassVar[bool] = False  # True: also before take-off and after landing
     tells_errors: ClassVar[bool] = True  # errors of the filter's positions are known with it
     constraints: tuple[Constraint, ...] = ()
+    left_out: ClassVar[tuple[str, ...]] = ()  # aids that flights are not judged with
     words: str  # the reference, in reports
 
     def prepare(self, flight: Flight) -> Flight:
@@ -228,6 +229,7 @@ class Heights(GroundTruth):
 
     positions_known = (False, False, True)
     attitude_known = False
+    left_out = AIDS
     words = "heights that a range finder measured; x and y are the filter's own"
 
     def __init__(
@@ -239,6 +241,10 @@ class Heights(GroundTruth):
         self._config = config
 
     def prepare(self, flight: Flight) -> Flight:
+        if self._config is not None and not self._config.use_height:
+            raise InputError(
+                "--without height: --reference heights compares with it; give one of the two."
+            )
         if flight.height is None or not len(flight.height):
             raise InputError(
                 f"{flight.name}: holds no height to compare with; record a range finder, or "
@@ -246,7 +252,7 @@ class Heights(GroundTruth):
             )
         alone = without_truth(flight)
         path = smooth(alone, self._config, Corrector(flight.anchors)).odometry
-        return replace(alone.without(*AIDS), truth=Truth(path.t, path.p, path.q))
+        return replace(alone.without(*self.left_out), truth=Truth(path.t, path.p, path.q))
 
 
 class OdometryReference(GroundTruth):

@@ -202,14 +202,8 @@ def with_maps(
     Each function alone is too weak to be selected; together they must gain clearly.
     """
     taken = {term.effect.merge_key for candidate in selection.chosen for term in candidate.terms}
-    for channel in CHANNELS.values():
-        terms: dict[Hashable, Term] = {}
-        for candidate in smooth:  # the first candidate of a function is common to all anchors
-            term = candidate.terms[0]
-            function = term.function if channel.name in candidate.channels else None
-            if function and function.form == "anchor" and function.covariate in channel.maps:
-                terms.setdefault(term.effect.merge_key, term)
-        maps = Candidate(tuple(term for identity, term in terms.items() if identity not in taken))
+    for every in maps_of(smooth):
+        maps = Candidate(tuple(term for term in every.terms if term.effect.merge_key not in taken))
         if not maps.terms:
             continue
         trial = selection.plus(maps)
@@ -230,6 +224,24 @@ def with_maps(
                 )
             )
     return selection
+
+
+def maps_of(smooth: Sequence[Candidate]) -> list[Candidate]:
+    """Return one Candidate per channel: functions of the place of each anchor, all together.
+
+    smooth : Candidates of functions
+    """
+    out = []
+    for channel in CHANNELS.values():
+        terms: dict[Hashable, Term] = {}
+        for candidate in smooth:  # the first candidate of a function is common to all anchors
+            term = candidate.terms[0]
+            function = term.function if channel.name in candidate.channels else None
+            if function and function.form == "anchor" and function.covariate in channel.maps:
+                terms.setdefault(term.effect.merge_key, term)
+        if terms:
+            out.append(Candidate(tuple(terms.values())))
+    return out
 
 
 def cross_validated(selection: Selection, refused: list[Refused]) -> Selection:

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from .attribution import Attribution
     from .channels import ChannelResiduals
     from .channels.base import Figures
+    from .comparison import ValidationCase
     from .references import Reference
     from .regression.confounding import Unobservable
 
@@ -34,6 +35,9 @@ class Diagnosis:
     changes : sentences, changes since the last calibration
     applying : ((command line, its purpose), ...), commands that apply the effects
     judge_truth : {name of a flight: sentences}, clock or frame errors of its ground truth
+    cases : (ValidationCase, ...) that `after` is of
+    tdoa_std : m, noise for the filter beside these effects, None if it was not measured
+    written : as `after`, with this noise too: what the written files give; None if not judged
     """
 
     flights: tuple[Flight, ...]
@@ -52,3 +56,6 @@ class Diagnosis:
     changes: tuple[str, ...] = ()
     applying: tuple[tuple[str, str], ...] = ()
     judge_truth: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    cases: tuple[ValidationCase, ...] = ()
+    tdoa_std: float | None = None
+    written: dict[str, Any] | None = None

@@ -49,6 +49,8 @@ WORSE = 0.005
 # In a single flight an effect stays only if the error grows by this share without it, because
 # flights differ.
 WORTH_OF_ONE = 0.05
+# m, and share of the error: with a smaller worth an effect is not written, as it rounds to nothing.
+LEAST_WORTH, LEAST_SHARE = 0.0005, 0.005
 SELECTED_ON = ", chosen on all of them (--holdout judges the choice too)"
 HELD_OUT = "flights that took no part in the fit"
 SECOND = "give a second flight with this one"
@@ -149,8 +151,9 @@ def select_by_error(
     all effects.
 
     After a drop, the other candidates that seemed harmful are tried again first. At the end all
-    candidates are tried with the final model. If trials are costly, several candidates are dropped
-    at once. Events at a time of a single flight are tried for their worth, but not kept.
+    candidates are tried with the final model, and those without worth are dropped, as many together
+    as leave the error as it is. If trials are costly, several candidates are dropped at once.
+    Events at a time of a single flight are tried for their worth, but not kept.
 
     map_function : as of `attribute`
     """
@@ -184,6 +187,20 @@ def select_by_error(
         suspects = (
             _applicable(candidates) if trials.costly else harmful[1:] or _applicable(candidates)
         )
+    while without:
+        limit = error + min(LEAST_WORTH, LEAST_SHARE * error)
+        idle = sorted((one for one in without if without[one] < limit), key=without.__getitem__)
+        gone = _gone(trials, (candidates, detections), idle, limit)
+        if not gone:
+            break
+        refused += [Refused(one.label, _why_without(error, without[one])) for one in gone]
+        worth.update((one, without[one] - error) for one in gone)
+        candidates = [one for one in candidates if one not in gone]
+        suspects = _applicable(candidates)
+        models = [(candidates, detections)]
+        models += [([c for c in candidates if c is not one], detections) for one in suspects]
+        error, *tried = trials.errors(models)
+        without = dict(zip(suspects, tried))
     worth.update((candidate, trial - error) for candidate, trial in without.items())
     for detection in attribution.detections:
         if not detection.effect.usable:
@@ -244,9 +261,11 @@ def _why_without(error: float, without: float) -> str:
     figures = f"{error:.3f} m with, {without:.3f} m without"
     if without <= error * (1.0 - WORSE):
         return f"the filter does better without it: {figures}"
+    if without < error + min(LEAST_WORTH, LEAST_SHARE * error):
+        return f"it is worth nothing for the position: {figures}"
     return (
-        f"of one flight, worth less than {WORTH_OF_ONE:.0%} of the error ({figures}), it may as "
-        f"well do harm to another: {SECOND}"
+        f"of one flight, worth less than {WORTH_OF_ONE:.0%} of the error, it may as well do harm to "
+        f"another; {SECOND}: {figures}"
     )
 
 

@@ -8,11 +8,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     # {flight: {share, None for no correction: 3D RMSE of the filter, m}}
     Errors = dict[str, dict[float | None, float]]
 
 
 SAME = 0.005  # of the error: what rounds to no per cent
+NO_DIFFERENCE = "no difference that these flights can show"
 SHARES = 0.0, 0.5, 0.75, 1.0
 
 
@@ -33,6 +36,24 @@ def gain_in_words(gained: float) -> str:
         if abs(gained) < SAME
         else f"{'falls' if gained > 0.0 else 'rises'} by {100.0 * abs(gained):.0f} %"
     )
+
+
+def difference(before: float, after: float, interval: Sequence[float] | None = None) -> int:
+    """Return 1 if an error falls, -1 if it rises, and 0 without a difference that can be shown.
+
+    A difference counts if its `interval` excludes zero. Without one it counts if it does not round
+    to nothing.
+
+    Parameters
+    ----------
+    before, after : float
+        The error, in one unit.
+    interval : (low, high), optional
+        95 % interval of the `gain`.
+    """
+    gained = gain(before, after) if before else 0.0
+    low, high = (gained - SAME, gained + SAME) if interval is None else interval
+    return int(low > 0.0) - int(high < 0.0)
 
 
 @dataclass(frozen=True)

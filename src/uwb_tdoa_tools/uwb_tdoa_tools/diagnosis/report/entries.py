@@ -11,7 +11,7 @@ import numpy as np
 from uwb_tdoa_bias.effects import LabelEffect
 from uwb_tdoa_bias.effects.base import listed, measured
 
-from ..over_flights import in_words
+from ..over_flights import ALL, course, in_words
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Iterable, Sequence
@@ -88,6 +88,12 @@ class Entry:
         return in_words(self.findings[0].shares)
 
     @property
+    def shared(self) -> str:
+        """Return in a few words how flights differ; "" for a single flight."""
+        words = self.over_flights
+        return "the same in all flights" if course(self.findings[0].shares) == ALL else words
+
+    @property
     def undecided(self) -> list[Alternative]:
         """Return the alternatives that fit nearly equally well, the nearest first."""
         gaps = [(other.gap, other) for other in self.alternatives if other.gap is not None]
@@ -100,16 +106,21 @@ class Entry:
 
 
 def entries(diagnosis: Diagnosis) -> list[Entry]:
-    """Return the entries of a Diagnosis, the most prominent first.
+    """Return the entries of a Diagnosis: added ones by their worth, then the others.
 
-    Entries of several findings, such as maps of all anchors, come last.
+    Without a known worth the most prominent comes first.
     """
     groups: dict[Hashable, list[EffectFinding]] = {}
     for finding in diagnosis.findings:
         key = finding.key if finding.declared or not finding.candidates else finding.candidates[0]
         groups.setdefault(key, []).append(finding)
     out = [_entry(tuple(group), diagnosis.refused) for group in groups.values()]
-    return sorted(out, key=lambda entry: (len(entry.findings) > 1, -entry.findings[0].prominence))
+
+    def place(entry: Entry) -> tuple[bool, float, float]:
+        worth = entry.worth or 0.0
+        return not entry.added, -worth if entry.added else 0.0, -entry.findings[0].prominence
+
+    return sorted(out, key=place)
 
 
 def worth_in_words(entry: Entry) -> str:
@@ -142,16 +153,25 @@ def doubt_in_words(entry: Entry) -> list[str]:
     ]
 
 
-def certainty_in_words(entry: Entry) -> str:
-    """Return a sentence for an entry without alternatives."""
-    first = entry.findings[0]
-    if first.candidates:
-        return "Nothing else in the catalogue explains as much."
-    like = first.effect.confounded_with
-    return (
-        "Was not compared with "
-        f"others{f'; may be confused with {listed(like, OR)}' if like else ''}."
-    )
+def doubts(found: Iterable[Entry]) -> dict[str, list[str]]:
+    """Return {title: what else an entry could be}; a repeated doubt refers to the first entry.
+
+    Nothing stands for an entry that was compared with the catalogue, and that nothing else explains.
+    """
+    out: dict[str, list[str]] = {}
+    first: dict[str, str] = {}
+    for entry in found:
+        sentences = doubt_in_words(entry)
+        if not sentences and not entry.findings[0].candidates:
+            like = entry.findings[0].effect.confounded_with
+            sentences = [f"not compared{f'; like {listed(like, OR)}' if like else ''}"]
+        told = [
+            sentence if sentence not in first else f"as {first[sentence]}" for sentence in sentences
+        ]
+        out[entry.title] = list(dict.fromkeys(told))
+        for sentence in sentences:
+            first.setdefault(sentence, entry.title)
+    return out
 
 
 def known_with(entry: Entry) -> list[str]:

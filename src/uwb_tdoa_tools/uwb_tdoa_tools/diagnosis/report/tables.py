@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from uwb_tdoa_bias.effects.base import listed, measured, rounded
@@ -13,7 +14,7 @@ from .runs import CM, labels
 from .unclear import by_remedy, undetermined
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from uwb_tdoa_bias.effects import Effect
 
@@ -95,13 +96,16 @@ def remedies(diagnosis: Diagnosis) -> Table:
 
 
 def untraced(diagnosis: Diagnosis) -> Table:
-    """Return all combinations of parameters that the flights do not determine."""
-    rows = [
-        (item.effect, item.what or "all of it", item.remedy)
-        for item in undetermined(diagnosis)
-        if item.what or not item.harmless
-    ]
-    return Table(("effect", "parameters", "what would tell"), rows)
+    """Return all combinations of parameters that the flights do not determine, by remedy."""
+    rows: dict[str, list[str]] = {}
+    for item in undetermined(diagnosis):
+        if item.what or not item.harmless:
+            what = f"{item.effect}: {item.what or 'all of it'}"
+            rows.setdefault(item.remedy, []).append(what)
+    return Table(
+        ("what would tell", "parameters"),
+        [(remedy, "; ".join(whats)) for remedy, whats in rows.items()],
+    )
 
 
 def values(diagnosis: Diagnosis) -> Table:
@@ -209,14 +213,35 @@ def _interval(row: dict[str, Any]) -> str:
 
 
 def refused(diagnosis: Diagnosis) -> Table:
-    """Return the candidates that were not added, with the reason."""
+    """Return the candidates that were not added, by reason."""
     added = {finding.effect.label for finding in diagnosis.findings if finding.added}
+    return by_reason(
+        (f"a further part of {item.what}" if item.what in added else item.what, item.why)
+        for item in diagnosis.refused
+    )
+
+
+def not_added(found: Sequence[Entry]) -> Table:
+    """Return the found entries that were not added, by reason."""
+    return by_reason(
+        (f"{entry.title}: {entry.values}", entry.why_not) for entry in found if entry.why_not
+    )
+
+
+def by_reason(items: Iterable[tuple[str, str]]) -> Table:
+    """Return a table with one row per reason, so that no reason repeats.
+
+    items : (what, why not); figures after ": ", or in brackets at the end, go with the item
+    """
+    rows: dict[str, list[str]] = {}
+    for what, why in items:
+        reason, figures = re.fullmatch(r"(.*?)(?:: (.*\d.*)| \(([^()]*\d[^()]*)\))?", why).group(
+            1, 2
+        )
+        figures = figures or why[len(reason) :].strip(" ()")
+        rows.setdefault(reason, []).append(f"{what} ({figures})" if figures else what)
     return Table(
-        ("what", "why not"),
-        [
-            (f"a further part of {item.what}" if item.what in added else item.what, item.why)
-            for item in diagnosis.refused
-        ],
+        ("why not", "what"), [(reason, "; ".join(whats)) for reason, whats in rows.items()]
     )
 
 

@@ -7,18 +7,21 @@ from typing import TYPE_CHECKING, Any
 
 from uwb_tdoa_bias.effects.base import listed
 
-from ...scoring.phases import NEAR_THE_FLOOR, TITLES
+from ...scoring.gains import NO_DIFFERENCE, difference
+from ...scoring.phases import TITLES
 from ..self_calibration.solve import CLEARLY, LEFT
 from .left_over import left_over
+from .reasons import reasons
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from uwb_tdoa_ekf.monitoring.finding import Finding as NumbersFinding
 
     from ..result import Diagnosis
 
 CM = 100.0  # cm per metre
+MOST_NAMES = 6  # largest number of named flights
 ERROR = "The position error (3D RMSE)"
 
 
@@ -99,9 +102,10 @@ def _with_errors(diagnosis: Diagnosis) -> Verdict:
     change = f"from {centimetres(before['rmse_3d'])} to {centimetres(after['rmse_3d'])}"
     more = [
         _intervals(before, after, interval),
-        f"Judged on {diagnosis.judged_on}: {_flights(diagnosis)}.",
-    ]
-    more += [
+        f"Judged on {diagnosis.judged_on}: {_flights(diagnosis)}; {_named(diagnosis)}.",
+        *reasons(diagnosis),
+        *_worse_phases(diagnosis),
+        *_with_noise(diagnosis),
         *_over_phases(diagnosis),
         *_shared(diagnosis),
         *_caveats(diagnosis),
@@ -123,8 +127,10 @@ def _with_errors(diagnosis: Diagnosis) -> Verdict:
         "More flights to judge on (--holdout) make that certain; until then compare before "
         "relying on effects.yaml."
     )
+    if interval and interval[1] < 0.0:
+        return Verdict(f"{ERROR} rises {change}.", tuple(more), "unsure")
     return Verdict(
-        f"It is not certain that the position error (3D RMSE) falls: {change}.",
+        f"There is {NO_DIFFERENCE}: the position error (3D RMSE) goes {change}.",
         tuple(more),
         "unsure",
     )
@@ -146,9 +152,12 @@ def _intervals(before: dict[str, Any], after: dict[str, Any], gain: Sequence[flo
 def _nothing_added(diagnosis: Diagnosis) -> Verdict:
     pooled, found = diagnosis.before["pooled"], len({finding.key for finding in diagnosis.findings})
     interval = f"95 % interval {_bounds(pooled['rmse_3d_ci'])} cm"
-    error = f"{ERROR} is {centimetres(pooled['rmse_3d'])}, {interval}: {_flights(diagnosis)}."
+    data = f"{_flights(diagnosis)}; {_named(diagnosis)}"
+    error = f"{ERROR} is {centimetres(pooled['rmse_3d'])}, {interval}: {data}."
     more = (
         error,
+        *(f"Not added: {item.why}." for item in diagnosis.refused if item.what == "all"),
+        *_with_noise(diagnosis),
         *_over_phases(diagnosis),
         *_shared(diagnosis),
         *_diverged(diagnosis),
@@ -220,16 +229,55 @@ def _flights(diagnosis: Diagnosis) -> str:
     return f"{count} flight{'s' if count > 1 else ''}, {seconds:.0f} s {parts}"
 
 
+def _named(diagnosis: Diagnosis) -> str:
+    """Return the names of the judged flights, the first few of many."""
+    names = _names(diagnosis)
+    rest = len(names) - MOST_NAMES
+    return listed(names) if rest <= 0 else f"{', '.join(names[:MOST_NAMES])} and {rest} more"
+
+
+def _worse_phases(diagnosis: Diagnosis) -> list[str]:
+    """Return a sentence on phases in which the error grows."""
+    worse = list(worse_phases(diagnosis.before["pooled"], diagnosis.after["pooled"]))
+    return [f"Worse: {'; '.join(worse)}."] if worse else []
+
+
+def _with_noise(diagnosis: Diagnosis) -> list[str]:
+    """Return a sentence on the error with all files as they are written."""
+    if diagnosis.written is None or diagnosis.tdoa_std is None:
+        return []
+    before, after = diagnosis.before["pooled"], diagnosis.written["pooled"]
+    worse = list(worse_phases(before, after))
+    also = f"; worse: {'; '.join(worse)}" if worse else ""
+    return [
+        f"With tdoa_std {diagnosis.tdoa_std:.3f} m of ekf_node.yaml too it is "
+        f"{centimetres(after['rmse_3d'])}{also}."
+    ]
+
+
 def _over_phases(diagnosis: Diagnosis) -> list[str]:
-    """Return a sentence on errors near the floor, which the verdict does not include."""
+    """Return a sentence on errors in the other phases, which the first sentence leaves out."""
     before, after = (
         side["pooled"].get("phases", {}) for side in (diagnosis.before, diagnosis.after)
     )
-    parts = []
-    for name in (name for name in NEAR_THE_FLOOR if name in before):
+    parts, judged = [], {score.part for score in diagnosis.before["scores"]}
+    for name in (name for name in TITLES if name in before and name not in judged):
         sides = [_of_phase(side[name]) for side in (before, after)]
         parts.append(f"{TITLES[name]} {' to '.join(dict.fromkeys(sides))}")
     return [f"Outside of that, before and after: {'; '.join(parts)}."] if parts else []
+
+
+def worse_phases(before: dict[str, Any], after: dict[str, Any]) -> Iterator[str]:
+    """Yield one clause per phase in which the error grows.
+
+    before, after : pooled figures of a side of `compare`
+    """
+    sides = before.get("phases", {}), after.get("phases", {})
+    for name in (name for name in TITLES if name in sides[0] and name in sides[1]):
+        first, second = (side[name] for side in sides)
+        known = first["rmse_3d"] is not None and second["rmse_3d"] is not None
+        if known and difference(first["rmse_3d"], second["rmse_3d"]) < 0:
+            yield f"{TITLES[name]} from {_of_phase(first)} to {_of_phase(second)}"
 
 
 def _of_phase(figures: dict[str, Any]) -> str:
