@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..common.anchors import Anchors
+from ..common.arrays import filled
 from ..common.compiled import compiled
 from ..effects import EffectSet, Samples
 from ..effects.samples import N_STATES, POSE_LAG, motion_at
@@ -190,11 +191,18 @@ class Corrector:
         if self.idle or len(t) == 0:
             return Correction.none(d)
         self._latest = samples = self.samples(t, a, b)
+        bias, std, status, slope, state = self.correction(samples)
+        return Correction(bias, std, d - bias, status.astype(np.uint8), slope, state)
+
+    def correction(self, samples: Samples) -> tuple[np.ndarray, ...]:
+        """Return bias, std, status, slope and state of a Correction of Samples."""
         bias, std, slope, state = self.contribution(samples)
-        status = np.full(len(t), EFFECTS if len(self.effects) else PASSED, dtype=np.uint8)
+        status = np.full(len(samples), float(EFFECTS if len(self.effects) else PASSED))
         if self.network is not None:
-            _add_learned(*self.network.predict(samples), bias, std, status)
-        return Correction(bias, std, d - bias, status, slope, state)
+            learned = self.network.predict(samples)
+            added = filled(_add_learned, (len(samples), 3), *learned, bias, std, status)
+            bias, std, status = added.T
+        return bias, std, status, slope, state
 
     def contribution(
         self, samples: Samples
@@ -226,12 +234,13 @@ class Corrector:
             headings = np.concatenate(
                 [samples.q, *(rotated_in_yaw(samples.q, k) for k in range(4))]
             )
-            known, *each = turning.bias(replace(samples.repeated(5), q=headings)).reshape(5, -1)
-            bias = np.where(unknown, bias - known + np.mean(each, axis=0), bias)
-            noise = np.where(unknown, np.hypot(noise, np.std(each, axis=0)), noise)
+            headed = turning.bias(replace(samples.repeated(5), q=headings)).reshape(5, -1)
+            known, each = headed[0], headed[1:]
+            bias = np.where(unknown, bias - known + each.mean(axis=0), bias)
+            noise = np.where(unknown, np.hypot(noise, each.std(axis=0)), noise)
         if len(steep) and unknown.any():
             level = steep.where(lambda effect: not effect.uses_attitude).bias_jacobian(samples)[1]
-            slope[unknown] = level[unknown]
+            slope = np.where(unknown[:, None], level, slope)
         return bias, noise, slope, state
 
     def samples(self, t: np.ndarray, a: np.ndarray, b: np.ndarray) -> Samples:
@@ -274,17 +283,20 @@ def _add_learned(
     bias: np.ndarray,
     std: np.ndarray,
     status: np.ndarray,
+    out: np.ndarray,
 ) -> None:
-    """Add the prediction of a network to bias and std (n,) m where it is finite; compiled.
+    """Write bias, m, std, m, and status (n, 3) with a network's prediction to out; compiled.
 
-    learned, deviation : (n,) m; known : (n,) 0 ... 1; status : (n,), updated
+    learned, deviation : (n,) m, added where finite; known : (n,) 0 ... 1
+    bias, std, status : (n,), of the effects
     """
     for i in range(len(bias)):
+        out[i, 0], out[i, 1], out[i, 2] = bias[i], std[i], status[i]
         if math.isfinite(learned[i]):
-            bias[i] += learned[i]
+            out[i, 0] += learned[i]
             if math.isfinite(deviation[i]):
-                std[i] = math.hypot(std[i], deviation[i])
-            status[i] = FADED if known[i] < FADED_BELOW else NETWORK
+                out[i, 1] = math.hypot(std[i], deviation[i])
+            out[i, 2] = FADED if known[i] < FADED_BELOW else NETWORK
 
 
 pass

@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from ..common.arrays import filled, floats
 from ..common.compiled import compiled
 from ..common.errors import InputError
 from ..common.files import read_bytes
@@ -160,19 +161,14 @@ class Network:
 
         Bias and std are NaN where a required feature is unknown.
         """
-        yaw_std = (
-            NO_NUMBERS
-            if samples.yaw_std is None
-            else np.ascontiguousarray(samples.yaw_std, dtype=float)
-        )
-        limits, found = (
-            (self.clip, self._fade_std, self.share, self._largest_yaw_std),
-            np.empty((3, len(samples))),
-        )
-        table, x = everything(samples), np.empty((len(samples), len(self._inputs)))
-        _select(table, self._inputs, self._offset, self._scale, x)
-        _limit(self._model.run(x), table, self._validity, limits, yaw_std, found)
-        return found[0], found[1], found[2]
+        yaw_std = NO_NUMBERS if samples.yaw_std is None else floats(samples.yaw_std)
+        limits = self.clip, self._fade_std, self.share, self._largest_yaw_std
+        table = everything(samples)
+        out = self._model.run((table[:, self._inputs] - self._offset) / self._scale)
+        bias, std, known = filled(
+            _limit, (len(samples), 3), out, table, self._validity, limits, yaw_std
+        ).T
+        return bias, std, known
 
 
 def _session(path: str | Path) -> Session:
@@ -190,15 +186,6 @@ def _session(path: str | Path) -> Session:
 
 
 @compiled
-def _select(
-    table: np.ndarray, columns: np.ndarray, offset: np.ndarray, scale: np.ndarray, x: np.ndarray
-) -> None:
-    for i in range(len(table)):
-        for k in range(len(columns)):
-            x[i, k] = (table[i, columns[k]] - offset[k]) / scale[k]
-
-
-@compiled
 def _limit(
     out: np.ndarray,
     table: np.ndarray,
@@ -207,7 +194,7 @@ def _limit(
     yaw_std: np.ndarray,
     found: np.ndarray,
 ) -> None:
-    """Write bias, m, std, m, and known share, (3, n), to found; compiled.
+    """Write bias, m, std, m, and known share, (n, 3), to found; compiled.
 
     out : (n, 1 to 3), output of the network; table : (n, 29), as of `everything`
     limits : clip, m, fade_std, m, share, largest_yaw_std, rad; yaw_std : (n,) rad, or empty
@@ -231,9 +218,9 @@ def _limit(
             beyond = 0.0
             for k in range(len(columns)):
                 value = table[i, columns[k]]
-                far = max(lower[k] - value, value - upper[k]) / margin[k]
-                beyond = far if far > beyond or value != value else beyond
-            trust = 1.0 - min(beyond, 1.0) if beyond == beyond else np.nan
+                far = np.maximum(lower[k] - value, value - upper[k]) / margin[k]
+                beyond = np.maximum(far, beyond)  # NaN of an unknown value
+            trust = 1.0 - np.minimum(beyond, 1.0)
             bias, known = trust * bias, trust * known
             std = math.sqrt((trust * std) ** 2 + (1.0 - trust**2) * fade_std**2)
         if share < 1.0:
@@ -241,4 +228,4 @@ def _limit(
         if len(yaw_std) and yaw_std[i] > largest_yaw_std:
             std = math.hypot(std, bias)
             bias = known = 0.0
-        found[0, i], found[1, i], found[2, i] = bias, std, known
+        found[i, 0], found[i, 1], found[i, 2] = bias, std, known
