@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..common.anchors import Anchors
-from ..common.arrays import filled
-from ..common.compiled import compiled
+from ..common.errors import InputError
 from ..effects import EffectSet, Samples
 from ..effects.samples import N_STATES, POSE_LAG, motion_at
+from .model import EFFECTS, PASSED, Prediction
 from .poses import POSE_NUMBERS, TWIST_NUMBERS, Poses, parts_of, rotated_in_yaw
 
 if TYPE_CHECKING:
@@ -22,18 +22,14 @@ if TYPE_CHECKING:
 
     from ..common.anchors import Anchors
     from ..effects.effect_set import EffectSet
-    from .network import Network
+    from .model import Model
 
 
-# status of one correction; the values of TdoaCorrected.STATUS_*
-PASSED, EFFECTS, NETWORK, FADED = range(4)
 # s after the first pose. Earlier TDOAs are corrected without a pose, which costs accuracy.
 START = 0.2
 # rad. A yaw with a larger standard deviation is unknown: then the filter follows four yaws,
 # 90 degrees apart.
 LARGEST_YAW_STD = 1.0
-# Share of the possible knowledge; a prediction with less counts as faded.
-FADED_BELOW = 0.5
 
 
 @dataclass(frozen=True)
@@ -88,7 +84,7 @@ class Corrector:
         self,
         anchors: Anchors,
         effects: EffectSet | None = None,
-        network: Network | None = None,
+        network: Model | None = None,
         lag: float = POSE_LAG,
         history: int = 4096,
         start: float = START,
@@ -99,7 +95,7 @@ class Corrector:
         ----------
         anchors : Anchors
         effects : EffectSet or None; hypotheses, which the filter weighs, are not corrected: see `weighed`
-        network : Network or None
+        network : Model or None
         lag : s
         history : number of poses kept
         start : s
@@ -109,6 +105,12 @@ class Corrector:
         self.effects = effects.where(lambda effect: not effect.is_hypothesis)
         self.weighed = effects.where(lambda effect: effect.is_hypothesis)
         self.network = network
+        twice = set(network.holds if network else ()) & {effect.name for effect in self.effects}
+        if twice:
+            raise InputError(
+                f"effects: {min(twice)} is in the model too, which holds {', '.join(network.holds)};"
+                " leave it out of the effects."
+            )
         self.lag = lag
         parts = [self.effects.name] if len(self.effects) else []
         self.model = "+".join(parts + ([network.name] if network else [])) or "none"
@@ -191,18 +193,15 @@ class Corrector:
         if self.idle or len(t) == 0:
             return Correction.none(d)
         self._latest = samples = self.samples(t, a, b)
-        bias, std, status, slope, state = self.correction(samples)
+        bias, std, status, slope, state = self.prediction(samples)
         return Correction(bias, std, d - bias, status.astype(np.uint8), slope, state)
 
-    def correction(self, samples: Samples) -> tuple[np.ndarray, ...]:
-        """Return bias, std, status, slope and state of a Correction of Samples."""
+    def prediction(self, samples: Samples) -> Prediction:
+        """Return the Prediction of Samples by effects and network."""
         bias, std, slope, state = self.contribution(samples)
         status = np.full(len(samples), float(EFFECTS if len(self.effects) else PASSED))
-        if self.network is not None:
-            learned = self.network.predict(samples)
-            added = filled(_add_learned, (len(samples), 3), *learned, bias, std, status)
-            bias, std, status = added.T
-        return bias, std, status, slope, state
+        known = Prediction(bias, std, status, slope, state)
+        return known if self.network is None else self.network.added(samples, known)
 
     def contribution(
         self, samples: Samples
@@ -250,7 +249,7 @@ class Corrector:
         places, p, q, yaw_std = self._poses.before(t, self._newest, self.lag)
         self._newest = max(self._newest, t.max())
         samples = Samples(t, a, b, p, q, self.anchors, self._first, yaw_std=yaw_std)
-        if not self.effects.needs_motion:
+        if not (self.effects.needs_motion or (self.network and self.network.needs_motion)):
             return samples
         last_t, last_b = self._last or (t[0], -1)
         self._last = (t[-1], self.anchors.ids[b[-1]])
@@ -262,7 +261,7 @@ class Corrector:
         )
 
 
-def warm_up(effects: EffectSet, network: Network | None, lag: float = POSE_LAG) -> Corrector:
+def warm_up(effects: EffectSet, network: Model | None, lag: float = POSE_LAG) -> Corrector:
     """Return a Corrector after one correction.
 
     The first correction compiles the functions, or loads them from numba's cache.
@@ -273,33 +272,6 @@ def warm_up(effects: EffectSet, network: Network | None, lag: float = POSE_LAG) 
     )
     corrector.correct(np.array([1.0]), np.array([0]), np.array([1]), np.array([0.0]))
     return corrector
-
-
-@compiled
-def _add_learned(
-    learned: np.ndarray,
-    deviation: np.ndarray,
-    known: np.ndarray,
-    bias: np.ndarray,
-    std: np.ndarray,
-    status: np.ndarray,
-    out: np.ndarray,
-) -> None:
-    """Write bias, m, std, m, and status (n, 3) with a network's prediction to out; compiled.
-
-    learned, deviation : (n,) m, added where finite; known : (n,) 0 ... 1
-    bias, std, status : (n,), of the effects
-    """
-    for i in range(len(bias)):
-        out[i, 0], out[i, 1], out[i, 2] = bias[i], std[i], status[i]
-        if math.isfinite(learned[i]):
-            out[i, 0] += learned[i]
-            if math.isfinite(deviation[i]):
-                out[i, 1] = math.hypot(std[i], deviation[i])
-            out[i, 2] = FADED if known[i] < FADED_BELOW else NETWORK
-
-
-pass
 
 
 class FixedPoseCorrector(Corrector):

@@ -22,7 +22,6 @@ from __future__ import annotations
 
 import json
 import math
-from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -30,12 +29,14 @@ import numpy as np
 from ..common.arrays import filled, floats
 from ..common.compiled import compiled
 from ..common.errors import InputError
-from ..common.files import read_bytes
-from ..common.limits import MODEL_BYTES
-from ..common.text import printable, sanitize
+from ..common.text import sanitize
+from .exported import ExportedCorrection
 from .features import NAMES, everything
+from .model import FADED, FADED_BELOW, NETWORK, Model, Prediction, session_of
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from ..effects.samples import Samples
     from .session import Session
 
@@ -43,9 +44,13 @@ NO_NUMBERS = np.empty(0)
 _COLUMN = {name: column for column, name in enumerate(NAMES)}
 
 
-def load_network(name: str | Path | None) -> Network | None:
-    """Return the Network of a file, or None for an empty name; raise InputError."""
-    return Network(name) if name else None
+def load_network(name: str | Path | None) -> Model | None:
+    """Return the Model of a file, or None for an empty name; raise InputError."""
+    if not name:
+        return None
+    session = session_of(name)
+    kind = ExportedCorrection if "kind" in session.meta and "inputs" in session.meta else Network
+    return kind(name, session)
 
 
 class Validity(NamedTuple):
@@ -64,42 +69,21 @@ class Validity(NamedTuple):
     margin: np.ndarray
 
 
-class Network:
-    """An ONNX bias model.
+class Network(Model):
+    """An ONNX bias model of some features.
 
     Attributes
     ----------
-    meta : all its metadata, dict of str
-    trained_with : names of the effects that were corrected before the training; they must be
-        corrected in use, too
     share : share of its prediction that is corrected, 0 ... 1
     """
 
-    def __init__(self, path: str | Path) -> None:
-        """Load a file; raise InputError if it is no model or has unsuitable metadata."""
-        self._path = Path(path).absolute()
-        if not Path(path).is_file():
-            raise InputError(
-                f"model: {path} does not exist; give an .onnx file or leave the model empty."
-            )
-        self._model = _session(path)
-        self.meta = self._model.meta
-        try:
-            self._read(self.meta)
-        except (
-            KeyError,
-            ValueError,
-            TypeError,
-            AttributeError,
-            OverflowError,
-            RecursionError,
-        ) as error:
-            raise InputError(
-                f"model: {path}: its metadata must hold features (names out of "
-                f"{', '.join(NAMES)}), offset, scale, "
-                "clip and name, and may hold validity with fade_std, as JSON; the problem is "
-                f"{error!r}."
-            ) from error
+    NEEDS = (
+        f"features (names out of {', '.join(NAMES)}), offset, scale, clip and name, and may hold "
+        "validity with fade_std, as JSON"
+    )
+
+    def __init__(self, path: str | Path, session: Session | None = None) -> None:
+        super().__init__(path, session)
         width, n = self._model.width, len(self._inputs)
         if not (n == len(self._offset) == len(self._scale) == width) or (self._scale == 0).any():
             raise InputError(
@@ -120,10 +104,6 @@ class Network:
                 f"model: {path}: gives (n, {out.shape[1]}), or no finite numbers; the output "
                 "must be (n, 1), (n, 2) or (n, 3)."
             )
-
-    def __reduce__(self) -> tuple[type[Network], tuple[Path]]:
-        """Return the path of the file for pickle, which cannot store a session."""
-        return Network, (self._path,)
 
     def _read(self, meta: dict[str, str]) -> None:
         names, self._offset, self._scale = (
@@ -156,6 +136,11 @@ class Network:
         if not 0.0 <= self.share <= 1.0:
             raise ValueError("share must be between 0 and 1")
 
+    def added(self, samples: Samples, known: Prediction) -> Prediction:
+        shape, learned = (len(samples), 3), self.predict(samples)
+        bias, std, status = filled(_add, shape, *learned, *known[:3]).T
+        return Prediction(bias, std, status, *known[3:])
+
     def predict(self, samples: Samples) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return bias (n,) m, its std (n,) m, and the share (n,) 0 ... 1 of the possible knowledge.
 
@@ -169,20 +154,6 @@ class Network:
             _limit, (len(samples), 3), out, table, self._validity, limits, yaw_std
         ).T
         return bias, std, known
-
-
-def _session(path: str | Path) -> Session:
-    """Return the Session of a file whose content passed its trial; raise InputError."""
-    content = read_bytes(path, MODEL_BYTES)
-    from .trial import Session, Unplayable, tried_out  # imports onnxruntime
-
-    try:
-        return Session(content, alone=tried_out(content))
-    except Unplayable as error:
-        raise InputError(
-            f"model: {path} cannot be played as an ONNX model of dense layers "
-            f"({printable(str(error))}); export it again, without what it names."
-        ) from error
 
 
 @compiled
@@ -229,3 +200,27 @@ def _limit(
             std = math.hypot(std, bias)
             bias = known = 0.0
         found[i, 0], found[i, 1], found[i, 2] = bias, std, known
+
+
+@compiled
+def _add(
+    learned: np.ndarray,
+    deviation: np.ndarray,
+    known: np.ndarray,
+    bias: np.ndarray,
+    std: np.ndarray,
+    status: np.ndarray,
+    out: np.ndarray,
+) -> None:
+    """Write bias, m, std, m, and status (n, 3) with a network's prediction to out; compiled.
+
+    learned, deviation : (n,) m, added where finite; known : (n,) 0 ... 1
+    bias, std, status : (n,), of the effects
+    """
+    for i in range(len(bias)):
+        out[i, 0], out[i, 1], out[i, 2] = bias[i], std[i], status[i]
+        if math.isfinite(learned[i]):
+            out[i, 0] += learned[i]
+            if math.isfinite(deviation[i]):
+                out[i, 1] = math.hypot(std[i], deviation[i])
+            out[i, 2] = FADED if known[i] < FADED_BELOW else NETWORK

@@ -27,16 +27,6 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.common.anchors import Anchors
 
-# Columns of the input table, by field of Samples; see `UNITS`
-INPUTS = (
-    *("anchor_a", "anchor_b"),
-    *("x", "y", "z"),
-    *("qx", "qy", "qz", "qw"),
-    *("vx", "vy", "vz"),
-    *("ax", "ay", "az"),
-    *("wx", "wy", "wz"),
-    *("time", "interval", "previous_anchor", "yaw_std"),
-)
 MOST_ANCHORS = 128  # constants of pairs grow with the square
 LN_10 = math.log(10.0)
 
@@ -377,15 +367,20 @@ _UFUNCS: dict[Any, Callable[..., Node]] = {
 
 
 def _concatenate(like: Traced, arrays: Sequence[Any], axis: int = 0) -> Node:
-    nodes = [as_number(like.lifted(one)) for one in arrays]
-    return joined([one for one in nodes if one.size], axis)
+    nodes = [node for node in map(like.lifted, arrays) if node.size]
+    return joined(_of_one_type(nodes), axis)
+
+
+def _of_one_type(nodes: list[Node]) -> list[Node]:
+    """Return the nodes, as numbers unless all are boolean."""
+    return nodes if all(one.is_bool for one in nodes) else list(map(as_number, nodes))
 
 
 def _stack(like: Traced, arrays: Sequence[Any], axis: int) -> Node:
     nodes = [taken(like.lifted(one), (..., None)) for one in arrays]
     shape = np.broadcast_shapes(*(one.shape for one in nodes))
     assert axis in (-1, len(shape) - 1)
-    return joined([_broadcast(one, shape) for one in nodes], -1)
+    return joined(_of_one_type([_broadcast(one, shape) for one in nodes]), -1)
 
 
 def _where(like: Traced, condition: Any, one: Any, other: Any) -> Node:
