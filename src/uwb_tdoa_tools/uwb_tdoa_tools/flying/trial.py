@@ -169,8 +169,9 @@ class Trial:
 
     def _simulator(self, duration: float) -> Simulator:
         """Return the simulated vehicle for `duration`, s."""
-        radius = getattr(self.task.path, "radius", 0.0)  # m, of the start from the middle
-        return Simulator(self.task.world, self.task.seed, duration, radius)
+        path = self.task.path
+        assert not isinstance(path, Waypoints)  # a rover has a simulator of its own
+        return Simulator(self.task.world, self.task.seed, duration, path.radius)
 
     def _controller(self) -> Any:
         """Return the controller."""
