@@ -46,7 +46,7 @@ def measure(progress: Callable[[str], object], peer: Peer, quick: bool = False) 
     first = int(np.searchsorted(truth.t, begin))
 
     def timed(events: np.ndarray) -> float:
-        peer.start(flight.anchors.positions, truth.p[first], truth.q[first])
+        peer.start(flight.anchors, truth.p[first], truth.q[first])
         return peer.run(events)
 
     seconds = np.array(

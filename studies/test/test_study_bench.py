@@ -239,7 +239,7 @@ def test_a_library_gets_the_events_of_a_flight_in_their_order(tmp_path):
     )
     assert set(both["t"]) == set(samples["t"])  # no prediction for a TDOA alone
     p, q = flight.truth.p[0], flight.truth.q[0]
-    other.start(flight.anchors.positions, p, q)
+    other.start(flight.anchors, p, q)
     assert other.run(both) > 0.0
     np.testing.assert_array_equal(other.position(), p)
     other.run(both[::-1].copy())  # it tells that this is nonsense

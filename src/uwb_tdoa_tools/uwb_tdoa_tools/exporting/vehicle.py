@@ -46,6 +46,7 @@ STATE = np.dtype(
         ("previous_anchor", np.float32),
     ]
 )
+RATES = {"ax", "ay", "az", "wx", "wy", "wz"}  # inputs of acceleration and rate
 NO_PAIR, NOT_FINITE = 1, 2  # results of the functions in C
 
 HEADER = """\
@@ -63,6 +64,8 @@ extern "C" {{
 #endif
 
 #define UWB_BIAS_ANCHORS {count}
+/* Whether the correction reads acceleration or rate. */
+#define UWB_BIAS_READS_RATES {rates}
 
 /* The state of the tag at a TDOA. Members that this correction reads: {inputs}. */
 typedef struct {{
@@ -245,6 +248,7 @@ def vehicle_code(
         "count": count,
         "ids": ", ".join(map(str, anchors.ids.tolist())),
         "reach": f"{REACH:g}",
+        "rates": int(not RATES.isdisjoint(inputs)),
         "inputs": ", ".join(MEMBERS[name] for name in inputs) or "none",
         "helpers": printer.helpers(),
         "tables": printer.tables(count),
