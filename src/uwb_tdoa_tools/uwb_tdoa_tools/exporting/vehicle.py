@@ -213,6 +213,16 @@ class VehicleCode:
     steep: dict[tuple[int, ...], Program]
     inputs: tuple[str, ...]
 
+    @property
+    def files(self) -> dict[str, str]:
+        """Return {name: text} of both files."""
+        return {"uwb_bias.h": self.header, "uwb_bias.c": self.source}
+
+    @property
+    def reads_rates(self) -> bool:
+        """Return whether it reads acceleration or rate, which not every filter estimates."""
+        return not RATES.isdisjoint(self.inputs)
+
 
 def vehicle_code(
     anchors: Anchors, effects: EffectSet, network: Network | None = None
