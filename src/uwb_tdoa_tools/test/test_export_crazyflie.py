@@ -119,6 +119,12 @@ int main(void) {
 """
 
 
+def extra_flags(makefile, folder):
+    """The flags that the Makefile of a build adds to those of the firmware."""
+    (line,) = (line for line in makefile.splitlines() if line.startswith("EXTRA_CFLAGS"))
+    return line.partition("+=")[2].replace("$(PWD)", str(folder)).split()
+
+
 def build(folder, names):
     """A folder with the build and the stand-ins; returns the program."""
     made = crazyflie.files(vehicle_code(ANCHORS, chosen(*names)), ANCHORS)
@@ -129,7 +135,8 @@ def build(folder, names):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
     flags = [flag for flag in c.FIRMWARE if flag != "-mfp16-format=ieee"]
-    include = ["-Ioverrides", "-Ifirmware", "-Isrc"]
+    # as Kbuild orders them: those of the firmware first, then EXTRA_CFLAGS
+    include = ["-Ifirmware", *extra_flags(made["Makefile"], folder / "app")]
     sources = ["src/uwb_bias.c", "src/uwb_bias_firmware.c"]
     sources += ["firmware/src/updates.c", "firmware/src/estimator_kalman.c"]
     command = [GCC, *flags, *include, *sources, "-lm", "-o", "estimator"]

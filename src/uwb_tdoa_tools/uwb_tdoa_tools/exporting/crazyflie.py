@@ -1,8 +1,12 @@
 """Write a correction as an out-of-tree build of the Crazyflie firmware.
 
-The build replaces one header of the firmware (docs/development/oot.md there, "Overriding in-tree
-headers"). The firmware's own Kalman filter stays as it is, with its logs and parameters. It gets
-each TDOA after the correction at its own newest state.
+The build uses EXTRA_CFLAGS, as docs/development/oot.md of the firmware describes. Kbuild puts these
+flags after those of the firmware, so `-I` cannot replace a header. `-iquote` can: the compiler
+searches it before all `-I`. The firmware's own Kalman filter stays as it is, with its logs and
+parameters. It gets each TDOA after the correction at its own newest state.
+
+The documented hook for estimators does not suffice. The Kalman filter takes TDOAs from the queue of
+all measurements in its own task, where an out-of-tree estimator cannot change them.
 """
 
 from __future__ import annotations
@@ -20,7 +24,7 @@ MAKEFILE = """\
 # make CRAZYFLIE_BASE=/path/to/crazyflie-firmware
 CRAZYFLIE_BASE ?= ../crazyflie-firmware
 OOT_CONFIG := $(PWD)/config
-EXTRA_CFLAGS += -I$(PWD)/src
+EXTRA_CFLAGS += -I$(PWD)/src -iquote $(PWD)/overrides
 
 include $(CRAZYFLIE_BASE)/tools/make/oot.mk
 """
@@ -127,17 +131,19 @@ Positioning deck before the Kalman filter uses it. The filter itself stays as it
 
 1. Load `anchors.yaml` in the client (Loco Positioning tab) and write it to the anchors. The
    correction belongs to these positions and ids.
-2. Build, with a firmware whose docs/development/oot.md has "Overriding in-tree headers":
+2. Build. `overrides/` replaces one header of the firmware. Its flags and headers were checked with
+   the firmware of August 2026 (2a18fc29). The whole firmware was not linked.
 
        git clone --recursive https://github.com/bitcraze/crazyflie-firmware
        make CRAZYFLIE_BASE=$PWD/crazyflie-firmware
 
 3. Write it to the vehicle: `make CRAZYFLIE_BASE=$PWD/crazyflie-firmware cload`
 4. Log `uwbBias.corrected`: it rises with each TDOA. If `uwbBias.refused` rises, the id of an anchor
-   is not in `anchors.yaml`. If both stay at 0, the firmware did not use `overrides/`.
+   is not in `anchors.yaml`. If both stay at 0, the firmware did not use `overrides/`: run
+   `make clean` and build again.
 5. Fly with and without the correction: the parameter `uwbBias.enable` is 1 or 0.
 
-Before you fly: the correction was tested in emulation and on recorded flights. It was not flown.
+Before you fly: the C of the correction was tested in emulation. This build was not flown.
 """
 
 
