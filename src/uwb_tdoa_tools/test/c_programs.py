@@ -40,7 +40,8 @@ RESULT = np.dtype(
         ("curved", np.float32),
     ]
 )
-COST = np.dtype([(name, np.uint32) for name in ("ticks", "ticks_jacobian", "stack", "cases")])
+COUNTS = "ticks", "most", "ticks_jacobian", "stack", "cases"
+COST = np.dtype([(name, np.uint32) for name in COUNTS])
 
 RNG = np.random.default_rng(7)
 POSITIONS = np.round(
@@ -156,6 +157,12 @@ def samples_of(some):
     )
 
 
+def missing():
+    """Executables that `cost_of` needs and that are not installed."""
+    needed = {"gcc": GCC, "arm-none-eabi-gcc": ARM_GCC, "qemu-system-arm": QEMU}
+    return [name for name, path in needed.items() if path is None]
+
+
 def _libm(name):
     function = getattr(ctypes.CDLL("libm.so.6"), name)
     function.restype = ctypes.c_float
@@ -240,8 +247,9 @@ def _size(folder, name):
 
 
 def cost_of(folder, code, n=320):
-    """What a correction costs on the board, dict: instructions per TDOA and per Jacobian (jacobian),
-    bytes of flash of the correction alone (own) and with what it needs of libm (flash), and of RAM.
+    """What a correction costs on the board, dict: instructions per TDOA, their mean and the most, and
+    per Jacobian; bytes of flash of the correction alone (own) and with what it needs of libm (flash),
+    and of RAM.
     """
     write(folder, code)
     whole = linked(folder, (*FIRMWARE, "-DWITHOUT_JACOBIAN"), "without.elf")
@@ -256,6 +264,7 @@ def cost_of(folder, code, n=320):
     per_case = 1e9 / CLOCK / cost["cases"][0]
     return {
         "instructions": float(cost["ticks"][0] * per_case),
+        "most": float(cost["most"][0] * 1e9 / CLOCK),
         "jacobian": float(cost["ticks_jacobian"][0] * per_case),
         "own": own,
         "flash": whole - empty,

@@ -13,7 +13,7 @@ typedef struct {
 } test_result;
 
 typedef struct {
-    uint32_t ticks, ticks_jacobian, stack, cases; /* of uwb_bias, of the Jacobian, bytes */
+    uint32_t ticks, most, ticks_jacobian, stack, cases; /* of uwb_bias, of the Jacobian, bytes */
 } test_cost;
 
 enum { BLOCK = 32 };
@@ -22,18 +22,20 @@ static test_case cases[BLOCK];
 static test_result results[BLOCK];
 
 int main(void) {
-    test_cost cost = {0, 0, 0, 0};
+    test_cost cost = {0, 0, 0, 0, 0};
     const int from = board_open("cases.bin", 0), to = board_open("results.bin", 1);
     size_t n;
     while ((n = board_read(from, cases, sizeof cases) / sizeof *cases) > 0) {
         board_stack_fill();
-        board_timer_start();
         for (size_t k = 0; k < n; k++) {
             test_result *one = &results[k];
+            board_timer_start();
             one->wrong =
                 uwb_bias(cases[k].a, cases[k].b, &cases[k].state, &one->bias, &one->std);
+            const uint32_t ticks = board_timer_ticks();
+            cost.ticks += ticks;
+            if (ticks > cost.most) cost.most = ticks;
         }
-        cost.ticks += board_timer_ticks();
         if (board_stack_used() > cost.stack) cost.stack = (uint32_t)board_stack_used();
 #ifndef WITHOUT_JACOBIAN
         board_timer_start();
