@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
     from .vehicle import VehicleCode
 
+LARGEST_ID = 255  # of an anchor in the firmware
+
 MAKEFILE = """\
 # make CRAZYFLIE_BASE=/path/to/crazyflie-firmware
 CRAZYFLIE_BASE ?= ../crazyflie-firmware
