@@ -330,7 +330,10 @@ def _filter_of(task: Task, place: np.ndarray, yaw: float) -> OwnFilter | PeerFil
     known: dict[str, Any] = (
         {"initial_yaw": yaw, "initial_yaw_std": GIVEN_STD} if task.yaw == "known" else {}
     )
-    return OwnFilter(anchors, replace(task.config, **known), task.effects, load_network(task.model))
+    model = load_network(task.model)
+    if model is not None:
+        model.require(anchors)
+    return OwnFilter(anchors, replace(task.config, **known), task.effects, model)
 
 
 def _silence_start(
