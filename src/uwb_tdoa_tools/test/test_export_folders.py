@@ -1,5 +1,7 @@
 """The folders that export writes in C, and what it leaves out of them."""
 
+from dataclasses import replace
+
 import c_programs as c
 from c_programs import ANCHORS, GCC, cases, chosen, on_host
 import numpy as np
@@ -8,6 +10,7 @@ import pytest
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
+from uwb_tdoa_tools.commands import export
 from uwb_tdoa_tools.exporting.correction import trace
 from uwb_tdoa_tools.exporting.folders import write_c, write_crazyflie
 
@@ -70,3 +73,38 @@ def test_names_in_a_file_do_not_end_its_comment(tmp_path):
     network.name = "*/ int x; /*"
     write_c(tmp_path / "c", trace(ANCHORS, None, network))
     assert "*/ int x" not in texts(tmp_path / "c")["uwb_bias.h"]
+
+
+@pytest.mark.skipif(GCC is None, reason="no C compiler (gcc)")
+def test_one_command_writes_all_targets(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    SMALL_IDS.to_yaml("anchors.yaml")
+    held = chosen("anchor_delay", "turning", "range_bias")
+    EffectSet((*held, EFFECTS["gyro_bias"]({"z": 0.01}))).to_yaml("effects.yaml")
+    options = "--survey anchors.yaml --effects effects.yaml --onnx bias.onnx --c c --crazyflie app"
+    assert export.main(options.split()) == 0
+    out, err = capsys.readouterr()
+    assert [line.rpartition(" ")[2] for line in out.splitlines()] == ["bias.onnx", "c", "app"]
+    assert "gyro_bias is left out" in err and "app: " in err and "turning_rate" in err
+    some = cases(50)
+    some["a"], some["b"] = (ANCHORS.index(some[end]) for end in "ab")
+    results = on_host(tmp_path / "c", some)
+    samples = c.samples_of(_with_ids(some))
+    expected = EffectSet.from_yaml("effects.yaml").where(lambda one: "tdoa" in one.channels)
+    samples = replace(samples, anchors=SMALL_IDS)
+    np.testing.assert_allclose(results["bias"], expected.bias(samples), atol=1e-5)
+
+
+def _with_ids(some):
+    """The cases with the ids of ANCHORS for rows."""
+    out = some.copy()
+    for end in "ab":
+        out[end] = ANCHORS.ids[some[end]]
+    return out
+
+
+def test_a_target_must_be_named(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    SMALL_IDS.to_yaml("anchors.yaml")
+    assert export.main(["--survey", "anchors.yaml", "--effects", "effects.yaml"]) == 2
+    assert "--onnx, --c, --crazyflie: all are missing" in capsys.readouterr().err

@@ -218,7 +218,7 @@ def test_the_command_writes_the_file_and_says_what_it_left_out(desk, capsys):
     "options, said",
     [
         ("--onnx bias.onnx", "--effects: is missing, and so is --model"),
-        ("--effects effects.yaml", "--onnx: is missing"),
+        ("--effects effects.yaml", "--onnx, --c, --crazyflie: all are missing"),
         ("--effects inert.yaml --onnx bias.onnx", "effects: nothing can be exported. gyro_bias"),
         ("--model other.onnx --onnx bias.onnx", "is an exported correction already"),
     ],

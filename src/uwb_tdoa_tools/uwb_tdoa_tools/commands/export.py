@@ -10,7 +10,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.effects import EffectSet
 
 from .. import cli, options
-from ..outputs import OutputFile
+from ..outputs import OutputFile, OutputFolder
 from ..parallel import Progress
 from ..readers import read_survey
 
@@ -30,6 +30,8 @@ def parser() -> ArgumentParser:
         "describes the files.",
         "export --survey anchors.yaml --effects effects.yaml --onnx bias.onnx",
         "export --survey anchors.yaml --effects effects.yaml --model model.onnx --onnx bias.onnx",
+        "export --survey anchors.yaml --effects effects.yaml --c correction/",
+        "export --survey anchors.yaml --effects effects.yaml --crazyflie crazyflie/",
         "evaluate flight.bag --survey anchors.yaml --model bias.onnx",
     )
     add = made.add_argument
@@ -37,26 +39,42 @@ def parser() -> ArgumentParser:
     add("--effects", metavar="FILE", help="effects.yaml, as diagnose, calibrate or train writes it")
     add("--model", metavar="FILE", help="ONNX bias network, as train writes it")
     add("--onnx", metavar="FILE", type=OutputFile, help="write the correction as an ONNX file")
+    add("--c", metavar="DIR", type=OutputFolder, help="write it as C99: uwb_bias.h and uwb_bias.c")
+    add(
+        "--crazyflie",
+        metavar="DIR",
+        type=OutputFolder,
+        help="write it as an out-of-tree build of the Crazyflie firmware",
+    )
     return made
 
 
 def _export(args: Namespace) -> None:
     if not (args.effects or args.model):
         raise InputError("--effects: is missing, and so is --model; give one of them, or both.")
-    if not args.onnx:
-        raise InputError("--onnx: is missing; name the file to write.")
-    from ..exporting.onnx_file import write_onnx  # imports onnx
+    if not (args.onnx or args.c or args.crazyflie):
+        raise InputError("--onnx, --c, --crazyflie: all are missing; name what to write.")
+    from ..exporting.correction import trace
+    from ..exporting.folders import write_c, write_crazyflie  # imports onnx
+    from ..exporting.onnx_file import write_onnx
 
     say = partial(cli.say, "export")
     anchors = read_survey(args.survey)
     effects = EffectSet.from_yaml(args.effects) if args.effects else None
     model = options.model_of(args, effects, say)
+    given = anchors, effects, model
     with Progress("export", what="writing the equations"):
-        traced = write_onnx(args.onnx, anchors, effects, model)
+        traced = write_onnx(args.onnx, *given) if args.onnx else trace(*given)
+        if args.c:
+            write_c(args.c, traced)
+        not_flown = write_crazyflie(args.crazyflie, traced) if args.crazyflie else ()
     for omitted in traced.left_out:
         say(str(omitted))
+    for omitted in not_flown:
+        say(f"{args.crazyflie}: {omitted}")
     name = traced.meta()["name"]
-    cli.show(f"{name} for {len(anchors)} anchors in frame {anchors.frame} -> {args.onnx}")
+    for made in filter(None, (args.onnx, args.c, args.crazyflie)):
+        cli.show(f"{name} for {len(anchors)} anchors in frame {anchors.frame} -> {made}")
 
 
 main = cli.executable(_export, parser)
