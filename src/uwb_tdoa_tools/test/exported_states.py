@@ -1,9 +1,9 @@
 """Random states of a tag, every effect that a file can hold, and networks of the paper's shape."""
 
+from known_effects import SIZES, effect_of
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from known_effects import SIZES, effect_of
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.correction.features import FEATURES
 from uwb_tdoa_bias.correction.network import Network

@@ -16,8 +16,8 @@ import time
 import numpy as np
 import pytest
 
-from uwb_tdoa_tools import command_lines
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
+from uwb_tdoa_tools import command_lines
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.rooms import corners

@@ -30,7 +30,6 @@ def parser() -> ArgumentParser:
         "describes the files.",
         "export --survey anchors.yaml --effects effects.yaml --onnx bias.onnx",
         "export --survey anchors.yaml --effects effects.yaml --model model.onnx --onnx bias.onnx",
-        "evaluate flight.bag --survey anchors.yaml --model bias.onnx",
     )
     add = made.add_argument
     add("--survey", metavar="S", required=True, help="anchors .yaml or survey (.txt, .csv)")
