@@ -9,7 +9,7 @@ import pytest
 
 onnx = pytest.importorskip("onnx")
 
-from exported_states import anchors_of, exportable, network_of, states  # noqa: E402
+from exported_states import anchors_of, exportable, network_of, states, term  # noqa: E402
 from known_effects import SIZES, effect_of  # noqa: E402
 
 from uwb_tdoa_bias.common.anchors import Anchors  # noqa: E402
@@ -26,9 +26,9 @@ from uwb_tdoa_bias.effects.effect_set import REACH  # noqa: E402
 from uwb_tdoa_bias.effects.samples import Motion  # noqa: E402
 from uwb_tdoa_tools.commands import export  # noqa: E402
 from uwb_tdoa_tools.estimate import with_antenna  # noqa: E402
-from uwb_tdoa_tools.exporting.correction import is_traceable  # noqa: E402
+from uwb_tdoa_tools.exporting.correction import is_traceable, trace  # noqa: E402
 from uwb_tdoa_tools.exporting.left_out import left_out  # noqa: E402
-from uwb_tdoa_tools.exporting.onnx_file import write_onnx  # noqa: E402
+from uwb_tdoa_tools.exporting.onnx_file import printed, write_onnx  # noqa: E402
 from uwb_tdoa_tools.training.network import FEATURES, WITHOUT  # noqa: E402
 
 EQUAL = 1e-4  # m
@@ -38,7 +38,7 @@ EFFECTS = exportable(ANCHORS)
 
 def exported(path, effects, network=None):
     """The ExportedCorrection of a file that is written for ANCHORS."""
-    write_onnx(path, ANCHORS, effects, network)
+    path.write_bytes(printed(trace(ANCHORS, effects, network)).SerializeToString())
     return ExportedCorrection(path, Session(path.read_bytes()))
 
 
@@ -187,6 +187,25 @@ def test_every_declared_effect_is_exported_or_left_out():
         if not is_traceable(effect):
             omitted = left_out(effect, ANCHORS)
             assert omitted.why and np.isfinite(omitted.worth), name
+
+
+def test_a_file_that_no_node_would_load_is_not_written(tmp_path):
+    many = EffectSet(tuple(EFFECTS.values()))
+    with pytest.raises(InputError, match="more than 2000 operators.*; export fewer effects"):
+        write_onnx(tmp_path / "bias.onnx", ANCHORS, many)
+    assert not (tmp_path / "bias.onnx").exists()
+
+
+def test_a_hall_of_many_anchors_fits(tmp_path):
+    """Its constants grow with the number of anchors, not of pairs, where effects are of anchors."""
+    hall, path = anchors_of(100), tmp_path / "bias.onnx"
+    effects = EffectSet((term(hall, "range", "anchor"), term(hall, "elevation_in_tag", "anchor")))
+    write_onnx(path, hall, effects)
+    assert path.stat().st_size < 4e5
+    samples = states(hall, 1000)
+    expected = Corrector(hall, effects).prediction(samples)
+    found = Corrector(hall, None, load_network(path)).prediction(samples)
+    np.testing.assert_allclose(found.bias, expected.bias, rtol=0.0, atol=EQUAL)
 
 
 # --- the command ---

@@ -32,7 +32,6 @@ def parser() -> ArgumentParser:
         "export --survey anchors.yaml --effects effects.yaml --model model.onnx --onnx bias.onnx",
         "export --survey anchors.yaml --effects effects.yaml --c correction/",
         "export --survey anchors.yaml --effects effects.yaml --crazyflie crazyflie/",
-        "evaluate flight.bag --survey anchors.yaml --model bias.onnx",
     )
     add = made.add_argument
     add("--survey", metavar="S", required=True, help="anchors .yaml or survey (.txt, .csv)")

@@ -1,11 +1,11 @@
-"""Node, an operation in the graph of a correction, and its evaluation in numpy.
+"""Node, an operation in the graph of a correction.
 
 A node is an array per TDOA: its `shape` has no axis of TDOAs. Printers translate these kinds; all
 have the meaning of numpy, NaN included.
 
 input     one column of the input table; `value` is its name, the shape is ()
 constant  `value` is (1, *shape), or (N * N, *shape) with one array for each pair of anchors; the
-          pair in rows a and b of the anchors has row a * N + b. See `table`.
+          pair in rows a and b of the anchors has row a * N + b
 pick      elements of its inputs: all inputs are flattened and joined, and `value`, an integer
           array of the result's shape, says which element stands where. This is the only structural
           kind: columns, stacks, concatenations and reshapes are all picks.
@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
 ELEMENTWISE: dict[str, Callable[..., Any]] = {
     "neg": np.negative,
@@ -202,57 +202,6 @@ def ordered(outputs: Sequence[Node]) -> tuple[list[Node], list[Node]]:
             known[key] = Node(node.kind, inputs, node.shape, node.value, node.is_bool)
         merged[id(node)] = known[key]
     return list(known.values()), [merged[id(one)] for one in outputs]
-
-
-def table(node: Node, count: int) -> tuple[str, np.ndarray]:
-    """Return what a constant depends on, and its values.
-
-    count : N, number of anchors
-
-    Returns ("", (*shape)), ("a" or "b", (N, *shape)) for one of the anchors, or
-    ("ab", (N, N, *shape)).
-    """
-    if len(node.value) == 1:
-        return "", node.value[0]
-    value = node.value.reshape(count, count, *node.shape)
-    if _equal(value, value[:, :1]):
-        return "a", value[:, 0]
-    if _equal(value, value[:1]):
-        return "b", value[0]
-    return "ab", value
-
-
-def evaluate(
-    outputs: Sequence[Node],
-    columns: Mapping[str, np.ndarray],
-    pairs: np.ndarray,
-    kind: type[np.floating] = np.float32,
-) -> list[np.ndarray]:
-    """Return the values of outputs, each (n, *shape), in numpy and one precision.
-
-    columns : {name of an input: (n,)}; pairs : (n,), row a * N + b of the constants
-    """
-    nodes, outputs = ordered(outputs)
-    made: dict[int, np.ndarray] = {}
-    with np.errstate(all="ignore"):
-        for node in nodes:
-            inputs = [made[id(one)] for one in node.inputs]
-            value: Any
-            if node.kind == "input":
-                value = columns[node.value]
-            elif node.kind == "constant":
-                value = node.value[pairs if len(node.value) > 1 else np.zeros_like(pairs)]
-            elif node.kind == "pick":
-                flat = [one.reshape(len(pairs), -1) for one in inputs]
-                value = np.concatenate(flat, axis=1)[:, node.value]
-            elif node.kind == "sum":
-                value = inputs[0].sum(axis=-1)
-            elif node.kind == "network":
-                value = node.value.run(inputs[0])
-            else:
-                value = ELEMENTWISE[node.kind](*inputs)
-            made[id(node)] = value if node.is_bool else value.astype(kind)
-    return [made[id(node)] for node in outputs]
 
 
 def _with_axes(node: Node, axes: int) -> Node:

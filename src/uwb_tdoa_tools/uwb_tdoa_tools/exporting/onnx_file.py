@@ -7,11 +7,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from onnx import load_model_from_string
 
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_bytes
+from uwb_tdoa_bias.common.limits import MODEL_BYTES
 from uwb_tdoa_bias.correction.exported import INPUTS, OUTPUTS
+from uwb_tdoa_bias.correction.trial import Unplayable, tried_out
 
 from .correction import TracedCorrection, trace
-from .graph import Node, ordered, table
+from .graph import Node, ordered
 from .onnx_graph import GraphBuilder
 
 if TYPE_CHECKING:
@@ -57,16 +60,37 @@ def write_onnx(
 ) -> TracedCorrection:
     """Write the correction of some Anchors as an ONNX file, and return what it holds.
 
-    Raises InputError if the file cannot be written or the correction cannot be traced.
+    Raises InputError if the correction cannot be traced, or if no node would load the file.
     """
     traced = trace(anchors, effects, network)
-    write_bytes(path, printed(traced).SerializeToString())
+    content = printed(traced).SerializeToString()
+    _try_out(content)
+    write_bytes(path, content)
     return traced
+
+
+def _try_out(content: bytes) -> None:
+    """Raise InputError unless the content of a file passes the trial of all models."""
+    try:
+        if len(content) > MODEL_BYTES:
+            raise Unplayable(f"it has {len(content)} bytes, more than {MODEL_BYTES}")
+        tried_out(content)
+    except Unplayable as error:
+        raise InputError(
+            f"effects: no node would load this correction ({error}); export fewer effects, or the "
+            "anchors of one area."
+        ) from error
 
 
 def printed(traced: TracedCorrection) -> ModelProto:
     """Return the ONNX model of a TracedCorrection, checked by onnx."""
     return _Printer(traced).model()
+
+
+def _is_constant(table: np.ndarray, some: np.ndarray) -> np.ndarray:
+    """Return which columns of a table (N, N, k) are `some` in all rows, (k,)."""
+    same = (table == some) | (np.isnan(table) & np.isnan(some))
+    return np.asarray(same.all(axis=(0, 1)))
 
 
 class _Printer:
@@ -76,7 +100,6 @@ class _Printer:
         self._traced, self._count = traced, len(traced.anchors)
         self._graph = GraphBuilder("state", "correction")
         self._names: dict[int, str] = {}
-        self._tables: dict[int, tuple[str, np.ndarray]] = {}  # constants by rows of anchors
 
     def model(self) -> ModelProto:
         graph, outputs = self._graph, self._traced.outputs
@@ -98,46 +121,51 @@ class _Printer:
             graph.op("Equal", graph.take(graph.input, [COLUMN[name]]), ids[None])
             for name in ("anchor_a", "anchor_b")
         )
-        hits = {"a": graph.op("Where", one, [1.0], [0.0])}
-        hits["b"] = graph.op("Where", other, [1.0], [0.0])
-        by_kind: dict[str, list[Node]] = {"a": [], "b": [], "ab": []}
-        values: dict[str, list[np.ndarray]] = {"a": [], "b": [], "ab": []}
-        for node in nodes:
-            if node.kind != "constant":
-                continue
-            kind, value = table(node, self._count)
-            if not kind:
-                continue
-            by_kind[kind].append(node)
-            values[kind].append(value.reshape(self._count ** len(kind), -1).astype(float))
-        if by_kind["ab"]:
-            first = graph.reshaped(hits["a"], 0, self._count, 1)
-            second = graph.reshaped(hits["b"], 0, 1, self._count)
-            hits["ab"] = graph.reshaped(graph.op("Mul", first, second), 0, self._count**2)
-        for kind, some in by_kind.items():
-            if some:
-                self._look_up(hits[kind], some, np.concatenate(values[kind], axis=1))
-        found = graph.op("Mul", graph.row_sum(hits["a"]), graph.row_sum(hits["b"]))
-        same = graph.row_sum(graph.op("Mul", hits["a"], hits["b"]))
+        hits_a = graph.op("Where", one, [1.0], [0.0])
+        hits_b = graph.op("Where", other, [1.0], [0.0])
+        constants = [node for node in nodes if node.kind == "constant" and len(node.value) > 1]
+        if constants:
+            self._name_constants(constants, hits_a, hits_b)
+        found = graph.op("Mul", graph.row_sum(hits_a), graph.row_sum(hits_b))
+        same = graph.row_sum(graph.op("Mul", hits_a, hits_b))
         return graph.op("Less", [0.5], graph.op("Sub", found, same))
 
-    def _look_up(self, hits: str, nodes: list[Node], values: np.ndarray) -> None:
-        """Name constants by the rows of anchors.
+    def _name_constants(self, nodes: list[Node], hits_a: str, hits_b: str) -> None:
+        """Name the constants that depend on the anchors: each number has a row for one or both."""
+        graph, count = self._graph, self._count
+        values = [node.value.reshape(count, count, -1).astype(float) for node in nodes]
+        table = np.concatenate(values, axis=2)
+        of_a = _is_constant(table, table[:, :1])
+        of_b = _is_constant(table, table[:1]) & ~of_a
+        of_both = ~(of_a | of_b)
+        rows = [self._look_up(hits_a, table[:, 0, of_a])] if of_a.any() else []
+        rows += [self._look_up(hits_b, table[0][:, of_b])] if of_b.any() else []
+        if of_both.any():
+            first = graph.reshaped(hits_a, 0, count, 1)
+            second = graph.reshaped(hits_b, 0, 1, count)
+            hits = graph.reshaped(graph.op("Mul", first, second), 0, count**2)
+            rows += [self._look_up(hits, table[:, :, of_both].reshape(count**2, -1))]
+        joined = graph.op("Concat", *rows, axis=1) if len(rows) > 1 else rows[0]
+        columns = np.concatenate([np.flatnonzero(kind) for kind in (of_a, of_b, of_both)])
+        place = np.argsort(columns)
+        for node in nodes:
+            mine, place = place[: node.size], place[node.size :]
+            name = graph.take(joined, mine.tolist())
+            name = graph.op("Less", [0.5], name) if node.is_bool else name
+            self._names[id(node)] = self._shaped(name, node.shape, (node.size,))
+
+    def _look_up(self, hits: str, values: np.ndarray) -> str:
+        """Return the row of a table that `hits` has a 1 for.
 
         A sum over all rows, of which one counts, needs no index that could be wrong. A sum takes no
         NaN: these are put in afterwards.
         """
         graph, unknown = self._graph, np.isnan(values)
         rows = graph.op("MatMul", hits, np.where(unknown, 0.0, values))
-        if unknown.any():
-            missing = graph.op("Less", [0.5], graph.op("MatMul", hits, unknown.astype(float)))
-            rows = graph.op("Where", missing, [np.nan], rows)
-        first = 0
-        for node in nodes:
-            name = graph.take(rows, range(first, first + node.size))
-            name = graph.op("Less", [0.5], name) if node.is_bool else name
-            self._names[id(node)] = self._shaped(name, node.shape, (node.size,))
-            first += node.size
+        if not unknown.any():
+            return rows
+        missing = graph.op("Less", [0.5], graph.op("MatMul", hits, unknown.astype(float)))
+        return graph.op("Where", missing, [np.nan], rows)
 
     def _print(self, node: Node) -> str:
         graph = self._graph
