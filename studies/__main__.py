@@ -27,6 +27,7 @@ from studies import (
     surveying,
     two_errors,
     two_machines,
+    vehicle_code,
     warehouse,
 )
 from studies.bench import soak, suite
@@ -81,6 +82,7 @@ STUDIES = {
     "surveying": surveying,
     "two-errors": two_errors,
     "two-machines": two_machines,
+    "vehicle-code": vehicle_code,
     "warehouse": warehouse,
 }
 DESCRIPTION = """Make the figures of the documentation anew. Nothing here is needed to use the suite. DATA is a folder
@@ -124,6 +126,7 @@ of measured flights: flights/, util/, surveys/.
   surveying        surveys shaken, and made better from flights alone (docs/calibration.md)
   two-errors       vibration that is rectified, and late anchors near the floor (docs/measured.md)
   two-machines     who hears whom on two machines, takes root (docs/ros.md)
+  vehicle-code     what exported C costs on an emulated Cortex-M4F (docs/export.md)
   warehouse        starts, slow tags and walks in halls, and their cost (docs/warehouse.md)
 """
 
@@ -145,6 +148,7 @@ def parser():
         "./dev study monitor DATA --days 0426 0607",
         "./dev study two-errors DATA",
         "./dev study two-machines",
+        "./dev study vehicle-code",
         './dev study warehouse --only "ten minutes" --seeds 20',
         "./dev study aids worth DATA/flights/0425 --survey DATA/surveys",
         "./dev study bench --json bench.json",

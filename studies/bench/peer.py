@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
+import math
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools.flying.estimates import Peer, events
+from uwb_tdoa_tools.scoring.alignment import require_truth
+from uwb_tdoa_tools.scoring.metrics import position_at, rms, scored_phase
 
 from .core import BEFORE, MEASURED, RARELY, Core, sample_before
 from .figures import Figure
 from .flights import make_flight
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
 
     from uwb_tdoa_bias.common.flight import Flight
+    from uwb_tdoa_tools.flying.exported import ExportedCorrection
 
 REPEATS = 41
+SAMPLED = 0.01  # s, from one position of a peer to the next
 
 
 def events_of(flight: Flight, begin: float, end: float) -> tuple[np.ndarray, np.ndarray]:
@@ -46,7 +52,7 @@ def measure(progress: Callable[[str], object], peer: Peer, quick: bool = False) 
     first = int(np.searchsorted(truth.t, begin))
 
     def timed(events: np.ndarray) -> float:
-        peer.start(flight.anchors.positions, truth.p[first], truth.q[first])
+        peer.start(flight.anchors, truth.p[first], truth.q[first])
         return peer.run(events)
 
     seconds = np.array(
@@ -68,6 +74,58 @@ def measure(progress: Callable[[str], object], peer: Peer, quick: bool = False) 
         yield Figure.of(section, f"{name}, the other's", "us", other)
         yield Figure.of(section, f"{name}, ours over the other's", "ratio", one / other)
     yield Figure.of(section, "the other's position at the end, off by", "m", off)
+
+
+def errors(
+    flights: Iterable[Flight], library: str, correction: ExportedCorrection | None
+) -> Iterator[Figure]:
+    """Generator of Figures: the 3D RMSE of a peer on Flights with ground truth, m.
+
+    correction : beside the errors with it, those without it and the change are given
+    """
+    ways = {"as it is": None} | ({"corrected": correction} if correction is not None else {})
+    section = f"3D RMSE of {Path(library).name} on measured flights"
+    found: dict[str, list[float]] = {way: [] for way in ways}
+    for flight in flights:
+        for way, known in ways.items():
+            found[way].append(rmse(flight, Peer(library, own=True, correction=known)))
+            yield Figure.of(section, f"{flight.name}, {way}", "m", found[way][-1])
+    if not found["as it is"]:
+        return
+    for way, some in found.items():
+        yield Figure.of(section, f"mean, {way}", "m", np.mean(some))
+    if correction is not None:
+        ratios = np.array(found["corrected"]) / found["as it is"]
+        yield Figure.of(section, "corrected, over as it is: the flights", "ratio", ratios)
+        yield Figure.of(section, "corrected, over as it is: the worst", "ratio", ratios.max())
+
+
+def rmse(flight: Flight, peer: Peer) -> float:
+    """3D RMSE of a peer that starts at the true pose of a Flight, m; where the flight is scored."""
+    require_truth(flight)
+    assert flight.imu is not None and flight.truth is not None
+    truth = flight.truth
+    _, first, last = scored_phase(truth)
+    parts = events(flight.imu, flight.tdoa, flight.anchors)
+    both = np.concatenate(parts)
+    both = both[np.isfinite(both["d"]) & (both["t"] >= truth.t[0])]
+    both = both[np.argsort(both["t"], kind="stable")]
+    peer.start(flight.anchors, truth.p[0], _level(truth.q[0]))
+    t = np.arange(both["t"][0], both["t"][-1], SAMPLED)
+    p = np.empty((len(t), 3))
+    for k, some in enumerate(np.split(both, np.searchsorted(both["t"], t[1:]))):
+        peer.run(some)
+        p[k] = peer.position()
+    t = t + SAMPLED  # when the events of a slice are over
+    inside = (t >= first) & (t <= last)
+    return float(rms(np.linalg.norm(p[inside] - position_at(t[inside], truth), axis=1)))
+
+
+def _level(q: np.ndarray) -> np.ndarray:
+    """The attitude (4,) with the yaw of q, level; yaw 0 if it is unknown."""
+    yaw = math.atan2(2.0 * (q[0] * q[1] + q[2] * q[3]), 1.0 - 2.0 * (q[1] ** 2 + q[2] ** 2))
+    yaw = yaw if math.isfinite(yaw) else 0.0
+    return np.array([0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw)])
 
 
 def _per_event(

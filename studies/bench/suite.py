@@ -7,11 +7,14 @@ nodes : time to ready, CPU, memory, latency and losses of both nodes at 1 kHz IM
 tags : the same for 1 to 8 tags, and for 30 and 60 at 100 Hz, in localization_nodes; all tags hear
 the same streams.
 hall : the same for a tag that hears 8 of 8, 1000 and 10 000 installed anchors.
+peer : another filter beside ours, with --peer alone.
 replay : how fast a bag goes through both nodes without loss.
 graph : how long parameters, a told pose and a clock that stops wait while streams, /clock and /tf
 flow; idle CPU.
 
 With --peer, another filter runs over the same events in turn with ours, and the ratio is printed.
+With --peer and --flights, it also runs over measured flights, and its errors are printed: as they
+are, and with --correction, a folder of export --c, too. It starts at the true pose.
 Real nodes run in a ROS domain of their own. Other work on the machine changes the figures, above all
 the latencies; the study prints how much processor time others used. To keep others away:
 sudo -E env PATH=$PATH chrt --fifo 10 ./dev study bench --only nodes tags
@@ -28,9 +31,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm import tqdm
 
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_tools import cli
 from uwb_tdoa_tools.flying.estimates import Peer
+from uwb_tdoa_tools.flying.exported import ExportedCorrection
 from uwb_tdoa_tools.outputs import OutputFile, OutputFolder
+from uwb_tdoa_tools.readers import inputs
 
 from . import core, graph, nodes, peer, rates, recordings
 from .figures import as_json, table
@@ -42,7 +48,7 @@ if TYPE_CHECKING:
 
     from .figures import Figure
 
-PARTS = ("core", "offline", "nodes", "tags", "hall", "replay", "graph")
+PARTS = ("core", "offline", "nodes", "tags", "hall", "replay", "graph", "peer")
 
 
 def add_options(add: Callable[..., object]) -> None:
@@ -59,6 +65,13 @@ def add_options(add: Callable[..., object]) -> None:
     add("--model", metavar="FILE", help="ONNX bias network whose figures offline prints, too")
     peer_help = "measure this shared library of another filter beside ours (docs/speed.md)"
     add("--peer", metavar="LIBRARY", help=peer_help)
+    add(
+        "--correction",
+        metavar="FOLDER",
+        help="correct the TDOAs of the peer by this folder of export --c (docs/export.md)",
+    )
+    add("--flights", nargs="+", default=[], metavar="FLIGHT", help=inputs.HELP)
+    add("--survey", metavar="S", help=inputs.SURVEY_HELP)
     out_help = "for the bags and the output of the nodes (default: out/bench)"
     add("--out", metavar="DIR", type=OutputFolder, default="out/bench", help=out_help)
     add("--json", metavar="FILE", type=OutputFile, help="write the machine and all figures")
@@ -66,7 +79,11 @@ def add_options(add: Callable[..., object]) -> None:
 
 def run(args: Namespace) -> None:
     """Measure, and print the table."""
-    other = None if args.peer is None else Peer(args.peer)
+    if args.peer is None and (args.correction is not None or args.flights):
+        raise InputError("--correction, --flights: are of another filter; give --peer, too.")
+    correction = None if args.correction is None else ExportedCorrection(args.correction)
+    other = None if args.peer is None else Peer(args.peer, correction=correction)
+    flights = inputs.Reading(args.survey).flights(args.flights) if args.flights else ()
     machine, figures = measure(args.only, args.out, args.quick, args.model, other)
     cli.show(
         f"{machine['cpu']}, {machine['cores']} cores, Python {machine['python']}, numpy "
@@ -76,6 +93,8 @@ def run(args: Namespace) -> None:
         f"meanwhile others used {machine['others']:.0%} of its CPU time, its host "
         f"{machine['stolen']:.0%}"
     )
+    if other is not None:
+        figures += peer.errors(flights, args.peer, correction)
     cli.show("\n".join(table(figures)))
     if args.json is not None:
         cli.write_json(args.json, {"machine": machine, "figures": as_json(figures)})

@@ -8,7 +8,10 @@ import time
 
 import numpy as np
 import pytest
-from test_flying_estimates import CC, built
+from test_flying_estimates import CC, built, exported
+
+from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
+from uwb_tdoa_bias.effects.anchor import AnchorDelay
 
 pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
@@ -17,6 +20,8 @@ from studies.bench import core, graph, nodes, peer, source, suite, usage  # noqa
 from studies.bench.figures import Figure, as_json, table  # noqa: E402
 from studies.bench.flights import TDOA_RATE, among, make_flight  # noqa: E402
 from uwb_tdoa_tools.flying.estimates import Peer  # noqa: E402
+from uwb_tdoa_tools.flying.exported import ExportedCorrection  # noqa: E402
+from uwb_tdoa_tools.flying.world import HALL  # noqa: E402
 
 OTHERS = 0.2  # of the CPU time, from which on nothing can be asked of what is played in real time
 LENIENT = 10.0  # times the target: on a loaded machine
@@ -239,7 +244,7 @@ def test_a_library_gets_the_events_of_a_flight_in_their_order(tmp_path):
     )
     assert set(both["t"]) == set(samples["t"])  # no prediction for a TDOA alone
     p, q = flight.truth.p[0], flight.truth.q[0]
-    other.start(flight.anchors.positions, p, q)
+    other.start(flight.anchors, p, q)
     assert other.run(both) > 0.0
     np.testing.assert_array_equal(other.position(), p)
     other.run(both[::-1].copy())  # it tells that this is nonsense
@@ -261,3 +266,42 @@ def test_both_are_measured_and_their_ratio(tmp_path):
     assert (
         value["the other's position at the end, off by"] > 0.1
     )  # this one stays where it is: how fast it is, is worth nothing
+
+
+# A peer whose height is its last TDOA.
+HEIGHT = """
+#include <stdint.h>
+typedef struct { double t, gyro[3], accel[3], d; int32_t a, b; } tdoa_peer_event;
+static double z;
+int32_t tdoa_peer_version(void) { return VERSION; }
+void tdoa_peer_start(const double *a, int32_t n, const double *p, const double *q) { z = p[2]; }
+void tdoa_peer_run(const tdoa_peer_event *e, int32_t n) {
+  for (; n--; e++) if (e->a >= 0) z = e->d;
+}
+void tdoa_peer_position(double *p) { p[0] = p[1] = 0; p[2] = z; }
+void tdoa_peer_state(double *p, double *v, double *q) {
+  for (int k = 0; k < 3; k++) p[k] = v[k] = q[k] = 0;
+  q[3] = 1;
+}
+"""
+
+
+@pytest.mark.skipif(CC is None, reason="no C compiler (cc)")
+def test_the_errors_of_a_peer_are_given_with_and_without_a_correction(tmp_path):
+    """The peer is 0.5 m off, which the correction takes out of every TDOA."""
+    t, n = np.arange(0.0, 5.0, 0.002), 2500
+    level = np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))
+    truth = Truth(t, np.tile([0.0, 0.0, 2.0], (n, 1)), level)
+    a, b = HALL.anchors.ids[:2]
+    tdoa = Tdoas(t, np.full(n, a), np.full(n, b), np.full(n, 2.5))
+    imu = Imu(t, np.zeros((n, 3)), np.tile([0.0, 0.0, 9.81], (n, 1)))
+    flight = Flight("still", HALL.anchors, tdoa, imu, truth)
+    correction = ExportedCorrection(exported(tmp_path / "c", AnchorDelay({str(b): 0.5})))
+    library = str(built(tmp_path, HEIGHT))
+    figures = {one.name: one.median for one in peer.errors([flight], library, correction)}
+    assert figures["still, as it is"] == pytest.approx(0.5, abs=1e-6)
+    assert figures["still, corrected"] == pytest.approx(0.0, abs=1e-6)
+    assert figures["mean, as it is"] == figures["still, as it is"]
+    assert figures["corrected, over as it is: the worst"] == pytest.approx(0.0, abs=1e-5)
+    alone = [one.name for one in peer.errors([flight], library, None)]
+    assert alone == ["still, as it is", "mean, as it is"]

@@ -19,6 +19,7 @@ from uwb_tdoa_bias.correction.corrector import (
 from uwb_tdoa_bias.correction.corrector import (
     Corrector as LateCorrector,
 )
+from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.correction.poses import known_yaw_std, parts_of, rotated_in_yaw
 from uwb_tdoa_bias.effects import EFFECTS as CATALOGUE
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm
@@ -29,7 +30,7 @@ DELAYS = EffectSet((AnchorDelay({4: 0.1, 6: -0.2}),))
 ARM = EffectSet((TagLeverArm({"z": 0.3}),))
 
 
-class Height:
+class Height(Network):
     """Stands in for a network: the bias is the height of the tag, unknown where there is no pose or
     z is above 2 m.
     """

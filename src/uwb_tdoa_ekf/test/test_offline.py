@@ -9,6 +9,7 @@ from scipy.stats import chi2
 
 from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas
 from uwb_tdoa_bias.correction.corrector import Corrector
+from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.correction.poses import known_yaw_std
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, SmoothTerm, TagLeverArm
 from uwb_tdoa_ekf.core.config import FilterConfig
@@ -68,12 +69,15 @@ def live(flight, corrector, config=None):
     )
 
 
-class Doubt:
+class Doubt(Network):
     """Stands in for a network that knows a bias and how sure it is of it, both depending on the
     pose.
     """
 
     name = "doubt"
+
+    def __init__(self):
+        pass
 
     def predict(self, samples):
         std = 0.05 + 0.02 * np.abs(samples.q[:, 2])

@@ -9,6 +9,10 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import Imu, Tdoas
+from uwb_tdoa_bias.effects import EffectSet, SmoothTerm
+from uwb_tdoa_bias.effects.anchor import AnchorClockDrift, AnchorDelay
+from uwb_tdoa_tools.exporting.vehicle import vehicle_code
 from uwb_tdoa_tools.flying import estimates
 from uwb_tdoa_tools.flying.mission import Circles
 from uwb_tdoa_tools.flying.trial import Task, fly
@@ -168,3 +172,86 @@ def test_the_stand_in_for_matrices_inverts_and_multiplies(tmp_path):
     out = np.zeros((9, 9), np.float32)
     ctypes.CDLL(str(library)).product(*(ctypes.c_void_p(x.ctypes.data) for x in (a, out)), 9)
     assert np.allclose(out, 2.0 * np.eye(9), atol=1e-4)
+
+
+RECORDS = """
+#include <stdint.h>
+typedef struct { double t, gyro[3], accel[3], d; int32_t a, b; } tdoa_peer_event;
+static double last; static int32_t samples, tdoas;
+int32_t tdoa_peer_version(void) { return VERSION; }
+void tdoa_peer_start(const double *a, int32_t n, const double *p, const double *q) {
+  (void)a; (void)n; (void)p; (void)q; samples = tdoas = 0;
+}
+void tdoa_peer_run(const tdoa_peer_event *e, int32_t n) {
+  for (; n--; e++) if (e->a < 0) samples++; else { tdoas++; last = e->d; }
+}
+void tdoa_peer_position(double *out) { out[0] = last; out[1] = samples; out[2] = tdoas; }
+"""
+
+
+def exported(folder, *effects):
+    """A folder as export --c writes it."""
+    folder.mkdir()
+    code = vehicle_code(HALL.anchors, EffectSet(effects))
+    (folder / "uwb_bias.h").write_text(code.header)
+    (folder / "uwb_bias.c").write_text(code.source)
+    return folder
+
+
+def test_an_exported_correction_reaches_each_tdoa_of_a_peer(tmp_path):
+    ids = HALL.anchors.ids
+    effects = AnchorDelay({str(ids[1]): 0.2}), AnchorClockDrift({str(ids[1]): 0.01})
+    correction = estimates.ExportedCorrection(exported(tmp_path / "c", *effects))
+    other = estimates.Peer(built(tmp_path, RECORDS + STATE_AT), correction=correction)
+    t, zeros = np.array([3.0, 5.0, 8.0]), np.zeros((3, 3))
+    imu = Imu(t - 0.5, zeros, zeros)
+    tdoa = Tdoas(t, np.full(3, ids[0]), np.array([ids[1], 999, ids[1]]), np.full(3, 1.0))
+    both = np.concatenate(estimates.events(imu, tdoa, HALL.anchors))
+    for _ in range(2):  # a start forgets the time of the first TDOA
+        other.start(HALL.anchors, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
+        other.run(both[np.argsort(both["t"], kind="stable")])
+        last, samples, tdoas = other.position()
+        assert (samples, tdoas) == (3, 2)  # of an unknown anchor nothing arrives
+        assert last == pytest.approx(1.0 - 0.2 - 0.01 * 5.0, abs=1e-6)
+
+
+STATE_AT = """
+void tdoa_peer_state(double *p, double *v, double *q) {
+  for (int k = 0; k < 3; k++) p[k] = v[k] = q[k] = 0.5;
+  q[3] = 0.5;
+}
+"""
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda folder: folder, "holds no uwb_bias.h; give a folder that export --c wrote"),
+        (
+            lambda folder: exported(
+                folder / "c", SmoothTerm({"c0": 0.1}, covariate="turning_rate", knots=(0.0, 1.0))
+            ),
+            "reads acceleration or rate",
+        ),
+    ],
+)
+def test_a_folder_that_cannot_correct_a_peer_is_named(tmp_path, make, words):
+    with pytest.raises(InputError, match=words):
+        estimates.ExportedCorrection(make(tmp_path))
+
+
+def test_a_correction_that_is_no_c_or_a_peer_without_a_state_is_named(tmp_path):
+    folder = exported(tmp_path / "c", AnchorDelay({"0": 0.1}))
+    with pytest.raises(InputError, match="does not export tdoa_peer_state"):
+        estimates.Peer(built(tmp_path), correction=estimates.ExportedCorrection(folder))
+    broken = exported(tmp_path / "broken")
+    (broken / "uwb_bias.c").write_text("no C")
+    with pytest.raises(InputError, match="cannot be compiled"):
+        estimates.ExportedCorrection(broken)
+
+
+def test_a_vehicle_flies_by_a_corrected_peer(tmp_path):
+    folder = exported(tmp_path / "c", AnchorDelay({str(HALL.anchors.ids[0]): 0.1}))
+    library = str(built(tmp_path, SOURCE + STATE))
+    task = Task(HALL, seed=2, given="place", peer=library, correction=str(folder))
+    assert verdict_of(fly(task))["landed"] is False  # it returns its start

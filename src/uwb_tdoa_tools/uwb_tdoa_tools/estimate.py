@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.correction.network import Network
+from uwb_tdoa_bias.correction.model import Model
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.tag import TagLeverArm
 from uwb_tdoa_ekf.core.config import FilterConfig
@@ -22,7 +22,7 @@ class FlightEstimator:
         Parameters of the filter.
     effects : EffectSet or None
         Effects to correct the TDOAs for.
-    network : Network or None
+    network : Model or None
         Bias network to correct the TDOAs with.
     smoothed : bool
         Use later measurements for each estimate too.
@@ -30,16 +30,15 @@ class FlightEstimator:
 
     config: FilterConfig | None = None
     effects: EffectSet | None = None
-    network: Network | None = None
+    network: Model | None = None
     smoothed: bool = False
 
     def __call__(self, flight: Flight) -> Run:
         engine = smooth if self.smoothed else run_offline
-        return engine(
-            flight,
-            self.config,
-            Corrector(flight.anchors, with_antenna(self.effects, flight), self.network),
-        )
+        if self.network:
+            self.network.require(flight.anchors)
+        effects = with_antenna(self.effects, flight, self.network)
+        return engine(flight, self.config, Corrector(flight.anchors, effects, self.network))
 
     @property
     def correction(self) -> str:
@@ -48,9 +47,15 @@ class FlightEstimator:
         return names or "nothing (neither effects nor a network are in use)"
 
 
-def with_antenna(effects: EffectSet | None, flight: Flight) -> EffectSet | None:
-    """Return the EffectSet; without a lever arm of the antenna, add that of the recording."""
+def with_antenna(
+    effects: EffectSet | None, flight: Flight, network: Model | None = None
+) -> EffectSet | None:
+    """Return the EffectSet; without a lever arm of the antenna, add that of the recording.
+
+    network : may hold the lever arm, too
+    """
     arm, known = flight.meta.get("antenna"), effects.effects if effects else ()
-    if not arm or not any(arm) or any(effect.name == TagLeverArm.name for effect in known):
+    names = (*(network.holds if network else ()), *(effect.name for effect in known))
+    if not arm or not any(arm) or TagLeverArm.name in names:
         return effects
     return EffectSet((*known, TagLeverArm(values=dict(zip("xyz", arm)))))

@@ -32,7 +32,8 @@ WITHOUT_INFLUENCE = (
     "record",
     "resume",
 )  # to what becomes of a flight
-NOT_OF_ROVERS = ("hover", "again", "peer", "aid")  # options
+NOT_OF_ROVERS = ("hover", "again", "peer", "correction", "aid")  # options
+INPUTS = ("config", "effects", "model", "peer", "correction")  # options that name files
 DESCRIPTION = """Fly a simulated quadrotor in closed loop, in lockstep and without ROS: its controller gets position, velocity and
 attitude from nothing but the estimate, by the very code of ekf_node, and its rates from the gyroscope. Four seconds at rest, up to
 1.2 m, two circles, down, land. The verdict is by ground truth alone.
@@ -155,6 +156,11 @@ def parser() -> argparse.ArgumentParser:
         metavar="LIBRARY",
         help="fly by this shared library of another filter (docs/flying.md), which gets its yaw",
     )
+    add(
+        "--correction",
+        metavar="FOLDER",
+        help="correct the TDOAs of the peer by this folder of export --c (docs/export.md)",
+    )
     parallel.add_options(made)
     add(
         "--at-least",
@@ -194,6 +200,10 @@ def _fly(args: argparse.Namespace) -> int:
             "need the flights themselves."
         )
     config, effects = options.filter_of(args)
+    if args.correction is not None and args.peer is None:
+        raise InputError(
+            "--correction: is of a peer; give --peer, or correct our filter by --model."
+        )
     load_network(args.model)  # or say what is wrong with it, before the first flight
     path: Circles | Waypoints = Circles(radius=0.0) if args.hover else Circles()
     aids = args.aid
@@ -216,14 +226,13 @@ def _fly(args: argparse.Namespace) -> int:
             args.model,
             args.again,
             args.peer,
+            args.correction,
             path,
         )
         for seed in seeds
     ]
     verdicts, pictures = [], []
-    with fleet.verdict_store(
-        args.resume, settings_of(args, WITHOUT_INFLUENCE, ("config", "effects", "model", "peer"))
-    ) as done:
+    with fleet.verdict_store(args.resume, settings_of(args, WITHOUT_INFLUENCE, INPUTS)) as done:
         for verdict, picture in fleet.fly_all(
             tasks, done, args.record, args.plot is not None, args.jobs, args.dask
         ):

@@ -38,6 +38,8 @@ from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.frames import poses_of
 from uwb_tdoa_ekf.results import Odometry, concatenated
 
+from .exported import ExportedCorrection
+
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -45,7 +47,7 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.common.anchors import Anchors
     from uwb_tdoa_bias.common.flight import Imu, Tdoas
-    from uwb_tdoa_bias.correction.network import Network
+    from uwb_tdoa_bias.correction.model import Model
     from uwb_tdoa_ekf.core.config import FilterConfig
 
     from .mission import Pose
@@ -75,7 +77,9 @@ class Peer:
         If the library cannot be loaded or has another interface.
     """
 
-    def __init__(self, path: str | Path, own: bool = False) -> None:
+    def __init__(
+        self, path: str | Path, own: bool = False, correction: ExportedCorrection | None = None
+    ) -> None:
         """Load the library.
 
         Parameters
@@ -83,6 +87,8 @@ class Peer:
         path : str or Path
         own : bool
             Load a copy, so that its static variables start with their initial values.
+        correction : ExportedCorrection, optional
+            Corrects each TDOA at the state of the peer. The library must export its state.
         """
         self.name = Path(path).name
         try:
@@ -104,7 +110,7 @@ class Peer:
                 f"--peer: {path} does not export {missing[0]}; add it as docs/speed.md shows."
             )
         self._version, self._start, self._run, self._position = functions.values()
-        self._state = getattr(library, "tdoa_peer_state", None)
+        self._state: Any = getattr(library, "tdoa_peer_state", None)
         self._version.restype = ctypes.c_int32
         version = self._version()
         if version != VERSION:
@@ -112,11 +118,16 @@ class Peer:
                 f"--peer: {path} is of version {version} of the interface, this is {VERSION}; "
                 "build it for that."
             )
+        self._correction = correction
+        if correction is not None:
+            self._require_state()
 
-    def start(self, anchors: np.ndarray, p: ArrayLike, q: ArrayLike) -> None:
-        """Restart at p (3,) m with attitude q (4,) x y z w, with anchors (n, 3) m."""
+    def start(self, anchors: Anchors, p: ArrayLike, q: ArrayLike) -> None:
+        """Restart at p (3,) m with attitude q (4,) x y z w."""
         # kept: the library may read them later
-        self._anchors = np.ascontiguousarray(anchors, dtype=float)
+        self._anchors = np.ascontiguousarray(anchors.positions, dtype=float)
+        if self._correction is not None:
+            self._correction.start(anchors.ids)
         self._start(
             _pointer(self._anchors),
             ctypes.c_int32(len(anchors)),
@@ -128,7 +139,10 @@ class Peer:
         """Process events (n,) of EVENT and return the duration, s."""
         data, count = _pointer(events), ctypes.c_int32(len(events))
         began = time.perf_counter()
-        self._run(data, count)
+        if self._correction is None:
+            self._run(data, count)
+        else:
+            self._correction.run(events, self._run, self._state)
         return time.perf_counter() - began
 
     def position(self) -> np.ndarray:
@@ -142,27 +156,28 @@ class Peer:
 
         Raises InputError if the library does not tell.
         """
+        self._require_state()
+        p, v, q = np.full(3, np.nan), np.full(3, np.nan), np.full(4, np.nan)
+        self._state(*map(_pointer, (p, v, q)))
+        return p, v, q
+
+    def _require_state(self) -> None:
         if self._state is None:
             raise InputError(
                 f"--peer: {self.name} does not export tdoa_peer_state; add it as "
                 "docs/speed.md shows."
             )
-        p, v, q = np.full(3, np.nan), np.full(3, np.nan), np.full(4, np.nan)
-        self._state(*map(_pointer, (p, v, q)))
-        return p, v, q
 
 
 def events(imu: Imu, tdoa: Tdoas, anchors: Anchors) -> tuple[np.ndarray, np.ndarray]:
     """Return the inertial samples and the TDOAs between known anchors as two arrays of EVENT."""
+    a, b = anchors.index(tdoa.a), anchors.index(tdoa.b)
+    known = (a >= 0) & (b >= 0)  # an event without an anchor would be an inertial sample
     samples: np.ndarray = np.zeros(len(imu), EVENT)
-    ranges: np.ndarray = np.zeros(len(tdoa), EVENT)
+    ranges: np.ndarray = np.zeros(int(known.sum()), EVENT)
     samples["t"], samples["gyro"], samples["accel"], samples["a"] = imu.t, imu.gyro, imu.accel, -1
-    ranges["t"], ranges["a"], ranges["b"], ranges["d"] = (
-        tdoa.t,
-        anchors.index(tdoa.a),
-        anchors.index(tdoa.b),
-        tdoa.d,
-    )
+    for name, values in (("t", tdoa.t), ("a", a), ("b", b), ("d", tdoa.d)):
+        ranges[name] = values[known]
     return samples, ranges
 
 
@@ -236,7 +251,7 @@ class OwnFilter:
         anchors: Anchors,
         config: FilterConfig,
         effects: EffectSet | None = None,
-        network: Network | None = None,
+        network: Model | None = None,
     ) -> None:
         """Set up the filter and its corrections.
 
@@ -245,7 +260,7 @@ class OwnFilter:
         anchors : Anchors
         config : FilterConfig
         effects : EffectSet, optional
-        network : Network, optional
+        network : Model, optional
             Corrections of the measurements.
         """
         effects = effects or EffectSet()
@@ -330,14 +345,19 @@ class OwnFilter:
 class PeerFilter:
     """Run a Peer as an estimate source.
 
-    It gets place and yaw at the start. It corrects no effects and gives no covariance.
+    It gets place and yaw at the start. It gives no covariance.
     """
 
     deviation = 0.0  # m; a peer gives none
     why = ""
 
     def __init__(
-        self, library: str | Path, anchors: Anchors, yaw: float, place: np.ndarray | None = None
+        self,
+        library: str | Path,
+        anchors: Anchors,
+        yaw: float,
+        place: np.ndarray | None = None,
+        correction: str | Path | None = None,
     ) -> None:
         """Load and start the peer.
 
@@ -349,15 +369,18 @@ class PeerFilter:
             rad.
         place : numpy.ndarray, optional
             (3,), m.
+        correction : str or Path, optional
+            Folder of an exported correction of the TDOAs.
 
         Raises
         ------
         InputError
-            If the library cannot be used.
+            If the library or the correction cannot be used.
         """
-        self._peer, self._anchors = Peer(library, own=True), anchors
+        known = None if correction is None else ExportedCorrection(correction)
+        self._peer, self._anchors = Peer(library, own=True, correction=known), anchors
         q = np.array([0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw)])
-        self._peer.start(anchors.positions, np.full(3, np.nan) if place is None else place, q)
+        self._peer.start(anchors, np.full(3, np.nan) if place is None else place, q)
         self._states: list[Pose] = []
         self._newest: Pose | None = None
 

@@ -61,6 +61,8 @@ class Task:
         Fly twice. The vehicle is carried by hand in between.
     peer : str, optional
         Path of a library to fly by instead of the own filter. Its yaw is always known.
+    correction : str, optional
+        Folder of an exported correction of the TDOAs of the peer.
     path : Circles or Waypoints
         Waypoints make the vehicle a rover.
     rules : Rules
@@ -75,6 +77,7 @@ class Task:
     model: str | None = None
     again: bool = False
     peer: str | None = None
+    correction: str | None = None
     path: Circles | Waypoints = Circles()
     rules: Rules = Rules()
 
@@ -322,11 +325,15 @@ def _filter_of(task: Task, place: np.ndarray, yaw: float) -> OwnFilter | PeerFil
     """Return the estimate source of a Task. `place` (3,) m and `yaw`, rad, are given if the task says so."""
     anchors = task.world.anchors
     if task.peer is not None:
-        return PeerFilter(task.peer, anchors, yaw, place if task.given == "place" else None)
+        given = place if task.given == "place" else None
+        return PeerFilter(task.peer, anchors, yaw, given, task.correction)
     known: dict[str, Any] = (
         {"initial_yaw": yaw, "initial_yaw_std": GIVEN_STD} if task.yaw == "known" else {}
     )
-    return OwnFilter(anchors, replace(task.config, **known), task.effects, load_network(task.model))
+    model = load_network(task.model)
+    if model is not None:
+        model.require(anchors)
+    return OwnFilter(anchors, replace(task.config, **known), task.effects, model)
 
 
 def _silence_start(

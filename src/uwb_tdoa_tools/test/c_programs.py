@@ -1,0 +1,296 @@
+"""Compile the C of a correction, run it on this computer or an emulated Cortex-M4F, and measure it."""
+
+import ctypes
+import math
+from pathlib import Path
+import shutil
+import subprocess
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.correction.network import Network
+from uwb_tdoa_bias.effects import EFFECTS, EffectSet, Samples, SmoothTerm
+from uwb_tdoa_bias.effects.samples import Motion
+from uwb_tdoa_tools.exporting.graph import ELEMENTWISE
+from uwb_tdoa_tools.exporting.vehicle import MEMBERS, STATE
+from uwb_tdoa_tools.training.network import WITHOUT, Paper
+
+HERE = Path(__file__).parent / "cortex_m"
+GCC, ARM_GCC = shutil.which("gcc"), shutil.which("arm-none-eabi-gcc")
+QEMU = shutil.which("qemu-system-arm")
+STRICT = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off")
+PROCESSOR = ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16")
+# Those of the Crazyflie firmware (its Makefile), which may fuse multiplication and addition
+FIRMWARE = (
+    *("-Os", "-std=gnu11", "-fno-math-errno", "-mfp16-format=ieee", "-fno-strict-aliasing"),
+    *("-ffunction-sections", "-fdata-sections"),
+    *("-Wall", "-Wextra", "-Wmissing-braces", "-Wdouble-promotion", "-Werror"),
+)
+CLOCK = 168e6  # Hz, of the emulated processor, which executes one instruction in 1 ns
+CASE = np.dtype([("a", np.int32), ("b", np.int32), ("state", STATE)])
+RESULT = np.dtype(
+    [
+        ("wrong", np.int32),
+        ("wrong_jacobian", np.int32),
+        ("bias", np.float32),
+        ("std", np.float32),
+        ("jacobian", np.float32, 6),
+        ("curved", np.float32),
+    ]
+)
+COUNTS = "ticks", "most", "ticks_jacobian", "stack", "cases"
+COST = np.dtype([(name, np.uint32) for name in COUNTS])
+
+RNG = np.random.default_rng(7)
+POSITIONS = np.round(
+    [[x, y, z] for x in (-3.5, 3.5) for y in (-4.0, 4.0) for z in (0.2, 2.9)]
+    + RNG.uniform(-0.2, 0.2, (8, 3)),
+    3,
+)
+ANCHORS = Anchors(np.array([0, 1, 2, 3, 4, 5, 9, 300]), POSITIONS, Rotation.random(8, 7).as_quat())
+SPLINE = {f"c{k}": 0.1 * math.sin(k) for k in range(6)}
+ONE_EACH = {
+    "anchor_delay": {str(i): 0.02 * k for k, i in enumerate(ANCHORS.ids)},
+    "anchor_position": {"0.x": 0.1, "3.z": -0.2, "300.y": 0.05},
+    "tag_lever_arm": {"x": 0.02, "z": 0.05},
+    "range_scale": {"scale": 0.01},
+    "range_bias": {"quadratic": 0.002},
+    "received_power_bias": {"scale": 1.0},
+    "antenna_pattern": {"tag": 0.1, "anchor": 0.2},
+    "anchor_clock_drift": {"2": 0.001},
+    "nlos": {"1.delay": 0.3, "1.x": 1.0, "1.y": 0.0, "1.z": 1.0, "1.radius": 1.5, "4.delay": 0.1},
+    "pair_offset": {"0-1": 0.1, "9-300": -0.2},
+    "noise_level": {"0-1": 0.1, "3-4": 0.2},
+    "noise_correlation": {"std": 0.05, "time": 0.5},
+}
+TERMS = {
+    "spline over elevation": {
+        "covariate": "elevation_in_tag",
+        "form": "arrival",
+        "knots": (-1.5, -0.7, 0.0, 0.7, 1.5),
+    },
+    "spline of an anchor": {"covariate": "range", "form": "anchor", "knots": (0.0, 2.0, 5.0, 12.0)},
+    "spline over climb rate": {"covariate": "climb_rate", "knots": (-1.0, -0.2, 0.3, 1.0)},
+    "spline over speed": {"covariate": "speed", "knots": (0.0, 0.5, 1.5, 2.0)},
+    "line": {"covariate": "height", "knots": (0.0, 3.0), "shape": "line"},
+    "wave": {"covariate": "x", "knots": (0.0, 2.5), "shape": "wave"},
+    "step of a pair": {"covariate": "y", "form": "pair", "knots": (-3, 0.5, 3), "shape": "step"},
+    "spline over tilt": {"covariate": "tilt", "knots": (0.0, 0.3, 1.0)},
+    "turning": {"covariate": "turning_rate", "knots": (0.0, 0.4, 2.0)},
+    "accelerating": {"covariate": "acceleration", "knots": (0.0, 1.0, 4.0)},
+    "interval": {"covariate": "interval", "knots": (0.0, 0.003, 0.01)},
+    "previous anchor": {"covariate": "previous_anchor", "knots": (0.0, 1.0, 9.0)},
+    "time, limited": {"covariate": "time", "knots": (0.0, 30.0, 60.0), "domain": {"time": (0, 60)}},
+}
+PREFIXES = {"anchor": "3.", "pair": "0-1."}
+
+
+def effects():
+    """{name: effect} of all kinds that C holds."""
+    out = {name: EFFECTS[name](values) for name, values in ONE_EACH.items()}
+    for name, settings in TERMS.items():
+        prefix = PREFIXES.get(settings.get("form"), "")
+        term = SmoothTerm(dict(), **settings)
+        count = term.count
+        out[name] = SmoothTerm({f"{prefix}c{k}": SPLINE[f"c{k}"] for k in range(count)}, **settings)
+    return out
+
+
+COMMON = (  # without the patterns of antennas
+    *("anchor_delay", "anchor_position", "tag_lever_arm", "range_scale", "range_bias"),
+    *("anchor_clock_drift", "nlos", "pair_offset", "noise_level", "spline over elevation"),
+)
+
+
+def chosen(*names):
+    """The EffectSet of some effects."""
+    known = effects()
+    return EffectSet(tuple(known[name] for name in names))
+
+
+def network(folder, orientations=True):
+    """A network of the first paper with random weights, of 14 inputs or 8: Network."""
+    from uwb_tdoa_bias.correction.features import FEATURES
+
+    names = FEATURES if orientations else WITHOUT
+    rng, sizes = np.random.default_rng(3), (len(names), 30, 30, 30, 1)
+    layers = [
+        (rng.normal(0.0, math.sqrt(1.5 / i), (i, o)), rng.normal(0.0, 0.1, o))
+        for i, o in zip(sizes[:-1], sizes[1:])
+    ]
+    scale = np.array([4.0 if name[0] == "d" else 2.0 for name in names])
+    paper = Paper(names, np.full(len(names), 0.1), scale, layers, 0.07)
+    path = Path(folder) / f"network_{len(names)}.onnx"
+    path.write_bytes(paper.onnx({"clip": 1.0, "name": "drawn"}).SerializeToString())
+    return Network(path)
+
+
+def cases(n, seed=0):
+    """n random states and pairs: array of CASE."""
+    rng, out = np.random.default_rng(seed), np.zeros(n, CASE)
+    a = rng.integers(0, 8, n)
+    out["a"], out["b"] = ANCHORS.ids[a], ANCHORS.ids[(a + rng.integers(1, 8, n)) % 8]
+    state = out["state"]
+    state["position"] = rng.uniform([-4.0, -4.5, 0.0], [4.0, 4.5, 3.0], (n, 3))
+    state["attitude"] = Rotation.random(n, seed).as_quat()
+    for name in ("velocity", "acceleration", "rate"):
+        state[name] = rng.normal(size=(n, 3))
+    state["time"], state["interval"] = rng.uniform(0.0, 100.0, n), rng.uniform(0.0, 0.01, n)
+    state["previous_anchor"] = rng.choice(ANCHORS.ids, n)
+    return out
+
+
+def samples_of(some):
+    """The Samples of cases."""
+    state = {name: some["state"][name].astype(float) for name in STATE.names}
+    return Samples(
+        state["time"],
+        *(ANCHORS.index(some[end]) for end in "ab"),
+        state["position"],
+        state["attitude"],
+        ANCHORS,
+        motion=Motion(state["velocity"], state["acceleration"], state["rate"]),
+        interval=state["interval"],
+        previous=state["previous_anchor"],
+    )
+
+
+def missing():
+    """Executables that `cost_of` needs and that are not installed."""
+    needed = {"gcc": GCC, "arm-none-eabi-gcc": ARM_GCC, "qemu-system-arm": QEMU}
+    return [name for name, path in needed.items() if path is None]
+
+
+def _libm(name):
+    function = getattr(ctypes.CDLL("libm.so.6"), name)
+    function.restype = ctypes.c_float
+
+    def of_arrays(*arrays):
+        numbers = zip(*(np.ravel(one).tolist() for one in arrays))
+        made = [function(*map(ctypes.c_float, some)) for some in numbers]
+        return np.array(made, dtype=np.float32).reshape(np.shape(arrays[0]))
+
+    return of_arrays
+
+
+# As C computes: the functions that IEEE 754 does not define are those of the C library.
+FUNCTIONS = {
+    **ELEMENTWISE,
+    **{name: _libm(f"{name}f") for name in ("exp", "log", "sin", "cos", "atan2")},
+    "max": lambda x, y: np.where((x >= y) | (x != x), x, y),
+    "min": lambda x, y: np.where((x <= y) | (x != x), x, y),
+}
+
+
+def by_numpy(code, some):
+    """(bias (n,), std (n,)) of cases by numpy in single precision, in the order of the C."""
+    columns = {}
+    for name, member in MEMBERS.items():
+        field, _, place = member.partition("[")
+        values = some["state"][field]
+        columns[name] = values[:, int(place[0])] if place else values
+    rows = [ANCHORS.index(some[end]) for end in "ab"]
+    bias, std = code.level.evaluate(columns, *rows, FUNCTIONS)
+    for program in code.steep.values():
+        bias = bias + program.evaluate(columns, *rows, FUNCTIONS)[0]
+    return bias, std
+
+
+def write(folder, code):
+    """Write uwb_bias.h and uwb_bias.c to a folder, which is made."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "uwb_bias.h").write_text(code.header)
+    (folder / "uwb_bias.c").write_text(code.source)
+
+
+def on_host(folder, some, flags=STRICT):
+    """Results (n,) of RESULT of cases on this computer."""
+    sources = [HERE / "main.c", HERE / "host.c", "uwb_bias.c"]
+    command = [GCC, *flags, f"-I{HERE}", "-I.", *sources, "-lm", "-o", "host"]
+    subprocess.run(command, cwd=folder, check=True)
+    return _results(folder, ["./host"], some)
+
+
+def linked(folder, flags=FIRMWARE, name="board.elf"):
+    """Compile the test program for the board; returns the size of its flash, bytes."""
+    sources = [HERE / "main.c", HERE / "board.c", "uwb_bias.c"]
+    options = ["-nostartfiles", "-T", HERE / "netduinoplus2.ld", "-Wl,--gc-sections"]
+    options += ["--specs=nano.specs", "--specs=nosys.specs", "-lm", "-o", name]
+    command = [ARM_GCC, *PROCESSOR, *flags, f"-I{HERE}", "-I.", *sources, *options]
+    subprocess.run(command, cwd=folder, check=True)
+    return sum(_size(folder, name)[:2])
+
+
+def on_board(folder, some, flags=FIRMWARE):
+    """(results (n,) of RESULT, cost (1,) of COST) of cases on the emulated board."""
+    linked(folder, flags)
+    quiet = ["-nographic", "-monitor", "none", "-serial", "none"]
+    hosted = ["-semihosting-config", "enable=on,target=native", "-icount", "shift=0"]
+    command = [QEMU, "-M", "netduinoplus2", *quiet, *hosted, "-kernel", "board.elf"]
+    results = _results(folder, command, some)
+    return results, np.fromfile(folder / "cost.bin", COST)
+
+
+def _results(folder, command, some):
+    (folder / "cases.bin").write_bytes(some.tobytes())
+    subprocess.run(command, cwd=folder, check=True, timeout=300)
+    return np.fromfile(folder / "results.bin", RESULT)
+
+
+def _size(folder, name):
+    """(text, data, bss) of a file, bytes."""
+    command = ["arm-none-eabi-size", name]
+    out = subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
+    return tuple(map(int, out.splitlines()[1].split()[:3]))
+
+
+def cost_of(folder, code, n=320):
+    """What a correction costs on the board, dict: instructions per TDOA, their mean and the most, and
+    per Jacobian; bytes of flash of the correction alone (own) and with what it needs of libm (flash),
+    and of RAM.
+    """
+    write(folder, code)
+    whole = linked(folder, (*FIRMWARE, "-DWITHOUT_JACOBIAN"), "without.elf")
+    (folder / "without").mkdir(exist_ok=True)
+    (folder / "without" / "uwb_bias.h").write_text(code.header)
+    (folder / "without" / "uwb_bias.c").write_text(STUB)
+    empty = linked(folder / "without", (*FIRMWARE, "-DWITHOUT_JACOBIAN"))
+    symbols = [ARM_GCC, *PROCESSOR, *FIRMWARE, "-c", "uwb_bias.c", "-o", "own.o"]
+    subprocess.run(symbols, cwd=folder, check=True)
+    own = _own_flash(folder)
+    _, cost = on_board(folder, cases(n))
+    per_case = 1e9 / CLOCK / cost["cases"][0]
+    return {
+        "instructions": float(cost["ticks"][0] * per_case),
+        "most": float(cost["most"][0] * 1e9 / CLOCK),
+        "jacobian": float(cost["ticks_jacobian"][0] * per_case),
+        "own": own,
+        "flash": whole - empty,
+        "ram": sum(_size(folder, "own.o")[1:]) + int(cost["stack"][0]) + STATE.itemsize,
+    }
+
+
+STUB = """
+#include "uwb_bias.h"
+int uwb_bias(int a, int b, const uwb_bias_state *state, float *bias, float *std) {
+    (void)state;
+    *bias = *std = 0.0f;
+    return a - b;
+}
+"""
+
+
+def _own_flash(folder):
+    """Bytes of the sections of uwb_bias.c that a program without the Jacobian keeps."""
+    command = ["arm-none-eabi-nm", "-S", "--defined-only", "without.elf"]
+    out = subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
+    kept = {
+        line.split()[-1]: int(line.split()[1], 16)
+        for line in out.splitlines()
+        if len(line.split()) == 4
+    }
+    command = ["arm-none-eabi-nm", "--defined-only", "own.o"]
+    out = subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
+    return sum(kept.get(line.split()[-1], 0) for line in out.splitlines())

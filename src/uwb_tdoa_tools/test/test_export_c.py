@@ -1,0 +1,170 @@
+"""The C of a correction: equal to numpy and Python, sound with any input, small on a Cortex-M4F."""
+
+import c_programs as c
+from c_programs import ANCHORS, GCC, by_numpy, cases, chosen, on_board, on_host, write
+import numpy as np
+import pytest
+
+from uwb_tdoa_bias.correction.corrector import Corrector
+from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_tools.exporting.vehicle import NO_PAIR, NOT_FINITE, vehicle_code
+
+pytestmark = pytest.mark.skipif(GCC is None, reason="no C compiler (gcc)")
+needs_board = pytest.mark.skipif(
+    None in (c.ARM_GCC, c.QEMU), reason="no arm-none-eabi-gcc or no qemu-system-arm"
+)
+SANITIZED = (*c.STRICT, "-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+KINDS = tuple(c.effects())
+
+
+def agree(code, results, some, effect_set, network=None):
+    """Check results against numpy in single precision, bit by bit, and against Python."""
+    bias, std = by_numpy(code, some)
+    np.testing.assert_array_equal(results["wrong"], 0)
+    np.testing.assert_array_equal(results["bias"], bias)
+    np.testing.assert_array_equal(results["std"], std)
+    samples = c.samples_of(some)
+    known = Corrector(ANCHORS, effect_set, network)
+    expected = known.prediction(samples)
+    np.testing.assert_allclose(results["bias"], expected[0], atol=1e-5)
+    _, jacobian, curved = effect_set.bias_jacobian(samples)
+    np.testing.assert_allclose(results["jacobian"], jacobian, atol=1e-4)
+    np.testing.assert_allclose(results["curved"], curved, atol=1e-4)
+    both = np.hypot(results["std"], results["curved"])
+    np.testing.assert_allclose(both, expected[1], atol=1e-4)
+
+
+@pytest.mark.parametrize("name", [*KINDS, "all"])
+def test_every_effect_is_equal_to_numpy_and_python(tmp_path, name):
+    held = chosen(*(KINDS if name == "all" else (name,)))
+    code, some = vehicle_code(ANCHORS, held), cases(10_000)
+    write(tmp_path, code)
+    agree(code, on_host(tmp_path, some), some, held)
+
+
+@pytest.mark.parametrize("orientations", [True, False])
+def test_both_networks_are_equal_to_numpy_and_python(tmp_path, orientations):
+    network, held = c.network(tmp_path, orientations), chosen("anchor_delay", "tag_lever_arm")
+    code, some = vehicle_code(ANCHORS, held, network), cases(10_000)
+    write(tmp_path, code)
+    agree(code, on_host(tmp_path, some), some, held, network)
+
+
+def numbers_of(some):
+    """The numbers of the states of cases, (n, 19), a view."""
+    return some.view(np.float32).reshape(len(some), -1)[:, 2:]
+
+
+def odd_cases(n):
+    """Cases of which most have numbers that no state and no id has."""
+    some, rng = cases(n, seed=5), np.random.default_rng(5)
+    odd = np.float32(
+        [np.nan, np.inf, -np.inf, 3e38, -3e38, 1e-45, 0.0, -0.0, 1e20, -1e20, 2.0**31, 1e-20]
+    )
+    numbers = numbers_of(some)
+    hit = rng.random(numbers.shape) < rng.choice([0.0, 0.03, 0.3, 1.0], (n, 1))
+    numbers[hit] = rng.choice(odd, hit.sum())
+    ids = np.array([-1, 6, 8, 256, 301, 65535, 65536, 2**31 - 1, -(2**31)], dtype=np.int32)
+    for end in "ab":
+        hit = rng.random(n) < 0.2
+        some[end][hit] = rng.choice([*ids, *ANCHORS.ids], hit.sum())
+    return some
+
+
+@pytest.mark.parametrize("with_network", [False, True])
+def test_no_input_is_a_fault(tmp_path, with_network):
+    network = c.network(tmp_path) if with_network else None
+    code, some = vehicle_code(ANCHORS, chosen(*KINDS), network), odd_cases(20_000)
+    write(tmp_path, code)
+    results = on_host(tmp_path, some, SANITIZED)
+    bad_pair = (ANCHORS.index(some["a"]) < 0) | (ANCHORS.index(some["b"]) < 0)
+    bad_pair |= some["a"] == some["b"]
+    numbers = numbers_of(some)
+    for wrong in (results["wrong"], results["wrong_jacobian"]):
+        np.testing.assert_array_equal(wrong == NO_PAIR, bad_pair)
+        assert (wrong[~bad_pair & ~np.isfinite(numbers).all(axis=1)] == NOT_FINITE).all()
+    for name in ("bias", "std", "jacobian", "curved"):
+        assert np.isfinite(results[name]).all()
+        wrong = results["wrong" if name in ("bias", "std") else "wrong_jacobian"] != 0
+        assert not results[name][wrong].any()
+    assert (results["wrong"] == 0).any() and results["bias"].any()
+
+
+def test_nothing_to_correct_is_zero(tmp_path):
+    write(tmp_path, vehicle_code(ANCHORS, EffectSet()))
+    results = on_host(tmp_path, cases(100), SANITIZED)
+    assert not any(results[name].any() for name in results.dtype.names)
+
+
+@needs_board
+def test_the_board_computes_the_same_bits(tmp_path):
+    """Where C's library is not involved: +, -, *, / and the square root."""
+    network = c.network(tmp_path, orientations=False)
+    names = [name for name in c.COMMON if name != "spline over elevation"]
+    code, some = vehicle_code(ANCHORS, chosen(*names)), cases(1000)
+    write(tmp_path, code)
+    flags = ("-Os", "-std=c99", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off")
+    results, _ = on_board(tmp_path, some, flags)
+    bias, std = by_numpy(code, some)
+    np.testing.assert_array_equal(results["bias"], bias)
+    np.testing.assert_array_equal(results["std"], std)
+    write(tmp_path / "network", vehicle_code(ANCHORS, EffectSet(), network))
+    there, here = (
+        on_board(tmp_path / "network", some, flags)[0],
+        on_host(tmp_path / "network", some),
+    )
+    np.testing.assert_allclose(there["bias"], here["bias"], atol=1e-5)  # its angles are of libm
+
+
+@needs_board
+def test_the_board_agrees_with_the_flags_of_the_firmware(tmp_path):
+    network, some = c.network(tmp_path), cases(1000)
+    write(tmp_path, vehicle_code(ANCHORS, chosen(*KINDS), network))
+    here, (there, _) = on_host(tmp_path, some), on_board(tmp_path, some)
+    np.testing.assert_array_equal(there["wrong"], 0)
+    np.testing.assert_allclose(there["bias"], here["bias"], atol=1e-5)
+    np.testing.assert_allclose(there["std"], here["std"], atol=1e-5)
+    np.testing.assert_allclose(there["jacobian"], here["jacobian"], atol=1e-4)
+    odd, _ = on_board(tmp_path, odd_cases(1000))
+    assert np.isfinite(odd["bias"]).all() and set(odd["wrong"]) == {0, NO_PAIR, NOT_FINITE}
+
+
+@needs_board
+def test_it_fits_a_small_vehicle(tmp_path):
+    ten = c.cost_of(tmp_path / "ten", vehicle_code(ANCHORS, chosen(*c.COMMON)))
+    assert ten["most"] <= 3000 and ten["own"] <= 3072 and ten["ram"] <= 2048
+    network = c.network(tmp_path)
+    learned = c.cost_of(tmp_path / "network", vehicle_code(ANCHORS, EffectSet(), network))
+    assert learned["most"] <= 15_000 and learned["flash"] <= 13 * 1024
+    assert learned["ram"] <= 2048
+
+
+LOOP = """
+#include "uwb_bias.h"
+int uwb_bias(int a, int b, const uwb_bias_state *state, float *bias, float *std) {
+    int left = 1000 * (a + 1); /* loops of two instructions */
+    (void)b; (void)state;
+    *bias = *std = 0.0f;
+    __asm__ volatile("1: subs %0, #1\\n bne 1b" : "+r"(left) : : "cc");
+    return 0;
+}
+int uwb_bias_jacobian(int a, int b, const uwb_bias_state *state, float jacobian[6], float *curved) {
+    (void)a; (void)b; (void)state; (void)jacobian;
+    *curved = 0.0f;
+    return 0;
+}
+"""
+
+
+@needs_board
+def test_the_emulator_counts_instructions(tmp_path):
+    """A known number of them, to 1 %; and twice the same."""
+    code, some = vehicle_code(ANCHORS, EffectSet()), cases(64)
+    some["a"] = np.arange(64) % 8
+    write(tmp_path, code)
+    (tmp_path / "uwb_bias.c").write_text(LOOP)
+    one, other = (on_board(tmp_path, some)[1] for _ in range(2))
+    assert one == other
+    per_tick = 1e9 / c.CLOCK
+    assert one["ticks"][0] * per_tick / 64 == pytest.approx(2 * 1000 * 4.5, rel=0.01)
+    assert one["most"][0] * per_tick == pytest.approx(2 * 1000 * 8, rel=0.01)

@@ -1,0 +1,203 @@
+"""The out-of-tree build for a Crazyflie, compiled against stand-ins of the firmware's headers."""
+
+import subprocess
+
+import c_programs as c
+from c_programs import ANCHORS, GCC, cases, chosen
+import numpy as np
+import pytest
+import yaml
+
+from uwb_tdoa_bias.effects import Samples
+from uwb_tdoa_bias.effects.samples import Motion
+from uwb_tdoa_tools.exporting import crazyflie
+from uwb_tdoa_tools.exporting.vehicle import vehicle_code
+
+pytestmark = pytest.mark.skipif(GCC is None, reason="no C compiler (gcc)")
+# What the build needs of the firmware. Its own files are not part of this repository.
+FIRMWARE = {
+    "kalman_core.h": """
+#pragma once
+#include <stdbool.h>
+#include <stdint.h>
+typedef struct { uint32_t timestamp; float x, y, z; } point_t;
+typedef struct {
+    point_t anchorPositions[2]; uint8_t anchorIds[2]; float distanceDiff, stdDev;
+} tdoaMeasurement_t;
+typedef enum {
+    KC_STATE_X, KC_STATE_Y, KC_STATE_Z, KC_STATE_PX, KC_STATE_PY, KC_STATE_PZ, KC_STATE_D0,
+    KC_STATE_D1, KC_STATE_D2, KC_STATE_DIM
+} kalmanCoreStateIdx_t;
+typedef struct { float S[KC_STATE_DIM], q[4], R[3][3]; } kalmanCoreData_t;
+""",
+    "mm_tdoa.h": """
+#pragma once
+#include "kalman_core.h"
+void kalmanCoreUpdateWithTdoa(kalmanCoreData_t *this, tdoaMeasurement_t *tdoa,
+                              const uint32_t nowMs, void *state);
+""",
+    "mm_tdoa_robust.h": """
+#pragma once
+#include "kalman_core.h"
+void kalmanCoreRobustUpdateWithTdoa(kalmanCoreData_t *this, tdoaMeasurement_t *tdoa, void *state);
+""",
+    "estimator_kalman.h": """
+#pragma once
+void estimatorKalmanInit(void);
+""",
+    "log.h": """
+#pragma once
+#define LOG_GROUP_START(NAME) void *log_of_##NAME[] = {
+#define LOG_ADD(TYPE, NAME, ADDRESS) ADDRESS,
+#define LOG_GROUP_STOP(NAME) 0};
+""",
+    "param.h": """
+#pragma once
+#define PARAM_GROUP_START(NAME) void *param_of_##NAME[] = {
+#define PARAM_ADD(TYPE, NAME, ADDRESS) ADDRESS,
+#define PARAM_GROUP_STOP(NAME) 0};
+""",
+    "usec_time.h": """
+#pragma once
+#include <stdint.h>
+uint64_t usecTimestamp(void);
+""",
+}
+UPDATES = """
+#include "mm_tdoa.h"
+#include "mm_tdoa_robust.h"
+float got;
+void kalmanCoreUpdateWithTdoa(kalmanCoreData_t *this, tdoaMeasurement_t *tdoa,
+                              const uint32_t nowMs, void *state) {
+    (void)this; (void)nowMs; (void)state;
+    got = tdoa->distanceDiff;
+}
+void kalmanCoreRobustUpdateWithTdoa(kalmanCoreData_t *this, tdoaMeasurement_t *tdoa, void *state) {
+    (void)this; (void)state;
+    got = -tdoa->distanceDiff;
+}
+"""
+ESTIMATOR = """
+#include <stdio.h>
+#include "kalman_core.h"
+#include "estimator_kalman.h"
+#include "mm_tdoa.h"
+#include "mm_tdoa_robust.h"
+extern float got;
+static uint64_t now;
+uint64_t usecTimestamp(void) { return now; }
+int main(void) {
+    kalmanCoreData_t core;
+    tdoaMeasurement_t tdoa = {0};
+    float state[16]; /* s; position, w x y z, velocity in the body; d; then a and b */
+    int a, b, robust = 0;
+    while (scanf("%f %f %f %f %f %f %f %f %f %f %f %f %d %d", state, state + 1, state + 2,
+                 state + 3, state + 4, state + 5, state + 6, state + 7, state + 8, state + 9,
+                 state + 10, state + 11, &a, &b) == 14) {
+        now = 1000000 + (uint64_t)(1e6f * state[0]);
+        for (int k = 0; k < 3; k++) {
+            core.S[KC_STATE_X + k] = state[1 + k];
+            core.S[KC_STATE_PX + k] = state[8 + k];
+        }
+        for (int k = 0; k < 4; k++) core.q[k] = state[4 + k];
+        const float w = core.q[0], x = core.q[1], y = core.q[2], z = core.q[3];
+        const float R[3][3] = {
+            {1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)},
+            {2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)},
+            {2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)}};
+        for (int i = 0; i < 9; i++) core.R[i / 3][i % 3] = R[i / 3][i % 3];
+        tdoa.distanceDiff = state[11];
+        tdoa.anchorIds[0] = (uint8_t)a;
+        tdoa.anchorIds[1] = (uint8_t)b;
+        robust = !robust;
+        if (robust) kalmanCoreRobustUpdateWithTdoa(&core, &tdoa, 0);
+        else kalmanCoreUpdateWithTdoa(&core, &tdoa, 0, 0);
+        printf("%.9g\\n", (double)(robust ? -got : got));
+    }
+    return 0;
+}
+"""
+
+
+def extra_flags(makefile, folder):
+    """The flags that the Makefile of a build adds to those of the firmware."""
+    (line,) = (line for line in makefile.splitlines() if line.startswith("EXTRA_CFLAGS"))
+    return line.partition("+=")[2].replace("$(PWD)", str(folder)).split()
+
+
+def build(folder, names):
+    """A folder with the build and the stand-ins; returns the program."""
+    made = crazyflie.files(vehicle_code(ANCHORS, chosen(*names)), ANCHORS)
+    made |= {f"firmware/{name}": text for name, text in FIRMWARE.items()}
+    made |= {"firmware/src/updates.c": UPDATES, "firmware/src/estimator_kalman.c": ESTIMATOR}
+    for name, text in made.items():
+        path = folder / "app" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    flags = [flag for flag in c.FIRMWARE if flag != "-mfp16-format=ieee"]
+    # as Kbuild orders them: those of the firmware first, then EXTRA_CFLAGS
+    include = ["-Ifirmware", *extra_flags(made["Makefile"], folder / "app")]
+    sources = ["src/uwb_bias.c", "src/uwb_bias_firmware.c"]
+    sources += ["firmware/src/updates.c", "firmware/src/estimator_kalman.c"]
+    command = [GCC, *flags, *include, *sources, "-lm", "-o", "estimator"]
+    subprocess.run(command, cwd=folder / "app", check=True, capture_output=True, text=True)
+    return folder / "app" / "estimator"
+
+
+NAMES = (*c.COMMON, "antenna_pattern", "spline over climb rate", "interval", "previous anchor")
+
+
+def test_the_filter_of_the_firmware_gets_corrected_tdoas(tmp_path):
+    program, some = build(tmp_path, NAMES), cases(200)
+    some = some[(some["a"] < 256) & (some["b"] < 256)]
+    some["state"]["time"] = np.round(np.cumsum(np.full(len(some), 0.004)) - 0.004, 6)
+    state, n = some["state"], len(some)
+    q = state["attitude"].astype(float)
+    world = np.array([_rotation(one) for one in q])
+    body = np.einsum("nji,nj->ni", world, state["velocity"].astype(float))
+    d = np.full(n, 0.25)
+    columns = [state["time"], *state["position"].T, *q[:, [3, 0, 1, 2]].T, *body.T, d]
+    columns += [some["a"], some["b"]]
+    lines = "".join(
+        " ".join(f"{one:.9g}" if k < 12 else f"{int(one)}" for k, one in enumerate(row)) + "\n"
+        for row in zip(*columns)
+    )
+    out = subprocess.run([program], input=lines, capture_output=True, text=True, check=True).stdout
+    got = np.array(out.split(), dtype=float)
+    previous = np.concatenate([[-1], some["b"][:-1]])
+    interval = np.concatenate([[0.0], np.diff(state["time"])])
+    samples = Samples(
+        state["time"].astype(float),
+        *(ANCHORS.index(some[end]) for end in "ab"),
+        state["position"].astype(float),
+        q,
+        ANCHORS,
+        motion=Motion(state["velocity"].astype(float), np.zeros((n, 3)), np.zeros((n, 3))),
+        interval=interval,
+        previous=previous,
+    )
+    np.testing.assert_allclose(0.25 - got, chosen(*NAMES).bias(samples), atol=2e-5)
+
+
+def _rotation(q):
+    x, y, z, w = q
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def test_what_the_filter_does_not_estimate_is_refused_by_the_compiler(tmp_path):
+    with pytest.raises(subprocess.CalledProcessError) as failed:
+        build(tmp_path, ["turning"])
+    assert "gives no acceleration and no rate" in failed.value.stderr
+
+
+def test_the_client_gets_the_anchors_of_the_correction():
+    content = yaml.safe_load(crazyflie.client_yaml(ANCHORS))
+    assert list(content) == ANCHORS.ids.tolist()
+    for i, position in zip(ANCHORS.ids, ANCHORS.positions):
+        assert [content[i][axis] for axis in "xyz"] == position.tolist()

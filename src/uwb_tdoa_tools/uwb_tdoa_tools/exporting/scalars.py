@@ -1,0 +1,335 @@
+"""The graph of a correction as a list of operations on single numbers, in single precision.
+
+A Scalar is one operation on numbers of one TDOA. Printers of sequential code print the list of
+Scalars in its order. Its kinds are the elementwise ones of `graph`, and
+
+input     `value` is the name of a column
+constant  `value` is the number
+anchor    `value` is (end, row): the number in a row of the table of constants of the anchors;
+          end is "a" or "b"
+pair      `value` is the row of the table of constants of the pairs
+network   `value` is (Dense, number of the output); the inputs are those of the network
+pieces    `value` is Pieces, a function of one number that consists of polynomials
+
+Equal Scalars are one. A sum adds its terms one by one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial, reduce
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from .dense import Dense
+from .graph import COMPARISONS, ELEMENTWISE, LOGICAL, ordered
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+
+    from .graph import Node
+
+SAME = 1e-9  # m; a smaller difference of constants is rounding
+
+EVEN = 1e-5  # share by which the widths of pieces of one width may differ, rounded
+
+
+class Scalar(NamedTuple):
+    """One operation; inputs are places of other Scalars in the list."""
+
+    kind: str
+    inputs: tuple[int, ...] = ()
+    value: Any = None
+
+    @property
+    def is_bool(self) -> bool:
+        """Return whether the result is boolean."""
+        return self.kind in (*COMPARISONS, *LOGICAL)
+
+
+@dataclass(frozen=True, eq=False)
+class Pieces:
+    """A function that is 0 up to the first break, polynomial between breaks, then constant.
+
+    Attributes
+    ----------
+    breaks : (k + 1,) float32
+    table : (k, degree + 1) float32; the value at the begin of each piece, then the coefficients of
+        the powers of the distance from there
+    """
+
+    breaks: np.ndarray
+    table: np.ndarray
+
+    @classmethod
+    def of(cls, node: Node) -> tuple[Node, Pieces] | None:
+        """Return (node of x, Pieces) of a sum that `piecewise` recorded, the same for all anchors.
+
+        Return None for another sum.
+        """
+        product = node.inputs[0]
+        if product.kind != "mul" or product.inputs[1].kind != "min":
+            return None
+        held, (positive, width) = product.inputs[1], product.inputs[1].inputs
+        if positive.kind != "max" or positive.inputs[0].kind != "sub":
+            return None
+        x, breaks = positive.inputs[0].inputs
+        powers, rest = [], product.inputs[0]
+        while rest.kind == "add" and rest.inputs[0].kind == "mul":
+            powers.append(rest.inputs[1])
+            if rest.inputs[0].inputs[1] is not held:
+                return None
+            rest = rest.inputs[0].inputs[0]
+        constants = [breaks, width, *powers, rest]
+        if any(one.kind != "constant" or one.value.size != width.size for one in constants):
+            return None
+        start, wide, *coefficients = (one.value.ravel() for one in constants)
+        degrees = np.arange(1, len(coefficients) + 1)[:, None]
+        gained = np.sum(coefficients * wide**degrees, axis=0)
+        begin = np.concatenate([[0.0], np.cumsum(gained)[:-1]])
+        table = np.stack([begin, *coefficients], axis=1)
+        edges = np.array([*start, start[-1] + wide[-1]], dtype=np.float32)
+        return x, cls(edges, table.astype(np.float32))
+
+    @property
+    def scale(self) -> np.float32:
+        """Return the number of pieces per unit if all are equally wide, else 0."""
+        width = np.diff(self.breaks.astype(float))
+        even = np.ptp(width) < EVEN * width.mean()
+        return np.float32(1.0 / width.mean() if even else 0.0)
+
+    @property
+    def key(self) -> bytes:
+        """Return bytes that are equal for equal functions."""
+        return self.breaks.tobytes() + self.table.tobytes()
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        """Return the values (n,) float32 at x (n,) float32."""
+        if self.scale:
+            at = (x - self.breaks[0]) * self.scale
+            held = np.clip(np.nan_to_num(at), 0.0, len(self.table) - 1.0)
+            piece = held.astype(int)
+        else:
+            piece = np.searchsorted(self.breaks[1:-1], x, side="right")
+            piece[np.isnan(x)] = 0
+        inside = np.where(x > self.breaks[piece], x - self.breaks[piece], np.float32(0.0))
+        width = self.breaks[piece + 1] - self.breaks[piece]
+        inside = np.where(inside > width, width, inside)
+        row = self.table[piece]
+        value = row[:, -1]
+        for power in range(self.table.shape[1] - 2, 0, -1):
+            value = value * inside + row[:, power]
+        return np.where(x == x, value * inside + row[:, 0], x)
+
+
+class Program:
+    """All Scalars of some outputs, inputs before their users.
+
+    Attributes
+    ----------
+    scalars : list of Scalar
+    outputs : places of the outputs
+    anchors : list of (N,) float32, rows of the table of the anchors
+    pairs : list of (N, N) float32, rows of the table of the pairs
+    """
+
+    def __init__(self, outputs: Sequence[Node], count: int) -> None:
+        """Take the nodes () of the outputs apart. count : N, number of anchors."""
+        self.scalars: list[Scalar] = []
+        self.anchors: list[np.ndarray] = []
+        self.pairs: list[np.ndarray] = []
+        self._known: dict[Any, int] = {}
+        self._rows: dict[Any, int] = {}
+        self._known_pieces: dict[bytes, Pieces] = {}
+        self._count = count
+        places: dict[int, np.ndarray] = {}
+        nodes, merged = ordered(outputs)
+        for node in nodes:
+            places[id(node)] = self._elements(node, places)
+        self.outputs = [int(places[id(one)]) for one in merged]
+        self._keep_used()
+
+    def _elements(self, node: Node, places: dict[int, np.ndarray]) -> np.ndarray:
+        """Return the places of the elements of a node, an array of its shape.
+
+        places : {id of a node: places of its elements}, of all nodes before
+        """
+        inputs = [places[id(one)] for one in node.inputs]
+        if node.kind == "input":
+            return np.array(self.add("input", (), node.value))
+        if node.kind == "constant":
+            return self._constants(node)
+        if node.kind == "pick":
+            return np.concatenate([one.ravel() for one in inputs])[node.value]
+        if node.kind == "sum":
+            found = Pieces.of(node)
+            if found is not None:
+                x, pieces = found
+                return _each(partial(self._piecewise, pieces), [places[id(x)][..., 0]])
+            return _each(lambda *terms: reduce(self._plus, terms), np.moveaxis(inputs[0], -1, 0))
+        if node.kind == "network":
+            network = Dense.of(node.value)
+            made = [
+                self.add("network", tuple(map(int, inputs[0])), (network, k))
+                for k in range(node.size)
+            ]
+            return np.array(made)
+        return _each(lambda *some: self.add(node.kind, some), np.broadcast_arrays(*inputs))
+
+    def _constants(self, node: Node) -> np.ndarray:
+        count = self._count
+        rows = np.broadcast_to(node.value, (count * count, *node.shape))
+        elements = rows.reshape(count, count, -1)
+        each = [self._from_table(elements[:, :, k]) for k in range(elements.shape[2])]
+        return np.array(each, dtype=int).reshape(node.shape)
+
+    def _from_table(self, values: np.ndarray) -> int:
+        """Return the place of a number for each pair of anchors, values (N, N)."""
+        of_b = values[0].astype(float)
+        if (values == values[0, 0]).all() or np.isnan(values).all():
+            return self.add("constant", (), values[0, 0])
+        if (values == values[:, :1]).all():
+            return self._of_anchor("a", values[:, 0])
+        if (values == values[:1]).all():
+            return self._of_anchor("b", values[0])
+        if np.abs(values - (of_b - of_b[:, None])).max() < SAME:
+            ends = self._of_anchor("b", of_b), self._of_anchor("a", of_b)
+            return self.add("sub", ends)
+        return self.add("pair", (), self._row(self.pairs, values))
+
+    def _of_anchor(self, end: str, values: np.ndarray) -> int:
+        return self.add("anchor", (), (end, self._row(self.anchors, values)))
+
+    def _row(self, rows: list[np.ndarray], values: np.ndarray) -> int:
+        """Return the number of a row of a table, which is added unless it is there."""
+        row = np.array(values, dtype=np.float32)
+        key = row.ndim, row.tobytes()
+        if key not in self._rows:
+            self._rows[key] = len(rows)
+            rows.append(row)
+        return self._rows[key]
+
+    def _piecewise(self, pieces: Pieces, place: int) -> int:
+        known = self._known_pieces.setdefault(pieces.key, pieces)
+        return self.add("pieces", (place,), known)
+
+    def _plus(self, one: int, other: int) -> int:
+        return self.add("add", (one, other))
+
+    def add(self, kind: str, inputs: tuple[int, ...] = (), value: Any = None) -> int:
+        """Return the place of a Scalar, which is new unless there is an equal or a simpler one."""
+        inputs = tuple(map(int, inputs))
+        if kind == "constant":
+            value = np.float32(value)
+        elif kind in ELEMENTWISE:
+            simpler = self._simpler(kind, inputs)
+            if simpler is not None:
+                return simpler
+        key = kind, inputs, value.tobytes() if isinstance(value, np.float32) else value
+        if key not in self._known:
+            self._known[key] = len(self.scalars)
+            self.scalars.append(Scalar(kind, inputs, value))
+        return self._known[key]
+
+    def _simpler(self, kind: str, inputs: tuple[int, ...]) -> int | None:
+        """Return the place of an equal Scalar that is known already, or of a constant."""
+        known = [self.scalars[k] for k in inputs]
+        if all(one.kind == "constant" for one in known):
+            with np.errstate(all="ignore"):
+                value = ELEMENTWISE[kind](*(one.value for one in known))
+            return self.add("constant", (), value)
+        numbers = [one.value if one.kind == "constant" else None for one in known]
+        if any(number is not None and np.isnan(number) for number in numbers):
+            if kind in COMPARISONS:
+                return self.add("constant", (), 0.0)
+            if kind != "where" and kind not in LOGICAL:
+                return self.add("constant", (), np.nan)
+        if kind == "add" and 0.0 in numbers:
+            return inputs[1 - numbers.index(0.0)]
+        if kind == "mul" and 1.0 in numbers:
+            return inputs[1 - numbers.index(1.0)]
+        if (kind == "sub" and numbers[1] == 0.0) or (kind == "div" and numbers[1] == 1.0):
+            return inputs[0]
+        if kind in ("sin", "cos") and known[0].kind == "atan2":
+            return self._of_angle(kind, *known[0].inputs)
+        if kind == "mul" and 0.0 in numbers:
+            return self.add("constant", (), 0.0)  # as of finite numbers
+        if kind == "where" and known[0].kind == "constant":
+            return inputs[1] if known[0].value else inputs[2]
+        if kind == "where" and inputs[1] == inputs[2]:
+            return inputs[1]
+        return None
+
+    def _of_angle(self, kind: str, y: int, x: int) -> int:
+        """Return the place of the sine or cosine of the angle of (x, y), without the angle."""
+        squares = self.add("mul", (x, x)), self.add("mul", (y, y))
+        length = self.add("sqrt", (self.add("add", squares),))
+        share = self.add("div", (x if kind == "cos" else y, length))
+        zero, at_zero = self.add("constant", (), 0.0), float(kind == "cos")
+        there = self.add("lt", (zero, length))
+        return self.add("where", (there, share, self.add("constant", (), at_zero)))
+
+    def _keep_used(self) -> None:
+        """Remove what no output needs."""
+        used = needed(self.scalars, self.outputs)
+        new = {old: k for k, old in enumerate(used)}
+        self.scalars = [
+            Scalar(one.kind, tuple(new[i] for i in one.inputs), one.value)
+            for one in (self.scalars[old] for old in used)
+        ]
+        self.outputs = [new[k] for k in self.outputs]
+
+    def evaluate(
+        self,
+        columns: Mapping[str, np.ndarray],
+        a: np.ndarray,
+        b: np.ndarray,
+        functions: Mapping[str, Callable[..., Any]] = ELEMENTWISE,
+    ) -> list[np.ndarray]:
+        """Return the values of the outputs, each (n,) float32, by numpy.
+
+        columns : {name of an input: (n,)}; a, b : (n,) rows of the anchors
+        functions : {kind: function of arrays}, of the elementwise kinds
+        """
+        made: list[Any] = []
+        with np.errstate(all="ignore"):
+            for one in self.scalars:
+                inputs = [made[k] for k in one.inputs]
+                value: Any
+                if one.kind == "input":
+                    value = columns[one.value]
+                elif one.kind == "constant":
+                    value = np.full(len(a), one.value)
+                elif one.kind == "anchor":
+                    end, row = one.value
+                    value = self.anchors[row][a if end == "a" else b]
+                elif one.kind == "pair":
+                    value = self.pairs[one.value][a, b]
+                elif one.kind == "network":
+                    network, k = one.value
+                    value = network.evaluate(np.stack(inputs, axis=1))[:, k]
+                elif one.kind == "pieces":
+                    value = one.value(*inputs)
+                else:
+                    value = functions[one.kind](*inputs)
+                made.append(value if one.is_bool else np.asarray(value, dtype=np.float32))
+        return [made[k] for k in self.outputs]
+
+
+def needed(scalars: Sequence[Scalar], outputs: Iterable[int]) -> list[int]:
+    """Return the places of some outputs and of all that they are computed from, rising."""
+    used, stack = set(), list(outputs)
+    while stack:
+        place = stack.pop()
+        if place not in used:
+            used.add(place)
+            stack.extend(scalars[place].inputs)
+    return sorted(used)
+
+
+def _each(function: Callable[..., int], arrays: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
+    """Return function(one number of each array) for all elements of arrays of one shape."""
+    shape = np.shape(arrays[0])
+    flat = [function(*numbers) for numbers in zip(*(np.ravel(one) for one in arrays))]
+    return np.array(flat, dtype=int).reshape(shape)

@@ -1,0 +1,318 @@
+"""A correction as C for a vehicle: what is printed, and its interface.
+
+The bias at one state has two parts: of effects that the filter differentiates by its state, and of
+everything else. Only the first part is computed again for the Jacobian, at states to both sides, as
+`EffectSet.bias_jacobian` does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from uwb_tdoa_bias.common.text import version
+from uwb_tdoa_bias.correction.corrector import Corrector
+from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_bias.effects.effect_set import REACH
+
+from .c_code import Printer, number
+from .scalars import Program
+from .tracing import nodes_of, samples_of
+
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.common.anchors import Anchors
+    from uwb_tdoa_bias.correction.network import Network
+
+MEMBERS = {  # of the state, by the names of inputs
+    **{name: f"position[{k}]" for k, name in enumerate(("x", "y", "z"))},
+    **{name: f"attitude[{k}]" for k, name in enumerate(("qx", "qy", "qz", "qw"))},
+    **{name: f"velocity[{k}]" for k, name in enumerate(("vx", "vy", "vz"))},
+    **{name: f"acceleration[{k}]" for k, name in enumerate(("ax", "ay", "az"))},
+    **{name: f"rate[{k}]" for k, name in enumerate(("wx", "wy", "wz"))},
+    **{name: name for name in ("time", "interval", "previous_anchor")},
+}
+# The state in C, all of 4 bytes each
+STATE = np.dtype(
+    [
+        ("position", np.float32, 3),
+        ("attitude", np.float32, 4),
+        ("velocity", np.float32, 3),
+        ("acceleration", np.float32, 3),
+        ("rate", np.float32, 3),
+        ("time", np.float32),
+        ("interval", np.float32),
+        ("previous_anchor", np.float32),
+    ]
+)
+RATES = {"ax", "ay", "az", "wx", "wy", "wz"}  # inputs of acceleration and rate
+NO_PAIR, NOT_FINITE = 1, 2  # results of the functions in C
+
+HEADER = """\
+/* Systematic errors of UWB TDOAs, written by uwb_tdoa_tools {version}.
+   Effects: {effects}. Network: {network}.
+
+   A TDOA of the ordered pair a, b is d = |p - b| - |p - a|, in m, p being the position of the tag.
+   Subtract the bias from it. All functions compute in single precision, and keep nothing between
+   calls. They need libm. They always write their results. */
+#ifndef UWB_BIAS_H
+#define UWB_BIAS_H
+
+#ifdef __cplusplus
+extern "C" {{
+#endif
+
+#define UWB_BIAS_ANCHORS {count}
+/* Whether the correction reads acceleration or rate. */
+#define UWB_BIAS_READS_RATES {rates}
+
+/* The state of the tag at a TDOA. Members that this correction reads: {inputs}. */
+typedef struct {{
+    float position[3];     /* m, world */
+    float attitude[4];     /* x y z w, body to world */
+    float velocity[3];     /* m/s, world */
+    float acceleration[3]; /* m/s^2, world, mean of the last 0.2 s */
+    float rate[3];         /* rad/s, body, mean of the last 0.2 s */
+    float time;            /* s since the first TDOA */
+    float interval;        /* s since the TDOA before */
+    float previous_anchor; /* id of the second anchor of the TDOA before */
+}} uwb_bias_state;
+
+/* Results of the functions. If the result is not 0, they write zeros. */
+enum {{
+    UWB_BIAS_NO_PAIR = 1,   /* an anchor is unknown, or both are the same */
+    UWB_BIAS_NOT_FINITE = 2 /* a member of the state is infinite or no number, or the bias is */
+}};
+
+/* Return the row of an anchor, 0 to UWB_BIAS_ANCHORS - 1, or -1 for an unknown id. */
+int uwb_bias_row(int id);
+
+/* Compute the bias of the TDOA of anchors with ids a and b, m, and the standard deviation of the
+   error that stays, m. */
+int uwb_bias(int a, int b, const uwb_bias_state *state, float *bias, float *std);
+
+/* Compute the derivative of the bias by position, 1, and by velocity, s, world. It is a difference
+   over {reach} m and {reach} m/s to both sides. `curved`, m, is the standard deviation of the
+   distance of the bias from this line. */
+int uwb_bias_jacobian(int a, int b, const uwb_bias_state *state, float jacobian[6], float *curved);
+
+#ifdef __cplusplus
+}}
+#endif
+#endif
+"""
+
+SOURCE = """\
+/* Written by uwb_tdoa_tools {version}; do not edit. */
+#include "uwb_bias.h"
+
+#include <math.h>
+
+static const unsigned short ids[UWB_BIAS_ANCHORS] = {{{ids}}};
+{helpers}
+{tables}
+{functions}
+static int is_finite(float x) {{ return x - x == 0.0f; }}
+
+static int usable(const uwb_bias_state *s) {{
+    return {usable};
+}}
+
+int uwb_bias_row(int id) {{
+    for (int row = 0; row < UWB_BIAS_ANCHORS; row++) {{
+        if (ids[row] == id) {{
+            return row;
+        }}
+    }}
+    return -1;
+}}
+
+/* Return 0 and the rows of two anchors, or what is wrong. */
+static int rows_of(int *a, int *b, const uwb_bias_state *s) {{
+    *a = uwb_bias_row(*a);
+    *b = uwb_bias_row(*b);
+    if (*a < 0 || *b < 0 || *a == *b) {{
+        return UWB_BIAS_NO_PAIR;
+    }}
+    return usable(s) ? 0 : UWB_BIAS_NOT_FINITE;
+}}
+
+int uwb_bias(int a, int b, const uwb_bias_state *state, float *bias, float *std) {{
+    float out[2];
+    *bias = *std = 0.0f;
+    const int wrong = rows_of(&a, &b, state);
+    if (wrong) {{
+        return wrong;
+    }}
+    level(a, b, state, out);
+    float sum = out[0];
+    const float noise = out[1];
+{steep}    if (!is_finite(sum) || !is_finite(noise)) {{
+        return UWB_BIAS_NOT_FINITE;
+    }}
+    *bias = sum;
+    *std = noise;
+    return 0;
+}}
+
+int uwb_bias_jacobian(int a, int b, const uwb_bias_state *state, float jacobian[6],
+                      float *curved) {{
+    for (int k = 0; k < 6; k++) {{
+        jacobian[k] = 0.0f;
+    }}
+    *curved = 0.0f;
+    const int wrong = rows_of(&a, &b, state);
+    if (wrong) {{
+        return wrong;
+    }}
+{slopes}    return 0;
+}}
+"""
+
+SLOPES = """\
+/* Write the differences of a function over the states first ... last - 1 of position and velocity,
+   and return their power, m^2. */
+static float slopes(void (*function)(int, int, const uwb_bias_state *, float *), int a, int b,
+                    const uwb_bias_state *state, int first, int last, float *jacobian) {{
+    float here, low, high, power = 0.0f;
+    uwb_bias_state moved = *state;
+    function(a, b, state, &here);
+    for (int k = first; k < last; k++) {{
+        float *one = k < 3 ? &moved.position[k] : &moved.velocity[k - 3];
+        const float middle = *one;
+        *one = middle - {reach};
+        function(a, b, &moved, &low);
+        *one = middle + {reach};
+        function(a, b, &moved, &high);
+        *one = middle;
+        jacobian[k] += (high - low) / {twice};
+        const float off = 0.5f * (high + low) - here;
+        power += 2.0f * (off * off);
+    }}
+    return power;
+}}
+"""
+
+
+@dataclass(frozen=True)
+class VehicleCode:
+    """A correction in C.
+
+    Attributes
+    ----------
+    header, source : text of uwb_bias.h and uwb_bias.c
+    level : Program of bias and standard deviation, without the steep part
+    steep : {states: Program of the bias of the effects that are differentiated by them}
+    inputs : names of the inputs that are read
+    """
+
+    header: str
+    source: str
+    level: Program
+    steep: dict[tuple[int, ...], Program]
+    inputs: tuple[str, ...]
+
+    @property
+    def files(self) -> dict[str, str]:
+        """Return {name: text} of both files."""
+        return {"uwb_bias.h": self.header, "uwb_bias.c": self.source}
+
+    @property
+    def reads_rates(self) -> bool:
+        """Return whether it reads acceleration or rate, which not every filter estimates."""
+        return not RATES.isdisjoint(self.inputs)
+
+
+def vehicle_code(
+    anchors: Anchors, effects: EffectSet, network: Network | None = None
+) -> VehicleCode:
+    """Return the C of a correction.
+
+    Raises Unsupported if the network is not a chain of dense layers.
+    """
+    samples = replace(samples_of(anchors, motion=True), yaw_std=None)
+    corrector = Corrector(anchors, effects, network)
+    known = corrector.effects
+    count = len(anchors)
+    level = Corrector(anchors, known.state_independent, network).prediction(samples)
+    bias, std = level.bias, level.std
+    if len(known.state_dependent):
+        std = np.hypot(std, known.state_dependent.noise_std(samples))
+    level_program = Program([nodes_of(samples, bias), nodes_of(samples, std)], count)
+    steep = {
+        states: Program([nodes_of(samples, group.bias(samples))], count)
+        for states, group in _by_states(known.state_dependent).items()
+    }
+    printer = Printer(MEMBERS)
+    functions = [printer.function("level", level_program)]
+    functions += [printer.function(f"steep_{k}", one) for k, one in enumerate(steep.values())]
+    if steep:
+        texts = {"reach": number(REACH), "twice": number(2.0 * np.float32(REACH))}
+        functions.append(SLOPES.format(**texts))
+    inputs = tuple(name for name in MEMBERS if name in printer.inputs)
+    made = {
+        "version": version(),
+        "effects": _in_comment(known.name),
+        "network": _in_comment(network.name if network else "none"),
+        "count": count,
+        "ids": ", ".join(map(str, anchors.ids.tolist())),
+        "reach": f"{REACH:g}",
+        "rates": int(not RATES.isdisjoint(inputs)),
+        "inputs": ", ".join(MEMBERS[name] for name in inputs) or "none",
+        "helpers": printer.helpers(),
+        "tables": printer.tables(count),
+        "functions": "\n".join(functions),
+        "usable": _usable(inputs),
+        "steep": "".join(
+            f"    steep_{k}(a, b, state, out);\n    sum += out[0];\n" for k in range(len(steep))
+        ),
+        "slopes": _slopes(steep),
+    }
+    return VehicleCode(HEADER.format(**made), SOURCE.format(**made), level_program, steep, inputs)
+
+
+def _by_states(effects: EffectSet) -> dict[tuple[int, ...], EffectSet]:
+    """Return {states: effects that are differentiated by them}."""
+    groups: dict[tuple[int, ...], EffectSet] = {}
+    for states in dict.fromkeys(effect.jacobian_states for effect in effects):
+        groups[states] = EffectSet(
+            tuple(effect for effect in effects if effect.jacobian_states == states)
+        )
+    return groups
+
+
+def _usable(inputs: tuple[str, ...]) -> str:
+    """Return the condition that all members that are read are finite."""
+    if not inputs:
+        return "(void)s, 1"
+    terms = [f"(s->{MEMBERS[name]} - s->{MEMBERS[name]})" for name in inputs]
+    return " +\n           ".join(terms) + " == 0.0f"
+
+
+def _slopes(steep: dict[tuple[int, ...], Program]) -> str:
+    """Return the statements that fill in the Jacobian."""
+    if not steep:
+        return ""
+    lines = ["float power = 0.0f;"]
+    for k, states in enumerate(steep):
+        ends = f"{states[0]}, {states[-1] + 1}"
+        lines.append(f"power += slopes(steep_{k}, a, b, state, {ends}, jacobian);")
+    lines += [
+        "*curved = sqrtf(power);",
+        "int finite = is_finite(*curved);",
+        "for (int k = 0; k < 6; k++) {\n        finite = finite && is_finite(jacobian[k]);\n    }",
+        "if (!finite) {\n"
+        "        for (int k = 0; k < 6; k++) {\n"
+        "            jacobian[k] = 0.0f;\n"
+        "        }\n"
+        "        *curved = 0.0f;\n"
+        "        return UWB_BIAS_NOT_FINITE;\n"
+        "    }",
+    ]
+    return "".join(f"    {line}\n" for line in lines)
+
+
+def _in_comment(text: str) -> str:
+    """Return a text that cannot end a comment of C."""
+    return "".join(one if one.isalnum() or one in " _-+.," else "?" for one in text)
