@@ -98,6 +98,11 @@ class Evaluator:
     align: str = NONE
 
     def __call__(self, recording: Recording) -> Result:
+        """Return the Result of a Recording, (path, survey).
+
+        The Result is of the truth aligned as asked. Its 3D RMSE is given for each of ALIGN. Remarks
+        on the survey go to stderr, and causes of the error if the run diverged or the truth is off.
+        """
         flight = self.reading.read(recording)
         require_truth(flight, self.align == NONE)
         survey_sentences = [] if self.odometry else list(survey_remarks(flight))
@@ -113,20 +118,21 @@ class Evaluator:
             odometry, residuals = run.odometry, radio_residuals(flight, run)
             flight = replace(flight, truth=corrected_truth(flight, self.estimator.effects))
         assert flight.truth is not None  # require_truth
-        found = estimate_alignment(flight, odometry)
-        truth_findings = list(self._truth_findings(flight, found))
-        truths = {how: found.applied_to(flight.truth, how) for how in ALIGN}
+        alignment = estimate_alignment(flight, odometry)
+        truth_findings = list(self._truth_findings(flight, alignment))
+        truths = {align: alignment.applied_to(flight.truth, align) for align in ALIGN}
         scores = {
-            how: Score(flight.name, odometry, one, residuals, flight.tdoa.t)
-            for how, one in truths.items()
+            align: Score(flight.name, odometry, truth, residuals, flight.tdoa.t)
+            for align, truth in truths.items()
         }
         score, truth = scores[self.align], truths[self.align]
         if truth_findings or (score.row()["diverged"] and not score.row()["late_start"]):
-            # ids and anchors first: the truth is measured better
+            # A late start alone is no divergence. Wrong ids or anchors make the truth look wrong too:
+            # its findings count only without such findings.
             causes = self._anchor_findings(flight)
             report_remarks(
                 flight.name,
-                [one for one in causes or truth_findings if one not in survey_sentences],
+                [text for text in causes or truth_findings if text not in survey_sentences],
             )
         if self.picture:
             from .scoring.plots import plot_error  # takes a second to import
@@ -139,11 +145,15 @@ class Evaluator:
         if self.rerun:
             lines = [f"{name}: {value}" for name, value in score.row().items()]
             write_rerun(self.rerun, flight, odometry, residuals, lines, truth)
-        aligned = {**found.as_dict(), "align": self.align, "words": found.frame_in_words()}
+        aligned = {
+            **alignment.as_dict(),
+            "align": self.align,
+            "words": alignment.frame_in_words(),
+        }
         return replace(
             score.result(),
             aligned=aligned
-            | {f"rmse_3d_{how}": one.row()["rmse_3d"] for how, one in scores.items()},
+            | {f"rmse_3d_{align}": each.row()["rmse_3d"] for align, each in scores.items()},
         )
 
     def _anchor_findings(self, flight: Flight) -> list[str]:

@@ -212,9 +212,10 @@ def coast(hypothesis: Record, dt: float, accel_psd: float, tilt_psd: float, yaw_
     accel_psd : float
         Power spectral density of the random acceleration, (m/s^2)^2/Hz.
     tilt_psd, yaw_psd : float
-        Growth of the variance of roll and pitch, and of yaw, (rad/s)^2/Hz.
+        Growth of the variance of the attitude about x and y, and about z, of the body, (rad/s)^2/Hz.
     """
     x, P = hypothesis.x, hypothesis.P
+    # P <- F P F': first the rows of the position, then its columns; only dp' = dp + dt dv changes
     for i in range(3):
         x[i] += dt * x[3 + i]
         for j in range(ERROR_STATES):
@@ -224,7 +225,7 @@ def coast(hypothesis: Record, dt: float, accel_psd: float, tilt_psd: float, yaw_
             P[i, j] += dt * P[i, 3 + j]
         for j in range(i, ERROR_STATES):
             P[j, i] = P[i, j]
-    for i in range(3):
+    for i in range(3):  # the part of the noise in the position, dt^3 / 3, is left out
         P[3 + i, 3 + i] += dt * accel_psd
         P[6 + i, 6 + i] += dt * (yaw_psd if i == 2 else tilt_psd)
 

@@ -68,9 +68,9 @@ class Change:
     slope : float
         Drift, in m/s.
     ratio : float
-        Likelihood ratio of the change.
+        Twice the log of the likelihood ratio of the change, over the scale of the errors before it.
     rival : float
-        Likelihood ratio of the best change of any other anchor.
+        The same of the best change of any other anchor.
     left : float
         Mean square of the unexplained errors since the onset over that before it.
     """

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 MOVING = 0.3
 SETTLE = 8.0  # s in motion before the search for an onset starts
 GAP = 30.0  # s without TDOAs after which a new flight begins
-# likelihood ratio above which an anchor has changed: a tenth above the largest of sound flights of
+# statistic (`Change.ratio`) above which an anchor has changed: a tenth above the largest of sound flights of
 # two days, see docs/reliability.md
 LIMIT = 16.3
 CLEARLY = 1.4  # factor by which this ratio must exceed the ratio of any other anchor
@@ -322,17 +322,17 @@ class Monitor:
                 self._compare(piece)
 
     def _compare(self, piece: Slice) -> None:
-        """Add a Slice to the comparison with the survey and repeat the comparison at times.
+        """Add a Slice to the comparisons with the survey; look at their results every LOOK slices.
 
-        An anchor that has changed in flight is reported for that change only.
+        The delays of changes in flight are taken out first. An anchor that has changed in flight is
+        reported for that change only.
         """
         delays = self._detector.delays_at(piece.t, piece.rows)
         if delays.any():
             piece = replace(piece, vector=piece.vector - piece.information @ delays)
-        if (
-            self._compared % YOUNG == 0 and self._calibrated is not None
-            # an anchor moved in flight was right before: recent slices find it sooner
-        ):
+        # An anchor moved in flight was where the calibration says before, so recent slices find it
+        # sooner. A tape is off everywhere and does not tell that.
+        if self._calibrated is not None and self._compared % YOUNG == 0:
             self._comparisons = [
                 self._comparisons[0],
                 *self._comparisons[1:][-1:],
@@ -354,7 +354,8 @@ class Monitor:
         self._displaced = {row: one for row, one in found.items() if self._suspected[row] >= NAMED}
 
     def _look_for_change(self, end: float) -> None:
-        # Find a new Change or refine the last, and drop changes that are over.
+        # Find a new Change, else refine the size of the newest. Drop changes whose anchor has a
+        # negligible delay again; the detector goes on subtracting them.
         change = self._detector.find(self._moving_since + SETTLE)
         if change is not None and _is_clear(change) and abs(change.at(end)) > SMALLEST_CHANGE:
             self._detector.compensate(change)
@@ -373,7 +374,8 @@ class Monitor:
 
     def _compare_anew(self) -> None:
         """Restart the comparison with the survey, because earlier slices are no longer valid."""
-        # comparisons of all slices, of the last YOUNG to 2 YOUNG, and of at most YOUNG
+        # comparisons of all slices; of the last YOUNG to 2 YOUNG, before 2 YOUNG slices of all; and one
+        # that is collecting, and is not asked yet
         self._comparisons = [self._new_comparison()]
         self._displaced, self._suspected, self._compared = {}, {}, 0
 

@@ -224,9 +224,12 @@ def _fitted(
 
 
 def worth(selection: Selection, choices: int) -> float:
-    """Return the criterion of a Selection: likelihood of its fit minus price of its candidates.
+    """Return the criterion of a Selection: twice the log-posterior of its fit, minus its prices.
 
-    Both are in units of twice a log-likelihood.
+    A candidate pays only for parameters that those before it do not contain. The value has an
+    unknown constant, so compare Selections of the same rows and inflation only.
+
+    choices : number of candidates that were offered; each choice costs 2 log(choices)
     """
     chosen, total = selection.chosen, selection.fit.likelihood(selection.table)
     for k, candidate in enumerate(chosen):
