@@ -293,7 +293,7 @@ def stub(monkeypatch, made, seen):
 
     monkeypatch.setattr(calibrate, "with_truth", instead)
     monkeypatch.setattr(calibrate, "without_truth", instead)
-    monkeypatch.setattr(calibrate, "check", lambda recording, *_: Report(recording.name, [], {}))
+    monkeypatch.setattr(library, "check", lambda recording, *_: Report(recording.name, [], {}))
 
 
 @pytest.mark.parametrize(
@@ -347,7 +347,7 @@ def faulty(monkeypatch, *names):
     """Let check find an error in the flights of these names."""
     error = Finding("tdoa_sign", ERROR, "the sign of all TDOAs is wrong", "seen", "turn it", 0.0)
     monkeypatch.setattr(
-        calibrate,
+        library,
         "check",
         lambda recording, *_: Report(
             recording.name, [error] if recording.name in names else [], {}
@@ -380,9 +380,9 @@ def test_a_bad_flight_is_left_out_by_name_and_rule(room, monkeypatch, capsys, ba
 def test_quick_answers_of_one_flight_and_ends_with_0(room, monkeypatch, capsys, more):
     told = SimpleNamespace(sentences=lambda: ["so it is"])
     for name in ("prospect", "forecast"):
-        monkeypatch.setattr(calibrate, name, lambda flights, *_, name=name: told)
-    monkeypatch.setattr(calibrate, "prospect" if not more else "forecast", None)
-    monkeypatch.setattr(calibrate, "check", lambda recording, *_: Report(recording.name, [], {}))
+        monkeypatch.setattr(library, name, lambda *_: told)
+    monkeypatch.setattr(library, "prospect" if not more else "forecast", None)
+    monkeypatch.setattr(library, "check", lambda recording, *_: Report(recording.name, [], {}))
     assert calibrate.main(["flight1.bag", *more, "--quick"]) == 0
     assert "so it is" in capsys.readouterr().out
 

@@ -9,13 +9,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import AIDS, Flight, Truth
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.base import counted
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.monitoring.finding import ERROR
 
+from . import cli, command_lines
+from .checking import report
+from .checking.check import check, different_surveys
 from .checking.ordered import OrderedRecording, displacement
+from .checking.recording import read_recording
 from .diagnosis import diagnose, output, with_noise
 from .diagnosis.attribution import first_fit
 from .diagnosis.comparison import Baseline, compare
@@ -26,15 +31,19 @@ from .diagnosis.self_calibration.equations import slow_innovations
 from .diagnosis.self_calibration.solve import IMPROVED, LEFT
 from .diagnosis.validation import cross_fitted
 from .estimate import FlightEstimator
+from .parallel import Progress
 from .scoring.gains import NO_DIFFERENCE, change_in_words, difference
 from .surveying.report import as_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
+    from pathlib import Path
 
     from uwb_tdoa_ekf.monitoring.finding import Finding
 
     from .checking.recording import Recording
+    from .readers.inputs import Reading
+    from .readers.inputs import Recording as ReadingPair
 
 
 RMSE = "3D RMSE"  # name of the figure with ground truth
@@ -118,6 +127,60 @@ def blocking_errors(recording: Recording, findings: Iterable[Finding], std: floa
         if np.median(displacement(fit.positions, fit.all_moved[1])) <= LARGEST_SHIFT * std:
             errors = [finding for finding in errors if finding.rule != MISFIT]
     return errors
+
+
+def usable_paths(
+    reading: Reading,
+    recordings: tuple[Sequence[ReadingPair], Sequence[ReadingPair]],
+    estimator: FlightEstimator,
+    std: float,
+    keep: bool = False,
+    effects: str | None = None,
+) -> tuple[list[Path], list[Path]]:
+    """Print what check finds, and return the paths that permit a calibration: to fit, held out.
+
+    A recording with an error is named with the rule, and left out. Raises InputError if those that
+    are left have different surveys.
+
+    Parameters
+    ----------
+    recordings : (sequence, sequence) of (path, survey)
+        Recordings to fit and to hold out, with the paths of their surveys.
+    estimator : FlightEstimator
+        Estimator with the given effects.
+    std : float
+        Standard deviation of a coordinate of an anchor, m.
+    keep : bool
+        Whether to use recordings with an error, too.
+    effects : str or None
+        File of the given effects.
+    """
+    found, held = recordings
+    usable: dict[Path, Recording] = {}
+    with Progress("calibrate", len(found) + len(held), "recording") as progress:
+        for path, survey in (*found, *held):
+            recording = read_recording(reading, path, survey)
+            line = command_lines.survey_line(path, survey, effects)
+            result = check(recording, (), estimator, line)
+            cli.show(report.text(result))
+            errors = blocking_errors(recording, result.findings, std)
+            if errors:
+                named = "; ".join(f"{finding.cause} ({finding.rule})" for finding in errors)
+                what = (
+                    "it is used all the same, as --keep asks for"
+                    if keep
+                    else "it is left out; put that right, or use it as it is with --keep"
+                )
+                cli.say("calibrate", f"{recording.name}: check finds an error: {named}: {what}.")
+            if keep or not errors:
+                usable[path] = recording
+            progress.update()
+    for finding in different_surveys(list(usable.values())):
+        raise InputError(f"{finding.cause}: {finding.evidence}; {finding.remedy}.")
+    paths, judges = ([path for path, _ in some if path in usable] for some in recordings)
+    if held and paths and not judges:
+        cli.say("calibrate", "no flight of --holdout is left: the last of the others judges.")
+    return paths, judges
 
 
 def with_truth(
@@ -393,6 +456,24 @@ def forecast(
         after["pooled"]["rmse_3d"],
         None if interval is None else (interval[0], interval[1]),
     )
+
+
+def expectation(
+    flights: Sequence[Flight],
+    truth: bool,
+    tape: Tape,
+    base: EffectSet,
+    config: FilterConfig,
+    progress: Callable[[str], object],
+) -> Forecast | Prospect:
+    """Return what a calibration is likely to gain: a Forecast with ground truth, else a Prospect.
+
+    progress : progress(text) is called every few seconds; other arguments as of these functions
+    """
+    looking = partial(progress, "looking at a part of the flights")
+    if truth:
+        return forecast(flights, base, config, looking)
+    return prospect(flights, tape, base, config, looking)
 
 
 def prospect(

@@ -9,10 +9,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.effects import EffectSet
 
 from .. import cli, command_lines, options
-from ..calibrating import blocking_errors, forecast, prospect, with_truth, without_truth
-from ..checking import report
-from ..checking.check import check, different_surveys
-from ..checking.recording import read_recording
+from ..calibrating import expectation, usable_paths, with_truth, without_truth
 from ..diagnosis.noise import write_parameters
 from ..estimate import FlightEstimator
 from ..outputs import OutputFolder
@@ -23,13 +20,9 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_ekf.core.config import FilterConfig
 
-    from ..calibrating import Calibration, Forecast, Prospect
-    from ..checking.check import NamedAnchors
-    from ..diagnosis.self_calibration import Tape
-    from ..readers.inputs import Reading, Recording
+    from ..calibrating import Calibration
 
 DESCRIPTION = """Calibrate a tag from recordings: check them, find systematic errors, and validate the correction on hold-out flights.
 
@@ -96,15 +89,12 @@ def _calibrate(args: Namespace) -> int:
     options.check_holdout(
         (path.resolve() for path, _ in found), (path.resolve() for path, _ in held)
     )
-    usable = _usable(reading, found + held, tape.std, FlightEstimator(config, base), args)
-    paths, judges = ([path for path, _ in some if path in usable] for some in (found, held))
+    estimator = FlightEstimator(config, base)
+    paths, judges = usable_paths(
+        reading, (found, held), estimator, tape.std, args.keep, args.effects
+    )
     if not paths:
         return _stop("no flight is left to calibrate with")
-    if held and not judges:
-        cli.say("calibrate", "no flight of --holdout is left: the last of the others judges.")
-    for finding in different_surveys([usable[path] for path in (*paths, *judges)]):
-        cli.show(*report.lines(finding))
-        return _stop(f"{finding.cause} ({finding.rule})")
     flights, holdout = (reading.flights(map(str, some)) for some in (paths, judges))
     known = [flight.truth is not None for flight in flights + holdout]
     if any(known) and not all(known):
@@ -116,7 +106,9 @@ def _calibrate(args: Namespace) -> int:
         because = "says how well anchors are known, and ground truth is there to tell"
         options.refuse(args, options.OF_TAPE, f"{because}; give --no-truth, too")
     if args.quick:
-        _show_expected(flights, all(known), (tape, base, config))
+        with Progress("calibrate") as progress:
+            expected = expectation(flights, all(known), tape, base, config, progress)
+        cli.show(*expected.sentences())
         return 0
     if not holdout and len(flights) > 1:
         flights, holdout = flights[:-1], flights[-1:]
@@ -136,68 +128,6 @@ def _calibrate(args: Namespace) -> int:
     if made.why_not is not None:
         return _stop(made.why_not)
     return _write(made, config, args, judges or paths, all(known))
-
-
-def _show_expected(
-    flights: Sequence[Flight], truth: bool, model: tuple[Tape, EffectSet, FilterConfig]
-) -> None:
-    """Print what a calibration is likely to gain. model : Tape, EffectSet and FilterConfig."""
-    tape, *rest = model
-    with Progress("calibrate") as progress:
-
-        def looking() -> None:
-            progress("looking at a part of the flights")
-
-        expected: Forecast | Prospect
-        if truth:
-            expected = forecast(flights, *rest, looking)
-        else:
-            expected = prospect(flights, *model, looking)
-    cli.show(*expected.sentences())
-
-
-def _usable(
-    reading: Reading,
-    recordings: Sequence[Recording],
-    std: float,
-    estimator: FlightEstimator,
-    args: Namespace,
-) -> dict[Path, NamedAnchors]:
-    """Print what check finds, and return {path: Recording} of those that permit a calibration.
-
-    An error is named with its rule. With --keep its recording is used all the same.
-
-    Parameters
-    ----------
-    recordings : sequence of (path, survey)
-        Recordings with the paths of their surveys.
-    std : float
-        Standard deviation of a coordinate of an anchor, m.
-    estimator : FlightEstimator
-        Estimator with the given effects.
-    args : Namespace
-        Options of the command.
-    """
-    usable: dict[Path, NamedAnchors] = {}
-    with Progress("calibrate", len(recordings), "recording") as progress:
-        for path, survey in recordings:
-            recording = read_recording(reading, path, survey)
-            line = command_lines.survey_line(path, survey, args.effects)
-            result = check(recording, (), estimator, line)
-            cli.show(report.text(result))
-            errors = blocking_errors(recording, result.findings, std)
-            if errors:
-                named = "; ".join(f"{finding.cause} ({finding.rule})" for finding in errors)
-                what = (
-                    "it is used all the same, as --keep asks for"
-                    if args.keep
-                    else "it is left out; put that right, or use it as it is with --keep"
-                )
-                cli.say("calibrate", f"{recording.name}: check finds an error: {named}: {what}.")
-            if args.keep or not errors:
-                usable[path] = recording
-            progress.update()
-    return usable
 
 
 def _stop(why: str) -> int:

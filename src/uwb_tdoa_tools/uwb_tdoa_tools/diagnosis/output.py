@@ -96,8 +96,7 @@ def as_text(diagnosis: Diagnosis) -> str:
     if added:
         lines += [("apply", command) for command, _ in diagnosis.applying]
     left_out = [(entry.title, entry.why_not) for entry in found if not entry.added]
-    for why, what in by_reason(left_out).rows:
-        lines.append(("not added", f"{what}: {why}."))
+    lines += [("not added", "{1}: {0}.".format(*row)) for row in by_reason(left_out).rows]
     return "\n".join([*(_wrapped(*line) for line in lines), *anchors.lines(diagnosis)])
 
 

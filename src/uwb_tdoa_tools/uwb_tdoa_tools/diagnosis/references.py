@@ -241,7 +241,7 @@ class Heights(GroundTruth):
         self._config = config
 
     def prepare(self, flight: Flight) -> Flight:
-        if self._config is not None and not self._config.use_height:
+        if self._config is not None and not vars(self._config)["use_height"]:
             raise InputError(
                 "--without height: --reference heights compares with it; give one of the two."
             )

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from .entries import Entry
 
 UNITS = ", ".join(f"{channel.unit} for {name}" for name, channel in CHANNELS.items())
+# a reason, and its figures: after ": ", or in brackets at the end
+FIGURES_OF_REASON = re.compile(r"(.*?)(?:: (.*\d.*)| \(([^()]*\d[^()]*)\))?")
 MANY = 3  # largest number of anchors whose values stand in a sentence
 SIDE_BY_SIDE = 2  # largest number of runs side by side on a phone
 EVIDENCE = {
@@ -235,9 +237,8 @@ def by_reason(items: Iterable[tuple[str, str]]) -> Table:
     """
     rows: dict[str, list[str]] = {}
     for what, why in items:
-        reason, figures = re.fullmatch(r"(.*?)(?:: (.*\d.*)| \(([^()]*\d[^()]*)\))?", why).group(
-            1, 2
-        )
+        split = FIGURES_OF_REASON.fullmatch(why)
+        reason, figures = split.group(1, 2) if split else (why, "")
         figures = figures or why[len(reason) :].strip(" ()")
         rows.setdefault(reason, []).append(f"{what} ({figures})" if figures else what)
     return Table(
