@@ -86,16 +86,16 @@ REGISTERED = """
 from dataclasses import fields, replace
 from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_bias.common.sensors.sensor import parameter
-use = {"use_magnetometer": parameter(True, "use it", fixed=True)}
-SENSORS["magnetometer"] = replace(SENSORS["pressure"], name="magnetometer", parameters=use)
+use = {"use_sonar": parameter(True, "use it", fixed=True)}
+SENSORS["sonar"] = replace(SENSORS["pressure"], name="sonar", parameters=use)
 from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools.bags.topics import topics_of
 from uwb_tdoa_tools.simulation import SimulationConfig
 names = [{each.name for each in fields(kind)} for kind in (Flight, FilterConfig, SimulationConfig)]
-assert "magnetometer" in names[0] and "use_magnetometer" in names[1]
-assert "magnetometer_noise" in names[2]
-assert topics_of("magnetometer") == (("magnetometer", "sensor_msgs/msg/FluidPressure"),)
+assert "sonar" in names[0] and "use_sonar" in names[1]
+assert "sonar_noise" in names[2]
+assert topics_of("sonar") == (("sonar", "sensor_msgs/msg/FluidPressure"),)
 """
 
 
