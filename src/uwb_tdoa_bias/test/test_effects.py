@@ -213,7 +213,8 @@ def test_what_is_injected_is_corrected(effect):
     changed = effects.effects[0].inject(before)
     after = effects.correct_streams(changed)
     touched = False
-    for channel in ("gyro", "accel", "truth", *RADIO, *BY_POSE):
+    held = [channel for channel in BY_POSE if measured_on(before, channel) is not None]
+    for channel in ("gyro", "accel", "truth", *RADIO, *held):
         left = 0.0
         if channel in RADIO:
             left = effects.bias(true_samples(after, RADIO[channel])[0])

@@ -32,7 +32,7 @@ STEP = 1e-6
 UNKNOWN_SENSOR = """
 from dataclasses import replace
 from uwb_tdoa_bias.common.sensors import SENSORS
-SENSORS["magnetometer"] = replace(SENSORS["velocity"], name="magnetometer")
+SENSORS["sonar"] = replace(SENSORS["velocity"], name="sonar")
 import uwb_tdoa_ekf.core.engine
 """
 
@@ -299,7 +299,7 @@ def test_any_sensors_in_any_mode_leave_covariances(seed, robust, loss, names, sl
 def test_a_sensor_without_a_branch_in_the_filter_is_refused_at_the_start():
     run = subprocess.run([sys.executable, "-c", UNKNOWN_SENSOR], capture_output=True, text=True)
     assert run.returncode == 1
-    assert "NotImplementedError: the filter has no branch for magnetometer of SENSORS" in run.stderr
+    assert "NotImplementedError: the filter has no branch for sonar of SENSORS" in run.stderr
 
 
 def test_a_kind_without_a_branch_raises():

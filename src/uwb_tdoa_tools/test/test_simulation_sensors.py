@@ -1,4 +1,6 @@
 from dataclasses import replace
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -78,3 +80,26 @@ def test_bad_values_are_refused():
         ImuErrors(gyro_noise=-1.0)
     with pytest.raises(InputError, match="vibration"):
         ImuErrors(vibration=np.nan)
+
+
+REGISTERED = """
+from dataclasses import fields, replace
+from uwb_tdoa_bias.common.sensors import SENSORS
+from uwb_tdoa_bias.common.sensors.sensor import parameter
+use = {"use_sonar": parameter(True, "use it", fixed=True)}
+SENSORS["sonar"] = replace(SENSORS["pressure"], name="sonar", parameters=use)
+from uwb_tdoa_bias.common.flight import Flight
+from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_tools.bags.topics import topics_of
+from uwb_tdoa_tools.simulation import SimulationConfig
+names = [{each.name for each in fields(kind)} for kind in (Flight, FilterConfig, SimulationConfig)]
+assert "sonar" in names[0] and "use_sonar" in names[1]
+assert "sonar_noise" in names[2]
+assert topics_of("sonar") == (("sonar", "sensor_msgs/msg/FluidPressure"),)
+"""
+
+
+def test_the_registry_alone_adds_a_sensor_to_recordings_parameters_simulation_and_bags():
+    """In another process: whoever imports the registry makes its fields by it."""
+    run = subprocess.run([sys.executable, "-c", REGISTERED], capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
