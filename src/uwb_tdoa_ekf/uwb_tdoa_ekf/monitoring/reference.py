@@ -260,9 +260,7 @@ class SurveyComparison:
                 vectors[size, number, own] = part.vector
                 rests[size] += part.rest
         unknowns = np.arange(n * k).reshape(n, k)
-        order = np.concatenate(
-            [unknowns[:, :3].ravel(), unknowns[:, 3], unknowns[:, 4:].ravel()]
-        )
+        order = np.concatenate([unknowns[:, :3].ravel(), unknowns[:, 3], unknowns[:, 4:].ravel()])
         parts = []
         for gram, vector, rest, error_std in zip(grams, vectors, rests.tolist(), ERROR_STDS):
             weighted = (gram[:, :, :, None] * by[:, None]).reshape(len(cells), n, n * k)
