@@ -265,7 +265,7 @@ def self_calibrate(
         progress=progress,
         map_function=map_function,
     )
-    spread = calibrated(tape)
+    spread = calibrated((tape, None))
     many = len(flights[0].anchors) > MANY
     if tape.unknown or many or not all(len(flight.tdoa) for flight in flights):
         return spread
@@ -274,7 +274,7 @@ def self_calibrate(
     for row, placed in misfit.suspects(base, progress, map_function).items():
         unknown = replace(tape, unknown=(spread.prior.ids[row],))
         try:
-            found[row] = _alone(spread, calibrated(unknown, placed=placed))
+            found[row] = _alone(spread, calibrated((unknown, placed)))
         except InputError:  # too few anchors are left
             continue
     return _most_probable(found, misfit, of_spread)
@@ -282,18 +282,18 @@ def self_calibrate(
 
 def _calibrated(
     flights: Sequence[Flight],
-    tape: Tape,
+    known: tuple[Tape, Anchors | None],
     base: EffectSet,
     config: FilterConfig,
     constraints: Sequence[Constraint],
     progress: Callable[[], object],
     map_function: MapFunction,
-    placed: Anchors | None = None,
 ) -> SelfCalibration:
     """Return the SelfCalibration for one Tape.
 
-    placed : Anchors with the unknown ones placed; None to place them
+    known : the Tape, and Anchors with its unknown ones placed; None to place them
     """
+    tape, placed = known
     given, names = flights[0].anchors, tuple(flight.name for flight in flights)
     std, rows, tdoas = (
         tape.position_std(given),
