@@ -72,7 +72,11 @@ def run(args):
         (kind, seed) for kind in args.only for seed in (seeds if kind in KINDS[:-1] else twice)
     ]
     ask = without_calibration if args.tape else judge
-    rows = [row for told in parallel.over(ask, cases, args.jobs, unit="recording") for row in told]
+    rows = []
+    for told in parallel.over(ask, cases, args.jobs, unit="recording"):
+        rows += told
+        if args.json:  # an interrupted study keeps what it has
+            write_text(args.json, json.dumps(rows, indent=1))
     reading = options.reading_of(args)
     found = reading.find(args.flights) if args.flights else []
     rows += parallel.over(partial(measured, reading), found, args.jobs, unit="flight")

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from numpy.typing import ArrayLike
 
@@ -27,6 +27,10 @@ if TYPE_CHECKING:
 # m, standard deviation of the drift that every coordinate and delay may have without a change
 DRIFT = 0.005
 MOVED, LATER = 0.3, 0.2  # m, standard deviation of a change: of each coordinate, of a delay
+# m, length scale of the error of an anchor as a smooth function of the place
+FUNCTION_LENGTH = 1.2
+# m, candidate standard deviations of unknown delays
+DELAY_STDS = (0.02, 0.05, 0.1, 0.2, 0.4)
 ODDS = 100.0  # factor by which a change must raise the probability of the data
 OF_ANCHORS = POSITION, DELAY = "anchor_position", "anchor_delay"
 
@@ -195,6 +199,27 @@ def most_probable(
     """
     known = np.linalg.inv(covariance), float(np.linalg.slogdet(covariance)[1])
     return max((log_evidence(part, *known, offset), k) for k, part in enumerate(parts))
+
+
+def smallest_delays(
+    parts: Sequence[Part], prior: Callable[[float], np.ndarray], offset: np.ndarray
+) -> float:
+    """Return the smallest of DELAY_STDS with at least 1 / ODDS of the largest probability, in m.
+
+    A small size matters, because delays absorb errors of other causes.
+
+    Parameters
+    ----------
+    parts : sequence of Part
+        Normal equations.
+    prior : callable
+        prior(std) is the covariance (n, n), in m^2, if unknown delays have this standard deviation.
+    offset : (n,) array
+        Linearization point minus mean of the prior, in m.
+    """
+    evidences = [most_probable(parts, prior(std), offset)[0] for std in DELAY_STDS]
+    least = max(evidences) - np.log(ODDS)
+    return next(std for std, evidence in zip(DELAY_STDS, evidences) if evidence >= least)
 
 
 def with_each_change(

@@ -11,6 +11,7 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.anchor import AnchorDelay, AnchorPosition
 from uwb_tdoa_bias.effects.effect_set import Covariance
+from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.evidence import keys_of
 from uwb_tdoa_ekf.monitoring.finding import ERROR, WARNING, Finding
 from uwb_tdoa_ekf.results import concatenated, rows_of
@@ -19,7 +20,8 @@ from uwb_tdoa_tools.checking import watch
 from uwb_tdoa_tools.checking.check import check
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.commands import calibrate, diagnose, evaluate, survey
-from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
+from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate, single, solve
+from uwb_tdoa_tools.diagnosis.self_calibration.placing import place
 from uwb_tdoa_tools.diagnosis.self_calibration.solve import AnchorChange
 from uwb_tdoa_tools.estimate import FlightEstimator
 from uwb_tdoa_tools.localizing.assessment import GOOD, assess
@@ -229,6 +231,29 @@ def test_one_that_the_filter_rejects_is_placed_by_all_of_its_tdoas():
     assert np.linalg.norm(off) < max(0.08, stated) and (np.abs(off) < 3.0 * std).all()
     assert ("The flights determine its place" in change.as_text()) == (stated > 0.08)
     assert found.left < 0.5 * found.before
+
+
+def test_each_anchor_is_placed_once_in_parallel_and_with_progress(moved, monkeypatch):
+    """The two most suspect ones were placed twice, one after the other, without a sign of life."""
+    placed, mapped, ticks = [], [], []
+
+    def placing(flights, rows, config=None):
+        placed.extend(rows)
+        return place(flights, rows, config)
+
+    def mapping(function, items):
+        mapped.append(list(items))
+        return map(function, mapped[-1])
+
+    for module in (single, solve):
+        monkeypatch.setattr(module, "place", placing)
+    flight, rows = replace(moved, truth=None), list(range(len(moved.anchors)))
+    misfit, _ = single.Misfit.about([flight], FilterConfig(), flight.anchors, EffectSet())
+    best = misfit.suspects(EffectSet(), lambda: ticks.append(1), mapping)
+    assert ROW in best and len(ticks) == len(rows) and mapped == [rows]
+    placed.clear()
+    self_calibrate([flight], Tape(std=0.05), map_function=mapping)
+    assert placed == rows and rows in mapped[1:]
 
 
 def test_a_sound_flight_has_no_moved_anchor(sound):

@@ -1,16 +1,17 @@
 """Test whether anchors differ from the survey or calibration, with a Bayesian test over Slices.
 
 The prior of an anchor position has the standard deviations of the survey. Each anchor also has a
-delay that depends on the place, because of antennas and reflections. Slices in one cell of the room
-share this error. Many slices of a cell therefore count little more than a single slice. A part of
-the error is a slope over all cells. The evidence selects the size of such errors. A change of an
-anchor is reported if it makes the flight ODDS times more probable. Then the search continues with
-the next change (`..evidence`).
+delay that depends on the place, because of antennas and reflections. One part of it is a smooth
+function of the place, a Gaussian process as in `survey`. The other part is constant in a cell of
+the room, so many slices of a cell count little more than a single slice. The evidence selects the
+sizes of both parts and of unknown delays. A change of an anchor is reported if it makes the flight
+ODDS times more probable. Then the search continues with the next change (`..evidence`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,12 +20,14 @@ from uwb_tdoa_bias.common.geometry import ranges
 
 from ..evidence import (
     DELAY,
+    FUNCTION_LENGTH,
     POSITION,
     Part,
     changes_of,
     eliminated,
     known_before,
     most_likely_changes,
+    smallest_delays,
 )
 from .slices import TDOA_VARIANCE
 
@@ -42,13 +45,16 @@ CELL = 0.7  # m, size of a cell of the room
 # cells in a comparison, the latest ones; and anchors that are heard in them
 MOST_CELLS, MOST_ANCHORS = (150, 24)
 TDOA_STD = 0.1  # m, standard deviation of one TDOA without these errors
-# m, standard deviations of errors that are constant in a cell; the evidence selects one
-ERROR_STDS = (0.02, 0.05, 0.1, 0.15, 0.22, 0.32, 0.45, 0.65)
-# m, prior standard deviations of coordinates and of delays without a calibration
-SURVEY_STD, DELAY_STD = (0.05, 0.15)
+# m, candidate standard deviations of errors that are constant in a cell
+ERROR_STDS = (0.02, 0.05, 0.1, 0.2, 0.4)
+# m, candidate standard deviations of functions of the place
+FUNCTION_STDS = (0.01, 0.03, 0.1, 0.3)
+# largest number of components of one function, and smallest mean square of a component, relative to
+# that of the function
+MOST_COMPONENTS, SMALLEST_COMPONENT = 10, 0.02
+SURVEY_STD = 0.05  # m, prior standard deviation of coordinates without a calibration
 ODDS = 1e3  # factor by which a change must raise the probability of the flight
 FEWEST_CELLS, FEWEST_SLICES = 12, 40  # fewest cells and slices of a comparison
-SLOPES = 0.5  # 1/m, standard deviation of the slope of errors over cells, relative to their size
 MORE = TDOA_VARIANCE / TDOA_STD**2
 
 
@@ -176,16 +182,21 @@ class SurveyComparison:
         rows, cells = self._latest()
         if len(cells) < FEWEST_CELLS or sum(cell.slices for cell in cells) < FEWEST_SLICES:
             return []
-        n, positions = len(rows), self._anchors.positions[rows]
-        parts = self._parts(rows, positions, cells)
-        variance = np.repeat([SURVEY_STD**2, DELAY_STD**2], [3 * n, n])
-        covariance, known = known_before(self._anchors.ids[rows], variance, self._calibrated)
+        n, ids, nothing = len(rows), self._anchors.ids[rows], np.zeros(4 * len(rows))
+        parts = self._parts(rows, cells)
+
+        def before(delay_std: float) -> tuple[np.ndarray, np.ndarray]:
+            variance = np.repeat([SURVEY_STD**2, delay_std**2], [3 * n, n])
+            return known_before(ids, variance, self._calibrated)
+
+        delay_std = smallest_delays(parts, lambda std: before(std)[0], nothing)
+        covariance, known = before(delay_std)
         possible = {
             key: one
             for key, one in changes_of(n).items()
             if key[0] == POSITION or known[one[0]].all()
         }
-        changes = most_likely_changes(parts, covariance, np.zeros(4 * n), possible, ODDS)
+        changes = most_likely_changes(parts, covariance, nothing, possible, ODDS)
         if not changes.found:
             return []
         named: dict[ChangeKey, tuple[float, bool, tuple[int, ...]]] = {}
@@ -221,41 +232,62 @@ class SurveyComparison:
             rows, cells = more, [*cells, cell]
         return np.array(sorted(rows), int), cells
 
-    def _parts(self, rows: np.ndarray, positions: np.ndarray, cells: Sequence[_Cell]) -> list[Part]:
-        """Return a Part of coordinates and delays for each of ERROR_STDS.
+    def _parts(self, rows: np.ndarray, cells: Sequence[_Cell]) -> list[Part]:
+        """Return a Part of coordinates and delays for each of ERROR_STDS and FUNCTION_STDS.
 
         Parameters
         ----------
         rows : (n,) int array
             Rows of the anchors.
-        positions : (n, 3) array
-            Their positions in the world frame, in m.
         cells : sequence of _Cell
             Cells of the comparison.
         """
-        n, middle = len(rows), np.mean([cell.place for cell in cells], axis=0)
-        grams, vectors, rests = (
-            np.zeros((len(ERROR_STDS), 7 * n, 7 * n)),
-            np.zeros((len(ERROR_STDS), 7 * n)),
-            np.zeros(len(ERROR_STDS)),
-        )
-        for cell in cells:
+        n, places = len(rows), np.array([cell.place for cell in cells])
+        functions = smooth_functions(places)
+        k = 4 + functions.shape[1]  # unknowns of one anchor
+        # derivatives of each delay in each cell by the coordinates, delay and functions of its anchor
+        by = np.zeros((len(cells), n, k))
+        grams = np.zeros((len(ERROR_STDS), len(cells), n, n))
+        vectors = np.zeros((len(ERROR_STDS), len(cells), n))
+        rests = np.zeros(len(ERROR_STDS))
+        for number, cell in enumerate(cells):
             own = np.searchsorted(rows, cell.rows)
-            towards = ranges(cell.place, positions[own])[1]
-            axes = (3 * own[:, None] + np.arange(3)).ravel()
-            columns = np.concatenate([axes, 3 * n + own, 4 * n + axes])
-            # derivatives of delays by coordinates, delays and slopes
-            by, each = (np.zeros((len(own), 7 * len(own))), np.arange(len(own)))
-            for axis in range(3):
-                by[each, 3 * each + axis] = -towards[:, axis]
-                by[each, 4 * len(own) + 3 * each + axis] = cell.place[axis] - middle[axis]
-            by[each, 3 * len(own) + each] = 1.0
-            for k, part in enumerate(cell.parts):
-                grams[k][np.ix_(columns, columns)] += by.T @ part.gram @ by
-                vectors[k][columns] += by.T @ part.vector
-                rests[k] += part.rest
+            by[number, own, :3] = -ranges(cell.place, self._anchors.positions[cell.rows])[1]
+            by[number, own, 3] = 1.0
+            by[number, own, 4:] = functions[number]
+            for size, part in enumerate(cell.parts):
+                grams[size, number][np.ix_(own, own)] = part.gram
+                vectors[size, number, own] = part.vector
+                rests[size] += part.rest
+        unknowns = np.arange(n * k).reshape(n, k)
+        order = np.concatenate([unknowns[:, :3].ravel(), unknowns[:, 3], unknowns[:, 4:].ravel()])
         parts = []
-        for gram, vector, rest, std in zip(grams, vectors, rests, ERROR_STDS):
-            less, right, more = eliminated(gram, vector, 4 * n, SLOPES * std)
-            parts.append(Part(less, right, float(rest) + more, std))
+        for gram, vector, rest, error_std in zip(grams, vectors, rests.tolist(), ERROR_STDS):
+            weighted = (gram[:, :, :, None] * by[:, None]).reshape(len(cells), n, n * k)
+            together = by.transpose(1, 2, 0) @ weighted.transpose(1, 0, 2)
+            whole = together.reshape(n * k, n * k)[np.ix_(order, order)]
+            right = np.einsum("cik,ci->ik", by, vector).ravel()[order]
+            for std in FUNCTION_STDS:
+                less, left, more = eliminated(whole, right, 4 * n, std)
+                parts.append(Part(less, left, rest + more, math.hypot(error_std, std)))
         return parts
+
+
+def smooth_functions(places: np.ndarray) -> np.ndarray:
+    """Return the components of a Gaussian process at places: (C, k), at most MOST_COMPONENTS.
+
+    A function of the place is the sum of the components, each with a random factor of variance 1.
+    Its standard deviation is 1 and its mean over the places is zero, because a constant is a delay.
+
+    Parameters
+    ----------
+    places : (C, 3) array
+        Positions in the world frame, in m.
+    """
+    away = np.sum((places[:, None] - places) ** 2, axis=2)
+    kernel = np.exp(-0.5 * away / FUNCTION_LENGTH**2)
+    kernel = kernel - kernel.mean(axis=0)
+    kernel = kernel - kernel.mean(axis=1, keepdims=True)
+    power, vectors = np.linalg.eigh(kernel)
+    kept = np.flatnonzero(power > SMALLEST_COMPONENT * len(places))[-MOST_COMPONENTS:]
+    return np.asarray(vectors[:, kept] * np.sqrt(power[kept]))

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
 import sys
 from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_bias.effects import EffectSet
 
-from .. import cli, command_lines, options
+from .. import cli, command_lines, options, parallel
 from ..checking.before_anchors import nothing_comes_first
 from ..diagnosis.noise import write_parameters
 from ..diagnosis.self_calibration import self_calibrate
@@ -19,6 +20,8 @@ from ..surveying.report import as_dict, as_text, picture, with_blocked
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
+
+FEW = 20  # flights; what fewer gain by other processes, these take to start (docs/speed.md)
 
 DESCRIPTION = """Improve a tape-measured survey, from flights alone.
 
@@ -66,6 +69,7 @@ def parser() -> ArgumentParser:
     add = made.add_argument
     options.add_tape(made)
     options.add_known(made)
+    parallel.add_options(made)
     add(
         "--out",
         metavar="DIR",
@@ -85,10 +89,14 @@ def _survey(args: Namespace) -> int:
         "survey", reading, args.flights, FlightEstimator(config, base)
     ):
         return 1
-    flights = reading.flights(args.flights)
+    jobs, dask = parallel.workers_for(args, len(reading.find(args.flights)), FEW)
+    over = partial(parallel.over, jobs=jobs, dask=dask, unit=None)  # only Progress prints a line
+    flights = reading.flights(args.flights, None, jobs, dask)
     known = options.known_of(args, flights)
     with Progress("survey") as progress:
-        result = self_calibrate(flights, tape, base, config, known, lambda: progress("solving"))
+        result = self_calibrate(
+            flights, tape, base, config, known, lambda: progress("solving"), over
+        )
         result = with_blocked(
             result, flights, config, lambda: progress("looking for what blocks anchors")
         )

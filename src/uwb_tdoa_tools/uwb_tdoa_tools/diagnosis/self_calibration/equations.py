@@ -25,7 +25,7 @@ from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
 from uwb_tdoa_bias.effects.anchor import AnchorPosition
 from uwb_tdoa_bias.effects.samples import RADIO
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.evidence import MOVED
+from uwb_tdoa_ekf.evidence import FUNCTION_LENGTH, MOVED
 from uwb_tdoa_ekf.offline import without_unknown_offset
 from uwb_tdoa_ekf.sensitivity import TDOAS
 
@@ -57,7 +57,7 @@ FEWEST = 4  # fewest measurements in a cell; with fewer, noise hides slow errors
 RESIDUALS = {
     kind.channel: RangeResidual if kind.ends == 1 else TdoaResidual for kind in RADIO.values()
 }
-FEATURES, LENGTH = 20, 1.2  # number of features of a function, and m, its length scale
+FEATURES = 20  # number of features of a function
 AT_ONCE = 32  # regressors that are computed together
 
 
@@ -527,7 +527,7 @@ def _inflation(
     )
 
 
-def features(p: np.ndarray, length: float = LENGTH) -> np.ndarray:
+def features(p: np.ndarray, length: float = FUNCTION_LENGTH) -> np.ndarray:
     """Return random Fourier features of a Gaussian kernel, (n, FEATURES).
 
     p : (n, 3) m, places; length : m, length scale of the kernel

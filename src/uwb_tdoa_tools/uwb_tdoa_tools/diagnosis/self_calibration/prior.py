@@ -1,8 +1,7 @@
 """Combine the prior of the anchors, a tape or the last calibration, with the normal equations.
 
-The evidence selects changes since the last calibration (`uwb_tdoa_ekf.evidence`). It also selects
-the size of unknown delays: the smallest size with at least 1 / ODDS of the largest probability. A
-small size matters, because delays absorb otherwise unexplained errors.
+The evidence selects changes since the last calibration, and the size of unknown delays
+(`uwb_tdoa_ekf.evidence`).
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from uwb_tdoa_ekf.evidence import (
     known_before,
     log_evidence,
     most_likely_changes,
-    most_probable,
+    smallest_delays,
 )
 
 from ...checking.pair_rules import MANY
@@ -36,8 +35,6 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.effects import Effect
     from uwb_tdoa_ekf.evidence import Change, ChangeKey
 
-# m, candidate standard deviations of unknown delays; the evidence selects
-DELAY_STDS = (0.02, 0.05, 0.1, 0.2, 0.4)
 DELAY_STD = 0.1  # m, prior standard deviation of a delay that the last calibration lacks
 # m, prior standard deviation of the antenna delay of the tag, which lengthens all ranges and
 # cancels in TDOAs
@@ -180,12 +177,7 @@ def solve(gram: np.ndarray, vector: np.ndarray, prior: Prior, offset: np.ndarray
     """
     parts, unchanged, delay_std = _parts(gram, vector, prior, offset), prior.covariance, DELAY_STD
     if not prior.known.any():
-        evidences = [most_probable(parts, prior.with_delays(std), offset)[0] for std in DELAY_STDS]
-        delay_std = next(
-            std
-            for std, evidence in zip(DELAY_STDS, evidences)
-            if evidence >= max(evidences) - np.log(ODDS)
-        )
+        delay_std = smallest_delays(parts, prior.with_delays, offset)
         unchanged = prior.with_delays(delay_std)
     changes, possible = (
         most_likely_changes(parts, unchanged, offset, prior.changes()),

@@ -9,6 +9,7 @@ ones.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,12 +23,14 @@ from ..regression.fit import NU
 from .placing import place
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from uwb_tdoa_bias.common.anchors import Anchors
     from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_bias.effects import EffectSet
     from uwb_tdoa_ekf.core.config import FilterConfig
+
+    from ...parallel import MapFunction
 
 # number of anchors that are calibrated as unknown: those with the best likelihood after placing
 TRIED = 2
@@ -49,35 +52,57 @@ class Misfit:
     @classmethod
     def about(
         cls, flights: Sequence[Flight], config: FilterConfig, anchors: Anchors, effects: EffectSet
-    ) -> Misfit:
-        """Return a Misfit with the scale of the innovations under Anchors and an EffectSet."""
+    ) -> tuple[Misfit, float]:
+        """Return a Misfit with the scale of the innovations under Anchors and an EffectSet.
+
+        Also return its value for them.
+        """
         innovations = _innovations(flights, config, anchors, effects)
         scale = 1.4826 * float(np.median(np.abs(innovations))) if len(innovations) else 0.0
-        return cls(flights, config, max(scale, 1e-3), len(innovations))
+        made = cls(flights, config, max(scale, 1e-3), len(innovations))
+        return made, made._of(innovations)
 
     def of(self, anchors: Anchors, effects: EffectSet) -> float:
         """Return the negative log-likelihood (Student's t) of all innovations in the air.
 
         It assumes independent innovations. The caller divides it by their variance inflation.
         """
-        value = _innovations(self.flights, self.config, anchors, effects) / self.scale
-        if not len(value):
+        return self._of(_innovations(self.flights, self.config, anchors, effects))
+
+    def _of(self, innovations: np.ndarray) -> float:
+        if not len(innovations):
             return np.inf
+        value = innovations / self.scale
         return float(0.5 * (NU + 1.0) * self.count * np.mean(np.log1p(value**2 / NU)))
 
-    def suspects(self, effects: EffectSet) -> list[int]:
-        """Return the rows of the TRIED anchors with the best likelihood after placing.
+    def suspects(
+        self,
+        effects: EffectSet,
+        progress: Callable[[], object] = lambda: None,
+        map_function: MapFunction = map,
+    ) -> dict[int, Anchors]:
+        """Return {row: placed Anchors} of the TRIED anchors with the best likelihood after placing.
 
-        The best comes first.
+        The best comes first. progress, map_function : as of `self_calibrate`
         """
-        misfits = {}
-        for row in range(len(self.flights[0].anchors)):
-            try:
-                placed = place(self.flights, [row], self.config)
-            except InputError:  # too few TDOAs determine its position
-                continue
-            misfits[row] = self.of(placed, effects)
-        return sorted(misfits, key=misfits.__getitem__)[:TRIED]
+        misfits: dict[int, float] = {}
+        placed: dict[int, Anchors] = {}
+        rows = range(len(self.flights[0].anchors))
+        for row, one in enumerate(map_function(partial(_placed, self, effects), rows)):
+            progress()
+            if one is not None:
+                placed[row], misfits[row] = one
+        best = sorted(misfits, key=misfits.__getitem__)[:TRIED]
+        return {row: placed[row] for row in best}
+
+
+def _placed(misfit: Misfit, effects: EffectSet, row: int) -> tuple[Anchors, float] | None:
+    """Return (Anchors with one row placed, their Misfit); None if too few TDOAs determine it."""
+    try:
+        placed = place(misfit.flights, [row], misfit.config)
+    except InputError:
+        return None
+    return placed, misfit.of(placed, effects)
 
 
 def _innovations(

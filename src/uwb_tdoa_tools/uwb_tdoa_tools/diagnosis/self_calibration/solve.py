@@ -265,31 +265,35 @@ def self_calibrate(
         progress=progress,
         map_function=map_function,
     )
-    spread = calibrated(tape)
+    spread = calibrated((tape, None))
     many = len(flights[0].anchors) > MANY
     if tape.unknown or many or not all(len(flight.tdoa) for flight in flights):
         return spread
-    misfit = Misfit.about(flights, config, spread.surveyed, _in_model(spread))
+    misfit, of_spread = Misfit.about(flights, config, spread.surveyed, _in_model(spread))
     found: dict[int | None, SelfCalibration] = {None: spread}
-    for row in misfit.suspects(base):
-        progress()
+    for row, placed in misfit.suspects(base, progress, map_function).items():
+        unknown = replace(tape, unknown=(spread.prior.ids[row],))
         try:
-            found[row] = _alone(spread, calibrated(replace(tape, unknown=(spread.prior.ids[row],))))
-        except InputError:  # too few TDOAs determine it, or too few anchors are left
+            found[row] = _alone(spread, calibrated((unknown, placed)))
+        except InputError:  # too few anchors are left
             continue
-    return _most_probable(found, misfit)
+    return _most_probable(found, misfit, of_spread)
 
 
 def _calibrated(
     flights: Sequence[Flight],
-    tape: Tape,
+    known: tuple[Tape, Anchors | None],
     base: EffectSet,
     config: FilterConfig,
     constraints: Sequence[Constraint],
     progress: Callable[[], object],
     map_function: MapFunction,
 ) -> SelfCalibration:
-    """Return the SelfCalibration for one Tape."""
+    """Return the SelfCalibration for one Tape.
+
+    known : the Tape, and Anchors with its unknown ones placed; None to place them
+    """
+    tape, placed = known
     given, names = flights[0].anchors, tuple(flight.name for flight in flights)
     std, rows, tdoas = (
         tape.position_std(given),
@@ -303,7 +307,7 @@ def _calibrated(
         )
     start, start_std = given, std.copy()
     if rows:
-        start = place(flights, rows, config)
+        start = placed if placed is not None else place(flights, rows, config)
         start_std[rows], std[rows] = PLACED_STD, NOTHING_KNOWN
         if base.covariance is not None:
             base = replace(base, covariance=base.covariance.without(tape.unknown))
@@ -374,7 +378,9 @@ def _alone(spread: SelfCalibration, found: SelfCalibration) -> SelfCalibration:
     )
 
 
-def _most_probable(found: dict[int | None, SelfCalibration], misfit: Misfit) -> SelfCalibration:
+def _most_probable(
+    found: dict[int | None, SelfCalibration], misfit: Misfit, of_spread: float
+) -> SelfCalibration:
     """Return the most probable of several SelfCalibrations.
 
     A single moved anchor must be ODDS times more probable than the error spread over all anchors,
@@ -382,13 +388,14 @@ def _most_probable(found: dict[int | None, SelfCalibration], misfit: Misfit) -> 
     used: errors of antennas and obstacles are no shift, but one anchor can absorb part of them.
 
     found : {row of the anchor tried alone, None for the spread solution: SelfCalibration}
+    of_spread : the Misfit of the spread solution
     """
     alike = SYSTEMATIC * max(1.0, min(one.inflation for one in found.values()))
-    evidence = {
-        row: _log_evidence(one, row) - misfit.of(one.surveyed, _in_model(one)) / alike
-        for row, one in found.items()
-        if row is None or (one.why_not is None and _stands_elsewhere(one, row))
-    }
+    evidence: dict[int | None, float] = {None: _log_evidence(found[None], None) - of_spread / alike}
+    for row, one in found.items():
+        if row is not None and one.why_not is None and _stands_elsewhere(one, row):
+            of_one = misfit.of(one.surveyed, _in_model(one))
+            evidence[row] = _log_evidence(one, row) - of_one / alike
     best = max(evidence, key=evidence.__getitem__)
     doubt = evidence[best] - np.log(ODDS)
     if best is None or evidence[None] > doubt:
