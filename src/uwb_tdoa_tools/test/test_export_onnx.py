@@ -28,6 +28,8 @@ from uwb_tdoa_tools.estimate import with_antenna  # noqa: E402
 from uwb_tdoa_tools.exporting.correction import is_traceable, trace  # noqa: E402
 from uwb_tdoa_tools.exporting.left_out import left_out  # noqa: E402
 from uwb_tdoa_tools.exporting.onnx_file import printed, write_onnx  # noqa: E402
+from uwb_tdoa_tools.readers import read_flight  # noqa: E402
+from uwb_tdoa_tools.scoring.evaluation import evaluate  # noqa: E402
 from uwb_tdoa_tools.training.network import FEATURES, WITHOUT  # noqa: E402
 
 EQUAL = 1e-4  # m
@@ -186,6 +188,23 @@ def test_a_file_that_no_node_would_load_is_not_written(tmp_path):
     with pytest.raises(InputError, match="more than 2000 operators.*; export fewer effects"):
         write_onnx(tmp_path / "bias.onnx", ANCHORS, many)
     assert not (tmp_path / "bias.onnx").exists()
+
+
+def test_a_measured_flight_has_the_same_figures_by_the_file_and_by_effects(shared_data, tmp_path):
+    """The filter is in the loop; gyro_bias, which the file lacks, comes with it."""
+    log, survey = shared_data / "flights/0426/0426-traj3", shared_data / "surveys/anchor_0426.txt"
+    flight, path = read_flight(log, survey), tmp_path / "bias.onnx"
+    kinds = "anchor_delay", "antenna_pattern", "gyro_bias"
+    values = {"3": 0.1, "5": -0.08}, {"tag": 0.1}, {"z": 0.01}
+    effects = EffectSet(tuple(DECLARED[kind](value) for kind, value in zip(kinds, values)))
+    traced = write_onnx(path, flight.anchors, effects)
+    rest = effects.where(lambda effect: effect.name == "gyro_bias")
+    assert [one.label for one in traced.left_out] == ["gyro_bias"]
+    expected, by_effects = evaluate(flight, effects=effects)
+    found, by_file = evaluate(flight, effects=rest, network=load_network(path))
+    assert found.row()["rmse_3d"] == pytest.approx(expected.row()["rmse_3d"], abs=1e-6)
+    np.testing.assert_allclose(by_file.bias, by_effects.bias, rtol=0.0, atol=EQUAL)
+    assert np.ptp(by_effects.bias) > 0.2
 
 
 def test_a_hall_of_many_anchors_fits(tmp_path):
