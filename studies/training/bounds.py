@@ -7,7 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 
 from uwb_tdoa_bias.common.geometry import tdoa
-from uwb_tdoa_bias.correction.corrector import NETWORK, Correction
+from uwb_tdoa_bias.correction.corrector import Correction
+from uwb_tdoa_bias.correction.model import NETWORK
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.scoring.metrics import Score, position_at, scored_phase

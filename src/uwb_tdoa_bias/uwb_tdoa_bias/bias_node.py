@@ -24,7 +24,8 @@ from uwb_tdoa_msgs.msg import Tdoa, TdoaCorrected
 
 from .common.errors import InputError
 from .common.stamps import LARGEST_STEP_BACK, StampGate
-from .correction.corrector import EFFECTS, FADED, NETWORK, PASSED, Correction, Corrector, warm_up
+from .correction.corrector import Correction, Corrector, warm_up
+from .correction.model import EFFECTS, FADED, NETWORK, PASSED
 from .correction.network import load_network
 from .correction.poses import PoseQueue, parts_of
 from .effects import EffectSet, LabelCorrector

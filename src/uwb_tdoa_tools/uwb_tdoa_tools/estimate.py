@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.correction.network import Network
+from uwb_tdoa_bias.correction.model import Model
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.tag import TagLeverArm
 from uwb_tdoa_ekf.core.config import FilterConfig
@@ -22,7 +22,7 @@ class FlightEstimator:
         Parameters of the filter.
     effects : EffectSet or None
         Effects to correct the TDOAs for.
-    network : Network or None
+    network : Model or None
         Bias network to correct the TDOAs with.
     smoothed : bool
         Use later measurements for each estimate too.
@@ -30,7 +30,7 @@ class FlightEstimator:
 
     config: FilterConfig | None = None
     effects: EffectSet | None = None
-    network: Network | None = None
+    network: Model | None = None
     smoothed: bool = False
 
     def __call__(self, flight: Flight) -> Run:

@@ -12,10 +12,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .arrays import floats, piecewise
 from .errors import InputError
 from .lazy import interpolate
 
@@ -136,14 +137,14 @@ class Antenna:
 
         direction : (..., 3), antenna frame, any length
         """
-        direction = np.asarray(direction, dtype=float)
+        direction = floats(direction)
         x, y, z = direction[..., 0], direction[..., 1], direction[..., 2]
         horizontal = np.hypot(x, y)
         theta, phi = np.arctan2(y, x), np.arctan2(z, horizontal)
         azimuth, first, second = self._cuts
-        gain_theta = azimuth(np.mod(theta, 2.0 * np.pi))
-        gain_phi_1 = first(np.mod(np.where(x >= 0.0, phi, np.pi - phi), 2.0 * np.pi))
-        gain_phi_2 = second(np.mod(np.where(y >= 0.0, phi, np.pi - phi), 2.0 * np.pi))
+        gain_theta = _around(azimuth, theta)
+        gain_phi_1 = _around(first, np.where(x >= 0.0, phi, np.pi - phi))
+        gain_phi_2 = _around(second, np.where(y >= 0.0, phi, np.pi - phi))
         near_plane = np.cos(phi) ** 40
         along_x = np.cos(theta) ** 2
         elevation = along_x * gain_phi_1 + (1.0 - along_x) * gain_phi_2
@@ -165,6 +166,11 @@ class Antenna:
         """Return the `group_delay` of directions with gains (...), dBi: (...) m."""
         amplitude = 10.0 ** ((gain - self.peak_gain) / 20.0)
         return self.delay_span * np.maximum(1.0 - amplitude, 0.0)
+
+
+def _around(cut: Any, angle: np.ndarray) -> np.ndarray:
+    """Return a periodic cubic spline at angles (...), rad."""
+    return piecewise(cut, np.mod(angle, 2.0 * np.pi), cut.x, 3)
 
 
 SPEED_OF_LIGHT = 299792458.0  # m/s
@@ -242,7 +248,8 @@ def power_bias(power_dbm: np.ndarray) -> np.ndarray:
 
     Linear between the entries of the table of APS011, constant beyond.
     """
-    return 1e-3 * np.interp(power_dbm, APS011_POWER_DBM[::-1], APS011_BIAS_MM[::-1])
+    power, bias = APS011_POWER_DBM[::-1], APS011_BIAS_MM[::-1]
+    return 1e-3 * piecewise(lambda at: np.interp(at, power, bias), power_dbm, power, 1)
 
 
 def arrival_bias(
@@ -267,7 +274,7 @@ def _gains(
     p_tag: ArrayLike, q_tag: ArrayLike, p_anchor: ArrayLike, q_anchor: ArrayLike, link: RadioLink
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the gains of the tag's and the anchor's antenna, dBi, and the distance, m."""
-    to_anchor = np.asarray(p_anchor, dtype=float) - np.asarray(p_tag, dtype=float)
+    to_anchor = floats(p_anchor) - floats(p_tag)
     seen_from_tag = into_frame(link.tag_mount, into_frame(q_tag, to_anchor))
     seen_from_anchor = into_frame(q_anchor, -to_anchor)
     return (
@@ -285,7 +292,7 @@ def into_frame(q: ArrayLike, v: ArrayLike) -> np.ndarray:
     q : (..., 4) x y z w, frame to world
     v : (..., 3), world
     """
-    q, v = np.asarray(q, dtype=float), np.asarray(v, dtype=float)
+    q, v = floats(q), floats(v)
     x, y, z, w = -q[..., 0], -q[..., 1], -q[..., 2], q[..., 3]
     vx, vy, vz = v[..., 0], v[..., 1], v[..., 2]
     tx, ty, tz = 2.0 * (y * vz - z * vy), 2.0 * (z * vx - x * vz), 2.0 * (x * vy - y * vx)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..common.arrays import filled
 from ..common.compiled import compiled
 from ..common.geometry import rotate
 
@@ -75,19 +76,15 @@ def everything(samples: Samples) -> np.ndarray:
 
     They are NaN where they need an unknown pose.
     """
-    out = np.empty((len(samples), len(NAMES)))
-    anchors = samples.anchors
-    _fill(samples.p, samples.q, samples.a, samples.b, anchors.positions, anchors.orientations, out)
-    _fill_place(
-        samples.p,
-        samples.q,
-        samples.a,
-        samples.b,
-        anchors.ids,
-        anchors.positions,
-        out[:, len(FEATURES) :],
+    n, anchors = len(samples), samples.anchors
+    ends = samples.p, samples.q, samples.a, samples.b
+    return np.concatenate(
+        [
+            filled(_fill, (n, len(FEATURES)), *ends, anchors.positions, anchors.orientations),
+            filled(_fill_place, (n, len(PLACE)), *ends, anchors.ids, anchors.positions),
+        ],
+        axis=1,
     )
-    return out
 
 
 @compiled

@@ -22,19 +22,21 @@ from __future__ import annotations
 
 import json
 import math
-from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from ..common.arrays import filled, floats
 from ..common.compiled import compiled
 from ..common.errors import InputError
-from ..common.files import read_bytes
-from ..common.limits import MODEL_BYTES
-from ..common.text import printable, sanitize
+from ..common.text import sanitize
+from .exported import ExportedCorrection
 from .features import NAMES, everything
+from .model import FADED, FADED_BELOW, NETWORK, Model, Prediction, session_of
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from ..effects.samples import Samples
     from .session import Session
 
@@ -42,9 +44,13 @@ NO_NUMBERS = np.empty(0)
 _COLUMN = {name: column for column, name in enumerate(NAMES)}
 
 
-def load_network(name: str | Path | None) -> Network | None:
-    """Return the Network of a file, or None for an empty name; raise InputError."""
-    return Network(name) if name else None
+def load_network(name: str | Path | None) -> Model | None:
+    """Return the Model of a file, or None for an empty name; raise InputError."""
+    if not name:
+        return None
+    session = session_of(name)
+    kind = ExportedCorrection if "kind" in session.meta and "inputs" in session.meta else Network
+    return kind(name, session)
 
 
 class Validity(NamedTuple):
@@ -63,42 +69,21 @@ class Validity(NamedTuple):
     margin: np.ndarray
 
 
-class Network:
-    """An ONNX bias model.
+class Network(Model):
+    """An ONNX bias model of some features.
 
     Attributes
     ----------
-    meta : all its metadata, dict of str
-    trained_with : names of the effects that were corrected before the training; they must be
-        corrected in use, too
     share : share of its prediction that is corrected, 0 ... 1
     """
 
-    def __init__(self, path: str | Path) -> None:
-        """Load a file; raise InputError if it is no model or has unsuitable metadata."""
-        self._path = Path(path).absolute()
-        if not Path(path).is_file():
-            raise InputError(
-                f"model: {path} does not exist; give an .onnx file or leave the model empty."
-            )
-        self._model = _session(path)
-        self.meta = self._model.meta
-        try:
-            self._read(self.meta)
-        except (
-            KeyError,
-            ValueError,
-            TypeError,
-            AttributeError,
-            OverflowError,
-            RecursionError,
-        ) as error:
-            raise InputError(
-                f"model: {path}: its metadata must hold features (names out of "
-                f"{', '.join(NAMES)}), offset, scale, "
-                "clip and name, and may hold validity with fade_std, as JSON; the problem is "
-                f"{error!r}."
-            ) from error
+    NEEDS = (
+        f"features (names out of {', '.join(NAMES)}), offset, scale, clip and name, and may hold "
+        "validity with fade_std, as JSON"
+    )
+
+    def __init__(self, path: str | Path, session: Session | None = None) -> None:
+        super().__init__(path, session)
         width, n = self._model.width, len(self._inputs)
         if not (n == len(self._offset) == len(self._scale) == width) or (self._scale == 0).any():
             raise InputError(
@@ -119,10 +104,6 @@ class Network:
                 f"model: {path}: gives (n, {out.shape[1]}), or no finite numbers; the output "
                 "must be (n, 1), (n, 2) or (n, 3)."
             )
-
-    def __reduce__(self) -> tuple[type[Network], tuple[Path]]:
-        """Return the path of the file for pickle, which cannot store a session."""
-        return Network, (self._path,)
 
     def _read(self, meta: dict[str, str]) -> None:
         names, self._offset, self._scale = (
@@ -155,47 +136,24 @@ class Network:
         if not 0.0 <= self.share <= 1.0:
             raise ValueError("share must be between 0 and 1")
 
+    def added(self, samples: Samples, known: Prediction) -> Prediction:
+        shape, learned = (len(samples), 3), self.predict(samples)
+        bias, std, status = filled(_add, shape, *learned, *known[:3]).T
+        return Prediction(bias, std, status, *known[3:])
+
     def predict(self, samples: Samples) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return bias (n,) m, its std (n,) m, and the share (n,) 0 ... 1 of the possible knowledge.
 
         Bias and std are NaN where a required feature is unknown.
         """
-        yaw_std = (
-            NO_NUMBERS
-            if samples.yaw_std is None
-            else np.ascontiguousarray(samples.yaw_std, dtype=float)
-        )
-        limits, found = (
-            (self.clip, self._fade_std, self.share, self._largest_yaw_std),
-            np.empty((3, len(samples))),
-        )
-        table, x = everything(samples), np.empty((len(samples), len(self._inputs)))
-        _select(table, self._inputs, self._offset, self._scale, x)
-        _limit(self._model.run(x), table, self._validity, limits, yaw_std, found)
-        return found[0], found[1], found[2]
-
-
-def _session(path: str | Path) -> Session:
-    """Return the Session of a file whose content passed its trial; raise InputError."""
-    content = read_bytes(path, MODEL_BYTES)
-    from .trial import Session, Unplayable, tried_out  # imports onnxruntime
-
-    try:
-        return Session(content, alone=tried_out(content))
-    except Unplayable as error:
-        raise InputError(
-            f"model: {path} cannot be played as an ONNX model of dense layers "
-            f"({printable(str(error))}); export it again, without what it names."
-        ) from error
-
-
-@compiled
-def _select(
-    table: np.ndarray, columns: np.ndarray, offset: np.ndarray, scale: np.ndarray, x: np.ndarray
-) -> None:
-    for i in range(len(table)):
-        for k in range(len(columns)):
-            x[i, k] = (table[i, columns[k]] - offset[k]) / scale[k]
+        yaw_std = NO_NUMBERS if samples.yaw_std is None else floats(samples.yaw_std)
+        limits = self.clip, self._fade_std, self.share, self._largest_yaw_std
+        table = everything(samples)
+        out = self._model.run((table[:, self._inputs] - self._offset) / self._scale)
+        bias, std, known = filled(
+            _limit, (len(samples), 3), out, table, self._validity, limits, yaw_std
+        ).T
+        return bias, std, known
 
 
 @compiled
@@ -207,7 +165,7 @@ def _limit(
     yaw_std: np.ndarray,
     found: np.ndarray,
 ) -> None:
-    """Write bias, m, std, m, and known share, (3, n), to found; compiled.
+    """Write bias, m, std, m, and known share, (n, 3), to found; compiled.
 
     out : (n, 1 to 3), output of the network; table : (n, 29), as of `everything`
     limits : clip, m, fade_std, m, share, largest_yaw_std, rad; yaw_std : (n,) rad, or empty
@@ -231,9 +189,9 @@ def _limit(
             beyond = 0.0
             for k in range(len(columns)):
                 value = table[i, columns[k]]
-                far = max(lower[k] - value, value - upper[k]) / margin[k]
-                beyond = far if far > beyond or value != value else beyond
-            trust = 1.0 - min(beyond, 1.0) if beyond == beyond else np.nan
+                far = np.maximum(lower[k] - value, value - upper[k]) / margin[k]
+                beyond = np.maximum(far, beyond)  # NaN of an unknown value
+            trust = 1.0 - np.minimum(beyond, 1.0)
             bias, known = trust * bias, trust * known
             std = math.sqrt((trust * std) ** 2 + (1.0 - trust**2) * fade_std**2)
         if share < 1.0:
@@ -241,4 +199,28 @@ def _limit(
         if len(yaw_std) and yaw_std[i] > largest_yaw_std:
             std = math.hypot(std, bias)
             bias = known = 0.0
-        found[0, i], found[1, i], found[2, i] = bias, std, known
+        found[i, 0], found[i, 1], found[i, 2] = bias, std, known
+
+
+@compiled
+def _add(
+    learned: np.ndarray,
+    deviation: np.ndarray,
+    known: np.ndarray,
+    bias: np.ndarray,
+    std: np.ndarray,
+    status: np.ndarray,
+    out: np.ndarray,
+) -> None:
+    """Write bias, m, std, m, and status (n, 3) with a network's prediction to out; compiled.
+
+    learned, deviation : (n,) m, added where finite; known : (n,) 0 ... 1
+    bias, std, status : (n,), of the effects
+    """
+    for i in range(len(bias)):
+        out[i, 0], out[i, 1], out[i, 2] = bias[i], std[i], status[i]
+        if math.isfinite(learned[i]):
+            out[i, 0] += learned[i]
+            if math.isfinite(deviation[i]):
+                out[i, 1] = math.hypot(std[i], deviation[i])
+            out[i, 2] = FADED if known[i] < FADED_BELOW else NETWORK

@@ -8,6 +8,8 @@ from __future__ import annotations
 import numpy as np
 import onnxruntime
 
+from ..common.arrays import SymbolicArray
+
 PACKED = 4  # rows; batches are filled up to a multiple
 BATCH = 64  # rows per run at most; their data fit into the cache
 
@@ -21,6 +23,7 @@ class Session:
 
     Attributes
     ----------
+    content : bytes of the file
     width, outputs : columns of the input and of the output
     meta : {key: text} of the file
     alone : whether each row is run separately
@@ -46,6 +49,7 @@ class Session:
         inputs = self._session.get_inputs()
         if len(inputs) != 1 or len(self._session.get_outputs()) != 1 or len(inputs[0].shape) != 2:
             raise Unplayable("more than one input or output, or an input that is no table")
+        self.content = content
         self._name, (rows, self.width) = inputs[0].name, inputs[0].shape
         if not isinstance(self.width, int):
             raise Unplayable("an input of unknown width")
@@ -61,6 +65,8 @@ class Session:
         Rows are filled up to whole packets, since onnxruntime has other kernels for incomplete packets
         and single rows. Each batch begins at its own address, a multiple of 16 bytes.
         """
+        if isinstance(x, SymbolicArray):
+            return x.played(self)
         out, most = np.empty((len(x), self.outputs)), 1 if self.alone else BATCH
         for first in range(0, len(x), most):
             out[first : first + most] = self._play(x[first : first + most])

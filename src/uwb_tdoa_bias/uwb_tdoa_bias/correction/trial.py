@@ -32,10 +32,10 @@ from ..common.limits import (
 from .session import BATCH, PACKED, Session, Unplayable, onnxruntime
 
 OPERATORS = (
-    "Abs Add Ceil Celu Clip Concat Constant Cos Div Elu Erf Exp Floor Gather Gemm HardSigmoid "
-    "Identity LeakyRelu Log LogSoftmax MatMul Max Min Mul "
-    "Neg Reciprocal ReduceMax ReduceSum Relu Reshape Selu Sigmoid Sign Sin Softmax Softplus "
-    "Softsign Sqrt Sub Sum Tanh"
+    "Abs Add And Atan Ceil Celu Clip Concat Constant Cos Div Elu Equal Erf Exp Floor Gather Gemm "
+    "HardSigmoid Identity LeakyRelu Less LessOrEqual Log LogSoftmax MatMul Max Min Mul "
+    "Neg Not Or Reciprocal ReduceMax ReduceSum Relu Reshape Selu Sigmoid Sign Sin Softmax Softplus "
+    "Softsign Sqrt Sub Sum Tanh Where"
 ).split()
 START = (
     f"import json, sys; sys.path[:] = json.loads(sys.argv[1]); from {__name__} import main; main()"

@@ -356,10 +356,8 @@ class Nlos(SearchedDelay):
     def delay_regressors(
         self, samples: Samples, rows: np.ndarray, keys: Sequence[str]
     ) -> np.ndarray:
-        out = np.zeros((len(rows), len(keys)))
-        for column, key in enumerate(keys):
-            out[:, column] = self._blocked(samples, rows, key.partition(".")[0])
-        return out
+        columns = [self._blocked(samples, rows, key.partition(".")[0])[:, None] for key in keys]
+        return 1.0 * np.concatenate([np.zeros((len(rows), 0)), *columns], axis=1)
 
     def _blocked(self, samples: Samples, rows: np.ndarray, anchor: str) -> np.ndarray:
         """Return whether arrivals are of the anchor and within its limits, (k * n,) bool."""

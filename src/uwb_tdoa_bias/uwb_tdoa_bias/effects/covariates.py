@@ -39,7 +39,7 @@ OF_TDOA: dict[str, Callable[[Any], np.ndarray | None]] = {
     "climb_rate": lambda s: None if s.motion is None else s.motion.velocity[:, 2],
     "acceleration": lambda s: None if s.motion is None else _norm(s.motion.acceleration),
     "turning_rate": lambda s: None if s.motion is None else _norm(s.motion.rate),
-    "tilt": lambda s: np.arccos(np.clip(1.0 - 2.0 * (s.q[:, 0] ** 2 + s.q[:, 1] ** 2), -1.0, 1.0)),
+    "tilt": lambda s: 2.0 * np.arcsin(np.minimum(np.hypot(s.q[:, 0], s.q[:, 1]), 1.0)),
     "interval": lambda s: s.interval,
     "previous_anchor": lambda s: s.previous,
     "vibration": lambda s: s.vibration,

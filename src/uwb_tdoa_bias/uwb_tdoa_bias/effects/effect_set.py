@@ -49,7 +49,7 @@ from .imu import (
     ImuMisalignment,
 )
 from .pair import NoiseCorrelation, NoiseLevel, OutlierRate, PairOffset, PairSign
-from .samples import N_STATES, RADIO, Motion
+from .samples import N_STATES, RADIO
 from .smooth_term import SmoothTerm
 from .stamps import RangeDelay, TdoaTimeOffset, VelocityDelay
 from .tag import AntennaPattern, RangeBias, RangeScale, ReceivedPowerBias, TagLeverArm
@@ -270,7 +270,7 @@ class EffectSet:
         """
         groups: dict[tuple[int, ...], list[Effect]] = {}
         n = len(samples)
-        bias, jacobian, power = np.zeros(n), np.zeros((n, N_STATES)), np.zeros(n)
+        bias, power, jacobian = np.zeros(n), np.zeros(n), [np.zeros(n)] * N_STATES
         for effect in self.effects:
             if effect.jacobian_states:
                 groups.setdefault(effect.jacobian_states, []).append(effect)
@@ -280,9 +280,9 @@ class EffectSet:
             here, *sides = sum(parts, np.zeros(len(moved))).reshape(-1, n)
             bias += here
             for k, (low, high) in zip(states, zip(sides[::2], sides[1::2])):
-                jacobian[:, k] += (high - low) / (2.0 * REACH)
+                jacobian[k] = jacobian[k] + (high - low) / (2.0 * REACH)
                 power += 2.0 * (0.5 * (high + low) - here) ** 2
-        return bias, jacobian, np.sqrt(power)
+        return bias, np.stack(jacobian, axis=1), np.sqrt(power)
 
     def where(self, condition: Callable[[Effect], Any]) -> EffectSet:
         """Return the EffectSet of the effects that meet a condition."""
@@ -456,14 +456,13 @@ def _finite_or_zero(bias: np.ndarray) -> np.ndarray:
 def _moved(samples: Samples, states: tuple[int, ...]) -> Samples:
     """Return the Samples, followed by copies with each state lowered and raised by REACH."""
     n, out = len(samples), samples.repeated(1 + 2 * len(states))
-    position = out.p.copy()
-    velocity = np.zeros_like(position) if out.motion is None else out.motion.velocity.copy()
+    by = np.zeros((len(out), N_STATES))
     for number, state in enumerate(states):
-        moved = position if state < 3 else velocity
         for side, step in enumerate((-REACH, REACH)):
             first = (1 + 2 * number + side) * n
-            moved[first : first + n, state % 3] += step
+            by[first : first + n, state] = step
+    position = out.p + by[:, :3]
     if out.motion is None:
         return replace(out, p=position)
-    motion = Motion(velocity, out.motion.acceleration, out.motion.rate)
+    motion = replace(out.motion, velocity=out.motion.velocity + by[:, 3:])
     return replace(out, p=position, motion=motion)

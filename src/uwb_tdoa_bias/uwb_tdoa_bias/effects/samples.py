@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 import numpy as np
 
 from ..common.anchors import Anchors
+from ..common.arrays import filled, floats
 from ..common.compiled import compiled
 from ..common.geometry import ranges, tdoa_each
 from ..common.lazy import rotations
@@ -179,10 +180,9 @@ class Samples:
         p : (n, 3) m, antenna of the tag, instead of its position
         positions : (N, 3) m, antennas of the anchors, instead of the survey
         """
-        out, at = np.empty(len(self)), np.ascontiguousarray(self.p if p is None else p, dtype=float)
+        at = floats(self.p if p is None else p)
         positions = self.anchors.positions if positions is None else positions
-        tdoa_each(at, positions[self.a], positions[self.b], out)
-        return out
+        return filled(tdoa_each, (len(self),), at, positions[self.a], positions[self.b])
 
     def position_jacobian(self, p: np.ndarray | None = None) -> np.ndarray:
         """Return the derivative of `predicted` by the antenna of the tag, (n, 3)."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from ..common.arrays import filled, floats, piecewise
 from ..common.compiled import compiled
 from ..common.errors import InputError
 from ..common.sensors import BY_POSE, COMPARED
@@ -218,11 +219,11 @@ class SmoothTerm(Effect):
 
         They are NaN for NaN.
         """
-        values = np.asarray(values, dtype=float)
+        values = floats(values)
         if self.shape != "spline":
             return shape_basis(self.shape, self.knots, values)
         if self.covariate in CATEGORIES:
-            return (values[:, None] == self._at).astype(float)
+            return 1.0 * (values[:, None] == self._at)
         out = np.zeros((len(values), self.count))
         _basis(self._at, values, out)
         return out
@@ -259,9 +260,11 @@ class SmoothTerm(Effect):
         """Return the values (n,) of functions with weights (m, k); function rows (n,)."""
         if self.shape != "spline" or self.covariate in CATEGORIES:
             return np.einsum("nk,nk->n", self.basis(values), weights[rows])
-        out = np.empty(len(values))
-        _curves(self._at, np.asarray(values, dtype=float), weights, rows, out)
-        return out
+
+        def curves(at: np.ndarray) -> np.ndarray:
+            return filled(_curves, at.shape, self._at, at, weights, rows)
+
+        return piecewise(curves, floats(values), self._at, DEGREE)
 
     @cached_by_anchors
     def _weights(self, anchors: Anchors) -> np.ndarray:
@@ -415,9 +418,10 @@ def _basis(knots: np.ndarray, values: np.ndarray, out: np.ndarray) -> None:
 def _curves(
     knots: np.ndarray, values: np.ndarray, weights: np.ndarray, rows: np.ndarray, out: np.ndarray
 ) -> None:
+    """Write functions at values (m * n,) to out; rows (n,) name the weights, (k, ...)."""
     for i in range(len(values)):
         piece, first, second, third = _pieces(knots, values[i])
-        w = weights[rows[i]]
+        w = weights[rows[i % len(rows)]]
         out[i] = first * w[piece] + second * w[piece + 1] + third * w[piece + 2]
 
 
@@ -441,7 +445,7 @@ def shape_basis(shape: str, knots: Sequence[float], values: np.ndarray) -> np.nd
     step, interval : 1 beyond the middle knot, or between the two inner knots
     wave : the sine of the period between the knots, and the cosine
     """
-    v, one = np.asarray(values, dtype=float), np.ones(len(values))
+    v, one = floats(values), np.ones(len(values))
     if shape == "wave":
         phase = 2.0 * np.pi * (v - knots[0]) / (knots[1] - knots[0])
         return np.stack([one, np.sin(phase), np.cos(phase)], axis=1)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..common.arrays import filled, floats
 from ..common.geometry import rotate_each
 from ..common.radio import (
     FLAT_MOUNT,
@@ -79,9 +80,7 @@ class TagLeverArm(GeometryEffect):
 
 def _rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Return R(q) v, (n, 3), for quaternions (n, 4) x y z w; NaN where q is NaN."""
-    out = np.empty((len(q), 3))
-    rotate_each(np.ascontiguousarray(q, dtype=float), v, out)
-    return out
+    return filled(rotate_each, (len(q), 3), floats(q), v)
 
 
 class RangeScale(Effect):
@@ -246,13 +245,14 @@ class AntennaPattern(ArrivalEffect):
         self, samples: Samples, rows: np.ndarray, keys: Sequence[str]
     ) -> np.ndarray:
         to_anchor = samples.anchors.positions[rows] - tile(samples, samples.p)
-        out = np.zeros((len(rows), len(keys)))
-        for column, key in enumerate(keys):
+        out = [np.zeros((len(rows), 0))]
+        for key in keys:
             if key == "tag":
                 seen = into_frame(FLAT_MOUNT, into_frame(tile(samples, samples.q), to_anchor))
-                out[:, column] = UNIT_ANTENNA.group_delay(seen)
+                delay = UNIT_ANTENNA.group_delay(seen)
             else:  # an anchor of unknown orientation has no delay
                 orientations = samples.anchors.orientations[rows]
                 delay = UNIT_ANTENNA.group_delay(into_frame(orientations, -to_anchor))
-                out[:, column] = np.where(np.isfinite(orientations).all(axis=1), delay, 0.0)
-        return out
+                delay = np.where(np.isfinite(orientations).all(axis=1), delay, 0.0)
+            out.append(delay[:, None])
+        return np.concatenate(out, axis=1)

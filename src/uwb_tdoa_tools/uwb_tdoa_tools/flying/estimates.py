@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.common.anchors import Anchors
     from uwb_tdoa_bias.common.flight import Imu, Tdoas
-    from uwb_tdoa_bias.correction.network import Network
+    from uwb_tdoa_bias.correction.model import Model
     from uwb_tdoa_ekf.core.config import FilterConfig
 
     from .mission import Pose
@@ -239,7 +239,7 @@ class OwnFilter:
         anchors: Anchors,
         config: FilterConfig,
         effects: EffectSet | None = None,
-        network: Network | None = None,
+        network: Model | None = None,
     ) -> None:
         """Set up the filter and its corrections.
 
@@ -248,7 +248,7 @@ class OwnFilter:
         anchors : Anchors
         config : FilterConfig
         effects : EffectSet, optional
-        network : Network, optional
+        network : Model, optional
             Corrections of the measurements.
         """
         effects = effects or EffectSet()

@@ -26,7 +26,7 @@ from .metrics import Score, radio_residuals
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.common.flight import Flight, Truth
-    from uwb_tdoa_bias.correction.network import Network
+    from uwb_tdoa_bias.correction.model import Model
     from uwb_tdoa_ekf.core.config import FilterConfig
     from uwb_tdoa_ekf.offline import Run
 
@@ -40,7 +40,7 @@ def evaluate(
     flight: Flight,
     config: FilterConfig | None = None,
     effects: EffectSet | None = None,
-    network: Network | None = None,
+    network: Model | None = None,
 ) -> tuple[Score, Run]:
     """Run the filter over a Flight with ground truth.
 

@@ -1,4 +1,4 @@
-"""Write ONNX graphs, and train the network of Zhao et al. (RA-L 2021).
+"""Train the network of Zhao et al. (RA-L 2021).
 
 The network has three layers of 30 neurons, with or without the orientations of the anchors. As
 published (section V-B), inputs are scaled, and mini-batch gradient descent minimizes squared errors.
@@ -9,111 +9,24 @@ that on the validation flights.
 from __future__ import annotations
 
 import copy
-import json
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from onnx import NodeProto, TensorProto, checker, helper, numpy_helper
 from sklearn.neural_network import MLPRegressor
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.text import version
 from uwb_tdoa_bias.correction.features import FEATURES, columns
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+from ..exporting.onnx_graph import GraphBuilder
 
-    from numpy.typing import ArrayLike
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
     from onnx import ModelProto
 
     from uwb_tdoa_bias.effects import Samples
 
     from .labels import Labels
-
-
-OPSET, IR_VERSION = 13, 8  # `trial.py` lists the operators of this version
-
-
-class GraphBuilder:
-    """Build an ONNX graph from plain operators.
-
-    Values are names of tensors. Tensors are (n, k) of float unless stated otherwise.
-    """
-
-    def __init__(self) -> None:
-        self._nodes: list[NodeProto] = []
-        self._constants: list[TensorProto] = []
-        self.input = "features"
-
-    def constant(self, value: ArrayLike, kind: type[np.generic] = np.float32) -> str:
-        """Add a constant tensor."""
-        self._constants.append(
-            numpy_helper.from_array(np.asarray(value, dtype=kind), f"c{len(self._constants)}")
-        )
-        return self._constants[-1].name
-
-    def op(self, kind: str, *inputs: Any, **attributes: Any) -> str:
-        """Append an operator and return the name of its output.
-
-        Inputs that are no names become constants.
-        """
-        names = [value if isinstance(value, str) else self.constant(value) for value in inputs]
-        self._nodes.append(helper.make_node(kind, names, [f"v{len(self._nodes)}"], **attributes))
-        return self._nodes[-1].output[0]
-
-    def take(self, value: str, columns: Iterable[int]) -> str:
-        """Select columns."""
-        return self.op("Gather", value, self.constant(list(columns), np.int64), axis=1)
-
-    def rows(self, value: str, width: int) -> str:
-        """Reshape to rows of another width, with the same order of numbers."""
-        return self.op("Reshape", value, self.constant([-1, width], np.int64))
-
-    def total(self, values: Sequence[str]) -> str:
-        """Sum tensors of one shape."""
-        return values[0] if len(values) == 1 else self.op("Sum", *values)
-
-    def row_sum(self, value: str) -> str:
-        """Sum along each row: (n, 1)."""
-        return self.op("ReduceSum", value, self.constant([1], np.int64), keepdims=1)
-
-    def distance2(self, points: str, centres: np.ndarray) -> str:
-        """Return squared distances (n, m) from points (n, k) to fixed centres (m, k)."""
-        cross = self.op("MatMul", points, -2.0 * centres.T)
-        own = self.row_sum(self.op("Mul", points, points))
-        far = self.op("Add", self.op("Add", cross, own), np.sum(centres**2, axis=1)[None])
-        return self.op("Max", far, [0.0])
-
-    def model(self, width: int, outputs: Sequence[str], meta: Mapping[str, Any]) -> ModelProto:
-        """Return the ONNX model.
-
-        Parameters
-        ----------
-        width : int
-            Number of input columns.
-        outputs : sequence of str
-            Tensors (n, 1) that are concatenated as output.
-        meta : mapping
-            Metadata, stored as JSON.
-        """
-        self._nodes.append(helper.make_node("Concat", outputs, ["bias"], axis=1))
-        graph = helper.make_graph(
-            self._nodes,
-            "bias",
-            [helper.make_tensor_value_info(self.input, TensorProto.FLOAT, ["n", width])],
-            [helper.make_tensor_value_info("bias", TensorProto.FLOAT, ["n", len(outputs)])],
-            self._constants,
-        )
-        about = {"producer_name": "uwb_tdoa", "producer_version": version()}
-        made = helper.make_model(
-            graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION, **about
-        )
-        helper.set_model_props(made, {key: json.dumps(value) for key, value in meta.items()})
-        checker.check_model(made)
-        return made
-
-
-pass
 
 
 LAYERS = (30, 30, 30)

@@ -27,7 +27,8 @@ from scipy.spatial.distance import cdist
 
 from uwb_tdoa_bias.correction.features import columns
 
-from . import linear, network
+from ..exporting.onnx_graph import GraphBuilder
+from . import linear
 from .labels import SAME_PLACE, constellations
 
 if TYPE_CHECKING:
@@ -267,7 +268,7 @@ class Structured:
 
     def onnx(self, meta: Mapping[str, Any]) -> ModelProto:
         """Return the ONNX model with the outputs bias, standard deviation and known share."""
-        graph, names = network.GraphBuilder(), self.inputs()
+        graph, names = GraphBuilder(), self.inputs()
         end = graph.rows(graph.input, len(names) // 2)  # (2n, ...): each row is one end
         maps = [self._site_graph(graph, end)] if len(self.site_ids) else []
         maps += [self._link_graph(graph, end)] if self.links else []
@@ -286,7 +287,7 @@ class Structured:
         }
         return graph.model(len(names), [bias, std, known], meta)
 
-    def _site_graph(self, graph: network.GraphBuilder, end: str) -> tuple[str, str]:
+    def _site_graph(self, graph: GraphBuilder, end: str) -> tuple[str, str]:
         """Return (mean, explained variance) of the site maps, each (2n, 1), from features of one end."""
         place, who, where = (graph.take(end, some) for some in ([0, 1, 2], [3], [4, 5, 6]))
         place = graph.op("Div", place, [self.options.length])
@@ -304,7 +305,7 @@ class Structured:
         known = _power(graph, values, _known_directions(self.site, self.site_covariance))
         return graph.row_sum(graph.op("Mul", weights, values)), graph.op("Mul", at_site, known)
 
-    def _link_graph(self, graph: network.GraphBuilder, end: str) -> tuple[str, str]:
+    def _link_graph(self, graph: GraphBuilder, end: str) -> tuple[str, str]:
         """Return (mean, explained variance) of the link maps, each (2n, 1).
 
         The input x is the log distance and a unit vector. A Gaussian of the distance to a centre c is an
@@ -368,7 +369,7 @@ def _known_directions(of: Map, covariance: np.ndarray) -> np.ndarray:
     return of.whiten @ (vector[:, leading] * np.sqrt(np.maximum(share[leading], 0.0)))
 
 
-def _power(graph: network.GraphBuilder, values: str, directions: np.ndarray) -> str:
+def _power(graph: GraphBuilder, values: str, directions: np.ndarray) -> str:
     """Return the sum of squares (n, 1) of values (n, m) along directions (m, k)."""
     part = graph.op("MatMul", values, directions)
     return graph.row_sum(graph.op("Mul", part, part))

@@ -1,0 +1,68 @@
+"""Functions of arrays that effects use beside numpy, for numbers and for symbols alike.
+
+An effect states its equation once, for arrays of numbers. `export` calls the same code with
+symbolic arrays, and records the equation. numpy's functions take both kinds by themselves. The
+functions below do so where numpy's do not: for conversions, compiled functions, and functions that
+are polynomials between given places.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+class SymbolicArray(ABC):
+    """An array of symbols, one row per measurement, that records what is computed of it."""
+
+    @abstractmethod
+    def filled(self, kernel: Callable[..., Any], shape: tuple[int, ...], inputs: Any) -> Any:
+        """Return what `filled` returns, recorded."""
+
+    @abstractmethod
+    def piecewise(
+        self, function: Callable[[np.ndarray], np.ndarray], breaks: np.ndarray, degree: int
+    ) -> Any:
+        """Return what `piecewise` returns, recorded."""
+
+    @abstractmethod
+    def played(self, model: Any) -> Any:
+        """Return the output (n, outputs) of a Session for this input (n, width), recorded."""
+
+
+def floats(values: Any) -> Any:
+    """Return values as an array of float; a SymbolicArray stays as it is."""
+    return values if isinstance(values, SymbolicArray) else np.asarray(values, dtype=float)
+
+
+def filled(kernel: Callable[..., Any], shape: tuple[int, ...], *inputs: Any) -> Any:
+    """Return the array of a shape that a compiled function writes to its last argument.
+
+    inputs : the other arguments; arrays are passed on in contiguous form
+    """
+    for value in inputs:
+        if isinstance(value, SymbolicArray):
+            return value.filled(kernel, shape, inputs)
+    out = np.empty(shape)
+    kernel(
+        *(np.ascontiguousarray(one) if isinstance(one, np.ndarray) else one for one in inputs), out
+    )
+    return out
+
+
+def piecewise(
+    function: Callable[[np.ndarray], np.ndarray], x: Any, breaks: np.ndarray, degree: int
+) -> Any:
+    """Return function(x) of a continuous piecewise polynomial, which is constant beyond its breaks.
+
+    function : of (m * n,) values, m for each row of x in turn, to (m * n,)
+    x : (n,); breaks : (k,), rising, where pieces meet, ends included; degree : of the pieces
+    """
+    if isinstance(x, SymbolicArray):
+        return x.piecewise(function, breaks, degree)
+    return function(x)

@@ -1,0 +1,275 @@
+"""Node, an operation in the graph of a correction, and its evaluation in numpy.
+
+A node is an array per TDOA: its `shape` has no axis of TDOAs. Printers translate these kinds; all
+have the meaning of numpy, NaN included.
+
+input     one column of the input table; `value` is its name, the shape is ()
+constant  `value` is (1, *shape), or (N * N, *shape) with one array for each pair of anchors; the
+          pair in rows a and b of the anchors has row a * N + b. See `table`.
+pick      elements of its inputs: all inputs are flattened and joined, and `value`, an integer
+          array of the result's shape, says which element stands where. This is the only structural
+          kind: columns, stacks, concatenations and reshapes are all picks.
+sum       the sum over the last axis
+network   the output (outputs,) of an ONNX model for its input (width,); `value` is its Session
+Other kinds are elementwise, of inputs that have as many axes as the result and broadcast:
+neg abs sqrt exp log sin cos floor, add sub mul div max min atan2, lt le eq (to bool),
+not and or (of bool), where (of bool and two numbers).
+
+A node is evaluated once, however many others use it: `ordered` lists the nodes of a graph, equal
+ones only once, inputs first.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+ELEMENTWISE: dict[str, Callable[..., Any]] = {
+    "neg": np.negative,
+    "abs": np.abs,
+    "sqrt": np.sqrt,
+    "exp": np.exp,
+    "log": np.log,
+    "sin": np.sin,
+    "cos": np.cos,
+    "floor": np.floor,
+    "add": np.add,
+    "sub": np.subtract,
+    "mul": np.multiply,
+    "div": np.divide,
+    "max": np.maximum,
+    "min": np.minimum,
+    "atan2": np.arctan2,
+    "lt": np.less,
+    "le": np.less_equal,
+    "eq": np.equal,
+    "not": np.logical_not,
+    "and": np.logical_and,
+    "or": np.logical_or,
+    "where": np.where,
+}
+COMPARISONS, LOGICAL = ("lt", "le", "eq"), ("not", "and", "or")
+NEUTRAL = {"add": 0.0, "mul": 1.0}
+
+
+class Node:
+    """An operation of a graph.
+
+    Attributes
+    ----------
+    kind, inputs, value : as the module describes
+    shape : of its result, without the axis of TDOAs
+    is_bool : whether the result is boolean
+    """
+
+    __slots__ = ("inputs", "is_bool", "kind", "shape", "value")
+
+    def __init__(
+        self,
+        kind: str,
+        inputs: tuple[Node, ...],
+        shape: tuple[int, ...],
+        value: Any = None,
+        is_bool: bool = False,
+    ) -> None:
+        """Set all attributes."""
+        self.kind, self.inputs, self.shape, self.value = kind, inputs, shape, value
+        self.is_bool = is_bool
+
+    @property
+    def size(self) -> int:
+        """Return the number of elements per TDOA."""
+        return int(np.prod(self.shape, dtype=int))
+
+
+def constant(value: Any) -> Node:
+    """Return a constant node of (1 or N * N, *shape) numbers or booleans."""
+    value = np.asarray(value)
+    is_bool = value.dtype == bool
+    value = value if is_bool else value.astype(float)
+    if len(value) > 1 and _equal(value, value[:1]):
+        value = value[:1]
+    return Node("constant", (), value.shape[1:], value, is_bool)
+
+
+def scalar(value: float) -> Node:
+    """Return a constant node of one number for all TDOAs."""
+    return constant(np.reshape(value, (1,)))
+
+
+def apply(kind: str, *inputs: Node) -> Node:
+    """Return an elementwise node; of constants a constant."""
+    axes = max(len(one.shape) for one in inputs)
+    inputs = tuple(_with_axes(one, axes) for one in inputs)
+    if kind == "where":
+        inputs = inputs[0], *map(as_number, inputs[1:])
+    elif kind not in LOGICAL:
+        inputs = tuple(map(as_number, inputs))
+    shape = np.broadcast_shapes(*(one.shape for one in inputs))
+    if all(one.kind == "constant" for one in inputs):
+        with np.errstate(all="ignore"):
+            return constant(ELEMENTWISE[kind](*(one.value for one in inputs)))
+    for one, other in (inputs, inputs[::-1]) if kind in NEUTRAL else ():
+        if other.kind == "constant" and one.shape == shape and (other.value == NEUTRAL[kind]).all():
+            return one
+    return Node(kind, inputs, shape, is_bool=kind in (*COMPARISONS, *LOGICAL))
+
+
+def as_number(node: Node) -> Node:
+    """Return a node with 1 and 0 for a boolean one."""
+    return apply("where", node, scalar(1.0), scalar(0.0)) if node.is_bool else node
+
+
+def pick(inputs: Sequence[Node], index: np.ndarray) -> Node:
+    """Return the node of elements of the flattened, joined inputs."""
+    if all(one.kind == "constant" for one in inputs):
+        rows = max(len(one.value) for one in inputs)
+        flat = [np.broadcast_to(one.value, (rows, *one.shape)) for one in inputs]
+        joined = np.concatenate([one.reshape(rows, -1) for one in flat], axis=1)
+        return constant(joined[:, index])
+    sources, index = _sources(inputs, index)
+    if len(sources) == 1 and index.shape == sources[0].shape and _counts_up(index):
+        return sources[0]
+    assert len({one.is_bool for one in sources}) == 1  # no effect mixes them
+    return Node("pick", tuple(sources), index.shape, index, sources[0].is_bool)
+
+
+def _sources(inputs: Sequence[Node], index: np.ndarray) -> tuple[list[Node], np.ndarray]:
+    """Return the nodes that a pick uses, none of them a pick, and its index into these."""
+    sources: dict[int, Node] = {}
+    owner, element = [], []  # of each element of the joined inputs: source, place in it
+    for one in inputs:
+        if one.kind != "pick":
+            sources[id(one)] = one
+            owner.append(np.full(one.size, id(one)))
+            element.append(np.arange(one.size))
+            continue
+        starts = np.cumsum([0, *(inner.size for inner in one.inputs)])
+        place = np.searchsorted(starts, one.value.ravel(), side="right") - 1
+        sources.update({id(inner): inner for inner in one.inputs})
+        owner.append(np.array([id(inner) for inner in one.inputs])[place])
+        element.append(one.value.ravel() - starts[place])
+    owners, elements = np.concatenate(owner)[index], np.concatenate(element)[index]
+    used = [node for key, node in sources.items() if (owners == key).any()]
+    starts = np.cumsum([0, *(one.size for one in used)])
+    for start, one in zip(starts, used):
+        elements = elements + start * (owners == id(one))
+    return used, elements
+
+
+def joined(inputs: Sequence[Node], axis: int) -> Node:
+    """Return the concatenation of nodes along an axis."""
+    starts = np.cumsum([0, *(one.size for one in inputs)])
+    parts = [start + np.arange(one.size).reshape(one.shape) for start, one in zip(starts, inputs)]
+    return pick(inputs, np.concatenate(parts, axis=axis))
+
+
+def taken(node: Node, key: Any) -> Node:
+    """Return node[key], with the indices of numpy."""
+    return pick([node], np.arange(node.size).reshape(node.shape)[key])
+
+
+def total(node: Node) -> Node:
+    """Return the sum over the last axis."""
+    if node.kind == "constant":
+        return constant(node.value.sum(axis=-1))
+    if node.shape[-1] == 1:
+        return taken(node, (..., 0))
+    return Node("sum", (as_number(node),), node.shape[:-1])
+
+
+def ordered(outputs: Sequence[Node]) -> tuple[list[Node], list[Node]]:
+    """Return (all nodes of a graph, inputs before their users; the outputs), equal nodes merged."""
+    merged: dict[int, Node] = {}
+    known: dict[tuple[Any, ...], Node] = {}
+    stack = list(outputs)[::-1]
+    while stack:
+        node = stack[-1]
+        waiting = [one for one in node.inputs if id(one) not in merged]
+        if waiting:
+            stack.extend(waiting)
+            continue
+        stack.pop()
+        if id(node) in merged:
+            continue
+        inputs = tuple(merged[id(one)] for one in node.inputs)
+        key = node.kind, tuple(map(id, inputs)), node.shape, _hashable(node.value)
+        if key not in known:
+            known[key] = Node(node.kind, inputs, node.shape, node.value, node.is_bool)
+        merged[id(node)] = known[key]
+    return list(known.values()), [merged[id(one)] for one in outputs]
+
+
+def table(node: Node, count: int) -> tuple[str, np.ndarray]:
+    """Return what a constant depends on, and its values.
+
+    count : N, number of anchors
+
+    Returns ("", (*shape)), ("a" or "b", (N, *shape)) for one of the anchors, or
+    ("ab", (N, N, *shape)).
+    """
+    if len(node.value) == 1:
+        return "", node.value[0]
+    value = node.value.reshape(count, count, *node.shape)
+    if _equal(value, value[:, :1]):
+        return "a", value[:, 0]
+    if _equal(value, value[:1]):
+        return "b", value[0]
+    return "ab", value
+
+
+def evaluate(
+    outputs: Sequence[Node],
+    columns: Mapping[str, np.ndarray],
+    pairs: np.ndarray,
+    kind: type[np.floating] = np.float32,
+) -> list[np.ndarray]:
+    """Return the values of outputs, each (n, *shape), in numpy and one precision.
+
+    columns : {name of an input: (n,)}; pairs : (n,), row a * N + b of the constants
+    """
+    nodes, outputs = ordered(outputs)
+    made: dict[int, np.ndarray] = {}
+    with np.errstate(all="ignore"):
+        for node in nodes:
+            inputs = [made[id(one)] for one in node.inputs]
+            value: Any
+            if node.kind == "input":
+                value = columns[node.value]
+            elif node.kind == "constant":
+                value = node.value[pairs if len(node.value) > 1 else np.zeros_like(pairs)]
+            elif node.kind == "pick":
+                flat = [one.reshape(len(pairs), -1) for one in inputs]
+                value = np.concatenate(flat, axis=1)[:, node.value]
+            elif node.kind == "sum":
+                value = inputs[0].sum(axis=-1)
+            elif node.kind == "network":
+                value = node.value.run(inputs[0])
+            else:
+                value = ELEMENTWISE[node.kind](*inputs)
+            made[id(node)] = value if node.is_bool else value.astype(kind)
+    return [made[id(node)] for node in outputs]
+
+
+def _with_axes(node: Node, axes: int) -> Node:
+    """Return the node with more axes, of length 1, before its own."""
+    missing = axes - len(node.shape)
+    return taken(node, (None,) * missing) if missing else node
+
+
+def _counts_up(index: np.ndarray) -> bool:
+    return np.array_equal(index.ravel(), np.arange(index.size))
+
+
+def _equal(one: np.ndarray, other: np.ndarray) -> bool:
+    return np.array_equal(one, np.broadcast_to(other, one.shape), equal_nan=one.dtype != bool)
+
+
+def _hashable(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return value.dtype.str, value.shape, value.tobytes()
+    return value if isinstance(value, (str, type(None))) else id(value)

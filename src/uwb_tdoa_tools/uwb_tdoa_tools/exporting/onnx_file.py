@@ -1,0 +1,196 @@
+"""Print a TracedCorrection as an ONNX file."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from onnx import load_model_from_string
+
+from uwb_tdoa_bias.common.files import write_bytes
+from uwb_tdoa_bias.correction.exported import INPUTS, OUTPUTS
+
+from .correction import TracedCorrection, trace
+from .graph import Node, ordered, table
+from .onnx_graph import GraphBuilder
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from onnx import ModelProto
+
+    from uwb_tdoa_bias.common.anchors import Anchors
+    from uwb_tdoa_bias.correction.network import Network
+    from uwb_tdoa_bias.effects import EffectSet
+
+OPERATORS = {
+    "neg": "Neg",
+    "abs": "Abs",
+    "sqrt": "Sqrt",
+    "exp": "Exp",
+    "log": "Log",
+    "sin": "Sin",
+    "cos": "Cos",
+    "floor": "Floor",
+    "add": "Add",
+    "sub": "Sub",
+    "mul": "Mul",
+    "div": "Div",
+    "max": "Max",
+    "min": "Min",
+    "lt": "Less",
+    "le": "LessOrEqual",
+    "eq": "Equal",
+    "not": "Not",
+    "and": "And",
+    "or": "Or",
+    "where": "Where",
+}
+COLUMN = {name: place for place, (name, *_) in enumerate(INPUTS)}
+
+
+def write_onnx(
+    path: str | Path,
+    anchors: Anchors,
+    effects: EffectSet | None,
+    network: Network | None = None,
+) -> TracedCorrection:
+    """Write the correction of some Anchors as an ONNX file, and return what it holds.
+
+    Raises InputError if the file cannot be written or the correction cannot be traced.
+    """
+    traced = trace(anchors, effects, network)
+    write_bytes(path, printed(traced).SerializeToString())
+    return traced
+
+
+def printed(traced: TracedCorrection) -> ModelProto:
+    """Return the ONNX model of a TracedCorrection, checked by onnx."""
+    return _Printer(traced).model()
+
+
+class _Printer:
+    """Prints the nodes of a graph in their order. Tensors are (n, *shape)."""
+
+    def __init__(self, traced: TracedCorrection) -> None:
+        self._traced, self._count = traced, len(traced.anchors)
+        self._graph = GraphBuilder("state", "correction")
+        self._names: dict[int, str] = {}
+        self._tables: dict[int, tuple[str, np.ndarray]] = {}  # constants by rows of anchors
+
+    def model(self) -> ModelProto:
+        graph, outputs = self._graph, self._traced.outputs
+        wanted = [outputs[name] for name in ("bias", "std", "slope", "status")]
+        nodes, wanted = ordered(wanted)
+        known = self._find_anchors(nodes)
+        for node in nodes:
+            if id(node) not in self._names:
+                self._names[id(node)] = self._print(node)
+        columns = [self._flat(node) for node in wanted]
+        together = graph.op("Concat", *columns, axis=1)
+        graph.op("Where", known, together, [0.0])
+        return graph.whole(len(INPUTS), len(OUTPUTS), self._traced.meta())
+
+    def _find_anchors(self, nodes: list[Node]) -> str:
+        """Look up the constants of both anchors; return whether they are two known ones, (n, 1)."""
+        graph, ids = self._graph, self._traced.anchors.ids.astype(float)
+        one, other = (
+            graph.op("Equal", graph.take(graph.input, [COLUMN[name]]), ids[None])
+            for name in ("anchor_a", "anchor_b")
+        )
+        hits = {"a": graph.op("Where", one, [1.0], [0.0])}
+        hits["b"] = graph.op("Where", other, [1.0], [0.0])
+        by_kind: dict[str, list[Node]] = {"a": [], "b": [], "ab": []}
+        values: dict[str, list[np.ndarray]] = {"a": [], "b": [], "ab": []}
+        for node in nodes:
+            if node.kind != "constant":
+                continue
+            kind, value = table(node, self._count)
+            if not kind:
+                continue
+            by_kind[kind].append(node)
+            values[kind].append(value.reshape(self._count ** len(kind), -1).astype(float))
+        if by_kind["ab"]:
+            first = graph.reshaped(hits["a"], 0, self._count, 1)
+            second = graph.reshaped(hits["b"], 0, 1, self._count)
+            hits["ab"] = graph.reshaped(graph.op("Mul", first, second), 0, self._count**2)
+        for kind, some in by_kind.items():
+            if some:
+                self._look_up(hits[kind], some, np.concatenate(values[kind], axis=1))
+        found = graph.op("Mul", graph.row_sum(hits["a"]), graph.row_sum(hits["b"]))
+        same = graph.row_sum(graph.op("Mul", hits["a"], hits["b"]))
+        return graph.op("Less", [0.5], graph.op("Sub", found, same))
+
+    def _look_up(self, hits: str, nodes: list[Node], values: np.ndarray) -> None:
+        """Name constants by the rows of anchors.
+
+        A sum over all rows, of which one counts, needs no index that could be wrong. A sum takes no
+        NaN: these are put in afterwards.
+        """
+        graph, unknown = self._graph, np.isnan(values)
+        rows = graph.op("MatMul", hits, np.where(unknown, 0.0, values))
+        if unknown.any():
+            missing = graph.op("Less", [0.5], graph.op("MatMul", hits, unknown.astype(float)))
+            rows = graph.op("Where", missing, [np.nan], rows)
+        first = 0
+        for node in nodes:
+            name = graph.take(rows, range(first, first + node.size))
+            name = graph.op("Less", [0.5], name) if node.is_bool else name
+            self._names[id(node)] = self._shaped(name, node.shape, (node.size,))
+            first += node.size
+
+    def _print(self, node: Node) -> str:
+        graph = self._graph
+        inputs = [self._names[id(one)] for one in node.inputs]
+        if node.kind == "input":
+            return self._shaped(graph.take(graph.input, [COLUMN[node.value]]), (), (1,))
+        if node.kind == "constant":
+            return graph.constant(node.value, np.bool_ if node.is_bool else np.float32)
+        if node.kind == "pick":
+            return self._print_pick(node)
+        if node.kind == "sum":
+            axis = np.array([len(node.shape) + 1])
+            return graph.op("ReduceSum", inputs[0], graph.constant(axis, np.int64), keepdims=0)
+        if node.kind == "network":
+            return graph.inlined(load_model_from_string(node.value.content), inputs[0])
+        if node.kind == "atan2":
+            return self._print_atan2(*inputs)
+        return graph.op(OPERATORS[node.kind], *inputs)
+
+    def _print_pick(self, node: Node) -> str:
+        graph = self._graph
+        if all(one.kind == "input" for one in node.inputs):  # columns of the table
+            columns = [COLUMN[one.value] for one in node.inputs]
+            name = graph.take(graph.input, np.array(columns)[node.value.ravel()].tolist())
+            return self._shaped(name, node.shape, (node.size,))
+        flat = [self._flat(one) for one in node.inputs]
+        name = graph.op("Concat", *flat, axis=1) if len(flat) > 1 else flat[0]
+        total = sum(one.size for one in node.inputs)
+        if not np.array_equal(node.value.ravel(), np.arange(total)):
+            name = graph.take(name, node.value.ravel().tolist())
+        return self._shaped(name, node.shape, (node.size,))
+
+    def _flat(self, node: Node) -> str:
+        """Return a tensor (n, size)."""
+        if node.kind == "constant" and len(node.value) == 1:  # for all TDOAs alike
+            ones = self._graph.op("Equal", self._graph.take(self._graph.input, [0]), [-1.0])
+            kind: Any = np.bool_ if node.is_bool else np.float32
+            value = self._graph.constant(node.value.reshape(1, -1), kind)
+            return self._graph.op("Where", ones, value, value)
+        return self._shaped(self._names[id(node)], (node.size,), node.shape)
+
+    def _shaped(self, name: str, shape: tuple[int, ...], known: tuple[int, ...]) -> str:
+        if shape == known:
+            return name
+        return self._graph.reshaped(name, 0, *shape)
+
+    def _print_atan2(self, y: str, x: str) -> str:
+        """Return the angle in all quadrants; the sign of a zero counts, as in numpy."""
+        graph = self._graph
+        angle = graph.op("Atan", graph.op("Div", y, x))
+        at_origin = graph.op("And", graph.op("Equal", x, [0.0]), graph.op("Equal", y, [0.0]))
+        angle = graph.op("Where", at_origin, [0.0], angle)
+        is_below = graph.op("Less", graph.op("Div", [1.0], y), [0.0])
+        half_turn = graph.op("Where", is_below, [-np.pi], [np.pi])
+        behind = graph.op("Where", graph.op("Less", x, [0.0]), half_turn, [0.0])
+        return graph.op("Add", angle, behind)
