@@ -1,4 +1,4 @@
-"""Send a flight through both nodes over ROS topics, and compare the estimate with ground truth."""
+"""Trace a hidden effect and fly with its correction, or send a measured flight through both nodes."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.errors import InputError
 
-from .. import cli, options
+from .. import cli, options, parallel
+from ..diagnosis import diagnose
 from ..evaluating import lines_of_errors
-from ..flying import demo
-from ..outputs import OutputFolder
+from ..flying import demo, loop
+from ..outputs import OutputFile, OutputFolder
+from ..parallel import Progress
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
@@ -22,15 +24,18 @@ if TYPE_CHECKING:
 
     from ..scoring.metrics import Score
 
-DESCRIPTION = """Take a flight, write it as a bag, replay the bag through bias_node and ekf_node over ROS topics, and
-compare the estimate with ground truth.
+DESCRIPTION = """Find a systematic error of the measurements, write its correction, and fly with it.
 
-Without --flight a simulated vehicle first takes off, flies and lands by nothing but the estimate (as in `fly`), among
-anchors that have delays of 0.1 m (standard deviation). It and the nodes correct for them with an effects.yaml that holds
-their true values, as a calibration would find them. A measured flight is corrected with what --effects and --model give,
-and with nothing else: what helped other flights may harm it. "raw" is the same filter without any correction, run
-without ROS. The exit code is 1 if the estimate diverged, or messages were lost or late.
+A simulated hall has an effect that no file declares; --seed draws its kind and size. Three flights are recorded, with
+the true path of the simulation as a motion capture system gives it. `diagnose` traces the residuals of the first two.
+What it adds is written as bias.onnx. The third flight goes through bias_node and ekf_node over ROS topics, without
+bias.onnx and with it. At the end the demo says what was really in the simulation.
+
+With --flight a measured flight goes through both nodes. It is corrected with what --effects and --model give, and with
+nothing else: what helped other flights may harm it. "raw" is the same filter without any correction, run without ROS.
+The exit code is 1 if the estimate diverged, or messages were lost or late.
 """
+SEED, RATES = 1, {"simulated": 20.0, "measured": 1.0}  # times as fast as flown
 
 
 def parser() -> ArgumentParser:
@@ -39,23 +44,30 @@ def parser() -> ArgumentParser:
         "demo",
         DESCRIPTION,
         "demo",
+        "demo --seed 7 --json demo.json",
         "demo --flight 0607/tdoa2-obs-log1 --survey anchor_0607.txt --rate 4",
-        "demo --rerun out/flight.rrd",
+        "demo --flight flight.bag --rerun out/flight.rrd",
         "demo --flight flight.bag --effects effects.yaml --out out/corrected",
     )
     add = made.add_argument
     add(
         "--flight",
         metavar="LOG",
-        help="a recording: micro-SD log, UTIL CSV or bag (default: simulate one)",
+        help="a recording: micro-SD log, UTIL CSV or bag (default: simulate three)",
+    )
+    add(
+        "--seed",
+        metavar="N",
+        type=parallel.whole_number,
+        help=f"of the simulated hall and its hidden effect (default {SEED})",
     )
     options.add_reading(made)
     add(
         "--rate",
         metavar="R",
         type=float,
-        default=1.0,
-        help="replay R times as fast as flown (default 1)",
+        help="replay R times as fast as flown (default 1; 20 of a simulated flight, or as fast as "
+        "this machine can)",
     )
     add(
         "--out",
@@ -67,22 +79,74 @@ def parser() -> ArgumentParser:
     add("--effects", metavar="FILE", help="effects.yaml to correct with")
     options.add_model(made)
     options.add_rerun(made)
+    add("--json", metavar="FILE", type=OutputFile, help="write all figures of the simulated hall")
     return made
 
 
 def _demo(args: Namespace) -> int:
+    if args.rate is None:
+        args.rate = RATES["measured" if args.flight else "simulated"]
     if not 0.0 < args.rate < float("inf"):
         raise InputError(f"--rate: {args.rate:g} is not a speed; give a number above 0.")
     if args.survey and not args.flight:
         raise InputError("--survey: needs --flight; a simulated flight has its own anchors.")
-    rerun = options.rerun_of(args, 1, partial(cli.say, "demo"))
-    started = time.monotonic()
-    args.out.mkdir(parents=True, exist_ok=True)
     if args.flight:
-        chosen = demo.measured(args.flight, options.reading_of(args), args.effects, args.model)
+        options.refuse(args, ("seed", "json"), "belongs to the simulated hall")
     else:
-        cli.show("flying     a simulated vehicle")
-        chosen = demo.simulated(args.out, args.effects, args.model)
+        options.refuse(args, ("effects", "model"), "needs --flight: the demo writes its own")
+    args.rerun = options.rerun_of(args, 1, partial(cli.say, "demo"))
+    args.out.mkdir(parents=True, exist_ok=True)
+    return _measured(args) if args.flight else _loop(args)
+
+
+def _loop(args: Namespace) -> int:
+    """Close the loop in a simulated hall."""
+    seed, clock = args.seed or SEED, demo.Stopwatch()
+    onnx, picture = args.out / "bias.onnx", args.out / "demo.png"
+    with Progress("demo") as progress:
+        progress("flying")
+        bags = loop.record(seed, args.out)
+        flights = loop.read(bags[:2])
+        cli.show(f"recorded   {loop.recordings_in_words(flights, seed)}")
+        _several("residual", loop.residuals_of(flights[0]).sentences())
+        clock.lap("flying")
+        diagnosis = diagnose(flights, progress=progress)
+        _several("traced to", loop.found_in_words(diagnosis))
+        clock.lap("tracing")
+        correction = loop.write_correction(onnx, diagnosis)
+        _several("added", loop.added_in_words(onnx, correction, diagnosis))
+        clock.lap("writing")
+    say = partial(cli.say, "demo")
+    result = demo.fly_both(bags[2], onnx if correction else None, args.rate, say)
+    clock.lap("both nodes, twice" if correction else "both nodes")
+    cli.show(f"flown      {result.arrived_in_words()}")
+    cli.show(f"error      {result.error_in_words()}")
+    from ..flying.demo_picture import draw  # takes a second to import
+
+    draw(result, picture)
+    clock.lap("picture")
+    cli.show(f"really     {loop.truth_in_words(seed, result.flight)}")
+    cli.show(f"picture    {picture}")
+    cli.show(f"took       {clock.in_words()}")
+    if args.rerun is not None:
+        result.show(args.rerun)
+        cli.show(f"rerun      {args.rerun}")
+    if args.json is not None:
+        cli.write_json(args.json, result.figures(seed, diagnosis, clock))
+    _several("next", demo.next_steps(bags[2]))
+    return int(result.failed)
+
+
+def _several(title: str, lines: Sequence[str]) -> None:
+    """Print lines with a title before the first."""
+    for number, line in enumerate(lines):
+        cli.show(f"{'' if number else title:11s}{line}")
+
+
+def _measured(args: Namespace) -> int:
+    """Take a measured flight through both nodes."""
+    started = time.monotonic()
+    chosen = demo.measured(args.flight, options.reading_of(args), args.effects, args.model)
     flight = chosen.flight
     assert flight.truth is not None
     length = flight.truth.t[-1] - flight.truth.t[0]
@@ -90,8 +154,6 @@ def _demo(args: Namespace) -> int:
         f"flight     {flight.name}: {length:.1f} s, {len(flight.tdoa)} TDOAs, "
         f"{len(flight.anchors)} anchors"
     )
-    if chosen.outcome:
-        cli.show(f"flown      by the estimate: {chosen.outcome}")
     cli.show(f"correction {chosen.correction()}")
     flown = demo.fly(chosen, args.out, args.rate, lambda text: cli.show(f"nodes      {text}"))
     scores, in_time = flown.scores, _all_in_time(flight, flown.outcome)
@@ -103,14 +165,11 @@ def _demo(args: Namespace) -> int:
 
     plot_comparison(flight, scores[:-1], args.out / "error.png")
     cli.show(f"plot       {args.out / 'error.png'}")
-    if rerun is not None:
-        flown.show(rerun, flight, [chosen.outcome, _change_in_words(scores)])
-        cli.show(f"rerun      {rerun}")
+    if args.rerun is not None:
+        flown.show(args.rerun, flight, [_change_in_words(scores)])
+        cli.show(f"rerun      {args.rerun}")
     cli.show(f"took {time.monotonic() - started:.0f} s")
-    cli.show(
-        "next       "
-        + "\n           ".join(demo.next_steps(args.flight or args.out / "flight.bag", args.survey))
-    )
+    _several("next", demo.next_steps(args.flight, args.survey))
     return int(scores[-2].row()["diverged"] or not in_time)  # of the nodes
 
 
@@ -143,7 +202,7 @@ def _all_in_time(flight: Flight, outcome: dict[str, int]) -> bool:
     cli.show(
         f"nodes      IMU samples {samples}: {outcome['imu_late']} late, {outcome['imu_lost']} lost"
     )
-    return not any(outcome[name] for name in ("lost", "late", "imu_late", "imu_lost"))
+    return not any(outcome[name] for name in demo.MISSING)
 
 
 main = cli.executable(_demo, parser)

@@ -107,9 +107,7 @@ def _bearing_at_anchor(rng: np.random.Generator, anchors: Anchors) -> Effect:
 def _heading_of_tag(rng: np.random.Generator, anchors: Anchors) -> Effect:
     values = {"c0": 0.0, "c1": _signed(rng, 0.15, 0.25), "c2": _signed(rng, 0.15, 0.25)}
     turn = (-TURN, TURN)
-    return SmoothTerm(
-        values, covariate="bearing_in_tag", form="arrival", knots=turn, shape="wave"
-    )
+    return SmoothTerm(values, covariate="bearing_in_tag", form="arrival", knots=turn, shape="wave")
 
 
 KINDS: dict[str, Callable[[np.random.Generator, Anchors], Effect]] = {
