@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 import sys
+import textwrap
 import time
 from typing import TYPE_CHECKING
 
@@ -35,6 +36,7 @@ With --flight a measured flight goes through both nodes. It is corrected with wh
 nothing else: what helped other flights may harm it. "raw" is the same filter without any correction, run without ROS.
 The exit code is 1 if the estimate diverged, or messages were lost or late.
 """
+WIDTH = 120  # characters of a line
 SEED, RATES = 1, {"simulated": 20.0, "measured": 1.0}  # times as fast as flown
 
 
@@ -107,7 +109,7 @@ def _loop(args: Namespace) -> int:
         progress("flying")
         bags = loop.record(seed, args.out)
         flights = loop.read(bags[:2])
-        cli.show(f"recorded   {loop.recordings_in_words(flights, seed)}")
+        _several("recorded", [loop.recordings_in_words(flights, seed)])
         _several("residual", loop.residuals_of(flights[0]).sentences())
         clock.lap("flying")
         diagnosis = diagnose(flights, progress=progress)
@@ -119,13 +121,13 @@ def _loop(args: Namespace) -> int:
     say = partial(cli.say, "demo")
     result = demo.fly_both(bags[2], onnx if correction else None, args.rate, say)
     clock.lap("both nodes, twice" if correction else "both nodes")
-    cli.show(f"flown      {result.arrived_in_words()}")
-    cli.show(f"error      {result.error_in_words()}")
+    _several("flown", [result.arrived_in_words()])
+    _several("error", [result.error_in_words()])
     from ..flying.demo_picture import draw  # takes a second to import
 
     draw(result, picture)
     clock.lap("picture")
-    cli.show(f"really     {loop.truth_in_words(seed, result.flight)}")
+    _several("really", [loop.truth_in_words(seed, result.flight)])
     cli.show(f"picture    {picture}")
     cli.show(f"took       {clock.in_words()}")
     if args.rerun is not None:
@@ -133,14 +135,15 @@ def _loop(args: Namespace) -> int:
         cli.show(f"rerun      {args.rerun}")
     if args.json is not None:
         cli.write_json(args.json, result.figures(seed, diagnosis, clock))
-    _several("next", demo.next_steps(bags[2]))
+    cli.show("next       " + "\n           ".join(demo.next_steps(bags[2])))
     return int(result.failed)
 
 
 def _several(title: str, lines: Sequence[str]) -> None:
-    """Print lines with a title before the first."""
+    """Print sentences with a title before the first."""
     for number, line in enumerate(lines):
-        cli.show(f"{'' if number else title:11s}{line}")
+        begin = f"{'' if number else title:11s}"
+        cli.show(textwrap.fill(line, WIDTH, initial_indent=begin, subsequent_indent=" " * 11))
 
 
 def _measured(args: Namespace) -> int:
@@ -169,7 +172,7 @@ def _measured(args: Namespace) -> int:
         flown.show(args.rerun, flight, [_change_in_words(scores)])
         cli.show(f"rerun      {args.rerun}")
     cli.show(f"took {time.monotonic() - started:.0f} s")
-    _several("next", demo.next_steps(args.flight, args.survey))
+    cli.show("next       " + "\n           ".join(demo.next_steps(args.flight, args.survey)))
     return int(scores[-2].row()["diverged"] or not in_time)  # of the nodes
 
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 COLOURS = ("tab:red", "tab:blue")  # of a flight without and with the correction
 SIZE = 14  # points: legible if the picture is shrunk to 700 pixels
-FAR = 0.95  # quantile of the errors, and of the residuals, that the axes show
+ROOM = 1.3  # of the largest error, the end of the axis: the legend covers no line
 
 
 def draw(result: LoopResult, path: Path) -> None:
@@ -38,6 +38,7 @@ def draw(result: LoopResult, path: Path) -> None:
         for ax, residuals, score in zip(axes[0], result.residuals, result.scores):
             _residuals(ax, residuals, limit)
             ax.set_title(f"TDOAs {score.name} bias.onnx: {CM * residuals.size:.1f} cm off")
+        ax.legend(title="pair of anchors", ncols=4, loc="lower center", handlelength=1.0)
         _path(axes[1, 0], result)
         _error(axes[1, 1], result)
         write_filled(path, partial(figure.savefig, dpi=100))
@@ -53,7 +54,6 @@ def _residuals(ax: Axes, residuals: PairResiduals, limit: float) -> None:
     for pair, values in residuals.median.items():
         ax.plot(residuals.t, CM * values, lw=1.8, label=pair)
     ax.set(xlabel="time in the air [s]", ylabel="residual [cm]", ylim=(-limit, limit))
-    ax.legend(title="pair of anchors", ncols=4, loc="lower center", handlelength=1.0)
     ax.grid(alpha=0.3)
 
 
@@ -67,7 +67,7 @@ def _path(ax: Axes, result: LoopResult) -> None:
         estimate = position_at(score.t, truth) + score.error
         ax.plot(*estimate[:, :2].T, color=colour, lw=1.2, label=score.name)
     ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", title="Path from above")
-    ax.legend(loc="upper right")
+    ax.legend(loc="best")
     ax.grid(alpha=0.3)
 
 
@@ -75,7 +75,9 @@ def _error(ax: Axes, result: LoopResult) -> None:
     for score, colour in zip(result.scores, COLOURS):
         size = CM * np.linalg.norm(score.error, axis=1)
         ax.plot(score.t - score.first, size, color=colour, lw=1.5, label=score.name)
-    ax.set(xlabel="time in the air [s]", ylabel="3D position error [cm]", ylim=(0.0, None))
+    highest = CM * max(np.linalg.norm(score.error, axis=1).max() for score in result.scores)
+    ax.set(xlabel="time in the air [s]", ylabel="3D position error [cm]")
+    ax.set_ylim(0.0, ROOM * highest)
     ax.set_title(f"Position: {listed([f'{CM * error:.1f}' for error in result.errors])} cm off")
-    ax.legend(loc="upper right")
+    ax.legend(loc="upper right", ncols=2)
     ax.grid(alpha=0.3)

@@ -184,7 +184,7 @@ def added_in_words(
         return ["nothing: no effect makes the error of a flight smaller that it was not fitted to"]
     before, after = (CM * side["pooled"]["rmse_3d"] for side in (diagnosis.before, diagnosis.after))
     return [
-        f"{path}, because it helps each flight with values from the other: "
+        f"{path}. Judged on each flight with values from the other, the position error falls from "
         f"{before:.1f} to {after:.1f} cm",
         *map(str, correction.left_out),
     ]
