@@ -58,6 +58,7 @@ setup(
             "demo = uwb_tdoa_tools.executables:demo",
             "diagnose = uwb_tdoa_tools.executables:diagnose",
             "evaluate = uwb_tdoa_tools.executables:evaluate",
+            "export = uwb_tdoa_tools.executables:export",
             "fly = uwb_tdoa_tools.executables:fly",
             "inject = uwb_tdoa_tools.executables:inject",
             "localize = uwb_tdoa_tools.executables:localize",

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+import os
 from pathlib import Path
 import re
 import subprocess
@@ -234,10 +235,12 @@ class _Asking:
 @contextmanager
 def _load(what: str, number: float) -> Iterator[subprocess.Popen[bytes]]:
     command = [sys.executable, "-m", "studies.bench.load", what, f"{number:g}"]
-    # -m looks for modules in the folder where it starts
-    with _process(command, stdout=subprocess.PIPE, cwd=ROOT) as process:
+    # By PYTHONPATH: with PYTHONSAFEPATH, -m does not look into the present folder.
+    found = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
+    with _process(command, stdout=subprocess.PIPE, env=found) as process:
         assert process.stdout is not None  # it is a pipe
-        process.stdout.readline()  # it begins
+        if not process.stdout.readline():  # a line says that it begins
+            raise LiveError(f"the {what} ended before it began: {' '.join(command)}")
         yield process
 
 

@@ -63,7 +63,7 @@ PARAMETERS = {  # in the order of config/bias_node.yaml
     ),
     "model_file": Parameter(
         "",
-        'path of an ONNX bias model, as `train` writes it; "" for none',
+        'path of an ONNX bias model, as `train` or `export` writes it; "" for none',
     ),
     "pose_lag": Parameter(
         0.05,
@@ -207,8 +207,7 @@ class BiasNode(StreamNode):
 
     def _models(self, effects: EffectSet) -> dict[int, str]:
         """Compile the functions of an EffectSet, and return {status: name of the bias model}."""
-        name = warm_up(effects, self._network, self._lag).model
-        return {PASSED: "none", EFFECTS: effects.name, NETWORK: name, FADED: name}
+        return warm_up(effects, self._network, self._lag).models
 
     def _start_over(self) -> None:
         """Delete the poses and all TDOAs that wait for one."""
@@ -265,9 +264,11 @@ class BiasNode(StreamNode):
         """
         trouble, effects, known = None, self._effects, self._antennas.get(frame)
         between = self._frames.frames.between(self._body, frame)
-        if any(effect.name == TagLeverArm.name for effect in effects.effects):
+        held = self._network.holds if self._network else ()
+        if TagLeverArm.name in (*held, *(effect.name for effect in effects.effects)):
+            source = "model_file" if TagLeverArm.name in held else "effects_file"
             self.get_logger().info(
-                f"{TagLeverArm.name} of effects_file counts, not the transform of '{frame}'"
+                f"{TagLeverArm.name} of {source} counts, not the transform of '{frame}'"
             )
         elif between is None:
             trouble = unknown_frame("uwb/tdoa", frame, self._body)
@@ -545,6 +546,9 @@ class BiasNode(StreamNode):
                 DiagnosticStatus.WARN,
                 "no TDOAs on uwb/tdoa: check that the tag's driver runs in this namespace",
             )
+        trouble = self._network and self._network.trouble(self._corrector.anchors)
+        if trouble:
+            return DiagnosticStatus.WARN, f"model_file {trouble}"
         if self._poses.newest == -math.inf:
             return (
                 DiagnosticStatus.WARN,

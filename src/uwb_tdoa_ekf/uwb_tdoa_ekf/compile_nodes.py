@@ -84,9 +84,6 @@ def warm_up() -> None:
     estimator.finish()
 
 
-pass
-
-
 def parser() -> ArgumentParser:
     """Return the command line parser; the program has no options."""
     layout = argparse.RawDescriptionHelpFormatter

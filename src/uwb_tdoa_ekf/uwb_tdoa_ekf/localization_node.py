@@ -51,7 +51,7 @@ PARAMETERS = {
     ),
     "frozen": FROZEN,
 }
-OF_PROCESS = "__ns", "__node", "__name"  # remappings that hold for this node only
+OWN_REMAPPINGS = "__ns", "__node", "__name"  # they hold for this node, not for its members
 # s until the nodes of a tag are started again after a failure; doubled each time
 FIRST, LONGEST = (1.0, 30.0)
 SOUND = 60.0  # s; after so long without a failure, the waiting time is FIRST again
@@ -99,19 +99,22 @@ class LocalizationNode(StreamNode):
         return level, text, {"tags": len(self._tags), "not served": "; ".join(troubles) or "none"}
 
     def _start(self, tag: str, arguments: list[str]) -> Pair:
-        """Create the Pair of nodes of a tag and return it."""
+        """Create the two nodes of a tag in its namespace and return them as a Pair.
+
+        They get the arguments of the process without the remappings of this node. Their `body_frame`
+        is TAG/base_link, unless the arguments say otherwise. After an exception no node is left.
+
+        tag : relative namespace, "" for that of this node; arguments : those of `__init__`
+        """
         namespace = f"{self.get_namespace().rstrip('/')}/{tag}".rstrip("/") or "/"
-        given = [
-            "--ros-args",
-            *(["-p", f"body_frame:={tag}/base_link"] if tag else []),
-            "--",
-            *_for_all(arguments),
-        ]
+        frame = ["-p", f"body_frame:={tag}/base_link"] if tag else []
         options: dict[str, Any] = {
             "namespace": namespace,
-            "cli_args": given,
-            "use_global_arguments": False,
+            # ROS takes the last of equal parameters: the process's own win over `frame`
+            "cli_args": ["--ros-args", *frame, "--", *_without_own_remappings(arguments)],
+            "use_global_arguments": False,  # else __ns and __node would rename these nodes, too
         }
+        # of all members: a parameter that another one has is not refused as unknown
         names = {*bias_node.PARAMETERS, *names_of_parameters(), *PARAMETERS}
         bias = BiasNode(member=names, **options)
         try:
@@ -257,13 +260,13 @@ class Pair:
         return any(busy)
 
 
-def _for_all(arguments: list[str]) -> list[str]:
+def _without_own_remappings(arguments: list[str]) -> list[str]:
     """Return command line arguments without those that name this node or its namespace."""
     flags = [k for k, word in enumerate(arguments) if word in ("-r", "--remap")]
     names = [
         k
         for k in flags
-        if k + 1 < len(arguments) and arguments[k + 1].partition(":=")[0] in OF_PROCESS
+        if k + 1 < len(arguments) and arguments[k + 1].partition(":=")[0] in OWN_REMAPPINGS
     ]
     dropped = {*names, *(k + 1 for k in names)}
     return [word for k, word in enumerate(arguments) if k not in dropped]

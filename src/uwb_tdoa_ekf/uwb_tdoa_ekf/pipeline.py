@@ -153,9 +153,6 @@ class RadioCorrections:
         return aids
 
 
-pass
-
-
 class PipelineOutput(NamedTuple):
     """Store the result of one call of the filter.
 

@@ -16,6 +16,7 @@ import time
 import numpy as np
 import pytest
 
+from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_tools import command_lines
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
@@ -36,6 +37,7 @@ WORDS = {  # command: words after it
     "demo": "--out out",
     "diagnose": "flight.bag --out diagnosis",
     "evaluate": "flight.bag",
+    "export": "--survey anchors.yaml --effects effects.yaml --onnx bias.onnx",
     "fly": "--flights 2 --jobs 1",
     "inject": "flight.bag --effect anchor_delay --value 3=0.3 --out late.bag",
     "localize": "flight.bag --smooth --residuals --out localized",
@@ -64,6 +66,7 @@ def desk(tmp_path_factory):
     np.negative(flight.tdoa.d, out=flight.tdoa.d)
     write_bag(flight, folder / "wrong.bag")
     corners().to_yaml(folder / "anchors.yaml")
+    EffectSet((EFFECTS["anchor_delay"]({"3": 0.3}),)).to_yaml(folder / "effects.yaml")
     return folder
 
 

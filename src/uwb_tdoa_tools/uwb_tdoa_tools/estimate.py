@@ -35,11 +35,10 @@ class FlightEstimator:
 
     def __call__(self, flight: Flight) -> Run:
         engine = smooth if self.smoothed else run_offline
-        return engine(
-            flight,
-            self.config,
-            Corrector(flight.anchors, with_antenna(self.effects, flight), self.network),
-        )
+        if self.network:
+            self.network.require(flight.anchors)
+        effects = with_antenna(self.effects, flight, self.network)
+        return engine(flight, self.config, Corrector(flight.anchors, effects, self.network))
 
     @property
     def correction(self) -> str:
@@ -48,9 +47,15 @@ class FlightEstimator:
         return names or "nothing (neither effects nor a network are in use)"
 
 
-def with_antenna(effects: EffectSet | None, flight: Flight) -> EffectSet | None:
-    """Return the EffectSet; without a lever arm of the antenna, add that of the recording."""
+def with_antenna(
+    effects: EffectSet | None, flight: Flight, network: Model | None = None
+) -> EffectSet | None:
+    """Return the EffectSet; without a lever arm of the antenna, add that of the recording.
+
+    network : may hold the lever arm, too
+    """
     arm, known = flight.meta.get("antenna"), effects.effects if effects else ()
-    if not arm or not any(arm) or any(effect.name == TagLeverArm.name for effect in known):
+    names = (*(network.holds if network else ()), *(effect.name for effect in known))
+    if not arm or not any(arm) or TagLeverArm.name in names:
         return effects
     return EffectSet((*known, TagLeverArm(values=dict(zip("xyz", arm)))))

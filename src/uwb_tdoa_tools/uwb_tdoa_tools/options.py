@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
     from uwb_tdoa_bias.common.flight import Flight
+    from uwb_tdoa_bias.correction.model import Model
 
     from .diagnosis.constraints import Distance, Mark
 
@@ -149,7 +150,9 @@ def add_estimator(parser: ArgumentParser) -> None:
 
 def add_model(parser: ArgumentParser) -> None:
     """Add --model."""
-    parser.add_argument("--model", metavar="FILE", help="ONNX bias network to correct with")
+    parser.add_argument(
+        "--model", metavar="FILE", help="ONNX file of `train` or `export` to correct with"
+    )
 
 
 def estimator_of(args: Namespace, say: Callable[[str], object]) -> FlightEstimator:
@@ -161,16 +164,26 @@ def estimator_of(args: Namespace, say: Callable[[str], object]) -> FlightEstimat
     config = with_parameters(config, [f"use_{aid}:=false" for aid in args.without])
     if args.no_bias:
         return FlightEstimator(config, smoothed=args.smooth)
-    network = load_network(args.model)
+    return FlightEstimator(config, effects, model_of(args, effects, say), args.smooth)
+
+
+def model_of(
+    args: Namespace, effects: EffectSet | None, say: Callable[[str], object]
+) -> Model | None:
+    """Return the Model of --model, or None. Raises InputError.
+
+    say(sentence) is called if it was trained with effects that `effects` lacks.
+    """
+    model = load_network(args.model)
     given = {effect.name for effect in effects.effects} if effects else set()
-    lacking = sorted(set(network.trained_with) - given) if network else []
+    lacking = sorted(set(model.trained_with) - given) if model else []
     if lacking:
         say(
             f"{args.model} was trained with {', '.join(lacking)} taken out, which no "
             "--effects gives; give the effects.yaml that was "
             "written beside it."
         )
-    return FlightEstimator(config, effects, network, args.smooth)
+    return model
 
 
 def given(args: Namespace, name: str) -> bool:

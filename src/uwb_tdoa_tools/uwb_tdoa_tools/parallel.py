@@ -127,9 +127,6 @@ class Progress:
         return f"{self._name}: " * bool(self._name) + ", ".join(parts)
 
 
-pass
-
-
 CONNECT_LIMIT = 10.0  # s for a Dask scheduler to answer
 
 Made = TypeVar("Made")
@@ -216,31 +213,40 @@ def over(
 def _results(
     function: Callable[[Item], Made], items: list[Item], jobs: int | None, dask: str | None
 ) -> Iterator[Made]:
+    """Yield the results of `over` in order.
+
+    The first item runs here while the processes start and import `function`. So numba fills its
+    cache once. The others run there.
+    """
     first, rest = items[:1], items[1:]
     # Always exactly `jobs` if given: with another number, joblib restarts all processes.
-    count = jobs or min(cpu_count(), len(rest))
-    if not rest or (min(count, len(rest)) == 1 and dask is None):
+    processes = jobs or min(cpu_count(), len(rest))
+    # one process would be enough: stay here
+    if not rest or (min(processes, len(rest)) == 1 and dask is None):
         yield from map(function, items)
         return
-    # For processes that joblib starts later, with Python 3.11 and newer; see `outside_present_folder`.
+    # Processes that joblib starts later import nothing from their working directory (Python 3.11).
+    # `outside_present_folder` below does so for those that it starts now.
     os.environ["PYTHONSAFEPATH"] = "1"
     with _cluster(dask) as backend:
 
-        def spread(calls: Iterable[Any]) -> Any:
-            with parallel_config(**backend):  # not around the loop: the caller may use joblib too
+        def run_in_pool(calls: Iterable[Any]) -> Any:
+            with parallel_config(**backend):  # not around a yield: the caller may use joblib too
                 # Arrays are not mapped from files: numba compiles again for read-only arrays.
-                pool = Parallel(count, return_as="generator", batch_size=1, max_nbytes=None)
+                pool = Parallel(processes, return_as="generator", batch_size=1, max_nbytes=None)
             # joblib starts Python by -m, which looks for modules in the present folder.
             with _children_ignore_interrupts(), outside_present_folder():
                 return pool(calls)
 
         folder = os.getcwd() if dask is None else None
-        with _closing(spread(delayed(_import)(function) for _ in range(count))) as starting:
-            yield from map(function, first)
-            for _ in starting:
-                pass
         with _closing(
-            spread(delayed(_attempt)(function, item, folder) for item in rest)
+            run_in_pool(delayed(_warm_up)(function) for _ in range(processes))
+        ) as warm_ups:
+            yield from map(function, first)
+            for _ in warm_ups:
+                pass  # wait until all have imported it
+        with _closing(
+            run_in_pool(delayed(_attempt)(function, item, folder) for item in rest)
         ) as outcomes:
             for result, error in outcomes:
                 if error is not None:
@@ -248,7 +254,7 @@ def _results(
                 yield result
 
 
-def _import(function: Callable[..., object]) -> None:
+def _warm_up(function: Callable[..., object]) -> None:
     """Import `function` by unpickling it, in a process that starts with the first item.
 
     The first item runs in the parent process meanwhile.
@@ -268,7 +274,7 @@ def _closing(outcomes: Any) -> Iterator[Any]:
 def _attempt(
     function: Callable[[Item], Made], item: Item, folder: str | None
 ) -> tuple[Made | None, Exception | None]:
-    """Return (result, None), or (None, an error that cli reports): else joblib raises it too early.
+    """Return (result, None), or (None, an InputError or OSError): joblib would raise it too early.
 
     folder : folder of relative paths in the item, or None.
     """

@@ -12,7 +12,7 @@ from ..common.anchors import Anchors
 from ..common.errors import InputError
 from ..effects import EffectSet, Samples
 from ..effects.samples import N_STATES, POSE_LAG, motion_at
-from .model import EFFECTS, PASSED, Prediction
+from .model import EFFECTS, FADED, NETWORK, PASSED, Prediction
 from .poses import POSE_NUMBERS, TWIST_NUMBERS, Poses, parts_of, rotated_in_yaw
 
 if TYPE_CHECKING:
@@ -105,15 +105,17 @@ class Corrector:
         self.effects = effects.where(lambda effect: not effect.is_hypothesis)
         self.weighed = effects.where(lambda effect: effect.is_hypothesis)
         self.network = network
-        twice = set(network.holds if network else ()) & {effect.name for effect in self.effects}
+        twice = set(network.holds if network else ()) & {effect.label for effect in self.effects}
         if twice:
             raise InputError(
                 f"effects: {min(twice)} is in the model too, which holds {', '.join(network.holds)};"
                 " leave it out of the effects."
             )
         self.lag = lag
-        parts = [self.effects.name] if len(self.effects) else []
-        self.model = "+".join(parts + ([network.name] if network else [])) or "none"
+        own = self.effects.name if len(self.effects) else ""
+        self.model = _joined(own, network.name if network else "")
+        of_effects = _joined(own, network.of_effects if network else "")
+        self.models = {PASSED: "none", EFFECTS: of_effects, NETWORK: self.model, FADED: self.model}
         self._history, self._start = history, start
         self.reset()
 
@@ -259,6 +261,11 @@ class Corrector:
             interval=t - np.concatenate([[last_t], t[:-1]]),
             previous=np.concatenate([[last_b], self.anchors.ids[b[:-1]]]),
         )
+
+
+def _joined(*names: str) -> str:
+    """Return names, joined by '+', or "none"."""
+    return "+".join(filter(None, names)) or "none"
 
 
 def warm_up(effects: EffectSet, network: Model | None, lag: float = POSE_LAG) -> Corrector:

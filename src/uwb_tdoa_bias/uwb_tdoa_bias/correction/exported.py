@@ -7,7 +7,8 @@ the columns OUTPUTS, both of single precision. Metadata of the file (all values 
     inputs, outputs  [name, unit, meaning] of each column
     frame     name of the world frame
     anchor_ids, anchor_positions  of the anchors that the constants of the graph belong to, m
-    effects   names of the effects in the graph
+    effects   labels of the effects in the graph
+    of_effects  their names, joined by +
     needs_motion  whether the columns from vx to previous_anchor count
     has_slope  whether a slope is other than 0
     sources, network, left_out, written_by  what it was made of, and what it does not hold
@@ -77,12 +78,13 @@ class ExportedCorrection(Model):
     """
 
     NEEDS = (
-        "name, effects, needs_motion, has_slope, anchor_ids, anchor_positions and frame, as export "
+        "name, effects, of_effects, needs_motion, has_slope, anchor_ids, anchor_positions and frame, as export "
         "writes them"
     )
 
     def _read(self, meta: dict[str, str]) -> None:
         self.name = sanitize(json.loads(meta["name"]))
+        self.of_effects = sanitize(json.loads(meta["of_effects"]))
         self.holds = tuple(map(sanitize, json.loads(meta["effects"])))
         self.needs_motion = bool(json.loads(meta["needs_motion"]))
         self._has_slope = bool(json.loads(meta["has_slope"]))
@@ -107,8 +109,8 @@ class ExportedCorrection(Model):
             return None
         words = counted(map(str, missing), "anchor")
         return (
-            f"model_file was exported without {words}, or for another place of it: its TDOAs "
-            "are not corrected; run export again with this survey"
+            f"was exported without {words}, or for another place: these TDOAs are not "
+            "corrected; run export again with this survey"
         )
 
     def _table(self, samples: Samples) -> np.ndarray:

@@ -45,7 +45,8 @@ class Model:
     name : name in messages
     trained_with : names of the effects that were corrected before the training; they must be
         corrected in use, too
-    holds : names of the effects that the file itself corrects; nothing else may correct them
+    holds : labels of the effects that the file itself corrects; nothing else may correct them
+    of_effects : their names, joined by '+', or ""
     needs_motion : whether it depends on more than poses
     """
 
@@ -53,6 +54,7 @@ class Model:
     name: str
     trained_with: tuple[str, ...] = ()
     holds: tuple[str, ...] = ()
+    of_effects: str = ""
     needs_motion: bool = False
 
     def __init__(self, path: str | Path, session: Session | None = None) -> None:
@@ -90,8 +92,14 @@ class Model:
         raise NotImplementedError
 
     def trouble(self, anchors: Anchors) -> str | None:
-        """Return a sentence if the model was not made for some Anchors, or None."""
+        """Return a predicate of the file if it was not made for some Anchors, or None."""
         return None
+
+    def require(self, anchors: Anchors) -> None:
+        """Raise InputError if the model was not made for all Anchors."""
+        trouble = self.trouble(anchors)
+        if trouble:
+            raise InputError(f"model: {self._path} {trouble}.")
 
 
 def session_of(path: str | Path) -> Session:

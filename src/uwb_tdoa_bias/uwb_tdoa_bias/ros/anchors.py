@@ -89,21 +89,24 @@ def in_words(before: Anchors, after: Anchors) -> str:
 
 
 class AnchorsInput:
-    """Input of anchors from a file or from uwb/anchors, latched or repeated.
+    """Input of anchors from a file or from uwb/anchors, transient local or repeated.
 
     Attributes
     ----------
     anchors : Anchors or None
-    refused : the fault of the last message, or None
+    refused : str or None, the fault of the last message that was refused
     """
 
     def __init__(
         self, node: StreamNode, on_change: Callable[[Anchors], None], file: str = ""
     ) -> None:
-        """Read the file, or subscribe; raise InputError for a faulty file.
+        """Read the file if there is one, and subscribe to uwb/anchors.
 
-        on_change(anchors) is called with the first Anchors, and with changed ones. The anchors of a file
-        are final; `start` delivers them.
+        With a file, messages are only compared with it. `start` delivers its anchors, after the node
+        is complete.
+
+        on_change(anchors) : called with the first Anchors, and with changed ones
+        file : path, "" for none; a faulty file raises InputError
         """
         self.anchors: Anchors | None = None
         self.refused: str | None = None

@@ -21,7 +21,7 @@ from .cdr import (
     decode,
     read_text,
 )
-from .parameters import LONGEST_NAME
+from .parameters import MOST_QUOTED
 from .topics import Input
 
 if TYPE_CHECKING:
@@ -105,7 +105,7 @@ class FramesInput:
     def _set(self, parent: str, child: str, q: Sequence[float], p: Sequence[float]) -> bool:
         if self._node.frozen and self.frames.knows(child):
             if self.frames.differs(parent, child, q, p):
-                self._node.refuse(f"another transform of {child!r:.{LONGEST_NAME}} on /tf_static")
+                self._node.refuse(f"another transform of {child!r:.{MOST_QUOTED}} on /tf_static")
             return False
         return self.frames.set(parent, child, q, p)
 

@@ -42,8 +42,8 @@ KINDS = {
 }
 QOS = "qos_overrides."
 SAY_AGAIN = 10.0  # s between warnings of the same kind
-LONGEST_NAME = 100  # characters quoted from another node
-# Parameters per request, 0.1 ms each, and waiting requests. Streams wait until all are answered.
+MOST_QUOTED = 100  # characters quoted from another node
+# Entries of a request, which take 0.1 ms each, and waiting requests. Streams wait for all of them.
 MOST_ASKED, MOST_REQUESTS = (100, 20)
 
 
@@ -162,7 +162,9 @@ class ParameterNode(Node):
         """Make a service as rclpy does.
 
         rclpy makes the parameter services by this method. They raise exceptions for unreadable requests,
-        and queue 1000 requests. Here they log such requests, and queue MOST_REQUESTS.
+        which end the node, and queue 1000 requests. Here such requests, and those of more than
+        MOST_ASKED entries, are logged, and the client gets the response as it is, possibly empty.
+        MOST_REQUESTS are queued.
         """
         if not srv_type.__module__.startswith("rcl_interfaces."):
             return super().create_service(srv_type, srv_name, callback, **options)
@@ -170,27 +172,25 @@ class ParameterNode(Node):
         options["qos_profile"] = QoSProfile(depth=MOST_REQUESTS)
 
         @wraps(callback)
-        def answer(request: Any, response: Any) -> Any:
-            try:
-                asked = sum(
-                    len(getattr(request, several, ()))
-                    for several in ("parameters", "names", "prefixes")
-                )
-                if asked > MOST_ASKED:
+        def guarded(request: Any, response: Any) -> Any:
+            try:  # each type of request has one of these fields
+                fields = ("parameters", "names", "prefixes")
+                entries = sum(len(getattr(request, field, ())) for field in fields)
+                if entries > MOST_ASKED:
                     raise InputError(
-                        f"it has {asked} parameters, names or prefixes; at most {MOST_ASKED} "
+                        f"it has {entries} parameters, names or prefixes; at most {MOST_ASKED} "
                         "are read."
                     )
                 return callback(request, response)
             except Exception as error:
                 text = (
-                    f"{srv_name}: a request cannot be read and changes nothing more: "
-                    f"{error!r:.{LONGEST_NAME}}"
+                    f"{srv_name}: a request is not, or only partly, carried out: "
+                    f"{error!r:.{MOST_QUOTED}}"
                 )
                 self.warn_at_times(srv_name, text)
                 return response
 
-        return super().create_service(srv_type, srv_name, answer, **options)
+        return super().create_service(srv_type, srv_name, guarded, **options)
 
     def set_parameters_atomically(self, parameter_list: list[RosParameter]) -> SetParametersResult:
         """Set parameters as rclpy does; the parameter services call this."""
@@ -200,7 +200,7 @@ class ParameterNode(Node):
         if others and self.frozen:
             return SetParametersResult(
                 successful=False,
-                reason=self.refuse(f"parameter {others[0].name!r:.{LONGEST_NAME}}"),
+                reason=self.refuse(f"parameter {others[0].name!r:.{MOST_QUOTED}}"),
             )
         unknown = [each.name for each in others if not self.has_parameter(each.name)]
         if unknown:  # rclpy would name no parameter: it reports an empty list
@@ -210,7 +210,7 @@ class ParameterNode(Node):
     def _unknown(self, name: str) -> str:
         """Return a sentence on an unknown parameter, with the most similar name."""
         near = get_close_matches(name, self._parameters, n=1, cutoff=0.5)
-        return f"{self.get_name()} has no parameter {name!r:.{LONGEST_NAME}}; " + (
+        return f"{self.get_name()} has no parameter {name!r:.{MOST_QUOTED}}; " + (
             f"set {near[0]}." if near else "see `ros2 param list`."
         )
 

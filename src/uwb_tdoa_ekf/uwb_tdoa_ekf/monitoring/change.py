@@ -109,8 +109,8 @@ class ChangeDetector:
         self._squares = np.zeros(room)  # normalised squares
         # ring buffer over the latest slices: responses of the anchors that were heard
         self._response: np.ndarray = np.zeros((WINDOW, 0, 0))
-        # ring buffer: place of each column's anchor among those that were heard
-        self._place: np.ndarray = np.full((WINDOW, 0), -1)
+        # ring buffer: index of each column's anchor in its slice, -1 if it was not heard
+        self._index: np.ndarray = np.full((WINDOW, 0), -1)
         self._known: list[Change] = []
         self._count = self._added = 0
 
@@ -118,7 +118,7 @@ class ChangeDetector:
         """Add a Slice."""
         if self._count == CAPACITY:
             self._forget_oldest(CAPACITY // 4)
-        k, n, columns = self._count, len(piece.rows), self._columns_of(piece.rows)
+        k, n, columns = self._count, len(piece.rows), self._ensure_columns(piece.rows)
         self._count, self._added = k + 1, self._added + 1
         self._t[k], self._p[k], self._freedom[k] = piece.t, piece.p, np.trace(piece.response)
         self._delays[k] = 0.0
@@ -126,8 +126,8 @@ class ChangeDetector:
             piece.t, piece.rows
         )
         turn = self._turn(k)
-        self._place[turn] = -1
-        self._place[turn, columns] = np.arange(n)
+        self._index[turn] = -1
+        self._index[turn, columns] = np.arange(n)
         self._response[turn, :n, :n] = piece.response
         self._whiten(k)
 
@@ -138,10 +138,13 @@ class ChangeDetector:
             total[np.asarray(rows) == change.row] += change.at(t)
         return total
 
-    def _columns_of(self, rows: np.ndarray) -> np.ndarray:
-        """Return the columns of anchors by their rows (k,), with new columns where needed.
+    def _ensure_columns(self, rows: np.ndarray) -> np.ndarray:
+        """Return the columns of anchors in _delays, _white and _index; add those that are missing.
 
-        The room of a slice grows with the number of rows.
+        Slices that did not hear an anchor hold a delay of 0 for it, and `_seen` leaves them out.
+        `_response` is enlarged if this slice has more anchors than any before.
+
+        rows : (n,) rows of the anchors in the installation
         """
         new = [row for row in rows.tolist() if row not in self._columns]
         if new:
@@ -150,9 +153,10 @@ class ChangeDetector:
             self._delays, self._white = (
                 np.pad(array, ((0, 0), (0, len(new)))) for array in (self._delays, self._white)
             )
-            self._place = np.pad(self._place, ((0, 0), (0, len(new))), constant_values=-1)
-        if (more := len(rows) - self._response.shape[1]) > 0:
-            self._response = np.pad(self._response, ((0, 0), (0, more), (0, more)))
+            self._index = np.pad(self._index, ((0, 0), (0, len(new))), constant_values=-1)
+        missing = len(rows) - self._response.shape[1]
+        if missing > 0:
+            self._response = np.pad(self._response, ((0, 0), (0, missing), (0, missing)))
         return np.array([self._columns[row] for row in rows.tolist()], int)
 
     def find(self, after: float) -> Change | None:
@@ -212,7 +216,7 @@ class ChangeDetector:
         for k in range(
             self._first(change.since), self._count
         ):  # the window holds all slices since any onset that `find` returns
-            place, response = self._place[self._turn(k)], self._response[self._turn(k)]
+            place, response = self._index[self._turn(k)], self._response[self._turn(k)]
             if place[column] >= 0:
                 heard = np.flatnonzero(place >= 0)
                 self._delays[k, heard] -= response[place[heard], place[column]] * change.at(
@@ -241,10 +245,10 @@ class ChangeDetector:
             Mean square of the errors before each onset.
         """
         n, turns = self._count - first, self._turn(np.arange(first, self._count))
-        some = np.flatnonzero((self._place[turns] >= 0).any(axis=0))  # anchors that were heard
+        some = np.flatnonzero((self._index[turns] >= 0).any(axis=0))  # anchors that were heard
         inverse, white = _inverse(self._factor, first, n), self._white[first : self._count, some]
         # contiguous, or numba compiles a second version in flight
-        of_slices = (np.ascontiguousarray(self._place[turns][:, some]), self._response[turns])
+        of_slices = (np.ascontiguousarray(self._index[turns][:, some]), self._response[turns])
         scores, information = _seen(*of_slices, inverse.T @ white, inverse.T @ inverse)
         # age of slices (columns) since each onset (rows)
         age = np.arange(n) - np.arange(n - YOUNGEST)[:, None]
@@ -280,13 +284,13 @@ class ChangeDetector:
         known = np.isin(self._rows, [change.row for change in self._known])
         kept = np.flatnonzero(
             (self._delays[: self._count] != 0.0).any(axis=0)
-            | (self._place >= 0).any(axis=0)
+            | (self._index >= 0).any(axis=0)
             | known
         )
         self._rows = self._rows[kept]
         self._columns = {row: k for k, row in enumerate(self._rows.tolist())}
-        self._delays, self._white, self._place = (
-            array[:, kept] for array in (self._delays, self._white, self._place)
+        self._delays, self._white, self._index = (
+            array[:, kept] for array in (self._delays, self._white, self._index)
         )
         for k in range(self._count):
             self._whiten(k)

@@ -37,6 +37,8 @@ WRONG_WITH_IMU = frozenset(  # ERRORs that make the position wrong while the fil
         "imu_rate_unit",
         "imu_turned",
         "imu_axes",
+        "gyro_axes",
+        "accel_axes",
         "imu_silent",
         "imu_axis_dead",
         "stamps_apart",

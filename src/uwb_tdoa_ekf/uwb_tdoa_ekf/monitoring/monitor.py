@@ -76,8 +76,8 @@ TURN_APART = 3.0  # s of stamps between two sign flips of all TDOAs
 MOST, AGREED = 0.5, 1.1
 MOST_EVENTS = 1000  # events that are stored
 CALIBRATE = 15.0  # s in motion over which the reference for the IMU biases is averaged
-# rad/s and m/s^2 by which an estimated bias must have changed
-BIAS_LIMITS = {"gyroscope": 0.03, "accelerometer": 0.6}
+# {sensor: (change of an estimated bias that is reported, unit)}, in the order of `_follow_biases`
+BIAS_LIMITS = {"gyroscope": (0.03, "rad/s"), "accelerometer": (0.6, "m/s^2")}
 
 SURVEYING = "survey RECORDING"  # command that estimates anchor positions
 
@@ -179,8 +179,8 @@ class Monitor:
         # another exchange, or none, that slices suggest instead, and how many consecutive ones
         self._instead: tuple[tuple[int, ...], int] = ((), 0)
         self._moving_since = math.nan  # s, stamp of the first motion
-        self._bias: np.ndarray | None = None
-        # (6,) gyroscope, accelerometer: reference, and the latest
+        # (6,) biases of gyroscope, rad/s, and accelerometer, m/s^2, body: reference, and the latest
+        self._bias_reference: np.ndarray | None = None
         self._bias_now: np.ndarray | None = None
         self._bias_calibration: list[np.ndarray] = []
 
@@ -476,8 +476,10 @@ class Monitor:
         # Average the biases in the second half of CALIBRATE as reference, and keep the latest.
         if end < self._moving_since + CALIBRATE:
             self._bias_calibration.append(bias)
-        elif self._bias is None and self._bias_calibration:
-            self._bias = np.mean(self._bias_calibration[len(self._bias_calibration) // 2 :], axis=0)
+        elif self._bias_reference is None and self._bias_calibration:
+            self._bias_reference = np.mean(
+                self._bias_calibration[len(self._bias_calibration) // 2 :], axis=0
+            )
         self._bias_now = bias
 
     @property
@@ -578,18 +580,17 @@ class Monitor:
         remedy = f"{SURVEYING} --survey anchors.yaml{effects} --out surveyed/  # or {again}"
         return Finding("anchor_displaced", WARNING, what, evidence, remedy, off)
 
-    def _axis_alarms(self) -> list:
-        # Return sentences on IMU axes whose bias differs from the reference.
-        if self._bias is None or self._bias_now is None:
+    def _axis_alarms(self) -> list[str]:
+        """Return sentences on IMU axes whose bias differs from the reference."""
+        if self._bias_reference is None or self._bias_now is None:
             return []
-        change, out = self._bias_now - self._bias, []
-        for k, (name, limit) in enumerate(BIAS_LIMITS.items()):
-            for axis, value in zip("xyz", change[3 * k : 3 * k + 3].tolist()):
+        moved, out = self._bias_now - self._bias_reference, []
+        for k, (name, (limit, unit)) in enumerate(BIAS_LIMITS.items()):
+            for axis, value in zip("xyz", moved[3 * k : 3 * k + 3].tolist()):
                 if abs(value) > limit:
-                    unit = "rad/s" if name == "gyroscope" else "m/s^2"
                     out.append(
-                        f"{name} {axis}: bias moved by {value:+.3f} {unit} since the start of "
-                        "the flight"
+                        f"{name} {axis}: bias moved by {value:+.3f} {unit} since the first "
+                        f"{CALIBRATE:g} s in motion"
                     )
         return out
 

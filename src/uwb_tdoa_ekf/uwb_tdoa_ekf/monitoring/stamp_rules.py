@@ -201,9 +201,6 @@ def stamp_window(s: np.ndarray) -> StampWindow:
     )
 
 
-pass
-
-
 STAMP_LINE = (
     "message.header.stamp = ...  # when the sample was measured, ROS time, in seconds and "
     "nanoseconds"
@@ -229,7 +226,7 @@ def total(windows: list[StampWindow], field: str) -> int:
     return sum(getattr(window, field) for window in windows)
 
 
-def usual(windows: list[StampWindow], field: str) -> float:
+def median_of(windows: list[StampWindow], field: str) -> float:
     """Return the median of the finite values of a field of StampWindow; NaN without any."""
     return median(value for window in windows if math.isfinite(value := getattr(window, field)))
 
@@ -237,17 +234,19 @@ def usual(windows: list[StampWindow], field: str) -> float:
 def pace_of(windows: list[StampWindow]) -> float:
     """Return the seconds of stamps per second of arrival; NaN if arrivals are unknown.
 
-    There are two estimates, and the one closer to 1 is returned. The first compares the first and
-    last message of a window, and blocks of messages disturb it. The second compares the smallest
-    latencies of successive windows, and jumps of the stamps disturb it.
+    There are two estimates. The first compares the first and last message of a window, and blocks of
+    messages disturb it. The second compares the smallest latencies of successive windows, and jumps
+    of the stamps disturb it. The one closer to 1 is returned, so one disturbance raises no alarm.
     """
     known = [(window.end, window.latency) for window in windows if math.isfinite(window.latency)]
-    ratios = [usual(windows, "pace")]
-    steps = [
-        (then - end, later - latency) for (end, latency), (then, later) in zip(known, known[1:])
+    ratios = [median_of(windows, "pace")]
+    changes = [
+        (end_2 - end, latency_2 - latency)
+        for (end, latency), (end_2, latency_2) in zip(known, known[1:])
     ]
-    if steps and all(time > 0.0 for time, _ in steps):
-        ratios.append(1.0 - median(latency / time for time, latency in steps))
+    if changes and all(elapsed > 0.0 for elapsed, _ in changes):  # else windows are out of order
+        # latency = arrival - stamp, so d stamp / d arrival = 1 - d latency / d arrival
+        ratios.append(1.0 - median(latency / elapsed for elapsed, latency in changes))
     return min(ratios, key=lambda ratio: abs(ratio - 1.0) if math.isfinite(ratio) else math.inf)
 
 
@@ -288,8 +287,8 @@ def standing(name: str, windows: list[StampWindow]) -> Finding | None:
             STAMP_LINE,
             share,
         )
-    scatter, step = usual(windows, "scatter"), usual(windows, "gap")
-    packets = share > REPEATED and usual(windows, "step") > LEAP * (1.0 - share)
+    scatter, step = median_of(windows, "scatter"), median_of(windows, "gap")
+    packets = share > REPEATED and median_of(windows, "step") > LEAP * (1.0 - share)
     if not (packets or scatter > SCATTER):
         return None
     evidence = f"{100.0 * share:.0f} % repeat the one before, then they leap by {step:.3f} s"
@@ -304,7 +303,7 @@ def standing(name: str, windows: list[StampWindow]) -> Finding | None:
             "microseconds"
         )
         evidence = (
-            f"steps of {usual(windows, 'step'):.4f} s on average scatter by {scatter:.1f} times "
+            f"steps of {median_of(windows, 'step'):.4f} s on average scatter by {scatter:.1f} times "
             "that"
         )
     severity = ERROR if step > LAG else WARNING
@@ -342,8 +341,8 @@ def gaps(name: str, windows: list[StampWindow]) -> Finding | None:
     longest, limit = max(window.gap for window in windows), LONGEST_GAP[name]
     if (
         longest <= limit
-        or usual(windows, "scatter") > SCATTER
-        or usual(windows, "step") > limit
+        or median_of(windows, "scatter") > SCATTER
+        or median_of(windows, "step") > limit
         or not orderly(windows)
     ):
         return None
@@ -360,7 +359,7 @@ def gaps(name: str, windows: list[StampWindow]) -> Finding | None:
 
 def rate(name: str, windows: list[StampWindow]) -> Finding | None:
     """Return a Finding if the rate by stamps is too low; a very low rate indicates another unit."""
-    step = usual(windows, "step")
+    step = median_of(windows, "step")
     if not step > 1.0 / SLOWEST[name]:
         return None
     for scale, unit in UNITS.items():
@@ -397,8 +396,8 @@ def pace(name: str, windows: list[StampWindow]) -> Finding | None:
 
 def blocks(name: str, windows: list[StampWindow]) -> Finding | None:
     """Return a Finding if the latency varies strongly, because messages are sent in blocks."""
-    spread = usual(windows, "spread")
-    if not spread > BLOCK or usual(windows, "scatter") > SCATTER or not orderly(windows):
+    spread = median_of(windows, "spread")
+    if not spread > BLOCK or median_of(windows, "scatter") > SCATTER or not orderly(windows):
         return None
     severity = ERROR if spread > LAG else WARNING
     cause = f"the messages of {name} arrive in blocks"
@@ -449,13 +448,13 @@ def offset(imu: list[StampWindow], tdoa: list[StampWindow]) -> Finding | None:
     """
     if not (orderly(imu) and orderly(tdoa)):
         return None
-    by_arrival = usual(tdoa, "latency") - usual(imu, "latency")
+    by_arrival = median_of(tdoa, "latency") - median_of(imu, "latency")
     if math.isfinite(by_arrival):
         ahead, evidence = (
             by_arrival,
-            f"stamp minus arrival: {-usual(imu, 'latency'):+.3f} s of the IMU, ",
+            f"stamp minus arrival: {-median_of(imu, 'latency'):+.3f} s of the IMU, ",
         )
-        evidence += f"{-usual(tdoa, 'latency'):+.3f} s of the TDOAs"
+        evidence += f"{-median_of(tdoa, 'latency'):+.3f} s of the TDOAs"
     else:
         begin, end = imu[0].begin - tdoa[0].begin, imu[-1].end - tdoa[-1].end
         ahead = 0.5 * (begin + end)
@@ -472,9 +471,9 @@ def offset(imu: list[StampWindow], tdoa: list[StampWindow]) -> Finding | None:
     if abs(ahead) < APART:
         return None
     severity = ERROR if abs(ahead) > LAG else WARNING
-    if _late(by_arrival, usual(tdoa, "latency"), usual(imu, "latency")):
+    if _late(by_arrival, median_of(tdoa, "latency"), median_of(imu, "latency")):
         cause = (
-            f"the TDOAs arrive {usual(tdoa, 'latency'):.3f} s after their stamps, the IMU's "
+            f"the TDOAs arrive {median_of(tdoa, 'latency'):.3f} s after their stamps, the IMU's "
             "samples in time"
         )
         line = (
@@ -510,10 +509,10 @@ def _late(by_arrival: float, tdoa: float, imu: float) -> bool:
 
 def other_clock(imu: list[StampWindow], tdoa: list[StampWindow]) -> Finding | None:
     """Return a Finding if both streams share a clock that differs from the recorder's."""
-    latency = usual(tdoa, "latency")
+    latency = median_of(tdoa, "latency")
     if not (orderly(imu) and orderly(tdoa)):
         return None
-    if not abs(latency) > 1.0 or abs(latency - usual(imu, "latency")) > LAG:
+    if not abs(latency) > 1.0 or abs(latency - median_of(imu, "latency")) > LAG:
         return None
     evidence = f"they arrive {latency:.3f} s after their stamps"
     line = (

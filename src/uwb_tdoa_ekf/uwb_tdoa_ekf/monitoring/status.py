@@ -226,9 +226,6 @@ class VolumeCheck:
         )
 
 
-pass
-
-
 # rad; with four yaw hypotheses the deviation is 100 degrees, with one below 20: docs/reliability.md
 YAW_KNOWN = math.radians(20.0)
 # rad and m/s, standard deviations that are published while a fault makes the estimate wrong

@@ -8,7 +8,7 @@ import numpy as np
 
 from .finding import NOTE, Steady, most_severe_first
 from .signs import SignWatch
-from .stamp_rules import usual
+from .stamp_rules import median_of
 from .stream_rules import StreamRules
 
 if TYPE_CHECKING:
@@ -137,7 +137,7 @@ class StreamWatch:
     def _starved(self) -> bool:
         """Return whether both streams arrive in blocks, because this process was not scheduled."""
         spreads = [
-            usual([window.stamps for window in windows], "spread")
+            median_of([window.stamps for window in windows], "spread")
             for windows in (self._rules.imu, self._rules.tdoa)
             if windows
         ]

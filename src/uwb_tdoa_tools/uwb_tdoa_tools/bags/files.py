@@ -169,7 +169,7 @@ def _opened(path: Path, folder: Path, salvage: bool) -> BagReader:
         reader = BagReader(readable)
         with _closing_second_connections(reader):
             reader.open()
-        _take_qos_of_metadata(reader)
+        _align_qos_with_metadata(reader)
         information = metadata(readable) if readable.is_dir() else {"compression_mode": ""}
         reader.data = data_files(readable, information) if readable.is_dir() else [readable]
         reader.packed = information["compression_mode"] == "message"
@@ -212,19 +212,20 @@ def _connections() -> list[Any]:
     return sys.modules["apsw"].connections() if "apsw" in sys.modules else []
 
 
-def _take_qos_of_metadata(reader: Reader) -> None:
-    """Set the QoS of each topic in the data files to that in metadata.yaml.
+def _align_qos_with_metadata(reader: Reader) -> None:
+    """Set the QoS of each topic in the data files of an open Reader to that in metadata.yaml.
 
-    rosbags skips messages of topics whose QoS differs.
+    rosbags compares both as text. Where they differ it drops the messages without a word, as with a
+    metadata.yaml of another version of the recorder. A single file has no metadata.yaml.
     """
     recorded = {
-        (one.topic, one.msgtype): one.ext.offered_qos_profiles  # type: ignore[union-attr]  # always a bag of ROS 2
-        for one in reader.connections
+        (topic.topic, topic.msgtype): topic.ext.offered_qos_profiles  # type: ignore[union-attr]  # always a bag of ROS 2
+        for topic in reader.connections
     }
     for file in getattr(reader.storage, "storages", ()):
-        for k, one in enumerate(file.connections):
-            qos = recorded.get((one.topic, one.msgtype), one.ext.offered_qos_profiles)
-            file.connections[k] = one._replace(ext=one.ext._replace(offered_qos_profiles=qos))
+        for k, topic in enumerate(file.connections):
+            qos = recorded.get((topic.topic, topic.msgtype), topic.ext.offered_qos_profiles)
+            file.connections[k] = topic._replace(ext=topic.ext._replace(offered_qos_profiles=qos))
 
 
 def _as_written(

@@ -37,6 +37,7 @@ HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, CHUNK_INDEX, DATA_END = (
     0x08,
     0x0F,
 )
+HEAD = 9  # bytes of a record before its content: opcode, size
 _BLOCK = 1 << 20  # bytes per read
 
 
@@ -65,12 +66,12 @@ class Record:
     @property
     def content(self) -> int:
         """Return the first byte of the content."""
-        return self.start + 9
+        return self.start + HEAD
 
     @property
     def end(self) -> int:
         """Return the first byte after the record."""
-        return self.start + 9 + self.size
+        return self.start + HEAD + self.size
 
 
 def check(path: str | Path) -> None:
@@ -141,21 +142,23 @@ def intact_records(path: str | Path) -> Iterator[tuple[int, bytes]]:
 
 
 def records(file: BinaryIO, start: int, end: int) -> Iterator[Record]:
-    """Yield the records that fill file[start:end].
+    """Yield the records that fill file[start:end], bytes, `end` excluded.
 
     Raises
     ------
     Damaged
-        If a record does not fit.
+        If a record exceeds `end`, or has opcode 0.
     """
     while start < end:
-        if start + 9 > end:
+        if start + HEAD > end:
             raise Damaged(f"byte {start}: it is cut within a record")
-        kind, size = struct.unpack("<BQ", _read(file, start, 9))
+        kind, size = struct.unpack("<BQ", _read(file, start, HEAD))
         record = Record(kind, start, size)
-        if record.end > end or kind == 0:
+        if kind == 0:
+            raise Damaged(f"byte {start}: a record has opcode 0")
+        if record.end > end:
             raise Damaged(
-                f"byte {start}: a record claims {size} bytes, {end - start - 9} are there"
+                f"byte {start}: a record claims {size} bytes, {end - start - HEAD} are there"
             )
         yield record
         start = record.end
@@ -171,10 +174,10 @@ def chunk_records(data: bytes) -> Iterator[tuple[int, bytes]]:
     """
     at = 0
     while at < len(data):
-        if at + 9 > len(data):
+        if at + HEAD > len(data):
             raise Damaged("a chunk is cut within a record")
         kind, size = struct.unpack_from("<BQ", data, at)
-        at += 9
+        at += HEAD
         if (
             size > len(data) - at
             or kind not in (SCHEMA, CHANNEL, MESSAGE)

@@ -1,4 +1,7 @@
-"""Ids, signs and units are put right before anchors: wrong ones look like anchors elsewhere."""
+"""Stop commands that estimate anchors while ids, signs or units are wrong.
+
+These mistakes look like misplaced anchors.
+"""
 
 from __future__ import annotations
 
@@ -18,24 +21,28 @@ if TYPE_CHECKING:
     from ..readers.inputs import Reading
 
 
-def ids_are_right(
+def nothing_comes_first(
     command: str, reading: Reading, paths: Sequence[str], estimator: FlightEstimator
 ) -> bool:
-    """Return whether `check` finds none of these mistakes in recordings; show which it finds.
+    """Return whether `check` finds no mistake of ids, signs, units or the scale of the survey.
 
-    command : name of the command that stops then; paths : files and folders to read.
+    Such mistakes (`watch.FIRST` and ids exchanged on the way) are printed. The caller must stop.
+
+    command : name of the command, for its messages; reading : how recordings are read
+    paths : files and folders to read; raises InputError
     """
     found = []
     with Progress(command) as progress:
         for path, survey in progress.over(reading.find(paths), "checking recordings"):
-            findings = check(read_recording(reading, path, survey), (), estimator).findings
+            recording = read_recording(reading, path, survey)
+            findings = check(recording, others=(), estimator=estimator).findings
             found += [finding for finding in findings if finding.rule in (*FIRST, EXCHANGED)]
     for finding in found:
         cli.show(*report.lines(finding))
     if found:
         cli.say(
             command,
-            "stopped, and nothing is written: ids, signs and units first, as said above; then "
+            "stopped, and nothing is written: ids, signs, units and scale first, as said above; then "
             "anchors.",
         )
     return not found

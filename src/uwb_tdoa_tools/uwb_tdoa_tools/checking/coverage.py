@@ -61,9 +61,6 @@ def to_copy(sides: Sequence[str]) -> str:
     return f"tell ekf_node the side, --ros-args {lines}{which} (tag_side in a file for --config)"
 
 
-pass
-
-
 RARE = 0.2  # share of the median rate of the anchors; healthy 0.54 at least
 SILENT = 5.0  # s for which an anchor that is heard otherwise is not
 # thickness of the constellation over its size; the measured rooms have 0.2 and more

@@ -102,9 +102,6 @@ def judge_truth(flight: Flight) -> Iterator[Finding]:
         )
 
 
-pass
-
-
 def judge_flight(flight: Flight) -> list[Finding]:
     """Return the findings of a Flight, most severe first, without notes.
 

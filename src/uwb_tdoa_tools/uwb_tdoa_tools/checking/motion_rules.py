@@ -28,9 +28,12 @@ BEYOND = round(LONGEST / CELL)  # further cells at both ends, to try delays
 FEWEST = 200  # cells in the air
 LIMIT = 4.0  # robust standard deviations at which a difference is clipped
 GRAVITY = 9.81  # m/s^2
-# Share of the power that other axes of a sensor leave; healthy 1.22 and 0.92 at least.
+# Largest power after a change of axes, over the power before, that counts as a mistake. In healthy
+# flights it is at least 1.22 (gyroscope) and 0.92 (accelerometer).
 AXES = {"gyro": 0.8, "accel": 0.75}
-ATTITUDE = 1.2  # largest power with another attitude of the truth, over that with other axes
+# A wrong attitude of the truth is blamed if it leaves at most this times the power of the gyroscope
+# that the best change of its axes leaves.
+ATTITUDE = 1.2
 # Share of the power that a low pass leaves (healthy 0.87 at least), and for a sensor that is smooth.
 FILTERED, FILTERED_SMOOTH = 0.8, 0.97
 SLOWNESS = 0.05, 0.1, 0.2, 0.4, 0.8  # s, time constants of the low pass
@@ -113,7 +116,9 @@ class TrueMotion:
         return true[BEYOND - late : len(true) - BEYOND - late]
 
     def power(self, sensor: str, true: np.ndarray, change: np.ndarray | None = None) -> float:
-        """Return the mean clipped square of measured minus true values, in units of the scatter as it is.
+        """Return the mean clipped square of measured minus true values.
+
+        The unit is the robust standard deviation of the uncorrected difference.
 
         Parameters
         ----------
@@ -122,7 +127,7 @@ class TrueMotion:
         true : (n + 2 BEYOND, 3) array
             True readings.
         change : (3, 3) array or None
-            Rotation of the measured values.
+            Matrix that is applied to the measured values.
         """
         measured = self.measured[sensor] if change is None else self.measured[sensor] @ change.T
         left = _slowly_left(measured - self.at(true), self.block) / self._scale[sensor]
@@ -174,23 +179,27 @@ def _triangle(t: np.ndarray, values: np.ndarray, when: np.ndarray) -> np.ndarray
 
 
 def wrong_axes(motion: TrueMotion) -> Iterator[Finding]:
-    """Yield exchanged or mirrored axes, another unit of the gyroscope, or a wrong attitude of the truth."""
+    """Yield a Finding for each sensor with wrong axes or units, or one for the ground truth.
+
+    A wrong attitude of the ground truth looks like wrong axes of both sensors. Then it is the only
+    Finding. `motion` must have at least FEWEST cells.
+    """
     base = {sensor: motion.power(sensor, motion.true[sensor]) for sensor in SENSORS}
     best = {sensor: _best_arrangement(motion, sensor) for sensor in SENSORS}
     wrong = [sensor for sensor in SENSORS if _explains(motion, sensor, base[sensor], *best[sensor])]
-    attitude, power = min(
+    attitude, powers = min(
         ((name, _with_attitude(motion, name)) for name in ATTITUDES), key=lambda x: x[1]["gyro"]
     )
     if (
-        power["gyro"] < AXES["gyro"] * base["gyro"]
-        and power["accel"] < base["accel"]
-        and power["gyro"] < ATTITUDE * best["gyro"][0]
+        powers["gyro"] < AXES["gyro"] * base["gyro"]
+        and powers["accel"] < base["accel"]
+        and powers["gyro"] < ATTITUDE * best["gyro"][0]
     ):
         evidence = (
-            f"{100 * (1 - power['gyro'] / base['gyro']):.0f} % less mean square difference of the "
+            f"{100 * (1 - powers['gyro'] / base['gyro']):.0f} % less mean square difference of the "
             "turns then, "
         )
-        evidence += f"{100 * (1 - power['accel'] / base['accel']):.0f} % of the accelerations"
+        evidence += f"{100 * (1 - powers['accel'] / base['accel']):.0f} % less of the accelerations"
         cause = f"the attitude of the ground truth is {attitude}"
         yield Finding(
             "truth_attitude",
@@ -198,16 +207,16 @@ def wrong_axes(motion: TrueMotion) -> Iterator[Finding]:
             cause,
             evidence,
             "write body to world, right-handed, x y z w",
-            power["gyro"],
+            powers["gyro"],
         )
         return
     for sensor in wrong:
-        left, change = best[sensor]
+        remaining, correction = best[sensor]
         evidence = (
-            f"{100 * (1 - left / base[sensor]):.0f} % less mean square difference to the ground "
+            f"{100 * (1 - remaining / base[sensor]):.0f} % less mean square difference to the ground "
             "truth"
         )
-        yield _of_axes(sensor, change, evidence, left)
+        yield _of_axes(sensor, correction, evidence, remaining)
 
 
 def _explains(

@@ -267,9 +267,6 @@ def _linearised(
     return by_tag, np.asfortranarray(by_anchors.reshape(len(residual), -1)), residual
 
 
-pass
-
-
 LONG, SHORT = 60.0, 14.0  # s of the recording for trials: to decide, and to choose candidates
 PERIOD = 1.0  # s over which motion is measured, to choose that part
 

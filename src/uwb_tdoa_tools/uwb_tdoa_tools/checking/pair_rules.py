@@ -90,9 +90,6 @@ class KnownPath:
         return int(self.ids[self.samples.a[row]]), int(self.ids[self.samples.b[row]])
 
 
-pass
-
-
 # Share of the median error with the other sign, or the ids exchanged; healthy 2.1 and 0.68 at least
 CONTRARY = 0.4
 MOVED = 0.3  # m, least standard deviation of the true TDOA that determines the sign
@@ -336,10 +333,6 @@ def _median_errors(
     return tuple(
         float(np.median(np.abs(d - tdoa(p, at[table[a]], at[table[b]])))) for table in tables
     )
-
-
-pass
-pass
 
 
 SOURCE = "numbers"

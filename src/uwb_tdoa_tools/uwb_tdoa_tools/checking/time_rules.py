@@ -202,9 +202,6 @@ def _looked_at(path: KnownPath) -> list[np.ndarray]:
     return [part[chosen[part]] for part in path.pairs.values()]
 
 
-pass
-
-
 # healthy: a pair 0.557, all together 0.984, drifting 0.9953, jumping 0.993
 LATE, OF_ALL, DRIFTS, JUMPS = 0.53, 0.965, 0.99, 0.985
 LEAST = 0.1  # s that count

@@ -12,7 +12,7 @@ from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_bias.effects import EffectSet
 
 from .. import cli, command_lines, options, parallel
-from ..checking.before_anchors import ids_are_right
+from ..checking.before_anchors import nothing_comes_first
 from ..checking.report import remarks_on
 from ..diagnosis import diagnose, output
 from ..diagnosis.noise import write_parameters
@@ -135,7 +135,9 @@ def _diagnose(args: Namespace) -> int:
     config, effects = options.filter_of(args)
     reading = options.reading_of(args)
     judge = FlightEstimator(config, effects)
-    if args.reference in BLIND and not ids_are_right("diagnose", reading, args.flights, judge):
+    if args.reference in BLIND and not nothing_comes_first(
+        "diagnose", reading, args.flights, judge
+    ):
         return 1
     found = reading.find(args.flights)
     rerun = options.rerun_of(args, len(found), partial(cli.say, "diagnose"))

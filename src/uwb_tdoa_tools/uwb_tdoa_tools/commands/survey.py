@@ -9,7 +9,7 @@ from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_bias.effects import EffectSet
 
 from .. import cli, command_lines, options
-from ..checking.before_anchors import ids_are_right
+from ..checking.before_anchors import nothing_comes_first
 from ..diagnosis.noise import write_parameters
 from ..diagnosis.self_calibration import self_calibrate
 from ..estimate import FlightEstimator
@@ -81,7 +81,7 @@ def _survey(args: Namespace) -> int:
     config, effects = options.filter_of(args)
     base, tape = effects or EffectSet(), options.tape_of(args, effects)
     reading = options.reading_of(args)
-    if not args.unknown and not ids_are_right(
+    if not args.unknown and not nothing_comes_first(
         "survey", reading, args.flights, FlightEstimator(config, base)
     ):
         return 1

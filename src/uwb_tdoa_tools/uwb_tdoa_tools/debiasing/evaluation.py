@@ -121,9 +121,6 @@ def evaluate_map(flown: Scored, bias_map: BiasMap, effects: EffectSet | None = N
     return Score(flight.name, debiased(odometry, bias_map), corrected_truth(flight, effects))
 
 
-pass
-
-
 SMALLEST_GAIN = 0.01  # share of the 3D RMSE, least gain or harm
 _RUN = ("rmse_x", "rmse_y", "rmse_z", "rmse_3d", "max_3d", "nees_mean")
 

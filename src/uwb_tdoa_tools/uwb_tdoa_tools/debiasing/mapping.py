@@ -108,9 +108,6 @@ def _from_table(path: str | Path, planar: bool) -> list[Part]:
     ]
 
 
-pass
-
-
 FEWEST = 2  # flights; a single one cannot be validated
 
 

@@ -33,9 +33,10 @@ if TYPE_CHECKING:
 
     from .constraints import Constraint
 
-MARGIN = 0.5  # s left out at both ends
+MARGIN = 0.5  # s left out at both ends of the phase that is diagnosed
 SHORTEST = 5.0  # s that can be diagnosed
-FLOWN_SHARE = 0.25  # smallest share of the time in the air, between its ends, of a flight
+# smallest share of the stamps in the air, from the first to the last such stamp, of a vehicle that flies
+FLOWN_SHARE = 0.25
 TRUTHS = "_truth"  # end of the names of streams in which a simulation stores the truth
 SPACING = 2.0  # s between the stamps at which an odometry is fitted
 FEWEST = 5  # such stamps
@@ -95,16 +96,18 @@ class Reference:
         return np.zeros(3)
 
     def span(self, flight: Flight, poses: Truth) -> tuple[float, float]:
-        """Return the (first, last) stamp, s, of the part that is diagnosed; raise InputError.
+        """Return the (first, last) stamp, s, of the phase that is diagnosed.
 
-        The part is in the air, or in motion on the floor, without its ends.
+        It is that of `scored_phase` (in the air, else in motion, else all) without MARGIN at both
+        ends. Raises InputError if it is shorter than SHORTEST.
+        flight : for its name; poses : Truth, known or estimated
         """
-        part, first, last = scored_phase(poses)
+        phase, first, last = scored_phase(poses)
         first, last = first + MARGIN, last - MARGIN
         if last - first < SHORTEST:
             raise InputError(
-                f"{flight.name}: only {last - first:.1f} s of it are {TITLES[part]}; "
-                f"{SHORTEST:g} s are needed."
+                f"{flight.name}: only {last - first:.1f} s of it are {TITLES[phase]}, without "
+                f"{MARGIN:g} s at both ends; {SHORTEST:g} s are needed."
             )
         return first, last
 

@@ -12,6 +12,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.text import written_by
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.correction.exported import INPUTS, KIND, OUTPUTS
+from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.effects import Effect, EffectSet
 
 from .left_out import LeftOut, left_out
@@ -19,7 +20,7 @@ from .tracing import nodes_of, samples_of
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.correction.network import Network
+    from uwb_tdoa_bias.correction.model import Model
 
     from .graph import Node
 
@@ -48,16 +49,18 @@ class TracedCorrection:
     def meta(self) -> dict[str, Any]:
         """Return the metadata of a file: what goes in, what comes out, and where it is from."""
         network = {} if self.network is None else self.network.meta
-        names = [effect.name for effect in self.effects]
+        of_effects = self.effects.name if len(self.effects) else ""
+        of_network = self.network.name if self.network else ""
         return {
             "kind": KIND,
-            "name": "+".join(names + ([self.network.name] if self.network else [])) or "none",
+            "name": "+".join(filter(None, (of_effects, of_network))),
             "inputs": [list(column) for column in INPUTS],
             "outputs": [list(column) for column in OUTPUTS],
             "frame": self.anchors.frame,
             "anchor_ids": self.anchors.ids.tolist(),
             "anchor_positions": self.anchors.positions.tolist(),
-            "effects": names,
+            "effects": [effect.label for effect in self.effects],
+            "of_effects": of_effects,
             "needs_motion": self.effects.needs_motion,
             "has_slope": len(self.effects.state_dependent) > 0,
             "sources": {effect.label: effect.source for effect in self.effects if effect.source},
@@ -72,7 +75,7 @@ PROVENANCE = ("name", "kind", "data", "trained_on", "validated_on", "trained_wit
 
 
 def trace(
-    anchors: Anchors, effects: EffectSet | None, network: Network | None = None
+    anchors: Anchors, effects: EffectSet | None, network: Model | None = None
 ) -> TracedCorrection:
     """Return the TracedCorrection of some Anchors; raise InputError.
 
@@ -85,16 +88,24 @@ def trace(
             f"anchors: anchor {anchors.ids[far][0]} is more than {FARTHEST:g} m from the origin, "
             "where single precision is too coarse; give positions in a frame that begins nearby."
         )
+    if network is not None and not isinstance(network, Network):
+        raise InputError(
+            f"model: {network.name} is an exported correction already; give the network of which "
+            "it was made, as train writes it."
+        )
     effects = EffectSet() if effects is None else effects
     held = effects.where(is_traceable)
+    omitted = [left_out(effect, anchors) for effect in effects if not is_traceable(effect)]
+    if not len(held) and network is None:
+        raise InputError(
+            f"effects: nothing can be exported. {' '.join(map(str, omitted))} Give effects on "
+            "TDOAs, or a network."
+        )
     samples = samples_of(anchors, held.needs_motion)
     found = Corrector(anchors, held, network).prediction(samples)
     bias, std, status, slope, _ = (nodes_of(samples, values) for values in found)
     outputs = {"bias": bias, "std": std, "status": status, "slope": slope}
-    omitted = effects.where(lambda effect: not is_traceable(effect))
-    return TracedCorrection(
-        anchors, held, network, outputs, tuple(left_out(effect, anchors) for effect in omitted)
-    )
+    return TracedCorrection(anchors, held, network, outputs, tuple(omitted))
 
 
 def is_traceable(effect: Effect) -> bool:

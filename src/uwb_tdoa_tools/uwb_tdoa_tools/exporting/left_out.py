@@ -24,8 +24,20 @@ PER_UNIT = {
     "m/s^2": (0.5, "after 1 s without TDOAs"),
     "rad": (0.5 * G, "after 1 s without TDOAs"),
     "rad/s": (G / 6.0, "after 1 s without TDOAs"),
-    "1": (1.0, "at 1 m, 1 m/s or 1 m/s^2"),
 }
+# Of a share or an angle what it means depends on the channel
+PER_UNIT_OF_CHANNEL = {
+    ("tdoa", "1"): (1.0, "for outliers of 1 m"),
+    ("height", "1"): (1.0, "at 1 m"),
+    ("velocity", "1"): (1.0, "after 1 s at 1 m/s"),
+    ("velocity", "rad"): (1.0, "after 1 s at 1 m/s"),
+    ("yaw_rate", "1"): (0.5, "after 1 s at 1 m/s and 1 rad/s"),
+    ("accel", "1"): (0.5, "after 1 s without TDOAs at 1 m/s^2"),
+    ("gyro", "1"): (G / 6.0, "after 1 s without TDOAs at 1 rad/s"),
+}
+# Parameters that say when or where an effect acts, or are in its second unit
+TIMES = "time", "start", "end"
+CONDITIONS = {"floor_multipath": ("x", "y", "height"), "truth_frame": ("roll", "pitch", "yaw")}
 SENSOR_UNITS = {"gyro": "rad/s", "accel": "m/s^2", "velocity": "m/s", "yaw_rate": "rad/s"}
 
 
@@ -56,7 +68,7 @@ def left_out(effect: Effect, anchors: Anchors) -> LeftOut:
         why = "it changes the ids or the sign of a TDOA before the correction"
         return LeftOut(effect.label, far, "at most, the distance between two anchors", why)
     unit = _unit(effect)
-    per_unit, when = PER_UNIT[unit]
+    per_unit, when = PER_UNIT_OF_CHANNEL.get((effect.channels[0], unit)) or PER_UNIT[unit]
     largest = max((abs(_own(effect, key)) for key in effect.values), default=0.0)
     return LeftOut(effect.label, per_unit * largest, when, _why(effect))
 
@@ -69,10 +81,9 @@ def _unit(effect: Effect) -> str:
 
 def _own(effect: Effect, key: str) -> float:
     """Return a value if it is in the first unit of the effect, else 0."""
-    part = key.partition(".")[2] or key
-    is_condition = part in ("time", "start", "end", "x", "y", "height", "radius")
-    first_unit_only = "," in effect.unit or effect.name == "floor_multipath"
-    return 0.0 if is_condition and first_unit_only else effect.values[key]
+    part = key.rpartition(".")[2]
+    is_condition = part in CONDITIONS.get(effect.name, ()) or part in TIMES and "," in effect.unit
+    return 0.0 if is_condition else effect.values[key]
 
 
 def _why(effect: Effect) -> str:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from onnx import ModelProto
 
     from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.correction.network import Network
+    from uwb_tdoa_bias.correction.model import Model
     from uwb_tdoa_bias.effects import EffectSet
 
 OPERATORS = {
@@ -53,7 +53,7 @@ def write_onnx(
     path: str | Path,
     anchors: Anchors,
     effects: EffectSet | None,
-    network: Network | None = None,
+    network: Model | None = None,
 ) -> TracedCorrection:
     """Write the correction of some Anchors as an ONNX file, and return what it holds.
 

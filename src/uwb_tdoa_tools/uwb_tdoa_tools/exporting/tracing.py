@@ -172,10 +172,12 @@ class Traced(NDArrayOperatorsMixin, SymbolicArray):
         return True
 
     def reshape(self, *shape: int) -> Blocks:
-        """Return the blocks; shape : (-1, n) or (blocks, -1)."""
-        blocks = self.node.shape[0]
-        assert self.ndim == 1 and shape in ((-1, self.n), (blocks, -1))
-        return Blocks([self[k * self.n : (k + 1) * self.n] for k in range(blocks)])
+        """Return parts of whole blocks; shape : (-1, rows of a part) or (parts, -1)."""
+        parts, rows = shape
+        if rows < 0:
+            rows = len(self) // parts
+        assert self.ndim == 1 and rows % self.n == 0 and len(self) % rows == 0
+        return Blocks([self[first : first + rows] for first in range(0, len(self), rows)])
 
     # SymbolicArray
 
@@ -242,25 +244,25 @@ class Traced(NDArrayOperatorsMixin, SymbolicArray):
 
 
 class Blocks(list[Traced]):
-    """The blocks of copies of samples: numpy's (blocks, n)."""
+    """Parts of equal length of an array: numpy's (parts, rows)."""
 
     def __getitem__(self, key: Any) -> Any:
         found = super().__getitem__(key)
         return Blocks(found) if isinstance(key, slice) else found
 
     def min(self, axis: int) -> Any:
-        """Return the least of all blocks."""
+        """Return the least of all parts."""
         least = self[0]
         for one in self[1:]:
             least = np.minimum(least, one)
         return least
 
     def mean(self, axis: int) -> Any:
-        """Return the mean of all blocks."""
+        """Return the mean of all parts."""
         return sum(self[1:], self[0]) / len(self)
 
     def std(self, axis: int) -> Any:
-        """Return the standard deviation of all blocks."""
+        """Return the standard deviation of all parts."""
         middle = self.mean(0)
         return np.sqrt(Blocks([(one - middle) ** 2 for one in self]).mean(0))
 

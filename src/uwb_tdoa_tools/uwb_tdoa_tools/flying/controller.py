@@ -46,7 +46,7 @@ class Gains:
     rate, yaw_rate : float
         From a rate error to angular accelerations, 1/s.
     damping : float
-        Share of the measured angular acceleration that is removed.
+        Factor of the measured angular acceleration that acts against it; no unit.
     most_tilt, most_rate : float
         Limits of tilt and body rate, rad and rad/s.
     least_thrust, most_thrust : float
@@ -68,6 +68,9 @@ class Gains:
     least_thrust: float = 0.3
     most_thrust: float = 1.8
 
+
+YAW_SHARE = 0.1  # of the full thrust of a rotor: the yaw has the lowest priority
+LEAST_SHARE = 0.01  # of the full thrust of a rotor, so that rotors do not stop in the air
 
 RECORD = np.dtype([(field.name, float) for field in fields(Gains)], align=True)
 
@@ -223,7 +226,10 @@ def inner(
     vehicle: Record,
     speeds: np.ndarray,
 ) -> None:
-    """Compute rotor speeds from thrust and body rates.
+    """Compute rotor speeds from thrust and body rates: rate control and mixing.
+
+    The body axes are x forward, y left, z up. Rotors are in the order of CORNERS. Without a wanted
+    thrust all rotors stop.
 
     Parameters
     ----------
@@ -250,13 +256,14 @@ def inner(
         gains.rate * (rates[1] - gyro[0, 1]) - gains.damping * (gyro[0, 1] - gyro[1, 1]) / dt
     )
     mz = vehicle.inertia_z * gains.yaw_rate * (rates[2] - gyro[0, 2])
-    most = vehicle.thrust * vehicle.top_speed**2
+    full = vehicle.thrust * vehicle.top_speed**2  # N, of one rotor
     for k in range(ROTORS):
-        tilt = 0.25 * (CORNERS[k, 1] * mx - CORNERS[k, 0] * my) / (0.5 * vehicle.arm)
-        turn = 0.25 * SPIN[k] * mz * vehicle.thrust / vehicle.moment
-        turn = min(max(turn, -0.1 * most), 0.1 * most)  # the yaw has the lowest priority
-        lift = 0.25 * thrust + tilt + turn
-        speeds[k] = math.sqrt(min(max(lift, 0.01 * most), most) / vehicle.thrust)
+        # forces, N: each square of CORNERS is 0.5, so 0.5 arm is the lever of a rotor over CORNERS
+        of_tilt = 0.25 * (CORNERS[k, 1] * mx - CORNERS[k, 0] * my) / (0.5 * vehicle.arm)
+        of_yaw = 0.25 * SPIN[k] * mz * vehicle.thrust / vehicle.moment
+        of_yaw = min(max(of_yaw, -YAW_SHARE * full), YAW_SHARE * full)
+        force = 0.25 * thrust + of_tilt + of_yaw
+        speeds[k] = math.sqrt(min(max(force, LEAST_SHARE * full), full) / vehicle.thrust)
 
 
 @compiled

@@ -170,9 +170,6 @@ def _pointer(array: np.ndarray) -> ctypes.c_void_p:
     return array.ctypes.data_as(ctypes.c_void_p)
 
 
-pass
-
-
 def odometry_of(
     t: np.ndarray, p: np.ndarray, v: np.ndarray, q: np.ndarray, covariance: np.ndarray
 ) -> Odometry:

@@ -127,9 +127,6 @@ def _error_key(one: DrawnFlight) -> tuple[bool, float]:
     return not reached(one.verdict), one.verdict["tracking"] or 0.0
 
 
-pass
-
-
 def verdict_store(
     path: str | Path | None, asked: dict[str, Any]
 ) -> AbstractContextManager[Verdicts]:

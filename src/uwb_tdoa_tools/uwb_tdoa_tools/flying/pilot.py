@@ -174,9 +174,6 @@ def _way(
     return value, value.derivative(1), value.derivative(2)
 
 
-pass
-
-
 class Pilot:
     """Execute the commands of a user with the vehicle of a Trial.
 

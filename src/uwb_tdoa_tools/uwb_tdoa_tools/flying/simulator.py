@@ -134,9 +134,6 @@ def poses_at(
             q[i, k] /= math.sqrt(length)
 
 
-pass
-
-
 TICK = 4  # inertial samples per turn of the controller
 DT = TICK / IMU_RATE  # s
 START_SPREAD = 0.5  # m, largest offset of the path from the middle of the hall along each axis
@@ -382,9 +379,6 @@ def _along(way: np.ndarray, share: np.ndarray) -> np.ndarray:
     k = np.minimum(part.astype(int), len(way) - 2)
     x = (part - k)[:, None]
     return way[k] + x**3 * (10.0 - 15.0 * x + 6.0 * x**2) * (way[k + 1] - way[k])
-
-
-pass
 
 
 class Transport:

@@ -169,8 +169,9 @@ class Trial:
 
     def _simulator(self, duration: float) -> Simulator:
         """Return the simulated vehicle for `duration`, s."""
-        radius = getattr(self.task.path, "radius", 0.0)  # m, of the start from the middle
-        return Simulator(self.task.world, self.task.seed, duration, radius)
+        path = self.task.path
+        assert not isinstance(path, Waypoints)  # a rover has a simulator of its own
+        return Simulator(self.task.world, self.task.seed, duration, path.radius)
 
     def _controller(self) -> Any:
         """Return the controller."""
@@ -325,7 +326,10 @@ def _filter_of(task: Task, place: np.ndarray, yaw: float) -> OwnFilter | PeerFil
     known: dict[str, Any] = (
         {"initial_yaw": yaw, "initial_yaw_std": GIVEN_STD} if task.yaw == "known" else {}
     )
-    return OwnFilter(anchors, replace(task.config, **known), task.effects, load_network(task.model))
+    model = load_network(task.model)
+    if model is not None:
+        model.require(anchors)
+    return OwnFilter(anchors, replace(task.config, **known), task.effects, model)
 
 
 def _silence_start(

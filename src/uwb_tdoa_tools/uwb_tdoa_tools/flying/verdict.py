@@ -280,9 +280,6 @@ def _figures(distance: np.ndarray, normalised: np.ndarray) -> dict[str, float | 
     }
 
 
-pass
-
-
 OVERCONFIDENT = 3.0  # standard deviations of a coordinate
 
 

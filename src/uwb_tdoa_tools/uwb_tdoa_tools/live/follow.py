@@ -237,9 +237,6 @@ def stamp_of(data: bytes) -> int:
     return seconds * 10**9 + nanoseconds
 
 
-pass
-
-
 SPIN = 0.05  # s
 ANSWER_LIMIT = 10.0  # s for a node's parameters
 SETTLE_LIMIT = 60.0  # s for the diagnostics of the nodes to settle

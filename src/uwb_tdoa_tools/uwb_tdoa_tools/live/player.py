@@ -265,7 +265,3 @@ class Player:
                         f"{ACKNOWLEDGE_LIMIT:g} s ({error}); stop it, or let it subscribe "
                         "best effort."
                     ) from error
-
-
-pass
-pass

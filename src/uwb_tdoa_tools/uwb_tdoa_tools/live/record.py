@@ -171,10 +171,6 @@ class Recorder:
         self._say(f"recording {topic} ({msgtype}, {qos.reliability.name.lower()})")
 
 
-pass
-pass
-
-
 FIRST_LIMIT = 20.0  # s until there must be a message on the first topic
 
 

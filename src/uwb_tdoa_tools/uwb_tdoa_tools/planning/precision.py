@@ -77,31 +77,36 @@ def _information(
 
 
 def weigh(
-    ranges: np.ndarray, variance: np.ndarray, pairing: Pairing, link_std: float = 0.0
+    change: np.ndarray, variance: np.ndarray, pairing: Pairing, link_std: float = 0.0
 ) -> np.ndarray:
-    """Return V' F^-1 V, the squared size of changes of the ranges in a round: (n, k, k).
+    """Return the information V' F^-1 V of one round about k unknowns, (n, k, k).
 
-    ranges : (n, N, k) m, changes of the ranges; V : (n, M, k) m, the changes of the TDOAs that
-    follow. variance : (n, N) m^2 of the receptions; link_std : m, as for Installation. If the
-    changes are the derivatives along x, y, z, this is the first term of eq. 1.
+    V are the derivatives of the measurements of the round: D `change` for TDOAs, `change` for
+    ranges. D (M, N) has -1 at anchor a and +1 at anchor b of each pair. F = D S D' + link_std^2 I
+    is the covariance of the measurements, S = diag(variance). For derivatives by the position the
+    result is the first term of eq. 1, in 1/m^2.
 
-    With one shared reception per anchor the result does not depend on the pairs D that connect the
-    anchors: D' (D S D')^-1 D = W - w w' / sum(w) with W = S^-1. N ranges with one unknown
-    offset, the tag's clock, have the same weight. A closed ring, whose D S D' is singular, has the same result.
+    If the anchors share one reception each and the pairs connect all of them, the result does not
+    depend on the pairs: with W = S^-1 and w its diagonal, D' (D S D')^-1 D = W - w w' / sum(w).
+    That is the information of N ranges with one unknown offset, the tag's clock. A closed ring,
+    whose D S D' is singular, has the same information. Only independent TDOAs have `times`.
+
+    change : (n, N, k) derivatives of the ranges to all N anchors; variance : (n, N) m^2, of the
+    receptions; pairing : Pairing; link_std : m, as for Installation
     """
     if pairing.beside:
-        return np.sum([weigh(ranges, variance, part, link_std) for part in pairing.parts], axis=0)
-    own = link_std**2
+        return np.sum([weigh(change, variance, part, link_std) for part in pairing.parts], axis=0)
+    link_variance = link_std**2
     if pairing.ranges:
-        return _product(ranges, ranges / (variance + own)[..., None])
+        return _product(change, change / (variance + link_variance)[..., None])
     if not pairing.shared:
-        v = ranges[:, pairing.b] - ranges[:, pairing.a]
-        weight = pairing.times / (variance[:, pairing.a] + variance[:, pairing.b] + own)
+        v = change[:, pairing.b] - change[:, pairing.a]
+        weight = pairing.times / (variance[:, pairing.a] + variance[:, pairing.b] + link_variance)
         return _product(v, weight[..., None] * v)
-    if own > 0.0:
-        return _product(ranges, _inverse(variance, pairing, link_std) @ ranges)
+    if link_variance > 0.0:
+        return _product(change, _inverse(variance, pairing, link_std) @ change)
     w = 1.0 / variance[..., None]
-    centred = ranges - (w * ranges).sum(axis=1, keepdims=True) / w.sum(axis=1, keepdims=True)
+    centred = change - (w * change).sum(axis=1, keepdims=True) / w.sum(axis=1, keepdims=True)
     return _product(centred, w * centred)
 
 
@@ -132,18 +137,18 @@ def _from_sizes(
 ) -> np.ndarray:
     """Return the second term of eq. 1, for the derivatives (n, N, k) m of the variances.
 
-    With F = D S D' + own, dF_i = D diag(g_i) D' and P = D' F^-1 D, half the trace is g_i' (P o P)
+    With F = D S D' + link_std^2 I, dF_i = D diag(g_i) D' and P = D' F^-1 D, half the trace is g_i' (P o P)
     g_j / 2.
     """
-    own = link_std**2
+    link_variance = link_std**2
     if pairing.ranges:
-        g = gradient / (variance + own)[..., None]
+        g = gradient / (variance + link_variance)[..., None]
         return 0.5 * _product(g, g)
     if not pairing.shared:
-        weight = 1.0 / (variance[:, pairing.a] + variance[:, pairing.b] + own)
+        weight = 1.0 / (variance[:, pairing.a] + variance[:, pairing.b] + link_variance)
         g = (gradient[:, pairing.a] + gradient[:, pairing.b]) * weight[..., None]
         return 0.5 * pairing.times * _product(g, g)
-    if own > 0.0:
+    if link_variance > 0.0:
         return 0.5 * _product(gradient, _inverse(variance, pairing, link_std) ** 2 @ gradient)
     w = 1.0 / variance[..., None]
     total, g = w.sum(axis=1, keepdims=True), w * gradient

@@ -1,12 +1,13 @@
 """Find where a round of TDOAs has two solutions: a second minimum of its misfit.
 
-With d(x) the distances from x to the N anchors that are heard at p, and Q = D' F^-1 D the weight of
-their errors in a round (`weigh`),
+With d(x) the distances from x to the N anchors that are heard at p, D the anchor pairs of the TDOAs
+of a round, F the covariance of these TDOAs, and Q = D' F^-1 D the information matrix of the
+distances, 1/m^2 (`precision.range_weights`),
     f(x) = (d(x) - d(p))' Q (d(x) - d(p))
 is the squared misfit, in standard deviations, of a tag at x with the TDOAs of a tag at p. Its
 smallest minimum is p, with 0. Levenberg-Marquardt searches a second one, from the mirrored places
-of choices of k + 1 anchors (`bifurcation`). An estimator that weighs all TDOAs prefers the second
-minimum with probability Phi(-sqrt(f) / 2).
+of choices of k + 1 anchors (`bifurcation`); k is the number of unknown coordinates, 2 or 3. An
+estimator that weighs all TDOAs prefers the second minimum with probability Phi(-sqrt(f) / 2).
 
 One more anchor raises f everywhere, but it may also make a second minimum. A long valley may come
 apart in two minima, or a minimum outside of the room may move into it. That is a property of this
@@ -30,10 +31,11 @@ FLIP = 0.5  # m; a minimum nearer than this is no failure, but imprecision
 CLEAR = 4.65  # standard deviations of misfit from which on at most 1 % of the estimates flip
 NEAREST = 8  # anchors whose choices of k + 1 are mirrored
 DESCENTS = 12  # from the mirrored places of least misfit
-SWEEPS = 60  # steps of a descent
-SETTLED = 0.01  # of f, that another step would gain at most where a descent has come to its end
+MAX_STEPS = 60  # of a descent
+SETTLED = 0.01  # a descent ends where another step would lower f by less than this
 LONGEST = 5.0  # m, of a step
-AROUND = 2.0  # m about the room, inside which descents start
+AROUND = 2.0  # m outside of the room, to which starts farther out are moved
+SAME = 0.5 * FLIP  # m between starts that count as one
 _FLAT = 1e-6  # of the volume of a cube; k + 1 anchors of less are in one plane (line)
 
 
@@ -47,7 +49,8 @@ def second_minima(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the second minimum of least misfit inside a room: (misfit (n,), place (n, 3) m).
 
-    The misfit is in standard deviations; inf and NaN if no descent ends more than FLIP away.
+    The misfit is in standard deviations; inf and NaN if no descent ends inside the room
+    and more than FLIP away.
     points : (n, 3) m; positions : (N, 3) m of anchors; columns : (n, K) rows of the heard ones;
     weights : (n, K, K) 1/m^2, Q; room : Room; unknowns : 2 if the height is known, else 3.
     """
@@ -67,12 +70,13 @@ def _search(
     choices: np.ndarray,
     out: np.ndarray,
 ) -> None:
-    """Fill out (n, 4): misfit squared and place, m.
+    """Fill out (n, 4): misfit squared and place, m; inf and NaN without a second minimum.
 
-    room : (2, 3) m, its corners; choices : (C, k + 1) of the nearest anchors.
+    points, positions, columns, weights : as of `second_minima`; room : (2, 3) m, its corners
+    choices : (C, k + 1) indices into the heard anchors, nearest first
     """
     heard, unknowns = columns.shape[1], choices.shape[1] - 1
-    anchors, true, end = np.empty((heard, 3)), np.empty(heard), np.empty(3)
+    anchors, distances, end = np.empty((heard, 3)), np.empty(heard), np.empty(3)
     starts, values = np.empty((len(choices), 3)), np.empty(len(choices))
     for n in range(len(points)):
         point = points[n]
@@ -80,22 +84,24 @@ def _search(
         out[n, 1:] = np.nan
         for i in range(heard):
             anchors[i] = positions[columns[n, i]]
-            true[i] = _distance(point, anchors[i])
-        nearest = np.argsort(true)
+            distances[i] = _distance(point, anchors[i])
+        nearest = np.argsort(distances)
         for c in range(len(choices)):
             values[c] = np.inf
-            if _mirror(point, anchors, true, nearest[choices[c]], starts[c]):
-                for k in range(unknowns):
-                    starts[c, k] = min(max(starts[c, k], room[0, k] - AROUND), room[1, k] + AROUND)
-                values[c] = _misfit(starts[c], anchors, true, weights[n])
+            if _mirror(point, anchors, distances, nearest[choices[c]], starts[c]):
+                for axis in range(unknowns):
+                    low, high = room[0, axis] - AROUND, room[1, axis] + AROUND
+                    starts[c, axis] = min(max(starts[c, axis], low), high)
+                values[c] = _misfit(starts[c], anchors, distances, weights[n])
         best = np.argsort(values)
         for c in range(min(DESCENTS, len(choices))):
-            known = not values[best[c]] < np.inf or _distance(starts[best[c]], point) < 0.5 * FLIP
-            for before in range(c):
-                known = known or _distance(starts[best[c]], starts[best[before]]) < 0.5 * FLIP
-            if known:
+            start = starts[best[c]]
+            skipped = not values[best[c]] < np.inf or _distance(start, point) < SAME
+            for better in range(c):
+                skipped = skipped or _distance(start, starts[best[better]]) < SAME
+            if skipped:
                 continue
-            f = _descend(starts[best[c]], point, anchors, true, weights[n], unknowns, end)
+            f = _descend(start, point, anchors, distances, weights[n], unknowns, end)
             for axis in range(unknowns):
                 f = f if room[0, axis] <= end[axis] <= room[1, axis] else np.inf
             if f < out[n, 0] and _distance(end, point) > FLIP:
@@ -207,7 +213,7 @@ def _descend(
     )
     normal, damped = np.zeros((3, 3)), np.zeros((3, 3))
     f, damping = _misfit(x, anchors, true, weight), 1e-2
-    for _ in range(SWEEPS):
+    for _ in range(MAX_STEPS):
         for i in range(len(anchors)):
             r = _distance(x, anchors[i])
             change[i] = r - true[i]

@@ -50,11 +50,12 @@ def _drifting_clock(rng: np.random.Generator, anchors: Anchors) -> Effect:
     return EFFECTS["anchor_clock_drift"]({one: _signed(rng, 0.01, 0.015)})
 
 
-def _moved_anchor(rng: np.random.Generator, anchors: Anchors) -> Effect:
-    (one,) = _some(rng, anchors, 1)
-    shift = rng.standard_normal(3)
-    shift *= rng.uniform(0.4, 0.7) / np.linalg.norm(shift)
-    values = {f"{one}.{axis}": round(float(part), 4) for axis, part in zip("xyz", shift)}
+def _moved_anchors(rng: np.random.Generator, anchors: Anchors) -> Effect:
+    values = {}
+    for one in _some(rng, anchors, 2):
+        shift = rng.standard_normal(3)
+        shift *= rng.uniform(0.4, 0.7) / np.linalg.norm(shift)
+        values.update({f"{one}.{axis}": round(float(part), 4) for axis, part in zip("xyz", shift)})
     return EFFECTS["anchor_position"](values)
 
 
@@ -118,7 +119,7 @@ KINDS: dict[str, Callable[[np.random.Generator, Anchors], Effect]] = {
     "heading of the tag": _heading_of_tag,
     "late anchors": _late_anchors,
     "lever arm": _lever_arm,
-    "moved anchor": _moved_anchor,
+    "moved anchors": _moved_anchors,
     "obstacle": _obstacle,
     "pairs": _pairs,
     "received power": _power,

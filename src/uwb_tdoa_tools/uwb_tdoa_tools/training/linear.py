@@ -135,29 +135,30 @@ def _inverse_diagonal(factor: np.ndarray) -> np.ndarray:
 
 
 def _normal_equations(
-    design: Design, groups: Sequence[tuple[int, int, np.ndarray]], size: int, row: np.ndarray
+    design: Design, groups: Sequence[tuple[int, int, np.ndarray]], size: int, weight: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return both sides (k, k) and (k,) of weighted least squares, with row weights `row` (n,)."""
+    """Return both sides of the normal equations, (size + q, size + q) and (size + q,).
+
+    They lack the priors. groups : of `_groups`; size : sites * m; weight : (n,) 1/m^2, of the rows
+    """
     m, q = design.phi.shape[1], design.dense.shape[1]
     left, right = np.zeros((size + q, size + q)), np.zeros(size + q)
     for a, b, rows in groups:
-        phi, w = design.phi[rows], row[rows, None]
-        square, one, both = (
-            phi.T @ (w * phi),
-            phi.T @ (w[:, 0] * design.y[rows]),
-            phi.T @ (w * design.dense[rows]),
-        )
-        at, bt = slice(a * m, (a + 1) * m), slice(b * m, (b + 1) * m)
-        left[at, at] += square
-        left[bt, bt] += square
-        left[at, bt] -= square
-        left[bt, at] -= square
-        for part, sign in ((at, -1.0), (bt, 1.0)):
-            right[part] += sign * one
-            left[part, size:] += sign * both
+        phi, w = design.phi[rows], weight[rows, None]
+        gram = phi.T @ (w * phi)
+        vector = phi.T @ (w[:, 0] * design.y[rows])
+        cross = phi.T @ (w * design.dense[rows])
+        of_a, of_b = slice(a * m, (a + 1) * m), slice(b * m, (b + 1) * m)
+        left[of_a, of_a] += gram
+        left[of_b, of_b] += gram
+        left[of_a, of_b] -= gram
+        left[of_b, of_a] -= gram
+        for block, sign in ((of_a, -1.0), (of_b, 1.0)):
+            right[block] += sign * vector
+            left[block, size:] += sign * cross
     left[size:, :size] = left[:size, size:].T
-    left[size:, size:] = design.dense.T @ (row[:, None] * design.dense)
-    right[size:] = design.dense.T @ (row * design.y)
+    left[size:, size:] = design.dense.T @ (weight[:, None] * design.dense)
+    right[size:] = design.dense.T @ (weight * design.y)
     return left, right
 
 
@@ -170,6 +171,7 @@ def predict(design: Design, weights: np.ndarray, dense: np.ndarray) -> np.ndarra
 
 
 def _groups(a: np.ndarray, b: np.ndarray, sites: int) -> list[tuple[int, int, np.ndarray]]:
+    """Return [(site a, site b, rows with these sites)]."""
     pair = a * sites + b
     order = np.argsort(pair, kind="stable")
     starts = np.flatnonzero(np.diff(pair[order], prepend=-1))

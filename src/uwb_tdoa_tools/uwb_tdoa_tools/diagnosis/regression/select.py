@@ -147,7 +147,7 @@ def select(
         It proposes functions. Separate fits score the first FITTED, because the present weights
         treat their contribution as outliers.
     start : Candidates
-        The initial model; backward elimination can drop them.
+        The initial model; backward elimination after a forward step can drop them.
     progress : function
         It is called every few seconds.
     """
@@ -172,7 +172,7 @@ def select(
         chosen.append(best)
         model = fit(table, columns_of(chosen), inflation, near=model)
         chosen, model = _backward(table, chosen, model, len(candidates))
-    loss = _losses(table, chosen, model, len(candidates))
+    loss = _criteria(table, chosen, model, len(candidates))
     progress()
     return Selection(table, tuple(chosen), model, tuple(loss), ((),) * len(chosen))
 
@@ -273,21 +273,27 @@ def acceptable(table: RegressionTable, candidate: Candidate, beta: np.ndarray) -
 def _backward(
     table: RegressionTable, chosen: list[Candidate], model: Fit, choices: int
 ) -> tuple[list[Candidate], Fit]:
-    """Drop candidates that fall below their price, or become negligible or impossible."""
+    """Drop candidates that fall below their price, or become negligible or impossible.
+
+    The one with the smallest criterion goes first; then the others are fitted anew. A single
+    candidate stays: the forward step has just accepted it. Returns (the others, their Fit).
+
+    choices : number of candidates that were offered, for the price of a choice
+    """
     while len(chosen) > 1:
-        losses = _losses(table, chosen, model, choices)
+        criteria = _criteria(table, chosen, model, choices)
         for k, candidate in enumerate(chosen):
             if not acceptable(table, candidate, model.values(candidate.columns)):
-                losses[k] = -np.inf
-        worst = int(np.argmin(losses))
-        if losses[worst] > 0.0:
+                criteria[k] = -np.inf
+        weakest = int(np.argmin(criteria))
+        if criteria[weakest] > 0.0:
             break
-        chosen = chosen[:worst] + chosen[worst + 1 :]
+        chosen = chosen[:weakest] + chosen[weakest + 1 :]
         model = fit(table, columns_of(chosen), model.inflation)
     return chosen, model
 
 
-def _losses(
+def _criteria(
     table: RegressionTable, chosen: list[Candidate], model: Fit, choices: int
 ) -> list[float]:
     """Return the criterion of each chosen Candidate given the others, twice a log-likelihood."""

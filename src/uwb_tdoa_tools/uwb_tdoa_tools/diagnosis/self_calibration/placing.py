@@ -19,10 +19,12 @@ if TYPE_CHECKING:
     from uwb_tdoa_ekf.core.config import FilterConfig
     from uwb_tdoa_ekf.results import Odometry
 
-MOST = 3000  # largest number of TDOAs of a flight that are used
-FEWEST = 200  # fewest TDOAs that place an anchor
+# number of TDOAs of a flight and an anchor; of more, every second, third, ... is used
+MOST = 3000
+FEWEST = 200  # fewest TDOAs of all flights that place an anchor
 SCALE = 0.3  # m, scale of the robust loss
-BEYOND = 1.0  # m, distance of the starting points beyond the box of the known anchors
+BEYOND = 1.0  # m, from the box of the known anchors to the starting points
+BOUND = 5.0  # m, from the starting points to the limits of the search
 # m, prior standard deviation of a placed coordinate in the calibration that follows
 PLACED_STD = 0.5
 
@@ -30,35 +32,39 @@ PLACED_STD = 0.5
 def place(
     flights: Sequence[Flight], rows: Sequence[int], config: FilterConfig | None = None
 ) -> Anchors:
-    """Return the Anchors of Flights with some rows placed, one after the other.
+    """Return the Anchors of Flights with some of them placed, each from the known anchors alone.
 
-    Each TDOA between the new anchor and a known anchor defines a hyperboloid at the tag's position.
-    Robust least squares over all TDOAs starts at the corners of the room. Raises InputError if
-    fewer than FEWEST TDOAs determine the anchor.
+    The known anchors give the path of the tag. Then each TDOA between the new and a known anchor is
+    a distance from the tag to the new anchor. Robust least squares over all distances starts at the
+    corners of the box of the known anchors, enlarged by BEYOND. Raises InputError if fewer than
+    FEWEST TDOAs determine an anchor.
+
+    flights : they have the same Anchors; rows : of the unknown anchors
     """
     anchors = flights[0].anchors
     known = np.setdiff1d(np.arange(len(anchors)), rows)
     positions = anchors.positions.copy()
+    # the ground truth is not read
     paths = [smooth(flight.among(known).without("truth"), config).odometry for flight in flights]
     low, high = positions[known].min(axis=0) - BEYOND, positions[known].max(axis=0) + BEYOND
     for row in rows:
         parts = [
             _distances(flight, path, row, known, positions) for flight, path in zip(flights, paths)
         ]
-        p, to = (np.concatenate(some) for some in zip(*parts))
-        if len(p) < FEWEST:
+        tag, distance = (np.concatenate(arrays) for arrays in zip(*parts))
+        if len(tag) < FEWEST:
             raise InputError(
-                f"--unknown {anchors.ids[row]}: {len(p)} TDOAs tell of it, {FEWEST} are "
+                f"--unknown {anchors.ids[row]}: {len(tag)} TDOAs tell of it, {FEWEST} are "
                 "needed; record motion for longer."
             )
 
-        def residual(x: np.ndarray, p: np.ndarray = p, to: np.ndarray = to) -> np.ndarray:
-            return np.linalg.norm(p - x, axis=1) - to
+        def residual(x: np.ndarray) -> np.ndarray:
+            return np.linalg.norm(tag - x, axis=1) - distance
 
         starts = itertools.product(*zip(low, high))
         found = [
             least_squares(
-                residual, start, loss="soft_l1", f_scale=SCALE, bounds=(low - 5.0, high + 5.0)
+                residual, start, loss="soft_l1", f_scale=SCALE, bounds=(low - BOUND, high + BOUND)
             )
             for start in starts
         ]
@@ -71,7 +77,7 @@ def _distances(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return positions of the tag, (n, 3) m, and measured distances to the anchor `row`, (n,) m.
 
-    The path comes from the filter. Each distance is a TDOA with a known anchor plus the distance to
+    The path comes from the smoother. Each distance is a TDOA with a known anchor plus the distance to
     that known anchor.
 
     known : rows of the known anchors; positions : (N, 3) m, world

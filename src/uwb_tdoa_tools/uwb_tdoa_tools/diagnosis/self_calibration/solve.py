@@ -377,8 +377,9 @@ def _alone(spread: SelfCalibration, found: SelfCalibration) -> SelfCalibration:
 def _most_probable(found: dict[int | None, SelfCalibration], misfit: Misfit) -> SelfCalibration:
     """Return the most probable of several SelfCalibrations.
 
-    A single moved anchor must be ODDS times more probable than the error spread over all anchors.
-    Its shift must be significant.
+    A single moved anchor must be ODDS times more probable than the error spread over all anchors,
+    and its shift significant. It must also leave few slow innovations, as any result that may be
+    used: errors of antennas and obstacles are no shift, but one anchor can absorb part of them.
 
     found : {row of the anchor tried alone, None for the spread solution: SelfCalibration}
     """
@@ -386,7 +387,7 @@ def _most_probable(found: dict[int | None, SelfCalibration], misfit: Misfit) -> 
     evidence = {
         row: _log_evidence(one, row) - misfit.of(one.surveyed, _in_model(one)) / alike
         for row, one in found.items()
-        if row is None or _stands_elsewhere(one, row)
+        if row is None or (one.why_not is None and _stands_elsewhere(one, row))
     }
     best = max(evidence, key=evidence.__getitem__)
     doubt = evidence[best] - np.log(ODDS)
