@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, partial
+import os
 from pathlib import Path
 import time
 from typing import TYPE_CHECKING, Any
@@ -265,9 +266,17 @@ class Stopwatch:
         self.laps[name], self._last = now - self._last, now
 
     def in_words(self) -> str:
-        """Return the time of all parts, and of each."""
+        """Return the time of all parts and of each, and the processor time of all processes."""
         parts = ", ".join(f"{name} {seconds:.0f} s" for name, seconds in self.laps.items())
-        return f"{sum(self.laps.values()):.0f} s: {parts}"
+        return (
+            f"{sum(self.laps.values()):.0f} s: {parts}; {self.processor_time:.0f} s of processor "
+            "time"
+        )
+
+    @property
+    def processor_time(self) -> float:
+        """Return the processor time of this process and of those that it ran, s."""
+        return sum(os.times()[:4])
 
 
 @dataclass(frozen=True)
@@ -348,6 +357,7 @@ class LoopResult:
                 "outcomes": [one.outcome for one in self.passes],
                 "really": loop.truth_in_words(seed, self.flight),
                 "seconds": clock.laps,
+                "processor_time": clock.processor_time,
             }
         )
 
