@@ -11,19 +11,13 @@ from typing import TYPE_CHECKING
 from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli, options, parallel
-from ..diagnosis import diagnose
 from ..evaluating import lines_of_errors
-from ..flying import demo, loop
+from ..flying import demo
 from ..outputs import OutputFile, OutputFolder
-from ..parallel import Progress
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
     from collections.abc import Sequence
-
-    from uwb_tdoa_bias.common.flight import Flight
-
-    from ..scoring.metrics import Score
 
 DESCRIPTION = """Find a systematic error of the measurements, write its correction, and fly with it.
 
@@ -36,7 +30,7 @@ With --flight a measured flight goes through both nodes. It is corrected with wh
 nothing else: what helped other flights may harm it. "raw" is the same filter without any correction, run without ROS.
 The exit code is 1 if the estimate diverged, or messages were lost or late.
 """
-WIDTH = 120  # characters of a line
+WIDTH, INDENT = 120, 11  # characters of a line, and before its text
 SEED, RATES = 1, {"simulated": 20.0, "measured": 1.0}  # times as fast as flown
 
 
@@ -103,47 +97,23 @@ def _demo(args: Namespace) -> int:
 
 def _loop(args: Namespace) -> int:
     """Close the loop in a simulated hall."""
-    seed, clock = args.seed or SEED, demo.Stopwatch()
-    onnx, picture = args.out / "bias.onnx", args.out / "demo.png"
-    with Progress("demo") as progress:
-        progress("flying")
-        bags = loop.record(seed, args.out)
-        flights = loop.read(bags[:2])
-        _several("recorded", [loop.recordings_in_words(flights, seed)])
-        _several("residual", loop.residuals_of(flights[0]).sentences())
-        clock.lap("flying")
-        diagnosis = diagnose(flights, progress=progress)
-        _several("traced to", loop.found_in_words(diagnosis))
-        clock.lap("tracing")
-        correction = loop.write_correction(onnx, diagnosis)
-        _several("added", loop.added_in_words(onnx, correction, diagnosis))
-        clock.lap("writing")
-    say = partial(cli.say, "demo")
-    result = demo.fly_both(bags[2], onnx if correction else None, args.rate, say)
-    clock.lap("both nodes, twice" if correction else "both nodes")
-    _several("flown", [result.arrived_in_words()])
-    _several("error", [result.error_in_words()])
-    from ..flying.demo_picture import draw  # takes a second to import
-
-    draw(result, picture)
-    clock.lap("picture")
-    _several("really", [loop.truth_in_words(seed, result.flight)])
-    cli.show(f"picture    {picture}")
-    cli.show(f"took       {clock.in_words()}")
+    result, figures = demo.close_loop(
+        args.seed or SEED, args.out, args.rate, _show, partial(cli.say, "demo")
+    )
     if args.rerun is not None:
         result.show(args.rerun)
-        cli.show(f"rerun      {args.rerun}")
     if args.json is not None:
-        cli.write_json(args.json, result.figures(seed, diagnosis, clock))
-    cli.show("next       " + "\n           ".join(demo.next_steps(bags[2])))
+        cli.write_json(args.json, figures)
+    _show("next", demo.next_steps(args.out / "flight-3.bag"), keep=True)
     return int(result.failed)
 
 
-def _several(title: str, lines: Sequence[str]) -> None:
-    """Print sentences with a title before the first."""
+def _show(title: str, lines: Sequence[str], keep: bool = False) -> None:
+    """Print lines with a title before the first; `keep` those that are to be copied as they are."""
     for number, line in enumerate(lines):
-        begin = f"{'' if number else title:11s}"
-        cli.show(textwrap.fill(line, WIDTH, initial_indent=begin, subsequent_indent=" " * 11))
+        begin = f"{'' if number else title:{INDENT}s}"
+        width = len(line) + INDENT if keep else WIDTH
+        cli.show(textwrap.fill(line, width, initial_indent=begin, subsequent_indent=" " * INDENT))
 
 
 def _measured(args: Namespace) -> int:
@@ -159,53 +129,22 @@ def _measured(args: Namespace) -> int:
     )
     cli.show(f"correction {chosen.correction()}")
     flown = demo.fly(chosen, args.out, args.rate, lambda text: cli.show(f"nodes      {text}"))
-    scores, in_time = flown.scores, _all_in_time(flight, flown.outcome)
-    if not in_time:
+    scores = flown.scores
+    _show("nodes", demo.arrivals_in_words(flight, flown.outcome))
+    if flown.missing:
         cli.say("demo", f"messages lost or late: too much load for --rate {args.rate:g}; try less.")
-    cli.show(*lines_of_errors(scores))
-    cli.show(_change_in_words(scores))
+    change = demo.change_of_scores(scores)
+    cli.show(*lines_of_errors(scores), change)
     from ..scoring.plots import plot_comparison  # takes a second to import
 
     plot_comparison(flight, scores[:-1], args.out / "error.png")
     cli.show(f"plot       {args.out / 'error.png'}")
     if args.rerun is not None:
-        flown.show(args.rerun, flight, [_change_in_words(scores)])
+        flown.show(args.rerun, flight, [change])
         cli.show(f"rerun      {args.rerun}")
     cli.show(f"took {time.monotonic() - started:.0f} s")
-    cli.show("next       " + "\n           ".join(demo.next_steps(args.flight, args.survey)))
-    return int(scores[-2].row()["diverged"] or not in_time)  # of the nodes
-
-
-def _change_in_words(scores: Sequence[Score]) -> str:
-    """State in words how correction changes the error."""
-    before, after = (score.row()["rmse_3d"] for score in scores[:2])
-    if len(scores) == 2:
-        return (
-            f"3D RMSE {before:.3f} m, with nothing corrected: diagnose finds what is wrong with "
-            "this flight, and what that is worth on others"
-        )
-    change = (
-        f"3D RMSE raw {before:.3f} m, corrected {after:.3f} m: "
-        f"{round(100.0 * (after - before) / before):+d} %"
-    )
-    worse = (
-        "; this correction does not fit this flight: other anchors, another day, another IMU. Do "
-        "not fly with it; diagnose finds one that fits"
-    )
-    return change + (worse if after > before else "")
-
-
-def _all_in_time(flight: Flight, outcome: dict[str, int]) -> bool:
-    """Print what became of every message. Returns whether all were there in time."""
-    counts = ", ".join(
-        f"{count} {name}" for name, count in outcome.items() if not name.startswith("imu_")
-    )
-    cli.show(f"nodes      TDOAs {len(flight.tdoa)}: {counts}")
-    samples = 0 if flight.imu is None else len(flight.imu)
-    cli.show(
-        f"nodes      IMU samples {samples}: {outcome['imu_late']} late, {outcome['imu_lost']} lost"
-    )
-    return not any(outcome[name] for name in demo.MISSING)
+    _show("next", demo.next_steps(args.flight, args.survey), keep=True)
+    return int(scores[-2].row()["diverged"] or flown.missing > 0)  # of the nodes
 
 
 main = cli.executable(_demo, parser)

@@ -19,9 +19,11 @@ from uwb_tdoa_ekf.results import Odometry
 
 from .. import command_lines
 from ..bags.bag import read_odometry, write_bag
+from ..diagnosis import diagnose
 from ..live.run import accounts, run_live
 from ..localizing.pictures import write_rerun
 from ..outputs import as_json
+from ..parallel import Progress
 from ..scoring.gains import change_in_words
 from ..scoring.metrics import Score
 from . import loop
@@ -135,6 +137,11 @@ class DemoResult:
     nodes: RecordedOdometry
     without_ros: Run
     raw: Odometry | None
+
+    @property
+    def missing(self) -> int:
+        """Return how many messages were lost or late."""
+        return sum(self.outcome[name] for name in MISSING)
 
     def show(self, path: Path, flight: Flight, sentences: Sequence[str]) -> None:
         """Write a file for Rerun with the output of the nodes and sentences."""
@@ -404,9 +411,111 @@ def fly_both(
     return LoopResult(flight, tuple(passes), load_network(model))
 
 
+def close_loop(
+    seed: int,
+    folder: Path,
+    rate: float,
+    show: Callable[[str, Sequence[str]], object],
+    say: Callable[[str], object],
+) -> tuple[LoopResult, dict[str, Any]]:
+    """Trace the hidden effect of a simulated hall, and fly with its correction.
+
+    Parameters
+    ----------
+    seed : int
+        Of the hall.
+    folder : Path
+        For all files.
+    rate : float
+        Speed of the replay.
+    show : callable
+        Called with a title and sentences, for each result.
+    say : callable
+        Called with lines of progress.
+
+    Returns
+    -------
+    LoopResult
+    dict
+        All figures, for JSON.
+
+    Raises
+    ------
+    InputError, LiveError
+        If the third flight cannot be played.
+    """
+    clock, onnx, picture = Stopwatch(), folder / "bias.onnx", folder / "demo.png"
+    with Progress("demo") as progress:
+        progress("flying")
+        bags = loop.record(seed, folder)
+        flights = loop.read(bags[:2])
+        show("recorded", [loop.recordings_in_words(flights, seed)])
+        show("residual", loop.residuals_of(flights[0]).sentences())
+        clock.lap("flying")
+        diagnosis = diagnose(flights, progress=progress)
+        show("traced to", loop.found_in_words(diagnosis) or ["nothing that helps"])
+        clock.lap("tracing")
+        correction = loop.write_correction(onnx, diagnosis)
+        show("added", loop.added_in_words(onnx, correction, diagnosis))
+    result = fly_both(bags[2], onnx if correction else None, rate, say)
+    clock.lap("both nodes, twice" if correction else "both nodes")
+    show("flown", [result.arrived_in_words()])
+    show("error", [result.error_in_words()])
+    from .demo_picture import draw  # takes a second to import
+
+    draw(picture, result.flight, result.residuals, result.scores)
+    clock.lap("picture")
+    show("really", [loop.truth_in_words(seed, result.flight)])
+    show("picture", [str(picture)])
+    show("took", [clock.in_words()])
+    return result, result.figures(seed, diagnosis, clock)
+
+
 def _named(say: Callable[[str], object], name: str, text: str) -> None:
     """Say a line of progress of one pass."""
     say(f"{name} bias.onnx: {text}")
+
+
+def change_of_scores(scores: Sequence[Score]) -> str:
+    """Return how a correction changes the error of a measured flight, from the scores of `fly`."""
+    before, after = (score.row()["rmse_3d"] for score in scores[:2])
+    if len(scores) == 2:
+        return (
+            f"3D RMSE {before:.3f} m, with nothing corrected: diagnose finds what is wrong with "
+            "this flight, and what that is worth on others"
+        )
+    change = (
+        f"3D RMSE raw {before:.3f} m, corrected {after:.3f} m: "
+        f"{round(100.0 * (after - before) / before):+d} %"
+    )
+    worse = (
+        "; this correction does not fit this flight: other anchors, another day, another IMU. Do "
+        "not fly with it; diagnose finds one that fits"
+    )
+    return change + (worse if after > before else "")
+
+
+def arrivals_in_words(flight: Flight, outcome: dict[str, int]) -> list[str]:
+    """Return what became of all messages of a flight.
+
+    Parameters
+    ----------
+    flight : Flight
+    outcome : dict
+        As of `accounts`.
+
+    Returns
+    -------
+    list of str
+    """
+    counts = ", ".join(
+        f"{count} {name}" for name, count in outcome.items() if not name.startswith("imu_")
+    )
+    samples = 0 if flight.imu is None else len(flight.imu)
+    return [
+        f"TDOAs {len(flight.tdoa)}: {counts}",
+        f"IMU samples {samples}: {outcome['imu_late']} late, {outcome['imu_lost']} lost",
+    ]
 
 
 def next_steps(recording: str | Path, survey: str | Path | None = None) -> list[str]:
