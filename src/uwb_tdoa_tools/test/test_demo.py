@@ -205,7 +205,7 @@ def test_the_loop_through_the_real_nodes(tmp_path, capsys):
     offline = [
         score_of(third, FlightEstimator(network=one))[0].row()["rmse_3d"] for one in (None, model)
     ]
-    assert live == pytest.approx(offline, abs=1e-9) and live[1] < 0.3 * live[0]
+    assert live == pytest.approx(offline, abs=1e-5) and live[1] < 0.3 * live[0]
     assert (tmp_path / "demo.png").stat().st_size > 10_000
 
 
