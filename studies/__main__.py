@@ -7,6 +7,7 @@ from studies import (
     aids,
     calibrating,
     crazyflie,
+    demo,
     deviations,
     domains,
     drives,
@@ -54,6 +55,7 @@ STUDIES = {
     "crazyflie": crazyflie,
     "debias-measured": measured,
     "debias-set-up": set_up,
+    "demo": demo,
     "deviations": deviations,
     "diagnose-ranges": diagnosed_ranges,
     "diagnosis": figures,
@@ -99,6 +101,7 @@ of measured flights: flights/, util/, surveys/.
   crazyflie        measured logs put through the radio link of a Crazyflie (docs/connect.md)
   debias-measured  bias maps of positions on measured flights (docs/debiasing.md)
   debias-set-up    a simulated copy of the set-up of Grasso et al. (docs/debiasing.md)
+  demo             the loop of the demo over seeds (docs/demo.md)
   deviations       deviations of anchor positions against their errors (docs/diagnosis.md)
   diagnose-ranges  errors put into simulated distances to anchors, and what diagnose makes of them (docs/sensors.md)
   diagnosis        effects put into flights, and found again (docs/diagnosis.md)
@@ -167,6 +170,7 @@ def parser():
         ),
         "./dev study compare-models --simulated 20 --out out/",
         "./dev study crazyflie DATA/flights/0425/TDOA2 DATA/flights/0422 --survey DATA/surveys",
+        "./dev study demo --seeds 2",
         "./dev study debias-measured --data DATA --diagnosed bench/ --out measured/",
         "./dev study debias-set-up --out set_up/",
         "./dev study diagnose-ranges --flights 5",

@@ -1,13 +1,31 @@
+from dataclasses import replace
+import inspect
+import json
+import re
 import shlex
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 pytest.importorskip("rclpy")
+from documented import ROOT  # noqa: E402
 import known_answer  # noqa: E402
 
+from uwb_tdoa_bias.correction.network import load_network  # noqa: E402
+from uwb_tdoa_bias.effects import EffectSet  # noqa: E402
 from uwb_tdoa_tools.commands import calibrate, check, demo, localize  # noqa: E402
-from uwb_tdoa_tools.flying.demo import DemoFlight, next_steps  # noqa: E402
+from uwb_tdoa_tools.diagnosis import diagnose  # noqa: E402
+from uwb_tdoa_tools.estimate import FlightEstimator  # noqa: E402
+from uwb_tdoa_tools.flying import loop  # noqa: E402
+from uwb_tdoa_tools.flying.demo import (  # noqa: E402
+    DemoFlight,
+    change_of_scores,
+    close_loop,
+    next_steps,
+)
+from uwb_tdoa_tools.scoring.evaluation import score_of  # noqa: E402
+from uwb_tdoa_tools.simulation import hidden, simulate  # noqa: E402
 from uwb_tdoa_tools.simulation.rooms import corners
 
 
@@ -20,6 +38,10 @@ from uwb_tdoa_tools.simulation.rooms import corners
             "--survey: needs --flight; a simulated flight has its own anchors.",
         ),
         (["--flight", "nowhere.log"], "nowhere.log: does not exist"),
+        (["--effects", "a.yaml"], "--effects: needs --flight: the demo writes its own"),
+        (["--model", "a.onnx"], "--model: needs --flight: the demo writes its own"),
+        (["--flight", "a.log", "--seed", "2"], "--seed: belongs to the simulated hall"),
+        (["--flight", "a.log", "--json", "a.json"], "--json: belongs to the simulated hall"),
     ],
 )
 def test_bad_usage_is_one_sentence(arguments, sentence, tmp_path, capsys):
@@ -75,8 +97,119 @@ def test_it_says_what_corrects_and_that_nothing_does_unless_it_is_asked_for(tmp_
     ],
 )
 def test_a_correction_that_does_harm_is_called_that(errors, said):
-    text = demo._change_in_words([ErrorOnly(error) for error in errors])
+    text = change_of_scores([ErrorOnly(error) for error in errors])
     assert said in text and ("does not fit" in text) == (errors[1] > errors[0])
+
+
+# --- the closed loop ---
+
+LATE = 17  # a hall in which one anchor is late
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """The bags of a hall."""
+    return loop.record(LATE, tmp_path_factory.mktemp("recorded"))
+
+
+@pytest.fixture(scope="module")
+def diagnosis(recorded):
+    """The Diagnosis of the first two recordings, with nothing there that declares the effect."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (hidden, loop):
+            patch.delattr(module, "hidden_effect")
+        patch.setattr(hidden, "KINDS", {})
+        return diagnose(loop.read(recorded[:2]))
+
+
+def test_the_diagnosis_needs_the_recordings_alone(diagnosis):
+    """It finds the effect where its declaration is removed."""
+    really = hidden.hidden_effect(LATE, corners())
+    found = diagnosis.effects.where(lambda effect: "tdoa" in effect.channels)
+    assert [effect.name for effect in found] == [really.name] == ["anchor_delay"]
+    ((anchor, late),) = really.values.items()
+    others = [value for key, value in found.effects[0].values.items() if key != anchor]
+    by = found.effects[0].values[anchor] - (np.mean(others) if others else 0.0)
+    assert by == pytest.approx(late, abs=0.01)
+
+
+def test_no_recording_declares_the_effect(recorded):
+    words = [word.encode() for word in ("anchor_delay", "hidden", "injected")]
+    for bag in recorded:
+        content = b"".join(path.read_bytes() for path in bag.rglob("*") if path.is_file())
+        assert not any(word in content for word in words)
+        (flight,) = loop.read([bag])
+        assert not {"config", "parameters"} & set(flight.meta) and not flight.extra
+
+
+def test_the_correction_takes_the_residual_of_the_third_flight_away(recorded, diagnosis, tmp_path):
+    written = loop.write_correction(tmp_path / "bias.onnx", diagnosis)
+    assert [effect.name for effect in written.effects] == ["anchor_delay"]
+    (third,) = loop.read(recorded[2:])
+    model = load_network(tmp_path / "bias.onnx")
+    before, after = loop.residuals_of(third), loop.residuals_of(third, model)
+    ((anchor, late),) = hidden.hidden_effect(LATE, third.anchors).values.items()
+    assert all(anchor in pair.split("-") for pair in before.largest)
+    assert before.constant == pytest.approx(late * np.sqrt(2 / 8), rel=0.1)  # 2 of 8 pairs
+    assert before.size > 5 * after.size and before.changing < 0.03 and after.size < 0.03
+    raw, corrected = (
+        score_of(third, FlightEstimator(network=one))[0].row()["rmse_3d"] for one in (None, model)
+    )
+    assert corrected < 0.3 * raw
+
+
+def test_nothing_is_written_where_nothing_helps(diagnosis, tmp_path):
+    nothing = replace(diagnosis, effects=EffectSet())
+    assert loop.write_correction(tmp_path / "bias.onnx", nothing) is None
+    assert not list(tmp_path.iterdir())
+    assert loop.added_in_words(tmp_path, None, nothing)[0].startswith("nothing: ")
+
+
+@pytest.mark.parametrize("kind", hidden.KINDS)
+def test_every_kind_of_hidden_effect_costs_something(kind):
+    """And the filter has the position to the error of a hall without it, once it is corrected."""
+    effect = hidden.KINDS[kind](np.random.default_rng(1), corners())
+    flight = simulate(replace(loop.HALL, seed=9, yaw="rotating"))
+    effect_in = effect.inject(flight)
+    clean, raw, corrected = (
+        score_of(one, FlightEstimator(effects=by))[0].row()["rmse_3d"]
+        for one, by in ((flight, None), (effect_in, None), (effect_in, EffectSet((effect,))))
+    )
+    assert 0.08 < raw < 0.7 and clean < 0.05
+    assert corrected < 0.5 * raw
+
+
+def test_a_seed_draws_one_effect_and_seeds_draw_all_kinds():
+    drawn = [hidden.hidden_effect(seed, corners()) for seed in range(1, 101)]
+    assert drawn[3] == hidden.hidden_effect(4, corners())
+    assert len({effect.label.rpartition(" over ")[2] for effect in drawn}) == len(hidden.KINDS)
+
+
+def lines_of(printed, title):
+    return [line for line in printed.out.splitlines() if line.startswith(title)]
+
+
+@pytest.mark.slow
+def test_the_loop_through_the_real_nodes(tmp_path, capsys):
+    figures = tmp_path / "demo.json"
+    assert demo.main(["--seed", str(LATE), "--out", str(tmp_path), "--json", str(figures)]) == 0
+    printed = capsys.readouterr()
+    for title in ("recorded", "residual", "traced to  anchor_delay", "added", "flown", "error"):
+        assert len(lines_of(printed, title)) == 1, title
+    assert "no message lost or late" in lines_of(printed, "flown")[0]
+    assert lines_of(printed, "really     anchor_delay: 6 = 0.286 (m)")
+    content = json.loads(figures.read_text())
+    live = [row["rmse_3d"] for row in content["errors"]]
+    (third,) = loop.read([tmp_path / "flight-3.bag"])
+    model = load_network(tmp_path / "bias.onnx")
+    offline = [
+        score_of(third, FlightEstimator(network=one))[0].row()["rmse_3d"] for one in (None, model)
+    ]
+    assert live == pytest.approx(offline, abs=1e-5) and live[1] < 0.3 * live[0]
+    assert (tmp_path / "demo.png").stat().st_size > 10_000
+
+
+# --- a measured flight ---
 
 
 def figures(line):
@@ -85,11 +218,12 @@ def figures(line):
 
 
 @pytest.mark.slow
-def test_a_simulated_flight_through_the_real_nodes(tmp_path, capsys):
-    assert demo.main(["--out", str(tmp_path)]) == 0
+def test_a_given_flight_through_the_real_nodes(recorded, diagnosis, tmp_path, capsys):
+    diagnosis.effects.to_yaml(tmp_path / "effects.yaml")
+    words = ["--flight", str(recorded[2]), "--effects", str(tmp_path / "effects.yaml")]
+    assert demo.main([*words, "--rate", "20", "--out", str(tmp_path / "out")]) == 0
     printed = capsys.readouterr()
     lines = printed.out.splitlines()
-    assert any(line.startswith("flown      by the estimate: landed ") for line in lines)
     raw, corrected, without_ros = (
         next(figures(line) for line in lines if line.startswith(name))
         for name in ("raw  ", "corrected  ", "corrected, without ROS")
@@ -97,5 +231,16 @@ def test_a_simulated_flight_through_the_real_nodes(tmp_path, capsys):
     assert corrected[3] < 0.6 * raw[3]  # 3D RMSE
     assert "lost or late" not in printed.err and "uwb_tdoa_tools check" in lines[-3]
     assert corrected == pytest.approx(without_ros, abs=1.01e-3)
-    for name in ("flight.bag", "recorded.bag", "effects.yaml", "error.png"):
-        assert (tmp_path / name).exists()
+    for name in ("flight.bag", "recorded.bag", "error.png"):
+        assert (tmp_path / "out" / name).exists()
+
+
+# --- the first page ---
+
+
+def test_the_readme_begins_with_the_demo_and_its_output():
+    blocks = re.findall(r"^```\w*\n(.*?)^```$", (ROOT / "README.md").read_text(), re.M | re.S)
+    assert blocks[0] == "./dev demo\n"
+    shown = re.findall(r"^(\w[\w ]*?) {2,}\S", blocks[1], re.M)
+    told = re.findall(r'show\("([a-z ]+)"', inspect.getsource(close_loop))
+    assert shown == told

@@ -1,4 +1,4 @@
-"""The first hour of a new user without ground truth, and the steps of README.md, by the commands of
+"""The first hour of a new user without ground truth, and the steps of guide.md, by the commands of
 the documentation word for word, and what came of it.
 """
 
@@ -89,7 +89,7 @@ def _lines_run(text):
             assert main(name, words) in (0, 1), line
 
 
-# --- README, from a log ---
+# --- guide.md, from a log ---
 
 
 def write_log(flight, path):
@@ -111,8 +111,8 @@ def write_log(flight, path):
 
 
 @pytest.mark.slow
-def test_the_four_steps_of_the_readme(tmp_path, monkeypatch, capsys):
-    """check, calibrate, diagnose, survey, localize: README.md, from a log and a survey."""
+def test_the_four_steps_of_the_guide(tmp_path, monkeypatch, capsys):
+    """check, calibrate, diagnose, survey, localize: guide.md, from a log and a survey."""
     at_desk(tmp_path, monkeypatch)
     hall = simulated(read_survey(written("anchors.yaml", *blocks(WALK, "yaml"))))
     write_log(hall.flights[0], "FLIGHT.log")
@@ -121,7 +121,7 @@ def test_the_four_steps_of_the_readme(tmp_path, monkeypatch, capsys):
     ]
     written("SURVEY.txt", "\n".join(["id,x,y,z", *rows, ""]))
     steps = [
-        command for text in blocks(section("README.md", "Four steps")) for command in commands(text)
+        command for text in blocks(section("guide.md", "Four steps")) for command in commands(text)
     ]
     steps = [
         (name, words)
@@ -143,7 +143,7 @@ def test_the_four_steps_of_the_readme(tmp_path, monkeypatch, capsys):
         if "--out" not in words or name == "localize":
             continue
         after = hall.error(words[words.index("--out") + 1])
-        said_on_the_way(capsys, f"README, {name}", before, after)
+        said_on_the_way(capsys, f"guide, {name}", before, after)
         assert (
             after < before
             if code == 0

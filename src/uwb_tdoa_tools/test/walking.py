@@ -14,9 +14,8 @@ FIGURES = "%.12g"  # stamps of another epoch, in ms, need them all
 
 
 def section(page, heading):
-    """The text below a heading of a page of docs/, or of README.md."""
-    path = ROOT / page if page == "README.md" else ROOT / "docs" / page
-    text = path.read_text()
+    """The text below a heading of a page of docs/."""
+    text = (ROOT / "docs" / page).read_text()
     level = re.search(rf"^(#+) {re.escape(heading)}$", text, re.MULTILINE).group(1)
     return re.split(
         rf"^#{{2,{max(2, len(level))}}} ",

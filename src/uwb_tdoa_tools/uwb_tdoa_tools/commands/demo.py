@@ -1,36 +1,37 @@
-"""Send a flight through both nodes over ROS topics, and compare the estimate with ground truth."""
+"""Trace a hidden effect and fly with its correction, or send a measured flight through both nodes."""
 
 from __future__ import annotations
 
 from functools import partial
 import sys
+import textwrap
 import time
 from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.errors import InputError
 
-from .. import cli, options
+from .. import cli, options, parallel
 from ..evaluating import lines_of_errors
 from ..flying import demo
-from ..outputs import OutputFolder
+from ..outputs import OutputFile, OutputFolder
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
     from collections.abc import Sequence
 
-    from uwb_tdoa_bias.common.flight import Flight
+DESCRIPTION = """Find a systematic error of the measurements, write its correction, and fly with it.
 
-    from ..scoring.metrics import Score
+A simulated hall has an effect that no file declares; --seed draws its kind and size. Three flights are recorded, with
+the true path of the simulation as a motion capture system gives it. `diagnose` traces the residuals of the first two.
+What it adds is written as bias.onnx. The third flight goes through bias_node and ekf_node over ROS topics, without
+bias.onnx and with it. At the end the demo says what was really in the simulation.
 
-DESCRIPTION = """Take a flight, write it as a bag, replay the bag through bias_node and ekf_node over ROS topics, and
-compare the estimate with ground truth.
-
-Without --flight a simulated vehicle first takes off, flies and lands by nothing but the estimate (as in `fly`), among
-anchors that have delays of 0.1 m (standard deviation). It and the nodes correct for them with an effects.yaml that holds
-their true values, as a calibration would find them. A measured flight is corrected with what --effects and --model give,
-and with nothing else: what helped other flights may harm it. "raw" is the same filter without any correction, run
-without ROS. The exit code is 1 if the estimate diverged, or messages were lost or late.
+With --flight a measured flight goes through both nodes. It is corrected with what --effects and --model give, and with
+nothing else: what helped other flights may harm it. "raw" is the same filter without any correction, run without ROS.
+The exit code is 1 if the estimate diverged, or messages were lost or late.
 """
+WIDTH, INDENT = 120, 11  # characters of a line, and before its text
+SEED, RATES = 1, {"simulated": 20.0, "measured": 1.0}  # times as fast as flown
 
 
 def parser() -> ArgumentParser:
@@ -39,23 +40,30 @@ def parser() -> ArgumentParser:
         "demo",
         DESCRIPTION,
         "demo",
+        "demo --seed 7 --json demo.json",
         "demo --flight 0607/tdoa2-obs-log1 --survey anchor_0607.txt --rate 4",
-        "demo --rerun out/flight.rrd",
+        "demo --flight flight.bag --rerun out/flight.rrd",
         "demo --flight flight.bag --effects effects.yaml --out out/corrected",
     )
     add = made.add_argument
     add(
         "--flight",
         metavar="LOG",
-        help="a recording: micro-SD log, UTIL CSV or bag (default: simulate one)",
+        help="a recording: micro-SD log, UTIL CSV or bag (default: simulate three)",
+    )
+    add(
+        "--seed",
+        metavar="N",
+        type=parallel.whole_number,
+        help=f"of the simulated hall and its hidden effect (default {SEED})",
     )
     options.add_reading(made)
     add(
         "--rate",
         metavar="R",
         type=float,
-        default=1.0,
-        help="replay R times as fast as flown (default 1)",
+        help="replay R times as fast as flown (default 1; 20 of a simulated flight, or as fast as "
+        "this machine can)",
     )
     add(
         "--out",
@@ -67,22 +75,51 @@ def parser() -> ArgumentParser:
     add("--effects", metavar="FILE", help="effects.yaml to correct with")
     options.add_model(made)
     options.add_rerun(made)
+    add("--json", metavar="FILE", type=OutputFile, help="write all figures of the simulated hall")
     return made
 
 
 def _demo(args: Namespace) -> int:
+    if args.rate is None:
+        args.rate = RATES["measured" if args.flight else "simulated"]
     if not 0.0 < args.rate < float("inf"):
         raise InputError(f"--rate: {args.rate:g} is not a speed; give a number above 0.")
     if args.survey and not args.flight:
         raise InputError("--survey: needs --flight; a simulated flight has its own anchors.")
-    rerun = options.rerun_of(args, 1, partial(cli.say, "demo"))
-    started = time.monotonic()
-    args.out.mkdir(parents=True, exist_ok=True)
     if args.flight:
-        chosen = demo.measured(args.flight, options.reading_of(args), args.effects, args.model)
+        options.refuse(args, ("seed", "json"), "belongs to the simulated hall")
     else:
-        cli.show("flying     a simulated vehicle")
-        chosen = demo.simulated(args.out, args.effects, args.model)
+        options.refuse(args, ("effects", "model"), "needs --flight: the demo writes its own")
+    args.rerun = options.rerun_of(args, 1, partial(cli.say, "demo"))
+    args.out.mkdir(parents=True, exist_ok=True)
+    return _measured(args) if args.flight else _loop(args)
+
+
+def _loop(args: Namespace) -> int:
+    """Close the loop in a simulated hall."""
+    result, figures = demo.close_loop(
+        args.seed or SEED, args.out, args.rate, _show, partial(cli.say, "demo")
+    )
+    if args.rerun is not None:
+        result.show(args.rerun)
+    if args.json is not None:
+        cli.write_json(args.json, figures)
+    _show("next", demo.next_steps(args.out / "flight-3.bag"), keep=True)
+    return int(result.failed)
+
+
+def _show(title: str, lines: Sequence[str], keep: bool = False) -> None:
+    """Print lines with a title before the first; `keep` those that are to be copied as they are."""
+    for number, line in enumerate(lines):
+        begin = f"{'' if number else title:{INDENT}s}"
+        width = len(line) + INDENT if keep else WIDTH
+        cli.show(textwrap.fill(line, width, initial_indent=begin, subsequent_indent=" " * INDENT))
+
+
+def _measured(args: Namespace) -> int:
+    """Take a measured flight through both nodes."""
+    started = time.monotonic()
+    chosen = demo.measured(args.flight, options.reading_of(args), args.effects, args.model)
     flight = chosen.flight
     assert flight.truth is not None
     length = flight.truth.t[-1] - flight.truth.t[0]
@@ -90,60 +127,24 @@ def _demo(args: Namespace) -> int:
         f"flight     {flight.name}: {length:.1f} s, {len(flight.tdoa)} TDOAs, "
         f"{len(flight.anchors)} anchors"
     )
-    if chosen.outcome:
-        cli.show(f"flown      by the estimate: {chosen.outcome}")
     cli.show(f"correction {chosen.correction()}")
     flown = demo.fly(chosen, args.out, args.rate, lambda text: cli.show(f"nodes      {text}"))
-    scores, in_time = flown.scores, _all_in_time(flight, flown.outcome)
-    if not in_time:
+    scores = flown.scores
+    _show("nodes", demo.arrivals_in_words(flight, flown.outcome))
+    if flown.missing:
         cli.say("demo", f"messages lost or late: too much load for --rate {args.rate:g}; try less.")
-    cli.show(*lines_of_errors(scores))
-    cli.show(_change_in_words(scores))
+    change = demo.change_of_scores(scores)
+    cli.show(*lines_of_errors(scores), change)
     from ..scoring.plots import plot_comparison  # takes a second to import
 
     plot_comparison(flight, scores[:-1], args.out / "error.png")
     cli.show(f"plot       {args.out / 'error.png'}")
-    if rerun is not None:
-        flown.show(rerun, flight, [chosen.outcome, _change_in_words(scores)])
-        cli.show(f"rerun      {rerun}")
+    if args.rerun is not None:
+        flown.show(args.rerun, flight, [change])
+        cli.show(f"rerun      {args.rerun}")
     cli.show(f"took {time.monotonic() - started:.0f} s")
-    cli.show(
-        "next       "
-        + "\n           ".join(demo.next_steps(args.flight or args.out / "flight.bag", args.survey))
-    )
-    return int(scores[-2].row()["diverged"] or not in_time)  # of the nodes
-
-
-def _change_in_words(scores: Sequence[Score]) -> str:
-    """State in words how correction changes the error."""
-    before, after = (score.row()["rmse_3d"] for score in scores[:2])
-    if len(scores) == 2:
-        return (
-            f"3D RMSE {before:.3f} m, with nothing corrected: diagnose finds what is wrong with "
-            "this flight, and what that is worth on others"
-        )
-    change = (
-        f"3D RMSE raw {before:.3f} m, corrected {after:.3f} m: "
-        f"{round(100.0 * (after - before) / before):+d} %"
-    )
-    worse = (
-        "; this correction does not fit this flight: other anchors, another day, another IMU. Do "
-        "not fly with it; diagnose finds one that fits"
-    )
-    return change + (worse if after > before else "")
-
-
-def _all_in_time(flight: Flight, outcome: dict[str, int]) -> bool:
-    """Print what became of every message. Returns whether all were there in time."""
-    counts = ", ".join(
-        f"{count} {name}" for name, count in outcome.items() if not name.startswith("imu_")
-    )
-    cli.show(f"nodes      TDOAs {len(flight.tdoa)}: {counts}")
-    samples = 0 if flight.imu is None else len(flight.imu)
-    cli.show(
-        f"nodes      IMU samples {samples}: {outcome['imu_late']} late, {outcome['imu_lost']} lost"
-    )
-    return not any(outcome[name] for name in ("lost", "late", "imu_late", "imu_lost"))
+    _show("next", demo.next_steps(args.flight, args.survey), keep=True)
+    return int(scores[-2].row()["diverged"] or flown.missing > 0)  # of the nodes
 
 
 main = cli.executable(_demo, parser)

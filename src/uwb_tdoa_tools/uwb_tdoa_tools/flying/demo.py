@@ -1,56 +1,60 @@
-"""Run a flight through both nodes over topics, and compare with the same filter without ROS."""
+"""Run flights through both nodes over topics, with and without a correction."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property, partial
+import os
 from pathlib import Path
-from typing import TYPE_CHECKING
+import time
+from typing import TYPE_CHECKING, Any
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.correction.network import load_network
-from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
+from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf.offline import Run, run_offline
 from uwb_tdoa_ekf.results import Odometry
 
 from .. import command_lines
 from ..bags.bag import read_odometry, write_bag
+from ..diagnosis import diagnose
 from ..live.run import accounts, run_live
 from ..localizing.pictures import write_rerun
+from ..outputs import as_json
+from ..parallel import Progress
+from ..scoring.gains import change_in_words
 from ..scoring.metrics import Score
-from . import trial
-from .sensors import Radio
-from .verdict import sentence, verdict_of
-from .world import HALL
+from . import loop
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from uwb_tdoa_bias.correction.model import Model
+
     from ..bags.bag import RecordedOdometry
+    from ..diagnosis.result import Diagnosis
     from ..readers.inputs import Reading
     from ..scoring.metrics import Estimate
 
-SIMULATED = trial.Task(HALL, seed=1, yaw="unknown")  # the nodes get no place and no yaw either
+MISSING = ("lost", "late", "imu_late", "imu_lost")  # outcomes of messages
 
 
 @dataclass(frozen=True)
 class DemoFlight:
-    """Describe the flight of a demo.
+    """Describe a measured flight of a demo.
 
     Parameters
     ----------
     flight : Flight
     effects_file, model : str or None
         Corrections.
-    outcome : str
-        Verdict of a simulated flight as a sentence, or "".
     """
 
     flight: Flight
     effects_file: str | Path | None
     model: str | None
-    outcome: str = ""
 
     def corrector(self) -> Corrector | None:
         """Return the Corrector of the flight, or None without corrections.
@@ -75,41 +79,6 @@ class DemoFlight:
             )
         sources = [str(path) for path in (self.effects_file, self.model) if path]
         return f"{corrector.model} ({', '.join(sources)})"
-
-
-def simulated(
-    folder: str | Path, effects_file: str | Path | None = None, model: str | None = None
-) -> DemoFlight:
-    """Fly among anchors with delays, by the estimate alone.
-
-    Without `effects_file` and `model` the true delays are corrected. They are written to an effects.yaml
-    in the folder, as a calibration writes them.
-
-    Parameters
-    ----------
-    folder : str or Path
-    effects_file : str or Path, optional
-    model : str, optional
-
-    Returns
-    -------
-    DemoFlight
-
-    Raises
-    ------
-    InputError
-        If a file cannot be used.
-    """
-    if not (effects_file or model):
-        delays = Radio(SIMULATED.world, SIMULATED.seed, 1.0).constants[:, 0]
-        values = dict(zip(SIMULATED.world.anchors.ids.tolist(), delays.round(4).tolist()))
-        effects_file = Path(folder) / "effects.yaml"
-        EffectSet((AnchorDelay(values, source="the simulation's own values"),)).to_yaml(
-            effects_file
-        )
-    effects = EffectSet.from_yaml(effects_file) if effects_file else None
-    flown = trial.fly(replace(SIMULATED, effects=effects))
-    return DemoFlight(flown.flight, effects_file, model, sentence(verdict_of(flown)))
 
 
 def measured(
@@ -169,6 +138,11 @@ class DemoResult:
     without_ros: Run
     raw: Odometry | None
 
+    @property
+    def missing(self) -> int:
+        """Return how many messages were lost or late."""
+        return sum(self.outcome[name] for name in MISSING)
+
     def show(self, path: Path, flight: Flight, sentences: Sequence[str]) -> None:
         """Write a file for Rerun with the output of the nodes and sentences."""
         write_rerun(
@@ -180,6 +154,58 @@ class DemoResult:
             flight.truth,
             self.raw,
         )
+
+
+@dataclass(frozen=True)
+class LivePass:
+    """Hold what both nodes made of a flight.
+
+    Parameters
+    ----------
+    outcome : dict
+        Number of messages by outcome, see `accounts`.
+    odometry : RecordedOdometry
+    """
+
+    outcome: dict[str, int]
+    odometry: RecordedOdometry
+
+
+def through_nodes(
+    flight: Flight,
+    bag: Path,
+    folder: Path,
+    rate: float,
+    bias: dict[str, Any],
+    say: Callable[[str], object],
+) -> LivePass:
+    """Play the bag of a flight to both nodes.
+
+    Parameters
+    ----------
+    flight : Flight
+    bag : Path
+    folder : Path
+        For the output of the nodes.
+    rate : float
+        Speed of the replay.
+    bias : dict
+        Parameters of bias_node.
+    say : callable
+        Called with lines of progress.
+
+    Returns
+    -------
+    LivePass
+
+    Raises
+    ------
+    InputError, LiveError
+        If the flight cannot be played.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    live = run_live(bag, folder, rate, bias, {"use_imu": flight.imu is not None}, say)
+    return LivePass(accounts(live.bias, live.ekf, flight), read_odometry(live.recorded))
 
 
 def fly(
@@ -213,9 +239,8 @@ def fly(
         "effects_file": _absolute(planned.effects_file),
         "model_file": _absolute(planned.model),
     }
-    ekf = {"use_imu": flight.imu is not None}
-    live = run_live(bag, folder, rate, bias, ekf, say)
-    nodes, raw = read_odometry(live.recorded), run_offline(flight)
+    passed = through_nodes(flight, bag, folder, rate, bias, say)
+    nodes, raw = passed.odometry, run_offline(flight)
     estimates: dict[str, Estimate] = {"nodes": nodes, "without ROS": raw.odometry}
     if correction:
         corrected = run_offline(flight, corrector=correction)
@@ -226,7 +251,271 @@ def fly(
         }
     scores = [Score(name, one, flight.truth) for name, one in estimates.items()]
     without_ros, before = (corrected, raw.odometry) if correction else (raw, None)
-    return DemoResult(accounts(live.bias, live.ekf, flight), scores, nodes, without_ros, before)
+    return DemoResult(passed.outcome, scores, nodes, without_ros, before)
+
+
+class Stopwatch:
+    """Measure the parts of a run.
+
+    Attributes
+    ----------
+    laps : dict
+        {part: s}.
+    """
+
+    def __init__(self) -> None:
+        self.laps: dict[str, float] = {}
+        self._last = time.monotonic()
+
+    def lap(self, name: str) -> None:
+        """End a part."""
+        now = time.monotonic()
+        self.laps[name], self._last = now - self._last, now
+
+    def in_words(self) -> str:
+        """Return the time of all parts and of each, and the processor time of all processes."""
+        parts = ", ".join(f"{name} {seconds:.0f} s" for name, seconds in self.laps.items())
+        return (
+            f"{sum(self.laps.values()):.0f} s: {parts}; {self.processor_time:.0f} s of processor "
+            "time"
+        )
+
+    @property
+    def processor_time(self) -> float:
+        """Return the processor time of this process and of those that it ran, s."""
+        return sum(os.times()[:4])
+
+
+@dataclass(frozen=True)
+class LoopResult:
+    """Hold the third flight of a closed loop.
+
+    Parameters
+    ----------
+    flight : Flight
+    passes : tuple of LivePass
+        Without the model, and with it. Only the first if there is no model.
+    model : Model or None
+    """
+
+    flight: Flight
+    passes: tuple[LivePass, ...]
+    model: Model | None
+
+    @cached_property
+    def scores(self) -> list[Score]:
+        """Return the score of each pass."""
+        assert self.flight.truth is not None
+        names = ("without", "with")
+        return [
+            Score(name, one.odometry, self.flight.truth) for name, one in zip(names, self.passes)
+        ]
+
+    @cached_property
+    def residuals(self) -> list[loop.PairResiduals]:
+        """Return the residuals of TDOAs of each pass."""
+        models = (None, self.model)[: len(self.passes)]
+        return [loop.residuals_of(self.flight, model) for model in models]
+
+    @property
+    def errors(self) -> list[float]:
+        """Return the 3D RMSE of each pass, m."""
+        return [float(score.row()["rmse_3d"]) for score in self.scores]
+
+    @property
+    def missing(self) -> int:
+        """Return how many messages were lost or late."""
+        return sum(one.outcome[name] for one in self.passes for name in MISSING)
+
+    @property
+    def failed(self) -> bool:
+        """Return whether the last pass diverged, or messages were lost or late."""
+        return bool(self.scores[-1].row()["diverged"] or self.missing)
+
+    def arrived_in_words(self) -> str:
+        """Return how many messages went through both nodes, and how many did not."""
+        times = "without bias.onnx, then with it" if len(self.passes) > 1 else "without a model"
+        lost = f"{self.missing} messages" if self.missing else "no message"
+        remedy = "; the machine has too much to do: give a lower --rate" if self.missing else ""
+        return (
+            f"{self.flight.name} through both nodes, {times}: {len(self.flight.tdoa)} TDOAs, "
+            f"{lost} lost or late{remedy}"
+        )
+
+    def error_in_words(self) -> str:
+        """Return the position error of each pass."""
+        before, *more = (loop.CM * error for error in self.errors)
+        if not more:
+            return f"3D RMSE {before:.1f} cm: nothing is corrected"
+        (after,) = more
+        return (
+            f"3D RMSE {before:.1f} cm without bias.onnx, {after:.1f} cm with it: it "
+            f"{change_in_words(before, after)}"
+        )
+
+    def figures(self, seed: int, diagnosis: Diagnosis, clock: Stopwatch) -> dict[str, Any]:
+        """Return all figures for JSON."""
+        return as_json(
+            {
+                "seed": seed,
+                "residual_rms": [one.size for one in self.residuals],
+                "found": loop.found_in_words(diagnosis),
+                "errors": [score.row() for score in self.scores],
+                "outcomes": [one.outcome for one in self.passes],
+                "really": loop.truth_in_words(seed, self.flight),
+                "seconds": clock.laps,
+                "processor_time": clock.processor_time,
+            }
+        )
+
+    def show(self, path: Path) -> None:
+        """Write a file for Rerun."""
+        before, *more = (one.odometry for one in self.passes)
+        estimate, raw = (more[0], before) if more else (before, None)
+        words = [self.error_in_words()]
+        write_rerun(path, self.flight, estimate, None, words, self.flight.truth, raw)
+
+
+def fly_both(
+    bag: Path, model: Path | None, rate: float, say: Callable[[str], object]
+) -> LoopResult:
+    """Play a recording to both nodes without a model file, then with it.
+
+    Parameters
+    ----------
+    bag : Path
+        The output of the nodes goes beside it.
+    model : Path or None
+    rate : float
+        Speed of the replay.
+    say : callable
+        Called with lines of progress.
+
+    Returns
+    -------
+    LoopResult
+
+    Raises
+    ------
+    InputError, LiveError
+        If the flight cannot be played.
+    """
+    (flight,) = loop.read([bag])
+    parameters: dict[str, dict[str, Any]] = {"without": {}}
+    if model is not None:
+        parameters["with"] = {"model_file": _absolute(model)}
+    passes = [
+        through_nodes(flight, bag, bag.parent / name, rate, one, partial(_named, say, name))
+        for name, one in parameters.items()
+    ]
+    return LoopResult(flight, tuple(passes), load_network(model))
+
+
+def close_loop(
+    seed: int,
+    folder: Path,
+    rate: float,
+    show: Callable[[str, Sequence[str]], object],
+    say: Callable[[str], object],
+) -> tuple[LoopResult, dict[str, Any]]:
+    """Trace the hidden effect of a simulated hall, and fly with its correction.
+
+    Parameters
+    ----------
+    seed : int
+        Of the hall.
+    folder : Path
+        For all files.
+    rate : float
+        Speed of the replay.
+    show : callable
+        Called with a title and sentences, for each result.
+    say : callable
+        Called with lines of progress.
+
+    Returns
+    -------
+    LoopResult
+    dict
+        All figures, for JSON.
+
+    Raises
+    ------
+    InputError, LiveError
+        If the third flight cannot be played.
+    """
+    clock, onnx, picture = Stopwatch(), folder / "bias.onnx", folder / "demo.png"
+    with Progress("demo") as progress:
+        progress("flying")
+        bags = loop.record(seed, folder)
+        flights = loop.read(bags[:2])
+        show("recorded", [loop.recordings_in_words(flights, seed)])
+        show("residual", loop.residuals_of(flights[0]).sentences())
+        clock.lap("flying")
+        diagnosis = diagnose(flights, progress=progress)
+        show("traced to", loop.found_in_words(diagnosis) or ["nothing that helps"])
+        clock.lap("tracing")
+        correction = loop.write_correction(onnx, diagnosis)
+        show("added", loop.added_in_words(onnx, correction, diagnosis))
+    result = fly_both(bags[2], onnx if correction else None, rate, say)
+    clock.lap("both nodes, twice" if correction else "both nodes")
+    show("flown", [result.arrived_in_words()])
+    show("error", [result.error_in_words()])
+    from .demo_picture import draw  # takes a second to import
+
+    draw(picture, result.flight, result.residuals, result.scores)
+    clock.lap("picture")
+    show("really", [loop.truth_in_words(seed, result.flight)])
+    show("picture", [str(picture)])
+    show("took", [clock.in_words()])
+    return result, result.figures(seed, diagnosis, clock)
+
+
+def _named(say: Callable[[str], object], name: str, text: str) -> None:
+    """Say a line of progress of one pass."""
+    say(f"{name} bias.onnx: {text}")
+
+
+def change_of_scores(scores: Sequence[Score]) -> str:
+    """Return how a correction changes the error of a measured flight, from the scores of `fly`."""
+    before, after = (score.row()["rmse_3d"] for score in scores[:2])
+    if len(scores) == 2:
+        return (
+            f"3D RMSE {before:.3f} m, with nothing corrected: diagnose finds what is wrong with "
+            "this flight, and what that is worth on others"
+        )
+    change = (
+        f"3D RMSE raw {before:.3f} m, corrected {after:.3f} m: "
+        f"{round(100.0 * (after - before) / before):+d} %"
+    )
+    worse = (
+        "; this correction does not fit this flight: other anchors, another day, another IMU. Do "
+        "not fly with it; diagnose finds one that fits"
+    )
+    return change + (worse if after > before else "")
+
+
+def arrivals_in_words(flight: Flight, outcome: dict[str, int]) -> list[str]:
+    """Return what became of all messages of a flight.
+
+    Parameters
+    ----------
+    flight : Flight
+    outcome : dict
+        As of `accounts`.
+
+    Returns
+    -------
+    list of str
+    """
+    counts = ", ".join(
+        f"{count} {name}" for name, count in outcome.items() if not name.startswith("imu_")
+    )
+    samples = 0 if flight.imu is None else len(flight.imu)
+    return [
+        f"TDOAs {len(flight.tdoa)}: {counts}",
+        f"IMU samples {samples}: {outcome['imu_late']} late, {outcome['imu_lost']} lost",
+    ]
 
 
 def next_steps(recording: str | Path, survey: str | Path | None = None) -> list[str]:

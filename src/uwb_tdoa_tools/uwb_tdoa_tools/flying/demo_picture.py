@@ -1,0 +1,97 @@
+"""Draw what a correction does to a flight. The import selects a backend without a screen."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt  # noqa: E402
+import numpy as np  # noqa: E402
+
+from uwb_tdoa_bias.common.files import write_filled  # noqa: E402
+from uwb_tdoa_bias.effects.base import listed  # noqa: E402
+
+from ..scoring.metrics import position_at  # noqa: E402
+from .loop import CM  # noqa: E402
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from matplotlib.axes import Axes
+
+    from uwb_tdoa_bias.common.flight import Flight
+
+    from ..scoring.metrics import Score
+    from .loop import PairResiduals
+
+COLOURS = ("tab:red", "tab:blue")  # of a flight without and with the correction
+SIZE = 14  # points: legible if the picture is shrunk to 700 pixels
+ROOM = 1.3  # of the largest error, the end of the axis: the legend covers no line
+
+
+def draw(
+    path: Path, flight: Flight, residuals: Sequence[PairResiduals], scores: Sequence[Score]
+) -> None:
+    """Draw the residuals, the path and the error of a Flight to an image file.
+
+    Parameters
+    ----------
+    path : Path
+    flight : Flight
+    residuals, scores : sequence
+        Without a correction, and with it, if there is one.
+    """
+    with plt.rc_context({"font.size": SIZE, "axes.titlesize": SIZE, "legend.fontsize": SIZE - 2}):
+        figure, axes = plt.subplots(2, 2, figsize=(12, 9.5), layout="constrained")
+        limit = _limit(residuals[0])
+        for ax, one, score in zip(axes[0], residuals, scores):
+            _residuals(ax, one, limit)
+            ax.set_title(f"TDOAs {score.name} bias.onnx: {CM * one.size:.1f} cm off")
+        ax.legend(title="pair of anchors", ncols=4, loc="lower center", handlelength=1.0)
+        _path(axes[1, 0], flight, scores)
+        _error(axes[1, 1], scores)
+        write_filled(path, partial(figure.savefig, dpi=100))
+        plt.close(figure)
+
+
+def _limit(residuals: PairResiduals) -> float:
+    values = np.abs(np.concatenate(list(residuals.median.values())))
+    return float(1.1 * CM * max(np.nanmax(values), 0.05))
+
+
+def _residuals(ax: Axes, residuals: PairResiduals, limit: float) -> None:
+    for pair, values in residuals.median.items():
+        ax.plot(residuals.t, CM * values, lw=1.8, label=pair)
+    ax.set(xlabel="time in the air [s]", ylabel="residual [cm]", ylim=(-limit, limit))
+    ax.grid(alpha=0.3)
+
+
+def _path(ax: Axes, flight: Flight, scores: Sequence[Score]) -> None:
+    truth = flight.truth
+    assert truth is not None
+    first, last = scores[0].first, scores[0].last
+    flown = (truth.t >= first) & (truth.t <= last)
+    ax.plot(*truth.p[flown, :2].T, "k", lw=2.5, label="true")
+    for score, colour in zip(scores, COLOURS):
+        estimate = position_at(score.t, truth) + score.error
+        ax.plot(*estimate[:, :2].T, color=colour, lw=1.2, label=score.name)
+    ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", title="Path from above")
+    ax.legend(loc="best")
+    ax.grid(alpha=0.3)
+
+
+def _error(ax: Axes, scores: Sequence[Score]) -> None:
+    for score, colour in zip(scores, COLOURS):
+        size = CM * np.linalg.norm(score.error, axis=1)
+        ax.plot(score.t - score.first, size, color=colour, lw=1.5, label=score.name)
+    sizes = [f"{CM * score.row()['rmse_3d']:.1f}" for score in scores]
+    highest = CM * max(np.linalg.norm(score.error, axis=1).max() for score in scores)
+    ax.set(xlabel="time in the air [s]", ylabel="3D position error [cm]")
+    ax.set_ylim(0.0, ROOM * highest)
+    ax.set_title(f"Position: {listed(sizes)} cm off")
+    ax.legend(loc="upper right", ncols=2)
+    ax.grid(alpha=0.3)

@@ -1,0 +1,197 @@
+"""Close the loop in a simulated hall: record flights, trace their residuals, write the correction.
+
+The hall has one effect that a seed draws. `record` puts it into the recordings. Everything after
+that reads the recordings only: no file, no argument and no stream declares the effect.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from uwb_tdoa_bias.common.geometry import tdoa
+from uwb_tdoa_bias.correction.corrector import Corrector
+from uwb_tdoa_bias.effects import true_samples
+from uwb_tdoa_bias.effects.base import listed, rounded
+
+from ..bags.bag import write_bag
+from ..diagnosis.report.entries import entries, worth_in_words
+from ..readers.inputs import Reading
+from ..scoring.metrics import rms, scored_phase
+from ..simulation import SimulationConfig, simulate
+from ..simulation.hidden import hidden_effect
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from uwb_tdoa_bias.common.flight import Flight
+    from uwb_tdoa_bias.correction.model import Model
+
+    from ..diagnosis.result import Diagnosis
+    from ..exporting.correction import TracedCorrection
+
+# Effects of `simulate` are off: what the residuals show is the drawn effect, noise and outliers.
+HALL = SimulationConfig(
+    duration=40.0, speed=1.2, imu_rate=200.0, truth_rate=100.0, bias=False, multipath=False
+)
+YAWS = ("along_track", "rotating", "along_track")  # of the flights
+PERIOD = 1.0  # s, of one residual of a pair
+FEWEST = 10  # TDOAs of a pair in it
+CM = 100.0  # cm per metre
+LARGEST = 2  # pairs that are named
+
+
+def flight_of(seed: int, number: int) -> Flight:
+    """Simulate flight 1, 2 or 3 in the hall of a seed, with its hidden effect.
+
+    The ground truth is that of the simulation. It stands in for a motion capture system.
+    """
+    config = replace(HALL, seed=len(YAWS) * seed + number, yaw=YAWS[number - 1])
+    flown = replace(simulate(config), name=f"flight-{number}", extra={}, meta={})
+    return hidden_effect(seed, flown.anchors).inject(flown)
+
+
+def record(seed: int, folder: Path) -> list[Path]:
+    """Fly three times in the hall of a seed, and return the bags."""
+    bags = [folder / f"flight-{number}.bag" for number in range(1, len(YAWS) + 1)]
+    for number, bag in enumerate(bags, start=1):
+        write_bag(flight_of(seed, number), bag, force=True)
+    return bags
+
+
+def read(bags: Sequence[Path]) -> list[Flight]:
+    """Read recordings."""
+    return [Reading().one(bag) for bag in bags]
+
+
+def write_correction(path: Path, diagnosis: Diagnosis) -> TracedCorrection | None:
+    """Write the effects that a Diagnosis added as an ONNX file, and return what it holds.
+
+    Return None, and write nothing, if no added effect acts on TDOAs. The diagnosis adds an effect
+    only if it helps a flight that it was not fitted to.
+    """
+    from ..exporting.onnx_file import write_onnx  # onnx takes a second to import
+
+    if not len(diagnosis.effects.where(lambda effect: "tdoa" in effect.channels)):
+        return None
+    return write_onnx(path, diagnosis.flights[0].anchors, diagnosis.effects)
+
+
+@dataclass(frozen=True, eq=False)
+class PairResiduals:
+    """Residuals of TDOAs at the true place: medians over PERIOD, of each pair of anchors.
+
+    Attributes
+    ----------
+    t : (n,) s since take-off
+    median : {pair "a-b": (n,) m}, NaN where a pair has fewer than FEWEST TDOAs
+    """
+
+    t: np.ndarray
+    median: dict[str, np.ndarray]
+
+    @property
+    def size(self) -> float:
+        """Return the root mean square, m."""
+        return rms(self._all)
+
+    @property
+    def constant(self) -> float:
+        """Return the root mean square of the mean of each pair, m: what the path does not change."""
+        return rms(np.array([np.nanmean(values) for values in self.median.values()]))
+
+    @property
+    def changing(self) -> float:
+        """Return the root mean square around the mean of each pair, m."""
+        around = [values - np.nanmean(values) for values in self.median.values()]
+        found = np.concatenate(around)
+        return rms(found[np.isfinite(found)])
+
+    @property
+    def largest(self) -> list[str]:
+        """Return the pairs with the largest residuals."""
+        sizes = {pair: rms(values[np.isfinite(values)]) for pair, values in self.median.items()}
+        return sorted(sizes, key=lambda pair: -sizes[pair])[:LARGEST]
+
+    @property
+    def _all(self) -> np.ndarray:
+        together = np.concatenate(list(self.median.values()))
+        return together[np.isfinite(together)]
+
+    def sentences(self) -> list[str]:
+        """Return the residuals in words: their size, and over what they change."""
+        named = listed(f"{pair} ({_signed_cm(self.median[pair])})" for pair in self.largest)
+        return [
+            f"TDOAs are {CM * self.size:.1f} cm off (RMS over pairs of anchors and seconds)",
+            f"{CM * self.constant:.1f} cm of it stays the same for a pair, "
+            f"{CM * self.changing:.1f} cm changes along the path; largest for pairs {named}",
+        ]
+
+
+def _signed_cm(values: np.ndarray) -> str:
+    low, high = (CM * value for value in np.nanquantile(values, [0.1, 0.9]))
+    return f"{low:+.0f} to {high:+.0f} cm"
+
+
+def residuals_of(flight: Flight, model: Model | None = None) -> PairResiduals:
+    """Return the PairResiduals of a Flight with ground truth in the air, corrected by a Model."""
+    assert flight.truth is not None
+    samples, rows = true_samples(flight)
+    off = flight.tdoa.d[rows] - tdoa(samples.p, samples.position_a, samples.position_b)
+    if model is not None:
+        off = off - Corrector(flight.anchors, network=model).prediction(samples).bias
+    _, first, last = scored_phase(flight.truth)
+    number = np.floor((samples.t - first) / PERIOD).astype(int)
+    count = int((last - first) / PERIOD)
+    ids, found = flight.anchors.ids, {}
+    for a, b in np.unique(np.column_stack([samples.a, samples.b]), axis=0):
+        of_pair = (samples.a == a) & (samples.b == b)
+        parts = [off[of_pair & (number == k)] for k in range(count)]
+        medians = [np.median(part) if len(part) >= FEWEST else np.nan for part in parts]
+        if np.isfinite(medians).any():
+            found[f"{ids[a]}-{ids[b]}"] = np.array(medians)
+    return PairResiduals(PERIOD * (np.arange(count) + 0.5), found)
+
+
+def found_in_words(diagnosis: Diagnosis) -> list[str]:
+    """Return what the residuals of TDOAs were traced to, with values, worth and cause."""
+    return [
+        f"{entry.title}: {entry.values}, worth {worth_in_words(entry)}: {entry.physics}"
+        for entry in entries(diagnosis)
+        if entry.added and "tdoa" in entry.findings[0].effect.channels
+    ]
+
+
+def recordings_in_words(flights: Sequence[Flight], seed: int) -> str:
+    """Return what was recorded, and where its ground truth is from."""
+    names = listed(flight.name for flight in flights)
+    seconds = [round(flight.end - flight.start) for flight in flights]
+    count = sum(len(flight.tdoa) for flight in flights)
+    return (
+        f"{names} in hall {seed}: {sum(seconds)} s, {count} TDOAs of "
+        f"{len(flights[0].anchors)} anchors. The simulation gives their true path"
+    )
+
+
+def added_in_words(
+    path: Path, correction: TracedCorrection | None, diagnosis: Diagnosis
+) -> list[str]:
+    """Return what was written, how it was validated, and what could not be written."""
+    if correction is None:
+        return ["nothing: no effect makes the error of a flight smaller that it was not fitted to"]
+    before, after = (CM * side["pooled"]["rmse_3d"] for side in (diagnosis.before, diagnosis.after))
+    return [
+        f"{path}. Judged on each flight with values from the other, the position error falls from "
+        f"{before:.1f} to {after:.1f} cm",
+        *map(str, correction.left_out),
+    ]
+
+
+def truth_in_words(seed: int, flight: Flight) -> str:
+    """Return the hidden effect of a hall with all its values."""
+    effect = hidden_effect(seed, flight.anchors)
+    values = ", ".join(f"{key} = {rounded(value)}" for key, value in effect.values.items())
+    return f"{effect.label}: {values} ({effect.unit})"
