@@ -10,6 +10,7 @@ from studies import (
     deviations,
     domains,
     drives,
+    export_cost,
     fuzz,
     localizing,
     lockstep,
@@ -58,6 +59,7 @@ STUDIES = {
     "diagnosis": figures,
     "domains": domains,
     "drives": drives,
+    "export-cost": export_cost,
     "faults": faults,
     "fly-faults": flown,
     "fuzz": fuzz,
@@ -102,6 +104,7 @@ of measured flights: flights/, util/, surveys/.
   diagnosis        effects put into flights, and found again (docs/diagnosis.md)
   domains          effects beyond where they were seen (docs/reliability.md)
   drives           a rover on wheels, by which sensors the filter uses (docs/aids.md)
+  export-cost      a TDOA corrected by an exported file and by compiled effects (docs/export.md)
   faults           faults of streams, surveys, nodes and clocks, played to the real nodes over topics (docs/reliability.md)
   fly-faults       faults of streams while a simulated vehicle flies by the estimate (docs/reliability.md)
   fuzz             changed files of every kind, given to every reader (docs/reliability.md)
@@ -146,6 +149,7 @@ def parser():
         "./dev study drives",
         "./dev study lockstep LOG SURVEY --from 10 --seconds 5",
         "./dev study monitor DATA --days 0426 0607",
+        "./dev study export-cost",
         "./dev study two-errors DATA",
         "./dev study two-machines",
         "./dev study vehicle-code",

@@ -16,7 +16,8 @@ from uwb_tdoa_bias.correction.session import BATCH, Session, Unplayable  # noqa:
 
 ELEMENTWISE = "Add Sub Mul Div Max Min Sum".split()
 OTHERS = "MatMul Gemm Gather Reshape Concat ReduceSum ReduceMax Clip Constant".split()
-UNARY = [kind for kind in trial.OPERATORS if kind not in (*ELEMENTWISE, *OTHERS)]
+CONDITIONS = "Less LessOrEqual Equal And Or Not Where".split()  # of numbers or of booleans
+UNARY = [kind for kind in trial.OPERATORS if kind not in (*ELEMENTWISE, *OTHERS, *CONDITIONS)]
 ROW_OF_ITS_OWN = [("ReduceSum", ["x", "a"], ["y"], {"keepdims": 1})]  # of five numbers
 
 
@@ -62,6 +63,20 @@ def test_operators_of_two(tmp_path, kind, other):
     nodes = [("Abs", ["column of x"], ["size"], {}), ("Add", ["size", "one"], ["column"], {})]
     nodes = [("MatMul", ["x", "C"], ["column of x"], {}), *nodes, (kind, ["x", other], ["y"], {})]
     assert_plays(model(tmp_path / "model.onnx", nodes), atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", CONDITIONS)
+def test_conditions(tmp_path, kind):
+    """A condition decides between two numbers, by Where."""
+    sides = [("Less", ["x", "low"], ["p"], {}), ("Less", ["high", "x"], ["q"], {})]
+    inputs = {"Not": ["p"], "And": ["p", "q"], "Or": ["p", "q"], "Equal": ["x", "size"]}
+    made = [("Abs", ["x"], ["size"], {}), *sides]
+    if kind == "Where":
+        made += [("Where", ["p", "low", "x"], ["y"], {})]
+    else:
+        made += [(kind, inputs.get(kind, ["x", "row"]), ["b"], {})]
+        made += [("Where", ["b", "x", "one"], ["y"], {})]
+    assert_plays(model(tmp_path / "model.onnx", made))
 
 
 @pytest.mark.parametrize(

@@ -5,8 +5,9 @@ import sys
 
 from hypothesis import settings
 
-# the network of a known answer lies beside the tests of the package below
-sys.path.append(str(Path(__file__).resolve().parents[2] / "uwb_tdoa_bias" / "test"))
+# helpers that lie beside the tests of the packages below
+for package in ("uwb_tdoa_bias", "uwb_tdoa_ekf"):
+    sys.path.append(str(Path(__file__).resolve().parents[2] / package / "test"))
 
 # The first call of a compiled function takes seconds, and a busy machine is no fault; every run
 # tries the same examples.

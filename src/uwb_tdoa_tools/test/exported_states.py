@@ -1,5 +1,7 @@
 """Random states of a tag, every effect that a file can hold, and networks of the paper's shape."""
 
+from dataclasses import replace
+
 from known_effects import SIZES, effect_of
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -68,6 +70,16 @@ def states(anchors, n=10_000, seed=0):
         previous=anchors.ids[rng.integers(0, count, n)],
         yaw_std=np.where(rng.random(n) < 0.1, 1.5, 0.1),
     )
+
+
+def rows_of(samples, some):
+    """Samples of some rows, with their Motion."""
+    values = {
+        name: value[some] if isinstance(value, np.ndarray) else value
+        for name, value in vars(samples).items()
+    }
+    motion = Motion(*(value[some] for value in vars(samples.motion).values()))
+    return replace(samples, **{**values, "motion": motion})
 
 
 def smooth_terms(anchors):

@@ -14,6 +14,7 @@ from uwb_tdoa_bias.correction.corrector import Corrector  # noqa: E402
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet  # noqa: E402
 from uwb_tdoa_ekf.offline import run_offline  # noqa: E402
 from uwb_tdoa_tools.exporting.onnx_file import write_onnx  # noqa: E402
+from uwb_tdoa_tools.training.network import WITHOUT  # noqa: E402
 
 EQUAL = 1e-4  # m
 
@@ -28,7 +29,7 @@ def test_bias_node_corrects_as_with_effects_and_network(make_rig, tmp_path):  # 
     }
     declared = (EFFECTS[name](value) for name, value in values.items())
     effects = EffectSet((*declared, term(flight.anchors, "climb_rate", "common")))
-    network, path = network_of(tmp_path), tmp_path / "bias.onnx"
+    network, path = network_of(tmp_path, WITHOUT), tmp_path / "bias.onnx"
     write_onnx(path, flight.anchors, effects, network)
     rig = make_rig()
     rig.start("localization_node", localization_node=["-p", f"model_file:={path}"])
@@ -49,7 +50,7 @@ def test_bias_node_corrects_as_with_effects_and_network(make_rig, tmp_path):  # 
 def test_bias_node_names_the_anchors_that_its_file_does_not_know(make_rig, tmp_path):  # noqa: F811
     anchors = recording().anchors
     moved = anchors.positions.copy()
-    moved[0] += 0.5
+    moved[anchors.index([10])[0]] += 0.5
     path = tmp_path / "bias.onnx"
     write_onnx(path, anchors.at(moved), EffectSet((EFFECTS["anchor_delay"]({"11": 0.1}),)))
     rig = make_rig()

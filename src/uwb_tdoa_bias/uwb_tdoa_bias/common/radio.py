@@ -137,8 +137,8 @@ class Antenna:
 
         direction : (..., 3), antenna frame, any length
         """
-        direction = floats(direction)
-        x, y, z = direction[..., 0], direction[..., 1], direction[..., 2]
+        along = floats(direction)
+        x, y, z = along[..., 0], along[..., 1], along[..., 2]
         horizontal = np.hypot(x, y)
         theta, phi = np.arctan2(y, x), np.arctan2(z, horizontal)
         azimuth, first, second = self._cuts
@@ -292,9 +292,9 @@ def into_frame(q: ArrayLike, v: ArrayLike) -> np.ndarray:
     q : (..., 4) x y z w, frame to world
     v : (..., 3), world
     """
-    q, v = floats(q), floats(v)
-    x, y, z, w = -q[..., 0], -q[..., 1], -q[..., 2], q[..., 3]
-    vx, vy, vz = v[..., 0], v[..., 1], v[..., 2]
+    turn, world = floats(q), floats(v)
+    x, y, z, w = -turn[..., 0], -turn[..., 1], -turn[..., 2], turn[..., 3]
+    vx, vy, vz = world[..., 0], world[..., 1], world[..., 2]
     tx, ty, tz = 2.0 * (y * vz - z * vy), 2.0 * (z * vx - x * vz), 2.0 * (x * vy - y * vx)
     return np.stack(
         [

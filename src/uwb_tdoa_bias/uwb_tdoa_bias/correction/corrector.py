@@ -105,11 +105,12 @@ class Corrector:
         self.effects = effects.where(lambda effect: not effect.is_hypothesis)
         self.weighed = effects.where(lambda effect: effect.is_hypothesis)
         self.network = network
-        twice = set(network.holds if network else ()) & {effect.label for effect in self.effects}
+        held = network.holds if network else ()
+        twice = set(held) & {effect.label for effect in self.effects}
         if twice:
             raise InputError(
-                f"effects: {min(twice)} is in the model too, which holds {', '.join(network.holds)};"
-                " leave it out of the effects."
+                f"effects: {min(twice)} is in the model too, which holds {', '.join(held)}; leave "
+                "it out of the effects."
             )
         self.lag = lag
         own = self.effects.name if len(self.effects) else ""
@@ -213,6 +214,7 @@ class Corrector:
         Units as in Correction. While the yaw is unknown, bias and std are mean and scatter over four
         headings. Then effects that use the attitude have no slope.
         """
+        slope: np.ndarray
         slope = state = np.zeros((len(samples), N_STATES))
         if not len(self.effects):
             return np.zeros(len(samples)), np.zeros(len(samples)), slope, state

@@ -64,7 +64,11 @@ OUTPUTS = (
     ("slope_vx", "s", "change of the bias with the velocity of the tag"),
     ("slope_vy", "s", ""),
     ("slope_vz", "s", ""),
-    ("status", "1", "0 unknown anchors, 1 effects, 2 effects and network, 3 network faded"),
+    (
+        "status",
+        "1",
+        "0 unknown anchors or infinite numbers, 1 effects, 2 with network, 3 network faded",
+    ),
 )
 UNKNOWN = -1  # id of no anchor
 

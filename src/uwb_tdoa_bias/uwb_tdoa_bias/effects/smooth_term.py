@@ -219,13 +219,13 @@ class SmoothTerm(Effect):
 
         They are NaN for NaN.
         """
-        values = floats(values)
+        at: np.ndarray = floats(values)
         if self.shape != "spline":
-            return shape_basis(self.shape, self.knots, values)
+            return shape_basis(self.shape, self.knots, at)
         if self.covariate in CATEGORIES:
-            return 1.0 * (values[:, None] == self._at)
-        out = np.zeros((len(values), self.count))
-        _basis(self._at, values, out)
+            return 1.0 * (at[:, None] == self._at)
+        out = np.zeros((len(at), self.count))
+        _basis(self._at, at, out)
         return out
 
     def curve(self, values: np.ndarray, prefix: str = "") -> np.ndarray:

@@ -245,7 +245,7 @@ class AntennaPattern(ArrivalEffect):
         self, samples: Samples, rows: np.ndarray, keys: Sequence[str]
     ) -> np.ndarray:
         to_anchor = samples.anchors.positions[rows] - tile(samples, samples.p)
-        out = [np.zeros((len(rows), 0))]
+        out: list[np.ndarray] = [np.zeros((len(rows), 0))]
         for key in keys:
             if key == "tag":
                 seen = into_frame(FLAT_MOUNT, into_frame(tile(samples, samples.q), to_anchor))

@@ -111,7 +111,8 @@ class _Printer:
                 self._names[id(node)] = self._print(node)
         columns = [self._flat(node) for node in wanted]
         together = graph.op("Concat", *columns, axis=1)
-        graph.op("Where", known, together, [0.0])
+        off = graph.row_sum(graph.op("Sub", together, together))  # NaN unless all are finite
+        graph.op("Where", graph.op("And", known, graph.op("Equal", off, [0.0])), together, [0.0])
         return graph.whole(len(INPUTS), len(OUTPUTS), self._traced.meta())
 
     def _find_anchors(self, nodes: list[Node]) -> str:

@@ -216,12 +216,13 @@ class Traced(NDArrayOperatorsMixin, SymbolicArray):
         breaks, blocks = np.asarray(breaks, dtype=float), self.node.shape[0]
         width, share = np.diff(breaks), np.linspace(0.0, 1.0, degree + 1)
         at = (breaks[:-1, None] + width[:, None] * share).ravel()
-        values = function(np.repeat(at, len(self))).reshape(len(at), blocks, self.n)
+        values: np.ndarray = function(np.repeat(at, len(self)))
+        values = values.reshape(len(at), blocks, self.n)
         values = np.moveaxis(values, [0, 1, 2], [2, 1, 0])[: self.pairs]
         values = values.reshape(self.pairs, blocks, len(width), degree + 1)
         np.testing.assert_allclose(values[:, :, 1:, 0], values[:, :, :-1, -1], atol=1e-9)
         solved = np.linalg.inv(np.vander(share, increasing=True))
-        powers = np.einsum("lbks,ds->dlbk", values, solved)
+        powers: np.ndarray = np.einsum("lbks,ds->dlbk", values, solved)
         powers = powers / width ** np.arange(degree + 1).reshape(-1, 1, 1, 1)
         if (powers == powers[:, :, :1]).all():
             powers = powers[:, :, :1]  # the same in all blocks
