@@ -58,7 +58,7 @@ def run(args):
     """Print the table, and how many errors fall and rise."""
     rows = []
     print(
-        "| seed | really | added | without, cm | with, cm | change |\n|---:|---|---|---:|---:|---:|"
+        "| seed | really | added | 3D RMSE without, cm | with, cm | change |\n|---:|---|---|---:|---:|---:|"
     )
     for row in parallel.over(looped, range(1, args.seeds + 1), args.jobs, unit="seed"):
         rows.append(row)

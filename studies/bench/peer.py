@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from uwb_tdoa_bias.common.flight import Flight
-    from uwb_tdoa_tools.flying.exported import ExportedCorrection
+    from uwb_tdoa_tools.flying.exported import CompiledCorrection
 
 REPEATS = 41
 SAMPLED = 0.01  # s, from one position of a peer to the next
@@ -77,7 +77,7 @@ def measure(progress: Callable[[str], object], peer: Peer, quick: bool = False) 
 
 
 def errors(
-    flights: Iterable[Flight], library: str, correction: ExportedCorrection | None
+    flights: Iterable[Flight], library: str, correction: CompiledCorrection | None
 ) -> Iterator[Figure]:
     """Generator of Figures: the 3D RMSE of a peer on Flights with ground truth, m.
 

@@ -34,7 +34,7 @@ from tqdm import tqdm
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_tools import cli
 from uwb_tdoa_tools.flying.estimates import Peer
-from uwb_tdoa_tools.flying.exported import ExportedCorrection
+from uwb_tdoa_tools.flying.exported import CompiledCorrection
 from uwb_tdoa_tools.outputs import OutputFile, OutputFolder
 from uwb_tdoa_tools.readers import inputs
 
@@ -81,7 +81,7 @@ def run(args: Namespace) -> None:
     """Measure, and print the table."""
     if args.peer is None and (args.correction is not None or args.flights):
         raise InputError("--correction, --flights: are of another filter; give --peer, too.")
-    correction = None if args.correction is None else ExportedCorrection(args.correction)
+    correction = None if args.correction is None else CompiledCorrection(args.correction)
     other = None if args.peer is None else Peer(args.peer, correction=correction)
     flights = inputs.Reading(args.survey).flights(args.flights) if args.flights else ()
     machine, figures = measure(args.only, args.out, args.quick, args.model, other)

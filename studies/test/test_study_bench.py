@@ -20,7 +20,7 @@ from studies.bench import core, graph, nodes, peer, source, suite, usage  # noqa
 from studies.bench.figures import Figure, as_json, table  # noqa: E402
 from studies.bench.flights import TDOA_RATE, among, make_flight  # noqa: E402
 from uwb_tdoa_tools.flying.estimates import Peer  # noqa: E402
-from uwb_tdoa_tools.flying.exported import ExportedCorrection  # noqa: E402
+from uwb_tdoa_tools.flying.exported import CompiledCorrection  # noqa: E402
 from uwb_tdoa_tools.flying.world import HALL  # noqa: E402
 
 OTHERS = 0.2  # of the CPU time, from which on nothing can be asked of what is played in real time
@@ -296,7 +296,7 @@ def test_the_errors_of_a_peer_are_given_with_and_without_a_correction(tmp_path):
     tdoa = Tdoas(t, np.full(n, a), np.full(n, b), np.full(n, 2.5))
     imu = Imu(t, np.zeros((n, 3)), np.tile([0.0, 0.0, 9.81], (n, 1)))
     flight = Flight("still", HALL.anchors, tdoa, imu, truth)
-    correction = ExportedCorrection(exported(tmp_path / "c", AnchorDelay({str(b): 0.5})))
+    correction = CompiledCorrection(exported(tmp_path / "c", AnchorDelay({str(b): 0.5})))
     library = str(built(tmp_path, HEIGHT))
     figures = {one.name: one.median for one in peer.errors([flight], library, correction)}
     assert figures["still, as it is"] == pytest.approx(0.5, abs=1e-6)

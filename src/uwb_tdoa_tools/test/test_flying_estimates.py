@@ -201,7 +201,7 @@ def exported(folder, *effects):
 def test_an_exported_correction_reaches_each_tdoa_of_a_peer(tmp_path):
     ids = HALL.anchors.ids
     effects = AnchorDelay({str(ids[1]): 0.2}), AnchorClockDrift({str(ids[1]): 0.01})
-    correction = estimates.ExportedCorrection(exported(tmp_path / "c", *effects))
+    correction = estimates.CompiledCorrection(exported(tmp_path / "c", *effects))
     other = estimates.Peer(built(tmp_path, RECORDS + STATE_AT), correction=correction)
     t, zeros = np.array([3.0, 5.0, 8.0]), np.zeros((3, 3))
     imu = Imu(t - 0.5, zeros, zeros)
@@ -237,17 +237,17 @@ void tdoa_peer_state(double *p, double *v, double *q) {
 )
 def test_a_folder_that_cannot_correct_a_peer_is_named(tmp_path, make, words):
     with pytest.raises(InputError, match=words):
-        estimates.ExportedCorrection(make(tmp_path))
+        estimates.CompiledCorrection(make(tmp_path))
 
 
 def test_a_correction_that_is_no_c_or_a_peer_without_a_state_is_named(tmp_path):
     folder = exported(tmp_path / "c", AnchorDelay({"0": 0.1}))
     with pytest.raises(InputError, match="does not export tdoa_peer_state"):
-        estimates.Peer(built(tmp_path), correction=estimates.ExportedCorrection(folder))
+        estimates.Peer(built(tmp_path), correction=estimates.CompiledCorrection(folder))
     broken = exported(tmp_path / "broken")
     (broken / "uwb_bias.c").write_text("no C")
     with pytest.raises(InputError, match="cannot be compiled"):
-        estimates.ExportedCorrection(broken)
+        estimates.CompiledCorrection(broken)
 
 
 def test_a_vehicle_flies_by_a_corrected_peer(tmp_path):

@@ -38,7 +38,7 @@ from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.frames import poses_of
 from uwb_tdoa_ekf.results import Odometry, concatenated
 
-from .exported import ExportedCorrection
+from .exported import CompiledCorrection
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -78,7 +78,7 @@ class Peer:
     """
 
     def __init__(
-        self, path: str | Path, own: bool = False, correction: ExportedCorrection | None = None
+        self, path: str | Path, own: bool = False, correction: CompiledCorrection | None = None
     ) -> None:
         """Load the library.
 
@@ -87,7 +87,7 @@ class Peer:
         path : str or Path
         own : bool
             Load a copy, so that its static variables start with their initial values.
-        correction : ExportedCorrection, optional
+        correction : CompiledCorrection, optional
             Corrects each TDOA at the state of the peer. The library must export its state.
         """
         self.name = Path(path).name
@@ -377,7 +377,7 @@ class PeerFilter:
         InputError
             If the library or the correction cannot be used.
         """
-        known = None if correction is None else ExportedCorrection(correction)
+        known = None if correction is None else CompiledCorrection(correction)
         self._peer, self._anchors = Peer(library, own=True, correction=known), anchors
         q = np.array([0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw)])
         self._peer.start(anchors, np.full(3, np.nan) if place is None else place, q)

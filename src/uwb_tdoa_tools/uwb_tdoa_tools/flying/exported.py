@@ -64,7 +64,7 @@ void corrected_run(const event *events, int32_t count, const int32_t *ids, past 
 PAST = np.dtype([("first", float), ("last", float), ("previous", np.int32), ("count", np.int32)])
 
 
-class ExportedCorrection:
+class CompiledCorrection:
     """A correction in C, for the events of a peer."""
 
     def __init__(self, folder: str | Path) -> None:
