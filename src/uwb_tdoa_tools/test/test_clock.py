@@ -81,6 +81,14 @@ def test_a_wrap_is_undone_by_its_exact_size():
     np.testing.assert_array_equal(found.shifts["tdoa"][-1], period)
 
 
+@pytest.mark.parametrize("name", ["2^40 ticks of 15.65 ps", "2^24 microseconds"])
+def test_slow_streams_take_the_nearest_of_two_wraps(name):
+    """They are 0.43 s apart, within the tolerance of streams of 5 Hz."""
+    true = stamps_of(rates={"imu": 5.0, "tdoa": 4.0})
+    (jump,) = straightened(moved(true, 18.0, -WRAPS[name])).jumps
+    assert (jump.kind, jump.period) == (WRAP, name)
+
+
 @pytest.mark.parametrize("by", [-5.0, 40.0, 2000.0, YEARS])
 def test_arrivals_determine_the_size_of_a_jump(by):
     true = {

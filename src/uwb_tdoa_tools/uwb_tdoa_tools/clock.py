@@ -362,7 +362,7 @@ class _Stream:
 def _groups(streams: list[_Stream]) -> Iterator[list[tuple[_Stream, _Break]]]:
     """Yield the breaks of several streams that are one jump of their clock.
 
-    The first stream is the quickest.
+    The first stream is the quickest of LEADING, or of all if none of LEADING jumped.
     """
     left = {stream.name: list(stream.breaks) for stream in streams}
     for stream in sorted(streams, key=lambda stream: (stream.name not in LEADING, stream.usual)):
@@ -386,7 +386,12 @@ def _groups(streams: list[_Stream]) -> Iterator[list[tuple[_Stream, _Break]]]:
 def _of_group(
     group: list[tuple[_Stream, _Break]], every: Mapping[str, _Stream]
 ) -> tuple[Jump, list[tuple[_Stream, _Break]]] | None:
-    """Return the Jump of one clock, and shift its streams; None for a silence of some streams."""
+    """Return (Jump of one clock, group), and shift its streams; None for a silence of some streams.
+
+    Two fields of the Jump are NaN until `straightened` knows all shifts.
+    """
+    # The smallest size: after the shift no stream of the group falls. Arrivals, of the quickest stream
+    # that has them, are better than usual steps.
     by = min(one.by for _, one in group)
     known = [(stream, one) for stream, one in group if stream.arrived is not None]
     if known:
@@ -394,15 +399,16 @@ def _of_group(
         by = min(one.by, *(float(of.t[its.first] - of.t[its.last]) for of, its in group))
     kind, period = (RESTART, "") if by < 0.0 else (SET, "")
     tolerance = WRAP_TOLERANCE + 3.0 * min(stream.usual for stream, _ in group)
-    for name, length in WRAPS.items():
-        if abs(by + length) < tolerance:
-            kind, by, period = WRAP, -length, name
+    name, length = min(WRAPS.items(), key=lambda wrap: abs(by + wrap[1]))
+    if abs(by + length) < tolerance:
+        kind, by, period = WRAP, -length, name
     if kind == SET and by <= PAUSE and not any(one.sure for _, one in group):
         kind = SILENCE
     for _, one in group:
         one.shift = 0.0 if kind == SILENCE else -by
     stream, one = group[0]
     names = tuple(stream.name for stream, _ in group)
+    # while a leading stream goes on, a silence of others is no event of the clock
     if kind == SILENCE and not {name for name in every if name in LEADING} <= set(names):
         return None
     return Jump(kind, names, one.first + 1, np.nan, by, np.nan, period), group

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 
 SAME_PLACE = 0.001  # m; two antennas are at least some cm apart
-# m. A UWB radio reaches at most 300 m, and a tag must receive several anchors at once. An anchor
-# farther than this from all others has no neighbours.
+# m. A UWB radio reaches at most 300 m, and a tag must receive several anchors at once. An anchor with
+# fewer than NEIGHBOURS others within this distance is out of place.
 LONELY = 500.0
 NEIGHBOURS = 2  # required within LONELY; fewer if there are fewer anchors
 USUAL = 6.0  # m between neighbours, typical; the unit that gives the nearest value is named
@@ -116,6 +116,8 @@ def _far(anchors: Anchors) -> list[SurveyFault]:
     off = np.abs(positions - np.median(positions, axis=0)).max(axis=1)
     rows = np.argsort(off)[-FARTHEST_OFF:]
     distances = np.linalg.norm(positions[rows, None] - positions, axis=2)
+    # to the second nearest other anchor, as place 0 is the anchor itself: the nearest may be misplaced
+    # with it
     nearest = np.partition(distances, min(NEIGHBOURS, len(anchors) - 1), axis=1)[
         :, min(NEIGHBOURS, len(anchors) - 1)
     ]
@@ -133,17 +135,19 @@ def _far(anchors: Anchors) -> list[SurveyFault]:
     else:
         names, looks = _listed(np.sort(anchors.ids[lonely])), "looks" if one else "look"
         who = f"the position of anchor {names}" if one else f"the positions of anchors {names}"
-        evidence = f"{spacing:.0f} m from the other anchors"
+        evidence = f"{spacing:.0f} m from the second nearest anchor"
         rest = positions[np.setdiff1d(np.arange(len(anchors)), lonely)]
         inside = {
             name: np.linalg.norm(positions[lonely[-1]] / count - np.median(rest, axis=0))
             for name, count in UNITS.items()
         }
+        # the smallest divisor that puts the farthest one within two room sizes of the rest
         unit = next(
             (name for name in reversed(UNITS) if inside[name] < 2.0 * np.ptp(rest, axis=0).max()),
             "",
         )
     evidence += ", and a radio reaches 300 m"
+    # after the division the spacing must be one of anchors
     if not unit or not 0.05 < spacing / UNITS[unit] < 0.5 * LONELY:
         return [
             SurveyFault(
@@ -154,9 +158,7 @@ def _far(anchors: Anchors) -> list[SurveyFault]:
                 spacing,
             )
         ]
-    remedy = (
-        f"give metres: divide {'it' if one or looks == 'looks' else 'them'} by {UNITS[unit]:.6g}"
-    )
+    remedy = f"give metres: divide {'it' if looks == 'looks' else 'them'} by {UNITS[unit]:.6g}"
     return [SurveyFault("survey_unit", f"{who} {looks} like {unit}", evidence, remedy, UNITS[unit])]
 
 
@@ -314,6 +316,10 @@ def _total_station(path: str | Path, lines: Lines) -> list[Entry]:
 def _orientation(
     path: str | Path, anchor: int, tips: dict[tuple[int, int], list[float]]
 ) -> list[float]:
+    """Return the quaternion x y z w, stand to world, of the arm tips of an anchor; NaN without any.
+
+    tips : {(anchor, arm 1 to 3): [x, y, z] m}; raises InputError for one or two tips, or a poor fit
+    """
     found = [tips[anchor, k] for k in (1, 2, 3) if (anchor, k) in tips]
     if not found:
         return survey_forms.NOT_SURVEYED

@@ -212,10 +212,12 @@ def _add(
     status: np.ndarray,
     out: np.ndarray,
 ) -> None:
-    """Write bias, m, std, m, and status (n, 3) with a network's prediction to out; compiled.
+    """Write bias, m, std, m, and status of effects and network to out, (n, 3); compiled.
 
-    learned, deviation : (n,) m, added where finite; known : (n,) 0 ... 1
-    bias, std, status : (n,), of the effects
+    learned, deviation : (n,) m, bias and std of the network; a row whose bias is NaN (a feature is
+    unknown) keeps the values of the effects
+    known : (n,) 0 ... 1, share of the possible knowledge; below FADED_BELOW the status is FADED
+    bias, std, status : (n,), of the effects alone
     """
     for i in range(len(bias)):
         out[i, 0], out[i, 1], out[i, 2] = bias[i], std[i], status[i]

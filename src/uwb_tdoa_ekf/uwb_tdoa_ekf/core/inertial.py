@@ -57,7 +57,7 @@ def observe(imu: Record, sample: Record, timeout: float) -> bool:
         imu.mean_accel[k] = low_pass(imu.mean_accel[k], imu.slow_accel[k], dt, VIBRATION_AVERAGE)
         imu.gyro_power[k] = low_pass(imu.gyro_power[k], sample.gyro[k] ** 2, dt, VIBRATION_AVERAGE)
         power, shakes = _from_hovering(imu.mean_accel, k) ** 2, imu.vibration[k] > QUIET_ACCEL**2
-        # an axis that does not vibrate shows no rectification
+        # without vibration the share is undefined: 1, the worst, until the axis has vibrated
         share = power / max(power, imu.vibration[k]) if shakes else 1.0
         imu.rectified[k] = low_pass(imu.rectified[k], share, dt, RECTIFYING_MEMORY)
         imu.gyro[k], imu.accel[k] = (
@@ -88,9 +88,10 @@ def store(imu: Record, sample: Record) -> None:
 def weigh(imu: Record, quiet: bool, parameters: Record) -> None:
     """Set the weight and the noise of each accelerometer axis: accel_weight and accel_psd.
 
-    A vibrating axis may rectify. Its error then has vibration_gain times the variance of the
-    vibration. The mean shows the rectification: a vehicle that hovers and moves about measures
-    gravity alone in the mean. The weight is the linear least squares combination of two specific
+    A vibrating axis may rectify: its mean is then off. The variance of this error is vibration_gain
+    times that of the vibration, times imu.rectified, at least LEAST_RECTIFIED. imu.rectified, 0 to
+    1, is the power of the mean beyond hovering over that of the vibration: over seconds, a vehicle
+    that hovers and moves about measures gravity alone. The weight is the linear least squares combination of two specific
     forces. The first is the measurement with this error variance, the second is hovering with
     accel_prior_std. A carried tag that lies on its side or upside down does not hover. If a force
     is farther from hovering than both explain, the variance of hovering grows by the rest.
@@ -112,8 +113,9 @@ def weigh(imu: Record, quiet: bool, parameters: Record) -> None:
             parameters.vibration_gain * max(imu.rectified[k], LEAST_RECTIFIED) * imu.vibration[k]
         )
         apart = _from_hovering(slow, k)
-        prior = max(usual, apart**2 - error)
-        weight = prior / (prior + error)
+        prior = max(usual, apart**2 - error)  # then prior + error is at least apart**2
+        weight = prior / (prior + error)  # of the measurement; the rest is of hovering
+        # weight * error is the variance of the combination
         noise = parameters.accel_noise**2 + 2.0 * PERSISTENCE * (weight * error)
         imu.accel_weight[k], imu.accel_psd[k] = weight, QUIET_NOISE**2 if quiet else noise
 

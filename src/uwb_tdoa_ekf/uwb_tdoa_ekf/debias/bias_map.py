@@ -99,6 +99,7 @@ class BiasMap:
     _mean_square: np.ndarray = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
+        """Check the fields, raise InputError, and prepare hull, tree and interpolator."""
         for name, kind in _ARRAYS.items():
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=kind))
         n, d = self.at.shape if self.at.ndim == 2 else (0, 0)

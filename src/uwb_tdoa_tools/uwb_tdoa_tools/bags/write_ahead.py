@@ -83,14 +83,13 @@ def _merge(file: Path) -> str:
                 connection.execute(f"PRAGMA {what}").fetchone()
                 for what in ("page_count", "page_size")
             )
-            if (
-                pages * page_size > size
-            ):  # a damaged header; SQLite would create a file of that size
+            # a damaged header: SQLite would create a file of that size
+            if pages * page_size > size:
                 raise Damaged(
                     f"{file.name} claims {pages} pages of {page_size} bytes, more than there are"
                 )
             # both -1 without a log; SQLite takes a log to end before a damaged frame
-            _, frames, merged = connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()
+            _busy, frames, merged = connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()
             written = max(frames, _written(file.with_name(file.name + LOG), page_size))
             connection.execute("PRAGMA journal_mode=DELETE")  # then no log and no journal stays
         finally:
@@ -109,14 +108,17 @@ def _written(log: Path, page_size: int) -> int:
     """Return the number of frames of a log up to the last that ends a transaction, -1 without any.
 
     Frames of a transaction that was not finished, and older ones, which have other salts, do not
-    count. Source: sqlite.org/walformat.html, sections 4.1 and 4.2.
+    count. Behind a damaged header all count. Source: sqlite.org/walformat.html, sections 4.1 to 4.3.
     """
     if not log.is_file():
         return -1
-    last = -1
+    last, count = -1, log.stat().st_size // (FRAME_HEADER + page_size)
     with log.open("rb") as file:
-        salts = file.read(HEADER)[16:24]
-        for number in range(1, 1 + log.stat().st_size // (FRAME_HEADER + page_size)):
+        header = file.read(HEADER)
+        if not _is_sound(header):
+            return count
+        salts = header[16:24]
+        for number in range(1, 1 + count):
             head = file.read(FRAME_HEADER)
             if len(head) < FRAME_HEADER or head[8:16] != salts:
                 break
@@ -124,3 +126,16 @@ def _written(log: Path, page_size: int) -> int:
             last = number if pages_after else last
             file.seek(page_size, 1)
     return last
+
+
+def _is_sound(header: bytes) -> bool:
+    """Return whether the header of a log has the checksum that it states."""
+    if len(header) < HEADER:
+        return False
+    order = ">" if header[3] & 1 else "<"  # the last bit of the magic number
+    words = struct.unpack(f"{order}6I", header[:24])
+    first = second = 0
+    for k in range(0, 6, 2):
+        first = (first + words[k] + second) & 0xFFFFFFFF
+        second = (second + words[k + 1] + first) & 0xFFFFFFFF
+    return (first, second) == struct.unpack(">2I", header[24:])

@@ -235,7 +235,7 @@ def _arranged(recording: OrderedRecording, accel: np.ndarray, gyro: np.ndarray) 
 def _unexplained(recording: OrderedRecording, limit: float = np.inf) -> Unexplained:
     """Return the Unexplained of the TDOAs by a filter that relies on the IMU.
 
-    limit : see streams.explain.
+    limit : see `monitoring.explain.unexplained`.
     """
     tdoa, imu, (a, b) = recording.tdoa, recording.imu, recording.rows()
     assert imu is not None

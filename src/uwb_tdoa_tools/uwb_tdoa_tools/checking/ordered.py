@@ -58,7 +58,7 @@ class SurveyFit:
     def __init__(
         self, t: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray, positions: np.ndarray
     ) -> None:
-        """Locate the tag in windows of TDOAs.
+        """Locate the tag in windows of TDOAs, and compute the loss `before`.
 
         Parameters
         ----------
@@ -72,9 +72,10 @@ class SurveyFit:
             Anchors, m, world.
         """
         self.positions = positions
+        # columns of each window, and (6,) m and m/s of the tag at its end
         self._windows, self._start = [], []
         config, state, box = FilterConfig(), new_state(positions), np.empty((2, 3))
-        workspace.set_bounds(state.record.extent, config.workspace_margin, box)
+        workspace.set_bounds(state.record.extent, config.workspace_margin, box)  # writes box
         rows = structured(TDOA, t, a, b, d, np.zeros(len(t)))
         for begin in np.linspace(t[0], t[-1] - LENGTH, WINDOWS) if len(t) else ():
             first, end = np.searchsorted(t, [begin, begin + LENGTH])
@@ -86,12 +87,12 @@ class SurveyFit:
                 state.anchors,
                 box,
                 config.parameters()[0],
-                KnownHeight(np.nan, np.nan),
-                places,
+                KnownHeight(np.nan, np.nan),  # unknown
+                places,  # filled, the most probable place first
             )
             self._windows.append(window)
             self._start.append(places.x[0])
-        # The best fit of the tag: the start is off if the tag is fast.
+        # The loss after the tag alone is fitted: the prior of `locate` draws a fast tag towards rest.
         self.before, _ = self.solve([])
 
     def __len__(self) -> int:
@@ -346,7 +347,8 @@ class OrderedRecording:
     def unexplained(self, limit: float = math.inf) -> Unexplained:
         """Return the Unexplained of the TDOAs alone.
 
-        limit : mean loss beyond which the result has no use (see streams.explain).
+        limit : if the mean loss is certain to exceed this, the result holds no blocks, see
+            `monitoring.explain.unexplained`.
         """
         rows = structured(TDOA, self.tdoa.t, *self.rows(), self.tdoa.d)
         return unexplained(rows, self.anchors.positions, limit=limit)

@@ -142,9 +142,9 @@ def _write(
     recordings: Sequence[str | Path],
     truth: bool,
 ) -> int:
-    """Write the files of a Calibration, and print the lines that use them.
+    """Write the files of a Calibration, print the lines that use them, and return the exit code.
 
-    recordings : hold-out data; truth : whether they have ground truth
+    recordings : hold-out data, or all flights without any; truth : whether they have ground truth
     """
     out = args.out
     files = anchors, effects, parameters = (
@@ -154,6 +154,7 @@ def _write(
     )
     made.anchors.to_yaml(anchors)
     made.effects.to_yaml(effects)
+    # no file, and an earlier one removed, if all parameters have their defaults
     write_parameters(parameters, made.tdoa_std, config)
     survey, corrected, tuned = (file if file.exists() else None for file in files)
     cli.show(

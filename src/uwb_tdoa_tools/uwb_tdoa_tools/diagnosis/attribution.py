@@ -187,14 +187,14 @@ def attribute(
         Residuals of the last and of the empty model are kept. If the path is unknown, computing
         them runs the filter.
         """
-        again = [residuals for other, residuals in known if other == tuple(model)]
+        again = [made for other, made in known if other == tuple(model)]
         if not again:
             again = [
                 residuals_of(
                     flights, reference, EffectSet((*base.effects, *model)), progress, map_function
                 )
             ]
-            known[1:] = [(tuple(model), again[0])]
+            known[1:] = [(tuple(model), again[0])]  # the first call, of the empty model, stays
         return again[0]
 
     under_base = at(())

@@ -245,13 +245,19 @@ def maps_of(smooth: Sequence[Candidate]) -> list[Candidate]:
 
 
 def cross_validated(selection: Selection, refused: list[Refused]) -> Selection:
-    """Return the Selection without terms that do not improve hold-out rows, dropped one by one."""
+    """Return the Selection without Candidates that do not improve hold-out rows.
+
+    The worst is dropped and the rest fitted again, until all gain more than MIN_GAIN. From three
+    flights on, whole flights are held out too, and the smaller gain counts.
+
+    refused : dropped Candidates are appended
+    """
     while selection.chosen:
         scores = held_out(selection)
         if selection.table.flights >= 3:
             across = held_out(selection, by_flight=True)
             scores = [
-                min(score, other) if recurs(candidate) else score
+                min(score, other) if recurs(candidate) else score  # by gain, their first field
                 for score, other, candidate in zip(scores, across, selection.chosen)
             ]
         worst = min(range(len(scores)), key=lambda k: scores[k].gain)

@@ -57,7 +57,8 @@ def interval(
     Parameters
     ----------
     state : numpy.ndarray
-        State (17,), updated in place.
+        State (17,) as in `vehicle`: position, velocity, quaternion, rates (10 to 12), rotor speeds
+        (13 to 16). Updated in place.
     gyro : numpy.ndarray
         The last two measured body rates (2, 3), rad/s, newest first, updated in place.
     wanted : tuple
@@ -71,10 +72,10 @@ def interval(
         (n, 3) m/s^2 while rotors turn.
     measured : tuple
         Outputs: true states (n, 17); mean rates and specific force (n, 6) since the sample before;
-        number of feet on the ground (n,).
+        largest number of feet on the ground in that time (n,).
     """
     thrust, rates = wanted[0], wanted[1]
-    gains, known = controller[0], controller[1]
+    gains, assumed = controller[0], controller[1]
     wind, errors, shaking = disturbances[0], disturbances[1], disturbances[2]
     truth, samples, contact = measured[0], measured[1], measured[2]
     dt = STEP * STEPS
@@ -85,7 +86,7 @@ def interval(
         np.empty(STATE),
     )
     for i in range(len(truth)):
-        inner(thrust, rates, gyro, dt, gains, known, speeds)
+        inner(thrust, rates, gyro, dt, gains, assumed, speeds)  # writes speeds, of the rotors
         earlier[:] = state
         feet = 0
         turn = np.zeros(3)
@@ -93,8 +94,8 @@ def interval(
             feet = max(feet, step(state, speeds, wind[i], STEP, vehicle, scratch))
             for k in range(3):
                 turn[k] += state[10 + k] / STEPS
-        specific_force(earlier, state, dt, force)
-        turning = state[13] > TURNING
+        specific_force(earlier, state, dt, force)  # writes force
+        turning = state[13] > TURNING  # one rotor stands for all
         for k in range(3):
             samples[i, k] = turn[k] + errors[i, k]
             samples[i, 3 + k] = force[k] + errors[i, 3 + k] + (shaking[i, k] if turning else 0.0)

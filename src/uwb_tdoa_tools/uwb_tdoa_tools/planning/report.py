@@ -84,7 +84,7 @@ def in_hull(chart: Chart, installation: Installation) -> dict[str, Any]:
 
 
 def print_room(room: Room, given: bool) -> None:
-    """Print the Room, and whether it was given."""
+    """Print the Room; given : whether by --room, else it is what the anchors span."""
     ends = ", ".join(
         f"{axis} {low:.2f} to {high:.2f}" for axis, low, high in zip("xyz", room.lower, room.upper)
     )

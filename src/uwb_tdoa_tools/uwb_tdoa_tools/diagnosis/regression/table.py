@@ -196,9 +196,9 @@ class RegressionTable:
 
 
 def _joined(parts: Sequence[tuple[int, Any]], k: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Return (rows, values) of each of k columns of stacked sparse matrices.
+    """Yield (rows, values) of each of k columns of stacked sparse matrices; rows ascend.
 
-    parts : [(first row, sparse matrix (n, k))]
+    parts : [(first row, csc_array (n, k))], by rising first row; none gives empty columns
     """
     for column in range(k):
         some = [(row, x, slice(*x.indptr[column : column + 2])) for row, x in parts]

@@ -349,6 +349,8 @@ def _equations(
     """
     innovations = parts[0].innovations
     assert innovations is not None  # as of a Reference that does not know the path
+    # n : columns of positions and delays, before those of functions; air : innovations in the air;
+    # placed : regressors of each stream in the rows of its innovations
     n, t, air, placed = (
         4 * len(flight.anchors),
         innovations.t,
@@ -362,9 +364,10 @@ def _equations(
         placed.append(own if len(places) == len(t) else _selection(places, len(t)) @ own)
     regressors = sum(placed[1:], placed[0])
     stamps = [one.stamps(flight.start) for one in constraints]
+    # derivatives of the position at the stamps of marks; in_blocks fills them
     moved = np.zeros((sum(map(len, stamps)), 3, regressors.shape[1]))
     error = innovations.value[air] / np.sqrt(innovations.variance[air])
-    scale = max(1.4826 * np.median(np.abs(error)), 1e-3)
+    scale = max(1.4826 * np.median(np.abs(error)), 1e-3)  # for the weights alone
     gram, vector, blocks = np.zeros((regressors.shape[1],) * 2), np.zeros(regressors.shape[1]), []
     number = np.floor((t - t[air][0]) / BLOCK).astype(int)
     for rows, columns, derivative in innovations.in_blocks(
@@ -382,7 +385,7 @@ def _equations(
         more, right = (some * weight[:, None]).T @ some, some.T @ (weight * value)
         _add(gram, columns, more)
         vector[columns] += right
-        last = np.searchsorted(columns, n)
+        last = np.searchsorted(columns, n)  # without functions
         # a copy, since a view would keep all of `more` in memory: megabytes
         blocks.append(_BlockEquations(columns[:last], more[:last, :last].copy(), right[:last]))
     return gram, vector, blocks, _known(constraints, stamps, moved, innovations.run.odometry)
