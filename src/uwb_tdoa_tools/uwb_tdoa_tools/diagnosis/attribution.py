@@ -493,10 +493,15 @@ def _findings(
 
 
 def _merged(finding: EffectFinding, other: EffectFinding) -> EffectFinding:
-    """Return one EffectFinding of two of the same effect."""
+    """Return one EffectFinding of two of the same effect; their gains are taken as independent."""
     evidence = {
-        key: round(finding.evidence[key] + other.evidence[key], 1) for key in other.evidence
+        key: round(finding.evidence[key] + other.evidence[key], 1)
+        for key in ("criterion", "held_out_gain")
     }
+    pair = finding.evidence, other.evidence
+    stds = [one["held_out_gain"] / one["held_out_t"] for one in pair if one["held_out_t"]]
+    std = float(np.hypot.reduce(stds)) if stds else 0.0
+    evidence["held_out_t"] = round(evidence["held_out_gain"] / std, 1) if std else 0.0
     named = {alternative.effect for alternative in finding.alternatives}
     more = tuple(
         alternative for alternative in other.alternatives if alternative.effect not in named

@@ -27,14 +27,15 @@ UNITS = ", ".join(f"{channel.unit} for {name}" for name, channel in CHANNELS.ite
 FIGURES_OF_REASON = re.compile(r"(.*?)(?:: (.*\d.*)| \(([^()]*\d[^()]*)\))?")
 MANY = 3  # largest number of anchors whose values stand in a sentence
 SIDE_BY_SIDE = 2  # largest number of runs side by side on a phone
-EVIDENCE = {
-    "criterion": "criterion",
+EVIDENCE = {  # key of EffectFinding.evidence: title of the column
+    "criterion": "criterion (twice a log-likelihood)",
     "held_out_gain": "gain on data held out",
-    "held_out_t": "its t value",
+    "held_out_t": "t value of that gain",
     "standard_errors": "standard errors",
     "slow_before": "slow innovations before, m",
-    "slow_left": "after, m",
-    "scatter_over_air": "scatter over that in the air",
+    "slow_left": "slow innovations after, m",
+    "median_error": "median error with it, m",
+    "median_error_without": "median error without it, m",
 }
 FIGURES = (  # key, title, factor
     ("rmse_x", "x", CM),
@@ -127,17 +128,24 @@ def values(diagnosis: Diagnosis) -> Table:
 
 
 def evidence(diagnosis: Diagnosis, found: Sequence[Entry]) -> Table:
-    """Return the evidence of each finding."""
+    """Return a row for each Entry: its channel and the figures of its first finding.
+
+    A cell is empty where the finding has no such figure. found : Entries of the Diagnosis
+    """
     used = [
         key for key in EVIDENCE if any(key in finding.evidence for finding in diagnosis.findings)
     ]
     firsts = [(entry.title, entry.findings[0]) for entry in found]
     rows = [
-        (title, first.channel, *(first.evidence.get(key) or "" for key in used))
+        (title, first.channel, *(_cell(first.evidence.get(key)) for key in used))
         for title, first in firsts
     ]
     head = ("finding", "channel", *(EVIDENCE[key] for key in used))
     return Table(head, rows, range(2, len(head)))
+
+
+def _cell(value: object) -> object:
+    return "" if value is None else value
 
 
 def errors(diagnosis: Diagnosis) -> Table:
