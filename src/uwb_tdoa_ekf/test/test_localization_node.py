@@ -13,11 +13,11 @@ from rig import make_rig, recording  # noqa: E402, F401
 
 from uwb_tdoa_bias.ros.process import Spinner  # noqa: E402
 from uwb_tdoa_ekf import localization_node  # noqa: E402
-from uwb_tdoa_ekf.localization_node import LocalizationNode, _for_all  # noqa: E402
+from uwb_tdoa_ekf.localization_node import LocalizationNode, _without_own_remappings  # noqa: E402
 from uwb_tdoa_msgs.msg import AnchorArray  # noqa: E402
 
 
-def test_what_is_for_all_nodes_of_the_process():
+def test_what_is_without_own_remappings_nodes_of_the_process():
     arguments = [
         "x",
         "--ros-args",
@@ -30,7 +30,14 @@ def test_what_is_for_all_nodes_of_the_process():
         "-r",
         "imu/data:=/imu",
     ]
-    assert _for_all(arguments) == ["x", "--ros-args", "-p", "lag:=0.2", "-r", "imu/data:=/imu"]
+    assert _without_own_remappings(arguments) == [
+        "x",
+        "--ros-args",
+        "-p",
+        "lag:=0.2",
+        "-r",
+        "imu/data:=/imu",
+    ]
 
 
 @pytest.mark.slow

@@ -141,7 +141,8 @@ def test_no_pose_and_no_parameter_ends_a_node_and_no_flood_of_poses_fills_it(att
     ):
         stranger.call(kind, f"ekf_node/{service}", parameters=odd)
     rig.wait(
-        lambda: said(ekf, "set_parameters: a request cannot be read"), "a request to be refused"
+        lambda: said(ekf, "set_parameters: a request is not, or only partly"),
+        "a request to be refused",
     )
 
     def listed(*prefixes):

@@ -17,11 +17,17 @@ from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.rooms import constellation
 
 
+def flown(seed):
+    return simulate(
+        SimulationConfig(
+            seed=seed, duration=20.0, imu_rate=100.0, truth_rate=50.0, start_in_air=True
+        )
+    )
+
+
 @pytest.fixture(scope="module")
 def flight():
-    return simulate(
-        SimulationConfig(seed=0, duration=20.0, imu_rate=100.0, truth_rate=50.0, start_in_air=True)
-    )
+    return flown(0)
 
 
 def renamed(flight, ids):
@@ -42,9 +48,11 @@ def test_missing_anchors_are_named(flight):
     assert "no anchor 7: " in remark and "% of the TDOAs" in remark
 
 
-def test_the_survey_of_another_room_does_not_fit(flight):
-    (remark,) = survey_remarks(replace(flight, anchors=constellation("staircase")))
-    assert "does not fit" in remark
+@pytest.mark.parametrize(("seed", "said"), [(0, "does not fit"), (2, "is of another room")])
+def test_the_survey_of_another_room_is_blamed_and_no_sign(seed, said):
+    """With other anchors, some pairs seem to have the other sign, and ids to be mixed up."""
+    (remark,) = survey_remarks(replace(flown(seed), anchors=constellation("staircase")))
+    assert said in remark
 
 
 def test_no_common_anchor_is_an_error(flight):

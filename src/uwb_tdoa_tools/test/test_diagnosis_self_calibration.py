@@ -75,7 +75,7 @@ def test_what_is_applied_is_found_with_its_evidence_and_the_same_in_all_flights(
     assert "pair_offset" in [other.effect for other in added[1].alternatives]
     shares = [(one.share, one.std) for one in added[1].shares]
     assert len(shares) == 2 and all(abs(share - 1.0) < 0.3 and std < 0.2 for share, std in shares)
-    assert "The same in all 2 flights" in output.as_text(diagnosis)
+    assert "the same in all flights" in output.as_text(diagnosis)
 
 
 def test_the_noise_that_the_filter_is_told_asks_for_no_functions_of_the_place():

@@ -237,7 +237,7 @@ def _try_corrections(
     blamed = [finding for finding in found if finding.rule in BLAMED]
     if not found:
         found += _misfit(fit)
-    elif blamed and tdoa_rules.gained(fit) is not None:  # the corrections did not make it fit
+    elif blamed and tdoa_rules.still_gains(fit):  # the corrections did not make it fit
         found = [finding for finding in found if finding not in blamed]
         found += [*_misfit(given.survey_fit)] or [*_misfit(fit)]
     if (
@@ -248,7 +248,7 @@ def _try_corrections(
         finding = imu_rules.find_imu_mistake(ordered)
         mixed = [other for other in found if other.cause.startswith(tdoa_rules.MIXED_UP)]
         if finding and mixed:
-            found = [other for other in found if other not in mixed] + [_other_room(*mixed)]
+            found = [other for other in found if other not in mixed] + [_other_room(mixed[0])]
         elif finding:
             found.append(finding)
     return found, fit.places

@@ -49,12 +49,13 @@ UNITS = {  # m in one
 NOISE, USUAL = (0.02, 0.2), 0.063
 WELL = 0.4  # loss below which a motion explains the TDOAs; healthy 0.31 at most
 BY_ERRORS = 0.1**2 / (0.1**2 + SCALE**2)  # loss that systematic errors of 0.1 m cause
-GAIN = 0.07  # fall of the loss by moving all anchors; measured healthy flights 0.064 at most
+GAIN = 0.065  # fall of the loss by moving all anchors; measured healthy flights 0.064 at most
 POOR = 0.33  # loss as surveyed beyond that of any healthy recording, which is 0.28 at most
 # fall of the loss with anchors fitted to the other half; measured healthy flights 0.052 at most,
 # surveys of other rooms 0.063 at least. In a recording shorter than ENOUGH, s, the tag sees a part
 # of the room, and other anchors describe the systematic errors there: healthy pieces 0.083 at most.
 HELD, HELD_OF_SHORT, ENOUGH = 0.06, 0.09, 30.0
+HELD_OF_TRIAL = 0.03  # the same after a correction: if more is left, the survey may be the mistake
 ALONE = 0.85  # share of the gain that one anchor explains
 FEWEST = 10  # windows with a position; TDOAs of an anchor that may have the id of another
 APART = 1.0  # m, least error of such an anchor: anchors of a hall are farther from each other
@@ -229,7 +230,7 @@ def swapped_ids(recording: OrderedRecording) -> Iterator[MistakeTrial]:
         table = {i: best_swap.get(table.get(i, i), table.get(i, i)) for i in ids}
         table = {i: k for i, k in table.items() if i != k}
         brief, trial = relabelled(brief, best_swap), relabelled(trial, best_swap)
-    if not table or (len(table) > 2 and gained(trial.survey_fit) is not None):
+    if not table or (len(table) > 2 and still_gains(trial.survey_fit)):
         # Exchanging many ids explains a survey of another room better, and it still does not fit.
         return
     names = ", ".join(f"{i} is {k}" for i, k in sorted(table.items()))
@@ -276,7 +277,7 @@ def inverted_pairs(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     for a, b in wrong:
         flip |= (tdoa.a == a) & (tdoa.b == b)
     trial = _flipped(recording, flip)
-    if gained(trial.survey_fit) is not None:
+    if still_gains(trial.survey_fit):
         # With a survey of another room some pairs seem to have the other sign, and it does not fit.
         return
     names = ", ".join(f"({a}, {b})" for a, b in wrong)
@@ -342,6 +343,14 @@ def gained(fit: SurveyFit) -> float | None:
     gain = apparent_gain(fit)
     least = HELD if fit.seconds >= ENOUGH else HELD_OF_SHORT
     return gain if gain > GAIN and (fit.before > POOR or fit.held_out_gain > least) else None
+
+
+def still_gains(fit: SurveyFit) -> bool:
+    """Return whether anchors elsewhere may explain more than a correction of the TDOAs did.
+
+    Less evidence suffices than for `gained`: signs and ids are not blamed for a wrong survey.
+    """
+    return apparent_gain(fit) > GAIN and (fit.before > POOR or fit.held_out_gain > HELD_OF_TRIAL)
 
 
 def apparent_gain(fit: SurveyFit) -> float:
