@@ -96,10 +96,10 @@ def test_diagnose_writes_before_and_after_and_what_was_found(desk, viewer):
 
 def test_demo_writes_what_the_nodes_said(flight, viewer, tmp_path):
     pytest.importorskip("rclpy")
-    from uwb_tdoa_tools.flying.demo import DemoResult
+    from uwb_tdoa_tools.flying.demo import DemoResult, LivePass
 
     run = FlightEstimator()(flight)
-    DemoResult({}, [], run.odometry, run, run.odometry).show(
+    DemoResult(LivePass({}, run.odometry), [], run, run.odometry).show(
         tmp_path / "flight.rrd", flight, ["landed"]
     )
     assert (

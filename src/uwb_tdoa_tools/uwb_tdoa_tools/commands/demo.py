@@ -130,8 +130,8 @@ def _measured(args: Namespace) -> int:
     cli.show(f"correction {chosen.correction()}")
     flown = demo.fly(chosen, args.out, args.rate, lambda text: cli.show(f"nodes      {text}"))
     scores = flown.scores
-    _show("nodes", demo.arrivals_in_words(flight, flown.outcome))
-    if flown.missing:
+    _show("nodes", demo.arrivals_in_words(flight, flown.live.outcome))
+    if flown.live.missing:
         cli.say("demo", f"messages lost or late: too much load for --rate {args.rate:g}; try less.")
     change = demo.change_of_scores(scores)
     cli.show(*lines_of_errors(scores), change)
@@ -144,7 +144,7 @@ def _measured(args: Namespace) -> int:
         cli.show(f"rerun      {args.rerun}")
     cli.show(f"took {time.monotonic() - started:.0f} s")
     _show("next", demo.next_steps(args.flight, args.survey), keep=True)
-    return int(scores[-2].row()["diverged"] or flown.missing > 0)  # of the nodes
+    return int(scores[-2].row()["diverged"] or flown.live.missing > 0)  # of the nodes
 
 
 main = cli.executable(_demo, parser)

@@ -114,49 +114,6 @@ def measured(
 
 
 @dataclass(frozen=True)
-class DemoResult:
-    """Hold the results of a demo.
-
-    Parameters
-    ----------
-    outcome : dict
-        Number of messages by outcome, see `accounts`.
-    scores : list of Score
-        With corrections: filter without correction, nodes, filter with correction. Without corrections:
-        nodes and filter.
-    nodes : RecordedOdometry
-        Output of the nodes.
-    without_ros : Run
-        Filter with the corrections of the nodes.
-    raw : Odometry or None
-        Filter without correction, if there are corrections.
-    """
-
-    outcome: dict[str, int]
-    scores: list[Score]
-    nodes: RecordedOdometry
-    without_ros: Run
-    raw: Odometry | None
-
-    @property
-    def missing(self) -> int:
-        """Return how many messages were lost or late."""
-        return sum(self.outcome[name] for name in MISSING)
-
-    def show(self, path: Path, flight: Flight, sentences: Sequence[str]) -> None:
-        """Write a file for Rerun with the output of the nodes and sentences."""
-        write_rerun(
-            path,
-            flight,
-            self.nodes,
-            self.without_ros.residuals,
-            list(sentences),
-            flight.truth,
-            self.raw,
-        )
-
-
-@dataclass(frozen=True)
 class LivePass:
     """Hold what both nodes made of a flight.
 
@@ -169,6 +126,46 @@ class LivePass:
 
     outcome: dict[str, int]
     odometry: RecordedOdometry
+
+    @property
+    def missing(self) -> int:
+        """Return how many messages were lost or late."""
+        return sum(self.outcome[name] for name in MISSING)
+
+
+@dataclass(frozen=True)
+class DemoResult:
+    """Hold the results of a demo.
+
+    Parameters
+    ----------
+    live : LivePass
+        Flight through the nodes.
+    scores : list of Score
+        With corrections: filter without correction, nodes, filter with correction. Without corrections:
+        nodes and filter.
+    without_ros : Run
+        Filter with the corrections of the nodes.
+    raw : Odometry or None
+        Filter without correction, if there are corrections.
+    """
+
+    live: LivePass
+    scores: list[Score]
+    without_ros: Run
+    raw: Odometry | None
+
+    def show(self, path: Path, flight: Flight, sentences: Sequence[str]) -> None:
+        """Write a file for Rerun with the output of the nodes and sentences."""
+        write_rerun(
+            path,
+            flight,
+            self.live.odometry,
+            self.without_ros.residuals,
+            list(sentences),
+            flight.truth,
+            self.raw,
+        )
 
 
 def through_nodes(
@@ -251,7 +248,7 @@ def fly(
         }
     scores = [Score(name, one, flight.truth) for name, one in estimates.items()]
     without_ros, before = (corrected, raw.odometry) if correction else (raw, None)
-    return DemoResult(passed.outcome, scores, nodes, without_ros, before)
+    return DemoResult(passed, scores, without_ros, before)
 
 
 class Stopwatch:
@@ -325,7 +322,7 @@ class LoopResult:
     @property
     def missing(self) -> int:
         """Return how many messages were lost or late."""
-        return sum(one.outcome[name] for one in self.passes for name in MISSING)
+        return sum(one.missing for one in self.passes)
 
     @property
     def failed(self) -> bool:
