@@ -4,7 +4,6 @@ import argparse
 import sys
 
 from studies import (
-    aids,
     calibrating,
     crazyflie,
     demo,
@@ -25,6 +24,7 @@ from studies import (
     recalibrating,
     rover,
     scale,
+    sensors,
     situations,
     surveying,
     two_errors,
@@ -46,7 +46,7 @@ from studies.training import compare, spin, splits
 from uwb_tdoa_tools import cli
 
 STUDIES = {
-    "aids": aids,
+    "sensors": sensors,
     "bench": suite,
     "calibrating": calibrating,
     "checking": checking,
@@ -92,7 +92,7 @@ STUDIES = {
 DESCRIPTION = """Make the figures of the documentation anew. Nothing here is needed to use the suite. DATA is a folder
 of measured flights: flights/, util/, surveys/.
 
-  aids             height, pressure and velocity on measured flights, and their faults (docs/aids.md)
+  sensors             height, pressure and velocity on measured flights, and their faults (docs/auxiliary_sensors.md)
   bench            what the suite costs on this machine (docs/measured.md)
   calibrating      surveys shaken, calibrated without ground truth, judged on other flights (docs/calibration.md)
   checking         mistakes put into flights, and what check says of them (docs/connect.md)
@@ -106,7 +106,7 @@ of measured flights: flights/, util/, surveys/.
   diagnose-ranges  errors put into simulated distances to anchors, and what diagnose makes of them (docs/sensors.md)
   diagnosis        effects put into flights, and found again (docs/diagnosis.md)
   domains          effects beyond where they were seen (docs/reliability.md)
-  drives           a rover on wheels, by which sensors the filter uses (docs/aids.md)
+  drives           a rover on wheels, by which sensors the filter uses (docs/auxiliary_sensors.md)
   export-cost      a TDOA corrected by an exported file and by compiled effects (docs/export.md)
   faults           faults of streams, surveys, nodes and clocks, played to the real nodes over topics (docs/reliability.md)
   fly-faults       faults of streams while a simulated vehicle flies by the estimate (docs/reliability.md)
@@ -157,7 +157,7 @@ def parser():
         "./dev study two-machines",
         "./dev study vehicle-code",
         './dev study warehouse --only "ten minutes" --seeds 20',
-        "./dev study aids worth DATA/flights/0425 --survey DATA/surveys",
+        "./dev study sensors worth DATA/flights/0425 --survey DATA/surveys",
         "./dev study bench --json bench.json",
         "./dev study bench --only core --peer libpeer.so",
         "./dev study bench --only offline --model network.onnx",

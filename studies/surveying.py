@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.files import write_text
-from uwb_tdoa_bias.common.flight import AIDS
+from uwb_tdoa_bias.common.flight import SENSOR_NAMES
 from uwb_tdoa_tools import parallel
 from uwb_tdoa_tools.diagnosis import diagnose
 from uwb_tdoa_tools.diagnosis.constraints import Mark, OdometryPath
@@ -32,7 +32,7 @@ _UTIL, _CONST4, _0425 = (
     "util/const4-trial1-tdoa2-traj{}.csv.gz",
     "flights/0425/TDOA2/0425-traj{}",
 )
-SETS = {  # name: (paths to survey with, paths to judge on, aids that are used)
+SETS = {  # name: (paths to survey with, paths to judge on, sensors that are used)
     "const1": (
         [_UTIL.format(1, k) for k in ("1-tdoa2", "1-tdoa3")],
         [_UTIL.format(1, k) for k in ("2-tdoa2", "3-tdoa2")],
@@ -48,7 +48,7 @@ SETS = {  # name: (paths to survey with, paths to judge on, aids that are used)
     "0425 with its range finder": (
         [_0425.format(k) for k in (1, 2, 6)],
         [_0425.format(k) for k in (3, 7, 10)],
-        AIDS,
+        SENSOR_NAMES,
     ),
 }
 MARKS = 6  # of each split at least
@@ -242,13 +242,13 @@ def at(flight, positions):
     return replace(flight, anchors=flight.anchors.at(positions))
 
 
-def _measured(data, fit, judge, aids):
-    return [measured_flights(data, some, aids) for some in (fit, judge)]
+def _measured(data, fit, judge, sensors):
+    return [measured_flights(data, some, sensors) for some in (fit, judge)]
 
 
-def measured_flights(data, paths, aids=()):
-    """Flights below a folder, with these of AIDS alone."""
-    unused = [aid for aid in AIDS if aid not in aids]
+def measured_flights(data, paths, sensors=()):
+    """Flights below a folder, with these of SENSOR_NAMES alone."""
+    unused = [sensor for sensor in SENSOR_NAMES if sensor not in sensors]
     reading = inputs.Reading(str(data / "surveys"))
     return [
         flight.without(*unused) for path in paths for flight in reading.flights([str(data / path)])

@@ -26,7 +26,7 @@ ANCHORS = (4, 8, 16, 32, 64)
 BEFORE, MEASURED = 3.0, 4.0  # s of a flight: until it is measured, and measured
 RARELY = 1e-3  # Hz of odometry: the core alone is measured
 TARGET = 1.5  # us of one prediction and one robust update
-OF_AID = 2.0  # us, of one height, pressure or velocity
+OF_SENSOR = 2.0  # us, of one height, pressure or velocity
 NOISES = {"height": 0.01, "pressure": 0.1, "velocity": 0.05}  # m, m, m/s
 SECTION = "compiled core, one core"
 
@@ -50,9 +50,9 @@ def measure(progress: Callable[[str], object], quick: bool = False) -> Iterator[
     yield from _pair(
         f"8 anchors, {ROBUST[0]}, while {N_YAWS} yaws are followed", 8, ROBUST[0], N_YAWS, repeats
     )
-    for aid in NOISES:
-        progress(f"core, {aid}")
-        yield Figure.of(SECTION, f"one {aid}", "us", per_aid(aid, repeats), OF_AID)
+    for sensor in NOISES:
+        progress(f"core, {sensor}")
+        yield Figure.of(SECTION, f"one {sensor}", "us", per_sensor(sensor, repeats), OF_SENSOR)
 
 
 def _pair(
@@ -87,14 +87,14 @@ def per_event(
     return 1e6 * seconds[:, 0] / core.samples, 1e6 * (seconds[:, 1] - seconds[:, 0]) / core.tdoas
 
 
-def per_aid(aid: str, repeats: int) -> np.ndarray:
+def per_sensor(sensor: str, repeats: int) -> np.ndarray:
     """us per height, pressure or velocity beside 1 kHz IMU and 400 Hz TDOA: (repeats,)."""
-    noise: dict[str, Any] = {f"{aid}_noise": NOISES[aid]}
+    noise: dict[str, Any] = {f"{sensor}_noise": NOISES[sensor]}
     flight = make_flight(BEFORE + MEASURED, start_in_air=True, multipath=False, **noise)
     core = Core(flight, FilterConfig(initial_yaw_std=0.5, odometry_rate=RARELY))
     core.start()
     seconds = np.array([[core.timed(True), core.timed(True, True)] for _ in range(repeats + 1)])[1:]
-    return 1e6 * (seconds[:, 1] - seconds[:, 0]) / core.aids
+    return 1e6 * (seconds[:, 1] - seconds[:, 0]) / core.sensors
 
 
 def sample_before(stamps: np.ndarray, t: np.ndarray) -> np.ndarray:
@@ -117,8 +117,8 @@ class Core:
         stamps = sample_before(imu.t, tdoa.t)
         rows = flight.anchors.index(tdoa.a), flight.anchors.index(tdoa.b)
         self._tdoa = structured(TDOA, stamps, *rows, tdoa.d, np.zeros(len(tdoa)))
-        self._aids = loaded(flight, config)[0].take(math.inf).aids
-        self._aids["t"] = sample_before(imu.t, self._aids["t"])
+        self._sensors = loaded(flight, config)[0].take(math.inf).sensors
+        self._sensors["t"] = sample_before(imu.t, self._sensors["t"])
         self._begin = imu.t[0]
 
     def start(self) -> None:
@@ -126,15 +126,15 @@ class Core:
 
         Raises RuntimeError if the filter does not run by then.
         """
-        streams = self._imu, self._tdoa, self._aids
+        streams = self._imu, self._tdoa, self._sensors
         ends = [int(np.searchsorted(stream["t"], self._begin + BEFORE)) for stream in streams]
         self._feed(self.state, *(stream[:end] for stream, end in zip(streams, ends)))
         if not self.state.record.running:
             raise RuntimeError("the filter has not started, so that there is nothing to measure")
-        self._imu, self._tdoa, self._aids = (stream[end:] for stream, end in zip(streams, ends))
-        self.samples, self.tdoas, self.aids = len(self._imu), len(self._tdoa), len(self._aids)
+        self._imu, self._tdoa, self._sensors = (stream[end:] for stream, end in zip(streams, ends))
+        self.samples, self.tdoas, self.sensors = len(self._imu), len(self._tdoa), len(self._sensors)
 
-    def timed(self, tdoa: bool, aids: bool = False) -> float:
+    def timed(self, tdoa: bool, sensors: bool = False) -> float:
         """s that the rest takes, with or without its TDOAs, and its heights, pressures and
         velocities.
         """
@@ -143,7 +143,7 @@ class Core:
             self.last,
             self._imu,
             self._tdoa if tdoa else self._tdoa[:0],
-            self._aids if aids else self._aids[:0],
+            self._sensors if sensors else self._sensors[:0],
         )
 
     def _feed(self, state: FilterState, *measured: np.ndarray) -> float:

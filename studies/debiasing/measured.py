@@ -10,7 +10,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_text
-from uwb_tdoa_bias.common.flight import AIDS
+from uwb_tdoa_bias.common.flight import SENSOR_NAMES
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf.debias import fit
 from uwb_tdoa_tools import parallel
@@ -147,7 +147,7 @@ def _effects_file(diagnosed, split):
 def flown(data, path, effects=None):
     """What `fly` gives for a flight of the data, without height, pressure and velocity."""
     (flight,) = inputs.Reading(data / "surveys").flights([data / path])
-    return estimate_flight(flight.without(*AIDS), effects=effects)
+    return estimate_flight(flight.without(*SENSOR_NAMES), effects=effects)
 
 
 def _figures(score):

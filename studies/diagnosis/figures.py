@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_filled, write_text
-from uwb_tdoa_bias.common.flight import AIDS
+from uwb_tdoa_bias.common.flight import SENSOR_NAMES
 from uwb_tdoa_tools.diagnosis import diagnose
 from uwb_tdoa_tools.diagnosis.references import Heights, Nothing
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
@@ -28,7 +28,7 @@ from . import bank, blind, faults, floor, measured, referenced, undeclared
 
 PARTS = (
     "bank",
-    "aids",
+    "sensors",
     "no-truth",
     "undeclared",
     "blind",
@@ -36,7 +36,7 @@ PARTS = (
     "faults",
     "injected",
     "measured",
-    "measured-aids",
+    "measured-sensors",
     "floor",
     "references",
     "speed",
@@ -86,7 +86,7 @@ def run(args):
     """Run a part, and write and print its figures."""
     args.out.mkdir(parents=True, exist_ok=True)
     on_data = dict.fromkeys(
-        ("faults", "injected", "measured", "measured-aids", "floor", "references"), ("data",)
+        ("faults", "injected", "measured", "measured-sensors", "floor", "references"), ("data",)
     )
     for option in {"undeclared": ("cases",), **on_data}.get(args.part, ()):
         if getattr(args, option) is None:
@@ -94,7 +94,7 @@ def run(args):
     started = time.monotonic()
     result = {
         "bank": _bank,
-        "aids": _aids,
+        "sensors": _sensors,
         "no-truth": _no_truth,
         "undeclared": _undeclared,
         "blind": _blind,
@@ -102,7 +102,7 @@ def run(args):
         "faults": _faults,
         "injected": _injected,
         "measured": _measured,
-        "measured-aids": _measured_aids,
+        "measured-sensors": _measured_sensors,
         "floor": _floor,
         "references": _references,
         "speed": _speed,
@@ -128,7 +128,7 @@ def _bank(args):
     return {"figures": bank.figures(results), "cases": results}
 
 
-def _aids(args):
+def _sensors(args):
     results = _each(
         bank.cases(args.seeds, aided=True),
         lambda kind, effects, seed: {"kind": kind, **bank.diagnose_case(effects, seed, aided=True)},
@@ -238,10 +238,10 @@ def _measured(args):
     return {"figures": {r["split"]: r["summary"] for r in results}, "cases": results}
 
 
-def _measured_aids(args):
+def _measured_sensors(args):
     results = _each(
         [(name,) for name in measured.AIDED],
-        lambda name: measured.run(args.data, name, args.out, AIDS),
+        lambda name: measured.run(args.data, name, args.out, SENSOR_NAMES),
     )
     return {"figures": {r["split"]: r["summary"] for r in results}, "cases": results}
 
@@ -262,7 +262,7 @@ def _speed(args):
     effect = bank.effect_of("anchor_delay", True, 1)
     flight = effect.inject(bank.clean_flight(500, 126.0))
     two = [effect.inject(bank.clean_flight(seed, 60.0, aided=True)) for seed in (502, 503)]
-    bare = [one.without(*AIDS) for one in two]
+    bare = [one.without(*SENSOR_NAMES) for one in two]
     calls = {
         "120 s of flight": lambda: diagnose([flight]),
         "survey, two of a minute": lambda: with_blocked(self_calibrate(bare, Tape()), bare),
@@ -271,7 +271,7 @@ def _speed(args):
     }
     short = bank.clean_flight(501, 40.0, aided=True)
     # compiles
-    (diagnose([short], reference=Heights()), self_calibrate([short.without(*AIDS)], Tape()))
+    (diagnose([short], reference=Heights()), self_calibrate([short.without(*SENSOR_NAMES)], Tape()))
     figures = {}
     for name, call in calls.items():
         started = time.process_time()

@@ -3,12 +3,12 @@
 import json
 import time
 
-from known_effects import AIDED as ON_AIDS
+from known_effects import AIDED as ON_SENSORS
 from known_effects import RANGED, SIZES, effect_of
 import numpy as np
 
 from uwb_tdoa_bias.common.files import write_text
-from uwb_tdoa_bias.common.flight import AIDS
+from uwb_tdoa_bias.common.flight import SENSOR_NAMES
 from uwb_tdoa_tools.diagnosis import diagnose, output
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.findings import usable
@@ -67,10 +67,13 @@ INTO = (
 PRESENT = ("outlier_rate", "noise_correlation", "floor_multipath")
 
 
-def load(data, paths, aids=()):
-    """Flights of paths below the folder `data`, with those of their AIDS that are named."""
+def load(data, paths, sensors=()):
+    """Flights of paths below the folder `data`, with those of their SENSOR_NAMES that are named."""
     flights = inputs.Reading(data / "surveys").flights([data / path for path in paths])
-    return [flight.without(*(name for name in AIDS if name not in aids)) for flight in flights]
+    return [
+        flight.without(*(name for name in SENSOR_NAMES if name not in sensors))
+        for flight in flights
+    ]
 
 
 def folder_of(name):
@@ -92,13 +95,13 @@ def _rounded(value):
     return None if value is None else round(value, 3)
 
 
-def run(data, name, out, aids=()):
-    """Diagnose one split; writes its report and effects.yaml. aids : streams that are used where
+def run(data, name, out, sensors=()):
+    """Diagnose one split; writes its report and effects.yaml. sensors : streams that are used where
     flights hold them. Returns dict of the summary and all findings.
     """
     fit, judge = SPLITS[name]
     started = time.monotonic()
-    result = diagnose(load(data, fit, aids), load(data, judge, aids))
+    result = diagnose(load(data, fit, sensors), load(data, judge, sensors))
     folder = out / folder_of(name)
     folder.mkdir(parents=True, exist_ok=True)
     write_text(folder / "report.html", html(result))
@@ -137,7 +140,10 @@ def injected(data, each):
     of the bank, with "hit" and "imitators": what explains as much, less plausibly.
     """
     cases = [
-        (path, name) for path in INTO for name in SIZES if name not in (*PRESENT, *ON_AIDS, *RANGED)
+        (path, name)
+        for path in INTO
+        for name in SIZES
+        if name not in (*PRESENT, *ON_SENSORS, *RANGED)
     ]
     known = {}
 

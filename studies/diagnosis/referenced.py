@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from uwb_tdoa_bias.common.flight import AIDS
+from uwb_tdoa_bias.common.flight import SENSOR_NAMES
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_tools.diagnosis import diagnose
 from uwb_tdoa_tools.diagnosis.references import REFERENCES
@@ -74,4 +74,4 @@ def figures(results):
 
 
 def _error(flight, effects):
-    return evaluate(flight.without(*AIDS), effects=effects)[0].row()["rmse_3d"]
+    return evaluate(flight.without(*SENSOR_NAMES), effects=effects)[0].row()["rmse_3d"]

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.common.flight import AIDS, Truth
+from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Truth
 from uwb_tdoa_bias.common.sensors import Height, Pressure, Ranges
 from uwb_tdoa_bias.common.sensors.pressure import SITE, pressure_at
 from uwb_tdoa_tools.scoring.metrics import position_at, scored_phase
 
-from ..aids import with_velocity
+from ..sensors import with_velocity
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.common.flight import Flight
@@ -75,7 +75,7 @@ def part_of(flight: Flight, seconds: float) -> Flight:
         columns = {name: column[rows] for name, column in vars(stream).items()}
         return replace(stream, **columns | {"t": columns["t"] - begin})
 
-    parts = {name: cut(getattr(flight, name)) for name in ("tdoa", "truth", *AIDS)}
+    parts = {name: cut(getattr(flight, name)) for name in ("tdoa", "truth", *SENSOR_NAMES)}
     return flight.replaced(**parts, imu=cut(flight.imu, IMU_EVERY))
 
 

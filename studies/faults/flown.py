@@ -33,7 +33,7 @@ from uwb_tdoa_tools.outputs import OutputFile
 BEGIN, END = 12.0, 15.0  # s
 LOOK, REPORT = 0.2, 1.0  # s between two looks at the status, and two at the streams, as in ekf_node
 LAG = 0.25  # s
-AIDS = "height", "velocity"
+SENSOR_NAMES = "height", "velocity"
 
 # of the part of a stream that came in one turn: Imu, Tdoas or another
 Change = Callable[[Any], Any]
@@ -49,9 +49,9 @@ class FlownFault:
     lasts: float = END - BEGIN
 
     @property
-    def aids(self) -> tuple[str, ...]:
+    def sensors(self) -> tuple[str, ...]:
         """Sensors that it needs beside TDOAs and the IMU."""
-        return (self.stream,) if self.stream in AIDS else ()
+        return (self.stream,) if self.stream in SENSOR_NAMES else ()
 
 
 def _put(**columns: Callable[[Any], np.ndarray]) -> Change:
@@ -218,7 +218,7 @@ def flown(task: tuple[str, int]) -> dict[str, Any]:
     """What becomes of one flight: (name of a fault, seed)."""
     name, seed = task
     fault = FAULTS[name]
-    trial = Trial(Task(world_of("hall", aids=fault.aids), seed))
+    trial = Trial(Task(world_of("hall", sensors=fault.sensors), seed))
     assert isinstance(trial.source, OwnFilter)
     trial.source = source = FaultyFilter(trial.source, fault)
     trial.fly()

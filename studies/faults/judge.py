@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from uwb_tdoa_bias.common.flight import AIDS
+from uwb_tdoa_bias.common.flight import SENSOR_NAMES
 from uwb_tdoa_tools.scoring.metrics import position_at
 
 from .events import Scene, yaws_at
@@ -195,7 +195,7 @@ def verdict(row: dict[str, Any]) -> str:
             "yaw wrong and certain": row["yaw wrong"] > YAW_LIMIT,
             "not recovered": row["recovered"] is not None and row["recovered"] > RECOVERED_LIMIT,
             "a sensor disturbs": (row["gap"] > FRESH or row["status"])
-            and row["fault"].partition(":")[0] in AIDS,  # it can do without
+            and row["fault"].partition(":")[0] in SENSOR_NAMES,  # it can do without
             "does not end": max(row["stop"].values(), default=0.0) > STOP_LIMIT,
         }.items()
         if is_missed

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from uwb_tdoa_bias.common.flight import AIDS
+from uwb_tdoa_bias.common.flight import SENSOR_NAMES
 
 from .changes import (
     Change,
@@ -43,7 +43,7 @@ BEGIN, LASTS, AFTER = (14.0, 6.0, 7.0)
 EARLY, LONG = 5.0, 22.0  # s: begin and length of one whose effect needs long
 FEET, LIGHT = 3.280839895, 0.299792458  # in a metre; m in a nanosecond
 NORMAL = 9.80665  # m/s^2 in g
-STREAMS = ("tdoa", "imu", *AIDS)
+STREAMS = ("tdoa", "imu", *SENSOR_NAMES)
 ALL = " ".join(STREAMS)
 
 
@@ -110,7 +110,7 @@ def ekf(**parameters: Any) -> dict[str, dict[str, Any]]:
 
 def of_stream(name: str) -> dict[str, Fault]:
     """What can be wrong with the time or the sequence of any stream."""
-    plays = (name,) if name in AIDS else ()
+    plays = (name,) if name in SENSOR_NAMES else ()
     rows = {
         "ahead 0.3 s": Fault("stamps are 0.3 s ahead", during(name, restamped(0.3))),
         "ahead 5 s": Fault("stamps are 5 s ahead", during(name, restamped(5.0))),
@@ -175,26 +175,34 @@ EXCHANGED, SHIFTED, UNKNOWN = (
 FAULTS: dict[str, Fault] = {
     "nothing": Fault("nothing"),
     "nothing, all sensors": Fault(
-        "nothing; with height, pressure, velocity and ranges", plays=AIDS
+        "nothing; with height, pressure, velocity and ranges", plays=SENSOR_NAMES
     ),
     **{key: row for name in STREAMS for key, row in of_stream(name).items()},
     # Several streams
     "all: jump +5 s": jump(
         "all clocks jump by 5 s ahead and stay there",
         for_good(during(ALL, restamped(5.0))),
-        plays=AIDS,
+        plays=SENSOR_NAMES,
     ),
     "all: jump -5 s": jump(
         "all clocks jump by 5 s back and stay there",
         for_good(during(ALL, restamped(-5.0))),
-        plays=AIDS,
+        plays=SENSOR_NAMES,
     ),
     "all: bursts": Fault(
-        "all messages come together, each half a second", during(ALL, in_bursts(0.5)), plays=AIDS
+        "all messages come together, each half a second",
+        during(ALL, in_bursts(0.5)),
+        plays=SENSOR_NAMES,
     ),
-    "all: silent 1 s": Fault("no message at all for 1 s", during(ALL, lost), plays=AIDS, lasts=1.0),
-    "all: silent 5 s": Fault("no message at all for 5 s", during(ALL, lost), plays=AIDS, lasts=5.0),
-    "all: flood": Fault("each message comes ten times", during(ALL, repeated(10)), plays=AIDS),
+    "all: silent 1 s": Fault(
+        "no message at all for 1 s", during(ALL, lost), plays=SENSOR_NAMES, lasts=1.0
+    ),
+    "all: silent 5 s": Fault(
+        "no message at all for 5 s", during(ALL, lost), plays=SENSOR_NAMES, lasts=5.0
+    ),
+    "all: flood": Fault(
+        "each message comes ten times", during(ALL, repeated(10)), plays=SENSOR_NAMES
+    ),
     "tdoa and imu: silent 10 s": Fault(
         "no TDOA and no IMU sample for 10 s", during("tdoa imu", lost), lasts=10.0
     ),

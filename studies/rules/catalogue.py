@@ -82,7 +82,7 @@ RULES = (
         "_on_tdoa",
         "initialization.is_repeat(ekf, tdoa, anchors)",
     ),
-    Rule("a repeated range is refused", "engine", "_on_range", "ranges.is_repeat(ekf, aid)"),
+    Rule("a repeated range is refused", "engine", "_on_range", "ranges.is_repeat(ekf, sensor)"),
     # Late anchors near the ground
     Rule(
         "anchors near the ground may be late",
@@ -373,8 +373,8 @@ RULES = (
     Rule(
         "open the yaw of a tag without IMU",
         "engine",
-        "_on_aid",
-        "aid.kind == aids.VELOCITY and (not parameters.use_imu)",
+        "_on_sensor",
+        "sensor.kind == sensors.VELOCITY and (not parameters.use_imu)",
     ),
     Rule(
         "a yaw that may be any grows no more",
@@ -600,13 +600,13 @@ RULES = (
         "a range finder that repeats is stuck",
         "height",
         "observe",
-        "not ekf.quiet and aid.t - height.changed > STUCK_TIME",
+        "not ekf.quiet and sensor.t - height.changed > STUCK_TIME",
     ),
     Rule(
         "a range finder that pulls is ignored",
         "height",
         "observe",
-        "aid.t < height.ignored_until",
+        "sensor.t < height.ignored_until",
     ),
     Rule(
         "a range weighs places",
@@ -614,7 +614,7 @@ RULES = (
         "observe",
         "_weigh_places(ekf, parameters, distance, share)",
     ),
-    Rule("a gap in ranges", "height", "observe", "aid.t - height.used > LONGEST_GAP"),
+    Rule("a gap in ranges", "height", "observe", "sensor.t - height.used > LONGEST_GAP"),
     Rule(
         "errors of ranges last",
         "height",
@@ -640,9 +640,9 @@ RULES = (
         "the offset of a barometer is taken anew",
         "barometer",
         "observe",
-        "aid.t - barometer.agreed > LONGEST_DISAGREEMENT",
+        "sensor.t - barometer.agreed > LONGEST_DISAGREEMENT",
     ),
-    Rule("a stuck velocity", "velocity", "observe", "_repeats(state, aid) and (not ekf.quiet)"),
+    Rule("a stuck velocity", "velocity", "observe", "_repeats(state, sensor) and (not ekf.quiet)"),
     Rule(
         "a velocity that disagrees is refused",
         "velocity",

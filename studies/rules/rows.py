@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from studies import ranges, rover, situations
 from studies.faults.flown import FAULTS as FLOWN
 from uwb_tdoa_bias.common.files import write_bytes
-from uwb_tdoa_bias.common.flight import AIDS, Flight, Imu
+from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Flight, Imu
 from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
@@ -65,7 +65,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Row:
-    """One row of the study. group : "measured", "flown", "starts", "halls", "faults" or "aids"; needs : sensors
+    """One row of the study. group : "measured", "flown", "starts", "halls", "faults" or "sensors"; needs : sensors
     without whose rules it changes nothing; screen : it is of the screen.
     """
 
@@ -141,11 +141,11 @@ class Inputs:
             *self._flown(),
             *self._starts(),
             *self._faults(),
-            *self._aids(),
+            *self._sensors(),
             *_halls(),
             *_rovers(),
         ]
-        order = "starts", "halls", "faults", "measured", "aids", "flown"
+        order = "starts", "halls", "faults", "measured", "sensors", "flown"
         return sorted(made, key=lambda row: (not row.screen, order.index(row.group)))
 
     def _measured(self) -> Iterator[Row]:
@@ -162,22 +162,22 @@ class Inputs:
                 make = partial(self._recording, path, until=SHORT)
                 yield Row(f"{name}, {SHORT:g} s", "measured", make, True)
 
-    def _recording(self, path: Path, aids: bool = False, until: float = math.inf) -> Case:
+    def _recording(self, path: Path, sensors: bool = False, until: float = math.inf) -> Case:
         (flight,) = Reading(self._data / "surveys").flights([path])
-        flight = _cut(flight if aids else flight.without(*AIDS), -math.inf, until)
+        flight = _cut(flight if sensors else flight.without(*SENSOR_NAMES), -math.inf, until)
         return Case(flight, phases(flight.truth))
 
     def recording(self, name: str) -> Case:
         """A measured flight by its name, with all its streams."""
-        return self.kept(f"{name} whole", lambda: self._recording(self._path(name), aids=True))
+        return self.kept(f"{name} whole", lambda: self._recording(self._path(name), sensors=True))
 
     def _path(self, name: str) -> Path:
         return next((self._data / "flights").rglob(name))
 
     def flight_of(self, world: str, seed: int) -> Flight:
-        """A flight of `fly` in a world, with TDOAs and IMU; "aids": the hall, with more sensors."""
-        aids = ("height", "velocity") if world == "aids" else ()
-        task = Task(world_of("hall" if world == "aids" else world, aids=aids), seed)
+        """A flight of `fly` in a world, with TDOAs and IMU; "sensors": the hall, with more sensors."""
+        sensors = ("height", "velocity") if world == "sensors" else ()
+        task = Task(world_of("hall" if world == "sensors" else world, sensors=sensors), seed)
         return self.kept(f"flown {world} {seed}", lambda: fly(task).flight)
 
     def _flown(self) -> Iterator[Row]:
@@ -272,37 +272,37 @@ class Inputs:
         flight = _during(flight, stream, change)
         return Case(flight, {"during": (BEGIN, END), "after": (END, CUT)}, END)
 
-    def _aids(self) -> Iterator[Row]:
+    def _sensors(self) -> Iterator[Row]:
         for name in ("0425-traj2", "0425-traj13"):
-            make = partial(self._recording, self._path(name), aids=True)
+            make = partial(self._recording, self._path(name), sensors=True)
             yield Row(
-                f"{name}, all sensors", "aids", make, True, ("height", "pressure", "velocity")
+                f"{name}, all sensors", "sensors", make, True, ("height", "pressure", "velocity")
             )
         for name, fault in FLOWN.items():
             stream = fault.stream
             if stream in SENSORS and "ahead" not in name:
-                make = partial(self._faulty_aid, stream, fault.change)
-                yield Row(f"fly, {name}", "aids", make, True, (stream,))
+                make = partial(self._faulty_sensor, stream, fault.change)
+                yield Row(f"fly, {name}", "sensors", make, True, (stream,))
         make = partial(self._at_fixed_height)
-        yield Row("flying, with a fixed height", "aids", make, False, ("plane",))
+        yield Row("flying, with a fixed height", "sensors", make, False, ("plane",))
         for name, (streams, config, late) in rover.ROWS.items():
             for seed in range(SEEDS):
                 make = partial(_driven, seed, streams, config, late)
                 yield Row(
-                    f"rover, {name}, seed {seed}", "aids", make, seed == 0, ("velocity", "plane")
+                    f"rover, {name}, seed {seed}", "sensors", make, seed == 0, ("velocity", "plane")
                 )
         for what in ("ranges", "both"):
-            yield Row(f"{what} of ranges", "aids", partial(_ranged, what), True, ("range",))
+            yield Row(f"{what} of ranges", "sensors", partial(_ranged, what), True, ("range",))
         for name in ranges.FAULTS:
             make = partial(_ranged, "both", name)
-            yield Row(f"ranges {name}", "aids", make, False, ("range",))
+            yield Row(f"ranges {name}", "sensors", make, False, ("range",))
 
     def _at_fixed_height(self) -> Case:
         case = self._recording(self._path("0426-traj1"))
         return replace(case, config={"fixed_height_std": 0.02})
 
-    def _faulty_aid(self, stream: str, change: Callable[[Any], Any]) -> Case:
-        flight = _cut(self.flight_of("aids", FIRST_SEED), -math.inf, CUT)
+    def _faulty_sensor(self, stream: str, change: Callable[[Any], Any]) -> Case:
+        flight = _cut(self.flight_of("sensors", FIRST_SEED), -math.inf, CUT)
         flight = _during(flight, stream, change)
         return Case(flight, {"during": (BEGIN, END), "after": (END, CUT)}, END)
 
@@ -480,9 +480,9 @@ def _rovers() -> Iterator[Row]:
         for imu in (True, False):
             make = partial(_contradicted, seed, late, imu)
             words = "wheels, IMU" if imu else "wheels alone"
-            yield Row(f"rover, {words}, two late, seed {seed}", "aids", make, False, needs)
+            yield Row(f"rover, {words}, two late, seed {seed}", "sensors", make, False, needs)
     yield Row(
-        "rover, wheels, then alone", "aids", partial(_contradicted, 1, (), False), False, needs
+        "rover, wheels, then alone", "sensors", partial(_contradicted, 1, (), False), False, needs
     )
 
 

@@ -18,7 +18,7 @@ from mistakes import MISTAKES, arriving
 import numpy as np
 
 from uwb_tdoa_bias.common.anchors import Anchors
-from uwb_tdoa_bias.common.flight import AIDS
+from uwb_tdoa_bias.common.flight import SENSOR_NAMES
 import uwb_tdoa_ekf
 from uwb_tdoa_ekf.monitoring.recorded import watched
 from uwb_tdoa_ekf.monitoring.stream_watch import StreamWatch
@@ -185,7 +185,7 @@ def _run(inputs: Inputs, key: str, flight: Any) -> Any:
 
 
 def _residuals(inputs: Inputs, name: str, moved: bool = False) -> Said:
-    flight = inputs.recording(name).flight.without(*AIDS)
+    flight = inputs.recording(name).flight.without(*SENSOR_NAMES)
     anchors = flight.anchors
     if moved:
         positions = anchors.positions.copy()

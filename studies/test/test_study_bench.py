@@ -112,9 +112,9 @@ def test_what_others_use():
     )
 
 
-@pytest.mark.parametrize("aid", core.NOISES)
-def test_an_aid_is_measured_beside_the_rest(aid):
-    microseconds = core.per_aid(aid, 15)
+@pytest.mark.parametrize("sensor", core.NOISES)
+def test_an_sensor_is_measured_beside_the_rest(sensor):
+    microseconds = core.per_sensor(sensor, 15)
     assert (
         len(microseconds) == 15 and np.isfinite(microseconds).all()
     )  # a difference: on a loaded machine below 0 at times

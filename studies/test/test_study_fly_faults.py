@@ -34,7 +34,7 @@ def taken(name, t):
 
 
 @pytest.mark.parametrize(
-    "name", [name for name in FAULTS if name != "nothing" and not FAULTS[name].aids]
+    "name", [name for name in FAULTS if name != "nothing" and not FAULTS[name].sensors]
 )
 def test_a_fault_changes_its_stream_while_it_lasts_and_no_other(name):
     before, during = taken(name, BEGIN - 0.5), taken(name, BEGIN + 0.1)

@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_text
-from uwb_tdoa_bias.common.flight import AIDS
+from uwb_tdoa_bias.common.flight import SENSOR_NAMES
 from uwb_tdoa_tools.outputs import OutputFolder
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.training import models
@@ -101,4 +101,4 @@ def _measured(args):
 
 def _read(paths, survey):
     """Flights without height, pressure and velocity: models are of TDOAs alone."""
-    return [flight.without(*AIDS) for flight in inputs.Reading(survey).flights(paths)]
+    return [flight.without(*SENSOR_NAMES) for flight in inputs.Reading(survey).flights(paths)]

@@ -12,7 +12,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from tqdm import tqdm
 
-from uwb_tdoa_bias.common.flight import AIDS
+from uwb_tdoa_bias.common.flight import SENSOR_NAMES
 from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.readers import inputs
@@ -49,7 +49,8 @@ def add_options(add):
 def run(args):
     """Do the splits that are missing, and print the table of all."""
     flights = [
-        flight.without(*AIDS) for flight in inputs.Reading(args.survey).flights(args.flights)
+        flight.without(*SENSOR_NAMES)
+        for flight in inputs.Reading(args.survey).flights(args.flights)
     ]
     seeds, uncorrected_errors = (
         range(args.first, args.first + args.splits),

@@ -14,12 +14,12 @@ from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_bias.common.sensors import Velocity
 from uwb_tdoa_bias.effects import (
     EFFECTS,
-    AidCorrector,
     AnchorDelay,
     EffectSet,
     ImuCorrector,
     LabelCorrector,
     Samples,
+    SensorCorrector,
     SmoothTerm,
     TagLeverArm,
 )
@@ -177,7 +177,7 @@ def test_inertial_samples_are_corrected_the_same_at_once_and_one_by_one():
         )
 
 
-def test_aids_are_corrected_the_same_at_once_and_one_by_one_whatever_was_not_measured():
+def test_sensors_are_corrected_the_same_at_once_and_one_by_one_whatever_was_not_measured():
     rng, n = np.random.default_rng(0), 50
     values = {
         "velocity_scale": {"scale": 0.1},
@@ -185,7 +185,7 @@ def test_aids_are_corrected_the_same_at_once_and_one_by_one_whatever_was_not_mea
         "velocity_delay": {"offset": 0.02},
         "yaw_rate_scale": {"scale": 0.25},
     }
-    corrector = AidCorrector([EFFECTS[name](each) for name, each in values.items()])
+    corrector = SensorCorrector([EFFECTS[name](each) for name, each in values.items()])
     t, v, std = np.arange(n) / 25.0, rng.standard_normal((n, 3)), rng.uniform(0.1, 0.2, (n, 3))
     v[:, 2], std[:, 2] = np.nan, np.inf
     rates = rng.standard_normal(n), np.where(rng.random(n) < 0.5, 0.0, 0.1)
@@ -224,7 +224,7 @@ def test_a_yaw_rate_that_was_not_measured_has_no_scale():
     some = np.arange(n) % 3 == 0
     std, rate = np.where(some, np.inf, 0.0), np.where(some, np.nan, 0.5)
     mixed = Velocity(t, v, np.full((n, 3), 0.1), rate, std)
-    corrected = AidCorrector([scale]).correct("velocity", mixed)
+    corrected = SensorCorrector([scale]).correct("velocity", mixed)
     np.testing.assert_array_equal(corrected.yaw_rate_std, std)
     np.testing.assert_allclose(corrected.yaw_rate[~some], 0.4)
     np.testing.assert_array_equal(corrected.v, v)

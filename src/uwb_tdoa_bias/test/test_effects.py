@@ -33,8 +33,8 @@ from uwb_tdoa_bias.effects import (
     ImuSamples,
     LabelEffect,
     Track,
-    aid_samples,
     samples_at,
+    sensor_samples,
     true_samples,
 )
 from uwb_tdoa_bias.effects.stamps import StampEffect
@@ -72,7 +72,7 @@ def flight_with_all(seed, n=400):
     track, late = Track(truth), t[10:-10:5] + 0.01
     row = np.arange(len(late)) % 5
     d = np.linalg.norm(track.positions(late) - ANCHORS.positions[row], axis=1)
-    reading = {name: aid_samples(name, t, track, t[0]).reading for name in BY_POSE}
+    reading = {name: sensor_samples(name, t, track, t[0]).reading for name in BY_POSE}
     return Flight(
         "f",
         ANCHORS,
@@ -131,7 +131,7 @@ def samples_of(flight, channel):
     """Samples of a sensor of a Flight for effects on it."""
     track = Track(flight.truth)
     if channel in BY_POSE:
-        return aid_samples(channel, measured_on(flight, channel).t, track, flight.tdoa.t[0])
+        return sensor_samples(channel, measured_on(flight, channel).t, track, flight.tdoa.t[0])
     t, reading = flight.imu.t, getattr(flight.imu, channel)
     up = Rotation.from_quat(track.attitudes(t)).inv().apply([0.0, 0.0, 1.0])
     unused = None

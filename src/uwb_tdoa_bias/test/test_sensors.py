@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.anchors import Anchors
-from uwb_tdoa_bias.common.flight import AIDS, Flight, Tdoas
+from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Flight, Tdoas
 from uwb_tdoa_bias.common.sensors import (
     SENSORS,
     STREAM_OF,
@@ -59,7 +59,7 @@ def of_message(sensor, stream):
 
 def test_a_flight_has_a_stream_of_each():
     flight = Flight("f", None, Tdoas(T, T, T, T), **STREAMS)
-    assert AIDS == tuple(SENSORS)
+    assert SENSOR_NAMES == tuple(SENSORS)
     assert all(
         getattr(flight, name) is stream and getattr(flight.without(name), name) is None
         for name, stream in STREAMS.items()

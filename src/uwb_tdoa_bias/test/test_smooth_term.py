@@ -9,7 +9,7 @@ import yaml
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.effects import RADIO, EffectSet, SmoothTerm
-from uwb_tdoa_bias.effects.covariates import OF_AIDS, OF_ARRIVAL, OF_IMU, OF_TDOA, UNITS
+from uwb_tdoa_bias.effects.covariates import OF_ARRIVAL, OF_IMU, OF_SENSORS, OF_TDOA, UNITS
 from uwb_tdoa_bias.effects.smooth_term import SHAPES, causes, described, shape_basis
 
 KNOTS = {2: (1.0, 3.0), 3: (1.0, 2.0, 3.0), 4: (1.0, 1.5, 2.5, 3.0)}
@@ -240,7 +240,7 @@ def test_every_function_has_causes_and_a_trial_that_tells(form):
 
 @pytest.mark.parametrize("channel", ["gyro.x", "accel.z"])
 def test_every_function_of_a_sensor_has_causes(channel):
-    for covariate in (*OF_IMU, *OF_AIDS):
+    for covariate in (*OF_IMU, *OF_SENSORS):
         assert all(causes(SmoothTerm(channel=channel, covariate=covariate, knots=(0.0, 1.0))))
 
 

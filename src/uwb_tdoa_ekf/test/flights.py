@@ -115,7 +115,7 @@ def fly(
     )
 
 
-def with_aids(
+def with_sensors(
     flight, seed=0, rate=25.0, height_std=0.01, pressure_std=0.05, drift=0.0, velocity_std=0.05
 ):
     """The flight of `fly` with a range finder over ground at z = 0, a barometer that drifts by

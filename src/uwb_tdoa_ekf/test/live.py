@@ -4,12 +4,12 @@ from dataclasses import fields, replace
 
 import numpy as np
 
-from uwb_tdoa_ekf.core.aids import STREAMS
+from uwb_tdoa_ekf.core.sensors import STREAMS
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.results import VERDICTS
 
-IMU, TDOA, FIRST_AID = range(3)
+IMU, TDOA, FIRST_SENSOR = range(3)
 
 
 def messages(flight):
@@ -27,7 +27,7 @@ def send(estimator, flight, stream, i):
     elif stream == TDOA:
         estimator.add_tdoa(tdoa.t[i], tdoa.a[i], tdoa.b[i], tdoa.d[i])
     else:
-        name = STREAMS[stream - FIRST_AID]
+        name = STREAMS[stream - FIRST_SENSOR]
         part = getattr(flight, name)
         estimator.add(name, type(part)(*(column[i : i + 1] for column in part.columns)))
 

@@ -432,7 +432,7 @@ class Rig:
         )
         self.send("odometry", message, t, "map", epoch)
 
-    def send_aid(self, topic, flight, i, epoch=EPOCH):
+    def send_sensor(self, topic, flight, i, epoch=EPOCH):
         """Measurement i of a Flight's height, pressure or velocity, on one of their topics."""
         part = getattr(flight, topic.partition("/")[0])
         message = STREAMS[topic]()
@@ -448,19 +448,19 @@ class Rig:
             message.twist.covariance = content["twist.covariance"][0]
         self.send(topic, message, part.t[i], epoch=epoch)
 
-    def play(self, flight, epoch=EPOCH, ahead=0.025, send_tdoa=None, aids=()):
+    def play(self, flight, epoch=EPOCH, ahead=0.025, send_tdoa=None, sensors=()):
         """Send a Flight in stamp order, never more than `ahead` s of stamps beyond what the nodes
         have made of it.
 
         Returns when every TDOA but those of the last `ahead` s has its residual. (Much further
         ahead than that, the result would depend on timing while the filter starts: bias_node cannot
         know yet that there will be poses.)
-        aids : topics of height, pressure or velocity to play too.
+        sensors : topics of height, pressure or velocity to play too.
         """
         imu, tdoa = flight.imu, flight.tdoa
-        of_aids = sorted(
+        of_sensors = sorted(
             (t, topic, i)
-            for topic in aids
+            for topic in sensors
             for i, t in enumerate(getattr(flight, topic.partition("/")[0]).t)
         )
         before, i = len(self.residuals), 0
@@ -468,8 +468,8 @@ class Rig:
             while i < len(imu) and imu.t[i] <= t:
                 self.send_imu(imu.t[i], imu.gyro[i], imu.accel[i], epoch)
                 i += 1
-            while of_aids and of_aids[0][0] <= t:
-                self.send_aid(*of_aids[0][1:2], flight, of_aids.pop(0)[2], epoch)
+            while of_sensors and of_sensors[0][0] <= t:
+                self.send_sensor(*of_sensors[0][1:2], flight, of_sensors.pop(0)[2], epoch)
             (send_tdoa or self.send_tdoa)(
                 t, tdoa.a[k], tdoa.b[k], tdoa.d[k], epoch, tdoa.variance[k]
             )

@@ -13,7 +13,7 @@ pytest.importorskip("uwb_tdoa_msgs.msg")
 from dataclasses import replace  # noqa: E402
 
 from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
-from flights import corners, with_aids  # noqa: E402
+from flights import corners, with_sensors  # noqa: E402
 from rig import MODULES, PATIENCE, make_rig, recording, seconds_of, stamp  # noqa: E402, F401
 from sensor_msgs.msg import Imu  # noqa: E402
 
@@ -213,7 +213,7 @@ def test_height_pressure_and_velocity_are_used_where_they_are_there(
     rig, file = make_rig(), tmp_path / "effects.yaml"
     file.write_text(effects)
     rig.start("ekf_node", ekf_node=["-p", f"effects_file:={file}"])
-    effects, flight = EffectSet.from_yaml(file), with_aids(recording(3.0), rate=50.0)
+    effects, flight = EffectSet.from_yaml(file), with_sensors(recording(3.0), rate=50.0)
     for effect in effects.effects:
         flight = effect.inject(flight)
     if topic == "velocity/odometry":  # wheels whose driver states no variance
@@ -232,16 +232,16 @@ def test_height_pressure_and_velocity_are_used_where_they_are_there(
     for each in topics:
         rig.add_publisher(each)
     rig.send_anchors(flight.anchors)
-    rig.play(flight, send_tdoa=rig.send_corrected, ahead=0.1, aids=topics)
+    rig.play(flight, send_tdoa=rig.send_corrected, ahead=0.1, sensors=topics)
     counts = rig.counts("ekf_node", TDOAs_received=len(flight.tdoa))
     verdicts = ("used", "rejected", "late", "invalid", "startup", "waiting")
-    for aid in ("height", "pressure", "velocity"):
+    for sensor in ("height", "pressure", "velocity"):
         assert (
-            sum(counts[f"{aid}_{verdict}"] for verdict in verdicts)
-            == counts[f"{aid}_received"]
+            sum(counts[f"{sensor}_{verdict}"] for verdict in verdicts)
+            == counts[f"{sensor}_received"]
             > 100
         )
-        assert counts[f"{aid}_used"] > 50
+        assert counts[f"{sensor}_used"] > 50
     assert counts["height_invalid"] == 1
     values = {entry.key: entry.value for entry in rig.fresh_status("ekf_node").values}
     said = {"velocity": "the messages", "velocity/odometry": "velocity_std, yaw_rate_std"}

@@ -3,11 +3,11 @@
 from dataclasses import fields, replace
 import math
 
-from flights import corners, fly, position_at, with_aids
+from flights import corners, fly, position_at, with_sensors
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from live import (
-    FIRST_AID,
+    FIRST_SENSOR,
     IMU,
     TDOA,
     arriving,
@@ -49,16 +49,16 @@ def received(estimator):
     ) + tdoa
 
 
-AIDS = "height", "pressure", "velocity"
+SENSOR_NAMES = "height", "pressure", "velocity"
 
 
-def assert_aids_as_offline(flight, config=None, **feeding):
+def assert_sensors_as_offline(flight, config=None, **feeding):
     estimator = Estimator(flight.anchors, config)
     odometry, _ = feed(estimator, flight, **feeding)
     expected = run_offline(flight, config)
     assert_same(odometry, expected.odometry)
-    for name in AIDS:
-        verdicts = expected.aids[name]["verdict"].tolist()
+    for name in SENSOR_NAMES:
+        verdicts = expected.sensors[name]["verdict"].tolist()
         counts = {said: estimator.counts[f"{name}_{said}"] for said in VERDICTS.values()}
         assert (
             counts == {said: verdicts.count(value) for value, said in VERDICTS.items()}
@@ -68,7 +68,7 @@ def assert_aids_as_offline(flight, config=None, **feeding):
 
 
 def spoiled(flight):
-    """Some of every aid cannot be measurements."""
+    """Some of every sensor cannot be measurements."""
     height, pressure, velocity = flight.height, flight.pressure, flight.velocity
     height.range[10:13], pressure.pressure[10:12], velocity.v[10] = (
         [np.nan, np.inf, -1.0],
@@ -80,25 +80,25 @@ def spoiled(flight):
 
 @settings(max_examples=5)
 @given(seeds, st.floats(0.0, 0.2))
-def test_with_aids_too_skew_changes_nothing(seed, delay):
-    flight, rng = spoiled(with_aids(fly(2, 2.0))), np.random.default_rng(seed)
+def test_with_sensors_too_skew_changes_nothing(seed, delay):
+    flight, rng = spoiled(with_sensors(fly(2, 2.0))), np.random.default_rng(seed)
     order = arriving(flight, rng, imu_delay=delay)
-    estimator = assert_aids_as_offline(flight, order=order, advance=lambda: rng.random() < 0.3)
-    assert [estimator.counts[f"{name}_invalid"] for name in AIDS] == [3, 2, 1]
+    estimator = assert_sensors_as_offline(flight, order=order, advance=lambda: rng.random() < 0.3)
+    assert [estimator.counts[f"{name}_invalid"] for name in SENSOR_NAMES] == [3, 2, 1]
 
 
 @settings(max_examples=5)
 @given(seeds)
 def test_batches_are_what_their_messages_are_one_by_one(seed):
-    flight, rng, parts = spoiled(with_aids(fly(2, 2.0))), np.random.default_rng(seed), []
+    flight, rng, parts = spoiled(with_sensors(fly(2, 2.0))), np.random.default_rng(seed), []
     estimator, cut = Estimator(flight.anchors), flight.imu.t[0]
     while cut <= flight.imu.t[-1]:
         before, cut = cut, cut + rng.choice([0.001, 0.01, 0.1])
-        for name in ("imu", "tdoa", *AIDS):
+        for name in ("imu", "tdoa", *SENSOR_NAMES):
             part = getattr(flight, name)
             some = (part.t >= before) & (part.t < cut)
             columns = [column[some] for key, column in vars(part).items() if key != "variance"]
-            if some.any() and name in AIDS:
+            if some.any() and name in SENSOR_NAMES:
                 estimator.add(name, type(part)(*columns))
             elif some.any():
                 getattr(estimator, f"add_{name}")(*columns)
@@ -108,11 +108,11 @@ def test_batches_are_what_their_messages_are_one_by_one(seed):
     assert {name: estimator.counts[name] for name in VERDICTS.values()} == expected.counts
 
 
-def test_an_aid_that_stops_is_waited_for_for_half_of_the_lag_and_after_a_second_done_without():
-    flight = with_aids(fly(3, 6.0))
+def test_an_sensor_that_stops_is_waited_for_for_half_of_the_lag_and_after_a_second_done_without():
+    flight = with_sensors(fly(3, 6.0))
     estimator, behind = Estimator(flight.anchors), {}
     for t, stream, i in messages(flight):
-        if stream in (IMU, TDOA) or (stream == FIRST_AID and t < 2.0):
+        if stream in (IMU, TDOA) or (stream == FIRST_SENSOR and t < 2.0):
             send(estimator, flight, stream, i)
             odometry, _ = estimator.advance()
             if len(odometry):
@@ -126,10 +126,11 @@ def test_an_aid_that_stops_is_waited_for_for_half_of_the_lag_and_after_a_second_
     )
 
 
-def test_an_aid_that_is_not_used_changes_nothing():
-    flight = with_aids(fly(1, 3.0))
+def test_an_sensor_that_is_not_used_changes_nothing():
+    flight = with_sensors(fly(1, 3.0))
     odometry, _ = feed(
-        Estimator(flight.anchors, FilterConfig(**{f"use_{name}": False for name in AIDS})), flight
+        Estimator(flight.anchors, FilterConfig(**{f"use_{name}": False for name in SENSOR_NAMES})),
+        flight,
     )
     assert_same(odometry, run_offline(fly(1, 3.0)).odometry)
 
@@ -542,7 +543,7 @@ def test_a_tag_without_tdoas_is_lost_once_it_may_be_anywhere_and_found_when_they
 def test_a_tag_whose_velocity_is_measured_is_not_lost_without_tdoas():
     flight = without_tdoas(
         replace(
-            with_aids(fly(3, 45.0, imu_rate=50.0, tdoa_rate=100.0)), height=None, pressure=None
+            with_sensors(fly(3, 45.0, imu_rate=50.0, tdoa_rate=100.0)), height=None, pressure=None
         ),
         5.0,
         40.0,

@@ -172,7 +172,7 @@ def test_a_tag_outside_of_the_flyable_volume_is_a_warning(clock):
     assert last[0] == OK  # it has come back
 
 
-def test_an_aid_that_stops_is_told_and_so_is_one_that_contradicts(clock):
+def test_an_sensor_that_stops_is_told_and_so_is_one_that_contradicts(clock):
     judge, counts = health.Health(FilterConfig(), 0.25), Counter(used=1)
     for _ in range(3):
         judge.received["height"] += 25

@@ -188,7 +188,7 @@ def test_a_rover_over_topics_is_that_of_the_offline_engine_to_the_bit(make_rig, 
     )
     rig.add_publisher("velocity/odometry")
     rig.send_anchors(flight.anchors)
-    rig.play(flight, aids=["velocity/odometry"])
+    rig.play(flight, sensors=["velocity/odometry"])
     ekf = rig.counts("ekf_node", TDOAs_received=len(flight.tdoa))
     assert ekf["velocity_used"] > 0.8 * len(flight.velocity) and ekf["velocity_late"] == 0
     assert ekf["late"] == ekf["invalid"] == ekf["restarts"] == 0

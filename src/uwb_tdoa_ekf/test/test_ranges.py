@@ -14,20 +14,20 @@ from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_ekf.anchor_table import AnchorTable
 from uwb_tdoa_ekf.core import ranges
-from uwb_tdoa_ekf.core.aids import STREAMS
 from uwb_tdoa_ekf.core.auxiliary import RANGE
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.memory import (
-    AID,
     IMU_SAMPLE,
     INVALID,
     ODOMETRY,
     REPEATED,
+    SENSOR_ROW,
     USED,
     Measurements,
     new_state,
 )
 from uwb_tdoa_ekf.core.memory import TDOA as TDOA_ROW
+from uwb_tdoa_ekf.core.sensors import STREAMS
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.offline import run_offline, without_offset
 from uwb_tdoa_ekf.pipeline import SLICE, RadioCorrections
@@ -46,7 +46,7 @@ def ranged():
 def test_ranges_alone_start_the_filter_and_hold_it(ranged):
     run = run_offline(ranged)
     assert len(run.odometry) > 100 and error(ranged, run.odometry) < STD
-    verdict = run.aids["range"]["verdict"]
+    verdict = run.sensors["range"]["verdict"]
     assert np.mean(verdict == USED) > 0.9 and not np.any(verdict == INVALID)
     assert error(ranged, run_offline(ranged, FilterConfig(use_imu=False)).odometry) < 3.0 * STD
 
@@ -62,7 +62,7 @@ def test_live_is_off_line(ranged, offset_std):
     odometry, _ = feed(estimator, ranged)
     expected = run_offline(ranged, config)
     assert_same(odometry, expected.odometry)
-    assert estimator.counts["range_used"] == np.sum(expected.aids["range"]["verdict"] == USED)
+    assert estimator.counts["range_used"] == np.sum(expected.sensors["range"]["verdict"] == USED)
 
 
 def test_without_an_imu_time_goes_on_by_ranges(ranged):
@@ -77,10 +77,10 @@ def test_what_is_no_range_is_counted(ranged):
     n = len(ranged.range)
     wrong = replace(ranged.range, anchor=np.where(np.arange(n) % 10 == 0, 999, ranged.range.anchor))
     run = run_offline(replace(ranged, range=wrong))
-    assert np.sum(run.aids["range"]["verdict"] == INVALID) == len(range(0, n, 10))
+    assert np.sum(run.sensors["range"]["verdict"] == INVALID) == len(range(0, n, 10))
     twice = Ranges(*(np.repeat(column, 2, axis=0) for column in ranged.range.columns))
     run = run_offline(replace(ranged, range=twice))
-    assert np.sum(run.aids["range"]["verdict"] == REPEATED) == n
+    assert np.sum(run.sensors["range"]["verdict"] == REPEATED) == n
 
 
 def test_outliers_are_not_used(ranged):
@@ -95,12 +95,12 @@ def test_outliers_are_not_used(ranged):
 def test_the_jacobian_is_that_of_the_distance():
     state, parameters = new_state(np.zeros((1, 3))), FilterConfig().parameters()[0]
     hypothesis, innovation = state.record.hypotheses[0], state.record.innovation
-    aid, anchor = np.zeros(1, AID)[0], np.array([1.0, -2.0, 3.0])
-    aid["value"][0], x = 4.0, np.array([0.5, 0.7, -0.2])
+    sensor, anchor = np.zeros(1, SENSOR_ROW)[0], np.array([1.0, -2.0, 3.0])
+    sensor["value"][0], x = 4.0, np.array([0.5, 0.7, -0.2])
 
     def compared(p):
         hypothesis["x"][:3] = p
-        ranges.compare(hypothesis, anchor, aid, parameters, innovation)
+        ranges.compare(hypothesis, anchor, sensor, parameters, innovation)
         return innovation["value"]
 
     compared(x)
@@ -114,7 +114,7 @@ def test_the_jacobian_is_that_of_the_distance():
 
 def test_two_ranges_make_a_tdoa():
     state = new_state(np.zeros((3, 3)))
-    one, two = np.zeros(2, AID)
+    one, two = np.zeros(2, SENSOR_ROW)
     one["t"], one["anchor"], one["value"][0], one["std"][0] = 1.0, 2, 3.0, 0.3
     two["t"], two["anchor"], two["value"][0], two["std"][0] = 1.05, 1, 4.5, 0.4
     assert not ranges.pair(state.ekf[0], one) and ranges.pair(state.ekf[0], two)
@@ -199,7 +199,7 @@ def test_what_is_known_of_ranges_is_taken_out_live_as_off_line():
 
 def measured(t, anchor, value):
     """Measurements of ranges alone."""
-    rows = np.zeros(len(t), AID)
+    rows = np.zeros(len(t), SENSOR_ROW)
     rows["t"], rows["kind"], rows["anchor"], rows["value"][:, 0] = (
         t,
         STREAMS.index("range"),
@@ -224,8 +224,8 @@ def test_a_slice_is_corrected_at_the_last_pose_before_it():
     t = np.array([0.01, 0.02, SLICE + 0.01, SLICE + 0.02, 2 * SLICE + 0.01])
     found = []
     for k, part in enumerate(corrections.slices(measured(t, np.ones(5, int), np.full(5, 4.0)))):
-        found.append(part.aids)
-        corrections.add_odometry(odometry_at(part.aids["t"][-1:], places[min(k, 1)]))
+        found.append(part.sensors)
+        corrections.add_odometry(odometry_at(part.sensors["t"][-1:], places[min(k, 1)]))
     assert [part["t"].tolist() for part in found] == [
         t[:2].tolist(),
         t[2:4].tolist(),
@@ -246,7 +246,7 @@ def test_ranges_of_anchors_that_are_gone_stay_as_they_are_and_others_keep_their_
     (part,) = corrections.slices(
         measured(np.array([0.01, 0.02, 0.03]), np.array([0, 1, 3]), np.full(3, 4.0))
     )
-    np.testing.assert_allclose(part.aids["value"][:, 0], [4.0, 4.0, 3.9])
+    np.testing.assert_allclose(part.sensors["value"][:, 0], [4.0, 4.0, 3.9])
 
 
 def test_what_does_not_act_on_ranges_leaves_everything_in_one_piece():
@@ -260,7 +260,7 @@ def test_what_does_not_act_on_ranges_leaves_everything_in_one_piece():
 def test_what_is_fed_is_not_changed():
     given = measured(np.array([0.01]), np.array([0]), np.array([4.0]))
     (part,) = RadioCorrections(EffectSet((DELAY,)), AnchorTable(BOX)).slices(given)
-    assert given.aids["value"][0, 0] == 4.0 and part.aids["value"][0, 0] == pytest.approx(3.7)
+    assert given.sensors["value"][0, 0] == 4.0 and part.sensors["value"][0, 0] == pytest.approx(3.7)
 
 
 def test_what_comes_at_once_and_one_by_one_is_corrected_alike():
@@ -272,8 +272,8 @@ def test_what_comes_at_once_and_one_by_one_is_corrected_alike():
         out = []
         for part in parts:
             for piece in corrections.slices(part):
-                out += piece.aids["value"][:, 0].tolist()
-                last = piece.aids["t"][-1:]
+                out += piece.sensors["value"][:, 0].tolist()
+                last = piece.sensors["t"][-1:]
                 corrections.add_odometry(odometry_at(last, last - t[0]))
         return out
 
@@ -290,7 +290,7 @@ def test_what_holds_no_distances_is_one_part_and_distances_after_it_are_correcte
     t = 1.7e9 + np.arange(12) / 100.0
     imu = np.zeros(len(t), IMU_SAMPLE)
     imu["t"] = t
-    given = Measurements(imu, np.empty(0, TDOA_ROW), np.empty(0, AID))
+    given = Measurements(imu, np.empty(0, TDOA_ROW), np.empty(0, SENSOR_ROW))
     later = [measured(t[-1:] + after, np.ones(1, int), np.full(1, 4.0)) for after in (0.001, SLICE)]
 
     def corrected(parts):
@@ -299,8 +299,8 @@ def test_what_holds_no_distances_is_one_part_and_distances_after_it_are_correcte
             pieces = 0
             for piece in corrections.slices(part):
                 pieces += 1
-                out += piece.aids["value"][:, 0].tolist()
-                stamps = np.concatenate([piece.imu["t"], piece.aids["t"]])
+                out += piece.sensors["value"][:, 0].tolist()
+                stamps = np.concatenate([piece.imu["t"], piece.sensors["t"]])
                 corrections.add_odometry(odometry_at(stamps, (stamps - t[0])[:, None]))
             assert pieces == 1
         return out

@@ -12,12 +12,12 @@ import pytest
 
 from uwb_tdoa_bias.common.flight import Tdoas
 from uwb_tdoa_bias.common.stamps import MOST_HELD
-from uwb_tdoa_ekf.core.memory import AID, IMU_SAMPLE, INVALID, LATE
+from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, INVALID, LATE, SENSOR_ROW
 from uwb_tdoa_ekf.core.memory import TDOA as TDOA_ROW
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.monitoring.filter_findings import clock_ahead, restarted
 from uwb_tdoa_ekf.reorder_buffer import (
-    FIRST_AID,
+    FIRST_SENSOR,
     IMU_STREAM,
     MOST_WAITING,
     SILENT,
@@ -147,7 +147,7 @@ def test_a_silent_stream_is_waited_for_no_longer_than_lag_and_a_sensor_only_wher
     buffer, *_ = buffer_of(use_imu=False, reorder=0.0)
     buffer.add(TDOA_STREAM, *rows(TDOA_ROW, *np.arange(0.0, 3.0, 0.5)))
     assert buffer.watermark == 2.5
-    buffer.add(FIRST_AID, *rows(AID, 2.5 - 0.9 * SILENT))
+    buffer.add(FIRST_SENSOR, *rows(SENSOR_ROW, 2.5 - 0.9 * SILENT))
     assert buffer.watermark == 2.5 - 0.5  # half of lag
     buffer.add(TDOA_STREAM, *rows(TDOA_ROW, 3.0))
     assert buffer.watermark == 3.0
@@ -191,13 +191,13 @@ def test_a_stream_that_falls_back_starts_anew_and_what_waited_is_late():
 
 def test_of_a_recording_nothing_is_late():
     buffer = ReorderBuffer.of_recording()
-    buffer.load(FIRST_AID + 1, rows(AID, 1.0, 2.0)[0])
-    buffer.load(FIRST_AID, rows(AID, 1.5, 2.0)[0])
+    buffer.load(FIRST_SENSOR + 1, rows(SENSOR_ROW, 1.0, 2.0)[0])
+    buffer.load(FIRST_SENSOR, rows(SENSOR_ROW, 1.5, 2.0)[0])
     buffer.load(TDOA_STREAM, rows(TDOA_ROW, 0.0, 3.0)[0])
-    assert buffer.take(1.0).aids["t"].tolist() == [1.0] and buffer.used_until == 1.0
+    assert buffer.take(1.0).sensors["t"].tolist() == [1.0] and buffer.used_until == 1.0
     buffer.load(TDOA_STREAM, rows(TDOA_ROW, 3.0, 4.0)[0])
-    imu, tdoa, aids = buffer.take(math.inf)
-    assert (len(imu), tdoa["t"].tolist(), aids["t"].tolist()) == (
+    imu, tdoa, sensors = buffer.take(math.inf)
+    assert (len(imu), tdoa["t"].tolist(), sensors["t"].tolist()) == (
         0,
         [3.0, 3.0, 4.0],
         [1.5, 2.0, 2.0],
@@ -308,7 +308,7 @@ class Played:
             self.sent[place] = int(kept.sum())
         self.most_waiting, self.lowest_lead, self._measured = 0, 0.0, {}
         for self.now, place, t, measured in sorted(arrivals):
-            rows = np.zeros(1, KIND.get(place, AID))
+            rows = np.zeros(1, KIND.get(place, SENSOR_ROW))
             rows["t"] = t
             if place >= 2:
                 rows["kind"] = place - 2
@@ -325,11 +325,11 @@ class Played:
             self.refused[place] += len(rows)
 
     def _take(self, until):
-        imu, tdoa, aids = self.buffer.take(until)
+        imu, tdoa, sensors = self.buffer.take(until)
         parts = [
             (IMU_STREAM, imu),
             (TDOA_STREAM, tdoa),
-            *((2 + kind, aids[aids["kind"] == kind]) for kind in np.unique(aids["kind"])),
+            *((2 + kind, sensors[sensors["kind"] == kind]) for kind in np.unique(sensors["kind"])),
         ]
         for place, rows in parts:
             assert (np.diff(rows["t"]) >= 0.0).all()

@@ -5,7 +5,7 @@ wheels.
 from dataclasses import replace
 import math
 
-from flights import corners, fly, with_aids
+from flights import corners, fly, with_sensors
 from hypothesis import given
 from hypothesis import strategies as st
 from live import assert_same, feed, joined, messages, send
@@ -172,7 +172,7 @@ def test_what_cannot_move_sideways(rover):
 
 def test_messages_without_a_variance_are_used_with_the_deviation_of_the_parameter(rover):
     silent = run_offline(rover, PLANAR)
-    assert (silent.aids["velocity"]["verdict"] == USED).mean() > 0.8
+    assert (silent.sensors["velocity"]["verdict"] == USED).mean() > 0.8
     n, config = len(rover.velocity), FilterConfig()
     stated = replace(
         rover.velocity,
@@ -326,7 +326,7 @@ def test_a_turn_about_the_vertical(seed, angle):
 
 def test_wheels_that_turn_evenly_are_not_stuck():
     """A simulated rover drives straight at one speed: its wheels repeat a value."""
-    flight = with_aids(fly(2, 6.0, anchors=corners()))
+    flight = with_sensors(fly(2, 6.0, anchors=corners()))
     t = flight.velocity.t
     even = Velocity(
         t,
@@ -337,6 +337,6 @@ def test_wheels_that_turn_evenly_are_not_stuck():
     )
     for velocity, used in ((even, 1.0), (Velocity(t, even.v, even.std), 0.0)):
         assert (
-            run_offline(flight.replaced(velocity=velocity)).aids["velocity"]["verdict"][t > 3.0]
+            run_offline(flight.replaced(velocity=velocity)).sensors["velocity"]["verdict"][t > 3.0]
             == USED
         ).mean() == used

@@ -1,6 +1,6 @@
 from dataclasses import replace
 
-from flights import fly, with_aids, with_ranges
+from flights import fly, with_ranges, with_sensors
 import numpy as np
 import pytest
 from scipy.sparse import csr_array
@@ -28,7 +28,7 @@ SETTLED = 4.0
 @pytest.mark.parametrize("imu, aided", [(False, False), (True, True)])
 def test_derivatives_are_those_of_two_runs(imu, aided):
     flight, step = fly(seed=3, duration=8.0, tdoa_std=0.02), 1e-4
-    flight = with_aids(flight) if aided else flight
+    flight = with_sensors(flight) if aided else flight
     config = replace(PLAIN, use_imu=imu)
     keys = [str(i) for i in flight.anchors.ids[:3]]
     found = record_innovations(flight, config)
@@ -68,7 +68,7 @@ def test_what_the_position_can_follow_leaves_little_trace():
 @pytest.mark.parametrize("aided", [False, True])
 def test_every_used_tdoa_is_found_in_the_history(aided):
     flight = fly(seed=5, duration=6.0, outliers=0.1)
-    flight = with_aids(flight) if aided else flight
+    flight = with_sensors(flight) if aided else flight
     found = record_innovations(flight)
     places = np.concatenate(found.of)
     assert sorted(places[places >= 0].tolist()) == list(range(len(found.rows)))

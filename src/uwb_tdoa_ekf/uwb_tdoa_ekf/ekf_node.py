@@ -28,7 +28,7 @@ from std_srvs.srv import Trigger
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flyable import FlyableVolume
 from uwb_tdoa_bias.common.sensors import SENSORS
-from uwb_tdoa_bias.effects import AidCorrector, EffectSet, ImuCorrector
+from uwb_tdoa_bias.effects import EffectSet, ImuCorrector, SensorCorrector
 from uwb_tdoa_bias.effects.tag import TagLeverArm
 from uwb_tdoa_bias.ros import process
 from uwb_tdoa_bias.ros.anchors import AnchorsInput
@@ -136,7 +136,7 @@ class EkfNode(StreamNode):
             )
         volume, effects_file = own["flyable_volume"], own["effects_file"]
         self._effects = EffectSet.from_yaml(effects_file) if effects_file else EffectSet()
-        self._aid_corrector = AidCorrector(self._effects.effects)
+        self._sensor_corrector = SensorCorrector(self._effects.effects)
         self._estimator: Estimator = None  # type: ignore[assignment]  # None until anchors arrive
         self._said_restart: Finding | None = None
         self._epoch, self._ros_clock = Epoch(), cast("ROSClock", self.get_clock())
@@ -427,7 +427,7 @@ class EkfNode(StreamNode):
         stream = sensor.read(t, {field: rows[field] for field in sensor.fields})
         if sensor.assumed is not None:
             self._assumed[name] = sensor.assumed(stream)
-        self._estimator.add(name, self._aid_corrector.correct(name, stream))
+        self._estimator.add(name, self._sensor_corrector.correct(name, stream))
 
     def _say_restart(self) -> None:
         """Log why the filter has restarted, once per restart."""
@@ -563,17 +563,18 @@ class EkfNode(StreamNode):
         values |= {name: counts[name] for name in ("imu_used", "imu_late", "imu_invalid")}
         values |= {"imu_waiting": waiting["imu"], "odometry published": self.outputs.published}
         values |= {name: counts[name] for name in ("recoveries", "restarts", "yaw_doubts")}
-        for aid in SENSORS:
+        for stream in SENSORS:
             values |= {
-                f"{aid}_received": self._health.received[aid],
-                f"{aid}_waiting": waiting[aid],
+                f"{stream}_received": self._health.received[stream],
+                f"{stream}_waiting": waiting[stream],
             }
             values |= {
-                f"{aid}_{verdict}": counts[f"{aid}_{verdict}"] for verdict in VERDICTS.values()
+                f"{stream}_{verdict}": counts[f"{stream}_{verdict}"]
+                for verdict in VERDICTS.values()
             }
         values |= {
-            f"{aid} deviations of": ", ".join(names) or "the messages"
-            for aid, names in self._assumed.items()
+            f"{stream} deviations of": ", ".join(names) or "the messages"
+            for stream, names in self._assumed.items()
         }
         values |= {f"lost on {name}": end.lost for name, end in self.streams.inputs.items()}
         values |= {

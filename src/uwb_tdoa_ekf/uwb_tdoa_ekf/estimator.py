@@ -13,18 +13,18 @@ from uwb_tdoa_bias.common.stamps import LARGEST_STEP_BACK
 from uwb_tdoa_bias.effects import EffectSet
 
 from .anchor_table import MOST_ROWS, AnchorTable
-from .core import aids
+from .core import sensors
 from .core.config import FilterConfig
 from .core.engine import LOST_TIME
 from .core.height import LONGEST_GAP
-from .core.measurements import aid_rows, imu_rows, usable_tdoas
+from .core.measurements import imu_rows, sensor_rows, usable_tdoas
 from .core.memory import (
-    AID,
     IMU_SAMPLE,
     INVALID,
     N_YAWS,
     ODOMETRY,
     POSE,
+    SENSOR_ROW,
     TDOA,
     USED,
     joined,
@@ -77,7 +77,7 @@ class Estimator:
         """Create an estimator without measurements.
 
         Streams that are added must already be corrected for all other effects (ImuCorrector,
-        AidCorrector, bias_node).
+        SensorCorrector, bias_node).
 
         Parameters
         ----------
@@ -92,15 +92,15 @@ class Estimator:
         """
         self._anchor_table, self._effects = AnchorTable(anchors), effects
         self.config = config or FilterConfig()
-        of_aids = [
-            f"{stream}_{verdict}" for stream in aids.STREAMS for verdict in VERDICTS.values()
+        of_sensors = [
+            f"{stream}_{verdict}" for stream in sensors.STREAMS for verdict in VERDICTS.values()
         ]
-        names = [*VERDICTS.values(), "imu_used", "imu_late", "imu_invalid", "restarts", *of_aids]
+        names = [*VERDICTS.values(), "imu_used", "imu_late", "imu_invalid", "restarts", *of_sensors]
         self.counts = dict.fromkeys(names, 0)
         self._refused: list[Residuals] = []
         # the inertial samples used last, and RATE_SAMPLES before them
         self._sensed = np.empty(0, IMU_SAMPLE)
-        self._wheels = np.empty(0, AID)  # yaw rates of wheels that were used last
+        self._wheels = np.empty(0, SENSOR_ROW)  # yaw rates of wheels that were used last
         self._buffer = ReorderBuffer(
             reorder, lag, self.config.use_imu, self._refuse, self._start_anew
         )
@@ -335,7 +335,7 @@ class Estimator:
     def add(self, name: str, stream: Stream) -> None:
         """Add a Stream of a sensor in SENSORS, its rows in the order of their arrival."""
         if getattr(self.config, f"use_{name}"):
-            self._add(STREAMS.index(name), *aid_rows(name, stream, self._anchor_table))
+            self._add(STREAMS.index(name), *sensor_rows(name, stream, self._anchor_table))
 
     def _add(self, stream: int, rows: np.ndarray, usable: np.ndarray) -> None:
         self.counts[f"{STREAMS[stream]}_invalid"] += len(usable) - int(usable.sum())
@@ -505,13 +505,15 @@ class Estimator:
         for part in parts:
             self.counts["imu_used"] += len(part.measured.imu)
             for kind, verdict in zip(
-                part.measured.aids["kind"].tolist(), part.aids["verdict"].tolist()
+                part.measured.sensors["kind"].tolist(), part.sensors["verdict"].tolist()
             ):
-                self.counts[f"{aids.STREAMS[kind]}_{VERDICTS[verdict]}"] += 1
+                self.counts[f"{sensors.STREAMS[kind]}_{VERDICTS[verdict]}"] += 1
         self._sensed = joined(
             IMU_SAMPLE, [self._sensed[-RATE_SAMPLES:], *(part.measured.imu for part in parts)]
         )
-        self._wheels = joined(AID, [self._wheels[-1:], *(_of_wheels(part) for part in parts)])
+        self._wheels = joined(
+            SENSOR_ROW, [self._wheels[-1:], *(_of_wheels(part) for part in parts)]
+        )
         residuals = concatenated([self._pipeline.residuals(parts), *self._refused])
         self._refused = []
         for verdict in residuals.verdict.tolist():
@@ -541,9 +543,9 @@ class Estimator:
 
 
 def _of_wheels(part: PipelineOutput) -> np.ndarray:
-    """Return the velocities with a yaw rate that the filter used, (n,) of AID."""
-    rows = part.measured.aids
-    used = (rows["kind"] == aids.VELOCITY) & (part.aids["verdict"] == USED)
+    """Return the velocities with a yaw rate that the filter used, (n,) of SENSOR_ROW."""
+    rows = part.measured.sensors
+    used = (rows["kind"] == sensors.VELOCITY) & (part.sensors["verdict"] == USED)
     out: np.ndarray = rows[used & (rows["std"][:, YAW_RATE] <= LONGEST_STD)]
     return out
 

@@ -12,14 +12,14 @@ from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet
 
 from .anchor_table import AnchorTable
-from .core.aids import STREAMS as AIDS
 from .core.config import FilterConfig
 from .core.hypotheses import yaw_offset
-from .core.measurements import aid_rows, imu_rows, usable_tdoas
-from .core.memory import AID, INVALID, RESIDUAL, TDOA, joined, structured
+from .core.measurements import imu_rows, sensor_rows, usable_tdoas
+from .core.memory import INVALID, RESIDUAL, SENSOR_ROW, TDOA, joined, structured
+from .core.sensors import STREAMS as SENSOR_NAMES
 from .frames import poses_of
 from .pipeline import Pipeline, odometry_of
-from .reorder_buffer import FIRST_AID, IMU_STREAM, TDOA_STREAM, ReorderBuffer
+from .reorder_buffer import FIRST_SENSOR, IMU_STREAM, TDOA_STREAM, ReorderBuffer
 from .results import VERDICTS, Odometry, Residuals
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ class Run:
         How often the filter detected divergence and initialized again.
     yaw_offset : float
         Start of the correct yaw hypothesis minus initial_yaw, in rad.
-    aids : dict
+    sensors : dict
         {stream: (m,) of RESIDUAL}, one row per measurement, for the SENSORS in the flight.
     range_offset : (float, float) or None
         Common offset of all ranges and its standard deviation, in m, when its variance was
@@ -63,7 +63,7 @@ class Run:
     bias_std: np.ndarray
     recoveries: int
     yaw_offset: float
-    aids: dict[str, np.ndarray]
+    sensors: dict[str, np.ndarray]
     range_offset: tuple[float, float] | None = None
 
     @property
@@ -135,8 +135,10 @@ def run_offline(
             corrector.add_pose(*poses_of(odometry_of(fed)))
     outcome = _verdicts(len(tdoa), np.concatenate(of_tdoas), [part.tdoas for part in parts])
     residuals = Residuals.from_rows(tdoa.t, tdoa.a, tdoa.b, outcome)
-    of_aids = joined(RESIDUAL, [part.aids for part in parts])
-    aids = {name: _verdicts(n, rows, [of_aids[ranks]]) for name, (n, rows, ranks) in places.items()}
+    of_sensors = joined(RESIDUAL, [part.sensors for part in parts])
+    sensors = {
+        name: _verdicts(n, rows, [of_sensors[ranks]]) for name, (n, rows, ranks) in places.items()
+    }
     ekf = pipeline.state.record
     offset, variance = ekf.range_offset.tolist()
     found = (offset, math.sqrt(variance)) if variance < math.inf else None
@@ -147,7 +149,7 @@ def run_offline(
         std,
         recoveries + int(ekf.recoveries),
         yaw_offset(int(ekf.best)),
-        aids,
+        sensors,
         found,
     )
 
@@ -204,19 +206,21 @@ def loaded(
         rows, usable = imu_rows(flight.imu.t, flight.imu.gyro, flight.imu.accel)
         buffer.load(IMU_STREAM, rows[usable])
     felt, kept_of = [], {}
-    for name in AIDS:
+    for name in SENSOR_NAMES:
         stream = getattr(flight, name)
         if stream is not None and getattr(config, f"use_{name}"):
-            rows, usable = aid_rows(name, stream, flight.anchors)
+            rows, usable = sensor_rows(name, stream, flight.anchors)
             (kept,) = np.nonzero(usable)
             kept = kept[np.argsort(rows["t"][kept], kind="stable")]
             felt.append(rows[kept])
             kept_of[name] = len(rows), kept
-    together = joined(AID, felt)  # merge into one stream, because one sort is faster than many
+    together = joined(
+        SENSOR_ROW, felt
+    )  # merge into one stream, because one sort is faster than many
     together = together[np.lexsort((together["kind"], together["t"]))]
-    buffer.load(FIRST_AID, together)
+    buffer.load(FIRST_SENSOR, together)
     return buffer, {
-        name: (*kept, np.flatnonzero(together["kind"] == AIDS.index(name)))
+        name: (*kept, np.flatnonzero(together["kind"] == SENSOR_NAMES.index(name)))
         for name, kept in kept_of.items()
     }
 

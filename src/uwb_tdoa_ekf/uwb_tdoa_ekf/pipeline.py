@@ -12,9 +12,9 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.samples import RADIO
 
 from .anchor_table import AnchorTable, forget, new_state_of
-from .core.aids import STREAMS
 from .core.engine import feed, set_pose
 from .core.memory import ODOMETRY, RESIDUAL, TDOA, FilterState, Measurements, joined
+from .core.sensors import STREAMS
 from .frames import poses_of
 from .monitoring.monitor import Monitor
 from .monitoring.slices import LENGTH
@@ -35,7 +35,7 @@ _NOWHERE = np.zeros(1, ODOMETRY)
 _NOWHERE["x"] = np.nan
 KINDS = {
     STREAMS.index(channel): kind for channel, kind in RADIO.items() if channel in STREAMS
-}  # {kind of AID: type of its samples}
+}  # {kind of SENSOR_ROW: type of its samples}
 
 
 class RadioCorrections:
@@ -91,7 +91,7 @@ class RadioCorrections:
         The caller must pass the odometry of each part to `add_odometry` before it asks for the
         next. Measurements without distances are one part, even a whole recording.
         """
-        if not len(measured.aids) or not self._ranged(measured.aids).any():
+        if not len(measured.sensors) or not self._ranged(measured.sensors).any():
             yield self._unchanged(measured)
             return
         of_rows = [np.floor(part["t"] / SLICE) for part in measured]
@@ -102,12 +102,12 @@ class RadioCorrections:
                 slice(*np.searchsorted(numbers, [number, number + 1.0])) for numbers in of_rows
             )
             now = Measurements(*(part[rows] for part, rows in zip(measured, inside)))
-            yield now._replace(aids=self._corrected(now))
+            yield now._replace(sensors=self._corrected(now))
 
     @staticmethod
-    def _ranged(aids: np.ndarray) -> np.ndarray:
-        """Return which of (m,) of AID are distances to anchors, (m,) bool."""
-        return np.isin(aids["kind"], list(KINDS))
+    def _ranged(sensors: np.ndarray) -> np.ndarray:
+        """Return which of (m,) of SENSOR_ROW are distances to anchors, (m,) bool."""
+        return np.isin(sensors["kind"], list(KINDS))
 
     def _unchanged(self, measured: Measurements) -> Measurements:
         """Return Measurements without distances unchanged and store their last slice."""
@@ -128,29 +128,29 @@ class RadioCorrections:
             Result of `_ranged`.
         """
         if math.isnan(self._start) and (len(measured.tdoa) or ranged.any()):
-            self._start = float(min([*measured.tdoa["t"][:1], *measured.aids["t"][ranged][:1]]))
+            self._start = float(min([*measured.tdoa["t"][:1], *measured.sensors["t"][ranged][:1]]))
 
     def _corrected(self, measured: Measurements) -> np.ndarray:
-        """Return the (m,) of AID of one slice, with the distances corrected."""
-        aids = measured.aids
-        self._begin(measured, self._ranged(aids))
+        """Return the (m,) of SENSOR_ROW of one slice, with the distances corrected."""
+        sensors = measured.sensors
+        self._begin(measured, self._ranged(sensors))
         _, p, q, _, yaw_std = poses_of(Odometry.from_rows(self._pose))
         for kind, corrector in self._correctors.items():
-            anchors, (rows,) = self._anchor_table.anchors, np.nonzero(aids["kind"] == kind)
-            at = anchors.index(self._anchor_table.ids[aids["anchor"][rows]])
+            anchors, (rows,) = self._anchor_table.anchors, np.nonzero(sensors["kind"] == kind)
+            at = anchors.index(self._anchor_table.ids[sensors["anchor"][rows]])
             rows, at = rows[at >= 0], at[at >= 0]
             if not len(rows):
                 continue
             n = len(rows)
             ps, qs, stds = np.repeat(p, n, axis=0), np.repeat(q, n, axis=0), np.repeat(yaw_std, n)
             samples = KINDS[kind](
-                aids["t"][rows], at, at, ps, qs, anchors, self._start, yaw_std=stds
+                sensors["t"][rows], at, at, ps, qs, anchors, self._start, yaw_std=stds
             )
             bias, std, _, _ = corrector.contribution(samples)
-            aids = aids.copy() if aids is measured.aids else aids
-            aids["value"][rows, 0] -= bias
-            aids["std"][rows, 0] = np.hypot(aids["std"][rows, 0], std)
-        return aids
+            sensors = sensors.copy() if sensors is measured.sensors else sensors
+            sensors["value"][rows, 0] -= bias
+            sensors["std"][rows, 0] = np.hypot(sensors["std"][rows, 0], std)
+        return sensors
 
 
 class PipelineOutput(NamedTuple):
@@ -162,14 +162,14 @@ class PipelineOutput(NamedTuple):
         Measurements that were used.
     odometry : (n,) array of ODOMETRY
         Odometry from these measurements.
-    tdoas, aids : (k,) and (m,) array of RESIDUAL
+    tdoas, sensors : (k,) and (m,) array of RESIDUAL
         Outcome of each TDOA and of each measurement of SENSORS.
     """
 
     measured: Measurements
     odometry: np.ndarray
     tdoas: np.ndarray
-    aids: np.ndarray
+    sensors: np.ndarray
 
 
 class Pipeline:

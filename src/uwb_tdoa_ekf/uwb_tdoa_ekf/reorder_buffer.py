@@ -17,15 +17,15 @@ from uwb_tdoa_bias.common.stamps import (
     usual_step,
 )
 
-from .core import aids
-from .core.memory import AID, IMU_SAMPLE, INVALID, LATE, TDOA, Measurements, joined
+from .core import sensors
+from .core.memory import IMU_SAMPLE, INVALID, LATE, SENSOR_ROW, TDOA, Measurements, joined
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-STREAMS = "imu", "tdoa", *aids.STREAMS
-KINDS = IMU_SAMPLE, TDOA, *[AID] * len(aids.STREAMS)
-IMU_STREAM, TDOA_STREAM, FIRST_AID = range(3)  # places in STREAMS
+STREAMS = "imu", "tdoa", *sensors.STREAMS
+KINDS = IMU_SAMPLE, TDOA, *[SENSOR_ROW] * len(sensors.STREAMS)
+IMU_STREAM, TDOA_STREAM, FIRST_SENSOR = range(3)  # places in STREAMS
 # the reference is among these streams; its stamps define the time
 LOCATING_STREAMS = (TDOA_STREAM, *map(STREAMS.index, LOCATING))
 VELOCITY_STREAM = STREAMS.index("velocity")
@@ -36,7 +36,7 @@ MOST_WAITING = 2000
 LATELY = 2.0
 SILENT = 1.0  # s of stamps after which the buffer stops waiting for a silent stream
 # share of `lag` for which the buffer waits for SENSORS; `hold` of bias_node must be much longer
-OF_AIDS = 0.5
+OF_SENSORS = 0.5
 TRIAL = 2.0  # s of stamps in order after which the buffer assumes that a stream stays in order
 # s, largest lead of each stream over the streams it is compared with. TDOAs that arrive 2 s after
 # inertial samples of the same time are still used. Other sensors are compared with inertial samples
@@ -44,7 +44,7 @@ TRIAL = 2.0  # s of stamps in order after which the buffer assumes that a stream
 LARGEST_LEADS = tuple(
     2.0 if place in (IMU_STREAM, *LOCATING_STREAMS) else 0.5 for place in range(len(STREAMS))
 )
-NO_AIDS = np.empty(0, AID)
+NO_SENSORS = np.empty(0, SENSOR_ROW)
 
 
 class Restart(NamedTuple):
@@ -180,9 +180,9 @@ class ReorderBuffer:
             silent = stream.gate.newest < newest - SILENT and newest > self.began + SILENT
             if not silent:
                 passed.append(max(stream.watermark(self.reorder), newest - self.lag))
-        for place, stream in enumerate(self._streams[FIRST_AID:], FIRST_AID):
+        for place, stream in enumerate(self._streams[FIRST_SENSOR:], FIRST_SENSOR):
             if newest - SILENT < stream.gate.newest < newest:
-                passed.append(max(stream.watermark(self.reorder), newest - OF_AIDS * self.lag))
+                passed.append(max(stream.watermark(self.reorder), newest - OF_SENSORS * self.lag))
             elif place in self._leading and stream.gate.newest >= newest:
                 passed.append(stream.watermark(self.reorder))
         leading = (self._streams[place] for place in self._leading)
@@ -247,7 +247,7 @@ class ReorderBuffer:
         """
         imu, tdoa, *parts = (stream.take(until) for stream in self._streams)
         parts = [part for part in parts if len(part)]
-        felt = joined(AID, parts) if parts else NO_AIDS
+        felt = joined(SENSOR_ROW, parts) if parts else NO_SENSORS
         felt = felt[np.lexsort((felt["kind"], felt["t"]))] if len(parts) > 1 else felt
         for part in (imu, tdoa, felt):
             if len(part):

@@ -249,10 +249,10 @@ def record_innovations(
     config = replace(config, **auxiliary.NONE)
     records = _Needed()
     run = run_offline(flight, config, corrector, records)
-    streams = [name for name in streams if name == TDOAS or name in run.aids]
+    streams = [name for name in streams if name == TDOAS or name in run.sensors]
     corrected = corrector.effects.correct_streams(flight)
     of_tdoas = structured(RESIDUAL, *(getattr(run.residuals, name) for name in OF_ROW))
-    sources = [of_tdoas if name == TDOAS else run.aids[name] for name in streams]
+    sources = [of_tdoas if name == TDOAS else run.sensors[name] for name in streams]
     outcomes = joined(RESIDUAL, sources)
     stamps = np.concatenate([getattr(corrected, name).t for name in streams])
     used = np.flatnonzero(outcomes["verdict"] == USED)

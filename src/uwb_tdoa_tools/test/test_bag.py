@@ -118,8 +118,8 @@ def flights(draw):
     std = draw(arrays(float, (len(t), 3), elements=st.sampled_from([0.5, 2.0, np.inf])))
     turns = draw(st.sampled_from([(), (values(len(t)), np.full(len(t), 0.5))]))
     velocity = draw(st.sampled_from([None, Velocity(t, values(len(t), 3), std, *turns)]))
-    aids = dict(height=height, pressure=pressure, velocity=velocity)
-    return Flight(name, anchors, tdoas, imu, truth, **aids)
+    sensors = dict(height=height, pressure=pressure, velocity=velocity)
+    return Flight(name, anchors, tdoas, imu, truth, **sensors)
 
 
 @settings(deadline=None, max_examples=15)

@@ -212,18 +212,18 @@ def test_pressures_and_velocities_that_are_not_finite(tmp_path, storage):
     t = np.array([10.0, 10.1])
     pressure = Pressure(t, np.array([101325.0, np.nan]))
     velocity = Velocity(t, np.array([[0.5, 0.0, 0.0], [0.0, np.inf, 0.0]]), np.full((2, 3), 0.1))
-    for aid, said in (
+    for sensor, said in (
         ({"pressure": pressure}, "/pressure, message 2 of 2 at 10.100 s: its number 1 is nan"),
         (
             {"velocity": velocity},
             "/velocity and /velocity/odometry, message 2 of 2 at 10.100 s: its number 2 is inf",
         ),
     ):
-        write_bag(replace(small_flight(0.1), **aid), tmp_path / "bag", storage, force=True)
+        write_bag(replace(small_flight(0.1), **sensor), tmp_path / "bag", storage, force=True)
         with pytest.raises(InputError, match=said):
             read_bag(tmp_path / "bag")
         back = read_bag(tmp_path / "bag", salvage=True)
-        (name,) = aid
+        (name,) = sensor
         assert len(getattr(back, name)) == 1 and len(back.meta["remarks"]) == 1
 
 

@@ -20,7 +20,7 @@ from uwb_tdoa_tools.scoring.metrics import position_at
 from uwb_tdoa_tools.simulation.config import NO_IMU_ERRORS
 
 SEEDS = 3, 4, 5
-WORLD = replace(HALL, aids=rover.AIDS)
+WORLD = replace(HALL, sensors=rover.SENSOR_NAMES)
 TASK = Task(WORLD, config=FilterConfig(**rover.FILTER), path=Waypoints())
 WALLS = 0.5 * np.array(HALL.size[:2])
 
@@ -128,7 +128,7 @@ def test_the_nearest_point_of_a_polyline(along, off):
 
 
 def test_it_drives_where_the_radio_is_silent_for_a_while():
-    silent = replace(WORLDS["silence-3s"], aids=rover.AIDS)
+    silent = replace(WORLDS["silence-3s"], sensors=rover.SENSOR_NAMES)
     one = rover.drive(replace(TASK, world=silent, seed=8))
     assert np.diff(one.flight.tdoa.t).max() > 2.9 and verdict_of(one)["arrived"]
     stamps = one.odometry.t[one.odometry.t > 5.0]
@@ -147,7 +147,7 @@ def rover_error(one, stamps):
     ("options", "said"),
     [
         (["--hover"], "--hover: is of the quadrotor"),
-        (["--aid", "height"], "--aid: is of the quadrotor"),
+        (["--sensor", "height"], "--sensor: is of the quadrotor"),
         (["--world", "table"], "does not start from a table"),
     ],
 )

@@ -5,7 +5,7 @@ import pytest
 
 from uwb_tdoa_bias.common.flight import Imu, Tdoas
 from uwb_tdoa_bias.common.radio import arrival_bias
-from uwb_tdoa_tools.flying.sensors import AIDS, InertialErrors, Radio, gusts
+from uwb_tdoa_tools.flying.sensors import SENSOR_NAMES, InertialErrors, Radio, gusts
 from uwb_tdoa_tools.flying.simulator import IMU_RATE, SensorReadings, Transport
 from uwb_tdoa_tools.flying.world import HALL, WORLDS
 from uwb_tdoa_tools.simulation.rooms import constellation
@@ -141,7 +141,7 @@ def test_other_sensors_say_what_is_true_but_for_their_noise():
         np.tile([np.sin(0.1), 0.0, 0.0, np.cos(0.1)], (100, 1)),
         np.ones((100, 3)),
     )
-    sensors = {name: kind(world, 0, 10.0) for name, kind in AIDS.items()}
+    sensors = {name: kind(world, 0, 10.0) for name, kind in SENSOR_NAMES.items()}
     (height,) = sensors["height"].measured(rows, p, q, v, p[:, 2] - 0.2)
     assert height.mean() == pytest.approx(
         1.0 / np.cos(0.2), abs=0.005

@@ -125,7 +125,7 @@ def test_it_is_flown_by_what_a_network_corrects(tmp_path):
     "name", ["table", "person", "three-kinds", "tdoa3", "jitter", "rectifying", "gusts"]
 )
 def test_every_world_can_be_flown_in(name):
-    world = replace(WORLDS[name], aids=("height", "pressure", "velocity"))
+    world = replace(WORLDS[name], sensors=("height", "pressure", "velocity"))
     flown = fly(
         Task(world, seed=1, path=Circles(turns=1, turn_time=2.0, radius=0.0), given="place")
     )

@@ -13,7 +13,7 @@ from std_msgs.msg import Float64  # noqa: E402
 
 from uwb_tdoa_bias.common.errors import InputError  # noqa: E402
 from uwb_tdoa_ekf.ekf_parameters import PARAMETERS  # noqa: E402
-from uwb_tdoa_ekf.reorder_buffer import OF_AIDS, SILENT  # noqa: E402
+from uwb_tdoa_ekf.reorder_buffer import OF_SENSORS, SILENT  # noqa: E402
 from uwb_tdoa_msgs.msg import TdoaResidual  # noqa: E402
 from uwb_tdoa_tools.live import follow  # noqa: E402
 from uwb_tdoa_tools.live.follow import LEAD, Follower, is_stamped, stamp_of  # noqa: E402
@@ -221,13 +221,13 @@ def test_a_filter_that_has_gone_silent_is_not_waited_for(filtered, monkeypatch):
 
 
 def test_the_constants_are_those_of_the_filter():
-    found = follow.AID_SILENT, follow.AID_SHARE, follow.LAG
-    assert found == (SILENT * SECOND, OF_AIDS, PARAMETERS["lag"].default)
+    found = follow.SENSOR_SILENT, follow.SENSOR_SHARE, follow.LAG
+    assert found == (SILENT * SECOND, OF_SENSORS, PARAMETERS["lag"].default)
 
 
 def test_the_replay_does_not_wait_for_tdoas_that_wait_for_a_height(filtered):
     follower, residuals = filtered
-    follower.add_aid("/height", 10 * SECOND)
+    follower.add_sensor("/height", 10 * SECOND)
     assert play(follower, STAMPS) == 22  # it waits for half of its lag
     residuals.say(*STAMPS[:6])
     assert play(follower, STAMPS[22:]) == 5

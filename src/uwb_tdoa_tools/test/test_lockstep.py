@@ -108,7 +108,8 @@ def test_ranges_are_used_as_off_line(tmp_path):
         and told["ekf_node"]["range_late"] == "0"
     ), said
     assert (
-        abs(int(told["ekf_node"]["range_used"]) - np.sum(run.aids["range"]["verdict"] == USED)) <= 2
+        abs(int(told["ekf_node"]["range_used"]) - np.sum(run.sensors["range"]["verdict"] == USED))
+        <= 2
     )
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.common.flight import AIDS
+from uwb_tdoa_bias.common.flight import SENSOR_NAMES
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.engine import feed
 from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, TDOA, Measurements, new_state, structured
@@ -35,7 +35,7 @@ def flights(shared_data):
     paths = [path for name in FLIGHTS for path in (shared_data / "flights").rglob(name)]
     assert len(paths) == len(FLIGHTS)
     flights = Reading(shared_data / "surveys").flights(paths)
-    return [flight.without(*AIDS) for flight in flights]  # starts from TDOAs alone
+    return [flight.without(*SENSOR_NAMES) for flight in flights]  # starts from TDOAs alone
 
 
 def between(stream, low, high):

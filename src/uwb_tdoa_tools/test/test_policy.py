@@ -56,7 +56,12 @@ def arguments(tmp_path):
         "debias_node": ["-p", f"map:={tmp_path / 'map.npz'}"],
         "ekf_node": ["-p", "publish_tf:=odom"],
         "localization_node": ["-p", "publish_tf:=odom"],
-        "vehicle_node": ["-p", "simulated_time:=true", "-p", "aids:=[height, pressure, velocity]"],
+        "vehicle_node": [
+            "-p",
+            "simulated_time:=true",
+            "-p",
+            "sensors:=[height, pressure, velocity]",
+        ],
     }
     return {name: ["--ros-args", "-p", "use_sim_time:=true", *own.get(name, ())] for name in KINDS}
 

@@ -8,7 +8,7 @@ import pytest
 
 from uwb_tdoa_bias.common.flight import Tdoas
 from uwb_tdoa_bias.common.sensors import Height
-from uwb_tdoa_bias.effects import Track, aid_samples
+from uwb_tdoa_bias.effects import Track, sensor_samples
 from uwb_tdoa_tools.readers.streams import FLOW_COUNTS, FLOW_NEAREST_RANGE, flow_velocity, protocol
 from uwb_tdoa_tools.scoring.metrics import scored_phase
 
@@ -78,8 +78,8 @@ def pixel_counts(flight):
     t = np.arange(100, 3900) / 100.0 + flight.imu.t[0]
     track = Track(flight.truth)
     v, depth = (
-        aid_samples("velocity", t - 0.005, track).reading,
-        aid_samples("height", t - 0.005, track).reading[:, 0],
+        sensor_samples("velocity", t - 0.005, track).reading,
+        sensor_samples("height", t - 0.005, track).reading[:, 0],
     )
     omega = np.stack(
         [np.interp(t - 0.005, flight.imu.t, flight.imu.gyro[:, k]) for k in range(3)], axis=1
@@ -93,7 +93,7 @@ def test_pixel_counts_become_the_velocity_that_made_them(flight):
     made = flow_velocity(*pixel_counts(flight), flight.height, flight.imu)
     _, first, last = scored_phase(flight.truth)
     air = (made.t > first + 0.5) & (made.t < last - 0.5)
-    true = aid_samples("velocity", made.t[air], Track(flight.truth)).reading
+    true = sensor_samples("velocity", made.t[air], Track(flight.truth)).reading
     assert np.isinf(made.std[:, 2]).all() and np.isfinite(made.std[:, :2]).all()
     # of ranges with 1 cm of noise
     error = np.sqrt(np.mean((made.v[air, :2] - true[:, :2]) ** 2, axis=0))

@@ -54,8 +54,11 @@ def test_requests_are_those_that_users_of_crazyswarm2_know(name):
 @pytest.mark.parametrize(
     "given, why",
     [
-        ("aids:=[sonar]", "aids: 'sonar' is not one of height, pressure, velocity, range."),
-        ("vehicle:=rover", "vehicle: a rover takes no commands and no aids; set mission to true."),
+        ("sensors:=[sonar]", "sensors: 'sonar' is not one of height, pressure, velocity, range."),
+        (
+            "vehicle:=rover",
+            "vehicle: a rover takes no commands and no sensors; set mission to true.",
+        ),
         ("world:=moon", "world: 'moon' is not one of hall,"),
     ],
 )
@@ -70,7 +73,7 @@ def test_what_it_does_not_know_is_refused(given, why):
 
 @pytest.mark.slow
 def test_it_flies_by_services_beside_two_busy_processes(tmp_path, load):  # noqa: F811
-    with hall(tmp_path, "seed:=3", "aids:=[height]") as flown:
+    with hall(tmp_path, "seed:=3", "sensors:=[height]") as flown:
         refused = flown.ask(GoTo, "go_to", goal=Point(z=1.0), duration=Duration(sec=5))
         assert not refused.success and refused.message == "it does not fly; take off first."
         flown.wait(lambda: flown.odometry, "odometry")
@@ -104,7 +107,7 @@ def test_a_rover_drives_by_the_nodes_as_it_does_in_lockstep(tmp_path):
         driven.wait(lambda: driven.verdicts, "the verdict")
     (verdict,) = driven.verdicts
     assert verdict["arrived"], verdict["why"]
-    world = replace(WORLDS["hall"], aids=rover.AIDS)
+    world = replace(WORLDS["hall"], sensors=rover.SENSOR_NAMES)
     task = Task(world, 3, "place", config=FilterConfig(**rover.FILTER), path=Waypoints())
     lockstep = verdict_of(rover.drive(task))
     one_turn = task.path.speed * DT  # m, by an odometry that came one turn later

@@ -10,7 +10,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.flight import AIDS, Flight, Truth
+from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Flight, Truth
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.base import counted
 from uwb_tdoa_ekf.core.config import FilterConfig
@@ -59,7 +59,7 @@ SECONDS = 60.0  # of a flight that are looked at
 FORECAST_FLIGHTS = 3  # largest number of flights that are looked at with ground truth
 SMALLEST_EXTENT = 0.25  # smallest extent of a path along an axis, relative to the anchors
 SMALLEST_IMPROVED_SHARE = 0.5  # share of the coordinates that must improve
-STREAMS = "tdoa", "imu", "truth", *AIDS
+STREAMS = "tdoa", "imu", "truth", *SENSOR_NAMES
 
 
 @dataclass(frozen=True, eq=False)

@@ -113,7 +113,7 @@ def add_filter(
     )
     parser.add_argument(
         "--without",
-        metavar="AID",
+        metavar="SENSOR",
         action="append",
         default=[],
         choices=tuple(SENSORS),
@@ -139,7 +139,7 @@ def filter_of(args: Namespace) -> tuple[FilterConfig, EffectSet | None]:
     Raises InputError.
     """
     config = FilterConfig.from_yaml(args.config) if args.config else FilterConfig()
-    switched_off = [f"use_{aid}:=false" for aid in args.without]
+    switched_off = [f"use_{stream}:=false" for stream in args.without]
     config = with_parameters(config, [*getattr(args, "parameters", ()), *switched_off])
     return config, EffectSet.from_yaml(args.effects) if args.effects else None
 

@@ -38,7 +38,7 @@ from .flying import rover
 from .flying.mission import Circles, Waypoints
 from .flying.over_topics import Lockstep, OverTopics, RealTime
 from .flying.pilot import Pilot
-from .flying.sensors import AIDS
+from .flying.sensors import SENSOR_NAMES
 from .flying.trial import VEHICLES, Task, Trial
 from .flying.verdict import reached, sentence, verdict_of
 from .flying.world import WORLDS, world_of
@@ -62,7 +62,9 @@ PARAMETERS = {  # in the order of config/vehicle_node.yaml
         "prior that the filter gets at the start: its place and yaw, to 0.1 m and 0.1 rad",
         choices=("nothing", "place"),
     ),
-    "aids": Parameter([""], f'what else it measures, of {", ".join(AIDS)}; [""] for nothing'),
+    "sensors": Parameter(
+        [""], f'what else it measures, of {", ".join(SENSOR_NAMES)}; [""] for nothing'
+    ),
     "mission": Parameter(
         False,
         (
@@ -89,14 +91,16 @@ class VehicleNode(StreamNode):
         super().__init__(self.NAME)
         own = declare_all(self, PARAMETERS)
         refuse_unknown(self)
-        self._mission, aids = own["mission"], [name for name in own["aids"] if name]
-        unknown = sorted(set(aids) - set(AIDS))
+        self._mission, sensors = own["mission"], [name for name in own["sensors"] if name]
+        unknown = sorted(set(sensors) - set(SENSOR_NAMES))
         if unknown:
-            raise InputError(f"aids: {unknown[0]!r} is not one of {', '.join(AIDS)}.")
+            raise InputError(f"sensors: {unknown[0]!r} is not one of {', '.join(SENSOR_NAMES)}.")
         drives = own["vehicle"] == "rover"
-        if drives and (aids or not self._mission):
-            raise InputError("vehicle: a rover takes no commands and no aids; set mission to true.")
-        world = world_of(own["world"], aids=rover.AIDS if drives else aids)
+        if drives and (sensors or not self._mission):
+            raise InputError(
+                "vehicle: a rover takes no commands and no sensors; set mission to true."
+            )
+        world = world_of(own["world"], sensors=rover.SENSOR_NAMES if drives else sensors)
         known = own["told"] == "place"
         path = Waypoints() if drives else Circles()
         task = Task(world, own["seed"], own["told"], "known" if known else "unknown", path=path)

@@ -11,7 +11,7 @@ from .anchors import Anchors
 from .sensors import LOCATING, SENSORS
 from .text import sanitize
 
-AIDS = tuple(SENSORS)  # optional streams of a Flight
+SENSOR_NAMES = tuple(SENSORS)  # optional streams of a Flight
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,7 @@ class Flight(_SensorStreams):
         return replace(self, **streams)
 
     def without(self, *streams: str) -> Flight:
-        """Return the Flight without some optional streams, given by name, e.g. AIDS."""
+        """Return the Flight without some optional streams, given by name, e.g. SENSOR_NAMES."""
         return self.replaced(**dict.fromkeys(streams))
 
     def among(self, rows: np.ndarray) -> Flight:

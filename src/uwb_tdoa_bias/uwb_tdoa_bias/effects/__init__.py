@@ -22,20 +22,20 @@ The file, written by people and by the tools, read by the nodes:
       - [0.4e-5, 1.6e-5]
 """
 
-from .aids import AidCorrector
 from .anchor import AnchorDelay
+from .auxiliary import SensorCorrector
 from .base import ArrivalEffect, Effect, LabelCorrector, LabelEffect, Row
 from .effect_set import EFFECTS, Covariance, EffectSet, StreamCorrector
 from .imu import ImuCorrector
 from .samples import (
     RADIO,
-    AidSamples,
     ImuSamples,
     RangeSamples,
     Samples,
+    SensorSamples,
     Track,
-    aid_samples,
     samples_at,
+    sensor_samples,
     true_samples,
 )
 from .smooth_term import SmoothTerm
@@ -44,8 +44,8 @@ from .tag import TagLeverArm
 __all__ = [
     "EFFECTS",
     "RADIO",
-    "AidCorrector",
-    "AidSamples",
+    "SensorCorrector",
+    "SensorSamples",
     "AnchorDelay",
     "ArrivalEffect",
     "Covariance",
@@ -62,7 +62,7 @@ __all__ = [
     "StreamCorrector",
     "TagLeverArm",
     "Track",
-    "aid_samples",
+    "sensor_samples",
     "samples_at",
     "true_samples",
 ]

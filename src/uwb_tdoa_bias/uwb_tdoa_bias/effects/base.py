@@ -353,12 +353,12 @@ class Effect:
         """Return derivatives of the measurement by the parameters `keys`.
 
         Of Samples (n, len(keys)), m per `unit`; of ImuSamples (n, 3, len(keys)), body; of
-        AidSamples (n, k, len(keys)).
+        SensorSamples (n, k, len(keys)).
         """
         return np.zeros((len(samples), len(keys)))
 
     def uncorrected(self, samples: Any) -> np.ndarray | float:
-        """Return the part that nodes cannot correct: of ImuSamples (n, 3), of AidSamples (n, k)."""
+        """Return the part that nodes cannot correct: of ImuSamples (n, 3), of SensorSamples (n, k)."""
         return 0.0
 
     @property

@@ -16,7 +16,7 @@ from .samples import ImuSamples, tile
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from .samples import AidSamples, Samples
+    from .samples import Samples, SensorSamples
 
 FADE = 0.5  # share of the width of a domain; this far beyond it, exp(-1/2) of an effect is left
 CATEGORIES = ("previous_anchor",)  # values are names, not sizes
@@ -87,8 +87,8 @@ OF_IMU = (
     "accel_z",
 )
 
-# Names of OF_TDOA that AidSamples have too
-OF_AIDS = (
+# Names of OF_TDOA that SensorSamples have too
+OF_SENSORS = (
     "time",
     "x",
     "y",
@@ -130,10 +130,10 @@ EXTRA = "extra."  # prefix of further columns of a log: "extra.STREAM.COLUMN"
 OF_ACCEL = ("accel", "accel_x", "accel_y", "accel_z")  # specific force, m/s^2
 
 
-def sensor_covariate(name: str, samples: ImuSamples | AidSamples) -> np.ndarray | None:
-    """Return a covariate of ImuSamples or AidSamples, (n,); None if the samples lack it.
+def sensor_covariate(name: str, samples: ImuSamples | SensorSamples) -> np.ndarray | None:
+    """Return a covariate of ImuSamples or SensorSamples, (n,); None if the samples lack it.
 
-    name : of OF_AIDS; for ImuSamples also of OF_IMU, or "extra.NAME"
+    name : of OF_SENSORS; for ImuSamples also of OF_IMU, or "extra.NAME"
     """
     if name.startswith(EXTRA):
         if not isinstance(samples, ImuSamples):

@@ -15,20 +15,9 @@ import yaml
 
 from ..common.errors import InputError
 from ..common.files import write_text
-from ..common.flight import AIDS
+from ..common.flight import SENSOR_NAMES
 from ..common.safe_yaml import read_yaml
 from ..common.text import written_by
-from .aids import (
-    AidCorrector,
-    BarometerDrift,
-    FloorStep,
-    HeightOffset,
-    HeightScale,
-    VelocityMisalignment,
-    VelocityScale,
-    VelocitySlip,
-    YawRateScale,
-)
 from .anchor import (
     AnchorClockDrift,
     AnchorDelay,
@@ -36,6 +25,17 @@ from .anchor import (
     AnchorPosition,
     Nlos,
     RangeOffset,
+)
+from .auxiliary import (
+    BarometerDrift,
+    FloorStep,
+    HeightOffset,
+    HeightScale,
+    SensorCorrector,
+    VelocityMisalignment,
+    VelocityScale,
+    VelocitySlip,
+    YawRateScale,
 )
 from .base import FADED_BELOW, Effect, LabelCorrector, SensorFunction
 from .floor import FloorMultipath
@@ -60,7 +60,7 @@ if TYPE_CHECKING:
 
     from ..common.anchors import Anchors
     from ..common.flight import Flight
-    from .samples import AidSamples, ImuSamples, Samples
+    from .samples import ImuSamples, Samples, SensorSamples
 
 # In the order in which `diagnose` lists them
 EFFECTS: dict[str, type[Effect]] = {
@@ -104,7 +104,7 @@ EFFECTS: dict[str, type[Effect]] = {
         PairSign,
     )
 }
-STREAMS = ("tdoa", "imu", "truth", *AIDS)  # of a Flight
+STREAMS = ("tdoa", "imu", "truth", *SENSOR_NAMES)  # of a Flight
 ENTRY = ("values", "std", "source", "domain")  # of an effect in effects.yaml
 COVARIANCE_ENTRY = ("parameters", "matrix")
 REACH = 0.3  # m and m/s, half the step of the statistical linearization: an error of the filter
@@ -205,15 +205,15 @@ class StreamCorrector:
         self._late = {
             stream: sum(effect.stamp_offset(stream) for effect in effects)
             for stream in STREAMS
-            if stream not in AIDS
+            if stream not in SENSOR_NAMES
         }
         self._labels, self._imu = LabelCorrector(effects), ImuCorrector(effects)
-        self._aids = AidCorrector(effects)
+        self._sensors = SensorCorrector(effects)
 
     def correct(self, name: str, stream: Any) -> Any:
         """Return the corrected stream `name` of a Flight, or its next part."""
-        if name in AIDS:
-            return self._aids.correct(name, stream)
+        if name in SENSOR_NAMES:
+            return self._sensors.correct(name, stream)
         if self._late[name]:
             stream = replace(stream, t=stream.t - self._late[name])
         if name == "tdoa" and not self._labels.idle:
@@ -298,8 +298,8 @@ class EffectSet:
         """Return the other effects."""
         return self.where(lambda effect: not effect.jacobian_states)
 
-    def uncorrected(self, samples: ImuSamples | AidSamples) -> np.ndarray:
-        """Return the error that remains in corrected ImuSamples, (n, 3), or AidSamples, (n, k)."""
+    def uncorrected(self, samples: ImuSamples | SensorSamples) -> np.ndarray:
+        """Return the error that remains in corrected ImuSamples, (n, 3), or SensorSamples, (n, k)."""
         mine = (effect for effect in self.effects if samples.channel in effect.channels)
         parts: Iterator[Any] = (effect.uncorrected(samples) for effect in mine)
         return sum(parts, np.zeros(samples.reading.shape))

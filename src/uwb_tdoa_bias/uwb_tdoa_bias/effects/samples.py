@@ -291,7 +291,7 @@ class ImuSamples:
 
 
 @dataclass(frozen=True)
-class AidSamples:
+class SensorSamples:
     """A batch of n measurements of an auxiliary sensor.
 
     channel : name of the stream, or of one of its parts
@@ -402,18 +402,18 @@ def true_samples(flight: Flight, kind: type[Samples] = Samples) -> tuple[Samples
     return kind(**vars(samples)), rows
 
 
-def aid_samples(
+def sensor_samples(
     channel: str,
     t: np.ndarray,
     track: Track,
     start: float = 0.0,
     vibration: np.ndarray | None = None,
-) -> AidSamples:
-    """Return AidSamples of a channel at stamps t (n,), s, of a Track."""
+) -> SensorSamples:
+    """Return SensorSamples of a channel at stamps t (n,), s, of a Track."""
     before, reading, after = (
         COMPARED[channel].reading(track, t + late) for late in (-0.5 * STEP, 0.0, 0.5 * STEP)
     )
     rate, q = (after - before) / STEP, track.attitudes(t)
     up = 1.0 - 2.0 * (q[:, 0] ** 2 + q[:, 1] ** 2)
     p, motion = track.positions(t), track.motion(t)
-    return AidSamples(channel, t, p, start, reading, rate, up, motion, vibration)
+    return SensorSamples(channel, t, p, start, reading, rate, up, motion, vibration)

@@ -29,10 +29,10 @@ from .covariates import (
     CATEGORIES,
     EXTRA,
     FADE,
-    OF_AIDS,
     OF_ARRIVAL,
     OF_IMU,
     OF_MOTION,
+    OF_SENSORS,
     OF_STATE,
     OF_TDOA,
     STATES,
@@ -50,12 +50,12 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from ..common.anchors import Anchors
-    from .samples import AidSamples, ImuSamples, Samples
+    from .samples import ImuSamples, Samples, SensorSamples
 
 DEGREE = 2  # of splines
 GONE = 4 * FADE  # widths of a domain beyond which nothing of a function is left
 IMU_CHANNELS = tuple(f"{sensor}.{axis}" for sensor in ("gyro", "accel") for axis in "xyz")
-AID_CHANNELS = tuple(name + axis for name in BY_POSE for axis in COMPARED[name].axes)
+SENSOR_CHANNELS = tuple(name + axis for name in BY_POSE for axis in COMPARED[name].axes)
 FORMS = ("common", "arrival", "anchor", "pair", "direction")
 OF_LINKS = ("pair", "direction")  # forms with one function per pair of anchors
 # Prior standard deviations of functions with few coefficients: m, rad/s and m/s^2
@@ -78,7 +78,7 @@ SHAPES = {
 class SmoothTerm(Effect):
     """A function of one covariate, held constant beyond its knots, with coefficients c0, c1, ...
 
-    channel : of RADIO, "gyro.x" ... "accel.z", or of AID_CHANNELS
+    channel : of RADIO, "gyro.x" ... "accel.z", or of SENSOR_CHANNELS
     covariate : name that the channel has, see `known_covariates`, or "extra.STREAM.COLUMN" on RADIO
         and inertial channels. Without its column in a recording the term is zero.
     form : of RADIO. "common": f(covariate) on every d_ab. "arrival": f_b - f_a, with the covariate
@@ -119,7 +119,7 @@ class SmoothTerm(Effect):
                 f"effects: smooth_term: knots: {self.knots!r} are not two or more rising numbers."
             )
         known = known_covariates()
-        extra = self.covariate.startswith(EXTRA) and self.channel not in AID_CHANNELS
+        extra = self.covariate.startswith(EXTRA) and self.channel not in SENSOR_CHANNELS
         if (
             self.form not in FORMS
             or self.channel not in known
@@ -331,7 +331,7 @@ class SmoothTerm(Effect):
         """Return the column of its axis in a reading."""
         return "xyz".index(self.channel.partition(".")[2] or "x")
 
-    def uncorrected(self, samples: ImuSamples | AidSamples) -> np.ndarray | float:
+    def uncorrected(self, samples: ImuSamples | SensorSamples) -> np.ndarray | float:
         if self.channel in IMU_CHANNELS and self.covariate in OF_IMU:
             return 0.0
         keys = self.keys()
@@ -431,8 +431,8 @@ def known_covariates() -> dict[str, tuple[str, ...]]:
     return {
         **dict.fromkeys(RADIO, (*without_motion, *OF_ARRIVAL)),
         "tdoa": (*OF_TDOA, *OF_ARRIVAL),
-        **dict.fromkeys(IMU_CHANNELS, tuple(dict.fromkeys((*OF_IMU, *OF_AIDS)))),
-        **dict.fromkeys(AID_CHANNELS, OF_AIDS),
+        **dict.fromkeys(IMU_CHANNELS, tuple(dict.fromkeys((*OF_IMU, *OF_SENSORS)))),
+        **dict.fromkeys(SENSOR_CHANNELS, OF_SENSORS),
     }
 
 

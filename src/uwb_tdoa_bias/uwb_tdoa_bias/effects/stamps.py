@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from ..common.flight import Flight
-    from .samples import AidSamples, Samples
+    from .samples import Samples, SensorSamples
 
 # The part of a row that all effects on stamps share
 STAMP = Row(
@@ -38,7 +38,7 @@ class StampEffect(Effect):
     def stamp_offset(self, stream: str) -> float:
         return self.values.get("offset", 0.0) if stream == self.stream else 0.0
 
-    def regressors(self, samples: Samples | AidSamples, keys: Sequence[str]) -> np.ndarray:
+    def regressors(self, samples: Samples | SensorSamples, keys: Sequence[str]) -> np.ndarray:
         return np.repeat(-samples.time_derivative[..., None], len(keys), axis=-1)
 
     def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:

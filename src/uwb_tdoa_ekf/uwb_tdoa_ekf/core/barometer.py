@@ -26,7 +26,7 @@ UNTRIED, WORST = 10.0, 100.0  # standard deviations: initial and largest inflati
 
 @compiled
 def observe(
-    ekf: Record, parameters: Record, aid: Record, residual: Record, records: np.ndarray
+    ekf: Record, parameters: Record, sensor: Record, residual: Record, records: np.ndarray
 ) -> None:
     """Update a running filter with the altitude of a barometer.
 
@@ -38,18 +38,18 @@ def observe(
         State of the filter, updated in place.
     parameters : PARAMETERS
         Tuning of the filter.
-    aid : AID
+    sensor : SENSOR_ROW
         Measurement.
     residual : RESIDUAL
         Filled by this function.
     records : (n,) RECORD
         History for the smoother; empty for no recording.
     """
-    barometer, innovation, altitude = ekf.barometer, ekf.innovation, aid.value[0]
-    dt = min(max(aid.t - barometer.heard, 0.0), AVERAGE)
-    barometer.heard = aid.t
+    barometer, innovation, altitude = ekf.barometer, ekf.innovation, sensor.value[0]
+    dt = min(max(sensor.t - barometer.heard, 0.0), AVERAGE)
+    barometer.heard = sensor.t
     excess = max(1.0, barometer.nis)
-    anew = aid.t - barometer.agreed > LONGEST_DISAGREEMENT
+    anew = sensor.t - barometer.agreed > LONGEST_DISAGREEMENT
     for h in range(len(ekf.hypotheses)):
         hypothesis = ekf.hypotheses[h]
         if not alive(hypothesis):
@@ -72,9 +72,9 @@ def observe(
             residual.innovation, residual.variance, residual.weight = innovation.value, total, w
             residual.verdict = USED if w > 0.0 else REJECTED
             if w > 0.0:
-                barometer.agreed = aid.t
+                barometer.agreed = sensor.t
     if anew:
-        barometer.agreed, barometer.nis = aid.t, UNTRIED**2
+        barometer.agreed, barometer.nis = sensor.t, UNTRIED**2
         residual.weight, residual.verdict = 0.0, REJECTED
 
 

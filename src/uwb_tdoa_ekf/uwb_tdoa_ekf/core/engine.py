@@ -22,7 +22,6 @@ from uwb_tdoa_bias.common.geometry import linearized_tdoa
 from uwb_tdoa_bias.effects.samples import N_STATES
 
 from . import (
-    aids,
     auxiliary,
     ground,
     height,
@@ -35,6 +34,7 @@ from . import (
     plane,
     ranges,
     robust,
+    sensors,
     stationarity,
     update,
     velocity,
@@ -77,7 +77,7 @@ LINEAR_RANGE = 1.0
 RECORDS_OF_TDOA = 1 + 4 + 6 + 1 + 2 + 2
 RECORDS_OF_REST = 3  # one per axis
 # a range has the same number; a velocity has one per component, plus an opened yaw
-RECORDS_OF_AID = RECORDS_OF_TDOA
+RECORDS_OF_SENSOR = RECORDS_OF_TDOA
 
 
 @compiled
@@ -110,13 +110,13 @@ def run(
         If a history has less room than `most_records`.
     """
     ekf, anchors, values = state.ekf[0], state.anchors, parameters[0]
-    imu, tdoa, aid = measurements.imu, measurements.tdoa, measurements.aids
+    imu, tdoa, sensor = measurements.imu, measurements.tdoa, measurements.sensors
     i = k = m = rows = 0
-    while i < len(imu) or k < len(tdoa) or m < len(aid):
+    while i < len(imu) or k < len(tdoa) or m < len(sensor):
         of_imu = imu[i].t if i < len(imu) else np.inf
         of_tdoa = tdoa[k].t if k < len(tdoa) else np.inf
-        of_aid = aid[m].t if m < len(aid) else np.inf
-        t = min(of_imu, of_tdoa, of_aid)
+        of_sensor = sensor[m].t if m < len(sensor) else np.inf
+        t = min(of_imu, of_tdoa, of_sensor)
         if of_imu == t and i < len(imu):
             if len(state.functions) and ekf.running:
                 subtract(state.functions, ekf.hypotheses[ekf.best].x, imu[i])
@@ -126,7 +126,7 @@ def run(
             _on_tdoa(ekf, anchors, values, tdoa[k], output.residuals[k], output.history)
             k += 1
         else:
-            _on_aid(ekf, anchors, values, aid[m], output.aids[m], output.history)
+            _on_sensor(ekf, anchors, values, sensor[m], output.sensors[m], output.history)
             m += 1
         if ekf.running and t >= ekf.next_odometry:
             ekf.next_odometry = (
@@ -165,12 +165,12 @@ def set_pose(state: FilterState, parameters: np.ndarray, pose: np.ndarray) -> No
 
 def most_records(measurements: Measurements) -> int:
     """Return the number of history records that a call with these Measurements can need."""
-    imu, tdoa, aid = measurements
+    imu, tdoa, sensor = measurements
     spans = [part["t"][-1] - part["t"][0] for part in measurements if len(part)]
-    most, seconds = len(imu) + len(tdoa) + len(aid), max(spans, default=0.0)
+    most, seconds = len(imu) + len(tdoa) + len(sensor), max(spans, default=0.0)
     periods = stationarity.PERIOD, plane.PERIOD, 0.5 * imu_fault_detector.CLEARED
     rests, floors, switches = (min(most, 2 + int(seconds / period)) for period in periods)
-    of_events = RECORDS_OF_TDOA * len(tdoa) + RECORDS_OF_AID * len(aid)
+    of_events = RECORDS_OF_TDOA * len(tdoa) + RECORDS_OF_SENSOR * len(sensor)
     return of_events + RECORDS_OF_REST * rests + plane.RECORDS * floors + switches
 
 
@@ -259,7 +259,7 @@ def _on_range(
     ekf: Record,
     anchors: np.ndarray,
     parameters: Record,
-    aid: Record,
+    sensor: Record,
     residual: Record,
     records: np.ndarray,
 ) -> None:
@@ -267,21 +267,21 @@ def _on_range(
 
     The TDOA with the distance before serves initialization and recovery.
     """
-    if ranges.is_repeat(ekf, aid):
+    if ranges.is_repeat(ekf, sensor):
         residual.verdict = REPEATED
         return
-    if ranges.pair(ekf, aid):
+    if ranges.pair(ekf, sensor):
         initialization.remember(ekf, ekf.paired[0], anchors)
-    t = aid.t
+    t = sensor.t
     if not _predict_or_initialize(ekf, anchors, parameters, t, records):
         return
     _prepare(ekf, anchors, parameters, t, records)
-    anchor, innovation = anchors[aid.anchor], ekf.innovation
+    anchor, innovation = anchors[sensor.anchor], ekf.innovation
     for h in range(HYPOTHESES):
         hypothesis = ekf.hypotheses[h]
         if not hypotheses.alive(hypothesis):
             continue
-        ranges.compare(hypothesis, anchor.position, aid, parameters, innovation)
+        ranges.compare(hypothesis, anchor.position, sensor, parameters, innovation)
         innovation.variance_inflation, innovation.curvature = stationarity.repetition(ekf, t), 0.0
         _update_hypothesis(ekf, h, parameters, t, residual, records, False)
         if h == ekf.best:
@@ -358,26 +358,26 @@ def _recover(
         initialization.recover(ekf, anchors, parameters, t, unsure, records)
 
 
-# Process an AID: update a running filter, or store the measurement.
+# Process a SENSOR_ROW: update a running filter, or store the measurement.
 @compiled
-def _on_aid(
+def _on_sensor(
     ekf: Record,
     anchors: np.ndarray,
     parameters: Record,
-    aid: Record,
+    sensor: Record,
     residual: Record,
     records: np.ndarray,
 ) -> None:
     residual.innovation = residual.variance = np.nan
     residual.weight, residual.verdict = 0.0, STARTUP
-    if aid.kind == aids.RANGE:
-        _on_range(ekf, anchors, parameters, aid, residual, records)
-    elif ekf.running and _predict(ekf, parameters, aid.t, records):
-        if aid.kind == aids.VELOCITY and not parameters.use_imu:
+    if sensor.kind == sensors.RANGE:
+        _on_range(ekf, anchors, parameters, sensor, residual, records)
+    elif ekf.running and _predict(ekf, parameters, sensor.t, records):
+        if sensor.kind == sensors.VELOCITY and not parameters.use_imu:
             initialization.open_unknown_yaw(ekf, parameters, records)
-        aids.observe(ekf, parameters, aid, residual, records)
+        sensors.observe(ekf, parameters, sensor, residual, records)
     else:
-        aids.record(ekf, aid)
+        sensors.record(ekf, sensor)
 
 
 @compiled
@@ -736,16 +736,16 @@ def feed(
     tuple
         Odometry (ODOMETRY), residuals of TDOAs and residuals of other measurements (RESIDUAL).
     """
-    imu, tdoa, aid = measurements
+    imu, tdoa, sensor = measurements
     room = (
         history.NOTHING if records is None else np.empty(most_records(measurements), history.RECORD)
     )
-    n = len(imu) + len(tdoa) + len(aid)
+    n = len(imu) + len(tdoa) + len(sensor)
     output = Output(
-        np.empty(n, ODOMETRY), np.empty(len(tdoa), RESIDUAL), room, np.empty(len(aid), RESIDUAL)
+        np.empty(n, ODOMETRY), np.empty(len(tdoa), RESIDUAL), room, np.empty(len(sensor), RESIDUAL)
     )
     rows = run(state, parameters, measurements, output)
     if records is not None:
         records.append(room[: state.record.recorded].copy())
         state.record.recorded = 0
-    return output.odometry[:rows], output.residuals, output.aids
+    return output.odometry[:rows], output.residuals, output.sensors

@@ -43,7 +43,7 @@ IGNORE_TIME, LONGEST_IGNORED = (3.0, 60.0)
 
 @compiled
 def observe(
-    ekf: Record, parameters: Record, aid: Record, residual: Record, records: np.ndarray
+    ekf: Record, parameters: Record, sensor: Record, residual: Record, records: np.ndarray
 ) -> None:
     """Update a running filter with a range, at the stamp of the range.
 
@@ -53,7 +53,7 @@ def observe(
         State of the filter, updated in place.
     parameters : PARAMETERS
         Tuning of the filter.
-    aid : AID
+    sensor : SENSOR_ROW
         Measurement.
     residual : RESIDUAL
         Filled by this function.
@@ -62,11 +62,11 @@ def observe(
     """
     height, share = (
         ekf.height,
-        min(max(aid.t - ekf.height.heard, 0.0) / (2.0 * CORRELATION_TIME), 1.0),
+        min(max(sensor.t - ekf.height.heard, 0.0) / (2.0 * CORRELATION_TIME), 1.0),
     )
-    record(ekf, aid)
+    record(ekf, sensor)
     residual.weight, residual.verdict = 0.0, REJECTED
-    innovation, distance = ekf.innovation, aid.value[0] + parameters.height_arm
+    innovation, distance = ekf.innovation, sensor.value[0] + parameters.height_arm
     up = compare(
         ekf.hypotheses[ekf.best],
         height.level,
@@ -80,7 +80,9 @@ def observe(
     z = _plausible_z(ekf, parameters, up)
     if math.isnan(z):
         return
-    if (not ekf.quiet and aid.t - height.changed > STUCK_TIME) or aid.t < height.ignored_until:
+    if (
+        not ekf.quiet and sensor.t - height.changed > STUCK_TIME
+    ) or sensor.t < height.ignored_until:
         height.agreed = 0.0
         return
     if _weigh_places(ekf, parameters, distance, share):
@@ -92,16 +94,16 @@ def observe(
             ekf.transition.rotation,
             innovation,
         )
-    if aid.t - height.used > LONGEST_GAP:
+    if sensor.t - height.used > LONGEST_GAP:
         height.agreed = 0.0
     base_innovation = z - ekf.hypotheses[ekf.best].x[2]
     limit = GATE * math.sqrt(residual.variance)
     if abs(innovation.value) > limit or _is_alike(height, innovation.value):
-        if not _settle(ekf, parameters, aid.t, base_innovation, limit, records):
+        if not _settle(ekf, parameters, sensor.t, base_innovation, limit, records):
             return
-    since = aid.t - height.used
+    since = sensor.t - height.used
     height.agreed += min(since, LONGEST_GAP) if since < LONGEST_GAP else 0.0
-    height.used, height.disagreeing = aid.t, max(0, height.disagreeing - 1)
+    height.used, height.disagreeing = sensor.t, max(0, height.disagreeing - 1)
     for h in range(len(ekf.hypotheses)):
         hypothesis = ekf.hypotheses[h]
         if not alive(hypothesis):
@@ -116,16 +118,16 @@ def observe(
         kalman(hypothesis, innovation)
         if h == ekf.best:
             residual.weight, residual.verdict = w, USED
-            add_update(ekf, aid.t, records)
+            add_update(ekf, sensor.t, records)
 
 
 @compiled
-def record(ekf: Record, aid: Record) -> None:
+def record(ekf: Record, sensor: Record) -> None:
     """Store a range, whether or not it is used."""
     height = ekf.height
-    if aid.value[0] != height.range:
-        height.changed = aid.t
-    height.range, height.heard = aid.value[0], aid.t
+    if sensor.value[0] != height.range:
+        height.changed = sensor.t
+    height.range, height.heard = sensor.value[0], sensor.t
 
 
 @compiled

@@ -10,8 +10,8 @@ import numpy as np
 from uwb_tdoa_bias.common.compiled import compiled
 from uwb_tdoa_bias.common.sensors import SENSORS
 
-from .aids import STREAMS
-from .memory import AID, IMU_SAMPLE, structured
+from .memory import IMU_SAMPLE, SENSOR_ROW, structured
+from .sensors import STREAMS
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.common.anchors import Anchors
@@ -57,10 +57,10 @@ def usable_tdoas(rows: np.ndarray, positions: np.ndarray) -> np.ndarray:
     return usable & usable_slopes(rows["slope"], rows["state"])
 
 
-def aid_rows(
+def sensor_rows(
     name: str, stream: Stream, anchors: Anchors | AnchorTable
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the measurements of a sensor as rows of AID, and which are usable.
+    """Return the measurements of a sensor as rows of SENSOR_ROW, and which are usable.
 
     Parameters
     ----------
@@ -74,10 +74,10 @@ def aid_rows(
     Returns
     -------
     tuple
-        (n,) AID, and (n,) bool.
+        (n,) SENSOR_ROW, and (n,) bool.
     """
     columns, usable = SENSORS[name].measured(stream)
-    rows = np.zeros(len(stream), AID)
+    rows = np.zeros(len(stream), SENSOR_ROW)
     rows["t"], rows["kind"] = stream.t, STREAMS.index(name)
     if "anchor" in columns:
         columns["anchor"] = anchors.index(columns["anchor"])

@@ -53,8 +53,10 @@ TDOA = _record(
     ("slope", float, N_STATES),
     ("state", float, N_STATES),  # linearization point of the bias, m and m/s
 )
-# Measurement of a sensor, see aids.py.
-AID = _record(("t", float), ("kind", int), ("value", float, 4), ("std", float, 4), ("anchor", int))
+# Measurement of a sensor, see sensors.py.
+SENSOR_ROW = _record(
+    ("t", float), ("kind", int), ("value", float, 4), ("std", float, 4), ("anchor", int)
+)
 
 # Estimate of the state, for a yaw and place that the tag may have started with.
 HYPOTHESIS = _record(
@@ -186,7 +188,7 @@ EKF = _record(
     ("height", HEIGHT),
     ("barometer", BAROMETER),
     ("velocity", VELOCITY),
-    ("ranged", AID, 1),  # last distance to an anchor
+    ("ranged", SENSOR_ROW, 1),  # last distance to an anchor
     # m, offset of all distances when its variance was smallest; m^2, this variance; inf: not
     # estimated yet
     ("range_offset", float, 2),
@@ -291,25 +293,25 @@ class FilterState(NamedTuple):
 class Measurements(NamedTuple):
     """Input of a call of the filter.
 
-    imu : (n,) IMU_SAMPLE. tdoa : (k,) TDOA. aids : (m,) AID.
+    imu : (n,) IMU_SAMPLE. tdoa : (k,) TDOA. sensors : (m,) SENSOR_ROW.
     """
 
     imu: np.ndarray
     tdoa: np.ndarray
-    aids: np.ndarray = np.empty(0, AID)
+    sensors: np.ndarray = np.empty(0, SENSOR_ROW)
 
 
 class Output(NamedTuple):
     """Room for the results of a call of the filter.
 
     odometry : at least (n + k + m,) ODOMETRY. residuals : (k,) RESIDUAL, of TDOAs. history :
-    RECORD, with room for engine.most_records, or empty for no recording. aids : (m,) RESIDUAL.
+    RECORD, with room for engine.most_records, or empty for no recording. sensors : (m,) RESIDUAL.
     """
 
     odometry: np.ndarray
     residuals: np.ndarray
     history: np.ndarray
-    aids: np.ndarray = np.empty(0, RESIDUAL)
+    sensors: np.ndarray = np.empty(0, RESIDUAL)
 
 
 def new_state(

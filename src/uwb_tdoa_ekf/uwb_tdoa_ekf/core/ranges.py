@@ -19,35 +19,39 @@ APART = 0.2  # s; ranges with a larger time difference give no TDOA
 
 
 @compiled
-def pair(ekf: Record, aid: Record) -> bool:
+def pair(ekf: Record, sensor: Record) -> bool:
     """Compute a TDOA from a range and the range before, in ekf.paired.
 
     Return whether the TDOA is valid: two anchors, within APART.
     """
     before, made = ekf.ranged[0], ekf.paired[0]
-    apart = before.anchor != aid.anchor and aid.t - before.t < APART
+    apart = before.anchor != sensor.anchor and sensor.t - before.t < APART
     made.t, made.a, made.b, made.d = (
-        aid.t,
+        sensor.t,
         before.anchor,
-        aid.anchor,
-        aid.value[0] - before.value[0],
+        sensor.anchor,
+        sensor.value[0] - before.value[0],
     )
-    made.variance = aid.std[0] ** 2 + before.std[0] ** 2
+    made.variance = sensor.std[0] ** 2 + before.std[0] ** 2
     made.slope[:], made.state[:] = 0.0, 0.0
-    ekf.ranged[0] = aid
+    ekf.ranged[0] = sensor
     return apart
 
 
 @compiled
-def is_repeat(ekf: Record, aid: Record) -> bool:
+def is_repeat(ekf: Record, sensor: Record) -> bool:
     """Return whether a range repeats the range before: a driver or network has sent it twice."""
     before = ekf.ranged[0]
-    return before.t == aid.t and before.anchor == aid.anchor and before.value[0] == aid.value[0]
+    return (
+        before.t == sensor.t
+        and before.anchor == sensor.anchor
+        and before.value[0] == sensor.value[0]
+    )
 
 
 @compiled
 def compare(
-    hypothesis: Record, position: np.ndarray, aid: Record, parameters: Record, innovation: Record
+    hypothesis: Record, position: np.ndarray, sensor: Record, parameters: Record, innovation: Record
 ) -> None:
     """Fill in the innovation of a distance to an anchor.
 
@@ -57,7 +61,7 @@ def compare(
         Hypothesis, predicted to the stamp of the measurement.
     position : (3,) array
         Position of the anchor, m, world frame.
-    aid : AID
+    sensor : SENSOR_ROW
         Measured distance, m.
     parameters : PARAMETERS
         Tuning of the filter.
@@ -70,8 +74,8 @@ def compare(
     innovation.entries = 3
     for k, along in enumerate((dx, dy, dz)):
         innovation.states[k], innovation.row[k] = k, along / distance
-    innovation.value = aid.value[0] - distance
-    innovation.noise_variance = parameters.range_std**2 + aid.std[0] ** 2
+    innovation.value = sensor.value[0] - distance
+    innovation.noise_variance = parameters.range_std**2 + sensor.std[0] ** 2
     project(hypothesis.P, innovation)
     if parameters.range_offset_std > 0.0:
         P = hypothesis.offset_P

@@ -31,7 +31,7 @@ AVERAGE = 0.5  # s over which innovations are averaged to compare the sensor wit
 # mean normalized innovation squared above which the sensor is refused, and below which it is used
 # again
 DISAGREES, AGREES = (4.0, 2.0)
-# index of the yaw rate in an AID, and of the error state of the gyroscope bias about z
+# index of the yaw rate in a SENSOR_ROW, and of the error state of the gyroscope bias about z
 YAW_RATE, GYRO_BIAS = (3, 14)
 SLIP = 2.0  # s for which disagreeing wheels may slip
 HELD = 0.5  # s for which the last velocity of wheels drives the prediction
@@ -42,7 +42,7 @@ GYRO_RATE = 100.0
 
 @compiled
 def observe(
-    ekf: Record, parameters: Record, aid: Record, residual: Record, records: np.ndarray
+    ekf: Record, parameters: Record, sensor: Record, residual: Record, records: np.ndarray
 ) -> None:
     """Update a running filter with a velocity.
 
@@ -52,7 +52,7 @@ def observe(
         State of the filter, updated in place.
     parameters : PARAMETERS
         Tuning of the filter.
-    aid : AID
+    sensor : SENSOR_ROW
         Velocity (m/s, body frame) and yaw rate (rad/s). Missing standard deviations are set.
     residual : RESIDUAL
         Filled with the component that has the largest normalized innovation.
@@ -60,14 +60,14 @@ def observe(
         History for the smoother; empty for no recording.
     """
     state, innovation = ekf.velocity, ekf.innovation
-    dt = min(max(aid.t - state.heard, 1e-3), AVERAGE)
-    _complete(aid, parameters)
-    of_wheels = aid.std[YAW_RATE] <= LONGEST_STD
-    frozen = _repeats(state, aid) and not ekf.quiet
-    state.heard = aid.t
+    dt = min(max(sensor.t - state.heard, 1e-3), AVERAGE)
+    _complete(sensor, parameters)
+    of_wheels = sensor.std[YAW_RATE] <= LONGEST_STD
+    frozen = _repeats(state, sensor) and not ekf.quiet
+    state.heard = sensor.t
     leads = of_wheels and not ekf.sensed
     inflation = max(1.0, 2.0 * CORRELATION_TIME / dt)
-    worst = _worst(ekf, aid, residual)
+    worst = _worst(ekf, sensor, residual)
     state.nis += min(1.0, dt / AVERAGE) * (min(worst, GATE**4) - state.nis)
     # simulated wheels turn evenly, so they may repeat values
     stuck = frozen and (state.refused or (np.any(state.value != 0.0) and not of_wheels))
@@ -78,22 +78,22 @@ def observe(
     residual.weight, residual.verdict = 1.0, USED
     if of_wheels:
         state.agreed, state.yaw_rate, state.yaw_rate_variance = (
-            aid.t,
-            aid.value[YAW_RATE],
-            aid.std[YAW_RATE] ** 2,
+            sensor.t,
+            sensor.value[YAW_RATE],
+            sensor.std[YAW_RATE] ** 2,
         )
-        state.speed_variance = aid.std[0] ** 2 if aid.std[0] <= LONGEST_STD else 0.0
+        state.speed_variance = sensor.std[0] ** 2 if sensor.std[0] <= LONGEST_STD else 0.0
     for h in range(len(ekf.hypotheses)):
         hypothesis = ekf.hypotheses[h]
         if not alive(hypothesis):
             continue
         for axis in range(3):
-            if aid.std[axis] > LONGEST_STD:
+            if sensor.std[axis] > LONGEST_STD:
                 continue
             compare(
                 hypothesis,
-                aid.value[axis],
-                aid.std[axis],
+                sensor.value[axis],
+                sensor.std[axis],
                 axis,
                 ekf.transition.rotation,
                 innovation,
@@ -108,9 +108,9 @@ def observe(
             kalman(hypothesis, innovation)
             if h == ekf.best:
                 residual.weight = min(residual.weight, w)
-                add_update(ekf, aid.t, records)
+                add_update(ekf, sensor.t, records)
         if of_wheels and ekf.sensed:
-            _compare_yaw_rate(hypothesis, aid, ekf.imu, innovation)
+            _compare_yaw_rate(hypothesis, sensor, ekf.imu, innovation)
             white = innovation.prior_variance + GYRO_RATE * parameters.gyro_noise**2
             w = weight(
                 GEMAN_MCCLURE, innovation.value / math.sqrt(white + innovation.noise_variance), GATE
@@ -118,7 +118,7 @@ def observe(
             innovation.total_variance = white + innovation.noise_variance * inflation / w
             kalman(hypothesis, innovation)
             if h == ekf.best:
-                add_update(ekf, aid.t, records)
+                add_update(ekf, sensor.t, records)
 
 
 @compiled
@@ -137,55 +137,55 @@ def agrees(state: Record, t: float) -> bool:
 
 
 @compiled
-def _complete(aid: Record, parameters: Record) -> None:
-    """Set missing standard deviations of an AID to the configured ones, and reduce them at rest.
+def _complete(sensor: Record, parameters: Record) -> None:
+    """Set missing standard deviations of a SENSOR_ROW to the configured ones, and reduce them at rest.
 
     The reduction by STANDING applies to wheels that do not turn.
     """
     for axis in range(3):
-        if aid.std[axis] == 0.0:
-            aid.std[axis] = parameters.velocity_std
-    if aid.std[YAW_RATE] == 0.0:
-        aid.std[YAW_RATE] = (
+        if sensor.std[axis] == 0.0:
+            sensor.std[axis] = parameters.velocity_std
+    if sensor.std[YAW_RATE] == 0.0:
+        sensor.std[YAW_RATE] = (
             parameters.yaw_rate_std if parameters.yaw_rate_std > 0.0 else 2.0 * LONGEST_STD
         )
-    if aid.std[YAW_RATE] > LONGEST_STD:
+    if sensor.std[YAW_RATE] > LONGEST_STD:
         return
     for axis in range(4):
-        if aid.value[axis] != 0.0:
+        if sensor.value[axis] != 0.0:
             return
     for axis in range(4):
-        if aid.std[axis] <= LONGEST_STD:
-            aid.std[axis] *= STANDING
+        if sensor.std[axis] <= LONGEST_STD:
+            sensor.std[axis] *= STANDING
 
 
 @compiled
-def _repeats(state: Record, aid: Record) -> bool:
+def _repeats(state: Record, sensor: Record) -> bool:
     """Store a velocity and return whether the sensor has repeated it for too long.
 
     A working sensor never repeats a value for this long.
     """
-    since = aid.t - state.heard
+    since = sensor.t - state.heard
     for k in range(4):
-        if aid.std[k] <= LONGEST_STD and aid.value[k] != state.value[k]:
-            state.value[k], state.changed = aid.value[k], aid.t
-    return aid.t - state.changed > max(STUCK_TIME, STUCK_COUNT * since)
+        if sensor.std[k] <= LONGEST_STD and sensor.value[k] != state.value[k]:
+            state.value[k], state.changed = sensor.value[k], sensor.t
+    return sensor.t - state.changed > max(STUCK_TIME, STUCK_COUNT * since)
 
 
 @compiled
-def _worst(ekf: Record, aid: Record, residual: Record) -> float:
+def _worst(ekf: Record, sensor: Record, residual: Record) -> float:
     """Return the largest normalized innovation squared of the components, for the best hypothesis.
 
     The residual is filled with this component.
     """
     innovation, worst = ekf.innovation, -1.0
     for axis in range(3):
-        if aid.std[axis] > LONGEST_STD:
+        if sensor.std[axis] > LONGEST_STD:
             continue
         compare(
             ekf.hypotheses[ekf.best],
-            aid.value[axis],
-            aid.std[axis],
+            sensor.value[axis],
+            sensor.std[axis],
             axis,
             ekf.transition.rotation,
             innovation,
@@ -235,12 +235,12 @@ def compare(
 
 
 @compiled
-def _compare_yaw_rate(hypothesis: Record, aid: Record, imu: Record, innovation: Record) -> None:
+def _compare_yaw_rate(hypothesis: Record, sensor: Record, imu: Record, innovation: Record) -> None:
     """Fill in the innovation of a yaw rate: it measures the bias of the gyroscope.
 
-    imu is an IMU_STATE; its last angular rate is compared with the yaw rate of the AID.
+    imu is an IMU_STATE; its last angular rate is compared with the yaw rate of the SENSOR_ROW.
     """
     innovation.entries, innovation.states[0], innovation.row[0] = 1, GYRO_BIAS, -1.0
-    innovation.value = aid.value[YAW_RATE] - (imu.gyro[2] - hypothesis.x[GYRO_BIAS + 1])
-    innovation.noise_variance = aid.std[YAW_RATE] ** 2
+    innovation.value = sensor.value[YAW_RATE] - (imu.gyro[2] - hypothesis.x[GYRO_BIAS + 1])
+    innovation.noise_variance = sensor.std[YAW_RATE] ** 2
     project(hypothesis.P, innovation)

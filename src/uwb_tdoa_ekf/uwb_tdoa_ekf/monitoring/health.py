@@ -65,13 +65,13 @@ class Health:
         self._use_imu, self._lag = config.use_imu, lag
         self._volume = VolumeCheck(volume)
         self._imu_rate, self._tdoa_rate, self._located_rate = Rate(), Rate(), Rate()
-        self._aids_before: dict[
+        self._sensors_before: dict[
             str, dict[str, int]
         ] = {}  # by sensor: messages received and not used at the last report
-        self._aids_bad: dict[
+        self._sensors_bad: dict[
             tuple[str, str], int
         ] = {}  # consecutive reports in which most messages of a sensor were not used, by reason
-        self._aids_heard: dict[
+        self._sensors_heard: dict[
             str, tuple[int, float]
         ] = {}  # by sensor: messages so far, and time.monotonic() of the last change, s
         self._starting: float | None = None  # time.monotonic(), s
@@ -162,7 +162,7 @@ class Health:
         else:
             status = OK, "looking for the start position"
         if status == (OK, "running"):
-            status = self._status_of_aids(now, counts)
+            status = self._status_of_sensors(now, counts)
         if status == (OK, "running") and estimator is not None and estimator.side_unknown:
             status = WARN, estimator.side_unknown
         at_position: dict[str, str] = {}
@@ -207,15 +207,15 @@ class Health:
         values |= {f"found {finding.rule}": f"{finding.value:.4g}" for finding in findings}
         return *status, values | at_position
 
-    def _status_of_aids(self, now: float, counts: Mapping[str, int]) -> tuple[bytes, str]:
+    def _status_of_sensors(self, now: float, counts: Mapping[str, int]) -> tuple[bytes, str]:
         """Return the status of sensors that went silent or whose messages are mostly not used."""
         status = OK, "running"
-        for aid, sensor in SENSORS.items():
-            received = self.received[aid]
-            heard, since = self._aids_heard.get(aid, (0, now))
+        for stream, sensor in SENSORS.items():
+            received = self.received[stream]
+            heard, since = self._sensors_heard.get(stream, (0, now))
             if received != heard:
                 since = now
-            self._aids_heard[aid] = received, since
+            self._sensors_heard[stream] = received, since
             reasons = {
                 "rejected": (
                     "contradict everything else and are not used: check the sensor, "
@@ -225,11 +225,11 @@ class Health:
                 "invalid": f"are invalid: {sensor.invalid}",
             }
             totals = {"received": received} | {
-                reason: counts[f"{aid}_{reason}"] for reason in reasons
+                reason: counts[f"{stream}_{reason}"] for reason in reasons
             }
-            before = self._aids_before.get(aid, dict.fromkeys(totals, 0))
+            before = self._sensors_before.get(stream, dict.fromkeys(totals, 0))
             recent = {name: total - before[name] for name, total in totals.items()}
-            self._aids_before[aid] = totals
+            self._sensors_before[stream] = totals
             if received and now - since > STOPPED:
                 status = (
                     WARN,
@@ -241,8 +241,8 @@ class Health:
                 continue
             for reason, words in reasons.items():
                 bad = recent[reason] > LARGEST_UNUSED * recent["received"]
-                repeats = self._aids_bad[aid, reason] = (
-                    self._aids_bad.get((aid, reason), 0) + 1 if bad else 0
+                repeats = self._sensors_bad[stream, reason] = (
+                    self._sensors_bad.get((stream, reason), 0) + 1 if bad else 0
                 )
                 if repeats >= REPEATS:
                     status = (

@@ -85,7 +85,7 @@ TEXTS = {
         ),
     ],
 }
-AIDS = {  # streams of a Flight
+SENSOR_NAMES = {  # streams of a Flight
     "height": Height(np.array([10.0, 10.1]), np.array([1.25, np.inf])),
     "pressure": Pressure(np.array([10.0]), np.array([101325.0])),
     "velocity": Velocity(
@@ -146,7 +146,7 @@ def _bags(folder):
     )
     write("bag_packed", "small", (folder / "small" / "small.mcap").read_bytes())
     write_bag(flight, folder / "tables", "sqlite3")
-    write_bag(replace(small_flight(0.008), **AIDS), folder / "aided")
+    write_bag(replace(small_flight(0.008), **SENSOR_NAMES), folder / "aided")
     with open_bag(folder / "aided") as reader:
         for topic, _, data in {c.topic: (c.topic, t, d) for c, t, d in reader.messages()}.values():
             if topic in MESSAGES:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.flight import AIDS
+from uwb_tdoa_bias.common.flight import SENSOR_NAMES
 from uwb_tdoa_ekf.results import rows_of
 
 from .bag import check_output, write_bag
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     Timed = Tdoas | Imu | Truth | Stream
 
-SENSORS = "tdoa", "imu", "truth", *AIDS  # streams of a Flight, each on its own clock
+SENSORS = "tdoa", "imu", "truth", *SENSOR_NAMES  # streams of a Flight, each on its own clock
 
 
 @dataclass(frozen=True)

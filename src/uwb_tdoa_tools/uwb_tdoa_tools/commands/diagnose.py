@@ -177,7 +177,7 @@ def _diagnose(args: Namespace) -> int:
     parameters = write_parameters(out / "ekf_node.yaml", result.tdoa_std, config)
     truth = all(flight.truth is not None for flight in holdout or flights)
     more = [*options.words_of_reading(args)]
-    more += [word for aid in reference.left_out for word in ("--without", aid)]
+    more += [word for sensor in reference.left_out for word in ("--without", sensor)]
     more += ["--align", args.align] if truth and args.align != NONE else []
     applying = command_lines.lines_of_use(
         out,

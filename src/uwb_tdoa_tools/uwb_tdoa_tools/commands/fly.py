@@ -13,7 +13,7 @@ from .. import cli, options, parallel
 from ..flying import fleet, rover
 from ..flying.fleet import plot
 from ..flying.mission import Circles, Waypoints
-from ..flying.sensors import AIDS
+from ..flying.sensors import SENSOR_NAMES
 from ..flying.trial import VEHICLES, Task
 from ..flying.verdict import summary, text, wording_of
 from ..flying.world import MOMENTS, WORLDS, world_of
@@ -32,7 +32,7 @@ WITHOUT_INFLUENCE = (
     "record",
     "resume",
 )  # to what becomes of a flight
-NOT_OF_ROVERS = ("hover", "again", "peer", "correction", "aid")  # options
+NOT_OF_ROVERS = ("hover", "again", "peer", "correction", "sensor")  # options
 INPUTS = ("config", "effects", "model", "peer", "correction")  # options that name files
 DESCRIPTION = """Fly a simulated quadrotor in closed loop, in lockstep and without ROS: its controller gets position, velocity and
 attitude from nothing but the estimate, by the very code of ekf_node, and its rates from the gyroscope. Four seconds at rest, up to
@@ -53,7 +53,7 @@ def parser() -> argparse.ArgumentParser:
         "fly",
         "fly --flights 100 --json flown.json --plot flown.png",
         "fly --no-floor-effect --told place --yaw unknown --set robust:=m_estimation",
-        "fly --aid height --flights 20 --seed 1000 --at-least 19",
+        "fly --sensor height --flights 20 --seed 1000 --at-least 19",
         "fly --world person --again --inject anchor_delay 3=0.3",
         "fly --vehicle rover --flights 20 --plot driven.png",
         "fly --silence circle:3 --effects effects.yaml",
@@ -106,10 +106,10 @@ def parser() -> argparse.ArgumentParser:
         help="at the start, to 0.1 rad (default: known)",
     )
     add(
-        "--aid",
+        "--sensor",
         action="append",
         default=[],
-        choices=AIDS,
+        choices=SENSOR_NAMES,
         help=(
             "what else it measures: a range finder, a barometer, its velocity, distances to anchors"
         ),
@@ -206,13 +206,13 @@ def _fly(args: argparse.Namespace) -> int:
         )
     load_network(args.model)  # or say what is wrong with it, before the first flight
     path: Circles | Waypoints = Circles(radius=0.0) if args.hover else Circles()
-    aids = args.aid
+    sensors = args.sensor
     if args.vehicle == "rover":
         _check_rover(args)
-        config, path, aids = replace(config, **rover.FILTER), Waypoints(), rover.AIDS
+        config, path, sensors = replace(config, **rover.FILTER), Waypoints(), rover.SENSOR_NAMES
     config = options.with_parameters(config, args.set)
     world = world_of(
-        args.world, args.floor_effect, aids, args.silence, args.inject, args.installation
+        args.world, args.floor_effect, sensors, args.silence, args.inject, args.installation
     )
     seeds = range(args.seed, args.seed + args.flights)
     tasks = [

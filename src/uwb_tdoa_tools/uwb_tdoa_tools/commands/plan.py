@@ -146,7 +146,7 @@ def parser() -> ArgumentParser:
     )
     add(
         "--with",
-        dest="aids",
+        dest="sensors",
         action="append",
         default=[],
         choices=["height"],

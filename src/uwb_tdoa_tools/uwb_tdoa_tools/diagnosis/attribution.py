@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.common.anchors import Anchors
-from uwb_tdoa_bias.common.flight import AIDS
+from uwb_tdoa_bias.common.flight import SENSOR_NAMES
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_bias.effects.covariates import UPWARDS
 from uwb_tdoa_bias.effects.samples import RADIO
@@ -288,7 +288,7 @@ def first_fit(
 
     flights : prepared Flights; base : EffectSet in the model
     """
-    others = [name for name in ("imu", *AIDS) if name not in RADIO]
+    others = [name for name in ("imu", *SENSOR_NAMES) if name not in RADIO]
     found = residuals_of([flight.without(*others) for flight in flights], reference, base)
     installation = _installation(flights)
     declared = _declared(found, reference, OF_ANCHORS, installation)

@@ -261,7 +261,7 @@ def _scale(innovation: np.ndarray) -> float:
 
 def _used(run: Run) -> np.ndarray:
     """Return innovations of the used TDOAs of a Run, or of its ranges without TDOAs, (n,) m."""
-    residuals, ranges = run.residuals, run.aids.get(RANGES)
+    residuals, ranges = run.residuals, run.sensors.get(RANGES)
     rows = (
         {name: getattr(residuals, name) for name in OF_ROW}
         if len(residuals) or ranges is None

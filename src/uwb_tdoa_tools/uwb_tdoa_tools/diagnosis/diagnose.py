@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.flight import AIDS
+from uwb_tdoa_bias.common.flight import SENSOR_NAMES
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.evidence import OF_ANCHORS
@@ -182,7 +182,7 @@ def with_noise(
 
 def unused_streams(config: FilterConfig) -> tuple[str, ...]:
     """Return the names of the streams of a Flight that the filter does not use."""
-    return tuple(name for name in ("imu", *AIDS) if not getattr(config, f"use_{name}"))
+    return tuple(name for name in ("imu", *SENSOR_NAMES) if not getattr(config, f"use_{name}"))
 
 
 def _only_of(unused: Sequence[str], effect: str) -> bool:

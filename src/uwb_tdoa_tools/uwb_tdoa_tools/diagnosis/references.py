@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.flight import AIDS, Truth
+from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Truth
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects.stamps import shifted
 from uwb_tdoa_ekf.core import auxiliary
@@ -66,7 +66,7 @@ class Reference:
     knows_floor: ClassVar[bool] = False  # True: also before take-off and after landing
     tells_errors: ClassVar[bool] = True  # errors of the filter's positions are known with it
     constraints: tuple[Constraint, ...] = ()
-    left_out: ClassVar[tuple[str, ...]] = ()  # aids that flights are not judged with
+    left_out: ClassVar[tuple[str, ...]] = ()  # sensors that flights are not judged with
     words: str  # the reference, in reports
 
     def prepare(self, flight: Flight) -> Flight:
@@ -229,7 +229,7 @@ class Heights(GroundTruth):
 
     positions_known = (False, False, True)
     attitude_known = False
-    left_out = AIDS
+    left_out = SENSOR_NAMES
     words = "heights that a range finder measured; x and y are the filter's own"
 
     def __init__(

@@ -176,7 +176,7 @@ class OverTopics:
         self._pending_pose: tuple[float, np.ndarray, float, float] | None = None
         self.status: EstimatorStatus | None = None
         self._outputs = {
-            name: _Output(node, *STREAMS[name]) for name in ("imu", "tdoa", *world.aids)
+            name: _Output(node, *STREAMS[name]) for name in ("imu", "tdoa", *world.sensors)
         }
         self._truth = _Output(node, *STREAMS["truth"], frame=self._anchors.frame)
         self._clock = node.create_publisher(Clock, "/clock", 10) if clock else None

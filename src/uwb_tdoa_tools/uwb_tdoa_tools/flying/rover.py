@@ -15,7 +15,7 @@ from uwb_tdoa_bias.common.sensors import SENSORS
 from ..simulation.config import WHEELS_RATE
 from ..simulation.sensors import YAW_RATE_STD, slips
 from .mission import DONE, FLYING, LOST, REFUSED, WAITING, Polyline, Rules, Waypoints, yaw_of
-from .sensors import AidSensor, random
+from .sensors import SensorSensor, random
 from .simulator import Simulator
 from .trial import REST_AFTER, Trial
 from .vehicle import GRAVITY, IMU_RATE
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 MAST = 0.4  # m
 # parameters of the filter of a rover
 FILTER: dict[str, Any] = {"planar": True, "fixed_height": MAST, "non_holonomic_std": 0.05}
-AIDS = ("velocity",)  # sensors besides the IMU and the radio
+SENSOR_NAMES = ("velocity",)  # sensors besides the IMU and the radio
 TRACK = 0.4  # m between its wheels
 SCALE, UNEQUAL = 0.03, 0.003  # largest common scale error; standard deviation of each wheel
 SLIP = 0.1  # share by which a slipping wheel turns too fast
@@ -59,7 +59,7 @@ class Steering:
         self.speed = self.turning = 0.0
 
 
-class Wheels(AidSensor):
+class Wheels(SensorSensor):
     """Simulate the encoders of both wheels."""
 
     rate, width = WHEELS_RATE, 2
@@ -85,7 +85,7 @@ class RoverSimulator(Simulator):
         self._scale = 1.0 + rng.uniform(-SCALE, SCALE) + UNEQUAL * rng.standard_normal(2)
         slipping = np.column_stack([slips(self.times, rng) for _ in range(2)])
         self._per_turn = 1.0 / (self._scale * (1.0 + SLIP * slipping))
-        self._aids = {"velocity": Wheels(world, seed, duration)}
+        self._sensors = {"velocity": Wheels(world, seed, duration)}
         self.wheels = np.zeros((len(self.times), 2))
 
     def _move(self, controller: Steering, rows: slice) -> None:
@@ -112,7 +112,7 @@ class RoverSimulator(Simulator):
             self.wheels[i], self.states[i], self.samples[i] = wheels, state, sample
             self.contact[i] = 2.0
 
-    def _aid_measured(self, name: str, sensor: AidSensor, lately: slice) -> Stream:
+    def _sensor_measured(self, name: str, sensor: SensorSensor, lately: slice) -> Stream:
         new, _, _ = self._poses(name, sensor.t, lately)
         t = sensor.t[new]
         wheels = np.column_stack(

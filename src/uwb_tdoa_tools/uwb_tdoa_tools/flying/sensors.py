@@ -290,7 +290,7 @@ def gusts(world: World, seed: int, duration: float) -> np.ndarray:
     return world.gust * lfilter([1.0], [1.0, -decay], white, axis=0)
 
 
-class AidSensor:
+class SensorSensor:
     """Simulate a further sensor of one flight.
 
     Attributes
@@ -328,7 +328,7 @@ class AidSensor:
         raise NotImplementedError
 
 
-class RangeFinder(AidSensor):
+class RangeFinder(SensorSensor):
     """Simulate a range finder along -z of the body, m, with inf beyond its range."""
 
     def rate_in(self, world: World) -> float:
@@ -344,7 +344,7 @@ class RangeFinder(AidSensor):
         )
 
 
-class Barometer(AidSensor):
+class Barometer(SensorSensor):
     """Simulate a barometer, Pa."""
 
     def measured(
@@ -353,7 +353,7 @@ class Barometer(AidSensor):
         return (pressure_at(SITE + p[:, 2] + ALTITUDE_STD * self.noise[rows, 0]),)
 
 
-class Speedometer(AidSensor):
+class Speedometer(SensorSensor):
     """Simulate a velocity sensor: velocity in the body frame and its standard deviation, m/s."""
 
     width = 3
@@ -364,7 +364,7 @@ class Speedometer(AidSensor):
         return v + VELOCITY_STD * self.noise[rows], np.full(v.shape, max(VELOCITY_STD, LEAST_STD))
 
 
-class TwoWayRanging(AidSensor):
+class TwoWayRanging(SensorSensor):
     """Simulate distances to the anchors in turn: ids, m, and an unknown variance of 0.
 
     No obstacle blocks them.
@@ -381,7 +381,7 @@ class TwoWayRanging(AidSensor):
         return anchors.ids[row], np.maximum(d, 0.0), np.zeros(len(d))
 
 
-AIDS = {
+SENSOR_NAMES = {
     "height": RangeFinder,
     "pressure": Barometer,
     "velocity": Speedometer,

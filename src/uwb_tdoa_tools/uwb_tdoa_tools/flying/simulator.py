@@ -15,7 +15,7 @@ from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_ekf.results import concatenated, rows_of
 
 from .controller import inner
-from .sensors import AIDS, InertialErrors, Radio, gusts, random
+from .sensors import SENSOR_NAMES, InertialErrors, Radio, gusts, random
 from .vehicle import (
     ATTITUDE,
     GRAVITY,
@@ -33,7 +33,7 @@ from .vehicle import (
 if TYPE_CHECKING:
     from uwb_tdoa_bias.common.sensors.sensor import Stream
 
-    from .sensors import AidSensor
+    from .sensors import SensorSensor
     from .vehicle import Record
     from .world import World
 
@@ -152,18 +152,18 @@ class SensorReadings:
     ----------
     imu : Imu
     tdoa : Tdoas
-    aids : dict of str to Stream
+    sensors : dict of str to Stream
         Streams of the other sensors of the world, by name.
     """
 
     imu: Imu
     tdoa: Tdoas
-    aids: dict[str, Stream]
+    sensors: dict[str, Stream]
 
     @property
     def streams(self) -> dict[str, Any]:
         """Return all streams by name."""
-        return {"imu": self.imu, "tdoa": self.tdoa, **self.aids}
+        return {"imu": self.imu, "tdoa": self.tdoa, **self.sensors}
 
 
 class Simulator:
@@ -209,7 +209,7 @@ class Simulator:
             Radio(world, seed, duration),
             InertialErrors(world, seed, duration),
         )
-        self._aids = {name: AIDS[name](world, seed, duration) for name in world.aids}
+        self._sensors = {name: SENSOR_NAMES[name](world, seed, duration) for name in world.sensors}
         self._wind, self._rng = gusts(world, seed, duration), random(seed, "effects")
         n = len(self._wind)
         self.times, self.states, self.contact = (
@@ -221,7 +221,7 @@ class Simulator:
         self.done, self.states[0], self._gyro = 0, self.state, np.zeros((2, 3))
         # state and time at the start, time at the end, path
         self._carrying: tuple[np.ndarray, float, float, np.ndarray] | None = None
-        self._heard = dict.fromkeys(("tdoa", *world.aids), 0)
+        self._heard = dict.fromkeys(("tdoa", *world.sensors), 0)
         # first TDOAs, and the state at that time
         self._first: tuple[Tdoas, np.ndarray] | None = None
 
@@ -267,10 +267,11 @@ class Simulator:
         tdoa = Tdoas(
             radio.t[new][heard], ids[radio.a[new][heard]], ids[radio.b[new][heard]], d[heard]
         )
-        aids = {
-            name: self._aid_measured(name, sensor, lately) for name, sensor in self._aids.items()
+        sensors = {
+            name: self._sensor_measured(name, sensor, lately)
+            for name, sensor in self._sensors.items()
         }
-        return self._with_effects(SensorReadings(imu, tdoa, aids))
+        return self._with_effects(SensorReadings(imu, tdoa, sensors))
 
     def _move(self, controller: Any, rows: slice) -> None:
         """Fly the samples in `rows` with the outputs of a Controller."""
@@ -334,7 +335,7 @@ class Simulator:
         self._heard[stream] = new.stop
         return new, p, q
 
-    def _aid_measured(self, name: str, sensor: AidSensor, lately: slice) -> Stream:
+    def _sensor_measured(self, name: str, sensor: SensorSensor, lately: slice) -> Stream:
         """Return the new measurements of one sensor."""
         new, p, q = self._poses(name, sensor.t, lately)
         v = np.broadcast_to(self.state[VELOCITY], p.shape)
@@ -360,14 +361,14 @@ class Simulator:
             np.concatenate([first.t[:1] - 1e-3, self.times[recent]]),
         )
         truth = Truth(t, states[:, POSITION], states[:, ATTITUDE])
-        aids: dict[str, Any] = measured.aids
-        flight = Flight("turn", self.world.anchors, Tdoas(*columns), measured.imu, truth, **aids)
+        sensors: dict[str, Any] = measured.sensors
+        flight = Flight("turn", self.world.anchors, Tdoas(*columns), measured.imu, truth, **sensors)
         for effect in self.world.effects.effects:
             flight = effect.inject(flight, self._rng)
         assert flight.imu is not None  # no effect removes it
-        aids = {name: getattr(flight, name) for name in measured.aids}
+        sensors = {name: getattr(flight, name) for name in measured.sensors}
         return replace(
-            measured, tdoa=rows_of(flight.tdoa, slice(1, None)), imu=flight.imu, aids=aids
+            measured, tdoa=rows_of(flight.tdoa, slice(1, None)), imu=flight.imu, sensors=sensors
         )
 
 

@@ -289,13 +289,20 @@ class Trial:
         parts = [
             concatenated([getattr(one, name) for one in self._arrived]) for name in ("imu", "tdoa")
         ]
-        aids: dict[str, Any] = {
-            name: concatenated([one.aids[name] for one in self._arrived]) for name in world.aids
+        sensors: dict[str, Any] = {
+            name: concatenated([one.sensors[name] for one in self._arrived])
+            for name in world.sensors
         }
         truth = Truth(simulator.times[:end], states[:, POSITION], states[:, ATTITUDE])
         meta = {"source": "fly", "format": "simulation", "protocol": world.protocol}
         flight = Flight(
-            f"flown-{self.task.seed}", world.anchors, parts[1], parts[0], truth, meta=meta, **aids
+            f"flown-{self.task.seed}",
+            world.anchors,
+            parts[1],
+            parts[0],
+            truth,
+            meta=meta,
+            **sensors,
         )
         return TrialResult(
             self.task,

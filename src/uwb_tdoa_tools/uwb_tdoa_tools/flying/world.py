@@ -81,7 +81,7 @@ class World:
         Standard deviation of the wind along each axis, m/s.
     table : float
         Height of a round table of 0.4 m radius at the start. 0 for none.
-    aids : tuple of str
+    sensors : tuple of str
         Further sensors: "height" (a range finder along -z of the body), "pressure", "velocity",
         "range" (distances to anchors). Rates and noises are those of `simulate`.
     height_rate, height_noise, height_range : float
@@ -117,7 +117,7 @@ class World:
     mass: tuple[float, float] = (0.027, 0.033)
     gust: float = 0.0
     table: float = 0.0
-    aids: tuple[str, ...] = ()
+    sensors: tuple[str, ...] = ()
     height_rate: float = 20.0
     height_noise: float = 0.01
     height_range: float = 4.0
@@ -161,7 +161,7 @@ WORLDS = {
 def world_of(
     name: str,
     floor_effect: bool | None = None,
-    aids: Iterable[str] = (),
+    sensors: Iterable[str] = (),
     silence: str | None = None,
     injected: Iterable[Sequence[str]] = (),
     installation: int | None = None,
@@ -172,7 +172,7 @@ def world_of(
     ----------
     name : str
     floor_effect : bool, optional
-    aids : iterable of str
+    sensors : iterable of str
     silence : str, optional
         "MOMENT:S".
     injected : iterable
@@ -184,7 +184,10 @@ def world_of(
     InputError
         If `silence` or `injected` cannot be read.
     """
-    changed: dict[str, Any] = {"aids": tuple(dict.fromkeys(aids)), "installation": installation}
+    changed: dict[str, Any] = {
+        "sensors": tuple(dict.fromkeys(sensors)),
+        "installation": installation,
+    }
     if floor_effect is not None:
         changed["floor_effect"] = floor_effect
     if silence is not None:

@@ -37,8 +37,8 @@ STEP = 80_000_000
 # which passes TDOAs on until it has a pose.
 START_STEP, START = 40_000_000, 1_000_000_000
 LOOK_PERIOD = LEAD // 20  # ns of stamps between two looks at a topic that is in step or silent
-AID_SILENT = 1_000_000_000  # ns until ekf_node stops waiting for a silent sensor: its SILENT
-AID_SHARE = 0.5  # of `lag`: how long ekf_node holds TDOAs back for an aid: its OF_AIDS
+SENSOR_SILENT = 1_000_000_000  # ns until ekf_node stops waiting for a silent sensor: its SILENT
+SENSOR_SHARE = 0.5  # of `lag`: how long ekf_node holds TDOAs back for a sensor: its OF_SENSORS
 LAG = 0.25  # s, default of `lag`
 SILENCE = 5.0  # s without a message after which the replay waits for a topic no longer
 POLL_PERIOD = 0.001  # s
@@ -81,22 +81,22 @@ class Follower:
         self._looked: int | None = None  # ns, stamp of the replay at the last look
         self._started: int | None = None  # ns, stamp of the first message
         self._silent = False
-        self._tdoas = _Tdoas(node, round(1e9 * AID_SHARE * lag))
+        self._tdoas = _Tdoas(node, round(1e9 * SENSOR_SHARE * lag))
 
     def add_tdoa(self, stamp: int) -> None:
         """Note that a TDOA with this stamp, ns, was published."""
         self._tdoas.add(stamp)
 
-    def add_aid(self, topic: str, stamp: int) -> None:
+    def add_sensor(self, topic: str, stamp: int) -> None:
         """Note that a measurement of one of the SENSORS with this stamp, ns, was published."""
-        self._tdoas.add_aid(topic, stamp)
+        self._tdoas.add_sensor(topic, stamp)
 
     def wait(self, stamp: int, stop: Stop) -> float:
         """Wait until a message may be published, and return how long that took, s.
 
         The topic must not be more than LEAD behind the message. Each TDOA that is older by STEP than
         the time of the filter must have left the filter. That time is the stamp of the newest TDOA, or
-        less while the filter waits for an aid.
+        less while the filter waits for a sensor.
 
         Parameters
         ----------
@@ -144,8 +144,8 @@ class Follower:
 class _Tdoas:
     """Count how far the published TDOAs have left the filter, in the order of their stamps."""
 
-    def __init__(self, node: Node, aid_wait: int) -> None:
-        self._subscription, self._aid_wait = None, aid_wait
+    def __init__(self, node: Node, sensor_wait: int) -> None:
+        self._subscription, self._sensor_wait = None, sensor_wait
         publishers = node.get_publishers_info_by_topic(node.resolve_topic_name(RESIDUAL))
         cls = message_class(publishers[0].topic_type) if publishers else None
         if cls is not None:
@@ -164,7 +164,7 @@ class _Tdoas:
         self._first: deque[int] = deque()  # first stamps that were published
         self._shift = 0  # ns by which the same stamps are smaller when they leave the filter
         self._learned = 0  # number of stamps from which `_shift` is known
-        self._aids: dict[str, int] = {}  # {topic: ns, newest stamp that was published}
+        self._sensors: dict[str, int] = {}  # {topic: ns, newest stamp that was published}
         # Whether START_STEP is too small, because the recorded IMU is behind the TDOAs.
         self._behind = False
 
@@ -177,8 +177,8 @@ class _Tdoas:
         if self._learned < LEARNED:
             self._first.append(stamp)
 
-    def add_aid(self, topic: str, stamp: int) -> None:
-        self._aids[topic] = stamp
+    def add_sensor(self, topic: str, stamp: int) -> None:
+        self._sensors[topic] = stamp
 
     def wait(self, starting: bool, stop: Stop) -> float:
         if self._subscription is None or self._newest is None:
@@ -201,8 +201,10 @@ class _Tdoas:
 
     def _is_in_step(self, step: int) -> bool:
         assert self._newest is not None
-        aids = [stamp for stamp in self._aids.values() if stamp > self._newest - AID_SILENT]
-        time_of_filter = max(min((self._newest, *aids)), self._newest - self._aid_wait)
+        sensors = [
+            stamp for stamp in self._sensors.values() if stamp > self._newest - SENSOR_SILENT
+        ]
+        time_of_filter = max(min((self._newest, *sensors)), self._newest - self._sensor_wait)
         return time_of_filter - step <= max(self._begin, self._out + self._shift)
 
     def _learn(self, stamps: list[int]) -> None:
@@ -346,7 +348,7 @@ class Nodes:
     def _check_patience(self) -> None:
         """Require: longest wait in the filter < hold < lag. Else a node drops data that are on the way."""
         hold, self.lag = (self._parameter(name, parameter) for name, parameter in PATIENCE.items())
-        least = 1e-9 * STEP + AID_SHARE * self.lag
+        least = 1e-9 * STEP + SENSOR_SHARE * self.lag
         if not least < hold < self.lag:
             raise InputError(
                 f"--follow: bias_node's hold is {hold:g} s and ekf_node's lag {self.lag:g} s; "

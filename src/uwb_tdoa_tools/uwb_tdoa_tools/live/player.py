@@ -118,7 +118,7 @@ def is_tdoa(publisher: Publisher) -> bool:
     return _kind(publisher) == "Tdoa"
 
 
-def is_aid(publisher: Publisher) -> bool:
+def is_sensor(publisher: Publisher) -> bool:
     """Return whether a publisher has measurements of one of the SENSORS, for ekf_node."""
     return publisher.topic_name.endswith(
         tuple(f"/{topic}" for sensor in SENSORS.values() for topic, _ in sensor.topics)
@@ -165,7 +165,7 @@ class Player:
             topic for topic, publisher in publishers.items() if is_stamped(publisher.msg_type)
         }
         self._tdoas = {topic for topic, publisher in publishers.items() if is_tdoa(publisher)}
-        self._aids = {topic for topic, publisher in publishers.items() if is_aid(publisher)}
+        self._sensors = {topic for topic, publisher in publishers.items() if is_sensor(publisher)}
         self._latched = [publisher for publisher in publishers.values() if is_latched(publisher)]
         self._start: int | None = None  # ns, stamp of the first message
         self._began = self._next_tick = 0.0
@@ -201,10 +201,10 @@ class Player:
                     self.follower.add_tdoa(stamp_of(data))
                 elif (
                     self.follower is not None
-                    and topic in self._aids
+                    and topic in self._sensors
                     and publisher.get_subscription_count()
                 ):
-                    self.follower.add_aid(topic, stamp_of(data))
+                    self.follower.add_sensor(topic, stamp_of(data))
 
     def _wait_for_latched(self) -> float:
         """Wait for the acknowledgement of latched messages (anchors), and return how long, s.

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.flight import AIDS
+from uwb_tdoa_bias.common.flight import SENSOR_NAMES
 from uwb_tdoa_bias.common.flyable import FlyableVolume
 
 from ..scoring.evaluation import evaluate
@@ -326,13 +326,13 @@ class ErrorSamples:
     covariance: np.ndarray
 
 
-def error_samples(flight: Flight, aids: Iterable[str] = ()) -> ErrorSamples:
+def error_samples(flight: Flight, sensors: Iterable[str] = ()) -> ErrorSamples:
     """Return the ErrorSamples of a Flight with ground truth. Raises InputError.
 
-    The filter uses TDOAs, IMU and `aids` (names of AIDS) alone.
+    The filter uses TDOAs, IMU and `sensors` (names of SENSOR_NAMES) alone.
     """
     assert flight.truth is not None
-    score, _ = evaluate(flight.without(*(name for name in AIDS if name not in aids)))
+    score, _ = evaluate(flight.without(*(name for name in SENSOR_NAMES if name not in sensors)))
     return ErrorSamples(score.t, position_at(score.t, flight.truth), score.error, score.covariance)
 
 

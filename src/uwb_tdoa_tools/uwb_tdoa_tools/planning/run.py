@@ -90,7 +90,7 @@ def installation_of(args: Namespace, anchors: Anchors) -> Installation:
         noise = RadioNoise(antenna, args.tx_power, args.temperature, args.voltage)
     # of a single anchor there is none, and Installation refuses it
     pairing: Any = PAIRINGS[_pairing(args)](len(anchors)) if len(anchors) > 1 else None
-    height_std = args.height_std if "height" in args.aids else np.inf
+    height_std = args.height_std if "height" in args.sensors else np.inf
     return Installation(
         anchors,
         noise,
@@ -357,7 +357,7 @@ def plan_room(
         report.print_check(figures["check"])
     if recordings:
         flown = parallel.over(
-            FlightErrors(reading, tuple(args.aids)), recordings, args.jobs, args.dask
+            FlightErrors(reading, tuple(args.sensors)), recordings, args.jobs, args.dask
         )
         figures["flights"] = evaluate_flights(
             flown, installation, demand.room, args.step or 0.4, args.out
@@ -451,21 +451,21 @@ def brute_force_check(installation: Installation, grid: Grid, out: Path) -> dict
 class FlightErrors:
     """Reads and estimates flights. It can be pickled.
 
-    reading : Reading; aids : names of AIDS that the filter uses.
+    reading : Reading; sensors : names of SENSOR_NAMES that the filter uses.
     """
 
     reading: Reading
-    aids: tuple[str, ...] = ()
+    sensors: tuple[str, ...] = ()
 
     def __call__(self, recording: Recording) -> tuple[str, maps.ErrorSamples]:
         """Return (name, ErrorSamples) of a recording (path, survey). Raises InputError."""
         flight = self.reading.read(recording)
-        for name in self.aids:
+        for name in self.sensors:
             if getattr(flight, name) is None:
                 raise InputError(
                     f"{flight.name}: holds no {name}; leave out --with {name}, or this flight."
                 )
-        return flight.name, maps.error_samples(flight, self.aids)
+        return flight.name, maps.error_samples(flight, self.sensors)
 
 
 def evaluate_flights(

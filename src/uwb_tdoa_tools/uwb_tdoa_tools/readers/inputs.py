@@ -11,7 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.flight import AIDS
+from uwb_tdoa_bias.common.flight import SENSOR_NAMES
 from uwb_tdoa_bias.common.limits import FOLDER_DEPTH, FOLDER_ENTRIES, Budget
 from uwb_tdoa_bias.common.sensors import LOCATING
 from uwb_tdoa_bias.common.text import printable
@@ -186,7 +186,7 @@ class Reading:
         report_remarks(path, flight.meta.get("remarks", ()))
         beside = {
             name: stream.t
-            for name in ("tdoa", "imu", *AIDS)
+            for name in ("tdoa", "imu", *SENSOR_NAMES)
             if (stream := getattr(flight, name)) is not None
         }
         report_remarks(path, (f"{sentence_on(*one)}." for one in apart(beside)))

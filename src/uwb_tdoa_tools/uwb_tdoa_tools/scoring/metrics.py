@@ -146,10 +146,10 @@ def radio_residuals(flight: Flight, run: Run) -> Residuals:
     """Return the Residuals of the TDOAs and ranges of a Run; a range has a = b."""
     parts = [run.residuals]
     for name in LOCATING:
-        if name in run.aids:
+        if name in run.sensors:
             stream = getattr(flight, name)
             parts.append(
-                Residuals.from_rows(stream.t, stream.anchor, stream.anchor, run.aids[name])
+                Residuals.from_rows(stream.t, stream.anchor, stream.anchor, run.sensors[name])
             )
     return concatenated(parts)
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.common.files import temporary_folder
-from uwb_tdoa_bias.common.flight import AIDS
+from uwb_tdoa_bias.common.flight import SENSOR_NAMES
 from uwb_tdoa_bias.correction.network import Network
 
 from ..scoring.evaluation import evaluate
@@ -152,4 +152,4 @@ def _left_out(
 def _error(
     flight: Flight, effects: EffectSet | None = None, network: Network | None = None
 ) -> float:
-    return evaluate(flight.without(*AIDS), None, effects, network)[0].row()["rmse_3d"]
+    return evaluate(flight.without(*SENSOR_NAMES), None, effects, network)[0].row()["rmse_3d"]

@@ -61,7 +61,7 @@ class Stream:
 class Compared:
     """How the diagnosis compares a sensor with poses.
 
-    `diagnosis/channels/aid.py` and `radio.py` of uwb_tdoa_tools use it.
+    `diagnosis/channels/sensor.py` and `radio.py` of uwb_tdoa_tools use it.
 
     Attributes
     ----------
@@ -123,7 +123,7 @@ class Sensor:
         are 0
     sound : callable of {field: (n,) or (n, k)} -> the same of bool: the numbers that a recording may
         hold
-    measured : callable of a Stream -> ({field of an AID: (n,) or (n, k)}, usable (n,) bool); AID:
+    measured : callable of a Stream -> ({field of a SENSOR_ROW: (n,) or (n, k)}, usable (n,) bool); SENSOR_ROW:
         core/memory.py of uwb_tdoa_ekf
     simulated : callable of (SimulationConfig, Room, motion, turn, noise) -> columns, without stamps:
         true values and white noise. The motion is of the body, turn holds its Rotations, and

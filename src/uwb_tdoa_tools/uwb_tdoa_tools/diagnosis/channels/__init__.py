@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 from uwb_tdoa_bias.common.sensors import BY_POSE, DIAGNOSED
 
-from .aid import Aid
 from .base import Channel, ChannelResidual, ChannelResiduals, Comparison, Rows
 from .inertial import Accel, Gyro
 from .radio import RadioResidual, Ranging, Tdoa, TdoaResidual
+from .sensor import Sensor
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -23,7 +23,7 @@ _ALL: tuple[Channel[Any], ...] = (
     Tdoa(),
     Gyro(),
     Accel(),
-    *(Aid(name) if name in BY_POSE else Ranging(name) for name in DIAGNOSED),
+    *(Sensor(name) if name in BY_POSE else Ranging(name) for name in DIAGNOSED),
 )
 CHANNELS = {channel.name: channel for channel in _ALL}
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from uwb_tdoa_bias.common.flight import Truth
-    from uwb_tdoa_bias.effects import AidSamples, Effect, ImuSamples, Samples, SmoothTerm
+    from uwb_tdoa_bias.effects import Effect, ImuSamples, Samples, SensorSamples, SmoothTerm
 
     from ..regression.algebra import Matrix
     from .views import CovariateView
@@ -101,11 +101,11 @@ class Rows:
 class ChannelResidual:
     """The residual of a channel in one flight: measured minus predicted at the reference.
 
-    samples : Samples, ImuSamples or AidSamples, the input of effects
+    samples : Samples, ImuSamples or SensorSamples, the input of effects
     residual : one per sample
     """
 
-    samples: Samples | ImuSamples | AidSamples
+    samples: Samples | ImuSamples | SensorSamples
     residual: np.ndarray
 
     def of_floor(self) -> ChannelResidual | None:

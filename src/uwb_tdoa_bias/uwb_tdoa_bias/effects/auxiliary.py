@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from ..common.errors import InputError
-from ..common.flight import AIDS
+from ..common.flight import SENSOR_NAMES
 from ..common.sensors import STREAM_OF, with_measured
 from ..common.sensors.sensor import UNKNOWN_STD, UNKNOWN_VARIANCE
 from .base import IDENTITY, Affine, Effect, Row, SensorEffect, finite, require
-from .samples import Track, aid_samples
+from .samples import Track, sensor_samples
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Hashable, Sequence
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
     from ..common.anchors import Anchors
     from ..common.flight import Flight
     from ..common.sensors.sensor import Stream
-    from .samples import AidSamples
+    from .samples import SensorSamples
 
 LIMITS = ("start", "end")  # s after the first TDOA
 UNLIMITED = 1e6  # s, bound of these
 
 
-class AidEffect(SensorEffect):
+class AuxiliaryEffect(SensorEffect):
     """An effect with an affine sensor model on one channel, its only one."""
 
     def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
@@ -37,7 +37,7 @@ class AidEffect(SensorEffect):
         return changed
 
 
-class HeightOffset(AidEffect):
+class HeightOffset(AuxiliaryEffect):
     """Measured range = true range from the origin of the body frame + `offset`.
 
     The parameter `height_arm` of the filter is -offset: set one of the two.
@@ -68,7 +68,7 @@ class HeightOffset(AidEffect):
         return Affine(np.eye(1), np.array([self.values.get("offset", 0.0)]))
 
 
-class HeightScale(AidEffect):
+class HeightScale(AuxiliaryEffect):
     """Measured range = (1 + `scale`) true range."""
 
     row = Row(
@@ -96,7 +96,7 @@ class HeightScale(AidEffect):
         return Affine((1.0 + self.values.get("scale", 0.0)) * np.eye(1), np.zeros(1))
 
 
-class VelocityScale(AidEffect):
+class VelocityScale(AuxiliaryEffect):
     """Measured velocity = (1 + `scale`) true velocity."""
 
     row = Row(
@@ -126,7 +126,7 @@ class VelocityScale(AidEffect):
         return Affine((1.0 + self.values.get("scale", 0.0)) * np.eye(3), np.zeros(3))
 
 
-class YawRateScale(AidEffect):
+class YawRateScale(AuxiliaryEffect):
     """Measured yaw rate = (1 + `scale`) true yaw rate."""
 
     row = Row(
@@ -154,7 +154,7 @@ class YawRateScale(AidEffect):
         return Affine((1.0 + self.values.get("scale", 0.0)) * np.eye(1), np.zeros(1))
 
 
-class VelocityMisalignment(AidEffect):
+class VelocityMisalignment(AuxiliaryEffect):
     """Measured velocity = R_z(yaw)^T true velocity, with `yaw` from body to sensor axes."""
 
     row = Row(
@@ -212,10 +212,10 @@ class BarometerDrift(Effect):
     usable = False
     channels = ("pressure",)
 
-    def uncorrected(self, samples: AidSamples) -> np.ndarray:
+    def uncorrected(self, samples: SensorSamples) -> np.ndarray:
         return self.values.get("rate", 0.0) * (samples.t - samples.start)[:, None]
 
-    def regressors(self, samples: AidSamples, keys: Sequence[str]) -> np.ndarray:
+    def regressors(self, samples: SensorSamples, keys: Sequence[str]) -> np.ndarray:
         return np.repeat((samples.t - samples.start)[:, None, None], len(keys), axis=2)
 
     def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
@@ -236,7 +236,7 @@ class IntervalEffect(Effect):
     fitted = False
     usable = False
 
-    def per_unit(self, samples: AidSamples) -> np.ndarray:
+    def per_unit(self, samples: SensorSamples) -> np.ndarray:
         """Return the error of the readings per unit of its size, (n, k)."""
         raise NotImplementedError
 
@@ -264,7 +264,7 @@ class IntervalEffect(Effect):
             *sorted(item for item in self.values.items() if item[0].endswith(LIMITS)),
         )
 
-    def regressors(self, samples: AidSamples, keys: Sequence[str]) -> np.ndarray:
+    def regressors(self, samples: SensorSamples, keys: Sequence[str]) -> np.ndarray:
         get, since, unit = self.values.get, samples.t - samples.start, self.per_unit(samples)
         out = np.zeros((*unit.shape, len(keys)))
         for column, key in enumerate(keys):
@@ -274,14 +274,14 @@ class IntervalEffect(Effect):
             out[inside, :, column] = unit[inside]
         return out
 
-    def uncorrected(self, samples: AidSamples) -> np.ndarray:
+    def uncorrected(self, samples: SensorSamples) -> np.ndarray:
         keys = [key for key in self.values if not key.endswith(LIMITS)]
         return self.regressors(samples, keys) @ np.array([self.values[key] for key in keys])
 
     def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
         (name,) = self.channels
         stream, truth = require(self, flight, name), require(self, flight, "truth")
-        samples = aid_samples(name, stream.t, Track(truth), float(flight.tdoa.t[0]))
+        samples = sensor_samples(name, stream.t, Track(truth), float(flight.tdoa.t[0]))
         error = finite(self, flight, self.uncorrected(samples))
         return flight.replaced(**{name: stream.sensed(stream.values + error)})
 
@@ -324,7 +324,7 @@ class FloorStep(IntervalEffect):
     part = "height"
     channels = ("height",)
 
-    def per_unit(self, samples: AidSamples) -> np.ndarray:
+    def per_unit(self, samples: SensorSamples) -> np.ndarray:
         return -1.0 / samples.up[:, None]
 
 
@@ -354,17 +354,18 @@ class VelocitySlip(IntervalEffect):
     part = "share"
     channels = ("velocity",)
 
-    def per_unit(self, samples: AidSamples) -> np.ndarray:
+    def per_unit(self, samples: SensorSamples) -> np.ndarray:
         return -samples.reading
 
 
-class AidCorrector:
+class SensorCorrector:
     """Corrector of the streams of auxiliary sensors, whole or one measurement after the other."""
 
     def __init__(self, effects: Collection[Effect]) -> None:
         """Select the effects on these streams among `effects`; they are undone in their order."""
         self._late = {
-            stream: sum(effect.stamp_offset(stream) for effect in effects) for stream in AIDS
+            stream: sum(effect.stamp_offset(stream) for effect in effects)
+            for stream in SENSOR_NAMES
         }
         self._undo = {channel: self._inverse(effects, channel) for channel in STREAM_OF}
         self.idle = not any(self._late.values()) and not any(self._undo.values())

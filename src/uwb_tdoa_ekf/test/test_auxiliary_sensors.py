@@ -7,7 +7,7 @@ import subprocess
 import sys
 
 from covariances import assert_covariance
-from flights import corners, fly, measurements, position_at, with_aids, with_ranges
+from flights import corners, fly, measurements, position_at, with_ranges, with_sensors
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -22,8 +22,8 @@ from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
 from uwb_tdoa_ekf.core.engine import feed
 from uwb_tdoa_ekf.core.history import NOTHING
 from uwb_tdoa_ekf.core.hypotheses import PRUNED_BELOW
-from uwb_tdoa_ekf.core.measurements import aid_rows
-from uwb_tdoa_ekf.core.memory import AID, N_YAWS, RESIDUAL, USED, new_state
+from uwb_tdoa_ekf.core.measurements import sensor_rows
+from uwb_tdoa_ekf.core.memory import N_YAWS, RESIDUAL, SENSOR_ROW, USED, new_state
 from uwb_tdoa_ekf.core.state import TRANSITION, inject
 from uwb_tdoa_ekf.offline import run_offline
 
@@ -92,12 +92,12 @@ def test_a_tilt_depends_on_the_attitude(seed, axis):
 
 @given(seeds)
 def test_a_yaw_rate_depends_on_the_bias_of_the_gyroscope(seed):
-    prior, aid, imu = tilted(seed), np.zeros(1, AID)[0], new_state(np.eye(3)).record.imu
-    aid["value"], aid["std"], imu.gyro[:] = [0.0, 0.0, 0.0, 0.7], 0.1, [0.1, 0.2, 0.5]
+    prior, sensor, imu = tilted(seed), np.zeros(1, SENSOR_ROW)[0], new_state(np.eye(3)).record.imu
+    sensor["value"], sensor["std"], imu.gyro[:] = [0.0, 0.0, 0.0, 0.7], 0.1, [0.1, 0.2, 0.5]
     assert_row_is_the_derivative(
-        prior, lambda: velocity._compare_yaw_rate(prior.hypothesis, aid, imu, prior.innovation)
+        prior, lambda: velocity._compare_yaw_rate(prior.hypothesis, sensor, imu, prior.innovation)
     )
-    velocity._compare_yaw_rate(prior.hypothesis, aid, imu, prior.innovation)
+    velocity._compare_yaw_rate(prior.hypothesis, sensor, imu, prior.innovation)
     assert prior.innovation.value == pytest.approx(0.7 - (0.5 - prior.hypothesis.x[15]))
 
 
@@ -171,7 +171,7 @@ def rms(flight, config=None, after=2.0):
 
 @pytest.fixture(scope="module")
 def flight():
-    return with_aids(
+    return with_sensors(
         fly(3, 20.0, tdoa_std=0.3, accel_noise=0.05, gyro_noise=0.002), drift=1.0 / 60.0
     )
 
@@ -181,7 +181,7 @@ def without(flight):
     return rms(only(flight))
 
 
-def test_each_aid_helps(flight, without):
+def test_each_sensor_helps(flight, without):
     of_height, of_pressure, of_velocity = (
         rms(only(flight, name)) for name in ("height", "pressure", "velocity")
     )
@@ -224,7 +224,7 @@ def test_wheels_that_spin_are_not_used(flight, without):
     spinning = v + np.where((t > 6.0) & (t < 8.0), 2.0, 0.0)[:, None] * [1.0, 0.0, 0.0]
     wrong = replace(only(flight, "velocity"), velocity=replace(flight.velocity, v=spinning))
     assert np.linalg.norm(rms(wrong)) < 1.1 * np.linalg.norm(without)
-    verdict = run_offline(wrong).aids["velocity"]["verdict"]
+    verdict = run_offline(wrong).sensors["velocity"]["verdict"]
     assert (verdict[(t > 6.0) & (t < 8.0)] != USED).mean() > 0.9 and (
         verdict[t > 9.0] == USED
     ).mean() > 0.9
@@ -234,7 +234,7 @@ def test_wheels_that_spin_are_not_used(flight, without):
 @given(seeds)
 def test_the_filter_is_never_locked_out_by_a_wrong_start(seed):
     """Ranges come only after 2 s; whatever z was by then, it is right soon after."""
-    flight = only(with_aids(fly(seed % 1000, 6.0, tdoa_std=0.5)), "height")
+    flight = only(with_sensors(fly(seed % 1000, 6.0, tdoa_std=0.5)), "height")
     kept = flight.height.t > 2.0
     late = replace(
         flight,
@@ -244,10 +244,10 @@ def test_the_filter_is_never_locked_out_by_a_wrong_start(seed):
     odometry = run.odometry
     error = odometry.p[:, 2] - position_at(late, odometry.t)[:, 2]
     assert np.abs(error[odometry.t > 4.0]).max() < 0.15
-    assert np.mean(run.aids["height"]["verdict"] == USED) > 0.8
+    assert np.mean(run.sensors["height"]["verdict"] == USED) > 0.8
 
 
-AIDS = "height", "pressure", "velocity", "range"
+SENSOR_NAMES = "height", "pressure", "velocity", "range"
 
 
 @settings(max_examples=25, deadline=None)
@@ -255,7 +255,7 @@ AIDS = "height", "pressure", "velocity", "range"
     seeds,
     st.sampled_from(ROBUST),
     st.sampled_from(LOSSES),
-    st.sets(st.sampled_from(AIDS)),
+    st.sets(st.sampled_from(SENSOR_NAMES)),
     st.booleans(),
     st.booleans(),
 )
@@ -264,25 +264,25 @@ def test_any_sensors_in_any_mode_leave_covariances(seed, robust, loss, names, sl
     has outliers.
     """
     rng = np.random.default_rng(seed)
-    flight = with_ranges(with_aids(fly(seed % 1000, 3.0, accel_noise=0.05, outliers=0.05)))
-    fed, aids = measurements(flight), []
+    flight = with_ranges(with_sensors(fly(seed % 1000, 3.0, accel_noise=0.05, outliers=0.05)))
+    fed, sensors = measurements(flight), []
     if slopes:
         fed.tdoa["slope"], fed.tdoa["state"] = (
             0.3 * rng.standard_normal((len(fed.tdoa), 6)),
             0.3 * rng.standard_normal((len(fed.tdoa), 6)),
         )
     for name in names:
-        rows, usable = aid_rows(name, getattr(flight, name), flight.anchors)
+        rows, usable = sensor_rows(name, getattr(flight, name), flight.anchors)
         rows["value"][:, 0] += np.where(wrong & (rng.random(len(rows)) < 0.1), 2.0, 0.0)
-        aids.append(rows[usable])
-    together = np.concatenate([np.empty(0, AID), *aids])
-    fed = fed._replace(aids=together[np.argsort(together["t"], kind="stable")])
+        sensors.append(rows[usable])
+    together = np.concatenate([np.empty(0, SENSOR_ROW), *sensors])
+    fed = fed._replace(sensors=together[np.argsort(together["t"], kind="stable")])
     state = new_state(flight.anchors.positions)
-    odometry, _, of_aids = feed(state, FilterConfig(robust=robust, loss=loss).parameters(), fed)
+    odometry, _, of_sensors = feed(state, FilterConfig(robust=robust, loss=loss).parameters(), fed)
     assert len(odometry) and all(np.isfinite(odometry[name]).all() for name in ("x", "covariance"))
     assert (
         np.isfinite(state.record.barometer.nis)
-        and (of_aids["variance"][~np.isnan(of_aids["variance"])] > 0.0).all()
+        and (of_sensors["variance"][~np.isnan(of_sensors["variance"])] > 0.0).all()
     )
     for hypothesis in state.record.hypotheses:
         if hypothesis["log_weight"] > -np.inf:
@@ -303,13 +303,13 @@ def test_a_sensor_without_a_branch_in_the_filter_is_refused_at_the_start():
 
 
 def test_a_kind_without_a_branch_raises():
-    flight = with_aids(fly(1, 3.0))
+    flight = with_sensors(fly(1, 3.0))
     fed = measurements(flight)
-    rows, _ = aid_rows("velocity", flight.velocity, flight.anchors)
+    rows, _ = sensor_rows("velocity", flight.velocity, flight.anchors)
     rows["kind"] = len(SENSORS)
     state = new_state(flight.anchors.positions)
     with pytest.raises(NotImplementedError, match="without a branch"):
-        feed(state, FilterConfig().parameters(), fed._replace(aids=rows))
+        feed(state, FilterConfig().parameters(), fed._replace(sensors=rows))
 
 
 @pytest.mark.parametrize("followed", [0, 1])
@@ -318,9 +318,9 @@ def test_a_range_finder_decides_between_mirrored_places(followed):
     at the lower one.
     """
     state, parameters = new_state(np.array(corners().positions)), FilterConfig().parameters()[0]
-    ekf, aid, residual, places = (
+    ekf, sensor, residual, places = (
         state.record,
-        np.zeros(1, AID)[0],
+        np.zeros(1, SENSOR_ROW)[0],
         np.zeros(1, RESIDUAL)[0],
         (0, N_YAWS),
     )
@@ -337,8 +337,8 @@ def test_a_range_finder_decides_between_mirrored_places(followed):
             0.01 * np.eye(15),
         )
     for t in np.arange(0.0, 3.0, 0.04):
-        aid["t"], aid["value"] = t, [1.1 + 0.01 * np.sin(40.0 * t), 0.0, 0.0, 0.0]
-        height.observe(ekf, parameters, aid, residual, NOTHING)
+        sensor["t"], sensor["value"] = t, [1.1 + 0.01 * np.sin(40.0 * t), 0.0, 0.0, 0.0]
+        height.observe(ekf, parameters, sensor, residual, NOTHING)
         if t < 0.04:
             assert (
                 ekf.hypotheses["log_weight"][places[1]] - ekf.hypotheses["log_weight"][0]
@@ -363,7 +363,7 @@ def test_a_velocity_that_does_not_change_any_more_is_not_used(flight):
     run = run_offline(
         replace(only(flight, "velocity"), velocity=replace(flight.velocity, v=v), tdoa=cut, imu=imu)
     )
-    verdict, odometry = run.aids["velocity"]["verdict"], run.odometry
+    verdict, odometry = run.sensors["velocity"]["verdict"], run.odometry
     assert (verdict[t > 8.8] != USED).all() and (
         verdict[(t > 2.0) & (t < 8.0)] == USED
     ).mean() > 0.9
@@ -373,12 +373,12 @@ def test_a_velocity_that_does_not_change_any_more_is_not_used(flight):
 
 
 def test_wheels_that_stand_may_repeat_zero():
-    still = with_aids(fly(2, 8.0, hover=True, accel_noise=0.02))
+    still = with_sensors(fly(2, 8.0, hover=True, accel_noise=0.02))
     zero = replace(
         only(still, "velocity"), velocity=replace(still.velocity, v=np.zeros_like(still.velocity.v))
     )
     t = zero.velocity.t
-    assert (run_offline(zero).aids["velocity"]["verdict"][t > 2.0] == USED).mean() > 0.9
+    assert (run_offline(zero).sensors["velocity"]["verdict"][t > 2.0] == USED).mean() > 0.9
 
 
 def test_a_fixed_height_of_a_tag_that_flies_is_contradicted_by_tdoas_and_the_deviation_covers_that():

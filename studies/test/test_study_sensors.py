@@ -1,4 +1,4 @@
-"""Faults of docs/aids.md put into simulated flights: ekf_node names the sensor."""
+"""Faults of docs/auxiliary_sensors.md put into simulated flights: ekf_node names the sensor."""
 
 from collections import Counter
 from dataclasses import replace
@@ -11,8 +11,8 @@ pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from known_effects import clean_flight  # noqa: E402
 
-from studies import aids  # noqa: E402
-from studies.aids import FAULTS, ONSET, bounds, of_four, only  # noqa: E402
+from studies import sensors  # noqa: E402
+from studies.sensors import FAULTS, ONSET, bounds, of_four, only  # noqa: E402
 from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_ekf.monitoring.health import OK, WARN, Health  # noqa: E402
 from uwb_tdoa_ekf.offline import run_offline  # noqa: E402
@@ -45,7 +45,7 @@ def said(flight, monkeypatch):
             int(np.sum(stream.t < now)) for stream in (flight.imu, flight.tdoa)
         )
         counts = Counter()
-        for name, outcome in run.aids.items():
+        for name, outcome in run.sensors.items():
             heard = getattr(flight, name).t < now
             judge.received[name] = int(np.sum(heard))
             counts.update(
@@ -64,27 +64,27 @@ def test_sound_sensors_are_not_complained_of(flight, monkeypatch):
 
 @pytest.mark.parametrize("name", [name for name in FAULTS if name not in COPED_WITH])
 def test_a_faulty_sensor_is_named(flight, monkeypatch, name):
-    aid, from_start, change = FAULTS[name]
+    sensor, from_start, change = FAULTS[name]
     begin = scored_phase(flight.truth)[1] + (0.0 if from_start else ONSET)
-    sound = only(flight, (aid,))
+    sound = only(flight, (sensor,))
     told = [
         text
         for level, text in said(
-            replace(sound, **{aid: change(getattr(sound, aid), begin)}), monkeypatch
+            replace(sound, **{sensor: change(getattr(sound, sensor), begin)}), monkeypatch
         )
         if level == WARN
     ]
     assert told and all(
-        text.startswith(f"more than half of the messages on {aid} ") for text in told
+        text.startswith(f"more than half of the messages on {sensor} ") for text in told
     )
 
 
 @pytest.mark.parametrize("name", COPED_WITH)
 def test_what_the_filter_copes_with_leaves_the_estimate_sound(flight, name):
-    aid, from_start, change = FAULTS[name]
-    sound = only(flight, (aid,))
+    sensor, from_start, change = FAULTS[name]
+    sound = only(flight, (sensor,))
     begin = scored_phase(flight.truth)[1] + (0.0 if from_start else ONSET)
-    run = run_offline(replace(sound, **{aid: change(getattr(sound, aid), begin)}))
+    run = run_offline(replace(sound, **{sensor: change(getattr(sound, sensor), begin)}))
     inside = (run.odometry.t > begin + 3.0) & (run.odometry.t < scored_phase(flight.truth)[2])
     true = np.interp(run.odometry.t[inside], flight.truth.t, flight.truth.p[:, 2])
     assert np.sqrt(np.mean((run.odometry.p[inside, 2] - true) ** 2)) < 0.05
@@ -102,7 +102,7 @@ def test_four_anchors_keep_their_tdoas_and_a_height_makes_their_bound_smaller(fl
 
 
 def test_the_table_of_worth_tells_the_floor_too(capsys, monkeypatch):
-    monkeypatch.setattr(aids, "SETS", ((), ("height",)))
+    monkeypatch.setattr(sensors, "SETS", ((), ("height",)))
     hop = simulate(
         SimulationConfig(
             seed=1,
@@ -113,7 +113,7 @@ def test_the_table_of_worth_tells_the_floor_too(capsys, monkeypatch):
             height_noise=0.02,
         )
     )
-    aids._worth([hop], FilterConfig(), aids.SETS)
+    sensors._worth([hop], FilterConfig(), sensors.SETS)
     head, rule, *rows = capsys.readouterr().out.splitlines()
     assert head.endswith("| at rest before, 2 s | first 3 s | last 3 s | at rest after |")
     assert len({row.count("|") for row in (head, rule, *rows)}) == 1

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.common.sensors import COMPARED, STREAM_OF, measured_on
-from uwb_tdoa_bias.effects import AidSamples, SmoothTerm, aid_samples
-from uwb_tdoa_bias.effects.covariates import OF_AIDS, sensor_covariate
+from uwb_tdoa_bias.effects import SensorSamples, SmoothTerm, sensor_samples
+from uwb_tdoa_bias.effects.covariates import OF_SENSORS, sensor_covariate
 
 from .base import Channel, ChannelResidual, Rows
 from .figures import APART, figures
@@ -28,14 +28,14 @@ FEWEST_CELLS = 8  # fewest cells of a residual
 
 
 @dataclass(frozen=True)
-class AidResidual(ChannelResidual):
-    """Residual (n, k) of AidSamples of cells, NaN where an axis was not measured.
+class SensorResidual(ChannelResidual):
+    """Residual (n, k) of SensorSamples of cells, NaN where an axis was not measured.
 
     labels : of its k axes; unit : of the channel
     floating : whether a constant has no meaning: rows and columns are without their mean
     """
 
-    samples: AidSamples
+    samples: SensorSamples
     residual: np.ndarray
     labels: tuple[str, ...]
     unit: str
@@ -74,7 +74,7 @@ class AidResidual(ChannelResidual):
         return values - values.mean(axis=0) if self.floating else values
 
 
-class Aid(Channel[AidResidual]):
+class Sensor(Channel[SensorResidual]):
     """Channel of an auxiliary sensor, or of a part, with the fields of its Compared."""
 
     axes: tuple[str, ...]
@@ -91,7 +91,7 @@ class Aid(Channel[AidResidual]):
         """Return the names of its axes."""
         return tuple(self.name + axis for axis in self.axes)
 
-    def residual(self, comparison: Comparison) -> AidResidual | None:
+    def residual(self, comparison: Comparison) -> SensorResidual | None:
         part, reference = measured_on(comparison.flight, self.name), comparison.reference
         known = all(reference.positions_known[k] for k in self.positions)
         if part is None or not known or (self.of_attitude and not comparison.attitude_known):
@@ -102,11 +102,11 @@ class Aid(Channel[AidResidual]):
         cell = np.unique((t / CELL).astype(int), return_inverse=True)[1]
         if not len(t) or cell.max() < FEWEST_CELLS:
             return None
-        error = values - aid_samples(self.name, t, comparison.track, comparison.start).reading
+        error = values - sensor_samples(self.name, t, comparison.track, comparison.start).reading
         edges = np.flatnonzero(np.diff(cell)) + 1
         middles = np.array([some.mean() for some in np.split(t, edges)])
         error = np.stack([_median(some) for some in np.split(error, edges)])
-        samples = aid_samples(
+        samples = sensor_samples(
             self.name,
             middles,
             comparison.track,
@@ -114,18 +114,18 @@ class Aid(Channel[AidResidual]):
             vibration_at(comparison.flight.imu, middles),
         )
         error = error - comparison.effects.uncorrected(samples)
-        return AidResidual(samples, error, self.labels, self.unit, self.floating)
+        return SensorResidual(samples, error, self.labels, self.unit, self.floating)
 
-    def smooth_terms(self, residuals: Sequence[AidResidual]) -> list[SmoothTerm]:
+    def smooth_terms(self, residuals: Sequence[SensorResidual]) -> list[SmoothTerm]:
         out = []
-        for name in OF_AIDS:
+        for name in OF_SENSORS:
             if knots := knots_of(name, [part.covariate(name) for part in residuals]):
                 out += [
                     SmoothTerm(channel=label, covariate=name, knots=knots) for label in self.labels
                 ]
         return out
 
-    def health(self, residuals: Sequence[AidResidual]) -> Figures:
+    def health(self, residuals: Sequence[SensorResidual]) -> Figures:
         out = []
         t = np.concatenate(
             [part.samples.t + APART * number for number, part in enumerate(residuals)]

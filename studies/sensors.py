@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.common.flight import AIDS
+from uwb_tdoa_bias.common.flight import SENSOR_NAMES
 from uwb_tdoa_bias.common.sensors import Velocity
 from uwb_tdoa_bias.common.sensors.pressure import altitude_of, pressure_at
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
@@ -39,9 +39,7 @@ STEP_PERIOD, STEP_LENGTH = 6.0, 3.0  # s between their beginnings, and of each
 
 def add_options(add):
     """add : add_argument of a parser."""
-    tables = (
-        "what each aid is worth, what faults put into them do, or what is wrong with the velocity"
-    )
+    tables = "what each sensor is worth, what faults put into them do, or what is wrong with the velocity"
     add("table", choices=("worth", "faults", "velocity"), help=tables)
     add("flights", nargs="+", metavar="FLIGHT", help=inputs.HELP)
     add("--survey", metavar="S", help=inputs.SURVEY_HELP)
@@ -83,8 +81,8 @@ def with_velocity(flight, rate=VELOCITY_RATE):
 
 
 def only(flight, names):
-    """The flight with no other aids than those of these names."""
-    return flight.without(*(name for name in AIDS if name not in names))
+    """The flight with no other sensors than those of these names."""
+    return flight.without(*(name for name in SENSOR_NAMES if name not in names))
 
 
 def velocity(flights, config):
@@ -102,7 +100,7 @@ def velocity(flights, config):
 
 
 def worth(flights, config):
-    """Tables of the errors with each set of aids: with all anchors and the IMU, without IMU, and
+    """Tables of the errors with each set of sensors: with all anchors and the IMU, without IMU, and
     with TDOAs of four anchors only; and the bound of `plan` beside them, of one round of TDOAs and
     a height.
     """
@@ -139,7 +137,7 @@ def bounds(flights, height_std):
 def _worth(flights, config, sets):
     titles = " | ".join(TITLES[name] for name in NEAR_THE_FLOOR)
     print(
-        f"| aids | x | y | z | 3D | largest 3D | at take-off | NEES | coverage | {titles} |\n|---|"
+        f"| sensors | x | y | z | 3D | largest 3D | at take-off | NEES | coverage | {titles} |\n|---|"
         + (8 + len(NEAR_THE_FLOOR)) * "---:|"
     )
     for names in sets:
@@ -169,8 +167,8 @@ def _worth(flights, config, sets):
 
 
 def faults(flights, config):
-    """Table of the 3D RMSE with a faulty aid over that without the aid, and of the flights in which
-    the status of ekf_node would name the aid: one row per fault.
+    """Table of the 3D RMSE with a faulty sensor over that without the sensor, and of the flights in which
+    the status of ekf_node would name the sensor: one row per fault.
     """
     print(
         "| fault | mean 3D without | sound | faulty | largest faulty / without | named | "
@@ -178,15 +176,17 @@ def faults(flights, config):
     )
     print("|---|---:|---:|---:|---:|---:|---:|")
     plain = [evaluate(only(flight, ()), config)[0] for flight in flights]
-    for name, (aid, from_start, change) in FAULTS.items():
+    for name, (sensor, from_start, change) in FAULTS.items():
         rows, named = [], []
         for flight, none in zip(flights, plain):
             begin = scored_phase(flight.truth)[1] + (0.0 if from_start else ONSET)
-            sound = only(flight, (aid,))
-            faulty = replace(sound, **{aid: change(getattr(sound, aid), begin)})
+            sound = only(flight, (sensor,))
+            faulty = replace(sound, **{sensor: change(getattr(sound, sensor), begin)})
             scores, runs = zip((none, None), *(evaluate(each, config) for each in (sound, faulty)))
             rows.append([_rmse(score, begin) for score in scores])
-            named.append([is_named(each, aid, run) for each, run in zip((sound, faulty), runs[1:])])
+            named.append(
+                [is_named(each, sensor, run) for each, run in zip((sound, faulty), runs[1:])]
+            )
         rows = np.array(rows)
         without, with_sound, with_faulty = rows.mean(axis=0)
         worst = int(np.argmax(rows[:, 2] / rows[:, 0]))
@@ -199,12 +199,12 @@ def faults(flights, config):
         )
 
 
-def is_named(flight, aid, run):
-    """Whether, for two seconds of a Run, most messages of an aid contradict everything else or are
+def is_named(flight, sensor, run):
+    """Whether, for two seconds of a Run, most messages of a sensor contradict everything else or are
     invalid.
     """
-    second = (getattr(flight, aid).t - flight.tdoa.t[0]).astype(int)
-    unused = np.isin(run.aids[aid]["verdict"], NAMED)
+    second = (getattr(flight, sensor).t - flight.tdoa.t[0]).astype(int)
+    unused = np.isin(run.sensors[sensor]["verdict"], NAMED)
     first = second.min()
     count, bad = np.bincount(second - first), np.bincount(second - first, unused)
     most = bad > LARGEST_UNUSED * count
@@ -245,7 +245,7 @@ def _turned(velocity, begin):
     return replace(velocity, v=Rotation.from_euler("z", np.pi / 2).apply(velocity.v))
 
 
-FAULTS = {  # name: aid, whether it is there from the start, and what it makes of the stream
+FAULTS = {  # name: sensor, whether it is there from the start, and what it makes of the stream
     "height: steps of 0.3 to 0.8 m": ("height", False, _range(_steps)),
     "height: out of range for 5 s": (
         "height",

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from uwb_tdoa_bias.effects.aids import FloorStep, IntervalEffect, VelocitySlip
+from uwb_tdoa_bias.effects.auxiliary import FloorStep, IntervalEffect, VelocitySlip
 
 from ..regression.terms import Candidate, Term
 from .base import Detector

@@ -1,6 +1,6 @@
 """Dispatch the measurements of all sensors except IMU and TDOA to their modules.
 
-An AID is a single measurement by a sensor of `SENSORS`.
+A SENSOR_ROW is a single measurement by a sensor of `SENSORS`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from uwb_tdoa_bias.common.sensors import SENSORS
 
 from . import barometer, height, velocity
 
-STREAMS = tuple(SENSORS)  # names of the sensors; AID.kind is an index into them
+STREAMS = tuple(SENSORS)  # names of the sensors; SENSOR_ROW.kind is an index into them
 # sensors with a branch in `observe`; engine.py has the branch of ranges
 BRANCHES = "height", "pressure", "velocity", "range"
 _missing = set(STREAMS) - set(BRANCHES)
@@ -26,7 +26,7 @@ HEIGHT, PRESSURE, VELOCITY, RANGE = map(STREAMS.index, BRANCHES)
 
 @compiled
 def observe(
-    ekf: Record, parameters: Record, aid: Record, residual: Record, records: np.ndarray
+    ekf: Record, parameters: Record, sensor: Record, residual: Record, records: np.ndarray
 ) -> None:
     """Update a running filter with a measurement of a sensor.
 
@@ -39,7 +39,7 @@ def observe(
         State of the filter, updated in place.
     parameters : PARAMETERS
         Tuning of the filter.
-    aid : AID
+    sensor : SENSOR_ROW
         Measurement.
     residual : RESIDUAL
         Filled by this function.
@@ -51,18 +51,18 @@ def observe(
     NotImplementedError
         If no branch is for the kind of the measurement.
     """
-    if aid.kind == HEIGHT:
-        height.observe(ekf, parameters, aid, residual, records)
-    elif aid.kind == PRESSURE:
-        barometer.observe(ekf, parameters, aid, residual, records)
-    elif aid.kind == VELOCITY:
-        velocity.observe(ekf, parameters, aid, residual, records)
+    if sensor.kind == HEIGHT:
+        height.observe(ekf, parameters, sensor, residual, records)
+    elif sensor.kind == PRESSURE:
+        barometer.observe(ekf, parameters, sensor, residual, records)
+    elif sensor.kind == VELOCITY:
+        velocity.observe(ekf, parameters, sensor, residual, records)
     else:
-        raise NotImplementedError("a kind of measurement without a branch in aids.observe")
+        raise NotImplementedError("a kind of measurement without a branch in sensors.observe")
 
 
 @compiled
-def record(ekf: Record, aid: Record) -> None:
-    """Store an AID that arrives while the filter does not run."""
-    if aid.kind == HEIGHT:
-        height.record(ekf, aid)
+def record(ekf: Record, sensor: Record) -> None:
+    """Store a SENSOR_ROW that arrives while the filter does not run."""
+    if sensor.kind == HEIGHT:
+        height.record(ekf, sensor)
