@@ -19,6 +19,7 @@ from studies import (
     moved_anchors_live,
     noise,
     odd_messages,
+    parameters,
     plans,
     ranges,
     recalibrating,
@@ -46,7 +47,6 @@ from studies.training import compare, spin, splits
 from uwb_tdoa_tools import cli
 
 STUDIES = {
-    "sensors": sensors,
     "bench": suite,
     "calibrating": calibrating,
     "checking": checking,
@@ -73,6 +73,7 @@ STUDIES = {
     "moved-anchors-live": moved_anchors_live,
     "noise": noise,
     "odd-messages": odd_messages,
+    "parameters": parameters,
     "plans": plans,
     "random-splits": splits,
     "ranges": ranges,
@@ -80,6 +81,7 @@ STUDIES = {
     "rover": rover,
     "rules": rules,
     "scale": scale,
+    "sensors": sensors,
     "situations": situations,
     "soak": soak,
     "spin": spin,
@@ -92,7 +94,6 @@ STUDIES = {
 DESCRIPTION = """Make the figures of the documentation anew. Nothing here is needed to use the suite. DATA is a folder
 of measured flights: flights/, util/, surveys/.
 
-  sensors             height, pressure and velocity on measured flights, and their faults (docs/auxiliary_sensors.md)
   bench            what the suite costs on this machine (docs/measured.md)
   calibrating      surveys shaken, calibrated without ground truth, judged on other flights (docs/calibration.md)
   checking         mistakes put into flights, and what check says of them (docs/connect.md)
@@ -119,6 +120,7 @@ of measured flights: flights/, util/, surveys/.
   moved-anchors-live  some of these recordings, played to the real nodes (docs/localizing.md)
   noise            whether covariances are honest after a calibration (docs/calibration.md)
   odd-messages     messages that no driver should send, to every node (docs/reliability.md)
+  parameters       what each parameter of the filter is worth (docs/filter.md)
   plans            random rooms and halls against an independent solver, and against a rerun (docs/planning.md)
   random-splits    bias models trained on flights drawn at random, and judged on the others (docs/bias.md)
   ranges           simulated distances to anchors against the bound of plan (docs/sensors.md)
@@ -126,6 +128,7 @@ of measured flights: flights/, util/, surveys/.
   rover            a simulated rover on wheels, and what diagnose finds on it (docs/rover.md)
   rules            rules and constants of the filter, switched off or changed one at a time (docs/notebook/rules.md)
   scale            processor time and memory over flights, anchors and effects (docs/speed.md)
+  sensors          height, pressure and velocity on measured flights, and their faults (docs/auxiliary_sensors.md)
   situations       where a tag can be and what can happen to it, simulated (docs/reliability.md)
   soak             both nodes for hours: memory and lost messages (docs/reliability.md)
   spin             the error of a TDOA over the yaw of the tag (docs/bias.md)
@@ -192,6 +195,7 @@ def parser():
         "./dev study moved-anchors-live --draws 3",
         "./dev study noise --data DATA --split const1",
         "./dev study odd-messages 10000",
+        "./dev study parameters --data DATA",
         "./dev study plans --json plans.json",
         "./dev study random-splits DATA/flights/0426 --survey DATA/surveys --out splits.jsonl",
         "./dev study ranges --flights 5",

@@ -44,6 +44,8 @@ with _hidden("scipy", "coverage"):
     from numba.core import event
     import numba.np.arraymath  # noqa: F401
 
+    from . import callees
+
 _FUNCTIONS: list[Any] = []  # all compiled functions; numba compiles at the first call
 SAY_EVERY = 4.0  # s
 # One row of a structured array. Compiled code reads and writes its fields as attributes. Python
@@ -53,6 +55,7 @@ Function = TypeVar("Function", bound="Callable[..., Any]")
 
 # numba would otherwise look for settings in the present folder before each compilation.
 config._config_fname = "/dev/null/.numba_config.yaml"
+callees.install()
 
 
 def compiled(function: Function) -> Function:

@@ -1,0 +1,101 @@
+"""Functions that only compiled code calls have no machine code of their own."""
+
+import os
+from pathlib import Path
+import subprocess
+import sys
+
+import pytest
+
+from uwb_tdoa_bias.common import callees
+
+SOURCES = Path(callees.__file__).parents[2]
+PROGRAM = """
+import numpy as np
+from uwb_tdoa_bias.common.compiled import compiled
+
+PAIR = np.dtype([("count", int), ("value", float, 2)], align=True)
+
+
+@compiled
+def scaled(pair, factor):
+    if factor < 0.0:
+        raise ValueError("a factor below 0")
+    out = np.zeros((2, 3))
+    out[:, :2] = np.concatenate((pair.value, pair.value)).reshape((2, 2)) * factor
+    pair.count += 1
+    return out
+
+
+@compiled
+def median(pair, factor):
+    return np.median(scaled(pair, factor))
+
+
+@compiled
+def root(pairs, factor):
+    total = 0.0
+    for k in range(len(pairs)):
+        total += median(pairs[k], factor) + scaled(pairs[k], factor).sum()
+    return total
+
+
+def outcome(root, scaled):
+    pairs = np.ones(3, PAIR)
+    print(root(pairs, 0.1).hex(), pairs["count"].tolist())
+    for function, argument in (root, pairs), (scaled, pairs[0]):
+        try:
+            function(argument, -1.0)
+        except ValueError as error:
+            print(error)
+    print(scaled(pairs[1], 0.3).tolist())  # now Python calls a callee
+
+
+outcome(root, scaled)
+print(sum(root.stats.cache_hits.values()) > 0)
+"""
+
+
+AS_USUAL = "import numba\nnumba.version_info = (9, 9)\n" + PROGRAM  # a version that was not tried
+
+
+@pytest.fixture
+def run(tmp_path):
+    """Run a program with a cache: (what it printed, whether it was cached)."""
+
+    def one(text, cache):
+        file = tmp_path / "program" / "program.py"
+        file.parent.mkdir(exist_ok=True)
+        file.write_text(text)
+        done = subprocess.run(
+            [sys.executable, str(file)],
+            env={"PATH": "/usr/bin:/bin", "NUMBA_CACHE_DIR": str(tmp_path / cache)}
+            | {"PYTHONPATH": os.pathsep.join([str(SOURCES), *filter(None, sys.path)])},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        *printed, cached = done.stdout.splitlines()
+        return printed, cached == "True"
+
+    return one
+
+
+def test_callees_give_the_bits_that_numba_gives_as_usual_also_from_the_cache(run):
+    usual = run(AS_USUAL, "usual")
+    assert (usual[0], False) == run(PROGRAM, "cache")
+    assert (usual[0], True) == run(PROGRAM, "cache")
+
+
+def test_only_what_python_calls_has_machine_code(run, tmp_path):
+    run(PROGRAM, "cache")
+    kept = {path.name.split("-")[0] for path in (tmp_path / "cache").rglob("*.nbi")}
+    assert kept == {"program.root", "program.scaled"}
+
+
+def test_another_version_of_numba_compiles_as_usual(monkeypatch):
+    usual = callees.dispatcher.Dispatcher.compile
+    for version in ((0, 56, 4), (0, callees.TRIED[1][1] + 1, 0), (1, 0, 0)):
+        monkeypatch.setattr(callees, "version_info", version)
+        assert not callees.install()
+    assert callees.dispatcher.Dispatcher.compile is usual

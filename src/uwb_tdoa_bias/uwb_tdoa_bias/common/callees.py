@@ -1,0 +1,136 @@
+"""Compile functions that only compiled code calls, without machine code of their own.
+
+numba makes machine code of each function together with all functions that it calls, and once more
+for each caller. Of the filter's 430 functions Python calls 40. Here a function that compiled code
+calls (a callee) is only typed and lowered. A function that Python calls (a root) links all callees
+below it once, optimizes them together and makes machine code. That takes 40 % of the processor
+time, and the results are equal to the bit: `docs/speed.md`.
+
+`install` replaces four methods and a class of numba, in versions in which this was tried. In others
+numba compiles as usual, which takes longer.
+"""
+
+from __future__ import annotations
+
+import threading
+from typing import TYPE_CHECKING, Any
+
+from numba import version_info
+from numba.core import codegen, cpu, dispatcher, sigutils
+from numba.core.caching import NullCache
+from numba.core.environment import lookup_environment
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+TRIED = (0, 57), (0, 68)  # first and last version of numba
+WITHOUT_WRAPPERS = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+ENVIRONMENT = "_ZN08NumbaEnv"  # prefix of a global variable that holds what a function may raise
+
+_compiler_thread = threading.local()  # `callee`: whether it compiles a callee
+
+
+class _Callee:
+    """Key of a callee among the functions that can be called by compiled code."""
+
+
+class _Library(codegen.JITCodeLibrary):  # type: ignore[misc]  # numba has no types
+    """Code of a function: a root links its callees, a callee nothing."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.of_callee = _is_callee()
+
+    def finalize(self) -> None:
+        if self.of_callee:
+            self._raise_if_finalized()
+            self._finalized = True
+            return
+        self._linking_libraries = _with_callees(self._linking_libraries)
+        super().finalize()
+
+
+def _is_callee() -> bool:
+    return getattr(_compiler_thread, "callee", False)
+
+
+def _with_callees(libraries: Iterable[Any]) -> list[Any]:
+    """Return code libraries and all below them, callers first.
+
+    LLVM links a function only if a function that is linked already calls it.
+    """
+    found: list[Any] = []
+    seen: set[Any] = set()
+
+    def visit(library: Any) -> None:
+        if library in seen:
+            return
+        seen.add(library)
+        if library.of_callee:
+            for each in reversed(library._linking_libraries):
+                visit(each)
+        found.append(library)
+
+    for library in reversed(list(libraries)):
+        visit(library)
+    return found[::-1]
+
+
+def install() -> bool:
+    """Let numba compile callees without machine code; return whether this version was tried."""
+    first, last = TRIED
+    if not first <= tuple(version_info[:2]) <= last:
+        return False
+    kind = dispatcher.Dispatcher
+    as_usual = kind.get_call_template, kind.compile, kind.add_overload
+    usual_template, usual_compile, usual_overload = as_usual
+    usual_executable = cpu.CPUContext.get_executable
+
+    def get_call_template(self: Any, args: Any, kws: Any) -> Any:
+        """Compile what compiled code is about to call."""
+        before = _is_callee()
+        _compiler_thread.callee = True
+        try:
+            return usual_template(self, args, kws)
+        finally:
+            _compiler_thread.callee = before
+
+    def compile_function(self: Any, sig: Any) -> Any:
+        types = tuple(sigutils.normalize_signature(sig)[0])
+        known = self.overloads.get(types)
+        if not _is_callee():
+            if known is not None and isinstance(known.entry_point, _Callee):
+                del self.overloads[types]  # Python calls it now
+            return usual_compile(self, sig)
+        if known is not None:
+            return known.entry_point
+        compiler, cache = self._compiler, self._cache
+        options = compiler.targetoptions
+        self._cache, compiler.targetoptions = NullCache(), {**options, **WITHOUT_WRAPPERS}
+        try:
+            return usual_compile(self, sig)
+        finally:
+            self._cache, compiler.targetoptions = cache, options
+
+    def add_overload(self: Any, cres: Any) -> None:
+        if isinstance(cres.entry_point, _Callee):
+            self.overloads[tuple(cres.signature.args)] = cres
+        else:
+            usual_overload(self, cres)
+
+    def get_executable(self: Any, library: Any, fndesc: Any, env: Any) -> Any:
+        if _is_callee():
+            return _Callee()
+        function = usual_executable(self, library, fndesc, env)
+        for variable in library._final_module.global_variables:
+            if variable.name.startswith(ENVIRONMENT):
+                environment = lookup_environment(variable.name)
+                if environment is not None:
+                    library.codegen.set_env(variable.name, environment)
+        return function
+
+    kind.get_call_template, kind.compile = get_call_template, compile_function
+    kind.add_overload = add_overload
+    cpu.CPUContext.get_executable = get_executable
+    codegen.JITCPUCodegen._library_class = _Library
+    return True
