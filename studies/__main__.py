@@ -94,7 +94,7 @@ STUDIES = {
 DESCRIPTION = """Make the figures of the documentation anew. Nothing here is needed to use the suite. DATA is a folder
 of measured flights: flights/, util/, surveys/.
 
-  bench            what the suite costs on this machine (docs/measured.md)
+  bench            what the suite costs on this machine (docs/notebook/measured.md)
   calibrating      surveys shaken, calibrated without ground truth, judged on other flights (docs/calibration.md)
   checking         mistakes put into flights, and what check says of them (docs/connect.md)
   closed-loop      the flights of Zhao et al. by networks and by effects (docs/flying.md)
@@ -127,13 +127,13 @@ of measured flights: flights/, util/, surveys/.
   recalibrating    surveys that start from the last one, after something changed (docs/calibration.md)
   rover            a simulated rover on wheels, and what diagnose finds on it (docs/rover.md)
   rules            rules and constants of the filter, switched off or changed one at a time (docs/notebook/rules.md)
-  scale            processor time and memory over flights, anchors and effects (docs/speed.md)
+  scale            processor time and memory over flights, anchors and effects (docs/notebook/speed.md)
   sensors          height, pressure and velocity on measured flights, and their faults (docs/auxiliary_sensors.md)
   situations       where a tag can be and what can happen to it, simulated (docs/reliability.md)
   soak             both nodes for hours: memory and lost messages (docs/reliability.md)
   spin             the error of a TDOA over the yaw of the tag (docs/bias.md)
   surveying        surveys shaken, and made better from flights alone (docs/calibration.md)
-  two-errors       vibration that is rectified, and late anchors near the floor (docs/measured.md)
+  two-errors       vibration that is rectified, and late anchors near the floor (docs/notebook/measured.md)
   two-machines     who hears whom on two machines, takes root (docs/ros.md)
   vehicle-code     what exported C costs on an emulated Cortex-M4F (docs/export.md)
   warehouse        starts, slow tags and walks in halls, and their cost (docs/warehouse.md)

@@ -63,7 +63,7 @@ def add_options(add: Callable[..., object]) -> None:
         help=f"of {', '.join(PARTS)} (default: all)",
     )
     add("--model", metavar="FILE", help="ONNX bias network whose figures offline prints, too")
-    peer_help = "measure this shared library of another filter beside ours (docs/speed.md)"
+    peer_help = "measure this shared library of another filter beside ours (docs/notebook/speed.md)"
     add("--peer", metavar="LIBRARY", help=peer_help)
     add(
         "--correction",

@@ -125,7 +125,7 @@ def test_what_a_library_remembers_of_one_flight_is_not_in_the_next(tmp_path):
 
 def test_one_that_does_not_tell_its_state_cannot_be_flown_by(tmp_path):
     with pytest.raises(
-        InputError, match="does not export tdoa_peer_state; add it as docs/speed.md shows"
+        InputError, match="does not export tdoa_peer_state; add it as docs/notebook/speed.md shows"
     ):
         fly(Task(HALL, seed=2, peer=str(built(tmp_path))))
 
@@ -146,7 +146,7 @@ def test_libraries_that_are_none(tmp_path):
 
 
 def test_the_documented_interface_is_the_one_that_is_called():
-    page = (ROOT / "docs" / "speed.md").read_text()
+    page = (ROOT / "docs" / "notebook" / "speed.md").read_text()
     declared = [line for line in estimates.__doc__.splitlines() if line.startswith("    ")]
     assert len(declared) == 6 and all(
         line.strip().partition(";  ")[0].split("(")[0] in page for line in declared

@@ -4,7 +4,7 @@ numba makes machine code of each function together with all functions that it ca
 for each caller. Of the filter's 430 functions Python calls 40. Here a function that compiled code
 calls (a callee) is only typed and lowered. A function that Python calls (a root) links all callees
 below it once, optimizes them together and makes machine code. That takes 40 % of the processor
-time, and the results are equal to the bit: `docs/speed.md`.
+time, and the results are equal to the bit: `docs/notebook/speed.md`.
 
 `install` replaces four methods and a class of numba, in versions in which this was tried. In others
 numba compiles as usual, which takes longer.

@@ -54,7 +54,7 @@ class Spinner:
     Every SERVED s an executor of rclpy serves the rest of the graph in the order of arrival: requests,
     timers, transforms. A mark at the end of its queue ensures completeness: the executor runs until
     it reaches the mark. While no stream has messages, the process sleeps in the executor.
-    `docs/measured.md` has the measurements.
+    `docs/notebook/measured.md` has the measurements.
 
     longest_wait : s, longest wait of any request since this was set to 0.0
     """

@@ -38,8 +38,8 @@ Writes diagnosis.json, effects.yaml (for evaluate, bias_node and ekf_node), ekf_
 assume with them; --config of evaluate) and report.html.
 Exit code: 0 done; 1 ids, signs or units are wrong and --no-truth or --reference marks is given; 2 bad input."""
 
-MOST = 300_000  # TDOAs; what they take: docs/speed.md
-FEW = 20  # flights; what fewer gain by other processes, these take to start (docs/speed.md)
+MOST = 300_000  # TDOAs; what they take: docs/notebook/speed.md
+FEW = 20  # flights; what fewer gain by other processes, these take to start (docs/notebook/speed.md)
 BLIND = "nothing", "marks"  # references of which no path shows that ids are wrong
 UNUSED = {  # by references, of the options of what is known
     "truth": ("marks", "distances", "odometry"),

@@ -21,7 +21,7 @@ from ..surveying.report import as_dict, as_text, picture, with_blocked
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
 
-FEW = 20  # flights; what fewer gain by other processes, these take to start (docs/speed.md)
+FEW = 20  # flights; what fewer gain by other processes, these take to start (docs/notebook/speed.md)
 
 DESCRIPTION = """Improve a tape-measured survey, from flights alone.
 

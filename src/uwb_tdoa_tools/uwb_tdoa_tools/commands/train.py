@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 # Options without influence on the results of a training; recordings count by their state.
 WITHOUT_INFLUENCE = "flights", "survey", "name", "out", "resume", "jobs", "dask"
-MOST = 1_500_000  # TDOAs; what they take: docs/speed.md
+MOST = 1_500_000  # TDOAs; what they take: docs/notebook/speed.md
 
 
 def parser() -> ArgumentParser:

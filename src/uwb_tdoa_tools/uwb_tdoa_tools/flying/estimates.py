@@ -1,6 +1,6 @@
 """Provide estimates: the own filter as the nodes run it, or a peer.
 
-A peer is a filter in a shared library that the user has built (docs/speed.md). It exports, in C:
+A peer is a filter in a shared library that the user has built (docs/notebook/speed.md). It exports, in C:
 
     typedef struct { double t, gyro[3], accel[3], d; int32_t a, b; } tdoa_peer_event;
     int32_t tdoa_peer_version(void);                                           // VERSION
@@ -107,7 +107,7 @@ class Peer:
         missing = [f"tdoa_peer_{name}" for name, function in functions.items() if function is None]
         if missing:
             raise InputError(
-                f"--peer: {path} does not export {missing[0]}; add it as docs/speed.md shows."
+                f"--peer: {path} does not export {missing[0]}; add it as docs/notebook/speed.md shows."
             )
         self._version, self._start, self._run, self._position = functions.values()
         self._state: Any = getattr(library, "tdoa_peer_state", None)
@@ -165,7 +165,7 @@ class Peer:
         if self._state is None:
             raise InputError(
                 f"--peer: {self.name} does not export tdoa_peer_state; add it as "
-                "docs/speed.md shows."
+                "docs/notebook/speed.md shows."
             )
 
 
