@@ -1,5 +1,6 @@
 """The pieces of `study bench`, and one quick run of the real thing."""
 
+from dataclasses import replace
 import json
 import os
 import subprocess
