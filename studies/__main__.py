@@ -4,6 +4,7 @@ import argparse
 import sys
 
 from studies import (
+    arm64,
     calibrating,
     crazyflie,
     demo,
@@ -47,6 +48,7 @@ from studies.training import compare, spin, splits
 from uwb_tdoa_tools import cli
 
 STUDIES = {
+    "arm64": arm64,
     "bench": suite,
     "calibrating": calibrating,
     "checking": checking,
@@ -94,6 +96,7 @@ STUDIES = {
 DESCRIPTION = """Make the figures of the documentation anew. Nothing here is needed to use the suite. DATA is a folder
 of measured flights: flights/, util/, surveys/.
 
+  arm64            the off-line filter on an emulated 64-bit Arm, value by value (docs/notebook/speed.md)
   bench            what the suite costs on this machine (docs/notebook/measured.md)
   calibrating      surveys shaken, calibrated without ground truth, judged on other flights (docs/calibration.md)
   checking         mistakes put into flights, and what check says of them (docs/connect.md)
@@ -150,6 +153,11 @@ def parser():
     made = cli.parser(
         "study",
         DESCRIPTION,
+        "./dev study arm64 --folder arm64/",
+        (
+            "./dev study arm64 --folder arm64/ --flights DATA/flights/0426/0426-traj5 "
+            "--survey DATA/surveys"
+        ),
         "./dev study deviations DATA",
         "./dev study domains DATA",
         "./dev study drives",

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 REPEATS = 41
 SAMPLED = 0.01  # s, from one position of a peer to the next
+START = 4.0  # s in the air, in which the error is that of the floor
 
 
 def events_of(flight: Flight, begin: float, end: float) -> tuple[np.ndarray, np.ndarray]:
@@ -81,27 +82,33 @@ def errors(
 ) -> Iterator[Figure]:
     """Generator of Figures: the 3D RMSE of a peer on Flights with ground truth, m.
 
+    The means are given of whole flights, and of what follows after START.
     correction : beside the errors with it, those without it and the change are given
     """
     ways = {"as it is": None} | ({"corrected": correction} if correction is not None else {})
     section = f"3D RMSE of {Path(library).name} on measured flights"
-    found: dict[str, list[float]] = {way: [] for way in ways}
+    found: dict[str, list[list[float]]] = {way: [] for way in ways}
     for flight in flights:
         for way, known in ways.items():
-            found[way].append(rmse(flight, Peer(library, own=True, correction=known)))
-            yield Figure.of(section, f"{flight.name}, {way}", "m", found[way][-1])
+            t, off = error_of(flight, Peer(library, own=True, correction=known))
+            found[way].append([float(rms(off)), float(rms(off[t >= START]))])
+            yield Figure.of(section, f"{flight.name}, {way}", "m", found[way][-1][0])
     if not found["as it is"]:
         return
     for way, some in found.items():
-        yield Figure.of(section, f"mean, {way}", "m", np.mean(some))
+        for part, mean in zip(("", f" after {START:g} s"), np.mean(some, axis=0)):
+            yield Figure.of(section, f"mean{part}, {way}", "m", mean)
     if correction is not None:
-        ratios = np.array(found["corrected"]) / found["as it is"]
+        ratios = np.array(found["corrected"])[:, 0] / np.array(found["as it is"])[:, 0]
         yield Figure.of(section, "corrected, over as it is: the flights", "ratio", ratios)
         yield Figure.of(section, "corrected, over as it is: the worst", "ratio", ratios.max())
 
 
-def rmse(flight: Flight, peer: Peer) -> float:
-    """3D RMSE of a peer that starts at the true pose of a Flight, m; where the flight is scored."""
+def error_of(flight: Flight, peer: Peer) -> tuple[np.ndarray, np.ndarray]:
+    """Error of a peer that starts at the true pose of a Flight, where the flight is scored.
+
+    Returns the time since the begin of that part (n,) s, and the distance to the truth (n,) m.
+    """
     require_truth(flight)
     assert flight.imu is not None and flight.truth is not None
     truth = flight.truth
@@ -118,7 +125,8 @@ def rmse(flight: Flight, peer: Peer) -> float:
         p[k] = peer.position()
     t = t + SAMPLED  # when the events of a slice are over
     inside = (t >= first) & (t <= last)
-    return float(rms(np.linalg.norm(p[inside] - position_at(t[inside], truth), axis=1)))
+    off = np.linalg.norm(p[inside] - position_at(t[inside], truth), axis=1)
+    return t[inside] - first, off
 
 
 def _level(q: np.ndarray) -> np.ndarray:

@@ -1,5 +1,6 @@
 """The pieces of `study bench`, and one quick run of the real thing."""
 
+from dataclasses import replace
 import json
 import os
 import subprocess
@@ -304,4 +305,7 @@ def test_the_errors_of_a_peer_are_given_with_and_without_a_correction(tmp_path):
     assert figures["mean, as it is"] == figures["still, as it is"]
     assert figures["corrected, over as it is: the worst"] == pytest.approx(0.0, abs=1e-5)
     alone = [one.name for one in peer.errors([flight], library, None)]
-    assert alone == ["still, as it is", "mean, as it is"]
+    assert alone == ["still, as it is", "mean, as it is", "mean after 4 s, as it is"]
+    better = replace(flight, tdoa=replace(tdoa, d=np.where(t < peer.START, 2.5, 2.1)))
+    *_, whole, after = (one.median for one in peer.errors([better], library, None))
+    assert whole > 0.4 and after == pytest.approx(0.1, abs=0.02)

@@ -7,6 +7,7 @@ pytest.importorskip("uwb_tdoa_msgs.msg")
 rclpy = pytest.importorskip("rclpy")
 
 from dataclasses import replace  # noqa: E402
+from fractions import Fraction  # noqa: E402
 import math  # noqa: E402
 import time  # noqa: E402
 
@@ -64,6 +65,17 @@ def test_seconds_do_not_depend_on_the_epoch(first, stamps):
     a = [now.seconds(Time(sec=first + second, nanosec=nanosecond)) for second, nanosecond in stamps]
     b = [long_ago.seconds(Time(sec=second, nanosec=nanosecond)) for second, nanosecond in stamps]
     assert a == b
+
+
+@given(st.integers(0, 2**31 - 1 - MONTH), st.integers(0, MONTH), NANOSECONDS)
+def test_seconds_are_the_nearest_float(first, second, nanosecond):
+    """As tools read them from a bag: else a period ends a sample earlier or later in a node."""
+    epoch = Epoch()
+    epoch.seconds(Time(sec=first))
+    nearest = float(Fraction(second * 10**9 + nanosecond, 10**9))
+    assert epoch.seconds(Time(sec=first + second, nanosec=nanosecond)) == nearest
+    columns = np.array([first + second]), np.array([nanosecond])
+    assert epoch.seconds_of(*columns).tolist() == [nearest]
 
 
 def test_an_orientation_of_zeros_is_not_known():

@@ -50,6 +50,13 @@ def test_both_networks_are_equal_to_numpy_and_python(tmp_path, orientations):
     agree(code, on_host(tmp_path, some), some, held, network)
 
 
+@pytest.mark.parametrize("name", ["antenna_pattern", "received_power_bias"])
+def test_an_angle_of_a_pattern_is_wrapped_by_a_comparison(name):
+    """floorf of the C library costs a hundred instructions for each anchor."""
+    source = vehicle_code(ANCHORS, chosen(name)).source
+    assert "atan2f(" in source and "floorf(" not in source
+
+
 def numbers_of(some):
     """The numbers of the states of cases, (n, 19), a view."""
     return some.view(np.float32).reshape(len(some), -1)[:, 2:]

@@ -98,6 +98,15 @@ def test_it_is_where_the_odometry_says_with_its_velocity_in_the_world(topics):
     np.testing.assert_allclose(topics.odometry.t, [4.9, 4.905])
 
 
+def test_odometry_of_the_present_is_used(topics):
+    """At every step of a grid, some of which 1e-9 times nanoseconds misses by a rounding."""
+    steps = [number / 200.0 for number in range(1001, 1201)]
+    for now in steps:
+        topics.publish_truth(now, np.zeros(STATE))
+        hear(topics, odometry(now))
+    assert topics._pace.stamps == steps
+
+
 @pytest.mark.parametrize(
     "bad",
     [

@@ -47,7 +47,9 @@ class Epoch:
     """Stamps as float seconds, counted from the whole second of the first stamp.
 
     They are exact to 1 ns within 48 days of the first stamp. Seconds since 1970 in a float64 would be
-    exact to 2e-7 s only.
+    exact to 2e-7 s only. The float is the one nearest to the stamp, as in `bags`. The sum of seconds
+    and 1e-9 times nanoseconds is sometimes its neighbor: on a grid of stamps, a sample then falls on
+    the other side of a period.
     """
 
     def __init__(self) -> None:
@@ -57,13 +59,13 @@ class Epoch:
         """Return float s of a builtin_interfaces/Time."""
         if self._second is None:
             self._second = stamp.sec
-        return (stamp.sec - self._second) + 1e-9 * stamp.nanosec
+        return ((stamp.sec - self._second) * 10**9 + stamp.nanosec) / 1e9
 
     def seconds_of(self, sec: np.ndarray, nanosec: np.ndarray) -> np.ndarray:
         """Return float s, (n,), of the two parts of stamps, (n,) each."""
         if self._second is None:
             self._second = int(sec[0])
-        return (sec.astype(np.int64) - self._second) + 1e-9 * nanosec
+        return ((sec.astype(np.int64) - self._second) * 10**9 + nanosec) / 1e9
 
     def parts(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return seconds and nanoseconds of t (n,) s, to 1 ns; the inverse of `seconds_of`."""

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 SAME = 1e-9  # m; a smaller difference of constants is rounding
 
+ANGLE = 3.1416  # rad, no atan2 is larger in single precision
 EVEN = 1e-5  # share by which the widths of pieces of one width may differ, rounded
 
 
@@ -253,6 +254,8 @@ class Program:
             return inputs[0]
         if kind in ("sin", "cos") and known[0].kind == "atan2":
             return self._of_angle(kind, *known[0].inputs)
+        if kind == "sub" and known[1].kind == "mul":
+            return self._wrapped(*inputs)
         if kind == "mul" and 0.0 in numbers:
             return self.add("constant", (), 0.0)  # as of finite numbers
         if kind == "where" and known[0].kind == "constant":
@@ -269,6 +272,39 @@ class Program:
         zero, at_zero = self.add("constant", (), 0.0), float(kind == "cos")
         there = self.add("lt", (zero, length))
         return self.add("where", (there, share, self.add("constant", (), at_zero)))
+
+    def _wrapped(self, x: int, multiple: int) -> int | None:
+        """Return the place of x - multiple if that wraps an angle less than a turn off, without floor.
+
+        multiple : place of period * floor(x / period)
+        """
+        turn = self.scalars[multiple].inputs
+        floor = self.scalars[turn[1]]
+        if floor.kind != "floor" or self.scalars[floor.inputs[0]] != Scalar("div", (x, turn[0])):
+            return None
+        period = self.scalars[turn[0]]
+        low, high = self._range(x)
+        if period.kind != "constant" or low < -period.value or high >= period.value:
+            return None
+        below = self.add("lt", (x, self.add("constant", (), 0.0)))
+        return self.add("where", (below, self.add("add", (x, turn[0])), x))
+
+    def _range(self, place: int) -> tuple[float, float]:
+        """Return bounds of a Scalar, as far as angles and their sums need them."""
+        one = self.scalars[place]
+        if one.kind == "constant":
+            return float(one.value), float(one.value)
+        if one.kind == "sqrt":
+            return 0.0, np.inf
+        if one.kind == "atan2":
+            largest = ANGLE if self._range(one.inputs[1])[0] < 0.0 else 0.5 * ANGLE
+            return -largest, largest
+        known = [self._range(k) for k in one.inputs] if one.kind in ("sub", "where") else []
+        if one.kind == "sub":
+            return known[0][0] - known[1][1], known[0][1] - known[1][0]
+        if one.kind == "where":
+            return min(known[1][0], known[2][0]), max(known[1][1], known[2][1])
+        return -np.inf, np.inf
 
     def _keep_used(self) -> None:
         """Remove what no output needs."""

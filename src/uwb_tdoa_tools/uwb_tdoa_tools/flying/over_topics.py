@@ -238,7 +238,7 @@ class OverTopics:
         for frame, rows, _ in self._odometry.fetch(self._odometry_codec):
             if self._begin is None:  # odometry of another vehicle: nothing was published yet
                 continue
-            t = 1e-9 * (rows["sec"].astype(np.int64) * 10**9 + rows["nanosec"] - self._begin)
+            t = (rows["sec"].astype(np.int64) * 10**9 + rows["nanosec"] - self._begin) / 1e9
             usable = (
                 np.isfinite(rows["pose"]).all(axis=1)
                 & np.isfinite(rows["twist"]).all(axis=1)
