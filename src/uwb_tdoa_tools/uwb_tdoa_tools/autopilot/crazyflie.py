@@ -1,0 +1,201 @@
+"""A Crazyflie by cflib: its log blocks come, poses go.
+
+cflib works in threads of its own. They hand everything over through one queue.
+"""
+
+from __future__ import annotations
+
+import logging
+from queue import SimpleQueue
+import re
+import time
+from typing import TYPE_CHECKING, Any
+
+from uwb_tdoa_bias.common.errors import InputError
+
+from ..crazyflie import BLOCKS, LogBlock
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from .estimate import Estimate
+
+    # block, timestamp in ms of the vehicle, values, arrival in s since 1970
+    Take = Callable[[LogBlock, float, Sequence[float], float], None]
+
+ADDRESS = re.compile(r"(radio|usb|udp|tcp)://\S+")
+CONNECTING, AGAIN = 60.0, 2.0  # s to connect at most; s until the next attempt
+# Deviations that the firmware assumes for what is sent. Its defaults are those of a motion capture
+# system: 0.01 m and 0.0045 rad.
+POSITION_STD, ATTITUDE_STD = "locSrv.extPosStdDev", "locSrv.extQuatStdDev"
+FINEST = {POSITION_STD: 0.01, ATTITUDE_STD: 0.0045}
+TOLD, TRUSTED = 1.25, 1.5  # ratios of a stated to a told deviation: tell it anew; do not send
+TELL = 0.5  # s between two requests of one parameter
+POSE, POSITION = "pose", "position"
+
+
+class CrazyflieLink:
+    """A link to one Crazyflie, which is opened again after it was lost."""
+
+    def __init__(
+        self,
+        uri: str,
+        content: str,
+        streams: Sequence[str],
+        take: Take,
+        clock: Callable[[], int],
+    ) -> None:
+        """Start to connect.
+
+        Parameters
+        ----------
+        uri : str
+            Of cflib, e.g. radio://0/80/2M/E7E7E7E7E7.
+        content : str
+            POSE, or POSITION without the attitude.
+        streams : sequence of str
+            Names from BLOCKS of what the vehicle is to log.
+        take : callable
+            Gets each message of a log block.
+        clock : callable
+            Returns the time that stamps refer to, in ns since 1970.
+        """
+        if not ADDRESS.fullmatch(uri):
+            raise InputError(
+                f"connection: {uri!r} is no address of a Crazyflie; give one such as "
+                "radio://0/80/2M/E7E7E7E7E7."
+            )
+        try:
+            from cflib import crtp
+            from cflib.crazyflie import Crazyflie
+            from cflib.crazyflie.log import LogConfig
+        except ImportError as error:
+            raise InputError(
+                "protocol: crazyflie needs the Python package cflib; install it with "
+                "`pip install cflib`."
+            ) from error
+        logging.getLogger("cflib").setLevel(logging.CRITICAL)  # `report` says what is wrong
+        crtp.init_drivers()
+        self._new, self._log_config = Crazyflie, LogConfig
+        self._uri, self._content, self._streams = uri, content, streams
+        self._take, self._clock = take, clock
+        self._events: SimpleQueue[Callable[[], None]] = SimpleQueue()
+        self._vehicle: Any = None  # a Crazyflie while it is opened or open
+        self._open, self._opened = False, 0.0  # whether it is connected; time.monotonic(), s
+        self._due = 0.0  # time.monotonic() of the next attempt, s
+        self._asked: dict[str, float] = {}  # {parameter: time.monotonic() of the last request, s}
+        self._trouble, self._missing = "", ""
+        self._sent = self._logged = 0
+
+    def turn(self) -> None:
+        """Take what came, and connect where there is no link."""
+        while not self._events.empty():
+            self._events.get()()
+        now = time.monotonic()
+        if self._vehicle is not None and not self._open and now > self._opened + CONNECTING:
+            self._lose(self._vehicle, "it does not answer")
+        if self._vehicle is None and now >= self._due:
+            self._connect(now)
+
+    def _connect(self, now: float) -> None:
+        vehicle = self._vehicle = self._new()
+        self._opened = now
+        vehicle.fully_connected.add_callback(
+            lambda _: self._events.put(lambda: self._start(vehicle))
+        )
+        for lost in (vehicle.connection_failed, vehicle.connection_lost):
+            lost.add_callback(
+                lambda _, why: self._events.put(lambda: self._lose(vehicle, why.split("\n")[0]))
+            )
+        vehicle.open_link(self._uri)
+
+    def _lose(self, vehicle: Any, why: str) -> None:
+        if vehicle is not self._vehicle:  # an earlier one
+            return
+        self._trouble = (
+            f"no link to the Crazyflie ({why}): check its power, its address and the radio"
+        )
+        self.close()
+        self._due = time.monotonic() + AGAIN
+
+    def _start(self, vehicle: Any) -> None:
+        """Start the log blocks of a vehicle that is connected."""
+        self._open, self._trouble, self._missing = True, "", ""
+        self._asked.clear()
+        for stream in self._streams:
+            variables, period = BLOCKS[stream]
+            config = self._log_config(stream, round(1e3 * period))
+            for name, kind in variables.items():
+                config.add_variable(name, kind)
+            try:
+                vehicle.log.add_config(config)
+            except (KeyError, AttributeError):
+                self._missing = (
+                    f"the Crazyflie has no log variables for {stream}: check its deck and its "
+                    f"firmware, or leave {stream} out of log"
+                )
+                continue
+            config.data_received_cb.add_callback(self._receiver(LogBlock(list(variables), period)))
+            config.start()
+
+    def _receiver(self, block: LogBlock) -> Callable[[float, dict[str, float], Any], None]:
+        """Return what a thread of cflib calls with each message of a log block."""
+
+        def receive(timestamp: float, values: dict[str, float], _: Any) -> None:
+            arrival = 1e-9 * self._clock()
+            self._events.put(lambda: self._deliver(block, timestamp, values, arrival))
+
+        return receive
+
+    def _deliver(
+        self, block: LogBlock, timestamp: float, values: dict[str, float], arrival: float
+    ) -> None:
+        self._logged += 1
+        self._take(block, timestamp, list(values.values()), arrival)
+
+    def send(self, estimate: Estimate, resets: int) -> None:
+        """Send the position, or the pose, once the Crazyflie does not trust it too much."""
+        if not self._open:
+            return
+        stated = {POSITION_STD: estimate.deviation}
+        if self._content == POSE:
+            stated[ATTITUDE_STD] = estimate.attitude_deviation
+        if not all([self._tell(name, value) for name, value in stated.items()]):
+            return
+        if self._content == POSE:
+            self._vehicle.extpos.send_extpose(*estimate.p.tolist(), *estimate.q.tolist())
+        else:
+            self._vehicle.extpos.send_extpos(*estimate.p.tolist())
+        self._sent += 1
+
+    def _tell(self, name: str, stated: float) -> bool:
+        """Set a parameter to a deviation if it differs; return whether it is large enough."""
+        stated = max(stated, FINEST[name])
+        told, now = float(self._vehicle.param.get_value(name)), time.monotonic()
+        same = stated / TOLD < told < stated * TOLD
+        if not same and now >= self._asked.get(name, 0.0) + TELL:
+            self._asked[name] = now
+            self._vehicle.param.set_value(name, stated)
+        return stated < TRUSTED * told
+
+    def report(self) -> tuple[str, dict[str, Any]]:
+        """Return the trouble, and the counts."""
+        trouble = self._trouble or self._missing
+        if not trouble and not self._open:
+            trouble = "connecting to the Crazyflie: it is not known yet whether it answers"
+        return trouble, {
+            "autopilot": "Crazyflie" if self._open else "none",
+            "poses sent": self._sent,
+            "messages of log blocks": self._logged,
+        }
+
+    def close(self) -> None:
+        """End the link.
+
+        close_link() of cflib would also send a thrust of 0: a flying vehicle would fall.
+        """
+        vehicle, self._vehicle, self._open = self._vehicle, None, False
+        link = getattr(vehicle, "link", None)
+        if link is not None:
+            vehicle.link = None
+            link.close()
