@@ -56,7 +56,9 @@ PARAMETERS = {  # in the order of config/autopilot_node.yaml
         "", f"of mavlink: {FORMS}; of crazyflie: an address of cflib (radio://0/80/2M/E7E7E7E7E7)"
     ),
     "baud": Parameter(921600, "bits/s of a serial port", 1200, 12_000_000),
-    "system_id": Parameter(1, "MAVLink system id of the vehicle (MAV_SYS_ID, SYSID_THISMAV)", 1, 255),
+    "system_id": Parameter(
+        1, "MAVLink system id of the vehicle (MAV_SYS_ID, SYSID_THISMAV)", 1, 255
+    ),
     "world": Parameter(
         FRD,
         (
@@ -72,7 +74,10 @@ PARAMETERS = {  # in the order of config/autopilot_node.yaml
     ),
     "rate": Parameter(50.0, "Hz; most estimates per second of their stamps", 5.0, 200.0),
     "largest_deviation": Parameter(
-        1.5, "m; an estimate with a larger standard deviation of a coordinate is not sent", 0.01, 100.0
+        1.5,
+        "m; an estimate with a larger standard deviation of a coordinate is not sent",
+        0.01,
+        100.0,
     ),
     "log": Parameter(
         [""],
@@ -136,9 +141,7 @@ class AutopilotNode(StreamNode):
             )
         if protocol == CRAZYFLIE:
             topics = VehicleTopics(self, streams)
-            return CrazyflieLink(
-                own["connection"], own["content"], streams, topics.take, self._now
-            )
+            return CrazyflieLink(own["connection"], own["content"], streams, topics.take, self._now)
         return NoLink()
 
     def _now(self) -> int:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from uwb_tdoa_bias.common.errors import InputError
 
 from ..crazyflie import BLOCKS, LogBlock
+from .link import missing
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -32,6 +33,7 @@ FINEST = {POSITION_STD: 0.01, ATTITUDE_STD: 0.0045}
 TOLD, TRUSTED = 1.25, 1.5  # ratios of a stated to a told deviation: tell it anew; do not send
 TELL = 0.5  # s between two requests of one parameter
 POSE, POSITION = "pose", "position"
+NOT_YET = "connecting to the Crazyflie: it is not known yet whether it answers"
 
 
 class CrazyflieLink:
@@ -70,57 +72,44 @@ class CrazyflieLink:
             from cflib.crazyflie import Crazyflie
             from cflib.crazyflie.log import LogConfig
         except ImportError as error:
-            raise InputError(
-                "protocol: crazyflie needs the Python package cflib; install it with "
-                "`pip install cflib`."
-            ) from error
+            raise missing("crazyflie", error, "cflib") from error
         logging.getLogger("cflib").setLevel(logging.CRITICAL)  # `report` says what is wrong
         crtp.init_drivers()
-        self._new, self._log_config = Crazyflie, LogConfig
-        self._uri, self._content, self._streams = uri, content, streams
-        self._take, self._clock = take, clock
+        self._log_config, self._uri, self._content = LogConfig, uri, content
+        self._streams, self._take, self._clock = streams, take, clock
         self._events: SimpleQueue[Callable[[], None]] = SimpleQueue()
-        self._vehicle: Any = None  # a Crazyflie while it is opened or open
-        self._open, self._opened = False, 0.0  # whether it is connected; time.monotonic(), s
-        self._due = 0.0  # time.monotonic() of the next attempt, s
+        self._is_open, self._since = False, 0.0  # time.monotonic() of the last attempt, s
+        self._due: float | None = 0.0  # time.monotonic() of the next attempt, s; None during one
         self._asked: dict[str, float] = {}  # {parameter: time.monotonic() of the last request, s}
-        self._trouble, self._missing = "", ""
+        self._trouble, self._missing = NOT_YET, ""
         self._sent = self._logged = 0
+        self._vehicle: Any = Crazyflie()
+        self._vehicle.fully_connected.add_callback(lambda _: self._events.put(self._start))
+        for lost in (self._vehicle.connection_failed, self._vehicle.connection_lost):
+            lost.add_callback(lambda _, why: self._events.put(lambda: self._lose(why)))
 
     def turn(self) -> None:
         """Take what came, and connect where there is no link."""
         while not self._events.empty():
             self._events.get()()
         now = time.monotonic()
-        if self._vehicle is not None and not self._open and now > self._opened + CONNECTING:
-            self._lose(self._vehicle, "it does not answer")
-        if self._vehicle is None and now >= self._due:
-            self._connect(now)
+        if self._due is None and not self._is_open and now > self._since + CONNECTING:
+            self._lose("it does not answer")
+        if self._due is not None and now >= self._due:
+            self._since, self._due = now, None
+            self._vehicle.open_link(self._uri)
 
-    def _connect(self, now: float) -> None:
-        vehicle = self._vehicle = self._new()
-        self._opened = now
-        vehicle.fully_connected.add_callback(
-            lambda _: self._events.put(lambda: self._start(vehicle))
-        )
-        for lost in (vehicle.connection_failed, vehicle.connection_lost):
-            lost.add_callback(
-                lambda _, why: self._events.put(lambda: self._lose(vehicle, why.split("\n")[0]))
-            )
-        vehicle.open_link(self._uri)
-
-    def _lose(self, vehicle: Any, why: str) -> None:
-        if vehicle is not self._vehicle:  # an earlier one
-            return
+    def _lose(self, why: str) -> None:
+        why = why.partition("\n")[0]
         self._trouble = (
             f"no link to the Crazyflie ({why}): check its power, its address and the radio"
         )
         self.close()
         self._due = time.monotonic() + AGAIN
 
-    def _start(self, vehicle: Any) -> None:
-        """Start the log blocks of a vehicle that is connected."""
-        self._open, self._trouble, self._missing = True, "", ""
+    def _start(self) -> None:
+        """Start the log blocks of the vehicle, which is connected now."""
+        self._is_open, self._trouble, self._missing = True, "", ""
         self._asked.clear()
         for stream in self._streams:
             variables, period = BLOCKS[stream]
@@ -128,7 +117,7 @@ class CrazyflieLink:
             for name, kind in variables.items():
                 config.add_variable(name, kind)
             try:
-                vehicle.log.add_config(config)
+                self._vehicle.log.add_config(config)
             except (KeyError, AttributeError):
                 self._missing = (
                     f"the Crazyflie has no log variables for {stream}: check its deck and its "
@@ -155,7 +144,7 @@ class CrazyflieLink:
 
     def send(self, estimate: Estimate, resets: int) -> None:
         """Send the position, or the pose, once the Crazyflie does not trust it too much."""
-        if not self._open:
+        if not self._is_open:
             return
         stated = {POSITION_STD: estimate.deviation}
         if self._content == POSE:
@@ -180,11 +169,8 @@ class CrazyflieLink:
 
     def report(self) -> tuple[str, dict[str, Any]]:
         """Return the trouble, and the counts."""
-        trouble = self._trouble or self._missing
-        if not trouble and not self._open:
-            trouble = "connecting to the Crazyflie: it is not known yet whether it answers"
-        return trouble, {
-            "autopilot": "Crazyflie" if self._open else "none",
+        return self._trouble or self._missing, {
+            "autopilot": "Crazyflie" if self._is_open else "none",
             "poses sent": self._sent,
             "messages of log blocks": self._logged,
         }
@@ -194,8 +180,8 @@ class CrazyflieLink:
 
         close_link() of cflib would also send a thrust of 0: a flying vehicle would fall.
         """
-        vehicle, self._vehicle, self._open = self._vehicle, None, False
-        link = getattr(vehicle, "link", None)
+        vehicle, self._is_open = self._vehicle, False
+        link, vehicle.link = vehicle.link, None
         if link is not None:
-            vehicle.link = None
             link.close()
+            vehicle.disconnected.call(self._uri)  # ends the threads of cflib

@@ -80,7 +80,9 @@ class Estimate:
             return None
         known = twist_covariance.diagonal()[3:] < UNKNOWN_VARIANCE
         w = np.where(known, twist[3:6], math.nan)
-        return cls(stamp, pose[:3], pose[3:7] / length, twist[:3], w, pose_covariance, twist_covariance)
+        return cls(
+            stamp, pose[:3], pose[3:7] / length, twist[:3], w, pose_covariance, twist_covariance
+        )
 
     @property
     def deviation(self) -> float:

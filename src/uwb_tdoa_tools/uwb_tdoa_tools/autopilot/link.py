@@ -4,8 +4,19 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Protocol
 
+from uwb_tdoa_bias.common.errors import InputError
+
 if TYPE_CHECKING:
     from .estimate import Estimate
+
+
+def missing(protocol: str, error: ImportError, package: str) -> InputError:
+    """Return the error of a protocol that needs a package which cannot be imported."""
+    name = (error.name or package).partition(".")[0]
+    return InputError(
+        f"protocol: {protocol} needs the Python package {name}; install it with "
+        f"`pip install {package}`."
+    )
 
 
 class Link(Protocol):

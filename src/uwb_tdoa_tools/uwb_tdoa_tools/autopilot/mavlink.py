@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from uwb_tdoa_bias.common.errors import InputError
 
 from .estimate import FRD, UPPER
+from .link import missing
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -52,14 +53,13 @@ class MavlinkLink:
         """
         if not CONNECTION.fullmatch(connection):
             raise InputError(f"connection: {connection!r} is none of {FORMS}.")
-        os.environ["MAVLINK20"] = "1"  # ODOMETRY is in MAVLink 2 alone; pymavlink reads it on import
+        os.environ["MAVLINK20"] = (
+            "1"  # ODOMETRY is in MAVLink 2 alone; pymavlink reads it on import
+        )
         try:
             from pymavlink import mavutil
         except ImportError as error:
-            raise InputError(
-                "protocol: mavlink needs the Python package pymavlink; install it with "
-                "`pip install pymavlink`."
-            ) from error
+            raise missing("mavlink", error, "pymavlink") from error
         self._dialect, self._world, self._clock = mavutil.mavlink, world, clock
         try:
             self._port = mavutil.mavlink_connection(
@@ -71,10 +71,7 @@ class MavlinkLink:
                 dialect="common",
             )
         except ImportError as error:
-            raise InputError(
-                "connection: a serial port needs the Python package pyserial; install it with "
-                "`pip install pyserial`."
-            ) from error
+            raise missing("mavlink", error, "pyserial") from error
         except (OSError, ValueError, OverflowError) as error:
             raise InputError(
                 f"connection: {connection} cannot be opened ({error}); connect the autopilot, or "
