@@ -36,7 +36,7 @@ class Px4:
             "udpin:127.0.0.1:0", source_system=1, source_component=1, dialect="common"
         )
         self.dialect = mavutil.mavlink
-        self.address = "127.0.0.1:%d" % self.port.port.getsockname()[1]
+        self.address = f"127.0.0.1:{self.port.port.getsockname()[1]}"
         self.odometry, self.beats, self.answers = [], [], []
 
     def receive(self):

@@ -4,13 +4,11 @@ The vehicle is a process of the test that speaks CRTP over UDP on loopback, as t
 logs what a recording holds.
 """
 
-from queue import SimpleQueue
 import socket
 import struct
-import sys
 import threading
 import time
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,6 +17,7 @@ rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg", reason="needs the built workspace: ./dev build")
 
 from autopilots import at_rest, bench  # noqa: E402
+from cflib_objects import PARAMETERS, Crazyflie, cflib  # noqa: E402, F401
 from sensor_msgs.msg import FluidPressure, Imu, Range  # noqa: E402
 
 from uwb_tdoa_bias.ros.topics import OUTPUT_QOS  # noqa: E402
@@ -33,7 +32,6 @@ from uwb_tdoa_tools.readers.streams import GRAVITY  # noqa: E402
 RUNNING = EstimatorStatus.STATUS_RUNNING
 KINDS = {"FP16": (8, "e"), "float": (7, "f"), "uint16_t": (2, "H")}  # codes of log variables
 STORED = {"FP16": "float"}  # what the firmware keeps of a variable that is sent as half floats
-PARAMETERS = {POSITION_STD: 0.01, ATTITUDE_STD: 0.0045}  # defaults of the firmware
 SECONDS = 3.0
 
 
@@ -100,7 +98,7 @@ class Vehicle:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", 0))
         self._socket.settimeout(0.001)
-        self.uri = "udp://127.0.0.1:%d" % self._socket.getsockname()[1]
+        self.uri = f"udp://127.0.0.1:{self._socket.getsockname()[1]}"
         self._variables = {
             name: STORED.get(kind, kind)
             for some, _ in BLOCKS.values()
@@ -233,7 +231,16 @@ def test_a_crazyflie_logs_to_topics_and_gets_poses(recording):
             rig.start("protocol:=crazyflie", f"connection:={vehicle.uri}", log)
             rig.tell(RUNNING)
 
-            rig.wait(lambda: rig.values.get("autopilot") == "Crazyflie", "link")
+            rig.wait(
+                lambda: (
+                    rig.values.get("autopilot") == "Crazyflie"
+                    and all(
+                        rig.values[f"subscribers of {topic}"] == "1"
+                        for topic in ("uwb/tdoa", "imu/data", "height", "pressure")
+                    )
+                ),
+                "link",
+            )
             vehicle.go.set()
 
             def is_over():
@@ -318,69 +325,11 @@ def _check_poses(vehicle):
 # --- without cflib: what the link does with its objects ---
 
 
-class Caller(list):
-    """As cflib.utils.callbacks.Caller."""
-
-    add_callback = list.append
-
-    def call(self, *arguments):
-        for callback in list(self):
-            callback(*arguments)
-
-
-class LogConfig:
-    def __init__(self, name, period):
-        self.name, self.period, self.variables = name, period, {}
-        self.data_received_cb, self.started = Caller(), False
-
-    def add_variable(self, name, kind):
-        self.variables[name] = kind
-
-    def start(self):
-        self.started = True
-
-
-class Crazyflie:
-    """cf.log, cf.param, cf.extpos and the callbacks. made : the last one."""
-
-    def __init__(self):
-        Crazyflie.made = self
-        self.fully_connected, self.connection_failed = Caller(), Caller()
-        self.connection_lost, self.disconnected = Caller(), Caller()
-        self.link, self.opened, self.poses, self.configs = None, 0, [], []
-        self.values = dict(PARAMETERS)
-        self.log = SimpleNamespace(add_config=self.configs.append)
-        self.param = SimpleNamespace(
-            get_value=lambda name: str(self.values[name]), set_value=self.values.__setitem__
-        )
-        self.extpos = SimpleNamespace(
-            send_extpose=lambda *pose: self.poses.append(pose),
-            send_extpos=lambda *place: self.poses.append(place),
-        )
-
-    def open_link(self, uri):
-        self.opened, self.link = self.opened + 1, SimpleNamespace(close=lambda: None)
-
-
-@pytest.fixture
-def cflib(monkeypatch):
-    modules = {
-        "cflib": {},
-        "cflib.crtp": {"init_drivers": lambda: None},
-        "cflib.crazyflie": {"Crazyflie": Crazyflie},
-        "cflib.crazyflie.log": {"LogConfig": LogConfig},
-    }
-    for name, content in modules.items():
-        module = ModuleType(name)
-        vars(module).update(content)
-        monkeypatch.setitem(sys.modules, name, module)
-    sys.modules["cflib"].crtp = sys.modules["cflib.crtp"]
-
-
 def link(content="pose", streams=("imu",), taken=None):
-    taken = SimpleQueue() if taken is None else taken
+    taken = [] if taken is None else taken
+    samples = SimpleNamespace(take=lambda *what: taken.append(what), restart=taken.clear)
     address = "radio://0/80/2M/E7E7E7E7E7"
-    made = CrazyflieLink(address, content, streams, lambda *what: taken.put(what), time.time_ns)
+    made = CrazyflieLink(address, content, streams, samples, time.time_ns)
     made.turn()
     return made, Crazyflie.made
 
@@ -391,8 +340,8 @@ def an_estimate(std):
     return Estimate(0, np.arange(3.0), q, np.zeros(3), np.zeros(3), covariance, covariance)
 
 
-def test_log_blocks_fit_their_packets(cflib):
-    taken = SimpleQueue()
+def test_log_blocks_fit_their_packets(cflib):  # noqa: F811
+    taken = []
     made, vehicle = link(streams=BLOCKS, taken=taken)
     vehicle.fully_connected.call("")
     made.turn()
@@ -403,11 +352,11 @@ def test_log_blocks_fit_their_packets(cflib):
     imu = next(config for config in vehicle.configs if config.name == "imu")
     imu.data_received_cb.call(1000, dict.fromkeys(imu.variables, 1.0), imu)
     made.turn()
-    _, timestamp, values, arrival = taken.get_nowait()
+    _, timestamp, values, arrival = taken[-1]
     assert (timestamp, values) == (1000, [1.0] * 6) and abs(arrival - time.time()) < 60.0
 
 
-def test_it_sends_nothing_that_the_crazyflie_would_believe_too_much(cflib):
+def test_it_sends_nothing_that_the_crazyflie_would_believe_too_much(cflib):  # noqa: F811
     made, vehicle = link()
     made.send(an_estimate(0.2), 0)
     assert vehicle.poses == []  # there is no link yet
@@ -425,7 +374,7 @@ def test_it_sends_nothing_that_the_crazyflie_would_believe_too_much(cflib):
     assert len(vehicle.poses) == 2
 
 
-def test_a_position_needs_no_attitude(cflib):
+def test_a_position_needs_no_attitude(cflib):  # noqa: F811
     made, vehicle = link(content="position")
     vehicle.fully_connected.call("")
     made.turn()
@@ -435,7 +384,7 @@ def test_a_position_needs_no_attitude(cflib):
     assert vehicle.values == {POSITION_STD: 0.2, ATTITUDE_STD: 0.0045}
 
 
-def test_a_link_that_is_lost_is_opened_again(cflib, monkeypatch):
+def test_a_link_that_is_lost_is_opened_again(cflib, monkeypatch):  # noqa: F811
     made, vehicle = link()
     assert "not known yet" in made.report()[0]
     vehicle.connection_failed.call("", "no radio\nTraceback ...")
@@ -457,7 +406,7 @@ def test_a_link_that_is_lost_is_opened_again(cflib, monkeypatch):
     assert "it does not answer" in made.report()[0]
 
 
-def test_log_variables_that_it_does_not_have_are_named(cflib):
+def test_log_variables_that_it_does_not_have_are_named(cflib):  # noqa: F811
     made, vehicle = link(streams=("height", "imu"))
 
     def add(config):

@@ -109,6 +109,7 @@ class AutopilotNode(StreamNode):
         self._codec, self._rate = CdrCodec(Odometry, "pose", "twist"), Rate()
         self._waiting: list[bytes] = []
         self._received = self._invalid = self._received_before = 0
+        self._topics = VehicleTopics(self, own["log"])
         self._link = self._open(own)
         self._publisher = publish_stream(self, Odometry, "odometry/gated")
         self._input = Input(
@@ -140,8 +141,9 @@ class AutopilotNode(StreamNode):
                 own["connection"], own["baud"], own["system_id"], own["world"], self._now
             )
         if protocol == CRAZYFLIE:
-            topics = VehicleTopics(self, streams)
-            return CrazyflieLink(own["connection"], own["content"], streams, topics.take, self._now)
+            return CrazyflieLink(
+                own["connection"], own["content"], streams, self._topics, self._now
+            )
         return NoLink()
 
     def _now(self) -> int:
@@ -186,6 +188,7 @@ class AutopilotNode(StreamNode):
             "publishers of odometry": self._input.subscription.get_publisher_count(),
             "subscribers of odometry/gated": self._publisher.get_subscription_count(),
             "unreadable on odometry": self._input.refusals.count,
+            **self._topics.subscribers,
         }
         text = (
             self._input.refusals.trouble()

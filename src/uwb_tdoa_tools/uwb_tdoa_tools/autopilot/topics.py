@@ -30,13 +30,7 @@ TOPICS = {
 
 
 class VehicleTopics:
-    """The topics of one Crazyflie.
-
-    Attributes
-    ----------
-    published : int
-        Number of messages so far.
-    """
+    """The topics of one Crazyflie."""
 
     def __init__(self, node: Node, streams: Collection[str]) -> None:
         """Make the publishers.
@@ -53,8 +47,19 @@ class VehicleTopics:
             for stream, (topic, kind) in TOPICS.items()
             if stream in streams
         }
+        self.restart()
+
+    @property
+    def subscribers(self) -> dict[str, int]:
+        """Return {text: number of subscribers} of each topic, for /diagnostics."""
+        return {
+            f"subscribers of {TOPICS[stream][0]}": publisher.get_subscription_count()
+            for stream, publisher in self._publishers.items()
+        }
+
+    def restart(self) -> None:
+        """Forget the clock of the vehicle."""
         self._clock = VehicleClock()
-        self.published = 0
 
     def take(
         self, block: LogBlock, timestamp: float, values: Sequence[float], arrival: float
@@ -98,4 +103,3 @@ class VehicleTopics:
         message.header.stamp = Time(nanoseconds=round(1e9 * stamp)).to_msg()
         message.header.frame_id = BODY_FRAME
         self._publishers[stream].publish(message)
-        self.published += 1
