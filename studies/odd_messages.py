@@ -75,6 +75,7 @@ STREAMS = {  # of each node: topic, type, and what counts those that could be re
     },
     "bias_node": {"uwb/tdoa": (Tdoa, "received"), "odometry": (Odometry, "poses")},
     "debias_node": {"odometry": (Odometry, "received")},
+    "autopilot_node": {"odometry": (Odometry, "received")},
 }
 SINGLE = {
     "ekf_node": {
@@ -85,12 +86,14 @@ SINGLE = {
     },
     "bias_node": {"uwb/anchors": AnchorArray, "/tf_static": TFMessage},
     "debias_node": {},
+    "autopilot_node": {"status": EstimatorStatus},
 }
 # topics, beside requests
 UNCOUNTED = {"vehicle_node": {"odometry": Odometry, "status": EstimatorStatus}}
 PACKAGES = nodes.PACKAGES | {
     "debias_node": "uwb_tdoa_ekf",
     "anchors_node": "uwb_tdoa_bias",
+    "autopilot_node": "uwb_tdoa_tools",
     "vehicle_node": "uwb_tdoa_tools",
 }
 OF_PARAMETERS = {
@@ -106,6 +109,7 @@ SERVICES = {
     "bias_node": {},
     "debias_node": {},
     "anchors_node": {},
+    "autopilot_node": {},
     "vehicle_node": {"takeoff": Takeoff, "go_to": GoTo, "land": Land},
 }
 NAMES = (
@@ -368,6 +372,7 @@ def _told(name, folder):
         "bias_node": ["-p", f"model_file:={CORPUS / 'model' / '0'}"],
         "debias_node": ["-p", f"map:={CORPUS / 'bias_map' / '0'}"],
         "anchors_node": ["-p", f"anchors_file:={Path(folder) / 'anchors.yaml'}"],
+        "autopilot_node": ["-p", "rate:=50.0"],
         "vehicle_node": ["-p", "duration:=1800.0"],
     }[name]
 

@@ -12,17 +12,17 @@ In crazyflies.yaml, for the robot type or the robot:
         imu: {frequency: 100, vars: ["gyro.x", "gyro.y", "gyro.z", "acc.x", "acc.y", "acc.z"]}
 
 then: python3 crazyflie_node.py --ros-args -r __ns:=/cf1
+
+Without crazyswarm2, autopilot_node does this by cflib (docs/autopilot.md).
 """
 
 import sys
 
 import rclpy
 from rclpy.executors import ExternalShutdownException
-from rclpy.time import Time
-from sensor_msgs.msg import Imu
 
-from uwb_tdoa_msgs.msg import Tdoa
-from uwb_tdoa_tools.crazyflie import LogBlock, VehicleClock
+from uwb_tdoa_tools.autopilot.topics import VehicleTopics
+from uwb_tdoa_tools.crazyflie import LogBlock
 
 try:
     from crazyflie_interfaces.msg import LogDataGeneric
@@ -42,30 +42,11 @@ BLOCKS = {
 def main():
     rclpy.init()
     node = rclpy.create_node("crazyflie_node")
-    tdoas, samples = (
-        node.create_publisher(Tdoa, "uwb/tdoa", 100),
-        node.create_publisher(Imu, "imu/data", 100),
-    )
-    clock = VehicleClock()
-
-    def stamp(message, t, arrival):
-        message.header.stamp = Time(nanoseconds=round(1e9 * clock.stamp(t, arrival))).to_msg()
-        message.header.frame_id = "base_link"
-        return message
+    topics = VehicleTopics(node, ["tdoa", "imu"])
 
     def on_block(message, block):
         arrival = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
-        pairs, sample = block.take(message.timestamp, message.values)
-        for t, a, b, d in pairs:
-            tdoas.publish(stamp(Tdoa(anchor_a=a, anchor_b=b, distance_difference=d), t, arrival))
-        if sample is not None:
-            t, gyro, accel = sample
-            imu = stamp(Imu(), t, arrival)
-            imu.angular_velocity.x, imu.angular_velocity.y, imu.angular_velocity.z = gyro.tolist()
-            imu.linear_acceleration.x, imu.linear_acceleration.y, imu.linear_acceleration.z = (
-                accel.tolist()
-            )
-            samples.publish(imu)
+        topics.take(block, message.timestamp, message.values, arrival)
 
     for topic, variables in BLOCKS.items():
         block = LogBlock(variables)

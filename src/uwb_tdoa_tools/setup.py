@@ -36,7 +36,10 @@ setup(
         "uwb_tdoa_ekf",
     ],
     extras_require={
+        # cflib 0.1.29 and newer need numpy 2
+        "crazyflie": ["cflib>=0.1.25"],  # for protocol crazyflie of autopilot_node
         "dask": ["distributed>=2024.1"],  # for --dask
+        "mavlink": ["pymavlink>=2.4.40"],  # for protocol mavlink of autopilot_node
         "rerun": ["rerun-sdk>=0.23"],  # for --rerun; needs numpy 2
         "oracle": ["rotorpy>=3.0"],  # beside which a test flies the vehicle of `fly`
         "test": ["hypothesis>=6.60", "pytest>=7.0"],  # colcon test runs pytest because of this
@@ -51,6 +54,7 @@ setup(
     zip_safe=False,  # numba keeps its cache beside the modules
     entry_points={
         "console_scripts": [
+            "autopilot_node = uwb_tdoa_tools.executables:autopilot_node",
             "calibrate = uwb_tdoa_tools.executables:calibrate",
             "check = uwb_tdoa_tools.executables:check",
             "convert = uwb_tdoa_tools.executables:convert",

@@ -19,7 +19,10 @@ GROWTH = 100e6  # bytes in the second half; an effect that is compiled takes 50 
     "name",
     [
         "ekf_node",
-        *(pytest.param(name, marks=pytest.mark.slow) for name in ("bias_node", "debias_node")),
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("bias_node", "debias_node", "autopilot_node")
+        ),
     ],
 )
 def test_no_message_ends_a_node_and_each_is_accounted_for(name, tmp_path):

@@ -6,12 +6,22 @@ import subprocess
 import sys
 
 from documented import ROOT
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from uwb_tdoa_tools.crazyflie import FORCES, GRAVITY, PERIOD, RATES, LogBlock, VehicleClock
+from uwb_tdoa_tools.crazyflie import (
+    FORCES,
+    GRAVITY,
+    HEIGHT,
+    PERIOD,
+    PRESSURE,
+    RATES,
+    WRAP,
+    LogBlock,
+    VehicleClock,
+)
 
 
 def test_a_value_is_a_measurement_once():
@@ -44,6 +54,48 @@ def test_the_clock_is_off_by_the_least_delay_and_never_runs_back_far(delays, off
         stamped = clock.stamp(t, t + offset + delay)
         assert stamped <= t + offset + delay + 1e-6
         assert stamped >= t + offset - 1e-6
+
+
+@given(st.floats(0.0, 0.05), st.floats(-1e3, 1e9), st.integers(1, 3))
+def test_the_clock_goes_on_when_the_time_of_the_vehicle_wraps(delay, offset, wraps):
+    """24 bits of ms: after 4.7 hours."""
+    clock = VehicleClock()
+    for t in np.linspace(0.0, wraps * WRAP, 200):
+        assert clock.stamp(t % WRAP, t + offset + delay) == pytest.approx(
+            t + offset + delay, abs=1e-5
+        )
+
+
+@given(st.floats(10.0, WRAP - 1.0), st.floats(5.0, 60.0))
+def test_the_clock_begins_anew_with_a_vehicle_that_was_switched_on_again(before, off):
+    """After the first message at the latest its stamps are those of its arrival."""
+    # nothing tells it from a wrap while it was off: a link that is opened again begins anew
+    assume(before + off + 1.0 < WRAP)
+    clock, now = VehicleClock(), 1e9
+    for t in (before - 0.02, before - 0.01, before):
+        clock.stamp(t, now + t)
+    back = now + before + off
+    for t in (0.5, 0.51, 0.52):
+        assert clock.stamp(t, back + t) == pytest.approx(back + t, abs=1e-5)
+
+
+def test_a_stalled_link_does_not_move_the_clock():
+    clock = VehicleClock()
+    for t in np.arange(0.0, 2.0, PERIOD):
+        clock.stamp(t, 100.0 + t)
+    stalled = [clock.stamp(t, 105.0) for t in np.arange(2.0, 5.0, PERIOD)]  # all come at once
+    np.testing.assert_allclose(stalled, 100.0 + np.arange(2.0, 5.0, PERIOD), atol=0.01)
+
+
+@pytest.mark.parametrize("no_target", [32000, 32767, 65535])
+def test_heights_and_pressures_are_in_si_units_and_come_once(no_target):
+    block = LogBlock([PRESSURE, "pm.vbat", HEIGHT], 2 * PERIOD)
+    t = pytest.approx(1.0 - PERIOD)
+    first = [("height", t, pytest.approx(1.25)), ("pressure", t, pytest.approx(95012.5))]
+    assert block.take_sensors(1000, [950.125, 3.9, 1250]) == first
+    assert block.take_sensors(1020, [950.125, 3.9, 1250]) == []
+    ((stream, _, height),) = block.take_sensors(1040, [950.125, 3.9, no_target])
+    assert stream == "height" and np.isinf(height)
 
 
 def test_the_example_says_what_is_missing():

@@ -29,6 +29,7 @@ from uwb_tdoa_tools.simulation.rooms import corners
 
 NODES = {
     "anchors_node": "uwb_tdoa_bias.anchors_node",
+    "autopilot_node": "uwb_tdoa_tools.autopilot_node",
     "bias_node": "uwb_tdoa_bias.bias_node",
     "debias_node": "uwb_tdoa_ekf.debias_node",
     "ekf_node": "uwb_tdoa_ekf.ekf_node",

@@ -28,6 +28,7 @@ ROS = """
     uwb_tdoa_ekf.launching
     uwb_tdoa_ekf.launching_actions uwb_tdoa_ekf.localization_node uwb_tdoa_ekf.outputs
     uwb_tdoa_ekf.monitoring.health
+    uwb_tdoa_tools.autopilot.topics uwb_tdoa_tools.autopilot_node
     uwb_tdoa_tools.commands.demo
     uwb_tdoa_tools.commands.replay uwb_tdoa_tools.flying.demo uwb_tdoa_tools.live.follow
     uwb_tdoa_tools.live.player uwb_tdoa_tools.live.processes uwb_tdoa_tools.live.record uwb_tdoa_tools.live.replay
@@ -39,6 +40,7 @@ IS_ROS = re.compile(r"rclpy|\w+_msgs|\w+_interfaces|domain_coordinator|ament_ind
 KEYS = {
     "PIL": ("python3-pil", "Pillow"),
     "backports": (None, "backports.zstd"),  # comes with rosbags, as lz4 does
+    "cflib": (None, "cflib"),  # for protocol crazyflie
     "dask": (None, "distributed"),
     "distributed": (None, "distributed"),
     "hypothesis": ("python3-hypothesis", "hypothesis"),
@@ -50,6 +52,7 @@ KEYS = {
     "numpy": ("python3-numpy", "numpy"),
     "onnx": (None, "onnx"),  # has no rosdep key: README
     "onnxruntime": ("python3-onnxruntime-pip", "onnxruntime"),
+    "pymavlink": (None, "pymavlink"),  # for protocol mavlink
     "pytest": ("python3-pytest", "pytest"),
     "rerun": (None, "rerun-sdk"),  # for --rerun
     "rosbags": ("python3-rosbags-pip", "rosbags"),
@@ -311,7 +314,10 @@ def test_every_executable_starts_behind_an_entry_point_of_its_name(package):
         assert entries[name] in modules() and entries[name].rpartition(".")[2] == name
     if package == "uwb_tdoa_tools":
         commands = {name for name in modules() if name.startswith("uwb_tdoa_tools.commands.")}
-        assert set(entries.values()) == commands | {"uwb_tdoa_tools.vehicle_node"}
+        assert set(entries.values()) == commands | {
+            "uwb_tdoa_tools.autopilot_node",
+            "uwb_tdoa_tools.vehicle_node",
+        }
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,8 @@ import pytest
 rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
+from cflib_objects import cflib  # noqa: E402, F401
+
 from uwb_tdoa_bias.anchors_node import AnchorsNode  # noqa: E402
 from uwb_tdoa_bias.bias_node import BiasNode  # noqa: E402
 from uwb_tdoa_bias.common.anchors import Anchors  # noqa: E402
@@ -16,13 +18,22 @@ from uwb_tdoa_ekf.debias import BiasMap  # noqa: E402
 from uwb_tdoa_ekf.debias_node import DebiasNode  # noqa: E402
 from uwb_tdoa_ekf.ekf_node import EkfNode  # noqa: E402
 from uwb_tdoa_ekf.localization_node import LocalizationNode  # noqa: E402
+from uwb_tdoa_tools.autopilot_node import AutopilotNode  # noqa: E402
 from uwb_tdoa_tools.vehicle_node import VehicleNode  # noqa: E402
 
 FILE = Path(__file__).resolve().parents[2] / "uwb_tdoa_ekf" / "sros2" / "policy.xml"
 ROLES = ("topic", "publish"), ("topic", "subscribe"), ("service", "reply"), ("service", "request")
 KINDS = {
     kind.NAME: kind
-    for kind in (BiasNode, EkfNode, LocalizationNode, AnchorsNode, DebiasNode, VehicleNode)
+    for kind in (
+        BiasNode,
+        EkfNode,
+        LocalizationNode,
+        AnchorsNode,
+        DebiasNode,
+        AutopilotNode,
+        VehicleNode,
+    )
 }
 OTHERS = {"robot", "operator"}  # who are not ours
 
@@ -53,6 +64,14 @@ def arguments(tmp_path):
     )
     own = {
         "anchors_node": ["-p", f"anchors_file:={tmp_path / 'anchors.yaml'}"],
+        "autopilot_node": [
+            "-p",
+            "protocol:=crazyflie",
+            "-p",
+            "connection:=radio://0/80/2M/E7E7E7E7E7",
+            "-p",
+            "log:=[tdoa, imu, height, pressure]",
+        ],
         "debias_node": ["-p", f"map:={tmp_path / 'map.npz'}"],
         "ekf_node": ["-p", "publish_tf:=odom"],
         "localization_node": ["-p", "publish_tf:=odom"],
@@ -79,7 +98,7 @@ def of_graph(observer, node):
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_a_node_may_do_what_it_does_and_nothing_else(name, arguments):
+def test_a_node_may_do_what_it_does_and_nothing_else(name, arguments, cflib):  # noqa: F811
     rclpy.init(args=arguments[name])
     node = KINDS[name](arguments[name])
     nodes, observer = [node, *node.members], rclpy.create_node("observer")

@@ -2,6 +2,7 @@
 
 from uwb_tdoa_bias.common.executable import executable, node_executable
 
+autopilot_node = node_executable("uwb_tdoa_tools.autopilot_node")
 calibrate = executable("uwb_tdoa_tools.commands.calibrate")
 check = executable("uwb_tdoa_tools.commands.check")
 convert = executable("uwb_tdoa_tools.commands.convert")

@@ -1,0 +1,243 @@
+"""A measured flight through the real nodes to an autopilot: a pose that is wrong, the recovery from
+it, a reset, and a loss of all TDOAs.
+
+The clock goes on when the nodes have kept up, so a busy machine changes nothing.
+"""
+
+from contextlib import contextmanager
+import time
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip("rclpy")
+pytest.importorskip("uwb_tdoa_msgs.msg", reason="needs the built workspace: ./dev build")
+pytest.importorskip("pymavlink")
+
+from autopilots import Px4, numbers, usec  # noqa: E402
+from geometry_msgs.msg import PoseWithCovarianceStamped  # noqa: E402
+from nav_msgs.msg import Odometry  # noqa: E402
+from rosgraph_msgs.msg import Clock  # noqa: E402
+from sensor_msgs.msg import Imu  # noqa: E402
+from std_srvs.srv import Trigger  # noqa: E402
+
+from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS, anchors_to_message  # noqa: E402
+from uwb_tdoa_bias.ros.topics import OUTPUT_QOS  # noqa: E402
+from uwb_tdoa_msgs.msg import AnchorArray, Tdoa  # noqa: E402
+from uwb_tdoa_tools.live.processes import Processes, own_domain, wait  # noqa: E402
+from uwb_tdoa_tools.live.session import session  # noqa: E402
+from uwb_tdoa_tools.readers import read_flight  # noqa: E402
+
+EPOCH = 1_700_000_000  # s
+STEP = 0.05  # s of the flight
+PATIENCE, IMPATIENCE = (
+    5.0,
+    0.05,
+)  # s of the wall clock for odometry, and for the next where none came
+POSE, RESET, SILENCE, END = 12.0, 18.0, (23.0, 32.0), 37.0  # s of the flight
+RATE = 50.0
+NODES = {
+    ("uwb_tdoa_bias", "bias_node"): ["qos_overrides./uwb/tdoa.subscription.reliability:=reliable"],
+    ("uwb_tdoa_ekf", "ekf_node"): [
+        "qos_overrides./imu/data.subscription.reliability:=reliable",
+        "initial_yaw:=0.0",
+        "initial_yaw_std:=0.1",
+    ],
+}
+
+
+class Player:
+    """Plays a flight, and listens to what the nodes make of it."""
+
+    def __init__(self, node, processes, flight, px4):
+        self.node, self.px4, self.gated, self._processes = node, px4, [], processes
+        self._begin, self._newest, self._silent = flight.imu.t[0], 0.0, False
+        make = node.create_publisher
+        self._tdoas, self._samples = (
+            make(Tdoa, "uwb/tdoa", OUTPUT_QOS),
+            make(Imu, "imu/data", OUTPUT_QOS),
+        )
+        self._clock, self._anchors = (
+            make(Clock, "/clock", 10),
+            make(AnchorArray, "uwb/anchors", ANCHORS_QOS),
+        )
+        self._pose = make(PoseWithCovarianceStamped, "initialpose", 10)
+        self._reset = node.create_client(Trigger, "ekf_node/reset")
+        node.create_subscription(Odometry, "odometry", self._on_odometry, OUTPUT_QOS)
+        node.create_subscription(Odometry, "odometry/gated", self.gated.append, OUTPUT_QOS)
+        self._anchors.publish(anchors_to_message(flight.anchors))
+        rows = [(t, None, k) for k, t in enumerate(flight.tdoa.t)]
+        rows += [(t, k, None) for k, t in enumerate(flight.imu.t) if k % 5 == 0]
+        self._rows, self._flight = sorted(rows, key=lambda row: row[0]), flight
+
+    def _on_odometry(self, message):
+        self._newest = 1e-6 * usec(message) - EPOCH
+
+    def wait(self, condition, what):
+        wait(400.0, what, self._processes, self.node, condition)
+
+    def is_connected(self):
+        return (
+            self._tdoas.get_subscription_count()
+            and self._samples.get_subscription_count()
+            and self._clock.get_subscription_count() == 3
+            and self.node.count_publishers("odometry/gated")
+            and self.node.count_subscribers("odometry") == 3
+            and self._reset.service_is_ready()
+            and self._pose.get_subscription_count()
+        )
+
+    def play(self, until, silent=(0.0, 0.0)):
+        """Play up to a time of the flight, s; without TDOAs from silent[0] to silent[1]."""
+        while self._rows and self._rows[0][0] - self._begin < until:
+            end = self._rows[0][0] - self._begin + STEP
+            while self._rows and self._rows[0][0] - self._begin < end:
+                self._publish(*self._rows.pop(0), silent)
+            self._keep_up(end)
+
+    def _publish(self, t, sample, tdoa, silent):
+        t -= self._begin
+        if sample is not None:
+            message, imu = Imu(), self._flight.imu
+            rates, forces = message.angular_velocity, message.linear_acceleration
+            rates.x, rates.y, rates.z = imu.gyro[sample].tolist()
+            forces.x, forces.y, forces.z = imu.accel[sample].tolist()
+            self._stamp(message.header, t, "base_link")
+            self._samples.publish(message)
+        elif not silent[0] <= t < silent[1]:
+            of = self._flight.tdoa
+            message = Tdoa(anchor_a=int(of.a[tdoa]), anchor_b=int(of.b[tdoa]))
+            message.distance_difference = float(of.d[tdoa])
+            self._stamp(message.header, t, "base_link")
+            self._tdoas.publish(message)
+
+    def _keep_up(self, end):
+        """Set the clock, and wait for odometry of this time and for what the autopilot gets of it."""
+        clock = Clock()
+        clock.clock.sec, clock.clock.nanosec = divmod(round(1e9 * (EPOCH + end)), 10**9)
+        self._clock.publish(clock)
+        limit = time.monotonic() + (IMPATIENCE if self._silent else PATIENCE)
+        while self._newest < end - STEP and time.monotonic() < limit:
+            rclpy.spin_once(self.node, timeout_sec=0.01)
+        self._silent = self._newest < end - STEP
+        answers = len(self.px4.answers)
+        self.px4.port.mav.timesync_send(0, round(1e9 * end))
+        while len(self.px4.answers) == answers:
+            rclpy.spin_once(self.node, timeout_sec=0.002)
+            self.px4.receive()
+            self._processes.check()
+
+    def _stamp(self, header, t, frame):
+        header.stamp.sec, header.stamp.nanosec = divmod(round(1e9 * (EPOCH + t)), 10**9)
+        header.frame_id = frame
+
+    def set_wrong_pose(self, place, t):
+        message = PoseWithCovarianceStamped()
+        self._stamp(message.header, t, "map")
+        at = message.pose.pose.position
+        at.x, at.y, at.z = place
+        message.pose.covariance = np.diag([0.05**2] * 3 + [0.0] * 3).ravel()
+        self._pose.publish(message)
+
+    def reset(self):
+        answer = self._reset.call_async(Trigger.Request())
+        self.wait(answer.done, "the reset")
+        assert answer.result().success
+
+
+@contextmanager
+def playing(folder, flight, px4):
+    """A Player of a flight to nodes that have found each other."""
+    with own_domain(), session("test", []) as (node, stop), Processes(folder, stop) as processes:
+        autopilot = [
+            "protocol:=mavlink",
+            f"connection:=udpout:{px4.address}",
+            f"rate:={RATE}",
+            "qos_overrides./odometry.subscription.reliability:=reliable",
+        ]
+        for (package, name), values in {
+            **NODES,
+            ("uwb_tdoa_tools", "autopilot_node"): autopilot,
+        }.items():
+            words = [word for value in ["use_sim_time:=true", *values] for word in ("-p", value)]
+            processes.start(package, name, "--ros-args", *words)
+        player = Player(node, processes, flight, px4)
+        player.wait(player.is_connected, "the nodes")
+        yield player
+
+
+@pytest.mark.slow
+def test_an_autopilot_gets_a_measured_flight(shared_data, tmp_path):
+    log, survey = shared_data / "flights/0426/0426-traj7", shared_data / "surveys/anchor_0426.txt"
+    flight, px4 = read_flight(log, survey), Px4()
+    begin = flight.imu.t[0]
+
+    def truth(t):
+        return np.array([np.interp(begin + t, flight.truth.t, axis) for axis in flight.truth.p.T])
+
+    try:
+        with playing(tmp_path, flight, px4) as player:
+            player.play(POSE)
+            player.set_wrong_pose(truth(POSE) + [2.0, 2.0, 0.0], POSE)
+            player.play(RESET)
+            player.reset()
+            player.play(END, SILENCE)
+        stream = [(1e-6 * m.time_usec - EPOCH, m) for m in px4.odometry]
+    finally:
+        px4.close()
+    _check_start(stream, truth)
+    _check_jumps(stream, truth)
+    _check_silences(stream)
+    _check_for_mavros(player.gated)
+
+
+def _check_start(stream, truth):
+    first = stream[0][0]
+    assert first < 6.0
+    steady = [(t, m) for t, m in stream if t < POSE]
+    assert (len(steady) - 1) / (steady[-1][0] - first) == pytest.approx(RATE, rel=0.02)
+    assert {m.reset_counter for _, m in steady} == {0}
+    errors = [np.linalg.norm([m.x, -m.y, -m.z] - truth(t)) for t, m in steady if t > 6.0]
+    assert np.median(errors) < 0.4 and np.max(errors) < 1.0
+    climb = [m.vz for t, m in steady if 2.0 < t < 4.0 or t < 6.0]
+    assert min(climb, default=-1.0) < -0.1 or truth(first)[2] > 1.0  # it took off, or had already
+
+
+def _check_jumps(stream, truth):
+    """The pose counts, and the way back from it; nothing else up to the reset."""
+    between = [(t, m) for t, m in stream if POSE <= t < RESET]
+    assert between[-1][1].reset_counter == 2
+    changes = [
+        (t, np.array([m.x - b.x, m.y - b.y, m.z - b.z]))
+        for (_, b), (t, m) in zip(between, between[1:])
+        if m.reset_counter != b.reset_counter
+    ]
+    assert changes[0][0] < POSE + 0.5 and np.linalg.norm(changes[0][1]) > 1.5
+    t, last = between[-1]
+    assert np.linalg.norm([last.x, -last.y, -last.z] - truth(t)) < 1.0
+
+
+def _check_silences(stream):
+    times = np.array([t for t, _ in stream])
+    gaps = [
+        (stream[k], stream[k + 1]) for k in np.flatnonzero(np.diff(times) > 0.5) if times[k] > POSE
+    ]
+    (_, of_reset), (before, of_loss) = gaps
+    assert of_reset[1].reset_counter == 3 and RESET < of_reset[0] < SILENCE[0]
+    assert SILENCE[0] < before[0] < SILENCE[1] < of_loss[0] < END
+    assert of_loss[1].reset_counter == 4
+    good = next(m for t, m in stream if t > SILENCE[0] - 0.5)
+    assert before[1].quality < 0.5 * good.quality  # it said so before it fell silent
+
+
+def _check_for_mavros(messages):
+    """Frames that mavros turns by its own transforms; a velocity in the body; covariances."""
+    for message in messages:
+        assert (message.header.frame_id, message.child_frame_id) == ("map", "base_link")
+        *_, pose, twist = numbers(message)
+        assert np.linalg.eigvalsh(pose).min() > 0.0 and np.linalg.eigvalsh(twist).min() > 0.0
+    here = [m for m in messages if 5.0 < 1e-6 * usec(m) - EPOCH < POSE]
+    p, turn, v, *_ = zip(*map(numbers, here))
+    moved = np.diff(p, axis=0) * RATE
+    told = np.array([of.apply(u) for of, u in zip(turn, v)])[1:]
+    assert np.sqrt(np.mean((moved - told) ** 2)) < 0.5

@@ -1,0 +1,197 @@
+"""A Crazyflie by cflib: its log blocks come, poses go.
+
+cflib works in threads of its own. They hand everything over through one queue.
+"""
+
+from __future__ import annotations
+
+import logging
+from queue import SimpleQueue
+import re
+import time
+from typing import TYPE_CHECKING, Any, Protocol
+
+from uwb_tdoa_bias.common.errors import InputError
+
+from ..crazyflie import BLOCKS, LogBlock
+from .link import missing
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from .estimate import Estimate
+
+ADDRESS = re.compile(r"(radio|usb|udp|tcp)://\S+")
+CONNECTING, AGAIN = 60.0, 2.0  # s to connect at most; s until the next attempt
+# Deviations that the firmware assumes for what is sent. Its defaults are those of a motion capture
+# system: 0.01 m and 0.0045 rad.
+POSITION_STD, ATTITUDE_STD = "locSrv.extPosStdDev", "locSrv.extQuatStdDev"
+FINEST = {POSITION_STD: 0.01, ATTITUDE_STD: 0.0045}
+TOLD, TRUSTED = 1.25, 1.5  # ratios of a stated to a told deviation: tell it anew; do not send
+TELL = 0.5  # s between two requests of one parameter
+POSE, POSITION = "pose", "position"
+NOT_YET = "connecting to the Crazyflie: it is not known yet whether it answers"
+
+
+class Samples(Protocol):
+    """What takes the messages of log blocks, as VehicleTopics does."""
+
+    def restart(self) -> None:
+        """Forget the clock of the vehicle, which may have been switched off."""
+
+    def take(
+        self, block: LogBlock, timestamp: float, values: Sequence[float], arrival: float
+    ) -> None:
+        """Take a message: ms of the vehicle, values of the variables, s since 1970."""
+
+
+class CrazyflieLink:
+    """A link to one Crazyflie, which is opened again after it was lost."""
+
+    def __init__(
+        self,
+        uri: str,
+        content: str,
+        streams: Sequence[str],
+        samples: Samples,
+        clock: Callable[[], int],
+    ) -> None:
+        """Start to connect.
+
+        Parameters
+        ----------
+        uri : str
+            Of cflib, e.g. radio://0/80/2M/E7E7E7E7E7.
+        content : str
+            POSE, or POSITION without the attitude.
+        streams : sequence of str
+            Names from BLOCKS of what the vehicle is to log.
+        samples : Samples
+            Gets each message of a log block.
+        clock : callable
+            Returns the time that stamps refer to, in ns since 1970.
+        """
+        if not ADDRESS.fullmatch(uri):
+            raise InputError(
+                f"connection: {uri!r} is no address of a Crazyflie; give one such as "
+                "radio://0/80/2M/E7E7E7E7E7."
+            )
+        try:
+            from cflib import crtp
+            from cflib.crazyflie import Crazyflie
+            from cflib.crazyflie.log import LogConfig
+        except ImportError as error:
+            raise missing("crazyflie", error, "cflib") from error
+        logging.getLogger("cflib").setLevel(logging.CRITICAL)  # `report` says what is wrong
+        crtp.init_drivers()
+        self._log_config, self._uri, self._content = LogConfig, uri, content
+        self._streams, self._samples, self._clock = streams, samples, clock
+        self._events: SimpleQueue[Callable[[], None]] = SimpleQueue()
+        self._is_open, self._since = False, 0.0  # time.monotonic() of the last attempt, s
+        self._due: float | None = 0.0  # time.monotonic() of the next attempt, s; None during one
+        self._asked: dict[str, float] = {}  # {parameter: time.monotonic() of the last request, s}
+        self._trouble, self._missing = NOT_YET, ""
+        self._sent = self._logged = 0
+        self._vehicle: Any = Crazyflie()
+        self._vehicle.fully_connected.add_callback(lambda _: self._events.put(self._start))
+        for lost in (self._vehicle.connection_failed, self._vehicle.connection_lost):
+            lost.add_callback(lambda _, why: self._events.put(lambda: self._lose(why)))
+
+    def turn(self) -> None:
+        """Take what came, and connect where there is no link."""
+        while not self._events.empty():
+            self._events.get()()
+        now = time.monotonic()
+        if self._due is None and not self._is_open and now > self._since + CONNECTING:
+            self._lose("it does not answer")
+        if self._due is not None and now >= self._due:
+            self._since, self._due = now, None
+            self._vehicle.open_link(self._uri)
+
+    def _lose(self, why: str) -> None:
+        why = why.partition("\n")[0]
+        self._trouble = (
+            f"no link to the Crazyflie ({why}): check its power, its address and the radio"
+        )
+        self.close()
+        self._due = time.monotonic() + AGAIN
+
+    def _start(self) -> None:
+        """Start the log blocks of the vehicle, which is connected now."""
+        self._is_open, self._trouble, self._missing = True, "", ""
+        self._asked.clear()
+        self._samples.restart()
+        for stream in self._streams:
+            variables, period = BLOCKS[stream]
+            config = self._log_config(stream, round(1e3 * period))
+            for name, kind in variables.items():
+                config.add_variable(name, kind)
+            try:
+                self._vehicle.log.add_config(config)
+            except (KeyError, AttributeError):
+                self._missing = (
+                    f"the Crazyflie has no log variables for {stream}: check its deck and its "
+                    f"firmware, or leave {stream} out of log"
+                )
+                continue
+            config.data_received_cb.add_callback(self._receiver(LogBlock(list(variables), period)))
+            config.start()
+
+    def _receiver(self, block: LogBlock) -> Callable[[float, dict[str, float], Any], None]:
+        """Return what a thread of cflib calls with each message of a log block."""
+
+        def receive(timestamp: float, values: dict[str, float], _: Any) -> None:
+            arrival = 1e-9 * self._clock()
+            self._events.put(lambda: self._deliver(block, timestamp, values, arrival))
+
+        return receive
+
+    def _deliver(
+        self, block: LogBlock, timestamp: float, values: dict[str, float], arrival: float
+    ) -> None:
+        self._logged += 1
+        self._samples.take(block, timestamp, list(values.values()), arrival)
+
+    def send(self, estimate: Estimate, resets: int) -> None:
+        """Send the position, or the pose, once the Crazyflie does not trust it too much."""
+        if not self._is_open:
+            return
+        stated = {POSITION_STD: estimate.deviation}
+        if self._content == POSE:
+            stated[ATTITUDE_STD] = estimate.attitude_deviation
+        if not all([self._tell(name, value) for name, value in stated.items()]):
+            return
+        if self._content == POSE:
+            self._vehicle.extpos.send_extpose(*estimate.p.tolist(), *estimate.q.tolist())
+        else:
+            self._vehicle.extpos.send_extpos(*estimate.p.tolist())
+        self._sent += 1
+
+    def _tell(self, name: str, stated: float) -> bool:
+        """Set a parameter to a deviation if it differs; return whether it is large enough."""
+        stated = max(stated, FINEST[name])
+        told, now = float(self._vehicle.param.get_value(name)), time.monotonic()
+        same = stated / TOLD < told < stated * TOLD
+        if not same and now >= self._asked.get(name, 0.0) + TELL:
+            self._asked[name] = now
+            self._vehicle.param.set_value(name, stated)
+        return stated < TRUSTED * told
+
+    def report(self) -> tuple[str, dict[str, Any]]:
+        """Return the trouble, and the counts."""
+        return self._trouble or self._missing, {
+            "autopilot": "Crazyflie" if self._is_open else "none",
+            "poses sent": self._sent,
+            "messages of log blocks": self._logged,
+        }
+
+    def close(self) -> None:
+        """End the link.
+
+        close_link() of cflib would also send a thrust of 0: a flying vehicle would fall.
+        """
+        vehicle, self._is_open = self._vehicle, False
+        link, vehicle.link = vehicle.link, None
+        if link is not None:
+            link.close()
+            vehicle.disconnected.call(self._uri)  # ends the threads of cflib

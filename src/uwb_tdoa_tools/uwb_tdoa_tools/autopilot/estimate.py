@@ -1,0 +1,141 @@
+"""One estimate of the filter, in the frames of ROS and in those of MAVLink.
+
+ROS (REP 103, nav_msgs/Odometry): the world has z up, the body is forward, left, up (FLU). The
+velocity is in the body frame. The covariance of the attitude is that of small rotations about the
+axes of the world.
+
+MAVLink (ODOMETRY): the world has z down, the body is forward, right, down (FRD). Everything is
+turned by one constant rotation on each side, so a Mahalanobis distance is equal in both.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+import math
+
+import numpy as np
+
+from uwb_tdoa_bias.common.sensors.sensor import UNKNOWN_VARIANCE
+
+FRD, NED = "frd", "ned"
+WORLDS = (FRD, NED)
+# World of ROS to that of MAVLink. FRD keeps the x axis of the world. NED takes x as east.
+_WORLD = {
+    FRD: np.diag([1.0, -1.0, -1.0]),
+    NED: np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
+}
+_HALF = math.sqrt(0.5)
+_TURN = {FRD: (1.0, 0.0, 0.0, 0.0), NED: (_HALF, _HALF, 0.0, 0.0)}  # of _WORLD; x y z w
+_BODY, _BODY_TURN = _WORLD[FRD], _TURN[FRD]  # FLU to FRD
+UPPER = np.triu_indices(6)
+LOWEST_QUALITY, BEST_QUALITY = 1, 100  # %, of an estimate that can be used
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Pose and velocity at one stamp.
+
+    Attributes
+    ----------
+    stamp : int
+        ns since 1970.
+    p : (3,) array
+        Position in the world, in m.
+    q : (4,) array
+        Quaternion x y z w, body to world.
+    v, w : (3,) arrays
+        Velocity, in m/s, and angular velocity, in rad/s, in the body frame; w is NaN if unknown.
+    pose_covariance : (6, 6) array
+        Of [position, rotation about the axes of the world], in m and rad.
+    twist_covariance : (6, 6) array
+        Of [v, w].
+    """
+
+    stamp: int
+    p: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    w: np.ndarray
+    pose_covariance: np.ndarray
+    twist_covariance: np.ndarray
+
+    @classmethod
+    def from_numbers(cls, stamp: int, pose: np.ndarray, twist: np.ndarray) -> Estimate | None:
+        """Return the Estimate of the numbers of a nav_msgs/Odometry; None if they are not one.
+
+        Parameters
+        ----------
+        stamp : int
+            ns since 1970.
+        pose : (43,) array
+            Position, quaternion x y z w, covariance by rows.
+        twist : (42,) array
+            Velocity, angular velocity, covariance by rows.
+        """
+        length = math.sqrt(float(pose[3:7] @ pose[3:7]))
+        if not (np.isfinite(pose).all() and np.isfinite(twist).all() and length > 0.5):
+            return None
+        pose_covariance, twist_covariance = pose[7:].reshape(6, 6), twist[6:].reshape(6, 6)
+        if min(pose_covariance.diagonal().min(), twist_covariance.diagonal().min()) < 0.0:
+            return None
+        known = twist_covariance.diagonal()[3:] < UNKNOWN_VARIANCE
+        w = np.where(known, twist[3:6], math.nan)
+        return cls(
+            stamp, pose[:3], pose[3:7] / length, twist[:3], w, pose_covariance, twist_covariance
+        )
+
+    @property
+    def deviation(self) -> float:
+        """Return the largest standard deviation of a coordinate, in m."""
+        return math.sqrt(self.pose_covariance.diagonal()[:3].max())
+
+    @property
+    def attitude_deviation(self) -> float:
+        """Return the largest standard deviation of a rotation, in rad."""
+        return math.sqrt(self.pose_covariance.diagonal()[3:].max())
+
+    @property
+    def quality(self) -> int:
+        """Return 100 less the deviation in cm, and at least 1: as MAVLink counts, in percent."""
+        return max(LOWEST_QUALITY, BEST_QUALITY - round(100.0 * self.deviation))
+
+    def in_mavlink(self, world: str) -> Estimate:
+        """Return the Estimate in the frames of MAVLink.
+
+        Parameters
+        ----------
+        world : str
+            FRD: x stays the x axis of the anchors' frame. NED: that frame has x east and y north.
+        """
+        turn = _WORLD[world]
+        q = _product(_product(_TURN[world], self.q), _BODY_TURN)
+        return replace(
+            self,
+            p=turn @ self.p,
+            q=-q if q[3] < 0.0 else q,
+            v=_BODY @ self.v,
+            w=_BODY @ self.w,
+            pose_covariance=_turned(turn, self.pose_covariance),
+            twist_covariance=_turned(_BODY, self.twist_covariance),
+        )
+
+
+def _turned(turn: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Return the (6, 6) covariance of two vectors that are both turned by a (3, 3) matrix."""
+    both = np.zeros((6, 6))
+    both[:3, :3] = both[3:, 3:] = turn
+    return both @ covariance @ both.T
+
+
+def _product(a: tuple[float, ...] | np.ndarray, b: tuple[float, ...] | np.ndarray) -> np.ndarray:
+    """Return the quaternion x y z w of rotation b followed by rotation a."""
+    ax, ay, az, aw = a
+    bx, by, bz, bw = b
+    return np.array(
+        [
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+            aw * bw - ax * bx - ay * by - az * bz,
+        ]
+    )

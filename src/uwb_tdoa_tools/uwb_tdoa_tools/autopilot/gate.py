@@ -1,0 +1,153 @@
+"""Decide which estimates an autopilot gets, and when it must accept a jump.
+
+An autopilot fuses whatever arrives: PX4 ignores the quality unless EKF2_EV_QMIN is set. So an
+estimate that may not be flown by is not sent at all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from .estimate import Estimate
+
+RUNNING = 2  # EstimatorStatus.STATUS_RUNNING
+OLDEST, EARLIEST = 0.5, -0.1  # s before the clock that a stamp may be
+BREAK = 0.4  # s without an estimate after which PX4 stops and starts its fusion anew
+SLACK = 0.1  # share of a period by which a stamp may be early
+SIGMAS = 5.0  # deviations beyond which a change is a jump
+# What a change may be besides, of position, velocity and rotation: rounding and process noise.
+SMALLEST = np.array([0.05, 0.1, 0.05])  # m, m/s, rad
+# m/s^2, rad/s: motion between two estimates that the earlier one does not predict
+ACCELERATION, TURN_RATE = 20.0, 10.0
+NOT_HEARD = "nothing came on status: start ekf_node in this namespace"
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What an autopilot gets.
+
+    Attributes
+    ----------
+    rate : float
+        Most estimates per second of their stamps.
+    deviation : float
+        Largest standard deviation of a coordinate, in m.
+    yaw : bool
+        Whether the yaw is sent, and so must be known.
+    """
+
+    rate: float
+    deviation: float
+    yaw: bool = True
+
+
+class Gate:
+    """Pass estimates on while the filter may be flown by.
+
+    Attributes
+    ----------
+    why : str
+        Reason why the last estimate was not passed; "" if it was, or was one too many for the rate.
+    resets : int
+        Number of jumps and silences that an autopilot must not take for motion.
+    passed : int
+        Number of estimates that were passed.
+    """
+
+    def __init__(self, limits: Limits) -> None:
+        self.why, self.resets, self.passed = NOT_HEARD, 0, 0
+        self._limits, self._closed = limits, NOT_HEARD
+        self._before: Estimate | None = None
+        self._due = -math.inf  # ns, stamp of the next estimate
+        self._silent = False  # True from an estimate that was held back to the next that passes
+
+    def set_status(self, status: int, yaw_known: bool, why: str) -> None:
+        """Take the status of the filter: one of EstimatorStatus, and its reason."""
+        self._closed = ""
+        if status != RUNNING:
+            self._closed = why or "the filter is not running"
+        elif self._limits.yaw and not yaw_known:
+            self._closed = why or "the yaw is not known"
+
+    def admit(self, estimate: Estimate, now: int) -> bool:
+        """Return whether an estimate is to be sent.
+
+        Parameters
+        ----------
+        estimate : Estimate
+            The next one, in the frames of ROS.
+        now : int
+            Time of the clock, in ns since 1970.
+        """
+        before, self._before = self._before, estimate
+        self.why = self._closed or self._fault(estimate, now)
+        if self.why:
+            self._silent = True
+            return False
+        if before is not None and (self._silent or jumped(before, estimate)):
+            self.resets += bool(self.passed)
+            self._due = -math.inf
+        self._silent = False
+        period = 1e9 / self._limits.rate
+        if estimate.stamp < self._due - SLACK * period:
+            return False
+        late = estimate.stamp >= self._due + period
+        self._due = (estimate.stamp if late else self._due) + period
+        self.passed += 1
+        return True
+
+    def _fault(self, estimate: Estimate, now: int) -> str:
+        """Return why an estimate cannot be used, or ""."""
+        age = 1e-9 * (now - estimate.stamp)
+        if not EARLIEST < age < OLDEST:
+            return (
+                f"odometry is stamped {abs(age):.1f} s {'before' if age > 0.0 else 'after'} the clock "
+                "of this node: set the clocks alike, or use_sim_time for a recording"
+            )
+        if estimate.deviation > self._limits.deviation:
+            return (
+                f"the position has a deviation of {estimate.deviation:.1f} m, above "
+                f"largest_deviation ({self._limits.deviation:g} m): see status"
+            )
+        return ""
+
+
+def jumped(before: Estimate, after: Estimate) -> bool:
+    """Return whether an estimate is elsewhere than motion and the stated deviation explain.
+
+    A measurement changes an estimate by less than its deviation. A restart, a recovery and a pose
+    that was set change it by more.
+    """
+    dt = 1e-9 * (after.stamp - before.stamp)
+    if not 0.0 <= dt < BREAK:
+        return True
+    turn = _rotation(before.q)
+    moved = after.p - before.p - turn @ before.v * dt
+    faster = _rotation(after.q) @ after.v - turn @ before.v
+    turned = 2.0 * math.acos(min(1.0, abs(float(before.q @ after.q))))
+    motion = ACCELERATION * dt * np.array([dt, 1.0, 0.0]) + [0.0, 0.0, TURN_RATE * dt]
+    deviations = [
+        before.deviation,
+        math.sqrt(before.twist_covariance.diagonal()[:3].max()),
+        before.attitude_deviation,
+    ]
+    allowed = SMALLEST + SIGMAS * np.array(deviations) + motion
+    changes = [math.sqrt(float(change @ change)) for change in (moved, faster)]
+    return bool((np.array([*changes, turned]) > allowed).any())
+
+
+def _rotation(q: np.ndarray) -> np.ndarray:
+    """Return the (3, 3) rotation matrix of a quaternion x y z w."""
+    x, y, z, w = q.tolist()
+    return np.array(
+        [
+            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
+            [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)],
+            [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)],
+        ]
+    )

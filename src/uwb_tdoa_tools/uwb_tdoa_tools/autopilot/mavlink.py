@@ -1,0 +1,162 @@
+"""ODOMETRY over MAVLink, for PX4 and ArduPilot, by pymavlink.
+
+Stamps are those of the filter, on the clock of the node. PX4 asks for that clock by TIMESYNC and
+converts the stamps itself; ArduPilot finds the offset from the stamps alone.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from typing import TYPE_CHECKING, Any
+
+from uwb_tdoa_bias.common.errors import InputError
+
+from .estimate import FRD, UPPER
+from .link import missing
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from .estimate import Estimate
+
+CONNECTION = re.compile(r"(udpin|udpout|tcp|tcpin):[^:\s]+:\d{1,5}|/dev/[\w./-]+")
+FORMS = "udpout:HOST:PORT, udpin:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT or /dev/NAME"
+COMPONENT = 197  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
+HEARTBEAT, SILENT = 1.0, 3.0  # s between heartbeats; s without one of the autopilot
+MOST_READ = 100  # messages of one turn; a flood must not hold up the odometry
+NAMES = {3: "ArduPilot", 12: "PX4"}  # MAV_AUTOPILOT
+INVALID = 8  # MAV_AUTOPILOT of what is none, e.g. a ground station
+
+
+class MavlinkLink:
+    """A link to PX4 or ArduPilot."""
+
+    def __init__(
+        self, connection: str, baud: int, system: int, world: str, clock: Callable[[], int]
+    ) -> None:
+        """Open the connection.
+
+        Parameters
+        ----------
+        connection : str
+            One of FORMS.
+        baud : int
+            Of a serial port.
+        system : int
+            MAVLink system id to send with: that of the vehicle.
+        world : str
+            FRD or NED (Estimate.in_mavlink).
+        clock : callable
+            Returns the time that stamps refer to, in ns since 1970.
+        """
+        if not CONNECTION.fullmatch(connection):
+            raise InputError(f"connection: {connection!r} is none of {FORMS}.")
+        os.environ["MAVLINK20"] = (
+            "1"  # ODOMETRY is in MAVLink 2 alone; pymavlink reads it on import
+        )
+        try:
+            from pymavlink import mavutil
+        except ImportError as error:
+            raise missing("mavlink", error, "pymavlink") from error
+        self._dialect, self._world, self._clock = mavutil.mavlink, world, clock
+        try:
+            self._port = mavutil.mavlink_connection(
+                connection,
+                baud=baud,
+                source_system=system,
+                source_component=COMPONENT,
+                autoreconnect=True,
+                dialect="common",
+            )
+        except ImportError as error:
+            raise missing("mavlink", error, "pyserial") from error
+        except (OSError, ValueError, OverflowError) as error:
+            raise InputError(
+                f"connection: {connection} cannot be opened ({error}); connect the autopilot, or "
+                "correct the connection."
+            ) from error
+        self._dialect = mavutil.mavlink
+        self._sent = self._asked = 0  # ODOMETRY sent; requests of TIMESYNC answered
+        self._beat = self._heard = -SILENT  # time.monotonic(), s
+        self._autopilot = "none"
+
+    def send(self, estimate: Estimate, resets: int) -> None:
+        """Send ODOMETRY."""
+        ours, dialect = estimate.in_mavlink(self._world), self._dialect
+        local = dialect.MAV_FRAME_LOCAL_FRD if self._world == FRD else dialect.MAV_FRAME_LOCAL_NED
+        x, y, z, w = ours.q.tolist()
+        self._write(
+            dialect.MAVLink_odometry_message(
+                ours.stamp // 1000,
+                local,
+                dialect.MAV_FRAME_BODY_FRD,
+                *ours.p.tolist(),
+                [w, x, y, z],
+                *ours.v.tolist(),
+                *ours.w.tolist(),
+                ours.pose_covariance[UPPER].tolist(),
+                ours.twist_covariance[UPPER].tolist(),
+                resets % 256,
+                dialect.MAV_ESTIMATOR_TYPE_VIO,
+                ours.quality,
+            )
+        )
+        self._sent += 1
+
+    def turn(self) -> None:
+        """Answer TIMESYNC, note heartbeats of the autopilot, and send ours."""
+        now = time.monotonic()
+        if now >= self._beat + HEARTBEAT:
+            self._beat, dialect = now, self._dialect
+            self._write(
+                dialect.MAVLink_heartbeat_message(
+                    dialect.MAV_TYPE_ONBOARD_CONTROLLER,
+                    dialect.MAV_AUTOPILOT_INVALID,
+                    0,
+                    0,
+                    dialect.MAV_STATE_ACTIVE,
+                    3,
+                )
+            )
+        for _ in range(MOST_READ):
+            message = self._read()
+            if message is None:
+                return
+            kind = message.get_type()
+            if kind == "TIMESYNC" and message.tc1 == 0:  # a request; others are answers
+                self._write(self._dialect.MAVLink_timesync_message(self._clock(), message.ts1))
+                self._asked += 1
+            elif kind == "HEARTBEAT" and message.autopilot != INVALID:
+                self._heard = now
+                self._autopilot = NAMES.get(message.autopilot, f"type {message.autopilot}")
+
+    def _read(self) -> Any:
+        try:
+            return self._port.recv_msg()
+        except OSError:  # of a port that is gone; pymavlink opens it again
+            return None
+
+    def _write(self, message: Any) -> None:
+        try:
+            self._port.mav.send(message)
+        except OSError:
+            pass  # as above; `report` says that nothing comes any more
+
+    def report(self) -> tuple[str, dict[str, Any]]:
+        """Return the trouble, and the counts."""
+        silent = time.monotonic() - self._heard > SILENT
+        trouble = (
+            "no heartbeat comes from the autopilot: check the connection, and that this port of the "
+            "autopilot speaks MAVLink"
+        )
+        return trouble if silent else "", {
+            "autopilot": self._autopilot,
+            "ODOMETRY sent": self._sent,
+            "TIMESYNC answered": self._asked,
+        }
+
+    def close(self) -> None:
+        """Close the port."""
+        self._port.close()

@@ -1,0 +1,215 @@
+"""autopilot_node: odometry that may be flown by to an autopilot, and samples of a Crazyflie.
+
+odometry (nav_msgs/Odometry), status (EstimatorStatus)
+  -> odometry/gated (nav_msgs/Odometry: what was sent), /diagnostics
+     (diagnostic_msgs/DiagnosticArray), and by `protocol`
+     mavlink: ODOMETRY to PX4 or ArduPilot;
+     crazyflie: positions or poses by cflib, and its log blocks -> uwb/tdoa (Tdoa),
+     imu/data (sensor_msgs/Imu), height (sensor_msgs/Range), pressure (sensor_msgs/FluidPressure).
+Every parameter is documented in config/autopilot_node.yaml.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING, Any
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from nav_msgs.msg import Odometry
+
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.ros import process
+from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS as STATUS_QOS
+from uwb_tdoa_bias.ros.cdr import CdrCodec
+from uwb_tdoa_bias.ros.diagnostics import Diagnostics, Rate
+from uwb_tdoa_bias.ros.node import StreamNode
+from uwb_tdoa_bias.ros.parameters import (
+    FROZEN,
+    Parameter,
+    declare_all,
+    files_of,
+    refuse_unknown,
+    say_unused,
+)
+from uwb_tdoa_bias.ros.topics import OVERRIDES, STREAM_QOS, Input, publish_stream
+from uwb_tdoa_msgs.msg import EstimatorStatus
+
+from .autopilot.crazyflie import POSE, POSITION, CrazyflieLink
+from .autopilot.estimate import FRD, WORLDS, Estimate
+from .autopilot.gate import Gate, Limits
+from .autopilot.link import Link, NoLink
+from .autopilot.mavlink import FORMS, MavlinkLink
+from .autopilot.topics import TOPICS, VehicleTopics
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+REST = 0.004  # s between two turns: PX4 uses a TIMESYNC answer that took less than 10 ms
+NONE, MAVLINK, CRAZYFLIE = "none", "mavlink", "crazyflie"
+PARAMETERS = {  # in the order of config/autopilot_node.yaml
+    "protocol": Parameter(
+        NONE,
+        "what the autopilot speaks; none: publish odometry/gated alone",
+        choices=(NONE, MAVLINK, CRAZYFLIE),
+    ),
+    "connection": Parameter(
+        "", f"of mavlink: {FORMS}; of crazyflie: an address of cflib (radio://0/80/2M/E7E7E7E7E7)"
+    ),
+    "baud": Parameter(921600, "bits/s of a serial port", 1200, 12_000_000),
+    "system_id": Parameter(
+        1, "MAVLink system id of the vehicle (MAV_SYS_ID, SYSID_THISMAV)", 1, 255
+    ),
+    "world": Parameter(
+        FRD,
+        (
+            "frame of ODOMETRY: frd keeps the x axis of the anchors' frame; ned if that axis points "
+            "east, and y north (PX4 alone takes ned)"
+        ),
+        choices=WORLDS,
+    ),
+    "content": Parameter(
+        POSE,
+        "what a Crazyflie gets: pose, or position, which needs no yaw",
+        choices=(POSE, POSITION),
+    ),
+    "rate": Parameter(50.0, "Hz; most estimates per second of their stamps", 5.0, 200.0),
+    "largest_deviation": Parameter(
+        1.5,
+        "m; an estimate with a larger standard deviation of a coordinate is not sent",
+        0.01,
+        100.0,
+    ),
+    "log": Parameter(
+        [""],
+        f'log blocks of a Crazyflie to publish, of {", ".join(TOPICS)}; [""] for none',
+    ),
+    "frozen": FROZEN,
+}
+
+
+class AutopilotNode(StreamNode):
+    """Read messages for a Gate, and give what passes it to a Link."""
+
+    NAME = "autopilot_node"
+    PERIOD = REST  # see `take`
+
+    def __init__(self, arguments: Sequence[str] = ()) -> None:
+        """Open the link, subscribe to odometry and status.
+
+        Parameters
+        ----------
+        arguments : sequence of str
+            Command line arguments of the process.
+        """
+        super().__init__(self.NAME)
+        own = declare_all(self, PARAMETERS)
+        refuse_unknown(self)
+        needs_yaw = own["protocol"] != CRAZYFLIE or own["content"] == POSE
+        self._gate = Gate(Limits(own["rate"], own["largest_deviation"], needs_yaw))
+        self._codec, self._rate = CdrCodec(Odometry, "pose", "twist"), Rate()
+        self._waiting: list[bytes] = []
+        self._received = self._invalid = self._received_before = 0
+        self._topics = VehicleTopics(self, own["log"])
+        self._link = self._open(own)
+        self._publisher = publish_stream(self, Odometry, "odometry/gated")
+        self._input = Input(
+            self,
+            Odometry,
+            "odometry",
+            self._waiting.append,
+            STREAM_QOS,
+            read=bytes,
+            served=False,
+            qos_overriding_options=OVERRIDES,
+        )
+        self._status = Input(self, EstimatorStatus, "status", self._on_status, STATUS_QOS)
+        self._diagnostics = Diagnostics(self, self._report)
+        say_unused([self], files_of(arguments))
+        self.turns = self
+        self.ready = f"ready; protocol {own['protocol']}"
+
+    def _open(self, own: dict[str, Any]) -> Link:
+        """Return the Link that the parameters ask for."""
+        protocol, streams = own["protocol"], [name for name in own["log"] if name]
+        unknown = sorted(set(streams) - set(TOPICS))
+        if unknown:
+            raise InputError(f"log: {unknown[0]!r} is not one of {', '.join(TOPICS)}.")
+        if streams and protocol != CRAZYFLIE:
+            raise InputError("log: only a Crazyflie has log blocks; set protocol to crazyflie.")
+        if protocol == MAVLINK:
+            return MavlinkLink(
+                own["connection"], own["baud"], own["system_id"], own["world"], self._now
+            )
+        if protocol == CRAZYFLIE:
+            return CrazyflieLink(
+                own["connection"], own["content"], streams, self._topics, self._now
+            )
+        return NoLink()
+
+    def _now(self) -> int:
+        return self.get_clock().now().nanoseconds
+
+    def _on_status(self, message: EstimatorStatus) -> None:
+        self._gate.set_status(message.status, message.yaw_known, message.why)
+
+    def take(self) -> float:
+        """Run one turn, and return the rest after it, in s."""
+        self._link.turn()
+        self._input.take_all()
+        if self._waiting:
+            messages, now = self._waiting[:], self._now()
+            self._waiting.clear()
+            for _, rows, some in self._codec.read(messages, self._input.refusals.add):
+                for row, data in zip(rows, messages[some]):
+                    self._pass_on(row, data, now)
+        return REST
+
+    def _pass_on(self, row: Any, data: bytes, now: int) -> None:
+        """Send one message of odometry if it may be flown by."""
+        self._received += 1
+        stamp = int(row["sec"]) * 10**9 + int(row["nanosec"])
+        estimate = Estimate.from_numbers(stamp, row["pose"], row["twist"])
+        if estimate is None:
+            self._invalid += 1
+        elif self._gate.admit(estimate, now):
+            self._link.send(estimate, self._gate.resets)
+            self._publisher.publish(data)
+
+    def _report(self) -> tuple[bytes, str, dict[str, Any]]:
+        trouble, counts = self._link.report()
+        recent, self._received_before = self._received - self._received_before, self._received
+        values = {
+            "received": self._received,
+            "passed": self._gate.passed,
+            "invalid": self._invalid,
+            "resets": self._gate.resets,
+            "rate": f"{self._rate.of(self._gate.passed):.1f} Hz",
+            **counts,
+            "publishers of odometry": self._input.subscription.get_publisher_count(),
+            "subscribers of odometry/gated": self._publisher.get_subscription_count(),
+            "unreadable on odometry": self._input.refusals.count,
+            **self._topics.subscribers,
+        }
+        text = (
+            self._input.refusals.trouble()
+            or trouble
+            or ("" if recent else "no odometry: start ekf_node in this namespace")
+            or (self._gate.why and f"nothing is sent to the autopilot: {self._gate.why}")
+        )
+        if text:
+            return DiagnosticStatus.WARN, text, values
+        return DiagnosticStatus.OK, "the autopilot gets odometry", values
+
+    def destroy_node(self) -> None:
+        """End the link and the node."""
+        self._link.close()
+        super().destroy_node()
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the node and return the exit code."""
+    return process.run(AutopilotNode, __doc__, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
