@@ -6,9 +6,10 @@ from recordings import ANCHORS, SURVEY
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_tools.commands.convert import main
-from uwb_tdoa_tools.readers import read_flight, read_survey
-from uwb_tdoa_tools.readers.columns import TIME, UNITS, parse_columns, read_columns
+from uwb_tdoa_tools.readers import read_by_profile, read_flight, read_survey
+from uwb_tdoa_tools.readers.columns import TIME, UNITS, parse_columns
 from uwb_tdoa_tools.readers.names import NamedAnchors, read_named_anchors
+from uwb_tdoa_tools.readers.profile import Profile
 
 NAMED = NamedAnchors(ANCHORS)
 TDOA = "time=t_ms:ms,anchor_a=from,anchor_b=to,tdoa=diff:mm"
@@ -19,6 +20,10 @@ IMU = ",".join(
 )
 RANGING = "t_ms,to,from,diff,quality\n1000,1,0,250,9\n1010,5,1,-500,9\n1020,0,0x5,750,9\n"
 INERTIAL = "t_ms,gx,gy,gz,ax,ay,az\n1000,180,0,0,0,0,1\n1001,0,90,0,0,0.5,1\n"
+
+
+def read_columns(paths, columns, named, salvage=False):
+    return read_by_profile(paths, Profile.of_columns(columns), named, salvage=salvage)
 
 
 @pytest.fixture

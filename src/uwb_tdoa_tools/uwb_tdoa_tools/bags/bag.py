@@ -304,7 +304,7 @@ def read_bag(
             why = (
                 f"{count} that are there cannot be read"
                 if count
-                else other_namespaces(reader, namespace)
+                else other_namespaces(path, reader, namespace)
             )
             raise InputError(f"{path}: has no message on {name_of('uwb/tdoa')}; {why}.")
         if anchors is None:
