@@ -51,6 +51,7 @@ KEYS = {
     "onnx": (None, "onnx"),  # has no rosdep key: README
     "onnxruntime": ("python3-onnxruntime-pip", "onnxruntime"),
     "pytest": ("python3-pytest", "pytest"),
+    "pyulog": (None, "pyulog"),  # for logs of PX4
     "rerun": (None, "rerun-sdk"),  # for --rerun
     "rosbags": ("python3-rosbags-pip", "rosbags"),
     "rotorpy": (None, "rotorpy"),  # an oracle of tests, for who wants it

@@ -213,7 +213,11 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
         tree = frames.read_frames(path, reader)
         remarks = tuple(remarks_of(reader))
     if not len(tdoa.stamps) and not sensors.keys() & set(LOCATING):
-        there = sorted(topic for topic, kind in topics.items() if kind == _ROWS[TDOA][0])
+        there = sorted(
+            topic
+            for topic, kind in topics.items()
+            if kind == _ROWS[TDOA][0] and topic != name_of(TDOA)
+        )
         places = " or ".join(f"--topic {TDOA}={topic}" for topic in there)
         hint = f"say where they are ({places})"
         if not there:

@@ -123,11 +123,14 @@ def _convert(args: Namespace) -> None:
         cli.show(
             "  ids in the bag: " + ", ".join(f"{name} is {number}" for name, number in ids.items())
         )
-    for what in ("read", "unread"):
-        for sentence in made.meta.get(what, ()):
-            cli.show(f"  {'not ' * (what == 'unread')}read: {sentence}")
+    for sentence in made.meta.get("read", ()):
+        cli.show(f"  read {sentence}")
+    for sentence in made.meta.get("unread", ()):
+        cli.show(f"  not read {sentence}")
     for remark in made.meta.get("remarks", ()):
         cli.show(f"  {remark}")
+    for stream, (count, first, last) in made.read.items():
+        cli.show(f"  {stream}: {count}, {first:.1f} to {last:.1f} s")
     for topic, count in made.messages.items():
         cli.show(f"  {topic}: {count}")
     for name, count in made.left_out.items():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -52,7 +52,7 @@ def read_util_csv(
 
     Units change from g to m/s^2, deg/s to rad/s, tof from mm to m, baro from m of altitude to Pa,
     flow from pixel counts to velocity. Ground truth without quaternion columns has NaN for q.
-    `meta["ignored_columns"]` lists columns outside of the schema.
+    `meta["unread"]` names columns outside of the schema.
 
     A plain file that was cut exactly between two lines looks like a shorter one; a gzip file does
     not.
@@ -90,9 +90,9 @@ def read_util_csv(
         tdoa.update({name: values[valid] for name, values in tdoa.items()})
     tdoa["a"], tdoa["b"] = _ids(path, "idA", tdoa["a"]), _ids(path, "idB", tdoa["b"])
 
-    meta = {"source": str(path), "format": "UTIL CSV", "remarks": remarks}
+    meta: dict[str, Any] = {"source": str(path), "format": "UTIL CSV", "remarks": remarks}
     if ignored := [name for name in header if name not in _KNOWN]:
-        meta["ignored_columns"] = ignored
+        meta["unread"] = [f"columns {', '.join(ignored)}: the UTIL schema has no such"]
     name = Path(path).name.removesuffix(".gz").removesuffix(".csv")
     return make_flight(name, anchors, streams, {}, meta, salvage, truth)
 
