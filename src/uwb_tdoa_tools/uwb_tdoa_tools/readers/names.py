@@ -65,7 +65,7 @@ def _read_named(path: str | Path) -> NamedAnchors:
 
 def named_anchors(path: str | Path, entries: list[survey.Entry], frame: str) -> NamedAnchors:
     """Return the NamedAnchors of entries, see `read_named_anchors`; `path` is for messages."""
-    names = [entry.name for entry in entries]
+    names = [_decimal(entry.name) for entry in entries]
     if all(map(survey.is_id, names)):
         return NamedAnchors(survey.anchors_of(path, entries, [int(name) for name in names], frame))
     if len(set(names)) < len(names):
@@ -78,6 +78,11 @@ def named_anchors(path: str | Path, entries: list[survey.Entry], frame: str) -> 
     if len(set(ids)) < len(names) or max(ids) > LARGEST_ID:
         ids = list(range(len(names)))
     return NamedAnchors(survey.anchors_of(path, entries, ids, frame), dict(zip(names, ids)))
+
+
+def _decimal(name: str) -> str:
+    """Return the decimal id of a name like 0x1A2B; other names as they are."""
+    return str(int(name, 16)) if re.fullmatch("0[xX][0-9A-Fa-f]{1,4}", name) else name
 
 
 def read_survey(path: str | Path) -> Anchors:
