@@ -394,6 +394,7 @@ def test_definitions_come_from_the_profile_where_the_bag_has_none(
         ({"body": "rfu"}, "body is 'rfu'; it must be flu or frd"),
         ({"where": ["LOS"]}, "where is no"),
         ({"topic": 3}, "topic is 3; it must be a text"),
+        ({"topic": "*a*b*c*d*e"}, "has more than 4 stars"),
         ({"topic": "/other"}, "takes TDOAs or ranges from; it has /tag/twr"),
     ],
 )
@@ -476,6 +477,15 @@ def test_a_damaged_bag_of_ros_1_is_refused_or_loses_no_message_silently(
         or read.meta["remarks"]
         or any("do not meet" in line for line in read.meta["read"])
     )
+
+
+def test_an_index_that_lacks_messages_is_damage(twr, survey):
+    """Those that the chunks state, in the last record of the file."""
+    content = twr.read_bytes()
+    count = int.from_bytes(content[-4:], "little")
+    twr.write_bytes(content[:-4] + (count + 1).to_bytes(4, "little"))
+    with pytest.raises(InputError, match="messages are missing on /tag/twr.*rosbag reindex"):
+        read_by_profile([twr], load_profile("uwb_msgs"), survey)
 
 
 def test_a_chunk_that_unpacks_to_too_much_is_refused(flight, survey, tmp_path):

@@ -31,6 +31,7 @@ from uwb_tdoa_bias.common.limits import (
 from . import is_ros_1
 from .files import messages, open_bag, remarks_of
 from .frames import recorded_anchors
+from .mcap import Damaged
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -119,7 +120,7 @@ class Message:
 
     def __init__(self, content: Any, received: int) -> None:
         self._content, self._received = content, received
-        stamp = getattr(getattr(content, "header", content), "stamp", None)
+        stamp: Any = getattr(getattr(content, "header", content), "stamp", None)
         in_header = stamp.sec * 10**9 + stamp.nanosec if hasattr(stamp, "nanosec") else 0
         self.is_stamped = in_header != 0
         self._stamp = in_header or received  # ns
@@ -342,6 +343,7 @@ def _ros_1(path: Path) -> Iterator[_Part]:
     reader = Ros1Reader(path)
     try:
         reader.open()
+        _check_counts(reader)
         _limit(reader, path)
     except Exception as error:  # rosbags raises whatever its parsers run into
         raise _damaged(path, error) from error
@@ -371,6 +373,18 @@ def _messages_of(
         except Exception as error:  # as in _ros_1
             raise _damaged(path, error) from error
         yield message
+
+
+def _check_counts(reader: Ros1Reader) -> None:
+    """Raise Damaged unless the index of an open reader has as many messages as its chunks state."""
+    stated: Counter[int] = Counter()
+    for chunk in reader.chunk_infos:
+        stated.update(chunk.connection_counts)
+    for connection in reader.connections:
+        if stated.pop(connection.id, 0) != connection.msgcount:
+            raise Damaged(f"messages are missing on {connection.topic}")
+    if stated:
+        raise Damaged("messages belong to no topic")
 
 
 def _damaged(path: Path, error: Exception) -> InputError:

@@ -30,6 +30,7 @@ HELP = (
     "how to read recordings of others: a profile that is shipped "
     "(convert --suggest names it), or your own YAML file (docs/connect.md)"
 )
+MOST_STARS = 4  # of a pattern; the time to compare it grows with each
 _KEYS = {"about", "sources", "types", "antenna"}
 _SOURCE = {"topic", "type", "each", "where", "tag", "columns", "body", "world"}
 _NAME = re.compile(r"\{(\w+)\}")
@@ -202,6 +203,8 @@ def _source(where: str, content: Any) -> Source:
     for name, value in texts.items():
         if not isinstance(value, str):
             raise InputError(f"{where}: {name} is {value!r}; it must be a text.")
+        if value.count("*") > MOST_STARS:
+            raise InputError(f"{where}: {name} has more than {MOST_STARS} stars; write names out.")
     axes = {"body": BODY, "world": WORLD}
     for name, known in axes.items():
         if content.get(name, known[0]) not in known:

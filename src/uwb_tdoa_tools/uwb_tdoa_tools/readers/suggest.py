@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 SAMPLE = 300  # messages of each table that are looked at
 ENTRIES = 8  # of an array in each of them
+LONGEST = 200  # characters of a path; longer ones are no name
 SHOWN = 12  # fields of a table that is not recognized
 FAST_TURN = 12.0  # rad/s; a larger reading of a gyroscope is in degrees/s
 LONG = 200.0  # m; a UWB radio reaches less, so larger distances are in mm
@@ -192,6 +193,8 @@ def _fields(records: Sequence[Any], names: Sequence[str]) -> list[Field]:
         paths |= record.paths() if hasattr(record, "paths") else dict.fromkeys(names, "")
     out = []
     for path, each in paths.items():
+        if len(path) > LONGEST:
+            continue
         values = []
         for record in records:
             for index in range(ENTRIES) if each else (None,):
