@@ -41,6 +41,7 @@ setup(
         "dask": ["distributed>=2024.1"],  # for --dask
         "mavlink": ["pymavlink>=2.4.40"],  # for protocol mavlink of autopilot_node
         "rerun": ["rerun-sdk>=0.23"],  # for --rerun; needs numpy 2
+        "ulog": ["pyulog>=1.1"],  # for logs of PX4
         "oracle": ["rotorpy>=3.0"],  # beside which a test flies the vehicle of `fly`
         "test": ["hypothesis>=6.60", "pytest>=7.0"],  # colcon test runs pytest because of this
     },
@@ -50,7 +51,7 @@ setup(
         (f"share/{NAME}/config", glob("config/*.yaml")),
         (f"share/{NAME}/launch", glob("launch/*.py")),
     ],
-    package_data={NAME: ["diagnosis/report/templates/*"]},
+    package_data={NAME: ["diagnosis/report/templates/*", "readers/profiles/*"]},
     zip_safe=False,  # numba keeps its cache beside the modules
     entry_points={
         "console_scripts": [

@@ -1,7 +1,6 @@
 import dataclasses
 import os
 from pathlib import Path
-import shutil
 import tempfile
 
 from hypothesis import assume, given, settings
@@ -468,11 +467,6 @@ def test_damaged_metadata(tmp_path, metadata):
 
 
 def test_not_a_bag(tmp_path):
-    write_bag(small_flight(0.05), tmp_path / "flight")
-    (tmp_path / "flight" / "metadata.yaml").unlink()
-    with pytest.raises(InputError, match="was not closed"):
-        read_bag(tmp_path / "flight")
-    shutil.rmtree(tmp_path / "flight")
     for path in (tmp_path, tmp_path / "flight"):
         with pytest.raises(InputError, match="is not a bag"):
             read_bag(path)

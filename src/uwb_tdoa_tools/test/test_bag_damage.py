@@ -158,7 +158,7 @@ def test_a_cut_bag_of_several_chunks_is_read_up_to_the_cut(tmp_path):
     file = data_file(tmp_path / "bag")
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
     (tmp_path / "bag" / "metadata.yaml").unlink()
-    with pytest.raises(InputError, match="has no metadata.yaml: .*--salvage"):
+    with pytest.raises(InputError, match="the recording was cut.*--salvage"):
         read_bag(tmp_path / "bag")
     back = read_bag(tmp_path / "bag", salvage=True)
     n = len(back.imu)
@@ -241,7 +241,6 @@ def test_pressures_and_velocities_that_are_not_finite(tmp_path, storage):
         ("name: /uwb/tdoa", "name: [/uwb/tdoa]"),
         ("type: uwb_tdoa_msgs/msg/Tdoa\n", "type: uwb_tdoa_msgs\n"),
         ("type: uwb_tdoa_msgs/msg/Tdoa\n", "type: 3\n"),
-        ("storage_identifier: ", "storage_identifier: x"),
         ("relative_file_paths:", "relative_file_paths: none\n  other:"),
         ("rosbag2_bagfile_information:", "rosbag2_bagfile_information: []\nother:"),
         ("version: 9", "version: 99"),

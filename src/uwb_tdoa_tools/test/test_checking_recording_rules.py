@@ -59,6 +59,13 @@ def test_an_imu_on_another_topic_is_named():
     assert rules_found(imu=None) == {}  # a CSV file has no topics
 
 
+def test_an_empty_topic_of_the_imu_is_not_mapped_to_itself():
+    found = rules_found(
+        imu=None, topics={"/imu/data": "sensor_msgs/msg/Imu"}, read=frozenset({"/imu/data"})
+    )
+    assert found.keys() == {"imu_empty"} and "--topic" not in found["imu_empty"].remedy
+
+
 ODOMETRY = "nav_msgs/msg/Odometry"
 
 

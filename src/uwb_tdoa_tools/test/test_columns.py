@@ -6,9 +6,10 @@ from recordings import ANCHORS, SURVEY
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_tools.commands.convert import main
-from uwb_tdoa_tools.readers import read_flight, read_survey
-from uwb_tdoa_tools.readers.columns import TIME, UNITS, parse_columns, read_columns
+from uwb_tdoa_tools.readers import read_by_profile, read_flight, read_survey
+from uwb_tdoa_tools.readers.columns import TIME, UNITS, parse_columns
 from uwb_tdoa_tools.readers.names import NamedAnchors, read_named_anchors
+from uwb_tdoa_tools.readers.profile import Profile
 
 NAMED = NamedAnchors(ANCHORS)
 TDOA = "time=t_ms:ms,anchor_a=from,anchor_b=to,tdoa=diff:mm"
@@ -19,6 +20,10 @@ IMU = ",".join(
 )
 RANGING = "t_ms,to,from,diff,quality\n1000,1,0,250,9\n1010,5,1,-500,9\n1020,0,0x5,750,9\n"
 INERTIAL = "t_ms,gx,gy,gz,ax,ay,az\n1000,180,0,0,0,0,1\n1001,0,90,0,0,0.5,1\n"
+
+
+def read_columns(paths, columns, named, salvage=False):
+    return read_by_profile(paths, Profile.of_columns(columns), named, salvage=salvage)
 
 
 @pytest.fixture
@@ -351,3 +356,21 @@ def test_tdoas_and_ranges_of_one_file(files):
 def test_a_survey_of_pandas_has_no_name_for_its_ids(files):
     (files / "anchors.csv").write_text(SURVEY.replace("id,x,y,z", ",x,y,z"))
     np.testing.assert_array_equal(read_survey(files / "anchors.csv").positions, ANCHORS.positions)
+
+
+def test_hexadecimal_ids_of_a_survey_are_the_ids_that_messages_have(tmp_path):
+    """Not the digits at their ends."""
+    survey = tmp_path / "survey.csv"
+    survey.write_text("id,x,y,z\n0x1A20,0,0,0\n0x1A21,4,0,3\n0x00F2,4,5,0\n")
+    named = read_named_anchors(survey)
+    assert named.anchors.ids.tolist() == [0x1A20, 0x1A21, 0xF2] and not named.ids
+    assert named.id_of("0x1A21") == named.id_of("6689") == 0x1A21
+
+
+def test_an_id_counts_where_the_names_of_anchors_end_with_it(tmp_path):
+    survey = tmp_path / "survey.csv"
+    survey.write_text("name,x,y,z\nA1,0,0,0\nA2,4,0,3\nA12,4,5,0\n")
+    named = read_named_anchors(survey)
+    assert [named.id_of(text) for text in ("A12", "12", "2", "3")] == [12, 12, 2, None]
+    survey.write_text("name,x,y,z\nNE,0,0,0\nNW,4,0,3\nSW,4,5,0\n")
+    assert read_named_anchors(survey).id_of("1") is None  # the second line, or an id of the radio

@@ -238,7 +238,7 @@ def test_topics_of_bags_are_refused_where_there_is_no_bag(tmp_path, given):
 
 def test_a_bag_that_was_not_closed_is_one(tmp_path):
     make(tmp_path, "bag/bag_0.mcap")
-    with pytest.raises(InputError, match="was not closed"):
+    with pytest.raises(InputError, match="bag is cut or damaged"):
         Reading(namespace="tag1").one(tmp_path / "bag")
 
 

@@ -54,6 +54,7 @@ KEYS = {
     "onnxruntime": ("python3-onnxruntime-pip", "onnxruntime"),
     "pymavlink": (None, "pymavlink"),  # for protocol mavlink
     "pytest": ("python3-pytest", "pytest"),
+    "pyulog": (None, "pyulog"),  # for logs of PX4
     "rerun": (None, "rerun-sdk"),  # for --rerun
     "rosbags": ("python3-rosbags-pip", "rosbags"),
     "rotorpy": (None, "rotorpy"),  # an oracle of tests, for who wants it

@@ -2,35 +2,23 @@
 nobody has calibrated.
 """
 
-import csv
-import gzip
+import shutil
 
 import pytest
 
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_tools.commands.convert import main as convert
-from uwb_tdoa_tools.readers import read_flight
+from uwb_tdoa_tools.readers import load_profile, read_by_profile
+from uwb_tdoa_tools.readers.names import read_named_anchors
 from uwb_tdoa_tools.scoring.evaluation import evaluate
-
-COLUMNS = "time=time_s,anchor=to_id,range=range,pose_x=tag_pos_x,pose_y=tag_pos_y,pose_z=tag_pos_z"
 
 
 @pytest.fixture(params=["1", "2"])
 def tag(request, tmp_path, shared_data):
-    """The flight of one tag of STAR-loc."""
+    """The flight of one tag of STAR-loc, without the inertial sensor."""
     folder = shared_data / "ranging" / "starloc"
-    with gzip.open(folder / "loop-2d-fast_s1" / "uwb.csv.gz", "rt", newline="") as file:
-        head, *rows = csv.reader(file)
-    with open(tmp_path / "tag.csv", "w", newline="") as file:
-        csv.writer(file).writerows([head, *(row for row in rows if row[2] == request.param)])
-    survey, bag = str(folder / "uwb_markers_v2.csv"), tmp_path / "tag.bag"
-    assert (
-        convert(
-            [str(tmp_path / "tag.csv"), "--columns", COLUMNS, "--survey", survey, "--out", str(bag)]
-        )
-        == 0
-    )
-    return read_flight(bag)
+    shutil.copy(folder / "loop-2d-fast_s1" / "uwb.csv.gz", tmp_path)
+    survey = read_named_anchors(folder / "uwb_markers_v2.csv")
+    return read_by_profile([tmp_path], load_profile("starloc"), survey, tag=request.param)
 
 
 def test_a_tag_of_which_nobody_knows_the_delay_is_located_and_honest(tag):

@@ -48,7 +48,7 @@ def test_streams_units_and_stamps(read):
 
 
 CANDIDATES = [
-    ("group", "H"),
+    ("group", "I"),
     ("idA", "B"),
     ("idB", "B"),
     ("distanceDiff", "f"),
@@ -57,35 +57,37 @@ CANDIDATES = [
 
 
 def with_candidates(*but):
-    """A log that has the same TDOAs as candidates, of the other sign, and others that were not
-    selected.
+    """A log that has the same TDOAs as candidates, of the other sign, and one more candidate of each packet, which
+    is written 20 us later.
     """
     rows = [row for row in ROWS if row[0] not in but]
-    for name, ticks, values in ROWS:
-        if name == "estTDOA":
-            a, b, d = values
-            rows += [
-                ("estTdoaCand", ticks, (7, a, b, -d, 1)),
-                ("estTdoaCand", ticks, (7, a, b, 9.0, 0)),
-            ]
+    packets = [row for row in ROWS if row[0] == "estTDOA"]
+    for number, (_, ticks, (a, b, d)) in enumerate(packets):
+        rows += [
+            ("estTdoaCand", ticks, (7 + number, a, b, -d, 1)),
+            ("estTdoaCand", ticks + 20, (7 + number, a, 5 - b, 9.0, 0)),
+        ]
     events = {name: known for name, known in EVENTS.items() if name not in but}
     return log_bytes(rows, events=events | {"estTdoaCand": (20, CANDIDATES)})
 
 
-def test_selected_candidates_have_the_other_sign(read):
-    flight = read(with_candidates("estTDOA"))
-    np.testing.assert_array_equal(flight.tdoa.t, [1.0005, 1.0025])
-    # the pair may come in either order, with its sign
-    signs = np.where(flight.tdoa.a == [0, 1], 1.0, -1.0)
-    np.testing.assert_array_equal(np.sort([flight.tdoa.a, flight.tdoa.b], axis=0), [[0, 1], [1, 5]])
-    np.testing.assert_array_equal(signs * flight.tdoa.d, [1.25, -0.5])
-    assert "estTdoaCand" not in flight.extra
+@pytest.mark.parametrize("but", [(), ("estTDOA",)])
+def test_all_candidates_of_a_packet_arrive_at_its_stamp_with_our_sign(read, but):
+    flight = read(with_candidates(*but))
+    np.testing.assert_array_equal(flight.tdoa.t, [1.0005, 1.0005, 1.0025, 1.0025])
+    np.testing.assert_array_equal(flight.tdoa.a, [1, 4, 5, 0])
+    np.testing.assert_array_equal(flight.tdoa.b, [0, 0, 1, 1])
+    np.testing.assert_array_equal(flight.tdoa.d, [-1.25, 9.0, 0.5, 9.0])
+    assert "estTdoaCand" not in flight.extra and ("estTDOA" in flight.extra) == (not but)
+    assert flight.meta["remarks"] == [
+        "estTdoaCand: all 4 candidates are TDOAs; the firmware used 2 of them."
+    ]
 
 
-def test_what_the_filter_got_comes_before_candidates(read):
-    flight = read(with_candidates())
-    np.testing.assert_array_equal(flight.tdoa.d, [1.25, -0.5])
-    assert len(flight.extra["estTdoaCand"]["t"]) == 4
+def test_candidates_of_a_firmware_that_numbers_no_packets(read):
+    rows = [("estTdoaCand", 1_000_500 + k, (1, 5, 0.5)) for k in range(3)]
+    flight = read(log_bytes(rows, events={"estTdoaCand": (20, CANDIDATES[1:4])}))
+    np.testing.assert_array_equal(flight.tdoa.t, [1.0005, 1.000501, 1.000502])
 
 
 def test_other_events_are_kept_sorted_and_empty_ones_are_not(read):

@@ -52,7 +52,7 @@ def test_windows_lines_byte_order_mark_and_foreign_columns(read):
     text = csv_text("t_tdoa,idA,idB,tdoa_meas,note", ["0.1,0,1,0.5,good"]).replace("\n", "\r\n")
     flight = read(b"\xef\xbb\xbf" + text.encode())
     assert len(flight.tdoa) == 1
-    assert flight.meta["ignored_columns"] == ["note"]
+    assert flight.meta["unread"] == ["columns note: the UTIL schema has no such"]
 
 
 def test_stamps_that_fall_are_sorted_and_counted(read):

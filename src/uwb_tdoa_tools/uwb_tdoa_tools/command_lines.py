@@ -30,6 +30,11 @@ def tool(name: str, *words: object) -> str:
     return " ".join([line_start(name), *([shlex.join(map(str, words))] if words else [])])
 
 
+def suggest_line(recording: str | Path) -> str:
+    """Return the line that writes a first profile of a recording of others, or names one that fits."""
+    return tool("convert", recording, "--suggest", "profile.yaml")
+
+
 def line_start(name: str) -> str:
     """Return the beginning of the line that starts an executable."""
     return f"{os.environ.get(RUN, 'ros2 run')} {PACKAGES.get(name, 'uwb_tdoa_tools')} {name}"

@@ -32,7 +32,7 @@ from .estimate import FlightEstimator
 from .localizing import pictures
 from .outputs import OutputFile
 from .parallel import whole_number
-from .readers import inputs
+from .readers import inputs, profile
 from .scoring.alignment import ALIGN, NONE
 from .surveying.known import read_distances, read_marks
 
@@ -62,7 +62,7 @@ def add_recordings(parser: ArgumentParser, nargs: str = "+") -> None:
 
 
 def add_reading(parser: ArgumentParser) -> None:
-    """Add --survey, --namespace, --topic and --salvage: how to read recordings."""
+    """Add --survey, --namespace, --topic, --profile, --tag and --salvage: how to read recordings."""
     add = parser.add_argument
     add("--survey", metavar="S", help=inputs.SURVEY_HELP)
     add("--namespace", default="", metavar="NS", help="of the tag's topics in bags, e.g. tag1")
@@ -74,6 +74,8 @@ def add_reading(parser: ArgumentParser) -> None:
         metavar="OURS=THEIRS",
         help="a topic of bags that has another name there, e.g. uwb/tdoa=/my/tdoa; may be repeated",
     )
+    add("--profile", metavar="P", help=profile.HELP)
+    add("--tag", default="", metavar="ID", help="of a recording with several tags, with --profile")
     add(
         "--salvage",
         action="store_true",
@@ -92,13 +94,22 @@ def reading_of(args: Namespace, truth: bool = True) -> inputs.Reading:
                 f"{', '.join(TOPICS)}."
             )
         topics[ours] = theirs
-    return inputs.Reading(args.survey, args.namespace, topics, args.salvage, truth)
+    if args.profile:
+        refuse(args, ("topics",), "the profile names the topics")
+    elif args.tag:
+        raise InputError("--tag: chooses a tag of a recording that is read with --profile.")
+    loaded = profile.load_profile(args.profile) if args.profile else None
+    return inputs.Reading(
+        args.survey, args.namespace, topics, args.salvage, truth, loaded, args.tag
+    )
 
 
 def words_of_reading(args: Namespace) -> tuple[str, ...]:
     """Return the words of a command line that read recordings as `reading_of`, without --survey."""
     words = ["--namespace", args.namespace] if args.namespace else []
     words += [word for topic in args.topics for word in ("--topic", topic)]
+    words += ["--profile", args.profile] if args.profile else []
+    words += ["--tag", args.tag] if args.tag else []
     return (*words, *["--salvage"][: args.salvage])
 
 

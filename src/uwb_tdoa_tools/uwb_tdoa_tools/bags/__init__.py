@@ -1,23 +1,45 @@
-"""ROS 2 bags: read, write, convert."""
+"""ROS bags: read, write, convert."""
 
 from __future__ import annotations
 
 from pathlib import Path
+import re
+
+from uwb_tdoa_bias.common.files import read_head
 
 ROS_2 = b"\x89MCAP0\r\n", b"SQLite format 3\0"  # first bytes of the files of a bag
+ZSTD = b"\x28\xb5\x2f\xfd"  # first bytes of a file that rosbag2 has packed
+ROS_1 = b"#ROSBAG V2.0"  # first bytes of a bag of ROS 1
+DATA = re.compile(r"(.+?)(?:_\d+)?\.(?:mcap|db3)(?:\.zstd)?")  # names of data files
 
 
 def is_bag(path: str | Path) -> bool:
-    """Return whether a path is a bag.
+    """Return whether a path is a bag of ROS 2.
 
-    A bag is a .mcap or .db3 file, or a directory with such a file or metadata.yaml.
+    A bag is a .mcap or .db3 file, packed with zstd or not, or a directory with such a file or metadata.yaml.
     """
     path = Path(path)
     if path.is_dir():
-        return (
-            any(path.glob("metadata.yaml")) or any(path.glob("*.mcap")) or any(path.glob("*.db3"))
-        )
-    if not path.is_file():
+        return (path / "metadata.yaml").exists() or any(_named_as_data(path))
+    if not path.is_file() or not path.stat().st_size:
         return False
-    with path.open("rb") as file:
-        return file.read(16).startswith(ROS_2)
+    head = read_head(path, 16)
+    return head.startswith(ROS_2) or (head.startswith(ZSTD) and bool(DATA.fullmatch(path.name)))
+
+
+def is_ros_1(path: str | Path) -> bool:
+    """Return whether a path is a bag of ROS 1."""
+    path = Path(path)
+    return path.is_file() and path.stat().st_size > 0 and read_head(path, 12) == ROS_1
+
+
+def is_one_bag(folder: Path) -> bool:
+    """Return whether the files in a folder are one bag: by metadata.yaml, or by names NAME_0.mcap, NAME_1.mcap, ..."""
+    if (folder / "metadata.yaml").exists():
+        return True
+    names = [match for match in _named_as_data(folder)]
+    return len(names) > 1 and len({match[1] for match in names}) == 1
+
+
+def _named_as_data(folder: Path) -> list[re.Match[str]]:
+    return [match for file in folder.iterdir() if (match := DATA.fullmatch(file.name))]

@@ -61,6 +61,8 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_ekf.results import Odometry
 
+    from .files import BagReader
+
     # {topic: (type, QoS, (stamp ns, message) in order)}
     Topics = dict[str, tuple[str, Qos, Iterable[tuple[int, Any]]]]
 
@@ -236,7 +238,7 @@ def read_bag(
     Other topics are ignored. Stamps are header stamps on a continuous time (`meta["clock"]`: [Jump] and {stream: outliers},
     see `clock.straightened`). Messages are sorted by stamp (`meta["reordered"]`). IMU samples are
     transformed to the body frame with /tf_static. `meta["antenna"]` is the position of the antenna
-    in the body, (3,) m.
+    in the body, (3,) m. `meta["unread"]` has sentences on other topics.
 
     Parameters
     ----------
@@ -304,7 +306,7 @@ def read_bag(
             why = (
                 f"{count} that are there cannot be read"
                 if count
-                else other_namespaces(reader, namespace)
+                else other_namespaces(path, reader, namespace)
             )
             raise InputError(f"{path}: has no message on {name_of('uwb/tdoa')}; {why}.")
         if anchors is None:
@@ -324,6 +326,7 @@ def read_bag(
         }
         remarks += [remark for _, remark in places.values() if remark]
         remarks = [*remarks_of(reader), *remarks]
+        unread = _unread(reader, name_of)
         poses = stream("pose")
     if imu is not None and (place := places["imu/data"][0]):
         imu = frames.imu_in_body(imu, place)
@@ -331,7 +334,20 @@ def read_bag(
         meta["antenna"] = place[1].tolist()
     if remarks:
         meta["remarks"] = remarks
+    if unread:
+        meta["unread"] = unread
     return Flight(about["name"], anchors, tdoa, imu, poses, {}, meta, clock.restarts, **sensors)
+
+
+def _unread(reader: BagReader, name_of: Names) -> list[str]:
+    """Return sentences on topics of an open bag that no stream takes."""
+    read = {name_of(topic) for name in STREAMS for topic, _ in topics_of(name)}
+    read |= {name_of("uwb/anchors"), frames.TF_STATIC}
+    return [
+        f"{one.topic}: {one.msgcount} messages of {one.msgtype}, which no stream takes"
+        for one in reader.connections
+        if one.topic not in read and one.msgcount
+    ]
 
 
 def read_odometry(
@@ -354,7 +370,9 @@ def read_odometry(
         remarks = tuple(remarks_of(reader))
     if not len(t):
         others = " or ".join(
-            f"--topic odometry={name}" for name in names if name.endswith("/odometry")
+            f"--topic odometry={name}"
+            for name in names
+            if name.endswith("/odometry") and name != topic
         )
         remedy = f"say which to take ({others})" if others else "record the output of the filter"
         raise InputError(f"{path}: has no message on {topic}; {remedy}.")

@@ -33,6 +33,7 @@ class Converted:
     ----------
     flight, bag : name of the flight, path of the bag.
     messages : {topic: count}.
+    read : {stream: (samples, s of the first, s of the last)}.
     start, end : s.
     anchors : number of anchors.
     tdoa_unknown_anchor : number of measurements of anchors outside of the survey.
@@ -44,6 +45,7 @@ class Converted:
     flight: str
     bag: str
     messages: dict[str, int]
+    read: dict[str, tuple[int, float, float]]
     start: float
     end: float
     anchors: int
@@ -74,6 +76,11 @@ def convert(
         flight=flight.name,
         bag=str(out),
         messages=counts,
+        read={
+            name: (len(t), float(t[0]), float(t[-1]))
+            for name in _held(flight)
+            for t in [getattr(flight, name).t]
+        },
         start=min(float(stream.t[0]) for stream in together),
         end=max(float(stream.t[-1]) for stream in together),
         anchors=len(flight.anchors),

@@ -22,12 +22,11 @@ from uwb_tdoa_bias.common.stamps import LARGEST_STEP_BACK
 
 from ..command_lines import SALVAGE
 from . import is_bag, mcap, write_ahead
+from .completion import completed
 from .integrity import (
     CHECKSUM_KEY,
     NO_CHECKSUM,
     data_files,
-    decompress,
-    is_compressed,
     is_mcap,
     metadata,
     sqlite_messages,
@@ -124,7 +123,7 @@ def open_bag(path: str | Path, salvage: bool = False) -> Iterator[BagReader]:
     """Yield an open BagReader of a bag directory or of one .mcap or .db3 file.
 
     Raises InputError if the path is no bag, or a damaged one without `salvage`. What must be
-    unpacked or repaired is copied to a temporary folder first.
+    unpacked, completed or repaired is copied to a temporary folder first.
 
     salvage : read the intact messages of a cut or damaged bag; `remarks` lists what is missing
     """
@@ -133,11 +132,6 @@ def open_bag(path: str | Path, salvage: bool = False) -> Iterator[BagReader]:
         raise InputError(
             f"{path}: is not a bag; give the directory with metadata.yaml or its .mcap or "
             ".db3 file."
-        )
-    if path.is_dir() and not (path / "metadata.yaml").is_file() and not salvage:
-        raise InputError(
-            f"{path}: has no metadata.yaml: the recording was not closed; run `ros2 bag "
-            f"reindex` on it, or {SALVAGE}."
         )
     with temporary_folder() as folder:
         reader = _opened(path, folder, salvage)
@@ -162,16 +156,19 @@ def _opened(path: Path, folder: Path, salvage: bool) -> BagReader:
                 "beside it is read, too."
             )
             remarks += [f"{sentence}." for sentence in lost]
+        try:
+            (folder / "completed").mkdir()
+            path, more = completed(path, folder / "completed")
+            remarks += more
+        except (Damaged, InputError):
+            if not salvage:
+                raise
         readable = path
         if salvage:
             readable = folder / "sound"
             remarks += write_sound_part(path, readable)
         else:
             check_whole(path)
-            if path.is_dir() and is_compressed(metadata(path)):
-                readable = folder
-                decompress(path, folder)
-                check_whole(folder)
         reader = BagReader(readable)
         with _closing_second_connections(reader):
             reader.open()

@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 import zlib
 
-import yaml
-
 from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_bias.common.limits import MESSAGE_BYTES, Budget, most_unpacked
 from uwb_tdoa_bias.common.safe_yaml import read_yaml
@@ -41,8 +39,7 @@ def check(path: str | Path) -> None:
     """Check the files of a bag.
 
     The check covers the checksums in MCAP files and in metadata.yaml (`write_checksums`). It also
-    covers the structure of SQLite files, and the entries of metadata.yaml. Files that rosbag2 has
-    compressed as a whole only have to exist.
+    covers the structure of SQLite files, and the entries of metadata.yaml.
 
     Parameters
     ----------
@@ -58,18 +55,22 @@ def check(path: str | Path) -> None:
     """
     path = Path(path)
     if not path.is_dir():
-        return _check_data(path)
+        return check_data(path)
     information = metadata(path)
-    stored = information["custom_data"].get(CHECKSUM_KEY, NO_CHECKSUM)
     for file in data_files(path, information):
         if not file.is_file():
             raise Damaged(f"{file.name} is missing")
-        if stored != NO_CHECKSUM and _checksum(file) != stored:
-            raise Damaged(
-                f"the checksum of {file.name} in metadata.yaml is {stored}, but it has {_checksum(file)}"
-            )
-        if not is_compressed(information):
-            _check_data(file, packed_messages=information["compression_mode"] == "message")
+        check_sum(file, information)
+        check_data(file, packed_messages=information["compression_mode"] == "message")
+
+
+def check_sum(file: Path, information: dict[str, Any]) -> None:
+    """Raise Damaged if the content of metadata.yaml has another checksum of a data file."""
+    stored = information["custom_data"].get(CHECKSUM_KEY, NO_CHECKSUM)
+    if stored != NO_CHECKSUM and _checksum(file) != stored:
+        raise Damaged(
+            f"the checksum of {file.name} in metadata.yaml is {stored}, but it has {_checksum(file)}"
+        )
 
 
 def data_files(path: Path, information: dict[str, Any]) -> list[Path]:
@@ -80,38 +81,6 @@ def data_files(path: Path, information: dict[str, Any]) -> list[Path]:
 def is_compressed(information: dict[str, Any]) -> bool:
     """Return whether rosbag2 has compressed whole data files."""
     return information["compression_mode"] == "file"
-
-
-def decompress(path: Path, folder: Path) -> None:
-    """Decompress a bag into an empty folder; its files are compressed as a whole.
-
-    Raises
-    ------
-    Damaged, InputError
-        If a file or metadata.yaml cannot be read.
-    """
-    information = metadata(path)
-    names, files = [], data_files(path, information)
-    packed = sum(file.stat().st_size for file in files)
-    budget, most = Budget(path, packed), most_unpacked(packed)
-    for file in files:
-        names.append(file.stem)
-        try:
-            with zstd.open(file, "rb") as source, open(folder / file.stem, "wb") as target:
-                while block := source.read(_BLOCK):
-                    budget.spend("bytes when its files are unpacked", len(block), most)
-                    target.write(block)
-        except (zstd.ZstdError, EOFError) as error:
-            raise Damaged(f"{file.name} cannot be unpacked ({error})") from error
-    information |= {
-        "relative_file_paths": names,
-        "compression_mode": "",
-        "compression_format": "",
-        "files": [],
-    }
-    information["custom_data"].pop(CHECKSUM_KEY, None)
-    content = yaml.safe_dump({"rosbag2_bagfile_information": information}, sort_keys=False)
-    write_text(folder / "metadata.yaml", content)
 
 
 def metadata(path: Path) -> dict[str, Any]:
@@ -214,7 +183,8 @@ def is_mcap(file: Path) -> bool:
         return opened.read(len(mcap.MAGIC)) == mcap.MAGIC
 
 
-def _check_data(file: Path, packed_messages: bool = False) -> None:
+def check_data(file: Path, packed_messages: bool = False) -> None:
+    """Check one data file, see `check`."""
     if is_mcap(file):
         mcap.check(file)
         contents = (
@@ -270,6 +240,12 @@ def _check_sqlite(file: Path) -> None:
     try:
         connection.execute("PRAGMA writable_schema=OFF")
         problems = [row[0] for row in connection.execute("PRAGMA integrity_check(1)")]
+        (page_size,) = connection.execute("PRAGMA page_size").fetchone()
+        cut = (
+            file.stat().st_size % page_size
+        )  # which SQLite passes over where it needs no such page
+        if cut:
+            raise Damaged(f"its last page has {cut} bytes instead of {page_size}")
         if problems != ["ok"]:
             raise Damaged(
                 " ".join(str(problems[0]).split())

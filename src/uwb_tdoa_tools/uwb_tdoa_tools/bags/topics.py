@@ -21,6 +21,7 @@ from rosbags.interfaces import (
 from uwb_tdoa_bias.common.sensors import SENSORS
 
 from ..clock import straightened
+from ..command_lines import suggest_line
 from . import messages as bag_messages
 from .files import connections_of, readable
 
@@ -204,8 +205,8 @@ def read_sensor(
     return TopicMessages(stamps, arrived, rows, sum((part.frames for part in filled), Counter()))
 
 
-def other_namespaces(reader: BagReader, namespace: str) -> str:
-    """Return a remedy for an error message: the namespace with such a topic, if there is one."""
+def other_namespaces(path: str | Path, reader: BagReader, namespace: str) -> str:
+    """Return a remedy for an error message: the namespace with such a topic, or a profile."""
     places = sorted(
         {
             one.topic.removesuffix("/uwb/tdoa")
@@ -218,4 +219,4 @@ def other_namespaces(reader: BagReader, namespace: str) -> str:
         return (
             f"give the namespace it was recorded in: {', '.join(place or '/' for place in places)}"
         )
-    return "it is no recording of this suite"
+    return f"a recording of others needs a profile, which this line names: {suggest_line(path)}"

@@ -20,6 +20,7 @@ from ..bags import messages as bag_messages
 from ..bags.files import open_bag, remarks_of
 from ..bags.frames import TF_STATIC, recorded_anchors
 from ..bags.topics import Names, arrivals, on_one_clock, read_sensor, read_topic
+from ..command_lines import suggest_line
 from ..readers import read_survey
 
 if TYPE_CHECKING:
@@ -111,7 +112,7 @@ def read_recording(
     reading: Reading, path: str | Path, survey: str | Path | None = None
 ) -> Recording:
     """Read a log, a CSV file or a bag. survey : path of a survey, or None. Raises InputError."""
-    if is_bag(path):
+    if is_bag(path) and not reading.profile:
         return _read_bag(reading, Path(path), survey)
     return of_flight(reading.read((Path(path), survey)))
 
@@ -212,9 +213,15 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
         tree = frames.read_frames(path, reader)
         remarks = tuple(remarks_of(reader))
     if not len(tdoa.stamps) and not sensors.keys() & set(LOCATING):
-        there = sorted(topic for topic, kind in topics.items() if kind == _ROWS[TDOA][0])
+        there = sorted(
+            topic
+            for topic, kind in topics.items()
+            if kind == _ROWS[TDOA][0] and topic != name_of(TDOA)
+        )
         places = " or ".join(f"--topic {TDOA}={topic}" for topic in there)
-        hint = f"say where they are ({places})" if there else "record the TDOAs of the tag"
+        hint = f"say where they are ({places})"
+        if not there:
+            hint = f"a recording of others needs a profile, which this line names: {suggest_line(path)}"
         raise InputError(f"{path}: has no message on {name_of(TDOA)}; {hint}.")
     anchors = read_survey(survey) if survey else recorded and recorded.anchors
     if anchors is None:

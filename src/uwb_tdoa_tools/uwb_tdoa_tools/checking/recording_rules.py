@@ -91,10 +91,19 @@ def no_imu(recording: Recording) -> Iterator[Finding]:
     """Yield a finding if there are no inertial samples, or under another name."""
     if recording.imu is not None:
         return
-    there = sorted(
-        topic for topic, kind in recording.topics.items() if kind == "sensor_msgs/msg/Imu"
-    )
-    if there:
+    of_type = [topic for topic, kind in recording.topics.items() if kind == "sensor_msgs/msg/Imu"]
+    there = sorted({*of_type} - recording.read)
+    if of_type and not there:
+        line = f"see that the driver publishes: ros2 topic hz {of_type[0]}"
+        yield Finding(
+            "imu_empty",
+            WARNING,
+            f"no inertial samples on {IMU}",
+            f"the topic {of_type[0]} is there, without a message",
+            line,
+            0.0,
+        )
+    elif there:
         line = (
             f"give --topic {IMU}={there[0]} to tools that read the bag, and -r {IMU}:={there[0]} "
             "to ekf_node"

@@ -2,36 +2,39 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 import json
 import math
+from pathlib import Path
 import sys
 from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.files import write_text
 
 from .. import cli, options
 from ..bags.convert import SENSORS, convert, shifted
-from ..outputs import OutputBag
+from ..command_lines import tool
+from ..outputs import OutputBag, OutputFile
 from ..parallel import Progress
 from ..readers import columns
-from ..readers.names import read_named_anchors
+from ..readers.profile import Profile, load_profile
+from ..readers.suggest import suggest
 from ..scoring.evaluation import on_one_clock
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
     from collections.abc import Iterable
 
-    from uwb_tdoa_bias.common.flight import Flight
-
-    from ..readers.names import NamedAnchors
+    from ..readers.inputs import Reading
 
 DESCRIPTION = """Convert a recorded flight to a ROS 2 bag.
 
-IN is a Crazyflie micro-SD event log (versions 1 and 2), a UTIL CSV file (plain or gzip), a bag, or, with --columns, one
-CSV file or several of any other tool (cells divided by commas, semicolons or tabs; anchors by ids or by the names that
-the survey has for them; records with empty cells are left out and counted). The new bag has imu/data, uwb/tdoa,
-uwb/anchors, ground_truth/pose and /tf_static. It appears only when it is complete.
+IN is a Crazyflie micro-SD event log (versions 1 and 2), a UTIL CSV file (plain or gzip) or a bag. With --profile it is a
+recording of any other tool: a bag of ROS 1 or ROS 2, a ULog, CSV files, several files or a folder of them. --columns is
+the short form of a profile for CSV files (cells divided by commas, semicolons or tabs; anchors by ids or by the names
+that the survey has for them). Records with empty cells are left out and counted. --suggest writes a first profile.
+The new bag has imu/data, uwb/tdoa, uwb/anchors, ground_truth/pose and /tf_static. It appears only when it is complete.
 """
 
 
@@ -57,6 +60,9 @@ def parser() -> ArgumentParser:
         "convert ranging.csv mocap.csv --columns "
         "time=t,anchor_a=from,anchor_b=to,tdoa=d,pose_x=x,pose_y=y,pose_z=z "
         "--time-offset truth=-0.4 --survey anchors.csv --out our.bag",
+        "convert theirs.bag --suggest profile.yaml",
+        "convert theirs.bag --profile profile.yaml --survey anchors.yaml --out our.bag",
+        "convert theirs.bag --profile dwm1001 --tag DW5722 --out our.bag",
     )
     made.add_argument(
         "input", metavar="IN", nargs="+", help="the recording; its kind is found by its content"
@@ -79,8 +85,13 @@ def parser() -> ArgumentParser:
         "--out",
         metavar="BAG",
         type=OutputBag,
-        required=True,
         help="the bag to write, a new directory",
+    )
+    made.add_argument(
+        "--suggest",
+        metavar="FILE",
+        type=OutputFile,
+        help="write a first profile of IN instead: what it seems to hold, and what is missing",
     )
     options.add_bag(made)
     made.add_argument("--json", action="store_true", help="print the summary as JSON")
@@ -88,11 +99,15 @@ def parser() -> ArgumentParser:
 
 
 def _convert(args: Namespace) -> None:
+    if args.suggest:
+        return _suggest(args)
+    if not args.out:
+        raise InputError("--out: is missing; give the path of the bag to write.")
     offsets = _offsets(args.offsets)
-    named = _named(args)
+    reading = _reading(args)
     with Progress("convert", what="reading and writing"):
         made = convert(
-            lambda: on_one_clock(shifted(_read(args, named), offsets), args.align),
+            lambda: on_one_clock(shifted(reading.one(*args.input), offsets), args.align),
             args.out,
             args.storage,
             args.force,
@@ -104,13 +119,18 @@ def _convert(args: Namespace) -> None:
         f"{made.flight}: {made.end - made.start:.1f} s, "
         f"{made.meta.get('protocol', 'protocol unknown')}"
     )
-    if named and named.ids:
+    if ids := made.meta.get("anchor_ids"):
         cli.show(
-            "  ids in the bag: "
-            + ", ".join(f"{name} is {number}" for name, number in named.ids.items())
+            "  ids in the bag: " + ", ".join(f"{name} is {number}" for name, number in ids.items())
         )
+    for sentence in made.meta.get("read", ()):
+        cli.show(f"  read {sentence}")
+    for sentence in made.meta.get("unread", ()):
+        cli.show(f"  not read {sentence}")
     for remark in made.meta.get("remarks", ()):
         cli.show(f"  {remark}")
+    for stream, (count, first, last) in made.read.items():
+        cli.show(f"  {stream}: {count}, {first:.1f} to {last:.1f} s")
     for topic, count in made.messages.items():
         cli.show(f"  {topic}: {count}")
     for name, count in made.left_out.items():
@@ -125,6 +145,16 @@ def _convert(args: Namespace) -> None:
     cli.show(f"  -> {args.out}")
     for sentence in made.apart:
         cli.say("convert", sentence)
+
+
+def _suggest(args: Namespace) -> None:
+    """Write a first profile of IN."""
+    text, fitting = suggest([Path(path) for path in args.input], args.salvage)
+    write_text(args.suggest, text)
+    for name in fitting:
+        cli.show(f"the shipped profile {name} fits: {load_profile(name).about}")
+    words = [*args.input, "--profile", fitting[0] if fitting else args.suggest]
+    cli.show(f"  -> {args.suggest}", f"next: {tool('convert', *words, '--out', 'our.bag')}")
 
 
 def _offsets(texts: Iterable[str]) -> dict[str, float]:
@@ -145,33 +175,22 @@ def _offsets(texts: Iterable[str]) -> dict[str, float]:
     return offsets
 
 
-def _named(args: Namespace) -> NamedAnchors | None:
-    """NamedAnchors anchors for --columns, or None. Raises InputError."""
-    if args.columns and not args.survey:
+def _reading(args: Namespace) -> Reading:
+    """Return how to read IN. Raises InputError."""
+    reading = options.reading_of(args)
+    if not args.columns:
+        return reading
+    options.refuse(
+        args,
+        ("namespace", "topics", "profile"),
+        "says how to read other recordings, and --columns is of CSV files",
+    )
+    if not args.survey:
         raise InputError(
             "--columns: CSV files do not say where the anchors are; give a survey file "
             "(--survey FILE)."
         )
-    return read_named_anchors(args.survey) if args.columns else None
-
-
-def _read(args: Namespace, named: NamedAnchors | None) -> Flight:
-    """The Flight."""
-    if args.columns:
-        options.refuse(
-            args,
-            ("namespace", "topics"),
-            "says where topics are in bags, and --columns is of CSV files",
-        )
-        assert named is not None  # as `_named` has seen to it
-        return columns.read_columns(
-            args.input, columns.parse_columns(args.columns), named, args.salvage
-        )
-    if len(args.input) > 1:
-        raise InputError(
-            f"IN: {len(args.input)} recordings are given; convert one by one, or name --columns."
-        )
-    return options.reading_of(args).one(args.input[0])
+    return replace(reading, profile=Profile.of_columns(columns.parse_columns(args.columns)))
 
 
 main = cli.executable(_convert, parser)

@@ -6,26 +6,28 @@
 from __future__ import annotations
 
 from pathlib import Path
-import shlex
+import re
 from typing import TYPE_CHECKING
 import zlib
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import read_head
 
-from ..bags import is_bag
+from ..bags import is_bag, is_ros_1
+from ..command_lines import suggest_line
+from .by_profile import read_by_profile
 from .names import read_survey
+from .profile import load_profile
+from .tables import GZIP_MAGIC
+from .ulog import is_ulog
 from .usd_log import MAGIC, read_usd_log
-from .util_csv import GZIP_MAGIC, is_util_csv, read_util_csv
+from .util_csv import is_util_csv, read_util_csv
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from uwb_tdoa_bias.common.anchors import Anchors
     from uwb_tdoa_bias.common.flight import Flight
-
-
-ROS_1 = b"#ROSBAG V2.0"  # what a bag of ROS 1 begins with
 
 
 def reader_of(path: Path) -> Callable[[Path, Anchors, bool, bool], Flight]:
@@ -40,23 +42,40 @@ def reader_of(path: Path) -> Callable[[Path, Anchors, bool, bool], Flight]:
             raise InputError(
                 f"{path}: the gzip data is damaged ({error}); copy the file again."
             ) from error
-    first = head.split(b"\n", 1)[0]
-    if is_util_csv(first.decode("utf-8", "replace")):
+    first = head.split(b"\n", 1)[0].decode("utf-8", "replace")
+    if is_util_csv(first):
         return read_util_csv
-    if head.startswith(ROS_1):
+    kind = _foreign_kind(path, first)
+    if kind:
         raise InputError(
-            f"{path}: is a bag of ROS 1: make a ROS 2 bag of it, rosbags-convert --src "
-            f"{shlex.quote(str(path))} --dst NAME, or of messages that only their makers "
-            "have CSV files for convert --columns."
+            f"{path}: is {kind}; it needs a profile (--profile NAME). This line names one that "
+            f"fits, or writes a first one: {suggest_line(path)}"
         )
     raise InputError(
         f"{path}: is of no known kind (it starts with {head[:16]!r}); a micro-SD log starts "
-        "with byte 0xBC, a UTIL CSV "
-        "file with a header line with t_tdoa, and a bag is a directory with metadata.yaml."
+        "with byte 0xBC, a CSV file with a line of names, a ULog with ULog, "
+        "and a bag is a directory with metadata.yaml. A folder of files of another tool needs --profile."
     )
 
 
-__all__ = ["read_flight", "read_survey", "read_usd_log", "read_util_csv"]
+def _foreign_kind(path: Path, first: str) -> str:
+    """Return what a recording of others is, or "" for anything else. `first` is its first line."""
+    if is_ros_1(path):
+        return "a bag of ROS 1"
+    if is_ulog(path):
+        return "a ULog of PX4"
+    names = [name for name in re.split("[,;\t]", first) if re.search("[A-Za-z]", name)]
+    return "a CSV file of another tool" if len(names) > 1 and first.isprintable() else ""
+
+
+__all__ = [
+    "load_profile",
+    "read_by_profile",
+    "read_flight",
+    "read_survey",
+    "read_usd_log",
+    "read_util_csv",
+]
 
 
 def read_flight(
@@ -68,6 +87,8 @@ def read_flight(
     truth: bool = True,
 ) -> Flight:
     """Read a recording of any known kind; its content decides, not its name.
+
+    `read_by_profile` reads recordings of other kinds.
 
     Parameters
     ----------
@@ -90,7 +111,8 @@ def read_flight(
         return read_bag(path, namespace, _anchors(survey), salvage, topics, truth)
     if path.is_dir():
         raise InputError(
-            f"{path}: is a directory without metadata.yaml; give a bag directory or a file."
+            f"{path}: is a directory without metadata.yaml; give a bag directory or a file, or say "
+            "with --profile how to read what is in it."
         )
     reader, anchors = reader_of(path), _anchors(survey)
     if anchors is None:

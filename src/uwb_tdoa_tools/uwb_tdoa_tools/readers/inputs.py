@@ -17,15 +17,18 @@ from uwb_tdoa_bias.common.sensors import LOCATING
 from uwb_tdoa_bias.common.text import printable
 
 from .. import parallel
-from ..bags import is_bag
+from ..bags import is_bag, is_one_bag
 from ..bags.write_ahead import BESIDE
 from ..clock import apart, sentence_on
-from . import read_flight
+from . import read_by_profile, read_flight
+from .names import read_named_anchors
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     from uwb_tdoa_bias.common.flight import Flight
+
+    from .profile import Profile
 
     Recording = tuple[Path, str | Path | None]  # and its survey
 
@@ -151,6 +154,9 @@ class Reading:
     topics : {our name of a topic: its name in the bags}.
     salvage : read damaged recordings up to the damage.
     truth : read the ground truth, if there is one.
+    profile : Profile of recordings of others; None for recordings of known kinds. With a profile each path
+        is one recording: a file, or a folder of files that belong together.
+    tag : id of the tag, if such a recording has several.
     """
 
     survey: str | Path | None = None
@@ -158,12 +164,17 @@ class Reading:
     topics: dict[str, str] = field(default_factory=dict)
     salvage: bool = False
     truth: bool = True
+    profile: Profile | None = None
+    tag: str = ""
 
     def find(self, paths: Iterable[str | Path], absolute: bool = False) -> list[Recording]:
         """Return pairs (recording, survey or None), see `find_flights`; empty without paths.
 
         Raises InputError if topics are given but no recording is a bag.
         """
+        if self.profile:
+            places = [Path(path).absolute() if absolute else Path(path) for path in paths]
+            return [(path, survey_for(path, self.survey)) for path in places]
         found = find_flights(paths, self.survey, absolute)
         if found and not any(is_bag(path) for path, _ in found):
             self._refuse_topics(found[0][0])
@@ -182,7 +193,12 @@ class Reading:
         Raises InputError.
         """
         path, survey = recording
-        flight = read_flight(path, survey, self.namespace, self.salvage, self.topics, self.truth)
+        if self.profile:
+            flight = self._by_profile([path], self.profile, survey)
+        else:
+            flight = read_flight(
+                path, survey, self.namespace, self.salvage, self.topics, self.truth
+            )
         report_remarks(path, flight.meta.get("remarks", ()))
         beside = {
             name: stream.t
@@ -192,9 +208,27 @@ class Reading:
         report_remarks(path, (f"{sentence_on(*one)}." for one in apart(beside)))
         return flight
 
-    def one(self, path: str | Path) -> Flight:
-        """Read the Flight of one recording."""
-        path = Path(path)
+    def _by_profile(
+        self, paths: Sequence[str | Path], profile: Profile, survey: str | Path | None
+    ) -> Flight:
+        named = read_named_anchors(survey) if survey else None
+        return read_by_profile(
+            paths, profile, named, self.tag, self.namespace, self.salvage, self.truth
+        )
+
+    def one(self, *paths: str | Path) -> Flight:
+        """Read the Flight of one recording; with a profile it may have several files.
+
+        Raises InputError.
+        """
+        path = Path(paths[0])
+        if self.profile:
+            return self._by_profile(paths, self.profile, survey_for(path, self.survey))
+        if len(paths) > 1:
+            raise InputError(
+                f"IN: {len(paths)} recordings are given; convert one by one, or name --columns "
+                "or --profile."
+            )
         if path.exists() and not is_bag(path):
             self._refuse_topics(path)
         return self.read((path, _survey_of(path, self.survey)))
@@ -246,7 +280,7 @@ def _recordings(path: Path) -> list[Path]:
     budget, seen, found = Budget(path), set(), []
 
     def look(path: Path, depth: int) -> None:
-        if path.is_file() or (path / "metadata.yaml").exists():
+        if path.is_file() or (path.is_dir() and is_one_bag(path)):
             found.append(path)
         elif path.is_dir() and (place := path.stat()[1:3]) not in seen:
             seen.add(place)

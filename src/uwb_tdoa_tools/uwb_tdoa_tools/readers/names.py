@@ -31,13 +31,21 @@ class NamedAnchors:
     ids: dict[str, int] = field(default_factory=dict)
 
     def id_of(self, text: str) -> int | None:
-        """Return the id of an anchor from its name or id (decimal or 0x1A2B); None if unknown."""
+        """Return the id of an anchor from its name or id (decimal or 0x1A2B); None if unknown.
+
+        Where anchors have names, an id counts if the name ends with it.
+        """
         if text in self.ids:
             return self.ids[text]
         folded = [number for name, number in self.ids.items() if name.casefold() == text.casefold()]
         if len(folded) == 1:
             return folded[0]
-        return None if self.ids else _whole(text)
+        number = _whole(text)
+        if self.ids and not any(
+            of == number and name.endswith(str(number)) for name, of in self.ids.items()
+        ):
+            return None
+        return number
 
 
 def read_named_anchors(path: str | Path) -> NamedAnchors:
@@ -52,8 +60,12 @@ def read_named_anchors(path: str | Path) -> NamedAnchors:
 
 
 def _read_named(path: str | Path) -> NamedAnchors:
-    entries, frame = survey.read_entries(path)
-    names = [entry.name for entry in entries]
+    return named_anchors(path, *survey.read_entries(path))
+
+
+def named_anchors(path: str | Path, entries: list[survey.Entry], frame: str) -> NamedAnchors:
+    """Return the NamedAnchors of entries, see `read_named_anchors`; `path` is for messages."""
+    names = [_decimal(entry.name) for entry in entries]
     if all(map(survey.is_id, names)):
         return NamedAnchors(survey.anchors_of(path, entries, [int(name) for name in names], frame))
     if len(set(names)) < len(names):
@@ -66,6 +78,11 @@ def _read_named(path: str | Path) -> NamedAnchors:
     if len(set(ids)) < len(names) or max(ids) > LARGEST_ID:
         ids = list(range(len(names)))
     return NamedAnchors(survey.anchors_of(path, entries, ids, frame), dict(zip(names, ids)))
+
+
+def _decimal(name: str) -> str:
+    """Return the decimal id of a name like 0x1A2B; other names as they are."""
+    return str(int(name, 16)) if re.fullmatch("0[xX][0-9A-Fa-f]{1,4}", name) else name
 
 
 def read_survey(path: str | Path) -> Anchors:

@@ -8,9 +8,11 @@ from __future__ import annotations
 from array import array
 from collections.abc import Iterator
 import csv
+from gzip import GzipFile
 import io
 import math
 from typing import TYPE_CHECKING, Any
+import zlib
 
 import numpy as np
 
@@ -27,6 +29,9 @@ from uwb_tdoa_bias.common.limits import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
+
+GZIP_MAGIC = b"\x1f\x8b"
+_BLOCK = 1 << 20  # bytes that are unpacked at once
 
 
 class CsvRows:
@@ -70,6 +75,13 @@ class CsvTable:
     ) -> None:
         self._path, self._most, self._complete = path, most, complete
         content = read_bytes(path, TABLE_BYTES)
+        if content.startswith(GZIP_MAGIC):
+            content, problem = unpacked(path, content, TABLE_BYTES)
+            if problem:
+                raise InputError(
+                    f"{path}: the gzip data is cut or damaged ({problem}); copy the file again."
+                )
+            Budget(path).spend("bytes of text", len(content), TABLE_BYTES)
         header = content[:ROW_CHARACTERS].lstrip().split(b"\n", 1)[0]
         self._rows = CsvRows(
             path,
@@ -114,6 +126,23 @@ class CsvTable:
             raise InputError(
                 f"{self._path}: line {self._rows.line}: is no CSV ({error}); correct it there."
             ) from error
+
+
+def unpacked(path: str | Path, content: bytes, most: int) -> tuple[bytes, str]:
+    """Return the content of gzip data, and why it ends early, or "".
+
+    It is limited to little more than `most` bytes: the header of gzip data does not contain the size.
+    """
+    out, budget, problem = io.BytesIO(), Budget(path, len(content)), ""
+    # a file may have a million members: no copy of the rest for each
+    with GzipFile(fileobj=io.BytesIO(content)) as file:
+        try:
+            while out.tell() <= most and (block := file.read1(_BLOCK)):
+                out.write(block)
+                budget.check_time()
+        except (EOFError, OSError, zlib.error) as error:
+            problem = str(error)
+    return out.getvalue(), problem
 
 
 def read_table(

@@ -43,7 +43,8 @@ _NUMPY_OF_STRUCT = {  # codes of Python's struct module, little endian and packe
     "f": "<f4",
     "d": "<f8",
 }
-_CANDIDATES, _SELECTED = "estTdoaCand", "isSelected"
+# TDOAs of a packet with every anchor that it can be paired with; the estimator of the firmware takes the selected one
+_CANDIDATES, _PACKET, _SELECTED = "estTdoaCand", "group", "isSelected"
 _STREAMS = {  # event name: our stream, {column in the log: column of the stream}
     "estTDOA": ("tdoa", {"idA": "a", "idB": "b", "distanceDiff": "d"}),
     # its sign is the other one
@@ -65,8 +66,8 @@ def read_usd_log(
 ) -> Flight:
     """Read a micro-SD event log ("uSD logger" of the Crazyflie firmware).
 
-    TDOAs come from estTDOA (d_B - d_A), else from the selected rows of estTdoaCand (d_A - d_B). The
-    IMU comes from estGyroscope (deg/s to rad/s) and estAcceleration (g to m/s^2), the ground truth
+    TDOAs come from estTdoaCand (d_A - d_B, all candidates of each packet), else from estTDOA (d_B - d_A).
+    The IMU comes from estGyroscope (deg/s to rad/s) and estAcceleration (g to m/s^2), the ground truth
     from estPose. The height comes from estTOF (mm to m), the pressure from estBarometer (altitude
     to Pa), the velocity from estFlow (pixel counts, with range and gyroscope). `Flight.extra` keeps
     other events, with the names and units of the log.
@@ -112,13 +113,13 @@ def read_usd_log(
         rows = _gather(raw, offsets[order[first:last]], dtypes[name])
         columns = {field: np.ascontiguousarray(rows["values"][field]) for field, _ in fields}
         columns["t"] = rows["t"] / ticks
-        if name not in _STREAMS or (name == _CANDIDATES and "estTDOA" in occurring):
+        if name not in _STREAMS or (name == "estTDOA" and _CANDIDATES in occurring):
             extra[name] = columns
             continue
         stream, rename = _STREAMS[name]
-        if name == _CANDIDATES and _SELECTED in columns:
-            selected = columns[_SELECTED] != 0
-            columns = {field: values[selected] for field, values in columns.items()}
+        if name == _CANDIDATES:
+            columns["t"] = _packet_times(columns)
+            meta["remarks"] += _about_candidates(columns)
         missing = [field for field in rename if field not in columns]
         if missing:
             known = ", ".join(field for field, _ in fields)
@@ -127,6 +128,30 @@ def read_usd_log(
     if "tdoa" in streams:
         streams["tdoa"] = _tdoa(path, streams["tdoa"])
     return make_flight(Path(path).name, anchors, streams, extra, meta, salvage, truth)
+
+
+def _packet_times(candidates: Columns) -> np.ndarray:
+    """Return the stamps of candidates: of their packet, (n,) s.
+
+    The log stamps an event when it is written, so the first candidate of a packet has the stamp that
+    is nearest to the reception.
+    """
+    t = candidates["t"]
+    if _PACKET not in candidates or not len(t):
+        return t
+    number = np.cumsum(np.diff(candidates[_PACKET].astype(np.int64), prepend=-1) != 0) - 1
+    first = np.full(number[-1] + 1, np.inf)
+    np.minimum.at(first, number, t)
+    return first[number]
+
+
+def _about_candidates(candidates: Columns) -> list[str]:
+    """Return a sentence on how many candidates the firmware used."""
+    n = len(candidates["t"])
+    if _SELECTED not in candidates or not n:
+        return []
+    used = np.count_nonzero(candidates[_SELECTED])
+    return [f"estTdoaCand: all {n} candidates are TDOAs; the firmware used {used} of them."]
 
 
 def _gather(raw: np.ndarray, at: np.ndarray, dtype: np.dtype) -> np.ndarray:

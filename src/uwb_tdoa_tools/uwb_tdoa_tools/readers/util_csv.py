@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import csv
-from gzip import GzipFile
-import io
 from pathlib import Path
-from typing import TYPE_CHECKING
-import zlib
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,7 +14,7 @@ from uwb_tdoa_bias.common.limits import CSV_BYTES, CSV_CELLS, Budget, most_unpac
 
 from ..command_lines import SALVAGE
 from .streams import make_flight
-from .tables import CsvRows, check_text
+from .tables import GZIP_MAGIC, CsvRows, check_text, unpacked
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -27,8 +24,6 @@ if TYPE_CHECKING:
 
     from .streams import Columns
 
-GZIP_MAGIC = b"\x1f\x8b"
-_BLOCK = 1 << 20  # bytes that are unpacked at once
 # Each sensor has its own time column and its own length: they are only set side by side, a row is
 # not one instant.
 # Units: the authors' converter writes the columns as the micro-SD log has them, so acc is in g and
@@ -57,7 +52,7 @@ def read_util_csv(
 
     Units change from g to m/s^2, deg/s to rad/s, tof from mm to m, baro from m of altitude to Pa,
     flow from pixel counts to velocity. Ground truth without quaternion columns has NaN for q.
-    `meta["ignored_columns"]` lists columns outside of the schema.
+    `meta["unread"]` names columns outside of the schema.
 
     A plain file that was cut exactly between two lines looks like a shorter one; a gzip file does
     not.
@@ -95,9 +90,9 @@ def read_util_csv(
         tdoa.update({name: values[valid] for name, values in tdoa.items()})
     tdoa["a"], tdoa["b"] = _ids(path, "idA", tdoa["a"]), _ids(path, "idB", tdoa["b"])
 
-    meta = {"source": str(path), "format": "UTIL CSV", "remarks": remarks}
+    meta: dict[str, Any] = {"source": str(path), "format": "UTIL CSV", "remarks": remarks}
     if ignored := [name for name in header if name not in _KNOWN]:
-        meta["ignored_columns"] = ignored
+        meta["unread"] = [f"columns {', '.join(ignored)}: the UTIL schema has no such"]
     name = Path(path).name.removesuffix(".gz").removesuffix(".csv")
     return make_flight(name, anchors, streams, {}, meta, salvage, truth)
 
@@ -111,7 +106,14 @@ def _text(path: str | Path, remarks: list[str], salvage: bool) -> bytes:
     content, most = read_bytes(path), CSV_BYTES
     if content.startswith(GZIP_MAGIC):
         most = most_unpacked(len(content), CSV_BYTES)
-        content = _unpacked(path, content, most, remarks, salvage)
+        content, problem = unpacked(path, content, most)
+        if problem and len(content) <= most:
+            if not salvage:
+                raise InputError(
+                    f"{path}: the gzip data is cut or damaged ({problem}); copy the file again, "
+                    f"or {SALVAGE}."
+                )
+            remarks.append(f"the gzip data is cut or damaged ({problem}): read up to there.")
     Budget(path).spend("bytes of text", len(content), most)
     if b"\0" in content:
         raise InputError(
@@ -121,33 +123,6 @@ def _text(path: str | Path, remarks: list[str], salvage: bool) -> bytes:
     if content.isspace():
         raise InputError(f"{path}: holds no text; a UTIL CSV file with a header line was expected.")
     return content
-
-
-def _unpacked(
-    path: str | Path, content: bytes, most: int, remarks: list[str], salvage: bool
-) -> bytes:
-    """Return the content of gzip data, limited to little more than `most` bytes.
-
-    The header of gzip data does not contain the size.
-    """
-    out, budget, problem = io.BytesIO(), Budget(path, len(content)), ""
-    with GzipFile(
-        fileobj=io.BytesIO(content)
-    ) as unpacked:  # a file may have a million members: no copy of the rest for each
-        try:
-            while out.tell() <= most and (block := unpacked.read1(_BLOCK)):
-                out.write(block)
-                budget.check_time()
-        except (EOFError, OSError, zlib.error) as error:
-            problem = str(error)
-    if problem and out.tell() <= most:
-        if not salvage:
-            raise InputError(
-                f"{path}: the gzip data is cut or damaged ({problem}); copy the file again, "
-                f"or {SALVAGE}."
-            )
-        remarks.append(f"the gzip data is cut or damaged ({problem}): read up to there.")
-    return out.getvalue()
 
 
 def _table(

@@ -1,0 +1,427 @@
+"""Read topics of any message type, from bags of ROS 1 and ROS 2.
+
+The fields of a message are named by paths such as "header.stamp", "ranges.id" or "imu_gyro_3d[0]".
+"""
+
+from __future__ import annotations
+
+import bz2
+from collections import Counter, OrderedDict
+from collections.abc import Callable
+from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
+import re
+from typing import TYPE_CHECKING, Any
+
+import lz4.frame
+from rosbags.interfaces import MessageDefinitionFormat
+from rosbags.rosbag1 import Reader as Ros1Reader
+from rosbags.rosbag1.reader import Compression, decompressors
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.limits import (
+    CHUNK_BYTES,
+    DEFINITION_BYTES,
+    READ_BYTES,
+    TooMuch,
+    most_unpacked,
+)
+
+from . import is_ros_1
+from .files import messages, open_bag, remarks_of
+from .frames import recorded_anchors
+from .mcap import Damaged
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+    from pathlib import Path
+
+    from rosbags.interfaces import Connection
+    from rosbags.typesys.store import Typestore
+
+    from .files import BagReader
+    from .frames import Recorded
+
+    Path_ = tuple[str | int, ...]  # parsed path of a field
+
+# Paths of no field: the time of recording, the place in the array, and the stamp of the header or of the field
+# `stamp`. Where that is zero or missing, the time of recording counts.
+RECEIVED, INDEX, STAMP = "received", "index", "stamp"
+SHORT = 4  # numbers of an array that are fields of their own
+KEPT_BYTES = 64 << 20  # of unpacked chunks of ROS 1
+_LIMITED: dict[str, Callable[[bytes, int], bytes]] = {  # of ROS 1: unpack at most so many bytes
+    Compression.BZ2.value: lambda data, most: bz2.BZ2Decompressor().decompress(data, most),
+    Compression.LZ4.value: lambda data, most: lz4.frame.LZ4FrameDecompressor().decompress(
+        data, most
+    ),
+}
+_STEP = re.compile(r"([A-Za-z]\w*)((?:\[\d+\])*)")
+_IDL = "=" * 80 + "\n"  # between the parts of a definition
+
+
+class ForeignBag:
+    """Topics of open bags that together are one recording.
+
+    Attributes
+    ----------
+    types : {topic: type}.
+    counts : {topic: messages}.
+    remarks : sentences on what is missing.
+    """
+
+    def __init__(self) -> None:
+        self.types: dict[str, str] = {}
+        self.counts: Counter[str] = Counter()
+        self.remarks: list[str] = []
+        self._parts: list[_Part] = []
+
+    def add(self, part: _Part) -> None:
+        """Add one open bag."""
+        self._parts.append(part)
+        for connection in part.connections:
+            self.types[connection.topic] = connection.msgtype
+            self.counts[connection.topic] += connection.msgcount
+
+    def fields(self, topic: str) -> list[str]:
+        """Return the names of the fields of a topic; empty if its type is unknown."""
+        for part in self._parts:
+            for connection in part.connections:
+                if connection.topic == topic:
+                    with suppress(InputError):
+                        return part.fields(connection)
+        return []
+
+    def time_of(self, topic: str) -> tuple[str, float]:
+        """Return the field with the time of a message, and its unit in s."""
+        return STAMP, 1.0
+
+    def recorded_anchors(self) -> Recorded | None:
+        """Return the anchors in frames or markers of a bag of ROS 2, or None. Raises InputError."""
+        return next(filter(None, (part.anchors() for part in self._parts)), None)
+
+    def messages(self, topics: Sequence[str]) -> Iterator[tuple[str, str, Message]]:
+        """Yield (topic, place in the bag, Message) of topics. Raises InputError."""
+        numbers: Counter[str] = Counter()
+        for part in self._parts:
+            for topic, received, content in part.messages(topics):
+                numbers[topic] += 1
+                yield topic, f"message {numbers[topic]}", Message(content, received)
+            self.remarks += [each for each in part.remarks() if each not in self.remarks]
+
+
+class Message:
+    """A message, with the time when it was recorded.
+
+    Attributes
+    ----------
+    is_stamped : whether the message has a stamp.
+    """
+
+    def __init__(self, content: Any, received: int) -> None:
+        self._content, self._received = content, received
+        stamp: Any = getattr(getattr(content, "header", content), "stamp", None)
+        in_header = stamp.sec * 10**9 + stamp.nanosec if hasattr(stamp, "nanosec") else 0
+        self.is_stamped = in_header != 0
+        self._stamp = in_header or received  # ns
+
+    def paths(self) -> dict[str, str]:
+        """Return {path of a number, text or stamp: the array that it lies in, or ""}."""
+        return dict(_paths(self._content, "", ""))
+
+    def length(self, path: str) -> int:
+        """Return the length of the array at a path. Raises KeyError."""
+        value = self._value(parsed(path), None)
+        if not _is_array(value):
+            raise KeyError(path)
+        return len(value)
+
+    def value(self, path: str, index: int | None = None) -> Any:
+        """Return the number, text or stamp (in s) at a path; raise KeyError if there is none.
+
+        index : place in each array that the path does not index itself.
+        """
+        if path == RECEIVED:
+            return self._received / 1e9
+        if path == STAMP:
+            return self._stamp / 1e9
+        if path == INDEX:
+            return index
+        value = self._value(parsed(path), index)
+        if hasattr(value, "nanosec"):
+            return (value.sec * 10**9 + value.nanosec) / 1e9
+        if _is_array(value) or hasattr(value, "__msgtype__"):
+            raise KeyError(path)
+        return value
+
+    def _value(self, steps: Path_, index: int | None) -> Any:
+        value = self._content
+        for step in steps:
+            try:
+                if isinstance(step, int):
+                    value = value[step]
+                else:
+                    value = getattr(_entry(value, index), step)
+            except (AttributeError, IndexError, TypeError):
+                raise KeyError(".".join(map(str, steps))) from None
+        return _entry(value, index)
+
+
+def _paths(value: Any, path: str, each: str) -> Iterator[tuple[str, str]]:
+    """Yield the paths of the fields below a path, of arrays by their first entry."""
+    if hasattr(value, "__msgtype__"):
+        for name in value.__dataclass_fields__:
+            if not name.startswith("__"):
+                yield from _paths(getattr(value, name), f"{path}.{name}".lstrip("."), each)
+    elif _is_array(value) and not each:
+        if len(value) and hasattr(value[0], "__msgtype__"):
+            yield from _paths(value[0], path, path)
+            return
+        yield path, path
+        for number in range(min(len(value), SHORT)):
+            yield f"{path}[{number}]", ""
+    elif not _is_array(value):
+        yield path, each
+
+
+def parsed(path: str) -> Path_:
+    """Return the steps of a path. Raises InputError."""
+    steps: list[str | int] = []
+    for part in path.split("."):
+        match = _STEP.fullmatch(part)
+        if not match:
+            raise InputError(
+                f"{path!r} is no field of a message; write fields as header.stamp or ranges.id, "
+                "and numbers of an array as gyro[0]."
+            )
+        steps += [match[1], *(int(number) for number in re.findall(r"\d+", match[2]))]
+    return tuple(steps)
+
+
+def _is_array(value: Any) -> bool:
+    return hasattr(value, "__len__") and not isinstance(value, (str, bytes))
+
+
+def _entry(value: Any, index: int | None) -> Any:
+    """Return the entry of an array, or the value itself if it is none."""
+    if index is None or not _is_array(value):
+        return value
+    if index >= len(value):
+        raise IndexError
+    return value[index]
+
+
+@contextmanager
+def open_foreign(
+    paths: Sequence[Path], definitions: Mapping[str, str], salvage: bool = False
+) -> Iterator[ForeignBag]:
+    """Yield the ForeignBag of bags that are one recording.
+
+    Parameters
+    ----------
+    definitions : {type: text of its .msg file}, for bags that have no definitions.
+    salvage : read a damaged bag of ROS 2 up to the damage.
+
+    Raises InputError.
+    """
+    bag = ForeignBag()
+    with ExitStack() as stack:
+        for path in paths:
+            opened = _ros_1(path) if is_ros_1(path) else _ros_2(path, definitions, salvage)
+            bag.add(stack.enter_context(opened))
+        yield bag
+
+
+class _Part:
+    """One open bag."""
+
+    def __init__(
+        self,
+        path: Path,
+        connections: list[Connection],
+        read: Callable[[list[Connection]], Iterator[tuple[Connection, int, bytes]]],
+        definitions: Mapping[str, str] | None,
+        reader: BagReader | None = None,
+    ) -> None:
+        self.path, self.connections, self._read = path, connections, read
+        self._definitions, self._reader = definitions, reader
+        self._stores: dict[str, Typestore] = {}
+        self._unreadable: Counter[str] = Counter()
+
+    def fields(self, connection: Connection) -> list[str]:
+        """Return the names of the fields of a topic."""
+        return [name for name, _ in self._store(connection).fielddefs[connection.msgtype][1]]
+
+    def messages(self, topics: Sequence[str]) -> Iterator[tuple[str, int, Any]]:
+        """Yield (topic, ns of recording, message)."""
+        wanted = [connection for connection in self.connections if connection.topic in topics]
+        stores = {connection.id: self._store(connection) for connection in wanted}
+        for connection, received, data in self._read(wanted) if wanted else ():
+            store = stores[connection.id]
+            decode = store.deserialize_ros1 if self._definitions is None else store.deserialize_cdr
+            try:
+                if len(data) > READ_BYTES:
+                    raise ValueError
+                message = decode(data, connection.msgtype)
+            except Exception:  # parsers of rosbags raise many types
+                self._unreadable[connection.topic] += 1
+                continue
+            yield connection.topic, received, message
+
+    def remarks(self) -> list[str]:
+        """Return sentences on missing messages."""
+        return [
+            *(remarks_of(self._reader) if self._reader else ()),
+            *(
+                f"{topic}: {count} messages left out, they do not fit to their type."
+                for topic, count in self._unreadable.items()
+            ),
+        ]
+
+    def anchors(self) -> Recorded | None:
+        """Return the anchors in frames or markers, or None."""
+        if self._reader is None:
+            return None
+        return recorded_anchors(self.path, self._reader, "/uwb/anchors")
+
+    def _store(self, connection: Connection) -> Typestore:
+        """Return the types of a topic: as in the bag, else of ROS or of the profile."""
+        kind, text = connection.msgtype, connection.msgdef.data
+        if kind in self._stores:
+            return self._stores[kind]
+        if len(text) > DEFINITION_BYTES:
+            raise InputError(
+                f"{self.path}: the definition of {kind} has more than {DEFINITION_BYTES} bytes; "
+                "record it again."
+            )
+        try:
+            if text:
+                store = get_typestore(Stores.EMPTY)
+                store.register(_types(connection))
+            else:
+                store = get_typestore(Stores.ROS2_JAZZY)
+                more = self._definitions or {}
+                for name in [name for name in more if name not in store.fielddefs]:
+                    store.register(get_types_from_msg(more[name], name))
+            store.get_msgdef(kind)
+        except Exception as error:  # parsers of rosbags raise many types
+            raise InputError(
+                f"{self.path}: {connection.topic} has the type {kind}, whose definition is not in "
+                f"the bag; write it into the profile, under types ({error!r})."
+            ) from error
+        self._stores[kind] = store
+        return store
+
+
+def _types(connection: Connection) -> Any:
+    """Return the types in the definition of a topic."""
+    text = connection.msgdef.data
+    if connection.msgdef.format == MessageDefinitionFormat.MSG:
+        return get_types_from_msg(text, connection.msgtype)
+    types: dict[str, Any] = {}
+    for part in text.split(_IDL):
+        idl = part.partition("\n")[2] if part.startswith("IDL: ") else part
+        if idl.strip():
+            types |= get_types_from_idl(idl)
+    return types
+
+
+@contextmanager
+def _ros_2(path: Path, definitions: Mapping[str, str], salvage: bool) -> Iterator[_Part]:
+    with open_bag(path, salvage) as reader:
+        yield _Part(
+            path,
+            list(reader.connections),
+            lambda connections: messages(path, reader, connections, written=True),
+            definitions,
+            reader,
+        )
+
+
+@contextmanager
+def _ros_1(path: Path) -> Iterator[_Part]:
+    reader = Ros1Reader(path)
+    try:
+        reader.open()
+        _check_counts(reader)
+        _limit(reader, path)
+    except Exception as error:  # rosbags raises whatever its parsers run into
+        raise _damaged(path, error) from error
+    try:
+        yield _Part(
+            path,
+            list(reader.connections),
+            lambda connections: _messages_of(reader, path, connections),
+            None,
+        )
+    finally:
+        with suppress(Exception):
+            reader.close()
+
+
+def _messages_of(
+    reader: Ros1Reader, path: Path, connections: list[Connection]
+) -> Iterator[tuple[Connection, int, bytes]]:
+    found = reader.messages(connections)
+    while True:
+        try:
+            message = next(found)
+        except StopIteration:
+            return
+        except InputError:
+            raise
+        except Exception as error:  # as in _ros_1
+            raise _damaged(path, error) from error
+        yield message
+
+
+def _check_counts(reader: Ros1Reader) -> None:
+    """Raise Damaged unless the index of an open reader has as many messages as its chunks state."""
+    stated: Counter[int] = Counter()
+    for chunk in reader.chunk_infos:
+        stated.update(chunk.connection_counts)
+    for connection in reader.connections:
+        if stated.pop(connection.id, 0) != connection.msgcount:
+            raise Damaged(f"messages are missing on {connection.topic}")
+    if stated:
+        raise Damaged("messages belong to no topic")
+
+
+def _damaged(path: Path, error: Exception) -> InputError:
+    said = " ".join(str(error).split()) or type(error).__name__
+    return InputError(
+        f"{path}: this bag of ROS 1 is cut or damaged ({said}); copy it again, or repair it with "
+        f"rosbag reindex {path.name}."
+    )
+
+
+def _limit(reader: Ros1Reader, path: Path) -> None:
+    """Let the chunks of an open reader unpack to a limited number of bytes, and keep some of them.
+
+    rosbags unpacks a chunk for each message if the topics of a bag lie in different chunks.
+    """
+    kept: OrderedDict[int, bytes] = OrderedDict()
+    sizes: dict[int, int] = {}
+    most = most_unpacked(path.stat().st_size)
+    unpack = {id(decompressors[name]): function for name, function in _LIMITED.items()}
+
+    def unpacked(at: int, data: bytes, function: Callable[[bytes, int], bytes]) -> bytes:
+        if at in kept:
+            kept.move_to_end(at)
+            return kept[at]
+        left = min(CHUNK_BYTES, most - sum(sizes.values()) + sizes.get(at, 0))
+        content = function(data, left + 1)
+        if len(content) > left:
+            raise TooMuch(
+                f"{path}: unpacks to more than {left} bytes; give another file, or split it."
+            )
+        kept[at], sizes[at] = content, len(content)
+        while sum(map(len, kept.values())) > KEPT_BYTES and len(kept) > 1:
+            kept.popitem(last=False)
+        return content
+
+    for at, chunk in reader.chunks.items():
+        function = unpack.get(id(chunk.decompressor))
+        if function:
+            of_chunk = partial(unpacked, at, function=function)
+            reader.chunks[at] = chunk._replace(decompressor=of_chunk)

@@ -1,0 +1,267 @@
+"""Profiles: which topic and which field of a foreign recording is which stream.
+
+profile = load_profile("dwm1001")               # a shipped profile, or a YAML file
+profile = Profile.of_columns(parse_columns("time=t_ms:ms,anchor=id,range=dist:mm"))
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+import math
+from pathlib import Path
+import re
+from typing import TYPE_CHECKING, Any
+
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.limits import DEFINITION_BYTES
+from uwb_tdoa_bias.common.safe_yaml import read_yaml
+from uwb_tdoa_bias.common.text import sanitize
+
+from .columns import RADIO, STREAMS, check_columns, parse_column
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from .columns import Columns
+
+SHIPPED = Path(__file__).resolve().parent / "profiles"
+BODY, WORLD = ("flu", "frd"), ("enu", "ned")  # axes; the first is ours
+HELP = (
+    "how to read recordings of others: a profile that is shipped "
+    "(convert --suggest names it), or your own YAML file (docs/connect.md)"
+)
+MOST_STARS = 4  # of a pattern; the time to compare it grows with each
+_KEYS = {"about", "sources", "types", "antenna"}
+_SOURCE = {"topic", "type", "each", "where", "tag", "columns", "body", "world"}
+_NAME = re.compile(r"\{(\w+)\}")
+_COMPARISON = re.compile(r"(<=|>=|<|>)\s*(\S+)")
+_COMPARE = {
+    "<": lambda a, b: a < b,
+    "<=": lambda a, b: a <= b,
+    ">": lambda a, b: a > b,
+    ">=": lambda a, b: a >= b,
+}
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A condition on a field: only records that meet it count.
+
+    Attributes
+    ----------
+    path : field.
+    comparison, limit : "<", "<=", ">" or ">=", and the number behind it; "" for `values`.
+    values : texts of the allowed values.
+    """
+
+    path: str
+    comparison: str = ""
+    limit: float = math.nan
+    values: tuple[str, ...] = ()
+
+    def met(self, value: Any) -> bool:
+        """Return whether a value meets the condition."""
+        if not self.comparison:
+            return as_text(value) in self.values
+        try:
+            return bool(_COMPARE[self.comparison](float(value), self.limit))
+        except (TypeError, ValueError):
+            return False
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a recording holds the columns of some streams.
+
+    Attributes
+    ----------
+    columns : {our column: (path of the field, factor to our unit)}.
+    topic : pattern of a topic, or of the name of a CSV file; "" for any file that has the columns.
+        `{name}` stands for a part of the topic and is a field, `*` for anything.
+    type : pattern of the type of the messages; "" for any.
+    each : path of an array; each of its entries is a record.
+    where : Conditions.
+    tag : path of the id of the tag; "" if the source holds one tag.
+    body, world : axes, of BODY and WORLD.
+    """
+
+    columns: Columns
+    topic: str = ""
+    type: str = ""
+    each: str = ""
+    where: tuple[Condition, ...] = ()
+    tag: str = ""
+    body: str = BODY[0]
+    world: str = WORLD[0]
+
+    def match(self, table: str, kind: str) -> dict[str, str] | None:
+        """Return {name: text} of the names in `topic`; None if another table is meant.
+
+        table, kind : topic and type of its messages, or name of a CSV file and "CSV".
+        """
+        if not re.fullmatch(_expression(self.type or "*"), kind):
+            return None
+        found = re.fullmatch(_expression(self.topic or "*"), table)
+        return None if found is None else found.groupdict()
+
+
+def _expression(pattern: str) -> str:
+    """Return the regular expression of a pattern of a topic or type."""
+    out = ""
+    for part in re.split(r"(\{\w+\}|\*)", pattern):
+        name = _NAME.fullmatch(part)
+        if name:
+            out += f"(?P<{name[1]}>[^/]+)"
+        else:
+            out += ".*" if part == "*" else re.escape(part)
+    return out
+
+
+@dataclass(frozen=True)
+class Profile:
+    """How to read recordings of one kind.
+
+    Attributes
+    ----------
+    name : of the shipped profile, or of the file.
+    sources : Sources.
+    about : one sentence.
+    types : {type of a message: text of its .msg file}, for bags without definitions.
+    antenna : {tag: (x, y, z) of its antenna in the body frame, m}; "" for every tag.
+    """
+
+    name: str
+    sources: tuple[Source, ...]
+    about: str = ""
+    types: dict[str, str] = field(default_factory=dict)
+    antenna: dict[str, tuple[float, ...]] = field(default_factory=dict)
+
+    @classmethod
+    def of_columns(cls, columns: Columns) -> Profile:
+        """Return the Profile of --columns: each stream from the file that has its columns."""
+        sources = []
+        for names in STREAMS.values():
+            mine = {name: columns[name] for name in names if name in columns}
+            times = {name: column for name, column in columns.items() if name.endswith("time")}
+            if mine:
+                sources.append(Source({**mine, **times}))
+        return cls("columns as given", tuple(sources))
+
+
+def shipped() -> list[str]:
+    """Return the names of the shipped profiles."""
+    return sorted(path.stem for path in SHIPPED.glob("*.yaml"))
+
+
+def load_profile(name: str | Path) -> Profile:
+    """Return a Profile by the name of a shipped one, or from a YAML file. Raises InputError."""
+    path = Path(name)
+    if str(name) in shipped():
+        path = SHIPPED / f"{name}.yaml"
+    elif not path.is_file():
+        raise InputError(
+            f"--profile: {name} is neither a file nor a shipped profile; these are "
+            f"{', '.join(shipped())}."
+        )
+    content = read_yaml(path)
+    if not isinstance(content, dict) or not isinstance(content.get("sources"), list):
+        raise InputError(f"{path}: is no profile; write a list under sources (docs/connect.md).")
+    _refuse_unknown(path, content, _KEYS)
+    sources = tuple(
+        _source(f"{path}: source {number}", each)
+        for number, each in enumerate(content["sources"], start=1)
+    )
+    if not any({*RADIO} & {*source.columns} for source in sources):
+        raise InputError(f"{path}: no source gives tdoa or range; one of them is needed.")
+    return Profile(
+        sanitize(path.stem),
+        sources,
+        str(content.get("about", "")),
+        _types(path, content.get("types")),
+        _antenna(path, content.get("antenna")),
+    )
+
+
+def _refuse_unknown(where: str | Path, content: Mapping[Any, Any], known: set[str]) -> None:
+    for key in content:
+        if key not in known:
+            raise InputError(
+                f"{where}: {str(key)[:40]!r} is not known; known are {', '.join(sorted(known))}."
+            )
+
+
+def _source(where: str, content: Any) -> Source:
+    if not isinstance(content, dict) or not isinstance(content.get("columns"), dict):
+        raise InputError(f"{where}: needs columns: {{OURS: THEIRS}}; see docs/connect.md.")
+    _refuse_unknown(where, content, _SOURCE)
+    columns = {
+        str(ours): parse_column(where, str(ours), str(theirs))
+        for ours, theirs in content["columns"].items()
+    }
+    check_columns(where, columns, time=False)
+    texts = {name: content.get(name, "") for name in ("topic", "type", "each", "tag")}
+    for name, value in texts.items():
+        if not isinstance(value, str):
+            raise InputError(f"{where}: {name} is {value!r}; it must be a text.")
+        if value.count("*") > MOST_STARS:
+            raise InputError(f"{where}: {name} has more than {MOST_STARS} stars; write names out.")
+    axes = {"body": BODY, "world": WORLD}
+    for name, known in axes.items():
+        if content.get(name, known[0]) not in known:
+            raise InputError(
+                f"{where}: {name} is {content[name]!r}; it must be {' or '.join(known)}."
+            )
+    conditions = content.get("where", {})
+    if not isinstance(conditions, dict):
+        raise InputError(f"{where}: where is no {{FIELD: VALUE}}; see docs/connect.md.")
+    return Source(
+        columns,
+        where=tuple(_condition(str(path), value) for path, value in conditions.items()),
+        **texts,
+        **{name: content.get(name, known[0]) for name, known in axes.items()},
+    )
+
+
+def _condition(path: str, value: Any) -> Condition:
+    match = _COMPARISON.fullmatch(value.strip()) if isinstance(value, str) else None
+    if match:
+        try:
+            return Condition(path, match[1], float(match[2]))
+        except ValueError as error:
+            raise InputError(f"where: {path}: {value!r} compares with no number.") from error
+    values = value if isinstance(value, list) else [value]
+    return Condition(path, values=tuple(as_text(each) for each in values))
+
+
+def as_text(value: Any) -> str:
+    """Return a value of a field as text: 1 for 1.0 and for true."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        return str(value).strip()
+    return str(int(number)) if number.is_integer() else repr(number)
+
+
+def _types(path: Path, content: Any) -> dict[str, str]:
+    types = content or {}
+    if not isinstance(types, dict) or not all(
+        isinstance(text, str) and len(text) < DEFINITION_BYTES for text in types.values()
+    ):
+        raise InputError(f"{path}: types must be {{pkg/msg/Name: text of the .msg file}}.")
+    return {str(name): text for name, text in types.items()}
+
+
+def _antenna(path: Path, content: Any) -> dict[str, tuple[float, ...]]:
+    antenna = {"": content} if isinstance(content, list) else content or {}
+    good = isinstance(antenna, dict) and all(
+        isinstance(place, list)
+        and len(place) == 3
+        and all(isinstance(each, (int, float)) and abs(each) < 100.0 for each in place)
+        for place in antenna.values()
+    )
+    if not good:
+        raise InputError(f"{path}: antenna must be [x, y, z], or {{TAG: [x, y, z]}}, in m.")
+    return {
+        as_text(tag) if tag != "" else "": tuple(map(float, place))
+        for tag, place in antenna.items()
+    }
