@@ -9,14 +9,12 @@ import sys
 from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.sensors import SENSORS
 
 from .. import cli, options
-from ..bags.convert import SENSORS, convert, shifted
+from ..choices import COLUMNS, STREAMS
 from ..outputs import OutputBag
 from ..parallel import Progress
-from ..readers import columns
-from ..readers.names import read_named_anchors
-from ..scoring.evaluation import on_one_clock
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
@@ -61,7 +59,7 @@ def parser() -> ArgumentParser:
     made.add_argument(
         "input", metavar="IN", nargs="+", help="the recording; its kind is found by its content"
     )
-    made.add_argument("--columns", metavar="MAP", help=columns.HELP)
+    made.add_argument("--columns", metavar="MAP", help=COLUMNS)
     options.add_reading(made)
     options.add_align(made)
     made.add_argument(
@@ -71,7 +69,7 @@ def parser() -> ArgumentParser:
         default=[],
         metavar="SENSOR=SECONDS",
         help=(
-            f"add this to the stamps of a sensor with another clock: {', '.join(SENSORS)}; "
+            f"add this to the stamps of a sensor with another clock: {', '.join((*STREAMS, *SENSORS))}; "
             "may be repeated"
         ),
     )
@@ -88,6 +86,9 @@ def parser() -> ArgumentParser:
 
 
 def _convert(args: Namespace) -> None:
+    from ..bags.convert import convert, shifted
+    from ..scoring.evaluation import on_one_clock
+
     offsets = _offsets(args.offsets)
     named = _named(args)
     with Progress("convert", what="reading and writing"):
@@ -129,6 +130,8 @@ def _convert(args: Namespace) -> None:
 
 def _offsets(texts: Iterable[str]) -> dict[str, float]:
     """Return {sensor: s} of "SENSOR=SECONDS" texts. Raises InputError."""
+    from ..bags.convert import SENSORS
+
     offsets = {}
     for text in texts:
         sensor, given, seconds = text.partition("=")
@@ -147,6 +150,8 @@ def _offsets(texts: Iterable[str]) -> dict[str, float]:
 
 def _named(args: Namespace) -> NamedAnchors | None:
     """NamedAnchors anchors for --columns, or None. Raises InputError."""
+    from ..readers.names import read_named_anchors
+
     if args.columns and not args.survey:
         raise InputError(
             "--columns: CSV files do not say where the anchors are; give a survey file "
@@ -157,6 +162,8 @@ def _named(args: Namespace) -> NamedAnchors | None:
 
 def _read(args: Namespace, named: NamedAnchors | None) -> Flight:
     """The Flight."""
+    from ..readers import columns
+
     if args.columns:
         options.refuse(
             args,

@@ -7,7 +7,7 @@ from importlib import import_module
 import math
 import signal
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import rclpy
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -36,15 +36,6 @@ KNOWN = frozenset(  # packages of message types: the usual ones of ROS, and ours
     sensor_msgs shape_msgs statistics_msgs std_msgs stereo_msgs tf2_msgs trajectory_msgs unique_identifier_msgs uwb_tdoa_msgs
     visualization_msgs""".split()
 )
-PACKAGE: dict[str, Any] = {  # the option that permits further packages
-    "action": "append",
-    "default": [],
-    "metavar": "NAME",
-    "help": (
-        "import message types of this package, too; the usual ones of ROS, and ours, are known; "
-        "may be repeated"
-    ),
-}
 AGAIN = 4.0  # s after which a node that has not answered is asked once more
 READER_DEPTH = 10_000  # messages that a subscription queues: 10 s of a 1 kHz stream
 
