@@ -23,6 +23,7 @@ from rosbags.interfaces import (
 )
 
 from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.ros.process import refusal
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -76,7 +77,7 @@ def session(name: str, arguments: Sequence[str]) -> Iterator[tuple[Node, Stop]]:
         try:
             rclpy.init(args=[name, *arguments], signal_handler_options=SignalHandlerOptions.NO)
         except (rclpy_implementation.RCLError, rclpy_implementation.UnknownROSArgsError) as error:
-            raise InputError(f"ROS arguments: {error}") from error
+            raise InputError(refusal(error)) from error
         try:
             # Without parameters and /rosout: a recording of all topics shall not hold our own.
             node = rclpy.create_node(name, start_parameter_services=False, enable_rosout=False)
