@@ -6,7 +6,7 @@ import subprocess
 import sys
 
 import pytest
-from test_executables import COMMANDS
+from test_executables import TOOLS
 
 from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_ekf.debias import INTERPOLATORS
@@ -20,7 +20,6 @@ from uwb_tdoa_tools.simulation import SimulationConfig
 from uwb_tdoa_tools.simulation.config import VEHICLE_DEFAULTS
 from uwb_tdoa_tools.simulation.paths import TRAJECTORIES
 
-TOOLS = [name for name, module in COMMANDS.items() if module.startswith("uwb_tdoa_tools")]
 # what a command imports only to work: half a second and more together
 HEAVY = """PIL apsw jinja2 joblib llvmlite matplotlib numba onnx onnxruntime pandas rclpy rosbags scipy sklearn
     tqdm""".split()
