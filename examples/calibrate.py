@@ -9,7 +9,7 @@ import numpy as np
 import uwb_tdoa as uwb
 
 settings = {"trajectory": "sines", "imu_rate": 100.0, "bias": False, "multipath": False}
-flight = uwb.simulate(duration=45.0, seed=4, **settings)
+flight = uwb.simulate(duration=60.0, seed=4, **settings)
 right = flight.anchors
 shift = np.random.default_rng(1).normal(0.0, 0.1, right.positions.shape)
 measured = replace(right, positions=right.positions + shift)

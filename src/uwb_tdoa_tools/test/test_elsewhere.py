@@ -61,6 +61,7 @@ START = (
 )
 
 
+@pytest.mark.slow
 def test_commands_run_without_posix(bag, tmp_path):
     for name, words in (
         ("check", [bag, "--json", "check.json"]),
@@ -81,6 +82,7 @@ def test_a_network_is_refused_where_its_trial_has_no_limits(tmp_path):
     assert done.stdout.startswith("this system does not limit the memory"), done.stderr
 
 
+@pytest.mark.slow
 def test_a_command_needs_no_home_to_write_to(bag, tmp_path):
     """What numba compiles is kept elsewhere here: without that it takes minutes, and is said."""
     kept = os.environ.get("NUMBA_CACHE_DIR") or os.path.expanduser("~/.cache/uwb_tdoa")
