@@ -55,14 +55,26 @@ def main(command):
     compiled = command in ("build", "demo")
     if is_ready(compiled):
         return
-    LOG.mkdir(exist_ok=True)
-    with open(LOG / "dev.lock", "w") as lock:
+    with opened_lock() as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             say("waiting for another ./dev to finish its set-up")
             fcntl.flock(lock, fcntl.LOCK_EX)
         prepare(compiled)
+
+
+def opened_lock():
+    """The file that one set-up at a time locks."""
+    try:
+        LOG.mkdir(exist_ok=True)
+        return open(LOG / "dev.lock", "w")
+    except OSError as error:
+        raise Failure(
+            f"there is something to set up, and {error.filename} cannot be written "
+            f"({error.strerror}); run ./dev build as the user who owns {ROOT}, or clone the "
+            "repository into a folder of your own."
+        ) from error
 
 
 def is_ready(compiled):
@@ -151,7 +163,7 @@ def make_environment():
                 "install ROS 2 Jazzy and the Python packages", ["--no-compile", *AS_LOCKED, LOCK]
             )
     except Failure as failure:
-        output = (LOG / "dev_pip.log").read_text(errors="replace")
+        output = (LOG / "dev_pip.log").read_text("utf-8", "replace")
         if re.search(
             r"NewConnectionError|NameResolution|Timeout|ProxyError|from versions: none", output
         ):
@@ -175,7 +187,7 @@ def missing_requirements():
         "is None))"
     )
     names = subprocess.check_output([PYTHON, "-c", code], text=True, cwd=ROOT).split()
-    pins = (ROOT / "requirements.txt").read_text().splitlines()
+    pins = (ROOT / "requirements.txt").read_text("utf-8").splitlines()
     return [pin for pin in pins if pin.split("==")[0] in names]
 
 
@@ -273,13 +285,13 @@ def digest(paths, *words):
 
 def read_steps():
     try:
-        return json.loads(STEPS.read_text())
+        return json.loads(STEPS.read_text("utf-8"))
     except (OSError, ValueError):
         return {}
 
 
 def write_steps(steps):
-    STEPS.write_text(json.dumps(steps, indent=2) + "\n")
+    STEPS.write_text(json.dumps(steps, indent=2) + "\n", "utf-8")
 
 
 def run(title, log_name, command, **variables):
@@ -318,7 +330,7 @@ def finish(*steps):
                 if process.returncode != 0:
                     tail = "".join(
                         f"  | {line}\n"
-                        for line in log.read_text(errors="replace").splitlines()[-15:]
+                        for line in log.read_text("utf-8", "replace").splitlines()[-15:]
                     )
                     print(tail, end="", file=sys.stderr)
                     raise Failure(
@@ -343,10 +355,10 @@ def finish(*steps):
 
 def share(log):
     """How much of a step is done, as far as its output tells: ", 40 %"."""
-    text = log.read_text(errors="replace")
+    text = log.read_text("utf-8", "replace")
     if log.name == "dev_pip.log":
         return (
-            f", package {text.count('Collecting ')} of {LOCK.read_text().count('==')}"
+            f", package {text.count('Collecting ')} of {LOCK.read_text('utf-8').count('==')}"
             if "Installing" not in text
             else ", unpacking"
         )

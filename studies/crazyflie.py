@@ -6,6 +6,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.flight import Imu
 from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_tools import choices
 from uwb_tdoa_tools.crazyflie import PERIOD
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.scoring.evaluation import evaluate
@@ -30,7 +31,7 @@ def add_options(add):
         metavar="FLIGHT",
         help="logs of TDoA2 flights with IMU and ground truth",
     )
-    add("--survey", required=True, metavar="S", help=inputs.SURVEY_HELP)
+    add("--survey", required=True, metavar="S", help=choices.SURVEY)
 
 
 def run(args):

@@ -13,7 +13,7 @@ from uwb_tdoa_bias.common.sensors.pressure import altitude_of, pressure_at
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.results import VERDICTS
-from uwb_tdoa_tools import options
+from uwb_tdoa_tools import choices, options
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
@@ -41,8 +41,8 @@ def add_options(add):
     """add : add_argument of a parser."""
     tables = "what each sensor is worth, what faults put into them do, or what is wrong with the velocity"
     add("table", choices=("worth", "faults", "velocity"), help=tables)
-    add("flights", nargs="+", metavar="FLIGHT", help=inputs.HELP)
-    add("--survey", metavar="S", help=inputs.SURVEY_HELP)
+    add("flights", nargs="+", metavar="FLIGHT", help=choices.RECORDINGS)
+    add("--survey", metavar="S", help=choices.SURVEY)
     add(
         "-p",
         dest="parameters",

@@ -1,6 +1,8 @@
-"""How colcon and pip install the package."""
+"""How colcon installs the package. pip installs all packages by the pyproject.toml of the repository."""
 
 from glob import glob
+from pathlib import Path
+from xml.etree import ElementTree
 
 from setuptools import find_packages, setup
 
@@ -8,21 +10,14 @@ NAME = "uwb_tdoa_bias"
 
 setup(
     name=NAME,
-    version="0.1.0",
+    version=ElementTree.parse(Path(__file__).with_name("package.xml")).findtext("version"),
     description="Predicts and removes the systematic error of UWB TDOA measurements",
     maintainer="uwb_tdoa maintainers",
     maintainer_email="maintainers@uwb-tdoa.invalid",
     license="Apache-2.0",
     packages=find_packages(exclude=["test"]),
     python_requires=">=3.10",
-    install_requires=[
-        "setuptools",
-        "numba>=0.57",
-        "numpy>=1.26",
-        "onnxruntime>=1.17",
-        "PyYAML>=6.0",
-        "scipy>=1.11",
-    ],
+    install_requires=["setuptools"],  # package.xml says what else: rosdep installs it
     # colcon test runs pytest because of this
     extras_require={"test": ["hypothesis>=6.60", "pytest>=7.0"]},
     data_files=[

@@ -1,6 +1,8 @@
-"""How colcon and pip install the package."""
+"""How colcon installs the package. pip installs all packages by the pyproject.toml of the repository."""
 
 from glob import glob
+from pathlib import Path
+from xml.etree import ElementTree
 
 from setuptools import find_packages, setup
 
@@ -8,7 +10,7 @@ NAME = "uwb_tdoa_tools"
 
 setup(
     name=NAME,
-    version="0.1.0",
+    version=ElementTree.parse(Path(__file__).with_name("package.xml")).findtext("version"),
     description=(
         "Reads, converts, simulates, replays and evaluates flights of UWB TDOA measurements"
     ),
@@ -17,34 +19,9 @@ setup(
     license="Apache-2.0",
     packages=find_packages(exclude=["test"]),
     python_requires=">=3.10",
-    install_requires=[
-        "setuptools",
-        "backports.zstd>=1.0; python_version < '3.14'",
-        "Jinja2>=3.1",
-        "joblib>=1.3",
-        "lz4>=4.0",
-        "matplotlib>=3.6",
-        "numpy>=1.26",
-        "onnx>=1.14",
-        "Pillow>=9.0",
-        "PyYAML>=6.0",
-        "rosbags>=0.11.9",
-        "scikit-learn>=1.3",
-        "scipy>=1.11",
-        "tqdm>=4.64",
-        "uwb_tdoa_bias",
-        "uwb_tdoa_ekf",
-    ],
-    extras_require={
-        # cflib 0.1.29 and newer need numpy 2
-        "crazyflie": ["cflib>=0.1.25"],  # for protocol crazyflie of autopilot_node
-        "dask": ["distributed>=2024.1"],  # for --dask
-        "mavlink": ["pymavlink>=2.4.40"],  # for protocol mavlink of autopilot_node
-        "rerun": ["rerun-sdk>=0.23"],  # for --rerun; needs numpy 2
-        "ulog": ["pyulog>=1.1"],  # for logs of PX4
-        "oracle": ["rotorpy>=3.0"],  # beside which a test flies the vehicle of `fly`
-        "test": ["hypothesis>=6.60", "pytest>=7.0"],  # colcon test runs pytest because of this
-    },
+    install_requires=["setuptools"],  # package.xml says what else: rosdep installs it
+    # colcon test runs pytest because of this
+    extras_require={"test": ["hypothesis>=6.60", "pytest>=7.0"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

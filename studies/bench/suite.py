@@ -32,7 +32,7 @@ import numpy as np
 from tqdm import tqdm
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_tools import cli
+from uwb_tdoa_tools import choices, cli
 from uwb_tdoa_tools.flying.estimates import Peer
 from uwb_tdoa_tools.flying.exported import CompiledCorrection
 from uwb_tdoa_tools.outputs import OutputFile, OutputFolder
@@ -70,8 +70,8 @@ def add_options(add: Callable[..., object]) -> None:
         metavar="FOLDER",
         help="correct the TDOAs of the peer by this folder of export --c (docs/export.md)",
     )
-    add("--flights", nargs="+", default=[], metavar="FLIGHT", help=inputs.HELP)
-    add("--survey", metavar="S", help=inputs.SURVEY_HELP)
+    add("--flights", nargs="+", default=[], metavar="FLIGHT", help=choices.RECORDINGS)
+    add("--survey", metavar="S", help=choices.SURVEY)
     out_help = "for the bags and the output of the nodes (default: out/bench)"
     add("--out", metavar="DIR", type=OutputFolder, default="out/bench", help=out_help)
     add("--json", metavar="FILE", type=OutputFile, help="write the machine and all figures")

@@ -11,7 +11,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_ekf.monitoring.finding import ERROR
-from uwb_tdoa_tools import parallel
+from uwb_tdoa_tools import choices, parallel
 from uwb_tdoa_tools.checking.check import check
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.checking.tdoa_rules import largest_displacement
@@ -24,7 +24,7 @@ ANOTHER = 0.3  # m that an anchor of another room is elsewhere at least
 
 def add_options(add):
     """add : add_argument of a parser."""
-    add("flights", nargs="+", metavar="FLIGHT", help=inputs.HELP)
+    add("flights", nargs="+", metavar="FLIGHT", help=choices.RECORDINGS)
     add("--survey", required=True, metavar="DIR", help="folder of all surveys")
     add(
         "--only",

@@ -13,6 +13,7 @@ from mistakes import MISTAKES, arriving
 import numpy as np
 
 from uwb_tdoa_bias.common.files import write_text
+from uwb_tdoa_tools import choices
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.checking.tdoa_rules import largest_displacement
 from uwb_tdoa_tools.outputs import OutputFile
@@ -30,7 +31,7 @@ READY, PAUSE = 180.0, 1.5  # s: the very first start compiles the filter; betwee
 
 def add_options(add):
     """add : add_argument of a parser."""
-    add("flight", metavar="FLIGHT", help=inputs.HELP)
+    add("flight", metavar="FLIGHT", help=choices.RECORDINGS)
     add("--survey", required=True, metavar="DIR", help="folder of all surveys")
     add(
         "--seconds",

@@ -13,9 +13,9 @@ from tqdm import tqdm
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_bias.common.flight import SENSOR_NAMES
+from uwb_tdoa_tools import choices
 from uwb_tdoa_tools.outputs import OutputFolder
 from uwb_tdoa_tools.readers import inputs
-from uwb_tdoa_tools.training import models
 
 from . import simulated
 from .comparison import compare
@@ -24,7 +24,7 @@ from .table import markdown
 
 def add_options(add):
     """The options of the study."""
-    add("--train", nargs="+", metavar="FLIGHT", help=inputs.HELP)
+    add("--train", nargs="+", metavar="FLIGHT", help=choices.RECORDINGS)
     add(
         "--test",
         nargs="+",
@@ -34,12 +34,12 @@ def add_options(add):
         help="a name for a group of flights, and the flights; may be repeated",
     )
     add("--simulated", type=int, metavar="N", help="simulate the flights, N in each constellation")
-    add("--survey", metavar="S", help=inputs.SURVEY_HELP)
+    add("--survey", metavar="S", help=choices.SURVEY)
     add(
         "--models",
         nargs="+",
-        choices=models.KINDS,
-        default=list(models.KINDS),
+        choices=choices.MODELS,
+        default=list(choices.MODELS),
         help="(default: all)",
     )
     add(

@@ -22,7 +22,7 @@ BOUNDS = {"oracle 0.5 s": 0.5, "oracle 1 s": 1.0, "oracle 2 s": 2.0}
 def compare(train, tests, kinds, out, seed=0, validation=None, bound=False):
     """Train, run, and draw. Returns a dict of plain values.
 
-    train : list of Flight; tests : {group: list of Flight}; kinds : of models.KINDS; out : folder,
+    train : list of Flight; tests : {group: list of Flight}; kinds : of choices.MODELS; out : folder,
         Path; validation :
     names or None; bound : with oracles and repeatability. Raises InputError.
     """

@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from uwb_tdoa_bias.common.flight import SENSOR_NAMES
 from uwb_tdoa_bias.correction.network import Network
+from uwb_tdoa_tools import choices
 from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.results_file import ResultsFile
@@ -25,8 +26,8 @@ WORSE = 1.05  # ratio of errors beyond which a judged flight counts as harmed
 
 def add_options(add):
     """The options of the study."""
-    add("flights", nargs="+", metavar="FLIGHT", help=inputs.HELP)
-    add("--survey", metavar="S", help=inputs.SURVEY_HELP)
+    add("flights", nargs="+", metavar="FLIGHT", help=choices.RECORDINGS)
+    add("--survey", metavar="S", help=choices.SURVEY)
     add(
         "--out",
         metavar="FILE",
@@ -37,8 +38,8 @@ def add_options(add):
     add(
         "--models",
         nargs="+",
-        choices=models.KINDS,
-        default=list(models.KINDS),
+        choices=choices.MODELS,
+        default=list(choices.MODELS),
         help="(default: all)",
     )
     add("--splits", type=int, default=20, metavar="N", help="(default: 20)")

@@ -14,13 +14,13 @@ ROOT = Path(__file__).resolve().parents[3]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
 LISTED = ("ls", "grep")  # what the blocks use besides
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-INLINE = re.compile(r"`((?:\./dev|ros2) [^`]+)`")
-PLACEHOLDERS = ("PACKAGE NAME", "PKG EXE")
+INLINE = re.compile(r"`((?:\./dev|ros2|uwb-tdoa) [^`]+)`")
+PLACEHOLDERS = ("PACKAGE NAME", "PKG EXE", "NAME ARGS")
 
 
 def commands(page, names, folder):
-    """[(page, [word, ...])] of every command on a page whose first word is ./dev, ros2 or one of
-    names.
+    """[(page, [word, ...])] of every command on a page whose first word is ./dev, ros2, uwb-tdoa or
+    one of names.
 
     folder : an empty one to run in; gets ./dev and a DATA that is as measured flights are.
     """
@@ -36,7 +36,7 @@ def commands(page, names, folder):
     notes = folder / "notes"
     notes.touch()
     stubs = folder / "stubs"
-    _write_stubs(stubs, ["ros2", *names], notes)
+    _write_stubs(stubs, ["ros2", "uwb-tdoa", *names], notes)
     shutil.copy(stubs / "ros2", folder / "dev")
     _write_stub(folder / "dev", "./dev", notes)
     _write_data(folder / "DATA")
@@ -61,7 +61,7 @@ def _is_shell(block, names):
     first = [
         line.split()[0] for line in block.splitlines() if line.strip() and not line.startswith(" ")
     ]
-    return any(word in ("./dev", "ros2", "for", *names) for word in first)
+    return any(word in ("./dev", "ros2", "uwb-tdoa", "for", *names) for word in first)
 
 
 def _without_brackets(script):

@@ -15,7 +15,7 @@ from rosbags.rosbag2 import Writer
 
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.bags.bag import bag_messages, read_bag, typestore, write_bag
-from uwb_tdoa_tools.bags.files import STORAGES
+from uwb_tdoa_tools.bags.files import PLUGINS
 from uwb_tdoa_tools.checking.check import check
 from uwb_tdoa_tools.checking.recording import read_recording
 from uwb_tdoa_tools.readers.inputs import Reading
@@ -64,7 +64,7 @@ def bag(path, clock, storage="mcap", arrivals=True, imu=lambda t: t):
                     store.serialize_cdr(message, kind),
                 )
             )
-    with Writer(path, version=Writer.VERSION_LATEST, storage_plugin=STORAGES[storage]) as writer:
+    with Writer(path, version=Writer.VERSION_LATEST, storage_plugin=PLUGINS[storage]) as writer:
         connections = {}
         for _, received, topic, kind, data in sorted(rows, key=lambda row: row[0]):
             if topic not in connections:

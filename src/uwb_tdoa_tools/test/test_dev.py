@@ -11,11 +11,13 @@ import re
 import shutil
 import subprocess
 import sys
+import tempfile
 import zipfile
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[3]
+PYTHONS = [f"/usr/bin/python3.{minor}" for minor in (12, 11, 10)]
 PROGRAMS = ("bash", "cat", "dirname", "readlink")
 BASE_PYTHON = os.path.realpath(sys.executable)
 
@@ -253,3 +255,32 @@ def test_a_step_that_fails_ends_those_beside_it(prepare):
     ):
         prepare.finish(long, prepare.start("fail", "fail", ["false"]))
     assert long[2].returncode is not None
+
+
+def test_another_user_than_the_one_who_built_is_told_what_to_do(workspace):
+    """Who may write anything is root: then the command runs as nobody."""
+    folder = Path(tempfile.mkdtemp(prefix="checkout of häns "))
+    try:
+        for name in ("dev", "requirements.txt", ".dev"):
+            shutil.move(workspace / name, folder / name)
+        for path in (folder, *folder.rglob("*")):
+            path.chmod(0o555 if path.is_dir() or path.name == "dev" else 0o444)
+        python = next(filter(None, map(shutil.which, PYTHONS)), None)
+        if python is None:
+            pytest.skip("no Python of the system that every user may run")
+        done = subprocess.run(
+            [folder / "dev", "run", "uwb_tdoa_tools", "check"],
+            env={"PATH": "/usr/bin:/bin", "PYTHON": python, "PYTHONDONTWRITEBYTECODE": "1"},
+            user="nobody" if os.geteuid() == 0 else None,
+            capture_output=True,
+            text=True,
+            timeout=60,
+        )
+    finally:
+        for path in (folder, *folder.rglob("*")):
+            path.chmod(0o755)
+        shutil.rmtree(folder)
+    assert done.returncode == 1 and "Traceback" not in done.stderr
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("dev: error: there is something to set up, and ")
+    assert "Permission denied" in line and f"as the user who owns {folder}" in line

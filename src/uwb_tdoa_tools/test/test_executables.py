@@ -42,6 +42,7 @@ COMMANDS = {"compile_nodes": "uwb_tdoa_ekf.compile_nodes"} | {
     for path in sorted((ROOT / "src/uwb_tdoa_tools/uwb_tdoa_tools/commands").glob("[a-z]*.py"))
 }
 EVERY = NODES | COMMANDS
+TOOLS = [name for name, module in COMMANDS.items() if module.startswith("uwb_tdoa_tools.")]
 
 
 def parser_of(name):
@@ -141,6 +142,10 @@ def documented(tmp_path_factory):
                         "bag",
                         "service",
                     ), (where, verb)
+            elif first == "uwb-tdoa":
+                if words != ["--completion"]:
+                    assert words[0] in TOOLS, (where, words)
+                    found.append((where, words[0], words[1:]))
             else:
                 found.append((where, first, words))
     return found

@@ -16,6 +16,8 @@ SRC = Path(__file__).resolve().parents[2]
 # imports go to the left
 ORDER = ("uwb_tdoa_msgs", "uwb_tdoa_bias", "uwb_tdoa_ekf", "uwb_tdoa_tools")
 PACKAGES = ORDER[1:]
+# the public module, which a package installs besides itself
+API = {"uwb_tdoa_tools": ("uwb_tdoa",)}
 # Who talks ROS. Everything else can be imported and tested without it.
 ROS = """
     uwb_tdoa_bias.anchors_node uwb_tdoa_bias.bias_node
@@ -29,8 +31,7 @@ ROS = """
     uwb_tdoa_ekf.launching_actions uwb_tdoa_ekf.localization_node uwb_tdoa_ekf.outputs
     uwb_tdoa_ekf.monitoring.health
     uwb_tdoa_tools.autopilot.topics uwb_tdoa_tools.autopilot_node
-    uwb_tdoa_tools.commands.demo
-    uwb_tdoa_tools.commands.replay uwb_tdoa_tools.flying.demo uwb_tdoa_tools.live.follow
+    uwb_tdoa_tools.flying.demo uwb_tdoa_tools.live.follow
     uwb_tdoa_tools.live.player uwb_tdoa_tools.live.processes uwb_tdoa_tools.live.record uwb_tdoa_tools.live.replay
     uwb_tdoa_tools.flying.over_topics uwb_tdoa_tools.live.run uwb_tdoa_tools.live.session uwb_tdoa_tools.vehicle_node
 """.split()
@@ -57,6 +58,7 @@ KEYS = {
     "pyulog": (None, "pyulog"),  # for logs of PX4
     "rerun": (None, "rerun-sdk"),  # for --rerun
     "rosbags": ("python3-rosbags-pip", "rosbags"),
+    "pandas": (None, "pandas"),  # for tables, where it is installed
     "rotorpy": (None, "rotorpy"),  # an oracle of tests, for who wants it
     "scipy": ("python3-scipy", "scipy"),
     "sklearn": ("python3-sklearn", "scikit-learn"),
@@ -74,7 +76,8 @@ def modules():
     """{module: path} of all our packages."""
     found = {}
     for package in PACKAGES:
-        for path in (SRC / package / package).rglob("*.py"):
+        folders = [SRC / package / name for name in (package, *API.get(package, ()))]
+        for path in (path for folder in folders for path in folder.rglob("*.py")):
             parts = path.relative_to(SRC / package).with_suffix("").parts
             found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
     return found
@@ -148,11 +151,10 @@ def test_no_command_imports_another():
 def test_no_package_imports_one_above():
     for module in modules():
         for name in imports(module):
-            package = name.partition(".")[0]
-            if package in ORDER:
-                assert ORDER.index(package) <= ORDER.index(module.partition(".")[0]), (
-                    f"{module} imports {name}"
-                )
+            package, own = name.partition(".")[0], module.partition(".")[0]
+            assert own == "uwb_tdoa" or package != "uwb_tdoa", f"{module} imports {name}"
+            if package in ORDER and own in ORDER:
+                assert ORDER.index(package) <= ORDER.index(own), f"{module} imports {name}"
 
 
 def test_files_are_on_floors():
@@ -233,10 +235,10 @@ def needed(package, *folders):
     import.
     """
     names = set()
-    for folder in folders:
+    for folder in (*folders, *(API.get(package, ()) if package in folders else ())):
         local = (
             {path.stem for path in (SRC / package / folder).rglob("*.py")}
-            if folder != package
+            if folder not in (package, *API.get(package, ()))
             else set()
         )
         for path in (SRC / package / folder).rglob("*.py"):
@@ -249,7 +251,12 @@ def needed(package, *folders):
     beside = {
         path.stem for other in PACKAGES for path in (SRC / other / "test").iterdir()
     }  # helpers of tests
-    return names - set(sys.stdlib_module_names) - beside - {package, "setuptools", "compression"}
+    return (
+        names
+        - set(sys.stdlib_module_names)
+        - beside
+        - {package, *API.get(package, ()), "setuptools", "compression"}
+    )
 
 
 def declared(package, *tags):
@@ -269,28 +276,15 @@ def test_package_xml_declares_what_is_imported_and_nothing_else(package):
     assert declared(package, "test_depend") - RUNNERS == tests
 
 
-@pytest.mark.parametrize("package", PACKAGES)
-def test_setup_py_declares_what_is_imported_and_nothing_else(package):
-    tree = ast.parse((SRC / package / "setup.py").read_text())
-    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
-    (call,) = (node for node in calls if getattr(node.func, "id", "") == "setup")
-    given = {keyword.arg: keyword.value for keyword in call.keywords}
-    extras = ast.literal_eval(given["extras_require"])
-    tests = {re.match(r"[\w.-]+", text)[0] for text in extras.pop("test")}
-    assert tests == {"hypothesis", "pytest"} <= needed(package, "test")
-    oracle = {
-        re.match(r"[\w.-]+", text)[0] for text in extras.pop("oracle", ())
-    }  # of tests that are skipped without it
-    assert oracle <= needed(package, "test")
-    required = [
-        *ast.literal_eval(given["install_requires"]),
-        *(text for some in extras.values() for text in some),
-    ]
-    names = {re.match(r"[\w.-]+", text)[0] for text in required} - {"setuptools"}
-    imported = needed(package, package)
-    assert names == {KEYS[name][1] for name in imported if name in KEYS} | (
-        imported & set(PACKAGES)
-    )
+def test_pyproject_declares_what_is_imported_and_nothing_else():
+    _, text = (SRC.parent / "pyproject.toml").read_text().split("\ndependencies =")
+    text = "dependencies =" + text.partition("[project.scripts]")[0]
+    lists = re.findall(r"^\w+ = (\[.*?\])(?: #[^\n]*)?$", text, re.MULTILINE | re.DOTALL)
+    names = [re.match(r"[\w.-]+", one)[0] for some in lists for one in ast.literal_eval(some)]
+    assert len(names) == len(set(names))
+    imported = set().union(*(needed(package, package) for package in PACKAGES))
+    tested = {"rotorpy"} & needed("uwb_tdoa_tools", "test")  # of tests that are skipped without it
+    assert set(names) == {KEYS[name][1] for name in (imported | tested) if name in KEYS}
 
 
 def test_messages_declare_what_they_are_made_of():

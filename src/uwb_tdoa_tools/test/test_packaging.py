@@ -24,9 +24,7 @@ PYTHON = [folder for folder in PACKAGES if (folder / "setup.py").exists()]
 
 def test_one_version_everywhere():
     found = {ElementTree.parse(folder / "package.xml").findtext("version") for folder in PACKAGES}
-    found |= {
-        re.search(r'version="([^"]+)"', (folder / "setup.py").read_text())[1] for folder in PYTHON
-    }
+    found |= {setup_of(folder, "version")["version"] for folder in PYTHON}
     found.add(yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"])
     found.add(re.search(r"^## ([\d.]+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)[1])
     assert found == {version()}

@@ -93,28 +93,32 @@ def test_a_direct_write_is_found(tmp_path, line):
     assert direct(tmp_path / "a.py")
 
 
-ASCII = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "PYTHONIOENCODING": "ascii"}
+ASCII = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
 
 
-def in_ascii(folder, command, *arguments):
-    """Run a command in an ASCII locale; returns what it printed."""
+def in_ascii(folder, command, *arguments, encoding="ascii"):
+    """Run a command in an ASCII locale; returns what it printed.
+
+    encoding : of what it prints, by the wish of the user.
+    """
     line = [
         sys.executable,
         "-m",
         f"uwb_tdoa_tools.commands.{command}",
         *map(os.fsencode, arguments),
     ]
-    done = subprocess.run(line, cwd=folder, env=os.environ | ASCII, capture_output=True)
+    variables = os.environ | ASCII | {"PYTHONIOENCODING": encoding}
+    done = subprocess.run(line, cwd=folder, env=variables, capture_output=True)
     assert done.returncode == 0 and b"Traceback" not in done.stderr, done.stderr.decode(
         "utf-8", "replace"
     )
-    return done.stdout.decode("ascii")
+    return done.stdout.decode(encoding)
 
 
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory):
-    """A bag of a short flight whose name is not ASCII."""
-    path = tmp_path_factory.mktemp("bags") / "bag"
+    """A bag of a short flight. Its name and its path are not ASCII, and have spaces."""
+    path = tmp_path_factory.mktemp("bags") / "zwei flüge — 二"
     write_bag(replace(clean_flight(100, 24.0), name="flüge"), path)
     return path
 
@@ -125,12 +129,15 @@ def read(path):
 
 
 def test_evaluate_writes_its_files_in_an_ascii_locale(bag, tmp_path):
-    in_ascii(tmp_path, "evaluate", bag, "--json", "é.json", "--markdown", "é.md")
+    words = ("--json", "é.json", "--markdown", "é.md", "--plot", "é è.png", "--tum", "ü ü")
+    in_ascii(tmp_path, "evaluate", bag, *words, encoding="latin-1")
+    assert list((tmp_path / "ü ü").glob("*.tum")) and (tmp_path / "é è.png").stat().st_size > 1000
     assert "flüge" in read(tmp_path / "é.md") and read(tmp_path / "é.json")["runs"]
 
 
 def test_localize_writes_its_files_in_an_ascii_locale(bag, tmp_path):
-    in_ascii(tmp_path, "localize", bag, "--out", "wo_ü")
+    in_ascii(tmp_path, "localize", bag, "--residuals", "--zones", "2", "--out", "wo_ü")
+    assert {path.suffix for path in (tmp_path / "wo_ü").rglob("*")} >= {".png", ".csv", ".tum"}
     written = [
         path
         for path in (tmp_path / "wo_ü").rglob("*")

@@ -16,11 +16,8 @@ import io
 import json
 import os
 from pathlib import Path
-import sqlite3
 import sys
 from typing import TYPE_CHECKING, Any
-
-from tqdm import tqdm
 
 from uwb_tdoa_bias.common.errors import Failure, InputError
 from uwb_tdoa_bias.common.files import write_text
@@ -49,7 +46,7 @@ def parser(name: str, description: str, *examples: str) -> argparse.ArgumentPars
     ]
     epilog = "\n".join(["examples:", *lines]) if examples else None
     made = argparse.ArgumentParser(
-        prog=name,
+        prog=command_lines.program(name),
         description=description,
         epilog=epilog,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -91,6 +88,7 @@ def run(
         reported in one sentence on stderr; 130 after Ctrl-C; 141 if the reader of our output has gone.
     """
     arguments = sys.argv[1:] if argv is None else list(argv)
+    os.environ["MPLBACKEND"] = "Agg"  # pictures go to files, also where there is a screen
     if isinstance(sys.stdout, io.TextIOWrapper):
         # The locale may lack a letter of the result.
         sys.stdout.reconfigure(errors="backslashreplace")
@@ -114,7 +112,7 @@ def run(
         # Else the flush at exit fails once more.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
-    except (OSError, sqlite3.OperationalError) as error:
+    except Exception as error:
         full = _full(error)
         if full:
             return _fail(
@@ -131,7 +129,9 @@ def _full(error: Exception) -> str | None:
     """Return why the disk has no room, as text, or None if an error has another reason."""
     if isinstance(error, OSError):
         return FULL.get(error.errno) if error.errno is not None else None
-    return FULL[errno.ENOSPC] if "disk is full" in str(error) else None
+    # of sqlite3, which takes long to import
+    of_database = type(error).__name__ == "OperationalError" and "disk is full" in str(error)
+    return FULL[errno.ENOSPC] if of_database else None
 
 
 def without_ros_arguments(arguments: Iterable[str]) -> list[str]:
@@ -166,6 +166,8 @@ def show(*lines: str) -> None:
 
     A progress bar, if there is one, stays below them.
     """
+    from tqdm import tqdm
+
     tqdm.write("\n".join(printable(line) for text in lines for line in text.split("\n")))
     sys.stdout.flush()
 

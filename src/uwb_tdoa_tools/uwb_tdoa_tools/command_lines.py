@@ -1,6 +1,7 @@
 """Make command lines to copy, as they run where the user is.
 
-tool("check", "flight.bag")          # ./dev run uwb_tdoa_tools check flight.bag, or ros2 run ...
+tool("check", "flight.bag")          # ./dev run uwb_tdoa_tools check flight.bag, or ros2 run ...,
+                                     # or uwb-tdoa check flight.bag
 node("ekf_node", {"effects_file": "effects.yaml"})
 """
 
@@ -16,12 +17,16 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 SALVAGE = "read what is sound of it with --salvage"
-RUN = "UWB_TDOA_RUN"  # environment variable in which ./dev passes how the user started it
+RUN = "UWB_TDOA_RUN"  # environment variable in which ./dev and COMMAND pass how the user started it
+COMMAND = "uwb-tdoa"  # of an installation without ROS
 PACKAGES = {
+    "anchors_node": "uwb_tdoa_bias",
     "bias_node": "uwb_tdoa_bias",
     "ekf_node": "uwb_tdoa_ekf",
     "debias_node": "uwb_tdoa_ekf",
     "compile_nodes": "uwb_tdoa_ekf",
+    "localization_node": "uwb_tdoa_ekf",
+    "vehicle_node": "uwb_tdoa_tools",
 }
 
 
@@ -37,17 +42,28 @@ def suggest_line(recording: str | Path) -> str:
 
 def line_start(name: str) -> str:
     """Return the beginning of the line that starts an executable."""
-    return f"{os.environ.get(RUN, 'ros2 run')} {PACKAGES.get(name, 'uwb_tdoa_tools')} {name}"
+    run = os.environ.get(RUN, "ros2 run")
+    if run == COMMAND and name not in PACKAGES:
+        return f"{COMMAND} {name}"
+    if run == COMMAND:  # nodes need ROS
+        run = "ros2 run"
+    return f"{run} {PACKAGES.get(name, 'uwb_tdoa_tools')} {name}"
+
+
+def program(name: str) -> str:
+    """Return the name that an executable has in its usage and messages."""
+    return f"{COMMAND} {name}" if os.environ.get(RUN) == COMMAND else name
 
 
 def as_it_runs(line: str) -> str:
     """Return a line as it runs where the user is: ./dev replaces ros2 where only ./dev exists."""
+    run = os.environ.get(RUN, "")
     if (
         line.startswith(("ros2 topic ", "ros2 node ", "ros2 param "))
-        and RUN in os.environ
+        and run.endswith(" run")
         and not shutil.which("ros2")
     ):
-        return f"{os.environ[RUN].removesuffix(' run')} {line}"
+        return f"{run.removesuffix(' run')} {line}"
     return line
 
 

@@ -18,13 +18,14 @@ from .checking.flight_rules import judge_truth
 from .checking.recording import of_flight
 from .checking.report import survey_remarks
 from .checking.watch import BEFORE_TRUTH
+from .choices import ALIGN, NONE
 from .estimate import FlightEstimator
 from .localizing.localize import write_tum
 from .localizing.pictures import write_rerun
 from .readers.inputs import Reading, report_remarks
 from .readers.tables import number, read_table
 from .results_file import ResultsFile, fingerprint_of
-from .scoring.alignment import ALIGN, NONE, estimate_alignment, require_truth
+from .scoring.alignment import estimate_alignment, require_truth
 from .scoring.evaluation import corrected_truth
 from .scoring.metrics import Score, radio_residuals
 from .scoring.phases import NEAR_THE_FLOOR, TITLES

@@ -22,19 +22,11 @@ from typing import TYPE_CHECKING, Any
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.safe_yaml import parse_yaml
 from uwb_tdoa_bias.common.sensors import SENSORS
-from uwb_tdoa_bias.correction.network import load_network
-from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_ekf.core.config import FilterConfig
 
-from .bags.files import STORAGES
-from .diagnosis.self_calibration import Tape
-from .estimate import FlightEstimator
-from .localizing import pictures
+from . import choices
+from .choices import ALIGN, NONE, STORAGES
 from .outputs import OutputFile
 from .parallel import whole_number
-from .readers import inputs, profile
-from .scoring.alignment import ALIGN, NONE
-from .surveying.known import read_distances, read_marks
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
@@ -42,8 +34,13 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_bias.correction.model import Model
+    from uwb_tdoa_bias.effects import EffectSet
+    from uwb_tdoa_ekf.core.config import FilterConfig
 
     from .diagnosis.constraints import Distance, Mark
+    from .diagnosis.self_calibration import Tape
+    from .estimate import FlightEstimator
+    from .readers import inputs
 
 TOPICS = (  # that are read from bags
     "uwb/tdoa",
@@ -57,14 +54,14 @@ TOPICS = (  # that are read from bags
 
 def add_recordings(parser: ArgumentParser, nargs: str = "+") -> None:
     """Add FLIGHT... and the options of reading."""
-    parser.add_argument("flights", nargs=nargs, metavar="FLIGHT", help=inputs.HELP)
+    parser.add_argument("flights", nargs=nargs, metavar="FLIGHT", help=choices.RECORDINGS)
     add_reading(parser)
 
 
 def add_reading(parser: ArgumentParser) -> None:
     """Add --survey, --namespace, --topic, --profile, --tag and --salvage: how to read recordings."""
     add = parser.add_argument
-    add("--survey", metavar="S", help=inputs.SURVEY_HELP)
+    add("--survey", metavar="S", help=choices.SURVEY)
     add("--namespace", default="", metavar="NS", help="of the tag's topics in bags, e.g. tag1")
     add(
         "--topic",
@@ -74,7 +71,7 @@ def add_reading(parser: ArgumentParser) -> None:
         metavar="OURS=THEIRS",
         help="a topic of bags that has another name there, e.g. uwb/tdoa=/my/tdoa; may be repeated",
     )
-    add("--profile", metavar="P", help=profile.HELP)
+    add("--profile", metavar="P", help=choices.PROFILE)
     add("--tag", default="", metavar="ID", help="of a recording with several tags, with --profile")
     add(
         "--salvage",
@@ -85,6 +82,8 @@ def add_reading(parser: ArgumentParser) -> None:
 
 def reading_of(args: Namespace, truth: bool = True) -> inputs.Reading:
     """Return the Reading for these options. truth : as in Reading. Raises InputError."""
+    from .readers import inputs, profile
+
     topics = {}
     for text in args.topics:
         ours, given, theirs = text.partition("=")
@@ -149,6 +148,9 @@ def filter_of(args: Namespace) -> tuple[FilterConfig, EffectSet | None]:
 
     Raises InputError.
     """
+    from uwb_tdoa_bias.effects import EffectSet
+    from uwb_tdoa_ekf.core.config import FilterConfig
+
     config = FilterConfig.from_yaml(args.config) if args.config else FilterConfig()
     switched_off = [f"use_{stream}:=false" for stream in args.without]
     config = with_parameters(config, [*getattr(args, "parameters", ()), *switched_off])
@@ -179,6 +181,8 @@ def estimator_of(args: Namespace, say: Callable[[str], object]) -> FlightEstimat
 
     say(sentence) is called if the network was trained with effects that --effects lacks.
     """
+    from .estimate import FlightEstimator
+
     config, effects = filter_of(args)
     if args.no_bias:
         return FlightEstimator(config, smoothed=args.smooth)
@@ -192,6 +196,8 @@ def model_of(
 
     say(sentence) is called if it was trained with effects that `effects` lacks.
     """
+    from uwb_tdoa_bias.correction.network import load_network
+
     model = load_network(args.model)
     given = {effect.name for effect in effects.effects} if effects else set()
     lacking = sorted(set(model.trained_with) - given) if model else []
@@ -273,7 +279,7 @@ def add_tape(parser: ArgumentParser) -> None:
         "--std",
         type=float,
         metavar="M",
-        help=f"m, standard deviation of a coordinate as given (default {Tape.std:g})",
+        help=f"m, standard deviation of a coordinate as given (default {choices.TAPE_STD:g})",
     )
     add(
         "--height-std",
@@ -292,7 +298,7 @@ def add_tape(parser: ArgumentParser) -> None:
         "--trusted-std",
         type=float,
         metavar="M",
-        help=f"m, how well those are known (default {Tape.trusted_std:g})",
+        help=f"m, how well those are known (default {choices.TRUSTED_STD:g})",
     )
     add(
         "--unknown",
@@ -308,6 +314,8 @@ def tape_of(args: Namespace, effects: EffectSet | None) -> Tape:
 
     effects : EffectSet of --effects, or None. Its covariance of the anchors excludes the options of Tape.
     """
+    from .diagnosis.self_calibration import Tape
+
     if effects is not None and effects.covariance is not None:
         refuse(
             args,
@@ -341,7 +349,7 @@ def add_align(parser: ArgumentParser, judges: bool = False) -> None:
 
 def add_rerun(parser: ArgumentParser) -> None:
     """Add --rerun: a recording for the viewer Rerun."""
-    parser.add_argument("--rerun", metavar="FILE", type=OutputFile, help=pictures.RERUN_HELP)
+    parser.add_argument("--rerun", metavar="FILE", type=OutputFile, help=choices.RERUN)
 
 
 def rerun_of(args: Namespace, count: int, say: Callable[[str], object]) -> Path | None:
@@ -349,6 +357,8 @@ def rerun_of(args: Namespace, count: int, say: Callable[[str], object]) -> Path 
 
     count : number of flights, which must be one; say(sentence) reports a missing library.
     """
+    from .localizing import pictures
+
     if not args.rerun:
         return None
     if count != 1:
@@ -373,6 +383,8 @@ def add_known(parser: ArgumentParser) -> None:
 
 def known_of(args: Namespace, flights: Sequence[Flight]) -> tuple[Mark | Distance, ...]:
     """Return the constraints on Flights as a tuple. Raises InputError."""
+    from .surveying.known import read_distances, read_marks
+
     out: list[Mark | Distance] = []
     out += [] if args.marks is None else read_marks(args.marks, flights)
     out += [] if args.distances is None else read_distances(args.distances, flights[0].anchors)
@@ -386,6 +398,8 @@ def with_parameters(config: FilterConfig, texts: Iterable[str]) -> FilterConfig:
 
 def _parameter(text: str) -> tuple[str, Any]:
     """Return (name, value) of "name:=value"."""
+    from uwb_tdoa_ekf.core.config import FilterConfig
+
     name, assigned, value = text.partition(":=")
     names = [field.name for field in fields(FilterConfig)]
     if not assigned or name not in names:

@@ -23,9 +23,6 @@ import time
 from typing import TYPE_CHECKING, Any, Protocol, TextIO, TypeVar
 import warnings
 
-from joblib import Parallel, cpu_count, delayed, parallel_config
-from tqdm import tqdm
-
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.executable import outside_present_folder
 
@@ -90,6 +87,8 @@ class Progress:
         self(f"{what} done, finishing")
 
     def __enter__(self) -> Progress:
+        from tqdm import tqdm
+
         stream = self._stream or sys.stderr
         self._start, self._bar = time.monotonic(), None
         if stream.isatty():
@@ -167,6 +166,8 @@ def workers_for(args: argparse.Namespace, count: int, few: int) -> tuple[int | N
 
     Without options there are as many jobs as cores and items, and one for fewer items than `few`.
     """
+    from joblib import cpu_count
+
     if args.jobs or args.dask:
         return args.jobs, args.dask
     return (min(cpu_count(), count) if count >= few else 1), None
@@ -218,6 +219,8 @@ def _results(
     The first item runs here while the processes start and import `function`. So numba fills its
     cache once. The others run there.
     """
+    from joblib import Parallel, cpu_count, delayed, parallel_config
+
     first, rest = items[:1], items[1:]
     # Always exactly `jobs` if given: with another number, joblib restarts all processes.
     processes = jobs or min(cpu_count(), len(rest))

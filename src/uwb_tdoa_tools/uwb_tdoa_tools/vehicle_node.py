@@ -34,12 +34,13 @@ from uwb_tdoa_bias.ros.parameters import (
 )
 from uwb_tdoa_msgs.srv import GoTo, Land, Takeoff
 
+from .choices import FLOWN
 from .flying import rover
 from .flying.mission import Circles, Waypoints
 from .flying.over_topics import Lockstep, OverTopics, RealTime
 from .flying.pilot import Pilot
 from .flying.sensors import SENSOR_NAMES
-from .flying.trial import VEHICLES, Task, Trial
+from .flying.trial import Task, Trial
 from .flying.verdict import reached, sentence, verdict_of
 from .flying.world import WORLDS, world_of
 
@@ -53,7 +54,7 @@ PARAMETERS = {  # in the order of config/vehicle_node.yaml
     "vehicle": Parameter(
         "quadrotor",
         "what it is; a rover drives, with mission alone, and publishes velocity",
-        choices=VEHICLES,
+        choices=FLOWN,
     ),
     "world": Parameter("hall", "what it flies in (docs/flying.md)", choices=tuple(WORLDS)),
     "seed": Parameter(1, "of all that is random, as of fly", 0, 2**31 - 1),

@@ -138,6 +138,8 @@ def _place(name: str) -> Path:
 
 def _is_ours_alone(folder: Path) -> bool:
     """Return whether a folder belongs to the user and gives access to no other user."""
+    if not hasattr(os, "getuid"):  # Windows gives each user a folder that others cannot write
+        return True
     found = folder.stat()
     return found.st_uid == os.getuid() and not found.st_mode & 0o077
 

@@ -11,7 +11,7 @@ This module imports only the standard library.
 
 from __future__ import annotations
 
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import partial
 import gc
 from importlib import import_module
@@ -19,17 +19,18 @@ from importlib.machinery import PathFinder
 import os
 import signal
 import sys
-from threading import Timer
+from threading import Timer, main_thread
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from importlib.machinery import ModuleSpec
-    from types import FrameType, ModuleType
+    from types import FrameType
 
 INTERRUPTED = 130  # exit code, as a shell gives it: 128 + SIGINT
 SOON = 0.05  # s, until a lost interrupt is repeated
-SAID = 1.5  # s of importing until a line reports it
+HAS_ALARM = hasattr(signal, "SIGALRM")  # Windows has none
+SAID = 1.5  # s after which a line reports that the imports take long
 # Path variables in which an empty entry or a dot means the present folder. `.dev/paths.sh` has the
 # same list, for programs that a shell starts.
 PATHS = (
@@ -79,13 +80,15 @@ def outside_present_folder() -> Iterator[None]:
 
     The present folder may hold settings, and modules that `python -m` would import.
     """
-    here = os.open(".", os.O_PATH | os.O_DIRECTORY)  # works even if the folder was removed
-    try:
-        os.chdir("/")
+    with ExitStack() as back:
+        if hasattr(os, "O_PATH"):
+            here = os.open(".", os.O_PATH | os.O_DIRECTORY)  # works even if the folder was removed
+            back.callback(os.close, here)
+            back.callback(os.fchdir, here)
+        else:
+            back.callback(os.chdir, os.getcwd())
+        os.chdir(os.sep)
         yield
-    finally:
-        os.fchdir(here)
-        os.close(here)
 
 
 class _ImportedElsewhere:
@@ -109,29 +112,48 @@ sys.meta_path.insert(0, _ImportedElsewhere)
 def interrupt(number: int, frame: FrameType | None) -> None:
     """Raise KeyboardInterrupt for a signal, and repeat SIGINT until the exception arrives.
 
+    During an import the process ends at once. Some imported packages answer a KeyboardInterrupt with
+    a traceback or ignore it.
+
     Callbacks from C code and destructors cannot raise. Python prints such an exception on stderr and
     continues; numba's compiler has both. From now on Python prints no such exception, including
     those of half-made objects. If the lost exception is a KeyboardInterrupt, SIGINT comes again
     after SOON seconds.
     """
+    if is_importing(frame):
+        os._exit(128 + number)
 
     def on_lost(lost: sys.UnraisableHookArgs) -> None:
-        if lost.exc_type is KeyboardInterrupt:
+        if lost.exc_type is KeyboardInterrupt and HAS_ALARM:
             signal.setitimer(signal.ITIMER_REAL, SOON)
+        elif lost.exc_type is KeyboardInterrupt:
+            Timer(SOON, signal.raise_signal, [signal.SIGINT]).start()
 
     sys.unraisablehook = on_lost
-    signal.signal(signal.SIGALRM, lambda number, frame: signal.raise_signal(signal.SIGINT))
+    if HAS_ALARM:
+        signal.signal(signal.SIGALRM, lambda number, frame: signal.raise_signal(signal.SIGINT))
     raise KeyboardInterrupt
+
+
+def is_importing(frame: FrameType | None) -> bool:
+    """Return whether a frame of the main thread runs within an import."""
+    while frame is not None and frame.f_globals.get("__name__") != "importlib._bootstrap":
+        frame = frame.f_back
+    return frame is not None
 
 
 def _run(module: str, *arguments: Any) -> Any:
     leave_present_folder_out()
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     name = module.rpartition(".")[2]
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, interrupt)
+    slow = Timer(SAID, _say_if_importing, [name])
+    slow.daemon = True
+    slow.start()
     try:
-        main = _imported(module).main
-        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-            signal.signal(signal.SIGINT, interrupt)
+        with outside_present_folder():
+            main = import_module(module).main
         return main(*arguments)
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
@@ -144,34 +166,20 @@ def _run(module: str, *arguments: Any) -> Any:
         return 2
     except KeyboardInterrupt:
         return INTERRUPTED
+    finally:
+        slow.cancel()
+
+
+def _say_if_importing(name: str) -> None:
+    """Report on stderr that an executable starts if its main thread imports."""
+    if is_importing(sys._current_frames().get(main_thread().ident or 0)):
+        print(f"{name}: starting", file=sys.stderr, flush=True)
 
 
 def _run_node(module: str, *arguments: Any) -> Any:
     # Imported objects are no garbage until the node runs. Searching them takes a tenth of a start.
     gc.disable()
     return _run(module, *arguments)
-
-
-def _imported(module: str) -> ModuleType:
-    """Return an imported module; report on stderr if the import takes longer than SAID seconds.
-
-    During the import, SIGINT ends the process at once. Some imported packages answer a
-    KeyboardInterrupt with a traceback or ignore it, and there is nothing to clean up yet.
-    """
-    before = signal.getsignal(signal.SIGINT)
-    if before is not signal.SIG_IGN:  # ignored in a background job of a shell script
-        signal.signal(signal.SIGINT, lambda number, frame: os._exit(INTERRUPTED))
-    slow = Timer(
-        SAID, lambda: print(f"{module.rpartition('.')[2]}: starting", file=sys.stderr, flush=True)
-    )
-    slow.daemon = True
-    slow.start()
-    try:
-        with outside_present_folder():
-            return import_module(module)
-    finally:
-        slow.cancel()
-        signal.signal(signal.SIGINT, before)
 
 
 def _remedy(package: str) -> str:

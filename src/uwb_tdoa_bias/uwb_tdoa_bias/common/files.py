@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import atexit
 from contextlib import ExitStack, contextmanager, suppress
-import fcntl
 import io
 import math
 import os
@@ -20,6 +19,11 @@ import zlib
 
 import numpy as np
 
+try:
+    import fcntl
+except ImportError:  # Windows locks no folders
+    fcntl = None  # type: ignore[assignment]  # None marks the missing module
+
 from .errors import InputError
 from .limits import ARRAYS_BYTES, RECORDING_BYTES, Budget
 
@@ -31,6 +35,7 @@ if TYPE_CHECKING:
 
 TEMPORARY = "uwb_tdoa_temporary_"  # prefix of the project's temporary folders
 STREAMS = "/dev/stdout", "/dev/stderr"  # links that the user redirects
+NO_WAIT = getattr(os, "O_NONBLOCK", 0)  # a pipe without a writer would block; Windows has none
 SETTLED = 60.0  # s; older temporary folders without a lock are removed
 _KEPT: list[
     tuple[Path, Path, os.stat_result, bool]
@@ -154,7 +159,7 @@ def open_file(path: str | Path) -> BinaryIO:
 
     Raises OSError, and InputError for a pipe or a device, where reading would block forever.
     """
-    file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
+    file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | NO_WAIT))
     if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         file.close()
         raise InputError(f"{path}: is a pipe, a device or a folder; give a file.")
@@ -170,9 +175,9 @@ def temporary_folder() -> Iterator[Path]:
     for old in Path(tempfile.gettempdir()).glob(f"{TEMPORARY}*"):
         with suppress(OSError):  # owned by another user, in use, or gone
             if time.time() - old.lstat().st_mtime > SETTLED:
-                with _held(old, fcntl.LOCK_EX):
+                with _held(old, alone=True):
                     shutil.rmtree(old)
-    with tempfile.TemporaryDirectory(prefix=TEMPORARY) as name, _held(Path(name), fcntl.LOCK_SH):
+    with tempfile.TemporaryDirectory(prefix=TEMPORARY) as name, _held(Path(name)):
         yield Path(name)
 
 
@@ -184,15 +189,21 @@ def folder_of_process() -> Path:
 
 
 @contextmanager
-def _held(folder: Path, kind: int) -> Iterator[None]:
+def _held(folder: Path, alone: bool = False) -> Iterator[None]:
     """Hold a lock on a folder of the user inside the block; raise OSError.
 
-    kind : fcntl.LOCK_SH or fcntl.LOCK_EX
+    alone : whether no other process may hold the folder. Without locks this raises OSError.
     """
+    if fcntl is None:
+        if alone:
+            raise PermissionError
+        yield
+        return
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     try:
         if os.fstat(descriptor).st_uid != os.getuid():
             raise PermissionError
+        kind = fcntl.LOCK_EX if alone else fcntl.LOCK_SH
         fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
         yield
     finally:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from functools import cache
 import re
 
@@ -44,13 +45,16 @@ def sanitize(text: object) -> str:
 
 @cache
 def version() -> str:
-    """Return the version of the packages, e.g. "0.1.0"; "unknown" if they are not installed."""
+    """Return the version of the packages, e.g. "0.1.0"; "unknown" if they are not installed.
+
+    colcon installs a distribution for each package, pip installs one for all.
+    """
     from importlib import metadata  # the import takes 0.05 s
 
-    try:
-        return metadata.version("uwb_tdoa_bias")
-    except metadata.PackageNotFoundError:
-        return "unknown"
+    for name in ("uwb_tdoa_bias", "uwb-tdoa"):
+        with suppress(metadata.PackageNotFoundError):
+            return metadata.version(name)
+    return "unknown"
 
 
 def written_by() -> str:

@@ -14,12 +14,16 @@ import json
 import os
 from pathlib import Path
 import re
-import resource
 import subprocess
 import sys
 import time
 
 import numpy as np
+
+try:
+    import resource
+except ImportError:  # Windows limits no process
+    resource = None  # type: ignore[assignment]  # None marks the missing module
 
 from ..common.files import temporary_folder
 from ..common.limits import (
@@ -37,6 +41,7 @@ OPERATORS = (
     "Neg Not Or Reciprocal ReduceMax ReduceSum Relu Reshape Selu Sigmoid Sign Sin Softmax Softplus "
     "Softsign Sqrt Sub Sum Tanh Where"
 ).split()
+MEMORY = Path("/proc/self/status")  # names the memory of this process
 START = (
     f"import json, sys; sys.path[:] = json.loads(sys.argv[1]); from {__name__} import main; main()"
 )
@@ -48,6 +53,8 @@ def tried_out(content: bytes) -> bool:
 
     Raises Unplayable if the content of an ONNX file fails the trial.
     """
+    if resource is None or not MEMORY.exists():
+        raise Unplayable("this system does not limit the memory of a trial; use it on Linux")
     path = [
         entry for entry in sys.path if os.path.isabs(entry)
     ]  # the process runs in an empty folder
@@ -98,7 +105,7 @@ def judge(content: bytes) -> tuple[bool, str]:
 
 def _limit_this_process() -> None:
     """Limit time and memory of this process; from now on it opens no file and leaves no dump."""
-    memory = int(re.search(r"VmSize:\s+(\d+)", Path("/proc/self/status").read_text())[1]) << 10  # type: ignore[index]  # found on Linux
+    memory = int(re.search(r"VmSize:\s+(\d+)", MEMORY.read_text("utf-8"))[1]) << 10  # type: ignore[index]  # found on Linux
     seconds = int(time.process_time()) + 1 + MODEL_SECONDS
     for limit, most in (
         ("AS", memory + MODEL_MEMORY),

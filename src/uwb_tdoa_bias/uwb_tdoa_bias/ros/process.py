@@ -222,4 +222,12 @@ def _init(parser: argparse.ArgumentParser, arguments: list[str]) -> None:
         implementation.RCLInvalidROSArgsError,
         implementation.UnknownROSArgsError,
     ) as error:
-        raise InputError(f"--ros-args: {error}.") from error
+        raise InputError(refusal(error)) from error
+
+
+def refusal(error: Exception) -> str:
+    """Return a sentence on why rclpy did not start: its arguments, or the folder of its log."""
+    if "log directory" in str(error):
+        reason = str(error).partition(", at ")[0]
+        return f"{reason}; name a folder that you can write to: export ROS_LOG_DIR=/tmp/ros-log"
+    return f"--ros-args: {error}."

@@ -11,6 +11,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import SENSOR_NAMES
 from uwb_tdoa_ekf.results import rows_of
 
+from ..choices import STREAMS
 from .bag import check_output, write_bag
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
     Timed = Tdoas | Imu | Truth | Stream
 
-SENSORS = "tdoa", "imu", "truth", *SENSOR_NAMES  # streams of a Flight, each on its own clock
+SENSORS = *STREAMS, *SENSOR_NAMES
 
 
 @dataclass(frozen=True)

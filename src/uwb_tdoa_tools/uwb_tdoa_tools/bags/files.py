@@ -20,6 +20,7 @@ from uwb_tdoa_bias.common.files import refuse_output, temporary_folder
 from uwb_tdoa_bias.common.limits import READ_BYTES, TooMuch, most_unpacked
 from uwb_tdoa_bias.common.stamps import LARGEST_STEP_BACK
 
+from ..choices import STORAGES
 from ..command_lines import SALVAGE
 from . import is_bag, mcap, write_ahead
 from .completion import completed
@@ -43,7 +44,7 @@ from .salvage import salvage as write_sound_part
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
-STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
+PLUGINS = dict(zip(STORAGES, (StoragePlugin.MCAP, StoragePlugin.SQLITE3)))
 
 
 class BagReader(Reader):
@@ -86,7 +87,7 @@ def new_bag(out: str | Path, storage: str = "mcap", force: bool = False) -> Iter
     scratch = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".partial", dir=out.parent))
     try:
         with Writer(
-            scratch / out.name, version=Writer.VERSION_LATEST, storage_plugin=STORAGES[storage]
+            scratch / out.name, version=Writer.VERSION_LATEST, storage_plugin=PLUGINS[storage]
         ) as writer:
             writer.set_custom_data(CHECKSUM_KEY, NO_CHECKSUM)
             yield writer

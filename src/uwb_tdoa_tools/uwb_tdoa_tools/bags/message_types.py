@@ -42,7 +42,8 @@ ADDED: dict[str, tuple[dict[str, Any], ...]] = {
         {"bias_slope": np.zeros(6), "bias_state": np.zeros(6)},
     ),
 }
-_SOURCE_TREE = Path(__file__).resolve().parents[3]  # where our packages lie side by side
+# where folders of message packages are besides installed ones: in a wheel, and in the sources
+_OURS = Path(__file__).parent, Path(__file__).resolve().parents[3]
 
 
 @lru_cache(maxsize=1)
@@ -165,7 +166,7 @@ def _definition(msgtype: str) -> str:
         for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
         if prefix
     ]
-    for share in [*prefixes, _SOURCE_TREE]:
+    for share in [*prefixes, *_OURS]:
         file = share / package / "msg" / f"{name}.msg"
         if file.is_file():
             return file.read_text(encoding="utf-8")

@@ -6,12 +6,8 @@ import sys
 from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.effects import EffectSet
 
 from .. import cli, command_lines, options
-from ..calibrating import expectation, usable_paths, with_truth, without_truth
-from ..diagnosis.noise import write_parameters
-from ..estimate import FlightEstimator
 from ..outputs import OutputFolder
 from ..parallel import Progress
 
@@ -80,6 +76,11 @@ def parser() -> ArgumentParser:
 
 
 def _calibrate(args: Namespace) -> int:
+    from uwb_tdoa_bias.effects import EffectSet
+
+    from ..calibrating import expectation, usable_paths, with_truth, without_truth
+    from ..estimate import FlightEstimator
+
     if not (args.out or args.quick):
         raise InputError("--out: is missing; say where to write, or ask for --quick.")
     config, effects = options.filter_of(args)
@@ -146,6 +147,8 @@ def _write(
 
     recordings : hold-out data, or all flights without any; truth : whether they have ground truth
     """
+    from ..diagnosis.noise import write_parameters
+
     out = args.out
     files = anchors, effects, parameters = (
         out / "anchors.yaml",

@@ -11,13 +11,8 @@ from typing import TYPE_CHECKING
 from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli, command_lines, options
-from ..checking import report
-from ..checking.check import check, different_surveys
-from ..checking.recording import read_live, read_recording
-from ..estimate import FlightEstimator
 from ..outputs import OutputFile
 from ..parallel import Progress
-from ..readers import read_survey
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
@@ -66,6 +61,10 @@ def parser() -> ArgumentParser:
 
 
 def _check(args: Namespace) -> int:
+    from ..checking import report
+    from ..checking.check import check, different_surveys
+    from ..estimate import FlightEstimator
+
     if bool(args.flights) == (args.live is not None):
         raise InputError("FLIGHT, --live: give recordings, or --live SECONDS, and not both.")
     if args.live is not None and not 0.0 < args.live < math.inf:
@@ -95,6 +94,8 @@ def _recordings(
 
     survey : path of the one survey, or None.
     """
+    from ..checking.recording import read_live, read_recording
+
     if args.live is not None:
         yield read_live(reading, args.live, survey, partial(cli.say, "check")), None, None
     found = reading.find(args.flights)
@@ -109,6 +110,8 @@ def _recordings(
 
 def _surveys(folder: Path) -> list[tuple[str, Anchors]]:
     """Return [(path, Anchors)] of a folder of surveys."""
+    from ..readers import read_survey
+
     return [(str(path), read_survey(path)) for path in sorted(folder.glob("anchor_?*"))]
 
 

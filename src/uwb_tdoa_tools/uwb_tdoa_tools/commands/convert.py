@@ -11,16 +11,13 @@ from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_text
+from uwb_tdoa_bias.common.sensors import SENSORS
 
 from .. import cli, options
-from ..bags.convert import SENSORS, convert, shifted
+from ..choices import COLUMNS, STREAMS
 from ..command_lines import tool
 from ..outputs import OutputBag, OutputFile
 from ..parallel import Progress
-from ..readers import columns
-from ..readers.profile import Profile, load_profile
-from ..readers.suggest import suggest
-from ..scoring.evaluation import on_one_clock
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
@@ -67,7 +64,7 @@ def parser() -> ArgumentParser:
     made.add_argument(
         "input", metavar="IN", nargs="+", help="the recording; its kind is found by its content"
     )
-    made.add_argument("--columns", metavar="MAP", help=columns.HELP)
+    made.add_argument("--columns", metavar="MAP", help=COLUMNS)
     options.add_reading(made)
     options.add_align(made)
     made.add_argument(
@@ -77,7 +74,7 @@ def parser() -> ArgumentParser:
         default=[],
         metavar="SENSOR=SECONDS",
         help=(
-            f"add this to the stamps of a sensor with another clock: {', '.join(SENSORS)}; "
+            f"add this to the stamps of a sensor with another clock: {', '.join((*STREAMS, *SENSORS))}; "
             "may be repeated"
         ),
     )
@@ -103,6 +100,9 @@ def _convert(args: Namespace) -> None:
         return _suggest(args)
     if not args.out:
         raise InputError("--out: is missing; give the path of the bag to write.")
+    from ..bags.convert import convert, shifted
+    from ..scoring.evaluation import on_one_clock
+
     offsets = _offsets(args.offsets)
     reading = _reading(args)
     with Progress("convert", what="reading and writing"):
@@ -149,6 +149,9 @@ def _convert(args: Namespace) -> None:
 
 def _suggest(args: Namespace) -> None:
     """Write a first profile of IN."""
+    from ..readers.profile import load_profile
+    from ..readers.suggest import suggest
+
     text, fitting = suggest([Path(path) for path in args.input], args.salvage)
     write_text(args.suggest, text)
     for name in fitting:
@@ -159,6 +162,8 @@ def _suggest(args: Namespace) -> None:
 
 def _offsets(texts: Iterable[str]) -> dict[str, float]:
     """Return {sensor: s} of "SENSOR=SECONDS" texts. Raises InputError."""
+    from ..bags.convert import SENSORS
+
     offsets = {}
     for text in texts:
         sensor, given, seconds = text.partition("=")
@@ -177,6 +182,9 @@ def _offsets(texts: Iterable[str]) -> dict[str, float]:
 
 def _reading(args: Namespace) -> Reading:
     """Return how to read IN. Raises InputError."""
+    from ..readers import columns
+    from ..readers.profile import Profile
+
     reading = options.reading_of(args)
     if not args.columns:
         return reading

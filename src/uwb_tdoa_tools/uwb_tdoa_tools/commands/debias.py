@@ -7,18 +7,18 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_ekf.debias import INTERPOLATORS, BiasMap
 
 from .. import cli, options, parallel
-from ..debiasing import evaluation
-from ..debiasing.evaluation import PositionEstimator, require_anchors
-from ..debiasing.mapping import cross_validated, fit_map
+from ..choices import INTERPOLATORS
 from ..outputs import OutputFile
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
     from collections.abc import Sequence
 
+    from uwb_tdoa_ekf.debias import BiasMap
+
+    from ..debiasing.evaluation import PositionEstimator
     from ..readers.inputs import Recording
 
 DESCRIPTION = """Map the bias of estimated positions over the room, after Grasso et al. (Sensors 2022, 22, 9136), and
@@ -82,6 +82,10 @@ def parser() -> ArgumentParser:
 
 
 def _fit(args: Namespace) -> int:
+    from ..debiasing import evaluation
+    from ..debiasing.evaluation import PositionEstimator
+    from ..debiasing.mapping import cross_validated, fit_map
+
     if not (args.flights or args.static):
         raise InputError(
             "FLIGHT: there is none; give flights with ground truth, or --static points."
@@ -132,6 +136,11 @@ def _fit(args: Namespace) -> int:
 
 
 def _judge(args: Namespace) -> int:
+    from uwb_tdoa_ekf.debias import BiasMap
+
+    from ..debiasing import evaluation
+    from ..debiasing.evaluation import PositionEstimator
+
     estimator = PositionEstimator(options.reading_of(args), *options.filter_of(args), args.align)
     made = BiasMap.load(args.map)
     rows = _judged(args, estimator, estimator.reading.find(args.flights, bool(args.dask)), made)
@@ -145,6 +154,9 @@ def _judge(args: Namespace) -> int:
 def _judged(
     args: Namespace, estimator: PositionEstimator, recordings: Sequence[Recording], made: BiasMap
 ) -> list[dict[str, Any]]:
+    from ..debiasing import evaluation
+    from ..debiasing.evaluation import require_anchors
+
     flown = parallel.over(estimator, recordings, args.jobs, args.dask)
     return evaluation.comparison_rows(require_anchors(flown, made), made, estimator.effects)
 

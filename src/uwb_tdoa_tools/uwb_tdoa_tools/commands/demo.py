@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING
 from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli, options, parallel
-from ..evaluating import lines_of_errors
-from ..flying import demo
 from ..outputs import OutputFile, OutputFolder
 
 if TYPE_CHECKING:
@@ -97,6 +95,8 @@ def _demo(args: Namespace) -> int:
 
 def _loop(args: Namespace) -> int:
     """Close the loop in a simulated hall."""
+    from ..flying import demo
+
     result, figures = demo.close_loop(
         args.seed or SEED, args.out, args.rate, _show, partial(cli.say, "demo")
     )
@@ -118,6 +118,9 @@ def _show(title: str, lines: Sequence[str], keep: bool = False) -> None:
 
 def _measured(args: Namespace) -> int:
     """Take a measured flight through both nodes."""
+    from ..evaluating import lines_of_errors
+    from ..flying import demo
+
     started = time.monotonic()
     chosen = demo.measured(args.flight, options.reading_of(args), args.effects, args.model)
     flight = chosen.flight

@@ -9,21 +9,11 @@ from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_text
-from uwb_tdoa_bias.effects import EffectSet
 
 from .. import cli, command_lines, options, parallel
-from ..checking.before_anchors import nothing_comes_first
-from ..checking.report import remarks_on
-from ..diagnosis import diagnose, output, with_noise
-from ..diagnosis.noise import write_parameters
-from ..diagnosis.references import REFERENCES
-from ..estimate import FlightEstimator
-from ..localizing.pictures import write_diagnosis
+from ..choices import DRIFT, NONE, REFERENCES
 from ..outputs import OutputFolder
 from ..parallel import Progress
-from ..readers import inputs
-from ..scoring.alignment import NONE
-from ..surveying.known import DRIFT, read_paths
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
@@ -39,7 +29,9 @@ assume with them; --config of evaluate) and report.html.
 Exit code: 0 done; 1 ids, signs or units are wrong and --no-truth or --reference marks is given; 2 bad input."""
 
 MOST = 300_000  # TDOAs; what they take: docs/notebook/speed.md
-FEW = 20  # flights; what fewer gain by other processes, these take to start (docs/notebook/speed.md)
+FEW = (
+    20  # flights; what fewer gain by other processes, these take to start (docs/notebook/speed.md)
+)
 BLIND = "nothing", "marks"  # references of which no path shows that ids are wrong
 UNUSED = {  # by references, of the options of what is known
     "truth": ("marks", "distances", "odometry"),
@@ -84,7 +76,7 @@ def parser() -> ArgumentParser:
     known = made.add_mutually_exclusive_group().add_argument
     known(
         "--reference",
-        choices=tuple(REFERENCES),
+        choices=REFERENCES,
         default="truth",
         help="what flights are compared with: their ground truth (default), the heights of a range "
         "finder, --marks, "
@@ -128,6 +120,17 @@ def parser() -> ArgumentParser:
 
 
 def _diagnose(args: Namespace) -> int:
+    from uwb_tdoa_bias.effects import EffectSet
+
+    from ..checking.before_anchors import nothing_comes_first
+    from ..checking.report import remarks_on
+    from ..diagnosis import diagnose, output, references, with_noise
+    from ..diagnosis.noise import write_parameters
+    from ..estimate import FlightEstimator
+    from ..localizing.pictures import write_diagnosis
+    from ..readers import inputs
+    from ..surveying.known import read_paths
+
     out = args.out
     options.refuse(
         args, UNUSED[args.reference], f"no part of it is used with --reference {args.reference}"
@@ -159,7 +162,7 @@ def _diagnose(args: Namespace) -> int:
             *known,
             *read_paths(args.odometry, (*flights, *holdout), args.drift, args.namespace),
         )
-    reference = REFERENCES[args.reference](
+    reference = references.REFERENCES[args.reference](
         config, known, *[args.align][: args.reference == "truth"]
     )
     # Only Progress prints a line.

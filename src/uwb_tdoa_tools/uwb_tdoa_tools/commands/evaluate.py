@@ -10,11 +10,8 @@ from typing import TYPE_CHECKING
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_text
 
-from .. import cli, evaluating, options, parallel
-from ..evaluating import Evaluator, results
+from .. import cli, options, parallel
 from ..outputs import OutputFile, OutputFolder, as_json
-from ..results_file import settings_of
-from ..scoring.pooling import FIGURES, Pool
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
@@ -91,6 +88,11 @@ def parser() -> ArgumentParser:
 
 
 def _evaluate(args: Namespace) -> int:
+    from .. import evaluating
+    from ..evaluating import Evaluator, results
+    from ..results_file import settings_of
+    from ..scoring.pooling import FIGURES, Pool
+
     if args.odometry:
         options.refuse(
             args,

@@ -7,12 +7,10 @@ import sys
 from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.effects import EffectSet
 
 from .. import cli, options
 from ..outputs import OutputFile, OutputFolder
 from ..parallel import Progress
-from ..readers import read_survey
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
@@ -49,6 +47,10 @@ def parser() -> ArgumentParser:
 
 
 def _export(args: Namespace) -> None:
+    from uwb_tdoa_bias.effects import EffectSet
+
+    from ..readers import read_survey
+
     if not (args.effects or args.model):
         raise InputError("--effects: is missing, and so is --model; give one of them, or both.")
     if not (args.onnx or args.c or args.crazyflie):

@@ -5,20 +5,17 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 import sys
+from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.correction.network import load_network
+from uwb_tdoa_bias.common.sensors import SENSORS
 
 from .. import cli, options, parallel
-from ..flying import fleet, rover
-from ..flying.fleet import plot
-from ..flying.mission import Circles, Waypoints
-from ..flying.sensors import SENSOR_NAMES
-from ..flying.trial import VEHICLES, Task
-from ..flying.verdict import summary, text, wording_of
-from ..flying.world import MOMENTS, WORLDS, world_of
+from ..choices import FLOWN, MOMENTS, WORLDS
 from ..outputs import OutputFile, OutputFolder
-from ..results_file import settings_of
+
+if TYPE_CHECKING:
+    from ..flying.mission import Circles, Waypoints
 
 # Options without influence on a flight.
 WITHOUT_INFLUENCE = (
@@ -77,7 +74,7 @@ def parser() -> argparse.ArgumentParser:
     )
     add(
         "--vehicle",
-        choices=VEHICLES,
+        choices=FLOWN,
         default="quadrotor",
         help="what is flown, or driven (default: quadrotor)",
     )
@@ -109,7 +106,7 @@ def parser() -> argparse.ArgumentParser:
         "--sensor",
         action="append",
         default=[],
-        choices=SENSOR_NAMES,
+        choices=tuple(SENSORS),
         help=(
             "what else it measures: a range finder, a barometer, its velocity, distances to anchors"
         ),
@@ -192,6 +189,16 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _fly(args: argparse.Namespace) -> int:
+    from uwb_tdoa_bias.correction.network import load_network
+
+    from ..flying import fleet, rover
+    from ..flying.fleet import plot
+    from ..flying.mission import Circles, Waypoints
+    from ..flying.trial import Task
+    from ..flying.verdict import summary, text, wording_of
+    from ..flying.world import world_of
+    from ..results_file import settings_of
+
     if args.record is not None:
         args.record.mkdir(parents=True, exist_ok=True)
     if args.resume and (args.plot or args.record):
@@ -249,6 +256,8 @@ def _fly(args: argparse.Namespace) -> int:
 
 def _check_rover(args: argparse.Namespace) -> None:
     """Refuse options that a rover has nothing to do with."""
+    from ..flying.world import WORLDS
+
     for name in NOT_OF_ROVERS:
         if getattr(args, name):
             raise InputError(f"--{name}: is of the quadrotor; leave it out with --vehicle rover.")

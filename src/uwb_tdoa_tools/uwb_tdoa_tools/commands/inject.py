@@ -6,12 +6,10 @@ import sys
 from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.effects import EFFECTS
 
 from .. import cli, options
 from ..outputs import OutputBag
 from ..parallel import Progress
-from ..simulation.inject import catalogue, inject, parse_effect
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
@@ -44,7 +42,7 @@ def parser() -> ArgumentParser:
         help="list effects, parameters and units, and do nothing else",
     )
     options.add_reading(made)
-    add("--effect", metavar="NAME", choices=EFFECTS, help="the effect to add")
+    add("--effect", metavar="NAME", help="the effect to add, one of --list")
     add("--value", metavar="KEY=NUMBER", nargs="+", default=[], help="its parameters")
     add("--seed", metavar="N", type=int, default=0, help="of effects that are random (default: 0)")
     add("--out", metavar="BAG", type=OutputBag, help="the bag to write: a new directory")
@@ -53,6 +51,8 @@ def parser() -> ArgumentParser:
 
 
 def _inject(args: Namespace) -> None:
+    from ..simulation.inject import catalogue, inject, parse_effect
+
     if args.list:
         cli.show(catalogue())
         return

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli, options, parallel
-from ..localizing.localize import Localizer, all_good, check_names
 from ..outputs import OutputFile, OutputFolder
 
 if TYPE_CHECKING:
@@ -72,6 +71,8 @@ def parser() -> ArgumentParser:
 
 
 def _localize(args: Namespace) -> int:
+    from ..localizing.localize import Localizer, all_good, check_names
+
     out = args.out
     if args.zones is not None and not args.zones > 0.0:
         raise InputError(

@@ -8,16 +8,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from uwb_tdoa_bias.common.anchors import Anchors
-from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_bias.common.radio import RadioLink
+from uwb_tdoa_bias.common.sensors import SENSORS
 
-from .. import cli, parallel
+from .. import choices, cli, parallel
+from ..choices import (
+    ACCURACY,
+    CRITERIA,
+    OBJECTIVES,
+    OF_PROTOCOL,
+    PAIRINGS,
+    TEMPERATURE,
+    VOLTAGE,
+)
 from ..outputs import OutputFile, OutputFolder
-from ..planning import run
-from ..planning.installation import OF_PROTOCOL, PAIRINGS, RadioNoise
-from ..planning.layout import OBJECTIVES
-from ..planning.maps import ACCURACY, CRITERIA
-from ..readers import inputs, read_survey
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
@@ -98,7 +102,7 @@ def parser() -> ArgumentParser:
     )
     add("--planar", action="store_true", help="the height of the tag is known: x and y only")
 
-    add, radio = made.add_argument_group("measurements").add_argument, RadioNoise
+    add, radio = made.add_argument_group("measurements").add_argument, RadioLink
     add("--protocol", choices=OF_PROTOCOL, default="tdoa2", help=ROUND)
     add(
         "--covariance",
@@ -121,14 +125,14 @@ def parser() -> ArgumentParser:
         "--temperature",
         metavar="C",
         **number,
-        default=radio.temperature,
+        default=TEMPERATURE,
         help=f"of the anchors {default}",
     )
     add(
         "--voltage",
         metavar="V",
         **number,
-        default=radio.voltage,
+        default=VOLTAGE,
         help=f"supply of the anchors {default}",
     )
     add(
@@ -152,7 +156,7 @@ def parser() -> ArgumentParser:
         choices=["height"],
         help="what the tag measures besides: a range finder that looks down",
     )
-    height_std = FilterConfig().height_std  # type: ignore[attr-defined]  # parameters of SENSORS are known at run time
+    height_std = SENSORS["height"].parameters["height_std"].default
     add("--height-std", metavar="M", **number, default=height_std, help=f"of that height {default}")
     add(
         "--accuracy",
@@ -200,7 +204,7 @@ def parser() -> ArgumentParser:
         "--flights",
         metavar="FLIGHT",
         nargs="+",
-        help=f"measured accuracy beside the bound; {inputs.HELP}",
+        help=f"measured accuracy beside the bound; {choices.RECORDINGS}",
     )
     parallel.add_options(more)
     add("--improve", choices=("move", "add"), help="better places: move all anchors, or add one")
@@ -233,6 +237,11 @@ def parser() -> ArgumentParser:
 
 
 def _plan(args: Namespace) -> int:
+    from uwb_tdoa_bias.common.anchors import Anchors
+
+    from ..planning import run
+    from ..readers import inputs, read_survey
+
     run.check_options(args)
     anchors = None if args.hall else read_survey(args.anchors)
     room = run.room_of_options(args, anchors)

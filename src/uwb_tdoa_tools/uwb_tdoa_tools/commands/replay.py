@@ -7,8 +7,7 @@ from functools import partial
 import sys
 
 from .. import cli
-from ..live.replay import ACKNOWLEDGE_LIMIT, ReplayOptions, replay
-from ..live.session import PACKAGE
+from ..choices import WAIT
 
 DESCRIPTION = """Replay a bag over ROS topics with its own timing, like `ros2 bag play`.
 
@@ -50,12 +49,9 @@ def parser() -> argparse.ArgumentParser:
     add(
         "--wait-matched",
         type=_positive,
-        default=ReplayOptions.wait,
+        default=WAIT,
         metavar="SECONDS",
-        help=(
-            "wait at most this long until somebody subscribes, or fail (default "
-            f"{ReplayOptions.wait:g})"
-        ),
+        help=(f"wait at most this long until somebody subscribes, or fail (default {WAIT:g})"),
     )
     add(
         "--wait-topics",
@@ -65,11 +61,22 @@ def parser() -> argparse.ArgumentParser:
         help="wait until somebody subscribes to each of these topics",
     )
     add("--follow", metavar="TOPIC", help="keep in step with this topic, e.g. odometry")
-    add("--package", **PACKAGE)
+    add(
+        "--package",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help=(
+            "import message types of this package, too; the usual ones of ROS, and ours, are known; "
+            "may be repeated"
+        ),
+    )
     return made
 
 
 def _replay(args: argparse.Namespace) -> int:
+    from ..live.replay import ACKNOWLEDGE_LIMIT, ReplayOptions, replay
+
     say = partial(cli.say, "replay")
     done = replay(
         args.bag,

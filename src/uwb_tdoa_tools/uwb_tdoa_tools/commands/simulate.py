@@ -6,13 +6,10 @@ import sys
 from typing import TYPE_CHECKING
 
 from .. import cli
-from ..bags.bag import check_output, write_bag
-from ..bags.files import STORAGES
+from ..choices import STORAGES
 from ..outputs import OutputBag, OutputFile
 from ..parallel import Progress
-from ..simulation import simulate
-from ..simulation.options import add_options, config_of
-from ..simulation.report import catalogue, check_image, plot, summary
+from ..simulation_options import add_options
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
@@ -72,6 +69,11 @@ def parser() -> ArgumentParser:
 
 
 def _simulate(args: Namespace) -> None:
+    from ..bags.bag import check_output, write_bag
+    from ..simulation import simulate
+    from ..simulation.report import catalogue, check_image, plot, summary
+    from ..simulation_options import config_of
+
     if args.list:
         cli.show(catalogue())
         return

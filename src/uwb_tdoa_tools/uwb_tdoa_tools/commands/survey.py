@@ -7,21 +7,17 @@ import sys
 from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.files import write_text
-from uwb_tdoa_bias.effects import EffectSet
 
 from .. import cli, command_lines, options, parallel
-from ..checking.before_anchors import nothing_comes_first
-from ..diagnosis.noise import write_parameters
-from ..diagnosis.self_calibration import self_calibrate
-from ..estimate import FlightEstimator
 from ..outputs import OutputFolder
 from ..parallel import Progress
-from ..surveying.report import as_dict, as_text, picture, with_blocked
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
 
-FEW = 20  # flights; what fewer gain by other processes, these take to start (docs/notebook/speed.md)
+FEW = (
+    20  # flights; what fewer gain by other processes, these take to start (docs/notebook/speed.md)
+)
 
 DESCRIPTION = """Improve a tape-measured survey, from flights alone.
 
@@ -81,6 +77,14 @@ def parser() -> ArgumentParser:
 
 
 def _survey(args: Namespace) -> int:
+    from uwb_tdoa_bias.effects import EffectSet
+
+    from ..checking.before_anchors import nothing_comes_first
+    from ..diagnosis.noise import write_parameters
+    from ..diagnosis.self_calibration import self_calibrate
+    from ..estimate import FlightEstimator
+    from ..surveying.report import as_dict, as_text, picture, with_blocked
+
     out = args.out
     config, effects = options.filter_of(args)
     base, tape = effects or EffectSet(), options.tape_of(args, effects)

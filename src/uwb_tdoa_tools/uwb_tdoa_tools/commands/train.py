@@ -8,13 +8,9 @@ import sys
 from typing import TYPE_CHECKING
 
 from .. import cli, options, parallel
+from ..choices import MODELS
 from ..outputs import OutputFile, OutputFolder
 from ..parallel import Progress
-from ..readers import inputs
-from ..results_file import ResultsFile, fingerprint_of, resumed, settings_of
-from ..scoring.evaluation import with_aligned_truth
-from ..training import labels as labelling
-from ..training import models, shrinking
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
@@ -25,6 +21,7 @@ if TYPE_CHECKING:
 
     from ..parallel import MapFunction
     from ..readers.inputs import Reading
+    from ..results_file import ResultsFile
 
 # Options without influence on the results of a training; recordings count by their state.
 WITHOUT_INFLUENCE = "flights", "survey", "name", "out", "resume", "jobs", "dask"
@@ -60,7 +57,7 @@ def parser() -> ArgumentParser:
     )
     add = made.add_argument
     options.add_recordings(made)
-    add("--model", choices=models.KINDS, required=True, help="what to train")
+    add("--model", choices=MODELS, required=True, help="what to train")
     options.add_most(made, MOST)
     options.add_align(made)
     add("--out", metavar="DIR", type=OutputFolder, required=True, help="where to write")
@@ -86,6 +83,10 @@ def parser() -> ArgumentParser:
 
 
 def _train(args: Namespace) -> None:
+    from ..readers import inputs
+    from ..results_file import resumed
+    from ..scoring.evaluation import with_aligned_truth
+
     reading = options.reading_of(args)
     # As many for folds as for flights: with another number, joblib restarts all processes.
     jobs, dask = parallel.workers_for(args, len(reading.find(args.flights)), 2)
@@ -103,6 +104,8 @@ def _train(args: Namespace) -> None:
 
 def _kept(args: Namespace, reading: Reading) -> AbstractContextManager[ResultsFile | None]:
     """Return the ResultsFile of --resume, or a context of None."""
+    from ..results_file import ResultsFile, fingerprint_of, settings_of
+
     if args.resume is None:
         return nullcontext()
     recordings = [
@@ -115,6 +118,9 @@ def _write(
     args: Namespace, several: Sequence[Flight], over: MapFunction, progress: Progress
 ) -> None:
     """Train on several Flights, and write all results. over : as in `shrinking.train`."""
+    from ..training import labels as labelling
+    from ..training import models, shrinking
+
     flights = {flight.name: flight for flight in several}
     names = labelling.split(list(flights), args.seed, args.validation)
     for what, some in zip(("training on", "validating on"), names):

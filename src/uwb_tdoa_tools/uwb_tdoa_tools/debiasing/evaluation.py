@@ -13,8 +13,8 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.results import Odometry
 
+from ..choices import NONE
 from ..readers.inputs import Reading
-from ..scoring.alignment import NONE
 from ..scoring.evaluation import corrected_truth, evaluate, with_aligned_truth
 from ..scoring.gains import change_in_words, gain, gain_in_words
 from ..scoring.metrics import Score

@@ -17,8 +17,8 @@ from uwb_tdoa_ekf.offline import without_unknown_offset
 from uwb_tdoa_ekf.sensitivity import RANGES, TDOAS, record_innovations
 from uwb_tdoa_ekf.smoother import smooth
 
+from ..choices import NONE
 from ..clock import grid
-from ..scoring.alignment import NONE
 from ..scoring.evaluation import align_truth
 from ..scoring.metrics import scored_phase
 from ..scoring.phases import AIRBORNE, TITLES

@@ -1,21 +1,18 @@
-"""Draw what a correction does to a flight. The import selects a backend without a screen."""
+"""Draw what a correction does to a flight."""
 
 from __future__ import annotations
 
 from functools import partial
 from typing import TYPE_CHECKING
 
-import matplotlib
+import matplotlib.pyplot as plt
+import numpy as np
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
-import numpy as np  # noqa: E402
+from uwb_tdoa_bias.common.files import write_filled
+from uwb_tdoa_bias.effects.base import listed
 
-from uwb_tdoa_bias.common.files import write_filled  # noqa: E402
-from uwb_tdoa_bias.effects.base import listed  # noqa: E402
-
-from ..scoring.metrics import position_at  # noqa: E402
-from .loop import CM  # noqa: E402
+from ..scoring.metrics import position_at
+from .loop import CM
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

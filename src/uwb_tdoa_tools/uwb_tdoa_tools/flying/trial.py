@@ -34,7 +34,6 @@ REST_AFTER = 3.0  # s, recording after the rotors have stopped
 # s at rest between two flights, then distance, m, and duration, s, of carrying
 PAUSE, CARRIED, CARRY_TIME = 60.0, 2.0, 6.0
 OUTSIDE = 0.5  # m beyond the walls, end of a flight
-VEHICLES = "quadrotor", "rover"
 TIPPED = math.radians(75.0)  # tilt on the ground from which it cannot recover
 # s after switching on, and standard deviation, m and rad, of the given place and yaw
 GIVEN_AT, GIVEN_STD = 0.3, 0.1

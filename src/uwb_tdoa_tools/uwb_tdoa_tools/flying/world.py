@@ -13,6 +13,7 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 
+from ..choices import MOMENTS
 from ..simulation.config import ImuErrors
 from ..simulation.inject import parse_effect
 from ..simulation.rooms import corners
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
 # of a flight; a circle of no radius is hovering
-MOMENTS = ("rest", "lift-off", "circle", "landing", "anywhere")
 LONGEST_SILENCE = 60.0  # s
 
 

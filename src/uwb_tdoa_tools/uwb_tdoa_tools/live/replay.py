@@ -14,6 +14,7 @@ from rclpy.qos import DurabilityPolicy
 from uwb_tdoa_bias.common.errors import InputError
 
 from ..bags.files import messages, open_bag
+from ..choices import WAIT
 from .follow import Follower, Nodes
 from .player import ACKNOWLEDGE_LIMIT, LONGEST_SLEEP, Played, Player, is_tdoa, read_ahead
 from .session import message_class, publisher_qos, session
@@ -64,7 +65,7 @@ class ReplayOptions:
     rate: float = 1.0
     loop: bool = False
     clock_rate: float | None = None
-    wait: float = 10.0
+    wait: float = WAIT
     wait_topics: Sequence[str] = ()
     follow: str | None = None
     ros_arguments: Sequence[str] = ()

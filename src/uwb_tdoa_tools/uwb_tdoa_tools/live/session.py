@@ -7,7 +7,7 @@ from importlib import import_module
 import math
 import signal
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import rclpy
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -23,6 +23,7 @@ from rosbags.interfaces import (
 )
 
 from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.ros.process import refusal
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -36,15 +37,6 @@ KNOWN = frozenset(  # packages of message types: the usual ones of ROS, and ours
     sensor_msgs shape_msgs statistics_msgs std_msgs stereo_msgs tf2_msgs trajectory_msgs unique_identifier_msgs uwb_tdoa_msgs
     visualization_msgs""".split()
 )
-PACKAGE: dict[str, Any] = {  # the option that permits further packages
-    "action": "append",
-    "default": [],
-    "metavar": "NAME",
-    "help": (
-        "import message types of this package, too; the usual ones of ROS, and ours, are known; "
-        "may be repeated"
-    ),
-}
 AGAIN = 4.0  # s after which a node that has not answered is asked once more
 READER_DEPTH = 10_000  # messages that a subscription queues: 10 s of a 1 kHz stream
 
@@ -85,7 +77,7 @@ def session(name: str, arguments: Sequence[str]) -> Iterator[tuple[Node, Stop]]:
         try:
             rclpy.init(args=[name, *arguments], signal_handler_options=SignalHandlerOptions.NO)
         except (rclpy_implementation.RCLError, rclpy_implementation.UnknownROSArgsError) as error:
-            raise InputError(f"ROS arguments: {error}") from error
+            raise InputError(refusal(error)) from error
         try:
             # Without parameters and /rosout: a recording of all topics shall not hold our own.
             node = rclpy.create_node(name, start_parameter_services=False, enable_rosout=False)

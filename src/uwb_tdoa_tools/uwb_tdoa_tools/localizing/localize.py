@@ -48,14 +48,19 @@ COLUMNS = (
 SUFFIXES = ".gz", ".csv", ".bag", ".mcap", ".db3", ".log"
 
 
-def write_trajectory(path: Path, odometry: Odometry) -> None:
-    """Write an Odometry as CSV, one line per estimate, in the world frame.
+def trajectory_rows(odometry: Odometry) -> np.ndarray:
+    """Return the COLUMNS of an Odometry, (n, 18), in the world frame.
 
     Columns: s, m, quaternion from body to world, m/s, then standard deviations in m, m/s and rad.
     """
     std = np.sqrt(np.einsum("nii->ni", odometry.covariance))
     yaw = rotation_std(odometry.q, odometry.covariance)[:, 2]
-    rows = np.column_stack([odometry.t, odometry.p, odometry.q, odometry.v, std[:, :6], yaw])
+    return np.column_stack([odometry.t, odometry.p, odometry.q, odometry.v, std[:, :6], yaw])
+
+
+def write_trajectory(path: Path, odometry: Odometry) -> None:
+    """Write `trajectory_rows` of an Odometry as CSV, one line per estimate."""
+    rows = trajectory_rows(odometry)
     kinds = ["%.9f"] + ["%.6f"] * (len(COLUMNS) - 1)
     write_filled(
         path,

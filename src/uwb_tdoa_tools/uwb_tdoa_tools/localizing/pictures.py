@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from types import ModuleType
 
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
     from uwb_tdoa_bias.effects import EffectSet
     from uwb_tdoa_ekf.core.config import FilterConfig
@@ -36,9 +37,6 @@ if TYPE_CHECKING:
 ELLIPSES = 60  # along the path
 SIGMAS = 3.0
 MARGIN = 0.5  # m around anchors and path
-RERUN_HELP = (
-    "write a recording for the viewer Rerun, too (.rrd; of one flight; needs pip install rerun-sdk)"
-)
 RERUN_RATE = 20.0  # Hz, of poses that are written
 BLUE, RED, GREY, BLACK, ORANGE = (
     (31, 119, 180),
@@ -56,7 +54,15 @@ def draw_estimate(
     spans: Sequence[tuple[float, float]],
     title: str,
 ) -> None:
-    """Draw an Odometry among Anchors, from above, from the side, and over time.
+    """Write the `estimate_figure` of an Odometry to an image file."""
+    figure = estimate_figure(odometry, anchors, spans, title)
+    write_filled(path, partial(figure.savefig, dpi=110))
+
+
+def estimate_figure(
+    odometry: Odometry, anchors: Anchors, spans: Sequence[tuple[float, float]], title: str
+) -> Figure:
+    """Return a Figure of an Odometry among Anchors, from above, from the side, and over time.
 
     Parameters
     ----------
@@ -99,7 +105,7 @@ def draw_estimate(
         ax.grid(alpha=0.25)
     ax.set_xlabel("time of the estimate [s]")
     figure.suptitle(title, fontsize=11)
-    write_filled(path, partial(figure.savefig, dpi=110))
+    return figure
 
 
 def _plane(

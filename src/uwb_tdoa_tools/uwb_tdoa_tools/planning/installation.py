@@ -14,6 +14,7 @@ from uwb_tdoa_bias.common.radio import SPEED_OF_LIGHT, Antenna, RadioLink, recei
 from uwb_tdoa_bias.common.safe_yaml import read_yaml
 
 from ..checking.coverage import sides_of, to_copy
+from ..choices import TEMPERATURE, VOLTAGE
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -59,8 +60,8 @@ class RadioNoise:
 
     antenna: Antenna = field(default_factory=Antenna)
     tx_power_dbm: float = RadioLink.tx_power_dbm
-    temperature: float = 25.0
-    voltage: float = 3.3
+    temperature: float = TEMPERATURE
+    voltage: float = VOLTAGE
     tx_power_per_degree: float = -0.05
     tx_power_per_volt: float = 2.73
     bandwidth: float = 499.2e6
@@ -271,13 +272,6 @@ PAIRINGS: dict[str, Callable[[int], Pairing]] = {
     "every_range": every_range,
     "ring+every_range": _beside_ranges(ring),
     "all_pairs+every_range": _beside_ranges(all_pairs),
-}
-OF_PROTOCOL = {
-    "tdoa2": "ring",
-    "tdoa3": "all_pairs",
-    "ranges": "every_range",
-    "tdoa2+ranges": "ring+every_range",
-    "tdoa3+ranges": "all_pairs+every_range",
 }
 
 

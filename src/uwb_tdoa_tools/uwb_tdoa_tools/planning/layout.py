@@ -142,7 +142,6 @@ def spread(points: np.ndarray, count: int) -> np.ndarray:
     return np.array(rows[:count])
 
 
-OBJECTIVES = ("worst", "mean")
 # m, stands for an infinite bound, and for a layout that determines no position
 UNUSABLE = 100.0
 

@@ -15,6 +15,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import SENSOR_NAMES
 from uwb_tdoa_bias.common.flyable import FlyableVolume
 
+from ..choices import ACCURACY
 from ..scoring.evaluation import evaluate
 from ..scoring.metrics import position_at
 from ..simulation.rooms import Room
@@ -35,15 +36,6 @@ if TYPE_CHECKING:
     # gives the same items, and prints how many are done
     Wrap = Callable[[Iterable[Any]], Iterable[Any]]
 
-# m, of the bound of one round: the default of --accuracy
-ACCURACY = 0.5
-CRITERIA = {
-    "round": "a whole round of all that is heard has one solution",
-    "pairings": (
-        "every choice of k + 1 anchors alone has one solution, inside their hull (Grasso et al., "
-        "sec. 2.3.2)"
-    ),
-}
 # States of a place. OUTSIDE of the hull counts with "pairings" only.
 FLYABLE, TWO_SOLUTIONS, IMPRECISE, TOO_FEW, OUTSIDE = range(5)
 _CHUNK = 2_000_000  # numbers in the largest array of one step

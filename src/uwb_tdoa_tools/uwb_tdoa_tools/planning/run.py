@@ -13,12 +13,12 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.radio import Antenna
 
 from .. import cli, parallel
+from ..choices import OF_PROTOCOL
 from ..parallel import Progress
 from ..readers.inputs import Reading
 from ..simulation.rooms import Room, Walls, room_of
 from . import hall, maps, optimisation, plots, report
 from .installation import (
-    OF_PROTOCOL,
     PAIRINGS,
     FixedNoise,
     Installation,

@@ -66,12 +66,6 @@ UNITS = {name: units for columns in STREAMS.values() for name, (_, units) in col
 UNITS |= {
     name: TIME for name in ("time", *sorted({name for names in TIMES.values() for name in names}))
 }
-HELP = (
-    "for CSV files of other tools: their columns, OURS=THEIRS[:UNIT],... (anchor_a, anchor_b, "
-    "tdoa; or anchor, range; "
-    "gyro_x ...; accel_x ...; pose_x ...; time, or tdoa_time, range_time, imu_time, "
-    "gyro_time, accel_time, pose_time where a sensor has its own)"
-)
 
 
 def parse_columns(text: str) -> Columns:

@@ -32,13 +32,6 @@ if TYPE_CHECKING:
 
     Recording = tuple[Path, str | Path | None]  # and its survey
 
-HELP = "recordings: raw logs, UTIL CSV files, bags, or folders that hold them"
-SURVEY_HELP = (
-    "anchor survey (total station .txt, const .csv or anchors .yaml), or a folder of them: "
-    "then anchor_KEY.* serves "
-    "the recordings whose path contains KEY; counts in place of the anchors that bags hold, "
-    "which keep their own where no KEY fits"
-)
 
 _REPORTED: set[str | Path | None] = set()  # surveys whose use for bags was printed
 

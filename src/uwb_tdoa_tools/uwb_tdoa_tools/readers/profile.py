@@ -26,10 +26,6 @@ if TYPE_CHECKING:
 
 SHIPPED = Path(__file__).resolve().parent / "profiles"
 BODY, WORLD = ("flu", "frd"), ("enu", "ned")  # axes; the first is ours
-HELP = (
-    "how to read recordings of others: a profile that is shipped "
-    "(convert --suggest names it), or your own YAML file (docs/connect.md)"
-)
 MOST_STARS = 4  # of a pattern; the time to compare it grows with each
 _KEYS = {"about", "sources", "types", "antenna"}
 _SOURCE = {"topic", "type", "each", "where", "tag", "columns", "body", "world"}

@@ -22,9 +22,9 @@ from ..checking.imu_rules import ARRANGEMENTS, signed_axis
 from ..checking.motion_rules import FEWEST, TrueMotion
 from ..checking.pair_rules import KnownPath
 from ..checking.time_rules import delays_of_tdoas
+from ..choices import NONE, TIME
 from ..clock import grid
 from .metrics import position_at, scored_phase
-from .pooling import ALIGN
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 
     from ..checking.time_rules import Delays
 
-NONE, TIME, FRAME = ALIGN
 # Limits beside measured values were set on 37 recordings with a correct ground truth.
 OVERLAP = 1.0  # s that ground truth and TDOAs must have in common
 LATE = 0.965  # largest ratio of the power after and before a delay is corrected; measured: >= 0.984

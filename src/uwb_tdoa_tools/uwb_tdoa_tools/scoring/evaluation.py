@@ -10,12 +10,10 @@ import numpy as np
 from uwb_tdoa_bias.effects import RADIO, EffectSet, true_samples
 
 from ..checking.pair_rules import repairs
+from ..choices import FRAME, NONE, TIME
 from ..estimate import FlightEstimator
 from ..readers.inputs import report_remarks
 from .alignment import (
-    FRAME,
-    NONE,
-    TIME,
     common_paths,
     estimate_alignment,
     median_distance,

@@ -1,21 +1,19 @@
-"""Pictures of errors, and labels of anchors. The import selects a backend without a screen."""
+"""Pictures of errors, and labels of anchors."""
 
 from __future__ import annotations
 
 from functools import partial
 from typing import TYPE_CHECKING
 
-import matplotlib
+from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+import matplotlib.pyplot as plt
+import numpy as np
 
-matplotlib.use("Agg")
-from matplotlib.patheffects import withStroke  # noqa: E402
-import matplotlib.pyplot as plt  # noqa: E402
-import numpy as np  # noqa: E402
+from uwb_tdoa_bias.common.files import write_filled
 
-from uwb_tdoa_bias.common.files import write_filled  # noqa: E402
-
-from .metrics import position_at  # noqa: E402
-from .phases import TITLES  # noqa: E402
+from .metrics import position_at
+from .phases import TITLES
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -43,8 +41,14 @@ _WIDE, _HIGH = 0.62, 1.15  # of the size of the letters: a letter, and a line
 
 
 def plot_error(score: Score, odometry: Estimate, truth: Truth, path: str | Path) -> None:
-    """Draw the error per axis with its 3-sigma band, phases, and the path, to an image file."""
-    figure, axes = plt.subplots(3, 2, figsize=(13, 8), width_ratios=(3, 2), layout="constrained")
+    """Write the `error_figure` of a Score to an image file."""
+    write_filled(path, partial(error_figure(score, odometry, truth).savefig, dpi=110))
+
+
+def error_figure(score: Score, odometry: Estimate, truth: Truth) -> Figure:
+    """Return a Figure of the error per axis with its 3-sigma band, the phases, and the path."""
+    figure = Figure(figsize=(13, 8), layout="constrained")
+    axes = figure.subplots(3, 2, width_ratios=(3, 2))
     series, found = score.series, score.phases()
     std = np.sqrt(np.einsum("nii->ni", series.covariance))
     since = series.t - truth.t[0]
@@ -89,8 +93,7 @@ def plot_error(score: Score, odometry: Estimate, truth: Truth, path: str | Path)
         f"{row['flight']}: 3D RMSE {row['rmse_3d']:.3f} m {where}, "
         f"{found['whole']['rmse_3d']:.3f} m of all"
     )
-    write_filled(path, partial(figure.savefig, dpi=110))
-    plt.close(figure)
+    return figure
 
 
 def plot_comparison(flight: Flight, scores: Sequence[Score], path: str | Path) -> None:

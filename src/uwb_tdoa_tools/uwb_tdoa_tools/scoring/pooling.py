@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..choices import ALIGN
 from ..outputs import as_json
 from .phases import TITLES
 
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
 
 RATIO = 1.01  # ratio of the limits of a bin
 SMALLEST = 1e-9  # smaller samples count as this
-ALIGN = "none", "time", "frame"  # how far a ground truth is aligned before scoring
 FIGURES = 3  # version of the content of a Result
 
 

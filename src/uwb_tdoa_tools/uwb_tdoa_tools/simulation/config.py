@@ -12,6 +12,7 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.sensors import SENSORS
 
+from ..choices import PROTOCOLS, YAW_PROFILES
 from .rooms import Walls, constellation, room_of
 
 if TYPE_CHECKING:
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
 
 
 MOST_HEARD = 64  # largest number of anchors that a tag hears at once
-YAW_PROFILES = ("fixed", "along_track", "rotating")
 WHEELS_RATE = 50.0  # Hz
 FARTHEST = 1e5  # m, of a point of a path
 VEHICLE_DEFAULTS = MappingProxyType(
@@ -41,7 +41,6 @@ VEHICLE_DEFAULTS = MappingProxyType(
     }
 )
 NOISES = tuple(f"{name}_noise" for name in SENSORS)
-PROTOCOLS = ("tdoa2", "tdoa3")
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,8 @@ def parse_effect(name: str, values: Sequence[str]) -> Effect:
 
     Raises InputError.
     """
+    if name not in EFFECTS:
+        raise InputError(f"--effect: {name!r} is not known; choose {', '.join(EFFECTS)}.")
     kind = EFFECTS[name]
     parameters: dict[str, Any] = {}  # the Effect converts the texts
     for text in ",".join(values).split(","):

@@ -13,6 +13,7 @@ from uwb_tdoa_bias.common.limits import TABLE_CELLS
 from uwb_tdoa_bias.common.safe_yaml import read_yaml
 
 from ..bags.bag import read_odometry
+from ..choices import DRIFT
 from ..diagnosis.constraints import Distance, Mark, OdometryPath
 from ..readers.tables import number, read_table
 
@@ -27,8 +28,6 @@ MARK_KEYS = ("flight", "from", "to", "position", "std")
 MARK_EXAMPLE = "{flight: monday, from: 12.0, to: 14.0, position: [1.0, -2.0, 0.5], std: 0.05}"
 DISTANCE_COLUMNS = "a", "b", "distance", "std"
 PATH_COLUMNS = "t", "x", "y", "z"
-# m per square root of a second: 1 % after 200 m at 1 m/s, as visual-inertial odometry
-DRIFT = 0.02
 
 
 def read_marks(path: str | Path, flights: Sequence[Flight]) -> list[Mark]:

@@ -14,6 +14,7 @@ from uwb_tdoa_bias.correction.corrector import LARGEST_YAW_STD
 from uwb_tdoa_bias.correction.features import columns
 from uwb_tdoa_bias.effects import EffectSet
 
+from ..choices import MODELS
 from . import labels as labelling
 from . import linear, network, physics, structured
 
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
     LearningCurve = tuple[str, list[int], list[float], list[float]]
 
 
-KINDS = ("paper", "paper_no_orientation", "structured", "physics", "physics+structured")
 SPACING = 0.01  # s between training samples: closer samples hold no more information
 CLIP = 1.0  # m
 # the correction fades over: positions, m, components of the forward axis and of the up axis
@@ -52,7 +52,7 @@ class Recipe(NamedTuple):
     Parameters
     ----------
     kind : str
-        One of KINDS.
+        One of MODELS.
     seed : int
         Seed of all random numbers.
     options : StructuredPriors
@@ -128,8 +128,8 @@ def train(
         If the kind is unknown or a flight cannot be used.
     """
     kind, seed, _ = recipe
-    if kind not in KINDS:
-        raise InputError(f"model: {kind!r} is not known; choose {', '.join(KINDS)}.")
+    if kind not in MODELS:
+        raise InputError(f"model: {kind!r} is not known; choose {', '.join(MODELS)}.")
     raw = groups = _labels(training, validation)
     effects: EffectSet | None = None
     model: Paper | Structured | None = None

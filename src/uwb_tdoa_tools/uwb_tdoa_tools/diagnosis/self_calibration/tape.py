@@ -9,6 +9,8 @@ import numpy as np
 
 from uwb_tdoa_bias.common.errors import InputError
 
+from ...choices import TAPE_STD, TRUSTED_STD
+
 if TYPE_CHECKING:
     from uwb_tdoa_bias.common.anchors import Anchors
 
@@ -24,10 +26,10 @@ class Tape:
     unknown : ids of anchors with unknown positions
     """
 
-    std: float = 0.1
+    std: float = TAPE_STD
     height_std: float | None = None
     trusted: tuple[str, ...] = ()
-    trusted_std: float = 0.01
+    trusted_std: float = TRUSTED_STD
     unknown: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

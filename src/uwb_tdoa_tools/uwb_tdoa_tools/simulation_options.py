@@ -5,27 +5,18 @@ from __future__ import annotations
 import argparse
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.sensors import SENSORS
-from uwb_tdoa_bias.common.survey import refuse_faulty
 
-from .config import (
-    NO_IMU_ERRORS,
-    PROTOCOLS,
-    VEHICLE_DEFAULTS,
-    YAW_PROFILES,
-    ImuErrors,
-    SimulationConfig,
-)
-from .paths import TRAJECTORIES
-from .rooms import Walls
+from .choices import CARRIERS, PROTOCOLS, TRAJECTORIES, YAW_PROFILES
+
+if TYPE_CHECKING:
+    from .simulation.config import SimulationConfig
 
 
 def add_options(made: argparse.ArgumentParser) -> None:
     """Add the options to a parser."""
-    default = SimulationConfig()
     # not given: the usual value of the vehicle
     unless: dict[str, Any] = {"default": argparse.SUPPRESS}
     made_path = made.add_argument_group("motion")
@@ -36,14 +27,12 @@ def add_options(made: argparse.ArgumentParser) -> None:
     )
     add(
         "--vehicle",
-        choices=VEHICLE_DEFAULTS,
-        default=default.vehicle,
+        choices=CARRIERS,
+        default="quadrotor",
         help=f"{words} (default: quadrotor)",
     )
     path = made_path.add_mutually_exclusive_group()
-    path.add_argument(
-        "--trajectory", choices=TRAJECTORIES, **unless, help=f"(default: {default.trajectory})"
-    )
+    path.add_argument("--trajectory", choices=TRAJECTORIES, **unless, help="(default: sines)")
     path.add_argument(
         "--path",
         metavar="'X,Y X,Y ...'",
@@ -62,7 +51,7 @@ def add_options(made: argparse.ArgumentParser) -> None:
         "--duration",
         metavar="S",
         type=float,
-        default=default.duration,
+        **unless,
         help="of the recording, s (default: 60)",
     )
     add(
@@ -111,7 +100,7 @@ def add_options(made: argparse.ArgumentParser) -> None:
         "--seed",
         metavar="N",
         type=int,
-        default=default.seed,
+        **unless,
         help="of everything random (default: 0)",
     )
 
@@ -122,7 +111,7 @@ def add_options(made: argparse.ArgumentParser) -> None:
     room.add_argument(
         "--anchors", metavar="FILE.yaml", type=Path, help="your own anchors, with orientations"
     )
-    add, share = radio.add_argument, default.outlier_probability
+    add = radio.add_argument
     off: dict[str, Any] = {"action": "store_false"}
     add("--protocol", choices=PROTOCOLS, **unless, help="(default: tdoa2; rover: tdoa3)")
     add(
@@ -158,7 +147,7 @@ def add_options(made: argparse.ArgumentParser) -> None:
         dest="noise_std",
         metavar="M",
         type=float,
-        default=default.noise_std,
+        **unless,
         help="standard deviation, m (default: 0.06)",
     )
     add(
@@ -171,8 +160,8 @@ def add_options(made: argparse.ArgumentParser) -> None:
         dest="outlier_probability",
         action="store_const",
         const=0.0,
-        default=share,
-        help=f"otherwise {100.0 * share:g} %% of the TDOAs are",
+        **unless,
+        help="otherwise 1 %% of the TDOAs are",
     )
     add(
         "--no-bias",
@@ -206,6 +195,12 @@ def add_options(made: argparse.ArgumentParser) -> None:
 
 def config_of(args: argparse.Namespace) -> SimulationConfig:
     """Return the SimulationConfig of the options; most have the names of its fields."""
+    from uwb_tdoa_bias.common.anchors import Anchors
+    from uwb_tdoa_bias.common.survey import refuse_faulty
+
+    from .simulation.config import NO_IMU_ERRORS, ImuErrors, SimulationConfig
+    from .simulation.rooms import Walls
+
     values = {
         field.name: getattr(args, field.name)
         for field in fields(SimulationConfig)

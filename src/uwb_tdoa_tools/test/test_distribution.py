@@ -1,0 +1,178 @@
+"""The distribution `uwb-tdoa`: a wheel in an empty environment, without ROS.
+
+The environments lie in build/distribution, always at the same paths: what numba compiled there for a
+wheel serves the next run, too.
+"""
+
+import json
+import os
+from pathlib import Path
+import re
+import shutil
+import subprocess
+import sys
+import zipfile
+
+from documented import ROOT
+import pytest
+
+from uwb_tdoa_bias.common.text import version
+from uwb_tdoa_tools import main
+from uwb_tdoa_tools.bags.bag import write_bag
+from uwb_tdoa_tools.command_lines import COMMAND, RUN
+from uwb_tdoa_tools.simulation import SimulationConfig, simulate
+
+pytestmark = pytest.mark.slow
+
+HERE = f"{sys.version_info.major}.{sys.version_info.minor}"
+NO_INDEX = r"NewConnectionError|NameResolution|Timeout|ProxyError|from versions: none"
+
+
+def run(*words, folder=None, code=0, **variables):
+    """Run a program as a user without ROS does, and return what it printed."""
+    plain = {name: os.environ[name] for name in ("HOME", "TMPDIR") if name in os.environ}
+    plain |= {name: value for name, value in os.environ.items() if name.startswith("PIP_")}
+    done = subprocess.run(
+        list(map(str, words)),
+        cwd=folder,
+        env={**plain, "PATH": "/usr/bin:/bin", **variables},
+        capture_output=True,
+        text=True,
+    )
+    if re.search(NO_INDEX, done.stderr) and "pip" in words:
+        pytest.skip("no package index can be reached")
+    assert done.returncode == code, (words, done.stdout, done.stderr)
+    return done.stdout
+
+
+def python_of(number):
+    """A Python of that version that can make an environment; skips the test where there is none."""
+    pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
+    found = [sys.base_prefix + f"/bin/python{number}", shutil.which(f"python{number}")]
+    found += sorted(pyenv.glob(f"{number}*/bin/python"))
+    code = f"import ensurepip, sys, venv; assert '%d.%d' % sys.version_info[:2] == '{number}'"
+    for candidate in filter(None, found):
+        if (
+            Path(candidate).exists()
+            and not subprocess.run([candidate, "-I", "-c", code], capture_output=True).returncode
+        ):
+            return candidate
+    pytest.skip(f"no Python {number} here")
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("wheel")
+    run(sys.executable, "-m", "pip", "wheel", "--no-deps", "-w", folder, ROOT, folder=folder)
+    (path,) = folder.glob("*.whl")
+    return path
+
+
+def installed(wheel, number):
+    """The folder of the programs of a new environment with the wheel, and what it needs by our pins."""
+    place = ROOT / "build" / "distribution" / number
+    shutil.rmtree(place, ignore_errors=True)
+    run(python_of(number), "-m", "venv", place)
+    pins = wheel.with_name("pins.txt")
+    lines = (ROOT / "requirements.txt").read_text().splitlines()
+    pins.write_text("\n".join(line for line in lines if re.match(r"[\w.-]+==", line)))
+    pip = (place / "bin" / "python", "-m", "pip", "install", "--only-binary", ":all:", "-c", pins)
+    run(*pip, wheel)
+    return place / "bin"
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """A bag with our message types, and its anchors."""
+    folder = tmp_path_factory.mktemp("recording")
+    settings = {"duration": 16.0, "imu_rate": 100.0, "start_in_air": True, "seed": 4}
+    flight = simulate(SimulationConfig(truth_rate=50.0, **settings))
+    write_bag(flight, folder / "flight.bag")
+    flight.anchors.to_yaml(folder / "anchors.yaml")
+    return folder
+
+
+def test_the_wheel_holds_the_packages_and_our_messages(wheel):
+    assert wheel.name == f"uwb_tdoa-{version()}-py3-none-any.whl"
+    names = zipfile.ZipFile(wheel).namelist()
+    tops = {name.partition("/")[0] for name in names}
+    packages = {"uwb_tdoa", "uwb_tdoa_bias", "uwb_tdoa_ekf", "uwb_tdoa_tools"}
+    assert tops == packages | {f"uwb_tdoa-{version()}.dist-info"}
+    held = {name.rpartition("/")[2] for name in names if name.endswith(".msg")}
+    assert held == {path.name for path in (ROOT / "src/uwb_tdoa_msgs/msg").glob("*.msg")}
+    assert not any("/test/" in name for name in names)
+    for package in packages - {"uwb_tdoa"}:
+        sources = ROOT / "src" / package / package
+        files = {path.relative_to(sources).as_posix() for path in sources.rglob("*.*")}
+        files = {name for name in files if not re.search(r"__pycache__|\.nb[ic]$", name)}
+        assert {f"{package}/{name}" for name in files} <= set(names)
+
+
+@pytest.mark.parametrize("number", ["3.10", "3.11", "3.12"])
+def test_every_command_starts_in_an_empty_environment(wheel, recording, tmp_path, number):
+    programs = installed(wheel, number)
+    ours = {path.name for path in programs.iterdir()}
+    assert COMMAND in ours and not ours & set(main.NAMES)  # `convert` is ImageMagick's
+    tool = programs / COMMAND
+    assert run(tool, "--version") == f"uwb-tdoa of uwb_tdoa {version()}\n"
+    for name in main.NAMES:
+        assert run(tool, name, "--help").startswith(f"usage: uwb-tdoa {name} ")
+    assert "complete " in run(tool, "--completion")
+    code = "import uwb_tdoa as uwb; print(len(uwb.read('flight.bag').tdoa) > 1000, uwb.__version__)"
+    told = run(programs / "python", "-I", "-c", code, folder=recording)
+    assert told.split() == ["True", version()]
+
+
+# what each command gets, and the files that it writes
+WORK = {
+    "check": (["flight.bag", "--json", "OUT/check.json"], 0),
+    "evaluate": (["flight.bag", "--json", "OUT/evaluate.json", "--tum", "OUT/tum"], 0),
+    "localize": (["flight.bag", "--smooth", "--out", "OUT/localized"], None),
+    "diagnose": (["flight.bag", "--most", "4000", "--out", "OUT/diagnosis"], 0),
+    "survey": (["flight.bag", "--out", "OUT/surveyed"], None),
+    "plan": (["anchors.yaml", "--step", "1", "--json", "OUT/plan.json"], 0),
+}
+FIGURES = ".json", ".csv", ".tum", ".yaml", ".html"
+
+
+def figures(folder):
+    """{path of a file of figures: content} below a folder. The folder has no part in them."""
+    return {
+        path.relative_to(folder): path.read_bytes().replace(str(folder).encode(), b"OUT")
+        for path in sorted(folder.rglob("*"))
+        if path.suffix in FIGURES
+    }
+
+
+def test_figures_are_those_with_ros_bit_by_bit(wheel, recording, tmp_path):
+    tool, made = installed(wheel, HERE) / COMMAND, {}
+    for name, (words, code) in WORK.items():
+        results = []
+        for side in ("with", "without"):
+            out = tmp_path / side
+            out.mkdir(exist_ok=True)
+            line = [word.replace("OUT", str(out)) for word in words]
+            if side == "without":
+                done = subprocess.run(
+                    [tool, name, *line],
+                    cwd=recording,
+                    env={"HOME": os.environ["HOME"], "PATH": "/usr/bin:/bin"},
+                    capture_output=True,
+                    text=True,
+                )
+            else:
+                start = [sys.executable, "-m", f"uwb_tdoa_tools.commands.{name}"]
+                variables = {**os.environ, "OMP_NUM_THREADS": "1", RUN: COMMAND}
+                done = subprocess.run(
+                    [*start, *line], cwd=recording, env=variables, capture_output=True, text=True
+                )
+            assert done.returncode in ((0, 1) if code is None else (code,)), done.stderr
+            results.append((done.returncode, done.stdout.replace(str(out), "OUT")))
+        assert results[0] == results[1], name
+        made[name] = results
+    with_ros, without = (figures(tmp_path / side) for side in ("with", "without"))
+    assert with_ros.keys() == without.keys()
+    for path, content in with_ros.items():
+        assert content == without[path], path
+    assert json.loads((tmp_path / "without" / "evaluate.json").read_text())["runs"]
+    assert len(with_ros) >= 9

@@ -1,0 +1,193 @@
+"""The public module: its names, what they take, and what examples and the page make of it."""
+
+import ast
+import inspect
+import json
+import os
+from pathlib import Path
+import re
+import subprocess
+import sys
+
+from documented import ROOT
+import numpy as np
+import pytest
+import uwb_tdoa as uwb
+
+from uwb_tdoa_bias.common.text import version
+from uwb_tdoa_bias.effects import EFFECTS
+
+# What a new version may add to, and may not take from.
+SIGNATURES = {
+    "calibrate": "flights holdout=() *effects=None *config=None *truth=None *tape=None",
+    "check": "flight",
+    "diagnose": "flights holdout=() *effects=None *config=None *reference='truth'",
+    "effect": "kind",
+    "errors": "flight run effects=None",
+    "filter": "flight effects=None config=None model=None",
+    "plot": "flight run",
+    "plot_errors": "flight run effects=None",
+    "read": "path survey=None *namespace='' *topics=None *salvage=False",
+    "report": "diagnosis",
+    "simulate": "vehicle='quadrotor' **settings",
+    "smooth": "flight effects=None config=None model=None",
+    "table": "part",
+    "write": "flight path *force=False",
+}
+OTHERS = """Anchors ArrivalEffect EFFECTS Effect EffectSet FilterConfig Flight InputError Row Run
+    Tape""".split()
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+PAGE = ROOT / "docs" / "python.md"
+
+
+def words_of(function):
+    """The arguments of a function: name, default, * before those that need their name."""
+    parts = []
+    for each in inspect.signature(function).parameters.values():
+        before = {each.KEYWORD_ONLY: "*", each.VAR_KEYWORD: "**"}.get(each.kind, "")
+        default = "" if each.default is each.empty else f"={each.default!r}"
+        parts.append(f"{before}{each.name}{default}")
+    return " ".join(parts)
+
+
+def test_names_and_arguments_are_as_promised():
+    assert sorted(uwb.__all__) == sorted([*SIGNATURES, *OTHERS]) and set(uwb.__all__) <= set(
+        dir(uwb)
+    )
+    assert {name: words_of(getattr(uwb, name)) for name in SIGNATURES} == SIGNATURES
+    assert uwb.__version__ == version()
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        uwb.nothing  # noqa: B018
+
+
+def test_every_name_is_documented():
+    text = PAGE.read_text()
+    table = re.findall(r"^\| (`.*?) \|", text, re.MULTILINE)
+    listed = re.findall(r"`(\w+)`", " ".join(table))
+    assert {*listed, "Tape"} == {*uwb.__all__}
+    for name in SIGNATURES:
+        assert inspect.getdoc(getattr(uwb, name))
+    for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+        used = {node.attr for node in ast.walk(ast.parse(block)) if is_of_uwb(node)}
+        assert used <= set(uwb.__all__)
+    assert {path.name for path in (ROOT / "examples").iterdir() if path.is_file()} == set(
+        re.findall(r"`(\w+\.(?:py|ipynb))`", text)
+    )
+
+
+def is_of_uwb(node):
+    return isinstance(node, ast.Attribute) and getattr(node.value, "id", "") == "uwb"
+
+
+def test_the_module_is_imported_in_no_time():
+    """It imports a library when a function needs one."""
+    code = "import sys, uwb_tdoa; print(*{'numpy', 'numba', 'scipy', 'matplotlib'} & sys.modules.keys())"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "\n", "")
+
+
+@pytest.fixture
+def own():
+    """A decorated effect, which is forgotten afterwards."""
+    known = dict(EFFECTS)
+
+    def make(name, module=__name__):
+        row = uwb.Row(name, "m", 1.0, 0.01, 0.1, "x", "an example", "nothing")
+        return type("Own", (uwb.ArrivalEffect,), {"row": row, "__module__": module})
+
+    yield make
+    EFFECTS.clear()
+    EFFECTS.update(known)
+
+
+def test_an_effect_of_your_own_is_known_everywhere(own, tmp_path):
+    kind = uwb.effect(own("warmth"))
+    assert uwb.EFFECTS["warmth"] is kind
+    assert uwb.effect(own("warmth")) is uwb.EFFECTS["warmth"] is not kind  # a cell that runs again
+    with pytest.raises(ValueError, match="an effect of that name exists"):
+        uwb.effect(own("anchor_delay"))
+    with pytest.raises(ValueError, match="has no `row`"):
+        uwb.effect(type("Bare", (uwb.Effect,), {}))
+
+
+@pytest.fixture(scope="module")
+def flight():
+    return uwb.simulate(duration=12.0, imu_rate=100.0, start_in_air=True, seed=4)
+
+
+def columns(table):
+    return list(table.columns if hasattr(table, "columns") else table.dtype.names)
+
+
+@pytest.mark.parametrize("with_pandas", [False, True])
+def test_tables_are_of_pandas_or_of_numpy(flight, monkeypatch, with_pandas):
+    if with_pandas:
+        pytest.importorskip("pandas")
+    else:
+        monkeypatch.setitem(sys.modules, "pandas", None)
+    tdoa, imu, truth = map(uwb.table, (flight.tdoa, flight.imu, flight.truth))
+    assert columns(tdoa) == ["t", "a", "b", "d", "variance"]
+    assert columns(imu) == ["t", *(f"{one}_{k}" for one in ("gyro", "accel") for k in "xyz")]
+    assert columns(truth) == ["t", "p_x", "p_y", "p_z", "q_x", "q_y", "q_z", "q_w"]
+    assert isinstance(tdoa, np.ndarray) != with_pandas and len(tdoa) == len(flight.tdoa)
+    np.testing.assert_array_equal(tdoa["d"], flight.tdoa.d)
+    np.testing.assert_array_equal(truth["p_z"], flight.truth.p[:, 2])
+
+
+def run_in(folder, program):
+    """Run a program of the examples, in a folder; returns what it printed."""
+    done = subprocess.run(
+        [sys.executable, program],
+        cwd=folder,
+        env={**os.environ, "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def numbers(pattern, text):
+    return [float(found) for found in re.findall(pattern, text)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("program", EXAMPLES, ids=lambda path: path.stem)
+def test_an_example_does_what_it_says(program, tmp_path):
+    told = run_in(tmp_path, program)
+    written = {path.name for path in tmp_path.iterdir()}
+    if program.stem == "locate":
+        assert "estimates, the first at x =" in told and "circle.png" in written
+    elif program.stem == "compare":
+        filtered, smoothed = numbers(r"RMSE ([\d.]+)", told)
+        assert smoothed < filtered and "errors.png" in written
+    elif program.stem == "find_error":
+        without, corrected = numbers(r"RMSE ([\d.]+)", told)
+        assert "anchor_delay" in told and corrected < 0.5 * without
+        assert {"report.html", "effects.yaml"} <= written
+    elif program.stem == "calibrate":
+        taped, calibrated = numbers(r"RMSE ([\d.]+)", told)
+        assert calibrated < taped
+    else:
+        found = dict(re.findall(r"'(cosine|sine)': (-?[\d.]+)", told.partition("found ")[2]))
+        assert "found side_delay" in told
+        assert abs(float(found["cosine"]) - 0.3) < 0.1 and abs(float(found["sine"]) + 0.2) < 0.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.ipynb")), ids=lambda p: p.stem)
+def test_a_notebook_runs_cell_by_cell(path, tmp_path):
+    """Without its magic lines, which set where pictures appear. The value of a last line is shown."""
+    cells = json.loads(path.read_text())["cells"]
+    codes = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+    assert len(codes) > 3 and all(cell.get("outputs", []) == [] for cell in cells)
+    program = tmp_path / "notebook.py"
+    lines = []
+    for code in codes:
+        body = ast.parse(re.sub(r"^%.*$", "", code, flags=re.MULTILINE)).body
+        *before, last = map(ast.unparse, body)
+        shown = isinstance(body[-1], ast.Expr)
+        lines += [*before, f"print(type({last}).__name__)" if shown else last]
+    program.write_text("\n".join(lines))
+    told = run_in(tmp_path, Path(program)).split()
+    assert told.count("Figure") == 2 and len(told) >= 5
