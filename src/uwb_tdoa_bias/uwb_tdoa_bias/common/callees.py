@@ -34,7 +34,7 @@ class _Callee:
     """Key of a callee among the functions that can be called by compiled code."""
 
 
-class _Library(codegen.JITCodeLibrary):  # type: ignore[misc]  # numba has no types
+class _Library(codegen.JITCodeLibrary):
     """Code of a function: a root links its callees, a callee nothing."""
 
     def __init__(self, *args: Any) -> None:
@@ -81,7 +81,7 @@ def install() -> bool:
     first, last = TRIED
     if not first <= tuple(version_info[:2]) <= last:
         return False
-    kind = dispatcher.Dispatcher
+    kind: Any = dispatcher.Dispatcher
     as_usual = kind.get_call_template, kind.compile, kind.add_overload
     usual_template, usual_compile, usual_overload = as_usual
     usual_executable = cpu.CPUContext.get_executable
