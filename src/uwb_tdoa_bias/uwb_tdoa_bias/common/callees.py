@@ -84,7 +84,8 @@ def install() -> bool:
     kind: Any = dispatcher.Dispatcher
     as_usual = kind.get_call_template, kind.compile, kind.add_overload
     usual_template, usual_compile, usual_overload = as_usual
-    usual_executable = cpu.CPUContext.get_executable
+    context: Any = cpu.CPUContext
+    usual_executable = context.get_executable
 
     def get_call_template(self: Any, args: Any, kws: Any) -> Any:
         """Compile what compiled code is about to call."""
@@ -131,6 +132,6 @@ def install() -> bool:
 
     kind.get_call_template, kind.compile = get_call_template, compile_function
     kind.add_overload = add_overload
-    cpu.CPUContext.get_executable = get_executable
+    context.get_executable = get_executable
     codegen.JITCPUCodegen._library_class = _Library
     return True
