@@ -9,7 +9,7 @@ import bz2
 from collections import Counter, OrderedDict
 from collections.abc import Callable
 from contextlib import ExitStack, contextmanager, suppress
-from functools import partial
+from functools import lru_cache, partial
 import re
 from typing import TYPE_CHECKING, Any
 
@@ -184,6 +184,7 @@ def _paths(value: Any, path: str, each: str) -> Iterator[tuple[str, str]]:
         yield path, each
 
 
+@lru_cache(maxsize=1024)
 def parsed(path: str) -> Path_:
     """Return the steps of a path. Raises InputError."""
     steps: list[str | int] = []

@@ -27,13 +27,12 @@ if TYPE_CHECKING:
 
 MESSAGES = "messages"
 LATEST = 2**63  # ns
+NO_HASH = "RIHS01_" + 64 * "0"  # of a type that is not installed; rosbags wants one
 _FORMATS = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinitionFormat.IDL}
 
 
 def salvage(path: str | Path, out: str | Path) -> list[str]:
     """Write the readable messages of a bag to a new bag.
-
-    Topics of types that are not installed are left out.
 
     Parameters
     ----------
@@ -53,7 +52,7 @@ def salvage(path: str | Path, out: str | Path) -> list[str]:
     """
     path = Path(path)
     remarks: list[str] = []
-    connections: dict[tuple[str, str], Connection | None] = {}
+    connections: dict[tuple[str, str], Connection] = {}
     files = [path] if path.is_file() else _files(path, remarks)
     with Writer(out, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP) as writer:
         for file in files:
@@ -67,7 +66,7 @@ def salvage(path: str | Path, out: str | Path) -> list[str]:
                 remarks.append(
                     f"{file.name} is cut or damaged ({damage}): read up to there, {count} messages."
                 )
-        if not any(connections.values()):
+        if not connections:
             raise InputError(
                 f"{path}: holds no message that can be read; copy it again, or record it again."
             )
@@ -85,7 +84,7 @@ def _files(path: Path, remarks: list[str]) -> list[Path]:
 
 
 def _copy(
-    path: Path, file: Path, writer: Writer, connections: dict[tuple[str, str], Connection | None]
+    path: Path, file: Path, writer: Writer, connections: dict[tuple[str, str], Connection]
 ) -> tuple[int, Counter[str], str | None]:
     """Copy the messages of a data file.
 
@@ -93,7 +92,7 @@ def _copy(
     ----------
     path, file, writer
     connections : dict
-        Connection of the writer by (topic, type), or None.
+        Connection of the writer by (topic, type).
 
     Returns
     -------
@@ -107,16 +106,14 @@ def _copy(
             key = connection.topic, connection.msgtype
             if key not in connections:
                 connections[key] = _added(path, connection, writer)
-            target = connections[key]
-            if target is not None:
-                if earlier := earlier_types(path, connection):
-                    try:
-                        data = upgraded(data, connection.msgtype, earlier)
-                    except Exception:  # parsers of rosbags raise many types
-                        lost[MESSAGES] += 1
-                        continue
-                writer.write(target, stamp, data)
-                count += 1
+            if earlier := earlier_types(path, connection):
+                try:
+                    data = upgraded(data, connection.msgtype, earlier)
+                except Exception:  # parsers of rosbags raise many types
+                    lost[MESSAGES] += 1
+                    continue
+            writer.write(connections[key], stamp, data)
+            count += 1
     except Damaged as damage:
         return count, lost, str(damage)
     return count, lost, None
@@ -135,13 +132,16 @@ def as_written(file: Path, lost: Counter[str]) -> Iterator[tuple[Connection, int
     return (_from_mcap if integrity.is_mcap(file) else _from_sqlite)(file, lost)
 
 
-def _added(path: Path, connection: Connection, writer: Writer) -> Connection | None:
+def _added(path: Path, connection: Connection, writer: Writer) -> Connection:
+    """Add a topic to the new bag; those of others keep their definition. Raises InputError."""
     try:
         check_type(path, connection)
     except InputError:
         if connection.msgtype in typestore().fielddefs:
             raise  # the installed type has another version
-        return None
+        return writer.add_connection(
+            connection.topic, connection.msgtype, msgdef=connection.msgdef.data, rihs01=NO_HASH
+        )
     return writer.add_connection(connection.topic, connection.msgtype, typestore=typestore())
 
 

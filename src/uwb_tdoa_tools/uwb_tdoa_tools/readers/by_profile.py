@@ -117,7 +117,7 @@ def files_of(paths: Sequence[Path]) -> list[Path]:
 
 
 def _may_be_recording(path: Path) -> bool:
-    return path.name.endswith((".csv", ".csv.gz", ".txt", ".bag", ".ulg")) or is_bag(path)
+    return path.name.endswith((".csv", ".csv.gz", ".bag", ".ulg")) or is_bag(path)
 
 
 def read_by_profile(
