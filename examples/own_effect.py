@@ -1,4 +1,4 @@
-"""An effect of your own: TDOAs err with the side from which an anchor sees the tag.
+"""An effect of your own: an anchor hears the tag late through two sides of its housing.
 
 python examples/own_effect.py
 """
@@ -9,7 +9,7 @@ import uwb_tdoa as uwb
 
 @uwb.effect
 class SideDelay(uwb.ArrivalEffect):
-    """Delay an arrival by cosine * cos(azimuth) + sine * sin(azimuth) of the tag at the anchor."""
+    """Delay an arrival by cosine * cos(2 a) + sine * sin(2 a), with the azimuth a of the tag."""
 
     row = uwb.Row(
         name="side_delay",
@@ -18,7 +18,7 @@ class SideDelay(uwb.ArrivalEffect):
         negligible=0.02,
         prior_std=0.2,
         example="cosine",
-        physics="the housing of the anchors delays signals from one side",
+        physics="the housing of the anchors delays signals from two opposite sides",
         reference="an example",
     )
 
@@ -29,15 +29,13 @@ class SideDelay(uwb.ArrivalEffect):
     def delay_regressors(self, samples, rows, keys):
         towards = np.tile(samples.p, (len(rows) // len(samples.p), 1))
         towards = towards - samples.anchors.positions[rows]
-        azimuth = np.arctan2(towards[:, 1], towards[:, 0])
-        return np.column_stack(
-            [np.cos(azimuth) if k == "cosine" else np.sin(azimuth) for k in keys]
-        )
+        angle = 2.0 * np.arctan2(towards[:, 1], towards[:, 0])
+        return np.column_stack([np.cos(angle) if k == "cosine" else np.sin(angle) for k in keys])
 
 
 if __name__ == "__main__":
     flight = uwb.simulate(duration=25.0, seed=3, imu_rate=100.0, bias=False, multipath=False)
-    hidden = SideDelay({"cosine": 0.3, "sine": -0.2})
+    hidden = SideDelay({"cosine": 0.1, "sine": -0.07})
     diagnosis = uwb.diagnose([hidden.inject(flight)])
     for found in diagnosis.effects:
         values = {key: round(value, 3) for key, value in found.values.items()}
