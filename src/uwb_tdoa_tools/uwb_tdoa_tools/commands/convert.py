@@ -13,7 +13,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_text
 
 from .. import cli, options
-from ..bags.convert import SENSORS, convert, shifted
+from ..bags.convert import SENSORS, convert, described, shifted
 from ..command_lines import tool
 from ..outputs import OutputBag, OutputFile
 from ..parallel import Progress
@@ -115,33 +115,7 @@ def _convert(args: Namespace) -> None:
     if args.json:
         cli.show(json.dumps(asdict(made), indent=2, default=str))
         return
-    cli.show(
-        f"{made.flight}: {made.end - made.start:.1f} s, "
-        f"{made.meta.get('protocol', 'protocol unknown')}"
-    )
-    if ids := made.meta.get("anchor_ids"):
-        cli.show(
-            "  ids in the bag: " + ", ".join(f"{name} is {number}" for name, number in ids.items())
-        )
-    for sentence in made.meta.get("read", ()):
-        cli.show(f"  read {sentence}")
-    for sentence in made.meta.get("unread", ()):
-        cli.show(f"  not read {sentence}")
-    for remark in made.meta.get("remarks", ()):
-        cli.show(f"  {remark}")
-    for stream, (count, first, last) in made.read.items():
-        cli.show(f"  {stream}: {count}, {first:.1f} to {last:.1f} s")
-    for topic, count in made.messages.items():
-        cli.show(f"  {topic}: {count}")
-    for name, count in made.left_out.items():
-        cli.show(f"  {name}: {count} events left out, a bag has no place for them")
-    for topic, falls in made.meta.get("reordered", {}).items():
-        cli.show(f"  {topic}: sorted, its stamps fell {falls} times")
-    if made.tdoa_unknown_anchor:
-        cli.show(
-            f"  {made.tdoa_unknown_anchor} measurements name an anchor that the survey does "
-            "not have"
-        )
+    cli.show(*described(made))
     cli.show(f"  -> {args.out}")
     for sentence in made.apart:
         cli.say("convert", sentence)
@@ -182,9 +156,10 @@ def _reading(args: Namespace) -> Reading:
         return reading
     options.refuse(
         args,
-        ("namespace", "topics", "profile"),
-        "says how to read other recordings, and --columns is of CSV files",
+        ("namespace", "topics"),
+        "says where topics are in bags, and --columns is of CSV files",
     )
+    options.refuse(args, ("profile",), "--columns is the short form of a profile")
     if not args.survey:
         raise InputError(
             "--columns: CSV files do not say where the anchors are; give a survey file "
