@@ -50,10 +50,11 @@ def test_bag_brings_its_anchors_unless_others_are_given(tmp_path, survey):
     [
         (b"", "is empty"),
         (b"\x00\x01binary", "of no known kind"),
-        (b"#ROSBAG V2.0\n", "is a bag of ROS 1: make a ROS 2 bag of it, rosbags-convert"),
-        (b"time,value\n1,2\n", "of no known kind"),
+        (b"#ROSBAG V2.0\n", "is a bag of ROS 1; it needs a profile .*convert .*--suggest"),
+        (b"ULog\x01\x12\x35\x01", "is a ULog of PX4; it needs a profile"),
+        (b"time,value\n1,2\n", "is a CSV file of another tool; it needs a profile"),
         (b"\x1f\x8bnothing that unpacks", "gzip data is damaged"),
-        (gzip.compress(b"time,value\n", mtime=0), "of no known kind"),
+        (gzip.compress(b"time,value\n", mtime=0), "is a CSV file of another tool"),
     ],
 )
 def test_foreign_files(tmp_path, survey, content, sentence):
@@ -70,8 +71,8 @@ def test_a_line_that_is_printed_to_be_copied_runs_nothing_else(tmp_path, survey,
     (tmp_path / name).write_bytes(b"#ROSBAG V2.0\n")
     with pytest.raises(InputError) as refused:
         read_flight(tmp_path / name, survey)
-    line = re.search(r"rosbags-convert .* --dst NAME", str(refused.value), re.DOTALL)[0]
-    assert shlex.split(line) == ["rosbags-convert", "--src", str(tmp_path / name), "--dst", "NAME"]
+    line = re.search(r"convert .* --suggest profile.yaml", str(refused.value), re.DOTALL)[0]
+    assert shlex.split(line) == ["convert", str(tmp_path / name), "--suggest", "profile.yaml"]
 
 
 def test_missing_and_directory(tmp_path, survey):

@@ -12,14 +12,17 @@ import tempfile
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.append(str(Path(__file__).resolve().parents[3] / "uwb_tdoa_bias" / "test"))
 
+from foreign_recordings import two_way_ranges, write_ros_1  # noqa: E402
 import known_answer  # noqa: E402
 import numpy as np  # noqa: E402
 from recordings import ROWS, SURVEY, csv_text, log_bytes, small_flight  # noqa: E402
+from rosbags.rosbag1 import Writer  # noqa: E402
 from targets import CORPUS, MESSAGES, bag_of  # noqa: E402
 from test_survey import survey_lines  # noqa: E402
 
 from uwb_tdoa_bias.common.flyable import FlyableVolume  # noqa: E402
 from uwb_tdoa_bias.common.sensors import Height, Pressure, Velocity  # noqa: E402
+from uwb_tdoa_bias.common.sensors.ranges import Ranges  # noqa: E402
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet  # noqa: E402
 from uwb_tdoa_ekf.debias import BiasMap  # noqa: E402
 from uwb_tdoa_tools.bags.bag import write_bag  # noqa: E402
@@ -46,6 +49,16 @@ TEXTS = {
         )
     ],
     "walls": ["walls: [[0, -5, 0, 5], [2, 0, 2.5, 4, 1.8]]\n"],
+    "profile": [
+        (
+            "about: text\nantenna: {7: [0.1, 0.2, 0.3]}\nsources:\n"
+            "  - {type: '*/TwoWayRangeStamped', where: {range_raw: '> 0', UWB_ID2: [0, 1, 5]}, "
+            "columns: {anchor: UWB_ID2, range: '-range_raw:cm', time: header.stamp}}\n"
+            "  - {topic: '/{name}/pose*', body: frd, world: ned, each: poses, columns: {pose_x: 'p[0]:mm', "
+            "pose_y: p.y, pose_z: index}}\n"
+            "types: {a/msg/B: uint8 c}\n"
+        )
+    ],
     "marks": [
         "marks:\n- {flight: monday, from: 12.0, to: 14.0, position: [1.0, -2.0, 0.5], std: 0.05}\n"
     ],
@@ -155,6 +168,12 @@ def _bags(folder):
                     topic.strip("/").replace("/", "_"),
                     bytes([list(MESSAGES).index(topic)]) + data,
                 )
+    ranges = replace(
+        flight, range=Ranges(flight.tdoa.t[:8], flight.tdoa.a[:8], 1.0 + flight.tdoa.t[:8])
+    )
+    for name, compression in (("plain", None), ("bz2", Writer.CompressionFormat.BZ2)):
+        bag = write_ros_1(folder / name, two_way_ranges(ranges), compression)
+        write("bag_ros_1", name, bag.read_bytes())
     write("bag_sqlite", "small", (folder / "tables" / "tables.db3").read_bytes())
 
 

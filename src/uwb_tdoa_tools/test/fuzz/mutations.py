@@ -374,6 +374,7 @@ STRUCTURES = {
             "bag_metadata",
             "marks",
             "tags",
+            "profile",
         ),
         of_yaml,
     ),

@@ -40,9 +40,17 @@ from uwb_tdoa_tools.bags.messages import tdoa_messages
 from uwb_tdoa_tools.evaluating import read_others
 from uwb_tdoa_tools.planning.installation import antenna_from_yaml
 from uwb_tdoa_tools.planning.layout import AnchorPlaces
-from uwb_tdoa_tools.readers import read_survey, read_usd_log, read_util_csv
-from uwb_tdoa_tools.readers.columns import parse_columns, read_columns
+from uwb_tdoa_tools.readers import (
+    load_profile,
+    read_by_profile,
+    read_survey,
+    read_usd_log,
+    read_util_csv,
+)
+from uwb_tdoa_tools.readers.columns import parse_columns
 from uwb_tdoa_tools.readers.names import NamedAnchors
+from uwb_tdoa_tools.readers.profile import Profile
+from uwb_tdoa_tools.readers.suggest import suggest
 from uwb_tdoa_tools.readers.tables import number, read_table
 from uwb_tdoa_tools.results_file import ResultsFile
 from uwb_tdoa_tools.simulation.rooms import Walls
@@ -207,7 +215,23 @@ def columns(data):
     asked = parse_columns(
         "time=t:ms,anchor_a=from,anchor_b=to,tdoa=d:mm,gyro_x=gx,gyro_y=gy,gyro_z=gz,accel_x=ax,accel_y=ay,accel_z=az"
     )
-    _finite(read_columns([_file(data)], asked, NamedAnchors(ANCHORS)))
+    _finite(read_by_profile([_file(data)], Profile.of_columns(asked), NamedAnchors(ANCHORS)))
+
+
+def profile(data):
+    """Used on a bag, too."""
+    read = load_profile(_file(data, "profile.yaml"))
+    read_by_profile([CORPUS / "bag_ros_1" / "plain"], read, NamedAnchors(ANCHORS))
+
+
+def bag_ros_1(data):
+    _finite(
+        read_by_profile([_file(data, "input.bag")], load_profile("uwb_msgs"), NamedAnchors(ANCHORS))
+    )
+
+
+def suggestion(data):
+    suggest([_file(data, "input.bag")])
 
 
 def marks(data):
@@ -389,6 +413,9 @@ TARGETS = {
         bag_message,
         bag_packed,
         columns,
+        profile,
+        bag_ros_1,
+        suggestion,
         marks,
         distances,
         tags,
@@ -409,6 +436,7 @@ SEEDS = {  # whose corpus a target starts from, if not its own
     "bag_mcap_sealed": "bag_mcap",
     "bag_mcap_salvaged": "bag_mcap",
     "bag_sqlite_salvaged": "bag_sqlite",
+    "suggestion": "bag_ros_1",
 }
 
 

@@ -100,7 +100,7 @@ def _convert(args: Namespace) -> None:
         return _suggest(args)
     if not args.out:
         raise InputError("--out: is missing; give the path of the bag to write.")
-    from ..bags.convert import convert, shifted
+    from ..bags.convert import convert, described, shifted
     from ..scoring.evaluation import on_one_clock
 
     offsets = _offsets(args.offsets)
@@ -115,33 +115,7 @@ def _convert(args: Namespace) -> None:
     if args.json:
         cli.show(json.dumps(asdict(made), indent=2, default=str))
         return
-    cli.show(
-        f"{made.flight}: {made.end - made.start:.1f} s, "
-        f"{made.meta.get('protocol', 'protocol unknown')}"
-    )
-    if ids := made.meta.get("anchor_ids"):
-        cli.show(
-            "  ids in the bag: " + ", ".join(f"{name} is {number}" for name, number in ids.items())
-        )
-    for sentence in made.meta.get("read", ()):
-        cli.show(f"  read {sentence}")
-    for sentence in made.meta.get("unread", ()):
-        cli.show(f"  not read {sentence}")
-    for remark in made.meta.get("remarks", ()):
-        cli.show(f"  {remark}")
-    for stream, (count, first, last) in made.read.items():
-        cli.show(f"  {stream}: {count}, {first:.1f} to {last:.1f} s")
-    for topic, count in made.messages.items():
-        cli.show(f"  {topic}: {count}")
-    for name, count in made.left_out.items():
-        cli.show(f"  {name}: {count} events left out, a bag has no place for them")
-    for topic, falls in made.meta.get("reordered", {}).items():
-        cli.show(f"  {topic}: sorted, its stamps fell {falls} times")
-    if made.tdoa_unknown_anchor:
-        cli.show(
-            f"  {made.tdoa_unknown_anchor} measurements name an anchor that the survey does "
-            "not have"
-        )
+    cli.show(*described(made))
     cli.show(f"  -> {args.out}")
     for sentence in made.apart:
         cli.say("convert", sentence)
@@ -162,8 +136,6 @@ def _suggest(args: Namespace) -> None:
 
 def _offsets(texts: Iterable[str]) -> dict[str, float]:
     """Return {sensor: s} of "SENSOR=SECONDS" texts. Raises InputError."""
-    from ..bags.convert import SENSORS
-
     offsets = {}
     for text in texts:
         sensor, given, seconds = text.partition("=")
@@ -190,9 +162,10 @@ def _reading(args: Namespace) -> Reading:
         return reading
     options.refuse(
         args,
-        ("namespace", "topics", "profile"),
-        "says how to read other recordings, and --columns is of CSV files",
+        ("namespace", "topics"),
+        "says where topics are in bags, and --columns is of CSV files",
     )
+    options.refuse(args, ("profile",), "--columns is the short form of a profile")
     if not args.survey:
         raise InputError(
             "--columns: CSV files do not say where the anchors are; give a survey file "
