@@ -203,6 +203,13 @@ def test_models_and_templates_are_installed_too(folder):
     } == given
 
 
+def test_colcon_sees_the_packages_below_the_pyproject_of_all(tmp_path):
+    pytest.importorskip("colcon_core")
+    words = [sys.executable, "-m", "colcon", "--log-base", tmp_path / "log", "list", "--names-only"]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
+    assert done.stdout.split() == [folder.name for folder in PACKAGES], done.stderr
+
+
 @pytest.mark.slow
 def test_colcon_test_runs_what_pytest_runs(tmp_path):
     pytest.importorskip("colcon_core")

@@ -87,11 +87,11 @@ class Progress:
         self(f"{what} done, finishing")
 
     def __enter__(self) -> Progress:
-        from tqdm import tqdm
-
         stream = self._stream or sys.stderr
         self._start, self._bar = time.monotonic(), None
         if stream.isatty():
+            from tqdm import tqdm
+
             form = (
                 {"bar_format": "{desc}"}
                 if self._total is None

@@ -136,17 +136,17 @@ def _suggest(args: Namespace) -> None:
 
 def _offsets(texts: Iterable[str]) -> dict[str, float]:
     """Return {sensor: s} of "SENSOR=SECONDS" texts. Raises InputError."""
-    offsets = {}
+    streams, offsets = (*STREAMS, *SENSORS), {}
     for text in texts:
         sensor, given, seconds = text.partition("=")
         try:
             offset = float(seconds)
         except ValueError:
             offset = math.nan
-        if not given or sensor not in SENSORS or sensor in offsets or not abs(offset) < 1e11:
+        if not given or sensor not in streams or sensor in offsets or not abs(offset) < 1e11:
             raise InputError(
                 f"--time-offset: {text!r} is not SENSOR=SECONDS, where SENSOR, once, is one "
-                f"of {', '.join(SENSORS)}."
+                f"of {', '.join(streams)}."
             )
         offsets[sensor] = offset
     return offsets
