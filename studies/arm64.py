@@ -23,6 +23,7 @@ from packaging.requirements import Requirement
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_tools import choices
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.cli import show
 from uwb_tdoa_tools.exporting.onnx_file import write_onnx
@@ -50,8 +51,8 @@ FLIGHT = SimulationConfig(seed=1, duration=20.0, imu_rate=500.0)
 def add_options(add):
     """add : add_argument of a parser."""
     add("--folder", metavar="DIR", type=OutputFolder, required=True, help="for all of that")
-    add("--flights", nargs="+", default=[], metavar="FLIGHT", help=f"further {inputs.HELP}")
-    add("--survey", metavar="S", help=inputs.SURVEY_HELP)
+    add("--flights", nargs="+", default=[], metavar="FLIGHT", help=f"further {choices.RECORDINGS}")
+    add("--survey", metavar="S", help=choices.SURVEY)
     add("--effects", metavar="FILE", help="effects.yaml to correct these flights with")
     add("--model", metavar="FILE", help="ONNX file to correct these flights with")
 
