@@ -147,6 +147,22 @@ def test_what_may_be_flown_by(estimator, yaw_std, use, status, yaw_known, why):
     assert why in said.why and bool(said.why) == bool(why)
 
 
+def test_a_yaw_that_is_known_is_known_to_who_hears_status():
+    """The deviation is a number of numpy; in the bytes of a message, its boolean would be false."""
+    serialization = pytest.importorskip("rclpy.serialization")
+    messages = pytest.importorskip("uwb_tdoa_msgs.msg")
+    from uwb_tdoa_ekf.outputs import StatusOutput, Time
+
+    sent = []
+    node = SimpleNamespace(create_publisher=lambda *_: SimpleNamespace(publish=sent.append))
+    said = status_of(RUNS, np.float64(KNOWN), 0.01, used())
+    StatusOutput(node).publish(said, np.float64(KNOWN), np.float64(0.1), Time(), "map")
+    heard = serialization.deserialize_message(
+        serialization.serialize_message(sent[0]), messages.EstimatorStatus
+    )
+    assert heard.yaw_known and heard.status == RUNNING
+
+
 def test_without_odometry_nothing_goes_by_the_imu_alone():
     said = status_of(RUNS, KNOWN, 10.0, used(silent=2.0))
     assert said.status == WAITING and "no odometry" in said.why and "alone" not in said.why

@@ -1,7 +1,8 @@
 """A measured flight through the real nodes to an autopilot: a pose that is wrong, the recovery from
 it, a reset, and a loss of all TDOAs.
 
-The clock goes on when the nodes have kept up, so a busy machine changes nothing.
+The clock goes on when the nodes have kept up, so a busy machine changes nothing. It is no faster than
+the clock of the wall, by which `status` is published.
 """
 
 from contextlib import contextmanager
@@ -52,6 +53,7 @@ class Player:
     def __init__(self, node, processes, flight, px4):
         self.node, self.px4, self.gated, self._processes = node, px4, [], processes
         self._begin, self._newest, self._silent = flight.imu.t[0], 0.0, False
+        self._due = 0.0  # time.monotonic() before which no step ends, s
         make = node.create_publisher
         self._tdoas, self._samples = (
             make(Tdoa, "uwb/tdoa", OUTPUT_QOS),
@@ -77,8 +79,10 @@ class Player:
         wait(400.0, what, self._processes, self.node, condition)
 
     def is_connected(self):
+        self.px4.receive()
         return (
-            self._tdoas.get_subscription_count()
+            self.px4.beats
+            and self._tdoas.get_subscription_count()
             and self._samples.get_subscription_count()
             and self._clock.get_subscription_count() == 3
             and self.node.count_publishers("odometry/gated")
@@ -113,6 +117,9 @@ class Player:
 
     def _keep_up(self, end):
         """Set the clock, and wait for odometry of this time and for what the autopilot gets of it."""
+        due, self._due = self._due, time.monotonic() + STEP
+        while time.monotonic() < due:
+            rclpy.spin_once(self.node, timeout_sec=0.01)
         clock = Clock()
         clock.clock.sec, clock.clock.nanosec = divmod(round(1e9 * (EPOCH + end)), 10**9)
         self._clock.publish(clock)
@@ -120,6 +127,7 @@ class Player:
         while self._newest < end - STEP and time.monotonic() < limit:
             rclpy.spin_once(self.node, timeout_sec=0.01)
         self._silent = self._newest < end - STEP
+        self.px4.beat()
         answers = len(self.px4.answers)
         self.px4.port.mav.timesync_send(0, round(1e9 * end))
         while len(self.px4.answers) == answers:

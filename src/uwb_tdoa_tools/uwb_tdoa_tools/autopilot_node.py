@@ -183,6 +183,7 @@ class AutopilotNode(StreamNode):
             "passed": self._gate.passed,
             "invalid": self._invalid,
             "resets": self._gate.resets,
+            "held back because": self._gate.why,
             "rate": f"{self._rate.of(self._gate.passed):.1f} Hz",
             **counts,
             "publishers of odometry": self._input.subscription.get_publisher_count(),

@@ -324,7 +324,7 @@ def status_of(
             use.trouble
             or (restarted.sentence if restarted else "the start position is looked for"),
         )
-    known = yaw_std <= YAW_KNOWN
+    known = bool(yaw_std <= YAW_KNOWN)  # a message takes no other type for true
     if fault is not None:
         return Status(FAULT, False, fault.sentence)
     if odometry_age > SILENT:
