@@ -24,6 +24,8 @@ from uwb_tdoa_tools.bags.bag import read_bag, read_fields, read_odometry, write_
 from uwb_tdoa_tools.bags.files import messages, new_bag, open_bag
 from uwb_tdoa_tools.bags.message_types import typestore
 from uwb_tdoa_tools.bags.messages import tdoa_messages
+from uwb_tdoa_tools.checking.recording import read_recording
+from uwb_tdoa_tools.readers.inputs import Reading
 from uwb_tdoa_tools.readers.streams import LARGEST_NUMBER
 
 BOTH = pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
@@ -282,6 +284,25 @@ def test_namespace_other_topics_and_order_of_stamps(tmp_path):
     np.testing.assert_array_equal(back.tdoa.d, tdoa.d)
     assert back.meta["reordered"] == {"uwb/tdoa": 1}
     assert back.imu is None and back.truth is None and back.name == "bag"
+    assert back.meta["unread"] == [
+        "/chatter: 1 messages of std_msgs/msg/String, which no stream takes"
+    ]
+
+
+@pytest.mark.parametrize(
+    "read", [read_bag, read_odometry, lambda path: read_recording(Reading(), path)]
+)
+def test_the_remedy_for_an_empty_topic_does_not_map_it_to_itself(tmp_path, read):
+    text = typestore().types["std_msgs/msg/String"]("hello")
+    write_topics(
+        tmp_path / "bag",
+        ("/uwb/tdoa", "uwb_tdoa_msgs/msg/Tdoa", []),
+        ("/odometry", "nav_msgs/msg/Odometry", []),
+        ("/chatter", "std_msgs/msg/String", [(5, text)]),
+    )
+    with pytest.raises(InputError, match="has no message on /") as refused:
+        read(tmp_path / "bag")
+    assert "--topic" not in str(refused.value)
 
 
 def test_wrong_type_on_a_topic(tmp_path):

@@ -49,6 +49,7 @@ def test_says_what_it_did(files, capsys):
     (files / "two.csv").write_text("id,x,y,z\n0,0,0,0\n1,4,0,3\n")
     assert main(["flight.log", "--survey", "two.csv", "--out", "flight.bag"]) == 0
     out = capsys.readouterr().out
+    assert "  tdoa: 2, 1.0 to 1.0 s" in out and "  imu: 3, 1.0 to 1.0 s" in out
     assert "/uwb/tdoa: 2" in out and "estTemperature: 2 events left out" in out
     assert "1 measurements name an anchor that the survey does not have" in out
 

@@ -160,7 +160,7 @@ def test_the_streams_of_a_recording_come_back(recording, flight, tmp_path, capsy
     code = convert([*words, "--out", str(tmp_path / "our.bag")])
     assert code == 0, capsys.readouterr().err
     told = capsys.readouterr().out
-    assert "read: " in told
+    assert "  read " in told and " records of " in told
     ours = read_flight(tmp_path / "our.bag")
     grouped = (
         any(name in str(words) for name in ("linktrack", "dwm1001", "isas")) and "range" in streams
@@ -353,6 +353,19 @@ def test_parts_of_a_bag_of_ros_1_are_one_recording(flight, survey, tmp_path):
         write_ros_1(tmp_path / "walk" / f"walk_{number}.bag", part(first, last))
     read = read_by_profile([tmp_path / "walk"], load_profile("uwb_msgs"), survey)
     np.testing.assert_allclose(read.range.d, flight.range.d, rtol=FLOAT32)
+
+
+@pytest.mark.parametrize(("shift", "said"), [(0, "at the same time"), (3600, "s apart")])
+def test_several_recordings_in_a_folder_are_never_merged(flight, survey, tmp_path, shift, said):
+    def later(store):
+        ((topic, (kind, messages)),) = two_way_ranges(flight)(store).items()
+        return {topic: (kind, [(stamp + shift * 10**9, content) for stamp, content in messages])}
+
+    (tmp_path / "day").mkdir()
+    write_ros_1(tmp_path / "day" / "flight1.bag", two_way_ranges(flight))
+    write_ros_1(tmp_path / "day" / "flight2.bag", later)
+    with pytest.raises(InputError, match=f"{said}: they are several recordings; give one"):
+        read_by_profile([tmp_path / "day"], load_profile("uwb_msgs"), survey)
 
 
 def test_definitions_come_from_the_profile_where_the_bag_has_none(

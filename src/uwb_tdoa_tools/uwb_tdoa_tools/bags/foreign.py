@@ -49,6 +49,7 @@ if TYPE_CHECKING:
 # `stamp`. Where that is zero or missing, the time of recording counts.
 RECEIVED, INDEX, STAMP = "received", "index", "stamp"
 SHORT = 4  # numbers of an array that are fields of their own
+LONGEST_GAP, SHORTEST_OVERLAP = 60.0, 1.0  # s between the parts of a recording
 KEPT_BYTES = 64 << 20  # of unpacked chunks of ROS 1
 _LIMITED: dict[str, Callable[[bytes, int], bytes]] = {  # of ROS 1: unpack at most so many bytes
     Compression.BZ2.value: lambda data, most: bz2.BZ2Decompressor().decompress(data, most),
@@ -82,6 +83,27 @@ class ForeignBag:
         for connection in part.connections:
             self.types[connection.topic] = connection.msgtype
             self.counts[connection.topic] += connection.msgcount
+
+    def check_parts(self) -> None:
+        """Raise InputError unless bags that share a topic follow each other in time."""
+        parts = sorted(self._parts, key=lambda part: part.span[0])
+        for number, part in enumerate(parts):
+            topics = {connection.topic for connection in part.connections}
+            before = [
+                one
+                for one in parts[:number]
+                if any(connection.topic in topics for connection in one.connections)
+            ]
+            if not before:
+                continue
+            last = max(before, key=lambda one: one.span[1])
+            gap = (part.span[0] - last.span[1]) / 1e9
+            if not -SHORTEST_OVERLAP < gap < LONGEST_GAP:
+                what = f"{gap:.0f} s apart" if gap > 0.0 else f"over {-gap:.1f} s at the same time"
+                raise InputError(
+                    f"{part.path}: and {last.path} hold the same topics {what}: they are several "
+                    "recordings; give one."
+                )
 
     def fields(self, topic: str) -> list[str]:
         """Return the names of the fields of a topic; empty if its type is unknown."""
@@ -230,6 +252,7 @@ def open_foreign(
         for path in paths:
             opened = _ros_1(path) if is_ros_1(path) else _ros_2(path, definitions, salvage)
             bag.add(stack.enter_context(opened))
+        bag.check_parts()
         yield bag
 
 
@@ -243,9 +266,11 @@ class _Part:
         read: Callable[[list[Connection]], Iterator[tuple[Connection, int, bytes]]],
         definitions: Mapping[str, str] | None,
         reader: BagReader | None = None,
+        span: tuple[int, int] = (0, 0),
     ) -> None:
         self.path, self.connections, self._read = path, connections, read
         self._definitions, self._reader = definitions, reader
+        self.span = span  # ns, times of recording
         self._stores: dict[str, Typestore] = {}
         self._unreadable: Counter[str] = Counter()
 
@@ -336,6 +361,7 @@ def _ros_2(path: Path, definitions: Mapping[str, str], salvage: bool) -> Iterato
             lambda connections: messages(path, reader, connections, written=True),
             definitions,
             reader,
+            (reader.start_time, reader.end_time),
         )
 
 
@@ -354,6 +380,7 @@ def _ros_1(path: Path) -> Iterator[_Part]:
             list(reader.connections),
             lambda connections: _messages_of(reader, path, connections),
             None,
+            span=(reader.start_time, reader.end_time),
         )
     finally:
         with suppress(Exception):

@@ -59,7 +59,7 @@ def parser() -> ArgumentParser:
         "--time-offset truth=-0.4 --survey anchors.csv --out our.bag",
         "convert theirs.bag --suggest profile.yaml",
         "convert theirs.bag --profile profile.yaml --survey anchors.yaml --out our.bag",
-        "convert theirs.bag --profile dwm1001 --tag DW5722 --out our.bag",
+        "convert theirs.bag --profile dwm1001 --tag 5722 --out our.bag",
     )
     made.add_argument(
         "input", metavar="IN", nargs="+", help="the recording; its kind is found by its content"
