@@ -10,6 +10,8 @@ import numpy as np
 from uwb_tdoa_bias.common.compiled import compiled
 from uwb_tdoa_bias.common.vibration import VIBRATION_CORNER, low_pass
 
+from ..core.imu_fault_detector import AXIS, UPRIGHT
+from ..core.state import GRAVITY
 from .finding import ERROR, WARNING, Finding
 from .stamp_rules import (
     LAST,
@@ -195,7 +197,6 @@ def imu_window(counters: ImuCounters) -> ImuWindow:
     )
 
 
-GRAVITY = 9.81
 # m/s^2, limits of the median length of the mean specific force; healthy 9.7 - 10.5
 FORCE_RANGE = 7.0, 14.0
 FORCE_UNITS = {
@@ -214,8 +215,6 @@ TURN_EXCESS = 0.35
 # limits of a tag at rest: relative deviation of the specific force, and change of its direction in
 # rad
 REST_SHAKES, REST_TURNS = (0.02, 0.02)
-# cosines of 35 and 25 degrees; healthy, with vibration, 22 degrees at most
-UPRIGHT, AXIS = (np.cos(np.deg2rad(35.0)), np.cos(np.deg2rad(25.0)))
 # m/s^2 rms of the part faster than 50 ms; healthy 0.6; 1.4 at least where the accelerometer
 # rectifies
 SHAKING = 1.0

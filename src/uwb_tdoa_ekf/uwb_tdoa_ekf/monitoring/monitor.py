@@ -19,6 +19,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.geometry import tdoa
 
+from ..core.initialization import LOST_TIME
 from ..core.memory import REJECTED
 from .change import ChangeDetector
 from .finding import ERROR, WARNING, Finding
@@ -43,7 +44,6 @@ if TYPE_CHECKING:
 # m/s, speed above which the tag is in motion; on the floor, residuals differ from those in the air
 MOVING = 0.3
 SETTLE = 8.0  # s in motion before the search for an onset starts
-GAP = 30.0  # s without TDOAs after which a new flight begins
 # statistic (`Change.ratio`) above which an anchor has changed: a tenth above the largest of sound flights of
 # two days, see docs/reliability.md
 LIMIT = 16.3
@@ -228,7 +228,7 @@ class Monitor:
 
     def add(self, odometry: Odometry, residuals: Residuals) -> None:
         """Add Odometry and the Residuals that belong to it."""
-        if self._end is not None and len(residuals.t) and residuals.t[0] > self._last + GAP:
+        if self._end is not None and len(residuals.t) and residuals.t[0] > self._last + LOST_TIME:
             # finish the flight before, so that no empty slices of the gap are tested
             self.update(math.inf)
         if len(odometry):
@@ -272,7 +272,7 @@ class Monitor:
             [np.concatenate(columns) for columns in zip(*parts)]
             for parts in (self._residuals, self._odometry)
         )
-        while self._end <= min(until, self._last + GAP):
+        while self._end <= min(until, self._last + LOST_TIME):
             now, of_now = residuals[0] < self._end, odometry[0] < self._end
             self._test(
                 self._end,

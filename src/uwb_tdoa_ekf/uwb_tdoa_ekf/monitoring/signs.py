@@ -13,6 +13,7 @@ import numpy as np
 from ..core.memory import TDOA, new_state, structured
 from .explain import Unexplained, compare, innovations
 from .finding import ERROR, Finding
+from .slices import FEWEST
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.common.anchors import Anchors
@@ -24,7 +25,6 @@ GAIN = 0.35  # largest share of that change that the other sign may leave
 # share that the present sign may explain. After a flip these were 0.66 to 1.0 and 0.0 in simulated
 # flights. Near a floor, where anchors are metres late, they were 0.67 and 0.3.
 SHARE, PRESENT = 0.6, 0.1
-FEWEST = 10  # fewest significant TDOAs
 
 
 def turned(innovation: np.ndarray, predicted: np.ndarray) -> bool:
