@@ -397,6 +397,9 @@ def _of_anchors(inputs: Inputs) -> Iterator[Watched]:
     for name in ("tdoa: sign", "tdoa: two ids exchanged", "tdoa: half are outliers"):
         yield Watched(f"{name}, residuals", "monitoring", partial(_faulty, inputs, name))
     yield Watched(HALL, "monitoring", partial(_passing, inputs))
+    for part, size in (("gyro", 0.06), ("accel", 1.2)):
+        words = f"{HEALTHY[1]}, {part} {size:g} off from 30 s on"
+        yield Watched(words, "monitoring", partial(_biased, inputs, part, size))
     for name, (change, calibrated) in CHANGES.items():
         for flight in HEALTHY[1:3] if name in OFTEN else HEALTHY[1:2]:
             run = partial(make, flight, name, change, calibrated)
@@ -513,6 +516,16 @@ def _flown(inputs: Inputs, world: str, seed: int) -> Said:
 def _faulty(inputs: Inputs, fault: str) -> Said:
     flight = inputs.faulty(VALUES[fault], fault.split(":")[0]).flight
     return _events(flight.anchors, _run(inputs, fault.replace(":", ""), flight))
+
+
+def _biased(inputs: Inputs, part: str, size: float) -> Said:
+    """The z axis of a sensor of the IMU reads more from 30 s on: rad/s or m/s^2."""
+    flight = inputs.recording(HEALTHY[1]).flight.without(*SENSOR_NAMES)
+    imu = flight.imu
+    values = getattr(imu, part).copy()
+    values[imu.t > flight.tdoa.t[0] + 30.0, 2] += size
+    flight = replace(flight, imu=replace(imu, **{part: values}))
+    return _events(flight.anchors, _run(inputs, f"biased {part}", flight))
 
 
 def _passing(inputs: Inputs) -> Said:

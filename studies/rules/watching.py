@@ -64,7 +64,6 @@ SWITCHES: dict[str, tuple[str, Any]] = {
     "no change soon after the first motion": ("monitor.SETTLE", 0.0),
     "a small change is over": ("monitor.SMALLEST_CHANGE", 0.0),
     "a displacement matters": ("monitor._matters", lambda *_: True),
-    "a displacement is certain": ("monitor.SURE", 0.0),
     "a displacement is found several times": ("monitor.NAMED", 1),
     "recent slices are compared with the calibration": ("monitor.YOUNG", 10**9),
     "a sure comparison settles a doubt": (
