@@ -19,9 +19,6 @@ COUNTS = {
     "stationarity.MOST_DOUBTS",
     "stationarity.LONG",
     "stationarity.LONG_ENOUGH",
-    "startup.GRID_POINTS",
-    "startup.GRID_LEVELS",
-    "startup.GRID_TDOAS",
     "startup.SWEEPS",
     "velocity.STUCK_COUNT",
 }
@@ -207,7 +204,7 @@ RULES = (
         "a slow quiet tag stands",
         "stationarity",
         "update_zero_velocity",
-        "slow and abs(x[state]) < SPEED and (P[state, state] < SPEED**2)",
+        "slow and abs(x[state]) < SPEED_STD and (P[state, state] < SPEED_STD**2)",
     ),
     Rule(
         "a quiet tag stands more exactly",
@@ -357,20 +354,6 @@ RULES = (
     ),
     Rule("widen at a wrong yaw", "initialization", "open_yaw", "widen(ekf, history)", ""),
     Rule(
-        "turns by updates doubt a yaw",
-        "yaw_check",
-        "evidence",
-        "0.5 * doubt.turned**2 / max(doubt.variance, 1e-9)",
-        "0.0",
-    ),
-    Rule(
-        "one innovation doubts a yaw little",
-        "yaw_check",
-        "observe",
-        "min(max(innovation.value, -largest), largest)",
-        "innovation.value",
-    ),
-    Rule(
         "open the yaw of a tag without IMU",
         "engine",
         "_on_sensor",
@@ -402,7 +385,7 @@ RULES = (
         "engine",
         "_report",
         "workspace.add_circle(ekf, parameters.fixed_height_std > 0.0 or "
-        "t - ekf.height.used < height.LONGEST_GAP, best.x, row.covariance)",
+        "t - ekf.height.used < height.MEMORY, best.x, row.covariance)",
         "",
     ),
     Rule(
@@ -420,12 +403,6 @@ RULES = (
         "_select",
         "_stay_in_workspace(ekf, t, records)",
         "",
-    ),
-    Rule(
-        "an unknown axis is that of the workspace",
-        "workspace",
-        "constrain",
-        "hypothesis.P[axis, axis] > size**2",
     ),
     Rule(
         "a wall looks as far as it is long",
@@ -488,19 +465,6 @@ RULES = (
         "locate",
         "parameters.motion_noise**2 * age**3 / 3.0 / std**2",
         "0.0",
-    ),
-    Rule(
-        "a grid over a large workspace",
-        "startup",
-        "locate",
-        "max(prior_std[0], prior_std[1]) > 0.5 * LARGE",
-    ),
-    Rule(
-        "other places widen a start",
-        "startup",
-        "locate",
-        "_hold_others(trials, losses - least, places)",
-        "",
     ),
     Rule(
         "the loss narrows",
@@ -614,12 +578,11 @@ RULES = (
         "observe",
         "_weigh_places(ekf, parameters, distance, share)",
     ),
-    Rule("a gap in ranges", "height", "observe", "sensor.t - height.used > LONGEST_GAP"),
     Rule(
         "errors of ranges last",
         "height",
         "observe",
-        "max(1.0, 2.0 * CORRELATION_TIME / max(min(since, LONGEST_GAP), 1e-3))",
+        "max(1.0, 2.0 * CORRELATION_TIME / max(min(since, MEMORY), 1e-3))",
         "1.0",
     ),
     Rule(
@@ -633,7 +596,7 @@ RULES = (
         "steps of the ground",
         "height",
         "_settle",
-        "(height.agreed >= SETTLED or doubted) and abs(value) < HIGHEST_STEP",
+        "(height.agreed >= MEMORY or doubted) and abs(value) < HIGHEST_STEP",
     ),
     Rule("a worse barometer counts less", "barometer", "observe", "max(1.0, barometer.nis)", "1.0"),
     Rule(

@@ -47,7 +47,7 @@ def add_options(add: Callable) -> None:
     add("--watch", action="store_true", help="rules over streams and residuals instead")
     add("--only", nargs="+", metavar="WORD", default=[""], help="variants with one of these words")
     add("--rows", nargs="+", metavar="WORD", default=[], help="rows with one of these words")
-    add("--stop", action="store_true", help="leave a variant when it is clearly worse")
+    add("--stop", action="store_true", help="leave a variant when it is decided")
     add("--table", action="store_true", help="run nothing: print what FILE holds")
 
 
@@ -125,8 +125,11 @@ def _largest(of: tuple[float, str]) -> str:
 def table_of_watch(found: Figures) -> str:
     """Markdown: of each variant, in how many rows something is said less, more, later or earlier."""
     base = found.get(work.BASE, {})
-    kinds = "lost", "new", "late", "early"
-    lines = [f"| variant | rows | {' | '.join(kinds)} | which |", f"|---|{'---:|' * 5}---|"]
+    kinds = "lost", "new", "late", "early", "longer", "shorter", "size"
+    lines = [
+        f"| variant | rows | {' | '.join(kinds)} | which |",
+        f"|---|{'---:|' * (1 + len(kinds))}---|",
+    ]
     made = []
     for name, rows in found.items():
         if name == work.BASE:

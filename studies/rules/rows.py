@@ -17,9 +17,10 @@ from scipy.spatial.transform import Rotation
 
 from studies import ranges, rover, situations
 from studies.faults.flown import FAULTS as FLOWN
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.files import write_bytes
 from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Flight, Imu
-from uwb_tdoa_bias.common.sensors import SENSORS
+from uwb_tdoa_bias.common.sensors import SENSORS, Height
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_ekf.core.config import FilterConfig
@@ -47,13 +48,12 @@ SCREENED = (  # recordings of the screen, each of another constellation, or day
 WORLDS = "hall", "person", "rectifying", "outliers", "anchor-late", "silence-3s", "table"
 SCREENED_FLIGHTS = {"hall": 2, "person": 1}
 FIRST_SEED = 9301  # of flights of `fly`
-WRONG_YAW = {"initial_yaw": 0.5 * math.pi, "initial_yaw_std": 0.1}
 
 
 @dataclass(frozen=True)
 class Case:
     """One run. spans : {name: (begin, end) s} that are judged; over : s from which the time to be
-    right again counts, or None; arm : m, of the tag, that is corrected.
+    right again counts, or None; arm : m, of the tag, that is corrected; effects : that are known.
     """
 
     flight: Flight
@@ -61,6 +61,7 @@ class Case:
     over: float | None = None
     config: dict[str, Any] = field(default_factory=dict)
     arm: tuple[float, ...] = ()
+    effects: EffectSet = EffectSet()
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,7 @@ class Row:
 
 def judged(case: Case) -> dict[str, list[float | None]]:
     """{span: [3D RMSE m, NEES, s without an estimate, RMSE of the yaw, rad]}, and {"again": [s]}."""
-    effects = EffectSet()
+    effects = case.effects
     if case.arm:
         effects = EffectSet((EFFECTS["tag_lever_arm"](dict(zip("xyz", case.arm))),))
     flight = case.flight
@@ -217,9 +218,19 @@ class Inputs:
             for share in (10, 40):
                 make = partial(self._few, name, share)
                 yield Row(f"{name}, one TDOA in {share}", "starts", make, share == 40)
+            make = partial(self._with_outliers, name)
+            yield Row(f"{name}, outliers of 2 to 6 m", "starts", make)
             yield Row(f"{name} from the air", "starts", partial(self._from_the_air, name), True)
             yield Row(f"{name}, wrong yaw", "starts", partial(self._wrong_yaw, name), True)
+        for name in ("0425-traj2", "0426-traj9", "0422-log02", "0426-traj1"):
+            for degrees in (60, 180):
+                make = partial(self._wrong_yaw, name, degrees)
+                yield Row(f"{name}, yaw wrong by {degrees} degrees", "starts", make)
         for seed in range(3):
+            for what in KNOWN_FLOORS:
+                make = partial(_known_floor, what, seed)
+                name = f"floor delays are known, {what}, seed {seed}"
+                yield Row(name, "starts", make)
             for late in (False, True):
                 words = ", low anchors 3.2 m late" if late else ""
                 make = partial(_silent_lift_off, seed, late)
@@ -243,6 +254,14 @@ class Inputs:
         tdoa = rows_of(flight.tdoa, slice(None, None, share))
         return replace(case, flight=replace(flight, tdoa=tdoa))
 
+    def _with_outliers(self, name: str) -> Case:
+        case, rng = self._recording(self._path(name)), np.random.default_rng(0)
+        tdoa = case.flight.tdoa
+        n = len(tdoa)
+        size = rng.uniform(2.0, 6.0, n) * rng.choice([-1.0, 1.0], n)
+        tdoa = replace(tdoa, d=tdoa.d + np.where(rng.random(n) < 0.1, size, 0.0))
+        return replace(case, flight=replace(case.flight, tdoa=tdoa))
+
     def _from_the_air(self, name: str) -> Case:
         flight = self._recording(self._path(name)).flight
         begin = phases(flight.truth)["in_the_air"][0] + 5.0
@@ -250,13 +269,12 @@ class Inputs:
         spans = {"first 3 s": (begin, begin + 3.0), "then": (begin + 3.0, begin + 12.0)}
         return Case(flight, spans, flight.tdoa.t[READY - 1])
 
-    def _wrong_yaw(self, name: str) -> Case:
+    def _wrong_yaw(self, name: str, degrees: float = 90.0) -> Case:
         case = self._recording(self._path(name))
         begin, end = case.spans["in_the_air"]
         middle = 0.5 * (begin + end)
-        return replace(
-            case, spans={"first": (begin, middle), "then": (middle, end)}, config=WRONG_YAW
-        )
+        config = {"initial_yaw": math.radians(degrees), "initial_yaw_std": 0.1}
+        return replace(case, spans={"first": (begin, middle), "then": (middle, end)}, config=config)
 
     def _faults(self) -> Iterator[Row]:
         screen = {"tdoa: silent, 1 s", "tdoa: sign", "tdoa: half are outliers", "imu: in g"}
@@ -283,6 +301,29 @@ class Inputs:
             if stream in SENSORS and "ahead" not in name:
                 make = partial(self._faulty_sensor, stream, fault.change)
                 yield Row(f"fly, {name}", "sensors", make, True, (stream,))
+        for name, (stream, change) in OF_A_SENSOR.items():
+            make = partial(self._faulty_sensor, stream, change)
+            yield Row(f"fly, {name}", "sensors", make, False, (stream,))
+        for name, (stream, change) in OF_A_SENSOR.items():
+            for seed in range(2):
+                make = partial(self._wrong_until_landed, stream, change, FIRST_SEED + seed)
+                words = f"fly, {name}, until it has landed, seed {seed}"
+                yield Row(words, "sensors", make, False, (stream,))
+        for silent in (False, True):
+            for seed in range(2):
+                words = ", range finder silent for 2 s" if silent else ""
+                make = partial(self._over_a_table, FIRST_SEED + seed, silent)
+                name = f"over a table{words}, seed {seed}"
+                yield Row(name, "sensors", make, False, ("height",))
+        for room in ("ceiling, 4", "ceiling, 8"):
+            for seed in range(SEEDS):
+                make = partial(_with_range_finder, room, seed)
+                yield Row(f"{room}, range finder, seed {seed}", "sensors", make, False, ("height",))
+        for what in ("ranges", "both"):
+            for seed in range(3):
+                make = partial(_ranged, what, twice=True, seed=seed)
+                name = f"each range twice, {what}, seed {seed}"
+                yield Row(name, "sensors", make, False, ("range",))
         make = partial(self._at_fixed_height)
         yield Row("flying, with a fixed height", "sensors", make, False, ("plane",))
         for name, (streams, config, late) in rover.ROWS.items():
@@ -301,10 +342,59 @@ class Inputs:
         case = self._recording(self._path("0426-traj1"))
         return replace(case, config={"fixed_height_std": 0.02})
 
+    def _over_a_table(self, seed: int, silent: bool) -> Case:
+        """A flight from a table over the floor, with a range finder."""
+        flight = fly_with(world_of("table", sensors=("height",)), seed, self)
+        begin, end = phases(flight.truth)["in_the_air"]
+        if silent:
+            middle = 0.5 * (begin + end)
+            t = flight.height.t
+            kept = (t < middle) | (t > middle + 2.0)
+            flight = replace(flight, height=rows_of(flight.height, kept))
+        return Case(_thinned(flight), phases(flight.truth))
+
+    def _wrong_until_landed(self, stream: str, change: Callable, seed: int) -> Case:
+        flight = self.flight_of("sensors", seed)
+        begin, end = phases(flight.truth)["in_the_air"]
+        part = getattr(flight, stream)
+        middle = 0.5 * (begin + end)
+        pieces = rows_of(part, part.t < middle), change(rows_of(part, part.t >= middle))
+        joined = type(part)(*map(np.concatenate, zip(*(vars(one).values() for one in pieces))))
+        spans = {"in the air": (middle, end), "then": (end, float(flight.truth.t[-1]))}
+        return Case(_thinned(replace(flight, **{stream: joined})), spans)
+
     def _faulty_sensor(self, stream: str, change: Callable[[Any], Any]) -> Case:
         flight = _cut(self.flight_of("sensors", FIRST_SEED), -math.inf, CUT)
         flight = _during(flight, stream, change)
         return Case(flight, {"during": (BEGIN, END), "after": (END, CUT)}, END)
+
+
+def fly_with(world: Any, seed: int, inputs: Inputs) -> Flight:
+    """A flight of `fly` in a World with a range finder."""
+    return inputs.kept(f"flown table height {seed}", lambda: fly(Task(world, seed)).flight)
+
+
+def _frozen(part: Any, name: str) -> Any:
+    column = getattr(part, name)
+    return replace(part, **{name: np.broadcast_to(column[:1], column.shape).copy()})
+
+
+# Faults of sensors that fly-faults does not have
+OF_A_SENSOR: dict[str, tuple[str, Callable[[Any], Any]]] = {
+    "height: frozen": ("height", lambda part: _frozen(part, "range")),
+    "velocity: frozen": ("velocity", lambda part: _frozen(part, "v")),
+    "velocity: twice as fast": ("velocity", lambda part: replace(part, v=2.0 * part.v)),
+    "velocity: 1 m/s to the side": ("velocity", lambda part: replace(part, v=part.v + [0, 1, 0])),
+    "velocity: 0.2 m/s to the side": (
+        "velocity",
+        lambda part: replace(part, v=part.v + [0, 0.2, 0]),
+    ),
+    "velocity: 0.1 m/s to the side": (
+        "velocity",
+        lambda part: replace(part, v=part.v + [0, 0.1, 0]),
+    ),
+    "velocity: a fifth too fast": ("velocity", lambda part: replace(part, v=1.2 * part.v)),
+}
 
 
 def _turned(part: Imu, R: np.ndarray) -> Imu:
@@ -391,6 +481,24 @@ def _long_silence() -> Case:
     return _gap(("tdoa",), 15.0, 60.0, 70.0)
 
 
+# Situations in which low anchors are late on the floor, as a calibration knows
+KNOWN_FLOORS = {
+    "landing": "landing, low anchors 3.2 m late on the floor",
+    "lift-off": "lift-off, low anchors 3.2 m late on the floor",
+    "at rest": "on the floor, low anchors 3.2 m late",
+}
+
+
+def _known_floor(what: str, seed: int) -> Case:
+    (one,) = [one for one in situations.SITUATIONS if one.name == KNOWN_FLOORS[what]]
+    case = _situation(one, seed)
+    anchors = case.flight.anchors
+    low = anchors.ids[anchors.positions[:, 2] < situations.LOW]
+    values = {f"{number}.delay": situations.LATE for number in low}
+    values |= dict(zip("xy", case.flight.truth.p[-1, :2].tolist()))
+    return replace(case, effects=EffectSet((EFFECTS["floor_multipath"](values),)))
+
+
 def _silent_lift_off(seed: int, late: bool) -> Case:
     """It lifts off at 4 s; no TDOAs from 3 to 8 s."""
     make = partial(situations._low_late, situations._hop) if late else situations._hop
@@ -444,6 +552,17 @@ def _halls() -> Iterator[Row]:
         for room in ("ceiling, 8", "wall, 8"):
             make = partial(_in_room, room, seed, 25.0, speed=1.0, dead=[(6.0, 16.0)])
             yield Row(f"{room}, silent for 10 s, seed {seed}", "halls", make)
+    for name in (HALL, "200 x 100 m, 231 anchors", "300 x 200 m, 988 anchors"):
+        for seed in range(10, 18):
+            yield Row(
+                f"{name}, first 4 s, seed {seed}", "halls", partial(_in_hall, name, seed, 4.0)
+            )
+    for seed in range(SEEDS):
+        yield Row(f"long wall, seed {seed}", "halls", partial(_at_a_long_wall, seed))
+        yield Row(f"100 x 60 m, 8 anchors, seed {seed}", "halls", partial(_among_few, seed))
+    for seed in range(3):
+        make = partial(_in_hall, HALL, seed, 60.0, rate=5.0)
+        yield Row(f"{HALL}, 5 TDOAs a second, seed {seed}", "halls", make)
     make = partial(_in_hall, HALL, 0, 120.0, dead=[(90.0, 103.3)])
     yield Row(f"{HALL}, silent after 90 s", "halls", make)
     make = partial(_in_hall, "300 x 200 m, 294 anchors", 0, 20.0)
@@ -460,6 +579,22 @@ def _in_hall(
 
 def _in_room(name: str, seed: int, duration: float, **more: Any) -> Case:
     return _walked(halls.room(name), seed, duration, True, more)
+
+
+def _at_a_long_wall(seed: int) -> Case:
+    """Ten anchors on a wall of 32 m, a tag up to 14 m away."""
+    positions = np.array([(0.0, y, z) for y in (0.0, 8.0, 16.0, 24.0, 32.0) for z in (0.5, 4.0)])
+    anchors = Anchors.from_positions(positions)
+    where = halls.Hall(anchors, (14.0, 32.0), 100.0, np.zeros(len(positions)))
+    return _walked(where, seed, 12.0, True, {"speed": 1.0})
+
+
+def _among_few(seed: int) -> Case:
+    """Eight anchors in the corners of a large hall, heard everywhere."""
+    corners_of = [(x, y, z) for x in (0.0, 100.0) for y in (0.0, 60.0) for z in (0.5, 6.0)]
+    anchors = Anchors.from_positions(np.array(corners_of))
+    where = halls.Hall(anchors, (100.0, 60.0), 200.0, np.zeros(len(anchors)))
+    return _walked(where, seed, 6.0, True, {})
 
 
 def _walked(where: Any, seed: int, duration: float, imu: bool, more: dict[str, Any]) -> Case:
@@ -509,7 +644,20 @@ def _driven(seed: int, streams: tuple[str, ...], config: FilterConfig, late: boo
     return Case(given, spans, None, changed, arm)
 
 
-def _ranged(what: str, fault: str = "sound") -> Case:
-    flight = ranges.spoiled(ranges.flown(0, persistent=True), ranges.FAULTS[fault], 0)
+def _with_range_finder(room: str, seed: int) -> Case:
+    """A tag below a ceiling of anchors, with a range finder over level ground."""
+    case = _in_room(room, seed, 12.0, speed=1.0)
+    truth = case.flight.truth
+    t = truth.t[4::4]
+    noise = 0.01 * np.random.default_rng(seed).standard_normal(len(t))
+    height = Height(t, np.interp(t, truth.t, truth.p[:, 2]) + noise)
+    return replace(case, flight=replace(case.flight, height=height))
+
+
+def _ranged(what: str, fault: str = "sound", twice: bool = False, seed: int = 0) -> Case:
+    flight = ranges.spoiled(ranges.flown(seed, persistent=True), ranges.FAULTS[fault], 0)
     flight = ranges.SETS[what](flight)
+    if twice:
+        both = np.repeat(np.arange(len(flight.range)), 2)
+        flight = replace(flight, range=rows_of(flight.range, both))
     return Case(flight, phases(flight.truth))

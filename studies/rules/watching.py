@@ -1,5 +1,5 @@
-"""The rules over streams and over residuals: what is said of sound and of faulty recordings, and
-when. They are Python, so that a variant is a changed module.
+"""Variants of the rules over streams and over residuals. They are Python, so that a variant is a
+changed module.
 """
 
 from __future__ import annotations
@@ -7,76 +7,117 @@ from __future__ import annotations
 import ast
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 import importlib
 import math
 from pathlib import Path
 from typing import Any
 
-from mistakes import MISTAKES, arriving
-import numpy as np
-
-from uwb_tdoa_bias.common.anchors import Anchors
-from uwb_tdoa_bias.common.flight import SENSOR_NAMES
 import uwb_tdoa_ekf
-from uwb_tdoa_ekf.monitoring.recorded import watched
-from uwb_tdoa_ekf.monitoring.stream_watch import StreamWatch
-from uwb_tdoa_ekf.offline import run_offline
-from uwb_tdoa_tools.checking.recording import of_flight
-from uwb_tdoa_tools.readers.streams import protocol
 
-from .rows import FIRST_SEED, SCREENED, VALUES, Inputs
+from .watched import Said
 
-Said = dict[str, list[float]]  # s, first and last, by rule
-HEALTHY = (*(name for name in SCREENED if "-" in name and "const" not in name), "0426-traj5")
-FAULTY = ("0426-traj5",)
-EVERY = 1.0  # s between two looks
-UNTIL = 45.0  # s
-LEAST = 1.0  # s, by which a detection must come later to count
+# s by which a detection must come later, or end later, to count; and share of the deciding number
+LEAST, NOTICED = 0.99, 0.02
 PACKAGE = "monitoring"
-KINDS = "streams", "monitoring"  # of what is watched
-# Modules whose rules judge streams by themselves
-OF_STREAMS = {
-    "stamp_rules",
-    "inertial_rules",
-    "ranging_rules",
-    "ranging_windows",
-    "stream_rules",
-    "stream_watch",
-    "survey_scale",
-    "explain",
-}
-NO_TUNING = {"inertial_rules.GRAVITY", "ranging_rules.TICK", "scale.NANOSECONDS"}
+KINDS = "streams", "scale", "sign", "monitoring"  # of what is watched
+# Kinds of rows that the rules of a module can change
+KINDS_OF = {
+    "explain": ("sign",),
+    "finding": KINDS,
+    "health": (),
+    "signs": ("sign", "monitoring"),
+    "status": (),
+    "survey_scale": ("scale",),
+} | dict.fromkeys(
+    (
+        "stamp_rules",
+        "inertial_rules",
+        "ranging_rules",
+        "ranging_windows",
+        "stream_rules",
+        "stream_watch",
+    ),
+    ("streams",),
+)
+NO_TUNING = {"ranging_rules.TICK", "survey_scale.NANOSECONDS"}
 LISTS = (  # of rules, by module
     ("monitoring.stamp_rules", "OF_ONE"),
     ("monitoring.stamp_rules", "OF_BOTH"),
     ("monitoring.inertial_rules", "RULES"),
     ("monitoring.ranging_rules", "RULES"),
 )
-METHODS = {  # of the monitor: what takes their place
-    "an anchor that changes": ("monitor.Monitor._look_for_change", None),
-    "an anchor that is not as surveyed": ("monitor.Monitor._compare", None),
-    "two anchors that are exchanged": ("monitor.Monitor._look_for_swap", False),
-    "an anchor that falls silent": ("monitor.Monitor._is_silent", False),
-    "a bias of the IMU that moves": ("monitor.Monitor._follow_biases", None),
-    "a change is clear": ("monitor._is_clear", True),
-    "a displacement matters": ("monitor._matters", True),
-    "signs that turn": ("monitor.turned", False),
-    "an anchor passed long ago": ("monitor.Monitor._was_often", True),
-    "signs that are wrong": ("sign_watch.SignWatch.feed", None),
-    "blocks of both streams are ours": ("stream_watch.StreamWatch._starved", False),
-    "notes are not said in flight": ("stream_watch.StreamWatch._counts", True),
+# What takes the place of a function of the package, or the value of a constant, where a rule is off
+SWITCHES: dict[str, tuple[str, Any]] = {
+    "an anchor that changes": ("monitor.Monitor._look_for_change", lambda *_: None),
+    "an anchor that is not as surveyed": ("monitor.Monitor._compare", lambda *_: None),
+    "two anchors that are exchanged": ("monitor.Monitor._look_for_swap", lambda *_: False),
+    "an anchor that falls silent": ("monitor.Monitor._is_silent", lambda *_: False),
+    "a silent anchor was heard often": ("monitor.Monitor._was_often", lambda *_: True),
+    "a silent anchor is near": ("monitor.NEARER", 1e9),
+    "anchors passed long ago are forgotten": ("monitor.FORGET", 10**9),
+    "a bias of the IMU that moves": ("monitor.Monitor._follow_biases", lambda *_: None),
+    "a change is clear": ("monitor._is_clear", lambda *_: True),
+    "a change is clearly of one anchor": ("monitor.CLEARLY", 0.0),
+    "a change explains most errors": ("monitor.MOST_LEFT", math.inf),
+    "no change while most TDOAs are rejected": ("monitor.FEWEST_ACCEPTED", 0.0),
+    "no change soon after the first motion": ("monitor.SETTLE", 0.0),
+    "a small change is over": ("monitor.SMALLEST_CHANGE", 0.0),
+    "a displacement matters": ("monitor._matters", lambda *_: True),
+    "a displacement is found several times": ("monitor.NAMED", 1),
+    "recent slices are compared with the calibration": ("monitor.YOUNG", 10**9),
+    "a sure comparison settles a doubt": (
+        "monitor._surest",
+        lambda displaced: {one.row: one for one in displaced},
+    ),
+    "an exchange is heard several times": ("monitor.TOGETHER", 1),
+    "an exchange holds for a while": ("monitor.HELD", 1),
+    "signs that turn": ("monitor.turned", lambda *_: False),
+    "signs turn only where the filter was right": ("monitor.AGREED", math.inf),
+    "signs turn once in a while": ("monitor.TURN_APART", 0.0),
+    "a clock that drifts": ("change.FASTEST_DRIFT", 0.0),
+    "a drift is clearer than a step": ("change.CLEARLY", 1.0),
+    "the size of a change is refined": ("change.ChangeDetector.refined", lambda *_: None),
+    "the errors of a flight set the limit": ("change.LARGEST_ERROR", 0.0),
+    "prior of the errors of a flight": ("change.SCALE_SLICES", 0),
+    "smooth errors of each anchor": ("reference.FUNCTION_STDS", (1e-4,)),
+    "errors that are constant in a cell": ("reference.ERROR_STDS", (1e-4,)),
+    "enough cells for a comparison": ("reference.FEWEST_CELLS", 0),
+    "enough slices for a comparison": ("reference.FEWEST_SLICES", 0),
+    "large innovations are clipped": ("slices.CLIP", math.inf),
+    "an exchange is looked for at large residuals only": ("swap.LARGE", 0.0),
+    "an exchange is clear by far": ("swap.SHARE", 0.0),
+    "an exchange is clear alone": ("swap.MOST_LEFT", 0.0),
+    "large residuals of an exchange are clipped": ("swap.CLIP", math.inf),
+    "signs: the present sign explains little": ("signs.PRESENT", 2.0),
+    "signs: enough TDOAs": ("signs.FEWEST", 0),
+    "signs that are wrong": ("signs.SignWatch.feed", lambda *_: None),
+    "doubts of the filter about signs": ("signs.SignWatch.doubt", lambda *_: None),
+    "a comparison of signs begins anew": ("signs.LONGEST", math.inf),
+    "signs: significant": ("signs.DEVIATIONS", -math.inf),
+    "signs: much better": ("signs.RATIO", 1.0),
+    "blocks of few TDOAs do not count": ("explain.FEW", 0),
+    "fewest blocks for signs": ("explain.LEAST", 2),
+    "blocks of both streams are ours": ("stream_watch.StreamWatch._starved", lambda *_: False),
+    "notes are not said in flight": ("stream_watch.StreamWatch._counts", lambda *_: True),
+    "a replay at another rate": ("stream_watch.SMALLEST_UNIT", 0.0),
+    "findings end with their cause": ("stream_watch.LATEST", 0),
+    "a finding needs several windows": ("stream_watch.FEWEST", 1),
+    "windows are checked together": ("stream_watch.KEPT", 2),
+    "unknown ids": ("stream_rules.StreamRules._unknown", lambda *_: None),
+    "order of stamps comes first": ("stamp_rules.orderly", lambda *_: True),
+    "TDOAs that are late": ("stamp_rules._late", lambda *_: False),
+    "a tag at rest": ("inertial_rules.resting", lambda *_: False),
+    "the direction of a force without gravity": ("inertial_rules.STEADY", 0.0),
+    "the motion outweighs a force without gravity": ("inertial_rules.WEIGHTLESS", math.inf),
+    "the scale of a survey": ("survey_scale.SurveyScale.add", lambda *_: None),
+    "one anchor in another unit": ("survey_scale.SINGLE", 0),
+    "a scale: significant": ("survey_scale.DEVIATIONS", -math.inf),
+    "a scale: much better": ("survey_scale.LEFT", 1.0),
+    "a scale: fits well": ("survey_scale.GOOD", math.inf),
+    "a scale: much time or motion where it is less clear": ("survey_scale.CLEARLY", 1.0),
+    "a scale: TDOAs that are not in metres": ("survey_scale.SMALL", 0.0),
 }
-
-
-@dataclass(frozen=True)
-class Watched:
-    """A row: said() : Said. of : "streams" or "monitoring", whose rules it shows."""
-
-    name: str
-    of: str
-    said: Callable[[], Said]
 
 
 @dataclass(frozen=True)
@@ -111,100 +152,6 @@ def _found(path: str) -> Any:
     return found
 
 
-def rows(inputs: Inputs) -> list[Watched]:
-    """All of them."""
-    made = []
-    for name in dict.fromkeys((*HEALTHY, *FAULTY)):
-        case = inputs.recording(name)
-        made.append(Watched(f"{name} is sound", "streams", partial(_streams, inputs, name, "")))
-        made.append(
-            Watched(f"{name} is sound, residuals", "monitoring", partial(_residuals, inputs, name))
-        )
-        if name in FAULTY:
-            made.append(
-                Watched(
-                    f"{name}, anchor moved", "monitoring", partial(_residuals, inputs, name, True)
-                )
-            )
-            kind = protocol(case.flight.tdoa)
-            for fault, mistake in MISTAKES.items():
-                needs = mistake.needs
-                if "other" in needs or "rooms" in needs or needs not in ("", "imu", "live", kind):
-                    continue
-                made.append(
-                    Watched(f"{name}, {fault}", "streams", partial(_streams, inputs, name, fault))
-                )
-    for world in ("hall", "anchor-late", "anchor-silent"):
-        for k in range(2):
-            name = f"fly {world} {FIRST_SEED + k}"
-            made.append(
-                Watched(
-                    f"{name}, residuals",
-                    "monitoring",
-                    partial(_flown, inputs, world, FIRST_SEED + k),
-                )
-            )
-    for fault in ("tdoa: sign", "tdoa: two ids exchanged", "tdoa: an anchor 1 m late"):
-        made.append(Watched(f"{fault}, residuals", "monitoring", partial(_faulty, inputs, fault)))
-    return made
-
-
-def _streams(inputs: Inputs, name: str, fault: str) -> Said:
-    recording = inputs.kept(f"streams {name} {fault}", lambda: _recording(inputs, name, fault))
-    watch = StreamWatch(recording.anchors, 0.25)
-    imu, tdoa = recording.imu, recording.tdoa
-    begin = min(recording.tdoa_arrival[0], recording.imu_arrival[0])
-    said: Said = {}
-    for at in np.arange(begin + EVERY, begin + UNTIL, EVERY):
-        k = (recording.imu_arrival > at - EVERY) & (recording.imu_arrival <= at)
-        watch.add_imu(imu.t[k], recording.imu_arrival[k], imu.gyro[k], imu.accel[k])
-        k = (recording.tdoa_arrival > at - EVERY) & (recording.tdoa_arrival <= at)
-        watch.add_tdoa(tdoa.t[k], recording.tdoa_arrival[k], tdoa.a[k], tdoa.b[k], tdoa.d[k])
-        for finding in watch.findings():
-            said.setdefault(finding.rule, [at - begin, 0.0])[1] = at - begin
-    return said
-
-
-def _recording(inputs: Inputs, name: str, fault: str) -> Any:
-    recording = arriving(of_flight(inputs.recording(name).flight), 0)
-    if not fault:
-        return recording
-    return MISTAKES[fault].make(recording, np.random.default_rng([0, *fault.encode()]), None)
-
-
-def _events(anchors: Anchors, run: Any) -> Said:
-    said: Said = {}
-    for event in watched(anchors, run.odometry, run.residuals):
-        key = f"{event.finding.rule} {event.finding.cause.split(':')[0]}"
-        said.setdefault(key, [event.since, event.until])[1] = event.until
-    return said
-
-
-def _run(inputs: Inputs, key: str, flight: Any) -> Any:
-    return inputs.kept(f"run {key}", lambda: run_offline(flight))
-
-
-def _residuals(inputs: Inputs, name: str, moved: bool = False) -> Said:
-    flight = inputs.recording(name).flight.without(*SENSOR_NAMES)
-    anchors = flight.anchors
-    if moved:
-        positions = anchors.positions.copy()
-        positions[3] += [0.5, -0.3, 0.0]
-        anchors = Anchors(anchors.ids, positions, anchors.orientations)
-        flight = replace(flight, anchors=anchors)
-    return _events(anchors, _run(inputs, f"{name} {moved}", flight))
-
-
-def _flown(inputs: Inputs, world: str, seed: int) -> Said:
-    flight = inputs.flight_of(world, seed)
-    return _events(flight.anchors, _run(inputs, f"{world} {seed}", flight))
-
-
-def _faulty(inputs: Inputs, fault: str) -> Said:
-    flight = inputs.faulty(VALUES[fault], fault.split(":")[0]).flight
-    return _events(flight.anchors, _run(inputs, fault, flight))
-
-
 def patches() -> list[Patch]:
     """Every rule off, every constant of Python code halved and doubled."""
     made = []
@@ -213,16 +160,30 @@ def patches() -> list[Patch]:
             left = tuple(one for one in getattr(_found(module), name) if one is not rule)
             label = f"without: {module.split('.')[1]}.{rule.__name__}"
             made.append(Patch(label, ("streams",), {(module, name): left}))
-    for label, (path, value) in METHODS.items():
-        owner, _, name = f"monitoring.{path}".rpartition(".")
-        of = "streams" if "watch." in path else "monitoring"
-        instead = partial(_constant, value)
-        made.append(Patch(f"without: {label}", (of,), {(owner, name): _method(instead)}))
-    return made + list(_constants(PACKAGE))
+    trees = _trees()
+    for label, (path, value) in SWITCHES.items():
+        module, *_ = path.split(".")
+        owner, _, name = f"{PACKAGE}.{path}".rpartition(".")
+        where = [owner] if "." in path.partition(".")[2] else _holders(trees, module, name)
+        instead = _method(value) if callable(value) else value
+        changed = {(one, name): instead for one in where}
+        made.append(Patch(f"without: {label}", _kinds(module), changed))
+    return made + list(_constants(trees))
 
 
-def _constant(value: Any, *_: object, **__: object) -> Any:
-    return value
+def _kinds(module: str) -> tuple[str, ...]:
+    return KINDS_OF.get(module, ("monitoring",))
+
+
+def _trees() -> dict[str, ast.Module]:
+    folder = Path(uwb_tdoa_ekf.__file__).parent / PACKAGE
+    return {path.stem: ast.parse(path.read_text()) for path in sorted(folder.glob("*.py"))}
+
+
+def _holders(trees: dict[str, ast.Module], module: str, name: str) -> list[str]:
+    """Modules that hold a name of a module: itself, and those that import it."""
+    others = [other for other, tree in trees.items() if _imports(tree, module, name)]
+    return [f"{PACKAGE}.{one}" for one in (module, *others)]
 
 
 def _method(function: Callable) -> Callable:
@@ -230,9 +191,7 @@ def _method(function: Callable) -> Callable:
     return lambda *args, **named: function(*args, **named)
 
 
-def _constants(package: str) -> Iterator[Patch]:
-    folder = Path(uwb_tdoa_ekf.__file__).parent / package
-    trees = {path.stem: ast.parse(path.read_text()) for path in sorted(folder.glob("*.py"))}
+def _constants(trees: dict[str, ast.Module]) -> Iterator[Patch]:
     for module, tree in trees.items():
         frozen = {
             node.id
@@ -242,19 +201,17 @@ def _constants(package: str) -> Iterator[Patch]:
             if isinstance(node, ast.Name)
         }
         for name in _tuned_names(tree):
-            found = getattr(_found(f"{package}.{module}"), name)
+            found = getattr(_found(f"{PACKAGE}.{module}"), name)
             key = f"{module}.{name}"
-            if name in frozen or key in NO_TUNING or not _is_number(found):
+            kinds = _kinds(module)
+            if name in frozen or key in NO_TUNING or not kinds or not _is_number(found):
                 continue
-            where = [f"{package}.{module}"] + [
-                f"{package}.{other}" for other, its in trees.items() if _imports(its, module, name)
-            ]
-            of = ("streams",) if module in OF_STREAMS else ("monitoring",)
+            where = _holders(trees, module, name)
             for factor in (0.5, 2.0):
                 scaled = _scaled(found, factor)
                 if scaled != found:
-                    label = f"{package}.{key} x {factor:g}"
-                    yield Patch(label, of, {(one, name): scaled for one in where})
+                    changed = {(one, name): scaled for one in where}
+                    yield Patch(f"{PACKAGE}.{key} x {factor:g}", kinds, changed)
 
 
 def _tuned_names(tree: ast.Module) -> list[str]:
@@ -292,10 +249,15 @@ def _imports(tree: ast.Module, module: str, name: str) -> bool:
 
 
 def differs(before: Said, after: Said) -> dict[str, str]:
-    """{rule: "lost", "new" or "late"} of what is said of a row."""
+    """{rule: "lost", "new", "late", "early", "longer", "shorter" or "size"} of what is said of a row."""
     out = {rule: "lost" for rule in before if rule not in after}
     out |= {rule: "new" for rule in after if rule not in before}
     for rule in before.keys() & after.keys():
-        if abs(after[rule][0] - before[rule][0]) > max(LEAST, 0.02 * abs(before[rule][0])):
-            out[rule] = "late" if after[rule][0] > before[rule][0] else "early"
+        (first, last, size), (its_first, its_last, its_size) = before[rule], after[rule]
+        if abs(its_first - first) > LEAST:
+            out[rule] = "late" if its_first > first else "early"
+        elif abs(its_last - last) > LEAST:
+            out[rule] = "longer" if its_last > last else "shorter"
+        elif abs(its_size - size) > NOTICED * max(abs(size), abs(its_size)):
+            out[rule] = "size"
     return out

@@ -13,11 +13,11 @@ from tqdm import tqdm
 from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_tools.results_file import ResultsFile
 
-from . import watching
+from . import watched, watching
 from .catalogue import OF_SENSORS, RULES
 from .rows import Inputs, Row, judged
 from .tuned import Entry, Live, Tuned
-from .worth import worth
+from .worth import MATTERS_ROWS, Worth, worth
 
 BASE = "as it is"
 FACTORS = 0.5, 2.0
@@ -50,6 +50,10 @@ class Variant:
     def concerns(self, row: Row) -> bool:
         """Whether it can change a Row in a way that rows without sensors do not show."""
         return self.entry is None or (self.sensor in row.needs if self.sensor else not row.needs)
+
+    def is_decided(self, so_far: Worth) -> bool:
+        """Whether more rows need not be run: a rule is clearly worth it, or a constant matters."""
+        return so_far.matters if self.factor else so_far.clear
 
     def apply(self, live: Live) -> bool:
         """Make the filter this one. Returns False if it stays what it is."""
@@ -87,16 +91,18 @@ def main(job: dict[str, Any]) -> None:
         for variant in variants_of(tuned)
         if variant.entry is None or any(word in variant.name for word in job["only"])
     ]
+    if job["stop"]:  # the shortest first
+        rows.sort(key=lambda row: len(inputs.case(row).flight.truth.t))
     base: dict[str, dict[str, list]] = {}
     with ResultsFile(job["results"], {"study": "rules"}) as done:
         for variant in tqdm(chosen, unit="variant", disable=None, file=sys.stderr):
             found: dict[str, dict[str, list]] = {}
             for row in rows:
                 key = f"{variant.name} | {row.name}"
-                if (job["screen"] and not variant.concerns(row)) or (
-                    worth(base, found).clear and job["stop"]
-                ):
+                if job["screen"] and not variant.concerns(row):
                     continue
+                if job["stop"] and variant.is_decided(worth(base, found)):
+                    break
                 if key not in done:
                     case = inputs.case(row)  # is made by the filter as it is
                     if not variant.apply(live):
@@ -110,27 +116,36 @@ def main(job: dict[str, Any]) -> None:
 
 def _watch(job: dict[str, Any], inputs: Inputs) -> None:
     """The rules over streams and residuals, by the filter as it is."""
-    rows = watching.rows(inputs)
+    rows = watched.rows(inputs)
     rows = [row for row in rows if not job["rows"] or any(word in row.name for word in job["rows"])]
     chosen = [watching.Patch(BASE, watching.KINDS, {}), *watching.patches()]
     chosen = [
         one for one in chosen if one.name == BASE or any(word in one.name for word in job["only"])
     ]
+    base: dict[str, watched.Said] = {}
     with ResultsFile(job["results"], {"study": "rules, watch"}) as done:
         for patch in tqdm(chosen, unit="variant", disable=None, file=sys.stderr):
+            changed = 0
             for row in rows:
                 key = f"{patch.name} | {row.name}"
-                if key not in done and row.of in patch.of:
+                if row.of not in patch.of or (job["stop"] and changed >= MATTERS_ROWS):
+                    continue
+                if key not in done:
                     done[key] = {"said": _said(patch, row)}
+                said = done[key]["said"]
+                if patch.name == BASE:
+                    base[row.name] = said
+                else:
+                    changed += bool(watching.differs(base[row.name], said))
 
 
-def _said(patch: watching.Patch, row: watching.Watched) -> Any:
+def _said(patch: watching.Patch, row: watched.Watched) -> watched.Said:
     """What is said of a row, or the error that a variant makes."""
     with patch.applied():
         try:
             return row.said()
         except (ArithmeticError, IndexError, KeyError, TypeError, ValueError) as error:
-            return {f"{type(error).__name__}": [0.0, 0.0]}
+            return {f"{type(error).__name__}": [0.0, 0.0, 0.0]}
 
 
 assert set(SENSORS) == {"height", "pressure", "velocity", "range"}  # as MODULES has them

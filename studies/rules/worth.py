@@ -14,6 +14,8 @@ HONEST = 3.0  # NEES of an honest filter
 # loss, in so many rows, and mean loss: it is worth it
 CLEAR, CLEAR_ROWS, CLEAR_MEAN = (0.05, 3, 0.01)
 
+MATTERS_ROWS = 2  # so many rows that change show that a constant matters
+
 
 @dataclass
 class Worth:
@@ -35,6 +37,11 @@ class Worth:
     def clear(self) -> bool:
         """Whether the filter is clearly worse: more rows need not be run."""
         return self.lost >= CLEAR_ROWS and self.mean > CLEAR_MEAN
+
+    @property
+    def matters(self) -> bool:
+        """Whether enough rows change to say that a constant matters."""
+        return self.changed >= MATTERS_ROWS
 
     @property
     def mean(self) -> float:

@@ -104,10 +104,17 @@ def test_a_loss_is_told_from_a_gain_and_from_what_does_not_matter():
 
 
 def test_what_is_said_less_more_or_later_is_told():
-    before = {"gap": [3.0, 9.0], "sign": [20.0, 30.0]}
-    after = {"gap": [6.0, 9.0], "rate": [4.0, 5.0]}
+    before = {"gap": [3.0, 9.0, 1.0], "sign": [20.0, 30.0, 0.5], "unit": [4.0, 9.0, 10.0]}
+    after = {"gap": [6.0, 9.0, 1.0], "rate": [4.0, 5.0, 2.0], "unit": [4.0, 9.0, 11.0]}
+    after["sign"] = [20.0, 27.0, 0.5]
     assert watching.differs(before, before) == {}
-    assert watching.differs(before, after) == {"sign": "lost", "rate": "new", "gap": "late"}
+    assert watching.differs(before, after) == {
+        "gap": "late",
+        "rate": "new",
+        "sign": "shorter",
+        "unit": "size",
+    }
+    assert watching.differs(after, {}) == dict.fromkeys(after, "lost")
 
 
 def test_patches_change_modules_only_while_they_are_applied():
@@ -120,3 +127,21 @@ def test_patches_change_modules_only_while_they_are_applied():
     with made["without: ranging_rules.rounded"].applied():
         assert len(ranging_rules.RULES) == len(rules) - 1
     assert monitor.LIMIT == 16.3 and ranging_rules.RULES is rules
+
+
+def test_every_switch_of_a_rule_over_streams_and_residuals_is_there():
+    """Each changes something that is there, and puts it back."""
+    made = {patch.name.removeprefix("without: "): patch for patch in watching.patches()}
+    for name in watching.SWITCHES:
+        with made[name].applied():
+            pass
+        assert made[name].of, name
+
+
+def test_a_constant_is_left_where_two_rows_show_that_it_matters_and_a_rule_where_it_is_worth_it():
+    base = {name: {"air": [0.2, 1.0, 0.0, 0.1]} for name in "abcd"}
+    worse = {name: {"air": [0.3, 1.0, 0.0, 0.1]} for name in "ab"}
+    constant, rule = (work.Variant("", None, factor) for factor in (0.5, 0.0))
+    assert constant.is_decided(worth(base, worse)) and not rule.is_decided(worth(base, worse))
+    worse["c"] = worse["a"]
+    assert rule.is_decided(worth(base, worse)) and not rule.is_decided(worth(base, base))

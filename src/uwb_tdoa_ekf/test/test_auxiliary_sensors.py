@@ -32,7 +32,9 @@ STEP = 1e-6
 UNKNOWN_SENSOR = """
 from dataclasses import replace
 from uwb_tdoa_bias.common.sensors import SENSORS
-SENSORS["sonar"] = replace(SENSORS["velocity"], name="sonar")
+velocity = SENSORS["velocity"]
+parameters = {"use_sonar": velocity.parameters["use_velocity"]}
+SENSORS["sonar"] = replace(velocity, name="sonar", parameters=parameters)
 import uwb_tdoa_ekf.core.engine
 """
 

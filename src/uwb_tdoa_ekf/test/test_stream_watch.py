@@ -96,6 +96,12 @@ def test_a_tag_at_a_fixed_height_may_hear_three_anchors():
     assert not any(FEW_ANCHORS in found for found in watched(imu, tdoa, ignored=[FEW_ANCHORS]))
 
 
+def test_few_tdoas_a_second_are_slow_and_not_clipped():
+    imu, tdoa = streams(10.0)
+    said = watched(imu, tuple(column[::37] for column in tdoa), 10.0)
+    assert {rule for found in said for rule in found} == {"rate"}
+
+
 def test_another_time_is_judged_anew():
     imu, tdoa = streams(8.0)
     watch = StreamWatch(ANCHORS, 0.25)

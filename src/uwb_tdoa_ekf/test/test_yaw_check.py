@@ -146,6 +146,3 @@ def test_evidence_is_the_likelihood_ratio_of_the_best_angle():
     # innovations of 270 degrees
     doubt.vector[:] = 10.0 * np.array([math.cos(1.5 * math.pi) - 1.0, math.sin(1.5 * math.pi)])
     assert evidence(doubt) == pytest.approx(0.5 * 10.0 * 2.0)
-    doubt.vector[:] = 0.0
-    doubt.turned, doubt.variance = 0.3, 0.01
-    assert evidence(doubt) == pytest.approx(4.5)

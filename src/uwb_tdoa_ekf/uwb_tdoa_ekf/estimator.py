@@ -13,10 +13,9 @@ from uwb_tdoa_bias.common.stamps import LARGEST_STEP_BACK
 from uwb_tdoa_bias.effects import EffectSet
 
 from .anchor_table import MOST_ROWS, AnchorTable
-from .core import sensors
+from .core import height, sensors
 from .core.config import FilterConfig
-from .core.engine import LOST_TIME
-from .core.height import LONGEST_GAP
+from .core.initialization import LOST_TIME
 from .core.measurements import imu_rows, sensor_rows, usable_tdoas
 from .core.memory import (
     IMU_SAMPLE,
@@ -156,7 +155,7 @@ class Estimator:
         ekf = self._ekf
         if not ekf.running:
             return None
-        known = self.config.fixed_height_std > 0.0 or ekf.t - ekf.height.used < LONGEST_GAP
+        known = self.config.fixed_height_std > 0.0 or ekf.t - ekf.height.used < height.MEMORY
         places = {
             h // N_YAWS for h in np.flatnonzero(ekf.hypotheses["log_weight"] > -np.inf).tolist()
         }

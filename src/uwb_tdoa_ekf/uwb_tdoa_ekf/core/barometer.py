@@ -13,12 +13,12 @@ from uwb_tdoa_bias.common.compiled import Record, compiled
 from uwb_tdoa_bias.common.robust_loss import GEMAN_MCCLURE, weight
 
 from .auxiliary import PRESSURE, PRESSURE_DRIFT, RANGE, add_offset_jacobian
+from .height import GATE
 from .hypotheses import alive
 from .memory import REJECTED, USED
 from .state import ERROR_STATES
 from .update import kalman, project
 
-GATE = 4.0  # standard deviations; the gate of an altitude
 LONGEST_DISAGREEMENT = 1.0  # s without a used altitude, after which the offset is initialized again
 AVERAGE = 3.0  # s over which innovations are averaged to inflate the random walk of the offset
 UNTRIED, WORST = 10.0, 100.0  # standard deviations: initial and largest inflation

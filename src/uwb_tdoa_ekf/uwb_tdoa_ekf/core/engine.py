@@ -41,6 +41,7 @@ from . import (
     workspace,
     yaw_check,
 )
+from .initialization import LOST_TIME, RECOVERY_WINDOW
 from .memory import (
     COMPENSATED,
     HYPOTHESES,
@@ -60,12 +61,8 @@ from .startup import INLIER
 from .state import coast, predict, turn_about_vertical
 from .update import project
 
-CONSISTENCY_TIME = 0.3  # s over which the share of TDOAs that agree with the filter is averaged
 INCONSISTENT = 0.5  # share below which the filter searches for the tag elsewhere
 UNSURE_TIME = 0.5  # s of TDOAs after a silence in which the filter searches for a lost tag
-# s without a TDOA after which a tag that may be anywhere in its workspace is lost: the filter
-# stops, then starts again
-LOST_TIME = 30.0
 MAX_STEP = 0.05  # s, longest single prediction
 # s of inertial samples that determine the initial attitude if the IMU starts after the filter
 AVERAGED = 0.25
@@ -341,7 +338,7 @@ def _select(ekf: Record, parameters: Record, t: float, records: np.ndarray) -> N
 @compiled
 def _note_agreement(ekf: Record, t: float, agrees: bool) -> None:
     """Average the share of measurements that agree with the best hypothesis; t is a stamp (s)."""
-    share = min(1.0, (t - ekf.last_tdoa) / CONSISTENCY_TIME)
+    share = min(1.0, (t - ekf.last_tdoa) / RECOVERY_WINDOW)
     ekf.consistency += share * ((1.0 if agrees else 0.0) - ekf.consistency)
 
 
@@ -679,7 +676,7 @@ def _report(ekf: Record, parameters: Record, t: float, row: Record) -> None:
     hypotheses.add_spread_of_means(ekf, row.covariance)
     workspace.add_circle(
         ekf,
-        parameters.fixed_height_std > 0.0 or t - ekf.height.used < height.LONGEST_GAP,
+        parameters.fixed_height_std > 0.0 or t - ekf.height.used < height.MEMORY,
         best.x,
         row.covariance,
     )

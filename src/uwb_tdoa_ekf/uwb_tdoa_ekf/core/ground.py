@@ -17,6 +17,8 @@ import numpy as np
 from uwb_tdoa_bias.common.compiled import Record, compiled
 from uwb_tdoa_bias.common.geometry import linearized_tdoa
 
+from .update import GATE
+
 # tangent of the elevation below which the ground inverts the phase of a reflection
 GRAZING = math.tan(math.radians(15.0))
 HALF_WAVE = 0.0375  # m, at 4 GHz: rays with a larger path difference do not cancel
@@ -27,7 +29,6 @@ FARTHER = 1e-3  # 1/m, density of larger delays, and of outliers of any kind
 RARE = 0.02  # least probability that an anchor is late, and that it is in time
 USUAL = 0.1  # prior probability that it is late
 CHANGE_TIME = 2.0  # s after which the last state of an anchor does not predict the next
-DEVIATIONS = 3.0  # standard deviations by which a tag may be lower than the estimate
 # m above the ground below which reflections distort the pulse; m, standard deviation of the error
 # at the ground
 BLURRED, BLUR_STD = (0.8, 0.25)
@@ -38,7 +39,7 @@ FEWEST_PAIRS = 3
 STILL_TDOAS = 2  # least number of TDOAs of a pair in each half of the window
 SMALLEST_SPREAD = 0.02  # m, least standard deviation of the values of a pair
 STILL_SPEED = 0.3  # m/s; a velocity of zero is accepted only if its standard deviation is smaller
-LIKELY_SPEED = 1.0  # m/s, prior standard deviation of the velocity
+SPEED = 1.0  # m/s, prior standard deviation of the velocity
 # scale of the loss, in standard deviations of a change: beyond, the lateness has changed; and
 # number of sweeps
 STILL_SCALE, STILL_SWEEPS = (2.5, 5)
@@ -148,7 +149,7 @@ def find_lateness(a: Record, b: Record, hypothesis: Record, t: float, ground: fl
     ground : float
         Height of the ground, m, world frame.
     """
-    lower = DEVIATIONS * math.sqrt(hypothesis.P[2, 2])
+    lower = GATE * math.sqrt(hypothesis.P[2, 2])
     _predict_lateness(a, hypothesis.x, lower, t, ground)
     _predict_lateness(b, hypothesis.x, lower, t, ground)
     return a.late > 0.0 or b.late > 0.0
@@ -305,7 +306,7 @@ def judge_motion(
     for _sweep in range(STILL_SWEEPS):
         both[:, :] = 0.0
         for k in range(3):
-            both[k, k], both[k, 3 + k] = 1.0 / LIKELY_SPEED**2, 1.0
+            both[k, k], both[k, 3 + k] = 1.0 / SPEED**2, 1.0
         for k in range(n):
             row = changes[k]
             r = row[3] - row[0] * v[0] - row[1] * v[1] - row[2] * v[2]

@@ -19,25 +19,25 @@ from uwb_tdoa_bias.common.robust_loss import GEMAN_MCCLURE, weight
 
 from .history import add_reset, add_update
 from .hypotheses import LARGEST_NIS, alive
+from .inertial import UPRIGHT
 from .memory import N_YAWS, REJECTED, USED
 from .state import rotation
 from .update import kalman, project
+from .workspace import STD
 
-STEEPEST = 0.5  # cos(tilt) below which the beam may hit the ground anywhere
 # s over which the error of a range persists: the ground is uneven, the sensor has an offset
 CORRELATION_TIME = 0.5
-LONGEST_GAP = 1.0  # s without an agreeing range, after which the ground level below is unknown
-STUCK_TIME = 0.5  # s; a working range finder in motion never repeats a value for this long
+# s of ranges and TDOAs that count: after so long without an agreeing range, the ground level below is
+# unknown; after so long in agreement, a disagreement is a step of the ground
+MEMORY = 1.0
+STUCK_TIME = 0.5  # s; a working sensor of a tag in motion never repeats a value for this long
 GATE = 4.0  # standard deviations beyond which a range disagrees
 ALIKE = 0.15  # m within which disagreeing ranges agree with each other
 STEP_TIME, STEP_COUNT = 0.25, 7  # s and number of consistent ranges that show a step
-SETTLED = 1.0  # s of agreement after which a disagreement means a step of the ground
 HIGHEST_STEP = 1.5  # m, of the ground
-BEYOND = 1.0  # m above or below the workspace that no tag reaches
 PULL_SCALE = 3.0  # m, scale of the loss that weighs the innovations of TDOAs
-# s over which TDOAs are averaged, m by which they disagree, s after which that counts
-PULL_TIME, PULL_LIMIT, PULL_DELAY = (1.0, 0.45, 3.0)
-# s for which the range finder is ignored, the first time and at most
+PULL_LIMIT = 0.45  # m by which TDOAs disagree
+# s of disagreement after which the range finder is ignored, for as long the first time, and at most
 IGNORE_TIME, LONGEST_IGNORED = (3.0, 60.0)
 
 
@@ -94,15 +94,13 @@ def observe(
             ekf.transition.rotation,
             innovation,
         )
-    if sensor.t - height.used > LONGEST_GAP:
-        height.agreed = 0.0
     base_innovation = z - ekf.hypotheses[ekf.best].x[2]
     limit = GATE * math.sqrt(residual.variance)
     if abs(innovation.value) > limit or _is_alike(height, innovation.value):
         if not _settle(ekf, parameters, sensor.t, base_innovation, limit, records):
             return
     since = sensor.t - height.used
-    height.agreed += min(since, LONGEST_GAP) if since < LONGEST_GAP else 0.0
+    height.agreed += min(since, MEMORY) if since < MEMORY else 0.0
     height.used, height.disagreeing = sensor.t, max(0, height.disagreeing - 1)
     for h in range(len(ekf.hypotheses)):
         hypothesis = ekf.hypotheses[h]
@@ -111,7 +109,7 @@ def observe(
         compare(hypothesis, height.level, distance, parameters, ekf.transition.rotation, innovation)
         total = innovation.prior_variance + innovation.noise_variance
         w = weight(GEMAN_MCCLURE, innovation.value / math.sqrt(total), GATE)
-        inflation = max(1.0, 2.0 * CORRELATION_TIME / max(min(since, LONGEST_GAP), 1e-3))
+        inflation = max(1.0, 2.0 * CORRELATION_TIME / max(min(since, MEMORY), 1e-3))
         innovation.total_variance = (
             innovation.prior_variance + innovation.noise_variance * inflation / w
         )
@@ -251,7 +249,7 @@ def _settle(
         height.level = parameters.ground_height
         return True
     doubted = height.ignore_time > 0.0
-    if (height.agreed >= SETTLED or doubted) and abs(value) < HIGHEST_STEP:
+    if (height.agreed >= MEMORY or doubted) and abs(value) < HIGHEST_STEP:
         height.level -= height.disagreement
         return True
     if doubted:
@@ -270,7 +268,7 @@ def _settle(
 def update_pull(height: Record, parameters: Record, innovation: Record, t: float) -> None:
     """Update the mean height error that TDOAs show, while a range finder or fixed height holds z.
 
-    If they disagree for PULL_DELAY, the range finder is ignored.
+    If they disagree for IGNORE_TIME, the range finder is ignored.
 
     Parameters
     ----------
@@ -283,13 +281,13 @@ def update_pull(height: Record, parameters: Record, innovation: Record, t: float
     t : float
         Stamp, s.
     """
-    ranged = t - height.used < LONGEST_GAP and t >= height.ignored_until
+    ranged = t - height.used < MEMORY and t >= height.ignored_until
     if not (ranged or parameters.fixed_height_std > 0.0):
         height.pulls_since = t
         return
     if height.compared == -np.inf and not ranged:
         height.pulls_since = t
-    step = min(1.0, max(0.0, t - height.compared) / PULL_TIME)
+    step = min(1.0, max(0.0, t - height.compared) / MEMORY)
     height.compared = t
     row = innovation.row[2]
     w = weight(GEMAN_MCCLURE, innovation.value, PULL_SCALE)
@@ -297,7 +295,7 @@ def update_pull(height: Record, parameters: Record, innovation: Record, t: float
     height.pull_information += step * (w * row * row - height.pull_information)
     if abs(height.pull) < PULL_LIMIT * height.pull_information:
         height.pulls_since = t
-    elif ranged and t - height.pulls_since > PULL_DELAY:
+    elif ranged and t - height.pulls_since > IGNORE_TIME:
         height.ignore_time = min(max(IGNORE_TIME, 2.0 * height.ignore_time), LONGEST_IGNORED)
         height.ignored_until = t + height.ignore_time
         height.agreed = 0.0
@@ -308,7 +306,7 @@ def contradiction(height: Record, parameters: Record, t: float) -> float:
     """Return by how much TDOAs place the tag above its fixed height, in m.
 
     The result is 0 without a fixed height, or if errors of TDOAs alone can explain the difference.
-    The difference must last for PULL_TIME: low among the anchors, noise alone causes short ones.
+    The difference must last for MEMORY: low among the anchors, noise alone causes short ones.
 
     Parameters
     ----------
@@ -319,7 +317,7 @@ def contradiction(height: Record, parameters: Record, t: float) -> float:
     t : float
         Stamp, s.
     """
-    moment = t - height.pulls_since < PULL_TIME
+    moment = t - height.pulls_since < MEMORY
     if (
         parameters.fixed_height_std == 0.0
         or moment
@@ -345,7 +343,7 @@ def at_start(ekf: Record, parameters: Record, up: float, t: float) -> float:
         Stamp, s.
     """
     height = ekf.height
-    if t - height.heard > LONGEST_GAP or t < height.ignored_until:
+    if t - height.heard > MEMORY or t < height.ignored_until:
         return np.nan
     return _plausible_z(ekf, parameters, up)
 
@@ -357,5 +355,5 @@ def _plausible_z(ekf: Record, parameters: Record, up: float) -> float:
     The ground counts as free of steps. up is cos(tilt).
     """
     z = parameters.ground_height + (ekf.height.range + parameters.height_arm) * up
-    inside = ekf.workspace[0, 2] - BEYOND < z < ekf.workspace[1, 2] + BEYOND
-    return z if inside and up > STEEPEST else np.nan
+    inside = ekf.workspace[0, 2] - STD < z < ekf.workspace[1, 2] + STD
+    return z if inside and up > UPRIGHT else np.nan

@@ -16,13 +16,13 @@ import numpy as np
 from uwb_tdoa_bias.common.compiled import Record, compiled
 
 from .memory import HYPOTHESES, N_YAWS
-from .state import difference
+from .state import CHECK_PERIOD, difference
+from .update import GATE
 
 YAW_STD = 0.6  # rad, of the yaw of each hypothesis: their yaws start 90 degrees apart
 PRUNED_BELOW = -8.0  # log probability relative to the best, below which a hypothesis is pruned
 MERGED_BELOW, MERGED_WITHIN = 0.1, 0.3  # rad and m: two hypotheses that are closer are merged
-MERGE_PERIOD = 0.1  # s between two searches for hypotheses to merge
-LARGEST_NIS = 9.0  # normalized innovation squared; limits the weight of a single measurement
+LARGEST_NIS = GATE**2  # normalized innovation squared; limits the weight of a single measurement
 
 
 @compiled
@@ -79,7 +79,7 @@ def select(ekf: Record, t: float) -> bool:
     ekf.best = best
     if t < ekf.next_merge:
         return followed == 1
-    ekf.next_merge = t + MERGE_PERIOD
+    ekf.next_merge = t + CHECK_PERIOD
     for h in range(HYPOTHESES):
         for other in range(HYPOTHESES):
             one, better = ekf.hypotheses[h], ekf.hypotheses[other]

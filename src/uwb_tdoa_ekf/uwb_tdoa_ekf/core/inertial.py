@@ -19,7 +19,7 @@ QUIET_ACCEL, QUIET_GYRO = (0.05, 0.02)
 # about half a second.
 RESTLESS = 0.002
 QUIET_TILT = 0.5  # m/s^2; the norm of the mean specific force may differ from gravity by this
-# cosine of the angle between specific force and body z axis, below which a tag does not hover
+# cosine of the tilt above which a tag does not hover, and the beam of a range finder may hit anything
 UPRIGHT = 0.5
 CARRIED_STD = 20.0  # m/s^2, of the specific force of a tag that does not hover, about hovering
 # s of samples that show how far an axis rectifies: no vehicle accelerates one way for longer

@@ -19,20 +19,22 @@ from . import (
     velocity,
     workspace,
 )
-from .ground import KnownHeight
+from .ground import SPEED, KnownHeight
 from .history import add_reset
 from .memory import HYPOTHESES, N_PLACES, N_YAWS, WINDOW
-from .startup import APART, SPEED, Places, inliers, level, locate, room_for, share_of_inliers, split
-from .state import GRAVITY
+from .startup import APART, Places, inliers, level, locate, room_for, share_of_inliers, split
+from .state import CHECK_PERIOD, GRAVITY
 
 MINIMUM = 12  # least number of TDOAs for a search
 AGREE, AGREE_ANYHOW = 0.7, 0.6  # share of TDOAs that a start, and a recovery, must explain
 CLEARLY_MORE = 0.2  # share of TDOAs by which a recovery must exceed the filter
-# s of TDOAs for a recovery. The window is short, because a tag that leaves the floor must not wait
-# until TDOAs of the floor have left it.
+# s of TDOAs for a recovery, and over which the share of TDOAs that agree with the filter is averaged.
+# It is short, because a tag that leaves the floor must not wait until TDOAs of the floor have left it.
 RECOVERY_WINDOW = 0.3
-# if few TDOAs come, a start uses this number of TDOAs and of stamps, and this age at most, s
-SLOW_TDOAS, SLOW_STAMPS, SLOWEST = (20, 3, 30.0)
+SLOW_TDOAS, SLOW_STAMPS = (20, 3)  # TDOAs and stamps of a start if few TDOAs come
+# s; older TDOAs do not show where the tag is. After so long without one, a tag that may be anywhere
+# in its workspace is lost: the filter stops, then starts again
+LOST_TIME = 30.0
 # m, standard deviation of an unknown position; share of its variance below which another position
 # is better
 UNKNOWN, BETTER = (2.0, 0.5)
@@ -40,7 +42,6 @@ UNKNOWN, BETTER = (2.0, 0.5)
 # just been switched on.
 LONGEST_GAP = 0.6
 LISTEN_PERIOD = 1.0  # s between two updates of the heard anchors
-SEARCH_PERIOD = 0.1  # s between two searches
 TILT_STD = 0.1  # rad, roll and pitch at the start
 ANY_YAW = math.pi / math.sqrt(3.0)  # rad, standard deviation of an unknown yaw
 WRONG_POSITION = 1.0  # m, standard deviation of the position error after faulty inertial samples
@@ -147,7 +148,7 @@ def start(
     window = recent(ekf, parameters.start_window)
     if len(window) < MINIMUM:
         return
-    ekf.next_search = t + SEARCH_PERIOD
+    ekf.next_search = t + CHECK_PERIOD
     places, near, known = room_for(N_PLACES), np.empty((2, 3)), _height_at_start(ekf, parameters, t)
     share = _look_for_places(ekf, anchors, parameters, window, known, places, near)
     x, covariance, cost = places.x, places.covariance, places.cost
@@ -337,10 +338,10 @@ def relocate(
 def _last(ekf: Record, t: float) -> tuple[np.ndarray, int]:
     """Return the last SLOW_TDOAS, or more until they have SLOW_STAMPS, and their number of stamps.
 
-    None is older than SLOWEST.
+    None is older than LOST_TIME.
     """
     first, stamps = ekf.kept - 1, 1
-    while first > 0 and ekf.kept - first < WINDOW and ekf.window[first - 1].t > t - SLOWEST:
+    while first > 0 and ekf.kept - first < WINDOW and ekf.window[first - 1].t > t - LOST_TIME:
         new = ekf.window[first - 1].t != ekf.window[first].t
         if ekf.kept - first >= SLOW_TDOAS and stamps >= SLOW_STAMPS and new:
             break
@@ -548,7 +549,7 @@ def recover(
     window = recent(ekf, min(parameters.start_window, RECOVERY_WINDOW))
     if len(window) < MINIMUM:
         return
-    ekf.next_search = t + SEARCH_PERIOD
+    ekf.next_search = t + CHECK_PERIOD
     count = N_PLACES if anywhere else 1
     places = room_for(count)
     q = ekf.hypotheses[ekf.best].x[6:10]

@@ -169,8 +169,6 @@ YAW_TEST = _record(
     ("response", float, (2, ERROR_STATES)),
     ("vector", float, 2),  # right side of the least squares of recent innovations by both responses
     ("information", float, (2, 2)),  # upper triangle of its matrix
-    ("turned", float),  # rad, recent turn of the yaw by updates
-    ("variance", float),  # rad^2, largest recent variance of the yaw
     ("alone", bool),  # a single hypothesis is left
     ("evidence", float),  # log likelihood ratio at the last test
     ("t", float),  # s, stamp of the last test

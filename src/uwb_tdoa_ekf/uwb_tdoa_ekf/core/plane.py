@@ -19,7 +19,7 @@ from . import hypotheses, velocity
 from .history import add_update
 from .memory import HYPOTHESES
 from .state import rotation
-from .update import kalman, project, update_state
+from .update import GATE, kalman, project, update_state
 
 PERIOD = 0.05  # s between two applications of the constraints
 RISE_STD = 0.02  # m/s, of the vertical velocity of a planar vehicle
@@ -75,7 +75,7 @@ def hold(ekf: Record, parameters: Record, t: float, records: np.ndarray) -> None
                     hypothesis, 0.0, parameters.non_holonomic_std, 1 + axis, R, innovation
                 )
                 total = innovation.prior_variance + innovation.noise_variance
-                w = weight(GEMAN_MCCLURE, innovation.value / math.sqrt(total), velocity.GATE)
+                w = weight(GEMAN_MCCLURE, innovation.value / math.sqrt(total), GATE)
                 alike = 2.0 * velocity.CORRELATION_TIME / PERIOD
                 innovation.total_variance = (
                     innovation.prior_variance + innovation.noise_variance * alike / w

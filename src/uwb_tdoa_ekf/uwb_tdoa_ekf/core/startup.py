@@ -1,8 +1,7 @@
 """Position and velocity of a tag from a short window of TDOAs.
 
-In a room the search starts in the middle and the corners of the workspace. In a large workspace, a
-coarse grid gives more starts. If a tag hears few TDOAs, the window is longer than usual. Older
-TDOAs then count less, because the tag may have accelerated since.
+The search starts in the middle of the workspace and around it. If a tag hears few TDOAs, the window
+is longer than usual. Older TDOAs then count less, because the tag may have accelerated since.
 """
 
 from __future__ import annotations
@@ -16,21 +15,12 @@ from uwb_tdoa_bias.common.compiled import Record, compiled
 from uwb_tdoa_bias.common.geometry import linearized_tdoa
 from uwb_tdoa_bias.common.robust_loss import GEMAN_MCCLURE, geman_mcclure_loss, weight
 
-from .ground import KnownHeight, solve
+from .ground import SPEED, KnownHeight, solve
 from .workspace import configured_side, reflect, rows_heard
 
 STARTS = 9  # the middle of the workspace and the corners of the half-size box around it
-GRID_STARTS = 7  # best points of the grid in a large workspace
-LARGE = 20.0  # m along x or y, above which a workspace is large
-# least horizontal distance of grid points, m; most points at a height; largest vertical distance, m
-GRID_STEP, GRID_POINTS, GRID_LEVEL = 2.0, 600, 4.0
-GRID_LEVELS = 20  # most heights: this limits the work, however far apart the anchors are
-GRID_TDOAS = 60  # TDOAs of the window that the grid search uses
-# grid steps: scale of the loss; least distance of two best points
-GRID_LOSS, GRID_APART = (1.5, 2.5)
 SWEEPS = 14  # Gauss-Newton steps per start
 COARSE, FINE = 5.0, 0.5  # m, scale of the Geman-McClure loss at the first and the last steps
-SPEED = 1.0  # m/s, prior standard deviation of the velocity
 LONGEST_STEP = 2.0  # m, longest change of the position in a Gauss-Newton step
 INLIER = 0.75  # m; a smaller residual agrees with a position
 NO_SCALE = 1e6  # m, scale of a loss that is quadratic in practice
@@ -92,8 +82,7 @@ def locate(
         Height by another sensor.
     places : Places
         Filled with places at the last stamp, the most probable first, then others that are APART.
-        Costs are relative to the first. In a large workspace, the covariance of the last place
-        includes all remaining places.
+        Costs are relative to the first.
 
     Returns
     -------
@@ -116,19 +105,14 @@ def locate(
     prior_information = 1.0 / prior_std**2
     rows = rows_heard(window)
     correlation_length = max(1.0, len(window) / max(1.0, len(rows) - 1.0))
-    trials, losses = np.zeros((STARTS + GRID_STARTS, 6)), np.full(STARTS + GRID_STARTS, np.inf)
+    trials, losses = np.empty((STARTS, 6)), np.empty(STARTS)
     residuals, system = np.zeros(len(window)), np.zeros((6, 7))
     side = configured_side(rows, anchors, parameters.tag_side)
-    large = max(prior_std[0], prior_std[1]) > 0.5 * LARGE
-    starts = STARTS + (
-        _best_of_grid(window, anchors, mean, prior_std, ageing, trials[STARTS:]) if large else 0
-    )
-    for start in range(starts):
+    for start in range(STARTS):
         trial = trials[start]
-        if start < STARTS:
-            trial[:] = mean
+        trial[:] = mean
         for k in range(3):
-            if 0 < start < STARTS:
+            if start > 0:
                 trial[k] += 0.5 * prior_std[k] * (1.0 if ((start - 1) >> k) & 1 else -1.0)
         for sweep in range(SWEEPS):
             scale = max(COARSE * 0.7**sweep, FINE)
@@ -158,103 +142,10 @@ def locate(
         covariance[place] = both[:, 6:] * variance
         if place == 0:
             share = float(np.mean(np.abs(residuals) < INLIER))
-        for other in range(starts):
+        for other in range(STARTS):
             if np.sum((trials[other, :3] - x[place, :3]) ** 2) < APART**2:
                 losses[other] = np.inf
-    if large:
-        _hold_others(trials, losses - least, places)
     return share
-
-
-@compiled
-def _hold_others(trials: np.ndarray, costs: np.ndarray, places: Places) -> None:
-    """Widen the covariance of the last used place to include all remaining places.
-
-    trials (m, 6) are the remaining places, costs (m,) their costs; inf if already used.
-    """
-    x, covariance, cost = places.x, places.covariance, places.cost
-    last = 0
-    for place in range(len(x)):
-        if cost[place] < np.inf:
-            last = place
-    total = math.exp(-cost[last])
-    for other in range(len(costs)):
-        total += math.exp(-costs[other]) if costs[other] < IMPROBABLE else 0.0
-    for other in range(len(costs)):
-        if costs[other] < IMPROBABLE:
-            share = math.exp(-costs[other]) / total
-            for i in range(3):
-                for j in range(3):
-                    covariance[last, i, j] += (
-                        share * (trials[other, i] - x[last, i]) * (trials[other, j] - x[last, j])
-                    )
-    cost[last] = min(cost[last], -math.log(total))
-
-
-@compiled
-def _best_of_grid(
-    window: np.ndarray,
-    anchors: np.ndarray,
-    mean: np.ndarray,
-    prior_std: np.ndarray,
-    ageing: np.ndarray,
-    places: np.ndarray,
-) -> int:
-    """Fill in the grid points that explain a window best, and return their number.
-
-    The points are apart from each other by GRID_APART grid steps.
-
-    Parameters
-    ----------
-    window : (n,) TDOA
-        TDOAs, by rising stamp.
-    anchors : (N,) ANCHOR
-        All anchors, by row.
-    mean, prior_std : (6,) array
-        The grid covers mean +- prior_std.
-    ageing : (n,) array
-        Additional variance of each TDOA, see `_normal_equations`.
-    places : (k, 6) array
-        Positions (m, world frame), at rest. Filled.
-    """
-    step = max(
-        GRID_STEP,
-        math.sqrt(4.0 * prior_std[0] * prior_std[1] / GRID_POINTS),
-        2.0 * max(prior_std[0], prior_std[1]) / GRID_POINTS,
-    )
-    counts, origin, steps = np.empty(3, np.int64), np.empty(3), np.empty(3)
-    for k in range(3):
-        wanted = math.ceil(2.0 * prior_std[k] / (GRID_LEVEL if k == 2 else step))
-        counts[k] = int(max(2.0, min(wanted, GRID_LEVELS))) if k == 2 else int(max(1.0, wanted))
-        steps[k] = 2.0 * prior_std[k] / counts[k]
-        origin[k] = mean[k] - prior_std[k] + 0.5 * steps[k]
-    losses, p, row = np.empty(counts[0] * counts[1] * counts[2]), np.empty(3), np.empty(3)
-    apart = max(1, len(window) // GRID_TDOAS)
-    for i in range(len(losses)):
-        p[0] = origin[0] + steps[0] * (i % counts[0])
-        p[1] = origin[1] + steps[1] * (i // counts[0] % counts[1])
-        p[2] = origin[2] + steps[2] * (i // (counts[0] * counts[1]))
-        losses[i] = 0.0
-        for j in range(len(window) - 1, -1, -apart):
-            r = window[j].d - linearized_tdoa(
-                p, anchors[window[j].a].position, anchors[window[j].b].position, row
-            )
-            losses[i] += geman_mcclure_loss(r / math.sqrt(1.0 + ageing[j]), GRID_LOSS * step)
-    for place in range(len(places)):
-        i = int(np.argmin(losses))
-        if losses[i] == np.inf:
-            return place
-        places[place, 0] = origin[0] + steps[0] * (i % counts[0])
-        places[place, 1] = origin[1] + steps[1] * (i // counts[0] % counts[1])
-        places[place, 2] = origin[2] + steps[2] * (i // (counts[0] * counts[1]))
-        for other in range(len(losses)):
-            away = (origin[0] + steps[0] * (other % counts[0]) - places[place, 0]) ** 2
-            away += (
-                origin[1] + steps[1] * (other // counts[0] % counts[1]) - places[place, 1]
-            ) ** 2
-            if away < (GRID_APART * step) ** 2:
-                losses[other] = np.inf
-    return len(places)
 
 
 @compiled

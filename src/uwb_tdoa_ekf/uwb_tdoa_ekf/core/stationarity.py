@@ -14,14 +14,14 @@ from uwb_tdoa_bias.common.compiled import Record, compiled
 from . import ground, hypotheses, stationary_position
 from .history import add_update, replace_velocity
 from .memory import HYPOTHESES
-from .state import GRAVITY, rotation
-from .update import update_state
+from .state import CHECK_PERIOD, GRAVITY, rotation
+from .stationary_position import SPEED_STD
+from .update import GATE, update_state
 
 PERIOD = 0.05  # s between zero-velocity updates
 # m/s, standard deviation of a zero-velocity update: with a quiet IMU, and with a vibrating one
 QUIET_STD, SHAKING_STD = (0.02, 0.15)
-SPEED = 0.05  # m/s; a quiet tag that is known to be slower is at rest, a faster one may glide
-LOOK_PERIOD, LOOK_WINDOW = 0.1, 0.4  # s between two checks of the TDOAs, and s of TDOAs in each
+LOOK_WINDOW = 0.4  # s of TDOAs in each check
 # checks in a row with changed TDOAs that end a rest: a check shows a change by chance in 1 of 20
 # cases
 MOST_DOUBTS = 3
@@ -33,7 +33,6 @@ LONG = 10
 # suffices
 EARLY, LONG_ENOUGH = (1.5, 3)
 AGAIN = 0.3  # s between two corrections of a tag near the ground that is not known to stand
-GATE = 3.0  # standard deviations of the predicted velocity, beyond which the tag moves
 # rotors or wheels have stopped if the vibration is below this share of its mean over this time, s
 CALM, SHAKING_MEMORY = (0.1, 2.0)
 LIFT = 0.25  # m/s upwards; a larger change of velocity, measured by the IMU, ends a rest
@@ -122,7 +121,7 @@ def check_stationarity(
     records : (n,) RECORD
         History for the smoother; empty for no recording.
     """
-    ekf.next_look = t + LOOK_PERIOD
+    ekf.next_look = t + CHECK_PERIOD
     best = ekf.hypotheses[ekf.best]
     calm = ekf.quiet or np.sum(ekf.imu.vibration) < CALM * ekf.shaking
     if not (ekf.resting or calm or stationary_position.is_near_ground(best, parameters)):
@@ -192,7 +191,7 @@ def update_zero_velocity(ekf: Record, t: float, records: np.ndarray) -> None:
         if not slow:
             slow = ekf.quiet
             for state in range(3, 6):
-                slow = slow and abs(x[state]) < SPEED and P[state, state] < SPEED**2
+                slow = slow and abs(x[state]) < SPEED_STD and P[state, state] < SPEED_STD**2
         if not slow:
             continue
         for state in range(3, 6):

@@ -18,12 +18,14 @@ from .history import add_reset, add_update
 from .hypotheses import alive
 from .memory import HYPOTHESES
 from .startup import Places
-from .update import update_state
+from .update import GATE, update_state
 from .workspace import surround
 
 NEAR = 1.0  # m beyond the anchors that a tag is expected in
 EXPLANATIONS = 4  # somewhere else, and on the ground with each lateness of ground.explain
-SPEED_STD = 0.05  # m/s, of a tag at rest, in addition to the uncertainty from its TDOAs
+# m/s, of a tag at rest, in addition to the uncertainty from its TDOAs; a quiet tag that is known to
+# be slower is at rest, a faster one may glide
+SPEED_STD = 0.05
 # Minus the logarithm of the prior probability that a tag at rest is more than NEAR above or below
 # the anchors,
 ABSURD = 20.0
@@ -216,7 +218,7 @@ def stop(x: np.ndarray, covariance: np.ndarray, of_velocity: np.ndarray) -> None
 @compiled
 def is_near_ground(hypothesis: Record, parameters: Record) -> bool:
     """Return whether a tag may stand on the ground, by the height of a HYPOTHESIS."""
-    lowest = hypothesis.x[2] - ground.DEVIATIONS * math.sqrt(hypothesis.P[2, 2])
+    lowest = hypothesis.x[2] - GATE * math.sqrt(hypothesis.P[2, 2])
     return lowest < parameters.ground_height + ground.GROUND_HEIGHT + ground.GROUND_STD
 
 

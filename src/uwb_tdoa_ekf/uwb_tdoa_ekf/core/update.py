@@ -16,6 +16,7 @@ from uwb_tdoa_bias.common.compiled import Record, compiled
 from . import auxiliary
 from .state import ERROR_STATES, inject
 
+GATE = 3.0  # standard deviations beyond which a measurement is an outlier
 LONGEST_ROW = 6  # most error states that a measurement depends on
 JOINT_STATES = ERROR_STATES + auxiliary.OFFSET_STATES
 

@@ -16,17 +16,17 @@ import numpy as np
 from uwb_tdoa_bias.common.compiled import Record, compiled
 from uwb_tdoa_bias.common.robust_loss import GEMAN_MCCLURE, weight
 
+from .height import STUCK_TIME
 from .history import add_update
 from .hypotheses import add_log_likelihood, alive
 from .memory import REJECTED, USED
 from .state import rotation
-from .update import kalman, project
+from .update import GATE, kalman, project
 
-GATE = 3.0  # standard deviations beyond which a component is not used
 CORRELATION_TIME = 1.0  # s over which the error of a velocity persists
 LONGEST_STD = 1e3  # m/s and rad/s; a component with a larger standard deviation is not measured
-# s, and number of equal velocities, after which the sensor of a vibrating tag is stuck
-STUCK_TIME, STUCK_COUNT = (0.5, 5)
+# equal velocities, in STUCK_TIME at least, after which the sensor of a vibrating tag is stuck
+STUCK_COUNT = 5
 AVERAGE = 0.5  # s over which innovations are averaged to compare the sensor with all others
 # mean normalized innovation squared above which the sensor is refused, and below which it is used
 # again

@@ -273,9 +273,8 @@ def is_filled(bounds: np.ndarray, P: np.ndarray) -> bool:
 def constrain(hypothesis: Record, innovation: Record, bounds: np.ndarray, axis: int) -> bool:
     """Apply a soft constraint to an axis: pull a tag outside towards its workspace.
 
-    A tag with a standard deviation larger than the workspace is constrained too. Otherwise the
-    constraint applies only while the standard deviation of the axis exceeds STD. A constraint that
-    is given once must not shrink the covariance again and again. TDOAs that agree on a place
+    The constraint applies only while the standard deviation of the axis exceeds STD. A constraint
+    that is given once must not shrink the covariance again and again. TDOAs that agree on a place
     outside are right.
 
     Parameters
@@ -294,12 +293,7 @@ def constrain(hypothesis: Record, innovation: Record, bounds: np.ndarray, axis: 
     bool
         Whether the hypothesis was updated.
     """
-    x, size = hypothesis.x[axis], bounds[1, axis] - bounds[0, axis]
-    if hypothesis.P[axis, axis] > size**2:
-        update_state(
-            hypothesis, innovation, axis, min(max(x, bounds[0, axis]), bounds[1, axis]), size
-        )
-        return True
+    x = hypothesis.x[axis]
     if bounds[0, axis] <= x <= bounds[1, axis] or hypothesis.P[axis, axis] <= STD**2:
         return False
     update_state(hypothesis, innovation, axis, min(max(x, bounds[0, axis]), bounds[1, axis]), STD)

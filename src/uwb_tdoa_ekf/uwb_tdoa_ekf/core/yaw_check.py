@@ -3,9 +3,8 @@
 A yaw error psi turns each predicted change of velocity. The resulting error of the state is linear
 in cos(psi) - 1 and sin(psi). The predictions and updates of the filter propagate it, as two
 responses of the error state. A generalized likelihood ratio (Willsky and Jones, IEEE Trans.
-Automatic Control 1976) tests recent innovations against both responses, for any psi. A turn of the
-yaw by updates that exceeds its standard deviation is evidence too. The test changes the filter only
-if the evidence suffices.
+Automatic Control 1976) tests recent innovations against both responses, for any psi. The test
+changes the filter only if the evidence suffices.
 """
 
 from __future__ import annotations
@@ -16,12 +15,10 @@ import numpy as np
 
 from uwb_tdoa_bias.common.compiled import Record, compiled
 
-from .state import ERROR_STATES
+from .state import CHECK_PERIOD, ERROR_STATES
 
-MEMORY, TURN_MEMORY = 6.0, 4.0  # s over which innovations, and turns by updates, count
-LARGEST = 3.0  # standard deviations; limits the effect of an innovation
+MEMORY = 6.0  # s over which innovations count
 KNOWN = 0.35**2  # rad^2, variance below which the yaw counts as known: 20 degrees
-PERIOD = 0.1  # s between two tests
 # Log likelihood ratio above which the yaw is opened again. It trades false alarms against late
 # detection. Of 22 measured flights the largest ratio is 3.5; the worst flight has 9.9 without its
 # range finder. See docs/reliability.md.
@@ -36,7 +33,6 @@ def clear(doubt: Record) -> None:
     doubt.response[:] = 0.0
     doubt.vector[:] = 0.0
     doubt.information[:] = 0.0
-    doubt.turned = doubt.variance = 0.0
 
 
 @compiled
@@ -96,11 +92,9 @@ def observe(ekf: Record, correlation_length: float, shows: bool) -> None:
         sine += innovation.row[n] * to_sine[innovation.states[n]]
     if shows:
         variance = innovation.prior_variance + innovation.noise_variance * correlation_length
-        largest = LARGEST * math.sqrt(variance)
-        value = min(max(innovation.value, -largest), largest)
         per_variance = 1.0 / variance
-        doubt.vector[0] += cosine * value * per_variance
-        doubt.vector[1] += sine * value * per_variance
+        doubt.vector[0] += cosine * innovation.value * per_variance
+        doubt.vector[1] += sine * innovation.value * per_variance
         doubt.information[0, 0] += cosine * cosine * per_variance
         doubt.information[0, 1] += cosine * sine * per_variance
         doubt.information[1, 1] += sine * sine * per_variance
@@ -111,37 +105,21 @@ def observe(ekf: Record, correlation_length: float, shows: bool) -> None:
         for i in range(ERROR_STATES):
             to_cosine[i] -= gain[i] * cosine
             to_sine[i] -= gain[i] * sine
-        if shows:
-            best = ekf.hypotheses[ekf.best]
-            if doubt.variance == 0.0:
-                doubt.variance = _yaw_variance(best)
-            u0, u1, u2 = _up(best.x)
-            doubt.turned += (
-                (u0 * gain[6] + u1 * gain[7] + u2 * gain[8]) * per_total * innovation.value
-            )
 
 
 @compiled
-def _forget(doubt: Record, variance: float, dt: float) -> None:
-    """Discount the evidence of a YAW_TEST over dt (s).
-
-    variance is the present variance of the yaw, rad^2.
-    """
-    kept, kept_turn = math.exp(-dt / MEMORY), math.exp(-dt / TURN_MEMORY)
+def _forget(doubt: Record, dt: float) -> None:
+    """Discount the evidence of a YAW_TEST over dt (s)."""
+    kept = math.exp(-dt / MEMORY)
     for i in range(2):
         doubt.vector[i] *= kept
         for j in range(i, 2):
             doubt.information[i, j] *= kept
-    doubt.turned *= kept_turn
-    doubt.variance = max(variance, variance + (doubt.variance - variance) * kept_turn)
 
 
 @compiled
 def evidence(doubt: Record) -> float:
-    """Return the log likelihood ratio of the best other yaw.
-
-    Turns of the yaw by updates add to it.
-    """
+    """Return the log likelihood ratio of the best other yaw."""
     v, J = doubt.vector, doubt.information
     best = 0.0
     for k in range(len(ANGLES)):
@@ -150,38 +128,30 @@ def evidence(doubt: Record) -> float:
             best,
             c * v[0] + s * v[1] - 0.5 * (c * c * J[0, 0] + 2.0 * c * s * J[0, 1] + s * s * J[1, 1]),
         )
-    return best + 0.5 * doubt.turned**2 / max(doubt.variance, 1e-9)
+    return best
 
 
 @compiled
 def contradicts(ekf: Record, t: float) -> bool:
     """Return whether the evidence at stamp t (s) contradicts a yaw that counts as known.
 
-    The test runs once per PERIOD.
+    The test runs once per CHECK_PERIOD.
     """
     doubt = ekf.yaw_test
     if t < doubt.next_look:
         return False
-    variance = _yaw_variance(ekf.hypotheses[ekf.best])
-    _forget(doubt, variance, max(t - doubt.t, 0.0))
-    doubt.t, doubt.next_look = t, t + PERIOD
+    _forget(doubt, max(t - doubt.t, 0.0))
+    doubt.t, doubt.next_look = t, t + CHECK_PERIOD
     doubt.evidence = evidence(doubt)
-    return doubt.evidence > EVIDENCE and variance < KNOWN
-
-
-@compiled
-def _up(x: np.ndarray) -> tuple[float, float, float]:
-    """Return the vertical of the world in the body frame, from a nominal state."""
-    return (
-        2.0 * (x[6] * x[8] - x[9] * x[7]),
-        2.0 * (x[7] * x[8] + x[9] * x[6]),
-        1.0 - 2.0 * (x[6] ** 2 + x[7] ** 2),
-    )
+    return doubt.evidence > EVIDENCE and _yaw_variance(ekf.hypotheses[ekf.best]) < KNOWN
 
 
 @compiled
 def _yaw_variance(hypothesis: Record) -> float:
     """Return the variance of the rotation about the vertical of the world, in rad^2."""
-    P, (u0, u1, u2) = hypothesis.P, _up(hypothesis.x)
+    x, P = hypothesis.x, hypothesis.P
+    u0 = 2.0 * (x[6] * x[8] - x[9] * x[7])
+    u1 = 2.0 * (x[7] * x[8] + x[9] * x[6])
+    u2 = 1.0 - 2.0 * (x[6] ** 2 + x[7] ** 2)
     square = u0 * u0 * P[6, 6] + u1 * u1 * P[7, 7] + u2 * u2 * P[8, 8]
     return square + 2.0 * (u0 * u1 * P[6, 7] + u0 * u2 * P[6, 8] + u1 * u2 * P[7, 8])

@@ -25,14 +25,13 @@ import numpy as np
 
 from uwb_tdoa_bias.common.compiled import compiled
 
-from .slices import LENGTH
+from .slices import DELAY_STD, LENGTH
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from .slices import Slice
 
-MEAN_STD = 0.15  # m, standard deviation of the constant part of a delay
 # m, standard deviation of the place-dependent part, and its correlation length
 PLACE_STD, PLACE_LENGTH = 0.2, 0.9
 # m, m, s, standard deviation, length and time of the part that lasts while the tag stays
@@ -324,12 +323,12 @@ def _whiten(
     """
     factor, white, squares = whitened[0], whitened[1], whitened[2]
     row, error = factor[k], delays[k].copy()
-    variance = MEAN_STD**2 + PLACE_STD**2 + LOCAL_STD**2 + NOISE_STD**2
+    variance = DELAY_STD**2 + PLACE_STD**2 + LOCAL_STD**2 + NOISE_STD**2
     for i in range(k):
         apart = (p[i, 0] - p[k, 0]) ** 2 + (p[i, 1] - p[k, 1]) ** 2 + (p[i, 2] - p[k, 2]) ** 2
         local = math.exp(-0.5 * apart / LOCAL_LENGTH**2 - abs(t[k] - t[i]) / LOCAL_TIME)
         kernel = (
-            MEAN_STD**2
+            DELAY_STD**2
             + PLACE_STD**2 * math.exp(-0.5 * apart / PLACE_LENGTH**2)
             + LOCAL_STD**2 * local
         )

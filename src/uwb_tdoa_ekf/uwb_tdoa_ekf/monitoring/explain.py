@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from ..core.memory import FilterState
 
 SCALE = 0.5  # m, scale of the Geman-McClure loss: an innovation of this size has a loss of one half
-BLOCK = 2.0  # s, length of a block
-SETTLE = 2.0  # s after the first TDOA that do not count, because the filter initializes
+# s, length of a block; the first does not count, because the filter initializes
+BLOCK = 2.0
 # a block with this many TDOAs or fewer does not count; smallest number of blocks
 FEW, LEAST = 10, 4
 CONFIG = FilterConfig(use_imu=False)
@@ -159,7 +159,7 @@ def innovations(
 
 def _numbers(t: np.ndarray) -> np.ndarray:
     """Return the block numbers of ascending stamps t (n,) s; negative before the first block."""
-    return np.floor((t - t[:1] - SETTLE) / BLOCK).astype(np.int64)
+    return np.floor((t - t[:1] - BLOCK) / BLOCK).astype(np.int64)
 
 
 def _loss(innovation: np.ndarray) -> np.ndarray:

@@ -10,6 +10,8 @@ import numpy as np
 from uwb_tdoa_bias.common.compiled import compiled
 from uwb_tdoa_bias.common.vibration import VIBRATION_CORNER, low_pass
 
+from ..core.imu_fault_detector import AXIS, UPRIGHT
+from ..core.state import GRAVITY
 from .finding import ERROR, WARNING, Finding
 from .stamp_rules import (
     LAST,
@@ -23,6 +25,38 @@ from .stamp_rules import (
 )
 
 ABSURD = 1e9  # no sensor returns this, in any unit
+# m/s^2, limits of the median length of the mean specific force; healthy 9.7 - 10.5
+FORCE_RANGE = 7.0, 14.0
+FORCE_UNITS = {
+    "g": (GRAVITY, 0.7, 1.5),
+    "mg": (1e-3 * GRAVITY, 700.0, 1500.0),
+    "mm/s^2": (1e-3, 7e3, 14e3),
+}
+# standard deviation over mean of the specific force above which it has no gravity; healthy 0.41 at
+# most
+WEIGHTLESS = 0.65
+# length of the mean specific force over the mean of its lengths; healthy 0.96 at least
+STEADY = 0.8
+# On 29 measured and simulated flights without gravity, the deviation is 0.74 at least or the
+# steadiness 0.64 at most.
+TURN_EXCESS = 0.35
+# limits of a tag at rest: relative deviation of the specific force, and change of its direction in
+# rad
+REST_SHAKES, REST_TURNS = (0.02, 0.02)
+# m/s^2 rms of the part faster than 50 ms; healthy 0.6; 1.4 at least where the accelerometer
+# rectifies
+SHAKING = 1.0
+REPEATS, DEAD = 0.2, 0.95  # shares of samples that equal the one before; healthy 0
+# samples at one end in a window, and distance of that end from the mean, m/s^2 and rad/s
+CLIPPED, FAR_FORCE, FAR_RATE = 8, 8.0, 2.0
+AXES = (
+    "gyroscope x",
+    "gyroscope y",
+    "gyroscope z",
+    "accelerometer x",
+    "accelerometer y",
+    "accelerometer z",
+)
 
 # places in the counters of one channel; the first two are kept between windows
 VALUE, SLOW, SUM, SQUARES, FAST, SAME, LOW, LOW_HITS, HIGH, HIGH_HITS = range(10)
@@ -193,43 +227,6 @@ def imu_window(counters: ImuCounters) -> ImuWindow:
         limit=np.where(at_low, c[:, LOW], c[:, HIGH]),
         invalid=float(whole[INVALID] / max(whole[INVALID] + whole[TAKEN], 1.0)),
     )
-
-
-GRAVITY = 9.81
-# m/s^2, limits of the median length of the mean specific force; healthy 9.7 - 10.5
-FORCE_RANGE = 7.0, 14.0
-FORCE_UNITS = {
-    "g": (GRAVITY, 0.7, 1.5),
-    "mg": (1e-3 * GRAVITY, 700.0, 1500.0),
-    "mm/s^2": (1e-3, 7e3, 14e3),
-}
-# standard deviation over mean of the specific force above which it has no gravity; healthy 0.41 at
-# most
-WEIGHTLESS = 0.65
-# length of the mean specific force over the mean of its lengths; healthy 0.96 at least
-STEADY = 0.8
-# On 29 measured and simulated flights without gravity, the deviation is 0.74 at least or the
-# steadiness 0.64 at most.
-TURN_EXCESS = 0.35
-# limits of a tag at rest: relative deviation of the specific force, and change of its direction in
-# rad
-REST_SHAKES, REST_TURNS = (0.02, 0.02)
-# cosines of 35 and 25 degrees; healthy, with vibration, 22 degrees at most
-UPRIGHT, AXIS = (np.cos(np.deg2rad(35.0)), np.cos(np.deg2rad(25.0)))
-# m/s^2 rms of the part faster than 50 ms; healthy 0.6; 1.4 at least where the accelerometer
-# rectifies
-SHAKING = 1.0
-REPEATS, DEAD = 0.2, 0.95  # shares of samples that equal the one before; healthy 0
-# samples at one end in a window, and distance of that end from the mean, m/s^2 and rad/s
-CLIPPED, FAR_FORCE, FAR_RATE = 8, 8.0, 2.0
-AXES = (
-    "gyroscope x",
-    "gyroscope y",
-    "gyroscope z",
-    "accelerometer x",
-    "accelerometer y",
-    "accelerometer z",
-)
 
 
 def force_of(windows: list[ImuWindow]) -> np.ndarray:
@@ -454,6 +451,7 @@ def upright(windows: list[ImuWindow]) -> Finding | None:
     """Return a Finding if the mean specific force does not point along +z.
 
     At rest, and on average in flight, the accelerometer of an upright tag reads +9.81 m/s^2 on z.
+    Sound recordings are tilted by 22 degrees at most, with vibration.
     """
     force = force_of(windows)
     length = np.linalg.norm(force)

@@ -19,6 +19,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.geometry import tdoa
 
+from ..core.initialization import LOST_TIME
 from ..core.memory import REJECTED
 from .change import ChangeDetector
 from .finding import ERROR, WARNING, Finding
@@ -43,7 +44,6 @@ if TYPE_CHECKING:
 # m/s, speed above which the tag is in motion; on the floor, residuals differ from those in the air
 MOVING = 0.3
 SETTLE = 8.0  # s in motion before the search for an onset starts
-GAP = 30.0  # s without TDOAs after which a new flight begins
 # statistic (`Change.ratio`) above which an anchor has changed: a tenth above the largest of sound flights of
 # two days, see docs/reliability.md
 LIMIT = 16.3
@@ -67,8 +67,6 @@ TOGETHER = 4  # slices in which the search for an exchange looks
 NAMED, HELD = (4, 8)
 # slices between two comparisons with the survey, and fewest slices of a comparison with recent data
 LOOK, YOUNG = (4, 40)
-# standard deviations by which an anchor must differ from the survey, in addition to SMALLEST_CHANGE
-SURE = 2.0
 TURN_APART = 3.0  # s of stamps between two sign flips of all TDOAs
 # share of accepted TDOAs of a slice where the filter is right, and s since then within which a sign
 # flip must occur, because it is an event. Near a floor, TDOAs that are metres too long may
@@ -228,7 +226,7 @@ class Monitor:
 
     def add(self, odometry: Odometry, residuals: Residuals) -> None:
         """Add Odometry and the Residuals that belong to it."""
-        if self._end is not None and len(residuals.t) and residuals.t[0] > self._last + GAP:
+        if self._end is not None and len(residuals.t) and residuals.t[0] > self._last + LOST_TIME:
             # finish the flight before, so that no empty slices of the gap are tested
             self.update(math.inf)
         if len(odometry):
@@ -272,7 +270,7 @@ class Monitor:
             [np.concatenate(columns) for columns in zip(*parts)]
             for parts in (self._residuals, self._odometry)
         )
-        while self._end <= min(until, self._last + GAP):
+        while self._end <= min(until, self._last + LOST_TIME):
             now, of_now = residuals[0] < self._end, odometry[0] < self._end
             self._test(
                 self._end,
@@ -607,11 +605,8 @@ def _surest(displaced: Iterable[Displaced]) -> dict[int, Displaced]:
 
 
 def _matters(one: Displaced) -> bool:
-    """Return whether the deviation of an anchor is relevant and statistically significant."""
-    off = float(np.linalg.norm(one.shift))
-    return max(off, abs(one.later)) > SMALLEST_CHANGE and (
-        bool(one.later) or off > SURE * float(np.linalg.norm(one.std)) / math.sqrt(3.0)
-    )
+    """Return whether the deviation of an anchor is relevant."""
+    return max(float(np.linalg.norm(one.shift)), abs(one.later)) > SMALLEST_CHANGE
 
 
 def _is_clear(change: Change) -> bool:

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.common.radio import SPEED_OF_LIGHT
+
 from .finding import ERROR, NOTE, WARNING, Finding
 from .ranging_windows import GRIDS
 from .stamp_rules import median
@@ -17,7 +19,7 @@ if TYPE_CHECKING:
     from .ranging_windows import TdoaWindow
 
 LARGE = 0.2  # share of TDOAs longer than the distance of their anchors; healthy 0.008 at most
-OUTLIERS = 0.05
+OUTLIERS = 0.05  # the same, from which on many TDOAs count as outliers
 DUPLICATES = 0.02  # share of TDOAs that come twice; healthy 0
 REPEATS = 0.15  # share of TDOAs that repeat the value of their pair; healthy 0.026
 RETURNS = 0.08  # share of TDOAs that jump by more than 0.5 m and back; healthy 0.04 at most
@@ -26,11 +28,11 @@ ON_GRID = 0.95  # share of TDOAs on a grid; healthy 0.005
 CLIPPED = 0.02  # share of TDOAs at the largest value
 # m, median jump; share of jumps that differ from it by less than NEAR, in m; number of jumps
 STEP, ALIKE, NEAR, FEWEST = (5.0, 0.6, 0.5, 10)
-TICK = 299792458.0 / (128 * 499.2e6)  # m, clock tick of a DW1000
+TICK = SPEED_OF_LIGHT / (128 * 499.2e6)  # m, clock tick of a DW1000
 WRAPS = {
     f"2^{bits} ticks of a DW1000": 2.0**bits * TICK for bits in (8, 16, 24, 31, 32, 39, 40)
-} | {f"2^{bits} ns": 2.0**bits * 0.299792458 for bits in (16, 31, 32)}
-FEW = 3.9  # anchors heard in 1 s below which there is no position
+} | {f"2^{bits} ns": 2.0**bits * SPEED_OF_LIGHT / 1e9 for bits in (16, 31, 32)}
+FEW = 4  # anchors: three differences of distances determine a position
 
 
 def share_of(windows: list[TdoaWindow], field: str, among: str = "known") -> float:
@@ -203,10 +205,10 @@ def rounded(windows: list[TdoaWindow]) -> Finding | None:
 
 def clipped(windows: list[TdoaWindow]) -> Finding | None:
     ceiling = max(w.ceiling for w in windows)
-    share = sum(w.hits for w in windows if w.ceiling == ceiling) / max(
-        sum(w.known for w in windows), 1
-    )
-    if share > CLIPPED and rounded(windows) is None and ceiling > 0.0:
+    hits = [w.hits for w in windows if w.ceiling == ceiling]
+    share = sum(hits) / max(sum(w.known for w in windows), 1)
+    repeats = sum(hits) > len(hits)  # the largest of few values is a large share of them
+    if share > CLIPPED and repeats and rounded(windows) is None and ceiling > 0.0:
         evidence = f"{100.0 * share:.0f} % are {ceiling:.3f} m or its negative"
         return Finding(
             "tdoa_clipped",

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..core.initialization import LOST_TIME
 from ..results import rows_of
-from .monitor import GAP, Event, Monitor
+from .monitor import Event, Monitor
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -48,7 +49,7 @@ def watched(
             Monitor(anchors, calibrated),
             np.sort(residuals.t[(residuals.t >= low) & (residuals.t < high)]),
         )
-        for begin, end in pairwise([low, *t[1:][np.diff(t) > GAP].tolist(), high]):
+        for begin, end in pairwise([low, *t[1:][np.diff(t) > LOST_TIME].tolist(), high]):
             heard = rows_of(residuals, _between(residuals.t, begin, end))
             monitor.add(rows_of(odometry, _between(odometry.t, begin, end)), heard)
             monitor.update(float(heard.t[-1]) if len(heard) else low)

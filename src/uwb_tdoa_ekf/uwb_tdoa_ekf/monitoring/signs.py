@@ -13,6 +13,7 @@ import numpy as np
 from ..core.memory import TDOA, new_state, structured
 from .explain import Unexplained, compare, innovations
 from .finding import ERROR, Finding
+from .slices import FEWEST
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.common.anchors import Anchors
@@ -24,7 +25,12 @@ GAIN = 0.35  # largest share of that change that the other sign may leave
 # share that the present sign may explain. After a flip these were 0.66 to 1.0 and 0.0 in simulated
 # flights. Near a floor, where anchors are metres late, they were 0.67 and 0.3.
 SHARE, PRESENT = 0.6, 0.1
-FEWEST = 10  # fewest significant TDOAs
+# Largest ratio of the losses, and smallest number of standard errors. On 37 measured flights, over
+# any 10 to 40 s from the start or in the air: healthy flights have 0.98 and 0.2. Flights with the
+# other sign have 0.81 and 2.5 after 30 s in the air, most of them after 12 s.
+RATIO, DEVIATIONS = 0.85, 3.0
+TURNED = -1.0  # value of a Finding on signs that flipped in flight
+LONGEST = 40.0  # s of stamps after which an undecided comparison restarts
 
 
 def turned(innovation: np.ndarray, predicted: np.ndarray) -> bool:
@@ -49,14 +55,6 @@ def turned(innovation: np.ndarray, predicted: np.ndarray) -> bool:
     return bool(
         np.mean(left < small) > SHARE and np.mean(np.abs(innovation[asked]) < small) < PRESENT
     )
-
-
-# Largest ratio of the losses, and smallest number of standard errors. On 37 measured flights, over
-# any 10 to 40 s from the start or in the air: healthy flights have 0.98 and 0.2. Flights with the
-# other sign have 0.81 and 2.5 after 30 s in the air, most of them after 12 s.
-RATIO, DEVIATIONS = 0.85, 3.0
-TURNED = -1.0  # value of a Finding on signs that flipped in flight
-LONGEST = 40.0  # s of stamps after which an undecided comparison restarts
 
 
 class SignWatch:

@@ -16,9 +16,12 @@ from uwb_tdoa_bias.common.geometry import ranges
 
 LENGTH = 0.5  # s of stamps of one slice
 CLIP = 1.5  # m; larger innovations are clipped to this
+FEWEST = 10  # fewest TDOAs of a slice that show an exchange, or signs that turn
 TDOA_VARIANCE = 0.02  # m^2, noise variance of one TDOA without its constant errors
 PLACE_STD = 0.5  # m, standard deviation of the position of the filter
-DELAY_STD = 0.15  # m, prior standard deviation of a delay
+DELAY_STD = (
+    0.15  # m, prior standard deviation of a delay, without its part that depends on the place
+)
 # largest number of anchors in a slice; the anchors with the fewest TDOAs are left out
 MOST = 100
 

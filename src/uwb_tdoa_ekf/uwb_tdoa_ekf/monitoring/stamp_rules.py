@@ -15,16 +15,6 @@ from .finding import ERROR, NOTE, WARNING, Finding
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-
-def median(values: Iterable[float]) -> float:
-    """Return the median; NaN for no values or if any value is NaN.
-
-    For so few values, numpy takes thirty times as long.
-    """
-    values = [float(value) for value in values]
-    return math.nan if not values or any(map(math.isnan, values)) else statistics.median(values)
-
-
 LENGTH = 1.0  # s, length of a window
 # s by which a stamp is ahead of its arrival, or behind the newest stamp; a late packet stays below
 # this
@@ -56,6 +46,34 @@ MAXIMUM = 5000  # messages of a window at most, for streams whose stamps stand s
     ARRIVAL_BEGIN,
     STAMP_BEGIN,
 ) = range(20)
+
+STAMP_LINE = (
+    "message.header.stamp = ...  # when the sample was measured, ROS time, in seconds and "
+    "nanoseconds"
+)
+SLOWEST = {"imu/data": 50.0, "uwb/tdoa": 20.0}  # Hz; healthy 946 and 191 at least
+# s between stamps; healthy 0.012 and 0.116 at most
+LONGEST_GAP = {"imu/data": 0.1, "uwb/tdoa": 0.5}
+SCATTER = 3.0  # standard deviation of the steps over their mean; healthy 1.4 at most
+# share of stamps that equal the one before, healthy 0; s between different stamps
+REPEATED, LEAP = (0.3, 0.01)
+PACE = 0.05  # largest difference between the pace of the stamps and of the clock
+BLOCK = 0.1  # s between the earliest and the latest arrival of a window, relative to the stamps
+APART = 0.1  # s between two streams that counts as a difference
+LATEST = 5.0  # s that TDOAs may be late; a larger value means another clock
+DRIFT, DRIFTED = 3e-4, 0.03  # s/s, and s over the recording, above which a drift is reported
+# s, default waiting times of ekf_node
+LAG, REORDER = (0.25, 0.003)
+UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
+
+
+def median(values: Iterable[float]) -> float:
+    """Return the median; NaN for no values or if any value is NaN.
+
+    For so few values, numpy takes thirty times as long.
+    """
+    values = [float(value) for value in values]
+    return math.nan if not values or any(map(math.isnan, values)) else statistics.median(values)
 
 
 class StampWindow(NamedTuple):
@@ -199,26 +217,6 @@ def stamp_window(s: np.ndarray) -> StampWindow:
         else math.nan,
         pace=float((s[LAST] - s[STAMP_BEGIN]) / arrived) if arrived > 0.0 else math.nan,
     )
-
-
-STAMP_LINE = (
-    "message.header.stamp = ...  # when the sample was measured, ROS time, in seconds and "
-    "nanoseconds"
-)
-SLOWEST = {"imu/data": 50.0, "uwb/tdoa": 20.0}  # Hz; healthy 946 and 191 at least
-# s between stamps; healthy 0.012 and 0.116 at most
-LONGEST_GAP = {"imu/data": 0.1, "uwb/tdoa": 0.5}
-SCATTER = 3.0  # standard deviation of the steps over their mean; healthy 1.4 at most
-# share of stamps that equal the one before, healthy 0; s between different stamps
-REPEATED, LEAP = (0.3, 0.01)
-PACE = 0.05  # largest difference between the pace of the stamps and of the clock
-BLOCK = 0.1  # s between the earliest and the latest arrival of a window, relative to the stamps
-APART = 0.1  # s between two streams that counts as a difference
-LATEST = 5.0  # s that TDOAs may be late; a larger value means another clock
-DRIFT, DRIFTED = 3e-4, 0.03  # s/s, and s over the recording, above which a drift is reported
-# s, default waiting times of ekf_node
-LAG, REORDER = (0.25, 0.003)
-UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
 
 
 def total(windows: list[StampWindow], field: str) -> int:

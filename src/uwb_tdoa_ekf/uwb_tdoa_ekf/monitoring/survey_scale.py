@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.common.compiled import compiled
+from uwb_tdoa_bias.common.radio import SPEED_OF_LIGHT
 from uwb_tdoa_bias.common.survey import UNITS
 
 from .finding import ERROR, Finding
@@ -48,7 +49,7 @@ GOOD = 0.35  # largest loss of a survey that fits; healthy flights of three days
 # at rest
 MOVED, CLEARLY = (0.3, 0.5)
 # m per nanosecond; TDOAs in nanoseconds or feet look like a survey that is too small by this factor
-NANOSECONDS = 0.299792458
+NANOSECONDS = SPEED_OF_LIGHT / 1e9
 AS_IT_IS, SCALED, SIGN, EXCHANGED, ALONE = range(5)  # kinds of hypotheses
 
 

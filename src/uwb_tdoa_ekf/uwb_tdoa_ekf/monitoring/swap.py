@@ -13,6 +13,8 @@ import numpy as np
 
 from uwb_tdoa_bias.common.geometry import ranges, tdoa
 
+from .slices import CLIP, FEWEST
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -25,8 +27,6 @@ PLACE_STD = 1.0  # m, standard deviation of the position of the filter
 # m, standard deviation of one TDOA; m, scale of the Geman-McClure weight; iterations for the
 # position
 STD, ROBUST, STEPS = (0.15, 0.4, 3)
-CLIP = 1.5  # m; larger residuals are clipped to this
-FEWEST = 10  # fewest TDOAs of a slice
 # largest ratio of the residual of an exchange to the residual of the survey, and to that of any
 # other exchange
 SHARE, OF_OTHERS = (0.4, 0.8)
