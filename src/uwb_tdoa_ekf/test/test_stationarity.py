@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 from flights import corners, fly
-from live import assert_same
 import numpy as np
 import pytest
 
@@ -129,24 +128,6 @@ def test_delays_that_are_known_of_the_floor_make_it_sharp():
         assert np.linalg.norm(error[rest], axis=1).max() < 0.25 and nees[rest].mean() < 9.0
         assert np.sqrt(np.mean(error[rest] ** 2)) < 0.6 * np.sqrt(np.mean(without[rest] ** 2))
         assert np.linalg.norm(error[t > 7.0], axis=1).max() < 0.3
-
-
-def test_live_the_delays_of_the_floor_do_the_same():
-    delays = np.where(np.array(corners().positions)[:, 2] < 1.0, 3.3, 0.3)
-    flight = on_floor(0, 3.0, known=delays)
-    known = EffectSet(
-        (
-            EFFECTS["floor_multipath"](
-                {f"{i}.delay": delay for i, delay in zip(flight.anchors.ids, delays)}
-            ),
-        )
-    )
-    estimator = Estimator(flight.anchors, reorder=0.0, effects=known)
-    estimator.add_imu(flight.imu.t, flight.imu.gyro, flight.imu.accel)
-    estimator.add_tdoa(flight.tdoa.t, flight.tdoa.a, flight.tdoa.b, flight.tdoa.d)
-    assert_same(
-        estimator.finish()[0], run_offline(flight, None, Corrector(flight.anchors, known)).odometry
-    )
 
 
 def test_a_tag_that_lies_still_stays_where_it_is_without_tdoas():

@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from uwb_tdoa_tools.flying.controller import Controller, rotate_attitude
+from uwb_tdoa_tools.flying.controller import Controller
 from uwb_tdoa_tools.flying.simulator import IMU_RATE, interval
 from uwb_tdoa_tools.flying.vehicle import ATTITUDE, GRAVITY, POSITION, VELOCITY, Vehicle
 
@@ -77,12 +77,3 @@ def test_support_is_what_the_rotors_do_not_carry():
     assert controller.support(1.5 * GRAVITY) == pytest.approx(0.5, abs=1e-3)
     controller.stop()
     assert controller.thrust == 0.0 and controller.support(GRAVITY) == pytest.approx(1.0)
-
-
-def test_an_attitude_turns_as_the_gyroscope_says():
-    q = np.array([0.0, 0.0, 0.0, 1.0])
-    for _ in range(100):
-        rotate_attitude(q, np.array([0.0, 0.0, math.pi / 2]), 0.01)
-    np.testing.assert_allclose(
-        q, [0.0, 0.0, math.sin(math.pi / 4), math.cos(math.pi / 4)], atol=1e-9
-    )

@@ -41,15 +41,6 @@ def test_it_begins_and_ends_at_rest_in_one_place_and_then_sinks(path):
     assert np.isnan(after[0, 2]) and after[1, 2] == -SINK
 
 
-def test_a_swing_is_one_of_the_height_alone():
-    level, swung = (followed(Circles(swing=swing))[2] for swing in (0.0, 0.4))
-    off = swung[:, 0] - level[:, 0]
-    np.testing.assert_allclose(off[:, :2], 0.0, atol=1e-9)
-    assert off[:, 2].max() == pytest.approx(0.4, abs=1e-3) and off[:, 2].min() == pytest.approx(
-        -0.4, abs=1e-3
-    )
-
-
 LEVEL = np.array([0.0, 0.0, math.sin(0.2), math.cos(0.2)])  # yaw 0.4
 STEP = 0.01
 

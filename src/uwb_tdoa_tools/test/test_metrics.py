@@ -134,12 +134,6 @@ def test_a_late_start_is_told_and_too_late_is_a_diverged_run(begin, diverged):
     )
 
 
-def test_a_late_start_does_not_hide_what_else_is_wrong():
-    truth = straight()
-    row = Score("flight", estimate(truth, constant(2.0, 0.0, 0.0), low=2.1), truth).row()
-    assert row["diverged"] and not row["late_start"] and line_of_run(row).endswith("DIVERGED")
-
-
 def test_an_estimate_that_ends_in_mid_flight_has_diverged():
     truth = straight()
     assert Score("flight", estimate(truth, constant(0.0, 0.0, 0.0), high=3.0), truth).row()[
@@ -168,13 +162,6 @@ def test_nees_of_hand_made_errors():
     assert nees(np.empty((0, 3)), np.empty((0, 3, 3))).shape == (0,)
 
 
-def test_nees_of_honest_errors_is_three():
-    rng = np.random.default_rng(0)
-    factor = rng.standard_normal((20000, 3, 3)) + 2.0 * np.eye(3)
-    error = np.einsum("nij,nj->ni", factor, rng.standard_normal((20000, 3)))
-    assert nees(error, factor @ factor.transpose(0, 2, 1)).mean() == pytest.approx(3.0, abs=0.1)
-
-
 def test_an_odometry_that_claims_no_covariance_still_has_errors():
     """Many a publisher of nav_msgs/Odometry leaves the covariance zero."""
     truth = straight()
@@ -196,56 +183,6 @@ def test_coverage_per_axis():
     np.testing.assert_allclose(coverage(error, covariance), [0.75, 0.25, 1.0])
     np.testing.assert_allclose(coverage(error, covariance, sigmas=1.0), [0.5, 0.25, 1.0])
     assert np.isnan(coverage(np.empty((0, 3)), np.empty((0, 3, 3)))).all()
-    rng = np.random.default_rng(0)
-    error, covariance = (
-        0.1 * rng.standard_normal((50000, 3)),
-        np.tile(np.diag([0.01] * 3), (50000, 1, 1)),
-    )
-    np.testing.assert_allclose(coverage(error, covariance), 0.9973, atol=0.001)
-
-
-def test_row_carries_the_nis_of_its_residuals():
-    truth = straight()
-    told = residuals([1.0, 2.0], [1.0, 1.0], [USED, USED])
-    row = Score("flight", estimate(truth, constant(0.0, 0.0, 0.0)), truth, told).row()
-    assert (row["nis_mean"], row["nis_median"]) == (2.5, 2.5)
-
-
-def test_pooled_weighs_samples_and_tells_of_runs():
-    long, short = straight(10.0), straight(6.0)
-    scores = [
-        Score("a", estimate(long, constant(0.1, 0.0, 0.0)), long, residuals([1.0], [1.0], [USED])),
-        Score(
-            "b",
-            estimate(short, constant(0.0, 2.0, 0.0), low=1.5, high=6.0),
-            short,
-            residuals([3.0], [1.0], [USED]),
-        ),
-    ]
-    counts = [len(score.t) for score in scores]
-    together = pooled(scores)
-    assert together["rmse_3d"] == pytest.approx(
-        np.sqrt((counts[0] * 0.01 + counts[1] * 4.0) / sum(counts))
-    )
-    assert together["rmse_x"] == pytest.approx(np.sqrt(counts[0] * 0.01 / sum(counts)))
-    assert together["frac_gt_1m"] == pytest.approx(counts[1] / sum(counts))
-    assert together["max_3d"] == pytest.approx(2.0) and together["nis_mean"] == 5.0
-    assert together["rmse_3d_mean_of_runs"] == pytest.approx(1.05)
-    assert together["rmse_3d_max_of_runs"] == pytest.approx(2.0)
-    assert together["diverged"] == 1  # a count here
-    assert together["start_delay"] == pytest.approx(0.5, abs=0.011)
-    needed = {
-        "flight",
-        "rmse_x",
-        "rmse_y",
-        "rmse_z",
-        "rmse_3d",
-        "median_3d",
-        "max_3d",
-        "frac_gt_1m",
-        "diverged",
-    }
-    assert needed <= set(together) and needed <= set(scores[0].row())
 
 
 def test_pooled_with_a_run_that_never_started():
@@ -275,6 +212,9 @@ def test_figures_pooled_of_what_runs_leave_are_those_of_all_samples():
         for name in ("error", "covariance", "nees", "nis")
     )
     expected, together = summary(error, of_nees, of_nis), pooled(scores)
+    of_runs = [score.row()["rmse_3d"] for score in scores]
+    assert together["rmse_3d_mean_of_runs"] == pytest.approx(np.mean(of_runs))
+    assert together["rmse_3d_max_of_runs"] == pytest.approx(max(of_runs))
     for name in (
         "rmse_x",
         "rmse_y",

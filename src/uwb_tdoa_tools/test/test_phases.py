@@ -9,7 +9,7 @@ import pytest
 from uwb_tdoa_tools.evaluating import lines_of_phases, markdown_of
 from uwb_tdoa_tools.scoring.metrics import Score
 from uwb_tdoa_tools.scoring.phases import TITLES, in_the_air, motion, phases
-from uwb_tdoa_tools.scoring.pooling import Pool, PooledErrors
+from uwb_tdoa_tools.scoring.pooling import Pool
 
 
 def test_phases_of_a_flight_are_those_of_the_data_and_leave_nothing_out():
@@ -88,13 +88,6 @@ def test_a_start_on_a_table_is_a_rest_in_the_air():
     assert found["at_rest_after"] == pytest.approx(
         (17.96, 20.0), abs=0.025
     )  # 0.07 m above the floor
-
-
-def test_a_person_who_walks_leaves_by_distance():
-    found = phases(truth_of((0, 0, 0, 1.2), (5, 0, 0, 1.2), (15, 10, 0, 1.2), (19, 10, 0, 1.2)))
-    assert found["first_3_s"] == pytest.approx((5.1, 8.1), abs=0.025) and found["at_rest_after"][
-        0
-    ] == pytest.approx(14.9, abs=0.025)
 
 
 @pytest.mark.parametrize("height", [0.0, 1.0])
@@ -195,15 +188,6 @@ def test_an_error_on_the_floor_is_told_beside_the_figure_of_the_air():
         assert found[name]["rmse_3d"] == pytest.approx(0.0, abs=1e-9), name
     share = (phases(truth)["in_the_air"][0] - truth.t[0]) / 21.0
     assert found["whole"]["rmse_3d"] == pytest.approx(4.0 * np.sqrt(share), rel=0.01)
-
-
-def test_the_figure_of_the_air_is_the_one_of_the_row():
-    truth, rng = flown(), np.random.default_rng(1)
-    made = odometry_of(truth, lambda t: rng.normal(0.0, 0.2, (len(t), 3)))
-    score = Score("flight", made, truth)
-    row, found = score.row(), score.phases()["in_the_air"]
-    for name in ("rmse_x", "rmse_y", "rmse_z", "rmse_3d", "max_3d", "nees_mean"):
-        assert row[name] == pytest.approx(found[name], rel=1e-12), name
 
 
 def test_the_step_is_the_largest_jump_between_estimates_and_where_it_is():
@@ -311,28 +295,6 @@ def test_a_tag_that_never_moves_is_judged_over_all():
         "still", odometry_of(truth, lambda t: np.tile([0.3, 0.0, 0.0], (len(t), 1))), truth
     ).row()
     assert row["part"] == "whole" and row["rmse_3d"] == pytest.approx(0.3) and not row["diverged"]
-
-
-def test_figures_of_several_runs_are_those_of_all_their_samples():
-    together, runs = PooledErrors(), []
-    for seed, off in enumerate((0.3, 2.0, 0.5)):
-        truth, rng = flown(rest=3.0 + seed), np.random.default_rng(seed)
-        score = Score(
-            "flight", odometry_of(truth, lambda t: off * rng.standard_normal((len(t), 3))), truth
-        )
-        together.add(score.phases()["in_the_air"])
-        runs.append(score)
-    found, error = together.figures(), np.concatenate([score.error for score in runs])
-    assert found["runs"] == 3 and found["count"] == len(error)
-    assert found["rmse_3d"] == pytest.approx(np.sqrt(np.mean(np.sum(error**2, axis=1))), rel=1e-12)
-    assert found["rmse_y"] == pytest.approx(np.sqrt(np.mean(error[:, 1] ** 2)), rel=1e-12)
-    assert found["nees_mean"] == pytest.approx(
-        np.mean(np.concatenate([score.nees for score in runs])), rel=1e-12
-    )
-    assert found["max_3d"] == pytest.approx(np.linalg.norm(error, axis=1).max())
-    of_runs = [score.row()["rmse_3d"] for score in runs]
-    assert found["rmse_3d_median_of_runs"] == pytest.approx(np.median(of_runs), rel=0.011)
-    assert found["rmse_3d_max_of_runs"] == pytest.approx(max(of_runs))
 
 
 def test_a_pool_counts_the_runs_that_have_a_phase():

@@ -10,7 +10,7 @@ from uwb_tdoa_tools.planning.bifurcation import Subsets
 from uwb_tdoa_tools.planning.installation import PAIRINGS, Installation
 from uwb_tdoa_tools.planning.maps import MOST_CELLS, OUTSIDE, TWO_SOLUTIONS, Demand, Grid, chart
 from uwb_tdoa_tools.planning.report import TOPICS, map_messages, write_messages
-from uwb_tdoa_tools.simulation.rooms import Room, constellation, corners
+from uwb_tdoa_tools.simulation.rooms import Room, corners
 
 
 def test_cells_are_cubes_that_cover_the_box():
@@ -83,17 +83,6 @@ def cpu_seconds(anchors, shape, pairing):
 def test_a_slice_is_quick(pairing):
     """100 x 100 cells, 8 anchors, all maps, in CPU time: 0.2 - 0.25 s on a 2020s laptop core."""
     assert min(cpu_seconds(corners(), (100, 100, 1), pairing) for _ in range(3)) < 0.5
-
-
-@pytest.mark.slow
-def test_a_volume_is_quick():
-    assert cpu_seconds(corners(), (50, 50, 50), "ring") < 20
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("pairing", PAIRINGS)
-def test_64_anchors(pairing):
-    cpu_seconds(constellation("random-3-64"), (50, 50, 1), pairing)
 
 
 INSTALLATION = Installation(corners())

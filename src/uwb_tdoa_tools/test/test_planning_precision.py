@@ -2,15 +2,11 @@ from dataclasses import replace
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 import numpy as np
 import pytest
 from scipy.linalg import cho_factor, cho_solve
-from scipy.ndimage import median_filter
 
 from uwb_tdoa_bias.common.anchors import Anchors
-from uwb_tdoa_bias.common.geometry import tdoa
-from uwb_tdoa_tools.planning import maps
 from uwb_tdoa_tools.planning.installation import (
     PAIRINGS,
     FixedNoise,
@@ -44,7 +40,6 @@ from uwb_tdoa_tools.planning.precision import (
 from uwb_tdoa_tools.readers import read_flight
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.rooms import constellation, corners, facing
-from uwb_tdoa_tools.simulation.tdoas import make_schedule
 
 SQUARE = facing([[0, 0, 0.2], [4, 0, 0.2], [4, 4, 0.2], [0, 4, 0.2]], (2, 2, 0.2))
 # metres of noise: the second term of eq. 1 counts
@@ -160,108 +155,6 @@ def test_link_noise_that_vanishes_leaves_the_ring():
     np.testing.assert_allclose(tiny, information(PLACES, Installation(corners())), rtol=1e-4)
 
 
-def information_of_schedule(protocol, anchors, point, variance, rounds):
-    """Information per N TDOAs of a simulated schedule in which TDOAs share the receptions that they
-    are made from.
-    """
-    n = len(anchors)
-    schedule = make_schedule(
-        protocol, n, 0.0165 * rounds * (1 if protocol == "tdoa2" else 2), np.random.default_rng(5)
-    )
-    d = np.zeros((len(schedule.t), len(schedule.sender)))
-    rows = np.arange(len(d))
-    d[rows, schedule.heard_b], d[rows, schedule.heard_a] = 1.0, -1.0
-    covariance = (d * variance[schedule.sender]) @ d.T
-    unit = (point - anchors.positions[schedule.sender]) / ranges(point, anchors)[schedule.sender][
-        :, None
-    ]
-    h = d @ unit
-    return h.T @ np.linalg.solve(covariance, h) / (len(d) / n)
-
-
-@pytest.mark.parametrize("protocol", ["tdoa2", "tdoa3"])
-def test_many_rounds_of_shared_receptions_tell_as_much_each_as_one_closed_ring(protocol):
-    """In flight, the ring does not close on the same reception of the first anchor, and TDOA3 pairs
-    at random. Over many rounds both come to the same information per round, but for lost packets.
-    """
-    anchors, point = corners(), PLACES[0]
-    variance = RadioNoise().variance(point[None], anchors)[0]
-    one = information(point[None], Installation(anchors), correction=False)[0]
-    many = information_of_schedule(protocol, anchors, point, variance, 40)
-    share = np.diag(many) / np.diag(one)
-    assert (share > 0.9).all() and (share < 1.1).all()
-
-
-@given(arrays(float, st.integers(4, 9), elements=st.floats(1e-4, 1.0)))
-def test_the_covariance_of_eqs_6_to_8_never_is_one(variance):
-    """Pairs without an anchor in common at the bound of eq. 7: the sum of all elements, a variance,
-    is negative.
-    """
-    pairs = ring(len(variance))
-    matrix = pairs.covariance(variance[None])[0]
-    assert abs(matrix.sum()) < 1e-9
-    apart = (np.abs(pairs.incidence()) @ np.abs(pairs.incidence()).T) == 0
-    std = np.sqrt(np.diag(matrix))
-    matrix[apart] = -np.outer(std, std)[apart]
-    assert matrix.sum() < 0.0 and np.linalg.eigvalsh(matrix)[0] < 0.0
-
-
-def estimates(point, installation, trials, rounds, seed):
-    """Maximum-likelihood positions (Fisher scoring of the whole likelihood) of simulated rounds of
-    TDOAs.
-    """
-    rng, anchors, k = np.random.default_rng(seed), installation.anchors, installation.dimensions
-    pairing = installation.pairing
-    if pairing.shared and installation.link_std == 0.0 and len(pairing.a) == len(anchors):
-        pairing = without(pairing, 0)
-    d = pairing.incidence()
-
-    def moments(x):
-        variance = installation.noise.variance(x, anchors)
-        return ranges(x, anchors) @ d.T, pairing.covariance(variance, installation.link_std)
-
-    mean, covariance = moments(point[None])
-    tau = (
-        mean[0]
-        + rng.standard_normal((trials, rounds, len(d))) @ np.linalg.cholesky(covariance[0]).T
-    )
-    x = np.tile(point, (trials, 1))
-    steps = 1e-4 * np.eye(3)[:k]
-    for _ in range(6):
-        mean, covariance = moments(x)
-        inverse, off = np.linalg.inv(covariance), tau - mean[:, None]
-        sides = [[moments(x + sign * step) for step in steps] for sign in (1, -1)]
-        h = np.stack([(up[0] - down[0]) / 2e-4 for up, down in zip(*sides)], axis=-1)
-        df = np.stack([(up[1] - down[1]) / 2e-4 for up, down in zip(*sides)], axis=1)
-        whitened = off @ inverse
-        score = np.einsum("tmk,tm->tk", h, whitened.sum(axis=1))
-        score += 0.5 * np.einsum("trm,tkmn,trn->tk", whitened, df, whitened)
-        score -= 0.5 * rounds * np.einsum("tmn,tknm->tk", inverse, df)
-        fisher = rounds * information(x, installation) / pairing.times
-        x[:, :k] += np.linalg.solve(fisher, score[..., None])[..., 0]
-    return x
-
-
-@pytest.mark.parametrize("case", CASES)
-def test_an_estimator_reaches_the_bound(case):
-    """Efficiency, bound over mean squared error, within 10 %."""
-    make, link_std = CASES[case]
-    pairing = replace(make(8), times=1.0)
-    installation = Installation(corners(), RadioNoise(tx_power_dbm=0.0), pairing, 0.2 * link_std)
-    for point in PLACES[:2]:
-        error = estimates(point, installation, trials=1500, rounds=1, seed=3) - point
-        limit = bound(information(point[None], installation))[0]
-        assert np.trace(limit) / np.mean(np.sum(error**2, axis=1)) == pytest.approx(1.0, abs=0.1)
-        np.testing.assert_allclose(error.T @ error / len(error), limit, atol=0.1 * np.trace(limit))
-
-
-def test_an_estimator_reaches_the_bound_where_the_size_of_the_errors_tells_the_place():
-    installation = Installation(corners(), NOISY)
-    error = estimates(PLACES[1], installation, trials=400, rounds=1000, seed=4) - PLACES[1]
-    limit = bound(information(PLACES[1:2], installation))[0] / 1000
-    assert np.trace(limit) / np.mean(np.sum(error**2, axis=1)) == pytest.approx(1.0, abs=0.1)
-
-
 def test_dilution_in_the_middle_of_a_square():
     """Four alike ranges with an unknown offset from the corners: variance 1/2 along each axis."""
     installation = Installation(SQUARE, dimensions=2)
@@ -323,53 +216,6 @@ def test_one_more_anchor_never_hurts(seed):
     point = np.random.default_rng(seed).uniform([-2, -2, 0.3], [2, 2, 2.3], (1, 3))
     gain = information(point, Installation(more)) - information(point, Installation(few))
     assert np.linalg.eigvalsh(gain)[0, 0] > -1e-6 * np.abs(gain).max()
-
-
-@pytest.mark.parametrize("name", ["0422/0422-log00", "0425/TDOA2/0425-traj2", "0426/0426-traj1"])
-def test_what_measured_tdoas_share(shared_data, name):
-    """Noise of TDOAs that follow each other in flight: pairs with one anchor in common are
-    anticorrelated, by less than the -1/2 of eq. 5 because each TDOA also has an error of its own;
-    pairs without one are uncorrelated, against eq. 7.
-    """
-    day = name[:4]
-    flight = read_flight(
-        shared_data / "flights" / name, shared_data / "surveys" / f"anchor_{day}.txt"
-    )
-    truth, measured, anchors = flight.truth, flight.tdoa, flight.anchors
-    above = truth.t[truth.p[:, 2] > 0.3]
-    flown = (measured.t > above[0] + 1.0) & (measured.t < above[-1] - 1.0)
-    t, a, b, d = (
-        measured.t[flown],
-        anchors.index(measured.a[flown]),
-        anchors.index(measured.b[flown]),
-        measured.d[flown],
-    )
-    place = np.stack([np.interp(t, truth.t, truth.p[:, k]) for k in range(3)], axis=1)
-    residual = d - tdoa(place, anchors.positions[a], anchors.positions[b])
-    noise = np.full(len(t), np.nan)
-    for pair in set(zip(a.tolist(), b.tolist())):
-        rows = np.flatnonzero((a == pair[0]) & (b == pair[1]))
-        # without what lasts longer than about 0.5 s
-        noise[rows] = residual[rows] - median_filter(residual[rows], 31)
-    noise[np.abs(noise) > 0.4] = np.nan
-
-    def correlation(lag):
-        one, other = slice(None, -lag), slice(lag, None)
-        near = t[other] - t[one] < 2.2e-3 * lag + 1e-3  # no packet missed in between
-        common = (
-            (a[one] == a[other])
-            | (a[one] == b[other])
-            | (b[one] == a[other])
-            | (b[one] == b[other])
-        )
-        rows = np.flatnonzero(
-            near & (common == (lag == 1)) & np.isfinite(noise[one]) & np.isfinite(noise[other])
-        )
-        assert len(rows) > 3000
-        return np.corrcoef(noise[rows], noise[rows + lag])[0, 1]
-
-    assert -0.35 < correlation(1) < -0.2
-    assert abs(correlation(2)) < 0.05 and abs(correlation(3)) < 0.05
 
 
 @given(st.floats(0.01, 0.5))
@@ -472,33 +318,6 @@ def test_a_simulated_flight(trajectory):
     limit = position_error(bound(information(flown.place, INSTALLATION)))
     assert found["bound"] == pytest.approx(np.sqrt(np.mean(limit**2)))
     assert 1.0 < found["efficiency_achieved"] < 1000.0
-
-
-def test_a_static_grid_is_mapped_place_by_place():
-    """Several hovers, as on the markers of the paper's Figure 1: one cell each."""
-    places = [(-1.0, -1.0), (1.0, 1.0)]
-    flights = [
-        error_samples(
-            simulate(
-                SimulationConfig(
-                    trajectory="hover",
-                    place=place,
-                    height=1.2,
-                    duration=20,
-                    start_in_air=True,
-                    floor_time=0.0,
-                )
-            )
-        )
-        for place in places
-    ]
-    grid = Grid.slice((-2, 2), (-2, 2), 1.2, 0.5)
-    found = maps.accuracy_map(maps.pooled(flights), INSTALLATION, grid)
-    known = np.isfinite(found.rmse[:, 0])
-    centres = grid.points[known]
-    for place in places:
-        assert np.linalg.norm(centres[:, :2] - place, axis=1).min() < 0.4
-    assert (np.linalg.norm(found.bias[known], axis=1) > 0.02).all()
 
 
 def test_a_measured_flight(shared_data):

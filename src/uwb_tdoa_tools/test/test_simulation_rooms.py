@@ -12,7 +12,6 @@ from uwb_tdoa_tools.simulation.rooms import (
     CONSTELLATIONS,
     Walls,
     constellation,
-    facing,
     heard_at,
     room_of,
 )
@@ -43,28 +42,6 @@ def test_corners_are_like_the_surveyed_ones():
     np.testing.assert_allclose(
         up[:, 2], np.where(anchors.positions[:, 2] < 0.5, 1.0, -1.0), atol=1e-12
     )
-
-
-def test_planar_is_the_one_of_grasso():
-    anchors = constellation("planar")
-    assert len(anchors) == 4
-    np.testing.assert_allclose(anchors.positions[:, 2], 0.2)
-    np.testing.assert_allclose(np.linalg.norm(np.diff(anchors.positions, axis=0), axis=1), 4.0)
-    front = Rotation.from_quat(anchors.orientations).apply([1.0, 0.0, 0.0])
-    np.testing.assert_allclose(
-        front * np.sqrt(8.0), [0.0, 0.0, 0.2] - anchors.positions, atol=1e-12
-    )
-
-
-def test_tilted_fronts_point_at_the_target_itself():
-    positions = np.array([[1.0, 2.0, 3.0], [0.0, 0.0, 2.0], [-4.0, 1.0, 0.2]])
-    target = np.array([0.0, 0.0, 1.0])
-    anchors = facing(positions, target, level=False, inverted=[False, False, True])
-    front = Rotation.from_quat(anchors.orientations).apply([1.0, 0.0, 0.0])
-    expected = (target - positions) / np.linalg.norm(target - positions, axis=1, keepdims=True)
-    np.testing.assert_allclose(front, expected, atol=1e-12)
-    up = Rotation.from_quat(anchors.orientations).apply([0.0, 0.0, 1.0])
-    assert up[0, 2] > 0.5 and up[2, 2] < -0.5
 
 
 def test_random_is_seeded():

@@ -59,14 +59,6 @@ def test_vibration_only_while_the_motors_turn():
     np.testing.assert_array_equal(gyro, 0.0)
 
 
-def test_each_error_has_its_own_stream():
-    everything = errors_of(ImuErrors())[0]
-    without_walk = errors_of(ImuErrors(gyro_bias_walk=0.0, accel_noise=0.0))[0]
-    assert (
-        np.abs(np.diff(everything - without_walk, axis=0)).max() < 1e-5
-    )  # only the walk's steps are gone
-
-
 def test_no_two_errors_draw_the_same_numbers():
     gyro, accel, flight = errors_of(replace(NO_IMU_ERRORS, gyro_noise=1.0, accel_noise=1.0))
     tdoa = flight.extra["tdoa_truth"]["noise"]

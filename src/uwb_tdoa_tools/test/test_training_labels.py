@@ -8,8 +8,6 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm
 from uwb_tdoa_tools.training.labels import (
-    constellations,
-    digest,
     labels,
     split,
     thinned,
@@ -118,12 +116,3 @@ def test_thinned_samples_count_for_as_much_together(one):
 
 def test_white_noise_is_what_changes_from_one_tdoa_to_the_next(one):
     assert white_noise([labels(one)]) == pytest.approx(0.06, rel=0.1)
-
-
-def test_digest_tells_data_apart(one):
-    found = [labels(one), labels(flight(1))]
-    assert digest(found) == digest(found[::-1]) != digest(found[:1])
-
-
-def test_constellations_are_told_apart_by_positions(one):
-    assert len(constellations([one, flight(1), flight(0, "pillars")])) == 2

@@ -43,11 +43,3 @@ def test_the_prior_is_as_large_as_the_weights():
     made, weights, dense = design(0.05, 0.0)
     found = fit(made, SITES, 0.05)
     assert 0.5 < found.site_std / weights.std() < 2.0 and 0.5 < found.dense_std / dense.std() < 2.0
-
-
-def test_without_a_dense_part():
-    made, weights, _ = design(0.1, 0.0)
-    bare = Design(made.phi, made.a, made.b, np.zeros((len(made.y), 0)), made.y, made.sample_weight)
-    found = fit(bare, SITES, 0.1)
-    assert found.dense.shape == (0,) and found.dense_std == 0.0
-    np.testing.assert_allclose(found.site, weights, atol=0.3)

@@ -1,12 +1,9 @@
 """As much of a model as flights left out bear out."""
 
-from functools import partial
-
 import pytest
 from training_flights import flight
 
 from uwb_tdoa_bias.effects import EFFECTS
-from uwb_tdoa_tools import parallel
 from uwb_tdoa_tools.scoring.gains import SHARES, Shrinkage, best_share
 from uwb_tdoa_tools.training import models, shrinking, structured
 
@@ -51,18 +48,3 @@ def test_a_flight_is_judged_by_what_it_took_no_part_in():
     alike, other = (told.errors[flights[k].name] for k in (0, 2))
     assert alike[1.0] < 0.95 * alike[None] and other[1.0] > 1.05 * other[None]
     assert told.share < 1.0 and told.as_dict()["worst"] == told.gains.min()
-
-
-@pytest.mark.slow
-def test_two_processes_give_the_same_to_the_bit():
-    flights, told = (
-        [EFFECTS["anchor_delay"]({"3": 0.4}).inject(flight(seed)) for seed in range(3)],
-        [],
-    )
-    for jobs in (1, 2):
-        over = partial(parallel.over, jobs=jobs)
-        uncorrected_errors = shrinking.uncorrected(flights, over)
-        told.append(
-            shrinking.cross_validated(RECIPE, flights, uncorrected_errors, map_function=over)
-        )
-    assert told[0] == told[1] and set(told[0].errors) == {one.name for one in flights}

@@ -1,11 +1,9 @@
-import copy
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from training_flights import flight, without_attitude
 
-from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_tools.training import models, structured
 from uwb_tdoa_tools.training.labels import labels, thinned
@@ -65,17 +63,6 @@ def test_a_pair_turned_round_has_the_opposite_error(two_places):
     np.testing.assert_allclose(one[1:], other[1:], atol=1e-5)
 
 
-def test_errors_add_up_round_a_triangle(two_places):
-    _, network = two_places
-    s = labels(flight(5)).samples
-    n = len(s)
-    pairs = [
-        network.predict(replace(s, a=np.full(n, a), b=np.full(n, b)))[0]
-        for a, b in ((0, 3), (3, 6), (6, 0))
-    ]
-    np.testing.assert_allclose(sum(pairs), 0.0, atol=1e-5)
-
-
 def test_carries_over_to_pairs_never_seen(one_place):
     _, network = one_place  # TDoA2: neighbours in a ring only
     found = labels(flight(7, protocol="tdoa3", **CIRCLE))
@@ -109,33 +96,6 @@ def test_fades_away_from_where_it_was(one_place):
     near, far = network.predict(s), network.predict(replace(s, p=s.p + [0.0, 0.0, 60.0]))
     assert np.abs(far[0]).max() < 0.05 * np.abs(near[0]).max()
     assert (far[1] > near[1].max()).all() and (far[2] < 0.1).all()
-
-
-def test_other_ids_at_the_same_places_are_other_anchors(one_place):
-    _, network = one_place
-    s = labels(flight(5, **CIRCLE)).samples
-    renamed = Anchors(s.anchors.ids + 20, s.anchors.positions, s.anchors.orientations)
-    np.testing.assert_allclose(network.predict(replace(s, anchors=renamed))[0], 0.0, atol=1e-5)
-
-
-def test_what_holds_for_all_anchors_can_be_kept_alone(two_places, tmp_path):
-    model, network = two_places
-    found = labels(flight(7, "wall_middles"))  # none of its anchors has a site
-    general = copy.deepcopy(model)
-    general.site_ids, general.site_positions, general.weights = (
-        model.site_ids[:0],
-        model.site_positions[:0],
-        model.weights[:0],
-    )
-    assert len(general.inputs()) < len(model.inputs())
-    path = tmp_path / "general.onnx"
-    path.write_bytes(general.onnx({"clip": 1.0, "name": "general"}).SerializeToString())
-    for expected, told in zip(network.predict(found.samples), Network(path).predict(found.samples)):
-        np.testing.assert_allclose(told, expected, atol=1e-5)
-    np.testing.assert_allclose(general.mean(found.samples), model.mean(found.samples), atol=1e-12)
-    np.testing.assert_allclose(
-        general.variance(found.samples), model.variance(found.samples), rtol=1e-9
-    )
 
 
 def test_flights_with_and_without_attitude_together(tmp_path):
