@@ -26,9 +26,9 @@ from uwb_tdoa_bias.common.sensors import Height, Pressure, Velocity  # noqa: E40
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet  # noqa: E402
 from uwb_tdoa_ekf.debias import BiasMap  # noqa: E402
 from uwb_tdoa_tools.bags.bag import write_bag  # noqa: E402
-from uwb_tdoa_tools.bags.files import open_bag  # noqa: E402  # noqa: E402
+from uwb_tdoa_tools.bags.files import open_bag  # noqa: E402
 from uwb_tdoa_tools.bags.integrity import CHECKSUM_KEY, NO_CHECKSUM, metadata  # noqa: E402
-from uwb_tdoa_tools.simulation.rooms import corners
+from uwb_tdoa_tools.simulation.rooms import corners  # noqa: E402
 
 TEXTS = {
     "yaml": [

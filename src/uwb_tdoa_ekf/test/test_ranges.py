@@ -248,30 +248,3 @@ def test_what_comes_at_once_and_one_by_one_is_corrected_alike():
     one_by_one = [measured(t[k : k + 1], np.ones(1, int), np.full(1, 4.0)) for k in range(400)]
     found = corrected(whole, [given])
     assert len(found) == 400 and len(set(found)) == 80 and found == corrected(single, one_by_one)
-
-
-def test_what_holds_no_distances_is_one_part_and_distances_after_it_are_corrected_as_they_would_be():
-    """Inertial samples and TDOAs alone, then a distance in the slice that they ended in, and one in
-    the next.
-    """
-    t = 1.7e9 + np.arange(12) / 100.0
-    imu = np.zeros(len(t), IMU_SAMPLE)
-    imu["t"] = t
-    given = Measurements(imu, np.empty(0, TDOA_ROW), np.empty(0, SENSOR_ROW))
-    later = [measured(t[-1:] + after, np.ones(1, int), np.full(1, 4.0)) for after in (0.001, SLICE)]
-
-    def corrected(parts):
-        corrections, out = RadioCorrections(EffectSet((MOVED,)), AnchorTable(BOX)), []
-        for part in parts:
-            pieces = 0
-            for piece in corrections.slices(part):
-                pieces += 1
-                out += piece.sensors["value"][:, 0].tolist()
-                stamps = np.concatenate([piece.imu["t"], piece.sensors["t"]])
-                corrections.add_odometry(odometry_at(stamps, (stamps - t[0])[:, None]))
-            assert pieces == 1
-        return out
-
-    one_by_one = [given._replace(imu=imu[k : k + 1]) for k in range(len(t))]
-    found = corrected([given, *later])
-    assert len(set(found)) == 2 and found == corrected([*one_by_one, *later])

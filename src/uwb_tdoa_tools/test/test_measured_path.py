@@ -31,7 +31,7 @@ def test_measured_flight_through_the_nodes_at_any_rate_is_the_offline_run(shared
     offline, _ = evaluate(flight, network=load_network(model))
     expected = offline.row()["rmse_3d"]
     assert expected < 0.35
-    for rate in (1.0, 4.0):
+    for rate in (2.0, 8.0):
         folder = tmp_path / f"rate{rate:g}"
         folder.mkdir()
         live = run_live(bag, folder, rate, {"model_file": str(model)})
