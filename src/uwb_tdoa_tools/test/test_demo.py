@@ -229,6 +229,3 @@ def test_a_given_flight_through_the_real_nodes(recorded, diagnosis, tmp_path, ca
     assert corrected == pytest.approx(without_ros, abs=1.01e-3)
     for name in ("flight.bag", "recorded.bag", "error.png"):
         assert (tmp_path / "out" / name).exists()
-
-
-# --- the first page ---
