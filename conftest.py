@@ -27,7 +27,7 @@ LONGEST = """first_hour_without_truth launch_files waiting printed_lines first_h
     diagnosis_references moved_anchors estimator each_node nodes both_nodes strangers diagnosis_ranging
     diagnosis_self_calibration vehicle_node flying_trial measured_path localizing warehouse alignment packaging
     connect offline engine stream_watch evaluate train training checking_report lint study_faults study_radio_link
-    replay rerun diagnosis_attribution diagnosis_validation diagnosis_deviations diagnosis_report plan
+    live_replay rerun diagnosis_attribution diagnosis_validation diagnosis_deviations diagnosis_report plan
     planning_solutions executables study_plans study_blind study_localizing study_checking""".split()
 KEPT = 3  # tests for which nobody gets the domain of a test that is over: others see a node that was killed for 20 s more
 

@@ -258,6 +258,7 @@ def test_nothing_is_said_to_be_untold_of_an_anchor_that_has_moved(calibration):
     assert "3" not in line and "anchor 3 has moved" in as_text(told)
 
 
+@pytest.mark.slow
 def test_anchors_of_a_hall_that_are_left_behind_are_no_fault():
     """There were 44 warnings: look at its power."""
     grid = np.array(

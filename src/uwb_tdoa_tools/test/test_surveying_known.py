@@ -172,6 +172,7 @@ def test_a_path_laid_beside_the_filters_is_where_the_tag_was_and_takes_its_shift
         reference.prepare(flights[1])
 
 
+@pytest.mark.slow
 def test_marks_on_the_floor_tell_nothing_and_those_in_the_air_judge_each_other(flights):
     flight = at(flights[0], flights[0].anchors.positions + [0.0, 0.0, 0.2])
     results = [
