@@ -21,12 +21,14 @@ except ImportError:  # no ROS: the tests of the cores need none
     domain_id = None
 # reservations of domains, oldest first; taken until this process ends, or KEPT others came
 _taken = deque()
-LONGEST = """waiting checking_check lockstep first_hour diagnosis_diagnose launch_files hall first_hour_without_truth each_node study_bench
-    stream_faults estimator
-    types flying_trial train surveying_known demo nodes both_nodes strangers packaging evaluate diagnosis_self_calibration measured_path
-    printed_lines lint study_closed_loop study_radio_link replay surveying rerun diagnosis_attribution diagnosis_references localizing
-    diagnosis_validation diagnosis_deviations plan connect executables training_shrinking training_structured study_blind training_compare
-    study_localizing diagnosis_report study_checking checking_imu_rules""".split()  # files of tests: each takes half a minute or more
+# files of tests: each takes half a minute or more
+LONGEST = """first_hour_without_truth launch_files waiting printed_lines first_hour lockstep diagnosis_diagnose
+    calibrating demo stream_faults checking_check hall surveying_known surveying types study_bench
+    diagnosis_references moved_anchors estimator each_node nodes both_nodes strangers diagnosis_ranging
+    diagnosis_self_calibration vehicle_node flying_trial measured_path localizing warehouse alignment packaging
+    connect offline engine stream_watch evaluate train training checking_report lint study_faults study_radio_link
+    live_replay rerun diagnosis_attribution diagnosis_validation diagnosis_deviations diagnosis_report plan
+    planning_solutions executables study_plans study_blind study_localizing study_checking""".split()
 KEPT = 3  # tests for which nobody gets the domain of a test that is over: others see a node that was killed for 20 s more
 
 

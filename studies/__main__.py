@@ -12,7 +12,6 @@ from studies import (
     domains,
     drives,
     export_cost,
-    fuzz,
     localizing,
     lockstep,
     monitor,
@@ -43,6 +42,7 @@ from studies.diagnosis import figures
 from studies.diagnosis import ranges as diagnosed_ranges
 from studies.faults import figures as faults
 from studies.faults import flown
+from studies.fuzzing import figures as fuzz
 from studies.rules import figures as rules
 from studies.training import compare, spin, splits
 from uwb_tdoa_tools import cli

@@ -17,17 +17,14 @@ from uwb_tdoa_bias.effects.anchor import AnchorDelay
 pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 from studies.__main__ import main  # noqa: E402
-from studies.bench import core, graph, nodes, peer, source, suite, usage  # noqa: E402
-from studies.bench.figures import Figure, as_json, table  # noqa: E402
+from studies.bench import core, nodes, peer, source, suite, usage  # noqa: E402
+from studies.bench.figures import Figure  # noqa: E402
 from studies.bench.flights import TDOA_RATE, among, make_flight  # noqa: E402
 from uwb_tdoa_tools.flying.estimates import Peer  # noqa: E402
 from uwb_tdoa_tools.flying.exported import CompiledCorrection  # noqa: E402
 from uwb_tdoa_tools.flying.world import HALL  # noqa: E402
 
 OTHERS = 0.2  # of the CPU time, from which on nothing can be asked of what is played in real time
-LENIENT = 10.0  # times the target: on a loaded machine
-CROWD = 0.5  # of the CPU time, from which on all that can be asked is that there are answers
-KEYS = {"section", "name", "unit", "median", "low", "high", "count", "target", "met"}
 
 
 def test_a_figure_is_the_median_and_the_quartiles_of_what_is_known():
@@ -39,30 +36,6 @@ def test_a_figure_is_the_median_and_the_quartiles_of_what_is_known():
     assert (
         Figure.of("core", "prediction", "us", np.nan, target=3.0).met is False
     )  # not known is not met
-
-
-def test_table():
-    figures = [
-        Figure.of("core", "prediction", "us", [1.0, 1.25, 1.5], target=3.5),
-        Figure.of("core", "update", "us", 12.0, target=3.5),
-        Figure.of("replay", "rate", "s/s", 8.0),
-    ]
-    lines = table(figures)
-    assert lines[0].split() == ["median", "quartiles", "unit", "target"]
-    assert [line for line in lines if line and not line.startswith(" ")] == ["core", "replay"]
-    assert lines[3].split() == ["prediction", "1.25", "1.12", "..", "1.38", "us", "<=", "3.5"]
-    assert lines[4].split() == ["update", "12", "us", "<=", "3.5", "MISSED"]
-    assert lines[-1].split() == ["rate", "8", "s/s"]
-    assert len({line.index("us") for line in lines[3:5]}) == 1  # columns
-
-
-def test_json_is_what_everybody_reads():
-    rows = as_json(
-        [Figure.of("core", "prediction", "us", np.nan), Figure.of("core", "update", "us", 1.0, 3.5)]
-    )
-    assert all(set(row) == KEYS for row in rows)
-    assert json.loads(json.dumps(rows, allow_nan=False))[0]["median"] is None
-    assert [row["met"] for row in rows] == [None, True]
 
 
 def test_a_flight_of_the_rates_it_is_measured_at():
@@ -127,12 +100,6 @@ def test_the_core_is_measured_per_event():
     assert (prediction > 0.0).all() and np.isfinite(
         update
     ).all()  # a difference: on a loaded machine below 0 at times
-
-
-def test_the_core_is_measured_while_several_yaws_are_followed():
-    # raises where fewer are followed
-    prediction, _ = core.per_event(8, "innovation", core.N_YAWS, 2)
-    assert (prediction > 0.0).all()
 
 
 def test_latency_is_that_of_the_first_odometry_that_contains_a_tdoa():
@@ -202,34 +169,6 @@ def test_a_quick_run_of_the_real_nodes(tmp_path, capsys):
     assert value["lost at rate 4"] == value["too late at rate 4"] == 0
     assert value["latency p50, TDOA published to odometry arrived"] > 0.0
     assert value["ready after its start, ekf_node"] > 0.1 and value["CPU, all nodes"] > 1.0
-
-
-@pytest.mark.slow  # where others leave it less of a core than it needs, nothing can be asked of it
-def test_everything_is_served_beside_streams_a_clock_and_transforms(tmp_path, monkeypatch):
-    monkeypatch.setenv("PYTHONSAFEPATH", "1")  # as after work on several cores in this process
-    before = usage.used_by_all()
-    found = graph.ask(tmp_path, 5.0, clock=200.0, tf=100.0, streams=True)
-    times = LENIENT if usage.used_by_others(before)["others"] < CROWD else np.inf
-    target = {name: min(graph.SILENCE, times * limit) for name, limit in graph.TARGETS.items()}
-    assert found.answers and max(found.answers) < target["get_parameters p99"]
-    assert max(found.poses) < target["initialpose, the longest"]
-    assert found.pause < target["a pause told after"]
-    assert max(found.periods) < times
-
-
-def test_a_case_is_described_and_judged():
-    assert graph.describe(0.0, 0.0, False, 0) == "the rest of the graph, ekf_node: nothing flows"
-    title = graph.describe(200.0, 500.0, True, 2)
-    assert title.endswith(
-        "/clock at 200 Hz, /tf at 500 Hz, streams at 1 kHz + 400 Hz, 2 busy loops"
-    )
-    slow = graph.Answers([0.01] * 98 + [3.0] * 2, [0.3, 0.1], [1.0, 1.1], graph.SILENCE, 0.02)
-    figures = {figure.name: figure for figure in graph.figures(title, slow, False)}
-    assert figures["get_parameters p99"].median == 3.0 and not figures["get_parameters p99"].met
-    assert not figures["initialpose, the longest"].met and not figures["a pause told after"].met
-    assert not figures[f"CPU, {graph.NODE}"].met and figures[
-        "from one report to the next"
-    ].median == pytest.approx(1.05)
 
 
 @pytest.mark.skipif(CC is None, reason="no C compiler (cc)")

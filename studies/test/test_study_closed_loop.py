@@ -5,7 +5,6 @@ the study alone.
 import json
 
 import numpy as np
-import pytest
 from test_flying_verdict import made_up
 
 from studies import __main__ as study
@@ -19,7 +18,6 @@ from studies.closed_loop.experiment import (
     WITH,
     WITHOUT,
 )
-from uwb_tdoa_bias.correction.network import load_network
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_tools.flying.fleet import drawn_flight
 from uwb_tdoa_tools.flying.verdict import verdict_of
@@ -101,20 +99,3 @@ def test_it_trains_flies_tells_and_draws(tmp_path, monkeypatch, capsys):
 def test_one_flight_to_train_on_is_too_few(tmp_path, capsys):
     assert study.main(["closed-loop", "--training", "1", "--out", str(tmp_path)]) == 2
     assert "leaves none to validate on" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_what_it_trains_takes_the_bias_of_antennas_out(tmp_path, monkeypatch):
-    monkeypatch.setattr(experiment, "FLOWN", 10.0)
-    folder = experiment.train(2, tmp_path / "trained", 1)
-    anchors = experiment.world_of(KNOWN).anchors
-    for name in experiment.NETWORKS:
-        features = json.loads(load_network(str(folder / name / "model.onnx")).meta["features"])
-        assert any("_A_" in one for one in features) == (name == "paper")
-    found = {
-        effect.name: effect.values
-        for effect in EffectSet.from_yaml(folder / "effects.yaml").effects
-    }
-    assert (
-        found["received_power_bias"]["scale"] == pytest.approx(1.0, abs=0.3) and len(anchors) == 8
-    )

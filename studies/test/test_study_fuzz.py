@@ -1,16 +1,26 @@
-"""Who fuzzes notices what is no InputError, takes too long or takes too much, and goes on behind
-it.
+"""Every reader on changed files returns or raises InputError; and who fuzzes for long notices what
+is no InputError, takes too long or takes too much, and goes on behind it.
 """
 
 from mmap import mmap
+import random
 
-from fuzz import targets
 import pytest
 
-from studies import fuzz
 from studies.__main__ import main
+from studies.fuzzing import figures as fuzz
+from studies.fuzzing import mutations, targets
 from uwb_tdoa_bias.common.errors import InputError
 
+SLOW = {
+    "bag_mcap_salvaged": 8,
+    "bag_sqlite": 15,
+    "bag_sqlite_salvaged": 8,
+    "bag_metadata": 10,
+    "bag_message": 30,
+    "bag_packed": 8,
+}
+EXAMPLES = 60
 SEED = b"seed"
 
 
@@ -36,7 +46,7 @@ def fails(data):
     raise ValueError("a defect")
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def one_seed(tmp_path, monkeypatch):
     (tmp_path / "seed").write_bytes(SEED)
     monkeypatch.setattr(targets, "seeds", lambda kind: [tmp_path / "seed"])
@@ -52,7 +62,7 @@ def one_seed(tmp_path, monkeypatch):
         (refuses, None),
     ],
 )
-def test_what_is_found(monkeypatch, tmp_path, capsys, work, said):
+def test_what_is_found(one_seed, monkeypatch, tmp_path, capsys, work, said):
     if work is hangs:
         monkeypatch.setattr(fuzz, "SECONDS", 0.1)
     monkeypatch.setitem(targets.TARGETS, "yaml", lambda data: None if data == SEED else work(data))
@@ -69,7 +79,34 @@ def test_what_is_found(monkeypatch, tmp_path, capsys, work, said):
         assert (tmp_path / "out" / "yaml-0-0").read_bytes() == fuzz.changed("yaml", 0, 0) != SEED
 
 
-def test_a_file_is_made_again_by_its_number():
+def test_a_file_is_made_again_by_its_number(one_seed):
     assert [fuzz.changed("yaml", 1, number) for number in range(5)] == [
         fuzz.changed("yaml", 1, number) for number in range(5)
     ]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def no_scratch_is_left():
+    yield
+    targets.clean_up()
+
+
+@pytest.mark.parametrize("name", targets.TARGETS)
+def test_the_corpus_is_right(name):
+    for path in targets.seeds(name):
+        targets.TARGETS[name](path.read_bytes())  # no InputError either
+
+
+@pytest.mark.filterwarnings("ignore:.*:RuntimeWarning")
+@pytest.mark.parametrize("name", targets.TARGETS)
+def test_a_changed_file_is_read_or_refused(name):
+    chance, seeds = random.Random(0), [path.read_bytes() for path in targets.seeds(name)]
+    for _ in range(SLOW.get(name, EXAMPLES)):
+        targets.run(name, mutations.changed(name, chance.choice(seeds), chance))
+
+
+@pytest.mark.parametrize("name", targets.TARGETS)
+def test_any_bytes_are_read_or_refused(name):
+    chance = random.Random(0)
+    for _ in range(SLOW.get(name, EXAMPLES)):
+        targets.run(name, chance.randbytes(chance.randrange(200)))

@@ -44,7 +44,7 @@ def test_a_wall_hides_anchors_behind_it():
     assert one.heard(np.array([2.0, 9.0, 1.0])).tolist() == [0, 1, 2, 3]
 
 
-@pytest.mark.parametrize("seed", [2, 101])
+@pytest.mark.parametrize("seed", [2, pytest.param(101, marks=pytest.mark.slow)])
 def test_a_case_agrees_with_the_solver_and_with_its_rerun(seed):
     row = plans.compared(30, seed)
     share, gain, bound = plans.differences(row)

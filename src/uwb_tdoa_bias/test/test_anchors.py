@@ -1,10 +1,18 @@
-from hypothesis import given
+"""Anchors, and the survey files that hold them."""
+
+import json
+
+from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.survey import UNITS, read_survey, refuse_faulty, survey_faults
+
+# --- anchors ---
+
 
 UNKNOWN = [np.nan] * 4
 unique_ids = st.lists(st.integers(0, 65535), min_size=1, max_size=70, unique=True)
@@ -135,3 +143,268 @@ def test_leaves_the_arrays_of_the_caller_alone():
     assert (
         anchors.positions[0, 0] == 1.0 and anchors.ids[0] == 0 and anchors.orientations[0, 3] == 1.0
     )
+
+
+# --- survey files ---
+
+
+# --- survey forms ---
+PLACES = {0: (-3.1062, -4.0031, 0.1832), 1: (-3.1907, 3.7809, 2.9519), 4: (3.7205, 3.6519, -0.1869)}
+ROWS = [(number, *place) for number, place in PLACES.items()]
+
+
+def joined(separator, rows=ROWS, header=None, comma=False):
+    lines = [separator.join(f"{cell}" for cell in row) for row in rows]
+    text = "\n".join(lines).replace(".", ",") if comma else "\n".join(lines)
+    return text if header is None else f"{header}\n{text}"
+
+
+def scaled(factor):
+    return [
+        (number, *(f"{factor * value:.6f}" for value in place)) for number, place in PLACES.items()
+    ]
+
+
+def mappings(form):
+    return "\n".join(form.format(number, *place) for number, place in PLACES.items())
+
+
+READ = {
+    "comma": joined(",", header="id,x,y,z"),
+    "of pandas": joined(",", header=",x,y,z"),
+    "spaces": joined("   "),
+    "tabs": joined("\t", header="Anchor\tX\tY\tZ"),
+    "no header": joined(","),
+    "no header, CRLF": joined(", ").replace("\n", "\r\n"),
+    "semicolons and decimal commas": joined(";", header="id;x;y;z", comma=True),
+    "tabs and decimal commas": joined("\t", comma=True),
+    "blanks and decimal commas": joined(" ", comma=True),
+    "commented header": joined(" ", header="# id x y z"),
+    "comments": joined(",", header="# measured on Monday\nid,x,y,z"),
+    "upper case with units": joined(",", header="ID,X [m],Y [m],Z [m]"),
+    "units in parentheses": joined(",", header="id,x (m),y (m),z (m)"),
+    "units after an underscore": joined(",", header="anchor_id,x_m,y_m,z_m"),
+    "millimetres in the header": joined(",", scaled(1000.0), "id,x_mm,y_mm,z_mm"),
+    "centimetres in the header": joined(",", scaled(100.0), "id,x[cm],y[cm],z[cm]"),
+    "feet in the header": joined(",", scaled(1.0 / 0.3048), "id,x (ft),y (ft),z (ft)"),
+    "prefixes": joined(",", header="anchor_id,pos_x,pos_y,pos_z"),
+    "suffixes": joined(",", header="id,x_pos,y_pos,z_pos"),
+    "fields of a message": joined(",", header="id,pose.position.x,pose.position.y,pose.position.z"),
+    "another order": joined(",", [(z, name, y, x) for name, x, y, z in ROWS], "z,id,y,x"),
+    "further columns": joined(",", [(*row, "up") for row in ROWS], "id,x,y,z,remark"),
+    "Crazyflie client": mappings("{0}:\n  x: {1}\n  y: {2}\n  z: {3}"),
+    "flow mappings": mappings("{0}: {{x: {1}, y: {2}, z: {3}}}"),
+    "lists by id": mappings("{0}: [{1}, {2}, {3}]"),
+    "lps-ros": "n_anchors: 3\n" + mappings("anchor{0}_pos: [{1}, {2}, {3}] # address"),
+    "names with numbers": mappings("anchor_{0}: {{position: [{1}, {2}, {3}]}}"),
+    "ours": "frame: hall\nanchors:\n" + mappings("  {0}: {{position: [{1}, {2}, {3}]}}"),
+    "anchors as mappings of axes": "anchors:\n" + mappings("  {0}: {{x: {1}, y: {2}, z: {3}}}"),
+    "anchors in a list": "anchors:\n" + mappings("  - {{id: {0}, position: [{1}, {2}, {3}]}}"),
+    "position as a mapping": "anchors:\n"
+    + mappings("  - id: {0}\n    position: {{x: {1}, y: {2}, z: {3}}}"),
+    "axes in a list": mappings("- {{anchor_id: {0}, x: {1}, y: {2}, z: {3}}}"),
+    "rows in a list": mappings("- [{0}, {1}, {2}, {3}]"),
+    "parameters of ROS": "/**:\n  ros__parameters:\n    anchors:\n"
+    + mappings("      '{0}': [{1}, {2}, {3}]"),
+    "JSON": json.dumps({str(number): dict(zip("xyz", place)) for number, place in PLACES.items()}),
+    "JSON list": json.dumps(
+        [{"id": number, "position": place} for number, place in PLACES.items()], indent=2
+    ),
+    "JSON anchors": json.dumps(
+        {
+            "anchors": [
+                {"name": number, "pos": dict(zip("xyz", place))} for number, place in PLACES.items()
+            ]
+        }
+    ),
+}
+
+
+@pytest.mark.parametrize("form", READ)
+def test_usual_forms_are_read(tmp_path, form):
+    file = tmp_path / "anchors"
+    file.write_text(READ[form] + "\n", newline="")
+    anchors = read_survey(file)
+    np.testing.assert_array_equal(anchors.ids, list(PLACES))
+    np.testing.assert_allclose(anchors.positions, list(PLACES.values()), atol=1e-6)
+    assert np.isnan(anchors.orientations).all()
+
+
+def test_the_rows_of_an_opencv_matrix_are_numbered(tmp_path):
+    data = ", ".join(str(value) for place in PLACES.values() for value in place)
+    head = "%YAML:1.0\n---\nnum_anchors: 3\naps_mat: !!opencv-matrix\n"
+    (tmp_path / "anchors.yaml").write_text(
+        f"{head}   rows: 3\n   cols: 3\n   dt: d\n   data: [ {data} ]\n"
+    )
+    anchors = read_survey(tmp_path / "anchors.yaml")
+    np.testing.assert_array_equal(anchors.ids, [0, 1, 2])
+    np.testing.assert_allclose(anchors.positions, list(PLACES.values()))
+
+
+def test_orientations_are_read_where_they_stand(tmp_path):
+    turn = np.array([0.0, 0.0, 0.6, 0.8])
+    tables = (
+        "id,x,y,z,qx,qy,qz,qw\n3,1,2,3,0,0,0.6,0.8\n",
+        "- {id: 3, x: 1, y: 2, z: 3, orientation: {x: 0, y: 0, z: 0.6, w: 0.8}}\n",
+    )
+    for text in (*tables, "anchors: {3: {position: [1, 2, 3], orientation: [0, 0, 0.6, 0.8]}}\n"):
+        (tmp_path / "anchors").write_text(text)
+        anchors = read_survey(tmp_path / "anchors")
+        np.testing.assert_allclose(anchors.orientations, [turn])
+        np.testing.assert_array_equal(anchors.positions, [[1.0, 2.0, 3.0]])
+
+
+REFUSED = {
+    "no ids in a table": (
+        "x,y,z\n1,2,3\n",
+        "line 1: columns x, y and z are recognized, and no column with the ids",
+    ),
+    "no ids and no header": (
+        "1 2 3\n4 5 6\n",
+        "line 1: three numbers are recognized as a position, and no id",
+    ),
+    "too many numbers": ("0,1,2,3,9\n", "line 1: 5 numbers and no header"),
+    "no ids in a list": (
+        "- [1, 2, 3]\n- [4, 5, 6]\n",
+        r"anchors\[0\]: a position is recognized, and no id; write",
+    ),
+    "no axes": ("0: {lat: 48.1, lon: 11.5}\n", "0: no position is recognized among lat, lon"),
+    "two axes": ("0: {x: 1, y: 2}\n", "0: no position is recognized among x, y"),
+    "decimal commas in a list": (
+        "anchors:\n  0: {position: [-3,1062, -4,0031, 0,1832]}\n",
+        "0: position: 6 numbers .* decimal commas",
+    ),
+    "decimal commas among commas": (
+        "id,x,y,z\n0,-3,1062,-4,0031,0,1832\n",
+        "line 2: .* 7 cells, the header 4; decimal commas need ';'",
+    ),
+    "a matrix of columns": (
+        "m: !!opencv-matrix\n  rows: 3\n  cols: 2\n  data: [1, 2, 3, 4, 5, 6]\n",
+        "m: a matrix of 3 x 2 is recognized",
+    ),
+    "not a number": ("id x y z\n0 1 two 3\n", "line 2: '0,1,two,3' is not"),
+    "nothing": ("scale: 3\n", "scale: 3 is no position"),
+    "a name": ("id,x,y,z\nNE,1,2,3\n", "line 2: id is 'NE'"),
+    "twice": ("- [0, 1, 2, 3]\n- [0, 4, 5, 6]\n", "id 0 is given twice"),
+    "an orientation of three": (
+        "0: {position: [1, 2, 3], orientation: [0, 0, 1]}\n",
+        "0: orientation is .* not 4 numbers",
+    ),
+}
+
+
+@pytest.mark.parametrize("form", REFUSED)
+def test_what_is_not_certain_is_refused_with_place_and_remedy(tmp_path, form):
+    text, sentence = REFUSED[form]
+    (tmp_path / "anchors").write_text(text)
+    with pytest.raises(InputError, match=sentence):
+        read_survey(tmp_path / "anchors")
+
+
+def test_cases_of_others(shared_data):
+    """Small files that failed once."""
+    folder = shared_data.parent / "cases" / "anchors"
+    for name in (
+        "cfclient.yaml",
+        "lps_ros.yaml",
+        "list_pos.yaml",
+        "opencv.yaml",
+        "starloc.csv",
+        "upper.csv",
+        "spaces.txt",
+    ):
+        anchors = read_survey(folder / name)
+        np.testing.assert_allclose(
+            anchors.positions[[0, 7]], [[-3.1062, -4.0031, 0.1832], [-3.1298, 3.3829, 0.1824]]
+        )
+        np.testing.assert_array_equal(anchors.ids, np.arange(8))
+    with pytest.raises(InputError, match="decimal"):
+        read_survey(folder / "decimalcomma.yaml")
+
+
+@given(st.text(alphabet="0123456789,;:.-{}[]() \t\nxyzidanchors#\"'mft", max_size=200))
+def test_any_text_is_read_or_refused(tmp_path_factory, text):
+    file = tmp_path_factory.getbasetemp() / "any"
+    file.write_text(text)
+    try:
+        assert np.isfinite(read_survey(file).positions).all()
+    except InputError as error:
+        assert str(error).startswith(str(file))
+
+
+# --- survey faults ---
+ROOM = np.array(
+    [[x, y, z] for x, y in ((-3.1, -4.0), (-3.2, 3.8), (3.7, 3.7), (4.0, -4.4)) for z in (0.2, 3.0)]
+)
+
+
+def sentence(positions):
+    """The first fault, or ""."""
+    faults = survey_faults(Anchors.from_positions(positions, ids=np.arange(len(positions)) + 10))
+    return faults[0].sentence if faults else ""
+
+
+@pytest.mark.parametrize("unit", ["millimetres", "centimetres"])
+@pytest.mark.parametrize("mirrored", [1.0, -1.0])
+def test_a_survey_in_a_small_unit_is_named(unit, mirrored):
+    said = sentence(ROOM * [mirrored, 1.0, 1.0] * UNITS[unit])
+    assert f"the survey looks like {unit}" in said and f"divide it by {UNITS[unit]:g}" in said
+
+
+@pytest.mark.parametrize("row", range(8))
+def test_one_anchor_in_millimetres_is_named(row):
+    positions = ROOM.copy()
+    positions[row] *= 1000.0
+    assert f"the position of anchor {row + 10} looks like millimetres" in sentence(positions)
+
+
+def test_a_mistyped_anchor_is_not_called_a_unit():
+    positions = ROOM.copy()
+    positions[2, 0] += 5e6
+    assert "anchor 12 cannot be in metres" in sentence(positions)
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), (4.0, 5.0, 6.0)])
+def test_all_at_one_place(place):
+    assert "all anchors are at one place" in sentence(np.tile(place, (8, 1)))
+
+
+def test_two_at_one_place_are_named():
+    positions = ROOM.copy()
+    positions[3] = positions[2]
+    assert "anchors 12 and 13 are at one place" in sentence(positions)
+
+
+def test_it_is_refused_with_its_source():
+    with pytest.raises(InputError, match="^room.csv: the survey looks like millimetres"):
+        refuse_faulty(Anchors.from_positions(1000.0 * ROOM), "room.csv")
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    st.integers(0, 2**31),
+    st.integers(1, 40),
+    st.floats(0.5, 300.0),
+    st.floats(0.5, 200.0),
+    st.floats(0.0, 20.0),
+    st.sampled_from([0.0, 1e3, 5e6]),
+)
+def test_rooms_and_halls_are_usable(seed, count, length, width, height, origin):
+    """From a table to a hall of 300 x 200 m, in any frame."""
+    positions = (
+        np.random.default_rng(seed).uniform(0.0, 1.0, (count, 3)) * [length, width, height] + origin
+    )
+    assert survey_faults(Anchors.from_positions(positions)) == []
+
+
+def test_a_large_network_takes_little_work():
+    """Ten thousand anchors over three kilometres, a grid of 30 m."""
+    x, y = np.meshgrid(np.arange(100) * 30.0, np.arange(100) * 30.0)
+    positions = np.column_stack([x.ravel(), y.ravel(), np.full(10_000, 5.0)])
+    assert survey_faults(Anchors.from_positions(positions)) == []
+
+
+def test_two_anchors_in_millimetres_are_named():
+    positions = ROOM.copy()
+    positions[[3, 5]] *= 1000.0
+    assert "the positions of anchors 13 and 15 look like millimetres" in sentence(positions)

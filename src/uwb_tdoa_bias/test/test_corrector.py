@@ -94,19 +94,6 @@ def test_what_the_filter_weighs_is_left_in():
     assert np.array_equal(found.bias, expected.bias) and np.array_equal(found.std, expected.std)
 
 
-def test_effects_see_the_pose():
-    corrector = Corrector(ANCHORS, ARM, lag=0.05)
-    q = Rotation.from_euler("x", 90, degrees=True).as_quat()  # body z points to world -y
-    corrector.add_pose(0.0, np.array([1.0, 2.0, 1.0]), q)
-    antenna = np.array([1.0, 1.7, 1.0])
-    found = correct(corrector, 0.1)
-
-    def d(p):
-        return np.linalg.norm(p - ANCHORS.positions[1]) - np.linalg.norm(p - ANCHORS.positions[0])
-
-    assert found.bias[0] == pytest.approx(d(antenna) - d(np.array([1.0, 2.0, 1.0])), abs=1e-12)
-
-
 @given(
     st.lists(st.integers(0, 100), max_size=30),
     st.lists(st.integers(0, 120), min_size=1, max_size=10),
@@ -139,18 +126,6 @@ def test_once_ready_no_later_pose_changes_a_correction(before, asked, after):
     first = correct(corrector, asked / 40).bias[0]
     climbing(corrector, np.array(after) / 40)
     assert correct(corrector, asked / 40).bias[0] == first
-
-
-def test_a_batch_is_the_same_as_one_by_one():
-    corrector = climbing(Corrector(ANCHORS, ARM, Height()), np.arange(0.0, 3.0, 0.01))
-    t = np.random.default_rng(0).uniform(-0.1, 3.1, 200)
-    a = np.arange(200) % 4
-    together = corrector.correct(t, a, (a + 1) % 4, t)
-    corrector = climbing(Corrector(ANCHORS, ARM, Height()), np.arange(0.0, 3.0, 0.01))
-    for i in range(200):
-        alone = corrector.correct(t[i : i + 1], a[i : i + 1], (a[i : i + 1] + 1) % 4, t[i : i + 1])
-        for name in ("bias", "std", "corrected", "status"):
-            assert getattr(alone, name)[0] == getattr(together, name)[i], name
 
 
 def test_where_the_network_cannot_tell_effects_remain():

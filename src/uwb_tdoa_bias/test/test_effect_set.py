@@ -21,7 +21,6 @@ from uwb_tdoa_bias.effects import (
     TagLeverArm,
 )
 from uwb_tdoa_bias.effects.anchor import AnchorClockDrift
-from uwb_tdoa_bias.effects.covariates import OF_ARRIVAL, OF_TDOA, STATES
 from uwb_tdoa_bias.effects.effect_set import REACH
 from uwb_tdoa_bias.effects.samples import Motion
 from uwb_tdoa_bias.effects.tag import RangeBias
@@ -200,11 +199,6 @@ def test_an_arrival_fades_with_the_longer_of_both_ranges():
     assert far.bias == pytest.approx(0.0, abs=1e-6) and len(corrector.outside) == 1
 
 
-def test_without_a_domain_everything_is_as_it_was():
-    assert corrected(AnchorClockDrift({"1": 0.01}), 600.0)[0].bias == pytest.approx([6.0])
-    assert corrected(AnchorDelay({"1": 0.3}), 600.0)[0].bias == pytest.approx([0.3])
-
-
 def test_inertial_corrections_fade_beyond_their_domain():
     knots = (0.0, 10.0)
     warming = SmoothTerm(
@@ -297,31 +291,6 @@ def test_what_is_left_of_a_step_is_a_standard_deviation():
     _, slope, curved = jacobian_of([step], samples)
     np.testing.assert_allclose(slope[:, 0], 0.8 / (2.0 * REACH))
     np.testing.assert_allclose(curved, np.sqrt(2.0) * 0.4)
-
-
-def test_jacobians_add_up():
-    samples = moving(4)
-    both = [line("x"), line("range", "arrival", 0.1), AnchorDelay({0: 1.0})]
-    bias, slope, _ = jacobian_of(both, samples)
-    np.testing.assert_allclose(
-        slope, jacobian_of(both[:1], samples)[1] + jacobian_of(both[1:2], samples)[1], atol=1e-12
-    )
-    np.testing.assert_allclose(bias, both[0].bias(samples) + both[1].bias(samples))
-    assert not jacobian_of(both[2:], samples)[1].any()
-    inertial = SmoothTerm({"c1": 1.0}, {}, "", "accel.x", "height", "common", (0.0, 1.0), "line")
-    assert inertial.jacobian_states == ()
-
-
-def test_the_jacobian_by_an_unknown_velocity_is_zero():
-    for part in jacobian_of([line("climb_rate")], random_samples(5)):
-        assert not part.any()
-
-
-@pytest.mark.parametrize(
-    "covariate", [name for name in (*OF_TDOA, *OF_ARRIVAL) if name not in STATES]
-)
-def test_other_covariates_have_no_jacobian(covariate):
-    assert line(covariate, "arrival" if covariate in OF_ARRIVAL else "common").jacobian_states == ()
 
 
 def test_the_jacobian_at_an_unknown_state_is_zero():

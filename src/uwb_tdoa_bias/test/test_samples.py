@@ -1,15 +1,28 @@
+"""Samples of TDOAs with the motion of the tag, and the inputs of a network."""
+
 from types import SimpleNamespace
 
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
 import pytest
+from random_samples import random_samples
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.vibration import (
+    VIBRATION_AVERAGE,
+    VIBRATION_CORNER,
+    low_pass,
+    track_vibration,
+)
 from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.effects import EffectSet, SmoothTerm, samples_at
+from uwb_tdoa_bias.correction.features import FEATURES, NAMES, PLACE, columns, everything
+from uwb_tdoa_bias.effects import EffectSet, Samples, SmoothTerm, samples_at
 from uwb_tdoa_bias.effects.samples import motion_at, preceding
+
+# --- samples ---
+
 
 ANCHORS = Anchors.from_positions([[0, 0, 0], [8, 0, 0], [0, 8, 0], [0, 0, 3]], ids=[4, 5, 6, 7])
 RATE = np.array([0.3, -0.5, 0.8])  # rad/s, body
@@ -95,3 +108,122 @@ def test_batches_know_what_was_heard_before():
         np.testing.assert_array_equal(
             np.concatenate([getattr(part, name) for part in found]), getattr(expected, name)
         )
+
+
+# --- features ---
+
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def expected(samples):
+    """Every feature by its name, each straight from its definition."""
+    anchors, out = samples.anchors, {}
+    for side, rows in (("a", samples.a), ("b", samples.b)):
+        to_anchor = anchors.positions[rows] - samples.p
+        for k, axis in enumerate("xyz"):
+            out[f"d{axis}_{side}"] = to_anchor[:, k]
+        seen_by_tag = Rotation.from_quat(samples.q).inv().apply(to_anchor)
+        seen_by_anchor = Rotation.from_quat(anchors.orientations[rows]).inv().apply(-to_anchor)
+        for viewer, direction in (("T", seen_by_tag), ("A", seen_by_anchor)):
+            x, y, z = direction.T / np.linalg.norm(direction, axis=1)
+            out[f"azimuth_{viewer}_{side}"] = np.arctan2(y, x)
+            out[f"elevation_{viewer}_{side}"] = np.arcsin(z)
+    return np.stack([out[name] for name in FEATURES], axis=1)
+
+
+@given(seeds)
+def test_places(seed):
+    samples = random_samples(seed)
+    body = Rotation.from_quat(samples.q).as_matrix()
+    ends = [
+        np.column_stack([samples.anchors.ids[k], samples.anchors.positions[k]])
+        for k in (samples.a, samples.b)
+    ]
+    expected_place = np.concatenate([samples.p, body[:, :2, 0], body[:, :2, 2], *ends], axis=1)
+    np.testing.assert_allclose(columns(samples, PLACE), expected_place, atol=1e-12)
+    np.testing.assert_array_equal(columns(samples, NAMES[::-1]), everything(samples)[:, ::-1])
+
+
+@given(seeds)
+def test_definitions(seed):
+    samples = random_samples(seed)
+    # arcsin is steep near the pole
+    np.testing.assert_allclose(columns(samples, FEATURES), expected(samples), atol=1e-6)
+
+
+def test_a_case_worked_by_hand():
+    quarter = [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]  # 90 degrees about z: body x is world y
+    anchors = Anchors([0, 1], [[3.0, 0.0, 4.0], [0.0, -2.0, 0.0]], [[0, 0, 0, 1], quarter])
+    samples = Samples(
+        np.zeros(1), np.array([0]), np.array([1]), np.zeros((1, 3)), np.array([quarter]), anchors
+    )
+    found = dict(zip(FEATURES, columns(samples, FEATURES)[0]))
+    up = np.arctan2(4.0, 3.0)
+    hand = {
+        "dx_a": 3.0,
+        "dy_a": 0.0,
+        "dz_a": 4.0,
+        "dx_b": 0.0,
+        "dy_b": -2.0,
+        "dz_b": 0.0,
+        "azimuth_A_a": np.pi,
+        "elevation_A_a": -up,  # anchor a sees the tag at (-3, 0, -4)
+        "azimuth_A_b": 0.0,
+        "elevation_A_b": 0.0,  # anchor b, whose x axis is world y, sees it ahead
+        "azimuth_T_a": -np.pi / 2,
+        "elevation_T_a": up,  # world x is to the right of the tag
+        "azimuth_T_b": np.pi,
+        "elevation_T_b": 0.0,
+    }
+    for name in FEATURES:
+        apart = found[name] - hand[name]
+        if name.startswith("azimuth"):
+            apart = (apart + np.pi) % (2.0 * np.pi) - np.pi
+        assert abs(apart) < 1e-12, name
+
+
+def test_unknown_attitudes_make_only_their_own_angles_nan():
+    samples = random_samples(3, n=4, n_anchors=2)
+    orientations = samples.anchors.orientations.copy()
+    orientations[0] = np.nan
+    q = samples.q.copy()
+    q[:2] = np.nan
+    anchors = Anchors(samples.anchors.ids, samples.anchors.positions, orientations)
+    unknown = Samples(
+        samples.t, np.array([0, 1, 0, 1]), np.array([1, 0, 1, 0]), samples.p, q, anchors
+    )
+    found = columns(unknown, FEATURES)
+    for i in range(4):
+        for k, name in enumerate(FEATURES):
+            row = unknown.a[i] if name.endswith("_a") else unknown.b[i]
+            needs_tag, needs_anchor = "_T_" in name, "_A_" in name
+            lost = (needs_tag and i < 2) or (needs_anchor and row == 0)
+            assert np.isnan(found[i, k]) == lost, (i, name)
+
+
+# --- vibration ---
+
+
+def test_low_pass_follows_a_step_with_its_time_constant():
+    value, dt = 0.0, 1e-4
+    for _ in range(round(VIBRATION_CORNER / dt)):
+        value = low_pass(value, 1.0, dt, VIBRATION_CORNER)
+    assert value == pytest.approx(1.0 - np.exp(-1.0), abs=1e-3)
+    assert (
+        low_pass(0.0, 5.0, 1.0, VIBRATION_CORNER) == 5.0
+    )  # a step longer than that: the sample itself
+
+
+def test_power_is_the_variance_of_what_is_fast_and_nothing_of_what_is_slow():
+    slow, power, dt = np.zeros(3), np.zeros(3), 1e-3
+    t = np.arange(0.0, 10.0 * VIBRATION_AVERAGE, dt)
+    accel = np.stack(
+        [np.sin(2 * np.pi * 100.0 * t), 2.0 * np.sin(2 * np.pi * 0.05 * t), np.full(len(t), 9.81)],
+        axis=1,
+    )
+    for sample in accel:
+        track_vibration(slow, power, sample, dt)
+    assert power[0] == pytest.approx(0.5, rel=0.05)
+    assert power[1] < 0.01 and slow[1] == pytest.approx(accel[-1, 1], abs=0.05)
+    assert power[2] < 0.01 and slow[2] == pytest.approx(9.81)

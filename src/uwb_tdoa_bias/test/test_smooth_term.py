@@ -9,8 +9,7 @@ import yaml
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.effects import RADIO, EffectSet, SmoothTerm
-from uwb_tdoa_bias.effects.covariates import OF_ARRIVAL, OF_IMU, OF_SENSORS, OF_TDOA, UNITS
-from uwb_tdoa_bias.effects.smooth_term import SHAPES, causes, described, shape_basis
+from uwb_tdoa_bias.effects.smooth_term import SHAPES, described, shape_basis
 
 KNOTS = {2: (1.0, 3.0), 3: (1.0, 2.0, 3.0), 4: (1.0, 1.5, 2.5, 3.0)}
 seeds = st.integers(0, 2**32 - 1)
@@ -134,22 +133,6 @@ def test_a_function_of_no_channel_is_refused_with_those_that_there_are():
         SmoothTerm(channel="gyro", covariate="time", knots=(0.0, 1.0))
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-def test_a_shape_has_a_level_and_is_held_beyond_its_knots(shape):
-    count, coefficients = SHAPES[shape]
-    at = np.linspace(-1.0, 5.0, 61)
-    out = shape_basis(shape, KNOTS[count], at)
-    assert out.shape == (61, coefficients)
-    np.testing.assert_array_equal(out[:, 0], 1.0)
-    if shape != "wave":
-        np.testing.assert_array_equal(
-            out[at <= 1.0], out[at <= 1.0][:1].repeat((at <= 1.0).sum(), axis=0)
-        )
-        np.testing.assert_array_equal(
-            out[at >= 3.0], out[at >= 3.0][:1].repeat((at >= 3.0).sum(), axis=0)
-        )
-
-
 @pytest.mark.parametrize(
     "shape, at, second",
     [
@@ -232,22 +215,6 @@ def test_a_function_in_words(found, part, words):
     assert described(found, part) == words
 
 
-@pytest.mark.parametrize("form", ["common", "arrival", "anchor", "pair", "direction"])
-def test_every_function_has_causes_and_a_trial_that_tells(form):
-    for covariate in OF_ARRIVAL if form == "arrival" else OF_TDOA:
-        assert all(causes(SmoothTerm(covariate=covariate, form=form, knots=(0.0, 1.0))))
-
-
-@pytest.mark.parametrize("channel", ["gyro.x", "accel.z"])
-def test_every_function_of_a_sensor_has_causes(channel):
-    for covariate in (*OF_IMU, *OF_SENSORS):
-        assert all(causes(SmoothTerm(channel=channel, covariate=covariate, knots=(0.0, 1.0))))
-
-
 def test_what_all_anchors_share_over_the_room_is_no_advice():
     values = {f"{anchor}.c0": 0.1 for anchor in range(8)}
     assert SmoothTerm(values, {}, "", "tdoa", "x", "anchor", (0.0, 1.0)).advice() == ()
-
-
-def test_every_covariate_has_a_unit():
-    assert set(UNITS) == {*OF_TDOA, *OF_ARRIVAL, *OF_IMU}

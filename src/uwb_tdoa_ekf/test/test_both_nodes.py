@@ -2,6 +2,7 @@
 
 import itertools
 import re
+import signal
 import time
 
 import numpy as np
@@ -153,11 +154,11 @@ def test_frames_that_alternate_are_warned_of_once(rig):
     assert max(len(warned("left")), len(warned("right"))) <= 1 + 2 * again
 
 
-def test_a_survey_that_is_too_wide_keeps_no_node_busy_and_ctrl_c_ends_both(rig):
+def test_a_survey_that_is_too_wide_keeps_no_node_busy_and_a_signal_ends_both(rig):
     flight = recording(3.0)
     rig.send_anchors(flight.anchors.at(40.0 * flight.anchors.positions))
     rig.play(flight)
-    for process in rig.processes[::-1]:
-        code, slept = process.stop()
+    for process, number in zip(rig.processes[::-1], (signal.SIGINT, signal.SIGTERM)):
+        code, slept = process.stop(number)
         assert code == 0 and slept < 4.0, "".join(process.lines)  # ros2 launch waits for 5 s
         assert not any("Traceback" in line or "FATAL" in line for line in process.lines)

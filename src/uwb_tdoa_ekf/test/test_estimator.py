@@ -216,12 +216,6 @@ def test_an_inertial_sample_that_is_not_finite_is_as_if_it_had_never_come():
     assert estimator.counts["imu_invalid"] == 31
 
 
-def test_an_absurd_inertial_sample_is_treated_as_offline():
-    flight = fly(6, 3.0)
-    flight.imu.gyro[300, 0], flight.imu.accel[400, 1] = 1e30, -1e200
-    assert_same_as_offline(flight)
-
-
 @settings(max_examples=40)
 @given(seeds, st.booleans())
 def test_every_message_is_accounted_for_once(seed, use_imu):
@@ -288,56 +282,6 @@ def test_falling_back_by_less_is_late_not_a_restart():
     )
 
 
-@pytest.mark.parametrize(
-    "off, verdict, count",
-    [
-        (-5.0, LATE, "imu_late"),
-        *((off, INVALID, "imu_invalid") for off in (2.0, 500.0)),
-    ],
-)
-def test_one_stamp_far_from_its_neighbours_changes_nothing(off, verdict, count):
-    flight = fly(8, 3.0)
-    half = len(flight.tdoa) // 2
-    plain, clean = feed(Estimator(flight.anchors), flight)
-    estimator, parts = Estimator(flight.anchors), []
-    for t, stream, i in messages(flight):
-        if stream == IMU:
-            estimator.add_imu(t, flight.imu.gyro[i], flight.imu.accel[i])
-            if i == len(flight.imu) // 2:
-                estimator.add_imu(t + off, *REST)
-        else:
-            estimator.add_tdoa(t, int(flight.tdoa.a[i]), int(flight.tdoa.b[i]), flight.tdoa.d[i])
-            if i in (half, len(flight.tdoa) - 1):  # the last has no successor that would tell
-                estimator.add_tdoa(t + off, FIRST, SECOND, 0.0)
-        parts.append(estimator.advance())
-    assert estimator.waiting[TDOA] > 0
-    parts.append(estimator.finish())
-    assert_same(joined([part[0] for part in parts]), plain)
-    residuals = joined([part[1] for part in parts])
-    stray = ~np.isin(residuals.t, flight.tdoa.t)
-    assert (
-        residuals.verdict[stray].tolist() == [verdict, verdict]
-        and len(residuals.t) == len(clean.t) + 2
-    )
-    assert estimator.counts[count] == 1 and estimator.counts["restarts"] == 0
-
-
-def test_what_is_invalid_does_not_hold_up_the_others():
-    flight = fly(8, 2.0)
-    estimator = Estimator(flight.anchors, lag=10.0)
-    for t, gyro, accel in zip(flight.imu.t, flight.imu.gyro, flight.imu.accel):
-        estimator.add_imu(t, gyro, accel)
-    half, last = len(flight.tdoa) // 2, flight.imu.t[-1]
-    for t, a, b, d in zip(flight.tdoa.t[:half], flight.tdoa.a, flight.tdoa.b, flight.tdoa.d):
-        estimator.add_tdoa(t, int(a), int(b), d)
-    assert estimator.advance()[0].t[-1] < flight.tdoa.t[half]
-    estimator.add_tdoa(last, FIRST, SECOND, 1e3)
-    odometry, residuals = estimator.advance()
-    assert odometry.t[-1] > last - 0.02 and residuals.verdict[residuals.t == last].tolist() == [
-        INVALID
-    ]
-
-
 def test_rates_are_those_measured_last():
     flight = fly(8, 1.0)
     estimator = Estimator(flight.anchors)
@@ -374,31 +318,18 @@ def test_the_order_of_the_anchors_changes_nothing():
 
 
 def test_a_sensor_whose_clock_is_ahead_costs_its_own_messages_and_is_named(ahead=60.0):
-    """At 100 Hz. More than 2000 of them moved the time of all streams, once."""
-    flight = fly(8, 24.0, imu_rate=50.0, tdoa_rate=50.0)
-    estimator, velocity, parts = Estimator(flight.anchors), SENSORS["velocity"], []
-    for k, (t, stream, i) in enumerate(messages(flight)):
+    flight, velocity = fly(8, 4.0, imu_rate=50.0, tdoa_rate=50.0), SENSORS["velocity"]
+    estimator = Estimator(flight.anchors)
+    fields = {name: np.ones((1, n) if n > 1 else 1) for name, n in velocity.fields.items()}
+    for t, stream, i in messages(flight):
         send(estimator, flight, stream, i)
-        fields = {name: np.ones((1, n) if n > 1 else 1) for name, n in velocity.fields.items()}
         estimator.add("velocity", velocity.read(np.array([t + ahead]), fields))
-        parts.append(estimator.advance())
-        if k == 2300:
-            (finding,) = estimator.clocks
-            assert (
-                finding.rule == "clock_ahead"
-                and "velocity" in finding.sentence
-                and finding.value == pytest.approx(ahead, abs=0.1)
-            )
-    parts.append(estimator.finish())
-    assert estimator.counts["velocity_invalid"] > 2300 and estimator.counts["velocity_used"] == 0
-    assert (
-        estimator.counts["late"]
-        == estimator.counts["imu_late"]
-        == estimator.counts["restarts"]
-        == 0
-    )
-    expected, _ = feed(Estimator(flight.anchors), flight)
-    assert_same(joined([part[0] for part in parts]), expected)
+        estimator.advance()
+    (finding,) = estimator.clocks
+    assert finding.rule == "clock_ahead" and "velocity" in finding.sentence
+    assert finding.value == pytest.approx(ahead, abs=0.1)
+    counts = estimator.counts
+    assert counts["velocity_used"] == counts["late"] == counts["imu_late"] == 0
 
 
 def test_a_restart_is_named_for_a_while():
@@ -412,22 +343,6 @@ def test_a_restart_is_named_for_a_while():
         named.append((t, estimator.restarted))
     assert "uwb/tdoa fell back by 1e+03 s" in named[20][1].sentence and named[-1][1] is None
     assert max(t for t, finding in named if finding is not None) == pytest.approx(10.0, abs=0.2)
-
-
-def test_anchors_that_are_sent_again_with_jitter_are_those_that_were_there():
-    flight, rng = fly(8, 3.0), np.random.default_rng(4)
-    expected, _ = feed(Estimator(flight.anchors), flight)
-    estimator, parts = Estimator(flight.anchors), []
-    for k, (_t, stream, i) in enumerate(messages(flight)):
-        send(estimator, flight, stream, i)
-        if k % 50 == 0:
-            places = flight.anchors.positions
-            estimator.change_anchors(
-                flight.anchors.at(places + rng.uniform(-0.002, 0.002, places.shape))
-            )
-        parts.append(estimator.advance())
-    parts.append(estimator.finish())
-    assert_same(joined([part[0] for part in parts]), expected)
 
 
 # --- estimator faults ---

@@ -42,8 +42,8 @@ def generate_launch_description():
 
 STOCK = """
 from launch import LaunchDescription
-from launch.actions import ExecuteProcess, LogInfo
-{actions}
+from launch.actions import ExecuteProcess
+from uwb_tdoa_ekf.launching_actions import actions
 
 def generate_launch_description():
     code = "import rclpy; rclpy.init(); rclpy.create_node('stock'); rclpy.shutdown()"
@@ -179,8 +179,7 @@ def test_one_tag_on_simulated_time_from_start_to_ctrl_c(make_rig, launch, tmp_pa
     ends_well(launched)
 
 
-@pytest.mark.parametrize("processes", [0, 2])
-def test_several_tags_each_with_its_own_parameters(make_rig, launch, tmp_path, processes):
+def test_several_tags_each_with_its_own_parameters(make_rig, launch, tmp_path):
     flight, rig = recording(2.0), make_rig(latched=False)
     file_of(flight, tmp_path)
     file = tags_file(
@@ -190,14 +189,8 @@ def test_several_tags_each_with_its_own_parameters(make_rig, launch, tmp_path, p
             "body_frame: drone}}"
         ),
     )
-    launched = launch(
-        "uwb_tdoa_ekf",
-        "tags.launch.py",
-        f"tags:={file}",
-        *([f"processes:={processes}"] if processes else []),
-        rig=rig,
-    )
-    rig.meet("bias_node", "ekf_node") if not processes else rig.meet("localization_node")
+    launched = launch("uwb_tdoa_ekf", "tags.launch.py", f"tags:={file}", rig=rig)
+    rig.meet("bias_node", "ekf_node")
     rig.play(flight)
     rig.counts("ekf_node", TDOAs_received=len(flight.tdoa))
     assert len(rig.odometry) > 200 and {message.child_frame_id for message in rig.odometry} == {
@@ -209,9 +202,6 @@ def test_several_tags_each_with_its_own_parameters(make_rig, launch, tmp_path, p
         assert values_of(rig, f"/{tag}/bias_node", "anchors_file") == [
             str(tmp_path / "anchors.yaml")
         ]
-    for k in range(processes):
-        tags = [["tag0", "tag1"]] if processes == 1 else [["tag0"], ["tag1"]]
-        assert values_of(rig, f"/localization_node_{k + 1}", "tags") == [tags[k]]
     ends_well(launched)
 
 
@@ -269,16 +259,15 @@ def test_a_bag_is_played_on_its_time_and_then_all_ends(make_rig, launch, tmp_pat
     assert launched.ended() == 1 and "ros2 bag play has ended with exit code 2" in launched.said
 
 
-def test_a_node_that_crashes_is_started_again_each_time_later(make_rig, launch):
+def test_a_node_that_crashes_is_started_again(make_rig, launch):
     rig, launched = make_rig(), launch("uwb_tdoa_ekf", "tdoa.launch.py")
     launched.wait(READY)
-    for crashes in (1, 2):
-        os.kill(launched.pid_of("ekf_node"), signal.SIGKILL)
-        launched.wait(f"ekf_node has ended with exit code -9: it is started again in {crashes} s")
-        launched.wait(READY, 1 + crashes)
+    os.kill(launched.pid_of("ekf_node"), signal.SIGKILL)
+    launched.wait("ekf_node has ended with exit code -9: it is started again in 1 s")
+    launched.wait(READY, 2)
     assert values_of(rig, "/ekf_node", "use_sim_time") == [False]  # it lives
     launched.interrupt()
-    assert launched.said.count("has died") == 2, launched.said
+    assert launched.said.count("has died") == 1, launched.said
     assert left_behind(launched) == []
 
 
@@ -360,23 +349,13 @@ def values_below(part):
     ]
 
 
-@pytest.mark.parametrize("ours", [False, True])
-def test_what_is_launched_obeys_no_profiles_of_the_present_folder(
-    launch, tmp_path, monkeypatch, ours
-):
+def test_what_is_launched_obeys_no_profiles_of_the_present_folder(launch, tmp_path, monkeypatch):
     """Programs of others, too, as rviz2. Fast DDS would empty the file that is named as its log."""
     (tmp_path / "bashrc").write_text("precious\n")
     (tmp_path / "DEFAULT_FASTRTPS_PROFILES.xml").write_text(PROFILES.format(tmp_path / "bashrc"))
-    line = (
-        "from uwb_tdoa_ekf.launching_actions import actions"
-        if ours
-        else "def actions(*_): return []"
-    )
-    (tmp_path / "stock.launch.py").write_text(STOCK.format(actions=line))
+    (tmp_path / "stock.launch.py").write_text(STOCK)
     monkeypatch.delenv("SKIP_DEFAULT_XML_FILE", raising=False)
     monkeypatch.chdir(tmp_path)
     launched = launch(tmp_path / "stock.launch.py")
     assert launched.ended() == 0 and "process has finished cleanly" in launched.said, launched.said
-    assert (tmp_path / "bashrc").read_text() == (
-        "precious\n" if ours else ""
-    )  # or the attack would be none
+    assert (tmp_path / "bashrc").read_text() == "precious\n"

@@ -1,16 +1,9 @@
-"""What the launch files start.
-
-Where there is no launch, it is played by stubs that take notes; test_launch_files.py runs the real
-one.
-"""
+"""What the launch files start; test_launch_files.py runs them."""
 
 import json
 import os
 from pathlib import Path
 import re
-import runpy
-import sys
-from types import ModuleType, SimpleNamespace
 
 import pytest
 import yaml
@@ -19,7 +12,6 @@ pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from nav_msgs.msg import Odometry  # noqa: E402
-from real_launch import WHY_NOT  # noqa: E402
 
 from uwb_tdoa_bias.common.errors import InputError  # noqa: E402
 from uwb_tdoa_ekf.launching import (
@@ -260,132 +252,6 @@ def test_as_many_processes_as_cores(tmp_path):
     )
 
 
-LEVEL = ["--log-level", "info"]
-
-
-class Noted(SimpleNamespace):
-    """What a launch file made: its class's name, and what it was given."""
-
-    def __init__(self, *args, **kwargs):
-        super().__init__(args=args, **kwargs)
-
-
-@pytest.fixture
-def launched(monkeypatch):
-    """launched(file, **arguments): the nodes of a launch file with such arguments, by stubs of
-    launch.
-    """
-    if WHY_NOT is None:
-        pytest.skip("the real launch is here: test_launch_files.py")
-    given = {}
-
-    class Configuration(Noted):
-        def perform(self, _):
-            return given.get(self.args[0], given["defaults"].get(self.args[0]))
-
-    kinds = {
-        "launch": ["LaunchDescription"],
-        "launch.actions": [
-            "DeclareLaunchArgument",
-            "ExecuteProcess",
-            "IncludeLaunchDescription",
-            "LogInfo",
-            "OpaqueFunction",
-            "Shutdown",
-            "TimerAction",
-        ],
-        "launch.launch_description_sources": ["PythonLaunchDescriptionSource"],
-        "launch_ros": [],
-        "launch_ros.actions": ["Node"],
-    }
-    for module, names in {**kinds, "launch.logging": [], "launch.substitutions": []}.items():
-        stub = ModuleType(module)
-        for name in names:
-            setattr(stub, name, type(name, (Noted,), {}))
-        monkeypatch.setitem(sys.modules, module, stub)
-    sys.modules["launch.substitutions"].LaunchConfiguration = Configuration
-
-    def launch(name, **arguments):
-        found = runpy.run_path(str(ROOT / "launch" / name))["generate_launch_description"]().args[0]
-        declared = {
-            each.args[0]: each for each in found if type(each).__name__ == "DeclareLaunchArgument"
-        }
-        assert arguments.keys() <= declared.keys() and all(
-            each.description for each in declared.values()
-        )
-        given.clear()
-        given.update(
-            arguments,
-            defaults={
-                name: getattr(each, "default_value", None) for name, each in declared.items()
-            },
-        )
-        (function,) = (each.function for each in found if type(each).__name__ == "OpaqueFunction")
-        return [action for action in function(None) if type(action).__name__ == "Node"]
-
-    return launch
-
-
-def test_one_tag(launched):
-    bias, ekf = launched("tdoa.launch.py")
-    assert (bias.executable, ekf.executable, ekf.ros_arguments) == (
-        "bias_node",
-        "ekf_node",
-        LEVEL,
-    )  # nothing set: can be overridden
-    told = dict(
-        anchors_file="a.yaml",
-        publish_tf="odom",
-        ekf_params="e.yaml",
-        use_sim_time="true",
-        rviz="true",
-        namespace="t",
-    )
-    bias, ekf, anchors, rviz = launched("tdoa.launch.py", **told)
-    values = [
-        "-p",
-        'anchors_file:="a.yaml"',
-        "-p",
-        'publish_tf:="odom"',
-        "-p",
-        "use_sim_time:=true",
-    ]
-    assert ekf.ros_arguments == [*LEVEL, "--params-file", "e.yaml", *values]
-    assert bias.ros_arguments == [*LEVEL, *values[:2], *values[4:]] and bias.namespace == "t"
-    assert (anchors.executable, rviz.executable) == ("anchors_node", "rviz2")
-    assert Path(rviz.arguments[1]).is_file() and rviz.ros_arguments == values[4:]
-
-
-@pytest.mark.parametrize("name", ["tdoa.launch.py", "tags.launch.py"])
-def test_nodes_are_discovered_by_this_machine_and_frozen_on_request(
-    launched, tmp_path, monkeypatch, name
-):
-    (tmp_path / "tags.yaml").write_text("tags: {a: {}}")
-    file = {"tags": str(tmp_path / "tags.yaml")} if name.startswith("tags") else {}
-    monkeypatch.delenv(RANGE, raising=False)
-    nodes = launched(name, frozen="true", **file)
-    assert [node.additional_env for node in nodes] == [{RANGE: "LOCALHOST"}] * 2
-    assert all("frozen:=true" in node.ros_arguments for node in nodes)
-    assert all(
-        node.additional_env == {RANGE: "SUBNET"}
-        for node in launched(name, discovery_range="SUBNET", **file)
-    )
-
-
-def test_several_tags(launched, tmp_path):
-    (tmp_path / "tags.yaml").write_text(
-        "tags: {a: {}, b: {}, c: {publish_tf: odom, odom_frame: c/odom}, d: {body_frame: drone}}"
-    )
-    nodes = launched("tags.launch.py", tags=str(tmp_path / "tags.yaml"))
-    assert [node.namespace for node in nodes] == list("aabbccdd")
-    told = [node.ros_arguments for node in nodes if node.executable == "ekf_node"]
-    for words, frame in zip(
-        told, ["a/base_link", "b/base_link", "c/base_link", "drone"]
-    ):  # no two alike
-        assert f'body_frame:="{frame}"' in words
-    assert 'odom_frame:="c/odom"' in told[2]
-
-
 def test_several_tags_in_a_pool_of_processes(tmp_path):
     file = tmp_path / "tags.yaml"
     file.write_text("anchors_file: a.yaml\ntags: {a: {}, b: {tdoa_std: 0.3}, c: {map: map.npz}}")
@@ -416,17 +282,6 @@ def test_several_tags_in_a_pool_of_processes(tmp_path):
         pooled([start("ekf_node", "a", {}, ["mine.yaml"])], 2)
     with pytest.raises(InputError, match="processes: 'two' must be a whole number"):
         pooled(tags(file, {}), "two")
-
-
-def test_a_bag_is_played_on_its_time(launched):  # the fixture puts the stubs in their places
-    found = runpy.run_path(str(ROOT / "launch" / "bag.launch.py"))[
-        "generate_launch_description"
-    ]().args[0]
-    include, play = found[-2:]
-    assert dict(include.launch_arguments) == {"use_sim_time": "true"}
-    assert (
-        play.cmd[:3] == ["ros2", "bag", "play"] and "--clock" in play.cmd and "--delay" in play.cmd
-    )
 
 
 def test_the_layout_of_rviz_is_yaml():

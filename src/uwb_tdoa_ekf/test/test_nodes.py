@@ -1,11 +1,7 @@
 """Both nodes, as processes, over topics."""
 
-from contextlib import contextmanager
 from dataclasses import replace
-import itertools
 from pathlib import Path
-import signal
-import threading
 
 import numpy as np
 import pytest
@@ -26,7 +22,6 @@ from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_ekf.frames import to_odometry  # noqa: E402
 from uwb_tdoa_ekf.offline import run_offline  # noqa: E402
 from uwb_tdoa_ekf.results import rows_of  # noqa: E402
-from uwb_tdoa_msgs.msg import TdoaResidual  # noqa: E402
 
 SOURCES = Path(__file__).resolve().parents[2]
 EFFECTS = (
@@ -168,18 +163,15 @@ def test_odometry_is_that_of_the_offline_engine(make_rig, tmp_path, what, proces
     assert [m.pose.pose for m in first] == [m.pose.pose for m in second]
 
 
-@pytest.mark.parametrize("bare", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_a_rover_over_topics_is_that_of_the_offline_engine_to_the_bit(make_rig, bare):
-    """Wheels that come as nav_msgs/Odometry, TDOAs, and an IMU or none; a planar vehicle."""
+def test_a_rover_over_topics_is_that_of_the_offline_engine_to_the_bit(make_rig):
+    """Wheels that come as nav_msgs/Odometry, TDOAs and an IMU; a planar vehicle."""
     flight = drive(1, 8.0, begin=0.0)
     for name in ("imu", "tdoa", "velocity"):
         part = getattr(flight, name)
         as_read = np.array([seconds_of(stamp(t)) for t in part.t])
         flight = replace(flight, **{name: replace(part, t=as_read)})
-    if bare:
-        flight = replace(flight, imu=rows_of(flight.imu, slice(0, 0)))
-    config = FilterConfig(planar=True, fixed_height=HEIGHT, use_imu=not bare)
-    told = {"planar": "true", "fixed_height": HEIGHT, "use_imu": str(not bare).lower()}
+    config = FilterConfig(planar=True, fixed_height=HEIGHT)
+    told = {"planar": "true", "fixed_height": HEIGHT}
     rig = make_rig()
     rig.start(
         "bias_node",
@@ -254,43 +246,3 @@ def test_quality_of_service(make_rig):
         return rig.corrected
 
     rig.wait(arrived, "a measurement to pass")
-
-
-def test_a_signal_ends_both_in_good_order(make_rig, number=signal.SIGTERM):
-    """SIGINT: test_both_nodes.py."""
-    flight = recording(1.0)
-    rig = make_rig()
-    processes = rig.start("bias_node", "ekf_node")
-    rig.send_anchors(flight.anchors)
-    rig.play(flight)
-    assert any(m.verdict == TdoaResidual.VERDICT_USED for m in rig.residuals)
-    with streaming(rig):
-        for process in processes:
-            code, slept = process.stop(number)
-            assert code == 0, "".join(process.lines)
-            assert slept < 4.0  # ros2 launch loses patience after 5 s
-            assert not any("Traceback" in line or "FATAL" in line for line in process.lines), (
-                "".join(process.lines)
-            )
-
-
-@contextmanager
-def streaming(rig):
-    """Send TDOAs as fast as they can be taken while the block lasts: the nodes are always busy."""
-    over = threading.Event()
-
-    def send():
-        for step in itertools.count():
-            if over.is_set():
-                return
-            rig.send_tdoa(1.0 + 0.001 * step, 10, 14, 1.0)
-            if step % 10 == 0:
-                over.wait(0.001)
-
-    sender = threading.Thread(target=send)
-    sender.start()
-    try:
-        yield
-    finally:
-        over.set()
-        sender.join()

@@ -14,7 +14,6 @@ from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_ekf.anchor_table import AnchorTable
 from uwb_tdoa_ekf.core import ranges
-from uwb_tdoa_ekf.core.auxiliary import RANGE
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.memory import (
     IMU_SAMPLE,
@@ -112,20 +111,6 @@ def test_the_jacobian_is_that_of_the_distance():
     np.testing.assert_allclose(row, -np.array(slope), atol=1e-8)
 
 
-def test_two_ranges_make_a_tdoa():
-    state = new_state(np.zeros((3, 3)))
-    one, two = np.zeros(2, SENSOR_ROW)
-    one["t"], one["anchor"], one["value"][0], one["std"][0] = 1.0, 2, 3.0, 0.3
-    two["t"], two["anchor"], two["value"][0], two["std"][0] = 1.05, 1, 4.5, 0.4
-    assert not ranges.pair(state.ekf[0], one) and ranges.pair(state.ekf[0], two)
-    made = state.ekf[0]["paired"][0]
-    assert (made["t"], made["a"], made["b"], made["d"]) == (1.05, 2, 1, 1.5) and made[
-        "variance"
-    ] == pytest.approx(0.25)
-    one["t"] = 2.0  # a second later
-    assert not ranges.pair(state.ekf[0], one)
-
-
 @pytest.mark.parametrize("offset", [0.0, 0.25])
 def test_an_offset_of_all_ranges_is_found(ranged, offset):
     longer = replace(ranged, range=replace(ranged.range, d=ranged.range.d + offset))
@@ -137,15 +122,6 @@ def test_an_offset_of_all_ranges_is_found(ranged, offset):
         np.mean(np.einsum("ni,nij,nj->n", away, np.linalg.inv(found.covariance[:, :3, :3]), away))
         < 3.0
     )  # as many as there are axes
-
-
-def test_who_knows_of_no_offset_is_wrong_and_certain(ranged):
-    """What the offset is for."""
-    longer = replace(ranged, range=replace(ranged.range, d=ranged.range.d + 0.25))
-    found = run_offline(longer)
-    assert error(ranged, run_offline(longer, CALIBRATED).odometry) > 2.0 * error(
-        ranged, found.odometry
-    )
 
 
 def test_the_smoother_takes_the_offset_out_that_the_filter_finds(ranged):
@@ -161,15 +137,6 @@ def test_without_ranges_nobody_looks_for_an_offset(engine):
     one, other = (engine(flight, FilterConfig(range_offset_std=std)) for std in (0.0, 0.3))
     assert_same(one.odometry, other.odometry)
     assert other.range_offset is None
-
-
-def test_an_offset_is_kept_where_it_was_known_best():
-    state = new_state(np.zeros((1, 3)))
-    ekf, hypothesis = state.ekf[0], state.ekf[0]["hypotheses"][0]
-    for offset, variance in ((0.0, 0.0), (0.3, 0.04), (0.2, 0.01), (0.5, 0.09)):
-        hypothesis["offset"][RANGE], hypothesis["offset_P"][RANGE, RANGE] = offset, variance
-        ranges.keep_offset(state.ekf[0], hypothesis)
-    assert ekf["range_offset"].tolist() == [0.2, 0.01]
 
 
 # --- radio corrections ---
@@ -281,30 +248,3 @@ def test_what_comes_at_once_and_one_by_one_is_corrected_alike():
     one_by_one = [measured(t[k : k + 1], np.ones(1, int), np.full(1, 4.0)) for k in range(400)]
     found = corrected(whole, [given])
     assert len(found) == 400 and len(set(found)) == 80 and found == corrected(single, one_by_one)
-
-
-def test_what_holds_no_distances_is_one_part_and_distances_after_it_are_corrected_as_they_would_be():
-    """Inertial samples and TDOAs alone, then a distance in the slice that they ended in, and one in
-    the next.
-    """
-    t = 1.7e9 + np.arange(12) / 100.0
-    imu = np.zeros(len(t), IMU_SAMPLE)
-    imu["t"] = t
-    given = Measurements(imu, np.empty(0, TDOA_ROW), np.empty(0, SENSOR_ROW))
-    later = [measured(t[-1:] + after, np.ones(1, int), np.full(1, 4.0)) for after in (0.001, SLICE)]
-
-    def corrected(parts):
-        corrections, out = RadioCorrections(EffectSet((MOVED,)), AnchorTable(BOX)), []
-        for part in parts:
-            pieces = 0
-            for piece in corrections.slices(part):
-                pieces += 1
-                out += piece.sensors["value"][:, 0].tolist()
-                stamps = np.concatenate([piece.imu["t"], piece.sensors["t"]])
-                corrections.add_odometry(odometry_at(stamps, (stamps - t[0])[:, None]))
-            assert pieces == 1
-        return out
-
-    one_by_one = [given._replace(imu=imu[k : k + 1]) for k in range(len(t))]
-    found = corrected([given, *later])
-    assert len(set(found)) == 2 and found == corrected([*one_by_one, *later])

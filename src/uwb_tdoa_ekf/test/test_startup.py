@@ -1,17 +1,37 @@
+"""How the filter starts: the position that it finds, and the hypotheses that it follows."""
+
+from dataclasses import replace
+
 from covariances import assert_covariance
-from flights import GRAVITY, corners
+from driving import assert_sound, drive, state_for
+from driving import errors as distances_off
+from flights import GRAVITY, corners, fly
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from uwb_tdoa_bias.common.flight import Tdoas
 from uwb_tdoa_bias.common.geometry import tdoa
-from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
 from uwb_tdoa_ekf.core.ground import KnownHeight
-from uwb_tdoa_ekf.core.memory import TDOA, new_state, structured
+from uwb_tdoa_ekf.core.hypotheses import MERGED_WITHIN, PRUNED_BELOW, YAW_STD, select
+from uwb_tdoa_ekf.core.memory import (
+    HYPOTHESES,
+    REJECTED,
+    STARTUP,
+    TDOA,
+    USED,
+    new_state,
+    structured,
+)
 from uwb_tdoa_ekf.core.startup import Places, level, locate, split
 from uwb_tdoa_ekf.core.workspace import set_bounds
+from uwb_tdoa_ekf.offline import run_offline
+
+# --- startup ---
+
 
 SIZE = np.array([7.0, 8.0, 3.0])
 STD = 0.25  # m, what locate is told of one TDOA
@@ -226,3 +246,173 @@ def test_halves_of_a_place_whose_velocity_is_correlated_have_covariances():
     np.testing.assert_allclose(covariance[0] + np.outer(x[0], x[0]), whole)
     for each in covariance:
         assert_covariance(each)
+
+
+# --- initialization ---
+
+
+def test_starts_by_itself_within_its_window_and_knows_where_it_is():
+    for seed in range(5):
+        flight = fly(seed, 2.0, outliers=0.1)
+        odometry, residuals = drive(flight)
+        assert 0.4 < odometry.t[0] < 0.6
+        assert distances_off(flight, odometry)[0] < 0.3
+        startup = residuals.verdict == STARTUP
+        np.testing.assert_array_equal(startup, flight.tdoa.t <= flight.tdoa.t[startup][-1])
+        for name in ("innovation", "variance"):
+            np.testing.assert_array_equal(np.isnan(residuals[name]), startup)
+        assert (residuals.weight[startup] == 0.0).all() and np.isfinite(residuals.weight).all()
+        assert np.isin(residuals.verdict[~startup], (USED, REJECTED)).all()
+
+
+def test_starts_level_with_the_yaw_it_was_told():
+    flight = fly(3, 2.0, hover=True)
+    turned = Rotation.from_euler("ZYX", [0.7, 0.2, -0.3])
+    flight = replace(flight, imu=replace(flight.imu, accel=turned.inv().apply(flight.imu.accel)))
+    odometry, _ = drive(flight, FilterConfig(initial_yaw=0.7, initial_yaw_std=0.5))
+    assert (Rotation.from_quat(odometry.x[0, 6:10]).inv() * turned).magnitude() < 0.02
+    assert odometry.covariance[0, 8, 8] == pytest.approx(0.25, rel=0.05)
+
+
+def test_contradicting_tdoas_start_only_after_the_timeout():
+    flight = fly(4, 3.0, outliers=0.6)
+    odometry, _ = drive(flight, FilterConfig(start_timeout=1.5))
+    assert 1.5 < odometry.t[0] < 1.75
+
+
+def test_one_tdoa_long_before_the_others_does_not_use_up_the_timeout():
+    flight = fly(4, 3.0, outliers=0.6, begin=30.0)
+    early = np.concatenate([[1.0], flight.tdoa.t])
+    first = [
+        np.concatenate([column[:1], column])
+        for column in (flight.tdoa.a, flight.tdoa.b, flight.tdoa.d)
+    ]
+    odometry, _ = drive(replace(flight, tdoa=Tdoas(early, *first)))
+    assert odometry.t[0] > 30.4  # a window of start_window, not a dozen TDOAs
+
+
+@pytest.mark.parametrize("robust", ROBUST)
+def test_finds_a_tag_again_that_was_carried_away(robust):
+    """3.6 m, which its inertial sensor has not felt: not before it could have come so far."""
+    near, far = fly(10, 12.0, hover=True), fly(10, 12.0, hover=True)
+    there = np.array([1.0, 6.5, 0.8])
+    p = np.where(far.tdoa.t[:, None] < 5.0, near.truth.p[0], there)
+    positions = far.anchors.positions
+    d = tdoa(p, positions[far.anchors.index(far.tdoa.a)], positions[far.anchors.index(far.tdoa.b)])
+    d += 0.1 * np.random.default_rng(0).standard_normal(len(d))
+    state = state_for(far)
+    odometry, _ = drive(
+        replace(far, tdoa=replace(far.tdoa, d=d)), FilterConfig(robust=robust), state
+    )
+    assert state.record.recoveries <= 2
+    assert np.linalg.norm(odometry.x[odometry.t > 8.0, :3] - there, axis=1).max() < 0.3
+    assert_sound(state, odometry)
+
+
+def test_a_good_flight_needs_no_recovery():
+    for seed in range(3):
+        flight = fly(seed, 10.0, outliers=0.1)
+        state = state_for(flight)
+        drive(flight, state=state)
+        assert state.record.recoveries == 0
+
+
+def beside(flight, positions):
+    """The flight, heard by anchors at other positions (N, 3) m."""
+    a, b = flight.anchors.index(flight.tdoa.a), flight.anchors.index(flight.tdoa.b)
+    p = flight.meta["wave"].motion(flight.tdoa.t)[0]
+    d = tdoa(p, positions[a], positions[b]) + 0.1 * np.random.default_rng(0).standard_normal(len(p))
+    return replace(
+        flight, anchors=replace(flight.anchors, positions=positions), tdoa=replace(flight.tdoa, d=d)
+    )
+
+
+def test_of_anchors_on_a_wall_both_sides_are_followed_until_motion_tells():
+    """The deviation is as large as the sides are apart; the accelerometer then decides."""
+    y, z = np.meshgrid([0.0, 2.7, 5.3, 8.0], [0.3, 3.0])
+    wall = np.column_stack([np.full(8, 0.5), y.ravel(), z.ravel()])
+    wrong = 0
+    for seed in range(6):
+        flight = beside(fly(seed, 15.0), wall)
+        odometry, _ = drive(flight)
+        off = distances_off(flight, odometry)
+        std = np.sqrt(np.trace(odometry.covariance[:, :3, :3], axis1=1, axis2=2))
+        wrong += (off > 1.5).any()
+        assert (off < 4.0 * std).all() and off[-1] < 1.0
+    assert wrong  # of some the other side is believed in for a while
+
+
+# --- hypotheses ---
+
+
+NOISE = dict(accel_noise=0.01, gyro_noise=0.001)  # a common sensor that does not vibrate
+
+
+def yaw_errors(flight, odometry):
+    """rad, at the stamps of the odometry."""
+    attitude = flight.meta["wave"].motion(odometry.t)[2]
+    return (attitude.inv() * Rotation.from_quat(odometry.q)).as_rotvec()[:, 2]
+
+
+def ekf_with(yaws, log_weights):
+    ekf = new_state(np.zeros((4, 3))).record
+    ekf.hypotheses["log_weight"] = np.append(
+        log_weights, np.full(HYPOTHESES - len(log_weights), -np.inf)
+    )
+    for h, yaw in enumerate(yaws):
+        ekf.hypotheses["x"][h, 6:10] = Rotation.from_euler("z", yaw).as_quat()
+    return ekf
+
+
+def test_select_follows_the_best_and_prunes_the_improbable_and_the_same():
+    ekf = ekf_with([0.0, 0.05, 2.0, 3.0], [-1.0, -2.0, -3.0, -1.0 + 1.1 * PRUNED_BELOW])
+    select(ekf, 5.0)
+    assert ekf.best == 0
+    np.testing.assert_array_equal(ekf.hypotheses["log_weight"][:4], [0.0, -np.inf, -2.0, -np.inf])
+
+
+def test_what_is_elsewhere_is_not_the_same_whichever_way_it_faces():
+    ekf = ekf_with([0.0, 0.0, 0.0], [0.0, -1.0, -1.0])
+    ekf.hypotheses["x"][1, 2], ekf.hypotheses["x"][2, 2] = 1.5 * MERGED_WITHIN, 0.5 * MERGED_WITHIN
+    select(ekf, 5.0)
+    np.testing.assert_array_equal(ekf.hypotheses["log_weight"][:3], [0.0, -1.0, -np.inf])
+
+
+@pytest.mark.parametrize("wrong", [0.5 * np.pi, -0.5 * np.pi, np.pi, 0.8])
+def test_a_yaw_that_nobody_told_is_found_while_moving_and_doubted_until_then(wrong):
+    """Within 15 degrees 10 s after the start; before, the error is inside three of its own standard
+    deviations.
+    """
+    for seed in range(3):
+        flight = fly(seed, 15.0, **NOISE)
+        yaw = Rotation.from_quat(flight.truth.q[0]).as_euler("ZYX")[0]
+        odometry = run_offline(flight, FilterConfig(initial_yaw=yaw + wrong)).odometry
+        error = yaw_errors(flight, odometry)
+        late = odometry.t > odometry.t[0] + 10.0
+        assert np.abs(np.degrees(error[late])).max() < 15.0, seed
+        assert (np.abs(error) < 3.0 * np.sqrt(odometry.covariance[:, 8, 8])).mean() > 0.99, seed
+
+
+def test_a_yaw_that_is_known_starts_one_filter():
+    flight = fly(1, 2.0, hover=True)
+    known = run_offline(flight, FilterConfig(initial_yaw=0.0, initial_yaw_std=YAW_STD))
+    assert known.odometry.covariance[0, 8, 8] == pytest.approx(YAW_STD**2, rel=0.05)
+    unknown = run_offline(flight, FilterConfig(initial_yaw=0.0))
+    assert unknown.odometry.covariance[0, 8, 8] > 1.5**2
+
+
+def test_a_yaw_that_no_motion_tells_stays_unknown():
+    flight = fly(2, 20.0, hover=True, **NOISE)
+    odometry = run_offline(flight).odometry
+    assert np.sqrt(odometry.covariance[-1, 8, 8]) > np.radians(45.0)
+
+
+def test_turning_the_world_turns_the_estimate():
+    """Nothing in the filter prefers a direction but initial_yaw, and that only among equals."""
+    flight = fly(3, 12.0, **NOISE)
+    turn = Rotation.from_euler("z", 2.0)
+    anchors = replace(flight.anchors, positions=turn.apply(flight.anchors.positions.copy()))
+    one = run_offline(flight).odometry
+    other = run_offline(replace(flight, anchors=anchors)).odometry
+    late = one.t > 11.0
+    np.testing.assert_allclose(other.p[late], turn.apply(one.p[late]), atol=0.02)

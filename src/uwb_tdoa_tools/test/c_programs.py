@@ -6,16 +6,17 @@ from pathlib import Path
 import shutil
 import subprocess
 
+from exported_states import network_of
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.anchors import Anchors
-from uwb_tdoa_bias.correction.network import Network
+from uwb_tdoa_bias.correction.features import FEATURES
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, Samples, SmoothTerm
 from uwb_tdoa_bias.effects.samples import Motion
 from uwb_tdoa_tools.exporting.graph import ELEMENTWISE
 from uwb_tdoa_tools.exporting.vehicle import MEMBERS, STATE
-from uwb_tdoa_tools.training.network import WITHOUT, Paper
+from uwb_tdoa_tools.training.network import WITHOUT
 
 HERE = Path(__file__).parent / "cortex_m"
 GCC, ARM_GCC = shutil.which("gcc"), shutil.which("arm-none-eabi-gcc")
@@ -112,19 +113,8 @@ def chosen(*names):
 
 def network(folder, orientations=True):
     """A network of the first paper with random weights, of 14 inputs or 8: Network."""
-    from uwb_tdoa_bias.correction.features import FEATURES
-
     names = FEATURES if orientations else WITHOUT
-    rng, sizes = np.random.default_rng(3), (len(names), 30, 30, 30, 1)
-    layers = [
-        (rng.normal(0.0, math.sqrt(1.5 / i), (i, o)), rng.normal(0.0, 0.1, o))
-        for i, o in zip(sizes[:-1], sizes[1:])
-    ]
-    scale = np.array([4.0 if name[0] == "d" else 2.0 for name in names])
-    paper = Paper(names, np.full(len(names), 0.1), scale, layers, 0.07)
-    path = Path(folder) / f"network_{len(names)}.onnx"
-    path.write_bytes(paper.onnx({"clip": 1.0, "name": "drawn"}).SerializeToString())
-    return Network(path)
+    return network_of(Path(folder), names, 3, clip=1.0, name="drawn")
 
 
 def cases(n, seed=0):

@@ -35,7 +35,6 @@ TRUTHS = {  # what may be wrong with a ground truth: function of a Truth
     "in time": lambda truth: truth,
     "late": lambda truth: replace(truth, t=truth.t + LATE),
     "in another frame": lambda truth: transform_truth(truth, TURNED, np.array([0.5, -0.3, 0.0])),
-    "on another epoch": lambda truth: replace(truth, t=truth.t + EPOCH),
     "z down, on another epoch": lambda truth: transform_truth(
         replace(truth, t=truth.t + EPOCH), np.diag([1.0, 1.0, -1.0]), np.zeros(3)
     ),

@@ -468,17 +468,6 @@ def test_fields_of_any_topic(tmp_path):
         read_fields(tmp_path / "bag", "uwb/tdoa_corrected")
 
 
-@BOTH
-@pytest.mark.parametrize("kept", [0.0, 0.1, 0.5, 0.95, 0.999])
-def test_cut_data_file(tmp_path, storage, kept):
-    write_bag(small_flight(), tmp_path / "flight", storage)
-    (file,) = (tmp_path / "flight").glob("flight.*")
-    whole = file.read_bytes()
-    file.write_bytes(whole[: int(kept * len(whole))])
-    with pytest.raises(InputError, match="cut or damaged|is no YAML"):
-        read_bag(tmp_path / "flight")
-
-
 @pytest.mark.parametrize("metadata", ["", "rosbag2_bagfile_information: 3", "{", "a: b"])
 def test_damaged_metadata(tmp_path, metadata):
     write_bag(small_flight(0.05), tmp_path / "flight")

@@ -18,7 +18,7 @@ from recordings import differences, small_flight
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.sensors import Height, Pressure, Velocity
+from uwb_tdoa_bias.common.sensors import Pressure, Velocity
 from uwb_tdoa_tools.bags import mcap
 from uwb_tdoa_tools.bags.bag import read_bag, write_bag
 from uwb_tdoa_tools.bags.files import messages, open_bag
@@ -194,17 +194,6 @@ def test_numbers_that_are_not_finite(tmp_path, storage):
     assert (len(back.tdoa), len(back.truth), len(back.imu)) == (49, 24, 99) and len(
         back.meta["remarks"]
     ) == 3
-
-
-@BOTH
-def test_heights_and_velocities_say_what_was_not_measured(tmp_path, storage):
-    height = Height(np.array([10.0, 10.1, 10.2]), np.array([1.25, np.inf, np.nan]))
-    velocity = Velocity(
-        np.array([10.0]), np.array([[0.5, 0.0, np.nan]]), np.array([[0.1, 0.1, np.inf]])
-    )
-    flight = replace(small_flight(0.1), height=height, velocity=velocity)
-    write_bag(flight, tmp_path / "bag", storage)
-    assert differences(flight, read_bag(tmp_path / "bag")) == []
 
 
 @BOTH

@@ -21,9 +21,7 @@ from uwb_tdoa_tools.calibrating import (
     Calibration,
     Forecast,
     Prospect,
-    between,
     prospect,
-    split,
     without_truth,
 )
 from uwb_tdoa_tools.checking.check import Report
@@ -60,19 +58,6 @@ def shaken_flight(seed):
 @pytest.fixture(scope="module")
 def flights():
     return [shaken_flight(seed) for seed in (1, 2, 3)]
-
-
-# --- parts ---
-
-
-def test_a_flight_in_two_parts_is_all_of_it(flights):
-    flight = flights[0]
-    first, rest = split(flight, 0.25)
-    for name in ("tdoa", "imu", "truth"):
-        one, two, whole = (getattr(part, name).t for part in (first, rest, flight))
-        np.testing.assert_array_equal(np.concatenate([one, two]), whole)
-        assert len(two) == pytest.approx(3 * len(one), rel=0.05)
-    assert np.ptp(between(flight, 10.0, 20.0).tdoa.t) == pytest.approx(10.0, abs=0.1)
 
 
 # --- without ground truth ---
@@ -121,18 +106,6 @@ def test_ranges_of_another_tag_judge():
 def test_a_single_flight_is_judged_on_its_end(flights):
     made = without_truth([replace(flights[0], truth=None)], [])
     assert made.judged_on == "the last third of flight1" and made.after < made.before
-
-
-@pytest.mark.slow
-def test_what_makes_it_worse_where_it_took_no_part_is_not_to_be_used(flights, monkeypatch):
-    told = iter([0.01, 0.02])
-    monkeypatch.setattr(library, "slow_innovations", lambda *_: next(told))
-    made = without_truth(
-        [replace(flight, truth=None) for flight in flights[:1]], [replace(flights[1], truth=None)]
-    )
-    assert (
-        "it makes things worse: slow innovations 1.0 -> 2.0 cm (it rises by 100 %) on flight2"
-    ) in made.why_not
 
 
 @pytest.mark.parametrize(
@@ -474,12 +447,6 @@ def test_a_rover_with_odometry_of_its_wheels_is_calibrated(tmp_path):
     assert config.planar and config.fixed_height == 0.0
     told = json.loads((out / "calibration.json").read_text())
     assert told["offered"] and told["after"] < 0.8 * told["before"]
-
-
-def test_parameters_that_were_given_are_written_beside_the_noise(tmp_path):
-    given = FilterConfig(planar=True, fixed_height=0.1, use_imu=False, tdoa_std=0.5)
-    read = FilterConfig.from_yaml(write_parameters(tmp_path / "ekf_node.yaml", 0.07, given))
-    assert read == replace(given, tdoa_std=0.07)
 
 
 @pytest.mark.parametrize(

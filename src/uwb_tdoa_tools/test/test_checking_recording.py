@@ -1,15 +1,27 @@
-"""Bags as they were received: order, arrivals, frames, and no look at the truth."""
+"""Bags as they were received, and what is found of their frames, topics, anchors, publishers, ranges and
+motion."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from recordings import SURVEY, csv_text, small_flight
+from recordings import ANCHORS, SURVEY, csv_text, small_flight
+from scipy.spatial.transform import Rotation
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import Tdoas
+from uwb_tdoa_ekf.monitoring.stream_rules import StreamRules
 from uwb_tdoa_tools.bags.bag import write_bag
+from uwb_tdoa_tools.checking import coverage, recording_rules
+from uwb_tdoa_tools.checking.check import check
 from uwb_tdoa_tools.checking.recording import IMU, TDOA, of_flight, read_recording
+from uwb_tdoa_tools.checking.recording_rules import RULES, tag_delay, window_offsets
+from uwb_tdoa_tools.live.record import End
 from uwb_tdoa_tools.readers.inputs import Reading
+from uwb_tdoa_tools.simulation import SimulationConfig, simulate
+
+# --- checking recording ---
 
 
 def test_a_bag_gives_the_streams_of_the_flight(tmp_path):
@@ -92,3 +104,288 @@ def test_a_cut_bag_is_salvaged(tmp_path):
 def test_a_flight_without_imu_is_read(tmp_path):
     made = of_flight(replace(small_flight(), imu=None))
     assert made.imu is None and len(made.imu_arrival) == 0
+
+
+# --- checking recording rules ---
+
+
+def rules_found(**changes):
+    made = replace(of_flight(small_flight()), **changes)
+    return {finding.rule: finding for rule in recording_rules.RULES for finding in rule(made)}
+
+
+@pytest.mark.parametrize("frame", ["base_link", "tag1/base_link", ""])
+def test_the_body_frame_has_no_finding(frame):
+    assert rules_found(frames={IMU: {frame: 5}, TDOA: {frame: 5}}) == {}
+
+
+def test_a_frame_without_a_transform_is_a_warning():
+    assert rules_found(frames={IMU: {"imu_link": 5}})["frame_unknown"].severity == "warning"
+
+
+@pytest.mark.parametrize(
+    "angle, shift, severity", [(90.0, 0.0, "note"), (0.0, 0.1, "note"), (0.5, 0.0, None)]
+)
+def test_a_frame_with_a_transform_is_a_note(angle, shift, severity):
+    place = Rotation.from_euler("z", angle, degrees=True), np.array([shift, 0.0, 0.0])
+    found = rules_found(frames={IMU: {"imu_link": 5}}, places={"imu_link": place})
+    assert {name: finding.severity for name, finding in found.items()} == (
+        {"frame_turned": severity} if severity else {}
+    )
+    if angle == 90.0:
+        assert (
+            found["frame_turned"].value == pytest.approx(np.pi / 2)
+            and "yaw 90" in found["frame_turned"].evidence
+        )
+
+
+def test_two_frames_are_two_senders():
+    assert "senders" in rules_found(frames={TDOA: {"tag1/base_link": 5, "tag2/base_link": 4}})
+
+
+def test_an_imu_on_another_topic_is_named():
+    found = rules_found(
+        imu=None, topics={"/uwb/tdoa": "uwb_tdoa_msgs/msg/Tdoa", "/imu/raw": "sensor_msgs/msg/Imu"}
+    )
+    assert "--topic imu/data=/imu/raw" in found["imu_elsewhere"].remedy
+    assert "imu_missing" in rules_found(imu=None, topics={"/uwb/tdoa": "uwb_tdoa_msgs/msg/Tdoa"})
+    assert rules_found(imu=None) == {}  # a CSV file has no topics
+
+
+def test_an_empty_topic_of_the_imu_is_not_mapped_to_itself():
+    found = rules_found(
+        imu=None, topics={"/imu/data": "sensor_msgs/msg/Imu"}, read=frozenset({"/imu/data"})
+    )
+    assert found.keys() == {"imu_empty"} and "--topic" not in found["imu_empty"].remedy
+
+
+ODOMETRY = "nav_msgs/msg/Odometry"
+
+
+def test_unread_odometry_is_named():
+    topics = {
+        "/uwb/tdoa": "",
+        "/tag1/uwb/tdoa": "",
+        "/odometry": ODOMETRY,
+        "/tag1/odometry": ODOMETRY,
+        "/odometry/debiased": ODOMETRY,
+    }
+    assert rules_found(topics=topics) == {}  # of filters of ours
+    found = rules_found(topics={**topics, "/odom": ODOMETRY})
+    assert "--topic velocity/odometry=/odom" in found["odometry_unread"].remedy
+    assert rules_found(topics={**topics, "/odom": ODOMETRY}, read=frozenset({"/odom"})) == {}
+
+
+def test_other_anchors_in_the_bag_are_named():
+    moved = replace(
+        ANCHORS, positions=ANCHORS.positions + [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
+    )
+    assert rules_found(recorded=moved)["survey_differs"].value == pytest.approx(1.0)
+    assert rules_found(recorded=ANCHORS) == {}
+    assert (
+        "no id in common"
+        in rules_found(recorded=replace(ANCHORS, ids=[7, 8, 9]))["survey_differs"].evidence
+    )
+
+
+IMU_TYPE, TDOA_TYPE = "sensor_msgs/msg/Imu", "uwb_tdoa_msgs/msg/Tdoa"
+DRIVER = End("/imu/data", "/driver", IMU_TYPE, True, False, False)
+NODE = End("/imu/data", "/ekf_node", IMU_TYPE, False, False, False)
+STRICT = replace(NODE, reliable=True)
+ANCHORS_END = End(
+    "/tag1/uwb/anchors", "/tag1/driver", "uwb_tdoa_msgs/msg/AnchorArray", True, True, False
+)
+
+
+@pytest.mark.parametrize(
+    "ends, expected",
+    [
+        ([DRIVER, NODE], set()),
+        ([DRIVER, STRICT], {"qos_unmatched"}),
+        ([DRIVER, STRICT, NODE], set()),  # one node that asks in both ways, as ours do for anchors
+        ([replace(DRIVER, reliable=True), STRICT], set()),
+        ([replace(DRIVER, reliable=True), replace(NODE, latched=True)], {"qos_unmatched"}),
+        ([DRIVER, replace(DRIVER, node="/other"), NODE], {"publishers_several"}),
+        (
+            [
+                replace(DRIVER, topic="/tf_static"),
+                replace(DRIVER, topic="/tf_static", node="/other"),
+            ],
+            set(),
+        ),
+        ([DRIVER, replace(NODE, kind=TDOA_TYPE)], {"type_other"}),
+        ([ANCHORS_END], {"anchors_volatile"}),
+        ([replace(ANCHORS_END, latched=True)], set()),
+        ([], set()),
+    ],
+)
+def test_publishers_and_subscriptions_are_judged(ends, expected):
+    recording = replace(of_flight(small_flight()), ends=tuple(ends))
+    found = [finding for rule in RULES for finding in rule(recording)]
+    assert {finding.rule for finding in found} == expected
+    for finding in found:
+        assert all(
+            node in finding.sentence
+            for node in {end.node for end in ends if end.node != "/ekf_node"}
+        )
+
+
+@pytest.fixture(scope="module", params=["sines", "circle"])
+def ranged(request):
+    """A Flight of ranges alone, without systematic errors."""
+    config = SimulationConfig(
+        seed=7,
+        trajectory=request.param,
+        duration=20.0,
+        imu_rate=100.0,
+        truth_rate=20.0,
+        range_noise=0.1,
+        bias=False,
+        multipath=False,
+    )
+    return replace(simulate(config), tdoa=Tdoas(*np.empty((4, 0))))
+
+
+def longer(flight, by):
+    return replace(flight, range=replace(flight.range, d=flight.range.d + by))
+
+
+@pytest.mark.parametrize("by", [0.25, -0.2])
+def test_a_common_error_of_ranges_is_found(ranged, by):
+    (found,) = tag_delay(of_flight(longer(ranged, by)))
+    assert found.severity == "note" and found.value == pytest.approx(by, abs=0.03)
+    assert ("too long" if by > 0.0 else "too short") in found.cause
+    report = check(of_flight(longer(ranged, by)))
+    assert not report.faulty and "tag_delay" in {finding.rule for finding in report.findings}
+
+
+def test_healthy_ranges_have_no_finding_with_a_tape_measured_survey(ranged):
+    assert not [*tag_delay(of_flight(ranged))]
+    shaken = ranged.anchors.positions + 0.1 * np.random.default_rng(3).standard_normal(
+        ranged.anchors.positions.shape
+    )
+    assert not [*tag_delay(of_flight(replace(ranged, anchors=ranged.anchors.at(shaken))))]
+
+
+def test_outliers_of_ranges_do_not_count(ranged):
+    rng, d = np.random.default_rng(0), longer(ranged, 0.25).range.d
+    d = np.where(rng.random(len(d)) < 0.1, d + rng.exponential(2.0, len(d)), d)
+    d[::50] = np.nan
+    (found,) = tag_delay(of_flight(replace(ranged, range=replace(ranged.range, d=d))))
+    assert found.value == pytest.approx(0.25, abs=0.08)
+
+
+def test_ranges_that_determine_no_delay_have_no_finding(ranged):
+    offsets = window_offsets(ranged.range, ranged.anchors.only(np.arange(4)))  # as many as unknowns
+    assert len(offsets) == 0
+    flat = ranged.anchors.at(ranged.anchors.positions * [1.0, 1.0, 0.0])
+    assert np.isfinite(window_offsets(ranged.range, flat)).all()
+    assert not [*tag_delay(of_flight(replace(ranged, range=None)))]
+    millimetres = replace(ranged.range, d=1000.0 * ranged.range.d)
+    assert not [*tag_delay(of_flight(replace(ranged, range=millimetres)))]
+
+
+# --- checking coverage ---
+
+
+BOX = np.array([[x, y, z] for x in (0.0, 6.0) for y in (0.0, 7.0) for z in (0.2, 3.0)])
+PLACES = np.random.default_rng(0).uniform([1.0, 1.0, 0.5], [5.0, 6.0, 2.5], (40, 3))
+
+
+def windows(anchors, heard, seconds=20):
+    """TdoaWindows of 100 TDOAs a second; heard(t, a, b) (n,) bool says which come through."""
+    t = np.arange(0.0, seconds, 0.01)
+    a = np.arange(len(t)) % len(anchors)
+    b = (a + 1) % len(anchors)
+    rows = heard(t, a, b)
+    rules = StreamRules(anchors)
+    rules.feed_tdoa(
+        t[rows],
+        np.full(rows.sum(), np.nan),
+        anchors.ids[a[rows]],
+        anchors.ids[b[rows]],
+        0.1 * np.sin(t[rows]),
+    )
+    rules.finish()
+    return list(rules.tdoa)
+
+
+def said(positions=BOX, places=PLACES, heard=lambda t, a, b: t >= 0.0, seconds=20):
+    anchors = Anchors.from_positions(positions)
+    view = coverage.CoverageView(anchors, windows(anchors, heard, seconds), places)
+    return {finding.rule: finding for rule in coverage.RULES for finding in rule(view)}
+
+
+def test_a_room_with_anchors_around_it_is_healthy():
+    assert said() == {}
+
+
+def test_an_anchor_that_is_never_heard():
+    assert "3" in said(heard=lambda t, a, b: (a != 3) & (b != 3))["anchor_missing"].cause
+
+
+def test_an_anchor_that_is_hardly_heard():
+    found = said(heard=lambda t, a, b: ((a != 3) & (b != 3)) | (np.floor(t * 100) % 32 == 3))
+    assert "anchor 3" in found["anchor_rare"].cause and found["anchor_rare"].severity == "note"
+
+
+def test_an_anchor_that_falls_silent():
+    found = said(heard=lambda t, a, b: ((a != 3) & (b != 3)) | (t < 8.0) | (t > 16.0))[
+        "anchor_silent"
+    ]
+    assert found.value == pytest.approx(8.0, abs=1.0) and "anchor 3" in found.cause
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_anchors_in_a_plane(axis):
+    flat = BOX.copy()
+    flat[:, axis] = 1.0 + 0.01 * np.arange(8)
+    assert "anchors_flat" in said(positions=flat)
+
+
+@pytest.mark.parametrize(
+    ("axis", "at", "said_of"),
+    [
+        (2, 3.0, "tag_side:=below"),
+        (2, 0.1, "tag_side:=above"),
+        (0, 0.0, "tag_side:=+x or -p tag_side:=-x"),
+        (1, 0.0, "tag_side:=+y"),
+    ],
+)
+def test_anchors_in_a_plane_across_an_axis_need_a_side(axis, at, said_of):
+    flat = BOX.copy()
+    flat[:, axis] = at + 0.01 * np.arange(8)
+    assert said_of in said(positions=flat)["side_unknown"].remedy
+
+
+def test_of_a_hall_the_side_is_needed_where_those_that_are_heard_have_one_height():
+    hall = np.array([[4.0 * k, 3.0 * (k % 2), 3.0 if k < 12 else 6.0] for k in range(24)])
+    turn = lambda t, a, b: (a // 6 == np.floor(t / 5.0)) & (b // 6 == np.floor(t / 5.0))  # noqa: E731
+    assert "tag_side:=below" in said(positions=hall, heard=turn)["side_unknown"].remedy
+
+
+def test_where_something_measures_the_height_no_side_is_needed():
+    flat = BOX.copy()
+    flat[:, 2] = 3.0
+    anchors = Anchors.from_positions(flat)
+    view = coverage.CoverageView(
+        anchors, windows(anchors, lambda t, a, b: t >= 0.0), PLACES, height_known=True
+    )
+    assert not list(coverage.unknown_side(view))
+
+
+def test_anchors_with_z_down():
+    assert "survey_z_down" in said(
+        positions=BOX * [1.0, 1.0, -1.0], places=PLACES * [1.0, 1.0, -1.0]
+    )
+
+
+def test_a_tag_outside():
+    assert "outside" in said(places=PLACES + [5.0, 0.0, 0.0])
+    assert "outside" not in said(places=PLACES + [0.0, 0.0, 0.2])
+
+
+def test_a_tag_that_does_not_move():
+    assert said(places=PLACES[:1] + 0.01 * PLACES)["little_motion"].severity == "note"
+    assert "little_motion" in said(seconds=5)
+    assert said(places=np.empty((0, 3))) == {}  # it was not tried

@@ -1,7 +1,5 @@
 from dataclasses import replace
-import inspect
 import json
-import re
 import shlex
 from types import SimpleNamespace
 
@@ -9,7 +7,6 @@ import numpy as np
 import pytest
 
 pytest.importorskip("rclpy")
-from documented import ROOT  # noqa: E402
 import known_answer  # noqa: E402
 
 from uwb_tdoa_bias.correction.network import load_network  # noqa: E402
@@ -22,7 +19,6 @@ from uwb_tdoa_tools.flying import loop  # noqa: E402
 from uwb_tdoa_tools.flying.demo import (  # noqa: E402
     DemoFlight,
     change_of_scores,
-    close_loop,
     next_steps,
 )
 from uwb_tdoa_tools.scoring.evaluation import score_of  # noqa: E402
@@ -237,14 +233,3 @@ def test_a_given_flight_through_the_real_nodes(recorded, diagnosis, tmp_path, ca
     assert corrected == pytest.approx(without_ros, abs=1.01e-3)
     for name in ("flight.bag", "recorded.bag", "error.png"):
         assert (tmp_path / "out" / name).exists()
-
-
-# --- the first page ---
-
-
-def test_the_readme_begins_with_the_demo_and_its_output():
-    blocks = re.findall(r"^```\w*\n(.*?)^```$", (ROOT / "README.md").read_text(), re.M | re.S)
-    assert blocks[0] == "./dev demo\n"
-    shown = re.findall(r"^(\w[\w ]*?) {2,}\S", blocks[1], re.M)
-    told = re.findall(r'show\("([a-z ]+)"', inspect.getsource(close_loop))
-    assert shown == told

@@ -7,7 +7,6 @@ from uwb_tdoa_bias.effects import EFFECTS, EffectSet, LabelEffect, SmoothTerm
 from uwb_tdoa_tools.diagnosis import attribution, refinement
 from uwb_tdoa_tools.diagnosis.attribution import attribute, residuals_of
 from uwb_tdoa_tools.diagnosis.channels import residuals
-from uwb_tdoa_tools.diagnosis.findings import EffectFinding
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.refinement import _simpler, effects_of, relinearised
 from uwb_tdoa_tools.diagnosis.regression.fit import fit
@@ -26,16 +25,6 @@ def flight():
 def quick(flight):
     """The declared effects alone, without functions without a name: Attribution."""
     return attribute([flight], TRUTH, undeclared=False)
-
-
-def test_two_candidates_of_an_effect_add_their_gains_but_not_their_t_values():
-    def found(gain, t):
-        evidence = {"criterion": 1.0, "held_out_gain": gain, "held_out_t": t}
-        return EffectFinding(EFFECTS["anchor_delay"](), "tdoa", evidence, 0.5)
-
-    both = attribution._merged(found(8.0, 4.0), found(6.0, 2.0))  # deviations 2 and 3
-    assert both.evidence == {"criterion": 2.0, "held_out_gain": 14.0, "held_out_t": 3.9}
-    assert attribution._merged(found(0.0, 0.0), found(0.0, 0.0)).evidence["held_out_t"] == 0.0
 
 
 def test_nothing_is_found_where_nothing_is(flight):

@@ -113,23 +113,14 @@ def test_without_ground_truth_ranges_have_a_channel_where_there_are_no_tdoas(bot
     assert np.sqrt(np.mean(shown[1]["range"].residual ** 2)) < 0.15
 
 
-def test_without_ground_truth_the_delay_of_the_tag_bends_no_path(both):
-    longer = without_offset(Nothing().prepare(both), -0.3)
-    one, other = (
-        residuals(flight, Nothing(), EffectSet())["tdoa"].residual
-        for flight in (longer, Nothing().prepare(both))
-    )
-    assert np.sqrt(np.mean(one**2)) < 1.05 * np.sqrt(np.mean(other**2))
+@pytest.mark.slow
+def test_without_ground_truth_nothing_is_added_for_what_the_filter_finds_itself(both):
+    assert not len(diagnose([without_offset(both, -0.3)], reference=Nothing()).effects)
 
 
-@pytest.mark.parametrize("taken", [alone, lambda flight: flight], ids=["ranges", "both"])
-def test_without_ground_truth_nothing_is_added_for_what_the_filter_finds_itself(both, taken):
-    assert not len(diagnose([taken(without_offset(both, -0.3))], reference=Nothing()).effects)
-
-
-@pytest.mark.parametrize("taken", [alone, lambda flight: flight], ids=["ranges", "both"])
-def test_without_ground_truth_the_delay_of_the_tag_is_found_with_that_of_an_anchor(both, taken):
-    result = diagnose([taken(without_offset(DELAY.inject(both), -0.3))], reference=Nothing())
+@pytest.mark.slow
+def test_without_ground_truth_the_delay_of_the_tag_is_found_with_that_of_an_anchor(both):
+    result = diagnose([alone(without_offset(DELAY.inject(both), -0.3))], reference=Nothing())
     values = {effect.name: effect.values for effect in result.effects}["anchor_delay"]
     assert np.mean(list(values.values())) == pytest.approx(
         0.3 + DELAY.values["3"] / len(values), abs=0.05
@@ -139,7 +130,7 @@ def test_without_ground_truth_the_delay_of_the_tag_is_found_with_that_of_an_anch
         "anchor_position",
     }
     assert result.after["pooled"]["nis_mean"] < result.before["pooled"]["nis_mean"]
-    assert ("predicted ranges" in output.as_text(result).replace("\n", " ")) == (taken is alone)
+    assert "predicted ranges" in output.as_text(result).replace("\n", " ")
 
 
 def test_without_ground_truth_nothing_is_added_where_nothing_is_wrong(both):

@@ -8,7 +8,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_bias.effects.truth import TruthTimeOffset
 from uwb_tdoa_tools.diagnosis import diagnose, output
-from uwb_tdoa_tools.diagnosis.references import REFERENCES, GroundTruth, Heights, Marks, Nothing
+from uwb_tdoa_tools.diagnosis.references import GroundTruth, Heights, Marks, Nothing
 from uwb_tdoa_tools.scoring.evaluation import evaluate
 
 NONSENSE = np.array([100.0, -50.0, 7.0])
@@ -102,16 +102,6 @@ def test_marks_tell_which_anchor_is_late_without_the_truth():
         for effects in (found[0].effects, EffectSet())
     )
     assert after < 0.5 * before
-    # last week's as the prior
-    again = diagnose([flight], base=found[0].effects, reference=Marks(None, marks))
-    assert [effect.name for effect in again.effects.effects] == [
-        effect.name for effect in found[0].effects.effects
-    ]
-    assert not again.changes
-
-
-def test_every_reference_is_made_of_a_filter_configuration():
-    assert all(make(None).words for make in REFERENCES.values())
 
 
 def test_the_truth_that_is_missing_is_asked_for(flight):

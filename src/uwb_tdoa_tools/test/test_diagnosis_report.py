@@ -26,7 +26,6 @@ from uwb_tdoa_tools.diagnosis.report.words import TERMS
 from uwb_tdoa_tools.scoring.gains import NO_DIFFERENCE
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
-STYLE = (Path(maps.__file__).parent / "templates" / "style.css").read_text()
 ELSEWHERE = Alternative("pair_offset", 0.95, None, "TDoA3")
 AS_WELL = Alternative("anchor_position", 1.0, 2.0, "a flight on several sides")
 
@@ -125,17 +124,6 @@ def test_a_gain_that_may_be_chance_is_not_called_one(result, gain):
     )
 
 
-def test_noise_is_described_alike_in_both_directions(result):
-    better, worse = (
-        verdict(judged(result, {"one": 0.3}, {"one": after}, [-0.05, 0.04])).headline
-        for after in (0.298, 0.302)
-    )
-    assert better.replace("29.8", "30.2") == worse
-    assert worse.startswith(f"There is {NO_DIFFERENCE}")
-    larger = verdict(judged(result, {"one": 0.3}, {"one": 0.4}, [-0.4, -0.2]))
-    assert larger.headline == "The position error (3D RMSE) rises from 30.0 cm to 40.0 cm."
-
-
 def test_a_phase_that_becomes_worse_is_in_the_verdict_with_the_flights_by_name(result):
     changed = judged(result, {"one": 0.3, "two": 0.3}, {"one": 0.2, "two": 0.2}, [0.2, 0.4])
     for side, until, first in ((changed.before, 0.339, 0.2), (changed.after, 0.41, 0.1)):
@@ -214,15 +202,6 @@ def test_a_single_judged_flight_and_a_judge_that_was_fitted_are_named_as_such(re
     )
     assert any("decided on these same flights" in sentence for sentence in halves)
     assert not any("decided on these same flights" in sentence for sentence in alone)
-
-
-def test_effects_that_were_in_the_model_already_are_mentioned(result):
-    more = EffectSet((*result.effects.effects, EFFECTS["range_scale"]({"scale": 0.01})))
-    assert any(
-        "with the 1 effect that the model held" in s
-        for s in verdict(replace(result, effects=more)).more
-    )
-    assert not any("held already" in sentence for sentence in verdict(result).more)
 
 
 def test_nothing_found_and_nothing_added_are_told_apart(result):
@@ -559,24 +538,6 @@ def test_a_page_is_well_formed_and_every_picture_is_described(all_pages):
         assert len({item["alt"] for item in pictures}) == len(pictures)
 
 
-def test_nothing_runs_off_a_narrow_page(all_pages):
-    for rule in (
-        "img { display: block; max-width: 100%",
-        ".wide { overflow-x: auto",
-        "overflow-wrap: anywhere",
-    ):
-        assert rule in STYLE
-    assert "minmax(min(100%, 27rem), 1fr)" in STYLE
-    for page in all_pages:
-        assert 'name="viewport" content="width=device-width' in page
-        for tag, attributes, around in Tags(page).seen:
-            if tag == "table":
-                assert ("div", {"class": "wide"}) in around
-            if tag == "span":  # bars: less than a phone is wide
-                assert float(re.search(r"width:([\d.]+)em", attributes["style"])[1]) <= 8.0
-            assert tag == "img" or "width" not in attributes
-
-
 def test_every_abbreviation_is_spelled_out_and_every_effect_explained(all_pages):
     for page in all_pages:
         text, _, meanings = said(page).rpartition("What abbreviations and names of effects mean")
@@ -605,49 +566,6 @@ def test_a_row_is_either_worth_something_or_says_why_it_is_not_in_the_file(resul
     folded = "Found, and not in effects.yaml why not what does not make the filter better floor_multipath"
     assert folded in text
     assert "yes" not in text.split() and "0 %" not in text
-
-
-def cells(page):
-    """Texts of the cells of each table of a page: [[text]]."""
-    for table in re.findall(r"<table.*?</table>", page, flags=re.S):
-        yield [said(cell) for cell in re.findall(r"<td.*?</td>", table, flags=re.S)]
-
-
-def test_no_sentence_repeats_in_a_table_and_what_was_refused_is_folded(result):
-    """With many effects that nothing imitates, that are alike in doubt, and that are refused."""
-    names = ("anchor_delay", "gyro_bias", "accel_bias", "range_scale", "tdoa_time_offset")
-    effects = [EFFECTS[name]({EFFECTS[name].row.example: 0.1}, {}) for name in names]
-    added = [finding(one, worth=0.01 * k) for k, one in enumerate(effects[:3])]
-    doubtful = [replace(one, alternatives=(AS_WELL, ELSEWHERE)) for one in added]
-    others = [finding(one, False, None) for one in effects[3:]]
-    refused = [
-        Refused(one.effect.label, f"it is worth nothing: 0.{k} m with")
-        for k, one in enumerate(others)
-    ]
-    refused += [Refused(f"other{k}", f"does not help held-out data ({k}.5)") for k in range(6)]
-    every = [
-        Unobservable(name, {"x": 1.0, "y": float(k)})
-        for k, name in enumerate(("accel_scale", "gyro_scale"))
-    ]
-    for some in (added, doubtful):
-        changed = replace(result, findings=[*some, *others], refused=refused, unobservable=every)
-        page = html(changed)
-        for table in cells(page):
-            sentences = [
-                sentence
-                for cell in table
-                for sentence in re.split(r"(?<=[.;])\s", cell)
-                if len(re.findall(r"[a-z]{2,}", sentence)) > 3
-            ]
-            assert len(sentences) == len(set(sentences)), table
-        for summary in ("Found, and not in effects.yaml", "Looked at and not added"):
-            assert f"<details><summary>{summary}" in page
-        worth = said(html(changed, "worth")).partition("Found, and not")[0]
-        assert "range_scale" not in worth
-        lines = output.as_text(changed).splitlines()
-        labels = [line[:10].strip() for line in lines if line[:10].strip()]
-        assert labels.index("found") < labels.index("apply") < labels.index("not added")
-        assert labels.count("not added") == 1
 
 
 def test_advice_on_what_is_not_added_is_less_urgent(result):
@@ -731,18 +649,6 @@ def test_labels_of_anchors_lie_on_nothing(result, monkeypatch):
         pictures.plt.close(figure)
 
 
-def test_letters_of_pictures_can_be_read_on_a_phone_and_curves_are_as_wide_as_the_page(page):
-    phone, letters = 390.0 - 2 * 16.0, 9.0 * 96.0 / 72.0  # px
-    assert letters * phone / (pictures.WIDTH * pictures.PIXELS) >= 10.0
-    sources = [attributes for tag, attributes, _ in Tags(page).seen if tag == "source"]
-    assert sources and all(item["media"] == "(max-width: 44rem)" for item in sources)
-    assert any(
-        attributes.get("width") == str(round(pictures.FULL * pictures.PIXELS))
-        for tag, attributes, _ in Tags(page).seen
-        if tag == "img"
-    )
-
-
 def test_a_blocked_region_is_on_the_map_and_in_the_list(result):
     values = {"1.x": -0.9, "1.y": -1.2, "1.z": 2.0, "1.radius": 1.0, "1.delay": 0.5}
     effect = EFFECTS["nlos"](values, {"1.delay": 0.02})
@@ -798,11 +704,3 @@ def test_a_curve_keeps_its_largest_value():
     values[7_777] = 5.0
     shown = curves._peaks(t, values)
     assert len(shown[0]) <= curves.BINS and shown[1].max() == 5.0
-
-
-def test_the_smaller_kind_of_picture_is_taken():
-    few, _ = pictures.drawing(2.0)
-    assert "data:image/svg+xml" in pictures.embedded(few, "empty axes").source
-    many, ax = pictures.drawing(2.0)
-    ax.plot(np.random.default_rng(0).random((20_000, 2)), ".")
-    assert "data:image/png" in pictures.embedded(many, "many dots").source

@@ -61,15 +61,6 @@ def test_halves_of_a_single_flight_judge_each_other(flights):
     assert first.effects.effects[0].values != second.effects.effects[0].values
 
 
-def test_parts_of_a_flight_are_judged_by_the_errors_within_them(flights):
-    single = attribute(flights[:1], TRUTH, undeclared=False)
-    cases, run = cross_fitted(single, flights[:1], NONE, (), ()), Baseline(NONE).run(flights[0])
-    parts, whole = [score(case, run) for case in cases], score(replace(cases[0], spans=None), run)
-    assert 0.9 * len(whole.t) < sum(len(part.t) for part in parts) <= len(whole.t) + 1
-    assert set(np.concatenate([part.error for part in parts])[:, 0]) <= set(whole.error[:, 0])
-    assert not any(part.row()["diverged"] for part in parts)
-
-
 def test_what_helps_is_kept_and_said_what_it_is_worth(flights, attribution):
     kept = select_by_error(attribution, flights, Baseline(NONE))
     assert kept.selection.chosen == attribution.selection.chosen and not kept.refused
@@ -171,11 +162,6 @@ def test_noise_that_the_filter_should_know_of_is_kept_and_noise_that_it_should_n
     assert kept.detections == () and "does not make the filter better" in kept.refused[-1].why
 
 
-def test_a_trial_is_judged_by_the_figure_of_the_whole_row(flights):
-    judged = score(ValidationCase(flights[0], NONE), run_offline(flights[0]))
-    assert judged.rmse_3d == judged.row()["rmse_3d"] > 0.0
-
-
 def test_a_run_corrected_at_the_poses_of_the_run_itself_is_that_run(flights):
     effects = EffectSet((AnchorDelay({"1": 0.3}), TagLeverArm({"x": 0.1, "z": 0.1})))
     run = run_offline(flights[0], None, Corrector(flights[0].anchors, effects))
@@ -183,27 +169,6 @@ def test_a_run_corrected_at_the_poses_of_the_run_itself_is_that_run(flights):
         flights[0], None, FixedPoseCorrector(flights[0].anchors, effects, poses_of(run.odometry))
     )
     np.testing.assert_allclose(again.odometry.p, run.odometry.p, atol=1e-9)
-
-
-def test_a_run_corrected_at_the_poses_of_another_model_is_nearly_the_run(flights):
-    moved, anchors = (
-        EffectSet((EFFECTS["anchor_position"]({"3.x": 0.3, "5.z": -0.3}),)),
-        flights[0].anchors,
-    )
-    without = run_offline(flights[0], None, Corrector(anchors))
-    run = run_offline(flights[0], None, Corrector(anchors, moved))
-    at_poses = run_offline(
-        flights[0], None, FixedPoseCorrector(anchors, moved, poses_of(without.odometry))
-    )
-    away, apart = (
-        np.mean(np.abs(other.odometry.p - run.odometry.p)) for other in (at_poses, without)
-    )
-    assert away < 0.1 * apart
-
-
-def test_a_baseline_runs_each_flight_once(flights):
-    baseline = Baseline(NONE)
-    assert baseline.run(flights[0]) is baseline.run(flights[0]) is not baseline.run(flights[1])
 
 
 def test_before_and_after_with_intervals(flights):

@@ -97,32 +97,6 @@ def test_no_input_is_a_fault(tmp_path, with_network):
     assert (results["wrong"] == 0).any() and results["bias"].any()
 
 
-def test_nothing_to_correct_is_zero(tmp_path):
-    write(tmp_path, vehicle_code(ANCHORS, EffectSet()))
-    results = on_host(tmp_path, cases(100), SANITIZED)
-    assert not any(results[name].any() for name in results.dtype.names)
-
-
-@needs_board
-def test_the_board_computes_the_same_bits(tmp_path):
-    """Where C's library is not involved: +, -, *, / and the square root."""
-    network = c.network(tmp_path, orientations=False)
-    names = [name for name in c.COMMON if name != "spline over elevation"]
-    code, some = vehicle_code(ANCHORS, chosen(*names)), cases(1000)
-    write(tmp_path, code)
-    flags = ("-Os", "-std=c99", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off")
-    results, _ = on_board(tmp_path, some, flags)
-    bias, std = by_numpy(code, some)
-    np.testing.assert_array_equal(results["bias"], bias)
-    np.testing.assert_array_equal(results["std"], std)
-    write(tmp_path / "network", vehicle_code(ANCHORS, EffectSet(), network))
-    there, here = (
-        on_board(tmp_path / "network", some, flags)[0],
-        on_host(tmp_path / "network", some),
-    )
-    np.testing.assert_allclose(there["bias"], here["bias"], atol=1e-5)  # its angles are of libm
-
-
 @needs_board
 def test_the_board_agrees_with_the_flags_of_the_firmware(tmp_path):
     network, some = c.network(tmp_path), cases(1000)
@@ -144,34 +118,3 @@ def test_it_fits_a_small_vehicle(tmp_path):
     learned = c.cost_of(tmp_path / "network", vehicle_code(ANCHORS, EffectSet(), network))
     assert learned["most"] <= 15_000 and learned["flash"] <= 13 * 1024
     assert learned["ram"] <= 2048
-
-
-LOOP = """
-#include "uwb_bias.h"
-int uwb_bias(int a, int b, const uwb_bias_state *state, float *bias, float *std) {
-    int left = 1000 * (a + 1); /* loops of two instructions */
-    (void)b; (void)state;
-    *bias = *std = 0.0f;
-    __asm__ volatile("1: subs %0, #1\\n bne 1b" : "+r"(left) : : "cc");
-    return 0;
-}
-int uwb_bias_jacobian(int a, int b, const uwb_bias_state *state, float jacobian[6], float *curved) {
-    (void)a; (void)b; (void)state; (void)jacobian;
-    *curved = 0.0f;
-    return 0;
-}
-"""
-
-
-@needs_board
-def test_the_emulator_counts_instructions(tmp_path):
-    """A known number of them, to 1 %; and twice the same."""
-    code, some = vehicle_code(ANCHORS, EffectSet()), cases(64)
-    some["a"] = np.arange(64) % 8
-    write(tmp_path, code)
-    (tmp_path / "uwb_bias.c").write_text(LOOP)
-    one, other = (on_board(tmp_path, some)[1] for _ in range(2))
-    assert one == other
-    per_tick = 1e9 / c.CLOCK
-    assert one["ticks"][0] * per_tick / 64 == pytest.approx(2 * 1000 * 4.5, rel=0.01)
-    assert one["most"][0] * per_tick == pytest.approx(2 * 1000 * 8, rel=0.01)

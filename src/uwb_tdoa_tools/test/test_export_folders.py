@@ -23,17 +23,6 @@ def texts(folder):
     return {str(path.relative_to(folder)): path.read_text() for path in found}
 
 
-@pytest.mark.skipif(GCC is None, reason="no C compiler (gcc)")
-def test_a_folder_of_c_holds_what_the_graph_holds(tmp_path):
-    held = chosen("anchor_delay", "turning")
-    gyro = EFFECTS["gyro_bias"]({"z": 0.01})
-    write_c(tmp_path / "c", trace(ANCHORS, EffectSet((*held, gyro))))
-    assert set(texts(tmp_path / "c")) == {"uwb_bias.h", "uwb_bias.c"}
-    some = cases(100)
-    results = on_host(tmp_path / "c", some)
-    np.testing.assert_allclose(results["bias"], held.bias(c.samples_of(some)), atol=1e-5)
-
-
 def test_the_build_for_a_crazyflie_names_what_its_filter_does_not_estimate(tmp_path):
     traced = trace(SMALL_IDS, chosen("anchor_delay", "turning", "accelerating"))
     left = write_crazyflie(tmp_path / "app", traced)
@@ -101,10 +90,3 @@ def _with_ids(some):
     for end in "ab":
         out[end] = ANCHORS.ids[some[end]]
     return out
-
-
-def test_a_target_must_be_named(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    SMALL_IDS.to_yaml("anchors.yaml")
-    assert export.main(["--survey", "anchors.yaml", "--effects", "effects.yaml"]) == 2
-    assert "--onnx, --c, --crazyflie: all are missing" in capsys.readouterr().err

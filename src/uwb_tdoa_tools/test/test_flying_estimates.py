@@ -145,14 +145,6 @@ def test_libraries_that_are_none(tmp_path):
         estimates.Peer(built(tmp_path / "less", SOURCE.replace("tdoa_peer_position", "position")))
 
 
-def test_the_documented_interface_is_the_one_that_is_called():
-    page = (ROOT / "docs" / "notebook" / "speed.md").read_text()
-    declared = [line for line in estimates.__doc__.splitlines() if line.startswith("    ")]
-    assert len(declared) == 6 and all(
-        line.strip().partition(";  ")[0].split("(")[0] in page for line in declared
-    )
-
-
 def test_the_stand_in_for_matrices_inverts_and_multiplies(tmp_path):
     (tmp_path / "inverse.c").write_text(
         '#include "arm_math.h"\n'

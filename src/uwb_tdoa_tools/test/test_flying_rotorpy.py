@@ -1,7 +1,4 @@
-"""The vehicle beside an oracle: rotorpy's Crazyflie 2, where it is installed (pip install rotorpy).
-
-python src/uwb_tdoa_tools/test/test_flying_rotorpy.py        # prints how far they are apart
-"""
+"""The vehicle beside an oracle: rotorpy's Crazyflie 2, where it is installed (pip install rotorpy)."""
 
 import numpy as np
 import pytest
@@ -89,12 +86,3 @@ def test_two_seconds_of_tumbling_agree_to_a_tenth_of_a_millimetre(seed):
     p, v, angle, w, fastest = apart(seed)
     assert fastest > 5.0
     assert p < 1e-4 and v < 1e-3 and angle < 1e-3 and w < 1e-2
-
-
-if __name__ == "__main__":
-    every = np.array([apart(seed) for seed in range(20)])
-    for what, column in zip(
-        ("position, m", "velocity, m/s", "attitude, rad", "rate, rad/s", "(fastest rate, rad/s)"),
-        every.T,
-    ):
-        print(f"{what:22s} median {np.median(column):.2e}, largest {column.max():.2e}")

@@ -11,7 +11,6 @@ from uwb_tdoa_bias.common.flight import Truth
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools.commands.fly import main
 from uwb_tdoa_tools.flying import rover
-from uwb_tdoa_tools.flying.fleet import drawn_flight
 from uwb_tdoa_tools.flying.mission import DONE, FLYING, LOST, REFUSED, Rules, Waypoints
 from uwb_tdoa_tools.flying.trial import Task
 from uwb_tdoa_tools.flying.verdict import summary, text, verdict_of
@@ -47,21 +46,6 @@ def test_it_arrives_and_the_verdict_is_that_of_its_truth(drives):
     summed = summary(verdicts)
     assert summed["arrived"] == summed["safe"] == summed["flights"] == len(SEEDS)
     assert "3 of 3 arrived" in text(summed) and "largest distance to the path" in text(summed)
-
-
-def test_what_is_drawn_is_wanted_on_the_path(drives):
-    picture = drawn_flight(drives[0], verdict_of(drives[0]))
-    wanted = picture.wanted[np.isfinite(picture.wanted).all(axis=1)]
-    path = drives[0].missions[0].path
-    assert len(wanted) > 100
-    off = np.linalg.norm(wanted - path.at(path.nearest(wanted[:, :2])), axis=1)
-    assert off.max() < 0.03  # of corners, between samples
-
-
-def test_the_same_task_is_the_same_drive(drives):
-    again = rover.drive(drives[0].task)
-    np.testing.assert_array_equal(again.states, drives[0].states)
-    np.testing.assert_array_equal(again.odometry.p, drives[0].odometry.p)
 
 
 def test_wheels_say_more_or_less_than_is_true_and_the_imu_what_is():

@@ -1,17 +1,205 @@
+"""A flight of `fly`: what its sensors say, and how it goes."""
+
 from dataclasses import replace
 
 import known_answer
 import numpy as np
 import pytest
 
+from uwb_tdoa_bias.common.flight import Imu, Tdoas
+from uwb_tdoa_bias.common.radio import arrival_bias
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_tools.flying.mission import DONE, REFUSED, Circles, Rules
+from uwb_tdoa_tools.flying.mission import DONE, Circles, Rules
+from uwb_tdoa_tools.flying.sensors import SENSOR_NAMES, InertialErrors, Radio, gusts
+from uwb_tdoa_tools.flying.simulator import IMU_RATE, SensorReadings, Transport
 from uwb_tdoa_tools.flying.trial import Task, fly
 from uwb_tdoa_tools.flying.verdict import verdict_of
 from uwb_tdoa_tools.flying.world import HALL, WORLDS
 from uwb_tdoa_tools.scoring.metrics import position_at
 from uwb_tdoa_tools.simulation.config import NO_IMU_ERRORS
 from uwb_tdoa_tools.simulation.inject import parse_effect
+from uwb_tdoa_tools.simulation.rooms import constellation
+from uwb_tdoa_tools.simulation.tdoas import tag_link
+
+# --- flying sensors ---
+
+
+CLEAN = replace(HALL, floor_effect=False, noise=0.0, outlier_share=0.0, delay=0.0, bearing_bias=0.0)
+HIGH, LEVEL = np.array([0.5, 0.3, 1.2]), np.array([0.0, 0.0, 0.0, 1.0])
+
+
+def residual(world, p=HIGH, seed=0, duration=20.0, schedule_faults=(np.inf, np.inf)):
+    """(Radio, what each TDOA has beside geometry (n,) m) at one place."""
+    radio = Radio(world, seed, duration)
+    radio.schedule_faults(*schedule_faults)
+    d = radio.measured(
+        slice(0, len(radio.t)), *(np.tile(one, (len(radio.t), 1)) for one in (p, LEVEL))
+    )
+    distance = np.linalg.norm(p - radio.positions, axis=1)
+    return radio, d - (distance[radio.b] - distance[radio.a])
+
+
+def test_a_clean_world_is_geometry_alone():
+    radio, rest = residual(CLEAN)
+    np.testing.assert_allclose(rest, 0.0, atol=1e-12)
+    assert len(radio.t) / 20.0 == pytest.approx(360.0, rel=0.02)
+
+
+def test_the_rate_is_as_asked_for_with_either_protocol():
+    radio = Radio(WORLDS["tdoa3"], 0, 60.0)
+    assert len(radio.t) / 60.0 == pytest.approx(240.0, rel=0.05)
+    assert len(np.unique(radio.a * 8 + radio.b)) == 56
+
+
+def test_noise_and_outliers_are_as_large_as_asked_for():
+    assert residual(replace(CLEAN, noise=0.08))[1].std() == pytest.approx(0.08, rel=0.03)
+    _, rest = residual(replace(CLEAN, outlier_share=0.03, outlier_size=2.5))
+    hit = rest[np.abs(rest) > 1e-9]
+    assert len(hit) / len(rest) == pytest.approx(0.03, rel=0.2) and np.abs(hit).max() <= 2.5
+    _, rest = residual(replace(CLEAN, outlier_share=0.1, outlier_size=0.0))
+    kinds = [
+        np.mean((np.abs(rest) > low) & (np.abs(rest) <= high))
+        for low, high in ((0.4, 0.6), (3.0, 5.0), (20.0, 250.0))
+    ]
+    np.testing.assert_allclose(kinds, [0.06, 0.03, 0.01], rtol=0.25)
+
+
+def test_low_anchors_are_late_or_not_up_to_their_own_height():
+    world = replace(CLEAN, floor_effect=True)
+    radio = Radio(world, 0, 1.0)
+    late, limit, _ = radio.floor.of_each(world.anchors)
+    low = radio.positions[:, 2] < 1.0
+    assert ((late[low] >= 3.0) & (late[low] <= 3.9)).all() and (late[~low] == 0.0).all()
+    assert ((limit[low] >= 0.06) & (limit[low] <= 0.2)).all()
+    for height, share in ((0.03, 1.0), (0.31, 0.0), (float(limit[2]), 0.5)):
+        radio, rest = residual(world, np.array([0.5, 0.3, height]), duration=60.0)
+        first = 2  # low, after a high one
+        mine = (radio.b == first) & ~low[radio.a]
+        hit = rest[mine] > 1.0
+        assert hit.mean() == pytest.approx(share, abs=0.05)
+        np.testing.assert_allclose(rest[mine], np.where(hit, late[first], 0.0), atol=1e-12)
+
+
+def test_an_installation_is_the_same_in_every_flight():
+    same, own = replace(HALL, installation=7), HALL
+    for world, alike in ((same, True), (own, False)):
+        first, second = Radio(world, 0, 5.0), Radio(world, 1, 5.0)
+        assert (
+            np.array_equal(first.constants, second.constants) == alike
+            and (first.floor.values == second.floor.values) == alike
+        )
+        assert not np.array_equal(first.t[:100], second.t[:100])
+
+
+def test_antennas_make_late_what_they_make_late_in_simulate():
+    world = replace(CLEAN, layout=constellation("pillars"), antennas=True)
+    radio, rest = residual(world, seed=4)
+    late = arrival_bias(
+        HIGH, LEVEL, world.anchors.positions, world.anchors.orientations, tag_link(4)
+    )
+    assert len(late) == 12 and np.ptp(late) > 0.03
+    np.testing.assert_allclose(rest, late[radio.b] - late[radio.a], atol=1e-12)
+    turned = replace(
+        world, layout=replace(world.layout, orientations=world.layout.orientations[::-1])
+    )
+    assert np.abs(residual(turned, seed=4)[1] - rest).max() > 0.01
+
+
+def test_a_silence_is_one():
+    radio, rest = residual(replace(CLEAN, silence=("circle", 3.0)), schedule_faults=(5.0, np.inf))
+    silent = (radio.t >= 5.0) & (radio.t < 8.0)
+    assert np.isnan(rest[silent]).all() and np.isfinite(rest[~silent]).all()
+
+
+@pytest.mark.parametrize("change", ["late", "silent"])
+def test_one_anchor_changes_from_then_on(change):
+    radio, rest = residual(replace(CLEAN, change=change), schedule_faults=(np.inf, 10.0))
+    mine = (radio.t >= 10.0) & ((radio.a == radio.other) | (radio.b == radio.other))
+    np.testing.assert_allclose(rest[~mine], 0.0, atol=1e-12)
+    if change == "silent":
+        assert np.isnan(rest[mine]).all()
+    else:
+        np.testing.assert_allclose(rest[mine], np.where(radio.b[mine] == radio.other, 0.3, -0.3))
+
+
+def test_a_person_blocks_what_passes_through_him_for_a_while():
+    _, rest = residual(replace(CLEAN, person=True), duration=120.0)
+    hit = np.abs(rest) > 1e-9
+    assert 0.01 < hit.mean() < 0.4 and np.abs(rest).max() < 2.0
+    bursts = np.flatnonzero(np.diff(hit.astype(int)) == 1)
+    assert hit.sum() > 10 * len(bursts) / 8  # they come in bursts, not one by one
+
+
+def test_vibration_is_as_strong_as_asked_for_and_in_its_band():
+    world = replace(HALL, vibration=(0.4, 0.5, 0.35), vibration_band=30.0)
+    shaking = InertialErrors(world, 0, 100.0).shaking
+    np.testing.assert_allclose(shaking.std(axis=0), world.vibration, rtol=1e-6)
+    power = np.abs(np.fft.rfft(shaking[:, 0])) ** 2
+    f = np.fft.rfftfreq(len(shaking), 1.0 / IMU_RATE)
+    assert power[f < 30.0].sum() > 0.8 * power.sum()
+    offset = InertialErrors(replace(world, rectified=1.0), 0, 100.0).shaking.mean(axis=0)
+    np.testing.assert_allclose(np.abs(offset), world.vibration, rtol=0.1)
+
+
+def test_gusts_are_as_strong_as_asked_for_and_slow():
+    wind = gusts(replace(HALL, gust=0.5), 0, 500.0)
+    np.testing.assert_allclose(wind.std(axis=0), 0.5, rtol=0.15)
+    assert np.corrcoef(wind[:-40, 0], wind[40:, 0])[0, 1] == pytest.approx(np.exp(-0.1), abs=0.03)
+
+
+def test_other_sensors_say_what_is_true_but_for_their_noise():
+    world, rows = replace(HALL, height_noise=0.01), slice(0, 100)
+    p, q, v = (
+        np.tile(HIGH, (100, 1)),
+        np.tile([np.sin(0.1), 0.0, 0.0, np.cos(0.1)], (100, 1)),
+        np.ones((100, 3)),
+    )
+    sensors = {name: kind(world, 0, 10.0) for name, kind in SENSOR_NAMES.items()}
+    (height,) = sensors["height"].measured(rows, p, q, v, p[:, 2] - 0.2)
+    assert height.mean() == pytest.approx(
+        1.0 / np.cos(0.2), abs=0.005
+    ) and height.std() == pytest.approx(0.01, rel=0.3)
+    assert np.isinf(sensors["height"].measured(rows, p, q, v, p[:, 2] + 4.0)[0]).all()
+    speed, std = sensors["velocity"].measured(rows, p, q, v, p[:, 2])
+    np.testing.assert_allclose(speed.mean(axis=0), 1.0, atol=0.02)
+    assert (std == 0.05).all()
+    assert len(sensors["height"].t) == 200 and len(sensors["pressure"].t) == 250
+    ids, d, variance = sensors["range"].measured(slice(50, 150), p, q, v, p[:, 2])
+    assert (
+        len(sensors["range"].t) == 1000
+        and ids.tolist() == np.resize(world.anchors.ids, 150)[50:].tolist()
+        and not variance.any()
+    )
+    off = d - np.linalg.norm(p - world.anchors.positions[world.anchors.index(ids)], axis=1)
+    assert abs(off.mean()) < 0.04 and off.std() == pytest.approx(0.1, rel=0.3)
+
+
+def test_what_takes_its_time_arrives_in_order_and_whole():
+    def sent(k):
+        t = 0.01 * k + 0.0025 * np.arange(1, 5)
+        return SensorReadings(
+            Imu(t, np.zeros((4, 3)), np.zeros((4, 3))),
+            Tdoas(t, np.zeros(4, int), np.ones(4, int), t),
+            {},
+        )
+
+    transport, came = Transport(0.05, 0.01, np.random.default_rng(0)), []
+    for k in range(200):
+        now = 0.01 * (k + 1)
+        arrived = transport.arrived(sent(k), now)
+        assert (arrived.imu.t <= now - 0.05 + 1e-9).all() and (
+            arrived.tdoa.t == arrived.tdoa.d
+        ).all()
+        came.append(arrived.imu.t)
+    came = np.concatenate(came)
+    np.testing.assert_allclose(came, 0.0025 * np.arange(1, len(came) + 1))
+    assert 2.0 - came[-1] == pytest.approx(0.07, abs=0.04)
+    at_once = Transport(0.0, 0.0, np.random.default_rng(0))
+    assert len(at_once.arrived(sent(0), 0.01).imu) == 4
+
+
+# --- flying trial ---
+
 
 SHORT = Circles(turns=1)
 PLAIN = replace(HALL, floor_effect=False)
@@ -135,21 +323,3 @@ def test_every_world_can_be_flown_in(name):
         and len(flown.flight.velocity)
     )
     assert flown.flight.truth.p[0, 2] == pytest.approx(world.table + 0.03, abs=0.005)
-
-
-def test_near_the_floor_low_anchors_are_late_one_by_one():
-    flown = fly(Task(HALL, seed=0, rules=Rules(rest=1.0, patience=0.5, arm=1e-6)))
-    assert flown.missions[0].state == REFUSED and verdict_of(flown)["why"] == "refused to arm"
-    tdoa, anchors = flown.flight.tdoa, flown.flight.anchors
-    low = anchors.positions[:, 2] < 1.0
-    p = flown.flight.truth.p[-1]
-    a, b = anchors.index(tdoa.a), anchors.index(tdoa.b)
-    residual = tdoa.d - (
-        np.linalg.norm(p - anchors.positions[b], axis=1)
-        - np.linalg.norm(p - anchors.positions[a], axis=1)
-    )
-    late = [
-        np.median(residual[(low[b] == of_b) & (low[a] == of_a)])
-        for of_b, of_a in ((True, False), (False, True))
-    ]
-    assert late[0] == pytest.approx(3.45, abs=0.5) and late[1] == pytest.approx(-3.45, abs=0.5)

@@ -3,8 +3,6 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.sensors import DIAGNOSED, measured_on
-from uwb_tdoa_bias.effects import EFFECTS, RADIO, EffectSet, true_samples
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands.inject import main
 from uwb_tdoa_tools.readers import read_flight
@@ -30,44 +28,6 @@ def flight():
         )
     )
     return with_yaw_rate(flown, 0.0)
-
-
-def example(effect):
-    if effect.name == "nlos":
-        return effect({"2.delay": 0.3, "2.start": 5.0, "2.end": 10.0})
-    if effect.name == "anchor_ids":
-        return effect({"1": 4, "4": 1})
-    return effect({effect.example: -1.0 if effect.name == "pair_sign" else 0.05})
-
-
-@pytest.mark.parametrize("effect", EFFECTS.values())
-def test_injected_effect_is_what_the_model_takes_out(flight, effect):
-    effect = example(effect)
-    changed = effect.inject(flight, np.random.default_rng(1))
-    streams = [
-        (flight.tdoa.t, changed.tdoa.t),
-        (flight.tdoa.d, changed.tdoa.d),
-        (flight.truth.t, changed.truth.t),
-    ]
-    streams += [
-        (flight.tdoa.a, changed.tdoa.a),
-        (flight.imu.gyro, changed.imu.gyro),
-        (flight.imu.accel, changed.imu.accel),
-    ]
-    for channel in DIAGNOSED:
-        before, after = (measured_on(one, channel) for one in (flight, changed))
-        streams += [(before.t, after.t), (before.values, after.values)]
-    assert any(not np.array_equal(before, after) for before, after in streams)
-    if effect.name in ("noise_level", "noise_correlation", "outlier_rate"):
-        return  # nothing to take out
-    corrected = EffectSet((effect,)).correct_streams(changed)
-    for channel, kind in RADIO.items():
-        samples, rows = true_samples(corrected, kind)
-        d = getattr(corrected, channel).d[rows] - EffectSet((effect,)).bias(samples)
-        np.testing.assert_allclose(d, samples.predicted(), atol=2e-3)
-    np.testing.assert_allclose(corrected.imu.gyro, flight.imu.gyro, atol=1e-9)
-    tilt = 0.2 if effect.name == "imu_gravity" else 0.0  # rad, which its correction neglects
-    np.testing.assert_allclose(corrected.imu.accel, flight.imu.accel, atol=1e-9 + 0.05 * tilt)
 
 
 def test_noise_has_the_size_asked_for(flight):

@@ -8,7 +8,7 @@ import time
 
 import numpy as np
 import pytest
-from recordings import ANCHORS, ROWS, SURVEY, log_bytes, small_flight
+from recordings import ROWS, SURVEY, log_bytes, small_flight
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import read_arrays, read_bytes, temporary_folder
@@ -132,17 +132,6 @@ def test_nothing_there_is_bad_input(tmp_path):
         find_flights([tmp_path / "empty"])
 
 
-def test_flights_are_read_with_their_survey(tmp_path):
-    for name in ("one", "two"):
-        (tmp_path / name).write_bytes(log_bytes())
-    (tmp_path / "surveys").mkdir()
-    survey = tmp_path / "surveys" / "here.csv"
-    survey.write_text(SURVEY)
-    flights = Reading(survey).flights([tmp_path / "one", tmp_path / "two"])
-    assert [flight.name for flight in flights] == ["one", "two"]
-    np.testing.assert_array_equal(flights[1].anchors.positions, ANCHORS.positions)
-
-
 def test_of_more_flights_than_are_to_be_held_some_are_drawn(tmp_path, capsys, monkeypatch):
     paths = [tmp_path / f"flight-{k}" for k in range(9)]
     for path in paths:
@@ -169,22 +158,6 @@ def test_what_is_missing_in_a_recording_is_told(tmp_path, capsys):
         Reading(tmp_path / "survey.csv").one(tmp_path / "cut")
     flight = Reading(tmp_path / "survey.csv", salvage=True).one(tmp_path / "cut")
     assert len(flight.tdoa) == 2 and "cut: cut or damaged: " in capsys.readouterr().err
-
-
-def test_every_measured_recording_finds_its_survey(shared_data):
-    folders = [shared_data / "flights", shared_data / "util"]
-    found = find_flights(folders, shared_data / "surveys")
-    assert {path for path, _ in found} == {
-        file for folder in folders for file in folder.rglob("*") if file.is_file()
-    }
-    for path, survey in found:
-        key = survey.stem.removeprefix("anchor_")
-        day = (
-            path.relative_to(shared_data / "flights").parts[0]
-            if "flights" in path.parts
-            else path.name.split("-")[0]
-        )
-        assert key == day
 
 
 def test_a_bag_without_anchors_takes_the_survey_that_is_given(tmp_path):

@@ -112,14 +112,6 @@ def ours(module, top_only=False):
     return {name for name in imports(module, top_only) if name in modules()}
 
 
-def test_the_walk_sees_what_there_is():
-    assert "uwb_tdoa_bias.common.errors" in imports("uwb_tdoa_tools.cli")
-    assert "uwb_tdoa_tools.options" in imports("uwb_tdoa_tools.commands.train")
-    assert "rclpy" in imports("uwb_tdoa_tools.planning.report")
-    assert "rclpy" not in imports("uwb_tdoa_tools.planning.report", True)
-    assert len(modules()) > 120
-
-
 def test_relative_imports_lead_to_modules():
     """Those in functions too, which fail only when they run."""
     for module, path in modules().items():
@@ -132,20 +124,10 @@ def test_relative_imports_lead_to_modules():
                 )
 
 
-def test_no_library_imports_a_command():
+def test_no_module_imports_a_command():
     for module in modules():
-        if not module.startswith("uwb_tdoa_tools.commands."):
-            assert not {
-                name for name in imports(module) if name.startswith("uwb_tdoa_tools.commands")
-            }, module
-
-
-def test_no_command_imports_another():
-    for module in modules():
-        if module.startswith("uwb_tdoa_tools.commands."):
-            assert not {
-                name for name in imports(module) if name.startswith("uwb_tdoa_tools.commands")
-            }, module
+        commands = [name for name in imports(module) if ".commands" in name]
+        assert not commands, module
 
 
 def test_no_package_imports_one_above():
@@ -339,23 +321,3 @@ def test_commands_are_thin(module):
     assert not re.search(
         r"(?<!\w)print\(|tqdm\.write", text
     )  # cli.show and cli.say make text of others printable
-
-
-def test_the_way_of_a_tdoa_is_as_documented():
-    """Files and functions in the table of architecture.md are there."""
-    text = (SRC.parent / "docs/architecture.md").read_text()
-    section = text.split("## One TDOA, from topic to odometry")[1].split("\n## ")[0]
-    rows = re.findall(r"^\|.*\| `([\w/]+\.py)` \| (.*) \|$", section, re.MULTILINE)
-    for file, names in rows:
-        (path,) = (
-            path for package in PACKAGES[:2] if (path := SRC / package / package / file).exists()
-        )
-        source = path.read_text()
-        for name in re.findall(r"`(\w+)(?:\.(\w+))?`", names):
-            kind = "class" if name[1] else "def"
-            assert re.search(rf"^\s*{kind} {name[0]}\b", source, re.MULTILINE), (file, name)
-            assert not name[1] or re.search(rf"^    def {name[1]}\b", source, re.MULTILINE), (
-                file,
-                name,
-            )
-    assert len(rows) > 20

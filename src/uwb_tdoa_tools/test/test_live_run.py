@@ -10,13 +10,6 @@ from uwb_tdoa_ekf.results import VERDICTS  # noqa: E402
 from uwb_tdoa_tools.live import run as live  # noqa: E402
 
 
-def test_parameters_are_yaml_whatever_they_hold():
-    arguments = live._parameters("ekf_node", {"file": "/a: b", "use_imu": False, "lag": 0.25})
-    assert arguments[0] == "--ros-args"
-    assert set(arguments[1::2]) == {"-p"}
-    assert {'file:="/a: b"', "use_imu:=false", "lag:=0.25"} <= set(arguments[2::2])
-
-
 def test_the_nodes_wait_for_a_slow_replay():
     arguments = live._parameters("bias_node", None)
     assert "hold:=9.975" in arguments

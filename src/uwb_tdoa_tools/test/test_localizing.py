@@ -13,7 +13,6 @@ from uwb_tdoa_tools.commands import evaluate, localize
 from uwb_tdoa_tools.estimate import FlightEstimator
 from uwb_tdoa_tools.localizing import assessment, residuals
 from uwb_tdoa_tools.localizing.localize import check_names, name_of, write_tum
-from uwb_tdoa_tools.readers.inputs import Reading, find_flights
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 CLEAN = dict(
@@ -127,31 +126,6 @@ def test_what_is_written_says_the_same(bags, flight, tmp_path, capsys):
         and found["estimates"] == len(odometry)
     )
     assert "flight: good: standard deviation" in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_the_trajectory_of_shared_recordings_is_that_of_evaluate_to_the_bit(shared_data, tmp_path):
-    """Every ninth of the 37 recordings."""
-    folders = [
-        str(path)
-        for path, _ in find_flights(
-            [shared_data / "flights", shared_data / "util"], shared_data / "surveys"
-        )
-    ][::9]
-    survey = ["--survey", str(shared_data / "surveys")]
-    assert evaluate.main([*folders, *survey, "--tum", str(tmp_path / "judged")]) == 0
-    assert localize.main([*folders, *survey, "--out", str(tmp_path / "located")]) in (0, 1)
-    judged = sorted(
-        path for path in (tmp_path / "judged").glob("*.tum") if not path.stem.endswith("_truth")
-    )
-    assert len(judged) == len(folders) == 5
-    for path in judged:
-        assert path.read_bytes() == (tmp_path / "located" / path.name).read_bytes(), path.name
-
-
-def test_a_reading_without_truth_gives_a_flight_without_it(bags):
-    assert Reading(truth=False).one(bags / "true" / "flight.bag").truth is None
-    assert Reading().one(bags / "true" / "flight.bag").truth is not None
 
 
 def test_a_tum_file_has_one_line_per_pose(tmp_path):

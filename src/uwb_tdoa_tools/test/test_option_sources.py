@@ -21,10 +21,8 @@ from uwb_tdoa_tools.commands import (
     diagnose,
     evaluate,
     inject,
-    localize,
     survey,
 )  # noqa: E402
-from uwb_tdoa_tools.diagnosis.references import REFERENCES  # noqa: E402
 from uwb_tdoa_tools.estimate import with_antenna  # noqa: E402
 from uwb_tdoa_tools.evaluating import Evaluator
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate  # noqa: E402
@@ -97,12 +95,6 @@ def test_convert_and_inject_put_the_survey_into_the_bag(desk):
     for bag in ("new.bag", "late.bag"):
         np.testing.assert_allclose(read_bag(bag).anchors.positions, right, atol=1e-9)
     assert not np.allclose(read_bag("flight.bag").anchors.positions, right, atol=0.01)
-
-
-def test_localize_takes_the_survey(desk):
-    for name, more in (("own", []), ("given", ["--survey", "right.yaml"])):
-        localize.main(["flight.bag", "--no-bias", "--out", name, *more])
-    assert (desk / "own" / "flight.tum").read_text() != (desk / "given" / "flight.tum").read_text()
 
 
 @pytest.mark.parametrize(
@@ -195,10 +187,6 @@ def test_options_that_a_reference_does_not_use_are_refused(desk, capsys, referen
         sentence,
         capsys,
     )
-
-
-def test_every_reference_lists_its_unused_options():
-    assert diagnose.UNUSED.keys() == REFERENCES.keys()
 
 
 @pytest.mark.parametrize(

@@ -309,29 +309,6 @@ def test_bad_input_is_told_in_one_sentence(options, says, anchors, tmp_path, mon
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(
-    ("positions", "says"),
-    [
-        ([[0, 0, 1], [4, 0, 1], [4, 4, 1], [0, 4, 1]], "in one plane"),
-        ([[0, 0, 0], [1, 1, 1], [2, 2, 2], [3, 3, 3]], "on one line"),
-        ([[0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 3], [0, 0, 3]], "at one place"),
-        ([[0, 0, 0], [4, 0, 0], [0, 4, 1]], "needs at least 4"),
-        ([[0, 0, 0]], "needs at least 4"),
-    ],
-)
-def test_useless_anchors_are_told_in_one_sentence(positions, says, tmp_path, capsys):
-    Anchors.from_positions(positions).to_yaml(tmp_path / "a.yaml")
-    assert plan.main([str(tmp_path / "a.yaml"), "--out", str(tmp_path / "out")]) == 2
-    err = capsys.readouterr().err
-    assert (
-        err.startswith("plan: error: ")
-        and "anchors" in err
-        and says in err
-        and err.count("\n") == 1
-    )
-    assert not (tmp_path / "out").exists()
-
-
 def test_maps_are_published_to_late_subscribers(anchors, tmp_path):
     rclpy = pytest.importorskip("rclpy")
     pytest.importorskip("uwb_tdoa_msgs")

@@ -1,4 +1,9 @@
+"""Simulated flights: the command, their configuration, rooms and inertial sensors."""
+
+from dataclasses import replace
 import json
+import subprocess
+import sys
 import time
 
 from hypothesis import given, settings
@@ -10,10 +15,113 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.sensors.pressure import altitude_of
-from uwb_tdoa_tools.simulation import SimulationConfig, simulate
+from uwb_tdoa_ekf.offline import run_offline
+from uwb_tdoa_tools.commands import simulate as command
+from uwb_tdoa_tools.simulation import NO_IMU_ERRORS, ImuErrors, SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.config import PROTOCOLS, YAW_PROFILES
 from uwb_tdoa_tools.simulation.paths import TRAJECTORIES
-from uwb_tdoa_tools.simulation.rooms import CONSTELLATIONS, room_of
+from uwb_tdoa_tools.simulation.rooms import CONSTELLATIONS, Walls, constellation, heard_at, room_of
+
+# --- simulate ---
+
+
+SHORT = ["--duration", "20", "--trajectory", "circle"]
+
+
+def test_list_names_everything(capsys):
+    assert command.main(["--list"]) == 0
+    out = capsys.readouterr().out
+    for name in ("rising_circle", "spin", "corners", "planar", "random-SEED"):
+        assert name in out
+
+
+def test_writes_bag_json_and_plot(tmp_path, capsys):
+    bag, report, picture = (
+        tmp_path / "flight.bag",
+        tmp_path / "flight.json",
+        tmp_path / "flight.png",
+    )
+    assert (
+        command.main([*SHORT, "--out", str(bag), "--json", str(report), "--plot", str(picture)])
+        == 0
+    )
+    assert (bag / "metadata.yaml").is_file()
+    content = json.loads(report.read_text())
+    assert content["imu_samples"] == 20_000 and content["config"]["trajectory"] == "circle"
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert str(bag) in capsys.readouterr().out
+
+
+def test_an_existing_bag_is_kept_unless_forced(tmp_path, capsys):
+    bag = tmp_path / "flight.bag"
+    assert command.main([*SHORT, "--out", str(bag)]) == 0
+    before = {path: path.read_bytes() for path in bag.iterdir()}
+    assert command.main([*SHORT, "--seed", "1", "--out", str(bag)]) == 2
+    assert {path: path.read_bytes() for path in bag.iterdir()} == before
+    assert "simulate: error: " in capsys.readouterr().err
+    assert command.main([*SHORT, "--seed", "1", "--out", str(bag), "--force"]) == 0
+    assert {path: path.read_bytes() for path in bag.iterdir()} != before
+
+
+def test_options_reach_the_configuration(tmp_path):
+    report, anchors = tmp_path / "r.json", tmp_path / "a.yaml"
+    SimulationConfig().complete()[0].anchors.to_yaml(anchors)
+    options = (
+        "--protocol tdoa3 --seed 4 --noise 0.02 --shared-noise --no-bias --no-outliers "
+        "--no-multipath"
+    )
+    options += " --perfect-imu --yaw rotating --height 1.1 --speed 0.8 --start-in-air"
+    options += " --height-noise 0.02 --pressure-noise 0.3 --velocity-noise 0.1"
+    options += f" --anchors {anchors} --json {report}"
+    assert command.main([*SHORT, *options.split()]) == 0
+    content = json.loads(report.read_text())
+    config = content["config"]
+    assert {
+        k: config[k]
+        for k in ("protocol", "seed", "noise_std", "shared_noise", "bias", "multipath", "yaw")
+    } == {
+        "protocol": "tdoa3",
+        "seed": 4,
+        "noise_std": 0.02,
+        "shared_noise": True,
+        "bias": False,
+        "multipath": False,
+        "yaw": "rotating",
+    }
+    assert (config["height"], config["speed"], config["outlier_probability"]) == (1.1, 0.8, 0.0)
+    assert [config[f"{stream}_noise"] for stream in ("height", "pressure", "velocity")] == [
+        0.02,
+        0.3,
+        0.1,
+    ]
+    assert config["start_in_air"] and content["parameters"]["take_off"] is None
+    assert set(config["imu_errors"].values()) == {0.0}
+    assert content["bias_std"] == content["multipath_std"] == content["outliers"] == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--duration", "3"], "duration: 3 s"),
+        (["--constellation", "nowhere"], "constellation: 'nowhere'"),
+        (["--speed", "nan"], "speed: nan"),
+        (["--anchors", "missing.yaml"], "missing.yaml"),
+        (["--plot", "picture.docx"], "plot: picture.docx"),
+        (["--json", "no/such/place.json"], "no/such/place.json"),
+        (["--trajectory", "loop"], "invalid choice: 'loop'"),
+        (["--constellation", "six", "--anchors", "a.yaml"], "not allowed with"),
+    ],
+)
+def test_bad_input_is_told_in_one_sentence(options, says, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert command.main([*options, "--out", "flight.bag"]) == 2
+    err = capsys.readouterr().err
+    assert says in err and "Traceback" not in err
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- simulation ---
+
 
 configs = st.builds(
     SimulationConfig,
@@ -176,3 +284,272 @@ def test_height_pressure_and_velocity_are_true_without_noise_and_noisy_as_told()
     assert plain.height is None and plain.pressure is None and plain.velocity is None
     # every part draws from its own stream
     np.testing.assert_array_equal(noisy.tdoa.d, plain.tdoa.d)
+
+
+# --- simulation rooms ---
+
+
+NAMES = [*CONSTELLATIONS, "random-5", "random-1-4", "random-2-64"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_is_a_usable_constellation_that_faces_the_middle(name):
+    anchors = constellation(name)
+    assert (4 <= len(anchors) <= 64) or name == "pair"
+    gaps = np.linalg.norm(anchors.positions[:, None] - anchors.positions, axis=2)[
+        np.triu_indices(len(anchors), 1)
+    ]
+    assert gaps.min() > 0.4
+    front = Rotation.from_quat(anchors.orientations).apply([1.0, 0.0, 0.0])
+    inwards = -(anchors.positions - anchors.positions.mean(axis=0))
+    assert (np.sum(front[:, :2] * inwards[:, :2], axis=1) > 0.0).all()
+    low, high = room_of(anchors).flyable
+    assert (high - low > 1.0).all()
+
+
+def test_corners_are_like_the_surveyed_ones():
+    anchors = constellation("corners")
+    np.testing.assert_allclose(np.ptp(anchors.positions[:, :2], axis=0), [7.0, 8.0])
+    assert np.count_nonzero(anchors.positions[:, 2] < 0.5) == 4
+    up = Rotation.from_quat(anchors.orientations).apply([0.0, 0.0, 1.0])
+    np.testing.assert_allclose(
+        up[:, 2], np.where(anchors.positions[:, 2] < 0.5, 1.0, -1.0), atol=1e-12
+    )
+
+
+def test_random_is_seeded():
+    one, same, other = (
+        constellation("random-7-12"),
+        constellation("random-7-12"),
+        constellation("random-8-12"),
+    )
+    assert len(one) == 12
+    np.testing.assert_array_equal(one.orientations, same.orientations)
+    assert np.abs(one.positions - other.positions).max() > 0.1
+
+
+@pytest.mark.parametrize("name", ["nowhere", "random", "random-x", "random-1-3", "random-1-65", ""])
+def test_unknown_names_are_refused(name):
+    with pytest.raises(InputError, match="^constellation: "):
+        constellation(name)
+
+
+ACROSS = Walls(((4.0, -10.0, 4.0, 2.0, np.inf),))
+SHELF = Walls(((4.0, -10.0, 4.0, 20.0, 3.0),))
+
+
+def hall_of_cells():
+    """32 Anchors in 28 x 14 m, whose ids are 256 times the number of their cell of 16, and 0 ...
+    15.
+    """
+    x, y = np.meshgrid(np.arange(8) * 4.0, np.arange(4) * 14.0 / 3.0)
+    positions = np.column_stack([x.ravel(), y.ravel(), np.tile([0.5, 3.0, 5.5, 4.0], 8)])
+    right = positions[:, 0] > 14.0
+    ids = np.where(right, 256, 0) + np.where(right, np.cumsum(right), np.cumsum(~right)) - 1
+    return Anchors.from_positions(positions, ids)
+
+
+def flown(**kind):
+    config = SimulationConfig(
+        anchors=hall_of_cells(),
+        bias=False,
+        protocol="tdoa3",
+        duration=20.0,
+        start_in_air=True,
+        radio_reach=12.0,
+        **kind,
+    )
+    return simulate(config)
+
+
+@pytest.mark.parametrize(
+    "walls, p, q, blocked",
+    [
+        (ACROSS, (0, 0, 1), (8, 0, 1), True),
+        (ACROSS, (0, 6, 1), (8, 6, 1), False),  # past its end
+        (ACROSS, (0, 0, 1), (3, 0, 1), False),  # this side of it
+        (ACROSS, (5, 0, 1), (8, 0, 1), False),
+        (ACROSS, (4, -20, 1), (4, 20, 1), False),  # along it
+        (ACROSS, (0, 0, 100), (8, 0, 100), True),
+        (SHELF, (0, 0, 1), (8, 0, 4), True),
+        (SHELF, (0, 0, 1), (8, 0, 6), False),  # over it
+    ],
+)
+def test_a_wall_stands_between(walls, p, q, blocked):
+    for one, other in ((p, q), (q, p)):
+        assert walls.between(np.array([one], float), np.array([other], float)).tolist() == [blocked]
+
+
+def test_nothing_is_heard_through_a_wall(monkeypatch):
+    monkeypatch.setattr("uwb_tdoa_tools.simulation.rooms.AT_ONCE", 100)
+    anchors, walls = hall_of_cells(), Walls(((15.0, -1.0, 15.0, 20.0, np.inf),))
+    p = np.random.default_rng(0).uniform((0.0, 0.0, 0.0), (28.0, 14.0, 3.0), (50, 3))
+    far = np.linalg.norm(p[:, None] - anchors.positions, axis=2) > 12.0
+    behind = (p[:, None, 0] > 15.0) != (anchors.positions[:, 0] > 15.0)
+    for rows, blocked in zip(heard_at(p, anchors.positions, 12.0, walls), far | behind):
+        np.testing.assert_array_equal(rows, np.flatnonzero(~blocked))
+
+
+def test_a_flight_hears_nothing_through_walls():
+    walls = Walls(((14.0, -1.0, 14.0, 20.0, np.inf),))
+    flight = flown(walls=walls)
+    place = np.column_stack(
+        [np.interp(flight.tdoa.t, flight.truth.t, column) for column in flight.truth.p.T]
+    )
+    for ids in (flight.tdoa.a, flight.tdoa.b):
+        assert not walls.between(place, flight.anchors.positions[flight.anchors.index(ids)]).any()
+    assert np.ptp(place[:, 0]) > 5.0 and flight.meta["config"]["walls"] == [
+        [14.0, -1.0, 14.0, 20.0]
+    ]
+    assert walls.between(
+        place, flown().anchors.positions[flown().anchors.index(flown().tdoa.a[: len(place)])]
+    ).any()
+
+
+def test_cells_that_use_the_same_ids_have_clocks_of_their_own():
+    flight = flown(cell_ids=256)
+    assert set(flight.anchors.ids % 256) == set(range(16))
+    np.testing.assert_array_equal(flight.tdoa.a // 256, flight.tdoa.b // 256)
+    assert set(flight.tdoa.a // 256) == {0, 1}
+    assert (flown().tdoa.a // 256 != flown().tdoa.b // 256).any()
+
+
+def test_a_tag_among_cells_is_found():
+    flight = flown(cell_ids=256)
+    odometry = run_offline(flight).odometry
+    place = np.column_stack(
+        [np.interp(odometry.t, flight.truth.t, column) for column in flight.truth.p.T]
+    )
+    assert np.linalg.norm(odometry.p - place, axis=1)[odometry.t > 5.0].max() < 0.5
+
+
+@pytest.mark.parametrize(
+    "text, wrong",
+    [
+        ("walls: []", "no list 'walls'"),
+        ("[1, 2]", "no list 'walls'"),
+        ("walls: [[0, 0, 1]]", "number 1 is"),
+        ("walls: [[0, 0, 1, 1], [2, 2, 2, 2]]", "number 2 is"),
+        ("walls: [[0, 0, x, 1]]", "number 1 is"),
+    ],
+)
+def test_what_is_no_wall_is_refused(tmp_path, text, wrong):
+    (tmp_path / "walls.yaml").write_text(text)
+    with pytest.raises(InputError, match=wrong):
+        Walls.from_yaml(tmp_path / "walls.yaml")
+
+
+def test_walls_of_a_file(tmp_path):
+    (tmp_path / "walls.yaml").write_text("walls:\n- [0, 1, 2.5, 3]\n- [0, 1, 2, 3, 4]\n")
+    assert Walls.from_yaml(tmp_path / "walls.yaml").segments == (
+        (0.0, 1.0, 2.5, 3.0, np.inf),
+        (0.0, 1.0, 2.0, 3.0, 4.0),
+    )
+
+
+@pytest.mark.parametrize(
+    "kind, wrong",
+    [
+        ({"walls": ACROSS}, "radio_reach"),
+        ({"cell_ids": 256}, "radio_reach"),
+        ({"cell_ids": 1, "radio_reach": 9.0}, "cell_ids"),
+    ],
+)
+def test_what_does_not_fit_together_is_refused(kind, wrong):
+    with pytest.raises(InputError, match=wrong):
+        SimulationConfig(**kind)
+
+
+# --- simulation sensors ---
+
+
+CONFIG = SimulationConfig(trajectory="hover", duration=30.0)
+
+
+def errors_of(imu_errors, **change):
+    """The errors of both sensors, (gyro (n, 3), accel (n, 3)), and the flight."""
+    config = replace(CONFIG, imu_errors=imu_errors, **change)
+    flight, exact = (
+        simulate(config),
+        simulate(replace(config, imu_errors=NO_IMU_ERRORS)),
+    )
+    return flight.imu.gyro - exact.imu.gyro, flight.imu.accel - exact.imu.accel, flight
+
+
+@pytest.mark.parametrize("rate", [1000.0, 250.0])
+def test_white_noise_has_the_density_whatever_the_rate(rate):
+    gyro, accel, _ = errors_of(
+        replace(NO_IMU_ERRORS, gyro_noise=3e-4, accel_noise=2e-3), imu_rate=rate
+    )
+    assert gyro.std() == pytest.approx(3e-4 * np.sqrt(rate), rel=0.02)
+    assert accel.std() == pytest.approx(2e-3 * np.sqrt(rate), rel=0.02)
+    flat = (gyro / gyro.std()).ravel()
+    assert abs(np.mean(flat[1:] * flat[:-1])) < 0.02
+
+
+def test_bias_walks_as_configured():
+    gyro, accel, flight = errors_of(
+        replace(NO_IMU_ERRORS, gyro_bias_walk=1e-3, accel_bias_walk=1e-2)
+    )
+    assert np.diff(gyro, axis=0).std() == pytest.approx(1e-3 * np.sqrt(1e-3), rel=0.02)
+    assert np.diff(accel, axis=0).std() == pytest.approx(1e-2 * np.sqrt(1e-3), rel=0.02)
+    state = flight.extra["state_truth"]
+    at = np.searchsorted(flight.imu.t, state["t"] + 1e-9) - 1
+    np.testing.assert_allclose(state["gyro_bias_y"], gyro[at, 1], atol=1e-12)
+    np.testing.assert_allclose(state["accel_bias_z"], accel[at, 2], atol=1e-12)
+
+
+def test_initial_bias_has_the_configured_spread():
+    only_bias = replace(NO_IMU_ERRORS, gyro_bias=0.01, accel_bias=0.1)
+    start = [errors_of(only_bias, seed=k, duration=1.0, start_in_air=True)[:2] for k in range(20)]
+    for values, spread in zip(zip(*start), (0.01, 0.1)):
+        # constant over each flight
+        np.testing.assert_allclose(np.ptp(values, axis=1), 0.0, atol=1e-12)
+        assert np.std([v[0] for v in values]) == pytest.approx(spread, rel=0.3)
+
+
+def test_vibration_only_while_the_motors_turn():
+    gyro, accel, flight = errors_of(replace(NO_IMU_ERRORS, vibration=2.0))
+    # half a second before take-off and after landing
+    flying = (flight.imu.t >= 2.5) & (flight.imu.t <= 27.5)
+    assert accel[flying].std() == pytest.approx(2.0, rel=0.02)
+    np.testing.assert_array_equal(accel[~flying], 0.0)
+    np.testing.assert_array_equal(gyro, 0.0)
+
+
+def test_no_two_errors_draw_the_same_numbers():
+    gyro, accel, flight = errors_of(replace(NO_IMU_ERRORS, gyro_noise=1.0, accel_noise=1.0))
+    tdoa = flight.extra["tdoa_truth"]["noise"]
+    n = len(tdoa)
+    draws = [gyro.ravel()[:n], accel.ravel()[:n], tdoa]
+    assert np.abs(np.corrcoef(draws) - np.eye(3)).max() < 0.05
+
+
+def test_bad_values_are_refused():
+    with pytest.raises(InputError, match="gyro_noise"):
+        ImuErrors(gyro_noise=-1.0)
+    with pytest.raises(InputError, match="vibration"):
+        ImuErrors(vibration=np.nan)
+
+
+REGISTERED = """
+from dataclasses import fields, replace
+from uwb_tdoa_bias.common.sensors import SENSORS
+from uwb_tdoa_bias.common.sensors.sensor import parameter
+use = {"use_sonar": parameter(True, "use it", fixed=True)}
+SENSORS["sonar"] = replace(SENSORS["pressure"], name="sonar", parameters=use)
+from uwb_tdoa_bias.common.flight import Flight
+from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_tools.bags.topics import topics_of
+from uwb_tdoa_tools.simulation import SimulationConfig
+names = [{each.name for each in fields(kind)} for kind in (Flight, FilterConfig, SimulationConfig)]
+assert "sonar" in names[0] and "use_sonar" in names[1]
+assert "sonar_noise" in names[2]
+assert topics_of("sonar") == (("sonar", "sensor_msgs/msg/FluidPressure"),)
+"""
+
+
+def test_the_registry_alone_adds_a_sensor_to_recordings_parameters_simulation_and_bags():
+    """In another process: whoever imports the registry makes its fields by it."""
+    run = subprocess.run([sys.executable, "-c", REGISTERED], capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr

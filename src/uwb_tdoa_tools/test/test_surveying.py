@@ -10,7 +10,6 @@ import pytest
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Tdoas
-from uwb_tdoa_bias.common.sensors import Ranges
 from uwb_tdoa_bias.common.survey import read_survey
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_ekf.core.config import FilterConfig
@@ -89,17 +88,6 @@ def test_the_noise_beside_a_calibration_is_that_of_the_flights_without_their_gro
     assert (
         tdoa_std_of(flights[:1], late) == tdoa_std_of(bare, late) < tdoa_std_of(bare, EffectSet())
     )
-
-
-def test_ground_truth_is_not_looked_at(flights, result):
-    wrong = [
-        replace(flight, truth=replace(flight.truth, p=flight.truth.p + 1.0))
-        for flight in flights[:2]
-    ]
-    again = self_calibrate(
-        [at(flight, result.given.positions) for flight in wrong], Tape(0.2, trusted=TRUSTED)
-    )
-    np.testing.assert_array_equal(again.surveyed.positions, result.surveyed.positions)
 
 
 def test_an_anchor_of_which_nothing_is_known_is_placed(flights):
@@ -299,20 +287,6 @@ def test_only_tdoas_place_an_anchor(ranged):
 
 def test_tdoas_know_nothing_of_the_delay_of_the_tag(flights, result):
     assert abs(np.mean(result.delays)) < 0.05 and result.prior.common == 0.0
-
-
-def test_ranges_that_are_not_to_be_used_tell_nothing(flights):
-    """Neither of anchors, nor that the tag may have a delay."""
-    tdoa = flights[0].tdoa
-    late = replace(
-        flights[0], range=Ranges(tdoa.t, tdoa.a, np.full(len(tdoa), 9.0), np.zeros(len(tdoa)))
-    )
-    config = FilterConfig(use_range=False)
-    with_them, without = (
-        self_calibrate([flight], Tape(0.2, trusted=TRUSTED), config=config)
-        for flight in (late, flights[0])
-    )
-    np.testing.assert_array_equal(with_them.surveyed.positions, without.surveyed.positions)
 
 
 def test_survey_of_a_recording_of_ranges(ranged, tmp_path, capsys):

@@ -27,7 +27,9 @@ ELSEWHERE = {  # what is no file that a user gets at once
     "uwb_tdoa_tools/results_file.py",  # grows line by line
     "uwb_tdoa_tools/live/processes.py",  # what a process prints
     "studies/scale.py",  # the same
-    "studies/fuzz.py",  # a word to the kernel
+    "studies/fuzzing/figures.py",  # a word to the kernel
+    "studies/fuzzing/make_corpus.py",  # files of the repository
+    "studies/fuzzing/targets.py",  # what a reader gets, in a temporary folder
 }
 WRITING = re.compile("(?=.*[wax+])[rwaxbt+]{1,3}")  # a mode of `open`
 FILLED = ("savefig", "savetxt", "savez", "savez_compressed")  # they take an open file

@@ -9,17 +9,20 @@ import shutil
 import sys
 import tempfile
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-sys.path.append(str(Path(__file__).resolve().parents[3] / "uwb_tdoa_bias" / "test"))
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT))
+sys.path += [
+    str(ROOT / "src" / package / "test") for package in ("uwb_tdoa_tools", "uwb_tdoa_bias")
+]
 
 from foreign_recordings import two_way_ranges, write_ros_1  # noqa: E402
 import known_answer  # noqa: E402
 import numpy as np  # noqa: E402
 from recordings import ROWS, SURVEY, csv_text, log_bytes, small_flight  # noqa: E402
 from rosbags.rosbag1 import Writer  # noqa: E402
-from targets import CORPUS, MESSAGES, bag_of  # noqa: E402
 from test_survey import survey_lines  # noqa: E402
 
+from studies.fuzzing.targets import CORPUS, MESSAGES, bag_of  # noqa: E402
 from uwb_tdoa_bias.common.flyable import FlyableVolume  # noqa: E402
 from uwb_tdoa_bias.common.sensors import Height, Pressure, Velocity  # noqa: E402
 from uwb_tdoa_bias.common.sensors.ranges import Ranges  # noqa: E402
@@ -28,7 +31,7 @@ from uwb_tdoa_ekf.debias import BiasMap  # noqa: E402
 from uwb_tdoa_tools.bags.bag import write_bag  # noqa: E402
 from uwb_tdoa_tools.bags.files import open_bag  # noqa: E402
 from uwb_tdoa_tools.bags.integrity import CHECKSUM_KEY, NO_CHECKSUM, metadata  # noqa: E402
-from uwb_tdoa_tools.simulation.rooms import corners
+from uwb_tdoa_tools.simulation.rooms import corners  # noqa: E402
 
 TEXTS = {
     "yaml": [

@@ -19,9 +19,9 @@ import tempfile
 import time
 import traceback
 
-from fuzz import mutations, targets
 from tqdm import tqdm
 
+from studies.fuzzing import mutations, targets
 from uwb_tdoa_bias.common.errors import Failure, InputError
 from uwb_tdoa_bias.common.files import write_bytes
 from uwb_tdoa_tools.outputs import OutputFolder

@@ -1,0 +1,512 @@
+"""Parts of the filter core, each against what it is documented to compute."""
+
+from dataclasses import replace
+
+from flights import corners, fly
+from hypothesis import given
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from uwb_tdoa_bias.common.geometry import tdoa, tdoa_jacobian
+from uwb_tdoa_ekf.core import noise
+from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.core.inertial import (
+    LEAST_RECTIFIED,
+    PERSISTENCE,
+    QUIET_NOISE,
+    RECTIFYING_MEMORY,
+    is_quiet,
+    observe,
+    store,
+    weigh,
+)
+from uwb_tdoa_ekf.core.measurements import (
+    FARTHEST,
+    LARGEST_ERROR,
+    STEEPEST,
+    usable,
+    usable_all,
+    usable_slopes,
+)
+from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, new_state
+from uwb_tdoa_ekf.core.noise import excess_variance, learn
+from uwb_tdoa_ekf.core.state import GRAVITY
+from uwb_tdoa_ekf.core.update import SMALLEST, variance
+from uwb_tdoa_ekf.core.workspace import SMALLEST as WORKSPACE_SMALLEST
+from uwb_tdoa_ekf.core.workspace import STD as WORKSPACE_STD
+from uwb_tdoa_ekf.core.workspace import constrain, contains, set_bounds
+from uwb_tdoa_ekf.frames import rotation_std, to_odometry
+from uwb_tdoa_ekf.offline import run_offline
+
+# --- measurements ---
+
+
+POSITIONS = np.array([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0], [0.0, 0.0, 2.0]])
+CASES = [
+    (0, 1, 0.0, 0.0, True),
+    (0, 1, 5.0, 0.0, True),  # right behind anchor 0
+    (0, 1, 5.0 + LARGEST_ERROR, 0.0, True),
+    (0, 1, -5.0 - LARGEST_ERROR, 0.0, True),
+    (0, 1, 5.001 + LARGEST_ERROR, 0.0, False),  # no place hears that
+    (1, 0, -5.001 - LARGEST_ERROR, 0.0, False),
+    (0, 2, 5.0, 0.0, False),
+    (0, 0, 0.0, 0.0, False),
+    (-1, 1, 0.0, 0.0, False),
+    (1, -1, 0.0, 0.0, False),
+    (-1, -1, 0.0, 0.0, False),
+    (0, 1, np.nan, 0.0, False),
+    (0, 1, np.inf, 0.0, False),
+    (0, 1, -np.inf, 0.0, False),
+    (0, 1, 0.0, np.nan, False),
+    (0, 1, 0.0, np.inf, False),
+    (0, 1, 0.0, -0.1, False),
+    (0, 1, 0.0, 0.3, True),
+]
+
+
+@pytest.mark.parametrize("a, b, d, variance, expected", CASES)
+def test_one(a, b, d, variance, expected):
+    assert usable(a, b, d, variance, POSITIONS) == expected
+
+
+def test_all_is_one_for_each():
+    a, b, d, variance, expected = (np.array(column) for column in zip(*CASES))
+    assert usable_all(a, b, d, variance, POSITIONS).tolist() == expected.tolist()
+
+
+@pytest.mark.parametrize(
+    "slope, state, expected",
+    [
+        (0.0, 0.0, True),
+        (-0.99 * STEEPEST, -0.99 * FARTHEST, True),
+        (STEEPEST, 0.0, False),
+        (0.0, FARTHEST, False),
+        (np.nan, 0.0, False),
+        (0.0, np.nan, False),
+        (-np.inf, 0.0, False),
+        (0.0, np.inf, False),
+    ],
+)
+def test_slopes(slope, state, expected):
+    slopes, states = np.zeros((2, 3, 6))
+    slopes[1, 5], states[1, 0] = slope, state
+    assert usable_slopes(slopes, states).tolist() == [True, expected, True]
+
+
+# --- curvature ---
+
+
+A, B = np.array([0.0, -3.0, 1.0]), np.array([1.0, 4.0, 2.0])
+
+
+@pytest.mark.parametrize("x", [[2.0, 0.0, 1.5], [-3.0, 1.0, 0.3]])
+def test_it_is_the_mean_square_of_what_the_slope_leaves_out(x):
+    x, rng = np.array(x), np.random.default_rng(0)
+    P = np.zeros((15, 15))
+    P[:3, :3] = np.diag([0.5, 0.1, 0.4]) ** 2
+    e = rng.standard_normal((200_000, 3)) * np.sqrt(np.diag(P)[:3])
+    left = tdoa(x + e, A, B) - tdoa(x, A, B) - e @ np.ravel(tdoa_jacobian(x, A, B))
+    assert variance(x, P, A, B) == pytest.approx(np.mean(left**2), rel=0.25)
+
+
+def test_it_is_not_asked_for_where_the_place_is_known_and_finite_at_an_anchor():
+    P = np.eye(15) * (0.9 * SMALLEST) ** 2 / 3.0
+    assert variance(np.array([2.0, 0.0, 1.5]), P, A, B) == 0.0
+    assert np.isfinite(variance(A.copy(), np.eye(15), A, B))
+
+
+# --- noise ---
+
+
+def taught(std, noise, seconds=20.0, seed=0):
+    """Excess variances after TDOAs at 400 Hz whose anchors have the standard deviations `noise`,
+    (N,) m.
+    """
+    rng, n = np.random.default_rng(seed), len(noise)
+    state, parameters = new_state(np.zeros((n, 3))), FilterConfig(tdoa_std=std).parameters()[0]
+    anchors, innovation, sampled = state.anchors, state.record.innovation, []
+    for k in range(int(400 * seconds)):
+        a = rng.integers(n)
+        b = (a + 1 + rng.integers(n - 1)) % n
+        innovation.value = rng.standard_normal() * np.hypot(noise[a], noise[b])
+        innovation.noise_variance = std**2 + excess_variance(anchors[a], anchors[b])
+        learn(anchors[a], anchors[b], k / 400.0, innovation, parameters)
+        sampled.append(anchors["excess_variance"].copy())
+    return np.mean(sampled[len(sampled) // 2 :], axis=0)
+
+
+def test_the_noisy_anchor_is_found():
+    noise = np.full(6, 0.1 / np.sqrt(2.0))
+    noise[2] = 0.6
+    learned = taught(0.1, noise)
+    assert learned[2] == pytest.approx(0.6**2, rel=0.3)
+    assert np.delete(learned, 2).max() < 0.1 * learned[2]
+
+
+def test_what_is_as_noisy_as_expected_has_no_excess():
+    learned = taught(0.25, np.full(6, 0.25 / np.sqrt(2.0)))
+    assert learned.max() < 0.5 * 0.25**2
+
+
+@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=50), st.floats(0.0, 1e3))
+def test_variances_stay_finite_and_not_negative(values, prior_variance):
+    state, parameters = new_state(np.zeros((3, 3))), FilterConfig(tdoa_std=0.1).parameters()[0]
+    innovation, innovation.prior_variance = state.record.innovation, prior_variance
+    for k, value in enumerate(values):
+        a, b = state.anchors[k % 3], state.anchors[(k + 1) % 3]
+        innovation.value, innovation.noise_variance = value, 0.01 + excess_variance(a, b)
+        learn(a, b, 0.01 * k, innovation, parameters)
+        learned = state.anchors["excess_variance"]
+        assert np.isfinite(learned).all() and (learned >= 0.0).all()
+
+
+def test_an_anchor_that_is_late_for_a_while_disturbs_less():
+    """Anchor 3 is a metre late in every pair for a second at a time, as behind an obstacle."""
+    errors = {}
+    for adapt in (False, True):
+        found = []
+        for seed in range(4):
+            flight = fly(seed, 12.0, tdoa_std=0.05, accel_noise=0.05, gyro_noise=0.003)
+            late = np.where((flight.tdoa.t % 3.0) < 1.0, 1.0, 0.0)
+            three = corners().ids[3]
+            d = flight.tdoa.d + late * (
+                (flight.tdoa.b == three).astype(float) - (flight.tdoa.a == three)
+            )
+            result = run_offline(
+                replace(flight, tdoa=replace(flight.tdoa, d=d)), FilterConfig(adapt_noise=adapt)
+            )
+            odometry = result.odometry
+            after = odometry.t > 3.0
+            off = odometry.p[after] - flight.meta["wave"].motion(odometry.t[after])[0]
+            found.append(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+        errors[adapt] = np.mean(found)
+    assert errors[True] < 0.9 * errors[False]
+
+
+# --- systematic ---
+
+
+ANCHORS = np.array([[x, y, z] for x in (0.0, 7.0) for y in (0.0, 8.0) for z in (0.2, 3.0)])
+STD = 0.25
+
+
+def informed(p, seconds=5.0, rate=400.0, heard=range(8), state=None, begin=0.0):
+    """A FilterState that has taken TDOAs round the ring of the anchors `heard` at a place p (3,)."""
+    state, heard = state or new_state(ANCHORS), list(heard)
+    anchors, information = state.anchors, state.record.information
+    way = np.array(p) - ANCHORS
+    unit = way / np.linalg.norm(way, axis=1)[:, None]
+    for k in range(int(seconds * rate)):
+        a, b = heard[k % len(heard)], heard[(k + 1) % len(heard)]
+        innovation = state.record.innovation
+        innovation.row[:3] = unit[b] - unit[a]
+        innovation.noise_variance, innovation.weight, innovation.curvature = STD**2, 1.0, 0.0
+        t = begin + k / rate
+        last = t - 1.0 / rate if k else -np.inf
+        noise.observe(information, anchors[a], anchors[b], innovation, t, last)
+    return state
+
+
+def stated(state, P, correlation_length=np.inf, height_std=0.0):
+    covariance = np.full((3, 3), np.nan)
+    whole = np.zeros((15, 15))
+    whole[:3, :3] = P
+    noise.fill(state.record.information, whole, correlation_length, height_std, covariance)
+    return covariance
+
+
+@pytest.mark.parametrize("p", [[3.0, 4.0, 1.5], [1.0, 6.0, 0.5]])
+def test_it_is_the_covariance_of_a_position_by_one_arrival_from_each_anchor(p):
+    """Least squares with an error of its own for each anchor, and a common one of the clock."""
+    way = np.array(p) - ANCHORS
+    unit = way / np.linalg.norm(way, axis=1)[:, None]
+    centred = unit - unit.mean(axis=0)
+    of_anchor = noise.SHARE * STD**2 / 2.0
+    expected = np.linalg.inv(centred.T @ centred) * of_anchor
+    # a ring of neighbours weighs directions a little differently from all pairs
+    found = stated(informed(p), 1e3 * np.eye(3))
+    assert 0.4 < np.trace(found) / np.trace(expected) < 2.5
+
+
+def test_it_does_not_become_less_with_more_tdoas():
+    slow, quick = (
+        np.trace(stated(informed([3.0, 4.0, 1.5], rate=rate), np.eye(3))) for rate in (50.0, 800.0)
+    )
+    assert slow == pytest.approx(quick, rel=0.2)
+
+
+def test_what_is_not_heard_any_more_is_forgotten_but_silence_is_not_taken_for_that():
+    state, P = informed([3.0, 4.0, 1.5]), 0.01 * np.eye(3)
+    before = np.trace(stated(state, P))
+    informed([3.0, 4.0, 1.5], 0.01, state=state, begin=30.0)
+    assert np.trace(stated(state, P)) < 2.0 * before
+    informed([3.0, 4.0, 1.5], 5.0, heard=(0, 1), state=state, begin=31.0)
+    assert np.trace(stated(state, P)) > 5.0 * before
+
+
+def test_of_white_noise_nothing_persists():
+    state, P = informed([3.0, 4.0, 1.5]), np.eye(3)
+    assert not stated(state, P, 1.0).any()
+    assert 0.5 < np.trace(stated(state, P, 6.0)) / np.trace(stated(state, P)) < 1.0
+
+
+def test_it_is_bounded_by_what_the_filter_knows():
+    P = np.diag([0.01, 0.02, 0.03])
+    state = new_state(ANCHORS)
+    np.testing.assert_allclose(stated(state, P), noise.MOST * P, rtol=1e-9)
+    assert not stated(state, np.zeros((3, 3))).any()
+
+
+@pytest.mark.parametrize("p", [[3.0, 4.0, 0.2], [1.0, 6.0, 0.5]])
+def test_a_height_that_is_held_does_not_follow_errors_that_persist(p):
+    """Held exactly, only x and y follow: the covariance of a problem in two dimensions."""
+    state, P = informed(p), 1e6 * np.eye(3)
+    plain, held, loose = (stated(state, P, height_std=std) for std in (0.0, 1e-4, 1e4))
+    information = np.linalg.inv(plain)
+    np.testing.assert_allclose(held[:2, :2], np.linalg.inv(information[:2, :2]), rtol=1e-4)
+    assert held[2, 2] < 1e-8 < 0.01 < plain[2, 2]
+    np.testing.assert_allclose(loose, plain, rtol=1e-4)
+    assert np.linalg.eigvalsh(held).min() >= -1e-12
+
+
+# --- workspace ---
+
+
+MARGIN = 1.0  # m
+
+
+def bounds_of(positions):
+    bounds = np.empty((2, 3))
+    set_bounds(new_state(positions).record.extent, MARGIN, bounds)
+    return bounds
+
+
+def test_it_ends_a_margin_beyond_the_anchors_and_is_never_flat():
+    positions = np.array(corners().positions)
+    bounds = bounds_of(positions)
+    middle = 0.5 * (positions.min(axis=0) + positions.max(axis=0))
+    half = np.array([3.5 + MARGIN, 4.0 + MARGIN, WORKSPACE_SMALLEST])
+    np.testing.assert_allclose(bounds, [middle - half, middle + half])
+    for k in range(3):
+        x = middle.copy()
+        x[k] += half[k] - 0.01
+        assert contains(bounds, x)
+        x[k] += 0.02
+        assert not contains(bounds, x)
+
+
+@pytest.mark.parametrize("axis, off", [(0, -2.0), (1, 0.7), (2, 5.0)])
+def test_a_tag_outside_is_drawn_back_by_as_much_as_it_is_uncertain(axis, off):
+    bounds, ekf = (
+        bounds_of(np.array(corners().positions)),
+        new_state(np.array(corners().positions)).record,
+    )
+    hypothesis = ekf.hypotheses[0]
+    hypothesis.x[:3] = 0.5 * (bounds[0] + bounds[1])
+    hypothesis.x[axis] = bounds[int(off > 0.0), axis] + off
+    hypothesis.P[axis, axis] = 3.0
+    before = hypothesis.x.copy()
+    assert [constrain(hypothesis, ekf.innovation, bounds, k) for k in range(3)] == [
+        k == axis for k in range(3)
+    ]
+    gain = 3.0 / (3.0 + WORKSPACE_STD**2)
+    assert hypothesis.x[axis] == pytest.approx(before[axis] - gain * off)
+    assert hypothesis.P[axis, axis] == pytest.approx((1.0 - gain) * 3.0)
+    assert np.delete(hypothesis.x, axis) == pytest.approx(np.delete(before, axis))
+
+
+@pytest.mark.parametrize("beyond", [1.0, 3.0])
+def test_a_tag_outside_is_right_or_says_how_wrong_it_is(beyond):
+    found = []
+    for seed in range(5):
+        flight = fly(seed, 6.0, hover=True, anchors=corners((8.0, 8.0, 3.0)), tdoa_rate=300.0)
+        p = np.array([8.0 + MARGIN + beyond, 3.0, 1.2])
+        a, b = flight.anchors.index(flight.tdoa.a), flight.anchors.index(flight.tdoa.b)
+        d = tdoa(p, flight.anchors.positions[a], flight.anchors.positions[b])
+        d += 0.1 * np.random.default_rng(seed).standard_normal(len(d))
+        odometry = run_offline(replace(flight, tdoa=replace(flight.tdoa, d=d))).odometry
+        error = (odometry.p - p)[odometry.t > 3.0]
+        P = odometry.covariance[odometry.t > 3.0, :3, :3]
+        found.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(P), error).mean())
+    assert np.mean(found) < 6.0
+
+
+# --- inertial ---
+
+
+UP = np.array([0.0, 0.0, GRAVITY])
+
+
+def sample_of(t, gyro, accel):
+    return np.array([(t, tuple(gyro), tuple(accel))], IMU_SAMPLE)[0]
+
+
+def fresh():
+    return new_state(np.zeros((4, 3))).record.imu
+
+
+def after(gyro, accel, rate=1000.0, seconds=3.0, imu=None, pause=0.0, seed=0):
+    """IMU_STATE after a stream of samples: gyro, accel are (mean (3,), standard deviation)."""
+    imu, rng = fresh() if imu is None else imu, np.random.default_rng(seed)
+    start = max(imu.t, 0.0) + pause
+    for k in range(int(rate * seconds)):
+        rates, accels = (
+            np.asarray(mean) + std * rng.standard_normal(3) for mean, std in (gyro, accel)
+        )
+        sample = sample_of(start + (k + 1) / rate, rates, accels)
+        observe(imu, sample, 0.1)
+        store(imu, sample)
+    return imu
+
+
+STILL = dict(gyro=(np.zeros(3), 0.002), accel=(UP, 0.02))
+
+
+@pytest.mark.parametrize(
+    "change, rests",
+    [
+        ({}, True),
+        ({"gyro": (np.zeros(3), 0.05)}, False),
+        ({"gyro": (np.array([0.0, 0.0, 0.1]), 0.002)}, False),
+        ({"accel": (UP, 0.3)}, False),
+        # a metre per second squared sideways is a tilt of 6 degrees
+        ({"accel": (UP + [1.0, 0.0, 0.0], 0.02)}, True),
+        ({"accel": (1.1 * UP, 0.02)}, False),
+    ],
+)
+def test_rest(change, rests):
+    assert is_quiet(after(**{**STILL, **change})) == rests
+
+
+def test_rest_is_not_believed_at_once_nor_after_a_gap():
+    imu = after(**STILL, seconds=0.3)
+    assert not is_quiet(imu)
+    imu = after(**STILL, imu=imu)
+    assert is_quiet(imu)
+    assert not is_quiet(after(**STILL, imu=imu, pause=1.0, seconds=0.3))
+
+
+def test_the_more_an_axis_rectifies_the_less_it_weighs_and_the_noisier_it_is():
+    vibration = np.array([0.0, 0.5, 5.0])
+    imu = after((np.zeros(3), 0.0), (UP + vibration, vibration))
+    weigh(
+        imu,
+        False,
+        FilterConfig(accel_prior_std=1.5, vibration_gain=4.0, accel_noise=0.1).parameters()[0],
+    )
+    one, two, three = imu.accel_weight
+    assert one == pytest.approx(1.0, abs=1e-3) and one > two > 0.5 > 0.1 > three
+    assert imu.accel_psd[2] == pytest.approx(
+        0.1**2 + 2.0 * PERSISTENCE * three * 4.0 * 25.0, rel=0.2
+    )
+    weigh(imu, False, FilterConfig(vibration_gain=0.0, accel_noise=0.1).parameters()[0])
+    assert imu.accel_weight.tolist() == [1.0] * 3 and imu.accel_psd == pytest.approx([0.1**2] * 3)
+    weigh(imu, True, FilterConfig().parameters()[0])
+    assert imu.accel_psd == pytest.approx([QUIET_NOISE**2] * 3)
+
+
+def test_an_axis_whose_mean_is_that_of_hovering_does_not_rectify_however_it_vibrates():
+    parameters = FilterConfig(accel_prior_std=1.5, vibration_gain=4.0).parameters()[0]
+    weights = {}
+    for offset in (0.0, 3.0):
+        imu = after(
+            (np.zeros(3), 0.0), (UP + [offset, 0.0, 0.0], 3.0), seconds=4.0 * RECTIFYING_MEMORY
+        )
+        weigh(imu, False, parameters)
+        weights[offset] = imu.accel_weight
+    error = 4.0 * 3.0**2
+    assert weights[3.0][0] == pytest.approx(
+        1.5**2 / (1.5**2 + error), rel=0.2
+    )  # as if nothing were known of its mean
+    for weight in (weights[0.0][0], weights[3.0][1], weights[3.0][2]):
+        assert weight == pytest.approx(1.5**2 / (1.5**2 + LEAST_RECTIFIED * error), rel=0.1)
+
+
+def test_what_begins_to_vibrate_is_not_believed_before_it_was_seen_for_a_while():
+    parameters = FilterConfig(accel_prior_std=1.5, vibration_gain=4.0).parameters()[0]
+    imu = after(**STILL)
+    imu = after((np.zeros(3), 0.0), (UP, 1.0), imu=imu, seconds=0.5)
+    weigh(imu, False, parameters)
+    early = imu.accel_weight.copy()
+    imu = after((np.zeros(3), 0.0), (UP, 1.0), imu=imu, seconds=4.0 * RECTIFYING_MEMORY)
+    weigh(imu, False, parameters)
+    assert (early < 0.6).all() and (imu.accel_weight > 0.8).all()
+
+
+@pytest.mark.parametrize("force", [-UP, np.array([np.linalg.norm(UP), 0.0, 0.0])])
+def test_what_hangs_upside_down_or_lies_on_its_side_does_not_hover_however_it_shakes(force):
+    imu = after((np.zeros(3), 0.0), (force, np.array([5.0, 5.0, 5.0])))
+    weigh(imu, False, FilterConfig(accel_prior_std=1.5, vibration_gain=4.0).parameters()[0])
+    assert imu.accel_weight.min() > 0.75
+
+
+def test_samples_are_averaged_with_the_last_one_unless_it_is_old():
+    imu = fresh()
+    for t, size, expected in ((0.0, 1.0, 1.0), (0.01, 3.0, 2.0), (1.0, 7.0, 7.0)):
+        sample = sample_of(t, [size] * 3, [10.0 * size] * 3)
+        assert observe(imu, sample, 0.1) == (t == 0.01)
+        np.testing.assert_allclose(imu.gyro, expected)
+        np.testing.assert_allclose(imu.accel, 10.0 * expected)
+        store(imu, sample)
+        np.testing.assert_allclose(imu.gyro, size)
+    np.testing.assert_allclose(imu.mean_accel, 70.0)
+
+
+def test_what_is_far_from_hovering_is_taken_for_what_it_is_however_it_vibrates():
+    """A turn with 3 g; a vibrating sensor that is off by as much as vibration makes it stays
+    between.
+    """
+    parameters = FilterConfig(accel_prior_std=1.5, vibration_gain=4.0).parameters()[0]
+    weights = {}
+    for force in (1.0, 1.2, 3.0):
+        imu = after((np.zeros(3), 0.0), (force * UP, 1.0))
+        weigh(imu, False, parameters)
+        weights[force] = imu.accel_weight[2]
+    assert weights[1.2] < 0.6 < weights[1.0] and weights[3.0] > 0.95
+
+
+# --- frames ---
+
+
+def state(seed=0):
+    """q (4,), v (3,), covariance (9, 9) of a filter that is sure to 1e-4."""
+    random = np.random.default_rng(seed)
+    root = random.normal(size=(9, 9)) * 1e-4
+    return Rotation.random(random_state=seed).as_quat(), random.normal(size=3) * 2, root @ root.T
+
+
+def disturbed(q, v, covariance, n=50_000):
+    """Samples of true attitude and velocity, as the filter believes them: true attitude = q
+    Exp(dtheta).
+    """
+    error = np.random.default_rng(1).multivariate_normal(np.zeros(9), covariance, n)
+    return (
+        error[:, :3],
+        v + error[:, 3:6],
+        Rotation.from_quat(q) * Rotation.from_rotvec(error[:, 6:]),
+    )
+
+
+def test_covariance_is_that_of_what_an_odometry_holds():
+    q, v, covariance = state()
+    dp, velocity, truth = disturbed(q, v, covariance)
+    turned = (
+        truth * Rotation.from_quat(q).inv()
+    ).as_rotvec()  # truth = Exp(turned) q: about the axes of the world
+    sampled = np.cov(np.hstack([dp, turned, truth.inv().apply(velocity)]).T)
+    u, converted = to_odometry(q[None], v[None], covariance[None])
+    np.testing.assert_allclose(u[0], Rotation.from_quat(q).inv().apply(v), atol=1e-12)
+    for part in (slice(0, 6), slice(6, 9)):  # pose and twist
+        np.testing.assert_allclose(
+            converted[0][part, part], sampled[part, part], atol=0.02 * sampled[part, part].max()
+        )
+
+
+def test_rotation_std_is_that_of_the_odometry():
+    q, v, covariance = (np.stack(rows) for rows in zip(*map(state, range(5))))
+    converted = to_odometry(q, v, covariance)[1]
+    np.testing.assert_allclose(
+        rotation_std(q, covariance), np.sqrt(converted[:, [3, 4, 5], [3, 4, 5]]), rtol=1e-12
+    )
