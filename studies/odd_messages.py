@@ -57,7 +57,7 @@ from uwb_tdoa_tools.live.processes import DiagnosticsListener, LiveError, wait
 from uwb_tdoa_tools.live.session import answer_of
 
 RCLError = rclpy_implementation.RCLError
-CORPUS = Path(__file__).parents[1] / "src" / "uwb_tdoa_tools" / "test" / "fuzz" / "corpus"
+CORPUS = Path(__file__).parent / "fuzzing" / "corpus"
 ALIGNED = 4  # bytes; the middleware fills up to that, so that other lengths arrive longer
 # bytes; after an empty message Fast DDS delivers nothing more of a reliable publisher, to whomever
 SHORTEST = 4
