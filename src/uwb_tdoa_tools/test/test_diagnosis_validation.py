@@ -22,7 +22,12 @@ from uwb_tdoa_tools.diagnosis.comparison import (
 from uwb_tdoa_tools.diagnosis.detectors import Detection
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.refinement import effects_of
-from uwb_tdoa_tools.diagnosis.validation import cross_fitted, select_by_error, validation_cases
+from uwb_tdoa_tools.diagnosis.validation import (
+    _groups,
+    cross_fitted,
+    select_by_error,
+    validation_cases,
+)
 from uwb_tdoa_tools.scoring.gains import NO_DIFFERENCE
 
 TRUTH = GroundTruth()
@@ -295,3 +300,17 @@ def test_noise_is_described_alike_in_both_directions(after, interval, sentence):
     sides = [{"pooled": {"rmse_3d": 0.15}}, {"pooled": {"rmse_3d": after}}]
     sides[1]["pooled"]["rmse_3d_gain_ci"] = interval
     assert why_not(*sides, 0.0).startswith(sentence)
+
+
+def test_effects_that_cancel_are_tried_together():
+    """Without one of them the filter rejects the anchor, and neither seems to help."""
+    drift = SmoothTerm(
+        {"3.c0": 0.0, "3.c1": 0.9}, covariate="time", form="anchor", knots=(0.0, 32.0), shape="line"
+    )
+    flight = drift.inject(clean_flight(100, 30.0))
+    found = attribute([flight], TRUTH)
+    groups = _groups(found.selection, found.selection.chosen, ())
+    assert [len(group) for group in groups] == [2] and len(found.selection.chosen) == 2
+    kept = select_by_error(found, [flight], Baseline(NONE))
+    assert kept.selection.chosen == found.selection.chosen
+    assert len({*kept.selection.shares.values()}) == 1

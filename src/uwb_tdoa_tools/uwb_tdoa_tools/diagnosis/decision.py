@@ -33,7 +33,8 @@ VALID, VALID_STD = 0.75, 0.4
 # Standard deviation, between flights, of the correlation of a displacement with the remaining error
 CORRELATION = 0.25
 LEAST_SHARE = 0.1  # a smaller share is nothing
-LEAST_WORTH = 0.0005  # m; an effect that is worth less is not applied, because it rounds to nothing
+# m, and share of the error; an effect that is worth less is not applied: it rounds to nothing
+LEAST_WORTH, LEAST_OF_ERROR = 0.0005, 0.005
 STEP = 0.1  # by which all shares shrink
 
 
@@ -41,8 +42,7 @@ STEP = 0.1  # by which all shares shrink
 class Decision:
     """The applied share of each effect, and the predicted change in a future flight.
 
-    shares : (k,) 0 to 1; worth : (k,) m, contribution of each effect to the decrease of the mean 3D
-        RMSE of the tried flights
+    shares : (k,) 0 to 1; worth : (k,) m, growth of the mean 3D RMSE of the tried flights without it
     gain : expected relative decrease of the 3D RMSE of a future flight; std : its standard deviation
     risk : probability that it grows by more than LOSS
     """
@@ -67,11 +67,10 @@ def products(
 ) -> np.ndarray:
     """Return the mean products of errors in a flight, (k + 2, k + 2) m^2, that `decide` needs.
 
-    They are of the error without effects if positions were linear in their shares, of the
-    displacements, and of the change.
+    They are of the sum of the error and all displacements, of the displacements, and of the change.
 
-    error : (n, 3) m, with all effects; displacements : k of (n, 3) m, the derivative by each share
-        with the opposite sign; change : (n, 3) m, of the error if all effects are left out
+    error : (n, 3) m, with all effects; displacements : k of (n, 3) m, change of the error without
+        each; change : (n, 3) m, of the error without all
     """
     vectors = np.stack([error + sum(displacements), *displacements, change], axis=-1)
     return np.einsum("nxi,nxj->ij", vectors, vectors) / len(error)
@@ -84,7 +83,9 @@ def decide(flights: Sequence[np.ndarray]) -> Decision:
     while True:
         shares = np.clip(_valid(flights, left), 0.0, 1.0)
         worth = np.mean([_worth(some, shares) for some in flights], axis=0)
-        small = left & ((shares < LEAST_SHARE) | (worth < LEAST_WORTH))
+        error = np.mean([np.sqrt(_power(some, _after(shares))) for some in flights])
+        least = min(LEAST_WORTH, LEAST_OF_ERROR * float(error))
+        small = left & ((shares < LEAST_SHARE) | (worth < least))
         if not small.any():
             break
         left[np.argmin(np.where(small, worth, np.inf))] = False
@@ -130,22 +131,18 @@ def _power(flight: np.ndarray, weights: np.ndarray) -> float:
 
 
 def _worth(flight: np.ndarray, shares: np.ndarray) -> np.ndarray:
-    """Return what each effect contributes to the decrease of the 3D RMSE, (k,) m.
+    """Return by how much the 3D RMSE grows without each effect, (k,) m.
 
-    The contributions of applied effects are Shapley values, scaled to add up to the decrease. The
-    contribution of another effect is the decrease if it is applied beside them in full.
+    An effect that is not applied counts as if it were applied in full.
     """
-    along = flight[0, 1:-1] - flight[1:-1, 1:-1] @ shares
-    applied = shares * (flight[0, 1:-1] + along)
-    before, after = _power(flight, _before(len(shares))), _power(flight, _after(shares))
-    linear = _power(flight, _after(0.0 * shares)) - after
-    scale = (before - after) / linear if min(before - after, linear) > 0.0 else 1.0
-    beside = after - 2.0 * along + np.diag(flight)[1:-1]
-    return np.where(
-        shares > 0.0,
-        scale * applied / (np.sqrt(before) + np.sqrt(after)),
-        np.sqrt(after) - np.sqrt(np.maximum(beside, 0.0)),
-    )
+    out = np.zeros(len(shares))
+    for place, share in enumerate(shares):
+        without, beside = shares.copy(), shares.copy()
+        without[place], beside[place] = 0.0, share or 1.0
+        out[place] = np.sqrt(_power(flight, _after(without))) - np.sqrt(
+            _power(flight, _after(beside))
+        )
+    return out
 
 
 def _predicted(

@@ -38,8 +38,7 @@ if TYPE_CHECKING:
     Part = Candidate | Detection
 
 TRIED = 5  # largest number of flights in trials
-# Share of an effect that a trial takes away. If it is larger, the filter rejects measurements.
-TAKEN = 0.5
+CANCELS = 0.7  # smallest negative correlation of two contributions that cancel
 # shapes of a function of the time that can recur, like the warm-up of a clock
 DRIFTS = ("line", "beyond", "below", "parabola")
 SELECTED_ON = ", chosen on all of them (--holdout judges the choice too)"
@@ -52,8 +51,8 @@ class ValidatedSelection:
     """The effects that the rule of `decision` applies, with their shares.
 
     refused : (Refused, ...) of the others
-    worth : {candidate or detection: what it contributes to the decrease of the mean 3D RMSE, m}; of
-        dropped ones at the time they were dropped
+    worth : {candidate or detection: increase of the mean 3D RMSE without it, m}; of dropped ones at the
+        time they were dropped
     decision : Decision on all that are left; None without any
     """
 
@@ -85,22 +84,16 @@ class Fold(NamedTuple):
     fitted: Sequence[int]
 
     def effects(
-        self,
-        attribution: Attribution,
-        candidates: Sequence[Candidate],
-        parts: Sequence[Part],
-        shares: dict[Candidate, float] | None = None,
+        self, attribution: Attribution, candidates: Sequence[Candidate], parts: Sequence[Part]
     ) -> EffectSet:
         """Return the EffectSet of some parts of a model, with values fitted to the rest.
 
         candidates : all Candidates of the model; parts : those that count, and Detections
-        shares : of the values, beside those of the Attribution
         """
         selection = attribution.selection
         chosen = tuple(part for part in parts if isinstance(part, Candidate))
         model = refit(selection.table, columns_of(candidates), selection.fit, self.rows)
-        known = {**selection.shares, **(shares or {})}
-        found = effects_of(replace(selection, chosen=chosen, fit=model, shares=known))
+        found = effects_of(replace(selection, chosen=chosen, fit=model))
         detected = [part.effect for part in parts if not isinstance(part, Candidate)]
         of_nodes = usable([*found, *detected]).effects
         return EffectSet((*self.case.effects, *attribution.seen.limited(of_nodes, self.fitted)))
@@ -160,8 +153,8 @@ def select_by_error(
 ) -> ValidatedSelection:
     """Return the ValidatedSelection: the rule of `decision` on flights that took no part in the fit.
 
-    The filter runs with all effects, and with less of each, on at most TRIED flights. The differences
-    give the displacements that `decide` judges. Effects that it drops leave the model, and the others are
+    The filter runs with all effects and without each, on at most TRIED flights. The differences are
+    the displacements that `decide` judges. Effects that it drops leave the model, and the others are
     fitted again with the same weights. Events at a time of a single flight are dropped at the end.
 
     map_function : as of `attribute`
@@ -172,11 +165,14 @@ def select_by_error(
     shares: dict[Part, float] = {}
     refused: list[Refused] = []
     decision = None
-    while parts := [part for part in (*chosen, *detections) if _is_applicable(part)]:
-        model = chosen, parts
-        decision = decide(_products(attribution, flights, baseline, model, progress, map_function))
-        shares = dict(zip(parts, decision.shares.tolist()))
-        worth.update(zip(parts, decision.worth.tolist()))
+    while groups := _groups(attribution.selection, chosen, detections):
+        decision = decide(
+            _products(attribution, flights, baseline, (chosen, groups), progress, map_function)
+        )
+        for group, share, value in zip(groups, decision.shares.tolist(), decision.worth.tolist()):
+            shares.update(dict.fromkeys(group, share))
+            worth.update(dict.fromkeys(group, value))
+        parts = sum(groups, [])
         dropped = {part: _why_not(worth[part]) for part in parts if not shares[part]}
         if single and not dropped:
             dropped = {part: MOMENTARY for part in parts if _is_momentary(part)}
@@ -188,38 +184,59 @@ def select_by_error(
         decision = None
     # with the weights of the trials: otherwise the dropped effects make outliers of their data
     selection = replace(
-        attribution.selection.kept(chosen), shares={one: shares.get(one, 1.0) for one in chosen}
+        attribution.selection.kept(chosen),
+        shares={part: shares[part] for part in chosen if part in shares},
     )
     return ValidatedSelection(selection, tuple(detections), tuple(refused), worth, decision)
+
+
+def _groups(
+    selection: Selection, chosen: Sequence[Candidate], detections: Sequence[Detection]
+) -> list[list[Part]]:
+    """Return the parts of a model that a node can correct, at least in part.
+
+    Candidates that cancel in the fitted rows are one group. Without one of them the filter rejects
+    the measurements of the other, and the errors do not show what each is worth.
+    """
+    table = selection.table
+    fitted = refit(table, columns_of(chosen), selection.fit)
+    root = np.sqrt(selection.fit.information(table))
+    out: list[tuple[list[Part], np.ndarray]] = []
+    for candidate in chosen:
+        if not any(term.effect.usable for term in candidate.terms):
+            continue
+        part = root * (table.matrix(candidate.columns) @ fitted.values(candidate.columns))
+        part = part / max(float(np.linalg.norm(part)), 1e-12)
+        for group, others in out:
+            if part @ others < -CANCELS:
+                group.append(candidate)
+                break
+        else:
+            out.append(([candidate], part))
+    alone: list[list[Part]] = [[one] for one in detections if one.effect.usable]
+    return [group for group, _ in out] + alone
 
 
 def _products(
     attribution: Attribution,
     flights: Sequence[Flight],
     baseline: Baseline,
-    model: tuple[Sequence[Candidate], Sequence[Part]],
+    model: tuple[Sequence[Candidate], Sequence[Sequence[Part]]],
     progress: Callable[[], object],
     map_function: MapFunction,
 ) -> list[np.ndarray]:
-    """Return the `products` of each tried flight, (1 + k, 1 + k), that `decide` needs.
+    """Return the `products` of each tried flight, (k + 2, k + 2), that `decide` needs.
 
-    model : the Candidates of a model, and its k parts that are tried
+    model : the Candidates of a model, and its k groups that are tried
     """
-    candidates, parts = model
+    candidates, groups = model
+    parts = sum(groups, [])
+    models = [parts, [], *([one for one in parts if one not in group] for group in groups)]
     several = folds(attribution, flights, baseline.base)
-    trials = []
-    for fold in several[:: -(-len(several) // TRIED)]:
-        models = [fold.effects(attribution, candidates, some) for some in (parts, ())]
-        steps = []
-        for part in parts:
-            if isinstance(part, Candidate):
-                models.append(fold.effects(attribution, candidates, parts, {part: 1.0 - TAKEN}))
-                steps.append(TAKEN)
-            else:
-                rest = [other for other in parts if other is not part]
-                models.append(fold.effects(attribution, candidates, rest))
-                steps.append(1.0)
-        trials.append((fold.case, models, steps))
+    trials = [
+        (fold.case, [fold.effects(attribution, candidates, some) for some in models])
+        for fold in several[:: -(-len(several) // TRIED)]
+    ]
     out = []
     for found in map_function(partial(_of_trial, baseline.config), trials):
         out.append(found)
@@ -228,16 +245,15 @@ def _products(
 
 
 def _of_trial(
-    config: FilterConfig | None,
-    trial: tuple[ValidationCase, Sequence[EffectSet], Sequence[float]],
+    config: FilterConfig | None, trial: tuple[ValidationCase, Sequence[EffectSet]]
 ) -> np.ndarray:
     """Return the `products` of one case.
 
-    trial : ValidationCase; EffectSets: all effects, none, and all with less of each; by how much
-        less. The first two run like the nodes. The others use the poses of the first run, which
-        takes a tenth of the time.
+    trial : ValidationCase; EffectSets: all effects, none, and all without each group. The first two
+        run like the nodes. The others use the poses of the first run, which takes a tenth of the
+        time.
     """
-    case, models, steps = trial
+    case, models = trial
     anchors, poses, scores = case.flight.anchors, None, []
     for place, effects in enumerate(models):
         corrector = Corrector(anchors, effects)
@@ -248,16 +264,9 @@ def _of_trial(
             poses = poses_of(run.odometry)
         scores.append(score(replace(case, effects=effects), run))
     t = reduce(np.intersect1d, [one.t for one in scores])
-    first, without, *others = (one.error[np.searchsorted(one.t, t)] for one in scores)
-    displacements = [(other - first) / step for other, step in zip(others, steps)]
-    return products(first, displacements, without - first)
-
-
-def _is_applicable(part: Part) -> bool:
-    """Return whether a node can correct an effect, at least in part."""
-    if isinstance(part, Candidate):
-        return any(term.effect.usable for term in part.terms)
-    return part.effect.usable
+    first, *others = (one.error[np.searchsorted(one.t, t)] for one in scores)
+    change, *displacements = (other - first for other in others)
+    return products(first, displacements, change)
 
 
 def _label(part: Part) -> str:
