@@ -76,10 +76,13 @@ def products(
     return np.einsum("nxi,nxj->ij", vectors, vectors) / len(error)
 
 
-def decide(flights: Sequence[np.ndarray]) -> Decision:
-    """Return the Decision on k effects from `products` of hold-out flights."""
+def decide(flights: Sequence[np.ndarray], offered: np.ndarray | None = None) -> Decision:
+    """Return the Decision on k effects from `products` of hold-out flights.
+
+    offered : (k,) bool, effects that may be applied; None for all
+    """
     count = len(flights[0]) - 2
-    left = np.full(count, True)  # effects that are not dropped
+    left = np.full(count, True) if offered is None else offered.copy()
     while True:
         shares = np.clip(_valid(flights, left), 0.0, 1.0)
         worth = np.mean([_worth(some, shares) for some in flights], axis=0)
@@ -89,11 +92,14 @@ def decide(flights: Sequence[np.ndarray]) -> Decision:
         if not small.any():
             break
         left[np.argmin(np.where(small, worth, np.inf))] = False
-    for factor in np.arange(1.0, 0.0, -STEP) if shares.any() else ():
+    nothing = Decision(np.zeros(count), worth, 0.0, 0.0, 0.0)
+    if not shares.any():
+        return nothing
+    for factor in np.arange(1.0, 0.0, -STEP).tolist():
         gain, std, probability = _predicted(flights, shares, factor)
         if gain > 0.0 and probability < RISK:
             return Decision(factor * shares, worth, gain, std, probability)
-    return Decision(np.zeros(count), worth, 0.0, 0.0, 0.0)
+    return nothing
 
 
 def _valid(flights: Sequence[np.ndarray], left: np.ndarray) -> np.ndarray:

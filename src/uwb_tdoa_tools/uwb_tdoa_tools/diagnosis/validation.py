@@ -51,9 +51,8 @@ class ValidatedSelection:
     """The effects that the rule of `decision` applies, with their shares.
 
     refused : (Refused, ...) of the others
-    worth : {candidate or detection: increase of the mean 3D RMSE without it, m}; of dropped ones at the
-        time they were dropped
-    decision : Decision on all that are left; None without any
+    worth : {candidate or detection: increase of the mean 3D RMSE without it, m}
+    decision : Decision on all; None if nothing is applied
     """
 
     selection: Selection
@@ -137,7 +136,7 @@ def cross_fitted(
     detections: Sequence[Detection],
 ) -> list[ValidationCase]:
     """Return the ValidationCases of all folds, with effects fitted to the rest."""
-    parts = (*candidates, *detections)
+    parts: tuple[Part, ...] = (*candidates, *detections)
     return [
         replace(fold.case, effects=fold.effects(attribution, candidates, parts))
         for fold in folds(attribution, flights, base)
@@ -154,40 +153,34 @@ def select_by_error(
     """Return the ValidatedSelection: the rule of `decision` on flights that took no part in the fit.
 
     The filter runs with all effects and without each, on at most TRIED flights. The differences are
-    the displacements that `decide` judges. Effects that it drops leave the model, and the others are
-    fitted again with the same weights. Events at a time of a single flight are dropped at the end.
+    the displacements that `decide` judges. The other effects are fitted again without the dropped
+    ones. Events at a time of a single flight are dropped.
 
     map_function : as of `attribute`
     """
-    single = len(flights) == 1
-    chosen, detections = list(attribution.selection.chosen), list(attribution.detections)
-    worth: dict[Part, float] = {}
+    selection = attribution.selection
+    groups = _groups(selection, selection.chosen, attribution.detections)
+    if not groups:
+        return ValidatedSelection(selection, (), (), {})
+    at_a_time = [len(flights) == 1 and any(map(_is_momentary, group)) for group in groups]
+    tried = _products(attribution, flights, baseline, groups, progress, map_function)
+    decision = decide(tried, ~np.array(at_a_time))
     shares: dict[Part, float] = {}
+    worth: dict[Part, float] = {}
     refused: list[Refused] = []
-    decision = None
-    while groups := _groups(attribution.selection, chosen, detections):
-        decision = decide(
-            _products(attribution, flights, baseline, (chosen, groups), progress, map_function)
-        )
-        for group, share, value in zip(groups, decision.shares.tolist(), decision.worth.tolist()):
-            shares.update(dict.fromkeys(group, share))
-            worth.update(dict.fromkeys(group, value))
-        parts = sum(groups, [])
-        dropped = {part: _why_not(worth[part]) for part in parts if not shares[part]}
-        if single and not dropped:
-            dropped = {part: MOMENTARY for part in parts if _is_momentary(part)}
-        if not dropped:
-            break
-        refused += [Refused(_label(part), why) for part, why in dropped.items()]
-        chosen = [part for part in chosen if part not in dropped]
-        detections = [part for part in detections if part not in dropped]
-        decision = None
+    for place, group in enumerate(groups):
+        share, value = float(decision.shares[place]), float(decision.worth[place])
+        shares.update(dict.fromkeys(group, share))
+        worth.update(dict.fromkeys(group, value))
+        if not share:
+            why = MOMENTARY if at_a_time[place] else _why_not(value)
+            refused += [Refused(_label(part), why) for part in group]
     # with the weights of the trials: otherwise the dropped effects make outliers of their data
-    selection = replace(
-        attribution.selection.kept(chosen),
-        shares={part: shares[part] for part in chosen if part in shares},
-    )
-    return ValidatedSelection(selection, tuple(detections), tuple(refused), worth, decision)
+    kept = selection.kept([part for part in selection.chosen if shares.get(part, 1.0)])
+    kept = replace(kept, shares={part: shares[part] for part in kept.chosen if part in shares})
+    detections = tuple(one for one in attribution.detections if shares.get(one))
+    applied = decision if decision.shares.any() else None
+    return ValidatedSelection(kept, detections, tuple(refused), worth, applied)
 
 
 def _groups(
@@ -221,16 +214,15 @@ def _products(
     attribution: Attribution,
     flights: Sequence[Flight],
     baseline: Baseline,
-    model: tuple[Sequence[Candidate], Sequence[Sequence[Part]]],
+    groups: Sequence[list[Part]],
     progress: Callable[[], object],
     map_function: MapFunction,
 ) -> list[np.ndarray]:
     """Return the `products` of each tried flight, (k + 2, k + 2), that `decide` needs.
 
-    model : the Candidates of a model, and its k groups that are tried
+    groups : k groups that are tried
     """
-    candidates, groups = model
-    parts = sum(groups, [])
+    candidates, parts = attribution.selection.chosen, sum(groups, [])
     models = [parts, [], *([one for one in parts if one not in group] for group in groups)]
     several = folds(attribution, flights, baseline.base)
     trials = [
@@ -254,7 +246,8 @@ def _of_trial(
         time.
     """
     case, models = trial
-    anchors, poses, scores = case.flight.anchors, None, []
+    anchors, scores = case.flight.anchors, []
+    poses: Sequence[np.ndarray] = ()
     for place, effects in enumerate(models):
         corrector = Corrector(anchors, effects)
         if place > 1:
