@@ -4,8 +4,8 @@ Each effect displaces the estimated positions. A regression of the position erro
 flights on these displacements estimates the share of each effect that is valid in other flights:
 1 if it is exact, 0 if it is unrelated to the errors. The remaining error of a flight correlates with
 a displacement by chance and by other systematic errors. The standard deviation of this correlation
-between flights, and a prior of the share, were measured on flights that no table reports
-(`./dev study diagnosis decision`). The posterior of the shares predicts the error of a future flight
+between flights, and a prior of the share, were measured on two splits of
+`studies/diagnosis/measured.py` that no table reports. The posterior of the shares predicts the error of a future flight
 (Gelman et al., Bayesian Data Analysis, 2013, chapter 5).
 """
 
@@ -28,7 +28,8 @@ RULE = (
     f"If that error rises by more than {100 * LOSS:.0f} % with a probability above "
     f"{100 * RISK:.0f} %, all shares shrink until the probability is below.",
 )
-# Prior of the share of an effect that other flights show, mean and standard deviation
+# Prior of the share of an effect that other flights show, mean and standard deviation. Both, and the
+# next constant, are from `0425 level` and `0426 three`.
 VALID, VALID_STD = 0.75, 0.4
 # Standard deviation, between flights, of the correlation of a displacement with the remaining error
 CORRELATION = 0.25
