@@ -104,12 +104,12 @@ def _with_errors(diagnosis: Diagnosis) -> Verdict:
     more = [
         _intervals(before, after, interval),
         f"Judged on {diagnosis.judged_on}: {_flights(diagnosis)}; {_named(diagnosis)}.",
-        *_expected(diagnosis),
         *reasons(diagnosis),
         *_worse_phases(diagnosis),
         *_with_noise(diagnosis),
         *_over_phases(diagnosis),
         *_shared(diagnosis),
+        *_expected(diagnosis),
         *_caveats(diagnosis),
         *_worse(diagnosis),
         *_diverged(diagnosis),
