@@ -37,6 +37,7 @@ PARTS = (
     "injected",
     "measured",
     "measured-sensors",
+    "decision",
     "floor",
     "references",
     "speed",
@@ -86,7 +87,8 @@ def run(args):
     """Run a part, and write and print its figures."""
     args.out.mkdir(parents=True, exist_ok=True)
     on_data = dict.fromkeys(
-        ("faults", "injected", "measured", "measured-sensors", "floor", "references"), ("data",)
+        ("faults", "injected", "measured", "measured-sensors", "decision", "floor", "references"),
+        ("data",),
     )
     for option in {"undeclared": ("cases",), **on_data}.get(args.part, ()):
         if getattr(args, option) is None:
@@ -103,6 +105,7 @@ def run(args):
         "injected": _injected,
         "measured": _measured,
         "measured-sensors": _measured_sensors,
+        "decision": _decision,
         "floor": _floor,
         "references": _references,
         "speed": _speed,
@@ -235,7 +238,16 @@ def _measured(args):
     results = _each(
         [(name,) for name in measured.SPLITS], lambda name: measured.run(args.data, name, args.out)
     )
-    return {"figures": {r["split"]: r["summary"] for r in results}, "cases": results}
+    figures = {r["split"]: r["summary"] for r in results}
+    return {"figures": {**figures, "promises": measured.promises(results)}, "cases": results}
+
+
+def _decision(args):
+    results = _each(
+        [(name,) for name in measured.CHOSEN_ON],
+        lambda name: measured.run(args.data, name, args.out),
+    )
+    return {"figures": measured.promises(results), "cases": results}
 
 
 def _measured_sensors(args):

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from .channels import ChannelResiduals
     from .channels.base import Figures
     from .comparison import ValidationCase
+    from .decision import Decision
     from .references import Reference
     from .regression.confounding import Unobservable
 
@@ -38,6 +39,7 @@ class Diagnosis:
     cases : (ValidationCase, ...) that `after` is of
     tdoa_std : m, noise for the filter beside these effects, None if it was not measured
     written : as `after`, with this noise too: what the written files give; None if not judged
+    decision : Decision on all effects; None if nothing is applied
     """
 
     flights: tuple[Flight, ...]
@@ -59,3 +61,4 @@ class Diagnosis:
     cases: tuple[ValidationCase, ...] = ()
     tdoa_std: float | None = None
     written: dict[str, Any] | None = None
+    decision: Decision | None = None
