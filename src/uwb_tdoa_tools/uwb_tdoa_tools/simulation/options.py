@@ -11,6 +11,7 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_bias.common.survey import refuse_faulty
 
+from ..readers.tables import read_numbers
 from .config import (
     NO_IMU_ERRORS,
     PROTOCOLS,
@@ -21,6 +22,8 @@ from .config import (
 )
 from .paths import TRAJECTORIES
 from .rooms import Walls
+
+POSE = "t", "x", "y", "z", "yaw"  # columns of --poses
 
 
 def add_options(made: argparse.ArgumentParser) -> None:
@@ -50,6 +53,13 @@ def add_options(made: argparse.ArgumentParser) -> None:
         type=_points,
         **unless,
         help="waypoints, m, or X,Y,Z, again and again",
+    )
+    path.add_argument(
+        "--poses",
+        metavar="FILE",
+        type=Path,
+        help="timed path, CSV with columns t, x, y, z, yaw, s, m and rad, e.g. next_flight.csv of "
+        "diagnose",
     )
     add(
         "--area",
@@ -211,6 +221,9 @@ def config_of(args: argparse.Namespace) -> SimulationConfig:
         for field in fields(SimulationConfig)
         if hasattr(args, field.name)
     }
+    values["poses"] = (
+        None if args.poses is None else tuple(map(tuple, read_numbers(args.poses, POSE).tolist()))
+    )
     values["walls"] = None if args.walls is None else Walls.from_yaml(args.walls)
     values["anchors"] = (
         None

@@ -1,0 +1,684 @@
+"""Plan the next flight: the path that settles what a diagnosis leaves open.
+
+Two explanations of a finding predict different measurements on another path. The planner makes a
+library of motions in a box. The channels of the diagnosis predict the rows of a fit on each motion.
+The distance between two explanations is the misfit of one to the prediction of the other, after a
+fit to the old flights and the new rows. It is twice the expected log Bayes factor, and averaged over
+the values that the old flights allow. The planner joins the motions with the largest gain per
+second. The worth of a finding, in metres, is the weight of its gain.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+import numpy as np
+from scipy.special import expit, ndtr
+
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
+from uwb_tdoa_bias.effects import EffectSet
+
+from ..simulation.paths import SPEED_UP, STEP
+from ..simulation.vehicles import Trajectory
+from .channels import CHANNELS, Comparison
+from .references import GroundTruth
+from .refinement import recurs
+from .regression.algebra import dense, product, weighted
+from .regression.fit import NU, prior_sizes, refit
+from .regression.select import AMBIGUOUS
+from .regression.table import table_of
+from .regression.terms import columns_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from uwb_tdoa_bias.common.anchors import Anchors
+
+    from ..simulation.rooms import Room
+    from .attribution import Attribution
+    from .channels import ChannelResiduals
+    from .findings import EffectFinding
+    from .regression.select import Selection
+    from .regression.terms import Candidate, Column
+
+RATE = 20.0  # Hz, of planned poses
+ANCHOR_CLEARANCE = 0.8  # m, smallest distance of the path to an anchor
+STEEPEST = 315.0 / 128.0  # largest derivative of STEP
+SLOW = 0.3  # share of the speed in a slow pass
+SHORTEST = 8.0  # s, a shorter flight is continued: its ends do not count in a diagnosis
+ENOUGH = 0.95  # value of all questions, relative to their worth, from which no motion is added
+CELL = 0.25  # s, between TDOAs of a pair in a prediction, two per cell of a fit
+IMU_RATE, TRUTH_RATE = 100.0, 50.0  # Hz, of a prediction
+DRAWS = 24  # values of an explanation that the old flights allow
+MARGIN = 0.25  # s, without a prediction at both ends of a motion
+FEW = 0.02  # share of the most frequent pair, below which a pair is not predicted
+MOST_PAIRS = 200  # pairs that are predicted
+NEAR_ANCHORS = 16  # anchors that motions approach
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of a planned flight: s, m/s, m/s^2 and rad/s."""
+
+    time: float = 60.0
+    speed: float = 1.0
+    acceleration: float = 1.5
+    turning: float = 0.8
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not 0.0 < value < np.inf:
+                raise InputError(f"--plan-{name}: {value!r} is not a finite number above 0.")
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """Timed poses at RATE, at rest at both ends.
+
+    p : (n, 3) m, world; yaw : (n,) rad, without jumps; what : the motion, in words
+    """
+
+    p: np.ndarray
+    yaw: np.ndarray
+    what: str
+
+    @property
+    def t(self) -> np.ndarray:
+        """Return the stamps, (n,) s from 0."""
+        return np.arange(len(self.p)) / RATE
+
+    @property
+    def duration(self) -> float:
+        """Return the duration, s."""
+        return (len(self.p) - 1) / RATE
+
+    def then(self, other: Path) -> Path:
+        """Return this Path and another that starts at its end; whole turns of the yaw are undone."""
+        turns = np.round((other.yaw[0] - self.yaw[-1]) / (2.0 * np.pi))
+        yaw = np.concatenate([self.yaw, other.yaw[1:] - 2.0 * np.pi * turns])
+        return Path(np.concatenate([self.p, other.p[1:]]), yaw, f"{self.what}; {other.what}")
+
+
+class Library(NamedTuple):
+    """Motions that a planned flight can consist of, the anchors, and its limits."""
+
+    paths: tuple[Path, ...]
+    anchors: Anchors
+    limits: Limits
+
+
+class Question(Protocol):
+    """A question that a flight can settle.
+
+    what : the question, in words; worth : m, by which its answer can change positions
+    """
+
+    what: str
+    worth: float
+
+    def value(self, information: np.ndarray) -> float:
+        """Return the value of more information (k, k) on all columns, 0 to 1."""
+        ...
+
+    def answer(self, information: np.ndarray) -> str:
+        """Return a sentence: what a flight with this information is expected to tell."""
+        ...
+
+
+class _Known(NamedTuple):
+    """The information that the old flights hold.
+
+    columns : k Columns; gram : (k, k) information on them; sizes : (k,) standard deviations of
+        their priors
+    """
+
+    columns: tuple[Column, ...]
+    gram: np.ndarray
+    sizes: np.ndarray
+
+    def places(self, candidates: Sequence[Candidate]) -> np.ndarray:
+        """Return the places of the columns of Candidates."""
+        where = {column: k for k, column in enumerate(self.columns)}
+        return np.array([where[column] for column in columns_of(candidates)], dtype=int)
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """An explanation of the old flights.
+
+    name : of its finding; places : of its m columns among all k; values : (m,) fitted
+    information : (m, m) of the old flights and the prior
+    """
+
+    name: str
+    places: np.ndarray
+    values: np.ndarray
+    information: np.ndarray
+
+    def draws(self, count: int) -> np.ndarray:
+        """Return values of all columns from its posterior, (DRAWS, count); the rest is 0."""
+        rng = np.random.default_rng(0)
+        root = np.linalg.cholesky(np.linalg.inv(self.information))
+        out = np.zeros((DRAWS, count))
+        out[:, self.places] = self.values + rng.standard_normal((DRAWS, len(root))) @ root.T
+        return out
+
+    def misfit(self, gram: np.ndarray, truth: np.ndarray) -> np.ndarray:
+        """Return its misfit to new rows that `truth` (d, k) predicts, fitted anew, (d,).
+
+        It is in squared deviations, of the new rows and of the old values. gram : (k, k)
+        information of the new rows
+        """
+        away = truth.copy()
+        away[:, self.places] -= self.values
+        pull = away @ gram
+        vector = pull[:, self.places]
+        inside = self.information + gram[np.ix_(self.places, self.places)]
+        explained = np.sum(vector * np.linalg.solve(inside, vector.T).T, axis=1)
+        return np.sum(pull * away, axis=1) - explained
+
+
+@dataclass(frozen=True, eq=False)
+class Rivalry:
+    """Two explanations that fit nearly equally well.
+
+    gap : by how much the criterion of the second is worse, twice a log-likelihood
+    """
+
+    what: str
+    worth: float
+    models: tuple[Model, Model]
+    gap: float
+
+    @property
+    def beliefs(self) -> tuple[float, float]:
+        """Return the probabilities of both after the old flights."""
+        first = float(expit(0.5 * self.gap))
+        return first, 1.0 - first
+
+    def distances(self, information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the growth of the gap without noise if the first, or the second, is true.
+
+        Each is (DRAWS,), over the posterior of its values: a flight must not settle the question
+        for the fitted values alone.
+        """
+        out = []
+        for true, other in (self.models, self.models[::-1]):
+            values = true.draws(len(information))
+            growth = other.misfit(information, values) - true.misfit(information, values)
+            out.append(np.maximum(growth, 0.0))
+        return out[0], out[1]
+
+    def value(self, information: np.ndarray) -> float:
+        # A concave function, so more evidence than decides does not attract motions.
+        return sum(
+            belief * float(np.mean(-np.expm1(-distance / (2.0 * AMBIGUOUS))))
+            for belief, distance in zip(self.beliefs, self.distances(information))
+        )
+
+    def probability(self, information: np.ndarray) -> float:
+        """Return the probability that the gap exceeds AMBIGUOUS in favour of the true one.
+
+        Noise adds 4 D to the variance of a gap that it leaves at D on the mean.
+        """
+        out = 0.0
+        for belief, distance, start in zip(
+            self.beliefs, self.distances(information), (self.gap, -self.gap)
+        ):
+            sure = (start + distance - AMBIGUOUS) / (2.0 * np.sqrt(np.maximum(distance, 1e-9)))
+            out += belief * float(np.mean(ndtr(sure)))
+        return out
+
+    def answer(self, information: np.ndarray) -> str:
+        return (
+            f"It distinguishes {self.models[0].name} from {self.models[1].name} with a probability of "
+            f"{100.0 * self.probability(information):.0f} %"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Precision:
+    """A finding without a rival; more data make its values more precise.
+
+    mine, all : places of its columns, and of those of the whole model
+    """
+
+    what: str
+    worth: float
+    known: _Known
+    mine: np.ndarray
+    all: np.ndarray
+
+    def shrinkage(self, information: np.ndarray) -> np.ndarray:
+        """Return standard deviations with more information, relative to those of today, (k,)."""
+        variances = []
+        for more in (np.zeros_like(information), information):
+            gram = (self.known.gram + more)[np.ix_(self.all, self.all)]
+            scaled = np.linalg.inv(gram + np.diag(self.known.sizes[self.all] ** -2.0))
+            variances.append(np.diag(scaled)[np.isin(self.all, self.mine)])
+        return np.sqrt(variances[1] / variances[0])
+
+    def value(self, information: np.ndarray) -> float:
+        return float(1.0 - np.mean(self.shrinkage(information) ** 2))
+
+    def answer(self, information: np.ndarray) -> str:
+        left = float(np.mean(self.shrinkage(information)))
+        return f"It reduces the standard deviations of {self.what} to {100.0 * left:.0f} %"
+
+
+@dataclass(frozen=True, eq=False)
+class NextFlight:
+    """A planned flight.
+
+    path : Path; parts : ((start s, motion in words), ...); answers : sentences, the most valuable
+        question first; probability : that all questions of rivals are settled, None without any
+    """
+
+    path: Path
+    parts: tuple[tuple[float, str], ...]
+    answers: tuple[str, ...]
+    probability: float | None
+
+    @property
+    def sentences(self) -> list[str]:
+        """Return the plan in words: how long, how fast, what it tells."""
+        steps = np.linalg.norm(np.diff(self.path.p, axis=0), axis=1)
+        return [
+            f"Fly next_flight.csv: {self.path.duration:.0f} s, {steps.sum():.0f} m, at most "
+            f"{steps.max() * RATE:.1f} m/s.",
+            *self.answers,
+            "Then diagnose the old flights and this one together.",
+        ]
+
+    def as_json(self) -> dict[str, object]:
+        """Return plain values for diagnosis.json."""
+        return {
+            "duration": self.path.duration,
+            "settles": list(self.answers),
+            "probability": self.probability,
+            "parts": [{"from": start, "motion": what} for start, what in self.parts],
+        }
+
+    def files(self) -> dict[str, str]:
+        """Return {name of a file: its text}: a timed path, TUM poses, and waypoints."""
+        t, p, yaw = self.path.t, self.path.p, self.path.yaw
+        rows = [",".join(f"{x:.4f}" for x in row) for row in np.column_stack([t, p, yaw])]
+        half = 0.5 * yaw
+        turns = np.column_stack([np.zeros((len(t), 2)), np.sin(half), np.cos(half)])
+        poses = [" ".join(f"{x:.6f}" for x in row) for row in np.column_stack([t, p, turns])]
+        points = ["x,y,z,yaw,t,motion"]
+        for k, what in self._waypoints():
+            values = (*p[k], np.angle(np.exp(1j * yaw[k])), t[k])
+            points.append(",".join([*(f"{x:.2f}" for x in values), what]))
+        return {
+            "next_flight.csv": "\n".join(["t,x,y,z,yaw", *rows]) + "\n",
+            "next_flight.tum": "\n".join(poses) + "\n",
+            "next_flight_waypoints.csv": "\n".join(points) + "\n",
+        }
+
+    def _waypoints(self) -> Iterator[tuple[int, str]]:
+        """Yield (row of the path, motion) every two seconds, and where a motion starts or ends."""
+        starts = [round(start * RATE) for start, _ in self.parts] + [len(self.path.p) - 1]
+        for first, last, (_, what) in zip(starts, starts[1:], self.parts):
+            count = max(1, round((last - first) / (2.0 * RATE)))
+            for k in range(count):
+                yield first + round(k * (last - first) / count), what
+        yield starts[-1], "end"
+
+
+def plan_flight(
+    flights: Sequence[Flight],
+    found: Attribution,
+    findings: Sequence[EffectFinding],
+    library: Library,
+) -> NextFlight | None:
+    """Plan the flight that settles what the diagnosis of some Flights leaves open.
+
+    Parameters
+    ----------
+    flights : sequence of Flight
+        The diagnosed flights, with TDOAs and ground truth.
+    found : Attribution
+        Their attribution; `findings` hold the worth of its candidates.
+    library : Library
+        Motions to join, as of `motions`.
+
+    Returns
+    -------
+    NextFlight, or None if the diagnosis found nothing.
+    """
+    questions, known, told = questions_of(found, findings)
+    if not questions:
+        return None
+    forecast = Forecast(flights, found.selection, known, told)
+    gains = forecast.information(library.paths)
+
+    def value(information: np.ndarray) -> float:
+        return sum(question.worth * question.value(information) for question in questions)
+
+    worth = sum(question.worth for question in questions)
+    path, parts = _joined(library, gains, value, worth)
+    information = forecast.information([path])[0]
+    most = sorted(questions, key=lambda one: -one.worth * one.value(information))
+    answers = tuple(
+        f"{one.answer(information)} (worth {100.0 * one.worth:.1f} cm)." for one in most
+    )
+    chances = [one.probability(information) for one in questions if isinstance(one, Rivalry)]
+    return NextFlight(path, parts, answers, float(np.min(chances)) if chances else None)
+
+
+def questions_of(
+    found: Attribution, findings: Sequence[EffectFinding]
+) -> tuple[list[Question], _Known, list[Candidate]]:
+    """Return (Questions, information of the old flights, Candidates that they are about).
+
+    A question is a finding and a rival with nearly the same criterion. Without any rivals, every
+    finding is a question of precision.
+    """
+    selection = found.selection
+    pairs = [
+        (candidate, rival)
+        for candidate, rivals in zip(selection.chosen, selection.rivals)
+        for rival in rivals
+        if abs(rival.gap) < AMBIGUOUS
+    ]
+    told = list(dict.fromkeys([*selection.chosen, *(rival.candidate for _, rival in pairs)]))
+    table = selection.table.with_terms([term for one in told for term in one.terms])
+    columns = tuple(columns_of(told))
+    x, weight = table.matrix(columns), selection.fit.information(table)
+    known = _Known(columns, product(weighted(x, weight), x), prior_sizes(columns))
+    worths = {
+        candidate: finding.worth
+        for finding in findings
+        for candidate in finding.candidates
+        if finding.worth is not None
+    }
+
+    def worth(candidate: Candidate) -> float:
+        size = table.matrix(candidate.columns) @ selection.fit.values(candidate.columns)
+        # Where no filter was run without it, its contribution to a row counts.
+        return max(worths.get(candidate, float(np.sqrt(np.mean(size**2)))), 0.001)
+
+    out: list[Question] = []
+    for candidate, rival in pairs:
+        rest = [one for one in selection.chosen if one is not candidate]
+        models = []
+        for own in (candidate, rival.candidate):
+            model = [*rest, own]
+            places = known.places(model)
+            fitted = refit(table, columns_of(model), selection.fit)
+            information = known.gram[np.ix_(places, places)] + np.diag(known.sizes[places] ** -2.0)
+            models.append(Model(own.label, places, fitted.beta, information))
+        share = sum(one is candidate for one, _ in pairs)
+        what = f"{candidate.label} or {rival.candidate.label}"
+        out.append(Rivalry(what, worth(candidate) / share, (models[0], models[1]), rival.gap))
+    if not out:
+        every = known.places(selection.chosen)
+        out += [
+            Precision(one.label, worth(one), known, known.places([one]), every)
+            for one in selection.chosen
+        ]
+    return out, known, told
+
+
+class Forecast:
+    """Predicts the information of paths about the columns of a diagnosis."""
+
+    def __init__(
+        self,
+        flights: Sequence[Flight],
+        selection: Selection,
+        known: _Known,
+        told: Sequence[Candidate],
+    ) -> None:
+        """Take the old flights, their Selection, and the Candidates of the columns of `known`.
+
+        New rows have the mean curvature of old rows of the same axis and channel.
+        """
+        self._selection, self._known, self._told = selection, known, told
+        self._anchors = flights[0].anchors
+        self._pairs, self._reach = _links(flights)
+        self._with_imu = any(name in selection.table.present for name in ("gyro", "accel"))
+        group = selection.table.group
+        most = 3 * len(CHANNELS)
+        total = np.bincount(group, _curvature(selection), most)
+        self._mean = total / np.maximum(np.bincount(group, minlength=most), 1)
+
+    def information(self, paths: Sequence[Path]) -> np.ndarray:
+        """Return the information of each Path on all columns, (len(paths), k, k)."""
+        table = table_of([self._predicted(path) for path in paths])
+        table = table.with_terms([term for one in self._told for term in one.terms])
+        x = dense(table.matrix(self._known.columns))
+        # An event of an old flight is not in another one.
+        events = [one for one in self._told if not recurs(one)]
+        x[:, self._known.places(events)] = 0.0
+        weight = self._mean[table.group]
+        out = []
+        for number in range(len(paths)):
+            rows = table.flight == number
+            out.append(x[rows].T @ (x[rows] * weight[rows, None]))
+        return np.array(out)
+
+    def _predicted(self, path: Path) -> ChannelResiduals:
+        """Return the residuals of a Path without errors and noise, whose regressors count."""
+        flown = Trajectory.along(path.t, path.p, path.yaw)
+        count = len(self._pairs)
+        cells = np.arange(0.0, path.duration, CELL)
+        t = (cells[:, None] + CELL * np.arange(count) / count).ravel()
+        a, b = np.tile(self._pairs, (len(cells), 1)).T
+        p = flown.motion(t).p
+        rows = self._anchors.index(a), self._anchors.index(b)
+        to = [np.linalg.norm(p - self._anchors.positions[row], axis=1) for row in rows]
+        heard = (np.maximum(*to) <= self._reach) & (t <= path.duration)
+        tdoa = Tdoas(t[heard], a[heard], b[heard], (to[1] - to[0])[heard])
+        t_truth = np.arange(0.0, path.duration, 1.0 / TRUTH_RATE)
+        motion = flown.motion(t_truth)
+        imu = None
+        if self._with_imu:
+            t_imu = np.arange(0.0, path.duration, 1.0 / IMU_RATE)
+            felt = flown.motion(t_imu)
+            imu = Imu(t_imu, felt.body_rates, felt.specific_force)
+        flight = Flight("next", self._anchors, tdoa, imu, Truth(t_truth, motion.p, motion.q))
+        span = MARGIN, path.duration - MARGIN
+        comparison = Comparison.of(flight, GroundTruth(), EffectSet(), span)
+        parts = {name: channel.residual(comparison) for name, channel in CHANNELS.items()}
+        return {name: part for name, part in parts.items() if part is not None}
+
+
+def _curvature(selection: Selection) -> np.ndarray:
+    """Return minus the second derivative of the log-likelihood by each row, (n,), 1 / unit^2.
+
+    On average it is below `Fit.information`, whose weights belong to iterations of a fit: a row of
+    Student's t distinguishes explanations less than a Gaussian row.
+    """
+    model, table = selection.fit, selection.table
+    scale = model.scale[table.group]
+    power = (model.residual / scale) ** 2
+    each = (NU + 1.0) * (NU - power) / (NU + power) ** 2
+    out: np.ndarray = each / (scale**2 * model.inflation[table.group])
+    return out
+
+
+def route(places: np.ndarray, yaw: Sequence[float], limits: Limits) -> Path:
+    """Return the Path from place to place, (n, 3) m, with a yaw (n,), rad, at each."""
+    out = Path(places[:1], np.array(yaw[:1]), "start")
+    for place, angle in zip(places[1:], yaw[1:]):
+        out = out.then(_line(out.p[-1], place, (out.yaw[-1], angle), limits, "line"))
+    return out
+
+
+def motions(room: Room, flights: Sequence[Flight], limits: Limits) -> Library:
+    """Return the Library of motions in a Room: lines, circles, turns, and passes at anchors.
+
+    They keep the clearance of `Room.flyable` to walls, floor and ceiling, and ANCHOR_CLEARANCE to
+    anchors. Raises InputError if none fits, or if a Flight lacks TDOAs.
+    """
+    anchors = flights[0].anchors
+    if not all(len(flight.tdoa) for flight in flights):
+        raise InputError("--plan-flight: needs TDOAs in each flight; leave it out.")
+    every = _everywhere(room, anchors, limits)
+    out = [path for path in every if path.duration <= limits.time and _is_clear(path, anchors)]
+    if not out:
+        raise InputError(
+            "--plan-flight: no motion fits into this box, this time and the distance of "
+            f"{ANCHOR_CLEARANCE:g} m to anchors; give a larger box or more time."
+        )
+    return Library(tuple(out), anchors, limits)
+
+
+def _everywhere(room: Room, anchors: Anchors, limits: Limits) -> list[Path]:
+    """Return the motions in a Room, whether they fit or not."""
+    low, high = room.flyable
+    centre, half = 0.5 * (low + high), 0.5 * (high - low)
+    levels = {"low": low[2], "middle": centre[2], "high": high[2]}
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    slow = replace(limits, speed=SLOW * limits.speed)
+    out = []
+    for name, z in levels.items():
+        at = np.array([*centre[:2], z])
+        for k, axis in enumerate("xy"):
+            reach = half * np.eye(3)[k]
+            for turn, how in ((0.0, ""), (2.0 * np.pi, ", turning once")):
+                words = f"line along {axis}, {name}{how}"
+                out.append(_line(at - reach, at + reach, (0.0, turn), limits, words))
+        for share, size in ((1.0, "wide"), (0.5, "narrow")):
+            radius = share * min(half[:2])
+            for along, how in ((False, "yaw kept"), (True, "yaw along the track")):
+                out.append(_circle(at, radius, along, limits, f"{size} circle, {name}, {how}"))
+    for corner in corners[:2]:
+        reach = half * [*corner, -1.0]
+        out.append(_line(centre + reach, centre - reach, (0.0, 0.0), limits, "rising diagonal"))
+    reach = half * [1.0, 1.0, 0.0]
+    for each, how in ((slow, "slowly"), (limits, "fast")):
+        there = _line(centre - reach, centre + reach, (0.0, 0.0), each, f"diagonal, {how}")
+        back = _line(centre + reach, centre - reach, (0.0, 0.0), each, "back")
+        out.append(there.then(back))
+    for place, name in (
+        (centre, "in the middle"),
+        *((centre + half * [*c, 0], "in a corner") for c in corners),
+    ):
+        out.append(_line(place, place, (0.0, 2.0 * np.pi), limits, f"full turn {name}"))
+    for anchor in np.argsort(np.linalg.norm(anchors.positions - centre, axis=1))[:NEAR_ANCHORS]:
+        near = _beside(anchors.positions[anchor], low, high)
+        number = anchors.ids[anchor]
+        to = _line(centre, near, (0.0, 0.0), limits, f"to anchor {number}")
+        out.append(to.then(_line(near, centre, (0.0, 0.0), limits, "back")))
+        foot, top = np.array([*near[:2], low[2]]), np.array([*near[:2], high[2]])
+        up = _line(foot, top, (0.0, 0.0), limits, f"up at anchor {number}")
+        out.append(up.then(_line(top, foot, (0.0, 0.0), limits, "down")))
+    return out
+
+
+def _joined(
+    library: Library, gains: np.ndarray, value: Callable[[np.ndarray], float], worth: float
+) -> tuple[Path, tuple[tuple[float, str], ...]]:
+    """Return the (Path, parts) of the motions with the largest gain of value per second.
+
+    gains : (n, k, k) information of each motion; value : of information, m; worth : its largest, m
+    """
+    paths, anchors, limits = library
+    path: Path | None = None
+    parts: list[tuple[float, str]] = []
+    information = np.zeros_like(gains[0])
+    while True:
+        now, choices = value(information), []
+        if path is not None and path.duration >= SHORTEST and now >= ENOUGH * worth:
+            break
+        for motion, gain in zip(paths, gains):
+            longer, start = motion, 0.0
+            if path is not None:
+                ends = path.yaw[-1], motion.yaw[0]
+                way = _line(path.p[-1], motion.p[0], ends, limits, "way")
+                if not _is_clear(way, anchors):
+                    continue
+                longer, start = path.then(way).then(motion), path.duration + way.duration
+            if longer.duration <= limits.time:
+                spent = longer.duration - (0.0 if path is None else path.duration)
+                choices.append(((value(information + gain) - now) / spent, start, longer, motion))
+        if not choices:
+            break
+        gained, start, longer, motion = max(choices, key=lambda one: one[0])
+        if gained <= 0.0 and path is not None and path.duration >= SHORTEST:
+            break
+        information = information + gains[paths.index(motion)]
+        if path is not None and start > path.duration:
+            parts.append((path.duration, "way"))
+        parts.append((start, motion.what))
+        path = longer
+    assert path is not None  # each motion of the library fits into the time
+    return path, tuple(parts)
+
+
+def _links(flights: Sequence[Flight]) -> tuple[np.ndarray, float]:
+    """Return (pairs of anchors (m, 2) that were heard, the most frequent first; reach, m)."""
+    anchors = flights[0].anchors
+    heard = np.concatenate([np.column_stack([one.tdoa.a, one.tdoa.b]) for one in flights])
+    heard = heard[np.isin(heard, anchors.ids).all(axis=1) & (heard[:, 0] != heard[:, 1])]
+    pairs, count = np.unique(heard, axis=0, return_counts=True)
+    order = np.argsort(-count, kind="stable")[:MOST_PAIRS]
+    farthest = 0.0
+    for flight in flights:
+        assert flight.truth is not None  # of GroundTruth
+        some = flight.truth.p[:: max(1, len(flight.truth.p) // 500)]
+        away = np.linalg.norm(some[:, None] - flight.anchors.positions, axis=2)
+        inside = np.isin(flight.anchors.ids, heard)
+        farthest = max(farthest, float(away[:, inside].min(axis=0).max()))
+    # All anchors of a room are heard everywhere; of a hall those that were ever near.
+    span = float(np.linalg.norm(np.ptp(anchors.positions, axis=0)))
+    return pairs[order][count[order] >= FEW * count.max()], max(farthest, span)
+
+
+def _beside(anchor: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return the place in a box nearest to an anchor, at least ANCHOR_CLEARANCE away, (3,) m."""
+    near = np.clip(anchor, low, high)
+    away = np.linalg.norm(near - anchor)
+    if away >= ANCHOR_CLEARANCE:
+        return near
+    inwards = 0.5 * (low + high) - anchor
+    return anchor + inwards * min(1.0, 1.01 * ANCHOR_CLEARANCE / max(np.linalg.norm(inwards), 1e-9))
+
+
+def _is_clear(path: Path, anchors: Anchors) -> bool:
+    """Return whether a Path keeps its distance to all anchors."""
+    away = np.linalg.norm(path.p[::5, None] - anchors.positions, axis=2)
+    return bool(away.min() >= ANCHOR_CLEARANCE)
+
+
+def _line(
+    start: np.ndarray, end: np.ndarray, yaw: tuple[float, float], limits: Limits, what: str
+) -> Path:
+    """Return the straight Path between two places, from rest to rest, while the yaw turns."""
+    s = _progress(float(np.linalg.norm(end - start)), abs(yaw[1] - yaw[0]), limits)
+    return Path(start + s[:, None] * (end - start), yaw[0] + s * (yaw[1] - yaw[0]), what)
+
+
+def _circle(centre: np.ndarray, radius: float, along: bool, limits: Limits, what: str) -> Path:
+    """Return a level circle, from rest to rest."""
+    speed = min(limits.speed, np.sqrt(limits.acceleration * radius))
+    turned = 2.0 * np.pi if along else 0.0
+    s = _progress(2.0 * np.pi * radius, turned, replace(limits, speed=speed))
+    angle = 2.0 * np.pi * s
+    around = radius * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(s))])
+    return Path(centre + around, 0.5 * np.pi + angle if along else np.zeros(len(s)), what)
+
+
+def _progress(length: float, turn: float, limits: Limits) -> np.ndarray:
+    """Return the progress, 0 to 1, at RATE on the way over a length, m, with a turn, rad.
+
+    Speed and turning rate rise and fall smoothly, within the limits.
+    """
+    speed = min(limits.speed, np.sqrt(max(length, 1e-6) * limits.acceleration / STEEPEST))
+    ramp = max(STEEPEST * speed / limits.acceleration, min(SPEED_UP, turn / limits.turning), 0.5)
+    cruise = max(length / speed, turn / limits.turning, ramp)
+    t = np.arange(np.ceil((cruise + ramp) * RATE) + 1) / RATE
+    scale = (cruise + ramp) / t[-1]  # the last sample is at the end
+
+    def since(x: np.ndarray) -> np.ndarray:
+        inside = np.clip(x, 0.0, 1.0)
+        return STEP.integ()(inside) + np.maximum(x - 1.0, 0.0)
+
+    t = t * scale
+    out: np.ndarray = ramp * (since(t / ramp) - since((t - cruise) / ramp)) / cruise
+    return out
