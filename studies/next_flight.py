@@ -190,4 +190,4 @@ def at_random(planned, room, limits, rng, turn):
     places = rng.uniform(*room.flyable, (count, 3))
     out = route(places, rng.uniform(-turn, turn, count), limits)
     rows = len(planned.p)
-    return type(out)(out.p[:rows], out.yaw[:rows], "random")
+    return type(out)(out.p[:rows], out.yaw[:rows], "random", (0, rows - 1))

@@ -237,12 +237,12 @@ def _diagnose(args: Namespace) -> int:
     if rerun is not None:
         write_diagnosis(rerun, result, effects or EffectSet(), config)
     cli.show(output.as_text(result))
-    cli.show(
-        "wrote diagnosis.json, effects.yaml, "
-        f"{'ekf_node.yaml ' if parameters is not None else ''}"
-        f"{'next_flight.csv, .tum and _waypoints.csv ' if result.next_flight else ''}"
-        f"and report.html to {out}"
+    files = (
+        *("diagnosis.json", "effects.yaml"),
+        *["ekf_node.yaml"][: parameters is not None],
+        *(result.next_flight.files() if result.next_flight else ()),
     )
+    cli.show(f"wrote {', '.join(files)} and report.html to {out}")
     return 0
 
 

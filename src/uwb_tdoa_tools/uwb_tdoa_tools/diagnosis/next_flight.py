@@ -78,11 +78,13 @@ class Path:
     """Timed poses at RATE, at rest at both ends.
 
     p : (n, 3) m, world; yaw : (n,) rad, without jumps; what : the motion, in words
+    stops : rows at rest, the first and the last among them
     """
 
     p: np.ndarray
     yaw: np.ndarray
     what: str
+    stops: tuple[int, ...]
 
     @property
     def t(self) -> np.ndarray:
@@ -98,7 +100,9 @@ class Path:
         """Return this Path and another that starts at its end; whole turns of the yaw are undone."""
         turns = np.round((other.yaw[0] - self.yaw[-1]) / (2.0 * np.pi))
         yaw = np.concatenate([self.yaw, other.yaw[1:] - 2.0 * np.pi * turns])
-        return Path(np.concatenate([self.p, other.p[1:]]), yaw, f"{self.what}; {other.what}")
+        p, last = np.concatenate([self.p, other.p[1:]]), len(self.p) - 1
+        stops = (*self.stops, *(last + stop for stop in other.stops[1:]))
+        return Path(p, yaw, f"{self.what}, {other.what}", stops)
 
 
 class Library(NamedTuple):
@@ -311,7 +315,7 @@ class NextFlight:
         points = ["x,y,z,yaw,t,motion"]
         for k, what in self._waypoints():
             values = (*p[k], np.angle(np.exp(1j * yaw[k])), t[k])
-            points.append(",".join([*(f"{x:.2f}" for x in values), what]))
+            points.append(",".join([*(f"{x:.2f}" for x in values), f'"{what}"']))
         return {
             "next_flight.csv": "\n".join(["t,x,y,z,yaw", *rows]) + "\n",
             "next_flight.tum": "\n".join(poses) + "\n",
@@ -319,13 +323,14 @@ class NextFlight:
         }
 
     def _waypoints(self) -> Iterator[tuple[int, str]]:
-        """Yield (row of the path, motion) every two seconds, and where a motion starts or ends."""
-        starts = [round(start * RATE) for start, _ in self.parts] + [len(self.path.p) - 1]
-        for first, last, (_, what) in zip(starts, starts[1:], self.parts):
+        """Yield (row of the path, motion) at each stop, and every two seconds between them."""
+        begins = np.array([start for start, _ in self.parts])
+        for first, last in zip(self.path.stops, self.path.stops[1:]):
             count = max(1, round((last - first) / (2.0 * RATE)))
+            part = np.searchsorted(begins, first / RATE + 1e-6, side="right") - 1
             for k in range(count):
-                yield first + round(k * (last - first) / count), what
-        yield starts[-1], "end"
+                yield first + round(k * (last - first) / count), self.parts[part][1]
+        yield self.path.stops[-1], "end"
 
 
 def plan_flight(
@@ -503,7 +508,7 @@ def _curvature(selection: Selection) -> np.ndarray:
 
 def route(places: np.ndarray, yaw: Sequence[float], limits: Limits) -> Path:
     """Return the Path from place to place, (n, 3) m, with a yaw (n,), rad, at each."""
-    out = Path(places[:1], np.array(yaw[:1]), "start")
+    out = Path(places[:1], np.array(yaw[:1]), "start", (0,))
     for place, angle in zip(places[1:], yaw[1:]):
         out = out.then(_line(out.p[-1], place, (out.yaw[-1], angle), limits, "line"))
     return out
@@ -589,7 +594,8 @@ def _joined(
         for motion, gain in zip(paths, gains):
             longer, start = motion, 0.0
             if path is not None:
-                ends = path.yaw[-1], motion.yaw[0]
+                turn = float(np.angle(np.exp(1j * (motion.yaw[0] - path.yaw[-1]))))
+                ends = path.yaw[-1], path.yaw[-1] + turn
                 way = _line(path.p[-1], motion.p[0], ends, limits, "way")
                 if not _is_clear(way, anchors):
                     continue
@@ -631,13 +637,15 @@ def _links(flights: Sequence[Flight]) -> tuple[np.ndarray, float]:
 
 
 def _beside(anchor: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return the place in a box nearest to an anchor, at least ANCHOR_CLEARANCE away, (3,) m."""
+    """Return a place in a box near an anchor, (3,) m, ANCHOR_CLEARANCE away if there is one."""
     near = np.clip(anchor, low, high)
     away = np.linalg.norm(near - anchor)
     if away >= ANCHOR_CLEARANCE:
         return near
     inwards = 0.5 * (low + high) - anchor
-    return anchor + inwards * min(1.0, 1.01 * ANCHOR_CLEARANCE / max(np.linalg.norm(inwards), 1e-9))
+    step = 1.01 * ANCHOR_CLEARANCE / max(np.linalg.norm(inwards), 1e-9)
+    out: np.ndarray = np.clip(anchor + min(1.0, step) * inwards, low, high)
+    return out
 
 
 def _is_clear(path: Path, anchors: Anchors) -> bool:
@@ -651,7 +659,8 @@ def _line(
 ) -> Path:
     """Return the straight Path between two places, from rest to rest, while the yaw turns."""
     s = _progress(float(np.linalg.norm(end - start)), abs(yaw[1] - yaw[0]), limits)
-    return Path(start + s[:, None] * (end - start), yaw[0] + s * (yaw[1] - yaw[0]), what)
+    p, turned = start + s[:, None] * (end - start), yaw[0] + s * (yaw[1] - yaw[0])
+    return Path(p, turned, what, (0, len(s) - 1))
 
 
 def _circle(centre: np.ndarray, radius: float, along: bool, limits: Limits, what: str) -> Path:
@@ -661,7 +670,8 @@ def _circle(centre: np.ndarray, radius: float, along: bool, limits: Limits, what
     s = _progress(2.0 * np.pi * radius, turned, replace(limits, speed=speed))
     angle = 2.0 * np.pi * s
     around = radius * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(s))])
-    return Path(centre + around, 0.5 * np.pi + angle if along else np.zeros(len(s)), what)
+    yaw = 0.5 * np.pi + angle if along else np.zeros(len(s))
+    return Path(centre + around, yaw, what, (0, len(s) - 1))
 
 
 def _progress(length: float, turn: float, limits: Limits) -> np.ndarray:

@@ -97,7 +97,8 @@ def as_text(diagnosis: Diagnosis) -> str:
     if added:
         lines += [("apply", command) for command, _ in diagnosis.applying]
     if diagnosis.next_flight:
-        lines += [("fly", sentence) for sentence in diagnosis.next_flight.sentences]
+        first, *others_of_it = diagnosis.next_flight.sentences
+        lines += [("fly", first), *(("", sentence) for sentence in others_of_it)]
     left_out = [(entry.title, entry.why_not) for entry in found if not entry.added]
     lines += [("not added", "{1}: {0}.".format(*row)) for row in by_reason(left_out).rows]
     return "\n".join([*(_wrapped(*line) for line in lines), *anchors.lines(diagnosis)])

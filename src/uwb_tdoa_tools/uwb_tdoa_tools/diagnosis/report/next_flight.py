@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from ..result import Diagnosis
 
 EVERY = 2.0  # s, between arrows of the heading
-AHEAD = 0.35  # m, length of such an arrow
+AHEAD = 0.5  # m, length of such an arrow
 MARGIN = 0.5  # m around anchors and path
 
 
@@ -43,23 +43,26 @@ def picture(diagnosis: Diagnosis) -> Picture:
             inside = (path.t >= first) & (path.t <= last)
             words = None if what == "way" else f"{first:.0f} s: {what}"
             ax.plot(*path.p[inside][:, view].T, lw=2.0, label=words, **style)
-        tails = path.p[arrows][:, view]
-        ax.quiver(
-            *tails.T,
-            *heading[arrows][:, view].T,
-            angles="xy",
-            scale_units="xy",
-            scale=1.0,
-            width=0.004,
-            color="0.25",
-        )
         ax.plot(*path.p[0, view], "ko", ms=5)
         ax.plot(*heard[:, view].T, "^", color="0.2", ms=5)
+        labels: dict[tuple[float, ...], list[str]] = {}
         for number, place in zip(anchors.ids, heard):
-            ax.annotate(str(number), place[view], (4, 4), textcoords="offset points")
+            labels.setdefault(tuple(np.round(place[view], 1)), []).append(str(number))
+        for place, ids in labels.items():
+            ax.annotate(", ".join(ids), place, (4, 4), textcoords="offset points")
         ax.set(aspect="equal", xlabel="x [m]", ylabel=f"{'xyz'[view[1]]} [m]")
         ax.margins(0.08)
         ax.grid(alpha=0.25, lw=0.5)
+    axes[0].quiver(
+        *path.p[arrows, :2].T,
+        *heading[arrows, :2].T,
+        angles="xy",
+        scale_units="xy",
+        scale=1.0,
+        width=0.006,
+        color="0.25",
+        zorder=3,
+    )
     axes[0].set_title("From above", loc="left", fontsize=10)
     axes[1].set_title("From the side", loc="left", fontsize=10)
     figure.legend(
@@ -69,5 +72,5 @@ def picture(diagnosis: Diagnosis) -> Picture:
         figure,
         f"Planned path of {path.duration:.0f} s among the anchors, from above and from the side",
         "Path of next_flight.csv. The dot is its start; dotted lines lead to the next motion; "
-        "triangles are anchors; arrows show the yaw every 2 s.",
+        "triangles are anchors; arrows from above show the yaw every 2 s.",
     )
