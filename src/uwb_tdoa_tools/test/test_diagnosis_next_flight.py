@@ -125,7 +125,7 @@ def test_a_probability_rises_with_what_distinguishes_and_not_with_what_does_not(
         Model("a", np.array([0]), np.ones(1), 100.0 * np.eye(1)),
         Model("b", np.array([1]), np.ones(1), 100.0 * np.eye(1)),
     )
-    rivalry = Rivalry("a or b", 0.05, models, 2.0)
+    rivalry = Rivalry(0.05, models, 2.0)
     alike, apart = np.ones((2, 2)), np.array([[1.0, 0.0], [0.0, 1.0]])
     for much in (1.0, 100.0, 1e4):
         assert rivalry.probability(much * alike) < 0.1 and rivalry.value(much * alike) < 0.2

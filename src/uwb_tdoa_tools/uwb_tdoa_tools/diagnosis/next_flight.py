@@ -11,7 +11,7 @@ second. The worth of a finding, in metres, is the weight of its gain.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.special import expit, ndtr
@@ -113,24 +113,6 @@ class Library(NamedTuple):
     limits: Limits
 
 
-class Question(Protocol):
-    """A question that a flight can settle.
-
-    what : the question, in words; worth : m, by which its answer can change positions
-    """
-
-    what: str
-    worth: float
-
-    def value(self, information: np.ndarray) -> float:
-        """Return the value of more information (k, k) on all columns, 0 to 1."""
-        ...
-
-    def answer(self, information: np.ndarray) -> str:
-        """Return a sentence: what a flight with this information is expected to tell."""
-        ...
-
-
 class _Known(NamedTuple):
     """The information that the old flights hold.
 
@@ -188,10 +170,10 @@ class Model:
 class Rivalry:
     """Two explanations that fit nearly equally well.
 
+    worth : m, by which its answer can change positions
     gap : by how much the criterion of the second is worse, twice a log-likelihood
     """
 
-    what: str
     worth: float
     models: tuple[Model, Model]
     gap: float
@@ -216,6 +198,7 @@ class Rivalry:
         return out[0], out[1]
 
     def value(self, information: np.ndarray) -> float:
+        """Return the value of more information (k, k) on all columns, 0 to 1."""
         # A concave function, so more evidence than decides does not attract motions.
         return sum(
             belief * float(np.mean(-np.expm1(-distance / (2.0 * AMBIGUOUS))))
@@ -236,6 +219,7 @@ class Rivalry:
         return out
 
     def answer(self, information: np.ndarray) -> str:
+        """Return a clause: what a flight with this information is expected to settle."""
         return (
             f"It distinguishes {self.models[0].name} from {self.models[1].name} with a probability of "
             f"{100.0 * self.probability(information):.0f} %"
@@ -246,6 +230,7 @@ class Rivalry:
 class Precision:
     """A finding without a rival; more data make its values more precise.
 
+    what : its label; worth : m, as of Rivalry
     mine, all : places of its columns, and of those of the whole model
     """
 
@@ -265,11 +250,16 @@ class Precision:
         return np.sqrt(variances[1] / variances[0])
 
     def value(self, information: np.ndarray) -> float:
+        """Return the value of more information (k, k) on all columns, 0 to 1."""
         return float(1.0 - np.mean(self.shrinkage(information) ** 2))
 
     def answer(self, information: np.ndarray) -> str:
+        """Return a clause: how much more precise the values become."""
         left = float(np.mean(self.shrinkage(information)))
         return f"It reduces the standard deviations of {self.what} to {100.0 * left:.0f} %"
+
+
+Question = Rivalry | Precision
 
 
 @dataclass(frozen=True, eq=False)
@@ -417,8 +407,7 @@ def questions_of(
             information = known.gram[np.ix_(places, places)] + np.diag(known.sizes[places] ** -2.0)
             models.append(Model(own.label, places, fitted.beta, information))
         share = sum(one is candidate for one, _ in pairs)
-        what = f"{candidate.label} or {rival.candidate.label}"
-        out.append(Rivalry(what, worth(candidate) / share, (models[0], models[1]), rival.gap))
+        out.append(Rivalry(worth(candidate) / share, (models[0], models[1]), rival.gap))
     if not out:
         every = known.places(selection.chosen)
         out += [
@@ -643,7 +632,7 @@ def _beside(anchor: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray
     if away >= ANCHOR_CLEARANCE:
         return near
     inwards = 0.5 * (low + high) - anchor
-    step = 1.01 * ANCHOR_CLEARANCE / max(np.linalg.norm(inwards), 1e-9)
+    step = 1.01 * ANCHOR_CLEARANCE / max(float(np.linalg.norm(inwards)), 1e-9)
     out: np.ndarray = np.clip(anchor + min(1.0, step) * inwards, low, high)
     return out
 
