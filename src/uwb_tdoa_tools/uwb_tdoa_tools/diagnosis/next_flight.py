@@ -434,7 +434,7 @@ class Forecast:
         self._selection, self._known, self._told = selection, known, told
         self._anchors = flights[0].anchors
         self._pairs, self._reach = _links(flights)
-        self._with_imu = any(name in selection.table.present for name in ("gyro", "accel"))
+        self._with_imu = any(CHANNELS[name].stream == "imu" for name in selection.table.present)
         group = selection.table.group
         most = 3 * len(CHANNELS)
         total = np.bincount(group, _curvature(selection), most)
