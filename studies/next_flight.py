@@ -185,7 +185,7 @@ def settles(found, effect, left):
 
 
 def at_random(planned, room, limits, rng, turn):
-    """A Path of the same length through random places, with random yaws up to `turn`, rad."""
+    """A TimedPath of the same length through random places, with random yaws up to `turn`, rad."""
     count = 2 + int(planned.duration)
     places = rng.uniform(*room.flyable, (count, 3))
     out = route(places, rng.uniform(-turn, turn, count), limits)

@@ -43,7 +43,7 @@ def of_anchors(anchors):
 
 
 def sides(path):
-    """Speeds, accelerations and turning rates along a Path."""
+    """Speeds, accelerations and turning rates along a TimedPath."""
     v = np.diff(path.p, axis=0) * RATE
     a = np.diff(v, axis=0) * RATE
     rate = np.diff(path.yaw) * RATE
@@ -125,13 +125,16 @@ def test_a_probability_rises_with_what_distinguishes_and_not_with_what_does_not(
         Model("a", np.array([0]), np.ones(1), 100.0 * np.eye(1)),
         Model("b", np.array([1]), np.ones(1), 100.0 * np.eye(1)),
     )
-    rivalry = Rivalry(0.05, models, 2.0)
+    rivalry = Rivalry(0.05, models, np.array([0.0, 2.0]))
     alike, apart = np.ones((2, 2)), np.array([[1.0, 0.0], [0.0, 1.0]])
     for much in (1.0, 100.0, 1e4):
         assert rivalry.probability(much * alike) < 0.1 and rivalry.value(much * alike) < 0.2
     chances = [rivalry.probability(much * apart) for much in (0.0, 10.0, 100.0)]
     assert chances[0] == 0.0 and np.all(np.diff(chances) > 0.0) and chances[-1] > 0.95
     assert "distinguishes a from b" in rivalry.answer(apart)
+    left, sentences = rivalry.without_twins(1e4 * alike)
+    assert len(left.models) == 1 and sentences == ["No flight in this box distinguishes a from b."]
+    assert rivalry.without_twins(1e4 * apart)[1] == []
 
 
 @pytest.fixture(scope="module")

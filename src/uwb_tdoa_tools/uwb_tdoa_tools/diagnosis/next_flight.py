@@ -14,11 +14,12 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.special import expit, ndtr
+from scipy.special import ndtr
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
 from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_bias.effects.base import listed
 
 from ..simulation.paths import SPEED_UP, STEP
 from ..simulation.vehicles import Trajectory
@@ -51,6 +52,8 @@ SHORTEST = 8.0  # s, a shorter flight is continued: its ends do not count in a d
 ENOUGH = 0.95  # value of all questions, relative to their worth, from which no motion is added
 CELL = 0.25  # s, between TDOAs of a pair in a prediction, two per cell of a fit
 IMU_RATE, TRUTH_RATE = 100.0, 50.0  # Hz, of a prediction
+SMALLEST_WORTH = 1e-4  # m, so that each question has a weight
+MOST_RIVALS = 5  # rivals of a finding, the nearest first
 DRAWS = 24  # values of an explanation that the old flights allow
 MARGIN = 0.25  # s, without a prediction at both ends of a motion
 FEW = 0.02  # share of the most frequent pair, below which a pair is not predicted
@@ -74,7 +77,7 @@ class Limits:
 
 
 @dataclass(frozen=True, eq=False)
-class Path:
+class TimedPath:
     """Timed poses at RATE, at rest at both ends.
 
     p : (n, 3) m, world; yaw : (n,) rad, without jumps; what : the motion, in words
@@ -96,19 +99,19 @@ class Path:
         """Return the duration, s."""
         return (len(self.p) - 1) / RATE
 
-    def then(self, other: Path) -> Path:
-        """Return this Path and another that starts at its end; whole turns of the yaw are undone."""
+    def then(self, other: TimedPath) -> TimedPath:
+        """Return this and another that starts at its end; whole turns of the yaw are undone."""
         turns = np.round((other.yaw[0] - self.yaw[-1]) / (2.0 * np.pi))
         yaw = np.concatenate([self.yaw, other.yaw[1:] - 2.0 * np.pi * turns])
         p, last = np.concatenate([self.p, other.p[1:]]), len(self.p) - 1
         stops = (*self.stops, *(last + stop for stop in other.stops[1:]))
-        return Path(p, yaw, f"{self.what}, {other.what}", stops)
+        return TimedPath(p, yaw, f"{self.what}, {other.what}", stops)
 
 
 class Library(NamedTuple):
     """Motions that a planned flight can consist of, the anchors, and its limits."""
 
-    paths: tuple[Path, ...]
+    paths: tuple[TimedPath, ...]
     anchors: Anchors
     limits: Limits
 
@@ -168,60 +171,80 @@ class Model:
 
 @dataclass(frozen=True, eq=False)
 class Rivalry:
-    """Two explanations that fit nearly equally well.
+    """Explanations of a finding that fit nearly equally well.
 
-    worth : m, by which its answer can change positions
-    gap : by how much the criterion of the second is worse, twice a log-likelihood
+    worth : m, by which the answer can change positions
+    models : m Models; gaps : (m,) by how much their criteria are worse than that of the first, twice
+        a log-likelihood
     """
 
     worth: float
-    models: tuple[Model, Model]
-    gap: float
+    models: tuple[Model, ...]
+    gaps: np.ndarray
 
     @property
-    def beliefs(self) -> tuple[float, float]:
-        """Return the probabilities of both after the old flights."""
-        first = float(expit(0.5 * self.gap))
-        return first, 1.0 - first
+    def beliefs(self) -> np.ndarray:
+        """Return the probabilities of the models after the old flights, (m,)."""
+        likelihood = np.exp(-0.5 * (self.gaps - self.gaps.min()))
+        out: np.ndarray = likelihood / likelihood.sum()
+        return out
 
-    def distances(self, information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the growth of the gap without noise if the first, or the second, is true.
+    def distances(self, information: np.ndarray) -> np.ndarray:
+        """Return the growth of each gap without noise, (true model, other model, DRAWS).
 
-        Each is (DRAWS,), over the posterior of its values: a flight must not settle the question
-        for the fitted values alone.
+        It is averaged over draws, since a flight must not settle the question for the fitted values
+        alone. A model has an infinite distance to itself.
         """
-        out = []
-        for true, other in (self.models, self.models[::-1]):
-            values = true.draws(len(information))
-            growth = other.misfit(information, values) - true.misfit(information, values)
-            out.append(np.maximum(growth, 0.0))
-        return out[0], out[1]
+        count = len(self.models)
+        out = np.full((count, count, DRAWS), np.inf)
+        for true, model in enumerate(self.models):
+            values = model.draws(len(information))
+            own = model.misfit(information, values)
+            for k, other in enumerate(self.models):
+                if k != true:
+                    growth = other.misfit(information, values) - own
+                    out[true, k] = np.maximum(growth, 0.0)
+        return out
 
     def value(self, information: np.ndarray) -> float:
         """Return the value of more information (k, k) on all columns, 0 to 1."""
+        nearest = self.distances(information).min(axis=1)
         # A concave function, so more evidence than decides does not attract motions.
-        return sum(
-            belief * float(np.mean(-np.expm1(-distance / (2.0 * AMBIGUOUS))))
-            for belief, distance in zip(self.beliefs, self.distances(information))
-        )
+        return float(self.beliefs @ np.mean(-np.expm1(-nearest / (2.0 * AMBIGUOUS)), axis=1))
 
     def probability(self, information: np.ndarray) -> float:
-        """Return the probability that the gap exceeds AMBIGUOUS in favour of the true one.
+        """Return the probability that all gaps exceed AMBIGUOUS in favour of the true model.
 
         Noise adds 4 D to the variance of a gap that it leaves at D on the mean.
         """
-        out = 0.0
-        for belief, distance, start in zip(
-            self.beliefs, self.distances(information), (self.gap, -self.gap)
-        ):
-            sure = (start + distance - AMBIGUOUS) / (2.0 * np.sqrt(np.maximum(distance, 1e-9)))
-            out += belief * float(np.mean(ndtr(sure)))
-        return out
+        distance = np.minimum(self.distances(information), 1e9)
+        start = (self.gaps - self.gaps[:, None])[:, :, None]
+        sure = (start + distance - AMBIGUOUS) / (2.0 * np.sqrt(np.maximum(distance, 1e-9)))
+        return float(self.beliefs @ np.mean(ndtr(sure.min(axis=1)), axis=1))
+
+    def without_twins(self, everything: np.ndarray) -> tuple[Rivalry, list[str]]:
+        """Return (Rivalry without models that no flight distinguishes from one before; sentences).
+
+        everything : (k, k) information of all motions together
+        """
+        distance = self.distances(everything).mean(axis=2)
+        kept: list[int] = []
+        sentences = []
+        for k in range(len(self.models)):
+            twin = next((one for one in kept if distance[one, k] < AMBIGUOUS), None)
+            if twin is None:
+                kept.append(k)
+                continue
+            names = self.models[twin].name, self.models[k].name
+            sentences.append("No flight in this box distinguishes {} from {}.".format(*names))
+        models = tuple(self.models[k] for k in kept)
+        return replace(self, models=models, gaps=self.gaps[kept]), sentences
 
     def answer(self, information: np.ndarray) -> str:
         """Return a clause: what a flight with this information is expected to settle."""
+        first, *others = (model.name for model in self.models)
         return (
-            f"It distinguishes {self.models[0].name} from {self.models[1].name} with a probability of "
+            f"It distinguishes {first} from {listed(others)} with a probability of "
             f"{100.0 * self.probability(information):.0f} %"
         )
 
@@ -266,11 +289,11 @@ Question = Rivalry | Precision
 class NextFlight:
     """A planned flight.
 
-    path : Path; parts : ((start s, motion in words), ...); answers : sentences, the most valuable
+    path : TimedPath; parts : ((start s, motion in words), ...); answers : sentences, the most valuable
         question first; probability : that all questions of rivals are settled, None without any
     """
 
-    path: Path
+    path: TimedPath
     parts: tuple[tuple[float, str], ...]
     answers: tuple[str, ...]
     probability: float | None
@@ -344,11 +367,15 @@ def plan_flight(
     -------
     NextFlight, or None if the diagnosis found nothing.
     """
-    questions, known, told = questions_of(found, findings)
-    if not questions:
+    if not found.selection.chosen:
         return None
+    rivalries, values, known, told = questions_of(found, findings)
     forecast = Forecast(flights, found.selection, known, told)
     gains = forecast.information(library.paths)
+    apart = [one.without_twins(gains.sum(axis=0)) for one in rivalries]
+    twins = [sentence for _, sentences in apart for sentence in sentences]
+    open_ones = [one for one, _ in apart if len(one.models) > 1]
+    questions: Sequence[Question] = open_ones or values
 
     def value(information: np.ndarray) -> float:
         return sum(question.worth * question.value(information) for question in questions)
@@ -357,29 +384,30 @@ def plan_flight(
     path, parts = _joined(library, gains, value, worth)
     information = forecast.information([path])[0]
     most = sorted(questions, key=lambda one: -one.worth * one.value(information))
-    answers = tuple(
-        f"{one.answer(information)} (worth {100.0 * one.worth:.1f} cm)." for one in most
-    )
-    chances = [one.probability(information) for one in questions if isinstance(one, Rivalry)]
-    return NextFlight(path, parts, answers, float(np.min(chances)) if chances else None)
+    answers = [f"{one.answer(information)} (worth {100.0 * one.worth:.1f} cm)." for one in most]
+    chances = [one.probability(information) for one in open_ones]
+    return NextFlight(path, parts, (*answers, *twins), min(chances) if chances else None)
 
 
 def questions_of(
     found: Attribution, findings: Sequence[EffectFinding]
-) -> tuple[list[Question], _Known, list[Candidate]]:
-    """Return (Questions, information of the old flights, Candidates that they are about).
+) -> tuple[list[Rivalry], list[Precision], _Known, list[Candidate]]:
+    """Return the open questions, and what the old flights know.
 
-    A question is a finding and a rival with nearly the same criterion. Without any rivals, every
-    finding is a question of precision.
+    Returns
+    -------
+    Rivalries of findings with the nearest MOST_RIVALS rivals; the Precision of every finding; the
+    information of the old flights; the Candidates that all this is about.
     """
     selection = found.selection
-    pairs = [
-        (candidate, rival)
+    near = {
+        candidate: sorted(
+            (rival for rival in rivals if rival.gap < AMBIGUOUS), key=lambda one: one.gap
+        )[:MOST_RIVALS]
         for candidate, rivals in zip(selection.chosen, selection.rivals)
-        for rival in rivals
-        if abs(rival.gap) < AMBIGUOUS
-    ]
-    told = list(dict.fromkeys([*selection.chosen, *(rival.candidate for _, rival in pairs)]))
+    }
+    rivals = [rival.candidate for several in near.values() for rival in several]
+    told = list(dict.fromkeys([*selection.chosen, *rivals]))
     table = selection.table.with_terms([term for one in told for term in one.terms])
     columns = tuple(columns_of(told))
     x, weight = table.matrix(columns), selection.fit.information(table)
@@ -394,27 +422,28 @@ def questions_of(
     def worth(candidate: Candidate) -> float:
         size = table.matrix(candidate.columns) @ selection.fit.values(candidate.columns)
         # Where no filter was run without it, its contribution to a row counts.
-        return max(worths.get(candidate, float(np.sqrt(np.mean(size**2)))), 0.001)
+        return max(worths.get(candidate, float(np.sqrt(np.mean(size**2)))), SMALLEST_WORTH)
 
-    out: list[Question] = []
-    for candidate, rival in pairs:
+    def model_of(own: Candidate, rest: Sequence[Candidate]) -> Model:
+        places = known.places([*rest, own])
+        fitted = refit(table, columns_of([*rest, own]), selection.fit)
+        information = known.gram[np.ix_(places, places)] + np.diag(known.sizes[places] ** -2.0)
+        return Model(own.label, places, fitted.beta, information)
+
+    rivalries = []
+    for candidate, several in near.items():
         rest = [one for one in selection.chosen if one is not candidate]
-        models = []
-        for own in (candidate, rival.candidate):
-            model = [*rest, own]
-            places = known.places(model)
-            fitted = refit(table, columns_of(model), selection.fit)
-            information = known.gram[np.ix_(places, places)] + np.diag(known.sizes[places] ** -2.0)
-            models.append(Model(own.label, places, fitted.beta, information))
-        share = sum(one is candidate for one, _ in pairs)
-        out.append(Rivalry(worth(candidate) / share, (models[0], models[1]), rival.gap))
-    if not out:
-        every = known.places(selection.chosen)
-        out += [
-            Precision(one.label, worth(one), known, known.places([one]), every)
-            for one in selection.chosen
-        ]
-    return out, known, told
+        models = [model_of(one, rest) for one in (candidate, *(each.candidate for each in several))]
+        # A rival with a better criterion was refused for another reason: nothing is decided.
+        gaps = np.array([0.0, *(max(rival.gap, -AMBIGUOUS) for rival in several)])
+        if several:
+            rivalries.append(Rivalry(worth(candidate), tuple(models), gaps))
+    every = known.places(selection.chosen)
+    values = [
+        Precision(one.label, worth(one), known, known.places([one]), every)
+        for one in selection.chosen
+    ]
+    return rivalries, values, known, told
 
 
 class Forecast:
@@ -440,8 +469,8 @@ class Forecast:
         total = np.bincount(group, _curvature(selection), most)
         self._mean = total / np.maximum(np.bincount(group, minlength=most), 1)
 
-    def information(self, paths: Sequence[Path]) -> np.ndarray:
-        """Return the information of each Path on all columns, (len(paths), k, k)."""
+    def information(self, paths: Sequence[TimedPath]) -> np.ndarray:
+        """Return the information of each TimedPath on all columns, (len(paths), k, k)."""
         table = table_of([self._predicted(path) for path in paths])
         table = table.with_terms([term for one in self._told for term in one.terms])
         x = dense(table.matrix(self._known.columns))
@@ -455,8 +484,8 @@ class Forecast:
             out.append(x[rows].T @ (x[rows] * weight[rows, None]))
         return np.array(out)
 
-    def _predicted(self, path: Path) -> ChannelResiduals:
-        """Return the residuals of a Path without errors and noise, whose regressors count."""
+    def _predicted(self, path: TimedPath) -> ChannelResiduals:
+        """Return the residuals of a TimedPath without errors and noise, whose regressors count."""
         flown = Trajectory.along(path.t, path.p, path.yaw)
         count = len(self._pairs)
         cells = np.arange(0.0, path.duration, CELL)
@@ -495,9 +524,9 @@ def _curvature(selection: Selection) -> np.ndarray:
     return out
 
 
-def route(places: np.ndarray, yaw: Sequence[float], limits: Limits) -> Path:
-    """Return the Path from place to place, (n, 3) m, with a yaw (n,), rad, at each."""
-    out = Path(places[:1], np.array(yaw[:1]), "start", (0,))
+def route(places: np.ndarray, yaw: Sequence[float], limits: Limits) -> TimedPath:
+    """Return the TimedPath from place to place, (n, 3) m, with a yaw (n,), rad, at each."""
+    out = TimedPath(places[:1], np.array(yaw[:1]), "start", (0,))
     for place, angle in zip(places[1:], yaw[1:]):
         out = out.then(_line(out.p[-1], place, (out.yaw[-1], angle), limits, "line"))
     return out
@@ -522,7 +551,7 @@ def motions(room: Room, flights: Sequence[Flight], limits: Limits) -> Library:
     return Library(tuple(out), anchors, limits)
 
 
-def _everywhere(room: Room, anchors: Anchors, limits: Limits) -> list[Path]:
+def _everywhere(room: Room, anchors: Anchors, limits: Limits) -> list[TimedPath]:
     """Return the motions in a Room, whether they fit or not."""
     low, high = room.flyable
     centre, half = 0.5 * (low + high), 0.5 * (high - low)
@@ -567,13 +596,13 @@ def _everywhere(room: Room, anchors: Anchors, limits: Limits) -> list[Path]:
 
 def _joined(
     library: Library, gains: np.ndarray, value: Callable[[np.ndarray], float], worth: float
-) -> tuple[Path, tuple[tuple[float, str], ...]]:
-    """Return the (Path, parts) of the motions with the largest gain of value per second.
+) -> tuple[TimedPath, tuple[tuple[float, str], ...]]:
+    """Return the (TimedPath, parts) of the motions with the largest gain of value per second.
 
     gains : (n, k, k) information of each motion; value : of information, m; worth : its largest, m
     """
     paths, anchors, limits = library
-    path: Path | None = None
+    path: TimedPath | None = None
     parts: list[tuple[float, str]] = []
     information = np.zeros_like(gains[0])
     while True:
@@ -581,15 +610,8 @@ def _joined(
         if path is not None and path.duration >= SHORTEST and now >= ENOUGH * worth:
             break
         for motion, gain in zip(paths, gains):
-            longer, start = motion, 0.0
-            if path is not None:
-                turn = float(np.angle(np.exp(1j * (motion.yaw[0] - path.yaw[-1]))))
-                ends = path.yaw[-1], path.yaw[-1] + turn
-                way = _line(path.p[-1], motion.p[0], ends, limits, "way")
-                if not _is_clear(way, anchors):
-                    continue
-                longer, start = path.then(way).then(motion), path.duration + way.duration
-            if longer.duration <= limits.time:
+            longer, start = _continued(path, motion, limits)
+            if longer.duration <= limits.time and _is_clear(longer, anchors):
                 spent = longer.duration - (0.0 if path is None else path.duration)
                 choices.append(((value(information + gain) - now) / spent, start, longer, motion))
         if not choices:
@@ -604,6 +626,19 @@ def _joined(
         path = longer
     assert path is not None  # each motion of the library fits into the time
     return path, tuple(parts)
+
+
+def _continued(
+    path: TimedPath | None, motion: TimedPath, limits: Limits
+) -> tuple[TimedPath, float]:
+    """Return (the path, the way to a motion and the motion; when the motion starts, s)."""
+    if path is None:
+        return motion, 0.0
+    turn = float(np.angle(np.exp(1j * (motion.yaw[0] - path.yaw[-1]))))
+    if max(float(np.linalg.norm(motion.p[0] - path.p[-1])), abs(turn)) > 1e-6:
+        ends = path.yaw[-1], path.yaw[-1] + turn
+        path = path.then(_line(path.p[-1], motion.p[0], ends, limits, "way"))
+    return path.then(motion), path.duration
 
 
 def _links(flights: Sequence[Flight]) -> tuple[np.ndarray, float]:
@@ -637,22 +672,22 @@ def _beside(anchor: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray
     return out
 
 
-def _is_clear(path: Path, anchors: Anchors) -> bool:
-    """Return whether a Path keeps its distance to all anchors."""
+def _is_clear(path: TimedPath, anchors: Anchors) -> bool:
+    """Return whether a TimedPath keeps its distance to all anchors."""
     away = np.linalg.norm(path.p[::5, None] - anchors.positions, axis=2)
     return bool(away.min() >= ANCHOR_CLEARANCE)
 
 
 def _line(
     start: np.ndarray, end: np.ndarray, yaw: tuple[float, float], limits: Limits, what: str
-) -> Path:
-    """Return the straight Path between two places, from rest to rest, while the yaw turns."""
+) -> TimedPath:
+    """Return the straight TimedPath between two places, from rest to rest, while the yaw turns."""
     s = _progress(float(np.linalg.norm(end - start)), abs(yaw[1] - yaw[0]), limits)
     p, turned = start + s[:, None] * (end - start), yaw[0] + s * (yaw[1] - yaw[0])
-    return Path(p, turned, what, (0, len(s) - 1))
+    return TimedPath(p, turned, what, (0, len(s) - 1))
 
 
-def _circle(centre: np.ndarray, radius: float, along: bool, limits: Limits, what: str) -> Path:
+def _circle(centre: np.ndarray, radius: float, along: bool, limits: Limits, what: str) -> TimedPath:
     """Return a level circle, from rest to rest."""
     speed = min(limits.speed, np.sqrt(limits.acceleration * radius))
     turned = 2.0 * np.pi if along else 0.0
@@ -660,7 +695,7 @@ def _circle(centre: np.ndarray, radius: float, along: bool, limits: Limits, what
     angle = 2.0 * np.pi * s
     around = radius * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(s))])
     yaw = 0.5 * np.pi + angle if along else np.zeros(len(s))
-    return Path(centre + around, yaw, what, (0, len(s) - 1))
+    return TimedPath(centre + around, yaw, what, (0, len(s) - 1))
 
 
 def _progress(length: float, turn: float, limits: Limits) -> np.ndarray:
