@@ -17,6 +17,7 @@ from studies import (
     monitor,
     moved_anchors,
     moved_anchors_live,
+    next_flight,
     noise,
     odd_messages,
     parameters,
@@ -73,6 +74,7 @@ STUDIES = {
     "monitor": monitor,
     "moved-anchors": moved_anchors,
     "moved-anchors-live": moved_anchors_live,
+    "next-flight": next_flight,
     "noise": noise,
     "odd-messages": odd_messages,
     "parameters": parameters,
@@ -121,6 +123,7 @@ of measured flights: flights/, util/, surveys/.
   monitor          what the monitor of ekf_node names in flight (docs/reliability.md)
   moved-anchors    anchors that were moved or exchanged, and who names them (docs/localizing.md)
   moved-anchors-live  some of these recordings, played to the real nodes (docs/localizing.md)
+  next-flight      whether a planned flight settles what a diagnosis left open (docs/diagnosis.md)
   noise            whether covariances are honest after a calibration (docs/calibration.md)
   odd-messages     messages that no driver should send, to every node (docs/reliability.md)
   parameters       what each parameter of the filter is worth (docs/notebook/parameters.md)
@@ -201,6 +204,7 @@ def parser():
         "./dev study localizing DATA/flights DATA/util --survey DATA/surveys --mistakes",
         "./dev study moved-anchors DATA/flights --survey DATA/surveys --draws 10 --json moved.json",
         "./dev study moved-anchors-live --draws 3",
+        "./dev study next-flight --cases 2",
         "./dev study noise --data DATA --split const1",
         "./dev study odd-messages 10000",
         "./dev study parameters --data DATA",

@@ -258,6 +258,22 @@ def test_waypoints_have_heights():
     assert np.ptp(flight.truth.p[(flight.truth.t > 8.0) & (flight.truth.t < 32.0), 2]) > 1.3
 
 
+def test_timed_poses_are_flown_as_they_are():
+    t = np.arange(0.0, 10.01, 0.1)
+    going = 5.0 * (1.0 - np.cos(0.1 * np.pi * t))  # from rest to rest
+    p = np.column_stack([np.sin(0.5 * going), np.cos(0.5 * going), 1.0 + 0.05 * going])
+    turned = 0.3 * going
+    poses = tuple(map(tuple, np.column_stack([t + 7.0, p, turned])))
+    truth = simulate(SimulationConfig(poses=poses, duration=10.0, start_in_air=True)).truth
+    places = np.column_stack([np.interp(truth.t, t, axis) for axis in p.T])
+    assert np.abs(truth.p - places).max() < 0.01
+    yaw = np.unwrap(Rotation.from_quat(truth.q).as_euler("ZYX")[:, 0])
+    assert np.abs(yaw - np.interp(truth.t, t, turned)).max() < 0.02
+    whole = simulate(SimulationConfig(poses=poses, duration=30.0)).truth
+    away = np.linalg.norm(whole.p[:, None] - p[[0, 50, 100]], axis=2).min(axis=0)
+    assert (away < 0.1).all() and whole.p[-1, 2] < 0.1  # it lands at the end
+
+
 @pytest.mark.parametrize("vehicle", VEHICLE_DEFAULTS)
 def test_a_trajectory_lies_in_its_area_even_beside_the_anchors(vehicle):
     area = ((-8.0, -3.0), (-5.0, 3.0))
@@ -274,6 +290,8 @@ def test_a_trajectory_lies_in_its_area_even_beside_the_anchors(vehicle):
         ({"path": ((0.0, 0.0),)}, "path: "),
         ({"path": ((0.0, 0.0), (1.0, float("nan")))}, "path: "),
         ({"path": ((0.0, 0.0), (1.0, 1.0, 1.0))}, "path: "),
+        ({"poses": ((0.0, 0.0, 0.0, 1.0, 0.0),)}, "poses: "),
+        ({"poses": ((1.0, 0.0, 0.0, 1.0, 0.0), (1.0, 0.0, 0.0, 1.0, 0.0))}, "poses: "),
         ({"area": ((1.0, 0.0), (0.0, 1.0))}, "area: "),
         ({"tdoa_rate": 0.0}, "tdoa_rate: "),
         ({"wheel_slip": -1.0}, "wheel_slip: "),

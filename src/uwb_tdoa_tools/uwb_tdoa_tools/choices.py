@@ -12,6 +12,7 @@ MODELS = "paper", "paper_no_orientation", "structured", "physics", "physics+stru
 # m per square root of a second, of the path of another odometry: 1 % after 200 m at 1 m/s, as
 # visual-inertial odometry
 DRIFT = 0.02
+PLAN_TIME, PLAN_SPEED = 60.0, 1.0  # s and m/s, of a flight that diagnose plans
 STREAMS = "tdoa", "imu", "truth"  # of a Flight, each on its own clock, besides those of SENSORS
 TAPE_STD, TRUSTED_STD = 0.1, 0.01  # m, of a coordinate of an anchor by a tape, and of a trusted one
 WAIT = 10.0  # s, until a subscription to a replay must exist

@@ -14,6 +14,8 @@ from .choices import CARRIERS, PROTOCOLS, TRAJECTORIES, YAW_PROFILES
 if TYPE_CHECKING:
     from .simulation.config import SimulationConfig
 
+POSE = "t", "x", "y", "z", "yaw"  # columns of --poses
+
 
 def add_options(made: argparse.ArgumentParser) -> None:
     """Add the options to a parser."""
@@ -39,6 +41,13 @@ def add_options(made: argparse.ArgumentParser) -> None:
         type=_points,
         **unless,
         help="waypoints, m, or X,Y,Z, again and again",
+    )
+    path.add_argument(
+        "--poses",
+        metavar="FILE",
+        type=Path,
+        help="timed path, CSV with columns t, x, y, z, yaw, s, m and rad, e.g. next_flight.csv of "
+        "diagnose",
     )
     add(
         "--area",
@@ -198,6 +207,7 @@ def config_of(args: argparse.Namespace) -> SimulationConfig:
     from uwb_tdoa_bias.common.anchors import Anchors
     from uwb_tdoa_bias.common.survey import refuse_faulty
 
+    from .readers.tables import read_numbers
     from .simulation.config import NO_IMU_ERRORS, ImuErrors, SimulationConfig
     from .simulation.rooms import Walls
 
@@ -206,6 +216,9 @@ def config_of(args: argparse.Namespace) -> SimulationConfig:
         for field in fields(SimulationConfig)
         if hasattr(args, field.name)
     }
+    values["poses"] = (
+        None if args.poses is None else tuple(map(tuple, read_numbers(args.poses, POSE).tolist()))
+    )
     values["walls"] = None if args.walls is None else Walls.from_yaml(args.walls)
     values["anchors"] = (
         None

@@ -11,7 +11,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_text
 
 from .. import cli, command_lines, options, parallel
-from ..choices import DRIFT, NONE, REFERENCES
+from ..choices import DRIFT, NONE, PLAN_SPEED, PLAN_TIME, REFERENCES
 from ..outputs import OutputFolder
 from ..parallel import Progress
 
@@ -35,10 +35,10 @@ FEW = (
 BLIND = "nothing", "marks"  # references of which no path shows that ids are wrong
 UNUSED = {  # by references, of the options of what is known
     "truth": ("marks", "distances", "odometry"),
-    "heights": ("marks", "distances", "odometry"),
-    "odometry": ("distances",),
-    "marks": ("odometry",),
-    "nothing": ("odometry",),
+    "heights": ("marks", "distances", "odometry", "plan_flight"),
+    "odometry": ("distances", "plan_flight"),
+    "marks": ("odometry", "plan_flight"),
+    "nothing": ("odometry", "plan_flight"),
 }
 
 
@@ -59,6 +59,7 @@ def parser() -> ArgumentParser:
             "diagnose flight.bag --reference odometry --odometry /vio/odometry --marks marks.yaml "
             "--out by-odometry/"
         ),
+        "diagnose flight.bag --plan-flight -3 3 -4 4 0 3 --out diagnosis/",
         "diagnose flight.bag --no-truth --out without/",
         "diagnose today.bag --no-truth --effects last-week/effects.yaml --out today/",
     )
@@ -105,6 +106,29 @@ def parser() -> ArgumentParser:
         metavar="M",
         help="of that, m per square root of a second (default %(default)s)",
     )
+    add(
+        "--plan-flight",
+        nargs=6,
+        type=float,
+        metavar=("X0", "X1", "Y0", "Y1", "Z0", "Z1"),
+        help="plan the flight that settles what stays ambiguous, m, between these walls, floor and "
+        "ceiling; needs ground truth. Writes next_flight.csv (t, x, y, z, yaw; for simulate "
+        "--poses), .tum and _waypoints.csv",
+    )
+    add(
+        "--plan-time",
+        type=float,
+        metavar="S",
+        default=PLAN_TIME,
+        help="of that flight, s at most (default %(default)s)",
+    )
+    add(
+        "--plan-speed",
+        type=float,
+        metavar="M/S",
+        default=PLAN_SPEED,
+        help="of that flight, m/s at most (default %(default)s)",
+    )
     options.add_most(made, MOST)
     options.add_align(made)
     options.add_rerun(made)
@@ -125,10 +149,12 @@ def _diagnose(args: Namespace) -> int:
     from ..checking.before_anchors import nothing_comes_first
     from ..checking.report import remarks_on
     from ..diagnosis import diagnose, output, references, with_noise
+    from ..diagnosis.next_flight import Limits, motions, plan_flight
     from ..diagnosis.noise import write_parameters
     from ..estimate import FlightEstimator
     from ..localizing.pictures import write_diagnosis
     from ..readers import inputs
+    from ..simulation.rooms import Room
     from ..surveying.known import read_paths
 
     out = args.out
@@ -165,6 +191,15 @@ def _diagnose(args: Namespace) -> int:
     reference = references.REFERENCES[args.reference](
         config, known, *[args.align][: args.reference == "truth"]
     )
+    library = (
+        motions(
+            Room.of_numbers("--plan-flight", args.plan_flight),
+            flights,
+            Limits(args.plan_time, args.plan_speed),
+        )
+        if args.plan_flight
+        else None
+    )
     # Only Progress prints a line.
     over = partial(parallel.over, jobs=jobs, dask=dask, unit=None)
     with Progress("diagnose") as progress:
@@ -173,6 +208,11 @@ def _diagnose(args: Namespace) -> int:
         )
         progress("measuring the noise")
         result = with_noise(result, config, over, partial(cli.say, "diagnose"))
+    if library:
+        plan = plan_flight(result.flights, result.attribution, result.findings, library)
+        result = replace(result, next_flight=plan)
+        if plan is None:
+            cli.say("diagnose", "no effect was found, so no flight is planned to settle one")
     from ..diagnosis.report.page import html  # here, because drawing takes a second to import
 
     out.mkdir(parents=True, exist_ok=True)
@@ -195,13 +235,17 @@ def _diagnose(args: Namespace) -> int:
     cli.write_json(out / "diagnosis.json", output.as_json(result))
     result.effects.to_yaml(out / "effects.yaml")
     write_text(out / "report.html", html(result))
+    for name, text in result.next_flight.files().items() if result.next_flight else ():
+        write_text(out / name, text)
     if rerun is not None:
         write_diagnosis(rerun, result, effects or EffectSet(), config)
     cli.show(output.as_text(result))
-    cli.show(
-        "wrote diagnosis.json, effects.yaml, "
-        f"{'ekf_node.yaml ' if parameters is not None else ''}and report.html to {out}"
+    files = (
+        *("diagnosis.json", "effects.yaml"),
+        *["ekf_node.yaml"][: parameters is not None],
+        *(result.next_flight.files() if result.next_flight else ()),
     )
+    cli.show(f"wrote {', '.join(files)} and report.html to {out}")
     return 0
 
 

@@ -66,6 +66,7 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
             "written": diagnosis.written
             and {key: diagnosis.written[key] for key in ("runs", "pooled")},
             "health": diagnosis.health,
+            "next_flight": diagnosis.next_flight and diagnosis.next_flight.as_json(),
         }
     )
 
@@ -97,6 +98,9 @@ def as_text(diagnosis: Diagnosis) -> str:
         lines.append(("not told", f"{listed(several)}; what would tell: {remedy}."))
     if added:
         lines += [("apply", command) for command, _ in diagnosis.applying]
+    if diagnosis.next_flight:
+        first, *others_of_it = diagnosis.next_flight.sentences
+        lines += [("fly", first), *(("", sentence) for sentence in others_of_it)]
     left_out = [(entry.title, entry.why_not) for entry in found if not entry.added]
     lines += [("not added", "{1}: {0}.".format(*row)) for row in by_reason(left_out).rows]
     return "\n".join([*(_wrapped(*line) for line in lines), *anchors.lines(diagnosis)])

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from .channels.base import Figures
     from .comparison import ValidationCase
     from .decision import Decision
+    from .next_flight import NextFlight
     from .references import Reference
     from .regression.confounding import Unobservable
 
@@ -38,6 +39,7 @@ class Diagnosis:
     judge_truth : {name of a flight: sentences}, clock or frame errors of its ground truth
     cases : (ValidationCase, ...) that `after` is of
     tdoa_std : m, noise for the filter beside these effects, None if it was not measured
+    next_flight : NextFlight that settles what is left open, None if none was asked for
     written : as `after`, with this noise too: what the written files give; None if not judged
     decision : Decision on all effects; None if nothing is applied
     """
@@ -62,3 +64,4 @@ class Diagnosis:
     tdoa_std: float | None = None
     written: dict[str, Any] | None = None
     decision: Decision | None = None
+    next_flight: NextFlight | None = None

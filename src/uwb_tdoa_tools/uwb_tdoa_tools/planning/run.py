@@ -149,7 +149,7 @@ def room_of_options(args: Namespace, anchors: Anchors | None) -> Room:
             raise InputError(
                 "room: --hall needs all of it, in metres; give --room X0 X1 Y0 Y1 Z0 Z1."
             )
-        return _box("room", args.room)
+        return Room.of_numbers("room", args.room)
     room = room_of(anchors)
     if args.room is None:
         return room
@@ -157,7 +157,7 @@ def room_of_options(args: Namespace, anchors: Anchors | None) -> Room:
         raise InputError(
             f"room: {len(args.room)} numbers were given; give X0 X1 Y0 Y1 or X0 X1 Y0 Y1 Z0 Z1."
         )
-    return _box(
+    return Room.of_numbers(
         "room", args.room if len(args.room) == 6 else [*args.room, room.lower[2], room.upper[2]]
     )
 
@@ -188,7 +188,7 @@ def aim_of(args: Namespace, installation: Installation, demand: Demand, height: 
     ):
         if value < least:
             raise InputError(f"{name}: {value} is too few; give at least {least}.")
-    fly = _box("fly", args.fly) if args.fly else Room(*demand.room.flyable)
+    fly = Room.of_numbers("fly", args.fly) if args.fly else Room(*demand.room.flyable)
     lower, upper, k = fly.lower.copy(), fly.upper.copy(), installation.dimensions
     lower[k:] = upper[k:] = height
     step = max(0.1, (np.prod((upper - lower)[:k]) / FLOWN_CELLS) ** (1.0 / k))
@@ -224,15 +224,6 @@ def as_json(args: Namespace) -> dict[str, Any]:
 
 def _pairing(args: Namespace) -> str:
     return args.covariance or OF_PROTOCOL[args.protocol]
-
-
-def _box(name: str, numbers: Sequence[float]) -> Room:
-    lower, upper = np.array(numbers[0::2]), np.array(numbers[1::2])
-    if not (upper > lower).all():
-        raise InputError(
-            f"{name}: {list(numbers)} is empty; give X0 X1 Y0 Y1 Z0 Z1, each pair rising."
-        )
-    return Room(lower, upper)
 
 
 PLACES_TRIED = 60  # places on the walls of a room that are tried for one more anchor, about

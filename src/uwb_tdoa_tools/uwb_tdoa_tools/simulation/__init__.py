@@ -62,9 +62,10 @@ def simulate(config: SimulationConfig, trajectory: Flyable | None = None) -> Fli
         state.update({name + axis: values[:, k] for k, axis in enumerate("xyz")})
     parameters |= {name: getattr(flown, name, None) for name in ("take_off", "landing")}
     kind = "" if config.vehicle == "quadrotor" else f"{config.vehicle}-"
+    path = config.path or config.poses
     room_name = config.constellation if config.anchors is None else "anchors"
     return Flight(
-        name=f"sim-{kind}{config.trajectory if config.path is None else 'path'}-{config.protocol}-{room_name}-{config.seed}",
+        name=f"sim-{kind}{'path' if path else config.trajectory}-{config.protocol}-{room_name}-{config.seed}",
         anchors=filled.anchors,
         tdoa=tdoa,
         imu=samples,

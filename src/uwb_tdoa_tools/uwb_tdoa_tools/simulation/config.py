@@ -101,6 +101,8 @@ class SimulationConfig(_Noises):
         stops; "hand": a person carries the tag, and stands still before and after. `of` gives each
         its usual sensors (default "quadrotor")
     path : ((x, y), ...) or ((x, y, z), ...) m, waypoints, instead of a trajectory (default None)
+    poses : ((t, x, y, z, yaw), ...) s, m, rad, a timed path instead of a trajectory, as `diagnose`
+        plans it (default None)
     area : ((x, y), (x, y)) m, lower and upper corner of the area for trajectories (default None:
         the room less a clearance)
     constellation : name of an anchor constellation, or random-SEED[-COUNT] (default "corners": 8 in
@@ -165,6 +167,7 @@ class SimulationConfig(_Noises):
     seed: int = 0
     vehicle: str = "quadrotor"
     path: tuple[tuple[float, ...], ...] | None = None
+    poses: tuple[tuple[float, ...], ...] | None = None
     area: tuple[tuple[float, ...], ...] | None = None
     constellation: str = "corners"
     anchors: Anchors | None = None
@@ -266,6 +269,14 @@ class SimulationConfig(_Noises):
                 f"path: {self.path!r} is not two different points or more, each x, y or x, y, "
                 "z in metres."
             )
+        if self.poses is not None and not (
+            _are_points(self.poses, (5,))
+            and len(self.poses) >= 2
+            and (np.diff([pose[0] for pose in self.poses]) > 0.0).all()
+        ):
+            raise InputError(
+                "poses: expected two or more rows t, x, y, z, yaw (s, m, rad) with rising t."
+            )
         if self.area is not None:
             good = _are_points(self.area, (2,)) and len(self.area) == 2
             if not good or not all(low < high for low, high in zip(*self.area)):
@@ -307,6 +318,9 @@ class SimulationConfig(_Noises):
         if self.path is not None:
             room = room.around(np.array(self.path))
             height = self.path[0][2] if height is None and len(self.path[0]) == 3 else height
+        if self.poses is not None:
+            room = room.around(np.array(self.poses)[:, 1:4])
+            height = self.poses[0][3] if height is None else height
         low, high = room.flyable
         x, y = room.centre[:2] if self.place is None else self.place
         place = float(x), float(y)

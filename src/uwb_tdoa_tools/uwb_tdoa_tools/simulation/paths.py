@@ -113,6 +113,16 @@ def waypoints(
     return _round(s, config.speed, around, ends, 0.0)
 
 
+def timed(
+    s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator
+) -> np.ndarray:
+    """Fly the timed `poses`, and stay at the last."""
+    assert config.poses is not None
+    t, x, y, z, _ = np.transpose(config.poses)
+    at: np.ndarray = CubicSpline(t - t[0], np.column_stack([x, y, z]))(np.minimum(s, t[-1] - t[0]))
+    return at
+
+
 def _laps(
     s: np.ndarray, config: SimulationConfig, corners: Sequence[Sequence[float]], ahead: float
 ) -> np.ndarray:
@@ -179,11 +189,9 @@ def path_of(
         raise InputError(
             f"trajectory: {config.trajectory!r} is not known; choose {', '.join(TRAJECTORIES)}."
         )
-    family, name = (
-        (TRAJECTORIES[config.trajectory], config.trajectory)
-        if config.path is None
-        else (waypoints, "the path")
-    )
+    family, name = TRAJECTORIES[config.trajectory], config.trajectory
+    if config.path is not None or config.poses is not None:
+        family, name = waypoints if config.poses is None else timed, "the path"
     p = family(s, config, room, rng)
     outside = (p < room.lower).any(axis=0) | (p > room.upper).any(axis=0)
     if outside.any():
@@ -210,7 +218,10 @@ def path_time(tau: np.ndarray, rise: float, air: float) -> np.ndarray:
 
 
 def yaw_along(s: np.ndarray, p: np.ndarray, config: SimulationConfig) -> np.ndarray:
-    """Return the yaw at every knot, rad: "fixed", "along_track" or "rotating" from config.yaw_angle."""
+    """Return the yaw at every knot, rad: that of the poses, or "fixed", "along_track" or "rotating"."""
+    if config.poses is not None:
+        t, *_, yaw = np.transpose(config.poses)
+        return config.yaw_angle + np.interp(s, t - t[0], np.unwrap(yaw))
     if config.trajectory == "spin" or config.yaw == "rotating":
         return config.yaw_angle + config.yaw_rate * s
     if config.yaw == "fixed" or np.ptp(s) == 0.0:

@@ -15,6 +15,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.safe_yaml import read_yaml
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from numpy.typing import ArrayLike
@@ -227,6 +228,19 @@ class Room:
     lower: np.ndarray
     upper: np.ndarray
     area: tuple[tuple[float, ...], ...] | None = None
+
+    @classmethod
+    def of_numbers(cls, name: str, numbers: Sequence[float]) -> Room:
+        """Return the Room of X0 X1 Y0 Y1 Z0 Z1, m. Raise InputError if it is empty.
+
+        name : option that gives the numbers
+        """
+        lower, upper = np.array(numbers[0::2]), np.array(numbers[1::2])
+        if not (upper > lower).all():
+            raise InputError(
+                f"{name}: {list(numbers)} is empty; give X0 X1 Y0 Y1 Z0 Z1, each pair rising."
+            )
+        return cls(lower, upper)
 
     @property
     def centre(self) -> np.ndarray:

@@ -120,6 +120,20 @@ class Trajectory:
                 f"more than {MAX_ACCELERATION:g}; fly slower or wider."
             )
 
+    @classmethod
+    def along(cls, t: np.ndarray, p: np.ndarray, yaw: np.ndarray) -> Trajectory:
+        """Return the flight along poses, at rest at both ends, without take-off and landing.
+
+        t : (n,) s, rising; p : (n, 3) m; yaw : (n,) rad, without jumps
+        """
+        out = cls.__new__(cls)
+        out.take_off = out.landing = None
+        out._start, out._end, out._clamped = float(t[0]), float(t[-1]), True
+        rest = ([(k, np.zeros(3)) for k in (1, 2, 3)],) * 2
+        out._p = make_interp_spline(t, p, k=7, bc_type=rest)
+        out._yaw = make_interp_spline(t, yaw, k=7, bc_type=([(k, 0.0) for k in (1, 2, 3)],) * 2)
+        return out
+
     def motion(self, t: ArrayLike) -> ExactMotion:
         """Return the ExactMotion at stamps t, (n,) s; it rests before take-off and after landing.
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from . import anchors, curves, entries, maps, reasons, tables, verdict, words
+from . import anchors, curves, entries, maps, next_flight, reasons, tables, verdict, words
 
 if TYPE_CHECKING:
     from ..result import Diagnosis
@@ -24,6 +24,7 @@ _TEMPLATES.globals |= {
     "curves": curves,
     "entries": entries,
     "maps": maps,
+    "next_flight": next_flight,
     "reasons": reasons,
     "tables": tables,
     "verdict": verdict,
