@@ -3,6 +3,7 @@
 import bz2
 import dataclasses
 import sqlite3
+import sys
 
 from foreign_recordings import (
     BEGIN,
@@ -530,6 +531,24 @@ def test_a_chunk_that_unpacks_to_too_much_is_refused(flight, survey, tmp_path):
     bag.write_bytes(content[:at] + bomb + bytes(size - len(bomb)) + content[at + size :])
     with pytest.raises(InputError, match="unpacks to more than"):
         read_by_profile([bag], load_profile("uwb_msgs"), survey)
+
+
+def test_a_ulog_without_pyulog_names_it(flight, survey, tmp_path, monkeypatch):
+    log = write_ulog(tmp_path / "flight.ulg", flight)
+    monkeypatch.setitem(sys.modules, "pyulog.core", None)
+    with pytest.raises(InputError, match="needs pyulog; run `pip install pyulog` first"):
+        read_by_profile([log], load_profile("px4"), survey)
+
+
+def test_a_ulog_that_is_damaged_is_refused(flight, survey, tmp_path):
+    pytest.importorskip("pyulog")
+    log = write_ulog(tmp_path / "flight.ulg", flight)
+    content = bytearray(log.read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 400] = bytes(400)
+    log.write_bytes(bytes(content))
+    with pytest.raises(InputError, match="this ULog is cut or damaged"):
+        read_by_profile([log], load_profile("px4"), survey)
 
 
 def test_the_profile_of_the_page_is_one(tmp_path):
