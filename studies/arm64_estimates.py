@@ -20,7 +20,7 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_tools.estimate import FlightEstimator
 from uwb_tdoa_tools.readers.inputs import Reading
 
-PATIENCE = 3600  # s of processor time for the trial of a model, which is emulated
+PATIENCE = 3600  # s, limit of the trial of a model and of each of its rows, which are emulated
 
 
 def estimates(recording, survey, effects, model):
@@ -45,7 +45,7 @@ def tried_out(content):
     reading, writing = os.pipe()
     child = os.fork()
     if not child:
-        trial.MODEL_SECONDS = PATIENCE
+        trial.MODEL_SECONDS = trial.MODEL_ROW_SECONDS = PATIENCE
         os.write(writing, json.dumps(trial.judge(content)).encode())
         os._exit(0)
     os.close(writing)
