@@ -18,7 +18,6 @@ LONGER = {
     "effects.md": 686,
     "flying.md": 172,
     "planning.md": 210,
-    "reliability.md": 578,
     "ros.md": 203,
     "sensors.md": 327,
     "symptoms.md": 157,
