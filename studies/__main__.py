@@ -142,7 +142,7 @@ of measured flights: flights/, util/, surveys/.
   two-errors       vibration that is rectified, and late anchors near the floor (docs/notebook/measured.md)
   two-machines     who hears whom on two machines, takes root (docs/ros.md)
   vehicle-code     what exported C costs on an emulated Cortex-M4F (docs/export.md)
-  warehouse        starts, slow tags and walks in halls, and their cost (docs/warehouse.md)
+  warehouse        starts, slow tags and walks in halls, and their cost (docs/notebook/warehouse.md)
 """
 
 

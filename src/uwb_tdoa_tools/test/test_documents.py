@@ -21,7 +21,6 @@ LONGER = {
     "ros.md": 203,
     "sensors.md": 327,
     "symptoms.md": 157,
-    "warehouse.md": 240,
 }
 
 
