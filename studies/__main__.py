@@ -127,7 +127,7 @@ of measured flights: flights/, util/, surveys/.
   noise            whether covariances are honest after a calibration (docs/calibration.md)
   odd-messages     messages that no driver should send, to every node (docs/notebook/reliability.md)
   parameters       what each parameter of the filter is worth (docs/notebook/parameters.md)
-  plans            random rooms and halls against an independent solver, and against a rerun (docs/planning.md)
+  plans            random rooms and halls against an independent solver, and against a rerun (docs/notebook/planning.md)
   random-splits    bias models trained on flights drawn at random, and judged on the others (docs/bias.md)
   ranges           simulated distances to anchors against the bound of plan (docs/sensors.md)
   recalibrating    surveys that start from the last one, after something changed (docs/calibration.md)

@@ -17,7 +17,6 @@ LONGER = {
     "diagnosis.md": 819,
     "effects.md": 686,
     "flying.md": 172,
-    "planning.md": 210,
     "ros.md": 203,
     "sensors.md": 327,
     "symptoms.md": 157,
