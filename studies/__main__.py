@@ -102,7 +102,7 @@ of measured flights: flights/, util/, surveys/.
   bench            what the suite costs on this machine (docs/notebook/measured.md)
   calibrating      surveys shaken, calibrated without ground truth, judged on other flights (docs/calibration.md)
   checking         mistakes put into flights, and what check says of them (docs/connect.md)
-  closed-loop      the flights of Zhao et al. by networks and by effects (docs/flying.md)
+  closed-loop      the flights of Zhao et al. by networks and by effects (docs/notebook/flying.md)
   compare-models   bias models side by side on flights that took no part in training (docs/bias.md)
   crazyflie        measured logs put through the radio link of a Crazyflie (docs/connect.md)
   debias-measured  bias maps of positions on measured flights (docs/debiasing.md)

@@ -16,7 +16,6 @@ LONGER = {
     "connect.md": 506,
     "diagnosis.md": 819,
     "effects.md": 686,
-    "flying.md": 172,
     "ros.md": 203,
     "sensors.md": 327,
     "symptoms.md": 157,
