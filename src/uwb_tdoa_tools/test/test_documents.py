@@ -18,7 +18,7 @@ LONGER = {
     "effects.md": 686,
     "ros.md": 203,
     "sensors.md": 327,
-    "symptoms.md": 157,
+    "symptoms.md": 167,
 }
 
 
