@@ -1,1 +1,1 @@
-"""Figures of docs/flying.md: the experiment of the paper."""
+"""Figures of docs/notebook/flying.md: the experiment of the paper."""

@@ -1,1 +1,1 @@
-"""Figures of docs/debiasing.md."""
+"""Figures of docs/notebook/debiasing.md."""

@@ -1,4 +1,4 @@
-"""Tables and a picture of docs/debiasing.md."""
+"""Tables and a picture of docs/notebook/debiasing.md."""
 
 from functools import partial
 

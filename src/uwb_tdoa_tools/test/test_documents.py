@@ -16,13 +16,9 @@ LONGER = {
     "connect.md": 506,
     "diagnosis.md": 819,
     "effects.md": 686,
-    "flying.md": 172,
-    "planning.md": 210,
-    "reliability.md": 578,
     "ros.md": 203,
     "sensors.md": 327,
-    "symptoms.md": 157,
-    "warehouse.md": 240,
+    "symptoms.md": 167,
 }
 
 

@@ -21,7 +21,7 @@ MEMORY = 6.0  # s over which innovations count
 KNOWN = 0.35**2  # rad^2, variance below which the yaw counts as known: 20 degrees
 # Log likelihood ratio above which the yaw is opened again. It trades false alarms against late
 # detection. Of 22 measured flights the largest ratio is 3.5; the worst flight has 9.9 without its
-# range finder. See docs/reliability.md.
+# range finder. See docs/notebook/reliability.md.
 EVIDENCE = 12.0
 ANGLES = 2.0 * math.pi * np.arange(1, 24) / 24.0  # rad, yaw errors to test
 COSINES, SINES = (np.cos(ANGLES) - 1.0, np.sin(ANGLES))  # the error of the state is linear in both

@@ -30,8 +30,9 @@ UNITS = (
     "true"
 )
 INTERPOLATORS = ("thin_plate", "network")
-SMOOTHING = 0.3  # smoothing of the thin plate at a marker of median count; see docs/debiasing.md
-# m beyond the known region over which the correction fades to 0; see docs/debiasing.md
+# smoothing of the thin plate at a marker of median count; see docs/notebook/debiasing.md
+SMOOTHING = 0.3
+# m beyond the known region over which the correction fades to 0; see docs/notebook/debiasing.md
 FADE = 1.0
 LARGEST = 1e5  # m; a larger place or bias is an error
 _ARRAYS = {

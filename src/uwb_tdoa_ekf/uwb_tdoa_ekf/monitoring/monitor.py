@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 MOVING = 0.3
 SETTLE = 8.0  # s in motion before the search for an onset starts
 # statistic (`Change.ratio`) above which an anchor has changed: a tenth above the largest of sound flights of
-# two days, see docs/reliability.md
+# two days, see docs/notebook/reliability.md
 LIMIT = 16.3
 CLEARLY = 1.4  # factor by which this ratio must exceed the ratio of any other anchor
 # largest mean square of the unexplained errors since the onset, over that before. If more is left,
