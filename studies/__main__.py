@@ -140,7 +140,7 @@ of measured flights: flights/, util/, surveys/.
   spin             the error of a TDOA over the yaw of the tag (docs/bias.md)
   surveying        surveys shaken, and made better from flights alone (docs/notebook/calibration.md)
   two-errors       vibration that is rectified, and late anchors near the floor (docs/notebook/measured.md)
-  two-machines     who hears whom on two machines, takes root (docs/ros.md)
+  two-machines     who hears whom on two machines, takes root (docs/notebook/ros.md)
   vehicle-code     what exported C costs on an emulated Cortex-M4F (docs/export.md)
   warehouse        starts, slow tags and walks in halls, and their cost (docs/warehouse.md)
 """

@@ -18,7 +18,6 @@ LONGER = {
     "flying.md": 172,
     "planning.md": 210,
     "reliability.md": 578,
-    "ros.md": 203,
     "sensors.md": 327,
     "symptoms.md": 157,
     "warehouse.md": 240,
