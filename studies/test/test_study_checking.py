@@ -1,4 +1,4 @@
-"""The table of docs/connect.md, of simulated flights."""
+"""The table of docs/notebook/checking.md, of simulated flights."""
 
 import json
 

@@ -111,7 +111,7 @@ def at_desk(folder, monkeypatch):
     return folder
 
 
-WALK = section("connect.md", "From a CSV file and a tape measure to a diagnosed flight")
+WALK = section("csv.md", "From a CSV file and a tape measure to a diagnosed flight")
 
 
 def recorded(hall, truth, name="in time"):

@@ -116,7 +116,7 @@ def test_an_axis_is_turned_upwards_by_a_rotation(axis, sign):
 
 @pytest.mark.slow
 def test_a_measured_flight_and_its_mistakes(shared_data):
-    """It took no part in choosing the limits; the table of all is in docs/connect.md."""
+    """It took no part in choosing the limits; the table of all is in docs/notebook/checking.md."""
     ((path, survey),) = inputs.find_flights(
         [shared_data / "flights/0426/0426-traj5"], shared_data / "surveys"
     )

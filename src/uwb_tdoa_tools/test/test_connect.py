@@ -1,4 +1,4 @@
-"""docs/connect.md as a new user follows it: the files it speaks of, and its commands in their
+"""docs/csv.md as a new user follows it: the files it speaks of, and its commands in their
 order.
 """
 
@@ -15,7 +15,7 @@ from uwb_tdoa_tools.readers import read_survey
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.rooms import facing
 
-WALK = section("connect.md", "From a CSV file and a tape measure to a diagnosed flight")
+WALK = section("csv.md", "From a CSV file and a tape measure to a diagnosed flight")
 LATE = 0.3  # m, anchor 3
 
 

@@ -1,4 +1,4 @@
-"""The publishers of docs/connect.md: the Python one as a process, over topics; the C++ one as far
+"""The publishers of docs/drivers.md: the Python one as a process, over topics; the C++ one as far
 as its messages go.
 """
 
@@ -83,7 +83,7 @@ def listener():
 def test_the_publisher_in_python(tmp_path, listener):
     """With reliable subscriptions, as most have, that come after the anchors were sent."""
     (tmp_path / "driver.py").write_text(
-        *blocks(section("connect.md", "Message by message"), "python")
+        *blocks(section("drivers.md", "In Python"), "python")
     )
     process = subprocess.Popen(
         [sys.executable, tmp_path / "driver.py"], stderr=subprocess.PIPE, text=True
@@ -123,7 +123,7 @@ def test_the_publisher_in_python(tmp_path, listener):
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="no g++")
 def test_the_publisher_in_cpp(tmp_path):
-    (code,) = blocks(section("connect.md", "Message by message"), "cpp")
+    (code,) = blocks(section("drivers.md", "In C++"), "cpp")
     (tmp_path / "rclcpp").mkdir()
     (tmp_path / "rclcpp" / "rclcpp.hpp").write_text(STAND_IN)
     (tmp_path / "driver.cpp").write_text(code + "\nint main() { Driver driver; }\n")

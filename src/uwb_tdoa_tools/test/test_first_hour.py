@@ -36,7 +36,7 @@ CHECKED = (("simulated", "in time"), ("measured", "late"))
 def test_from_csv_and_tape_to_a_diagnosed_flight(
     tmp_path, monkeypatch, capsys, shared_data, source, name
 ):
-    """convert, check, evaluate, diagnose, evaluate: docs/connect.md."""
+    """convert, check, evaluate, diagnose, evaluate: docs/csv.md."""
     at_desk(tmp_path, monkeypatch)
     if source == "simulated":
         hall = simulated(read_survey(written("anchors.yaml", *blocks(WALK, "yaml"))))

@@ -552,7 +552,7 @@ def test_a_ulog_that_is_damaged_is_refused(flight, survey, tmp_path):
 
 
 def test_the_profile_of_the_page_is_one(tmp_path):
-    text = section("connect.md", "Recordings of others")
+    text = section("recordings.md", "Recordings of others")
     (tmp_path / "page.yaml").write_text(*blocks(text, "yaml"))
     page = load_profile(tmp_path / "page.yaml")
     assert page.sources[0].match("/uwb/2/ranges", "my_msgs/msg/Ranges") == {"tag": "2"}

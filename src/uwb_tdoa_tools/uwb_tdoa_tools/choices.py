@@ -27,7 +27,7 @@ SURVEY = (
 )
 PROFILE = (
     "how to read recordings of others: a profile that is shipped "
-    "(convert --suggest names it), or your own YAML file (docs/connect.md)"
+    "(convert --suggest names it), or your own YAML file (docs/recordings.md)"
 )
 RERUN = (
     "write a recording for the viewer Rerun, too (.rrd; of one flight; needs pip install rerun-sdk)"

@@ -161,7 +161,7 @@ def load_profile(name: str | Path) -> Profile:
         )
     content = read_yaml(path)
     if not isinstance(content, dict) or not isinstance(content.get("sources"), list):
-        raise InputError(f"{path}: is no profile; write a list under sources (docs/connect.md).")
+        raise InputError(f"{path}: is no profile; write a list under sources (docs/recordings.md).")
     _refuse_unknown(path, content, _KEYS)
     sources = tuple(
         _source(f"{path}: source {number}", each)
@@ -188,7 +188,7 @@ def _refuse_unknown(where: str | Path, content: Mapping[Any, Any], known: set[st
 
 def _source(where: str, content: Any) -> Source:
     if not isinstance(content, dict) or not isinstance(content.get("columns"), dict):
-        raise InputError(f"{where}: needs columns: {{OURS: THEIRS}}; see docs/connect.md.")
+        raise InputError(f"{where}: needs columns: {{OURS: THEIRS}}; see docs/recordings.md.")
     _refuse_unknown(where, content, _SOURCE)
     columns = {
         str(ours): parse_column(where, str(ours), str(theirs))
@@ -209,7 +209,7 @@ def _source(where: str, content: Any) -> Source:
             )
     conditions = content.get("where", {})
     if not isinstance(conditions, dict):
-        raise InputError(f"{where}: where is no {{FIELD: VALUE}}; see docs/connect.md.")
+        raise InputError(f"{where}: where is no {{FIELD: VALUE}}; see docs/recordings.md.")
     return Source(
         columns,
         where=tuple(_condition(str(path), value) for path, value in conditions.items()),

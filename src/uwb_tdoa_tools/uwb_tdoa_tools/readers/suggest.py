@@ -95,7 +95,7 @@ def suggest(paths: Sequence[Path], salvage: bool = False) -> tuple[str, list[str
     with open_recording(paths, types, salvage) as tables:
         fitting = [name for name in shipped() if _fits(name, tables)]
         lines = [
-            "# A first profile. Check each line, then give it with --profile (docs/connect.md)."
+            "# A first profile. Check each line, then give it with --profile (docs/recordings.md)."
         ]
         lines += [f"# The shipped profile {name} fits: --profile {name}" for name in fitting]
         lines += ["about: a first profile", "sources:"]
