@@ -20,7 +20,6 @@ LONGER = {
     "planning.md": 210,
     "reliability.md": 578,
     "ros.md": 203,
-    "sensors.md": 327,
     "symptoms.md": 157,
     "warehouse.md": 240,
 }
