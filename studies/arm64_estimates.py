@@ -13,7 +13,7 @@ import sys
 
 import numpy as np
 
-from uwb_tdoa_bias.common.files import write_filled
+from uwb_tdoa_bias.common.files import temporary_folder, write_filled
 from uwb_tdoa_bias.correction import trial
 from uwb_tdoa_bias.correction.network import load_network
 from uwb_tdoa_bias.effects import EffectSet
@@ -43,15 +43,17 @@ def tried_out(content):
     A copy of this process is tried instead, with the same limits but time.
     """
     reading, writing = os.pipe()
-    child = os.fork()
-    if not child:
-        trial.MODEL_SECONDS = trial.MODEL_ROW_SECONDS = PATIENCE
-        os.write(writing, json.dumps(trial.judge(content)).encode())
-        os._exit(0)
-    os.close(writing)
-    with os.fdopen(reading) as file:
-        alone, why = json.load(file)
-    os.waitpid(child, 0)
+    with temporary_folder() as folder:
+        child = os.fork()
+        if not child:
+            os.chdir(folder)  # onnxruntime writes its profile to the present folder
+            trial.MODEL_SECONDS = trial.MODEL_ROW_SECONDS = PATIENCE
+            os.write(writing, json.dumps(trial.judge(content)).encode())
+            os._exit(0)
+        os.close(writing)
+        with os.fdopen(reading) as file:
+            alone, why = json.load(file)
+        os.waitpid(child, 0)
     if why:
         raise trial.Unplayable(why)
     return alone

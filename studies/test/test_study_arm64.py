@@ -9,6 +9,7 @@ import pytest
 
 from studies import arm64, arm64_estimates
 from studies.__main__ import main
+from uwb_tdoa_bias.correction import trial
 
 
 def test_missing_programs_are_named_by_their_packages(tmp_path, monkeypatch, capsys):
@@ -61,6 +62,10 @@ def test_values_are_compared_by_their_bits(one, other, differing, largest):
 
 def test_the_cases_are_what_estimates_are_made_of(tmp_path, monkeypatch):
     """Without an emulator: twice by this Python. A changed recording differs."""
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    monkeypatch.setattr(trial, "tried_out", arm64_estimates.tried_out)
     monkeypatch.setattr(arm64, "FLIGHT", replace(arm64.FLIGHT, duration=16.0))
     known = arm64.cases(tmp_path, SimpleNamespace(flights=[], survey=None))
     files = [tmp_path / name for name in ("one.npz", "other.npz")]
@@ -72,5 +77,6 @@ def test_the_cases_are_what_estimates_are_made_of(tmp_path, monkeypatch):
     rows = arm64.compared({name: one[name] for name in other}, other)
     assert not any(row["differing"] for row in rows)
     assert {"simulated: odometry covariance", "simulated: counts"} <= {row["name"] for row in rows}
+    assert not list(here.iterdir())
     biased = [np.abs(one[f"{case}: TDOA bias"]).max() for case in known]
     assert biased[0] == 0.0 and min(biased[1:]) > 0.1

@@ -208,8 +208,8 @@ def test_a_jump_counts_once(change):
 
 @given(st.floats(-3.0, 3.0), st.floats(-3.0, 3.0), st.floats(-15.0, 15.0), st.integers(1, 4))
 def test_motion_and_measurements_are_no_jump(speed, turn, acceleration, step):
-    """As fast as a quadrotor moves; an update moves the estimate by up to 3 deviations."""
-    dt, update = 1e-9 * PERIOD * step, 3.0 * 0.05
+    """As fast as a quadrotor moves; an update moves the estimate by decimetres at most."""
+    dt, update = 1e-9 * PERIOD * step, 0.2
     before = estimate(0.0, v=(speed, 0.0, 0.0), yaw=0.3, std=0.05)
     faster = speed + acceleration * dt
     place = speed * dt + 0.5 * acceleration * dt**2 + update

@@ -28,10 +28,15 @@ HERE = f"{sys.version_info.major}.{sys.version_info.minor}"
 NO_INDEX = r"NewConnectionError|NameResolution|Timeout|ProxyError|from versions: none"
 
 
+def kept(*beginnings):
+    """The variables of this process with such names. BLAS chooses its kernels by some of them."""
+    return {name: value for name, value in os.environ.items() if name.startswith(beginnings)}
+
+
 def run(*words, folder=None, code=0, **variables):
     """Run a program as a user without ROS does, and return what it printed."""
     plain = {name: os.environ[name] for name in ("HOME", "TMPDIR") if name in os.environ}
-    plain |= {name: value for name, value in os.environ.items() if name.startswith("PIP_")}
+    plain |= kept("PIP_", "OPENBLAS_")
     done = subprocess.run(
         list(map(str, words)),
         cwd=folder,
@@ -156,7 +161,7 @@ def test_figures_are_those_with_ros_bit_by_bit(wheel, recording, tmp_path):
                 done = subprocess.run(
                     [tool, name, *line],
                     cwd=recording,
-                    env={"HOME": os.environ["HOME"], "PATH": "/usr/bin:/bin"},
+                    env={**kept("HOME", "OPENBLAS_"), "PATH": "/usr/bin:/bin"},
                     capture_output=True,
                     text=True,
                 )

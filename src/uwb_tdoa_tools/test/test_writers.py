@@ -119,8 +119,8 @@ def in_ascii(folder, command, *arguments, encoding="ascii"):
 
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory):
-    """A bag of a short flight. Its name and its path are not ASCII, and have spaces."""
-    path = tmp_path_factory.mktemp("bags") / "zwei flüge — 二"
+    """A bag of a short flight. Its name and its folder are not ASCII, and have spaces."""
+    path = tmp_path_factory.mktemp("zwei flüge — 二") / "bag"
     write_bag(replace(clean_flight(100, 24.0), name="flüge"), path)
     return path
 

@@ -189,10 +189,12 @@ class AutopilotNode(StreamNode):
             "publishers of odometry": self._input.subscription.get_publisher_count(),
             "subscribers of odometry/gated": self._publisher.get_subscription_count(),
             "unreadable on odometry": self._input.refusals.count,
+            "unreadable on status": self._status.refusals.count,
             **self._topics.subscribers,
         }
         text = (
             self._input.refusals.trouble()
+            or self._status.refusals.trouble()
             or trouble
             or ("" if recent else "no odometry: start ekf_node in this namespace")
             or (self._gate.why and f"nothing is sent to the autopilot: {self._gate.why}")

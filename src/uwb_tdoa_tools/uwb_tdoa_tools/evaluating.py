@@ -22,6 +22,7 @@ from .choices import ALIGN, NONE
 from .estimate import FlightEstimator
 from .localizing.localize import write_tum
 from .localizing.pictures import write_rerun
+from .outputs import file_name
 from .readers.inputs import Reading, report_remarks
 from .readers.tables import number, read_table
 from .results_file import ResultsFile, fingerprint_of
@@ -140,9 +141,9 @@ class Evaluator:
 
             plot_error(score, odometry, truth, self.picture)
         if self.trajectories:
-            folder = self.trajectories
-            write_tum(folder / f"{flight.name}.tum", odometry.t, odometry.p, odometry.q)
-            write_tum(folder / f"{flight.name}_truth.tum", truth.t, truth.p, truth.q)
+            folder, name = self.trajectories, file_name(flight.name)
+            write_tum(folder / f"{name}.tum", odometry.t, odometry.p, odometry.q)
+            write_tum(folder / f"{name}_truth.tum", truth.t, truth.p, truth.q)
         if self.rerun:
             lines = [f"{name}: {value}" for name, value in score.row().items()]
             write_rerun(self.rerun, flight, odometry, residuals, lines, truth)

@@ -119,6 +119,11 @@ def _check_writable(path: Path, folder: Path) -> None:
         ) from error
 
 
+def file_name(name: str) -> str:
+    """Return a text as a name of a file: in UTF-8, also in an ASCII locale."""
+    return os.fsdecode(name.encode("utf-8", "surrogateescape"))
+
+
 def as_json(value: Any) -> Any:
     """Convert a value, or nested dicts and sequences, to JSON.
 

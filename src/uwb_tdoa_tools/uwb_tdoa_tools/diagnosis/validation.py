@@ -159,22 +159,19 @@ def select_by_error(
     map_function : as of `attribute`
     """
     selection = attribution.selection
-    groups = _groups(selection, selection.chosen, attribution.detections)
-    if not groups:
+    parts = _parts(attribution)
+    if not parts:
         return ValidatedSelection(selection, (), (), {})
-    at_a_time = [len(flights) == 1 and any(map(_is_momentary, group)) for group in groups]
-    tried = _products(attribution, flights, baseline, groups, progress, map_function)
-    decision = decide(tried, ~np.array(at_a_time))
-    shares: dict[Part, float] = {}
-    worth: dict[Part, float] = {}
-    refused: list[Refused] = []
-    for place, group in enumerate(groups):
-        share, value = float(decision.shares[place]), float(decision.worth[place])
-        shares.update(dict.fromkeys(group, share))
-        worth.update(dict.fromkeys(group, value))
-        if not share:
-            why = MOMENTARY if at_a_time[place] else _why_not(value)
-            refused += [Refused(_label(part), why) for part in group]
+    at_a_time = np.array([len(flights) == 1 and _is_momentary(part) for part in parts])
+    tried = _products(attribution, flights, baseline, parts, progress, map_function)
+    decision = decide(tried, ~at_a_time)
+    shares = dict(zip(parts, decision.shares.tolist()))
+    worth = dict(zip(parts, decision.worth.tolist()))
+    refused = [
+        Refused(_label(part), MOMENTARY if momentary else _why_not(worth[part]))
+        for part, momentary in zip(parts, at_a_time)
+        if not shares[part]
+    ]
     # with the weights of the trials: otherwise the dropped effects make outliers of their data
     kept = selection.kept([part for part in selection.chosen if shares.get(part, 1.0)])
     kept = replace(kept, shares={part: shares[part] for part in kept.chosen if part in shares})
@@ -183,50 +180,61 @@ def select_by_error(
     return ValidatedSelection(kept, detections, tuple(refused), worth, applied)
 
 
-def _groups(
-    selection: Selection, chosen: Sequence[Candidate], detections: Sequence[Detection]
-) -> list[list[Part]]:
-    """Return the parts of a model that a node can correct, at least in part.
+def _parts(attribution: Attribution) -> list[Part]:
+    """Return the parts of a model that a node can correct, at least in part."""
+    return [
+        *(
+            candidate
+            for candidate in attribution.selection.chosen
+            if any(term.effect.usable for term in candidate.terms)
+        ),
+        *(one for one in attribution.detections if one.effect.usable),
+    ]
 
-    Candidates that cancel in the fitted rows are one group. Without one of them the filter rejects
-    the measurements of the other, and the errors do not show what each is worth.
-    """
-    table = selection.table
-    fitted = refit(table, columns_of(chosen), selection.fit)
-    root = np.sqrt(selection.fit.information(table))
-    out: list[tuple[list[Part], np.ndarray]] = []
-    for candidate in chosen:
-        if not any(term.effect.usable for term in candidate.terms):
-            continue
-        part = root * (table.matrix(candidate.columns) @ fitted.values(candidate.columns))
-        part = part / max(float(np.linalg.norm(part)), 1e-12)
-        for group, others in out:
-            if part @ others < -CANCELS:
-                group.append(candidate)
-                break
-        else:
-            out.append(([candidate], part))
-    alone: list[list[Part]] = [[one] for one in detections if one.effect.usable]
-    return [group for group, _ in out] + alone
+
+def _cancelled(selection: Selection) -> list[Candidate]:
+    """Return the chosen Candidates whose contribution another one cancels in the fitted rows."""
+    table, model = selection.table, selection.fit
+    root = np.sqrt(model.information(table))
+    x = [
+        root * (table.matrix(candidate.columns) @ model.values(candidate.columns))
+        for candidate in selection.chosen
+    ]
+    unit = [one / max(float(np.linalg.norm(one)), 1e-12) for one in x]
+    return [
+        candidate
+        for candidate, one in zip(selection.chosen, unit)
+        if any(one @ other < -CANCELS for other in unit)
+    ]
 
 
 def _products(
     attribution: Attribution,
     flights: Sequence[Flight],
     baseline: Baseline,
-    groups: Sequence[list[Part]],
+    parts: Sequence[Part],
     progress: Callable[[], object],
     map_function: MapFunction,
 ) -> list[np.ndarray]:
     """Return the `products` of each tried flight, (k + 2, k + 2), that `decide` needs.
 
-    groups : k groups that are tried
+    Without one of two effects that cancel, the filter would reject the measurements of the other.
+    So the others are fitted again without it.
+
+    parts : k parts of the model that are tried
     """
-    candidates, parts = attribution.selection.chosen, sum(groups, [])
-    models = [parts, [], *([one for one in parts if one not in group] for group in groups)]
+    candidates = attribution.selection.chosen
+    cancelled = _cancelled(attribution.selection)
+    models: list[tuple[Sequence[Candidate], Sequence[Part]]] = [
+        (candidates, parts),
+        (candidates, []),
+    ]
+    for part in parts:
+        fitted = [one for one in candidates if one is not part or part not in cancelled]
+        models.append((fitted, [one for one in parts if one is not part]))
     several = folds(attribution, flights, baseline.base)
     trials = [
-        (fold.case, [fold.effects(attribution, candidates, some) for some in models])
+        (fold.case, [fold.effects(attribution, *model) for model in models])
         for fold in several[:: -(-len(several) // TRIED)]
     ]
     out = []
@@ -241,7 +249,7 @@ def _of_trial(
 ) -> np.ndarray:
     """Return the `products` of one case.
 
-    trial : ValidationCase; EffectSets: all effects, none, and all without each group. The first two
+    trial : ValidationCase; EffectSets: all effects, none, and all without each. The first two
         run like the nodes. The others use the poses of the first run, which takes a tenth of the
         time.
     """

@@ -15,7 +15,7 @@ from uwb_tdoa_bias.common.sensors import SENSORS
 from ..simulation.config import WHEELS_RATE
 from ..simulation.sensors import YAW_RATE_STD, slips
 from .mission import DONE, FLYING, LOST, REFUSED, WAITING, Polyline, Rules, Waypoints, yaw_of
-from .sensors import SensorSensor, random
+from .sensors import AuxiliarySensor, random
 from .simulator import Simulator
 from .trial import REST_AFTER, Trial
 from .vehicle import GRAVITY, IMU_RATE
@@ -59,7 +59,7 @@ class Steering:
         self.speed = self.turning = 0.0
 
 
-class Wheels(SensorSensor):
+class Wheels(AuxiliarySensor):
     """Simulate the encoders of both wheels."""
 
     rate, width = WHEELS_RATE, 2
@@ -112,7 +112,7 @@ class RoverSimulator(Simulator):
             self.wheels[i], self.states[i], self.samples[i] = wheels, state, sample
             self.contact[i] = 2.0
 
-    def _sensor_measured(self, name: str, sensor: SensorSensor, lately: slice) -> Stream:
+    def _sensor_measured(self, name: str, sensor: AuxiliarySensor, lately: slice) -> Stream:
         new, _, _ = self._poses(name, sensor.t, lately)
         t = sensor.t[new]
         wheels = np.column_stack(

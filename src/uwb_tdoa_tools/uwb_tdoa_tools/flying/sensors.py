@@ -290,7 +290,7 @@ def gusts(world: World, seed: int, duration: float) -> np.ndarray:
     return world.gust * lfilter([1.0], [1.0, -decay], white, axis=0)
 
 
-class SensorSensor:
+class AuxiliarySensor:
     """Simulate a further sensor of one flight.
 
     Attributes
@@ -328,7 +328,7 @@ class SensorSensor:
         raise NotImplementedError
 
 
-class RangeFinder(SensorSensor):
+class RangeFinder(AuxiliarySensor):
     """Simulate a range finder along -z of the body, m, with inf beyond its range."""
 
     def rate_in(self, world: World) -> float:
@@ -344,7 +344,7 @@ class RangeFinder(SensorSensor):
         )
 
 
-class Barometer(SensorSensor):
+class Barometer(AuxiliarySensor):
     """Simulate a barometer, Pa."""
 
     def measured(
@@ -353,7 +353,7 @@ class Barometer(SensorSensor):
         return (pressure_at(SITE + p[:, 2] + ALTITUDE_STD * self.noise[rows, 0]),)
 
 
-class Speedometer(SensorSensor):
+class Speedometer(AuxiliarySensor):
     """Simulate a velocity sensor: velocity in the body frame and its standard deviation, m/s."""
 
     width = 3
@@ -364,7 +364,7 @@ class Speedometer(SensorSensor):
         return v + VELOCITY_STD * self.noise[rows], np.full(v.shape, max(VELOCITY_STD, LEAST_STD))
 
 
-class TwoWayRanging(SensorSensor):
+class TwoWayRanging(AuxiliarySensor):
     """Simulate distances to the anchors in turn: ids, m, and an unknown variance of 0.
 
     No obstacle blocks them.

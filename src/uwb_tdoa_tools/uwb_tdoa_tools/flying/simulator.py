@@ -33,7 +33,7 @@ from .vehicle import (
 if TYPE_CHECKING:
     from uwb_tdoa_bias.common.sensors.sensor import Stream
 
-    from .sensors import SensorSensor
+    from .sensors import AuxiliarySensor
     from .vehicle import Record
     from .world import World
 
@@ -335,7 +335,7 @@ class Simulator:
         self._heard[stream] = new.stop
         return new, p, q
 
-    def _sensor_measured(self, name: str, sensor: SensorSensor, lately: slice) -> Stream:
+    def _sensor_measured(self, name: str, sensor: AuxiliarySensor, lately: slice) -> Stream:
         """Return the new measurements of one sensor."""
         new, p, q = self._poses(name, sensor.t, lately)
         v = np.broadcast_to(self.state[VELOCITY], p.shape)

@@ -1,10 +1,10 @@
 """Searches for effects that linear regression does not find, by family of effects."""
 
 from .anchor import NlosDetector
+from .auxiliary import FloorStepDetector, VelocitySlipDetector
 from .base import Detection, Detector
 from .floor import FloorMultipathDetector
 from .pair import NoiseCorrelationDetector, NoiseLevelDetector, OutlierRateDetector
-from .sensors import FloorStepDetector, VelocitySlipDetector
 
 DETECTORS = {
     detector.effect.name: detector

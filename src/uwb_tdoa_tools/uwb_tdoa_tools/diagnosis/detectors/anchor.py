@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 from uwb_tdoa_bias.effects import EFFECTS
 
 from ..regression.terms import Candidate, Term
+from .auxiliary import LEAST_GAIN, LONGEST, best_interval
 from .base import Detector
-from .sensors import LEAST_GAIN, LONGEST, best_interval
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
