@@ -1,1 +1,1 @@
-"""Figures of docs/diagnosis.md."""
+"""Figures of docs/notebook/diagnosis.md."""

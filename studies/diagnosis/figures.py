@@ -1,6 +1,6 @@
-"""diagnosis: the figures of docs/diagnosis.md. Every part prints its figures and writes them, with
-all cases, to PART.json in the output folder; bank, blind and injected draw what was found first for
-what was put in, too.
+"""diagnosis: the figures of docs/notebook/diagnosis.md. Every part prints its figures and writes them,
+with all cases, to PART.json in the output folder; bank, blind and injected draw what was found
+first for what was put in, too.
 """
 
 from functools import partial

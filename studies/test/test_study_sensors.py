@@ -1,4 +1,6 @@
-"""Faults of docs/auxiliary_sensors.md put into simulated flights: ekf_node names the sensor."""
+"""Faults of docs/notebook/auxiliary_sensors.md put into simulated flights: ekf_node
+names the sensor.
+"""
 
 from collections import Counter
 from dataclasses import replace

@@ -1,1 +1,1 @@
-"""Figures of docs/bias.md, and the model that is shipped."""
+"""Figures of docs/notebook/bias.md, and the model that is shipped."""

@@ -494,7 +494,7 @@ def test_findings_and_alternatives_in_json(result):
 
 
 def test_every_key_of_json_is_in_the_document(result, without_truth):
-    text = (DOCS / "diagnosis.md").read_text()
+    text = (DOCS / "diagnosis_report.md").read_text()
     term = SmoothTerm({"c0": 0.1}, {}, knots=(0.0, 1.0))
     shown = replace(result, findings=[*result.findings, finding(term)], refused=[Refused("a", "b")])
     keys = keys_of(output.as_json(shown)) | keys_of(output.as_json(without_truth))

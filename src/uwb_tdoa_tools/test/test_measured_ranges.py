@@ -1,5 +1,5 @@
-"""Measured ranges, as docs/sensors.md takes them: the filter finds the antenna delay of a tag that
-nobody has calibrated.
+"""Measured ranges, as docs/notebook/ranges.md takes them: the filter finds the
+antenna delay of a tag that nobody has calibrated.
 """
 
 import shutil

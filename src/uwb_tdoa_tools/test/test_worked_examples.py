@@ -1,4 +1,6 @@
-"""What docs/effects.md tells people to write is written here as they would, and works."""
+"""What docs/add_effect.md and docs/add_channel.md tell people to write is written here as they
+would, and works.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -15,20 +17,17 @@ from uwb_tdoa_tools.diagnosis.channels import CHANNELS
 from uwb_tdoa_tools.diagnosis.detectors import DETECTORS
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 
-DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "effects.md"
+DOCS = Path(__file__).resolve().parents[3] / "docs"
 
 
-def written(heading):
-    """The names that the code under a heading of the document defines."""
-    section = (
-        DOCUMENT.read_text()
-        .partition(f"### {heading}\n")[2]
-        .partition("\n## ")[0]
-        .partition("\n### ")[0]
-    )
+def written(page, heading=""):
+    """The names that the code of a page defines, of one heading of it if one is given."""
+    text = (DOCS / page).read_text()
+    if heading:
+        text = text.partition(f"## {heading}\n")[2].partition("\n## ")[0]
     names = {"__name__": "worked_example"}
-    for block in re.findall(r"```python\n(.*?)```", section, re.DOTALL):
-        exec(compile(block, str(DOCUMENT), "exec"), names)
+    for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+        exec(compile(block, page, "exec"), names)
     return names
 
 
@@ -38,7 +37,7 @@ def flight():
 
 
 def test_an_effect_with_a_search_of_its_own(flight, monkeypatch):
-    names = written("An effect with a search of its own")
+    names = written("add_effect.md", "An effect with a search")
     ripple = names["RangeRipple"]
     monkeypatch.setitem(EFFECTS, ripple.name, ripple)
     monkeypatch.setitem(DETECTORS, ripple.name, names["RangeRippleDetector"]())
@@ -53,7 +52,7 @@ def test_an_effect_with_a_search_of_its_own(flight, monkeypatch):
 
 
 def test_a_channel(flight, monkeypatch, tmp_path):
-    names = written("A channel")
+    names = written("add_channel.md")
     offset = names["CompassOffset"]
     monkeypatch.setitem(EFFECTS, offset.name, offset)
     monkeypatch.setitem(CHANNELS, "heading", names["Heading"]())

@@ -303,7 +303,7 @@ def calibrate(
 def effect(kind: Kind) -> Kind:
     """Make an effect of your own known to `diagnose`, `inject` and effects.yaml; a class decorator.
 
-    `kind` is a subclass of Effect with a `row`. docs/effects.md says what a kind of effect needs, and
+    `kind` is a subclass of Effect with a `row`. docs/add_effect.md says what a kind of effect needs, and
     examples/own_effect.py shows one. A class of the same module and name is replaced, as when a cell
     of a notebook runs again.
 

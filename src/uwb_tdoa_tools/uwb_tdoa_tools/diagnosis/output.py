@@ -30,7 +30,7 @@ WIDTH, LABEL = 120, 10  # characters of a line on the screen, and of its label
 def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return the content of diagnosis.json as plain values.
 
-    docs/diagnosis.md describes its keys.
+    docs/diagnosis_report.md describes its keys.
     """
     return outputs.as_json(
         {

@@ -57,7 +57,7 @@ _END = ("id", "x", "y", "z")
 class StructuredPriors:
     """Set the priors of the structured model.
 
-    The defaults were chosen on the validation flights of docs/bias.md.
+    The defaults were chosen on the validation flights of docs/notebook/bias.md.
 
     Parameters
     ----------
