@@ -37,7 +37,6 @@ PARTS = (
     "injected",
     "measured",
     "measured-sensors",
-    "decision",
     "floor",
     "references",
     "speed",
@@ -87,8 +86,7 @@ def run(args):
     """Run a part, and write and print its figures."""
     args.out.mkdir(parents=True, exist_ok=True)
     on_data = dict.fromkeys(
-        ("faults", "injected", "measured", "measured-sensors", "decision", "floor", "references"),
-        ("data",),
+        ("faults", "injected", "measured", "measured-sensors", "floor", "references"), ("data",)
     )
     for option in {"undeclared": ("cases",), **on_data}.get(args.part, ()):
         if getattr(args, option) is None:
@@ -105,7 +103,6 @@ def run(args):
         "injected": _injected,
         "measured": _measured,
         "measured-sensors": _measured_sensors,
-        "decision": _decision,
         "floor": _floor,
         "references": _references,
         "speed": _speed,
@@ -238,16 +235,7 @@ def _measured(args):
     results = _each(
         [(name,) for name in measured.SPLITS], lambda name: measured.run(args.data, name, args.out)
     )
-    figures = {r["split"]: r["summary"] for r in results}
-    return {"figures": {**figures, "promises": measured.promises(results)}, "cases": results}
-
-
-def _decision(args):
-    results = _each(
-        [(name,) for name in measured.CHOSEN_ON],
-        lambda name: measured.run(args.data, name, args.out),
-    )
-    return {"figures": measured.promises(results), "cases": results}
+    return {"figures": {r["split"]: r["summary"] for r in results}, "cases": results}
 
 
 def _measured_sensors(args):

@@ -11,7 +11,6 @@ from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_bias.common.flight import SENSOR_NAMES
 from uwb_tdoa_tools.diagnosis import diagnose, output
 from uwb_tdoa_tools.diagnosis.attribution import attribute
-from uwb_tdoa_tools.diagnosis.decision import LOSS
 from uwb_tdoa_tools.diagnosis.findings import usable
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.report.page import html
@@ -57,30 +56,6 @@ SPLITS = {
         [f"util/const4-trial3-tdoa2-traj{k}.csv.gz" for k in (2, 3)],
     ),
 }
-# Splits on which the constants of `diagnosis/decision.py` were set; no table reports them.
-_CONST3, _CONST4 = "util/const3-trial{}-tdoa2.csv.gz", "util/const4-trial{}-tdoa2-traj{}.csv.gz"
-CHOSEN_ON = {
-    "0425 level": (
-        [_T2 + k for k in ("1", "2", "3")],
-        [_T2 + "6", _T2 + "7", _T3 + "17"],
-    ),
-    "0425 three": (
-        [_T2 + "6", _T3 + "13", _T3 + "21"],
-        [_T2 + "1", _T2 + "10", _T3 + "14"],
-    ),
-    "0425 one": ([_T2 + "10"], [_T2 + "2", _T2 + "6", _T3 + "17"]),
-    "0426 three": (
-        [f"flights/0426/0426-traj{k}" for k in (1, 7, 9)],
-        [f"flights/0426/0426-traj{k}" for k in (2, 11, 15)],
-    ),
-    "0426 two": (
-        [f"flights/0426/0426-traj{k}" for k in (3, 13)],
-        [f"flights/0426/0426-traj{k}" for k in (1, 2, 5)],
-    ),
-    "const3 one": ([_CONST3.format(3)], [_CONST3.format(k) for k in (1, 2, 4)]),
-    "const4 trial 1 two": ([_CONST4.format(1, k) for k in (1, 2)], [_CONST4.format(1, 3)]),
-    "const4 trial 3 one": ([_CONST4.format(3, 3)], [_CONST4.format(3, k) for k in (1, 2)]),
-}
 AIDED = ("0425 a", "0425 b")  # all of whose flights hold height and pressure
 INTO = (
     "flights/0425/TDOA2/0425-traj2",
@@ -124,7 +99,7 @@ def run(data, name, out, sensors=()):
     """Diagnose one split; writes its report and effects.yaml. sensors : streams that are used where
     flights hold them. Returns dict of the summary and all findings.
     """
-    fit, judge = {**SPLITS, **CHOSEN_ON}[name]
+    fit, judge = SPLITS[name]
     started = time.monotonic()
     result = diagnose(load(data, fit, sensors), load(data, judge, sensors))
     folder = out / folder_of(name)
@@ -155,37 +130,8 @@ def run(data, name, out, sensors=()):
         "split": name,
         "summary": summary,
         "runs": runs,
-        "promised": content["expected"],
         "judged_on": content["judged_on"],
         "seconds": time.monotonic() - started,
-    }
-
-
-def promises(results):
-    """What the diagnosis expects of other flights against what they show, over splits: dict.
-
-    The slope is that of a line through zero. A flight counts as a loss beyond LOSS.
-    """
-    applied = [one for one in results if one["promised"]]
-    promised = np.array([one["promised"]["gain"] for one in applied])
-    ratios = [np.array([after / before for _, before, after in one["runs"]]) for one in applied]
-    obtained = np.array([1.0 - ratio.mean() for ratio in ratios])
-    std = np.array([one["promised"]["std"] for one in applied])
-    every = np.concatenate(ratios)
-    return {
-        "splits": {
-            one["split"]: [round(float(p), 3), round(float(o), 3)]
-            for one, p, o in zip(applied, promised, obtained)
-        },
-        "slope": round(float(promised @ obtained / (promised @ promised)), 2),
-        "obtained minus promised over its standard deviation, rms": round(
-            float(np.sqrt(np.mean(((obtained - promised) / std) ** 2))), 2
-        ),
-        "flights with a loss": f"{np.sum(every > 1.0 + LOSS)} of {len(every)}",
-        "promised probability of a loss, mean": round(
-            float(np.mean([one["promised"]["risk"] for one in applied])), 3
-        ),
-        "worst ratio": round(float(every.max()), 2),
     }
 
 

@@ -82,9 +82,7 @@ def listener():
 
 def test_the_publisher_in_python(tmp_path, listener):
     """With reliable subscriptions, as most have, that come after the anchors were sent."""
-    (tmp_path / "driver.py").write_text(
-        *blocks(section("drivers.md", "In Python"), "python")
-    )
+    (tmp_path / "driver.py").write_text(*blocks(section("drivers.md", "In Python"), "python"))
     process = subprocess.Popen(
         [sys.executable, tmp_path / "driver.py"], stderr=subprocess.PIPE, text=True
     )

@@ -13,7 +13,6 @@ from uwb_tdoa_bias.effects import EFFECTS, EffectSet, SmoothTerm
 from uwb_tdoa_bias.effects.base import measured
 from uwb_tdoa_tools.command_lines import lines_of_use
 from uwb_tdoa_tools.diagnosis import diagnose, output
-from uwb_tdoa_tools.diagnosis.decision import RULE, Decision
 from uwb_tdoa_tools.diagnosis.findings import EffectFinding, Refused
 from uwb_tdoa_tools.diagnosis.references import Heights, Nothing
 from uwb_tdoa_tools.diagnosis.regression.confounding import Alternative, Unobservable
@@ -80,15 +79,6 @@ def test_the_verdict_has_the_error_before_and_after_its_interval_and_how_many_fl
     assert any(
         "flights that took no part in the fit: 2 flights" in sentence for sentence in found.more
     )
-
-
-def test_the_verdict_states_the_rule_and_what_another_flight_can_expect(result):
-    decision = Decision(np.ones(1), np.ones(1), 0.31, 0.12, 0.018)
-    more = " ".join(verdict(replace(result, decision=decision)).more)
-    assert "another flight the error is expected to fall by 31 %" in more
-    assert "by more than 3 % with a probability of 2 %" in more
-    assert all(sentence in more for sentence in RULE)
-    assert RULE[0] not in " ".join(verdict(replace(result, decision=None)).more)
 
 
 def test_a_flight_of_which_each_half_was_judged_was_flown_once():

@@ -55,7 +55,7 @@ if TYPE_CHECKING:
     from .detectors import Detection, Detector
     from .references import Reference
     from .regression.fit import Fit
-    from .regression.select import Rival, Search
+    from .regression.select import Rival
     from .regression.table import RegressionTable
 
 # Flights, fewest for a map. With fewer, the map depends on their paths and does not generalize; two
@@ -118,13 +118,12 @@ class Attribution:
 
         It is the prior of the next calibration.
         """
-        left_out = {
-            column: 1.0 - self.selection.shares.get(candidate, 1.0)
+        columns = [
+            column
             for candidate in self.selection.chosen
             if candidate.name in OF_ANCHORS
             for column in candidate.columns
-        }
-        columns = list(left_out)
+        ]
         if not columns:
             return None
         places = [self.selection.fit.columns.index(column) for column in columns]
@@ -132,8 +131,6 @@ class Attribution:
         covariance = (
             covariance + in_common(self.selection.table, columns) * prior_sizes(columns) ** 2.0
         )  # the data do not determine common means
-        away = np.array(list(left_out.values())) * self.selection.fit.values(columns)
-        covariance = covariance + np.outer(away, away)
         return to_keep(tuple((str(column.effect[0]), column.key) for column in columns), covariance)
 
     def findings(self) -> list[EffectFinding]:
@@ -182,177 +179,103 @@ def attribute(
     map_function : function
         Like map(function, items), possibly in parallel processes.
     """
-    refused: list[Refused] = []
-    at = _ResidualsAt(flights, reference, base, progress, map_function)
-    offered = _Offered.of(at(()), flights, reference, kinds)
-    unmoved = linearised(at(()), offered.declared, ())
-    declared = _named_effects(at, offered, unmoved, refused)
-    if undeclared:
-        selection, smooth = _with_functions(declared, at, offered, unmoved, refused)
-    else:
-        selection, smooth = with_rivals(declared, offered.declared, None, progress), []
-    if undeclared and len(flights) >= FOR_MAPS:
-        selection = with_maps(selection, smooth, refused)
-    remaining = at(effects_of(selection))
-    detected = (detector.detect(remaining) for detector in offered.detectors)
-    names = tuple(flight.name for flight in flights)
-    alone: tuple[tuple[str, Selection], ...] = ()
-    if undeclared and len(flights) > 1 and all(reference.positions_known):
-        of_each = of_one(remaining, selection.fit.inflation, _views, offered.search, map_function)
-        alone = tuple((names[k], own) for k, own in of_each)
-    near = [(name, part) for name, part in zip(names, map(near_floor, remaining)) if part]
-    floor = None
-    if near:
-        parts = [part for _, part in near]
-        floor = on_floor(parts, offered.on_floor, undeclared, refused, progress)
-    return Attribution(
-        at(()),
-        with_deviations(selection),
-        tuple(detection for detection in detected if detection is not None),
-        offered.declared,
-        tuple(refused),
-        names,
-        alone,
-        floor,
-        tuple(name for name, _ in near),
-    )
+    known: list[tuple[tuple[Effect, ...], list[ChannelResiduals]]] = []
 
+    def at(model: Sequence[Effect]) -> list[ChannelResiduals]:
+        """Return the residuals under a model.
 
-class _ResidualsAt:
-    """The residuals of Flights under a model, computed on demand.
-
-    Those of the last and of the empty model are kept. If the path is unknown, computing them runs
-    the filter.
-    """
-
-    def __init__(
-        self,
-        flights: Sequence[Flight],
-        reference: Reference,
-        base: EffectSet,
-        progress: Callable[[], object],
-        map_function: MapFunction,
-    ) -> None:
-        """Take the arguments of `attribute`."""
-        self._flights, self._reference, self._base = flights, reference, base
-        self.progress, self._map_function = progress, map_function
-        self._known: list[tuple[tuple[Effect, ...], list[ChannelResiduals]]] = []
-
-    def __call__(self, model: Sequence[Effect]) -> list[ChannelResiduals]:
-        """Return [{channel: ChannelResidual}] under the effects of a model beyond the base."""
-        for other, made in self._known:
-            if other == tuple(model):
-                return made
-        effects = EffectSet((*self._base.effects, *model))
-        found = residuals_of(
-            self._flights, self._reference, effects, self.progress, self._map_function
-        )
-        self._known[1:] = [(tuple(model), found)]  # the first call, of the empty model, stays
-        return found
-
-    @property
-    def latest(self) -> list[ChannelResiduals]:
-        """Return the residuals under the last model that was asked for."""
-        return self._known[-1][1]
-
-
-@dataclass(frozen=True)
-class _Offered:
-    """What a search can choose from.
-
-    declared : Candidates of declared effects; installation : Anchors, and pairs (m, 2)
-    detectors : of effects in the air; on_floor : of effects near the floor
-    """
-
-    declared: list[Candidate]
-    installation: tuple[Anchors, np.ndarray]
-    detectors: list[Detector]
-    on_floor: list[Detector]
-
-    @classmethod
-    def of(
-        cls,
-        found: Sequence[ChannelResiduals],
-        flights: Sequence[Flight],
-        reference: Reference,
-        kinds: Collection[str] | None,
-    ) -> _Offered:
-        """Return what the channels of some residuals and the reference can show.
-
-        kinds : as of `attribute`
+        Residuals of the last and of the empty model are kept. If the path is unknown, computing
+        them runs the filter.
         """
-        shown = {name for flight in found for name in flight}
-        wanted = [
-            one
-            for name, one in DETECTORS.items()
-            if (kinds is None or name in kinds) and shown & set(one.effect.channels)
-        ]
-        installation = _installation(flights)
-        return cls(
-            _declared(found, reference, kinds, installation),
-            installation,
-            [detector for detector in wanted if not detector.on_floor],
-            [detector for detector in wanted if detector.on_floor],
-        )
+        again = [made for other, made in known if other == tuple(model)]
+        if not again:
+            again = [
+                residuals_of(
+                    flights, reference, EffectSet((*base.effects, *model)), progress, map_function
+                )
+            ]
+            known[1:] = [(tuple(model), again[0])]  # the first call, of the empty model, stays
+        return again[0]
 
-    @property
-    def search(self) -> Search:
-        """Return the search of all detectors."""
-        return partial(_search, self.detectors)
-
-    @property
-    def disguises(self) -> Search:
-        """Return the search of effects that look like noise."""
-        return partial(_search, [one for one in self.detectors if one.searched_first])
-
-
-def _named_effects(
-    at: _ResidualsAt, offered: _Offered, unmoved: RegressionTable, refused: list[Refused]
-) -> Selection:
-    """Return the Selection of declared effects, linearized at its own values.
-
-    unmoved : RegressionTable linearized at no effects; refused : dropped Candidates are appended
-    """
-    candidates, table = offered.declared, unmoved
-    inflation = inflation_of(unmoved, candidates, offered.disguises)
-    at.progress()
-    selection = select(table, candidates, inflation, offered.search, progress=at.progress)
+    under_base = at(())
+    shown = {name for flight in under_base for name in flight}
+    wanted = [
+        one
+        for name, one in DETECTORS.items()
+        if (kinds is None or name in kinds) and shown & set(one.effect.channels)
+    ]
+    detectors = [detector for detector in wanted if not detector.on_floor]
+    search = partial(_search, detectors)
+    installation = _installation(flights)
+    declared = _declared(under_base, reference, kinds, installation)
+    unmoved = linearised(under_base, declared, ())
+    disguises = partial(_search, [detector for detector in detectors if detector.searched_first])
+    inflation = inflation_of(unmoved, declared, disguises)
+    progress()
+    selection = select(unmoved, declared, inflation, search, progress=progress)
+    current, found = under_base, effects_of(selection)
     for _ in range(ROUNDS - 1):
-        found = effects_of(selection)
         if not found:
             break
-        table = linearised(at(found), candidates, found)
-        at.progress()
-        selection = select(table, candidates, inflation, offered.search, progress=at.progress)
-    return cross_validated(selection, refused)
-
-
-def _with_functions(
-    selection: Selection,
-    at: _ResidualsAt,
-    offered: _Offered,
-    unmoved: RegressionTable,
-    refused: list[Refused],
-) -> tuple[Selection, list[Candidate]]:
-    """Return the Selection with functions without a name, and all Candidates of functions.
-
-    selection : of declared effects; unmoved, refused : as of `_named_effects`
-    """
+        current = at(found)
+        progress()
+        selection = select(
+            linearised(current, declared, found), declared, inflation, search, progress=progress
+        )
+        found = effects_of(selection)
+    refused: list[Refused] = []
+    selection = cross_validated(selection, refused)
+    smooth: list[Candidate] = []
     scans: dict[int, Scan] = {}
 
-    def scan_of(table: RegressionTable) -> Scan:
-        """Return the Scan of a table; one per number of rows, because stamp offsets change it."""
+    def scan_of(
+        table: RegressionTable,
+    ) -> Scan:  # one per number of rows, because stamp offsets change it
         if len(table.y) not in scans:
             scans[len(table.y)] = Scan(table, _views(table))
         return scans[len(table.y)]
 
-    smooth = _smooth(at.latest, offered.installation)
-    everything = offered.declared + smooth
-    found = with_smooth(
-        selection, unmoved, offered.declared, smooth, offered.search, scan_of, at.progress
+    if undeclared:
+        smooth = _smooth(current, installation)
+        selection = with_smooth(selection, unmoved, declared, smooth, search, scan_of, progress)
+        selection = relinearised(selection, at, declared + smooth)
+        selection = cross_validated(selection, refused)
+    selection = with_rivals(
+        selection, declared + smooth, scan_of(selection.table) if undeclared else None, progress
     )
-    found = cross_validated(relinearised(found, at, everything), refused)
-    return with_rivals(found, everything, scan_of(found.table), at.progress), smooth
+    if undeclared and len(flights) >= FOR_MAPS:
+        selection = with_maps(selection, smooth, refused)
+    remaining, selection = at(effects_of(selection)), with_deviations(selection)
+    detected = (detector.detect(remaining) for detector in detectors)
+    detections = tuple(detection for detection in detected if detection is not None)
+    names = tuple(flight.name for flight in flights)
+    alone: tuple[tuple[str, Selection], ...] = ()
+    if undeclared and len(flights) > 1 and all(reference.positions_known):
+        alone = tuple(
+            (names[k], own) for k, own in of_one(remaining, inflation, _views, search, map_function)
+        )
+    near = [(name, part) for name, part in zip(names, map(near_floor, remaining)) if part]
+    floor = None
+    if near:
+        floor = on_floor(
+            [part for _, part in near],
+            [one for one in wanted if one.on_floor],
+            undeclared,
+            refused,
+            progress,
+        )
+    floor_names = tuple(name for name, _ in near)
+    return Attribution(
+        under_base,
+        selection,
+        detections,
+        declared,
+        tuple(refused),
+        names,
+        alone,
+        floor,
+        floor_names,
+    )
 
 
 def first_fit(
@@ -546,8 +469,6 @@ def _findings(
             "held_out_gain": round(score.gain, 1),
             "held_out_t": round(score.t, 1),
         }
-        if candidate in selection.shares:
-            evidence["applied_share"] = round(selection.shares[candidate], 2)
         others = tuple(alternatives(selection, candidate, candidates))
         for term in candidate.terms:
             identity = entry_of(term.effect)

@@ -21,9 +21,8 @@ from uwb_tdoa_ekf.sensitivity import RANGES
 
 from ..clock import numbered
 from ..outputs import as_json
-from ..scoring.gains import NO_DIFFERENCE, SAME, difference
+from ..scoring.gains import NO_DIFFERENCE, difference
 from ..scoring.metrics import EVERYTHING, Score, nis, pooled, radio_residuals
-from .decision import RISK, risk
 from .regression.table import BLOCK
 
 if TYPE_CHECKING:
@@ -205,20 +204,16 @@ def score(case: ValidationCase, run: Run) -> Score:
 def why_not(before: dict[str, Any], after: dict[str, Any], shift_std: float) -> str | None:
     """Return why the result of `compare` must not be applied; None if it may.
 
-    The judged flights must meet the rule of `decision`.
-
     shift_std : m, standard deviation of a reference error common to a flight; the gain must exceed
         SURE standard deviations of its effect
     """
     sides = before["pooled"]["rmse_3d"], after["pooled"]["rmse_3d"]
     interval = after["pooled"]["rmse_3d_gain_ci"]
-    gain, std = 1.0 - sides[1] / sides[0], SAME
-    if interval:
-        std = (interval[1] - interval[0]) / (2.0 * Z95)
+    changed = difference(*sides, interval)
     much = f"{100 * sides[0]:.1f} -> {100 * sides[1]:.1f} cm"
     if interval:
         much += f", 95 % interval of the gain {100 * interval[0]:.0f} to {100 * interval[1]:.0f} %"
-    if difference(*sides, interval) < 0:
+    if changed < 0:
         return f"together they make the error larger on held-out data ({much})"
     if shift_std > 0.0 and (
         interval is None or sum(interval) < SURE / Z95 * (interval[1] - interval[0])
@@ -228,7 +223,7 @@ def why_not(before: dict[str, Any], after: dict[str, Any], shift_std: float) -> 
             "on each axis, and the gain is less than that "
             "can feign; measure more marks, or better ones"
         )
-    if gain <= 0.0 or risk(gain, std) >= RISK:
+    if changed == 0:
         return f"together they make {NO_DIFFERENCE} ({much})"
     return None
 

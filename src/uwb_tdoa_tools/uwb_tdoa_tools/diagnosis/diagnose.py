@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.common.flight import Flight
 
     from ..parallel import MapFunction
-    from .decision import Decision
     from .detectors import Detection
     from .regression.terms import Candidate
     from .self_calibration import SelfCalibration
@@ -152,7 +151,6 @@ def diagnose(
         outcome.changes,
         judge_truth=judge_truth,
         cases=tuple(outcome.cases),
-        decision=outcome.decision,
     )
 
 
@@ -215,7 +213,7 @@ class _Outcome:
     sides : (before, after) and judged_on, as of Diagnosis
     attribution : Attribution with repairs of ids and signs; baseline : Baseline; changes :
         sentences
-    cases : the judged ValidationCases; decision : Decision on all effects, None without ground truth
+    cases : the judged ValidationCases
     """
 
     findings: list[EffectFinding]
@@ -227,7 +225,6 @@ class _Outcome:
     baseline: comparison.Baseline
     cases: Sequence[comparison.ValidationCase]
     changes: tuple[str, ...] = ()
-    decision: Decision | None = None
 
 
 def _by_error(
@@ -277,17 +274,8 @@ def _by_error(
     findings = _findings(
         model.findings(), attribution.findings(), attribution.detections, selected.worth
     )
-    return _Outcome(
-        findings,
-        effects,
-        refused,
-        (before, after),
-        judged_on,
-        attribution,
-        baseline,
-        cases,
-        decision=selected.decision,
-    )
+    sides = before, after
+    return _Outcome(findings, effects, refused, sides, judged_on, attribution, baseline, cases)
 
 
 def _by_self_calibration(

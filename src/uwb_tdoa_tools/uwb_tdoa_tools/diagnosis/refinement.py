@@ -39,24 +39,22 @@ MIN_GAIN = 2.0  # smallest gain of a term on hold-out data, twice a log-likeliho
 def effects_of(selection: Selection) -> tuple[Effect, ...]:
     """Return the Effects of the chosen Candidates with fitted values, clipped to their bounds.
 
-    Parameters of one effect are merged. What the applied share leaves out counts as an error of the
-    value.
+    Parameters of one effect are merged.
     """
     values: dict[Hashable, dict[str, float]] = {}
     std: dict[Hashable, dict[str, float]] = {}
     effects: dict[Hashable, Effect] = {}
     error = np.sqrt(np.diag(selection.fit.cov))
     fitted = dict(zip(selection.fit.columns, zip(selection.fit.beta.tolist(), error.tolist())))
-    for candidate, term in ((one, term) for one in selection.chosen for term in one.terms):
-        effect, share = term.effect, selection.shares.get(candidate, 1.0)
+    for term in (term for candidate in selection.chosen for term in candidate.terms):
+        effect = term.effect
         identity = entry_of(effect)
         effects.setdefault(identity, effect)
         values.setdefault(identity, {}).update(effect.values)
         for column in term.columns:
             bound = effect.bound_of(column.key)
             value, deviation = fitted[column]
-            values[identity][column.key] = min(max(share * value, -bound), bound)
-            deviation = float(np.hypot(deviation, (1.0 - share) * value))
+            values[identity][column.key] = min(max(value, -bound), bound)
             std.setdefault(identity, {})[column.key] = min(deviation, bound)
     return tuple(
         replace(effect, values=values[identity], std=std[identity], source="diagnose")

@@ -10,9 +10,9 @@ import numpy as np
 from uwb_tdoa_bias.effects import EffectSet, LabelEffect
 
 from ..checking.pair_rules import KnownPath, repairs
-from .comparison import Baseline, ValidationCase, score
+from .comparison import ValidationCase
 from .detectors import Detection
-from .validation import TRIED
+from .validation import TRIAL_FLIGHTS, WORSE, error_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -40,7 +40,7 @@ def repaired(
     for effect in _common([repairs(base.correct_streams(flight)) for flight in flights]):
         error = _error(flights, effects, config, progress) if error is None else error
         less = _error(flights, (*effects, effect), config, progress)
-        if less < error:
+        if less < error * (1.0 - WORSE):
             out[Detection(effect, effect.channels[0], _evidence(flights[0], effects, effect))] = (
                 error - less
             )
@@ -103,11 +103,10 @@ def _error(
     config: FilterConfig | None,
     progress: Callable[[], object],
 ) -> float:
-    """Return the mean 3D RMSE, m, of at most TRIED flights."""
-    errors, model = [], EffectSet(tuple(effects))
-    baseline = Baseline(model, config)
-    for flight in flights[:: -(-len(flights) // TRIED)]:
-        errors.append(score(ValidationCase(flight, model), baseline.run(flight)).rmse_3d)
+    """Return the mean 3D RMSE, m, of at most TRIAL_FLIGHTS flights."""
+    errors = []
+    for flight in flights[:: -(-len(flights) // TRIAL_FLIGHTS)]:
+        errors.append(error_of(config, (ValidationCase(flight, EffectSet(tuple(effects))), None)))
         progress()
     return float(np.mean(errors))
 

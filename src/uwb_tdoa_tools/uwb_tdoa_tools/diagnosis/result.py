@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from .channels import ChannelResiduals
     from .channels.base import Figures
     from .comparison import ValidationCase
-    from .decision import Decision
     from .next_flight import NextFlight
     from .references import Reference
     from .regression.confounding import Unobservable
@@ -41,7 +40,6 @@ class Diagnosis:
     tdoa_std : m, noise for the filter beside these effects, None if it was not measured
     next_flight : NextFlight that settles what is left open, None if none was asked for
     written : as `after`, with this noise too: what the written files give; None if not judged
-    decision : Decision on all effects; None if nothing is applied
     """
 
     flights: tuple[Flight, ...]
@@ -63,5 +61,4 @@ class Diagnosis:
     cases: tuple[ValidationCase, ...] = ()
     tdoa_std: float | None = None
     written: dict[str, Any] | None = None
-    decision: Decision | None = None
     next_flight: NextFlight | None = None

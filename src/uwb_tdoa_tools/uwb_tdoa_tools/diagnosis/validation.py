@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial, reduce
-from typing import TYPE_CHECKING, NamedTuple
+from functools import partial
+from itertools import cycle
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -15,51 +16,59 @@ from uwb_tdoa_ekf.offline import run_offline
 
 from ..scoring.metrics import EVERYTHING
 from .comparison import Baseline, ValidationCase, score
-from .decision import LEAST_WORTH, decide, products
 from .deviations import with_deviations
 from .findings import Refused, usable
 from .refinement import effects_of, recurs
 from .regression.fit import refit
 from .regression.select import Selection
 from .regression.table import BLOCK
-from .regression.terms import Candidate, columns_of
+from .regression.terms import columns_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_ekf.core.config import FilterConfig
+    from uwb_tdoa_ekf.offline import Run
 
     from ..parallel import MapFunction
     from .attribution import Attribution
-    from .decision import Decision
     from .detectors import Detection
+    from .regression.terms import Candidate
 
-    Part = Candidate | Detection
+    Model = tuple[Sequence[Candidate], Sequence[Detection]]
+    Poses = tuple[np.ndarray, ...]  # return value of `poses_of`
 
-TRIED = 5  # largest number of flights in trials
-CANCELS = 0.7  # smallest negative correlation of two contributions that cancel
+Made = TypeVar("Made")
+
+TRIAL_FLIGHTS = 3  # largest number of flights, or halves of one, in trials
 # shapes of a function of the time that can recur, like the warm-up of a clock
 DRIFTS = ("line", "beyond", "below", "parabola")
+# An effect is dropped if the error falls by at least this share without it.
+WORSE = 0.005
+# In a single flight an effect stays only if the error grows by this share without it, because
+# flights differ.
+WORTH_OF_ONE = 0.05
+# m, and share of the error: with a smaller worth an effect is not written, as it rounds to nothing.
+LEAST_WORTH, LEAST_SHARE = 0.0005, 0.005
 SELECTED_ON = ", chosen on all of them (--holdout judges the choice too)"
 HELD_OUT = "flights that took no part in the fit"
-MOMENTARY = "it happened at a time of this flight, and another flight does not have it"
+SECOND = "give a second flight with this one"
 
 
 @dataclass(frozen=True, eq=False)
 class ValidatedSelection:
-    """The effects that the rule of `decision` applies, with their shares.
+    """The effects that do not make the filter worse.
 
     refused : (Refused, ...) of the others
-    worth : {candidate or detection: increase of the mean 3D RMSE without it, m}
-    decision : Decision on all; None if nothing is applied
+    worth : {candidate or detection: increase of the mean 3D RMSE without it, m}; for dropped ones,
+        at the time they were dropped
     """
 
     selection: Selection
     detections: tuple[Detection, ...]
     refused: tuple[Refused, ...]
-    worth: dict[Part, float]
-    decision: Decision | None = None
+    worth: dict[Candidate | Detection, float]
 
     def applied(self, attribution: Attribution) -> Attribution:
         """Return the Attribution with the selected effects only."""
@@ -71,76 +80,60 @@ class ValidatedSelection:
         )
 
 
-class Fold(NamedTuple):
-    """A part of the data that is judged with effects fitted to the rest.
-
-    case : ValidationCase of the part, with the effects of the base
-    rows : (n,) bool, rows of the RegressionTable in the rest; fitted : numbers of its flights
-    """
-
-    case: ValidationCase
-    rows: np.ndarray
-    fitted: Sequence[int]
-
-    def effects(
-        self, attribution: Attribution, candidates: Sequence[Candidate], parts: Sequence[Part]
-    ) -> EffectSet:
-        """Return the EffectSet of some parts of a model, with values fitted to the rest.
-
-        candidates : all Candidates of the model; parts : those that count, and Detections
-        """
-        selection = attribution.selection
-        chosen = tuple(part for part in parts if isinstance(part, Candidate))
-        model = refit(selection.table, columns_of(candidates), selection.fit, self.rows)
-        found = effects_of(replace(selection, chosen=chosen, fit=model))
-        detected = [part.effect for part in parts if not isinstance(part, Candidate)]
-        of_nodes = usable([*found, *detected]).effects
-        return EffectSet((*self.case.effects, *attribution.seen.limited(of_nodes, self.fitted)))
-
-
-def folds(attribution: Attribution, flights: Sequence[Flight], base: EffectSet) -> list[Fold]:
-    """Return one Fold per flight; of a single flight, two of alternating blocks."""
-    table = attribution.selection.table
-    if len(flights) > 1:
-        return [
-            Fold(
-                ValidationCase(flight, base),
-                table.flight != k,
-                [other for other in range(len(flights)) if other != k],
-            )
-            for k, flight in enumerate(flights)
-        ]
-    # alternating, so both parts cover the whole flight
-    start, since = flights[0].start, table.t - table.t.min()
-    length = min(BLOCK, 0.5 * since.max())
-    number = np.minimum((since / length).astype(int), int(since.max() / length) - 1)
-    edges = start + table.t.min() + length * np.arange(number.max() + 2)
-    edges[-1] = start + table.t.max()
-    spans = list(zip(edges[:-1].tolist(), edges[1:].tolist()))
-    reach = (
-        [(-np.inf, spans[0][1]), *spans[1:-1], (spans[-1][0], np.inf)]
-        if len(spans) > 1
-        else EVERYTHING
-    )
-    halves = [
-        ValidationCase(flights[0], base, tuple(spans[k::2]), tuple(reach[k::2])) for k in range(2)
-    ]
-    return [Fold(half, number % 2 != k, [0]) for k, half in enumerate(halves)]
-
-
 def cross_fitted(
     attribution: Attribution,
     flights: Sequence[Flight],
     base: EffectSet,
     candidates: Sequence[Candidate],
     detections: Sequence[Detection],
+    most: int | None = None,
 ) -> list[ValidationCase]:
-    """Return the ValidationCases of all folds, with effects fitted to the rest."""
-    parts: tuple[Part, ...] = (*candidates, *detections)
-    return [
-        replace(fold.case, effects=fold.effects(attribution, candidates, parts))
-        for fold in folds(attribution, flights, base)
-    ]
+    """Return ValidationCases with effects of `candidates` fitted to the other flights.
+
+    A single flight is divided into two halves of alternating blocks. Each half is judged with
+    effects fitted to the other half.
+
+    most : largest number of cases, evenly taken; None for all
+    """
+    table, selection = attribution.selection.table, attribution.selection
+    if len(flights) > 1:
+        parts = [
+            (ValidationCase(flights[k], base), k, table.flight != k) for k in range(len(flights))
+        ]
+    else:
+        # alternating, so both parts cover the whole flight
+        start, since = flights[0].start, table.t - table.t.min()
+        length = min(BLOCK, 0.5 * since.max())
+        number = np.minimum((since / length).astype(int), int(since.max() / length) - 1)
+        edges = start + table.t.min() + length * np.arange(number.max() + 2)
+        edges[-1] = start + table.t.max()
+        spans = list(zip(edges[:-1].tolist(), edges[1:].tolist()))
+        reach = (
+            [(-np.inf, spans[0][1]), *spans[1:-1], (spans[-1][0], np.inf)]
+            if len(spans) > 1
+            else EVERYTHING
+        )
+        halves = [
+            ValidationCase(flights[0], base, tuple(spans[k::2]), tuple(reach[k::2]))
+            for k in range(2)
+        ]
+        parts = [(half, 0, number % 2 != k) for k, half in enumerate(halves)]
+    out, columns = [], columns_of(candidates)
+    for case, k, rows in parts[:: -(-len(parts) // (most or len(parts)))]:
+        others = replace(
+            selection, chosen=tuple(candidates), fit=refit(table, columns, selection.fit, rows)
+        )
+        found = usable([*effects_of(others), *(detection.effect for detection in detections)])
+        fitted = [other for other in range(len(flights)) if other != k] or [k]
+        out.append(
+            replace(
+                case,
+                effects=EffectSet(
+                    (*base.effects, *attribution.seen.limited(found.effects, fitted))
+                ),
+            )
+        )
+    return out
 
 
 def select_by_error(
@@ -150,150 +143,230 @@ def select_by_error(
     progress: Callable[[], object] = lambda: None,
     map_function: MapFunction = map,
 ) -> ValidatedSelection:
-    """Return the ValidatedSelection: the rule of `decision` on flights that took no part in the fit.
+    """Return the ValidatedSelection of effects that do not make the filter worse on hold-out data.
 
-    The filter runs with all effects and without each, on at most TRIED flights. The differences are
-    the displacements that `decide` judges. The other effects are fitted again without the dropped
-    ones. Events at a time of a single flight are dropped.
+    Candidates are dropped one by one if the error falls without them. In a single flight they are
+    also dropped if the error hardly grows. Detections stay only if the error falls with them. At
+    most TRIAL_FLIGHTS flights are judged. Trials correct measurements at the poses of a run with
+    all effects.
+
+    After a drop, the other candidates that seemed harmful are tried again first. At the end all
+    candidates are tried with the final model, and those without worth are dropped, as many together
+    as leave the error as it is. If trials are costly, several candidates are dropped at once.
+    Events at a time of a single flight are tried for their worth, but not kept.
 
     map_function : as of `attribute`
     """
-    selection = attribution.selection
-    parts = _parts(attribution)
-    if not parts:
-        return ValidatedSelection(selection, (), (), {})
-    at_a_time = np.array([len(flights) == 1 and _is_momentary(part) for part in parts])
-    tried = _products(attribution, flights, baseline, parts, progress, map_function)
-    decision = decide(tried, ~at_a_time)
-    shares = dict(zip(parts, decision.shares.tolist()))
-    worth = dict(zip(parts, decision.worth.tolist()))
-    refused = [
-        Refused(_label(part), MOMENTARY if momentary else _why_not(worth[part]))
-        for part, momentary in zip(parts, at_a_time)
-        if not shares[part]
-    ]
-    # with the weights of the trials: otherwise the dropped effects make outliers of their data
-    kept = selection.kept([part for part in selection.chosen if shares.get(part, 1.0)])
-    kept = replace(kept, shares={part: shares[part] for part in kept.chosen if part in shares})
-    detections = tuple(one for one in attribution.detections if shares.get(one))
-    applied = decision if decision.shares.any() else None
-    return ValidatedSelection(kept, detections, tuple(refused), worth, applied)
+    candidates, refused = list(attribution.selection.chosen), []
+    detections: list[Detection] = []
+    least = WORTH_OF_ONE if len(flights) == 1 else -WORSE
+    trials = _Trials(attribution, flights, baseline, progress, map_function)
+    error = trials.start(candidates, detections)
+    without: dict[Candidate, float] = {}
+    worth: dict[Candidate | Detection, float] = {}
+    suspects = _applicable(candidates)
+    while suspects:
+        less = [([c for c in candidates if c is not one], detections) for one in suspects]
+        without = dict(zip(suspects, trials.errors(less)))
+        harmful = sorted(
+            (one for one in suspects if without[one] <= error * (1.0 + least)),
+            key=without.__getitem__,
+        )
+        gone = (
+            _gone(trials, (candidates, detections), harmful, error * (1.0 + least))
+            if trials.costly
+            else harmful[:1]
+        )
+        if gone:
+            refused += [Refused(one.label, _why_without(error, without[one])) for one in gone]
+            worth.update((one, without[one] - error) for one in gone)
+            candidates = [one for one in candidates if one not in gone]
+            error, without = trials.start(candidates, detections), {}
+        elif len(suspects) == len(_applicable(candidates)):
+            break
+        suspects = (
+            _applicable(candidates) if trials.costly else harmful[1:] or _applicable(candidates)
+        )
+    while without:
+        limit = error + min(LEAST_WORTH, LEAST_SHARE * error)
+        idle = sorted((one for one in without if without[one] < limit), key=without.__getitem__)
+        gone = _gone(trials, (candidates, detections), idle, limit)
+        if not gone:
+            break
+        refused += [Refused(one.label, _why_without(error, without[one])) for one in gone]
+        worth.update((one, without[one] - error) for one in gone)
+        candidates = [one for one in candidates if one not in gone]
+        suspects = _applicable(candidates)
+        models = [(candidates, detections)]
+        models += [([c for c in candidates if c is not one], detections) for one in suspects]
+        error, *tried = trials.errors(models)
+        without = dict(zip(suspects, tried))
+    worth.update((candidate, trial - error) for candidate, trial in without.items())
+    for detection in attribution.detections:
+        if not detection.effect.usable:
+            continue
+        (trial,) = trials.errors([(candidates, [*detections, detection])])
+        if trial < error * (1.0 - max(least, WORSE)):
+            detections.append(detection)
+            worth[detection] = error - trial
+            error = trial
+        else:
+            useless = f"does not make the filter better: {error:.3f} m without, {trial:.3f} m with"
+            why = useless if trial >= error * (1.0 - WORSE) else _why_without(trial, error)
+            refused.append(Refused(detection.effect.label, why))
+    for momentary in (one for one in candidates if len(flights) == 1 and _momentary(one)):
+        refused.append(
+            Refused(
+                momentary.label,
+                (
+                    "it happened at a time of this flight; of another one that tells nothing: "
+                    f"{SECOND}"
+                ),
+            )
+        )
+        candidates = [one for one in candidates if one is not momentary]
+    selection = attribution.selection.kept(candidates)  # with the weights of the trials
+    return ValidatedSelection(selection, tuple(detections), tuple(refused), worth)
 
 
-def _parts(attribution: Attribution) -> list[Part]:
-    """Return the parts of a model that a node can correct, at least in part."""
-    return [
-        *(
-            candidate
-            for candidate in attribution.selection.chosen
-            if any(term.effect.usable for term in candidate.terms)
-        ),
-        *(one for one in attribution.detections if one.effect.usable),
-    ]
+def _gone(
+    trials: _Trials, model: Model, harmful: Sequence[Candidate], limit: float
+) -> Sequence[Candidate]:
+    """Return the Candidates that can be dropped together with an error of at most `limit`, m.
 
+    They are tried together. If the error is too large, each half is tried separately, and so on.
 
-def _cancelled(selection: Selection) -> list[Candidate]:
-    """Return the chosen Candidates whose contribution another one cancels in the fitted rows."""
-    table, model = selection.table, selection.fit
-    root = np.sqrt(model.information(table))
-    x = [
-        root * (table.matrix(candidate.columns) @ model.values(candidate.columns))
-        for candidate in selection.chosen
-    ]
-    unit = [one / max(float(np.linalg.norm(one)), 1e-12) for one in x]
-    return [
-        candidate
-        for candidate, one in zip(selection.chosen, unit)
-        if any(one @ other < -CANCELS for other in unit)
-    ]
-
-
-def _products(
-    attribution: Attribution,
-    flights: Sequence[Flight],
-    baseline: Baseline,
-    parts: Sequence[Part],
-    progress: Callable[[], object],
-    map_function: MapFunction,
-) -> list[np.ndarray]:
-    """Return the `products` of each tried flight, (k + 2, k + 2), that `decide` needs.
-
-    Without one of two effects that cancel, the filter would reject the measurements of the other.
-    So the others are fitted again without it.
-
-    parts : k parts of the model that are tried
+    harmful : Candidates of the model, the least worth first
     """
-    candidates = attribution.selection.chosen
-    cancelled = _cancelled(attribution.selection)
-    models: list[tuple[Sequence[Candidate], Sequence[Part]]] = [
-        (candidates, parts),
-        (candidates, []),
-    ]
-    for part in parts:
-        fitted = [one for one in candidates if one is not part or part not in cancelled]
-        models.append((fitted, [one for one in parts if one is not part]))
-    several = folds(attribution, flights, baseline.base)
-    trials = [
-        (fold.case, [fold.effects(attribution, *model) for model in models])
-        for fold in several[:: -(-len(several) // TRIED)]
-    ]
-    out = []
-    for found in map_function(partial(_of_trial, baseline.config), trials):
-        out.append(found)
-        progress()
-    return [np.mean(out, axis=0)] if len(flights) == 1 else out
+    candidates, detections = model
+    gone: list[Candidate] = []
+    parts = [list(harmful)] if harmful else []
+    while parts:
+        part = parts.pop(0)
+        rest = [one for one in candidates if one not in (*gone, *part)]
+        if (len(part) == 1 and not gone) or trials.errors([(rest, detections)])[0] <= limit:
+            gone += part
+        elif len(part) > 1:
+            parts[:0] = [part[: len(part) // 2], part[len(part) // 2 :]]
+    return gone
 
 
-def _of_trial(
-    config: FilterConfig | None, trial: tuple[ValidationCase, Sequence[EffectSet]]
-) -> np.ndarray:
-    """Return the `products` of one case.
-
-    trial : ValidationCase; EffectSets: all effects, none, and all without each. The first two
-        run like the nodes. The others use the poses of the first run, which takes a tenth of the
-        time.
-    """
-    case, models = trial
-    anchors, scores = case.flight.anchors, []
-    poses: Sequence[np.ndarray] = ()
-    for place, effects in enumerate(models):
-        corrector = Corrector(anchors, effects)
-        if place > 1:
-            corrector = FixedPoseCorrector(anchors, effects, poses)
-        run = run_offline(case.flight, config, corrector)
-        if place == 0:
-            poses = poses_of(run.odometry)
-        scores.append(score(replace(case, effects=effects), run))
-    t = reduce(np.intersect1d, [one.t for one in scores])
-    first, *others = (one.error[np.searchsorted(one.t, t)] for one in scores)
-    change, *displacements = (other - first for other in others)
-    return products(first, displacements, change)
+def _applicable(candidates: Sequence[Candidate]) -> list[Candidate]:
+    """Return the Candidates that a node can correct, at least in part."""
+    return [one for one in candidates if any(term.effect.usable for term in one.terms)]
 
 
-def _label(part: Part) -> str:
-    return part.label if isinstance(part, Candidate) else part.effect.label
+def _why_without(error: float, without: float) -> str:
+    """Return why an effect is not applied, given the errors with and without it, m."""
+    figures = f"{error:.3f} m with, {without:.3f} m without"
+    if without <= error * (1.0 - WORSE):
+        return f"the filter does better without it: {figures}"
+    if without < error + min(LEAST_WORTH, LEAST_SHARE * error):
+        return f"it is worth nothing for the position: {figures}"
+    return (
+        f"of one flight, worth less than {WORTH_OF_ONE:.0%} of the error, it may as well do harm to "
+        f"another; {SECOND}: {figures}"
+    )
 
 
-def _why_not(worth: float) -> str:
-    """Return why an effect is not applied, given its worth in the flights that took no part, m."""
-    if worth < -LEAST_WORTH:
-        return f"with it the error of hold-out flights rises by {-100.0 * worth:.1f} cm"
-    if worth < LEAST_WORTH:
-        return "it is worth nothing for the position of hold-out flights"
-    return "too little of it is seen again in hold-out flights"
-
-
-def _is_momentary(part: Part) -> bool:
-    """Return whether a part is an event at a time of one flight.
+def _momentary(candidate: Candidate) -> bool:
+    """Return whether a Candidate is an event at a time of one flight.
 
     It is a temporary delay, or a function of the time that is not a drift.
     """
-    if not isinstance(part, Candidate):
-        return False
-    functions = [term.function for term in part.terms if term.function]
-    return not recurs(part) or any(
+    functions = [term.function for term in candidate.terms if term.function]
+    return not recurs(candidate) or any(
         one.covariate == "time" and one.shape not in DRIFTS for one in functions
     )
+
+
+class _Trials:
+    """Mean 3D RMSE, m, of cross-fitted models.
+
+    The first model runs like the nodes. Later models use the poses of that run, which takes a tenth
+    of the time.
+    """
+
+    def __init__(
+        self,
+        attribution: Attribution,
+        flights: Sequence[Flight],
+        baseline: Baseline,
+        progress: Callable[[], object],
+        map_function: MapFunction,
+    ) -> None:
+        self._attribution, self._flights, self._baseline, self._progress = (
+            attribution,
+            flights,
+            baseline,
+            progress,
+        )
+        self._map_function = map_function
+        self._poses: Sequence[Poses | None] = [None]
+
+    @property
+    def costly(self) -> bool:
+        """Return whether trials are costly: a single flight with MANY anchors is long."""
+        return len(self._flights) == 1 and self._attribution.selection.table.sparse
+
+    def start(self, candidates: Sequence[Candidate], detections: Sequence[Detection]) -> float:
+        """Return the error of a model, m, and keep the poses of its runs for later trials."""
+        (results,) = self._tried(_error_and_poses, [(candidates, detections)])
+        self._poses = [poses for _, poses in results]
+        return float(np.mean([error for error, _ in results]))
+
+    def errors(self, models: Sequence[Model]) -> list[float]:
+        """Return the errors of models [(candidates, detections)], in m."""
+        return [float(np.mean(errors)) for errors in self._tried(error_of, models)]
+
+    def _tried(
+        self,
+        function: Callable[[FilterConfig | None, tuple[ValidationCase, Poses | None]], Made],
+        models: Sequence[Model],
+    ) -> list[list[Made]]:
+        """Return [[function of each trial] of each model], computed in one map."""
+        attribution, flights, base = self._attribution, self._flights, self._baseline.base
+        fitted = [
+            cross_fitted(attribution, flights, base, candidates, detections, TRIAL_FLIGHTS)
+            for candidates, detections in models
+        ]
+        results = []
+        trials = zip(sum(fitted, []), cycle(self._poses))
+        for of_case in self._map_function(partial(function, self._baseline.config), trials):
+            results.append(of_case)
+            self._progress()
+        return [results[k : k + len(fitted[0])] for k in range(0, len(results), len(fitted[0]))]
+
+
+def error_of(config: FilterConfig | None, trial: tuple[ValidationCase, Poses | None]) -> float:
+    """Return the 3D RMSE of a trial, m."""
+    return _judged(config, trial)[0]
+
+
+def _error_and_poses(
+    config: FilterConfig | None, trial: tuple[ValidationCase, Poses | None]
+) -> tuple[float, Poses]:
+    """Return the 3D RMSE, m, and the poses of the run of a trial.
+
+    trial : ValidationCase, and the poses for corrections, None to use the poses of the run
+    """
+    error, run = _judged(config, trial)
+    return error, poses_of(run.odometry)
+
+
+def _judged(
+    config: FilterConfig | None, trial: tuple[ValidationCase, Poses | None]
+) -> tuple[float, Run]:
+    """Return the 3D RMSE, m, and the Run of a trial."""
+    case, poses = trial
+    anchors, effects = case.flight.anchors, case.effects
+    corrector = (
+        Corrector(anchors, effects)
+        if poses is None
+        else FixedPoseCorrector(anchors, effects, poses)
+    )
+    run = run_offline(case.flight, config, corrector)
+    return score(case, run).rmse_3d, run
 
 
 def validation_cases(

@@ -8,7 +8,7 @@ the false-alarm rate of the whole catalogue.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -65,7 +65,6 @@ class Selection:
     table : RegressionTable with the columns of all candidates; fit : Fit of the chosen ones
     loss : decrease of the criterion without each chosen Candidate
     rivals : (Rival, ...) of each chosen Candidate, filled by `with_rivals`
-    shares : {Candidate: applied share of its fitted values}; 1 by default
     """
 
     table: RegressionTable
@@ -73,7 +72,6 @@ class Selection:
     fit: Fit
     loss: tuple[float, ...]
     rivals: tuple[tuple[Rival, ...], ...]
-    shares: dict[Candidate, float] = field(default_factory=dict)
 
     def only(self, candidates: Collection[Candidate]) -> Selection:
         """Return the Selection of some of the chosen Candidates, with a new robust fit."""

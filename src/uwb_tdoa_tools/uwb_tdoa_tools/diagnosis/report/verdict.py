@@ -9,7 +9,6 @@ from uwb_tdoa_bias.effects.base import listed
 
 from ...scoring.gains import NO_DIFFERENCE, difference
 from ...scoring.phases import TITLES
-from ..decision import LOSS, RULE
 from ..self_calibration.solve import CLEARLY, LEFT
 from .left_over import left_over
 from .reasons import reasons
@@ -109,7 +108,6 @@ def _with_errors(diagnosis: Diagnosis) -> Verdict:
         *_with_noise(diagnosis),
         *_over_phases(diagnosis),
         *_shared(diagnosis),
-        *_expected(diagnosis),
         *_caveats(diagnosis),
         *_worse(diagnosis),
         *_diverged(diagnosis),
@@ -236,19 +234,6 @@ def _named(diagnosis: Diagnosis) -> str:
     names = _names(diagnosis)
     rest = len(names) - MOST_NAMES
     return listed(names) if rest <= 0 else f"{', '.join(names[:MOST_NAMES])} and {rest} more"
-
-
-def _expected(diagnosis: Diagnosis) -> list[str]:
-    """Return the expected gain in another flight, and the rule that decided."""
-    decision = diagnosis.decision
-    if decision is None:
-        return []
-    expected = (
-        f"In another flight the error is expected to fall by {_share(decision.gain)} "
-        f"(standard deviation {_share(decision.std)}); it rises by more than {_share(LOSS)} with a "
-        f"probability of {_share(decision.risk)}."
-    )
-    return [expected, *RULE]
 
 
 def _worse_phases(diagnosis: Diagnosis) -> list[str]:
