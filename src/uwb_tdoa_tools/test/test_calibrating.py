@@ -264,8 +264,8 @@ def stub(monkeypatch, made, seen):
         )
         return made
 
-    monkeypatch.setattr(calibrate, "with_truth", instead)
-    monkeypatch.setattr(calibrate, "without_truth", instead)
+    monkeypatch.setattr(library, "with_truth", instead)
+    monkeypatch.setattr(library, "without_truth", instead)
     monkeypatch.setattr(library, "check", lambda recording, *_: Report(recording.name, [], {}))
 
 
@@ -304,7 +304,7 @@ def test_what_is_not_to_be_used_is_not_written(room, monkeypatch, capsys):
 
 def test_it_stops_where_check_finds_an_error(room, flights, monkeypatch, capsys):
     for name in ("with_truth", "without_truth"):
-        monkeypatch.setattr(calibrate, name, lambda *_: pytest.fail("it went on"))
+        monkeypatch.setattr(library, name, lambda *_: pytest.fail("it went on"))
     wrong = replace(flights[0], tdoa=replace(flights[0].tdoa, d=-flights[0].tdoa.d))
     write_bag(wrong, "wrong.bag")
     assert calibrate.main(["wrong.bag", "--out", "out"]) == 1

@@ -8,6 +8,7 @@ import pytest
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_tools import diagnosis
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.checking.report import survey_remarks
 from uwb_tdoa_tools.commands import diagnose, evaluate, inject
@@ -94,7 +95,7 @@ def test_diagnose_prints_remarks_first(flight, tmp_path, capsys, monkeypatch):
     def stop(*args):
         raise InputError("far enough.")
 
-    monkeypatch.setattr(diagnose, "diagnose", stop)
+    monkeypatch.setattr(diagnosis, "diagnose", stop)
     assert (
         diagnose.main(
             [str(tmp_path / "f.bag"), str(tmp_path / "g.bag"), "--out", str(tmp_path / "out")]

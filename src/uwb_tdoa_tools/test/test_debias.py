@@ -10,8 +10,8 @@ import pytest
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_ekf.debias import BiasMap
 from uwb_tdoa_tools.bags.bag import write_bag
-from uwb_tdoa_tools.commands import debias as command
 from uwb_tdoa_tools.commands.debias import main
+from uwb_tdoa_tools.debiasing import mapping
 from uwb_tdoa_tools.debiasing.mapping import part_of, static_parts
 from uwb_tdoa_tools.scoring.evaluation import evaluate
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
@@ -173,9 +173,9 @@ def test_a_map_that_does_harm_where_it_took_no_part_is_not_written(
     tmp_path, flights, monkeypatch, capsys
 ):
     one, two, out = str(flights / "one.bag"), str(flights / "two.bag"), tmp_path / "m.npz"
-    made = command.fit_map
+    made = mapping.fit_map
     monkeypatch.setattr(
-        command,
+        mapping,
         "fit_map",
         lambda *args, **options: (m := made(*args, **options)) and replace(m, bias=-5.0 * m.bias),
     )

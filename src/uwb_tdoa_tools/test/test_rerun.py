@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.effects import AnchorDelay
+from uwb_tdoa_tools import diagnosis
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands import diagnose, evaluate, localize
 from uwb_tdoa_tools.estimate import FlightEstimator
@@ -119,7 +120,7 @@ def test_errors_are_those_of_each_path(flight, viewer, tmp_path):
 @pytest.mark.parametrize("name", ["localize", "evaluate", "diagnose"])
 def test_it_is_left_out_with_a_sentence_where_it_is_not_installed(desk, capsys, monkeypatch, name):
     monkeypatch.setattr(pictures, "find_spec", lambda name: None)
-    monkeypatch.setattr(diagnose, "diagnose", lambda *_: pytest.skip("it goes on"))
+    monkeypatch.setattr(diagnosis, "diagnose", lambda *_: pytest.skip("it goes on"))
     command = {"localize": localize, "evaluate": evaluate, "diagnose": diagnose}[name]
     out = [] if name == "evaluate" else ["--out", "out"]
     try:

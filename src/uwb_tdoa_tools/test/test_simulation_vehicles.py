@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_tools import simulation
 from uwb_tdoa_tools.commands import simulate as command
 from uwb_tdoa_tools.simulation import NO_IMU_ERRORS, SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.config import VEHICLE_DEFAULTS
@@ -310,7 +311,9 @@ def test_too_short_is_refused(vehicle):
 
 def test_what_is_given_counts_more_than_what_is_usual(tmp_path, monkeypatch):
     made = []
-    monkeypatch.setattr(command, "simulate", lambda config: made.append(config) or simulate(config))
+    monkeypatch.setattr(
+        simulation, "simulate", lambda config: made.append(config) or simulate(config)
+    )
     given = ["--path", "-2,-1 2,1", "--tdoa-rate", "50", "--tag-lever-arm", "0,0,0.2"]
     assert command.main(["--vehicle", "rover", "--duration", "12", *given]) == 0
     assert command.main(["--duration", "20", "--area", "-1,-1 1,1"]) == 0
