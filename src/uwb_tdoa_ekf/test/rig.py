@@ -117,7 +117,7 @@ def seconds_of(stamp, epoch=EPOCH):
     """Seconds after the epoch, as a node reads them if its first stamp is in the epoch's first
     second.
     """
-    return (stamp.sec - epoch) + 1e-9 * stamp.nanosec
+    return ((stamp.sec - epoch) * 10**9 + stamp.nanosec) / 1e9
 
 
 @dataclass

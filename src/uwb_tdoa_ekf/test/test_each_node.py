@@ -81,7 +81,7 @@ def test_bias_node_corrects_each_tdoa_at_its_pose_and_accounts_for_it(make_rig, 
 
     # a recording that starts again: what waits belongs to the old one, whose poses are forgotten
     send(0.1, 14, 10, 2.0)
-    send(0.15, 14, 10, 3.0)  # one stamp could have been wrong
+    send(0.16, 14, 10, 3.0)  # one stamp could have been wrong
     corrected(8, "no waiting for poses of the past")
     assert [message.raw for message in rig.corrected[6:]] == [2.0, 3.0]
     counts = rig.counts("bias_node", received=11)

@@ -27,8 +27,8 @@ from uwb_tdoa_tools.diagnosis.next_flight import (
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.report import next_flight as report
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.simulation_options import POSE, add_options, config_of
 from uwb_tdoa_tools.simulation.rooms import Room, corners, pillars, room_of
+from uwb_tdoa_tools.simulation_options import POSE, add_options, config_of
 
 RATES = {"imu_rate": 200.0, "truth_rate": 100.0, "start_in_air": True}
 

@@ -344,7 +344,7 @@ def test_odometry_is_recorded_as_it_was_sent(tmp_path, node):
             ["flight.bag", "--wait-topics", "uwb/nothing"],
             "/uwb/nothing is not in the bag",
         ),
-        (["flight.bag", "--ros-args", "--nonsense"], "replay: error: ROS arguments: "),
+        (["flight.bag", "--ros-args", "--nonsense"], "replay: error: --ros-args: "),
     ],
 )
 def test_bad_usage_is_one_sentence_and_code_two(tmp_path, monkeypatch, capsys, arguments, sentence):

@@ -172,7 +172,12 @@ def test_options_of_the_estimate_are_refused_with_a_recorded_odometry(desk, caps
     refused(evaluate, ["flight.bag", "--odometry", "flight.bag", *more], sentence, capsys)
 
 
-KNOWN = {"marks": "m.yaml", "distances": "d.csv", "odometry": "/vio"}
+KNOWN = {
+    "marks": ["m.yaml"],
+    "distances": ["d.csv"],
+    "odometry": ["/vio"],
+    "plan_flight": ["-3", "3", "-3", "3", "0", "3"],
+}
 
 
 @pytest.mark.parametrize(
@@ -180,10 +185,11 @@ KNOWN = {"marks": "m.yaml", "distances": "d.csv", "odometry": "/vio"}
     [(reference, option) for reference, some in diagnose.UNUSED.items() for option in some],
 )
 def test_options_that_a_reference_does_not_use_are_refused(desk, capsys, reference, option):
-    sentence = f"--{option}: no part of it is used with --reference {reference}"
+    name = option.replace("_", "-")
+    sentence = f"--{name}: no part of it is used with --reference {reference}"
     refused(
         diagnose,
-        ["flight.bag", "--reference", reference, f"--{option}", KNOWN[option], "--out", "out"],
+        ["flight.bag", "--reference", reference, f"--{name}", *KNOWN[option], "--out", "out"],
         sentence,
         capsys,
     )

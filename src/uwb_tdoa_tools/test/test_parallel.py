@@ -12,6 +12,7 @@ import sys
 from threading import Event
 import time
 
+from joblib import cpu_count
 import pytest
 
 from uwb_tdoa_bias.common.errors import InputError
@@ -142,7 +143,7 @@ def options(*argv):
 
 def test_few_items_run_in_one_process_by_default():
     assert parallel.workers_for(options(), 4, 5) == (1, None)
-    assert parallel.workers_for(options(), 5, 5) == (min(parallel.cpu_count(), 5), None)
+    assert parallel.workers_for(options(), 5, 5) == (min(cpu_count(), 5), None)
     assert parallel.workers_for(options("--jobs", "2"), 4, 5) == (2, None)
     assert parallel.workers_for(options("--dask", "tcp://here:1"), 4, 5) == (None, "tcp://here:1")
 

@@ -22,6 +22,7 @@ SOURCES = [
 ] + [ROOT / "studies"]
 ELSEWHERE = {  # what is no file that a user gets at once
     "uwb_tdoa_bias/common/files.py",
+    "uwb_tdoa_tools/bags/completion.py",  # files unpacked in a temporary folder
     "uwb_tdoa_tools/bags/integrity.py",  # a bag unpacked in a temporary folder
     "uwb_tdoa_tools/bags/mcap.py",  # checksums into a bag that is not yet in its place
     "uwb_tdoa_tools/results_file.py",  # grows line by line
