@@ -134,7 +134,7 @@ WORK = {
     "evaluate": (["flight.bag", "--json", "OUT/evaluate.json", "--tum", "OUT/tum"], 0),
     "localize": (["flight.bag", "--smooth", "--out", "OUT/localized"], None),
     "diagnose": (["flight.bag", "--most", "4000", "--out", "OUT/diagnosis"], 0),
-    "survey": (["flight.bag", "--out", "OUT/surveyed"], None),
+    "survey": (["flight.bag", "--out", "OUT/surveyed"], 2),  # it refuses a flight as short as this
     "plan": (["anchors.yaml", "--step", "1", "--json", "OUT/plan.json"], 0),
 }
 FIGURES = ".json", ".csv", ".tum", ".yaml", ".html"
