@@ -135,7 +135,7 @@ WORK = {
     "localize": (["flight.bag", "--smooth", "--out", "OUT/localized"], None),
     "diagnose": (["flight.bag", "--most", "4000", "--out", "OUT/diagnosis"], 0),
     "survey": (["flight.bag", "--out", "OUT/surveyed"], 2),  # it refuses a flight as short as this
-    "plan": (["anchors.yaml", "--step", "1", "--json", "OUT/plan.json"], 0),
+    "plan": (["anchors.yaml", "--step", "1", "--out", "OUT/plan"], 0),
 }
 FIGURES = ".json", ".csv", ".tum", ".yaml", ".html"
 
