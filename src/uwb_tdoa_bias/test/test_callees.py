@@ -93,6 +93,40 @@ def test_only_what_python_calls_has_machine_code(run, tmp_path):
     assert kept == {"program.root", "program.scaled"}
 
 
+BEFORE = """
+import numba
+import numpy as np
+
+@numba.njit
+def theirs(x):
+    return np.median(x) + np.concatenate((x, x)).sum()
+
+theirs(np.ones(3))  # libraries that numba made before the import of ours
+"""
+AFTER = """
+@numba.njit(parallel=True)
+def many(x):
+    total = 0.0
+    for i in numba.prange(len(x)):
+        total += x[i] + theirs(x[:2])
+    return total
+
+@numba.njit
+def caller(x):
+    return many(x)
+
+assert caller(np.ones(4)) == 4 * 6.0
+(compiled_callee,) = many.overloads.values()
+assert type(compiled_callee.entry_point).__name__ == "builtin_function_or_method"
+print(True)
+"""
+
+
+def test_functions_of_other_packages_compile_as_usual_before_and_after_ours(run):
+    printed, _ = run(BEFORE + PROGRAM + AFTER, "cache")
+    assert printed[:-1] == run(PROGRAM, "cache of ours")[0]
+
+
 def test_another_version_of_numba_compiles_as_usual(monkeypatch):
     usual = callees.dispatcher.Dispatcher.compile
     for version in ((0, 56, 4), (0, callees.TRIED[1][1] + 1, 0), (1, 0, 0)):

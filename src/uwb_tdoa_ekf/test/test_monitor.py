@@ -14,7 +14,7 @@ from uwb_tdoa_bias.effects import Covariance
 from uwb_tdoa_ekf.core.memory import INVALID, REJECTED, USED
 from uwb_tdoa_ekf.evidence import POSITION, Part, changes_of, keys_of, most_likely_changes
 from uwb_tdoa_ekf.monitoring.change import CAPACITY, ChangeDetector
-from uwb_tdoa_ekf.monitoring.monitor import LIMIT, Monitor, _surest
+from uwb_tdoa_ekf.monitoring.monitor import LIMIT, Monitor, _matters, _surest
 from uwb_tdoa_ekf.monitoring.recorded import watched
 from uwb_tdoa_ekf.monitoring.reference import Displaced, SurveyComparison, smooth_functions
 from uwb_tdoa_ekf.monitoring.slices import LENGTH, MOST, reduced
@@ -438,6 +438,14 @@ def test_the_sentence_on_a_moved_anchor_names_those_that_are_as_probable():
         "anchor 5, 9 or 11 does not stand where the survey has it, but if it is anchor 5, about"
     )
     assert "do not separate" in said[1].evidence and said[1].remedy.endswith("measure them again")
+
+
+def test_a_coordinate_that_is_hardly_known_displaces_no_anchor():
+    """Evidence for a shift of x is none for the height that the same fit has."""
+    sure = Displaced(1, np.array([0.06, 0.0, 0.3]), np.array([0.01, 0.01, 0.1]), 0.0, 12.0, False)
+    unknown = replace(sure, std=np.array([0.01, 0.01, 0.5]))
+    late = replace(unknown, shift=np.zeros(3), later=0.3)
+    assert [_matters(one) for one in (sure, unknown, late)] == [True, False, True]
 
 
 def test_a_comparison_that_is_sure_settles_the_doubt_of_another():

@@ -7,7 +7,7 @@ below it once, optimizes them together and makes machine code. That takes 40 % o
 time, and the results are equal to the bit: `docs/notebook/speed.md`.
 
 `install` replaces four methods and a class of numba, in versions in which this was tried. In others
-numba compiles as usual, which takes longer.
+numba compiles as usual, which takes longer. Functions of other packages compile as usual, too.
 """
 
 from __future__ import annotations
@@ -26,8 +26,16 @@ if TYPE_CHECKING:
 TRIED = (0, 57), (0, 68)  # first and last version of numba
 WITHOUT_WRAPPERS = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 ENVIRONMENT = "_ZN08NumbaEnv"  # prefix of a global variable that holds what a function may raise
+OURS = "of_uwb_tdoa"  # attribute of dispatchers whose callees compile in this way
 
-_compiler_thread = threading.local()  # `callee`: whether it compiles a callee
+
+class _State(threading.local):
+    """What this thread compiles: a function below one of ours, a callee; a callee is next."""
+
+    below_ours = callee = callee_is_next = False
+
+
+_state = _State()
 
 
 class _Callee:
@@ -39,7 +47,7 @@ class _Library(codegen.JITCodeLibrary):
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
-        self.of_callee = _is_callee()
+        self.of_callee = _state.callee
 
     def finalize(self) -> None:
         if self.of_callee:
@@ -50,14 +58,11 @@ class _Library(codegen.JITCodeLibrary):
         super().finalize()
 
 
-def _is_callee() -> bool:
-    return getattr(_compiler_thread, "callee", False)
-
-
 def _with_callees(libraries: Iterable[Any]) -> list[Any]:
     """Return code libraries and all below them, callers first.
 
-    LLVM links a function only if a function that is linked already calls it.
+    LLVM links a function only if a function that is linked already calls it. A library that numba
+    made before `install` has no callees.
     """
     found: list[Any] = []
     seen: set[Any] = set()
@@ -66,7 +71,7 @@ def _with_callees(libraries: Iterable[Any]) -> list[Any]:
         if library in seen:
             return
         seen.add(library)
-        if library.of_callee:
+        if getattr(library, "of_callee", False):
             for each in reversed(library._linking_libraries):
                 visit(each)
         found.append(library)
@@ -82,35 +87,36 @@ def install() -> bool:
     if not first <= tuple(version_info[:2]) <= last:
         return False
     kind: Any = dispatcher.Dispatcher
-    as_usual = kind.get_call_template, kind.compile, kind.add_overload
-    usual_template, usual_compile, usual_overload = as_usual
     context: Any = cpu.CPUContext
-    usual_executable = context.get_executable
+    usual_template, usual_compile = kind.get_call_template, kind.compile
+    usual_overload, usual_executable = kind.add_overload, context.get_executable
 
     def get_call_template(self: Any, args: Any, kws: Any) -> Any:
         """Compile what compiled code is about to call."""
-        before = _is_callee()
-        _compiler_thread.callee = True
+        _state.callee_is_next = _state.below_ours
         try:
             return usual_template(self, args, kws)
         finally:
-            _compiler_thread.callee = before
+            _state.callee_is_next = False
 
     def compile_function(self: Any, sig: Any) -> Any:
+        callee, _state.callee_is_next = _state.callee_is_next, False
         types = tuple(sigutils.normalize_signature(sig)[0])
         known = self.overloads.get(types)
-        if not _is_callee():
-            if known is not None and isinstance(known.entry_point, _Callee):
-                del self.overloads[types]  # Python calls it now
-            return usual_compile(self, sig)
-        if known is not None:
+        if known is not None and (callee or not isinstance(known.entry_point, _Callee)):
             return known.entry_point
+        if known is not None:
+            del self.overloads[types]  # Python calls it now
+        before = _state.below_ours, _state.callee
         compiler, cache = self._compiler, self._cache
         options = compiler.targetoptions
-        self._cache, compiler.targetoptions = NullCache(), {**options, **WITHOUT_WRAPPERS}
+        _state.below_ours, _state.callee = callee or hasattr(self, OURS), callee
+        if callee:
+            self._cache, compiler.targetoptions = NullCache(), {**options, **WITHOUT_WRAPPERS}
         try:
             return usual_compile(self, sig)
         finally:
+            _state.below_ours, _state.callee = before
             self._cache, compiler.targetoptions = cache, options
 
     def add_overload(self: Any, cres: Any) -> None:
@@ -120,7 +126,7 @@ def install() -> bool:
             usual_overload(self, cres)
 
     def get_executable(self: Any, library: Any, fndesc: Any, env: Any) -> Any:
-        if _is_callee():
+        if _state.callee:
             return _Callee()
         function = usual_executable(self, library, fndesc, env)
         for variable in library._final_module.global_variables:

@@ -68,8 +68,10 @@ def compiled(function: Function) -> Function:
     place = _place(_digest(Path(function.__code__.co_filename).parent))
     config.CACHE_DIR = str(place)  # type: ignore[attr-defined]  # as above
     try:
-        _FUNCTIONS.append(njit(error_model="numpy", cache=True)(function))
-        return _FUNCTIONS[-1]
+        made: Any = njit(error_model="numpy", cache=True)(function)
+        setattr(made, callees.OURS, True)
+        _FUNCTIONS.append(made)
+        return made
     finally:
         config.CACHE_DIR = before  # type: ignore[attr-defined]  # as above
 

@@ -67,6 +67,9 @@ TOGETHER = 4  # slices in which the search for an exchange looks
 NAMED, HELD = (4, 8)
 # slices between two comparisons with the survey, and fewest slices of a comparison with recent data
 LOOK, YOUNG = (4, 40)
+# standard deviations by which an anchor must differ from the survey, in addition to SMALLEST_CHANGE: a
+# coordinate that is hardly known can be far off beside a well-known one that has changed
+SURE = 2.0
 TURN_APART = 3.0  # s of stamps between two sign flips of all TDOAs
 # share of accepted TDOAs of a slice where the filter is right, and s since then within which a sign
 # flip must occur, because it is an event. Near a floor, TDOAs that are metres too long may
@@ -605,8 +608,11 @@ def _surest(displaced: Iterable[Displaced]) -> dict[int, Displaced]:
 
 
 def _matters(one: Displaced) -> bool:
-    """Return whether the deviation of an anchor is relevant."""
-    return max(float(np.linalg.norm(one.shift)), abs(one.later)) > SMALLEST_CHANGE
+    """Return whether the deviation of an anchor is relevant and statistically significant."""
+    off = float(np.linalg.norm(one.shift))
+    return max(off, abs(one.later)) > SMALLEST_CHANGE and (
+        bool(one.later) or off > SURE * float(np.linalg.norm(one.std)) / math.sqrt(3.0)
+    )
 
 
 def _is_clear(change: Change) -> bool:

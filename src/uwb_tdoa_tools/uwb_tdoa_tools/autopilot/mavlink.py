@@ -53,14 +53,13 @@ class MavlinkLink:
         """
         if not CONNECTION.fullmatch(connection):
             raise InputError(f"connection: {connection!r} is none of {FORMS}.")
-        os.environ["MAVLINK20"] = (
-            "1"  # ODOMETRY is in MAVLink 2 alone; pymavlink reads it on import
-        )
+        # ODOMETRY is in MAVLink 2 alone; pymavlink reads this on import
+        os.environ["MAVLINK20"] = "1"
         try:
             from pymavlink import mavutil
         except ImportError as error:
             raise missing("mavlink", error, "pymavlink") from error
-        self._dialect, self._world, self._clock = mavutil.mavlink, world, clock
+        self._world, self._clock = world, clock
         try:
             self._port = mavutil.mavlink_connection(
                 connection,
