@@ -26,6 +26,7 @@ import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+import uwb_tdoa
 from walking import blocks, section
 import yaml
 
@@ -256,6 +257,15 @@ def test_a_tag_is_chosen_and_never_merged_with_another(flight, tmp_path):
         read_by_profile([bag], load_profile("dwm1001"), tag="9")
     one = read_by_profile([bag], load_profile("dwm1001"), tag="8")
     assert len(one.range) == len(flight.range) and one.name.endswith("tag8")
+
+
+def test_the_public_module_reads_by_a_profile(twr, flight, tmp_path):
+    flight.anchors.to_yaml(tmp_path / "anchors.yaml")
+    for survey in (flight.anchors, tmp_path / "anchors.yaml"):
+        read = uwb_tdoa.read(twr, survey, profile="uwb_msgs")
+        np.testing.assert_allclose(read.range.d, flight.range.d, rtol=FLOAT32)
+    with pytest.raises(InputError, match="^tag: "):
+        uwb_tdoa.read(twr, tag="7")
 
 
 def test_topics_of_two_vehicles_are_never_merged(flight, survey, tmp_path):

@@ -27,7 +27,7 @@ SIGNATURES = {
     "filter": "flight effects=None config=None model=None",
     "plot": "flight run",
     "plot_errors": "flight run effects=None",
-    "read": "path survey=None *namespace='' *topics=None *salvage=False",
+    "read": "path survey=None *namespace='' *topics=None *salvage=False *profile=None *tag=''",
     "report": "diagnosis",
     "simulate": "vehicle='quadrotor' **settings",
     "smooth": "flight effects=None config=None model=None",

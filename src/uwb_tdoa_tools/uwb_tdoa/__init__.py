@@ -13,11 +13,11 @@ module is quick: a function imports what it needs when it is called.
 from __future__ import annotations
 
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from pathlib import Path
 
     from matplotlib.figure import Figure
 
@@ -99,8 +99,10 @@ def read(
     namespace: str = "",
     topics: dict[str, str] | None = None,
     salvage: bool = False,
+    profile: str | Path | None = None,
+    tag: str = "",
 ) -> Flight:
-    """Return the Flight of a recording: a micro-SD log, a UTIL CSV file or a ROS 2 bag.
+    """Return the Flight of a recording: a micro-SD log, a UTIL CSV file, a ROS 2 bag, or by a profile.
 
     Parameters
     ----------
@@ -112,15 +114,30 @@ def read(
         {our topic: its name in a bag}, e.g. {"uwb/tdoa": "/my/tdoa"}.
     salvage : bool
         Read the intact part of a damaged recording; `meta["remarks"]` says what is missing.
+    profile : str or path or None
+        How to read a recording of another tool: the name of a shipped profile, or a YAML file
+        (docs/recordings.md).
+    tag : str
+        Id of the tag, if such a recording has several.
 
     Raises
     ------
     InputError
         If the recording or the survey cannot be used. The message says what to do.
     """
-    from uwb_tdoa_tools.readers import read_flight
+    from uwb_tdoa_bias.common.errors import InputError
+    from uwb_tdoa_tools.readers import load_profile, read_by_profile, read_flight
+    from uwb_tdoa_tools.readers.names import NamedAnchors, read_named_anchors
 
-    return read_flight(path, survey, namespace, salvage, topics)
+    if profile is None:
+        if tag:
+            raise InputError("tag: chooses a tag of a recording that is read by a profile.")
+        return read_flight(path, survey, namespace, salvage, topics)
+    if isinstance(survey, (str, Path)):
+        known = read_named_anchors(survey)
+    else:
+        known = None if survey is None else NamedAnchors(survey)
+    return read_by_profile([path], load_profile(profile), known, tag, namespace, salvage)
 
 
 def write(flight: Flight, path: str | Path, *, force: bool = False) -> None:
