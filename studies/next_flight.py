@@ -12,7 +12,8 @@ import numpy as np
 from uwb_tdoa_bias.effects import EFFECTS, SmoothTerm
 from uwb_tdoa_tools import cli
 from uwb_tdoa_tools.diagnosis.attribution import attribute
-from uwb_tdoa_tools.diagnosis.next_flight import Limits, motions, plan_flight, route
+from uwb_tdoa_tools.diagnosis.motions import Limits, motions, route
+from uwb_tdoa_tools.diagnosis.next_flight import plan_flight
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.regression.select import AMBIGUOUS
 from uwb_tdoa_tools.outputs import OutputFile

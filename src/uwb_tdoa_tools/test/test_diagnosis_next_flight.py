@@ -13,17 +13,8 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.effects import EFFECTS
 from uwb_tdoa_tools.commands import diagnose
 from uwb_tdoa_tools.diagnosis.attribution import attribute
-from uwb_tdoa_tools.diagnosis.next_flight import (
-    ANCHOR_CLEARANCE,
-    RATE,
-    Limits,
-    Model,
-    NextFlight,
-    Rivalry,
-    motions,
-    plan_flight,
-    route,
-)
+from uwb_tdoa_tools.diagnosis.motions import ANCHOR_CLEARANCE, RATE, Limits, motions, route
+from uwb_tdoa_tools.diagnosis.next_flight import Model, NextFlight, Rivalry, plan_flight
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.report import next_flight as report
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate

@@ -133,10 +133,11 @@ def read(
         if tag:
             raise InputError("tag: chooses a tag of a recording that is read by a profile.")
         return read_flight(path, survey, namespace, salvage, topics)
+    known: NamedAnchors | None = None
     if isinstance(survey, (str, Path)):
         known = read_named_anchors(survey)
-    else:
-        known = None if survey is None else NamedAnchors(survey)
+    elif survey is not None:
+        known = NamedAnchors(survey)
     return read_by_profile([path], load_profile(profile), known, tag, namespace, salvage)
 
 

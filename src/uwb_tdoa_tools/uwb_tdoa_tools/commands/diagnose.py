@@ -149,7 +149,8 @@ def _diagnose(args: Namespace) -> int:
     from ..checking.before_anchors import nothing_comes_first
     from ..checking.report import remarks_on
     from ..diagnosis import diagnose, output, references, with_noise
-    from ..diagnosis.next_flight import Limits, motions, plan_flight
+    from ..diagnosis.motions import Limits, motions
+    from ..diagnosis.next_flight import plan_flight
     from ..diagnosis.noise import write_parameters
     from ..estimate import FlightEstimator
     from ..localizing.pictures import write_diagnosis
