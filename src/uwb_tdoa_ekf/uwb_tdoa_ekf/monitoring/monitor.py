@@ -67,8 +67,8 @@ TOGETHER = 4  # slices in which the search for an exchange looks
 NAMED, HELD = (4, 8)
 # slices between two comparisons with the survey, and fewest slices of a comparison with recent data
 LOOK, YOUNG = (4, 40)
-# standard deviations by which an anchor must differ from the survey, in addition to SMALLEST_CHANGE: a
-# coordinate that is hardly known can be far off beside a well-known one that has changed
+# standard deviations by which an anchor must differ from the survey, in addition to SMALLEST_CHANGE.
+# Evidence for a change of x says nothing about a height that is uncertain by half a metre.
 SURE = 2.0
 TURN_APART = 3.0  # s of stamps between two sign flips of all TDOAs
 # share of accepted TDOAs of a slice where the filter is right, and s since then within which a sign

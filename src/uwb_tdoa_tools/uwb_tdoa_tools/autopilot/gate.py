@@ -20,7 +20,7 @@ OLDEST, EARLIEST = 0.5, -0.1  # s before the clock that a stamp may be
 BREAK = 0.4  # s without an estimate after which PX4 stops and starts its fusion anew
 SLACK = 0.1  # share of a period by which a stamp may be early
 # Change of position, velocity and attitude from one estimate to the next, besides motion, that an
-# autopilot must not take for motion. Three steps of 15 measured flights exceed it, all while landing.
+# autopilot must not take for motion. Three steps of 15 measured flights exceed it, all near the end of a flight.
 JUMP = np.array([0.3, 0.75, 0.2])  # m, m/s, rad
 # m/s^2, rad/s: motion between two estimates that the earlier one does not predict
 ACCELERATION, TURN_RATE = 20.0, 10.0
