@@ -19,6 +19,7 @@ import numpy as np
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Flight
 from uwb_tdoa_bias.common.geometry import ranges
+from uwb_tdoa_bias.common.radio import TICK
 from uwb_tdoa_bias.common.survey import UNITS
 from uwb_tdoa_bias.effects import Covariance
 from uwb_tdoa_ekf.evidence import keys_of
@@ -44,7 +45,7 @@ RATE = 50.0  # Hz, estimates of a run that are kept
 LAG = 0.25  # s
 CHECKED = ", checked"  # of a finding over the whole recording
 A, B = 2, 3  # columns of the TDOAs, behind T and ARRIVAL
-TICKS = 2.0**32 * 299792458.0 / (128 * 499.2e6)  # m, range of 32 bits of the clock of a DW1000
+TICKS = 2.0**32 * TICK  # m, range of 32 bits of the clock of a DW1000
 Columns = tuple[np.ndarray, ...]
 
 

@@ -40,7 +40,7 @@ KINDS_OF = {
     ),
     ("streams",),
 )
-NO_TUNING = {"ranging_rules.TICK", "survey_scale.NANOSECONDS"}
+NO_TUNING = {"survey_scale.NANOSECONDS"}
 LISTS = (  # of rules, by module
     ("monitoring.stamp_rules", "OF_ONE"),
     ("monitoring.stamp_rules", "OF_BOTH"),

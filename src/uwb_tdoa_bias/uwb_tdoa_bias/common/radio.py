@@ -174,6 +174,7 @@ def _around(cut: Any, angle: np.ndarray) -> np.ndarray:
 
 
 SPEED_OF_LIGHT = 299792458.0  # m/s
+TICK = SPEED_OF_LIGHT / (128 * 499.2e6)  # m, clock tick of a DW1000
 
 # Range error of the DW1000 over received power, 500 MHz channels, 64 MHz PRF. Source: Decawave
 # APS011, table 2.

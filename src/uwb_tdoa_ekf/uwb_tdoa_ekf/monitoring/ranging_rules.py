@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.common.radio import SPEED_OF_LIGHT
+from uwb_tdoa_bias.common.radio import SPEED_OF_LIGHT, TICK
 
 from .finding import ERROR, NOTE, WARNING, Finding
 from .ranging_windows import GRIDS
@@ -28,7 +28,6 @@ ON_GRID = 0.95  # share of TDOAs on a grid; healthy 0.005
 CLIPPED = 0.02  # share of TDOAs at the largest value
 # m, median jump; share of jumps that differ from it by less than NEAR, in m; number of jumps
 STEP, ALIKE, NEAR, FEWEST = (5.0, 0.6, 0.5, 10)
-TICK = SPEED_OF_LIGHT / (128 * 499.2e6)  # m, clock tick of a DW1000
 WRAPS = {
     f"2^{bits} ticks of a DW1000": 2.0**bits * TICK for bits in (8, 16, 24, 31, 32, 39, 40)
 } | {f"2^{bits} ns": 2.0**bits * SPEED_OF_LIGHT / 1e9 for bits in (16, 31, 32)}

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.common.radio import SPEED_OF_LIGHT, TICK
 from uwb_tdoa_bias.common.survey import UNITS as SURVEY_UNITS
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.memory import TDOA, new_state, structured
@@ -36,14 +37,14 @@ if TYPE_CHECKING:
 # trial
 RATIO, DEVIATIONS = 0.93, 2.5
 UNITS = {  # m in one
-    "nanoseconds": 0.299792458,
+    "nanoseconds": SPEED_OF_LIGHT / 1e9,
     "centimetres": 0.01,
-    "DW1000 ticks": 0.0046917639,
+    "DW1000 ticks": TICK,
     "millimetres": 0.001,
     "kilometres": 1000.0,
-    "microseconds": 299.792458,
-    "milliseconds": 299792.458,
-    "seconds": 299792458.0,
+    "microseconds": SPEED_OF_LIGHT / 1e6,
+    "milliseconds": SPEED_OF_LIGHT / 1e3,
+    "seconds": SPEED_OF_LIGHT,
 }
 # m, median difference of successive TDOAs of a pair: limits, and usual; healthy 0.047 - 0.084
 NOISE, USUAL = (0.02, 0.2), 0.063

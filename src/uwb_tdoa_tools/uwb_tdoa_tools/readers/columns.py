@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.radio import SPEED_OF_LIGHT, TICK
 
 from .streams import GRAVITY
 
@@ -18,8 +19,8 @@ LENGTH = {
     "m": 1.0,
     "cm": 1e-2,
     "mm": 1e-3,
-    "ticks": 299792458.0 / (128 * 499.2e6),
-    "ns": 0.299792458,
+    "ticks": TICK,
+    "ns": SPEED_OF_LIGHT / 1e9,
 }
 # As `make_flight` takes them, from a Crazyflie: deg/s and g.
 RATE = {"rad/s": 180.0 / np.pi, "deg/s": 1.0}
