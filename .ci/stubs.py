@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Write type stubs of ROS messages and services for mypy, from their installed classes.
 
 The classes are generated from the .msg and .srv files, and hold the type of each field.

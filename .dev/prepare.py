@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Bring the workspace up to date: environment, message package, Python packages. What is up to date
 is not touched.
 

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What is most needed of the `ros2` command, for those without ROS: `./dev ros2 ...`.
 
 Where ROS 2 is sourced, that one runs.

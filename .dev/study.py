@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """`./dev study`.
 
 Python looks for modules beside this file, and not in the present folder as `python -m studies`

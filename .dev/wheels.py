@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Three repairs of the ROS wheels in a virtual environment. Run by its Python.
 
 1. Their CMake files name the paths of the machine they were built on: put ours in.

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Where do the anchors really stand? Improve a survey by a flight without ground truth.
 
 python examples/calibrate.py

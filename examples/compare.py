@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How much better is the smoother than the filter? Compare both with the ground truth.
 
 python examples/compare.py

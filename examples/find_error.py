@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What is wrong with the measurements? Diagnose a flight, and correct the next one.
 
 python examples/find_error.py

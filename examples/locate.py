@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Where was the tag? Smooth a recording, and write the path as a table and a picture.
 
 python examples/locate.py [RECORDING [SURVEY]]

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """An effect of your own: an anchor hears the tag late through two sides of its housing.
 
 python examples/own_effect.py

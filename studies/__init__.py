@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What re-makes the figures of the documentation.
 
 Not installed: `./dev study NAME` runs it from the repository.

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """`./dev study NAME ...`: make the figures of the documentation anew."""
 
 import argparse

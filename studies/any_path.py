@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Motion along any path, for what the families of trajectories do not do: tags that are carried,
 driven, thrown, or far away.
 """

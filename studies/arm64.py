@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """arm64: the off-line filter on an emulated 64-bit Arm beside this machine, value by value.
 
 The folder gets Debian's arm64 Python (apt-get and the package sources of this machine), the

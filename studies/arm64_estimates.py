@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Run the off-line filter over recordings, and write all of its numbers.
 
 `study arm64` runs this file on two kinds of processors:

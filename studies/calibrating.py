@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """calibrating: surveys shaken as by a tape, calibrated without ground truth, judged on flights that
 took no part in anything.
 

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Measured TDoA2 logs put through the radio link of a Crazyflie: what the estimate loses by that."""
 
 from dataclasses import replace

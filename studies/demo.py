@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """demo: the loop of `./dev demo` over many seeds, by the filter without ROS."""
 
 from pathlib import Path

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """deviations: whether errors of anchors are as large as `diagnose` says, on recordings on which
 nothing was chosen.
 """

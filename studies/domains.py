@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """domains: what an effect does to flights beyond where it was seen: a clock's drift, fitted to the first
 seconds of one flight, taken out of the others, without its domain and with it.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """drives: each way to use the sensors of a simulated rover on wheels, by the filter."""
 
 import numpy as np

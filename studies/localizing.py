@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """localizing: what localize says of recordings, as they are and with mistakes put into them,
 against their ground truth.
 

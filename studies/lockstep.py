@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """lockstep: replays that follow the nodes, at several rates and loads, beside the run off line."""
 
 from contextlib import ExitStack

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """monitor: what the monitor of ekf_node names on measured flights, what it names on flights that
 nothing was put into, and what it costs. The same filter and monitor as in the node, off line.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """moved_anchors: recordings in which an anchor was moved by 0.3 to 1 m, or two were exchanged,
 before the start or in the middle.
 

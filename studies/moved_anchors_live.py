@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """moved-anchors-live: recordings of the study moved-anchors, played to bias_node and ekf_node.
 
 Both nodes run as processes and get the calibration of last week, and so does the monitor offline.

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """next-flight: whether a flight that `diagnose` plans settles what the first flight left open.
 
 A systematic error is put into a short simulated flight on a simple path. If its diagnosis is

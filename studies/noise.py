@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """noise: whether the covariance of the position is honest after a calibration (NEES, 3 is right),
 on flights that took no part in it, with IMU and without, with the parameters of the filter as they
 are and as `survey` and `diagnose` write them; and with others at half or a multiple of what they

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """odd-messages: what nodes do with messages that no driver should send.
 
 Messages of every type that a node takes, so many on each topic, changed at random: numbers that are

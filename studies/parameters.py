@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """parameters: what each parameter of the filter is worth, halved and doubled, on measured flights."""
 
 from dataclasses import fields, replace

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """plans: random rooms and halls, planned and solved a second time by an independent solver.
 
 The solver is scipy's `least_squares`, from random starts at each place. Its Cramer-Rao bound is made

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A recorded flight as it would have come over the radio link: sampled, rounded, repeated, lost and
 late.
 """

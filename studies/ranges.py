@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """ranges: simulated flights with distances to anchors, alone and beside TDOAs, against the bound of
 `plan` for one round; and what faulty ranges do beside TDOAs.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """recalibrating: a survey with one flight, something changed, and a survey with another that starts
 from the first.
 

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """rover: simulated drives over a floor, each judged by its truth: how well the filter does, and
 whether what diagnose writes is true.
 

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """scale: how processor time and memory of the tools grow with flights, anchors and effects, each
 case in a process of its own.
 

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Height, pressure and velocity on measured flights: what each is worth, and what faults put into
 them do.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """situations: where a tag can be and what can happen to it, simulated over many seeds, and how
 right and how honest the filter is there.
 

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Surveys of measured flights, shaken and made better from the flights alone; the tag is judged on
 other flights.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """two-errors: how far accelerometers rectify vibration, and how late each anchor is over the height of
 the tag.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """two-machines: who hears whom on two machines, by what each is told. The machines are two network
 namespaces of this one, joined by a virtual cable, for which it takes root.
 """

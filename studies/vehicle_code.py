@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """vehicle-code: what exported C costs on an emulated STM32F405, of effects and of networks.
 
 Instructions are those of one TDOA, the mean and the most over random states, counted by the

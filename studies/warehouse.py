@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """warehouse: starts in halls, slow tags, anchors in a plane, a walk of ten minutes, and what a tag
 costs by how many anchors are installed.
 """

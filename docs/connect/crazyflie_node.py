@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Log blocks of one Crazyflie, as crazyswarm2 publishes them, to uwb/tdoa and imu/data.
 
 In crazyflies.yaml, for the robot type or the robot:

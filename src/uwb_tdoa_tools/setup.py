@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How colcon installs the package. pip installs all packages by the pyproject.toml of the repository."""
 
 from glob import glob

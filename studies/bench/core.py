@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """us per prediction, per robust update, and per height, pressure or velocity in the compiled core."""
 
 from __future__ import annotations

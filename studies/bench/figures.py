@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Measured figures, and how they are printed: a table, and JSON."""
 
 from __future__ import annotations

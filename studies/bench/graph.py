@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How fast nodes answer the rest of the graph, parameters, poses that are given, a clock that
 stops, while messages flow.
 """

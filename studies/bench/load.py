@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What else there is in a graph, as a process: a simulator's clock, a robot's transforms, a tag's
 streams.
 

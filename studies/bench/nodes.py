@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The nodes live, in real time: CPU, memory, latency, losses, time to ready; for one tag and for
 several.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The highest rate of a replay at which nothing is lost."""
 
 from __future__ import annotations

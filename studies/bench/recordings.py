@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """s that a whole recording takes without ROS: filter, correction, smoother."""
 
 from __future__ import annotations

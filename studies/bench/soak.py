@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """soak: both nodes for hours at 1 kHz IMU and 400 Hz TDOAs: their memory, and whether their counters
 hold all that was published.
 """

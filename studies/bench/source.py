@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The surroundings of the nodes: publishes a flight in real time and takes the odometry that comes
 back.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """bench: measure what the suite costs on this machine. Figures are medians with their quartiles,
 beside their targets.
 

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Mistakes of drivers, surveys and clocks put into flights, and what `check` says of them; and of
 the flights as they are.
 """

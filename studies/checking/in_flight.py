@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What ekf_node says in flight of the mistakes that `check` finds in recordings: a part of a
 flight, with each, played to both nodes as it would have arrived.
 """

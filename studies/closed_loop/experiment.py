@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """closed-loop: the flights of Zhao et al. (RA-L 2021, section V) made anew in the loop of `fly`:
 trajectories A (a level circle) and B (a circle that rises and falls), in a constellation of anchors
 that took part in training and in three that did not, by the M-estimation EKF alone, with the

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Counterparts of figures 7 to 9 of Zhao et al. (RA-L 2021)."""
 
 from functools import partial

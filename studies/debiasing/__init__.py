@@ -1,1 +1,3 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Figures of docs/notebook/debiasing.md."""

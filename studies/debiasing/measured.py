@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """debias-measured: a map fitted to some measured flights, judged on others, beside what `diagnose`
 reaches on them.
 """

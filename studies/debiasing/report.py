@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Tables and a picture of docs/notebook/debiasing.md."""
 
 from functools import partial

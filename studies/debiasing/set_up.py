@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """debias-set-up: a simulated copy of the set-up of Grasso et al. (Sensors 2022, 22, 9136), sections
 4 and 5. 4 x 4 m, four anchors at the height of the tag, 0.2 m, a calibration grid of 50 cm, a
 validation grid of 25 cm beside it, rails, and a square path.

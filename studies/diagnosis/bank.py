@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The bank of simulated flights with known effects."""
 
 from known_effects import AIDED, RANGED, SIZES, clean_flight, effect_of, names_found

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The blind bank: effects of the grammar put into flights, measured ones on top of what others of
 the day have told.
 

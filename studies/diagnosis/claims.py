@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What findings say, and what an effect of the grammar is, in the same terms: stream, subset,
 covariate, shape.
 

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Faults of numbers, drawn and put into measured flights: are they named?"""
 
 from number_faults import FAULTS

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """diagnosis: the figures of docs/notebook/diagnosis.md. Every part prints its figures and writes them,
 with all cases, to PART.json in the output folder; bank, blind and injected draw what was found
 first for what was put in, too.

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What happens on the floor of the measured flights: found by the search alone and with the effect,
 and what one set of flights tells of another.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Effects that no catalogue holds, drawn from a grammar: which stream, which part of it, over what,
 of which shape, how large.
 

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """diagnose-ranges: errors put into simulated distances to anchors, alone and beside TDOAs, and what
 diagnose makes of them on another flight.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Measured flights diagnosed with less than ground truth, and judged with it on others."""
 
 import numpy as np

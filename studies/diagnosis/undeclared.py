@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Effects that no catalogue holds: does the scan name channel and covariate, and does its term help
 other flights?
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Changes of the events of a flight, by which faults are made: each takes (events, Scene) and
 returns events.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What is sent to the nodes during a flight: one Event for each message."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Faults put into a flight that real nodes hear over topics: how wrong they get, what they say, and
 whether they recover.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """fly-faults: the vehicle of `fly` takes off, flies and lands by the estimate while a fault is put
 into its streams.
 

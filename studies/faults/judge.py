@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A row of the table: what the nodes published during a fault, compared with ground truth."""
 
 from __future__ import annotations

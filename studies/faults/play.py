@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Events sent to bias_node and ekf_node in real time, and what these publish meanwhile."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The faults: one row each. A new one is a line of `FAULTS`."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """fuzz: changed files of every kind, given to every reader. A reader returns, or raises InputError,
 within 5 s and 500 MB.
 

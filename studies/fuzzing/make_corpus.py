@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Makes the corpus that fuzzing starts from, of simulated and made-up recordings:  python
 make_corpus.py
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Changes of files: bytes, and by what the files are made of (numbers and lines of text, trees,
 protocol buffers, records, tables).
 """

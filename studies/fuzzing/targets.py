@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What is fuzzed: every function that reads a file from outside, each with bytes. It may return or
 raise InputError.
 

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The rules of the compiled core, and which of its constants are no tuning."""
 
 from __future__ import annotations

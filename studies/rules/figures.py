@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """rules: what each rule and each constant of the filter's core is worth, and with --watch those of
 the rules over streams and residuals.
 

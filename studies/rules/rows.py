@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the filter is run on, and what is judged of it."""
 
 from __future__ import annotations

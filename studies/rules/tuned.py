@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A copy of the filter whose constants and rules are read from one table while it runs.
 
 Compiled code freezes its constants, and compiling it takes minutes. So the sources are copied once:

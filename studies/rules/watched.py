@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the rules over streams and residuals are run on, and what they find in it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Variants of the rules over streams and over residuals. They are Python, so that a variant is a
 changed module.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Run variants of the filter, in a process that imports its tuned copy: started by `figures`."""
 
 from __future__ import annotations

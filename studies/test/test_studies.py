@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """All studies: their help, their examples, and the commands that the documentation shows."""
 
 import shlex

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Paths of any kind: where they lead, and how fast."""
 
 import numpy as np

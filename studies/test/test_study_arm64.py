@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The comparison with 64-bit Arm, without an emulator."""
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The pieces of `study bench`, and one quick run of the real thing."""
 
 from dataclasses import replace

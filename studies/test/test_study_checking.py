@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The table of docs/notebook/checking.md, of simulated flights."""
 
 import json

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The experiment of the paper: its halls, its training, its table; the flights themselves are in
 the study alone.
 """

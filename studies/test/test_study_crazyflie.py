@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Measured logs over the link of a Crazyflie."""
 
 from dataclasses import replace

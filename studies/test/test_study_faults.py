@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The study of faults over topics: what its changes do to events, how it judges, and one fault
 played to real nodes.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The study of faults in closed loop: what a fault changes, and that the vehicle obeys what the
 status would be.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Every reader on changed files returns or raises InputError; and who fuzzes for long notices what
 is no InputError, takes too long or takes too much, and goes on behind it.
 """

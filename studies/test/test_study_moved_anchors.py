@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The study of moved and exchanged anchors: its tables."""
 
 from types import SimpleNamespace

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The table of moved anchors at the real nodes; the nodes themselves run in the study alone."""
 
 import argparse

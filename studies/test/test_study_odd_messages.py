@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Messages that no driver should send, over topics, to real nodes."""
 
 import numpy as np

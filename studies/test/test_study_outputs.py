@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """No study writes through a link, or over what it reads."""
 
 from output_attacks import attack, outputs, parsers, place, unknown  # noqa: F401

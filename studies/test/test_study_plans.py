@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The study of plans: its solver against places with a known answer, and two cases of it."""
 
 import numpy as np

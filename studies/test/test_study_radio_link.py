@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What comes over the radio of a Crazyflie, sampled and late, to streams; and the example node on
 that.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The study of rules: the tuned copy is the filter, changes while it runs, and changes are judged."""
 
 import json

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The table of how the tools grow, and its cases; the tools themselves run in the study alone."""
 
 import argparse

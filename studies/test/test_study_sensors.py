@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Faults of docs/notebook/auxiliary_sensors.md put into simulated flights: ekf_node
 names the sensor.
 """

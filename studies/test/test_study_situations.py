@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The table of situations: its harness on a few seeds; the table itself is the study's."""
 
 import json

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What any model of the pose could reach at most, and how much of the errors comes again at the
 same place.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """compare-models: train bias models on some flights, run the filter with each of them, and with
 none, on others, and print the 3D RMSE, in metres. With --bound beside them: the filter with the
 true errors, smoothed, a bound for any model of the pose. With --simulated N both are simulated: N

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Every kind of bias model trained on the same flights, and what the filter reaches with each on
 others.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Simulated flights to compare models on: some constellations to train on, others never seen."""
 
 from __future__ import annotations

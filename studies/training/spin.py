@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """spin: simulate a tag that spins between two anchors, and draw the error of their TDOA over its
 yaw, for several orientations of anchor 0 and for five specimens of the tag. Counterpart of figure 4
 of Zhao et al. (2021).

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """random-splits: every kind of bias model trained on some flights drawn at random, and judged on
 all others; by whole flights.
 

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """One judge for every analytic derivative: central differences."""
 
 import numpy as np

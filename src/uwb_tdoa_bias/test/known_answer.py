@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A bias network for tests whose output can be computed by hand. Needs the onnx package.
 
 bias = 0.05 m + 0.02 dx_a + 0.01 m elevation_T_b,  limited to +-1 m

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Small ONNX files for tests. Needs the onnx package."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Random attitudes, and random TDOAs with the poses they were taken at."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Functions that only compiled code calls have no machine code of their own."""
 
 import os

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Compiled code is read from no folder in which anybody else may have put it: what is there is run."""
 
 import ast

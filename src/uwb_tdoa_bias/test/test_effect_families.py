@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What single effects and their correctors do: delays, geometry, floor, labels, sensors, advice."""
 
 from hypothesis import given

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """effects.yaml, domains, covariances and the bias Jacobian: what an EffectSet does."""
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How executables start, and how they end when they are interrupted before they have begun."""
 
 import os

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Geometry of TDOAs, transforms between frames, and antenna patterns."""
 
 import math

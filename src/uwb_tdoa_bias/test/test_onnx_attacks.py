@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Models that were made to run, hang or fill: each is refused at once, with the reason."""
 
 import json

@@ -1,3 +1,6 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Stamps, quality of service, anchors, log and diagnostics on the ROS side."""
 
 import pytest

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Samples of TDOAs with the motion of the tag, and the inputs of a network."""
 
 from types import SimpleNamespace

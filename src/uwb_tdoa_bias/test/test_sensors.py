@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Every sensor of the registry keeps what its record promises; what each says in particular is in
 tests of its own.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a model says is what the reference of ONNX says, with the same bits whatever comes with it."""
 
 import numpy as np

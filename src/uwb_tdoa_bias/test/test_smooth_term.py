@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Functions without a name: splines and shapes, their bias, their refusals and their words."""
 
 from hypothesis import given

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Which stamps are accepted, and which pose belongs to a stamp."""
 
 from hypothesis import given

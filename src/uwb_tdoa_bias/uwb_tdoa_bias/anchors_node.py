@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """anchors_node: the anchors of a survey file, for nodes, RViz and bags.
 
   -> uwb/anchors (AnchorArray), /tf_static (tf2_msgs/TFMessage: the frame of the survey ->

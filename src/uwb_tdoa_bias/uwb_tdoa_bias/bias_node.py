@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """bias_node: raw TDOAs in, corrected TDOAs out.
 
 uwb/tdoa (Tdoa), odometry (nav_msgs/Odometry), uwb/anchors (AnchorArray), /tf_static

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A bag through the nodes of one tag, on the time of the bag.
 
 ros2 launch uwb_tdoa_ekf bag.launch.py bag:=flight.bag

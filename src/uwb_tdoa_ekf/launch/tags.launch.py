@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Several tags of one YAML file, each in its own namespace and with its own frame.
 
 ros2 launch uwb_tdoa_ekf tags.launch.py tags:=tags.yaml

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """All nodes of one tag.
 
 ros2 launch uwb_tdoa_ekf tdoa.launch.py anchors_file:=anchors.yaml ros2 launch uwb_tdoa_ekf

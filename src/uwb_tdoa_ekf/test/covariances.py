@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Random covariances, and what makes a matrix one."""
 
 import numpy as np

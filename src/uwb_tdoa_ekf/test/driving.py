@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Feed a flight to the core, and judge what comes out."""
 
 from covariances import assert_covariance

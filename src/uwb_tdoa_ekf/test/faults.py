@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Faults of drivers put into a simulated flight, as columns of what is sent and when.
 
 Without ROS.

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Small simulated flights whose every error is known, for the tests of the filter."""
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Simulated halls in which a tag hears the anchors within the radio's reach, and a room in which it
 hears few TDOAs, for tests and tables.
 """

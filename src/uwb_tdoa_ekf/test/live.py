@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Feed a flight to an Estimator message by message."""
 
 from dataclasses import fields, replace

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What watching the anchors in flight takes, by their number: memory, and time for each slice of
 half a second.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A random prior, for the tests of updates."""
 
 from covariances import random_covariance

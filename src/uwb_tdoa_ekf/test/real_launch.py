@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The real ros2 command: that of the ROS installation, or the one in ../shared/ros2cli beside the
 checkout, made ready once.
 """

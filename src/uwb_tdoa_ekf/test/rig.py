@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The real nodes as processes of their own, and a node of the test that plays their surroundings
 and listens.
 """

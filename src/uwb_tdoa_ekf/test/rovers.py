@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Small simulated drives of a rover on a floor whose every error is known: wheels, an inertial
 sensor and TDOAs.
 """

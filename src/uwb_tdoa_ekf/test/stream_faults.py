@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Simulated flights with faults of drivers, played live to real nodes, in lanes side by side."""
 
 from contextlib import contextmanager

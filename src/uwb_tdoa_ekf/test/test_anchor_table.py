@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Anchors that come, go and move while a filter runs."""
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Height, pressure and velocity in the core: each update against the textbook, and what goes wrong
 with them in flights.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The position bias map: markers, fit, interpolation and file."""
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Both nodes, started once, from no anchors to their end: what they say, and what they survive."""
 
 import itertools

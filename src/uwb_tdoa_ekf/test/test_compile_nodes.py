@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What compile_nodes leaves to be compiled when the nodes start: nothing."""
 
 import os

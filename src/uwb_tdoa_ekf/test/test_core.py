@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Parts of the filter core, each against what it is documented to compute."""
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """debias_node: its parameters, and alone as a process over topics."""
 
 from pathlib import Path

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Parameters, initialpose and transforms of ekf_node."""
 
 import pytest

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The filter core: flights, and the history that it records of them."""
 
 from dataclasses import replace

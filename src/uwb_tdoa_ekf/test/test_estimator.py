@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The live filter: arrival in any order gives what the recording gives."""
 
 from dataclasses import fields, replace

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a filter leaves unexplained: fed block by block as at once, and left out from where on it is
 certain to be too much.
 """

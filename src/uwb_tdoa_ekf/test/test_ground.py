@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Near the ground and at rest: anchors that may be late, and a tag that does not move."""
 
 from dataclasses import replace

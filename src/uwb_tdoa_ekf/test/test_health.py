@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """/diagnostics of ekf_node, and the flyable volume in them."""
 
 import pytest

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Inertial samples that cannot be right are left out at once, and used again; healthy ones never
 are (those of measured flights: test_stream_watch.py).
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The launch files under the real launch and launch_ros, with the nodes they start."""
 
 from contextlib import contextmanager

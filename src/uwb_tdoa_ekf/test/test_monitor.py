@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The monitor of anchors and IMU biases in flight."""
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """ekf_node and bias_node among the frames, parameters and services that a robot has.
 
 One start of the nodes serves many questions.

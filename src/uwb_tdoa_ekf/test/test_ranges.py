@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Distances to anchors: update, start, corrections; live and offline give the same."""
 
 from dataclasses import replace

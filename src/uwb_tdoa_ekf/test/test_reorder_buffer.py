@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The reorder buffer: order, waiting, and clocks that jump or drift."""
 
 from dataclasses import dataclass, replace

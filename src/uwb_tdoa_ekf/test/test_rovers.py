@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A rover on a floor: wheels as a sensor of motion, the plane, and TDOAs that contradict the
 wheels.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The sign of all TDOAs in flight: certain, either way, on simulated flights and on measured ones."""
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How the filter starts: the position that it finds, and the hypotheses that it follows."""
 
 from dataclasses import replace

@@ -1,3 +1,6 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 from covariances import assert_covariance, random_covariance
 from finite_differences import numerical_jacobian
 from hypothesis import given

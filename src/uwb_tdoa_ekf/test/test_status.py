@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """`status`: what may be flown by, and what became of the measurements."""
 
 from collections import Counter

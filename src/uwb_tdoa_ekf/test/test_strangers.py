@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What anybody on the network can do to the nodes: each test is an attack."""
 
 import math

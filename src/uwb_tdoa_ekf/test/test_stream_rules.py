@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Rules over the streams: silent on healthy streams; each fault gives its finding."""
 
 from dataclasses import replace

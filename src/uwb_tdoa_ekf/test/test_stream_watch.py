@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The rules over streams as they act in flight, on measured and simulated flights."""
 
 from collections import Counter

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The scale of a survey is found in TDOAs, before TDOAs are blamed; what they do not determine is
 not named.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """One update of a hypothesis, plain and robust, against the textbook and the paper."""
 
 from covariances import assert_covariance

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The walk of docs/architecture.md: the files that one TDOA passes through both nodes."""
 
 from pathlib import Path

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Tags in halls with many anchors, tags that hear few TDOAs, and anchors in a plane.
 
 The figures of many seeds: `./dev study warehouse`.

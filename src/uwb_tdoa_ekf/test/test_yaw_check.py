@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A yaw that is wrong is doubted: opened again within seconds of motion, and not one that is right."""
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How runs of tags in halls are judged: their errors, and what they cost by how many anchors are
 installed, of which a tag hears the same 20.
 """

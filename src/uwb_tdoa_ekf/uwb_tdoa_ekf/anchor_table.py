@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Keep track of anchors that appear and disappear while a filter runs.
 
 Each anchor has its own row. State that is stored by row stays valid after a change of anchors.

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """compile_nodes: compile what the nodes need, so that their first start takes no longer than any
 other.
 

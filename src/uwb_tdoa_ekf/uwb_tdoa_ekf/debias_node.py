@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """debias_node: odometry in, odometry with the bias of its position taken out.
 
 odometry (nav_msgs/Odometry), uwb/anchors (AnchorArray)

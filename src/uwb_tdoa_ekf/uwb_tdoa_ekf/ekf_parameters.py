@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Declare the parameters of ekf_node: FilterConfig, and the node's own."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Run the filter on live streams; the odometry depends on stamps, not on the order of arrival."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Find which anchor positions and delays have changed since the last calibration, by evidence.
 
 A calibration holds until an anchor is moved or a module is replaced. The search adds one change at

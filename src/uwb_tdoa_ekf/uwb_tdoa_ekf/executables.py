@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Define the entry points that setup.py names."""
 
 from uwb_tdoa_bias.common.executable import node_executable

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Convert between the conventions of the filter, of ROS messages, and of a rotated IMU.
 
 nav_msgs/Odometry follows REP 105 and the comments in its message definition.

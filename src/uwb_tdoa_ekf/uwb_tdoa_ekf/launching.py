@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Decide which nodes the launch files start, in which namespace and with which parameters.
 
 This module does not import launch.

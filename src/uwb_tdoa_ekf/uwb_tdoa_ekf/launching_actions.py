@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Turn the decisions of launching.py into actions of launch."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """localization_node: bias_node and ekf_node of one tag, or of several, in one process.
 
 Both are nodes of their own for each tag, with the names, parameters, topics and diagnostics that

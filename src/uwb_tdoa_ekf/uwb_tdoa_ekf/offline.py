@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Run bias correction and filter on a recording without ROS, with the results of the two nodes."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Publish the results of ekf_node: odometry, transforms, residuals and status."""
 
 from __future__ import annotations

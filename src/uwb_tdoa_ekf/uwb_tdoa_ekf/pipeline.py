@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Run the filter and the Monitor on measurements in the order of their stamps, live and offline."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Sort the measurements of all streams by stamp and check the clock of each stream."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Define the results of the filter: estimates, and the outcome of each TDOA."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Compute how constant errors of TDOAs and ranges change the innovations of a run.
 
 The path is marginalized. The derivative of the state by each parameter follows the recorded

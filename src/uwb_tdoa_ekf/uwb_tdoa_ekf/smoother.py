@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Smooth the filter's own run with a fixed-interval smoother: each estimate uses all measurements.
 
 The smoother is the modified Bryson-Frazier recursion (Bierman, Fixed interval smoothing with

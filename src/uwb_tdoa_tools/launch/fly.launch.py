@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A simulated vehicle, and the nodes that it flies by.
 
 ros2 launch uwb_tdoa_tools fly.launch.py

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """An autopilot_node as a process, an autopilot that listens on loopback, and a node of the test that
 publishes odometry.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Compile the C of a correction, run it on this computer or an emulated Cortex-M4F, and measure it."""
 
 import ctypes

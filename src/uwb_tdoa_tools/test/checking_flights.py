@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Simulated recordings for the tests of `check`: healthy, and quick to try."""
 
 from functools import cache

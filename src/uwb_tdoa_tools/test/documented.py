@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The commands that the documentation shows, found by letting a shell run its blocks among stubs
 that only take notes.
 

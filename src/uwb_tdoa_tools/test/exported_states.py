@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Random states of a tag, every effect that a file can hold, and networks of the paper's shape."""
 
 from dataclasses import replace

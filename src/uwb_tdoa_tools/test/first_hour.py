@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a new user has in the first hour.
 
 A recording in CSV files of another tool, a survey by tape that is good to 10 cm, ground truth in a

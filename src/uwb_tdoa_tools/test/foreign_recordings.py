@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Recordings of others, written from a Flight: bags of ROS 1 and ROS 2 with messages of their types, CSV files, ULog.
 
 The definitions of the messages are written here by what their fields are.

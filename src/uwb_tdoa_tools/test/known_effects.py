@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Simulated flights without any effect, every effect at a small and at a large size to put into
 them, places known on their paths, and what is found by name.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A vehicle_node and the nodes that it flies by, as processes, and a node of the test that asks and
 listens.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Mistakes of drivers, surveys and clocks, put into recordings: what each does to the streams, and
 by what name it is found.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Attacks on what command lines write: links, inputs and parts of bags in the place of an output."""
 
 import argparse

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Small recordings made from nothing, for the tests of everything that reads and writes them."""
 
 import struct

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What tests of reports share: findings and diagnoses made up, and pages read."""
 
 from dataclasses import replace

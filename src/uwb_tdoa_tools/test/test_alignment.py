@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Ground truth is a sensor too: late, of another epoch, turned, shifted, z down."""
 
 from dataclasses import replace

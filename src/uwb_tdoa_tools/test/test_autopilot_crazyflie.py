@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A Crazyflie by cflib: its log blocks to topics, and positions to it.
 
 The vehicle is a process of the test that speaks CRTP over UDP on loopback, as the firmware does, and

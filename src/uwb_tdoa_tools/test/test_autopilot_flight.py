@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A measured flight through the real nodes to an autopilot: a pose that is wrong, the recovery from
 it, a reset, and a loss of all TDOAs.
 

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What an autopilot gets: frames and covariances of MAVLink, the gate, and jumps."""
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """autopilot_node as a process: what PX4 gets over loopback, parsed by pymavlink."""
 
 import pathlib

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Sound bags whose metadata.yaml is lost, or does not fit to the files: what the files hold decides."""
 
 import re

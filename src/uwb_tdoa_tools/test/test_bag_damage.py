@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Bags that are cut, damaged or forged: refused with what is wrong, or read as far as they are
 sound.
 """

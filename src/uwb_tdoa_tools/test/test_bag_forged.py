@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Bags that somebody made to hang, to fill or to mislead, and single messages that are none."""
 
 from contextlib import nullcontext

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Frames in bags: sensors outside of the body frame, and the sources of anchors."""
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Wheel odometry in bags, as nav_msgs/Odometry and as a twist, under our name and another: read as
 the node reads it.
 """

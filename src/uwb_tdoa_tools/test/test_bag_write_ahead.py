@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """SQLite bags of a recorder that was killed: what is in the -wal file counts, or the bag is
 refused.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """calibrate: from recordings to a calibrated tag."""
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Findings of `check` about whole recordings: none if healthy, else the mistake."""
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What is found of a flight against its ground truth: in the TDOAs of a pair, in stamps, and in
 inertial samples."""
 

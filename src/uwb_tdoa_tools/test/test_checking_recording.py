@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Bags as they were received, and what is found of their frames, topics, anchors, publishers, ranges and
 motion."""
 

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A survey that cannot be right is said by whoever estimates, not by `check` alone."""
 
 from dataclasses import replace

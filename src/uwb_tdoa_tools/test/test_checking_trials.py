@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What `check` tries on a recording without ground truth: causes compete, the one that explains the most
 is named, and where a recording determines none, none is an error."""
 

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What options offer: the names are those that the code knows, and no parser imports more than it
 shows.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """One continuous time from clocks that restart, wrap or are set, by the order of the file."""
 
 from hypothesis import given, settings

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Recordings whose clock is set, starts again or wraps: read on one continuous time, named by
 check, and of no more memory.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """CSV files of other tools: any column names, any of the usual units, one file or several."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """docs/csv.md as a new user follows it: the files it speaks of, and its commands in their
 order.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The publishers of docs/drivers.md: the Python one as a process, over topics; the C++ one as far
 as its messages go.
 """

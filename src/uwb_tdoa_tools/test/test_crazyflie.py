@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Log variables of a Crazyflie to streams; studies/test/test_study_radio_link.py runs the example
 node around that.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """debias: maps of the position bias, from flights and from places."""
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What ./dev says without doing anything, and what it says is missing.
 
 Nothing here installs or builds.

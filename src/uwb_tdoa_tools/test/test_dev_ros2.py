@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """`./dev ros2` of those without ROS, as processes against a live node; and the commands of the
 documentation.
 """

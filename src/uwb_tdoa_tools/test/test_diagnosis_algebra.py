@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Sparse tables say what dense ones do; what is eliminated, and what a change would bring, is what
 the whole system says.
 """

@@ -1,3 +1,6 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 from known_effects import AIDED, SIZES, clean_flight, effect_of, names_found
 import numpy as np
 import pytest

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Deviations of positions of anchors that are found beside ground truth: whether errors are as
 large as they say.
 """

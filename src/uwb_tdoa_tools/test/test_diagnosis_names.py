@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The driver of the diagnosis knows no effect, no channel and no detector by name."""
 
 import ast

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The flight that settles what a diagnosis leaves open."""
 
 from argparse import ArgumentParser

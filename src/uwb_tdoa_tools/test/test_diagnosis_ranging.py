@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Distances to anchors in the diagnosis: alone, and beside TDOAs."""
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Tables, fits, selection, held-out checks and confounding, on small tables of known content."""
 
 from dataclasses import replace

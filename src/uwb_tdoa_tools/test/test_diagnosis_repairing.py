@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Ids and signs before physics."""
 
 from known_effects import clean_flight, effect_of

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What `diagnose` finds on a vehicle that never leaves the floor, whose truth is known; and values
 that are those of the written model.
 """

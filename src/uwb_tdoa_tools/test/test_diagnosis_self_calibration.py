@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """One calibration of anchors from flights alone, whoever asks for it: when it may be used, and what
 `diagnose` makes of it.
 """

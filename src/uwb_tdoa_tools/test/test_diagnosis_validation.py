@@ -1,3 +1,6 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 from dataclasses import fields, replace
 from types import SimpleNamespace
 

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The distribution `uwb-tdoa`: a wheel in an empty environment, without ROS.
 
 The environments lie in build/distribution, always at the same paths: what numba compiled there for a

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What holds for every page of the documentation: links lead somewhere, and a page stays short."""
 
 from pathlib import Path

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Where a machine has less than ours: no POSIX-only modules, and a home that nobody can write to.
 
 An ASCII locale, and names with spaces and umlauts: test_writers.py. Another user: test_dev.py.

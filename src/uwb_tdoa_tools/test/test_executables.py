@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Every executable: its help, its examples, the commands that the documentation shows, and Ctrl-C
 while it starts.
 """

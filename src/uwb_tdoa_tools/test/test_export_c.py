@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The C of a correction: equal to numpy and Python, sound with any input, small on a Cortex-M4F."""
 
 import c_programs as c

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The out-of-tree build for a Crazyflie, compiled against stand-ins of the firmware's headers."""
 
 import subprocess

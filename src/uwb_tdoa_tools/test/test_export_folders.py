@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The folders that export writes in C, and what it leaves out of them."""
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """bias_node with the exported file alone, over topics, beside effects and network off line."""
 
 import numpy as np

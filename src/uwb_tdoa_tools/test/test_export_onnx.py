@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A correction in one ONNX file is that of effects and network: each effect, all together."""
 
 from dataclasses import replace

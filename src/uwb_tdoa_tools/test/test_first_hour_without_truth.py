@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The first hour of a new user without ground truth, and the steps of guide.md, by the commands of
 the documentation word for word, and what came of it.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """fly.launch.py under the real launch, with the nodes that it starts."""
 
 from pathlib import Path

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A peer as estimate: a tiny library that is compiled here and returns its start."""
 
 import ctypes

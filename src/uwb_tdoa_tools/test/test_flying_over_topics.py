@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Flights over topics: messages of any content, and the time of each turn."""
 
 from types import SimpleNamespace

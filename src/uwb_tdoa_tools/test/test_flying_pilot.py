@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Flights by commands, in lockstep and without ROS."""
 
 from dataclasses import replace

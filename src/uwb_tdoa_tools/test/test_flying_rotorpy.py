@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The vehicle beside an oracle: rotorpy's Crazyflie 2, where it is installed (pip install rotorpy)."""
 
 import numpy as np

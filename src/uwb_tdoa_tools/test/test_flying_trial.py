@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A flight of `fly`: what its sensors say, and how it goes."""
 
 from dataclasses import replace

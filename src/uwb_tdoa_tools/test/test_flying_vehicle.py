@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The vehicle of `fly`, its controller and its mission."""
 
 import math

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Verdicts of flights that are made up."""
 
 from types import SimpleNamespace

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """diagnose and survey in a hall, of whose anchors a tag hears a part."""
 
 from dataclasses import replace

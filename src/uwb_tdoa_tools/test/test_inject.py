@@ -1,3 +1,6 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 from known_effects import with_yaw_rate
 import numpy as np
 import pytest

@@ -1,3 +1,6 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 from dataclasses import replace
 import os
 from pathlib import Path

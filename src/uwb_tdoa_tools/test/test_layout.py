@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The layout of the packages, read from their sources: who imports whom, and what is declared as a
 dependency.
 """

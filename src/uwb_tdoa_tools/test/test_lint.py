@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Format and rules of the sources, as ruff.toml says, and the number of arguments of a function."""
 
 import ast

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The life of the processes of a live run, and what they say."""
 
 from contextlib import nullcontext

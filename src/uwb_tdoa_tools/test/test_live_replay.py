@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Replays as real processes that talk over DDS, and what is recorded of topics.
 
 No step waits for time to pass, only for what must happen.

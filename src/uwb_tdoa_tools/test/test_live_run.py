@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How the nodes are started for a live run. (test_demo.py runs the real ones.)"""
 
 from types import SimpleNamespace

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Replays that follow the nodes, with the nodes' own parameters and best-effort links, beside a
 computer at work.
 """

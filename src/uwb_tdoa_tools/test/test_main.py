@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The command `uwb-tdoa`: its help, its subcommands, and its completion in a shell."""
 
 import shutil

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The main job on a measured flight: nodes over topics, eight times as fast, against the offline engine
 and ground truth.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Measured ranges, as docs/notebook/ranges.md takes them: the filter finds the
 antenna delay of a tag that nobody has calibrated.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Every measured file is read whole: against counts from a second, plain way through the file."""
 
 from collections import Counter

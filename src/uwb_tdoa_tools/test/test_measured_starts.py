@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Bad starts on measured flights: put 2 m aside, switched on in flight, with a yaw that is 90
 degrees wrong.
 """

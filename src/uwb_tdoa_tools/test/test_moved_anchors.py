@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Anchors that were moved or exchanged, before a recording or on the way: who names them, and who
 is not blamed.
 """

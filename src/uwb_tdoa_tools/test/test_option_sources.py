@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What an option says and a file says too: the option counts, or is refused with a sentence;
 nothing is passed over.
 """

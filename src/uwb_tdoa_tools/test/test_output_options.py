@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """No command writes through a link, or over what it reads.
 
 The commands are those of setup.py, so that a new one is among them.

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """One version everywhere, in what is written too; keys that rosdep knows; and what colcon test
 would run.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Runs over many flights at once.
 
 (The functions are of this module, which the other processes import.)

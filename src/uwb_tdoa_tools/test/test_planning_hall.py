@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """plan of a hall in which a tag hears the anchors within the radio's reach."""
 
 from dataclasses import replace

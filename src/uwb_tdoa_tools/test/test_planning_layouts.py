@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Layouts of anchors that are searched for, and the maps and pictures of a plan."""
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What an installation and its radio noise let anybody know, and what flights achieve of it."""
 
 from dataclasses import replace

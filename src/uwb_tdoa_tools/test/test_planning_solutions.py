@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Where a position has a second solution: of pairings, of all that is heard, and what follows."""
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What SROS2 lets each node do is what it does: sros2/policy.xml and the graph."""
 
 from pathlib import Path

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A folder of recordings may hold anything.
 
 Nothing in it is a library, a module, a program or a setting of what is started there.

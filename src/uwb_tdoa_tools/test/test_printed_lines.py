@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Command lines that are printed to be copied: each runs as it stands, and does good where it says
 so.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Recordings of others, read by the shipped profiles and by others: to a trajectory with one command each."""
 
 import bz2

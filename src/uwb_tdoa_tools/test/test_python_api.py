@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The public module: its names, what they take, and what examples and the page make of it."""
 
 import ast

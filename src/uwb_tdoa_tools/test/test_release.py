@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a release to the ROS index needs: changelogs, and Debian packages as bloom makes them."""
 
 import gzip
@@ -14,6 +16,7 @@ import yaml
 
 from uwb_tdoa_bias.common.text import version
 
+LICENCE = "# SPDX-License-Identifier: Apache-2.0\n"
 PACKAGES = sorted(path.parent for path in (ROOT / "src").glob("*/package.xml"))
 
 
@@ -28,6 +31,13 @@ def test_each_package_has_a_changelog_that_catkin_reads(folder):
     found = changelog.Changelog(folder.name)
     changelog.populate_changelog_from_rst(found, text)
     assert found.get_content_of_version(version())
+
+
+def test_each_source_names_its_licence():
+    """An empty file needs none."""
+    files = [path for path in (ROOT / "src").rglob("*.py") if path.stat().st_size]
+    without = [str(path) for path in files if LICENCE not in path.read_text()[:200]]
+    assert len(files) > 300 and not without
 
 
 @pytest.fixture(scope="module")

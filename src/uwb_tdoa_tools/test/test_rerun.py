@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """--rerun: what each tool writes for the viewer."""
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """docs/rover.md: its file of tags, its tables and its commands."""
 
 import re

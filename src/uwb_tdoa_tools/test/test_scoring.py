@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Figures of a run: errors, consistency, phases, and figures of several runs."""
 
 import json

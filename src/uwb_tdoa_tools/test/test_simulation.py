@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Simulated flights: the command, their configuration, rooms and inertial sensors."""
 
 from dataclasses import replace

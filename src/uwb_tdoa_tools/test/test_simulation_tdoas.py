@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Simulated TDOAs: schedules, radio links, errors."""
 
 from hypothesis import given

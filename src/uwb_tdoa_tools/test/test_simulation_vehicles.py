@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Paths and vehicles of simulated flights."""
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Streams of readers: the protocol of TDOAs, and velocities from pixel counts."""
 
 from dataclasses import replace

@@ -1,3 +1,6 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
+
 import numpy as np
 import pytest
 from recordings import ANCHORS, SURVEY

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """From a tape measure and flights to anchors."""
 
 from dataclasses import replace

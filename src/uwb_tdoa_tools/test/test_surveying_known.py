@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What is known beside the flights: the last calibration, distances between anchors, the path of
 another odometry.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """docs/symptoms.md names every finding of `check`, and no other."""
 
 import ast

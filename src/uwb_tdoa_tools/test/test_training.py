@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a bias model is trained on, the kinds of models, and how much of one is taken."""
 
 from dataclasses import replace

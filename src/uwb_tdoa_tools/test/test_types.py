@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """mypy, where it is installed, as .ci/mypy.ini says: the annotations of the packages and folders
 that it names, and messages by the stubs that .ci/stubs.py writes.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """vehicle_node: its parameters, and a flight with the real nodes by services, beside a computer at
 work.
 """

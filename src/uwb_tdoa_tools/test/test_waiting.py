@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Nobody waits in silence: each command says something within 2 s, and goes on to say something
 every 5 s.
 

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What docs/add_effect.md and docs/add_channel.md tell people to write is written here as they
 would, and works.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Whatever the suite writes goes through `common/files.py`: whole or not at all, and in UTF-8
 in any locale.
 """

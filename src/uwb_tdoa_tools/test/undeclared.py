@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Effects that nobody declared: they exist here only, for tests and benchmarks of diagnose to find.
 
 Each takes a Flight and returns the Flight with the effect. CASES: {name: (function, channel,

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The commands of a page of the documentation, run as somebody who follows it would, and files as
 other tools write them.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """UWB TDOA localization from Python, without ROS.
 
 import uwb_tdoa as uwb

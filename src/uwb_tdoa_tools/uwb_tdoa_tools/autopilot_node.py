@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """autopilot_node: odometry that may be flown by to an autopilot, and samples of a Crazyflie.
 
 odometry (nav_msgs/Odometry), status (EstimatorStatus)

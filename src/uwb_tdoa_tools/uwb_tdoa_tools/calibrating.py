@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Calibrate a tag and its anchors from recordings, and validate that on hold-out flights."""
 
 from __future__ import annotations

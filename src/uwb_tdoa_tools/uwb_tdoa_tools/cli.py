@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Share the look of --help, and the handling of failures, between all executables.
 
 def parser():

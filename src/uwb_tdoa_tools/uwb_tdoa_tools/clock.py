@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Put the streams of a recording on one time if its clock restarted, wrapped or was set.
 
 The evidence is the order of the messages in the file: sorted by stamp, a clock that restarts makes

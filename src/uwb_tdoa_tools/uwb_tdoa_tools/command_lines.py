@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Make command lines to copy, as they run where the user is.
 
 tool("check", "flight.bag")          # ./dev run uwb_tdoa_tools check flight.bag, or ros2 run ...,

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Convert log variables of a Crazyflie to TDOAs, samples of the IMU, heights and pressures.
 
     block = LogBlock(["tdoa2.d7-0", "tdoa2.d0-1", "acc.x", ...], PERIOD)

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Estimate a recording: bias correction and filter as in the nodes, or smoothed."""
 
 from dataclasses import dataclass

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Score recordings one by one against their ground truth, and tabulate the errors."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Entry points that setup.py names: one for each file in commands/."""
 
 from uwb_tdoa_bias.common.executable import executable, node_executable

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The command `uwb-tdoa`: every tool as a subcommand, and completion for a shell.
 
 uwb-tdoa check flight.bag

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Options that several commands share, and the values that they give.
 
 options.add_recordings(parser)                  # FLIGHT..., --survey, --namespace, --topic, --salvage

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Check the outputs of a command before the work. An output must not change an input or a bag.
 
 The types below mark options that name outputs. No output follows a link.

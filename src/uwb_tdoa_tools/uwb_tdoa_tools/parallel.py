@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Run one function over many flights, on every core or on an existing Dask cluster; show progress.
 
     parallel.add_options(parser)                                         # --jobs, --dask

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Keep the results of long work in a file, a line of JSON each: interrupted work continues there.
 
     with ResultsFile(path, {"seed": 1}) as done:            # the settings, besides the keys

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Options of the command `simulate`, and the SimulationConfig that they give."""
 
 from __future__ import annotations

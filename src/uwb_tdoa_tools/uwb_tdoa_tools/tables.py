@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Tables of results: named columns, as a DataFrame of pandas or as a structured array of numpy."""
 
 from __future__ import annotations

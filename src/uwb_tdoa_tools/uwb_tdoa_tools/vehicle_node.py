@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """vehicle_node: a simulated quadrotor or rover that goes by the odometry of our nodes, or of others.
 
 odometry (nav_msgs/Odometry), status (EstimatorStatus)

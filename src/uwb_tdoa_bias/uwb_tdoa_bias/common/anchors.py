@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Anchors of an installation: ids, positions and orientations of the fixed radios."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Functions of arrays that effects use beside numpy, for numbers and for symbols alike.
 
 An effect states its equation once, for arrays of numbers. `export` calls the same code with

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Compile functions that only compiled code calls, without machine code of their own.
 
 numba makes machine code of each function together with all functions that it calls, and once more

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """numba's njit with an on-disk cache that follows every change of the sources.
 
 numba's own cache notices a change in the file of a compiled function. It does not notice changes

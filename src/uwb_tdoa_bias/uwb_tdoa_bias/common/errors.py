@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The two exceptions that programs report to the user in one sentence.
 
 Every other exception is a defect and keeps its traceback.

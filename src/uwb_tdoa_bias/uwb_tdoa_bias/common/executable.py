@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Start of every executable: quiet Ctrl-C, and no influence of the present folder.
 
 Ctrl-C ends an executable quietly at any moment. Files in the present folder do not change what it

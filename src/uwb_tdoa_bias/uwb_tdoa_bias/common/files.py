@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Read and write files safely: size limits, atomic writes, .npz arrays, temporary folders."""
 
 from __future__ import annotations

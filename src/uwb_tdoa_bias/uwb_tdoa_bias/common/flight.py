@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Flight: the numpy arrays of one recording. All readers return it and all tools take it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The volume in which a tag can be located reliably; `plan` saves it and `ekf_node` reads it."""
 
 from __future__ import annotations

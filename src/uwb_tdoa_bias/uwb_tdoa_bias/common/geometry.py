@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Geometry of a TDOA without systematic effects, and rotations.
 
 The numpy functions take arrays of any shape. The compiled functions do the same for single TDOAs

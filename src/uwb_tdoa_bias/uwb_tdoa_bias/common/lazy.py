@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Parts of scipy that are imported at their first use.
 
 They take long to import, and nodes rarely need them.

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Limits of reading, and the exception that names the exceeded limit.
 
 The limits hold for files from any source. A reader compares the claims of a header with these

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The radio link of a tag and an anchor: antennas, received power, and late arrivals.
 
 Antenna frame: z along the null axis of the doughnut, x out of its front face. The null axis is the

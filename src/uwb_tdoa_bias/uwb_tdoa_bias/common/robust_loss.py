@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Robust losses: they reduce the weight of large residuals.
 
 A loss rho(e) of the normalised residual e gives iteratively re-weighted least squares. The weight

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A safe subset of YAML: anything ambiguous is refused with its line.
 
 It reads mappings, lists, texts, finite numbers, true, false and null. The rules are those of the

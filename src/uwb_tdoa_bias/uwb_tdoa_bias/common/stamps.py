@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Decide whether the stamps of one stream are plausible, and when its clock has jumped."""
 
 from __future__ import annotations

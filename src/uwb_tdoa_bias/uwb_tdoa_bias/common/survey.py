@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Read anchor surveys, and find faults that a survey alone shows."""
 
 from __future__ import annotations

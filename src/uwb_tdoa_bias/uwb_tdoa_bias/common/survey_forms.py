@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The usual forms of anchor files: tables, and mappings or lists in YAML or JSON."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Sanitize texts of files and topics, and name the version that wrote a file."""
 
 from __future__ import annotations

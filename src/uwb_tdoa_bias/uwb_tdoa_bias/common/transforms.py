@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A tree of frames and the transforms between them: the content of TF, without ROS."""
 
 from __future__ import annotations

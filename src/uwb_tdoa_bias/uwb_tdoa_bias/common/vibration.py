@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Vibration of a vehicle: first-order filters of the specific force, compiled."""
 
 from __future__ import annotations

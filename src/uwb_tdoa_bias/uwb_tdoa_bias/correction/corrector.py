@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Correct raw TDOAs: the core of bias_node and of the offline filter."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A whole correction in one ONNX file, as `export` writes it: effects and network in one graph.
 
 The graph has one input table (n, 22), with the columns INPUTS, and one output table (n, 9), with

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Input features of a network: the 14 features of Zhao et al., and places.
 
 Source: Zhao et al. (RA-L 2021), section III.

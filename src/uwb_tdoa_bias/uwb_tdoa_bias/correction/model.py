@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Model, an ONNX file that corrects TDOAs, and the statuses of a correction."""
 
 from __future__ import annotations

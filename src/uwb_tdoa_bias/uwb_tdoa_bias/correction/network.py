@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A bias network in an ONNX file with its own inputs, limits and validity.
 
 Metadata of the model (all values JSON text):

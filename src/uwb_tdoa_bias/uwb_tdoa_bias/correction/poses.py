@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The poses of the last seconds, and a queue of measurements that wait for a pose."""
 
 from __future__ import annotations

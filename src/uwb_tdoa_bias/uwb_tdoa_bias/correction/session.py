@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A model in onnxruntime.
 
 The import of onnxruntime takes 60 ms; only users of a model import this module.

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Run a model first in a process with little time and memory that opens no file.
 
 A model may come from anywhere, and 1 kB of it may unfold to terabytes. `tried_out` starts a

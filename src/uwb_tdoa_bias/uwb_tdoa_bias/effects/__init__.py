@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Systematic effects, and `effects.yaml`: which of them are in the model, with which values.
 
 The file, written by people and by the tools, read by the nodes:

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Effects of single anchors: delays, clocks, surveyed positions, obstacles and ids."""
 
 from __future__ import annotations

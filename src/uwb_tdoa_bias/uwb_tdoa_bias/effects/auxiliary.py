@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Effects of auxiliary sensors (height, pressure, velocity), and the corrector of their streams."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Effect, the base of all systematic effects, and the kinds of effects that families share."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Covariates: quantities by name that a systematic error may depend on, and their domains."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """EffectSet and effects.yaml: the effects of a model with their values and covariance.
 
 EFFECTS lists all declared effects.

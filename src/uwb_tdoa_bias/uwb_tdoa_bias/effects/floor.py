@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Multipath near the floor: the direct path is lost, and a receiver takes an echo for it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Effects of the inertial sensor, measured = (I + E) true + b, and their corrector."""
 
 from __future__ import annotations

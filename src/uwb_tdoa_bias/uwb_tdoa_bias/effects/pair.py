@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Effects of pairs of anchors: offsets and signs of TDOAs, and their noise."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Samples: batches of measurements with the motion of the tag, the input of effects."""
 
 from __future__ import annotations

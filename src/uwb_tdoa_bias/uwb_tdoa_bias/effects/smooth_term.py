@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """SmoothTerm, an effect without a name: a function of one covariate that residuals show.
 
 First the term, then its shapes, then its words.

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Effects of late stamps: stream by stream, stamp = instant of the measurement + `offset`."""
 
 from __future__ import annotations

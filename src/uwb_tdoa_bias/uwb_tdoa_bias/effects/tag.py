@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Effects of the tag and its radio, the same for all anchors."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Effects of the ground truth: its frame and its stamps."""
 
 from __future__ import annotations

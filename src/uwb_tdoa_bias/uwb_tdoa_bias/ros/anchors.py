@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Anchors as messages, and their input into a node: a file or the topic uwb/anchors."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Convert serialized messages (CDR) to rows of numbers and back, by the definition of the type.
 
 A message object takes tens of microseconds to make and to read, mostly for fields without use

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Status of a node on /diagnostics and in the log, including paused simulated time."""
 
 from __future__ import annotations

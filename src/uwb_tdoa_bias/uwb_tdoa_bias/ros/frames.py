@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Input of TF into a node: constant transforms, and on request moving ones."""
 
 from __future__ import annotations

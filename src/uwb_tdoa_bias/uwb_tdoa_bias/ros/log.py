@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The log of a node, with a limit that no peer can exceed."""
 
 from __future__ import annotations

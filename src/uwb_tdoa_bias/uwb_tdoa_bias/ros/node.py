@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A node whose streams and /clock wait until it takes all arrived messages together."""
 
 from __future__ import annotations

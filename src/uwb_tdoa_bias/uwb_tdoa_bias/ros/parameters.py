@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Parameters of a node with text, unit and range; unknown parameters are refused or reported."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Run the nodes of a process until Ctrl-C; serve their streams and the rest of the graph."""
 
 from __future__ import annotations

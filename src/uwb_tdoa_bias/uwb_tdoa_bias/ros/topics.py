@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Publishers, subscriptions and stamps: QoS, messages read as bytes, faults of topics."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The compiled filter: states, prediction, robust updates, hypotheses and initialization.
 
 It uses no ROS and no files.

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Auxiliary states beyond the 15 error states: biases common to all measurements of a sensor.
 
 The filter estimates them together with the position. `offset_cross` is their covariance with the

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Barometer: its altitude is the height of the body plus an offset that wanders and drifts.
 
 Offset and drift are auxiliary states, see auxiliary.py.

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Tuning parameters of the filter, with unit and reason."""
 
 from dataclasses import Field, dataclass, fields, make_dataclass

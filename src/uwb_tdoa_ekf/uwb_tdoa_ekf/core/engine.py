@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The compiled filter: events in stamp order in, odometry and residuals out.
 
 FilterState holds the entire state between two calls. Each TDOA or range takes five steps:

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Tag near the ground: anchors that may be late there, and the position of a tag at rest.
 
 The ground inverts the phase of a ray at grazing incidence. If tag and anchor are near the ground,

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Range finder that looks down along the body's -z, over ground that may have steps.
 
 The height of the body above z = 0 of the world is the ground level plus (range + height_arm) *

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """History of the filter for the smoother: a record for each update of the best hypothesis."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Multiple hypotheses: several yaws and places, until the measurements decide.
 
 A tag that starts anywhere cannot observe its yaw. The yaw becomes observable by motion that both

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """IMU fault detector: gravity is 9.81 m/s^2 long and turns as the gyroscope measures.
 
 A sensor in a wrong unit, or turned, is left out within tenths of a second. It is used again after

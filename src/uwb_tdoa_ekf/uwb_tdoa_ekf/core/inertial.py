@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Statistics of the inertial samples: vibration, rectification, and whether the tag is quiet."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Initialization of the filter, and recovery of a lost tag."""
 
 from __future__ import annotations

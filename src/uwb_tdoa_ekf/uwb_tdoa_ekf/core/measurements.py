@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Conversion of measurements to rows of the core, and rejection of unusable ones."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """State of a filter between two events: all record types, with named fields.
 
 A copy of its arrays is a copy of the filter. The types are rows of numpy's structured arrays.

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Measurement noise of each anchor, and the covariance of persisting errors.
 
 The filter learns the noise of each anchor from its innovations.

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Constraints of a vehicle on its floor: fixed height, planar motion and non-holonomic motion.
 
 The height is known. A planar vehicle is also level and does not rise. A vehicle that cannot move

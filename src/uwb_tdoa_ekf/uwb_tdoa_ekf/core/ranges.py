@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Two-way ranging: the distance to an anchor.
 
 The difference of two successive distances is a TDOA. The filter uses such TDOAs for initialization

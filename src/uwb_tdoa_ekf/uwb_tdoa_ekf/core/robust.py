@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Three robust weights of a measurement: by the whitened innovation, by a gate, by M-estimation.
 
 Each takes a HYPOTHESIS and an INNOVATION after `update.project`, and prepares `update.kalman`. noise_variance is the variance of

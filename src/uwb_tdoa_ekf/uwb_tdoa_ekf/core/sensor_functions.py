@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """State-dependent errors of the inertial sensor.
 
 They are subtracted from each sample, evaluated at the state of the best hypothesis.

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Dispatch the measurements of all sensors except IMU and TDOA to their modules.
 
 A SENSOR_ROW is a single measurement by a sensor of `SENSORS`.

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Position and velocity of a tag from a short window of TDOAs.
 
 The search starts in the middle of the workspace and around it. If a tag hears few TDOAs, the window

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Nominal state, error state, and their prediction with an IMU sample.
 
 Nominal state x, (16,): position p (m) and velocity v (m/s) in the world, quaternion q (x y z w,

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Detection of a tag at rest, and zero-velocity updates.
 
 Inertial samples alone cannot distinguish rest from a steady glide, and they vibrate while rotors

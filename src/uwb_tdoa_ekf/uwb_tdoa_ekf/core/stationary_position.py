@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Position of a tag at rest: on the ground, with late anchors there, or somewhere else.
 
 The explanations are weighed by their probability. The covariance of the best explanation includes

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Kalman update with a scalar measurement of any kind.
 
 Each kind of measurement fills an INNOVATION: the Jacobian row with its error states, measured minus

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Velocity in the body frame: wheels, optical flow, visual odometry.
 
 Slip and lost features show as innovations. A velocity with a yaw rate comes from wheels. Without

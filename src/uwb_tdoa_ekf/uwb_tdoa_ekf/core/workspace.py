@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Workspace: the surroundings of the anchors, where a tag is expected.
 
 It is a box along the axes of the world. In a large hall it is not the hall but the surroundings of

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Test of the yaw that the filter follows, by innovations and the inertial sensor.
 
 A yaw error psi turns each predicted change of velocity. The resulting error of the state is linear

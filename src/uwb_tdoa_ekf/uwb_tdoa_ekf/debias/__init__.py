@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Correct estimated positions with a map of their bias.
 
 The method follows Grasso et al., *Analysis and Accuracy Improvement of UWB-TDoA-Based Indoor

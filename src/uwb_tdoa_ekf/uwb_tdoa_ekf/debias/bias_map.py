@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Store, apply and save the map from a measured position to its bias.
 
 The map follows Grasso et al. (Sensors 2022, 22, 9136), eqs. 20 and 21.

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Fit a BiasMap to measured and true positions and estimate its precision at other places."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Compute markers with a bias each from pairs of measured and true positions.
 
 The method is Grasso et al. (Sensors 2022, 22, 9136), eqs. 15 - 19 and 22, in two dimensions as

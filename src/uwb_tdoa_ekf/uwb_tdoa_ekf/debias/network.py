@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Interpolate with the radial-basis-function network of Grasso et al., extended to 3D.
 
 The source is Sensors 2022, 22, 9136, appendix A.

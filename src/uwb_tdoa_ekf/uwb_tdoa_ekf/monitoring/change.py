@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Test sequentially over Slices whether one anchor has changed.
 
 The delays of the anchors depend on the place, because of antennas, reflections and survey errors. A

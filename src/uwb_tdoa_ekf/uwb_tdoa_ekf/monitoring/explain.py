@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Measure how well any motion explains a stream of TDOAs, by the innovations of an IMU-free filter.
 
 Two hypotheses about one stream, for example right and wrong signs, are compared block by block by

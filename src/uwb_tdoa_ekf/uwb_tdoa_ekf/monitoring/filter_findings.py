@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Make Findings of the estimator itself: clocks of streams, and implausible inertial samples."""
 
 from __future__ import annotations

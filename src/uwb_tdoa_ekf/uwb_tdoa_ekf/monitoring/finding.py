@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Define the Finding, the result of a rule that detects a problem."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Decide what ekf_node publishes on /diagnostics about itself, with the remedy."""
 
 from __future__ import annotations

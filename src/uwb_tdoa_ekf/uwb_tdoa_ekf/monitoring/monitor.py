@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Watch the residuals for changes since the start of the flight and deviations from the survey.
 
 The Monitor works live and on recordings. It detects an anchor that is late or early, drifts, is

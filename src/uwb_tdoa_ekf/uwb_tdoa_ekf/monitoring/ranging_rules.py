@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Check windows of a TDOA stream for wrong values.
 
 Each rule takes windows and returns a Finding or None.

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Count the values of a TDOA stream over windows of 1 s and compute the statistics of a window."""
 
 from __future__ import annotations

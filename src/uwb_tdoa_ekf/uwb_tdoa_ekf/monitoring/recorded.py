@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Run the Monitor on a recording, with the results of ekf_node and their times."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Test whether anchors differ from the survey or calibration, with a Bayesian test over Slices.
 
 The prior of an anchor position has the standard deviations of the survey. Each anchor also has a

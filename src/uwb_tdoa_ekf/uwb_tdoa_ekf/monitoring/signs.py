@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Detect whether the signs of all TDOAs are wrong.
 
 No counter shows this. Two filters without IMU process the TDOAs with both signs. Their unexplained

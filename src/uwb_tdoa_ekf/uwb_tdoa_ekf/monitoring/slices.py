@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Reduce the residuals of half a second to one delay for each anchor.
 
 A TDOA has anchors with the delays delay_a and delay_b. Its prediction uses a position with the

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Count the stamps of a stream over windows of 1 s and check the windows."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Decide whether a vehicle may fly by the odometry, from the Estimator and from all findings."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Count both streams of a tag in windows and apply all rules to the windows."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Apply the rules over streams in flight, to the last seconds and without rules for recordings."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Detect whether the survey, or a single anchor, has another unit.
 
 TDOAs that are heard together locate the tag in surveys of every scale. TDOAs in metres have an

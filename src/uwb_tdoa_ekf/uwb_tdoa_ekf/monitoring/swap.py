@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Detect two exchanged anchors: each transmits from the surveyed position of the other.
 
 The position of the filter may be wrong by then. Each hypothesis of an exchange therefore gets its

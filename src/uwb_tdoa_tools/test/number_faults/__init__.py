@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Faults of numbers, drawn and put into flights: is each named by its rule of `check`?"""
 
 from dataclasses import dataclass

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Faults in the stamps of a stream. A reader puts what falls in order, so does this."""
 
 from dataclasses import replace

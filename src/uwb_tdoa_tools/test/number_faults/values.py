@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Faults in the values of TDOAs: of one pair, or of every pair.
 
 Each takes a Flight and a generator and gives the Flight with it.

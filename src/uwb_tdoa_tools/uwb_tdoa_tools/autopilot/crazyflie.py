@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A Crazyflie by cflib: its log blocks come, poses go.
 
 cflib works in threads of its own. They hand everything over through one queue.

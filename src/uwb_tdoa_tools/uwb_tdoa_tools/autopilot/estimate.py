@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """One estimate of the filter, in the frames of ROS and in those of MAVLink.
 
 ROS (REP 103, nav_msgs/Odometry): the world has z up, the body is forward, left, up (FLU). The

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Decide which estimates an autopilot gets, and when it must accept a jump.
 
 An autopilot fuses whatever arrives: PX4 ignores the quality unless EKF2_EV_QMIN is set. So an

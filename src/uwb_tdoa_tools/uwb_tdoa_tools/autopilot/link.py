@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a link to an autopilot can do, whatever it speaks."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """ODOMETRY over MAVLink, for PX4 and ArduPilot, by pymavlink.
 
 Stamps are those of the filter, on the clock of the node. PX4 asks for that clock by TIMESYNC and

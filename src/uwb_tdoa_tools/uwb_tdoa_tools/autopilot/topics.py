@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Publish the samples that a Crazyflie logs on the topics of a robot."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """ROS bags: read, write, convert."""
 
 from __future__ import annotations

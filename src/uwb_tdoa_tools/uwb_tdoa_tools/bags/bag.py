@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Flights to and from ROS 2 bags (mcap or sqlite3), with the topics that the nodes use.
 
 Topic (in a bag always absolute)   type                              what

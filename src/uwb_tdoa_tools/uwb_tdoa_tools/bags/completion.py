@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Complete bags whose metadata.yaml is missing, or does not fit to the files beside it.
 
 metadata.yaml of sound bags is lost, or names files that were renamed, unpacked or packed by hand. What the files hold

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Convert a recording of any kind to a bag."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Bags as files: open them, iterate over their messages, and write new ones atomically."""
 
 from __future__ import annotations

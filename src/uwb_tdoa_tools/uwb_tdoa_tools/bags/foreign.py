@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Read topics of any message type, from bags of ROS 1 and ROS 2.
 
 The fields of a message are named by paths such as "header.stamp", "ranges.id" or "imu_gyro_3d[0]".

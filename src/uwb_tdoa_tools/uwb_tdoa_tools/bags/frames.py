@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Where a bag places sensors and anchors: /tf_static, uwb/anchors, markers for RViz.
 
 Sensors outside of the body frame are transformed as in the nodes.

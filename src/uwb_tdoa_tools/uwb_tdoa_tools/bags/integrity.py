@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Check the files of a bag before they are used."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Check and repair MCAP files record by record (https://mcap.dev/spec).
 
 Sizes are compared with the file, or limited, before data are read or unpacked. The package `mcap`

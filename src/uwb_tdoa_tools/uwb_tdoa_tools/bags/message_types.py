@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Types of ROS 2 messages, to read and write bags without a ROS installation."""
 
 from __future__ import annotations

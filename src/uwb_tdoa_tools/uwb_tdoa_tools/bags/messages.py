@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Convert the arrays of a Flight to ROS messages of a rosbags typestore, and back.
 
 `valid`, or `<stream>_valid`, returns which numbers of rows (n, k) can be used: (n, k) bool.

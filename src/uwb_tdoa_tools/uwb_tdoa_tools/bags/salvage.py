@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Copy the readable messages of a cut or damaged bag to another bag."""
 
 from __future__ import annotations

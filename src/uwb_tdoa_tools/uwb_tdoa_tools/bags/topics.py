@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Topics of a bag: their names, types, QoS, and messages as arrays."""
 
 from __future__ import annotations

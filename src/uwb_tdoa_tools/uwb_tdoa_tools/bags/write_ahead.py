@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Merge the logs of SQLite files that the recorder did not close.
 
 A -wal file holds transactions that are missing in the file (sqlite.org/walformat.html). A -journal file

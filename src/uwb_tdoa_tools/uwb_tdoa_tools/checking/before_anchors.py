@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Stop commands that estimate anchors while ids, signs or units are wrong.
 
 These mistakes look like misplaced anchors.

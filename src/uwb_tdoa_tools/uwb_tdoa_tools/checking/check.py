@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Apply all rules to one recording, in the order in which one mistake hides another."""
 
 from __future__ import annotations

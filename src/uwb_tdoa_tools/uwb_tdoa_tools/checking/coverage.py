@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Judge which positions the anchors and the motion of the tag determine.
 
 A rule takes a CoverageView and yields Findings.

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Judge the numbers of a flight: its streams alone, and against its ground truth if it has one.
 
 The streams alone are judged by `uwb_tdoa_ekf.streams`. Here geometry and motion show what should

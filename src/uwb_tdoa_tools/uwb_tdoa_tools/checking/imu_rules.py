@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Test whether the inertial sensor fits the TDOAs, and whether its values are clipped or smooth.
 
 Each arrangement of axes and each unit of the rates is tried: a filter that relies on the sensor

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Test whether the inertial sensor fits the rotations and accelerations of the ground truth.
 
 A rule takes a TrueMotion and yields Findings. Both sensors are compared over short cells, after

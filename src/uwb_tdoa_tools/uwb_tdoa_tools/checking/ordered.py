@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Order a recording for the rules that try corrections, and fit its anchors.
 
 `SurveyFit` estimates positions of tag and anchors together, from windows of TDOAs alone. Systematic

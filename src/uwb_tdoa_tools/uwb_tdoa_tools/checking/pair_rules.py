@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Compare the TDOAs of each pair with the geometry of the ground truth: values, signs, ids.
 
 A rule takes a KnownPath and yields Findings. Limits are shares, or the part of an error that

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Read the streams of a recording as `check` judges them: in the order of arrival."""
 
 from __future__ import annotations

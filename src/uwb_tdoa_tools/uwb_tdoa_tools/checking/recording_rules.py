@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Judge a recording by what its messages state: frames, topics, anchors, clocks, publishers, ranges.
 
 A rule takes a Recording and yields Findings.

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Write the findings of `check` as text and JSON, and as remarks of tools that estimate."""
 
 from __future__ import annotations

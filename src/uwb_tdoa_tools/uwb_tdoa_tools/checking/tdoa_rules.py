@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Find mistakes of all TDOAs, or of the ids of anchors: undo each mistake, and compare the fit.
 
 A rule takes an OrderedRecording and yields trials, each with one mistake undone, and the Finding to

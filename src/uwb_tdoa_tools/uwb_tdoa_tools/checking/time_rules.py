@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Find streams that are late, drift or jump against the ground truth.
 
 Each delay is tried, and the power of the remaining error is compared. Slow changes, as systematic

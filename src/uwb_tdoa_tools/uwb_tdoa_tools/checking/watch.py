@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the monitor of ekf_node finds in a recording: anchors that were moved, exchanged or changed,
 before it began or while it lasts.
 """

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Calibrate a tag from recordings, in one command."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Check recordings for mistakes of drivers, before anything else uses them."""
 
 from __future__ import annotations

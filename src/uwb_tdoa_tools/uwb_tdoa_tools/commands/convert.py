@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Convert a recording to a ROS 2 bag."""
 
 from __future__ import annotations

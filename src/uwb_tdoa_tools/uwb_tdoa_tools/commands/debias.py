@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Map the bias of estimated positions, remove it, and show the gain."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Trace a hidden effect and fly with its correction, or send a measured flight through both nodes."""
 
 from __future__ import annotations

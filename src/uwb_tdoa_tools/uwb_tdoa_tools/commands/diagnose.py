@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Find missing effects from residuals, and reduce the error."""
 
 from __future__ import annotations

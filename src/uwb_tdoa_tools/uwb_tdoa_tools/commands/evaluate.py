@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Evaluate an estimate against ground truth: of the filter run here, or a recorded odometry."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Write the correction of TDOAs by effects and network as one file for other runtimes."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Fly a simulated vehicle by the estimate, many times: take off, fly and land."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Add a declared effect to a recorded or simulated flight."""
 
 from __future__ import annotations

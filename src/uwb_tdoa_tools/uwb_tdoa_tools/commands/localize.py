@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Estimate where the tag was, and how far that can be trusted."""
 
 from __future__ import annotations

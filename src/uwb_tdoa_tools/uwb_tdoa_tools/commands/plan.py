@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Plan an installation: where a tag can be located, how precisely, and better anchors."""
 
 from __future__ import annotations

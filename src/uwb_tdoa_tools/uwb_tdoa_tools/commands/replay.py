@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Replay a bag over ROS topics, for those who have no `ros2 bag play`."""
 
 from __future__ import annotations

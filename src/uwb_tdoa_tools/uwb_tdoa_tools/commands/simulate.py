@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Simulate a flight, a drive or a walk, and write it as a bag."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Improve surveyed anchors by flights."""
 
 from __future__ import annotations

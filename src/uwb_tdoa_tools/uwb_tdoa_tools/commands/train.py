@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Learn the systematic error of TDOAs from flights with ground truth."""
 
 from __future__ import annotations

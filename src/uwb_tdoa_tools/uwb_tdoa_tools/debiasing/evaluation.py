@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Estimate flights, apply a bias map, and report the change."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Fit a bias map to flights and to places where a tag stood still.
 
 Cross-validation over flights scales the map.

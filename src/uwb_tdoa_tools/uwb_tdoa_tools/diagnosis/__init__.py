@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Find missing systematic effects in residuals.
 
 from uwb_tdoa_tools.diagnosis import diagnose

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Attribute residuals of flights to effects, with values, uncertainty and alternatives."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Run the filter with the model before and after, and compare errors with their uncertainty.
 
 Where errors are unknown, it compares innovations.

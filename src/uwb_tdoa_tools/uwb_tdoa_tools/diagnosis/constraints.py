@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Constraints: knowledge besides TDOAs and IMU for a calibration without ground truth.
 
 A constraint of a flight (`flight` is its name) has `stamps(begin)` and `equations(t, estimate,

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Compute realistic standard deviations of anchor parameters fitted with ground truth.
 
 The covariance of a fit assumes a correct model. Positions and delays of anchors absorb other

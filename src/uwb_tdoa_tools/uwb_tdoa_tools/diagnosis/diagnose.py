@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Run the complete diagnosis in one call."""
 
 from __future__ import annotations

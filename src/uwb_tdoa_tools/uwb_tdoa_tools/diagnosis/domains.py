@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Domains of effects: the ranges of their covariates in the fitted flights."""
 
 from __future__ import annotations

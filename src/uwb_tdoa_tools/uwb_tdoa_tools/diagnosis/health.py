@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Health figures of each channel and of the filter."""
 
 from __future__ import annotations

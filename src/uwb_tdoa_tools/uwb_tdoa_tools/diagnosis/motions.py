@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Motions of a flight to come: timed paths in a box, within limits of speed and turning.
 
 A motion begins and ends at rest. A planned flight joins motions by the straight ways between them.

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Plan the next flight: the path that settles what a diagnosis leaves open.
 
 Two explanations of a finding predict different measurements on another path. The planner makes a

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Write a parameter file for ekf_node with the measured noise."""
 
 from __future__ import annotations

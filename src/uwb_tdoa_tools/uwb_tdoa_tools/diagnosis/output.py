@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Write a Diagnosis as JSON and as text for the screen. Both follow the order of the report."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Compare a finding between flights: equal, different, growing, or in one flight only."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """References: the paths that flights are compared with, and their known coordinates."""
 
 from __future__ import annotations

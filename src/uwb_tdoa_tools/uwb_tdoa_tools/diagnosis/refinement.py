@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Refine a selection: relinearize, add functions without a name, and cross-validate."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Correct wrong ids and signs before the fit, and validate them like any other effect."""
 
 from __future__ import annotations

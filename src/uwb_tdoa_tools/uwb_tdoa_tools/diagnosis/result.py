@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The result of a diagnosis; `output` and `report` write it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Validate effects: run the filter with and without them, on data that they were not fitted to."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Print a correction as C99: single precision, no memory of its own, libm only."""
 
 from __future__ import annotations

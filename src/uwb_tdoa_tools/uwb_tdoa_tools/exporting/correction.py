@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """TracedCorrection, the graph of all that a Corrector does, and what had to be left out of it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Write a correction as an out-of-tree build of the Crazyflie firmware.
 
 The build uses EXTRA_CFLAGS, as docs/development/oot.md of the firmware describes. Kbuild puts these

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A dense network, out of an ONNX file, for sequential code."""
 
 from __future__ import annotations

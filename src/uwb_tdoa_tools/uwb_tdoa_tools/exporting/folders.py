@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Write a correction as C: a folder with both files, or the build for a Crazyflie."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Node, an operation in the graph of a correction.
 
 A node is an array per TDOA: its `shape` has no axis of TDOAs. Printers translate these kinds; all

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """LeftOut: an effect that an exported file does not hold, with its worth in metres."""
 
 from __future__ import annotations

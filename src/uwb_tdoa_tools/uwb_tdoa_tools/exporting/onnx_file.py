@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Print a TracedCorrection as an ONNX file."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Write ONNX graphs of plain operators."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The graph of a correction as a list of operations on single numbers, in single precision.
 
 A Scalar is one operation on numbers of one TDOA. Printers of sequential code print the list of

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Record equations as graphs: run their own code with arrays of symbols.
 
 `Traced` stands for an array with one row per TDOA. Its rows are all pairs of anchors, in all blocks

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A correction as C for a vehicle: what is printed, and its interface.
 
 The bias at one state has two parts: of effects that the filter differentiates by its state, and of

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Fly a quadrotor by an estimate of position, velocity and attitude, and by its gyroscope.
 
 The controller is a cascade. Position and velocity give a wanted acceleration. The acceleration gives

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Run flights through both nodes over topics, with and without a correction."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Draw what a correction does to a flight."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Provide estimates: the own filter as the nodes run it, or a peer.
 
 A peer is a filter in a shared library that the user has built (docs/notebook/speed.md). It exports, in C:

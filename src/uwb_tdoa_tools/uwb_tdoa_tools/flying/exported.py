@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Correct the TDOAs of a peer by exported C, as a vehicle does.
 
 `export --c FOLDER` writes uwb_bias.h and uwb_bias.c. They are compiled here, together with a loop

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Fly many tasks on all cores, keep their verdicts, and draw them."""
 
 from __future__ import annotations

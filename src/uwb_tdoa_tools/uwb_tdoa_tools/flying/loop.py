@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Close the loop in a simulated hall: record flights, trace their residuals, write the correction.
 
 The hall has one effect that a seed draws. `record` puts it into the recordings. Everything after

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Define what is flown, and decide when to wait, take off, fly and land.
 
 A mission uses the estimate, its standard deviation and the accelerometer alone.

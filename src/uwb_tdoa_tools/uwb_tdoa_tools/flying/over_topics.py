@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Fly by a filter that is reached over topics.
 
 Sensor samples are published. Odometry and status are received.

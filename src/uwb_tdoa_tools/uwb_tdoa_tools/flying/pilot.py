@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Fly a vehicle by commands: take off, go to, land, as in crazyswarm2.
 
 A command that cannot be executed raises an InputError with the reason.

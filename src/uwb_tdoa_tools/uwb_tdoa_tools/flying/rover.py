@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Drive a rover by its estimate: two driven wheels with encoders, and a path controller.
 
 The origin of the body is the antenna, MAST above the floor.

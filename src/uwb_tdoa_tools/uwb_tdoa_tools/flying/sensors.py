@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Simulate radio, inertial sensor and further sensors of one flight.
 
 Errors that do not depend on the path are drawn in advance, by seed.

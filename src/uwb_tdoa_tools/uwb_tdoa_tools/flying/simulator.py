@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Move a vehicle turn by turn, simulate its sensors, and delay their messages."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Fly one task in lockstep, without ROS.
 
 The same task gives the same flight on any computer.

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Simulate a small quadrotor: rigid body, motors, drag, wind, and ground contact.
 
 The rigid body follows Newton and Euler. Thrust and yaw moment grow with the square of the rotor

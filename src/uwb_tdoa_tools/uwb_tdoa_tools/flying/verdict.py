@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Judge flights by ground truth, and report many of them."""
 
 from __future__ import annotations

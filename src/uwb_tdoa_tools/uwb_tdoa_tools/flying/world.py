@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Describe the world of a flight: radio, inertial sensor and air with their errors."""
 
 from __future__ import annotations

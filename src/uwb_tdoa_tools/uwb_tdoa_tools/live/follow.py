@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Let a replay keep in step with the nodes that it feeds, and report what these have lost."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Publish recorded messages in the time between their stamps."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Start executables as processes in a private ROS domain, and read their /diagnostics."""
 
 from __future__ import annotations

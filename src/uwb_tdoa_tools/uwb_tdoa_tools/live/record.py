@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Record topics of running nodes to a bag, and list who publishes and hears them."""
 
 from __future__ import annotations

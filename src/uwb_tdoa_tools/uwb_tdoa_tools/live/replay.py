@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Replay a bag over topics: publishers as recorded, paced by the stamps, everything acknowledged."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Run a bag through both nodes, as processes, over ROS topics, and record their output."""
 
 from __future__ import annotations

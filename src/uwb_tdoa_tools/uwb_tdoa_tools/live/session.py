@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Common parts of replay and record: the ROS node, message classes by name, QoS of bags."""
 
 from __future__ import annotations

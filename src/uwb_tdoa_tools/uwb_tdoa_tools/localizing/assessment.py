@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Assess how reliable an estimate is, from the recording and the run, without ground truth."""
 
 from __future__ import annotations

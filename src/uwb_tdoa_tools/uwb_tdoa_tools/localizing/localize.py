@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Recordings to trajectories, one by one, and the files of a trajectory."""
 
 from __future__ import annotations

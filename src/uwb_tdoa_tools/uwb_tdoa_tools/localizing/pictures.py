@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """An estimate drawn: as a picture, and for the viewer Rerun (rerun.io)."""
 
 from __future__ import annotations

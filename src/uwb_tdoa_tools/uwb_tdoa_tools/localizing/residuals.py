@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Residuals of TDOAs and ranges: per pair of anchors, and per square of the floor."""
 
 from __future__ import annotations

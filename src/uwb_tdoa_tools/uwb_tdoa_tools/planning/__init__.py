@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Plan an installation: precision, failure, accuracy, and better anchor layouts.
 
     from uwb_tdoa_tools.planning.installation import Installation

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Judge and design a hall in which a tag hears the anchors within the radio's reach.
 
 A design tries regular patterns, from sparse to dense, until the wanted share can be flown.

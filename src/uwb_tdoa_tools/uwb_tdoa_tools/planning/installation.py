@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Describe an installation: anchors, the noise of their radio, and the TDOAs of a round."""
 
 from __future__ import annotations

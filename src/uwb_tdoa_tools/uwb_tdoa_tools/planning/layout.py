@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Describe layouts of anchors: where anchors may be, as numbers, and their score."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Judge places: whether a tag can be flown there, and if not, why.
 
 A place hears too few anchors, is imprecise, has two solutions, or can be flown. A solver checks the

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Search better anchors: gradients of the bound, descents from many layouts, and one more anchor."""
 
 from __future__ import annotations

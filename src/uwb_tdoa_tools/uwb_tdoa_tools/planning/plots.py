@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Draw maps and layouts, each with one message, to be read at 700 pixels."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Compute how precise a position can be.
 
 Fisher information, the Cramer-Rao bound, dilution of precision and ellipses.

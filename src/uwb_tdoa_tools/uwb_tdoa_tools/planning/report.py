@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Report a plan: figures for plan.json, lines for the screen, and ROS messages of the maps."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Run the parts of `plan`: read the options, compute, write the pictures, and return the figures."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Find where a round of TDOAs has two solutions: a second minimum of its misfit.
 
 With d(x) the distances from x to the N anchors that are heard at p, D the anchor pairs of the TDOAs

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Readers: each turns one kind of recording into a Flight.
 
 `read_flight` recognizes the kind.

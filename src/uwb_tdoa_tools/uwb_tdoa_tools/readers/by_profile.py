@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Read recordings of others by a Profile: bags of ROS 1 and ROS 2, CSV files, ULog."""
 
 from __future__ import annotations

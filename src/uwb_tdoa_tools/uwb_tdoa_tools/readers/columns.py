@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Our columns of foreign recordings, and their units.
 
 columns = parse_columns("time=t_ms:ms,anchor_a=from,anchor_b=to,tdoa=diff_mm:mm")

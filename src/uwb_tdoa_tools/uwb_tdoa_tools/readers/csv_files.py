@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """CSV files of other tools as one foreign recording."""
 
 from __future__ import annotations

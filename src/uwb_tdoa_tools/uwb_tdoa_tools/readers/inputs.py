@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Find and read the recordings on a command line: files, folders, and their surveys."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Surveys whose anchors have names: surveys say "NE corner" or "A3", messages have numbers."""
 
 from __future__ import annotations

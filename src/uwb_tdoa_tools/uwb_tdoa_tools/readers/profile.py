@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Profiles: which topic and which field of a foreign recording is which stream.
 
 profile = load_profile("dwm1001")               # a shipped profile, or a YAML file

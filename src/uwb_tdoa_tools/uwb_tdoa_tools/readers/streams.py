@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the readers share: order streams, join both inertial sensors, name the protocol."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Write a first profile of a recording of others: what its tables seem to hold, and what is missing."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """CSV tables with a header line.
 
 Rows are read one by one, because the cells of a large file as text exceed the memory.

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """ULog files of PX4 as a foreign recording. pyulog, an optional extra, parses them."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Event logs of the Crazyflie's micro-SD card deck (uSD logger), versions 1 and 2."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """CSV files of the UTIL dataset (Zhao et al., IJRR 2024), plain or gzip, with all 27 columns or some."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Align ground truth: compare its clock and its frame with those of an estimate.
 
 The search has an order, because one error hides the next: other axes (z down, two exchanged),

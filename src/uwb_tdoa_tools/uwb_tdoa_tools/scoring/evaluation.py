@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Run the filter over a flight and score it; align its ground truth before that."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How an error changes, and the share of a correction that flights support."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How far an estimate is from ground truth, and whether its covariance is honest."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The phases of a recording, from the motion in its ground truth.
 
 Together the phases are the whole recording. Some overlap.

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Pictures of errors, and labels of anchors."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Figures of one run as a record of fixed size, and figures of several runs together."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Simulated flights: a room with anchors, a path, an inertial sensor, and the TDOAs of a UWB tag.
 
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Draw the effect of a simulated hall that no file declares.
 
 Sizes trade realism for effect: each costs the filter 0.1 to 0.5 m of position, as the systematic

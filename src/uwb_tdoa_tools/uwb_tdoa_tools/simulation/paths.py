@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Paths: trajectory families and waypoints.
 
 A family gives positions over "path time" s. Path time runs with the clock at cruise; vehicles slow

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a simulated flight holds, and what can be simulated: figures, words, a picture."""
 
 from __future__ import annotations

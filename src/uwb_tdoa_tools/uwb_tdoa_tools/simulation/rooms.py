@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Anchors, walls, and the room that they span."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Simulated sensors besides TDOAs: the inertial sensor, and each of SENSORS."""
 
 from __future__ import annotations

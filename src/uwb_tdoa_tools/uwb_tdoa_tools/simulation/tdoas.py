@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Simulated TDOAs: which anchors are heard when, geometry, and the errors of both arrival times."""
 
 from __future__ import annotations

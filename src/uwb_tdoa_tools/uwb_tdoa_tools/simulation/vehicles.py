@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Vehicles that carry the tag along a path: a quadrotor, a rover on wheels, a person on foot."""
 
 from __future__ import annotations

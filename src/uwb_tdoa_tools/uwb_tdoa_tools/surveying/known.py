@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Measurements besides flights: marks, distances between anchors, paths of another odometry."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a self-calibration found: figures, sentences, a picture, and blocked anchors."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Learn the bias of TDOAs from flights with ground truth.
 
 labels     errors of the TDOAs of flights at their true poses; training and validation flights

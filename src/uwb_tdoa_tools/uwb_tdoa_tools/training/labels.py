@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Compute labels: the errors of the TDOAs of a flight at their true poses."""
 
 from __future__ import annotations

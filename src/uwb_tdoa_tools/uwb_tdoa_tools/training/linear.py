@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Robust Bayesian regression with a sparse and a dense design.
 
 The model of a row is y = w[site_b] . phi - w[site_a] . phi + dense . v + noise, with Gaussian priors

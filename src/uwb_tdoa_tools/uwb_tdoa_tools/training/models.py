@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Train the different kinds of models by one call, `train`."""
 
 from __future__ import annotations

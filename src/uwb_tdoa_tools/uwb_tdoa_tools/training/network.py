@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Train the network of Zhao et al. (RA-L 2021).
 
 The network has three layers of 30 neurons, with or without the orientations of the anchors. As

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Find the physical effects of the training flights, as `diagnose` does."""
 
 from __future__ import annotations

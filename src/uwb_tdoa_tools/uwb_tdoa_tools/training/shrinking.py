@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Scale a correction to the share that cross-validation over flights supports.
 
 The flights are split into FOLDS. For each fold a model is trained on the other flights, and the filter

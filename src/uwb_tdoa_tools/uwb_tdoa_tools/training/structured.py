@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Model the error of a pair as the difference of two one-anchor errors: e_ab = g(b) - g(a).
 
 The model is antisymmetric. It holds for pairs, protocols and numbers of anchors outside the training.

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The registry of all sensors except IMU and TDOAs.
 
 A new sensor is one file in this folder and one line here.

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A range finder that looks down along the body's -z."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A barometer, and altitudes of the international standard atmosphere.
 
 Source: ICAO Doc 7488, troposphere.

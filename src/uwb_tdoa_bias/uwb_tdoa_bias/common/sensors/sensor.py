@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Description of a sensor other than IMU and TDOAs: all its properties outside of the filter."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A velocity in the body frame: wheels, optical flow, visual odometry."""
 
 from __future__ import annotations

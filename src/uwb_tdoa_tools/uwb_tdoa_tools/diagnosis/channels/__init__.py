@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Channels, kinds of measurement: their residuals, rows of a fit, covariates and health."""
 
 from __future__ import annotations

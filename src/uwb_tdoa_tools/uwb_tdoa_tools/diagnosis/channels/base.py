@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Channel, a kind of measurement, and its residual in a flight."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Figures of health: bias, spread, tails and correlations of residuals, and of pairs of anchors."""
 
 from __future__ import annotations

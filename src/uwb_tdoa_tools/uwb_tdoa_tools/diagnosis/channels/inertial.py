@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Channels of gyroscope and accelerometer: residuals of means over cells, axis by axis."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Channels of TDOAs and of distances to anchors: residuals, averaged over cells.
 
 Successive TDOAs of a pair have correlated errors. They are averaged, pair by pair, over cells of

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Channels of auxiliary sensors and their parts: residuals of their medians over cells."""
 
 from __future__ import annotations

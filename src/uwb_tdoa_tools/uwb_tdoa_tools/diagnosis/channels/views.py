@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Covariates of a channel: views of its rows over one covariate, knots, and columns of logs."""
 
 from __future__ import annotations

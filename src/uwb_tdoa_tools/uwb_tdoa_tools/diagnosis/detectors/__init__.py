@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Searches for effects that linear regression does not find, by family of effects."""
 
 from .anchor import NlosDetector

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Detector of anchors that were blocked during an interval or from a region."""
 
 from __future__ import annotations

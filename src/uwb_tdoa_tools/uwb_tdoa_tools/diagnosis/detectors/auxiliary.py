@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Detectors of effects of auxiliary sensors that last for an interval, and the interval search."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Detector, the search for an effect that linear regression does not find."""
 
 from __future__ import annotations

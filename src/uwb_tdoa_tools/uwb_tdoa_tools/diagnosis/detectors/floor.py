@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Detector of anchors that are late near the floor, and of the height below which they are."""
 
 from __future__ import annotations

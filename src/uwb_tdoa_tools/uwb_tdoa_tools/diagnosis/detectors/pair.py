@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Detectors of noise: correlated errors, noisy pairs and outliers, in residuals in the air."""
 
 from __future__ import annotations

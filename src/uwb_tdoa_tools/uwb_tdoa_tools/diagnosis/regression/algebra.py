@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Products of dense matrices, or of scipy's sparse matrices if most entries are 0."""
 
 from __future__ import annotations

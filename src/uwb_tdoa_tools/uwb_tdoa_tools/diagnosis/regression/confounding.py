@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Find effects that a finding can be confounded with, and parameters that are not observable."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Fit a RegressionTable robustly, and compute the likelihood of a fit.
 
 Noise is Student's t with NU degrees of freedom. The fit uses iteratively re-weighted least squares

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Scan thousands of undeclared functions of one anchor, pair, direction or axis over one covariate.
 
 Each function is a level and one simple shape: a line, a rise beyond or below a point, a step, an

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Compute the gain in likelihood of sets of columns in closed form.
 
 Products of all columns with the base of the model are computed once per group. A group is an axis

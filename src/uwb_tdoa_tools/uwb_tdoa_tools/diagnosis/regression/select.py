@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Select effects that explain the residuals, by forward and backward steps.
 
 The statistic of a candidate is its gain in twice the log-likelihood over all channels, counted in

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Residuals of flights and channels, and regressors, as one immutable table of a linear fit."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Parameters of effects as regressors: Column, Term and Candidate."""
 
 from __future__ import annotations

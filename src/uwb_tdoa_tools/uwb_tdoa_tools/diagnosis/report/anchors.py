@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """List estimated positions and delays of anchors.
 
 The values fit the data. They do not replace a survey.

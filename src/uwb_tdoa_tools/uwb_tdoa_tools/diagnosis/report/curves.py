@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Draw curves: error over time, residuals, and functions without a name."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Group findings for a reader: candidates of one selection step form one entry."""
 
 from __future__ import annotations

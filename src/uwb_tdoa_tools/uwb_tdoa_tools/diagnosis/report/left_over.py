@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Find pairs, times and places at which the model leaves the largest residuals."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Draw the room from above and from the side: anchors, findings, and position errors."""
 
 from __future__ import annotations

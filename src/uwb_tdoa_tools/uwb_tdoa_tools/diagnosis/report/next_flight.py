@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Draw the planned flight from above and from the side."""
 
 from __future__ import annotations

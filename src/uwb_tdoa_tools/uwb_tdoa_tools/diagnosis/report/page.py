@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Write the report: one HTML page without external files."""
 
 from __future__ import annotations

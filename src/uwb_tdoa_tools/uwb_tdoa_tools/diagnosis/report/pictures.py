@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Draw pictures for the page. The import takes a second, because it loads matplotlib."""
 
 from __future__ import annotations

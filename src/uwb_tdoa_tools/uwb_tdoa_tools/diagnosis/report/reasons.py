@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Say in words of the field why the estimate is off."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Collect quantities over the place: position errors, anchor shifts, and blocked regions."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Make the tables of the page: values, errors, health, and undetermined parameters."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """List parameters that the data do not determine, and data that would determine them."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """State the verdict: the error before and after, the data, and the uncertainty."""
 
 from __future__ import annotations

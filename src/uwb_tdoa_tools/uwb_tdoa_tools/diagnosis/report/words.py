@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Explain terms that a reader may not know."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Normal equations of anchor positions and delays, from flights without ground truth.
 
 A filter run gives innovations and their derivatives by each position and delay, with the path

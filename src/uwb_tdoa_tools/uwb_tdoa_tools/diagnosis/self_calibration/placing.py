@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Place anchors with unknown positions by TDOAs to known anchors along an estimated path."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Combine the prior of the anchors, a tape or the last calibration, with the normal equations.
 
 The evidence selects changes since the last calibration, and the size of unknown delays

@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Test the hypothesis that a single anchor has moved, before its error is spread over all anchors.
 
 The filter rejects TDOAs with large innovations. Equations about the given anchors then hold few

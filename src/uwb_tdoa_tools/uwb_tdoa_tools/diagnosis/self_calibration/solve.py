@@ -1,3 +1,5 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Calibrate anchors from flights and prior knowledge, and decide whether to use the result."""
 
 from __future__ import annotations
