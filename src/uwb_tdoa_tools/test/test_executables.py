@@ -138,6 +138,7 @@ def documented(tmp_path_factory):
                         "test",
                         "build",
                         "shell",
+                        "site",
                         "study",
                         "help",
                         "launch",
