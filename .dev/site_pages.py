@@ -32,9 +32,9 @@ PAGES = {  # {file at the top of the repository: its page}
 }
 NODES = ("bias_node", "ekf_node", "localization_node", "anchors_node", "debias_node")
 NODES += ("autopilot_node", "vehicle_node")
-# code, where nothing is a link; or the end of a link, with its text if that is the name of a page
-LINK = re.compile(
-    r"(^```.*?^```$|`[^`\n]*`)|(\[\w+\.md)?\]\(([^)\s:]+)\)", re.MULTILINE | re.DOTALL
+# code, where nothing is a link; or the indent of a line; or the end of a link, with its text if that is the name of a page
+PART = re.compile(
+    r"(^```.*?^```$|`[^`\n]*`)|(^ +(?=\S))|(\[\w+\.md)?\]\(([^)\s:]+)\)", re.MULTILINE | re.DOTALL
 )
 EQUATION = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 
@@ -67,7 +67,7 @@ def on_page_content(content, **_):
 
 
 def with_links(text, source, page):
-    """Return the text of a page with links within the site, and the files outside docs/ to add.
+    """Return the text of a page for the site, and the files outside docs/ to which it has links.
 
     source : path of the page in the repository
     page : its path in the site
@@ -75,7 +75,9 @@ def with_links(text, source, page):
     others = set()
 
     def turned(found):
-        path, hash_, anchor = (found[3] or "").partition("#")
+        if found[2]:  # lists in lists: GitHub takes an indent of 2, Python-Markdown needs 4
+            return 2 * found[2]
+        path, hash_, anchor = (found[4] or "").partition("#")
         if not path:
             return found[0]
         target = posixpath.normpath(posixpath.join(posixpath.dirname(source), path))
@@ -86,10 +88,10 @@ def with_links(text, source, page):
             place = f"repository/{target}.txt"
             others.add(place)
         start = posixpath.dirname(page) or "."
-        text = f"[{title(ROOT / target)}" if found[2] else ""
+        text = f"[{title(ROOT / target)}" if found[3] else ""
         return f"{text}]({posixpath.relpath(place, start)}{hash_}{anchor})"
 
-    return LINK.sub(turned, text), others
+    return PART.sub(turned, text), others
 
 
 def title(path):

@@ -93,6 +93,12 @@ def test_nothing_is_loaded_from_elsewhere(site):
     assert [link for link in loaded if re.match(r"(?!data:)([a-z]+:|//)", str(link))] == []
 
 
+def test_lists_in_lists_stay_there(site):
+    text = (folder_of(site) / "index.html").read_text("utf-8")
+    how_to = text.partition("<strong>How-to</strong>")[2].partition("</li>")[0]
+    assert "<ul>" in how_to
+
+
 def test_equations_are_mathml(site):
     text = (folder_of(site) / "filter.html").read_text("utf-8")
     assert text.count("<math") > 60 and "arithmatex" not in text
