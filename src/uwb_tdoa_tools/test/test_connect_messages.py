@@ -121,6 +121,17 @@ def test_the_publisher_in_python(tmp_path, listener):
         assert message.distance_difference == pytest.approx(to_b - to_a, abs=0.4)
 
 
+def test_the_recipe_for_stamps_follows_a_drifting_clock_by_the_smallest_delay():
+    code, names = blocks(section("drivers.md", "Stamps"), "python"), {}
+    exec(*code, names)
+    clock, rng = names["DeviceClock"](), np.random.default_rng(1)
+    true = np.arange(0.0, 300.0, 0.01)
+    device = 123.0 + (1 + 20e-6) * true
+    arrival = true + 0.002 + rng.exponential(0.01, len(true))
+    late = np.array([clock.stamp(*one) for one in zip(device, arrival)]) - true
+    assert 0.0015 < late[500:].min() and late[500:].max() < 0.003
+
+
 @pytest.mark.skipif(shutil.which("g++") is None, reason="no g++")
 def test_the_publisher_in_cpp(tmp_path):
     (code,) = blocks(section("drivers.md", "In C++"), "cpp")

@@ -1,11 +1,16 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What holds for every page of the documentation: links lead somewhere, and a page stays short."""
+"""What holds for every page of the documentation: links lead somewhere, a page stays short, and the
+reference has every topic.
+"""
 
+import ast
 from pathlib import Path
 import re
 
 import pytest
+
+from uwb_tdoa_bias.common.sensors import SENSORS
 
 ROOT = Path(__file__).resolve().parents[3]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
@@ -17,6 +22,10 @@ LONGER = {
     "effects.md": 488,
     "symptoms.md": 167,
 }
+
+MAKERS = ("create_publisher", "create_subscription", "create_service", "Input", "StreamInput")
+MAKERS += ("StreamOutput",)  # of topics and services
+TOPIC = re.compile(r"/?(uwb|imu|odometry|plan|ground_truth|velocity)/[a-z_]+(/[a-z_]+)?")
 
 
 def slug(heading):
@@ -62,3 +71,30 @@ def test_a_link_that_leads_nowhere_is_found(tmp_path):
     page = tmp_path / "page.md"
     page.write_text("# A `b` c\n\n[one](#a-b-c) [two](#no) [three](no.md) [four](https://x.y)\n")
     assert list(broken(page)) == ["#no", "no.md"]
+
+
+def topics():
+    """The topics and services of the packages: those that a node makes, and texts that look like one."""
+    found = {topic for sensor in SENSORS.values() for topic in sensor.topics}
+    for path in ROOT.glob("src/uwb_tdoa_*/uwb_tdoa_*/**/*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Constant) and TOPIC.fullmatch(str(node.value)):
+                found.add(node.value)
+            elif isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] in MAKERS:
+                found |= {one.value for one in node.args if isinstance(one, ast.Constant)}
+    return {str(one).replace("~", "ekf_node").strip("/") for one in found if isinstance(one, str)}
+
+
+def test_the_reference_has_every_topic_and_service():
+    text = (ROOT / "docs" / "reference.md").read_text()
+    section = text.partition("\n## Topics\n")[2].partition("\n## ")[0]
+    listed = {name.strip("/") for name in re.findall(r"`([\w/]+)`", section)}
+    assert len(topics()) > 20 and topics() - listed == set()
+
+
+def test_a_page_with_commands_shows_how_they_run_without_ros():
+    for page in PAGES:
+        text = page.read_text()
+        shown = re.findall(r"^\./dev run uwb_tdoa_tools (?!\w+_node|replay)", text, re.MULTILINE)
+        if page.parent.name != "notebook" and len(shown) > 1:
+            assert "`uwb-tdoa " in text, page.name

@@ -2,10 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The C of a correction: equal to numpy and Python, sound with any input, small on a Cortex-M4F."""
 
+import subprocess
+
 import c_programs as c
 from c_programs import ANCHORS, GCC, by_numpy, cases, chosen, on_board, on_host, write
 import numpy as np
 import pytest
+from walking import blocks, section
 
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet
@@ -120,3 +123,16 @@ def test_it_fits_a_small_vehicle(tmp_path):
     learned = c.cost_of(tmp_path / "network", vehicle_code(ANCHORS, EffectSet(), network))
     assert learned["most"] <= 15_000 and learned["flash"] <= 13 * 1024
     assert learned["ram"] <= 2048
+
+
+def test_the_example_of_the_page_compiles(tmp_path):
+    (code,) = blocks(section("export.md", "C99, and a Crazyflie"), "c")
+    write(tmp_path, vehicle_code(ANCHORS, chosen("anchor_delay")))
+    (tmp_path / "example.c").write_text(f"{code}\nint main(void) {{ return 0; }}\n")
+    files = [tmp_path / "example.c", tmp_path / "uwb_bias.c"]
+    done = subprocess.run(
+        [GCC, *c.STRICT, "-I", tmp_path, *files, "-lm", "-o", tmp_path / "example"],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr

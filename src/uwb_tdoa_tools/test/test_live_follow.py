@@ -9,6 +9,7 @@ import pytest
 rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
+from documented import ROOT  # noqa: E402
 from rclpy.serialization import serialize_message  # noqa: E402
 from sensor_msgs.msg import Imu, TimeReference  # noqa: E402
 from std_msgs.msg import Float64  # noqa: E402
@@ -17,6 +18,7 @@ from uwb_tdoa_bias.common.errors import InputError  # noqa: E402
 from uwb_tdoa_ekf.ekf_parameters import PARAMETERS  # noqa: E402
 from uwb_tdoa_ekf.reorder_buffer import OF_SENSORS, SILENT  # noqa: E402
 from uwb_tdoa_msgs.msg import TdoaResidual  # noqa: E402
+from uwb_tdoa_tools.commands.replay import DESCRIPTION  # noqa: E402
 from uwb_tdoa_tools.live import follow  # noqa: E402
 from uwb_tdoa_tools.live.follow import LEAD, Follower, is_stamped, stamp_of  # noqa: E402
 
@@ -235,3 +237,11 @@ def test_the_replay_does_not_wait_for_tdoas_that_wait_for_a_height(filtered):
     assert play(follower, STAMPS[22:]) == 5
     residuals.say(*STAMPS[6:95])
     assert play(follower, STAMPS[27:]) == 77  # after a second without one it does not
+
+
+def test_help_and_pages_give_the_age_until_which_tdoas_are_awaited():
+    age = f"{follow.STEP / 1e9:g} s"
+    assert f"older TDOAs ({age}) have left" in DESCRIPTION
+    pages = {name: (ROOT / "docs" / name).read_text() for name in ("replay.md", "architecture.md")}
+    for name, text in pages.items():
+        assert f"TDOAs that are {age} older" in text, name

@@ -16,7 +16,7 @@ DESCRIPTION = """Replay a bag over ROS topics with its own timing, like `ros2 ba
 Every topic is published with the durability it was recorded with, and always reliably, which serves best-effort
 subscriptions too. A reliable subscription gets every message at any rate: the replay waits for it. A best-effort
 one may miss messages. The replay starts with the first subscription. With --follow it stays within 2 s of the followed
-topic. While ekf_node publishes uwb/residual, it also waits until older TDOAs (0.1 s) have left the filter: a slow
+topic. While ekf_node publishes uwb/residual, it also waits until older TDOAs (0.08 s) have left the filter: a slow
 computer takes longer, and gets the same result. The replay ends when every reliable subscription has every message. It
 prints the counts and the largest delay, and ends with code 1 if the followed nodes were late or lost messages. ROS
 arguments move all topics (except /tf, /clock and the like) into the namespace of a tag, or single topics, as in the
