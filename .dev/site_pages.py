@@ -77,6 +77,8 @@ def with_links(text, source, page):
     def turned(found):
         if found[2]:  # lists in lists: GitHub takes an indent of 2, Python-Markdown needs 4
             return 2 * found[2]
+        if found[1] and not found[1].startswith("```"):  # code in tables: GitHub escapes bars in it
+            return found[1].replace(r"\|", "|")
         path, hash_, anchor = (found[4] or "").partition("#")
         if not path:
             return found[0]

@@ -99,6 +99,11 @@ def test_lists_in_lists_stay_there(site):
     assert "<ul>" in how_to
 
 
+def test_bars_in_code_of_tables_stay_bars(site):
+    text = (folder_of(site) / "csv.html").read_text("utf-8")
+    assert "<code>|p - b| - |p - a|</code>" in text
+
+
 def test_equations_are_mathml(site):
     text = (folder_of(site) / "filter.html").read_text("utf-8")
     assert text.count("<math") > 60 and "arithmatex" not in text
