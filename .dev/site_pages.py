@@ -190,23 +190,27 @@ def messages():
 
 
 def python():
-    """Return the page of the Python module: the docstrings of its public names."""
+    """Return the page of the Python module: the docstrings of its public names, and of what they return."""
     import uwb_tdoa
 
-    kinds = {True: [], False: []}
-    for name in uwb_tdoa.__all__:
-        value = getattr(uwb_tdoa, name)
-        if inspect.isclass(value):
-            kinds[True].append(f"::: {value.__module__}.{name}")
-        elif inspect.isfunction(value):
-            kinds[False].append(f"::: uwb_tdoa.{name}")
-    return "\n\n".join(
-        [
-            "# Python",
-            "The public names of the module `uwb_tdoa`. [From Python](../python.md) shows how to use them.",
-        ]
-        + ["## Functions", *kinds[False], "## Classes", *kinds[True]]
-    )
+    values = [getattr(uwb_tdoa, name) for name in uwb_tdoa.__all__]
+    functions = [f"::: uwb_tdoa.{value.__name__}" for value in values if inspect.isfunction(value)]
+    classes = [value for value in values if inspect.isclass(value)]
+    returned = [getattr(import_module(module), name) for module, name in RETURNED.items()]
+    text = "The public names of the module `uwb_tdoa`. [From Python](../python.md) shows how to use them."
+    parts = ["# Python", text, "## Functions", *functions, "## Classes", *map(directive, classes)]
+    return "\n\n".join([*parts, "## Results of functions", *map(directive, returned)])
 
 
+def directive(value):
+    """Return the line that mkdocstrings replaces by the documentation of a class."""
+    return f"::: {value.__module__}.{value.__qualname__}"
+
+
+RETURNED = {  # {module: class} of records that are no public names, but results of public functions
+    "uwb_tdoa_ekf.monitoring.finding": "Finding",
+    "uwb_tdoa_tools.scoring.metrics": "Score",
+    "uwb_tdoa_tools.diagnosis": "Diagnosis",
+    "uwb_tdoa_tools.calibrating": "Calibration",
+}
 REFERENCE = {"commands": commands, "parameters": parameters, "messages": messages, "python": python}
