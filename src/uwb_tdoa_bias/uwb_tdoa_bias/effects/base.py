@@ -161,7 +161,9 @@ def cached_by_anchors(method: Callable[[Any, Anchors], Made]) -> Callable[[Any, 
 class Row:
     """A row of the table of effects: its parameters, sizes, source and wording.
 
-    name : key in effects.yaml
+    Attributes
+    ----------
+    name : its key in an effects file
     unit : of the parameters; `bound`, `negligible` and `prior_std` are in this unit
     bound : largest magnitude that is accepted
     negligible : smallest magnitude that deserves a term in a model
@@ -197,14 +199,16 @@ class Row:
 class Effect:
     """A named systematic error with scalar parameters.
 
+    A subclass declares its `row` and states its equation once: `bias` of TDOAs and ranges,
+    `model` of a sensor, or `stamp_offset` of a stream. Nodes, off-line runs and `inject` use that
+    equation. `regressors` are its derivatives by the parameters, for `diagnose`.
+
+    Attributes
+    ----------
     values : {parameter: value in `unit`}
     std : {parameter: standard error in `unit`}, empty if unknown
     source : where the values come from, free text
     domain : {covariate: (low, high)}, where the effect was observed
-
-    A subclass declares its `row` and states its equation once: `bias` of TDOAs and ranges,
-    `model` of a sensor, or `stamp_offset` of a stream. Nodes, off-line runs and `inject` use that
-    equation. `regressors` are its derivatives by the parameters, for `diagnose`.
     """
 
     values: dict[str, float] = field(default_factory=dict)

@@ -27,12 +27,18 @@ if TYPE_CHECKING:
 class Diagnosis:
     """The effects found in some flights, and their validation.
 
-    flights : (Flight, ...), prepared by the reference; reference : Reference
-    findings : [EffectFinding]; effects : EffectSet, the base and the added effects
-    refused : [Refused]; unobservable : [Unobservable]
-    before, after : results of `comparison.compare`, without and with the added effects; judged_on :
-        sentence, the validation data
-    health : figures of the channels and the filter; attribution : Attribution
+    Attributes
+    ----------
+    flights : (Flight, ...), prepared by the reference
+    reference : Reference
+    findings : [EffectFinding]
+    effects : EffectSet, the base and the added effects
+    refused : [Refused]
+    unobservable : [Unobservable]
+    before, after : results of `comparison.compare`, without and with the added effects
+    judged_on : sentence, the validation data
+    health : figures of the channels and the filter
+    attribution : Attribution
     remaining : [{channel: ChannelResidual}] under `effects`, one per flight
     numbers : {name of a flight: [Finding of checking]}, errors of a driver, survey or clock
     changes : sentences, changes since the last calibration

@@ -23,8 +23,12 @@ AXES = "xyz"
 class Tape:
     """Prior standard deviations of anchor coordinates that were measured, e.g. with a tape.
 
-    std : m, of each coordinate; height_std : m, of z; None: as `std`
-    trusted : anchors ("3") or coordinates ("3.z") that are known better: to trusted_std, m
+    Attributes
+    ----------
+    std : m, of each coordinate
+    height_std : m, of z; None: as `std`
+    trusted : anchors ("3") or coordinates ("3.z") that are known better
+    trusted_std : m, of these
     unknown : ids of anchors with unknown positions
     """
 
