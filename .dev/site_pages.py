@@ -30,6 +30,7 @@ PAGES = {  # {file at the top of the repository: its page}
     "CONTRIBUTING.md": "project/contributing.md",
     "SECURITY.md": "project/security.md",
 }
+NO_NAVIGATION = "---\nhide:\n  - navigation\n---\n"  # beside the text: the first page has none
 NODES = ("bias_node", "ekf_node", "localization_node", "anchors_node", "debias_node")
 NODES += ("autopilot_node", "vehicle_node")
 # code, where nothing is a link; or the indent of a line; or the end of a link, with its text if that is the name of a page
@@ -45,7 +46,9 @@ EQUATION = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>'
 def on_files(files, config):
     """Add the pages that are not in docs/, and turn the links of all pages to the pages of the site."""
     for source, page in PAGES.items():
-        files.append(File.generated(config, page, content=(ROOT / source).read_text("utf-8")))
+        head = NO_NAVIGATION if page == "index.md" else ""
+        text = head + (ROOT / source).read_text("utf-8")
+        files.append(File.generated(config, page, content=text))
     sources = {page: source for source, page in PAGES.items()}
     for file in files.documentation_pages():
         source = sources.get(file.src_uri, f"docs/{file.src_uri}")
