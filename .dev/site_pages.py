@@ -157,21 +157,23 @@ def parameters():
 
 
 def parts_of(block):
-    """Return what shows a block of a parameter file: its heading and its table, or its text."""
-    rows, heading = [], []
+    """Return what shows a block of a parameter file: its heading, its table, and its notes."""
+    rows, heading, notes = [], [], []
     for line in block.splitlines():
         key = re.match(r"\s+(\w+): *(.*?) +# (.*)", line)
         if key:
             rows.append([key[1], key[2], key[3]])
-        elif rows:
+        elif rows and line.startswith("    # ("):  # the rest of a meaning
             rows[-1][2] += f" {line.strip(' #')}"
         else:
-            heading.append(line.strip(" #"))
+            (notes if rows else heading).append(line.removeprefix("    "))
     if not rows:
-        return ["```yaml\n" + re.sub(r"^    ", "", block, flags=re.MULTILINE) + "\n```"]
-    lines = [f"| `{name}` | `{default}` | {escaped(meaning)} |" for name, default, meaning in rows]
-    table = "\n".join(["| parameter | default | meaning |", "|---|---|---|", *lines])
-    return [*(f"### {line}" for line in heading), table]
+        heading, notes = [], heading
+    parts = [f"### {line.strip(' #')}" for line in heading]
+    if rows:
+        lines = [f"| `{name}` | `{value}` | {escaped(text)} |" for name, value, text in rows]
+        parts.append("\n".join(["| parameter | default | meaning |", "|---|---|---|", *lines]))
+    return [*parts, *(["\n".join(["```yaml", *notes, "```"])] if notes else [])]
 
 
 def escaped(text):
