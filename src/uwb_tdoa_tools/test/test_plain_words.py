@@ -8,6 +8,7 @@ from documented import PAGES, ROOT
 import pytest
 
 GUIDE = [page for page in PAGES if page.parent.name != "notebook"]
+GUIDE += [ROOT / "CONTRIBUTING.md", ROOT / "SECURITY.md"]
 HIGHEST_GRADE = 7.0  # Flesch-Kincaid, of a page
 LONGEST = 25  # words of a sentence
 MOST = 0.05  # share of the sentences of a page that may be longer, or have a habit
