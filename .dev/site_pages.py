@@ -40,7 +40,26 @@ PART = re.compile(
 EQUATION = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 
 
+KIND = re.compile(r"^- \*\*(.*?)\*\*:(.*?)(?=^- \*\*|^\n)", re.MULTILINE | re.DOTALL)
+
+
 # --- events of mkdocs ---
+
+
+def on_config(config):
+    """Take the navigation from the list in README.md: kinds of pages, groups, and pages."""
+    nav = [{"Home": "index.md"}]
+    for kind, text in KIND.findall((ROOT / "README.md").read_text("utf-8")):
+        first, *groups = re.split(r"^  - ", text, flags=re.MULTILINE)
+        pages = linked(first, "README.md")
+        pages += [{group.partition(":")[0]: linked(group, "README.md")} for group in groups]
+        if kind == "Reference":
+            pages[1:1] = [f"reference/{name}.md" for name in REFERENCE]
+        elif kind == "Notebook":
+            pages += linked((ROOT / "docs" / pages[0]).read_text("utf-8"), f"docs/{pages[0]}")
+        nav.append({kind: pages})
+    config.nav = [*nav, {"Project": [*list(PAGES.values())[1:], "release.md"]}]
+    return config
 
 
 def on_files(files, config):
@@ -97,6 +116,13 @@ def with_links(text, source, page):
         return f"{text}]({posixpath.relpath(place, start)}{hash_}{anchor})"
 
     return PART.sub(turned, text), others
+
+
+def linked(text, source):
+    """Return the pages to which a text has links, in their order."""
+    folder = posixpath.dirname(source)
+    targets = re.findall(r"\]\(([^)#]+\.md)\)", text)
+    return [posixpath.join(folder, one).removeprefix("docs/") for one in targets]
 
 
 def title(path):

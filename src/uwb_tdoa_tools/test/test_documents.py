@@ -67,6 +67,18 @@ def test_a_page_to_read_is_short_and_a_long_one_becomes_no_longer():
     assert {name: count for name, count in lines.items() if count > most[name]} == {}
 
 
+@pytest.mark.parametrize(
+    "folder, index", [("docs", "README.md"), ("docs/notebook", "docs/notebook/README.md")]
+)
+def test_the_list_of_pages_has_every_page(folder, index):
+    """It is also the navigation of the site."""
+    start = (ROOT / index).parent
+    linked = {
+        (start / link.partition("#")[0]).resolve() for link, _ in LINK.findall(prose(ROOT / index))
+    }
+    assert {*(ROOT / folder).glob("*.md")} - {ROOT / index} - linked == set()
+
+
 def test_a_link_that_leads_nowhere_is_found(tmp_path):
     page = tmp_path / "page.md"
     page.write_text("# A `b` c\n\n[one](#a-b-c) [two](#no) [three](no.md) [four](https://x.y)\n")
