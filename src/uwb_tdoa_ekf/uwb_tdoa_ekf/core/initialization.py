@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from uwb_tdoa_bias.common.compiled import Record, compiled
+from uwb_tdoa_bias.common.compiled import Record, compiled, compiled_apart
 
 from . import (
     auxiliary,
@@ -121,7 +121,7 @@ def _look_for_places(
     return share
 
 
-@compiled
+@compiled_apart
 def start(
     ekf: Record,
     anchors: np.ndarray,
@@ -185,7 +185,7 @@ def start(
     add_reset(ekf, t, history)
 
 
-@compiled
+@compiled_apart
 def start_slowly(
     ekf: Record, anchors: np.ndarray, parameters: Record, t: float, history: np.ndarray
 ) -> None:
@@ -289,7 +289,7 @@ def waits(
     return True
 
 
-@compiled
+@compiled_apart
 def relocate(
     ekf: Record, anchors: np.ndarray, parameters: Record, t: float, history: np.ndarray
 ) -> None:
@@ -517,7 +517,7 @@ def _turn(hypothesis: Record, yaw: float, std: float) -> None:
     hypothesis.P[8, 8] = std**2
 
 
-@compiled
+@compiled_apart
 def recover(
     ekf: Record,
     anchors: np.ndarray,

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from uwb_tdoa_bias.common.compiled import Record, compiled
+from uwb_tdoa_bias.common.compiled import Record, compiled, compiled_apart
 
 from . import ground, hypotheses, stationary_position
 from .history import add_update, replace_velocity
@@ -94,7 +94,7 @@ def detect_liftoff(ekf: Record, sample: Record, dt: float, records: np.ndarray) 
     ekf.resting, ekf.next_look = False, sample.t + AWAY
 
 
-@compiled
+@compiled_apart
 def check_stationarity(
     ekf: Record,
     anchors: np.ndarray,
