@@ -74,7 +74,7 @@ def smooth(
     value, std = offset or (0.0, 0.0)
     nearer = flight if offset is None else without_offset(flight, value)
     run = _smoothed_run(nearer, config, corrector)
-    if nearer.range is not None and not len(nearer.tdoa):
+    if nearer.range is not None and not len(nearer.tdoa) and len(run.odometry):
         corrector = corrector or Corrector(flight.anchors)
         length = correlation_length(nearer, run.odometry, corrector.effects)
         if length > config.tdoa_correlation_length:

@@ -656,7 +656,9 @@ def test_the_measured_walk_of_isas(shared_data):
     )
     # measured by the accelerometer: the anchors with z = 1.86 are below those with z = 0
     assert sorted(read.anchors.positions[:, 2].round(2).tolist()) == [-1.86, -1.85, 0.0, 0.0, 0.0]
-    upside_down = dataclasses.replace(read, anchors=read.anchors.at(read.anchors.positions * [1.0, -1.0, -1.0]))
+    upside_down = dataclasses.replace(
+        read, anchors=read.anchors.at(read.anchors.positions * [1.0, -1.0, -1.0])
+    )
     rules = [
         {finding.rule for finding in judged(of_flight(flight)).findings}
         for flight in (read, upside_down)
