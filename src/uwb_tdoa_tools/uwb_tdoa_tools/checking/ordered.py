@@ -32,9 +32,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     Window = tuple[np.ndarray, ...]  # t (n,) s, a and b (n,) rows of the anchors, d (n,) m
-    from uwb_tdoa_ekf.monitoring.explain import Unexplained
-
     from uwb_tdoa_bias.common.sensors import Ranges
+    from uwb_tdoa_ekf.monitoring.explain import Unexplained
 
     from .recording import Recording
 
