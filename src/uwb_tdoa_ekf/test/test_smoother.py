@@ -4,7 +4,7 @@
 from dataclasses import replace
 
 from covariances import assert_covariance
-from flights import WORKSPACE, corners, fly, leaving, position_at, with_ranges
+from flights import WORKSPACE, corners, fly, kept, leaving, position_at, with_ranges
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -249,6 +249,14 @@ def test_a_tag_outside_of_its_workspace_is_smoothed_to_the_end():
     assert np.diff(odometry.t).max() < 0.1
     outside = odometry.t > 2.0
     assert (odometry.p[outside] > WORKSPACE[1]).all(axis=1).mean() > 0.5
+
+
+@pytest.mark.parametrize("seed, late", [(4, 1.5), (2, 3.0), (4, 3.0)])
+def test_an_inertial_sensor_that_comes_later_leaves_a_covariance(seed, late):
+    """It opens the yaw in flight, and the filter changes between yaws with paths of their own."""
+    flight = fly(seed, 10.0, accel_noise=0.05, gyro_noise=0.003, tdoa_std=0.3, tdoa_rate=60.0)
+    flight = replace(flight, imu=kept(flight.imu, flight.imu.t > late))
+    assert_covariance(smooth(flight).odometry.covariance, tolerance=1e-6)
 
 
 def ranged(seed, time, size=0.1):
