@@ -30,6 +30,7 @@ from studies import (
     scale,
     sensors,
     situations,
+    survey_ranges,
     surveying,
     two_errors,
     two_machines,
@@ -91,6 +92,7 @@ STUDIES = {
     "situations": situations,
     "soak": soak,
     "spin": spin,
+    "survey-ranges": survey_ranges,
     "surveying": surveying,
     "two-errors": two_errors,
     "two-machines": two_machines,
@@ -140,6 +142,7 @@ of measured flights: flights/, util/, surveys/.
   situations       where a tag can be and what can happen to it, simulated (docs/notebook/reliability.md)
   soak             both nodes for hours: memory and lost messages (docs/notebook/reliability.md)
   spin             the error of a TDOA over the yaw of the tag (docs/notebook/bias.md)
+  survey-ranges    errors of ranges that are not of the anchors, and what survey makes of them (docs/notebook/ranges.md)
   surveying        surveys shaken, and made better from flights alone (docs/notebook/calibration.md)
   two-errors       vibration that is rectified, and late anchors near the floor (docs/notebook/measured.md)
   two-machines     who hears whom on two machines, takes root (docs/notebook/ros.md)
@@ -190,6 +193,7 @@ def parser():
         "./dev study debias-measured --data DATA --diagnosed bench/ --out measured/",
         "./dev study debias-set-up --out set_up/",
         "./dev study diagnose-ranges --flights 5",
+        "./dev study survey-ranges --flights 5",
         "./dev study diagnosis bank --out bench/",
         "./dev study diagnosis measured --data DATA --out bench/",
         (

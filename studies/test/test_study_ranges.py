@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 
-from studies import ranges
+from studies import ranges, survey_ranges
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools.scoring.evaluation import evaluate
 
@@ -51,3 +51,16 @@ def test_a_row_has_means_and_the_largest_ratio():
         ranges.line("ranges", "defaults", rows, [0.2, 0.2])
         == "| ranges | defaults | 0.200 m | 0.200 m | 1.50 | 1.50 |"
     )
+
+
+def test_late_errors_of_ranges_are_never_too_short(flight):
+    for words, puts in survey_ranges.ERRORS.items():
+        changed = flight
+        for put in puts:
+            changed = put(changed, 1)
+        added = changed.range.d - flight.range.d
+        assert bool(added.any()) == bool(puts)
+        if "late" in words:
+            assert (added >= 0.0).all() and added.max() < 0.8
+    again = survey_ranges.of_place(0.1)
+    np.testing.assert_array_equal(again(flight, 2).range.d, again(flight, 2).range.d)

@@ -4,13 +4,15 @@
 from dataclasses import replace
 
 from covariances import assert_covariance
-from flights import WORKSPACE, corners, fly, leaving, position_at, with_ranges
+from flights import WORKSPACE, corners, fly, kept, leaving, position_at, with_ranges
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
 
 from uwb_tdoa_bias.common.flight import Tdoas
+from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_ekf import smoother
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
 from uwb_tdoa_ekf.offline import run_offline, without_offset
 from uwb_tdoa_ekf.smoother import smooth
@@ -249,6 +251,59 @@ def test_a_tag_outside_of_its_workspace_is_smoothed_to_the_end():
     assert (odometry.p[outside] > WORKSPACE[1]).all(axis=1).mean() > 0.5
 
 
+@pytest.mark.parametrize("seed, late", [(4, 1.5), (2, 3.0), (4, 3.0)])
+def test_an_inertial_sensor_that_comes_later_leaves_a_covariance(seed, late):
+    """It opens the yaw in flight, and the filter changes between yaws with paths of their own."""
+    flight = fly(seed, 10.0, accel_noise=0.05, gyro_noise=0.003, tdoa_std=0.3, tdoa_rate=60.0)
+    flight = replace(flight, imu=kept(flight.imu, flight.imu.t > late))
+    assert_covariance(smooth(flight).odometry.covariance, tolerance=1e-6)
+
+
+def ranged(seed, time, size=0.1):
+    """A flight of ranges alone: with white noise, and an error of each anchor that persists for
+    `time` s.
+    """
+    flight = with_ranges(fly(seed, 24.0, **NOISE), seed)
+    d, rng = flight.range.d.copy(), np.random.default_rng(seed)
+    for anchor in flight.anchors.ids if time else ():
+        own = flight.range.anchor == anchor
+        stays = np.exp(-np.mean(np.diff(flight.range.t[own])) / time)
+        error = size * rng.standard_normal()
+        for row in np.flatnonzero(own):
+            error = stays * error + size * np.sqrt(1.0 - stays**2) * rng.standard_normal()
+            d[row] += error
+    none = Tdoas(*np.empty((4, 0)))
+    return replace(flight, tdoa=none, range=replace(flight.range, d=d))
+
+
+def test_the_correlation_of_ranges_is_measured():
+    """200 ranges a second to eight anchors: 25 of an anchor."""
+    lengths = []
+    for time in (0.0, 0.5, 1.0):
+        flight = ranged(0, time)
+        path = smooth(flight).odometry
+        lengths.append(smoother.correlation_length(flight, path, EffectSet()))
+    assert lengths[0] <= 4.0 and 12.0 < lengths[1] < 38.0 and lengths[1] < lengths[2] < 76.0
+
+
+def test_ranges_with_errors_that_persist_count_less(monkeypatch):
+    flights = [ranged(seed, 1.0) for seed in range(3)]
+    measured = [rmse(flight, smooth(flight).odometry) for flight in flights]
+    monkeypatch.setattr(smoother, "correlation_length", lambda *_: 1.0)
+    as_configured = [rmse(flight, smooth(flight).odometry) for flight in flights]
+    assert np.mean(measured) < 0.95 * np.mean(as_configured)
+
+
+def test_white_ranges_and_ranges_beside_tdoas_are_smoothed_as_configured(monkeypatch):
+    beside = with_ranges(fly(0, 6.0, **NOISE))
+    for flight in (ranged(0, 0.0), beside):
+        one = smooth(flight).odometry
+        with monkeypatch.context() as patch:
+            patch.setattr(smoother, "correlation_length", lambda *_: 1.0)
+            np.testing.assert_array_equal(one.p, smooth(flight).odometry.p)
+
+
 def test_a_flight_too_short_to_start():
-    flight = fly(5, 0.2)
-    assert len(smooth(flight).odometry) == 0
+    flight = with_ranges(fly(5, 0.2))
+    for short in (flight.without("range"), replace(flight, tdoa=Tdoas(*np.empty((4, 0))))):
+        assert len(smooth(short).odometry) == 0

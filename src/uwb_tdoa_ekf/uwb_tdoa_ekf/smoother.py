@@ -16,6 +16,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.common.compiled import compiled
+from uwb_tdoa_bias.common.flight import Truth
+from uwb_tdoa_bias.correction.corrector import Corrector
+from uwb_tdoa_bias.effects import RADIO, true_samples
 
 from .core import auxiliary, plane
 from .core.config import FilterConfig
@@ -29,9 +32,14 @@ from .results import Odometry
 if TYPE_CHECKING:
     from uwb_tdoa_bias.common.compiled import Record
     from uwb_tdoa_bias.common.flight import Flight
-    from uwb_tdoa_bias.correction.corrector import Corrector
+    from uwb_tdoa_bias.effects import EffectSet
 
     from .offline import Run
+
+RANGE = "range"
+LAGS = 64  # most ranges of one anchor over which their errors are compared
+FEWEST_RANGES = 4 * LAGS  # of one anchor; fewer show no correlation
+OUTLIER = 3.0  # standard deviations to which a residual is limited
 
 
 def smooth(
@@ -41,8 +49,9 @@ def smooth(
 
     The odometry has the stamps of updates, thinned to odometry_rate. Pressures are not used. If the
     yaw is unknown, the smoother uses the final yaw hypothesis from the start. An unknown common
-    range offset (`range_offset_std`) is treated the same way and needs a second smoothing run. The
-    memory is 3.5 kB per update.
+    range offset (`range_offset_std`) is treated the same way and needs a second smoothing run. If
+    the flight has ranges and no TDOAs, their correlation length is measured first
+    (`correlation_length`). The memory is 3.5 kB per update.
 
     Parameters
     ----------
@@ -62,16 +71,59 @@ def smooth(
             yaw = math.remainder(config.initial_yaw + first.yaw_offset, 2.0 * math.pi)
             config = replace(config, initial_yaw=yaw, initial_yaw_std=YAW_STD)
     config = replace(config, **auxiliary.NONE)
+    value, std = offset or (0.0, 0.0)
+    nearer = flight if offset is None else without_offset(flight, value)
+    run = _smoothed_run(nearer, config, corrector)
+    if nearer.range is not None and not len(nearer.tdoa) and len(run.odometry):
+        corrector = corrector or Corrector(flight.anchors)
+        length = correlation_length(nearer, run.odometry, corrector.effects)
+        if length > config.tdoa_correlation_length:
+            config = replace(config, tdoa_correlation_length=length)
+            run = _smoothed_run(nearer, config, corrector)
     if offset is None:
-        return _smoothed_run(flight, config, corrector)
-    value, std = offset
-    run, beside = (
-        _smoothed_run(without_offset(flight, one), config, corrector)
-        for one in (value, value + std)
-    )
+        return run
+    beside = _smoothed_run(without_offset(flight, value + std), config, corrector)
     return replace(
         run, odometry=_with_common_error(run.odometry, beside.odometry), range_offset=offset
     )
+
+
+def correlation_length(flight: Flight, odometry: Odometry, effects: EffectSet) -> float:
+    """Return how many ranges count as one, because errors of one anchor persist.
+
+    Reflections and bodies in the way change over seconds, and each anchor has its own. The errors
+    are ranges minus distances along the smoothed path, without the median of each anchor. An
+    exponential correlation that falls to 1/e after k ranges of an anchor has the length 2 k.
+
+    Parameters
+    ----------
+    flight : Flight
+        Recording with ranges.
+    odometry : Odometry
+        Smoothed estimates.
+    effects : EffectSet
+        Known errors of the recording.
+    """
+    path = Truth(odometry.t, odometry.p, odometry.q)
+    flight = replace(effects.correct_streams(flight), truth=path)
+    samples, rows = true_samples(flight, RADIO[RANGE])
+    ranges = getattr(flight, RANGE)
+    left = ranges.d[rows] - samples.predicted() - effects.bias(samples)
+    left[(samples.t < path.t[0]) | (samples.t > path.t[-1])] = np.nan
+    products = np.zeros(LAGS)
+    for anchor in np.unique(samples.b):
+        own = left[samples.b == anchor]
+        own = own[np.isfinite(own)]
+        if len(own) < FEWEST_RANGES:
+            continue
+        own = own - np.median(own)
+        limit = OUTLIER * 1.4826 * np.median(np.abs(own))
+        own = np.clip(own, -limit, limit)
+        products += [np.dot(own[: len(own) - lag], own[lag:]) for lag in range(LAGS)]
+    fallen = np.flatnonzero(products < math.exp(-1.0) * products[0])
+    if not products[0] > 0.0:
+        return 1.0
+    return 2.0 * float(fallen[0] if len(fallen) else LAGS)
 
 
 def _smoothed_run(flight: Flight, config: FilterConfig, corrector: Corrector | None) -> Run:

@@ -17,6 +17,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 BEGIN = 1_700_000_000 * 10**9  # ns, when the recordings begin
 TAG = 7
+NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # of our world axes
 
 NODE2 = "uint8 role\nuint8 id\nfloat32 dis\nfloat32 fp_rssi\nfloat32 rx_rssi\n"
 INERTIA = "float32[3] imu_gyro_3d\nfloat32[3] imu_acc_3d\n"
@@ -445,7 +446,7 @@ def isas(flight):
             )
         anchors = [
             message(store, place, id=int(number), position=vector(store, "Point", p))
-            for number, p in zip(flight.anchors.ids, flight.anchors.positions)
+            for number, p in zip(flight.anchors.ids, flight.anchors.positions @ NED.T)
         ]
         imu, pose = "sensor_msgs/msg/Imu", "geometry_msgs/msg/TransformStamped"
         samples = [

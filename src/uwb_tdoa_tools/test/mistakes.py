@@ -245,6 +245,11 @@ def mirrored_survey(recording, rng, other):
     return _moved(recording, recording.anchors.positions[:, [1, 0, 2]])
 
 
+@mistake("survey upside down", "survey_upside_down", needs="imu", alone=True)
+def upside_down_survey(recording, rng, other):
+    return _moved(recording, recording.anchors.positions * [1.0, -1.0, -1.0])
+
+
 # The inertial sensor
 
 

@@ -15,6 +15,7 @@ from uwb_tdoa_bias.effects.stamps import shifted
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.scoring.alignment import (
+    _other_axes,
     estimate_alignment,
     require_truth,
     rigid_transform,
@@ -244,3 +245,11 @@ def test_no_healthy_recording_is_moved_and_every_late_one_is(shared_data):
         assert down.axes_differ and np.array_equal(down.axes, np.diag([1, 1, -1])), one.name
         epoch = estimate_alignment(shifted(one, "truth", EPOCH), path)
         assert abs(epoch.late - EPOCH) < 0.03, one.name
+
+
+def test_a_frame_of_its_own_is_turned_and_not_mirrored(flight, odometry):
+    """A mirror image may be nearer by chance, where the truth is metres away."""
+    rng = np.random.default_rng(0)
+    for turn in Rotation.random(100, random_state=1).as_matrix():
+        other = in_frame(flight, turn, rng.uniform(-5.0, 5.0, 3))
+        assert np.linalg.det(_other_axes(other.truth, odometry)) > 0.0

@@ -21,6 +21,8 @@ import yaml
 
 from uwb_tdoa_bias.common import limits
 from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import Tdoas
+from uwb_tdoa_bias.common.sensors import Ranges
 from uwb_tdoa_tools.bags import integrity, mcap
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag
 from uwb_tdoa_tools.bags.files import messages, open_bag
@@ -374,6 +376,16 @@ def test_the_place_of_the_antenna_is_written_where_nodes_look_for_it(tmp_path, s
     ]
     write_bag(back, tmp_path / "again", storage)
     assert read_bag(tmp_path / "again").meta["antenna"] == [0.5, 0.0, -0.1]
+
+
+def test_the_antenna_of_ranges_alone_is_written_and_read(tmp_path):
+    flight = small_flight(0.1)
+    t, ids = flight.tdoa.t, flight.tdoa.a
+    ranges = Ranges(t, ids, np.full(len(t), 2.0), np.zeros(len(t)))
+    none = Tdoas(*np.empty((4, 0)))
+    alone = replace(flight, tdoa=none, range=ranges, meta={"antenna": [0.1, -0.2, 0.3]})
+    write_bag(alone, tmp_path / "bag")
+    assert read_bag(tmp_path / "bag").meta["antenna"] == [0.1, -0.2, 0.3]
 
 
 def shared_children(file, table, levels=10):

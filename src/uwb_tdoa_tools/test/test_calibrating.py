@@ -130,10 +130,19 @@ def test_a_single_flight_is_judged_on_its_end(flights):
     ],
 )
 def test_innovations_alone_must_speak_clearly(before, after, why):
-    against = library._reason_against_unverified(after, GOOD.judged_on)
+    against = library._reason_against_unverified(before, after, False, GOOD.judged_on)
     blind = replace(GOOD, before=before, after=after, measure="slow innovations", why_not=against)
     told = library._validated(blind, True).why_not
     assert told is why if why is None else why.replace(GOOD.measure, blind.measure) in told
+
+
+@pytest.mark.parametrize(("before", "after", "kept"), [(0.12, 0.064, True), (0.08, 0.07, False)])
+def test_ranges_may_leave_more_if_much_less_is_slow(before, after, kept):
+    of_ranges, of_tdoas = (
+        library._reason_against_unverified(before, after, alone, "flight3")
+        for alone in (True, False)
+    )
+    assert (of_ranges is None) == kept and "more than 5.5 cm" in of_tdoas
 
 
 @pytest.mark.parametrize(

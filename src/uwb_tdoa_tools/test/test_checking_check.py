@@ -4,7 +4,7 @@
 
 from dataclasses import replace
 
-from checking_flights import recording
+from checking_flights import QUICK, recording
 from known_effects import clean_flight
 from mistakes import MISTAKES
 import numpy as np
@@ -20,6 +20,7 @@ from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.rooms import constellation
 
 OTHER_ROOM = constellation("random-5")
+NO_TDOAS = Tdoas(*(np.empty(0, kind) for kind in (float, int, int, float)))
 # with these, nothing but the streams themselves is judged
 NOTHING_TRIED = ["stamp_zero", "clipped", "jump"]
 LONGER = {"mirrored_survey": {"duration": 30.0}}  # shows once the yaw is known
@@ -83,6 +84,14 @@ def test_healthy_flights_have_no_error(trajectory, room):
 def test_a_mistake_is_named(name):
     report = with_mistake(name)
     assert rules(report) & set(MISTAKES[name].named), report.findings
+
+
+def test_ranges_alone_show_a_survey_upside_down():
+    flight = simulate(SimulationConfig(seed=0, range_noise=0.1, **QUICK))
+    healthy = replace(of_flight(flight), tdoa=NO_TDOAS)
+    upside_down = MISTAKES["upside_down_survey"].make(healthy, None, None)
+    assert "survey_upside_down" in rules(check(upside_down))
+    assert rules(check(healthy)) == set()
 
 
 @pytest.mark.slow

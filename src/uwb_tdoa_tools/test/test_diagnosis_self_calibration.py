@@ -19,7 +19,7 @@ from uwb_tdoa_tools.diagnosis.references import Nothing
 from uwb_tdoa_tools.diagnosis.self_calibration import self_calibrate
 from uwb_tdoa_tools.diagnosis.self_calibration.equations import Runs
 from uwb_tdoa_tools.diagnosis.self_calibration.prior import with_calibration
-from uwb_tdoa_tools.diagnosis.self_calibration.solve import CLEARLY, LEFT
+from uwb_tdoa_tools.diagnosis.self_calibration.solve import CLEARLY, CLEARLY_OF_RANGES, LEFT
 from uwb_tdoa_tools.scoring.evaluation import evaluate
 
 DELAYS = {"1": 0.3, "4": -0.2, "6": 0.25}
@@ -124,6 +124,16 @@ def test_nothing_is_applied_if_something_else_is_wrong_too():
     blocked = {"2.x": 1.0, "2.y": 0.0, "2.z": 1.0, "2.radius": 1.5, "2.delay": 1.5}
     other = EFFECTS["nlos"](blocked), LATE, EFFECTS["noise_correlation"]({"std": 0.2, "time": 1.0})
     assert "something else is wrong too" in why_not_of(flight_with(*other))
+
+
+@pytest.mark.parametrize("ratio, applied", [(0.95, False), (1.05, True)])
+def test_slow_errors_of_ranges_ask_for_a_smaller_fall(late, ratio, applied):
+    """Whatever remains: more than of TDOAs may, or so little that TDOAs would be taken."""
+    for left in (0.5 * LEFT, 2.0 * LEFT):
+        before = ratio * CLEARLY_OF_RANGES * left
+        found = replace(late, before=before, left=left, marks=None)
+        assert (found.why_not is None) == (left < LEFT)
+        assert (replace(found, tdoa_std=None).why_not is None) == applied
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,14 @@ import shutil
 import pytest
 
 from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_tools.choices import FRAME
+from uwb_tdoa_tools.diagnosis.self_calibration import self_calibrate
+from uwb_tdoa_tools.estimate import FlightEstimator
 from uwb_tdoa_tools.readers import load_profile, read_by_profile
 from uwb_tdoa_tools.readers.names import read_named_anchors
+from uwb_tdoa_tools.scoring.alignment import estimate_alignment
 from uwb_tdoa_tools.scoring.evaluation import evaluate
+from uwb_tdoa_tools.scoring.metrics import Score, radio_residuals
 
 
 @pytest.fixture(params=["1", "2"])
@@ -30,3 +35,28 @@ def test_a_tag_of_which_nobody_knows_the_delay_is_located_and_honest(tag):
     )
     assert row["rmse_3d"] < 0.25 < 0.9 < wrong["rmse_3d"]
     assert row["nees_mean"] < 3.0 < 15.0 < wrong["nees_mean"]
+
+
+def test_a_survey_of_ranges_is_applied_and_the_position_gets_better(tag):
+    """Anchors that the flight itself shows, without its ground truth."""
+    found = self_calibrate([tag])
+    assert found.why_not is None and found.before > 1.25 * found.left
+    before, after = (
+        evaluate(flight, effects=effects)[0].row()["rmse_3d"]
+        for flight, effects in (
+            (tag, None),
+            (tag.replaced(anchors=found.anchors), found.effects),
+        )
+    )
+    assert after < before
+
+
+@pytest.mark.parametrize(("smoothed", "peer"), [(False, 0.454), (True, 0.111)])
+def test_a_walk_is_nearer_to_the_truth_than_its_peer(shared_data, smoothed, peer):
+    """On line and in hindsight, after rigid alignment, without a calibration."""
+    bag = shared_data / "ranging" / "isas" / "ISAS-Walk1.bag"
+    walk = read_by_profile([bag], load_profile("isas"))
+    run = FlightEstimator(smoothed=smoothed)(walk)
+    truth = estimate_alignment(walk, run.odometry).applied_to(walk.truth, FRAME)
+    score = Score(walk.name, run.odometry, truth, radio_residuals(walk, run), walk.tdoa.t)
+    assert score.row()["rmse_3d"] < peer and score.row()["nees_mean"] < 3.0

@@ -33,6 +33,8 @@ from walking import blocks, section
 import yaml
 
 from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_tools.checking.check import check as judged
+from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.commands.check import main as check
 from uwb_tdoa_tools.commands.convert import main as convert
 from uwb_tdoa_tools.commands.localize import main as localize
@@ -652,6 +654,16 @@ def test_the_measured_walk_of_isas(shared_data):
         4839,
         3168,
     )
+    # measured by the accelerometer: the anchors with z = 1.86 are below those with z = 0
+    assert sorted(read.anchors.positions[:, 2].round(2).tolist()) == [-1.86, -1.85, 0.0, 0.0, 0.0]
+    upside_down = dataclasses.replace(
+        read, anchors=read.anchors.at(read.anchors.positions * [1.0, -1.0, -1.0])
+    )
+    rules = [
+        {finding.rule for finding in judged(of_flight(flight)).findings}
+        for flight in (read, upside_down)
+    ]
+    assert "survey_upside_down" not in rules[0] and "survey_upside_down" in rules[1]
     assert read.meta["unread"] == [
         "/rtls_pose: 970 messages of geometry_msgs/msg/PoseStamped, which the profile does not name"
     ]

@@ -30,7 +30,7 @@ from .diagnosis.references import GroundTruth, Nothing
 from .diagnosis.report.verdict import percent, worse_phases
 from .diagnosis.self_calibration import SelfCalibration, Tape, self_calibrate
 from .diagnosis.self_calibration.equations import slow_innovations
-from .diagnosis.self_calibration.solve import IMPROVED, LEFT
+from .diagnosis.self_calibration.solve import CLEARLY_OF_RANGES, IMPROVED, LEFT
 from .diagnosis.validation import cross_fitted
 from .estimate import FlightEstimator
 from .parallel import Progress
@@ -252,18 +252,19 @@ def without_truth(
         before,
         after,
         on,
-        found.why_not or _reason_against_unverified(after, on),
+        found.why_not or _reason_against_unverified(before, after, found.tdoa_std is None, on),
         as_text(found),
     )
     return _validated(calibration, True)
 
 
-def _reason_against_unverified(after: float, on: str) -> str | None:
+def _reason_against_unverified(before: float, after: float, of_ranges: bool, on: str) -> str | None:
     """Return why a calibration may do harm although the innovations decrease, or None.
 
-    after : m, slow innovations with it; on : names of the hold-out data
+    before, after : m, slow innovations without and with it; of_ranges : without TDOAs
+    on : names of the hold-out data
     """
-    if after <= LEFT:
+    if after <= LEFT or (of_ranges and before > CLEARLY_OF_RANGES * after):
         return None
     return (
         f"{100 * after:.1f} cm of the innovations are slow with it on {on}, more than "

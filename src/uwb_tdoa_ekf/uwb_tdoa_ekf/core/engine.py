@@ -324,9 +324,9 @@ def _select(ekf: Record, parameters: Record, t: float, records: np.ndarray) -> N
     followed = ekf.best
     alone = hypotheses.select(ekf, t) and parameters.use_imu and not (ekf.quiet or ekf.resting)
     # If the best hypothesis is at another place, the history needs a reset. If only the yaw
-    # differs, it needs a reset after a yaw was opened again. The yaws of a start share the history
-    # before the choice, so they need none.
-    opened = ekf.yaw_test.count > 0 or not parameters.use_imu
+    # differs, it needs a reset after the attitude was reset in flight. The yaws of a start share the
+    # history before the choice, so they need none.
+    opened = ekf.attitude_reset or not parameters.use_imu
     if ekf.best // N_YAWS != followed // N_YAWS or (ekf.best != followed and opened):
         history.add_reset(ekf, t, records)
     if alone and yaw_check.contradicts(ekf, t):

@@ -680,6 +680,7 @@ def reset_attitude(ekf: Record, parameters: Record, yaw_std: float, history: np.
     yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     x, covariance = best.x[:6].copy().reshape(1, 6), best.P[:6, :6].copy().reshape(1, 6, 6)
     _begin(ekf, parameters, ekf.t, Places(x, covariance, np.zeros(1)), yaw, yaw_std, True)
+    ekf.attitude_reset = True
     add_reset(ekf, ekf.t, history)
 
 

@@ -201,6 +201,8 @@ EKF = _record(
     ("imu_fault_detector", IMU_FAULT_DETECTOR),  # of the inertial samples
     ("imu_faulty", bool),  # inertial samples are not used, because they are implausible
     ("yaw_test", YAW_TEST),  # see yaw_check.py
+    # the attitude was reset while the filter ran: the yaws that follow have no common history
+    ("attitude_reset", bool),
     # s, stamp until which the first inertial samples of a running filter are averaged; -inf:
     # samples are used
     ("attitude_averaged_until", float),

@@ -143,7 +143,7 @@ def write_bag(
             topics[f"/{sensor.topics[0][0]}"] = (
                 sensor.message,
                 STREAM_QOS,
-                bag_messages.sensor_messages(sensor, stream, store),
+                bag_messages.sensor_messages(sensor, stream, store, antenna),
             )
     topics["/uwb/tdoa"] = (
         "uwb_tdoa_msgs/msg/Tdoa",
@@ -322,18 +322,22 @@ def read_bag(
             remarks += recorded.remarks(name_of("uwb/anchors"))
         imu = stream("imu")
         tree = frames.read_frames(path, reader)
+        # the antenna is that of the TDOAs, or of ranges without any
+        radio = ["tdoa"] if len(tdoa) else [name for name in LOCATING if sensors[name] is not None]
         places = {
-            kinds[name].topic: frames.sensor_place(tree, kinds[name].topic, found[name].frames)
-            for name in ("imu", "tdoa")
+            name: frames.sensor_place(tree, kinds[name].topic, found[name].frames)
+            for name in ("imu", *radio)
         }
         remarks += [remark for _, remark in places.values() if remark]
         remarks = [*remarks_of(reader), *remarks]
         unread = _unread(reader, name_of)
         poses = stream("pose")
-    if imu is not None and (place := places["imu/data"][0]):
+    if imu is not None and (place := places["imu"][0]):
         imu = frames.imu_in_body(imu, place)
-    if place := places["uwb/tdoa"][0]:
-        meta["antenna"] = place[1].tolist()
+    for name in radio:
+        antenna, _ = places[name]
+        if antenna is not None:
+            meta["antenna"] = antenna[1].tolist()
     if remarks:
         meta["remarks"] = remarks
     if unread:

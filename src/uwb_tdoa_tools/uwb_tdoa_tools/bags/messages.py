@@ -94,15 +94,21 @@ def imu_of(stamps: np.ndarray, rows: np.ndarray) -> Imu:
     return Imu(stamps, rows[:, 0:3], rows[:, 3:6])
 
 
-def sensor_messages(sensor: Sensor, stream: Stream, store: Typestore) -> Iterator[tuple[int, Any]]:
-    """Yield (stamp ns, message) of the Stream of a Sensor; other fields are 0."""
+def sensor_messages(
+    sensor: Sensor, stream: Stream, store: Typestore, antenna: Sequence[float] | None = None
+) -> Iterator[tuple[int, Any]]:
+    """Yield (stamp ns, message) of the Stream of a Sensor; other fields are 0.
+
+    `antenna` is its position in the body frame, for ranges, see `transforms_message`.
+    """
+    frame = ANTENNA_FRAME if antenna and sensor.locates else BODY_FRAME
     content = {
         field: np.broadcast_to(values, (len(stream), *np.shape(values)[1:]))
         for field, values in sensor.content(stream).items()
     }
     for k, stamp in enumerate(nanoseconds(sensor.name, stream.t).tolist()):
         message = _blank(store, sensor.message)
-        message.header = header_of(store, stamp, BODY_FRAME)
+        message.header = header_of(store, stamp, frame)
         for field, values in content.items():
             *way, last = field.split(".")
             _set(reduce(getattr, way, message), last, values[k])

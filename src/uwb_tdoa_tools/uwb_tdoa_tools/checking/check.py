@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from uwb_tdoa_bias.common.sensors import SENSORS
+from uwb_tdoa_bias.common.sensors import SENSORS, Ranges
 from uwb_tdoa_ekf.monitoring.finding import ERROR, NOTE, WARNING, Finding, most_severe_first
 from uwb_tdoa_ekf.monitoring.stream_rules import StreamRules
 
 from ..estimate import FlightEstimator
 from ..readers.streams import protocol
 from . import coverage, imu_rules, recording_rules, tdoa_rules
-from .ordered import OrderedRecording, displacement
+from .ordered import OrderedRecording, differences, displacement
 from .tdoa_rules import SAME, largest_displacement
 from .watch import found_by_monitor, together
 
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from .recording import Recording
     from .tdoa_rules import Survey
 
+FEWEST_PAIRS = 1000  # of successive ranges, for a trial without TDOAs
 ROUNDS = 3  # mistakes that are undone one after the other
 # After one of these findings no correction, or none of the IMU, can be tried.
 NOTHING_TO_TRY = {
@@ -124,11 +125,31 @@ def check(
         found += rule(recording)
     if any(finding.rule == "clock_silence" for finding in found):  # the gap of all streams
         found = [finding for finding in found if finding.rule != "gap"]
-    if len(recording.tdoa):  # with ranges alone, nothing can be tried
+    if len(recording.tdoa):
         found = _with_trials(recording, streams, found, others, estimator, line)
+    else:
+        found += _tried_with_ranges(recording, found)
     return Report(
         recording.name, most_severe_first(found), _facts(recording, streams), recording.ends
     )
+
+
+def _tried_with_ranges(recording: Recording, found: list[Finding]) -> list[Finding]:
+    """Return the finding about inertial sensor and survey of a Recording without TDOAs, or none.
+
+    Two successive ranges make a TDOA. Other corrections cannot be tried with ranges alone.
+
+    found : findings of the streams
+    """
+    ranges = recording.sensors.get("range")
+    names = {finding.rule for finding in found}
+    if not isinstance(ranges, Ranges) or names & (NOTHING_TO_TRY | WITHOUT_IMU):
+        return []
+    paired = OrderedRecording.of(replace(recording, tdoa=differences(ranges, recording.anchors)))
+    if len(paired.tdoa) < FEWEST_PAIRS or paired.imu is None:
+        return []
+    finding = imu_rules.find_imu_mistake(_without_stream_mistakes(paired, found))
+    return [] if finding is None else [finding]
 
 
 def _with_trials(

@@ -96,6 +96,8 @@ STEADY = 0.02  # share of the specific force by which it varies at rest
 TURNED = 0.3  # rad, least rotation in motion
 TIE = 0.03  # ratios this close are equal: the simplest arrangement is taken
 CHOSEN = 8  # arrangements that are tried on the longer part
+# The survey upside down: a second fault, e.g. a useless gyroscope, may explain a little more.
+OVER, NEARLY = np.diag([1.0, -1.0, -1.0]), 2.0 * TIE
 UPRIGHT, MIRROR = np.eye(3), np.diag([1.0, -1.0, 1.0])
 # Axes that are exchanged or mirrored, as (3, 3) matrices that undo it; the first is as it is.
 ARRANGEMENTS = [
@@ -124,8 +126,12 @@ def find_imu_mistake(recording: OrderedRecording) -> Finding | None:
         return None
     base = _unexplained(brief)
     trials = [_tried(base, brief, accel, gyro) for accel, gyro in _usual()]
-    if not min(ratio for ratio, _, _, _ in trials) < RATIO:
+    least = min(ratio for ratio, _, _, _ in trials)
+    if not least < RATIO:
         return None
+    upside_down = _upside_down(base, brief, least)
+    if upside_down is not None:
+        return upside_down
     scale = _scaled(trials)
     if scale is None:
         trials += _all(brief, base)
@@ -138,6 +144,24 @@ def find_imu_mistake(recording: OrderedRecording) -> Finding | None:
     if len(near) > 1:
         evidence += f"; {len(near) - 1} other arrangements fit about as well"
     return _finding(accel, gyro, evidence, ratio)
+
+
+def _upside_down(base: Unexplained, recording: OrderedRecording, least: float) -> Finding | None:
+    """Return the Finding that the survey is upside down, or None.
+
+    Systems that survey their own anchors lay the plane z = 0 through three of them, not on the
+    floor.
+
+    least : ratio of the best arrangement of the inertial sensor
+    """
+    turned = recording.anchors.at(recording.anchors.positions @ OVER)
+    ratio, z = compare(base, _unexplained(replace(recording, anchors=turned), RATIO * base.mean))
+    if not (ratio < min(RATIO, least + NEARLY) and z > DEVIATIONS):
+        return None
+    evidence = f"{100.0 * (1.0 - ratio):.0f} % less stays unexplained then, {z:.1f} standard errors"
+    cause = "the survey is upside down: z points down, and the inertial sensor measures where up is"
+    line = "x, y, z = y, x, -z  # of every anchor; in a profile: world: ned"
+    return Finding("survey_upside_down", ERROR, cause, evidence, line, ratio)
 
 
 def has_moved(places: np.ndarray) -> bool:

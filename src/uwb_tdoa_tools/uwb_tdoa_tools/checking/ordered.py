@@ -22,6 +22,7 @@ from uwb_tdoa_ekf.core import workspace
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.ground import KnownHeight
 from uwb_tdoa_ekf.core.memory import TDOA, new_state, structured
+from uwb_tdoa_ekf.core.ranges import APART
 from uwb_tdoa_ekf.core.startup import locate, room_for
 from uwb_tdoa_ekf.monitoring.explain import SCALE, unexplained
 from uwb_tdoa_ekf.monitoring.ranging_windows import BEYOND
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     Window = tuple[np.ndarray, ...]  # t (n,) s, a and b (n,) rows of the anchors, d (n,) m
+    from uwb_tdoa_bias.common.sensors import Ranges
     from uwb_tdoa_ekf.monitoring.explain import Unexplained
 
     from .recording import Recording
@@ -217,6 +219,17 @@ class SurveyFit:
             if states
             else np.nan
         )
+
+
+def differences(ranges: Ranges, anchors: Anchors) -> Tdoas:
+    """Return the TDOAs of successive Ranges to two known anchors, less than APART apart."""
+    known = np.flatnonzero(
+        (anchors.index(ranges.anchor) >= 0) & np.isfinite(ranges.t) & np.isfinite(ranges.d)
+    )
+    known = known[np.argsort(ranges.t[known], kind="stable")]
+    t, ids, d = ranges.t[known], ranges.anchor[known], ranges.d[known]
+    kept = np.flatnonzero((ids[1:] != ids[:-1]) & (np.diff(t) < APART)) + 1
+    return Tdoas(t[kept], ids[kept - 1], ids[kept], d[kept] - d[kept - 1])
 
 
 def displacement(surveyed: np.ndarray, fitted: np.ndarray) -> np.ndarray:

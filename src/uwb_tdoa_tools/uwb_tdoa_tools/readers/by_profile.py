@@ -316,6 +316,11 @@ class _Request:
             )
         self.positions[name] = (at[0], at[1], at[2])
 
+    def surveyed(self) -> dict[str, np.ndarray]:
+        """Return {name of an anchor: (3,) m} in our axes."""
+        turned = _axes_of_world(self.source)
+        return {name: turned @ np.array(place) for name, place in self.positions.items()}
+
     def streams(self, remarks: list[str], salvage: bool) -> Streams:
         """Return {stream: {column: (n,) array}} in the units of `make_flight`.
 
@@ -367,7 +372,7 @@ def _in_our_axes(
     if stream in ("gyro", "acc") and source.body == "frd":
         out["y"], out["z"] = -out["y"], -out["z"]
     if stream == "pose":
-        turned = ENU_OF_NED if source.world == "ned" else np.eye(3)
+        turned = _axes_of_world(source)
         place = np.stack([out[axis] for axis in "xyz"])
         out.update(zip("xyz", turned @ place))
         if ATTITUDE <= arrays.keys():
@@ -381,6 +386,11 @@ def _in_our_axes(
             q = np.where(known[:, None], ours if changed else q, np.nan)
             out.update(zip((f"q{k}" for k in "xyzw"), q.T))
     return out
+
+
+def _axes_of_world(source: Source) -> np.ndarray:
+    """Return the rotation (3, 3) from the world axes of a Source to ours."""
+    return ENU_OF_NED if source.world == "ned" else np.eye(3)
 
 
 def _requests(
@@ -481,9 +491,9 @@ def _recorded_anchors(
     """Return the anchors in the recording. Raises InputError."""
     sources = [request for request in requests if request.has_survey]
     _take(tables, sources, None, "")
-    places: dict[str, tuple[float, float, float]] = {}
+    places: dict[str, np.ndarray] = {}
     for request in sources:
-        places |= request.positions
+        places |= request.surveyed()
         remarks += [
             f"{request.table}: the position of anchor {name} changes by {shift:.2f} m; the last "
             "one counts."

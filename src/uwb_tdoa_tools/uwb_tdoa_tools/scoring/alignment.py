@@ -346,7 +346,11 @@ def _inertial(flight: Flight) -> Delays | None:
 
 
 def _other_axes(truth: Truth, odometry: PoseColumns) -> np.ndarray:
-    """Return the signed permutation (3, 3) that brings the truth much nearer, else the identity."""
+    """Return the signed permutation (3, 3) that brings the truth much nearer, else the identity.
+
+    A truth in a frame of its own is rotated, not mirrored: a mirror image that leaves the truth
+    elsewhere must also fit better than a rotation.
+    """
     true, estimated = common_paths(truth, odometry)
     if len(true) < FEWEST:
         return np.eye(3)
@@ -355,7 +359,13 @@ def _other_axes(truth: Truth, odometry: PoseColumns) -> np.ndarray:
         return median_distance(true @ axes.T, estimated)
 
     best = min(ARRANGEMENTS, key=error)
-    return best if error(best) < AXES * error(np.eye(3)) else np.eye(3)
+    if not error(best) < AXES * error(np.eye(3)):
+        return np.eye(3)
+    if np.linalg.det(best) < 0.0 and error(best) > HEIGHT:
+        mirrored = _aligned_rms(true @ best.T, estimated)
+        if mirrored * DISTINCT_ERROR_RATIO > _aligned_rms(true, estimated):
+            return np.eye(3)
+    return best
 
 
 def common_paths(truth: Truth, odometry: PoseColumns) -> tuple[np.ndarray, np.ndarray]:

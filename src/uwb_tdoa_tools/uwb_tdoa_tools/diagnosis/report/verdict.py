@@ -11,7 +11,7 @@ from uwb_tdoa_bias.effects.base import listed
 
 from ...scoring.gains import NO_DIFFERENCE, difference
 from ...scoring.phases import TITLES
-from ..self_calibration.solve import CLEARLY, LEFT
+from ..self_calibration.solve import CLEARLY, CLEARLY_OF_RANGES, LEFT
 from .left_over import left_over
 from .reasons import reasons
 
@@ -202,11 +202,16 @@ def _without_truth(diagnosis: Diagnosis) -> Verdict:
         "What was found makes measurements agree better; what that is worth for the position is "
         "unknown."
     )
+    limit = (
+        f"not above {100 * LEFT:.1f} cm, or {CLEARLY:g} times smaller than it was, limits that "
+        "were set on measured flights"
+        if measured == "TDOAs"
+        else f"{CLEARLY_OF_RANGES:g} times smaller than it was, a limit that was set on simulated "
+        "flights"
+    )
     validated = (
         "It is added because what is slow in the innovations becomes small: what it leaves is "
-        "not above "
-        f"{100 * LEFT:.1f} cm, or {CLEARLY:g} times smaller than it was, limits that were set "
-        "on measured flights."
+        f"{limit}."
     )
     change = f"{scatter} before and {centimetres(after)} after, on {diagnosis.judged_on}."
     return Verdict(headline, (_UNKNOWN, validated, change), "unknown")
