@@ -21,13 +21,18 @@ COUNTS = {
     "initialization.SLOW_STAMPS",
     "initialization.LATE_ANCHORS",
     "initialization.AMONG_OTHERS",
-    "stationarity.MOST_DOUBTS",
+    "stationarity.FEWEST_CHECKS",
     "stationarity.LONG",
-    "stationarity.LONG_ENOUGH",
     "startup.SWEEPS",
     "velocity.STUCK_COUNT",
 }
-STRUCTURE = {"state.GRAVITY", "startup.NO_SCALE", "startup.SMALLEST", "velocity.LONGEST_STD"}
+STRUCTURE = {
+    "initialization.ANY_YAW",
+    "state.GRAVITY",
+    "startup.NO_SCALE",
+    "startup.SMALLEST",
+    "velocity.LONGEST_STD",
+}
 
 
 @dataclass(frozen=True)
@@ -175,8 +180,8 @@ RULES = (
         "one look ends a rest after some lift",
         "stationarity",
         "check_stationarity",
-        "MOST_DOUBTS if np.abs(ekf.lift).max() < UNFELT else 1",
-        "MOST_DOUBTS",
+        "FEWEST_CHECKS if np.abs(ekf.lift).max() < UNFELT else 1",
+        "FEWEST_CHECKS",
     ),
     Rule("landing by late anchors", "stationarity", "check_stationarity", "lateness >= 0"),
     Rule(
@@ -608,7 +613,7 @@ RULES = (
         "the offset of a barometer is taken anew",
         "barometer",
         "observe",
-        "sensor.t - barometer.agreed > LONGEST_DISAGREEMENT",
+        "sensor.t - barometer.agreed > MEMORY",
     ),
     Rule("a stuck velocity", "velocity", "observe", "_repeats(state, sensor) and (not ekf.quiet)"),
     Rule(

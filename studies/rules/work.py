@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 import pickle
@@ -66,6 +67,8 @@ class Variant:
 
     def is_decided(self, so_far: Worth) -> bool:
         """Whether more rows need not be run: a rule is clearly worth it, or a constant matters."""
+        if self.entry is None:
+            return False
         return so_far.changed > 0 if self.factor else so_far.clear
 
     def apply(self, live: Live) -> bool:
@@ -143,12 +146,14 @@ def _watch(job: dict[str, Any], inputs: Inputs, live: Live) -> None:
         one for one in chosen if one.name == BASE or any(word in one.name for word in job["only"])
     ]
     base: dict[str, watched.Said] = {}
+    hits: Counter[tuple[str, str]] = Counter()  # how often a row changes, by its name and a module
     with ResultsFile(job["results"], {"study": "rules, watch"}) as done:
         for patch in tqdm(chosen, unit="variant", disable=None, file=sys.stderr):
-            changed = 0
-            for row in rows:
+            changed, module = 0, patch.name.split(" x ")[0].rpartition(".")[0]
+            enough = CHANGED_ROWS if patch.factor == 1.0 else 1
+            for row in sorted(rows, key=lambda one: -hits[one.name, module]):
                 key = f"{patch.name} | {row.name}"
-                if row.of not in patch.of or (job["stop"] and changed >= CHANGED_ROWS):
+                if row.of not in patch.of or (job["stop"] and changed >= enough):
                     continue
                 if key not in done:
                     inputs.anew = patch.entry is not None
@@ -156,8 +161,9 @@ def _watch(job: dict[str, Any], inputs: Inputs, live: Live) -> None:
                 said = done[key]["said"]
                 if patch.name == BASE:
                     base[row.name] = said
-                else:
-                    changed += bool(watching.differs(base[row.name], said))
+                elif watching.differs(base[row.name], said):
+                    changed += 1
+                    hits[row.name, module] += 1
 
 
 def _said(patch: watching.Patch, row: watched.Watched, live: Live) -> watched.Said:

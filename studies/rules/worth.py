@@ -73,6 +73,7 @@ def worth(base: dict, variant: dict, noise: dict[str, float] | None = None) -> W
                 changes.append(_change(before, after, LEAST[4 if is_time else k], k == 1))
             if not is_time and old[0] and new[0]:
                 out.logs.append(math.log(new[0] / old[0]))
+            if not is_time and old[1] and new[1]:
                 out.excess.append(max(new[1] - HONEST, 0.0) - max(old[1] - HONEST, 0.0))
         largest, smallest = max(changes), min(changes)
         out.lost += largest > CLEAR

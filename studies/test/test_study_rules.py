@@ -153,7 +153,9 @@ def test_every_switch_of_a_rule_over_streams_and_residuals_is_there(made):
 def test_a_constant_is_decided_by_one_row_and_a_rule_by_its_losses():
     base = {name: {"air": [0.2, 1.0, 0.0, 0.1]} for name in "abcd"}
     worse = {name: {"air": [0.3, 1.0, 0.0, 0.1]} for name in "a"}
-    constant, rule = (work.Variant("", None, factor) for factor in (0.5, 0.0))
+    entry = tuned.Entry("noise.SHARE", 0, (0.5,))
+    constant, rule = (work.Variant("", entry, factor) for factor in (0.5, 0.0))
+    assert not work.Variant("", None).is_decided(worth(base, worse))
     assert constant.is_decided(worth(base, worse)) and not rule.is_decided(worth(base, worse))
     worse |= {name: worse["a"] for name in "bc"}
     assert rule.is_decided(worth(base, worse)) and not rule.is_decided(worth(base, base))

@@ -60,11 +60,10 @@ from .memory import (
 )
 from .sensor_functions import subtract
 from .startup import INLIER
-from .state import coast, predict, turn_about_vertical
+from .state import CONSTRAINT_PERIOD, coast, predict, turn_about_vertical
 from .update import project
 
 INCONSISTENT = 0.5  # share below which the filter searches for the tag elsewhere
-UNSURE_TIME = 0.5  # s of TDOAs after a silence in which the filter searches for a lost tag
 MAX_STEP = 0.05  # s, longest single prediction
 # s of inertial samples that determine the initial attitude if the IMU starts after the filter
 AVERAGED = 0.25
@@ -167,10 +166,10 @@ def most_records(measurements: Measurements) -> int:
     imu, tdoa, sensor = measurements
     spans = [part["t"][-1] - part["t"][0] for part in measurements if len(part)]
     most, seconds = len(imu) + len(tdoa) + len(sensor), max(spans, default=0.0)
-    periods = stationarity.PERIOD, plane.PERIOD, 0.5 * imu_fault_detector.CLEARED
-    rests, floors, switches = (min(most, 2 + int(seconds / period)) for period in periods)
+    periods = CONSTRAINT_PERIOD, 0.5 * imu_fault_detector.CLEARED
+    constraints, switches = (min(most, 2 + int(seconds / period)) for period in periods)
     of_events = RECORDS_OF_TDOA * len(tdoa) + RECORDS_OF_SENSOR * len(sensor)
-    return of_events + RECORDS_OF_REST * rests + plane.RECORDS * floors + switches
+    return of_events + (RECORDS_OF_REST + plane.RECORDS) * constraints + switches
 
 
 # Process an IMU_SAMPLE: fault detection, prediction, rest and zero-velocity updates.
@@ -314,7 +313,7 @@ def _prepare(
     if t >= ekf.next_bounds:
         initialization.look_around(ekf, anchors, parameters, t)
     if t - ekf.last_tdoa > parameters.start_window and initialization.is_unsure(ekf):
-        ekf.position_unknown_until = t + UNSURE_TIME
+        ekf.position_unknown_until = t + parameters.start_window
 
 
 @compiled
