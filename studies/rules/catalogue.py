@@ -19,7 +19,6 @@ COUNTS = {
     "initialization.MINIMUM",
     "initialization.SLOW_TDOAS",
     "initialization.SLOW_STAMPS",
-    "initialization.LATE_ANCHORS",
     "initialization.AMONG_OTHERS",
     "stationarity.FEWEST_CHECKS",
     "stationarity.LONG",
@@ -28,6 +27,7 @@ COUNTS = {
 }
 STRUCTURE = {
     "initialization.ANY_YAW",
+    "initialization.LATE_ANCHORS",
     "state.GRAVITY",
     "startup.NO_SCALE",
     "startup.SMALLEST",
@@ -649,8 +649,8 @@ OF_SENSORS = {
     "wheels outweigh another place": "velocity",
     "two late anchors explain another place": "velocity",
     "TDOAs of another place wait": "velocity",
+    "initialization.SMALLEST_STD": "height",
     "initialization.RIVAL_TIME": "velocity",
     "initialization.RIVAL_HELD": "velocity",
-    "initialization.LATE_ANCHORS": "velocity",
     "initialization.AMONG_OTHERS": "velocity",
 }

@@ -64,6 +64,7 @@ from .state import CONSTRAINT_PERIOD, coast, predict, turn_about_vertical
 from .update import project
 
 INCONSISTENT = 0.5  # share below which the filter searches for the tag elsewhere
+UNSURE_TIME = 0.5  # s of TDOAs after a silence in which the filter searches for a lost tag
 MAX_STEP = 0.05  # s, longest single prediction
 # s of inertial samples that determine the initial attitude if the IMU starts after the filter
 AVERAGED = 0.25
@@ -313,7 +314,7 @@ def _prepare(
     if t >= ekf.next_bounds:
         initialization.look_around(ekf, anchors, parameters, t)
     if t - ekf.last_tdoa > parameters.start_window and initialization.is_unsure(ekf):
-        ekf.position_unknown_until = t + parameters.start_window
+        ekf.position_unknown_until = t + UNSURE_TIME
 
 
 @compiled
