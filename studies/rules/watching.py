@@ -43,7 +43,12 @@ KINDS_OF = {
     ),
     ("streams",),
 )
-NO_TUNING = {"survey_scale.NANOSECONDS"}
+NO_TUNING = {  # what nature gives, and what nothing returns
+    "inertial_rules.ABSURD",
+    "ranging_windows.ABSURD",
+    "stamp_rules.ABSURD",
+    "survey_scale.NANOSECONDS",
+}
 LISTS = (  # of rules, by module
     ("monitoring.stamp_rules", "OF_ONE"),
     ("monitoring.stamp_rules", "OF_BOTH"),
