@@ -13,18 +13,26 @@ COUNTS = {
     "ground.STILL_SWEEPS",
     "ground.SWEEPS",
     "height.STEP_COUNT",
+    "monitoring.stamp_rules.MAXIMUM",
+    "monitoring.stamp_rules.MINIMUM",
+    "monitoring.survey_scale.STEPS",
     "initialization.MINIMUM",
     "initialization.SLOW_TDOAS",
     "initialization.SLOW_STAMPS",
-    "initialization.LATE_ANCHORS",
     "initialization.AMONG_OTHERS",
-    "stationarity.MOST_DOUBTS",
+    "stationarity.FEWEST_CHECKS",
     "stationarity.LONG",
-    "stationarity.LONG_ENOUGH",
     "startup.SWEEPS",
     "velocity.STUCK_COUNT",
 }
-STRUCTURE = {"state.GRAVITY", "startup.NO_SCALE", "startup.SMALLEST", "velocity.LONGEST_STD"}
+STRUCTURE = {
+    "initialization.ANY_YAW",
+    "initialization.LATE_ANCHORS",
+    "state.GRAVITY",
+    "startup.NO_SCALE",
+    "startup.SMALLEST",
+    "velocity.LONGEST_STD",
+}
 
 
 @dataclass(frozen=True)
@@ -172,8 +180,8 @@ RULES = (
         "one look ends a rest after some lift",
         "stationarity",
         "check_stationarity",
-        "MOST_DOUBTS if np.abs(ekf.lift).max() < UNFELT else 1",
-        "MOST_DOUBTS",
+        "FEWEST_CHECKS if np.abs(ekf.lift).max() < UNFELT else 1",
+        "FEWEST_CHECKS",
     ),
     Rule("landing by late anchors", "stationarity", "check_stationarity", "lateness >= 0"),
     Rule(
@@ -605,7 +613,7 @@ RULES = (
         "the offset of a barometer is taken anew",
         "barometer",
         "observe",
-        "sensor.t - barometer.agreed > LONGEST_DISAGREEMENT",
+        "sensor.t - barometer.agreed > MEMORY",
     ),
     Rule("a stuck velocity", "velocity", "observe", "_repeats(state, sensor) and (not ekf.quiet)"),
     Rule(
@@ -641,8 +649,8 @@ OF_SENSORS = {
     "wheels outweigh another place": "velocity",
     "two late anchors explain another place": "velocity",
     "TDOAs of another place wait": "velocity",
+    "initialization.SMALLEST_STD": "height",
     "initialization.RIVAL_TIME": "velocity",
     "initialization.RIVAL_HELD": "velocity",
-    "initialization.LATE_ANCHORS": "velocity",
     "initialization.AMONG_OTHERS": "velocity",
 }

@@ -14,6 +14,7 @@ from argparse import Namespace
 from collections import defaultdict
 from collections.abc import Callable
 import json
+import math
 import os
 from pathlib import Path
 import pickle
@@ -25,7 +26,7 @@ from uwb_tdoa_bias.common.files import write_bytes
 from uwb_tdoa_tools.outputs import OutputFile, OutputFolder
 
 from . import tuned, watching, work
-from .worth import NOTICED, worth
+from .worth import NOTICED, Worth, noise_of, worth
 
 
 def add_options(add: Callable) -> None:
@@ -103,50 +104,86 @@ def read(path: Path) -> Figures:
 
 
 def table(found: Figures) -> str:
-    """Markdown: each variant, those that change least first."""
+    """Markdown: each rule, those that change least first; then each constant."""
     base = found.get(work.BASE, {})
+    noise = noise_of(base, (rows for name, rows in found.items() if name.startswith(work.NUDGED)))
+    each = {
+        name: worth(base, rows, noise)
+        for name, rows in found.items()
+        if name != work.BASE and not name.startswith(work.NUDGED)
+    }
     lines = [
-        "| variant | rows | changed | 3D RMSE, mean | NEES beyond 3 | largest loss | largest gain |",
+        "| rule | rows | changed | 3D RMSE, mean | NEES beyond 3 | largest loss | largest gain |",
         "|---|---:|---:|---:|---:|---|---|",
     ]
-    each = {name: worth(base, rows) for name, rows in found.items() if name != work.BASE}
-    for name, one in sorted(each.items(), key=lambda item: (item[1].changed, abs(item[1].mean))):
+    of_rules = {name: one for name, one in each.items() if not _scaled(name)}
+    for name, one in sorted(
+        of_rules.items(), key=lambda item: (item[1].changed, abs(item[1].mean))
+    ):
         same = " (same to the bit)" if one.same else ""
         lines.append(
             f"| {name}{same} | {one.rows} | {one.changed} | {one.mean:+.2%} | {one.nees:+.2f} | "
             f"{_largest(one.worse)} | {_largest(one.better)} |"
         )
-    return "\n".join(lines)
+    texts = {name: _most(one) for name, one in each.items() if _scaled(name)}
+    return "\n".join([*(lines if of_rules else []), *constants(texts)])
+
+
+def constants(texts: dict[str, str]) -> list[str]:
+    """Lines of Markdown: each constant, and what its half and its double change."""
+    if not texts:
+        return []
+    lines = ["", "| constant | halved | doubled |", "|---|---|---|"]
+    for name in sorted({_scaled(variant) for variant in texts}):
+        cells = [texts.get(f"{name} x {factor:g}", "") for factor in work.FACTORS]
+        lines.append(f"| `{name}` | {' | '.join(cells)} |")
+    return lines
+
+
+def _scaled(variant: str) -> str:
+    """Name of the constant that a variant scales, "" for a rule."""
+    name, _, factor = variant.rpartition(" x ")
+    return name if factor in [f"{one:g}" for one in work.FACTORS] else ""
+
+
+def _most(one: Worth) -> str:
+    """The largest change, and of how many rows."""
+    if not one.changes:
+        return f"- ({one.rows})"
+    row, share = max(one.changes.items(), key=lambda item: abs(item[1]))
+    return f"{_percent(share)}: {row} ({one.changed} of {one.rows})"
+
+
+def _percent(share: float) -> str:
+    if math.isinf(share):
+        return "lost" if share > 0.0 else "found"
+    return f"x {1.0 + share:.0f}" if share >= 9.0 else f"{share:+.0%}"
 
 
 def _largest(of: tuple[float, str]) -> str:
     share, row = of
-    return f"{share:+.0%}: {row}" if abs(share) > NOTICED else ""
+    return f"{_percent(share)}: {row}" if abs(share) > NOTICED else ""
 
 
 def table_of_watch(found: Figures) -> str:
-    """Markdown: of each variant, in how many rows something is said less, more, later or earlier."""
+    """Markdown: what is found less, more, later or earlier without each rule; then each constant."""
     base = found.get(work.BASE, {})
-    kinds = "lost", "new", "late", "early", "longer", "shorter", "size"
-    lines = [
-        f"| variant | rows | {' | '.join(kinds)} | which |",
-        f"|---|{'---:|' * (1 + len(kinds))}---|",
-    ]
-    made = []
+    lines = ["| rule | rows | changed | which |", "|---|---:|---:|---|"]
+    texts, made = {}, []
     for name, rows in found.items():
-        if name == work.BASE:
-            continue
         changes = {
             row: watching.differs(base[row], said) for row, said in rows.items() if row in base
         }
-        counts = [sum(kind in one.values() for one in changes.values()) for kind in kinds]
         which = [
-            f"{row}: {', '.join(f'{rule} {kind}' for rule, kind in one.items())}"
+            f"{row}: {', '.join(f'`{rule}` {kind}' for rule, kind in one.items())}"
             for row, one in changes.items()
             if one
         ]
-        made.append((sum(counts), name, len(changes), counts, which))
-    for _, name, rows, counts, which in sorted(made):
-        cells = " | ".join(map(str, counts))
-        lines.append(f"| {name} | {rows} | {cells} | {'; '.join(which[:3])} |")
-    return "\n".join(lines)
+        if _scaled(name):
+            texts[name] = (
+                f"{which[0]} ({len(which)} of {len(rows)})" if which else f"- ({len(rows)})"
+            )
+        elif name != work.BASE:
+            made.append((len(which), name, len(changes), "; ".join(which[:3])))
+    lines += [f"| {name} | {rows} | {count} | {some} |" for count, name, rows, some in sorted(made)]
+    return "\n".join([*(lines if made else []), *constants(texts)])

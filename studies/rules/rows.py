@@ -117,6 +117,7 @@ class Inputs:
     def __init__(self, data: Path, cache: Path) -> None:
         """data : folder of measured flights; cache : folder."""
         self._data, self._cache = data, cache / "inputs"
+        self.anew = False  # count streams anew, as constants of their counters have changed
         self._cache.mkdir(parents=True, exist_ok=True)
         self._kept: dict[str, Any] = {}
 
@@ -126,6 +127,8 @@ class Inputs:
 
     def kept(self, name: str, make: Callable[[], Any]) -> Any:
         """make(), from the folder if it is there. Only this study writes and reads that folder."""
+        if self.anew and name.startswith("seen "):
+            return make()
         if name in self._kept:
             return self._kept[name]
         path = self._cache / f"{name.replace('/', ' ')}.pickle"

@@ -12,6 +12,7 @@ from __future__ import annotations
 import ast
 import ctypes
 from dataclasses import dataclass
+from functools import cache
 import hashlib
 import importlib
 import mmap
@@ -26,6 +27,7 @@ from .catalogue import COUNTS, RULES, STRUCTURE, Rule
 ADDRESS, SIZE = 0x5A0000000000, 1 << 16  # of the table: bytes
 FIRST_RULE = 4096  # place of the first rule, behind all constants
 PACKAGE = "uwb_tdoa_ekf"
+FOLDERS = "core", "monitoring"  # with compiled functions
 LOADS = '''"""Loads from the table of the study `rules`."""
 
 from llvmlite import ir
@@ -67,7 +69,7 @@ def tuned_on(typingctx, place):
 
 @dataclass(frozen=True)
 class Entry:
-    """What the table holds from a place on. name : of a constant, "core.rest.PERIOD", or of a rule;
+    """What the table holds from a place on. name : of a constant, "plane.PERIOD", or of a rule;
     values : as they are, 1.0 for a rule that is on; is_count : they are whole numbers.
     """
 
@@ -86,6 +88,11 @@ class Tuned:
     rules: tuple[Entry, ...]
 
     @property
+    def core(self) -> tuple[Entry, ...]:
+        """The constants of the core."""
+        return tuple(one for one in self.constants if not one.name.startswith("monitoring."))
+
+    @property
     def initial(self) -> list[float]:
         """All values of the table, as they are."""
         table = [0.0] * (FIRST_RULE + len(self.rules))
@@ -101,15 +108,16 @@ def copy_to(cache: Path, rules: tuple[Rule, ...] = RULES) -> Tuned:
     source = Path(uwb_tdoa_ekf.__file__).resolve().parent
     table = _Table()
     files = {}
-    for path in sorted((source / "core").glob("*.py")):
-        copy = _Copy(path.stem, ast.parse(path.read_text()), table)
-        changed = copy.changed(rules)
-        if changed is not None:
-            files[path.name] = ast.unparse(changed)
+    for folder in FOLDERS:
+        for path in sorted((source / folder).glob("*.py")):
+            module = f"{folder}.{path.stem}"
+            changed = _Copy(module, _tree(module), table).changed(rules)
+            if changed is not None:
+                files[f"{folder}/{path.name}"] = ast.unparse(changed)
     missing = [rule.name for rule in rules if rule.name not in table.rules]
     if missing:
         raise ValueError(f"the core has no such place: {', '.join(missing)}; see catalogue.py")
-    files["_tuned.py"] = LOADS.format(address=ADDRESS)
+    files["core/_tuned.py"] = LOADS.format(address=ADDRESS)
     digest = hashlib.sha256(repr(sorted(files.items())).encode())
     for path in sorted(source.rglob("*.py")):
         digest.update(path.read_bytes())
@@ -120,7 +128,7 @@ def copy_to(cache: Path, rules: tuple[Rule, ...] = RULES) -> Tuned:
         leave = shutil.ignore_patterns("__pycache__")
         shutil.copytree(source, part / PACKAGE, ignore=leave)
         for name, text in files.items():
-            write_text(part / PACKAGE / "core" / name, text)
+            write_text(part / PACKAGE / name, text)
         part.rename(folder)
     return Tuned(folder, tuple(table.constants.values()), tuple(table.rules.values()))
 
@@ -140,6 +148,7 @@ class Live:
         at = libc.mmap(ADDRESS, SIZE, mmap.PROT_READ | mmap.PROT_WRITE, flags, -1, 0)
         if at != ADDRESS:
             raise OSError(ctypes.get_errno(), "the address of the table is taken")
+        self._constants = tuned.constants
         self._initial = tuned.initial
         self._values = (ctypes.c_double * len(self._initial)).from_address(ADDRESS)
         self.restore()
@@ -151,6 +160,12 @@ class Live:
     def switch_off(self, rule: Entry) -> None:
         """Let a rule not apply."""
         self._values[rule.place] = 0.0
+
+    def nudge(self, factor: float) -> None:
+        """Multiply all constants that are no counts."""
+        for entry in self._constants:
+            if not entry.is_count:
+                self.scale(entry, factor)
 
     def scale(self, constant: Entry, factor: float) -> bool:
         """Multiply a constant. Returns False if it stays what it is: 0, or a count that is rounded."""
@@ -192,17 +207,21 @@ class _Copy(ast.NodeTransformer):
         self._module, self._tree, self._table = module, tree, table
         self._names: dict[str, tuple[str, str]] = {}  # as they are called here: module, name
         self._modules: dict[str, str] = {}
+        self._definitions: dict[str, ast.expr] = {}
         self._rules: list[tuple[Rule, str]] = []
         self._inside = False
         for node in tree.body:
-            if isinstance(node, ast.ImportFrom) and node.level == 1:
+            if isinstance(node, ast.ImportFrom) and node.level:
+                folder = f"{module.split('.')[0]}." if node.level == 1 else ""
                 for alias in node.names:
                     called = alias.asname or alias.name
                     if node.module is None:
-                        self._modules[called] = alias.name
+                        self._modules[called] = folder + alias.name
                     else:
-                        self._names[called] = node.module, alias.name
+                        self._names[called] = folder + node.module, alias.name
             elif isinstance(node, ast.Assign):
+                if isinstance(node.targets[0], ast.Name):
+                    self._definitions[node.targets[0].id] = node.value
                 for target in ast.walk(node):
                     if isinstance(target, ast.Name) and isinstance(target.ctx, ast.Store):
                         self._names[target.id] = module, target.id
@@ -211,14 +230,14 @@ class _Copy(ast.NodeTransformer):
         """The module with its loads, None if it has no compiled function."""
         if not any(_is_compiled(node) for node in self._tree.body):
             return None
-        self._all = [rule for rule in rules if rule.module == self._module]
+        self._all = [rule for rule in rules if f"core.{rule.module}" == self._module]
         tree = self.visit(self._tree)
         first = next(
             k
             for k, node in enumerate(tree.body)
             if not (isinstance(node, ast.Expr) or _is_future(node))
         )
-        loads = ast.parse("from ._tuned import tuned_count, tuned_number, tuned_on").body
+        loads = ast.parse("from ..core._tuned import tuned_count, tuned_number, tuned_on").body
         tree.body[first:first] = loads
         return ast.fix_missing_locations(tree)
 
@@ -265,6 +284,17 @@ class _Copy(ast.NodeTransformer):
     def _on(self, rule: Rule) -> ast.expr:
         return ast.parse(f"tuned_on({self._table.place_of_rule(rule)})", mode="eval").body
 
+    def derived(self, name: str) -> ast.expr | None:
+        """What computes a constant of this module that follows from others: NIS = GATE**2."""
+        definition = self._definitions.get(name)
+        if definition is None:
+            return None
+        names = [node.id for node in ast.walk(definition) if isinstance(node, ast.Name)]
+        if not names or not all(_is_tuned(*self._names.get(one, ("", one))) for one in names):
+            return None
+        self._inside = True
+        return self.visit(definition)
+
     def _constant(self, node: ast.expr) -> ast.expr | None:
         """What loads a constant, where node is one."""
         if isinstance(node, ast.Name) and node.id in self._names:
@@ -277,26 +307,51 @@ class _Copy(ast.NodeTransformer):
             module, name = self._modules[node.value.id], node.attr
         else:
             return None
+        derived = _Copy(module, _tree(module), self._table).derived(name)
+        if derived is not None:
+            return derived
+        if not _is_tuned(module, name):
+            return None
         value = _value(module, name)
         values = value if isinstance(value, tuple) else (value,)
-        key = f"{module}.{name}"
-        if key in STRUCTURE or not all(type(one) in (int, float) for one in values) or not values:
-            return None
-        if any(one == float("inf") for one in values):
-            return None
         is_count = all(type(one) is int for one in values)
-        if is_count and key not in COUNTS:
-            return None
-        place = self._table.place_of(key, tuple(map(float, values)), is_count)
+        place = self._table.place_of(_key(module, name), tuple(map(float, values)), is_count)
         load = "tuned_count" if is_count else "tuned_number"
         parts = [f"{load}({place + k})" for k in range(len(values))]
         text = parts[0] if not isinstance(value, tuple) else f"({', '.join(parts)},)"
         return ast.parse(text, mode="eval").body
 
 
+@cache
+def _source(module: str) -> str:
+    path = Path(uwb_tdoa_ekf.__file__).resolve().parent / f"{module.replace('.', '/')}.py"
+    return path.read_text() if path.exists() else ""
+
+
+def _tree(module: str) -> ast.Module:
+    """A tree of a module of the package, to be changed; an empty one of another module."""
+    return ast.parse(_source(module))
+
+
+def _key(module: str, name: str) -> str:
+    """Name of a constant, "plane.PERIOD" of the core or "monitoring.change.OUTLIER"."""
+    return f"{module}.{name}".removeprefix("core.")
+
+
+def _is_tuned(module: str, name: str) -> bool:
+    """Whether a name is a number, or some, that were chosen: no size, and no property of nature."""
+    value, key = _value(module, name), _key(module, name)
+    values = value if isinstance(value, tuple) else (value,)
+    if key in STRUCTURE or not values or not all(type(one) in (int, float) for one in values):
+        return False
+    if any(one == float("inf") for one in values):
+        return False
+    return key in COUNTS or not all(type(one) is int for one in values)
+
+
 def _value(module: str, name: str) -> object:
     try:
-        return getattr(importlib.import_module(f"{PACKAGE}.core.{module}"), name, None)
+        return getattr(importlib.import_module(f"{PACKAGE}.{module}"), name, None)
     except ModuleNotFoundError:
         return None
 

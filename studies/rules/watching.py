@@ -1,7 +1,7 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Variants of the rules over streams and over residuals. They are Python, so that a variant is a
-changed module.
+"""Variants of the rules over streams and over residuals. Most are Python, so that a variant is a
+changed module; constants of compiled functions are read from the table of `tuned`.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import Any
 
 import uwb_tdoa_ekf
 
+from .tuned import Entry, Live, Tuned
 from .watched import Said
 
 # s by which a detection must come later, or end later, to count; and share of the deciding number
@@ -42,7 +43,12 @@ KINDS_OF = {
     ),
     ("streams",),
 )
-NO_TUNING = {"survey_scale.NANOSECONDS"}
+NO_TUNING = {  # what nature gives, and what nothing returns
+    "inertial_rules.ABSURD",
+    "ranging_windows.ABSURD",
+    "stamp_rules.ABSURD",
+    "survey_scale.NANOSECONDS",
+}
 LISTS = (  # of rules, by module
     ("monitoring.stamp_rules", "OF_ONE"),
     ("monitoring.stamp_rules", "OF_BOTH"),
@@ -124,23 +130,31 @@ SWITCHES: dict[str, tuple[str, Any]] = {
 
 @dataclass(frozen=True)
 class Patch:
-    """A variant: name : as in the table; of : of a Watched; changed : {(module, attribute): value}."""
+    """A variant: name : as in the table; of : of a Watched; changed : {(module, attribute): value};
+    entry, factor : what is scaled in compiled functions.
+    """
 
     name: str
     of: tuple[str, ...]
     changed: dict[tuple[str, str], Any]
+    entry: Entry | None = None
+    factor: float = 1.0
 
     @contextmanager
-    def applied(self) -> Iterator[None]:
-        """The modules are changed inside."""
+    def applied(self, live: Live | None = None) -> Iterator[None]:
+        """The modules, and the table of compiled functions, are changed inside."""
         before = {}
         try:
+            if self.entry is not None and live is not None:
+                live.scale(self.entry, self.factor)
             for (owner, name), value in self.changed.items():
                 target = _found(owner)
                 before[owner, name] = getattr(target, name)
                 setattr(target, name, value)
             yield
         finally:
+            if live is not None:
+                live.restore()
             for (owner, name), value in before.items():
                 setattr(_found(owner), name, value)
 
@@ -154,8 +168,8 @@ def _found(path: str) -> Any:
     return found
 
 
-def patches() -> list[Patch]:
-    """Every rule off, every constant of Python code halved and doubled."""
+def patches(tuned: Tuned) -> list[Patch]:
+    """Every rule off, every constant halved and doubled."""
     made = []
     for module, name in LISTS:
         for rule in getattr(_found(module), name):
@@ -170,7 +184,7 @@ def patches() -> list[Patch]:
         instead = _method(value) if callable(value) else value
         changed = {(one, name): instead for one in where}
         made.append(Patch(f"without: {label}", _kinds(module), changed))
-    return made + list(_constants(trees))
+    return made + list(_constants(trees, {entry.name: entry for entry in tuned.constants}))
 
 
 def _kinds(module: str) -> tuple[str, ...]:
@@ -193,7 +207,7 @@ def _method(function: Callable) -> Callable:
     return lambda *args, **named: function(*args, **named)
 
 
-def _constants(trees: dict[str, ast.Module]) -> Iterator[Patch]:
+def _constants(trees: dict[str, ast.Module], entries: dict[str, Entry]) -> Iterator[Patch]:
     for module, tree in trees.items():
         frozen = {
             node.id
@@ -204,16 +218,17 @@ def _constants(trees: dict[str, ast.Module]) -> Iterator[Patch]:
         }
         for name in _tuned_names(tree):
             found = getattr(_found(f"{PACKAGE}.{module}"), name)
-            key = f"{module}.{name}"
-            kinds = _kinds(module)
-            if name in frozen or key in NO_TUNING or not kinds or not _is_number(found):
+            key, kinds = f"{PACKAGE}.{module}.{name}", _kinds(module)
+            entry = entries.get(key)
+            is_size = name in frozen and entry is None
+            if is_size or f"{module}.{name}" in NO_TUNING or not kinds or not _is_number(found):
                 continue
             where = _holders(trees, module, name)
             for factor in (0.5, 2.0):
                 scaled = _scaled(found, factor)
                 if scaled != found:
                     changed = {(one, name): scaled for one in where}
-                    yield Patch(f"{PACKAGE}.{key} x {factor:g}", kinds, changed)
+                    yield Patch(f"{key} x {factor:g}", kinds, changed, entry, factor)
 
 
 def _tuned_names(tree: ast.Module) -> list[str]:
@@ -236,6 +251,7 @@ def _is_number(value: object) -> bool:
 
 
 def _scaled(value: Any, factor: float) -> Any:
+    """A number, or some, times a factor; a count is at least 1."""
     if isinstance(value, tuple):
         return tuple(_scaled(one, factor) for one in value)
     return max(1, round(factor * value)) if isinstance(value, int) else factor * value

@@ -4,30 +4,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 import math
 
 import numpy as np
 
 NOTICED = 0.02  # share by which a figure must change to count
+MARGIN = 2.0  # times what a row changes by anything, by which it must change to count
 LEAST = (0.002, 0.02, 0.05, 0.005, 0.05)  # m, NEES, s, rad, s: changes that never count
 HONEST = 3.0  # NEES of an honest filter
 
 # loss, in so many rows, and mean loss: it is worth it
 CLEAR, CLEAR_ROWS, CLEAR_MEAN = (0.05, 3, 0.01)
 
-MATTERS_ROWS = 2  # so many rows that change show that a constant matters
-
 
 @dataclass
 class Worth:
-    """What a variant changes. rows : how many were run; changed : how many rows change by more than
-    NOTICED; lost : how many are worse by more than CLEAR; worse, better : (share, row), the largest; mean : share, of the 3D RMSE over all
-    spans; nees : of the mean excess over HONEST.
+    """What a variant changes. rows : how many were run; changes : {row: largest change} of those that
+    change by more than NOTICED; lost : how many are worse by more than CLEAR; worse, better :
+    (share, row), the largest; mean : share, of the 3D RMSE over all spans; nees : of the mean
+    excess over HONEST.
     """
 
     rows: int = 0
-    changed: int = 0
+    changes: dict[str, float] = field(default_factory=dict)
     lost: int = 0
     same: bool = True
     worse: tuple[float, str] = (0.0, "")
@@ -41,9 +42,9 @@ class Worth:
         return self.lost >= CLEAR_ROWS and self.mean > CLEAR_MEAN
 
     @property
-    def matters(self) -> bool:
-        """Whether enough rows change to say that a constant matters."""
-        return self.changed >= MATTERS_ROWS
+    def changed(self) -> int:
+        """How many rows change by more than NOTICED."""
+        return len(self.changes)
 
     @property
     def mean(self) -> float:
@@ -56,8 +57,8 @@ class Worth:
         return float(np.mean(self.excess)) if self.excess else 0.0
 
 
-def worth(base: dict, variant: dict) -> Worth:
-    """Worth of a variant, of {row: {span: figures}}."""
+def worth(base: dict, variant: dict, noise: dict[str, float] | None = None) -> Worth:
+    """Worth of a variant, of {row: {span: figures}}. noise : by how much rows change by anything."""
     out = Worth()
     for row, spans in variant.items():
         if row not in base:
@@ -72,13 +73,24 @@ def worth(base: dict, variant: dict) -> Worth:
                 changes.append(_change(before, after, LEAST[4 if is_time else k], k == 1))
             if not is_time and old[0] and new[0]:
                 out.logs.append(math.log(new[0] / old[0]))
+            if not is_time and old[1] and new[1]:
                 out.excess.append(max(new[1] - HONEST, 0.0) - max(old[1] - HONEST, 0.0))
         largest, smallest = max(changes), min(changes)
         out.lost += largest > CLEAR
-        out.changed += largest > NOTICED or smallest < -NOTICED
+        if max(largest, -smallest) > max(NOTICED, MARGIN * (noise or {}).get(row, 0.0)):
+            out.changes[row] = max(largest, smallest, key=abs)
         out.worse = max(out.worse, (largest, row))
         out.better = min(out.better, (smallest, row))
     return out
+
+
+def noise_of(base: dict, nudged: Iterable[dict]) -> dict[str, float]:
+    """{row: the largest share by which it changes, if all constants change a little}."""
+    noise: dict[str, float] = {}
+    for variant in nudged:
+        for row, change in worth(base, variant).changes.items():
+            noise[row] = max(noise.get(row, 0.0), abs(change))
+    return noise
 
 
 def _change(before: float | None, after: float | None, least: float, is_nees: bool) -> float:

@@ -9,9 +9,9 @@ import sys
 
 import pytest
 
-from studies.rules import tuned, watching, work
+from studies.rules import figures, tuned, watching, work
 from studies.rules.catalogue import RULES, Rule
-from studies.rules.worth import worth
+from studies.rules.worth import noise_of, worth
 from uwb_tdoa_ekf.core import noise, update
 
 # In another process, as the copy takes the place of the filter: a variance, and the noise that is
@@ -65,6 +65,10 @@ def test_the_constants_of_compiled_functions_are_in_the_table(made):
     assert known["noise.LARGEST_OUTLIER"].values == (noise.LARGEST_OUTLIER,)
     assert known["stationary_position.LANDING_STD"].values == (0.2, 0.2, 0.5)
     assert known["stationarity.LONG"].is_count and "state.GRAVITY" not in known
+    # what follows from another constant is no constant of its own
+    assert "update.GATE" in known and "hypotheses.LARGEST_NIS" not in known
+    copied = (made.folder / "uwb_tdoa_ekf/core/hypotheses.py").read_text()
+    assert f"tuned_number({known['update.GATE'].place}) ** 2" in copied
     places = [entry.place + k for entry in made.constants for k in range(len(entry.values))]
     assert len(set(places)) == len(places) and max(places) < tuned.FIRST_RULE
 
@@ -88,7 +92,9 @@ def test_the_copy_changes_while_it_runs_and_is_the_filter_otherwise(made, tmp_pa
 
 def test_each_rule_and_constant_is_a_variant(made):
     variants = work.variants_of(made)
-    assert len(variants) == 1 + len(made.rules) + 2 * len(made.constants)
+    nudged = [variant for variant in variants if variant.name.startswith(work.NUDGED)]
+    assert len(variants) == 1 + len(nudged) + len(made.rules) + 2 * len(made.core)
+    assert len(nudged) == len(work.NUDGES)
     assert len({variant.name for variant in variants}) == len(variants)
 
 
@@ -119,31 +125,59 @@ def test_what_is_said_less_more_or_later_is_told():
     assert watching.differs(after, {}) == dict.fromkeys(after, "lost")
 
 
-def test_patches_change_modules_only_while_they_are_applied():
-    made = {patch.name: patch for patch in watching.patches()}
+def test_patches_change_modules_only_while_they_are_applied(made):
+    named = {patch.name: patch for patch in watching.patches(made)}
     from uwb_tdoa_ekf.monitoring import monitor, ranging_rules
 
     rules = ranging_rules.RULES
-    with made["monitoring.monitor.LIMIT x 2"].applied():
+    with named["monitoring.monitor.LIMIT x 2"].applied():
         assert monitor.LIMIT == 2 * 16.3
-    with made["without: ranging_rules.rounded"].applied():
+    with named["without: ranging_rules.rounded"].applied():
         assert len(ranging_rules.RULES) == len(rules) - 1
     assert monitor.LIMIT == 16.3 and ranging_rules.RULES is rules
+    # a constant that Python and compiled code use changes in both; a size does not change
+    both = named["monitoring.slices.DELAY_STD x 2"]
+    assert both.changed and both.entry.name == "monitoring.slices.DELAY_STD"
+    assert "monitoring.ranging_windows.PROBES x 2" not in named
 
 
-def test_every_switch_of_a_rule_over_streams_and_residuals_is_there():
+def test_every_switch_of_a_rule_over_streams_and_residuals_is_there(made):
     """Each changes something that is there, and puts it back."""
-    made = {patch.name.removeprefix("without: "): patch for patch in watching.patches()}
+    made = {patch.name.removeprefix("without: "): patch for patch in watching.patches(made)}
     for name in watching.SWITCHES:
         with made[name].applied():
             pass
         assert made[name].of, name
 
 
-def test_a_constant_is_left_where_two_rows_show_that_it_matters_and_a_rule_where_it_is_worth_it():
+def test_a_constant_is_decided_by_one_row_and_a_rule_by_its_losses():
     base = {name: {"air": [0.2, 1.0, 0.0, 0.1]} for name in "abcd"}
-    worse = {name: {"air": [0.3, 1.0, 0.0, 0.1]} for name in "ab"}
-    constant, rule = (work.Variant("", None, factor) for factor in (0.5, 0.0))
+    worse = {name: {"air": [0.3, 1.0, 0.0, 0.1]} for name in "a"}
+    entry = tuned.Entry("noise.SHARE", 0, (0.5,))
+    constant, rule = (work.Variant("", entry, factor) for factor in (0.5, 0.0))
+    assert not work.Variant("", None).is_decided(worth(base, worse))
     assert constant.is_decided(worth(base, worse)) and not rule.is_decided(worth(base, worse))
-    worse["c"] = worse["a"]
+    worse |= {name: worse["a"] for name in "bc"}
     assert rule.is_decided(worth(base, worse)) and not rule.is_decided(worth(base, base))
+
+
+def test_a_row_that_changes_by_anything_shows_little():
+    base = {"steady": {"air": [0.2, 1.0, 0.0, 0.1]}, "unsteady": {"air": [0.2, 1.0, 0.0, 0.1]}}
+    nudged = {"steady": base["steady"], "unsteady": {"air": [0.3, 1.0, 0.0, 0.1]}}
+    noise = noise_of(base, [base, nudged])
+    assert noise == {"unsteady": pytest.approx(0.5)}
+    changed = {"steady": {"air": [0.22, 1.0, 0.0, 0.1]}, "unsteady": {"air": [0.39, 1.0, 0.0, 0.1]}}
+    assert worth(base, changed, noise).changes == {"steady": pytest.approx(0.1)}
+    changed["unsteady"] = {"air": [0.41, 1.0, 0.0, 0.1]}
+    assert set(worth(base, changed, noise).changes) == {"steady", "unsteady"}
+
+
+def test_the_table_says_what_half_and_double_of_a_constant_change():
+    base = {"a": {"air": [0.2, 1.0, 0.0, 0.1]}, "b": {"again": [2.0]}}
+    doubled = {"a": {"air": [0.3, 1.0, 0.0, 0.1]}, "b": {"again": [None]}}
+    found = {work.BASE: base, "noise.SHARE x 0.5": base, "noise.SHARE x 2": doubled}
+    assert figures.table(found).splitlines()[-1] == "| `noise.SHARE` | - (2) | lost: b (2 of 2) |"
+    said = {"gap": [3.0, 9.0, 1.0]}
+    found = {work.BASE: {"a": said}, "monitoring.monitor.LIMIT x 0.5": {"a": {}}}
+    last = figures.table_of_watch(found).splitlines()[-1]
+    assert last == "| `monitoring.monitor.LIMIT` | a: `gap` lost (1 of 1) |  |"

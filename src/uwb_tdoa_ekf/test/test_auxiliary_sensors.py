@@ -23,7 +23,7 @@ from uwb_tdoa_ekf.core import auxiliary, height, plane, update, velocity
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
 from uwb_tdoa_ekf.core.engine import feed
 from uwb_tdoa_ekf.core.history import NOTHING
-from uwb_tdoa_ekf.core.hypotheses import PRUNED_BELOW
+from uwb_tdoa_ekf.core.hypotheses import IMPROBABLE
 from uwb_tdoa_ekf.core.measurements import sensor_rows
 from uwb_tdoa_ekf.core.memory import N_YAWS, RESIDUAL, SENSOR_ROW, USED, new_state
 from uwb_tdoa_ekf.core.state import TRANSITION, inject
@@ -346,7 +346,7 @@ def test_a_range_finder_decides_between_mirrored_places(followed):
         if t < 0.04:
             assert (
                 ekf.hypotheses["log_weight"][places[1]] - ekf.hypotheses["log_weight"][0]
-                > PRUNED_BELOW
+                > -IMPROBABLE
             )
     right, mirrored = ekf.hypotheses["log_weight"][list(places)]
     assert (

@@ -18,7 +18,7 @@ from uwb_tdoa_ekf.core.inertial import (
     LEAST_RECTIFIED,
     PERSISTENCE,
     QUIET_NOISE,
-    RECTIFYING_MEMORY,
+    SHAKING_MEMORY,
     is_quiet,
     observe,
     store,
@@ -414,7 +414,7 @@ def test_an_axis_whose_mean_is_that_of_hovering_does_not_rectify_however_it_vibr
     weights = {}
     for offset in (0.0, 3.0):
         imu = after(
-            (np.zeros(3), 0.0), (UP + [offset, 0.0, 0.0], 3.0), seconds=4.0 * RECTIFYING_MEMORY
+            (np.zeros(3), 0.0), (UP + [offset, 0.0, 0.0], 3.0), seconds=4.0 * SHAKING_MEMORY
         )
         weigh(imu, False, parameters)
         weights[offset] = imu.accel_weight
@@ -432,7 +432,7 @@ def test_what_begins_to_vibrate_is_not_believed_before_it_was_seen_for_a_while()
     imu = after((np.zeros(3), 0.0), (UP, 1.0), imu=imu, seconds=0.5)
     weigh(imu, False, parameters)
     early = imu.accel_weight.copy()
-    imu = after((np.zeros(3), 0.0), (UP, 1.0), imu=imu, seconds=4.0 * RECTIFYING_MEMORY)
+    imu = after((np.zeros(3), 0.0), (UP, 1.0), imu=imu, seconds=4.0 * SHAKING_MEMORY)
     weigh(imu, False, parameters)
     assert (early < 0.6).all() and (imu.accel_weight > 0.8).all()
 

@@ -21,8 +21,8 @@ from uwb_tdoa_ekf.core.config import PLANAR_HEIGHT_STD, FilterConfig
 from uwb_tdoa_ekf.core.initialization import ANY_YAW, RIVAL_TIME
 from uwb_tdoa_ekf.core.memory import USED
 from uwb_tdoa_ekf.core.state import turn_about_vertical
+from uwb_tdoa_ekf.core.yaw_check import YAW_KNOWN
 from uwb_tdoa_ekf.estimator import Estimator
-from uwb_tdoa_ekf.monitoring.status import YAW_KNOWN
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.results import rows_of
 from uwb_tdoa_ekf.smoother import smooth

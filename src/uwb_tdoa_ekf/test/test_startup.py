@@ -18,7 +18,7 @@ from uwb_tdoa_bias.common.flight import Tdoas
 from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
 from uwb_tdoa_ekf.core.ground import KnownHeight
-from uwb_tdoa_ekf.core.hypotheses import MERGED_WITHIN, PRUNED_BELOW, YAW_STD, select
+from uwb_tdoa_ekf.core.hypotheses import IMPROBABLE, MERGED_WITHIN, YAW_STD, select
 from uwb_tdoa_ekf.core.memory import (
     HYPOTHESES,
     REJECTED,
@@ -367,7 +367,7 @@ def ekf_with(yaws, log_weights):
 
 
 def test_select_follows_the_best_and_prunes_the_improbable_and_the_same():
-    ekf = ekf_with([0.0, 0.05, 2.0, 3.0], [-1.0, -2.0, -3.0, -1.0 + 1.1 * PRUNED_BELOW])
+    ekf = ekf_with([0.0, 0.05, 2.0, 3.0], [-1.0, -2.0, -3.0, -1.0 - 1.1 * IMPROBABLE])
     select(ekf, 5.0)
     assert ekf.best == 0
     np.testing.assert_array_equal(ekf.hypotheses["log_weight"][:4], [0.0, -np.inf, -2.0, -np.inf])

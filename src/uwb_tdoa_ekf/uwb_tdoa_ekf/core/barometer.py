@@ -15,13 +15,13 @@ from uwb_tdoa_bias.common.compiled import Record, compiled
 from uwb_tdoa_bias.common.robust_loss import GEMAN_MCCLURE, weight
 
 from .auxiliary import PRESSURE, PRESSURE_DRIFT, RANGE, add_offset_jacobian
-from .height import GATE
+from .height import GATE, MEMORY
 from .hypotheses import alive
 from .memory import REJECTED, USED
 from .state import ERROR_STATES
 from .update import kalman, project
 
-LONGEST_DISAGREEMENT = 1.0  # s without a used altitude, after which the offset is initialized again
+# Set on the six flights of 0425/TDOA2, see docs/notebook/auxiliary_sensors.md.
 AVERAGE = 3.0  # s over which innovations are averaged to inflate the random walk of the offset
 UNTRIED, WORST = 10.0, 100.0  # standard deviations: initial and largest inflation
 
@@ -51,7 +51,7 @@ def observe(
     dt = min(max(sensor.t - barometer.heard, 0.0), AVERAGE)
     barometer.heard = sensor.t
     excess = max(1.0, barometer.nis)
-    anew = sensor.t - barometer.agreed > LONGEST_DISAGREEMENT
+    anew = sensor.t - barometer.agreed > MEMORY
     for h in range(len(ekf.hypotheses)):
         hypothesis = ekf.hypotheses[h]
         if not alive(hypothesis):

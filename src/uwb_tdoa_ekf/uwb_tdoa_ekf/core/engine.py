@@ -60,7 +60,7 @@ from .memory import (
 )
 from .sensor_functions import subtract
 from .startup import INLIER
-from .state import coast, predict, turn_about_vertical
+from .state import CONSTRAINT_PERIOD, coast, predict, turn_about_vertical
 from .update import project
 
 INCONSISTENT = 0.5  # share below which the filter searches for the tag elsewhere
@@ -167,10 +167,10 @@ def most_records(measurements: Measurements) -> int:
     imu, tdoa, sensor = measurements
     spans = [part["t"][-1] - part["t"][0] for part in measurements if len(part)]
     most, seconds = len(imu) + len(tdoa) + len(sensor), max(spans, default=0.0)
-    periods = stationarity.PERIOD, plane.PERIOD, 0.5 * imu_fault_detector.CLEARED
-    rests, floors, switches = (min(most, 2 + int(seconds / period)) for period in periods)
+    periods = CONSTRAINT_PERIOD, 0.5 * imu_fault_detector.CLEARED
+    constraints, switches = (min(most, 2 + int(seconds / period)) for period in periods)
     of_events = RECORDS_OF_TDOA * len(tdoa) + RECORDS_OF_SENSOR * len(sensor)
-    return of_events + RECORDS_OF_REST * rests + plane.RECORDS * floors + switches
+    return of_events + (RECORDS_OF_REST + plane.RECORDS) * constraints + switches
 
 
 # Process an IMU_SAMPLE: fault detection, prediction, rest and zero-velocity updates.

@@ -20,6 +20,7 @@ from uwb_tdoa_bias.common.compiled import Record, compiled
 from uwb_tdoa_bias.common.geometry import linearized_tdoa
 
 from .update import GATE
+from .workspace import STD
 
 # tangent of the elevation below which the ground inverts the phase of a reflection
 GRAZING = math.tan(math.radians(15.0))
@@ -55,13 +56,11 @@ GROUND_STD = 0.15  # m, of the height of the tag of a body that stands on the gr
 GROUND_HEIGHT = 0.05  # m, mean of this height
 # standard deviation of the error of a pair, and of an anchor, in units of tdoa_std
 PAIR_SHARE, ANCHOR_SHARE = (0.4, 1.0)
-# m: mean of the delay that late anchors share, its standard deviation, and the deviation of each
-# anchor from it
-USUAL_LATENESS, LATENESS_STD, ALIKE_STD = (2.0, 2.0, 0.3)
+# m: mean of the delay that late anchors share, and its standard deviation
+LATENESS = 2.0
+ALIKE_STD = 0.3  # m, standard deviation of the delay of each late anchor about it
 # probability ratio of any other delay, and of no delay, to the shared delay
 OTHER, TIMELY = 0.1, 0.5
-# m; a tag is not above the workspace, and rarely to the side of it
-ABOVE_STD, BESIDE_STD = 0.2, 2.0
 SWEEPS = 25
 KNOWN_STD = 0.1  # m, standard deviation of the delay of an anchor about the known delay
 # lateness of anchors near the ground: none, shared by all, or as known
@@ -364,7 +363,7 @@ def explain(
     n = 3 + len(rows) + 1
     system, u = np.empty((n, n + 1)), np.zeros(n)
     u[:3] = x
-    u[n - 1] = USUAL_LATENESS if lateness == ALIKE else 0.0
+    u[n - 1] = LATENESS if lateness == ALIKE else 0.0
     late, errors = np.zeros(len(rows), np.bool_), np.zeros((len(rows), 2))
     errors[:, 1] = ANCHOR_SHARE * parameters.tdoa_std
     for i in range(len(rows)):
@@ -378,7 +377,7 @@ def explain(
                 anchors[rows[i]].position, u, 0.0, parameters.ground_height
             )
             if sweep == 0 and late[i]:
-                u[3 + i] = USUAL_LATENESS
+                u[3 + i] = LATENESS
         _equations(evidence, height, places, late, errors, u, system)
         if not solve(system):
             return np.inf
@@ -479,17 +478,17 @@ def _equations(
                 alike / total / (ALIKE_STD**2 * (1.0 + square)),
             )
             _add(system, states[:1], entries[:1], -u[3 + i], timely / total / of_anchor**2)
-            _add(system, states[:1], entries[:1], 0.0, 1.0 / LATENESS_STD**2)
+            _add(system, states[:1], entries[:1], 0.0, 1.0 / LATENESS**2)
         else:
             apart, std = errors[i, 0] - u[3 + i], errors[i, 1]
             square = 0.5 * (apart / std) ** 2
             cost += math.log1p(square) + math.log(std / of_anchor)
             states[0], entries[0] = 3 + i, 1.0
             _add(system, states[:1], entries[:1], apart, 1.0 / (std**2 * (1.0 + square)))
-    apart = u[n - 1] - USUAL_LATENESS
-    cost += 0.5 * (apart / LATENESS_STD) ** 2 if late.any() else 0.0
+    apart = u[n - 1] - LATENESS
+    cost += 0.5 * (apart / LATENESS) ** 2 if late.any() else 0.0
     states[0], entries[0] = n - 1, 1.0
-    _add(system, states[:1], entries[:1], -apart, 1.0 / LATENESS_STD**2)
+    _add(system, states[:1], entries[:1], -apart, 1.0 / LATENESS**2)
     for axis in range(3):
         states[0] = axis
         low, high = workspace[0, axis], workspace[1, axis]
@@ -498,10 +497,9 @@ def _equations(
             system[axis, n] += prior[1 + axis, k] * (prior[0, k] - u[k])
             cost += 0.5 * (prior[0, axis] - u[axis]) * prior[1 + axis, k] * (prior[0, k] - u[k])
         outside = u[axis] - min(max(u[axis], low), high)
-        std = ABOVE_STD if axis == 2 else BESIDE_STD
-        cost += 0.5 * (outside / std) ** 2
+        cost += 0.5 * (outside / STD) ** 2
         if outside != 0.0:
-            _add(system, states[:1], entries[:1], -outside, 1.0 / std**2)
+            _add(system, states[:1], entries[:1], -outside, 1.0 / STD**2)
     if not math.isnan(height.z):
         cost += 0.5 * ((u[2] - height.z) / height.std) ** 2 - math.log(
             (workspace[1, 2] - workspace[0, 2]) / (2.5 * height.std)

@@ -27,10 +27,12 @@ from .state import rotation
 from .update import kalman, project
 from .workspace import STD
 
+# Set on the six flights of 0425/TDOA2, see docs/notebook/auxiliary_sensors.md.
 # s over which the error of a range persists: the ground is uneven, the sensor has an offset
 CORRELATION_TIME = 0.5
-# s of ranges and TDOAs that count: after so long without an agreeing range, the ground level below is
-# unknown; after so long in agreement, a disagreement is a step of the ground
+# s of ranges, altitudes and TDOAs that count: after so long without agreement, the ground level below,
+# or the offset of a barometer, is unknown; after so long in agreement, a disagreement is a step of the
+# ground
 MEMORY = 1.0
 STUCK_TIME = 0.5  # s; a working sensor of a tag in motion never repeats a value for this long
 GATE = 4.0  # standard deviations beyond which a range disagrees

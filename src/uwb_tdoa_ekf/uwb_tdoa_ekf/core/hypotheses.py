@@ -22,7 +22,8 @@ from .state import CHECK_PERIOD, difference
 from .update import GATE
 
 YAW_STD = 0.6  # rad, of the yaw of each hypothesis: their yaws start 90 degrees apart
-PRUNED_BELOW = -8.0  # log probability relative to the best, below which a hypothesis is pruned
+# minus the log probability relative to the best, above which a hypothesis or a place is dropped
+IMPROBABLE = 8.0
 MERGED_BELOW, MERGED_WITHIN = 0.1, 0.3  # rad and m: two hypotheses that are closer are merged
 LARGEST_NIS = GATE**2  # normalized innovation squared; limits the weight of a single measurement
 
@@ -75,7 +76,7 @@ def select(ekf: Record, t: float) -> bool:
     for h in range(HYPOTHESES):
         hypothesis = ekf.hypotheses[h]
         hypothesis.log_weight -= highest
-        if hypothesis.log_weight < PRUNED_BELOW:
+        if hypothesis.log_weight < -IMPROBABLE:
             hypothesis.log_weight = -np.inf
         followed += alive(hypothesis)
     ekf.best = best

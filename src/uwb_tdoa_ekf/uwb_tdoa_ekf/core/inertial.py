@@ -24,8 +24,9 @@ QUIET_TILT = 0.5  # m/s^2; the norm of the mean specific force may differ from g
 # cosine of the tilt above which a tag does not hover, and the beam of a range finder may hit anything
 UPRIGHT = 0.5
 CARRIED_STD = 20.0  # m/s^2, of the specific force of a tag that does not hover, about hovering
-# s of samples that show how far an axis rectifies: no vehicle accelerates one way for longer
-RECTIFYING_MEMORY = 2.0
+# s over which the vibration of a vehicle, and how far an axis rectifies, are averaged: no vehicle
+# accelerates one way for longer
+SHAKING_MEMORY = 2.0
 LEAST_RECTIFIED = 0.1  # least share of the vibration power that counts as rectified
 QUIET_NOISE = 0.01  # m/s^2/sqrt(Hz), of the accelerometer of a quiet tag
 
@@ -61,7 +62,7 @@ def observe(imu: Record, sample: Record, timeout: float) -> bool:
         power, shakes = _from_hovering(imu.mean_accel, k) ** 2, imu.vibration[k] > QUIET_ACCEL**2
         # without vibration the share is undefined: 1, the worst, until the axis has vibrated
         share = power / max(power, imu.vibration[k]) if shakes else 1.0
-        imu.rectified[k] = low_pass(imu.rectified[k], share, dt, RECTIFYING_MEMORY)
+        imu.rectified[k] = low_pass(imu.rectified[k], share, dt, SHAKING_MEMORY)
         imu.gyro[k], imu.accel[k] = (
             0.5 * (imu.gyro[k] + sample.gyro[k]),
             0.5 * (imu.accel[k] + sample.accel[k]),

@@ -43,7 +43,6 @@ UNKNOWN, BETTER = (2.0, 0.5)
 # longest gap, as a share of the duration of all TDOAs above. A longer gap means that the tag has
 # just been switched on.
 LONGEST_GAP = 0.6
-LISTEN_PERIOD = 1.0  # s between two updates of the heard anchors
 TILT_STD = 0.1  # rad, roll and pitch at the start
 ANY_YAW = math.pi / math.sqrt(3.0)  # rad, standard deviation of an unknown yaw
 WRONG_POSITION = 1.0  # m, standard deviation of the position error after faulty inertial samples
@@ -367,8 +366,8 @@ def look_around(ekf: Record, anchors: np.ndarray, parameters: Record, t: float) 
 
     The workspace thus follows the tag through a hall.
     """
-    ekf.next_bounds = t + LISTEN_PERIOD
-    _find_surroundings(ekf, recent(ekf, LISTEN_PERIOD), anchors, parameters)
+    ekf.next_bounds = t + noise.MEMORY
+    _find_surroundings(ekf, recent(ekf, noise.MEMORY), anchors, parameters)
 
 
 @compiled

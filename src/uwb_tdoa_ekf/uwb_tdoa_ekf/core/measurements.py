@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from ..anchor_table import AnchorTable
 
+# Limits of what can be a measurement; nothing is tuned.
 MAX_RATE, MAX_ACCEL = 100.0, 1000.0  # rad/s and m/s^2, beyond the range of any inertial sensor
 # largest slope of a bias (m per m or m/s), and largest state (m or m/s) of its linearization
 STEEPEST, FARTHEST = 1e3, 1e6

@@ -13,10 +13,22 @@ from uwb_tdoa_bias.common.compiled import Record, compiled
 
 from .ground import solve
 
+# Noise of each anchor.
 LARGEST_OUTLIER = 5.0  # standard deviations; limits the effect of an outlier
 # largest share of a new innovation in the variance of an anchor: ten innovations show more than a
 # single one
 LARGEST_STEP = 0.1
+
+# Persisting errors.
+# share of the variance of a TDOA that persists where its errors are correlated: delays and antennas
+# cause errors as large as the noise
+SHARE = 0.5
+MEMORY = 1.0  # s of TDOAs that count; an anchor that was silent for longer counts as absent
+# s; limits the decay, because silence does not remove the information from anchors
+LONGEST_STEP = 0.1
+# largest ratio of the added covariance to the covariance of the filter, because anchors are not the
+# only source of position
+MOST = 400.0
 
 
 @compiled
@@ -63,17 +75,6 @@ def _learn_one(anchor: Record, t: float, excess: float, memory: float) -> None:
     )
     anchor.excess_variance = max(0.0, anchor.excess_variance + step * excess)
     anchor.learned = t
-
-
-# share of the variance of a TDOA that persists where its errors are correlated: delays and antennas
-# cause errors as large as the noise
-SHARE = 0.5
-MEMORY = 1.0  # s of TDOAs that count; an anchor that was silent for longer counts as absent
-# s; limits the decay, because silence does not remove the information from anchors
-LONGEST_STEP = 0.1
-# largest ratio of the added covariance to the covariance of the filter, because anchors are not the
-# only source of position
-MOST = 400.0
 
 
 @compiled

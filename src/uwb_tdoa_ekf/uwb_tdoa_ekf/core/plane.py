@@ -20,10 +20,9 @@ from uwb_tdoa_bias.common.robust_loss import GEMAN_MCCLURE, weight
 from . import hypotheses, velocity
 from .history import add_update
 from .memory import HYPOTHESES
-from .state import rotation
+from .state import CONSTRAINT_PERIOD, rotation
 from .update import GATE, kalman, project, update_state
 
-PERIOD = 0.05  # s between two applications of the constraints
 RISE_STD = 0.02  # m/s, of the vertical velocity of a planar vehicle
 # records in a history per application: height, rise, tilt about two axes, velocity along two
 RECORDS = 6
@@ -50,7 +49,7 @@ def hold(ekf: Record, parameters: Record, t: float, records: np.ndarray) -> None
     records : (n,) RECORD
         History for the smoother; empty for no recording.
     """
-    ekf.next_floor = t + PERIOD
+    ekf.next_floor = t + CONSTRAINT_PERIOD
     innovation, R, std = ekf.innovation, ekf.transition.rotation, parameters.fixed_height_std
     rolls = parameters.non_holonomic_std > 0.0 and (ekf.sensed or velocity.drives(ekf.velocity, t))
     for h in range(HYPOTHESES):
@@ -78,7 +77,7 @@ def hold(ekf: Record, parameters: Record, t: float, records: np.ndarray) -> None
                 )
                 total = innovation.prior_variance + innovation.noise_variance
                 w = weight(GEMAN_MCCLURE, innovation.value / math.sqrt(total), GATE)
-                alike = 2.0 * velocity.CORRELATION_TIME / PERIOD
+                alike = 2.0 * velocity.CORRELATION_TIME / CONSTRAINT_PERIOD
                 innovation.total_variance = (
                     innovation.prior_variance + innovation.noise_variance * alike / w
                 )

@@ -18,6 +18,7 @@ from uwb_tdoa_bias.common.geometry import linearized_tdoa
 from uwb_tdoa_bias.common.robust_loss import GEMAN_MCCLURE, geman_mcclure_loss, weight
 
 from .ground import SPEED, KnownHeight, solve
+from .hypotheses import IMPROBABLE
 from .workspace import configured_side, reflect, rows_heard
 
 STARTS = 9  # the middle of the workspace and the corners of the half-size box around it
@@ -27,8 +28,6 @@ LONGEST_STEP = 2.0  # m, longest change of the position in a Gauss-Newton step
 INLIER = 0.75  # m; a smaller residual agrees with a position
 NO_SCALE = 1e6  # m, scale of a loss that is quadratic in practice
 APART = 1.0  # m between two places; also the standard deviation above which a place is split
-# minus the log probability ratio to the best place, above which a place is dropped
-IMPROBABLE = 8.0
 SMALLEST = 1e-300  # m^2, replaces a variance of 0
 SPLIT = 0.8  # standard deviations from the middle of a place to each half after a split
 

@@ -19,6 +19,7 @@ from uwb_tdoa_bias.common.compiled import Record, compiled
 GRAVITY = 9.81  # m/s^2, along -z of the world
 # s between two searches for the tag, checks of rest, tests of the yaw, and merges of hypotheses
 CHECK_PERIOD = 0.1
+CONSTRAINT_PERIOD = 0.05  # s between two updates of a tag at rest, or of a vehicle on its floor
 NOMINAL_STATES, ERROR_STATES = 16, 15
 MOVING_STATES = 9  # first error states; the states behind are biases, which only random-walk
 

@@ -15,28 +15,27 @@ from uwb_tdoa_bias.common.compiled import Record, compiled, compiled_apart
 
 from . import ground, hypotheses, stationary_position
 from .history import add_update, replace_velocity
+from .inertial import SHAKING_MEMORY
 from .memory import HYPOTHESES
-from .state import CHECK_PERIOD, GRAVITY, rotation
+from .state import CHECK_PERIOD, CONSTRAINT_PERIOD, GRAVITY, rotation
 from .stationary_position import SPEED_STD
 from .update import GATE, update_state
 
-PERIOD = 0.05  # s between zero-velocity updates
 # m/s, standard deviation of a zero-velocity update: with a quiet IMU, and with a vibrating one
 QUIET_STD, SHAKING_STD = (0.02, 0.15)
 LOOK_WINDOW = 0.4  # s of TDOAs in each check
 # checks in a row with changed TDOAs that end a rest: a check shows a change by chance in 1 of 20
-# cases
-MOST_DOUBTS = 3
+# cases; checks in a row without a change that begin a rest within EARLY
+FEWEST_CHECKS = 3
 # m/s; if the IMU has measured a larger change of velocity, a single such check ends the rest
 UNFELT = 0.06
 # checks in a row without a change that begin the rest of a quiet tag: fewer may be a turning point
 LONG = 10
-# s after the start, or after the beginning of its last rest, within which this number of checks
-# suffices
-EARLY, LONG_ENOUGH = (1.5, 3)
+# s after the start, or after the beginning of its last rest, within which FEWEST_CHECKS suffice
+EARLY = 1.5
 AGAIN = 0.3  # s between two corrections of a tag near the ground that is not known to stand
-# rotors or wheels have stopped if the vibration is below this share of its mean over this time, s
-CALM, SHAKING_MEMORY = (0.1, 2.0)
+# rotors or wheels have stopped if the vibration is below this share of its mean over SHAKING_MEMORY
+CALM = 0.1
 LIFT = 0.25  # m/s upwards; a larger change of velocity, measured by the IMU, ends a rest
 LIFT_MEMORY = 0.7  # s over which the measured acceleration is integrated
 AWAY = 1.5  # s after such an end in which no new rest begins
@@ -136,7 +135,7 @@ def check_stationarity(
     if ekf.resting:
         if not unshown:
             ekf.doubts = 0 if still else ekf.doubts + 1
-        ekf.resting = ekf.doubts < (MOST_DOUBTS if np.abs(ekf.lift).max() < UNFELT else 1)
+        ekf.resting = ekf.doubts < (FEWEST_CHECKS if np.abs(ekf.lift).max() < UNFELT else 1)
     else:
         ekf.lift[:] = 0.0
         ekf.doubts = 0
@@ -153,7 +152,7 @@ def check_stationarity(
             stationary_position.set_position(ekf, place, covariance, t, records)
         elif landed:
             stationary_position.set_hovering_position(ekf, place, still, t, records)
-        long = ekf.stills >= (LONG if t - ekf.rest_since > EARLY else LONG_ENOUGH)
+        long = ekf.stills >= (LONG if t - ekf.rest_since > EARLY else FEWEST_CHECKS)
         ekf.resting = stands and landed
         if not landed and long and not _moves(best, QUIET_STD):
             ekf.resting, ekf.late_as_known = True, False
@@ -167,7 +166,7 @@ def check_stationarity(
 def update_zero_velocity(ekf: Record, t: float, records: np.ndarray) -> None:
     """Apply a zero-velocity update to a tag at rest, and to a quiet tag with a slow velocity.
 
-    The three axes are updated in sequence, at most once per PERIOD.
+    The three axes are updated in sequence, at most once per CONSTRAINT_PERIOD.
 
     Parameters
     ----------
@@ -182,7 +181,7 @@ def update_zero_velocity(ekf: Record, t: float, records: np.ndarray) -> None:
         ekf.resting = False
     if not (ekf.resting or ekf.quiet) or t < ekf.next_rest:
         return
-    ekf.next_rest = t + PERIOD
+    ekf.next_rest = t + CONSTRAINT_PERIOD
     std = QUIET_STD if ekf.quiet else SHAKING_STD
     for h in range(HYPOTHESES):
         hypothesis = ekf.hypotheses[h]

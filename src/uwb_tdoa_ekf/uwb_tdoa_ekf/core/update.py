@@ -19,6 +19,8 @@ from . import auxiliary
 from .state import ERROR_STATES, inject
 
 GATE = 3.0  # standard deviations beyond which a measurement is an outlier
+SMALLEST = 0.5  # m, 3D standard deviation below which the second-order term is negligible
+NEAREST = 0.1  # m, least distance to an anchor, for the curvature of its range
 LONGEST_ROW = 6  # most error states that a measurement depends on
 JOINT_STATES = ERROR_STATES + auxiliary.OFFSET_STATES
 
@@ -108,10 +110,6 @@ def update_state(
     project(hypothesis.P, innovation)
     innovation.total_variance = innovation.prior_variance + innovation.noise_variance
     kalman(hypothesis, innovation)
-
-
-SMALLEST = 0.5  # m, 3D standard deviation below which the second-order term is negligible
-NEAREST = 0.1  # m, least distance to an anchor, for the curvature of its range
 
 
 @compiled

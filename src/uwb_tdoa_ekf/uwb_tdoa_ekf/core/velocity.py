@@ -25,6 +25,8 @@ from .memory import REJECTED, USED
 from .state import rotation
 from .update import GATE, kalman, project
 
+# Set on the six flights of 0425/TDOA2, see docs/notebook/auxiliary_sensors.md. They have no wheels:
+# SLIP, HELD and STANDING were set on simulated drives.
 CORRELATION_TIME = 1.0  # s over which the error of a velocity persists
 LONGEST_STD = 1e3  # m/s and rad/s; a component with a larger standard deviation is not measured
 # equal velocities, in STUCK_TIME at least, after which the sensor of a vibrating tag is stuck

@@ -20,7 +20,7 @@ from uwb_tdoa_bias.common.compiled import Record, compiled
 from .state import CHECK_PERIOD, ERROR_STATES
 
 MEMORY = 6.0  # s over which innovations count
-KNOWN = 0.35**2  # rad^2, variance below which the yaw counts as known: 20 degrees
+YAW_KNOWN = math.radians(20.0)  # rad, standard deviation below which the yaw counts as known
 # Log likelihood ratio above which the yaw is opened again. It trades false alarms against late
 # detection. Of 22 measured flights the largest ratio is 3.5; the worst flight has 9.9 without its
 # range finder. See docs/notebook/reliability.md.
@@ -145,7 +145,7 @@ def contradicts(ekf: Record, t: float) -> bool:
     _forget(doubt, max(t - doubt.t, 0.0))
     doubt.t, doubt.next_look = t, t + CHECK_PERIOD
     doubt.evidence = evidence(doubt)
-    return doubt.evidence > EVIDENCE and _yaw_variance(ekf.hypotheses[ekf.best]) < KNOWN
+    return doubt.evidence > EVIDENCE and _yaw_variance(ekf.hypotheses[ekf.best]) < YAW_KNOWN**2
 
 
 @compiled

@@ -60,8 +60,8 @@ SCATTER = 3.0  # standard deviation of the steps over their mean; healthy 1.4 at
 # share of stamps that equal the one before, healthy 0; s between different stamps
 REPEATED, LEAP = (0.3, 0.01)
 PACE = 0.05  # largest difference between the pace of the stamps and of the clock
-BLOCK = 0.1  # s between the earliest and the latest arrival of a window, relative to the stamps
-APART = 0.1  # s between two streams that counts as a difference
+# s by which arrivals of a window, or of two streams, must differ from their stamps to count
+APART = 0.1
 LATEST = 5.0  # s that TDOAs may be late; a larger value means another clock
 DRIFT, DRIFTED = 3e-4, 0.03  # s/s, and s over the recording, above which a drift is reported
 # s, default waiting times of ekf_node
@@ -398,7 +398,7 @@ def pace(name: str, windows: list[StampWindow]) -> Finding | None:
 def blocks(name: str, windows: list[StampWindow]) -> Finding | None:
     """Return a Finding if the latency varies strongly, because messages are sent in blocks."""
     spread = median_of(windows, "spread")
-    if not spread > BLOCK or median_of(windows, "scatter") > SCATTER or not orderly(windows):
+    if not spread > APART or median_of(windows, "scatter") > SCATTER or not orderly(windows):
         return None
     severity = ERROR if spread > LAG else WARNING
     cause = f"the messages of {name} arrive in blocks"

@@ -13,6 +13,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.sensors import LOCATING
 
+from ..core.yaw_check import YAW_KNOWN
 from ..results import Odometry
 
 if TYPE_CHECKING:
@@ -34,8 +35,6 @@ SETTLED = 5.0
 EARLY = 0.05  # s by which a check may come early
 LARGEST_UNUSED = 0.5  # share of TDOAs that are not used for one reason, before it is reported
 FEWEST = 10  # fewest TDOAs of a window
-# rad; with four yaw hypotheses the deviation is 100 degrees, with one below 20: docs/reliability.md
-YAW_KNOWN = math.radians(20.0)
 # rad and m/s, standard deviations that are published while a fault makes the estimate wrong
 ANY_YAW, ANY_SPEED = math.pi, 2.0
 WAITING, STARTING, RUNNING, LOST, FAULT = range(5)  # values of EstimatorStatus

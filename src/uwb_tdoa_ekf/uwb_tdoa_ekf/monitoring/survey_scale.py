@@ -21,6 +21,7 @@ from uwb_tdoa_bias.common.compiled import compiled
 from uwb_tdoa_bias.common.radio import SPEED_OF_LIGHT
 from uwb_tdoa_bias.common.survey import UNITS
 
+from .explain import SCALE
 from .finding import ERROR, Finding
 
 if TYPE_CHECKING:
@@ -35,9 +36,8 @@ FEWEST, MANY, KEPT = (4, 20, 60)
 SINGLE = 12
 # smallest factor, ratio of successive factors, largest factor
 SMALLEST, RATIO, LARGEST = (1.5, 1.25, 1500.0)
-# m, scale of the Geman-McClure loss; number of Gauss-Newton steps; longest step relative to the
-# room
-LOSS, STEPS, NEAR = (0.5, 8, 0.3)
+# number of Gauss-Newton steps; longest step relative to the room
+STEPS, NEAR = (8, 0.3)
 STARTS = np.array(
     [[0.0, 0.0, 0.0], [0.6, 0.6, 0.6], [-0.6, -0.6, 0.6], [0.6, -0.6, -0.6], [-0.6, 0.6, -0.6]]
 )
@@ -274,7 +274,7 @@ def locate(
         for j in range(3):
             p[j] = 0.5 * (low[j] + high[j]) + 0.5 * starts[start, j] * (high[j] - low[j])
         for step in range(STEPS + 1):
-            scale, loss = max(0.3 * size * 0.5**step, LOSS) if step < STEPS else LOSS, 0.0
+            scale, loss = max(0.3 * size * 0.5**step, SCALE) if step < STEPS else SCALE, 0.0
             system[:, :] = 0.0
             for i in range(n):
                 r = hypothesis[2] * d[i]

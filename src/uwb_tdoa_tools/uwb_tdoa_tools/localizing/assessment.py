@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from uwb_tdoa_bias.common.flight import Flight
+from uwb_tdoa_ekf.core.yaw_check import YAW_KNOWN
 from uwb_tdoa_ekf.frames import rotation_std
 from uwb_tdoa_ekf.monitoring.finding import ERROR
-from uwb_tdoa_ekf.monitoring.status import YAW_KNOWN
 from uwb_tdoa_ekf.offline import Run
 from uwb_tdoa_ekf.results import Odometry, Residuals
 
