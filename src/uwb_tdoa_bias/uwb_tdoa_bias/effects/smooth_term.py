@@ -361,11 +361,17 @@ class SmoothTerm(Effect):
             ]
             return np.stack([part * self._of_link(samples, link) for part, link in parts], axis=1)
         basis, ids = self.basis(both), samples.anchors.ids[samples.rows]
+        unknown = np.isnan(basis).any(axis=1)
+        columns: dict[str, list[int]] = {}
         for column, key in enumerate(keys):
-            anchor, _, c = key.rpartition(".")
-            out[:, column] = samples.difference(
-                basis[:, int(c[1:])] * (1.0 if not anchor else ids == int(anchor))
-            )
+            columns.setdefault(key.rpartition(".")[0], []).append(column)
+        for anchor, some in columns.items():
+            mine = ids == int(anchor) if anchor else np.ones(len(ids), dtype=bool)
+            of_arrivals = np.zeros((len(ids), len(some)))
+            numbers = [int(keys[column].rpartition(".")[2][1:]) for column in some]
+            of_arrivals[mine] = basis[mine][:, numbers]
+            of_arrivals[unknown] = np.nan
+            out[:, some] = samples.difference(of_arrivals)
         return out
 
     def groups(  # type: ignore[override]  # of a term
