@@ -13,7 +13,7 @@ import numpy as np
 
 from ..common.errors import InputError
 from ..common.sensors import STREAM_OF, measured_on
-from .covariates import OF_ARRIVAL, OF_TDOA, UNITS, checked_domain, fade_weight
+from .covariates import OF_ARRIVAL, UNITS, checked_domain, covariate_of, fade_weight
 from .samples import RADIO, Samples, true_samples
 
 if TYPE_CHECKING:
@@ -410,9 +410,9 @@ class Effect:
         weight, n = np.ones(len(samples)), len(samples)
         for covariate, limits in self.domain.items():
             if covariate in OF_ARRIVAL:
-                of_arrivals = fade_weight(OF_ARRIVAL[covariate](samples, samples.rows), limits)
+                of_arrivals = fade_weight(covariate_of(samples, covariate), limits)
                 weight *= of_arrivals.reshape(-1, n).min(axis=0)
-            elif (values := OF_TDOA[covariate](samples)) is not None:
+            elif (values := covariate_of(samples, covariate)) is not None:
                 weight *= fade_weight(values, limits)
         if "time" in self.domain:
             samples = samples.until(samples.start + self.domain["time"][1])
