@@ -300,7 +300,7 @@ class SmoothTerm(Effect):
             parts = (self._of_link(samples, k) * self.curve(values, f"{k}.") for k in links)
             return sum(parts, np.zeros(n))
         rows, weights = samples.rows, self._weights(samples.anchors)
-        mine = np.flatnonzero(weights.any(axis=1)[rows])
+        mine = np.flatnonzero(np.count_nonzero(weights, axis=1)[rows])
         if len(mine) == len(rows) or not isinstance(both, np.ndarray):
             return samples.difference(self._functions(both, weights, rows))
         late = np.where(np.isnan(both), np.nan, 0.0)  # of anchors without a function

@@ -196,7 +196,7 @@ class ReceivedPowerBias(ArrivalEffect):
     ) -> np.ndarray:
         p, positions = tile(samples, samples.p), samples.anchors.positions[rows]
         orientations = samples.anchors.orientations[rows]
-        power = np.full(len(rows), np.nan)
+        power: np.ndarray = np.full(len(rows), np.nan)
         if np.isfinite(orientations).any():
             q = tile(samples, samples.q)
             power = received_power_dbm(p, q, positions, orientations, LINK)
