@@ -100,12 +100,12 @@ def rmse(flight, effects):
     return score.row()["rmse_3d"] if len(score.t) else np.inf
 
 
-def case(source, seed, number=2):
+def case(source, seed, number=2, draw=grammar.draw):
     """(Undeclared, `number` flights with it, the same without, base, where) of a seed; None if the
-    effect costs too little however it is enlarged.
+    effect costs too little however it is enlarged. draw : draw(seed, flight) returns the effect
     """
     flights, base, where = source.flights(np.random.default_rng([seed, 7]), number)
-    effect = grammar.draw(seed, flights[0])
+    effect = draw(seed, flights[0])
     before = [rmse(flight, base) for flight in flights]
     for _ in range(1 + GROWTHS):
         flown = [effect.inject(flight) for flight in flights]
@@ -175,9 +175,9 @@ def _as_they_are(flights, judge, base, where):
     return _told_as_they_are[key]
 
 
-def run(source, seed):
-    """dict of the case of a seed; None if it costs too little."""
-    drawn = case(source, seed)
+def run(source, seed, draw=grammar.draw):
+    """dict of the case of a seed; None if it costs too little. draw : as of `case`"""
+    drawn = case(source, seed, draw=draw)
     return None if drawn is None else {"seed": seed, **_judge(1, *drawn)}
 
 

@@ -96,7 +96,7 @@ def truth_of(effect, flight):
             else "pair"
         )
     who = frozenset(("xyz"[effect.who[0]],) if subset == "axis" else map(str, effect.who))
-    return Claim(effect.stream, subset, who, (effect.covariate,), effect.shape, effect.name)
+    return Claim(effect.stream, subset, who, effect.covariates, effect.shape, effect.name)
 
 
 def _only_pair(effect, flight):

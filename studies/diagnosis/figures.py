@@ -26,7 +26,7 @@ from uwb_tdoa_tools.results_file import ResultsFile
 from uwb_tdoa_tools.scoring.plots import plt
 from uwb_tdoa_tools.surveying.report import with_blocked
 
-from . import bank, blind, faults, floor, measured, referenced, undeclared
+from . import bank, blind, faults, floor, measured, processes, referenced, undeclared
 
 PARTS = (
     "bank",
@@ -34,6 +34,7 @@ PARTS = (
     "no-truth",
     "undeclared",
     "blind",
+    "processes",
     "several",
     "faults",
     "injected",
@@ -57,8 +58,8 @@ def add_options(add):
         type=int,
         default=5,
         help=(
-            "flights for each effect and size, cases of blind and several, or costly draws of "
-            "each of the faults (default: 5)"
+            "flights for each effect and size, cases of blind, processes and several, or costly "
+            "draws of each of the faults (default: 5)"
         ),
     )
     add(
@@ -66,7 +67,7 @@ def add_options(add):
         metavar="SEED",
         type=int,
         default=blind.DEVELOPED_ON,
-        help="first seed of blind, several, faults and no-truth (default: %(default)s)",
+        help="first seed of blind, processes, several, faults and no-truth (default: %(default)s)",
     )
     add("--data", metavar="DIR", type=Path, help="the measured flights: flights/, util/, surveys/")
     add(
@@ -74,7 +75,7 @@ def add_options(add):
         metavar="N",
         type=whole_number,
         default=1,
-        help="cases of blind and several at once (default: %(default)s)",
+        help="cases of blind, processes and several at once (default: %(default)s)",
     )
     add(
         "--cases",
@@ -100,6 +101,7 @@ def run(args):
         "no-truth": _no_truth,
         "undeclared": _undeclared,
         "blind": _blind,
+        "processes": _processes,
         "several": _several,
         "faults": _faults,
         "injected": _injected,
@@ -172,6 +174,19 @@ def _blind(args):
         clean = list(blind.false_alarms(args.seeds, args.first))
         figures["false alarms"] = bank.share(bool(r["said"]) for r in clean)
     _confusions(results, args.out / "blind.png")
+    return {"figures": figures, "cases": results}
+
+
+def _processes(args):
+    """As blind, with the effects of the second generator, which have no shape that a word names."""
+    results = _drawn(args, partial(blind.run, _source(args), draw=processes.draw))
+    figures = blind.figures(results)
+    del figures["shape right"]
+    kinds = {r["shape"] for r in results}
+    figures["first, by kind"] = {
+        kind: bank.share(r["place"] == 0 for r in results if r["shape"] == kind)
+        for kind in sorted(kinds)
+    }
     return {"figures": figures, "cases": results}
 
 

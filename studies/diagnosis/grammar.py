@@ -60,6 +60,11 @@ class Undeclared:
     form: tuple
 
     @property
+    def covariates(self):
+        """Those of which one counts as right."""
+        return (self.covariate,)
+
+    @property
     def name(self):
         """In a few words."""
         part = "xyz"[self.who[0]] if self.subset == "axis" else "-".join(map(str, self.who))
@@ -97,7 +102,7 @@ class Undeclared:
         if self.stream != "tdoa":
             imu = flight.imu
             change = np.zeros((len(imu), 3))
-            change[:, self.who[0]] = np.nan_to_num(self.course(_of_imu(flight, self.covariate)))
+            change[:, self.who[0]] = np.nan_to_num(self.course(of_imu(flight, self.covariate)))
             return replace(
                 flight, imu=replace(imu, **{self.stream: getattr(imu, self.stream) + change})
             )
@@ -111,7 +116,7 @@ class Undeclared:
         ids = samples.anchors.ids
         a, b = ids[samples.a], ids[samples.b]
         if self.covariate in ON_ARRIVAL:
-            both = _of_arrival(samples, self.covariate).reshape(2, -1)
+            both = of_arrival(samples, self.covariate).reshape(2, -1)
             late = self.course(both)
             of = (
                 [1.0, 1.0]
@@ -119,7 +124,7 @@ class Undeclared:
                 else [1.0 * (a == self.who[0]), 1.0 * (b == self.who[0])]
             )
             return late[1] * of[1] - late[0] * of[0]
-        late = self.course(_of_tdoa(samples, self.covariate))
+        late = self.course(of_tdoa(samples, self.covariate))
         if self.subset == "anchor":
             return late * (1.0 * (b == self.who[0]) - (a == self.who[0]))
         if self.subset == "all":
@@ -165,20 +170,20 @@ def _values(flight, stream, covariate):
     """Values of a covariate in the air: (n,)."""
     up = flight.truth.t[flight.truth.p[:, 2] > 0.3]
     if stream != "tdoa":
-        values = _of_imu(flight, covariate)
+        values = of_imu(flight, covariate)
         return values[(flight.imu.t >= up[0]) & (flight.imu.t <= up[-1])]
     samples, _ = true_samples(flight)
     flown = (samples.t >= up[0]) & (samples.t <= up[-1])
     if covariate in ON_ARRIVAL:
-        return _of_arrival(samples, covariate).reshape(2, -1)[:, flown].ravel()
-    return _of_tdoa(samples, covariate)[flown]
+        return of_arrival(samples, covariate).reshape(2, -1)[:, flown].ravel()
+    return of_tdoa(samples, covariate)[flown]
 
 
-def _of_arrival(samples, name):
+def of_arrival(samples, name):
     return OF_ARRIVAL[name](samples, np.concatenate([samples.a, samples.b]))
 
 
-def _of_tdoa(samples, name):
+def of_tdoa(samples, name):
     if name == "interval":
         return (
             np.diff(samples.t, prepend=samples.t[:1])
@@ -192,7 +197,7 @@ def _of_tdoa(samples, name):
     return OF_TDOA[name](samples)
 
 
-def _of_imu(flight, name):
+def of_imu(flight, name):
     imu = flight.imu
     if name in OF_IMU:
         return ImuFeatures()(imu.t, imu.gyro, imu.accel)[:, OF_IMU.index(name)]

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Random attitudes, and random TDOAs with the poses they were taken at."""
 
+from dataclasses import fields
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -31,4 +33,5 @@ def random_samples(seed, n=20, n_anchors=5):
 
 def ranges_of(samples, rows):
     """RangeSamples of Samples: the distances to anchors in rows (n,)."""
-    return RangeSamples(**{**vars(samples), "a": rows, "b": rows})
+    own = {one.name: getattr(samples, one.name) for one in fields(samples)}
+    return RangeSamples(**{**own, "a": rows, "b": rows})

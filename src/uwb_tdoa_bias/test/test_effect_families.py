@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What single effects and their correctors do: delays, geometry, floor, labels, sensors, advice."""
 
+from dataclasses import replace
+
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
@@ -24,6 +26,7 @@ from uwb_tdoa_bias.effects import (
     SensorCorrector,
     SmoothTerm,
     TagLeverArm,
+    tag,
 )
 from uwb_tdoa_bias.effects.base import counted, listed, measured
 
@@ -31,6 +34,17 @@ ANCHORS = Anchors.from_positions([[0, 0, 0], [8, 0, 3], [0, 7, 0], [8, 7, 3]], i
 A, B, D = np.array([1, 2, 4, 7]), np.array([2, 4, 7, 1]), np.array([0.5, -1.0, 2.0, -0.25])
 IDS, SIGN = EFFECTS["anchor_ids"]({"1": 4, "4": 1}), EFFECTS["pair_sign"]({"4-2": -1})
 seeds = st.integers(0, 2**32 - 1)
+
+
+def test_the_power_of_anchors_of_unknown_orientation_needs_no_pattern(monkeypatch):
+    samples = random_samples(1)
+    effect = EFFECTS["received_power_bias"]({"scale": 2.0})
+    turned = replace(samples.anchors, orientations=np.full((5, 4), np.nan))
+    unknown = replace(samples, anchors=turned)
+    expected = effect.bias(replace(unknown, q=np.full((20, 4), np.nan)))
+    monkeypatch.setattr(tag, "received_power_dbm", None)
+    np.testing.assert_array_equal(effect.bias(unknown), expected)
+    assert np.abs(expected).max() > 0.01
 
 
 @given(seeds)

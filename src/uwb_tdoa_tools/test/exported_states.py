@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Random states of a tag, every effect that a file can hold, and networks of the paper's shape."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 from known_effects import SIZES, effect_of
 import numpy as np
@@ -76,9 +76,10 @@ def states(anchors, n=10_000, seed=0):
 
 def rows_of(samples, some):
     """Samples of some rows, with their Motion."""
+    known = {one.name: getattr(samples, one.name) for one in fields(samples)}
     values = {
         name: value[some] if isinstance(value, np.ndarray) else value
-        for name, value in vars(samples).items()
+        for name, value in known.items()
     }
     motion = Motion(*(value[some] for value in vars(samples.motion).values()))
     return replace(samples, **{**values, "motion": motion})

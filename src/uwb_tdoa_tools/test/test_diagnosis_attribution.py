@@ -108,6 +108,44 @@ def test_an_undeclared_effect_is_found_by_its_covariate(flight):
     assert 1.4826 * np.median(np.abs(left.residual[left.airborne])) == pytest.approx(0.06, rel=0.1)
 
 
+@pytest.mark.parametrize(
+    "effect, named",
+    [
+        ("slow_wave", "tdoa of anchor 3 over time"),
+        ("fast_and_high", "tdoa of anchor 3 over "),
+        ("late_by_speed", "tdoa of anchor 5 over speed"),
+        ("leaning_accel", "accel.z over height"),
+    ],
+)
+def test_what_was_missed_once_is_named_first(flight, effect, named):
+    """No function has two covariates: of an anchor late if fast and high the anchor is named."""
+    first, *_ = attribute([getattr(undeclared, effect)(flight)], TRUTH).findings()
+    assert first.effect.label.startswith(named)
+
+
+def test_a_function_does_not_hide_itself_as_noise(flight, monkeypatch):
+    """What no declared effect describes is correlated in time, as noise is."""
+    inflation, original = [], attribution.with_measured_noise
+
+    def noted(selection, *rest):
+        after = original(selection, *rest)
+        inflation.append((selection.fit.inflation[0], after.fit.inflation[0]))
+        return after
+
+    monkeypatch.setattr(attribution, "with_measured_noise", noted)
+    attribute([undeclared.slow_wave(flight)], TRUTH)
+    (before, after), alone = inflation[0], inflation_alone(flight)
+    assert before > 2.0 * alone and after < 1.1 * alone
+
+
+def inflation_alone(flight):
+    """The variance inflation of TDOAs of a Flight beside all declared effects."""
+    under_base = residuals_of([flight], TRUTH, EffectSet())
+    declared = attribution._declared(under_base, TRUTH, None, attribution._installation([flight]))
+    table = refinement.linearised(under_base, declared, ())
+    return refinement.inflation_of(table, declared, lambda *_: [])[0]
+
+
 @pytest.mark.slow
 def test_measured_flight(shared_data):
     from uwb_tdoa_tools.readers import read_flight

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, SmoothTerm
-from uwb_tdoa_tools.diagnosis.channels import CHANNELS, residuals
+from uwb_tdoa_bias.effects.covariates import ImuFeatures
+from uwb_tdoa_tools.diagnosis.channels import CHANNELS, base, residuals
 from uwb_tdoa_tools.diagnosis.references import GroundTruth, Nothing
 
 
@@ -29,6 +30,21 @@ def test_residuals_of_a_clean_flight_are_its_noise(parts):
     assert np.std(ranges.residual[ranges.airborne]) == pytest.approx(0.1, rel=0.05)
     tdoa = parts["tdoa"]
     assert 1.4826 * np.median(np.abs(tdoa.residual[tdoa.airborne])) == pytest.approx(0.06, rel=0.05)
+
+
+def test_features_of_inertial_samples_are_computed_once_for_all_channels(monkeypatch):
+    made = []
+
+    class Counted(ImuFeatures):
+        def __init__(self):
+            made.append(self)
+            super().__init__()
+
+    monkeypatch.setattr(base, "ImuFeatures", Counted)
+    assert {"tdoa", "gyro", "accel"} <= set(
+        residuals(clean_flight(100, 20.0), GroundTruth(), EffectSet())
+    )
+    assert len(made) == 1
 
 
 @pytest.mark.parametrize("name", CHANNELS)

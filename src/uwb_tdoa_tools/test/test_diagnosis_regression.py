@@ -4,6 +4,7 @@
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -14,6 +15,7 @@ import pytest
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_tools.diagnosis.channels import CHANNELS, residuals
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
+from uwb_tdoa_tools.diagnosis.regression import confounding
 from uwb_tdoa_tools.diagnosis.regression.confounding import (
     alternatives,
     flight_to_tell,
@@ -219,3 +221,12 @@ def test_what_no_tdoa_can_tell_is_named(late):
 def test_a_flight_that_tells_is_the_same_both_ways():
     assert flight_to_tell("nlos", "anchor_delay") == flight_to_tell("anchor_delay", "nlos")
     assert "flight" in flight_to_tell("gyro_bias", "pair_offset")
+
+
+def test_alternatives_that_explain_as_much_have_the_order_of_their_names(monkeypatch):
+    """And not that of a set, which differs from process to process."""
+    names = ["pair_offset", "anchor_delay", "range_bias", "nlos", "range_scale"]
+    monkeypatch.setattr(confounding, "_shares", lambda *_: dict.fromkeys(names, 0.95))
+    chosen = Candidate((Term(EFFECTS["anchor_position"](), ()),))
+    selection = SimpleNamespace(chosen=(chosen,), rivals=((),))
+    assert [other.effect for other in alternatives(selection, chosen, [])] == sorted(names)

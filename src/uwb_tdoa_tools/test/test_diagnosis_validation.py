@@ -14,7 +14,7 @@ from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, EffectSet, SmoothTerm, T
 from uwb_tdoa_bias.effects.samples import Track
 from uwb_tdoa_ekf.frames import poses_of
 from uwb_tdoa_ekf.offline import run_offline
-from uwb_tdoa_tools.diagnosis import validation
+from uwb_tdoa_tools.diagnosis import comparison, validation
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.comparison import (
     Baseline,
@@ -53,6 +53,19 @@ def test_every_flight_is_judged_with_effects_that_it_took_no_part_in(flights, at
     values = [list(case.effects.effects[0].values.values()) for case in cases]
     assert values[0] != values[1]
     assert other.selection.table.flights == 2
+
+
+def test_a_model_that_no_trial_changes_is_not_run_again(flights, attribution, monkeypatch):
+    """The runs of the trials, as in the nodes, are those that judge the written model."""
+    kept = select_by_error(attribution, flights, Baseline(NONE))
+    model = kept.applied(attribution)
+    assert model.selection.chosen == attribution.selection.chosen
+    cases, _ = validation_cases(model, flights, [], NONE, EffectSet(model.effects))
+    baseline = Baseline(NONE)
+    _, again = compare(cases, baseline)
+    monkeypatch.setattr(comparison, "_run", lambda *_: pytest.fail("the filter runs again"))
+    _, known = compare(cases, baseline, known=kept.runs)
+    assert known["pooled"] == again["pooled"]
 
 
 def test_halves_of_a_single_flight_judge_each_other(flights):
@@ -281,7 +294,7 @@ def test_what_is_worth_nothing_is_not_written(monkeypatch, worth, kept):
     """Of several flights, too, where it does no harm either."""
 
     class Trials(_Figures):
-        costly = False
+        costly, runs = False, ()
 
         def __init__(self, *_):
             super().__init__({})

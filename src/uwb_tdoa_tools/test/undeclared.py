@@ -86,6 +86,42 @@ def spun_accelerometer(flight):
     return _imu(flight, accel=np.array([0.0, 0.8, 0.0]) * rate**2)
 
 
+# Effects that were not named once
+
+
+def slow_wave(flight):
+    """One anchor is late and early in turn, every 17 s."""
+    return _of_anchor(flight, 3, lambda s: 0.3 * np.sin(2.0 * np.pi * (s.t - s.start) / 17.0))
+
+
+def fast_and_high(flight):
+    """One anchor is late where the tag is both fast and high."""
+
+    def late(s):
+        speed, height = np.linalg.norm(s.velocity, axis=1), s.p[:, 2]
+        return 0.8 * ((speed > np.quantile(speed, 0.6)) & (height > np.quantile(height, 0.6)))
+
+    return _of_anchor(flight, 3, late)
+
+
+def late_by_speed(flight):
+    """The delay of one anchor grows with the speed of the tag."""
+    return _of_anchor(flight, 5, lambda s: 0.3 * np.linalg.norm(s.velocity, axis=1))
+
+
+def leaning_accel(flight):
+    """The bias of the accelerometer's z changes with the height."""
+    height = np.interp(flight.imu.t, flight.truth.t, flight.truth.p[:, 2])
+    return _imu(flight, accel=0.3 * (height - height.mean())[:, None] * [0.0, 0.0, 1.0])
+
+
+def _of_anchor(flight, anchor, late):
+    ids = flight.anchors.ids
+    return _tdoa(
+        flight, lambda s: late(s) * (1.0 * (ids[s.b] == anchor) - 1.0 * (ids[s.a] == anchor))
+    )
+
+
 CASES = {
     "drag_on_cable": (drag_on_cable, "tdoa", ("speed",)),
     "warming_tag": (warming_tag, "tdoa", ("time",)),

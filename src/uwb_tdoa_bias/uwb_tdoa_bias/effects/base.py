@@ -13,7 +13,7 @@ import numpy as np
 
 from ..common.errors import InputError
 from ..common.sensors import STREAM_OF, measured_on
-from .covariates import OF_ARRIVAL, OF_TDOA, UNITS, checked_domain, fade_weight
+from .covariates import OF_ARRIVAL, UNITS, checked_domain, covariate_of, fade_weight
 from .samples import RADIO, Samples, true_samples
 
 if TYPE_CHECKING:
@@ -398,30 +398,44 @@ class Effect:
 
     # Domain
 
+    def corrected_bias(self, samples: Samples) -> np.ndarray:
+        """Return the bias that is corrected, (n,) m: it fades beyond the domain.
+
+        It is NaN where unknown. A time is held at the end of its domain: no growth beyond it was
+        observed.
+        """
+        if not self.domain:
+            return self.bias(samples)
+        weight, bias = self._in_domain(samples)
+        return weight * bias
+
     def faded_bias(
         self, samples: Samples
     ) -> tuple[np.ndarray, np.ndarray | float, np.ndarray | float]:
         """Return the bias that is corrected within and beyond the domain.
 
-        Beyond its domain an effect fades, and the uncorrected rest counts as noise. A time is held
-        at the end of its domain: no growth beyond it was observed.
+        Beyond its domain an effect fades, and the uncorrected rest counts as noise.
 
-        Returns (bias (n,) m, NaN where unknown; standard deviation of the uncorrected rest (n,) m;
-        weight (n,)). The last two are 0.0 and 1.0 without a domain.
+        Returns (bias (n,) m, as of `corrected_bias`; standard deviation of the uncorrected rest
+        (n,) m; weight (n,)). The last two are 0.0 and 1.0 without a domain.
         """
         if not self.domain:
             return self.bias(samples), 0.0, 1.0
+        weight, bias = self._in_domain(samples)
+        return weight * bias, (1.0 - weight) * np.abs(np.nan_to_num(bias)), weight
+
+    def _in_domain(self, samples: Samples) -> tuple[np.ndarray, np.ndarray]:
+        """Return the weight and the bias, (n,) each, of an effect with a domain."""
         weight, n = np.ones(len(samples)), len(samples)
         for covariate, limits in self.domain.items():
             if covariate in OF_ARRIVAL:
-                of_arrivals = fade_weight(OF_ARRIVAL[covariate](samples, samples.rows), limits)
+                of_arrivals = fade_weight(covariate_of(samples, covariate), limits)
                 weight *= of_arrivals.reshape(-1, n).min(axis=0)
-            elif (values := OF_TDOA[covariate](samples)) is not None:
+            elif (values := covariate_of(samples, covariate)) is not None:
                 weight *= fade_weight(values, limits)
         if "time" in self.domain:
             samples = samples.until(samples.start + self.domain["time"][1])
-        bias = self.bias(samples)
-        return weight * bias, (1.0 - weight) * np.abs(np.nan_to_num(bias)), weight
+        return weight, self.bias(samples)
 
     @property
     def domain_words(self) -> str:

@@ -150,6 +150,19 @@ def sensor_covariate(name: str, samples: ImuSamples | SensorSamples) -> np.ndarr
     return OF_TDOA[name](samples)
 
 
+def covariate_of(samples: Samples, name: str) -> Any:
+    """Return a covariate of OF_TDOA, (n,) or None, or of OF_ARRIVAL, (ends * n,).
+
+    Effects on the same samples share it; it is computed once, and must not be changed.
+    """
+    if name not in samples.known:
+        of_arrival = OF_ARRIVAL.get(name)
+        samples.known[name] = (
+            OF_TDOA[name](samples) if of_arrival is None else of_arrival(samples, samples.rows)
+        )
+    return samples.known[name]
+
+
 def has_domain(name: str) -> bool:
     """Return whether a covariate has a domain: a number that nodes can compute."""
     return name not in CATEGORIES and not name.startswith(EXTRA)

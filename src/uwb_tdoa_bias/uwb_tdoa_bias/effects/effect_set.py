@@ -256,7 +256,7 @@ class EffectSet:
         total = np.zeros(len(samples))
         for effect in self.effects:
             if samples.channel in effect.channels:
-                total += _finite_or_zero(effect.faded_bias(samples)[0])
+                total += _finite_or_zero(effect.corrected_bias(samples))
         return total
 
     def bias_jacobian(self, samples: Samples) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -278,7 +278,7 @@ class EffectSet:
                 groups.setdefault(effect.jacobian_states, []).append(effect)
         for states, group in groups.items():
             moved = _moved(samples, states)
-            parts = (_finite_or_zero(effect.faded_bias(moved)[0]) for effect in group)
+            parts = (_finite_or_zero(effect.corrected_bias(moved)) for effect in group)
             here, *sides = sum(parts, np.zeros(len(moved))).reshape(-1, n)
             bias += here
             for k, (low, high) in zip(states, zip(sides[::2], sides[1::2])):

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 import math
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
@@ -139,16 +139,18 @@ class Samples:
     def __len__(self) -> int:
         return len(self.t)
 
+    @cached_property
+    def known(self) -> dict[str, Any]:
+        """Return the covariates that effects have asked for, by name: see `covariate_of`."""
+        return {}
+
     def repeated(self, times: int) -> Samples:
         """Return the whole batch `times` times, one after the other."""
         kept = "anchors", "start"
+        names = (one.name for one in fields(self) if one.name not in kept)
         return replace(
             self,
-            **{
-                name: _repeated(value, times)
-                for name, value in vars(self).items()
-                if name not in kept
-            },
+            **{name: _repeated(getattr(self, name), times) for name in names},
         )
 
     def until(self, t: float) -> Samples:

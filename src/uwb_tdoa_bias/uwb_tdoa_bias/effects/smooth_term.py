@@ -39,6 +39,7 @@ from .covariates import (
     OF_TDOA,
     STATES,
     UNITS,
+    covariate_of,
     fade_weight,
     has_domain,
     sensor_covariate,
@@ -280,9 +281,9 @@ class SmoothTerm(Effect):
     def _covariate(self, samples: Samples) -> tuple[Any, np.ndarray | None]:
         """Return (values per measurement or None, values per arrival or None)."""
         if self.covariate in OF_ARRIVAL:
-            return None, OF_ARRIVAL[self.covariate](samples, samples.rows)
+            return None, covariate_of(samples, self.covariate)
         if self.covariate in OF_TDOA:
-            values = OF_TDOA[self.covariate](samples)
+            values = covariate_of(samples, self.covariate)
         else:
             values = (samples.extra or {}).get(self.covariate.removeprefix(EXTRA))
         return values, None if values is None else tile(samples, values)
@@ -298,9 +299,13 @@ class SmoothTerm(Effect):
             links = dict.fromkeys(key.rpartition(".")[0] for key in self.values)
             parts = (self._of_link(samples, k) * self.curve(values, f"{k}.") for k in links)
             return sum(parts, np.zeros(n))
-        return samples.difference(
-            self._functions(both, self._weights(samples.anchors), samples.rows)
-        )
+        rows, weights = samples.rows, self._weights(samples.anchors)
+        mine = np.flatnonzero(np.count_nonzero(weights, axis=1)[rows])
+        if len(mine) == len(rows) or not isinstance(both, np.ndarray):
+            return samples.difference(self._functions(both, weights, rows))
+        late = np.where(np.isnan(both), np.nan, 0.0)  # of anchors without a function
+        late[mine] = self._functions(both[mine], weights, rows[mine])
+        return samples.difference(late)
 
     def _of_link(self, samples: Samples, link: str) -> np.ndarray:
         """Return the sign of the function of the pair "0-1" in each d_ab, (n,) 1, -1 or 0."""
@@ -361,11 +366,17 @@ class SmoothTerm(Effect):
             ]
             return np.stack([part * self._of_link(samples, link) for part, link in parts], axis=1)
         basis, ids = self.basis(both), samples.anchors.ids[samples.rows]
+        unknown = np.isnan(basis).any(axis=1)
+        columns: dict[str, list[int]] = {}
         for column, key in enumerate(keys):
-            anchor, _, c = key.rpartition(".")
-            out[:, column] = samples.difference(
-                basis[:, int(c[1:])] * (1.0 if not anchor else ids == int(anchor))
-            )
+            columns.setdefault(key.rpartition(".")[0], []).append(column)
+        for anchor, some in columns.items():
+            mine = ids == int(anchor) if anchor else np.ones(len(ids), dtype=bool)
+            of_arrivals = np.zeros((len(ids), len(some)))
+            numbers = [int(keys[column].rpartition(".")[2][1:]) for column in some]
+            of_arrivals[mine] = basis[mine][:, numbers]
+            of_arrivals[unknown] = np.nan
+            out[:, some] = samples.difference(of_arrivals)
         return out
 
     def groups(  # type: ignore[override]  # of a term

@@ -195,8 +195,11 @@ class ReceivedPowerBias(ArrivalEffect):
         self, samples: Samples, rows: np.ndarray, keys: Sequence[str]
     ) -> np.ndarray:
         p, positions = tile(samples, samples.p), samples.anchors.positions[rows]
-        q, orientations = tile(samples, samples.q), samples.anchors.orientations[rows]
-        power = received_power_dbm(p, q, positions, orientations, LINK)
+        orientations = samples.anchors.orientations[rows]
+        power: np.ndarray = np.full(len(rows), np.nan)
+        if np.isfinite(orientations).any():
+            q = tile(samples, samples.q)
+            power = received_power_dbm(p, q, positions, orientations, LINK)
         unknown = ~np.isfinite(power)
         if unknown.any():
             loss = LINK.path_loss_db(np.linalg.norm(p - positions, axis=1))

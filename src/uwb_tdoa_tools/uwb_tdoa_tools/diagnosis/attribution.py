@@ -34,6 +34,7 @@ from .refinement import (
     maps_of,
     relinearised,
     with_maps,
+    with_measured_noise,
     with_smooth,
 )
 from .regression.confounding import alternatives
@@ -239,6 +240,7 @@ def attribute(
 
     if undeclared:
         smooth = _smooth(current, installation)
+        selection = with_measured_noise(selection, declared, scan_of(selection.table), progress)
         selection = with_smooth(selection, unmoved, declared, smooth, search, scan_of, progress)
         selection = relinearised(selection, at, declared + smooth)
         selection = cross_validated(selection, refused)

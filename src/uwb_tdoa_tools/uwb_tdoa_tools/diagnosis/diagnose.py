@@ -258,7 +258,12 @@ def _by_error(
     work.progress("judging")
     cases, judged_on = validation.validation_cases(model, fitted, held_out, base, effects)
     before, after = comparison.compare(
-        cases, baseline, work.saying("judging"), work.reference.shift_std, map_function
+        cases,
+        baseline,
+        work.saying("judging"),
+        work.reference.shift_std,
+        map_function,
+        selected.runs,
     )
     refused = list(selected.refused)
     shift_std = max(work.reference.shift_std(flight.name).max() for flight in fitted)

@@ -15,7 +15,7 @@ from .channels import CHANNELS
 from .findings import Refused
 from .regression.fit import fit
 from .regression.held_out import held_out
-from .regression.select import select, worth
+from .regression.select import criterion_of, select, worth
 from .regression.table import table_of
 from .regression.terms import Candidate, Term, columns_of
 
@@ -115,6 +115,38 @@ def inflation_of(
         table = table.with_terms([term for candidate in found for term in candidate.terms])
         model = fit(table, columns_of(known), covariance=False)
     return model.inflation
+
+
+def with_measured_noise(
+    selection: Selection, declared: Sequence[Candidate], scan: Scan, progress: Callable[[], object]
+) -> Selection:
+    """Return the Selection with the variance inflation that is left beside functions.
+
+    A function that no declared effect describes counts as correlated noise, and hides itself.
+    Functions are added to the fit that measures the inflation, as long as they pay their price
+    with the inflation that they leave.
+
+    declared : Candidates of the fit that measured the inflation; scan : Scan of the table
+    """
+    table, model, chosen = selection.table, selection.fit, list(selection.chosen)
+    known = list(dict.fromkeys([*declared, *chosen]))
+    for _ in range(DISGUISED):
+        found = scan(table, model, chosen)[:1]
+        progress()
+        if not found:
+            break
+        wider = table.with_terms(found[0].terms)
+        less = fit(wider, columns_of([*known, *found]), covariance=False).inflation
+        less = np.minimum(less, model.inflation)
+        trial = fit(table, columns_of(chosen), less, covariance=False, near=model)
+        if criterion_of(wider, chosen, trial, found[0], len(declared), scan.even) <= 0.0:
+            break
+        table, chosen, known = wider, [*chosen, *found], [*known, *found]
+        model = fit(table, columns_of(chosen), less, covariance=False, near=trial)
+    if model is selection.fit:
+        return selection
+    anew = fit(selection.table, columns_of(selection.chosen), model.inflation)
+    return replace(selection, fit=anew)
 
 
 def relinearised(

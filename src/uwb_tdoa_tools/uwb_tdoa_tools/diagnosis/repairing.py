@@ -61,7 +61,8 @@ def sound(
     labels = [effect for effect in base.effects if isinstance(effect, LabelEffect)]
     undo = EffectSet((*labels, *(detection.effect for detection in found)))
     rest = tuple(effect for effect in base.effects if not isinstance(effect, LabelEffect))
-    return tuple(map(undo.correct_streams, flights)), replace(base, effects=rest)
+    corrected = tuple(map(undo.correct_streams, flights)) if len(undo) else tuple(flights)
+    return corrected, replace(base, effects=rest)
 
 
 def before_others(

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import cycle
+from itertools import chain, cycle
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
     from ..parallel import MapFunction
     from .attribution import Attribution
+    from .comparison import KnownRuns
     from .detectors import Detection
     from .regression.terms import Candidate
 
@@ -65,12 +66,14 @@ class ValidatedSelection:
     refused : (Refused, ...) of the others
     worth : {candidate or detection: increase of the mean 3D RMSE without it, m}; for dropped ones,
         at the time they were dropped
+    runs : runs of the filter as in the nodes, made on the way, by their cases
     """
 
     selection: Selection
     detections: tuple[Detection, ...]
     refused: tuple[Refused, ...]
     worth: dict[Candidate | Detection, float]
+    runs: KnownRuns = ()
 
     def applied(self, attribution: Attribution) -> Attribution:
         """Return the Attribution with the selected effects only."""
@@ -228,7 +231,7 @@ def select_by_error(
         )
         candidates = [one for one in candidates if one is not momentary]
     selection = attribution.selection.kept(candidates)  # with the weights of the trials
-    return ValidatedSelection(selection, tuple(detections), tuple(refused), worth)
+    return ValidatedSelection(selection, tuple(detections), tuple(refused), worth, trials.runs)
 
 
 def _gone(
@@ -305,6 +308,7 @@ class _Trials:
         )
         self._map_function = map_function
         self._poses: Sequence[Poses | None] = [None]
+        self.runs: KnownRuns = ()
 
     @property
     def costly(self) -> bool:
@@ -313,53 +317,50 @@ class _Trials:
 
     def start(self, candidates: Sequence[Candidate], detections: Sequence[Detection]) -> float:
         """Return the error of a model, m, and keep the poses of its runs for later trials."""
-        (results,) = self._tried(_error_and_poses, [(candidates, detections)])
-        self._poses = [poses for _, poses in results]
-        return float(np.mean([error for error, _ in results]))
+        cases = self._cases(candidates, detections)
+        (results,) = self._tried(_judged, [cases])
+        if self._poses == [None]:
+            self.runs = tuple((case, run) for case, (run, _) in zip(cases, results))
+        self._poses = [poses_of(run.odometry) for run, _ in results]
+        return float(np.mean([error for _, error in results]))
 
     def errors(self, models: Sequence[Model]) -> list[float]:
         """Return the errors of models [(candidates, detections)], in m."""
-        return [float(np.mean(errors)) for errors in self._tried(error_of, models)]
+        results = self._tried(error_of, [self._cases(*model) for model in models])
+        return [float(np.mean(errors)) for errors in results]
+
+    def _cases(
+        self, candidates: Sequence[Candidate], detections: Sequence[Detection]
+    ) -> list[ValidationCase]:
+        attribution, base = self._attribution, self._baseline.base
+        return cross_fitted(attribution, self._flights, base, candidates, detections, TRIAL_FLIGHTS)
 
     def _tried(
         self,
         function: Callable[[FilterConfig | None, tuple[ValidationCase, Poses | None]], Made],
-        models: Sequence[Model],
+        cases: Sequence[list[ValidationCase]],
     ) -> list[list[Made]]:
         """Return [[function of each trial] of each model], computed in one map."""
-        attribution, flights, base = self._attribution, self._flights, self._baseline.base
-        fitted = [
-            cross_fitted(attribution, flights, base, candidates, detections, TRIAL_FLIGHTS)
-            for candidates, detections in models
-        ]
         results = []
-        trials = zip(sum(fitted, []), cycle(self._poses))
+        trials = zip(chain.from_iterable(cases), cycle(self._poses))
         for of_case in self._map_function(partial(function, self._baseline.config), trials):
             results.append(of_case)
             self._progress()
-        return [results[k : k + len(fitted[0])] for k in range(0, len(results), len(fitted[0]))]
+        return [results[k : k + len(cases[0])] for k in range(0, len(results), len(cases[0]))]
 
 
 def error_of(config: FilterConfig | None, trial: tuple[ValidationCase, Poses | None]) -> float:
     """Return the 3D RMSE of a trial, m."""
-    return _judged(config, trial)[0]
-
-
-def _error_and_poses(
-    config: FilterConfig | None, trial: tuple[ValidationCase, Poses | None]
-) -> tuple[float, Poses]:
-    """Return the 3D RMSE, m, and the poses of the run of a trial.
-
-    trial : ValidationCase, and the poses for corrections, None to use the poses of the run
-    """
-    error, run = _judged(config, trial)
-    return error, poses_of(run.odometry)
+    return _judged(config, trial)[1]
 
 
 def _judged(
     config: FilterConfig | None, trial: tuple[ValidationCase, Poses | None]
-) -> tuple[float, Run]:
-    """Return the 3D RMSE, m, and the Run of a trial."""
+) -> tuple[Run, float]:
+    """Return the Run and the 3D RMSE, m, of a trial.
+
+    trial : ValidationCase, and the poses for corrections, None to use the poses of the run
+    """
     case, poses = trial
     anchors, effects = case.flight.anchors, case.effects
     corrector = (
@@ -368,7 +369,7 @@ def _judged(
         else FixedPoseCorrector(anchors, effects, poses)
     )
     run = run_offline(case.flight, config, corrector)
-    return score(case, run).rmse_3d, run
+    return run, score(case, run).rmse_3d
 
 
 def validation_cases(

@@ -12,6 +12,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.effects import EffectSet, Track
+from uwb_tdoa_bias.effects.covariates import OF_IMU, ImuFeatures
 
 from ..references import Reference, ReferenceView
 
@@ -76,6 +77,20 @@ class Comparison:
     def track(self) -> Track:
         """Return the interpolated poses."""
         return Track(self.poses)
+
+    @cached_property
+    def imu_features(self) -> np.ndarray:
+        """Return the covariates OF_IMU along the inertial stream, (n, len(OF_IMU))."""
+        imu = self.flight.imu
+        assert imu is not None  # as the callers know
+        return ImuFeatures()(imu.t, imu.gyro, imu.accel)
+
+    def vibration_at(self, t: np.ndarray) -> np.ndarray | None:
+        """Return the vibration, (n,) m/s^2, at stamps t (n,), s; None without an IMU."""
+        imu = self.flight.imu
+        if imu is None:
+            return None
+        return np.interp(t, imu.t, self.imu_features[:, OF_IMU.index("vibration")])
 
     @property
     def start(self) -> float:

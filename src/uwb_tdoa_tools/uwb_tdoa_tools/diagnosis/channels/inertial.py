@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.effects import ImuSamples, SmoothTerm
-from uwb_tdoa_bias.effects.covariates import OF_IMU, ImuFeatures, sensor_covariate
+from uwb_tdoa_bias.effects.covariates import OF_IMU, sensor_covariate
 from uwb_tdoa_ekf.core.state import GRAVITY
 
 from .base import Channel, ChannelResidual, Rows
@@ -165,7 +165,10 @@ class Gyro(Inertial):
         measured, true = means(imu.t, imu.gyro, edges), _true_rates(poses, edges)
         before, after = (means(imu.t, imu.gyro, edges + shift) for shift in (-SHIFT, SHIFT))
         middles = 0.5 * (edges[:-1] + edges[1:])
-        features, derivative = means(imu.t, features_of(imu), edges), (after - before) / (2 * SHIFT)
+        features, derivative = (
+            means(imu.t, comparison.imu_features, edges),
+            (after - before) / (2 * SHIFT),
+        )
         # About an axis without turns the measured rate is the residual: a function of itself.
         still = ~_turns(measured, true)
         reading = np.where(still, 0.0, measured)
@@ -181,7 +184,10 @@ class Gyro(Inertial):
 
     def _at_rest(self, comparison: Comparison, imu: Imu) -> ImuResidual | None:
         edges = np.arange(imu.t[0], imu.t[-1], CELL)
-        features, measured = means(imu.t, features_of(imu), edges), means(imu.t, imu.gyro, edges)
+        features, measured = (
+            means(imu.t, comparison.imu_features, edges),
+            means(imu.t, imu.gyro, edges),
+        )
         moving = features[:, OF_IMU.index("vibration")] > STILL_FORCE
         moving |= np.abs(measured).max(axis=1) > STILL_RATE
         moving |= (
@@ -243,7 +249,7 @@ class Accel(Inertial):
         flown = (imu.t >= edges[0]) & (imu.t <= edges[-1])
         world = Rotation.from_quat(track.attitudes(imu.t[flown])).apply(imu.accel[flown])
         measured = to_body.apply(_triangular_means(imu.t[flown], world, edges))
-        features = means(imu.t, features_of(imu), edges)
+        features = means(imu.t, comparison.imu_features, edges)
         samples = self._samples(comparison, middles, true, 0.5 * (features[1:] + features[:-1]))
         measured = measured - comparison.effects.uncorrected(samples)
         return ImuResidual(samples, measured - true, self.unit)
@@ -264,18 +270,6 @@ def _triangular_means(t: np.ndarray, values: np.ndarray, edges: np.ndarray) -> n
         for k in range(3):
             out[:, k] += np.bincount(rows, weight[inside] * values[inside, k], len(edges))
     return out[1:-1] / np.maximum(total[1:-1, None], 1e-9)
-
-
-def features_of(imu: Imu) -> np.ndarray:
-    """Return the covariates OF_IMU along the stream, (n, len(OF_IMU))."""
-    return ImuFeatures()(imu.t, imu.gyro, imu.accel)
-
-
-def vibration_at(imu: Imu | None, t: np.ndarray) -> np.ndarray | None:
-    """Return the vibration, (n,) m/s^2, at stamps t (n,), s; None without an IMU."""
-    if imu is None:
-        return None
-    return np.interp(t, imu.t, features_of(imu)[:, OF_IMU.index("vibration")])
 
 
 def cells_in_the_air(comparison: Comparison, imu: Imu, shift: float) -> np.ndarray:

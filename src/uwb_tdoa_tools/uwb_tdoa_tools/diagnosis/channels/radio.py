@@ -27,7 +27,6 @@ from ...scoring.phases import in_the_air
 from ..regression.algebra import Matrix
 from .base import Channel, ChannelResidual, Rows
 from .figures import APART, figures, health_of_pairs
-from .inertial import vibration_at
 from .views import OF_EACH, extra_at, extra_names, knots_of, views_of_anchors, views_of_pairs
 
 if TYPE_CHECKING:
@@ -203,7 +202,7 @@ def compared(comparison: Comparison, kind: type[Samples], made: type[Radio]) -> 
     if not airborne.any():
         return None
     samples = kind(**vars(samples_at(t, a, b, poses, anchors, comparison.start)))
-    samples = replace(samples, vibration=vibration_at(flight.imu, t), extra=extra_at(flight, t))
+    samples = replace(samples, vibration=comparison.vibration_at(t), extra=extra_at(flight, t))
     if kind is Samples:
         previous = np.concatenate([[-1], anchors.ids[b[:-1]]])
         samples = replace(samples, interval=np.diff(t, prepend=t[:1]), previous=previous)

@@ -15,7 +15,7 @@ from uwb_tdoa_bias.effects.covariates import OF_SENSORS, sensor_covariate
 
 from .base import Channel, ChannelResidual, Rows
 from .figures import APART, figures
-from .inertial import CELL, vibration_at
+from .inertial import CELL
 from .views import knots_of
 
 if TYPE_CHECKING:
@@ -113,7 +113,7 @@ class Sensor(Channel[SensorResidual]):
             middles,
             comparison.track,
             comparison.start,
-            vibration_at(comparison.flight.imu, middles),
+            comparison.vibration_at(middles),
         )
         error = error - comparison.effects.uncorrected(samples)
         return SensorResidual(samples, error, self.labels, self.unit, self.floating)

@@ -75,7 +75,7 @@ def alternatives(
     gaps = {rival.candidate.title: rival.gap for rival in rivals}
     shares = _shares(selection, candidate, candidates)
     names = sorted(
-        {*gaps, *shares}, key=lambda name: (gaps.get(name, np.inf), -shares.get(name, 0.0))
+        {*gaps, *shares}, key=lambda name: (gaps.get(name, np.inf), -shares.get(name, 0.0), name)
     )
     return [
         Alternative(name, shares.get(name), gaps.get(name), flight_to_tell(candidate.name, name))

@@ -96,11 +96,13 @@ class Scorer:
         root, y = root[rows], table.y[rows]
         base = weighted(table.matrix([columns[place] for place in self._base.tolist()], rows), root)
         cross, vector = np.empty((len(self._base), len(columns))), np.empty(len(columns))
+        acting = np.zeros(len(columns), dtype=bool)
         for first in range(0, len(columns), AT_ONCE):
             some = slice(first, first + AT_ONCE)
             x = table.matrix(columns[some], rows)
             cross[:, some], vector[some] = product(base, x), x.T @ (root * y)
-        return _Part(table, columns, rows, root, cross, vector, float(root @ y**2))
+            acting[some] = x.any(axis=0)
+        return _Part(table, columns, rows, root, cross, vector, float(root @ y**2), acting)
 
     def _gains_alone(self, beta: np.ndarray) -> np.ndarray:
         """Return the least-squares gain of each column alone, (columns,), twice a log-likelihood.
@@ -181,6 +183,7 @@ class _Part:
 
     root : (n,) weights of the rows; power : y' W y
     cross : (base, k) X_base' W X; vector : (k,) X' W y
+    acting : (k,) bool, columns that are not zero in these rows; None for sparse columns
     products : products between columns of one effect, for sparse columns only
     """
 
@@ -191,11 +194,14 @@ class _Part:
     cross: np.ndarray
     vector: np.ndarray
     power: float
+    acting: np.ndarray | None = None
     products: _Products | None = None
 
     def gram(self, places: np.ndarray) -> np.ndarray:
         if self.products is not None:
             return self.products.gram(places)
+        if self.acting is not None and not self.acting[places].any():
+            return np.zeros((len(places), len(places)))
         x = self.table.matrix([self.columns[place] for place in places], self.rows)
         return x.T @ (x * self.root[:, None])
 
@@ -299,5 +305,5 @@ def _sparse_part(
         cross,
         x.T @ (root * y),
         float(root @ y**2),
-        _Products.of(x, root, effects),
+        products=_Products.of(x, root, effects),
     )

@@ -162,7 +162,7 @@ def select(
         wider = table.with_terms([term for candidate in found for term in candidate.terms])
         ranked = rank(wider, candidates + found, chosen, model)
         ranked += [
-            (_fitted(table, chosen, model, one, len(candidates), even), one)
+            (criterion_of(table, chosen, model, one, len(candidates), even), one)
             for one in scanned[:FITTED]
         ]
         ranked.sort(key=lambda item: -item[0])
@@ -192,7 +192,7 @@ def _sparse_first(ranked: list[tuple[float, Candidate]]) -> Candidate:
     return best if len(best.columns) <= LARGE else next(few, best)
 
 
-def _fitted(
+def criterion_of(
     table: RegressionTable,
     chosen: Sequence[Candidate],
     model: Fit,
