@@ -86,7 +86,7 @@ class Linear:
 
     residual, weight : (n,) of TDOAs and ranges, m and 1/m^2; by_tag : (n, 3), by_columns : (n, k)
     misfit : mean square of accelerations over ACCEL_STD^2, of each flight; NaN without
-    between : (m,) residuals of distances over their std
+    between : (m,) residuals of distances over their std; by_distances : (m, k), weighted
     covariance : (k, k) of the columns for independent errors
     """
 
@@ -101,21 +101,41 @@ class Linear:
     path_by_columns: np.ndarray
     cross: np.ndarray
     by_tag: csr_matrix
+    by_distances: np.ndarray
 
-    def response(self, errors: np.ndarray, accel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def response(
+        self, radio: np.ndarray, accel: np.ndarray, rest: tuple[np.ndarray, np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return errors of the columns, (k, s), and residuals, (n, s), for errors of measurements.
 
-        errors : (n, s) m; accel : (m, 3, s) m/s^2 at the middle bins
+        radio : (n, s) m; accel : (m, 3, s) m/s^2 at the middle bins
+        rest : gradients by the columns (k, s) and by the path (3J, s) that other errors make
         """
         problem = self.problem
-        weighted = -self.weight[:, None] * errors
-        of_columns = self.by_columns.T @ weighted
-        spread = problem.spread(-problem.accel_weight[:, None, None] * accel)
-        of_path = self.by_tag @ weighted + spread.reshape(-1, errors.shape[1])
+        weighted = -self.weight[:, None] * radio
+        of_columns = rest[0] + self.by_columns.T @ weighted
+        spread = problem.spread(-problem.motion_weight[:, None, None] * accel)
+        of_path = rest[1] + self.by_tag @ weighted + spread.reshape(-1, radio.shape[1])
         solved = cho_solve_banded((self.path_factor, False), of_path)
         columns = -self.covariance @ (of_columns - self.cross.T @ solved)
         path = -(solved + self.path_by_columns @ columns)
-        return columns, self.by_columns @ columns + self.by_tag.T @ path - errors
+        return columns, self.by_columns @ columns + self.by_tag.T @ path - radio
+
+    def others(self, rng: np.random.Generator, draws: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return draws of the gradients that errors of heights, distances, coordinates and priors make."""
+        problem = self.problem
+        size = problem.layout.size
+        columns = np.sqrt(problem.prior)[:, None] * rng.standard_normal((size, draws))
+        known = problem.coordinates
+        std = problem.seen.coordinates[: len(known), 3]
+        noise = rng.standard_normal((len(known), draws)) / std[:, None]
+        np.add.at(columns, known, noise)
+        between = self.by_distances * problem.distance_std[:, None]
+        columns += between.T @ rng.standard_normal((len(between), draws))
+        path = np.zeros((3 * problem.bins, draws))
+        high = 3 * problem.high + 2
+        path[high] = rng.standard_normal((len(high), draws)) / HEIGHT_STD
+        return columns, path
 
 
 class Problem:
@@ -336,6 +356,7 @@ class _Equations:
         weighted = by * _weight(state.distance, problem.distance_std)[:, None]
         self.gram += by.T @ weighted
         self.gradient = self.gradient + weighted.T @ state.distance
+        self.by_distances = weighted
         known, information = problem.coordinates, state.coordinate_std**-2.0
         np.add.at(self.gram, (known, known), information)
         np.add.at(self.gradient, known, information * state.coordinate)
@@ -387,6 +408,7 @@ class _Equations:
             solved,
             self.cross,
             self.by_tag,
+            self.by_distances,
         )
 
 

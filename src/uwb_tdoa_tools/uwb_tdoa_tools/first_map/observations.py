@@ -21,7 +21,9 @@ STEP = 0.2  # s, length of a time bin; the tag has one position in it
 LONGEST = 150.0  # s of all flights that are used; more costs time and hardly adds information
 SAMPLE = 0.02  # s, step of the attitude integration
 G = 9.81  # m/s^2
-LEVELLING = 0.1  # 1/s, gain by which the mean specific force corrects the attitude
+# 1/s, gain by which the specific force corrects the attitude, with and without a rest before take-off.
+# A small one needs the bias of the gyroscope, which the rest gives.
+LEVELLING = 0.03, 0.1
 SMOOTHED = 0.5  # s, over which rest is judged
 AT_REST = 0.15, 0.03  # m/s^2 and rad/s, largest deviation at rest
 BIN_STD, ONE_STD = 0.07, 0.15  # m, of the median of a bin: a part that remains, and of one value
@@ -207,17 +209,15 @@ class _Level:
         """Integrate the gyroscope; the specific force corrects roll and pitch slowly."""
         t = np.arange(imu.t[0], imu.t[-1], SAMPLE) + 0.5 * SAMPLE
         gyro, force = (_averaged(imu.t, values, t) for values in (imu.gyro, imu.accel))
-        window = np.ones(int(SMOOTHED / SAMPLE)) / int(SMOOTHED / SAMPLE)
-        slow_gyro, slow_force = (
-            np.column_stack([np.convolve(column, window, "same") for column in values.T])
-            for values in (gyro, force)
-        )
-        beginning = gyro[: len(window)]
+        window = np.ones(int(SMOOTHED / SAMPLE))
+        slow_gyro, slow_force = (_smoothed(values, window) for values in (gyro, force))
         off = np.abs(np.linalg.norm(slow_force, axis=1) - G)
-        turning = np.linalg.norm(slow_gyro - np.median(beginning, axis=0), axis=1)
+        turning = np.linalg.norm(slow_gyro - slow_gyro[0], axis=1)
         moving = np.flatnonzero((off > AT_REST[0]) | (turning > AT_REST[1]))
         first, last = (moving[0], moving[-1]) if len(moving) else (0, len(t) - 1)
-        bias = gyro[:first].mean(axis=0) if first > len(window) else np.zeros(3)
+        rested = first > len(window)
+        bias = gyro[:first].mean(axis=0) if rested else np.zeros(3)
+        gain = LEVELLING[0 if rested else 1] * SAMPLE
         mean = force[: 2 * len(window)].mean(axis=0)
         turn = Rotation.align_vectors([[0.0, 0.0, 1.0]], [mean])[0].as_matrix()
         steps = Rotation.from_rotvec((gyro - bias) * SAMPLE).as_matrix()
@@ -226,7 +226,7 @@ class _Level:
             specific = turn @ force[row]
             accel[row] = specific - [0.0, 0.0, G]
             up[row] = turn[2, 2]
-            x, y, _ = LEVELLING * SAMPLE * specific / max(np.linalg.norm(specific), 1e-9)
+            x, y, _ = gain * specific / max(np.linalg.norm(specific), 1e-9)
             # a small rotation about (y, -x, 0) turns the specific force upwards
             turn = np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [x, y, 1.0]]) @ turn @ step
             if row % 50 == 0:
@@ -242,10 +242,7 @@ class _Level:
         """
         half = round(STEP / SAMPLE)
         weights = 1.0 - np.abs(np.arange(-half, half + 1)) / half
-        weights /= weights.sum()
-        smooth = np.column_stack(
-            [np.convolve(column, weights, "same") for column in self.accel.T]
-        )
+        smooth = _smoothed(self.accel, weights)
         out = np.column_stack([np.interp(t, self.t, column) for column in smooth.T])
         out[(t < self.t[0] + STEP) | (t > self.t[-1] - STEP)] = np.nan
         return out
@@ -253,6 +250,12 @@ class _Level:
     def upright(self, t: np.ndarray) -> np.ndarray:
         """Return the cosine of the tilt at stamps t, (n,)."""
         return np.interp(t, self.t, self.up)
+
+
+def _smoothed(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return weighted means of values (m, 3); at the ends of the weights that are inside."""
+    whole = np.convolve(np.ones(len(values)), weights, "same")
+    return np.column_stack([np.convolve(column, weights, "same") / whole for column in values.T])
 
 
 def _averaged(t: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 FEWEST = 4  # anchors of a map
 AMBIGUOUS = 12.0  # cost by which another map must be worse
 CONTRADICTING = 2.0  # robust scale of residuals of distances, in their standard deviations
-DEFORMED = 1.0  # mean square of the residuals of accelerations, in their variance
+DEFORMED = 0.6  # mean square of the residuals of accelerations, in their variance
 KNOWN = 0.1  # m, standard deviation of a coordinate up to which it is trusted
 
 
@@ -58,9 +58,13 @@ class FirstMap:
         return out
 
     @property
-    def anchors(self) -> Anchors:
-        """Return the Anchors, in frame "map"."""
-        return Anchors.from_positions(self.positions, self.ids)
+    def usual_std(self) -> float:
+        """Return the root mean square of the standard deviations that are not trusted, m."""
+        return float(np.sqrt(np.mean(self.std[~self.trusted] ** 2)))
+
+    def anchors(self, frame: str = "map") -> Anchors:
+        """Return the Anchors in a frame of this name."""
+        return Anchors.from_positions(self.positions, self.ids, frame)
 
 
 def map_anchors(
@@ -141,16 +145,16 @@ def _open(found: FirstMap, accuracy: float) -> str:
     """Return a sentence if other maps explain the data equally well."""
     if not found.others:
         return ""
-    far = [np.linalg.norm(other - found.positions, axis=1) for other in found.others]
-    other, off = found.others[int(np.argmax([one.max() for one in far]))], np.max(far, axis=0)
-    if rigid_distance(found.positions, other, False) < SAME_SHAPE:
+    if any(rigid_distance(found.positions, other, False) < SAME_SHAPE for other in found.others):
         return _TURNS
-    if rigid_distance(found.positions, other, True) < SAME_SHAPE:
+    if any(rigid_distance(found.positions, other, True) < SAME_SHAPE for other in found.others):
         return (
             "a mirror image of the map explains the data equally well; give a rough coordinate of "
             "an anchor off the line of the trusted ones (--coordinates), or add a flight with an "
             "inertial sensor"
         )
+    far = [np.linalg.norm(other - found.positions, axis=1) for other in found.others]
+    off = np.max(far, axis=0)
     names = ", ".join(map(str, found.ids[off > min(accuracy, 0.5)]))
     return (
         f"anchors {names or 'all'} have a second place that explains the data equally well; "
@@ -206,41 +210,3 @@ def _unchecked(found: FirstMap, seen: Observations, best: Fit, accuracy: float) 
                 "is not determined; measure more distances of these anchors"
             )
     return ""
-
-
-def as_dict(found: FirstMap) -> dict[str, Any]:
-    """Return the figures for JSON."""
-    return {
-        "accepted": not found.why_not,
-        "why_not": found.why_not,
-        "anchors": {
-            str(i): {
-                "position": found.positions[row].tolist(),
-                "std": found.std[row].tolist(),
-                "trusted": found.trusted[row].tolist(),
-                "others": [other[row].tolist() for other in found.others],
-            }
-            for row, i in enumerate(found.ids)
-        },
-        "covariance": found.covariance.tolist(),
-        "lasting_std": found.lasting,
-    }
-
-
-def as_text(found: FirstMap) -> str:
-    """Return a table of the anchors, and the verdict."""
-    lines = [f"{'anchor':>6}  {'position [m]':>24}  {'std [m]':>18}"]
-    for row, i in enumerate(found.ids):
-        position = "".join(f"{value:8.2f}" for value in found.positions[row])
-        std = "".join(f"{value:6.2f}" for value in found.std[row])
-        mark = "  trusted" if found.trusted[row].all() else ""
-        lines.append(f"{i:>6}  {position}  {std}{mark}")
-    if found.why_not:
-        lines.append(f"no map: {found.why_not}")
-    else:
-        off = np.linalg.norm(found.std[~found.trusted.all(axis=1)], axis=1)
-        lines.append(
-            f"{len(off)} anchors are known to {np.median(off):.2f} m (median), {off.max():.2f} m at "
-            "most: a first map, for survey to improve"
-        )
-    return "\n".join(lines)
