@@ -57,7 +57,9 @@ def given(
             f"{survey}: holds all {len(ids)} anchors; leave out those that are unknown, or use survey."
         )
     if len(ids) > MOST:
-        raise InputError(f"{len(ids)} anchors are too many for one map; give data of {MOST} at most.")
+        raise InputError(
+            f"{len(ids)} anchors are too many for one map; give data of {MOST} at most."
+        )
     rows = [
         (np.searchsorted(ids, i), axis, value, deviations[0])
         for i, position in zip(known.ids, known.positions)
@@ -65,7 +67,9 @@ def given(
     ]
     for anchor, axis, value, std in [] if files[0] is None else read_coordinates(files[0]):
         if anchor not in ids:
-            raise InputError(f"{files[0]}: no measurement is of anchor {anchor}; leave its lines out.")
+            raise InputError(
+                f"{files[0]}: no measurement is of anchor {anchor}; leave its lines out."
+            )
         rows.append((np.searchsorted(ids, anchor), axis, value, std))
     table = [
         (np.searchsorted(ids, one.a), np.searchsorted(ids, one.b), one.distance, one.std)

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,6 +28,9 @@ SMOOTHED = 0.5  # s, over which rest is judged
 AT_REST = 0.15, 0.03  # m/s^2 and rad/s, largest deviation at rest
 BIN_STD, ONE_STD = 0.07, 0.15  # m, of the median of a bin: a part that remains, and of one value
 FEWEST_BINS = 25  # bins of a recording
+# Signs of the gyroscope that contradict the right ones. (1, 1, -1) does not while the yaw stays, and
+# (-1, 1, -1) is a mirror image of the world.
+SIGNS = (1, -1, 1), (1, -1, -1), (-1, 1, 1), (-1, -1, 1), (-1, -1, -1)
 RANGE = -1  # `a` of a range
 
 
@@ -45,6 +48,7 @@ class Observations:
     d, std : (n,) m, d_ab = |p - b| - |p - a|, or the range
     accel : (J, 3) m/s^2 without gravity, z up, yaw unknown; NaN without inertial samples
     height : (J,) m above z = 0; NaN where unknown
+    flipped : (s, J, 3) m/s^2, as `accel`, with other signs of the axes of the gyroscope: SIGNS
     distances : (k, 4) rows a and b, distance m, std m
     coordinates : (k, 4) row, axis, value m, std m
     delay_std : m, of the part of an anchor in the error of all of its distances
@@ -60,6 +64,7 @@ class Observations:
     std: np.ndarray
     accel: np.ndarray
     height: np.ndarray
+    flipped: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)))
     distances: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
     coordinates: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
     delay_std: float = 0.0
@@ -102,7 +107,8 @@ def observe(flights: Sequence[Flight], ids: np.ndarray) -> Observations:
         return Observations(
             ids, whole, empty, whole, whole, whole, empty, empty, np.zeros((0, 3)), empty
         )
-    t, accel, height, rows = zip(*parts)
+    t, accels, height, rows = zip(*parts)
+    accel = np.concatenate(accels, axis=1)
     lengths = [len(each) for each in t]
     begins = np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(int)
     for part, begin in zip(rows, begins):
@@ -120,15 +126,19 @@ def observe(flights: Sequence[Flight], ids: np.ndarray) -> Observations:
         b,
         table[:, 3],
         table[:, 4],
-        np.concatenate(accel),
+        accel[0],
         np.concatenate(height),
+        accel[1:],
     )
 
 
 def _of_flight(
     flight: Flight, ids: np.ndarray, longest: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return stamps (J,), accelerations (J, 3), heights (J,) and rows (bin, a, b, d, std)."""
+    """Return stamps (J,), accelerations, heights (J,) and rows (bin, a, b, d, std).
+
+    Accelerations, (1 + s, J, 3), are those of the samples and those of SIGNS.
+    """
     begin, end = flight.start, flight.end
     level = None
     if flight.imu is not None and len(flight.imu) > 1:
@@ -142,7 +152,12 @@ def _of_flight(
             f"a map needs {FEWEST_BINS * STEP:g} s at least, and a minute to be good."
         )
     t = begin + STEP * (np.arange(count) + 0.5)
-    accel = np.full((count, 3), np.nan) if level is None else level.accelerations(t)
+    accel = np.full((1 + len(SIGNS), count, 3), np.nan)
+    if level is not None and flight.imu is not None:
+        accel[0] = level.accelerations(t)
+        for row, signs in enumerate(SIGNS, start=1):
+            turned = replace(flight.imu, gyro=flight.imu.gyro * np.array(signs, float))
+            accel[row] = _Level.of(turned).accelerations(t)
     tdoa = flight.tdoa
     a, b = np.searchsorted(ids, tdoa.a), np.searchsorted(ids, tdoa.b)
     swapped = a > b

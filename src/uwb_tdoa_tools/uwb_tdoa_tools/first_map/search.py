@@ -30,6 +30,7 @@ CLOSE = 0.1, 50.0  # share of the best cost, and cost, within which a shape is p
 TURNS = 24  # random rotations that are tried without inertial samples
 ROUGH = 0.3  # m, of coordinates while a shape is placed
 SMOOTHING = 5  # bins over which accelerations are averaged to compare rotations
+ROUNDS, BETTER = 3, 1.0  # of reflections, and the decrease of the cost that is worth another round
 MOVING = 20  # fewest bins with accelerations
 
 
@@ -52,10 +53,14 @@ def minima(
             progress("placing the map in its frame")
             keep(*_placed(seen, shape, turn, shift))
     fits.sort(key=lambda fit: fit.cost)
-    for path, columns in _reflections(seen, fits[0]):
-        progress("looking for second places of anchors")
-        keep(path, columns)
-    fits.sort(key=lambda fit: fit.cost)
+    for _ in range(ROUNDS):
+        best = fits[0]
+        for path, columns in _reflections(seen, best):
+            progress("looking for second places of anchors")
+            keep(path, columns)
+        fits.sort(key=lambda fit: fit.cost)
+        if fits[0].cost > best.cost - BETTER:
+            break
     return _distinct(fits, len(seen.ids)), reached
 
 
@@ -256,19 +261,42 @@ def _placed(
 
 
 def _reflections(seen: Observations, fit: Fit) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return a fit with each anchor reflected at planes of the path, or of the other anchors.
+    """Return a fit with each anchor, and all unknown ones, reflected at planes.
 
-    A path in a plane, or on a line, gives an anchor a second place on the other side.
+    The planes are those of the path, or of the other anchors. A path in a plane, or on a line, gives an
+    anchor a second place on the other side.
     """
-    out, count = [], len(seen.ids)
+    count = len(seen.ids)
     anchors = fit.anchors(count)
-    for row in range(count):
-        points = fit.path if len(fit.path) else np.delete(anchors, row, axis=0)
+    known = np.bincount(seen.coordinates[:, 0].astype(int), minlength=count) >= 3
+    groups = [np.array([row]) for row in range(count) if not known[row]]
+    out = []
+    for rows in [*groups, np.flatnonzero(~known)]:
+        points = fit.path if len(fit.path) else np.delete(anchors, rows, axis=0)
+        if len(points) < 3:
+            continue
         middle = points.mean(axis=0)
         _, axes = np.linalg.eigh(np.cov(points.T))
         for normal in axes.T[: 2 if len(fit.path) else 1]:
+            there = anchors.copy()
+            there[rows] -= 2.0 * np.outer((anchors[rows] - middle) @ normal, normal)
             columns = fit.columns.copy()
-            there = anchors[row] - 2.0 * ((anchors[row] - middle) @ normal) * normal
-            columns[3 * row : 3 * row + 3] = there
+            columns[: 3 * count] = there.ravel()
             out.append((fit.path, columns))
     return out
+
+
+def misfit_of(seen: Observations, path: np.ndarray, accel: np.ndarray) -> float:
+    """Return the mean square between slow accelerations (J, 3) and a path (J, 3), after a rotation.
+
+    The rotation may hold a reflection. NaN if too few bins of a flight have accelerations.
+    """
+    middle, total = seen.middle, []
+    for number in range(seen.flights):
+        measured = np.isfinite(accel[middle]).all(axis=1) & (seen.flight[middle] == number)
+        if measured.sum() > MOVING:
+            one = _slow(np.diff(path, 2, axis=0)[middle - 1][measured] / STEP**2)
+            other = _slow(accel[middle][measured])
+            turns = [orthogonal(one, other, determinant) for determinant in (1.0, -1.0)]
+            total.append(min(np.mean((one @ turn.T - other) ** 2) for turn in turns))
+    return float(np.mean(total)) if total else np.nan

@@ -15,7 +15,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from ..choices import MAP_ACCURACY
 from .deviations import covariance
 from .least_squares import Problem, Stage
-from .search import SAME_SHAPE, minima, rigid_distance
+from .search import SAME_MAP, SAME_SHAPE, minima, misfit_of, rigid_distance
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -25,8 +25,12 @@ if TYPE_CHECKING:
 
 FEWEST = 4  # anchors of a map
 AMBIGUOUS = 12.0  # cost by which another map must be worse
+BEYOND = 3.0  # standard deviations within which two minima are one map
 CONTRADICTING = 2.0  # robust scale of residuals of distances, in their standard deviations
 DEFORMED = 0.6  # mean square of the residuals of accelerations, in their variance
+CLEARER = 3.0  # misfit of accelerations with other signs of the gyroscope, multiples of the misfit
+FLAT = 0.5  # m, range of the middle 80 % of the path along its flattest axis
+UPRIGHT = 0.9  # vertical part of a normal from which heights settle the sides of a flat path
 KNOWN = 0.1  # m, standard deviation of a coordinate up to which it is trusted
 
 
@@ -90,7 +94,13 @@ def map_anchors(
     best, count = fits[0], len(seen.ids)
     linear = Problem(seen, Stage()).about(best)
     spread, lasting = covariance(linear, best, rng)
-    near = [fit for fit in fits[1:] if fit.cost < best.cost + AMBIGUOUS]
+    apart = SAME_MAP + BEYOND * np.sqrt(np.diag(spread)).reshape(-1, 3)
+    near = [
+        fit
+        for fit in fits[1:]
+        if fit.cost < best.cost + AMBIGUOUS
+        and (np.abs(fit.anchors(count) - best.anchors(count)) > apart).any()
+    ]
     trusted = np.zeros((count, 3), bool)
     row, axis = seen.coordinates[seen.coordinates[:, 3] <= KNOWN, :2].astype(int).T
     trusted[row, axis] = True
@@ -112,7 +122,9 @@ def _judged(
     """Return the FirstMap with `why_not`."""
     why = (
         _contradiction(seen, linear)
+        or _handedness(seen, best)
         or _open(found, accuracy)
+        or _flat(found, best)
         or _imprecise(found, accuracy)
         or _unchecked(found, seen, best, accuracy)
     )
@@ -139,6 +151,40 @@ def _contradiction(seen: Observations, linear: Linear) -> str:
             "give the true ones in the column std, or --delay-std for distances by radio"
         )
     return ""
+
+
+def _handedness(seen: Observations, best: Fit) -> str:
+    """Return a sentence if another gyroscope explains the accelerations about as well.
+
+    A gyroscope with a wrong sign makes a mirror image of the map, which fits all TDOAs.
+    """
+    given = misfit_of(seen, best.path, seen.accel)
+    if not np.isfinite(given):
+        return ""
+    others = [misfit_of(seen, best.path, accel) for accel in seen.flipped]
+    if np.nanmedian(others) > CLEARER * given:
+        return ""
+    return (
+        "accelerations and turning rates do not show which of two mirror images is right: the flight "
+        "hardly moves, or the inertial sensor has wrong axes; look at the recording with check, and "
+        "fly faster, with turns"
+    )
+
+
+def _flat(found: FirstMap, best: Fit) -> str:
+    """Return a sentence if the path is in a plane, and coordinates do not settle the sides of anchors."""
+    if not len(best.path):
+        return ""
+    _, axes = np.linalg.eigh(np.cov(best.path.T))
+    normal = axes[:, 0]
+    low, high = np.percentile(best.path @ normal, [10.0, 90.0])
+    settled = abs(normal[2]) > UPRIGHT and bool(found.trusted[:, 2].all())
+    if high - low > FLAT or settled:
+        return ""
+    return (
+        f"the path is flat ({high - low:.2f} m), so each anchor has a place on either side of it; fly "
+        "high and low, or give the heights of all anchors (--coordinates)"
+    )
 
 
 def _open(found: FirstMap, accuracy: float) -> str:
