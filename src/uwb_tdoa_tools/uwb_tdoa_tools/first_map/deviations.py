@@ -20,6 +20,9 @@ SHAKEN = 0.15  # m/s^2, of the acceleration of a bin
 # Factor on the variance that lasting errors make: the fit is linear here, and their size is
 # estimated from the residuals. Set on simulated halls other than those of the study.
 MARGIN = 1.5
+NEAR = 5  # bins, at most between two measurements whose common error lasts
+CLIPPED = 3.0  # robust standard deviations beyond which a residual is an outlier
+LEAST_SHARE = 0.1  # of the variance of residuals that lasts at least
 LEAST = 0.01  # m, of a coordinate
 
 
@@ -27,8 +30,9 @@ def covariance(linear: Linear, fit: Fit, rng: np.random.Generator) -> tuple[np.n
     """Return the covariance of the anchors, (3N, 3N) m^2, and the size of lasting errors, m.
 
     Draws of all errors pass through the linear problem. Each anchor has a smooth error of the place of
-    the tag. The residuals give its size: most of such an error disappears in the map, so the errors
-    are larger than the residuals. Accelerations have a slow error. The rest is independent.
+    the tag. Successive residuals of a pair give its size by what they share. Most of such an error
+    disappears in the map, so the errors are larger than the residuals. Accelerations have a slow error.
+    The rest is independent.
     """
     problem = linear.problem
     seen, size = problem.seen, 3 * len(problem.seen.ids)
@@ -44,12 +48,31 @@ def covariance(linear: Linear, fit: Fit, rng: np.random.Generator) -> tuple[np.n
     nothing = np.zeros((problem.layout.size, DRAWS)), np.zeros((3 * problem.bins, DRAWS))
     lasting, left = linear.response(radio, still, nothing)
     scale = _scale(linear.residual)
-    std = scale / max(_scale(left), 1e-6)
+    pairs = _neighbours(linear)
+    clipped = np.clip(linear.residual, -CLIPPED * scale, CLIPPED * scale)
+    together = max(_lasting(clipped[:, None], pairs), LEAST_SHARE * scale**2)
+    std = float(np.sqrt(together / max(_lasting(left, pairs), 1e-9)))
     noise = scale * rng.standard_normal(radio.shape)
     rest = linear.others(rng, DRAWS)
     independent, _ = linear.response(noise, _accelerations(linear, rng), rest)
     total = std * lasting[:size] + independent[:size]
     return least + MARGIN * total @ total.T / DRAWS, std
+
+
+def _neighbours(linear: Linear) -> tuple[np.ndarray, np.ndarray]:
+    """Return rows (k,) of measurements, and of the next one of the same anchors within NEAR bins."""
+    seen = linear.problem.seen
+    order = np.lexsort((seen.bin, seen.b, seen.a))
+    first, second = order[:-1], order[1:]
+    same = (seen.a[first] == seen.a[second]) & (seen.b[first] == seen.b[second])
+    near = same & (seen.bin[second] - seen.bin[first] <= NEAR)
+    return first[near], second[near]
+
+
+def _lasting(residual: np.ndarray, pairs: tuple[np.ndarray, np.ndarray]) -> float:
+    """Return the variance of the part of residuals (n, s) that two successive ones share, m^2."""
+    first, second = pairs
+    return float(np.mean(residual[first] * residual[second])) if len(first) else 0.0
 
 
 def _root(path: np.ndarray) -> np.ndarray:
