@@ -72,7 +72,9 @@ def picture(found: FirstMap, path: str | Path) -> None:
             values, vectors = np.linalg.eigh(found.covariance[np.ix_(columns, columns)])
             width, height = 2.0 * np.sqrt(CHI2_95 * np.maximum(values, 0.0))
             angle = np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0]))
-            ax.add_patch(Ellipse(place, width, height, angle=angle, fc="none", ec="tab:blue"))
+            ax.add_patch(
+                Ellipse(tuple(place), width, height, angle=angle, fc="none", ec="tab:blue")
+            )
             ax.plot(*place, "s" if found.trusted[row].all() else "o", color="tab:blue", ms=5)
             ax.annotate(str(i), place, textcoords="offset points", xytext=(6, 6))
         side = axes[1] == 2

@@ -30,6 +30,7 @@ CONTRADICTING = 2.0  # robust scale of residuals of distances, in their standard
 DEFORMED = 0.6  # mean square of the residuals of accelerations, in their variance
 CLEARER = 3.0  # misfit of accelerations with other signs of the gyroscope, multiples of the misfit
 FLAT = 0.5  # m, range of the middle 80 % of the path along its flattest axis
+RIGID = 4  # distances of each anchor that settle its side
 UPRIGHT = 0.9  # vertical part of a normal from which heights settle the sides of a flat path
 KNOWN = 0.1  # m, standard deviation of a coordinate up to which it is trusted
 
@@ -124,7 +125,7 @@ def _judged(
         _contradiction(seen, linear)
         or _handedness(seen, best)
         or _open(found, accuracy)
-        or _flat(found, best)
+        or _flat(found, seen, best)
         or _imprecise(found, accuracy)
         or _unchecked(found, seen, best, accuracy)
     )
@@ -171,9 +172,10 @@ def _handedness(seen: Observations, best: Fit) -> str:
     )
 
 
-def _flat(found: FirstMap, best: Fit) -> str:
+def _flat(found: FirstMap, seen: Observations, best: Fit) -> str:
     """Return a sentence if the path is in a plane, and coordinates do not settle the sides of anchors."""
-    if not len(best.path):
+    measured = np.bincount(seen.distances[:, :2].astype(int).ravel(), minlength=len(seen.ids))
+    if not len(best.path) or (measured >= RIGID).all():
         return ""
     _, axes = np.linalg.eigh(np.cov(best.path.T))
     normal = axes[:, 0]
