@@ -25,7 +25,7 @@ sensor, which settles what is up and which of two mirror images is right. Withou
 --coordinates: heights of anchors, and a rough coordinate of one anchor off the line of the known ones.
 
 The command writes a map only if one map alone explains the data, and if its standard deviations are below --accuracy.
-Otherwise it prints what is open and what would settle it. survey improves the map with the same flights.
+Otherwise it prints what is open and what would settle it. survey starts from the map.
 
 Writes anchors.yaml and anchors.csv (a map that is accepted), map.json (covariance, other maps) and map.png to --out.
 
