@@ -14,6 +14,7 @@ from studies import (
     domains,
     drives,
     export_cost,
+    first_map,
     localizing,
     lockstep,
     monitor,
@@ -69,6 +70,7 @@ STUDIES = {
     "drives": drives,
     "export-cost": export_cost,
     "faults": faults,
+    "first-map": first_map,
     "fly-faults": flown,
     "fuzz": fuzz,
     "in-flight": in_flight,
@@ -119,6 +121,7 @@ of measured flights: flights/, util/, surveys/.
   drives           a rover on wheels, by which sensors the filter uses (docs/notebook/auxiliary_sensors.md)
   export-cost      a TDOA corrected by an exported file and by compiled effects (docs/notebook/export.md)
   faults           faults of streams, surveys, nodes and clocks, played to the real nodes (docs/notebook/reliability.md)
+  first-map        first maps of unknown anchors in simulated halls, and their errors (docs/notebook/first_map.md)
   fly-faults       faults of streams while a simulated vehicle flies by the estimate (docs/notebook/reliability.md)
   fuzz             changed files of every kind, given to every reader (docs/notebook/reliability.md)
   in-flight        the same mistakes played to ekf_node, and what it says of them (docs/notebook/checking.md)
@@ -201,6 +204,7 @@ def parser():
             "bench/"
         ),
         "./dev study faults --only '^velocity' --json faults.json --out faults.md",
+        "./dev study first-map --halls 20",
         "./dev study fly-faults --flights 6",
         "./dev study fuzz --count 20000",
         (

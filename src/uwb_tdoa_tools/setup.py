@@ -46,6 +46,7 @@ setup(
             "fly = uwb_tdoa_tools.executables:fly",
             "inject = uwb_tdoa_tools.executables:inject",
             "localize = uwb_tdoa_tools.executables:localize",
+            "map_anchors = uwb_tdoa_tools.executables:map_anchors",
             "plan = uwb_tdoa_tools.executables:plan",
             "replay = uwb_tdoa_tools.executables:replay",
             "simulate = uwb_tdoa_tools.executables:simulate",

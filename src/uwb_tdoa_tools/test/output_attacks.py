@@ -12,7 +12,7 @@ from uwb_tdoa_tools.outputs import Output, OutputBag, OutputFile, OutputFolder
 
 READ = set(  # options and arguments that name what is read, or no path at all
     """flights flight input bag map anchors survey effects config model peer correction marks distances holdout odometry beside antenna
-    walls places poses static data diagnosed trained train test cases columns seed names""".split()
+    walls places poses coordinates static data diagnosed trained train test cases columns seed names""".split()
 )
 NUMBERS = "int", "float", "whole_number"  # names of types of options
 PATHS = re.compile("FILE|DIR|BAG|LOG|CSV|MAP|FLIGHT|IN$|S$|ANCHORS|LIBRARY|DATA|DIRECTORY|FOLDER")

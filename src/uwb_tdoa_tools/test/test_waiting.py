@@ -41,6 +41,7 @@ WORDS = {  # command: words after it
     "fly": "--flights 2 --jobs 1",
     "inject": "flight.bag --effect anchor_delay --value 3=0.3 --out late.bag",
     "localize": "flight.bag --smooth --residuals --out localized",
+    "map_anchors": "flight.bag --survey two.yaml --out map",
     "plan": "anchors.yaml --improve move --out maps",
     "simulate": "--duration 300 --out long.bag",
     "survey": "flight.bag --out surveyed",
@@ -65,6 +66,7 @@ def desk(tmp_path_factory):
     np.negative(flight.tdoa.d, out=flight.tdoa.d)
     write_bag(flight, folder / "wrong.bag")
     corners().to_yaml(folder / "anchors.yaml")
+    corners().only([0, 2]).to_yaml(folder / "two.yaml")
     EffectSet((EFFECTS["anchor_delay"]({"3": 0.3}),)).to_yaml(folder / "effects.yaml")
     return folder
 

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 MARK_KEYS = ("flight", "from", "to", "position", "std")
 MARK_EXAMPLE = "{flight: monday, from: 12.0, to: 14.0, position: [1.0, -2.0, 0.5], std: 0.05}"
 DISTANCE_COLUMNS = "a", "b", "distance", "std"
+COORDINATE_COLUMNS = "anchor", "axis", "value", "std"
+AXES = ("x", "y", "z")
 PATH_COLUMNS = "t", "x", "y", "z"
 
 
@@ -81,17 +83,22 @@ def _mark(where: str, entry: Any, lengths: Mapping[str, float]) -> Mark:
     return Mark(flight, first, last, position, std)
 
 
-def read_distances(path: str | Path, anchors: Anchors) -> list[Distance]:
+def read_distances(path: str | Path, anchors: Anchors | None = None) -> list[Distance]:
     """Read [Distance] between Anchors from a CSV file with the columns DISTANCE_COLUMNS: ids, m, m.
 
-    Raises InputError.
+    anchors : None allows any ids. Raises InputError.
     """
-    out, known = [], ", ".join(str(i) for i in anchors.ids)
+    out, known = [], "" if anchors is None else ", ".join(str(i) for i in anchors.ids)
     for line, row in read_table(path, DISTANCE_COLUMNS):
         a, b, distance, std = (number(path, line, row, name) for name in DISTANCE_COLUMNS)
-        if a == b or (anchors.index(np.array([a, b])) < 0).any():
+        if anchors is None:
+            _check_id(path, line, a)
+            _check_id(path, line, b)
+        if a == b or (anchors is not None and (anchors.index(np.array([a, b])) < 0).any()):
             raise InputError(
                 f"{path}: line {line}: {a:g} and {b:g} must be two of the anchors {known}."
+                if known
+                else f"{path}: line {line}: {a:g} and {b:g} must be two anchors."
             )
         if not (0.0 < distance < 1e4 and 0.0 < std < 10.0):
             raise InputError(
@@ -104,6 +111,30 @@ def read_distances(path: str | Path, anchors: Anchors) -> list[Distance]:
             f"{path}: holds no distance; write one in each line below {','.join(DISTANCE_COLUMNS)}."
         )
     return out
+
+
+def read_coordinates(path: str | Path) -> list[tuple[int, int, float, float]]:
+    """Read coordinates of anchors from a CSV file with the columns COORDINATE_COLUMNS.
+
+    Returns (id, axis 0 to 2, value m, std m) of each line; in the file axes are x, y, z. Raises InputError.
+    """
+    out = []
+    for line, row in read_table(path, COORDINATE_COLUMNS):
+        anchor, value, std = (number(path, line, row, n) for n in ("anchor", "value", "std"))
+        _check_id(path, line, anchor)
+        axis = row["axis"].strip().lower()
+        if axis not in AXES or not abs(value) < 1e6 or not 0.0 < std <= 10.0:
+            raise InputError(
+                f"{path}: line {line}: {axis} = {value:g} +- {std:g} m is no coordinate; write x, y or "
+                "z, and a std above 0, at most 10 m."
+            )
+        out.append((int(anchor), AXES.index(axis), value, std))
+    return out
+
+
+def _check_id(path: str | Path, line: int, value: float) -> None:
+    if not (0.0 <= value <= 65535.0 and value == int(value)):
+        raise InputError(f"{path}: line {line}: {value:g} is no id; ids are whole, 0 ... 65535.")
 
 
 def read_paths(

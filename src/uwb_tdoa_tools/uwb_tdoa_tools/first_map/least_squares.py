@@ -1,0 +1,429 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
+"""Robust least squares for anchors and the path of the tag together.
+
+The unknowns are the position of the tag in each time bin, and the columns `Layout` of anchors and
+flights. Levenberg-Marquardt steps eliminate the positions, whose normal equations are banded.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve, cho_solve_banded, cholesky_banded
+from scipy.sparse import csr_matrix
+
+from .observations import STEP
+
+if TYPE_CHECKING:
+    from .observations import Observations
+
+NU = 4.0  # degrees of freedom of Student's t, of TDOAs, ranges, heights and distances
+DELAY = 0.1  # m, prior of the delay of an anchor
+TAG_DELAY = 0.5  # m, prior of the antenna delay of the tag, in ranges
+ANYWHERE = 100.0  # m, prior of an anchor, about the origin
+YAW, YAW_RATE, BIAS = 100.0, 0.02, 0.15  # rad, rad/s, m/s^2: priors of each flight
+PER_FLIGHT = np.array([YAW, YAW_RATE, BIAS, BIAS, BIAS, TAG_DELAY])
+# Errors of a TDOA or range last: 12 count as one, as in `survey`. Counted fully, they outweigh the
+# inertial sensor, which gives the size of the path.
+LASTING = 3.5
+ACCEL_STD = 0.2  # m/s^2, of the acceleration of a bin
+MOTION = 2.5  # m/s^2, acceleration of a tag without inertial samples
+HEIGHT_STD = 0.1  # m, of the height of a bin
+HELD = 1e-4  # m, prior of a delay that does not exist
+WEAK = 1e-6  # 1/m^2, information of each coordinate of the path: bins without measurements
+DAMPING, LESS, MORE, TRIES = 1e-3, 0.2, 5.0, 8
+STEPS = 80  # most accepted steps
+CONVERGED = 0.05  # smallest decrease of the cost that another step is worth
+
+
+class Layout:
+    """Columns of anchors and flights: positions, delays, delays of distances, PER_FLIGHT."""
+
+    def __init__(self, anchors: int, flights: int) -> None:
+        self.anchors, self.flights = anchors, flights
+        self.positions = slice(0, 3 * anchors)
+        self.delays = slice(3 * anchors, 4 * anchors)
+        self.between = slice(4 * anchors, 5 * anchors)
+        self.of_flights = 5 * anchors + len(PER_FLIGHT) * np.arange(flights)
+        self.size = 5 * anchors + len(PER_FLIGHT) * flights
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """What a least-squares problem uses.
+
+    inertial : whether accelerations hold; otherwise the path is only smooth
+    frame : whether coordinates and heights hold; otherwise the frame is arbitrary
+    wide : factor on the standard deviations of radio measurements and distances; more than 1
+        smooths the cost, for a search
+    """
+
+    inertial: bool = True
+    frame: bool = True
+    wide: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A minimum: path (J, 3) m, columns (size,), cost (negative log-likelihood)."""
+
+    path: np.ndarray
+    columns: np.ndarray
+    cost: float
+
+    def anchors(self, count: int) -> np.ndarray:
+        """Return positions of the anchors, (N, 3) m."""
+        return self.columns[: 3 * count].reshape(count, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """The problem about a Fit.
+
+    residual, weight : (n,) of TDOAs and ranges, m and 1/m^2; by_tag : (n, 3), by_columns : (n, k)
+    misfit : mean square of accelerations over ACCEL_STD^2, of each flight; NaN without
+    between : (m,) residuals of distances over their std; by_distances : (m, k), weighted
+    covariance : (k, k) of the columns for independent errors
+    """
+
+    problem: Problem
+    residual: np.ndarray
+    weight: np.ndarray
+    by_columns: np.ndarray
+    misfit: np.ndarray
+    between: np.ndarray
+    covariance: np.ndarray
+    path_factor: np.ndarray
+    path_by_columns: np.ndarray
+    cross: np.ndarray
+    by_tag: csr_matrix
+    by_distances: np.ndarray
+
+    def response(
+        self, radio: np.ndarray, accel: np.ndarray, rest: tuple[np.ndarray, np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return errors of the columns, (k, s), and residuals, (n, s), for errors of measurements.
+
+        radio : (n, s) m; accel : (m, 3, s) m/s^2 at the middle bins
+        rest : gradients by the columns (k, s) and by the path (3J, s) that other errors make
+        """
+        problem = self.problem
+        weighted = -self.weight[:, None] * radio
+        of_columns = rest[0] + self.by_columns.T @ weighted
+        spread = problem.spread(-problem.motion_weight[:, None, None] * accel)
+        of_path = rest[1] + self.by_tag @ weighted + spread.reshape(-1, radio.shape[1])
+        solved = cho_solve_banded((self.path_factor, False), of_path)
+        columns = -self.covariance @ (of_columns - self.cross.T @ solved)
+        path = -(solved + self.path_by_columns @ columns)
+        return columns, self.by_columns @ columns + self.by_tag.T @ path - radio
+
+    def others(self, rng: np.random.Generator, draws: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return draws of the gradients that errors of heights, distances, coordinates and priors make."""
+        problem = self.problem
+        size = problem.layout.size
+        columns = np.sqrt(problem.prior)[:, None] * rng.standard_normal((size, draws))
+        known = problem.coordinates
+        std = problem.seen.coordinates[: len(known), 3]
+        noise = rng.standard_normal((len(known), draws)) / std[:, None]
+        np.add.at(columns, known, noise)
+        between = self.by_distances * problem.distance_std[:, None]
+        columns += between.T @ rng.standard_normal((len(between), draws))
+        path = np.zeros((3 * problem.bins, draws))
+        high = 3 * problem.high + 2
+        path[high] = rng.standard_normal((len(high), draws)) / HEIGHT_STD
+        return columns, path
+
+
+class Problem:
+    """Observations under a Stage."""
+
+    def __init__(self, seen: Observations, stage: Stage) -> None:
+        self.seen, self.stage = seen, stage
+        self.layout = Layout(len(seen.ids), seen.flights)
+        self.bins = len(seen.t)
+        self.two = seen.two
+        self.first = np.where(self.two, seen.a, 0)
+        self.std = seen.std * stage.wide * (LASTING if stage.frame else 1.0)
+        self.middle = seen.middle
+        known = np.isfinite(seen.accel[self.middle]).all(axis=1)
+        self.measured = known & stage.inertial
+        self.accel = np.where(self.measured[:, None], np.nan_to_num(seen.accel[self.middle]), 0.0)
+        self.motion_weight = np.where(self.measured, ACCEL_STD, MOTION) ** -2.0
+        self.accel_weight = np.where(self.measured, self.motion_weight, 0.0)
+        self.of_flight = self.layout.of_flights[seen.flight]
+        self.high = np.flatnonzero(np.isfinite(seen.height) & stage.frame)
+        ends = seen.distances[:, :2].astype(int)
+        self.ends = ends[:, 0], ends[:, 1]
+        self.distance_std = seen.distances[:, 3] * stage.wide
+        row, axis = seen.coordinates[:, :2].astype(int).T
+        self.coordinates = 3 * row + axis if stage.frame else np.zeros(0, int)
+        self.prior = np.empty(self.layout.size)
+        self.prior[self.layout.positions] = ANYWHERE**-2.0
+        self.prior[self.layout.delays] = DELAY**-2.0
+        self.prior[self.layout.between] = max(seen.delay_std, HELD) ** -2.0
+        self.prior[5 * len(seen.ids) :] = np.tile(PER_FLIGHT**-2.0, seen.flights)
+
+    def solve(self, path: np.ndarray, columns: np.ndarray) -> Fit:
+        """Return the minimum that Levenberg-Marquardt steps reach from path (J, 3) and columns."""
+        state = _State(self, path, columns)
+        damping = DAMPING
+        for _ in range(STEPS):
+            equations = state.equations()
+            for _ in range(TRIES):
+                moved = equations.step(damping)
+                following = None if moved is None else state.moved(*moved)
+                if following is not None and following.cost < state.cost:
+                    break
+                damping *= MORE
+            else:
+                break
+            gain, state = state.cost - following.cost, following
+            damping = max(damping * LESS, 1e-9)
+            if gain < CONVERGED:
+                break
+        return Fit(state.path, state.columns, state.cost)
+
+    def about(self, fit: Fit) -> Linear:
+        """Return the linear problem about a Fit."""
+        state = _State(self, fit.path, fit.columns)
+        return state.equations().linear()
+
+    def spread(self, values: np.ndarray) -> np.ndarray:
+        """Return the gradient by the path (J, 3, s) of second differences (m, 3, s)."""
+        out = np.zeros((self.bins, *values.shape[1:]))
+        for shift, factor in ((-1, 1.0), (0, -2.0), (1, 1.0)):
+            out[self.middle + shift] += factor * values / STEP**2
+        return out
+
+    @cached_property
+    def smooth(self) -> np.ndarray:
+        """Normal equations of second differences: upper bands (7, 3J)."""
+        bands, weight = np.zeros((3, self.bins)), self.motion_weight / STEP**4
+        for shift, factor in ((-1, 1.0), (0, 4.0), (1, 1.0)):
+            bands[0][self.middle + shift] += factor * weight
+        bands[1][self.middle] -= 2.0 * weight
+        bands[1][self.middle + 1] -= 2.0 * weight
+        bands[2][self.middle + 1] += weight
+        out = np.zeros((7, 3 * self.bins))
+        out[6], out[3], out[0] = (np.repeat(band, 3) for band in bands)
+        out[6] += WEAK
+        return out
+
+    @cached_property
+    def pattern(self) -> tuple[np.ndarray, csr_matrix]:
+        """(order, matrix): places of (n, 3) derivatives by positions of the tag in (3J, n)."""
+        count = len(self.seen.d)
+        rows = (3 * self.seen.bin[:, None] + np.arange(3)).ravel()
+        numbers = np.arange(3 * count) + 1.0
+        matrix = csr_matrix(
+            (numbers, (rows, np.repeat(np.arange(count), 3))), shape=(3 * self.bins, count)
+        )
+        return matrix.data.astype(int) - 1, matrix
+
+
+class _State:
+    """Residuals of a Problem at a path and columns."""
+
+    def __init__(self, problem: Problem, path: np.ndarray, columns: np.ndarray) -> None:
+        self.problem, self.path, self.columns = problem, path, columns
+        seen, layout = problem.seen, problem.layout
+        anchors = columns[layout.positions].reshape(-1, 3)
+        delay, between = columns[layout.delays], columns[layout.between]
+        tag = path[seen.bin]
+        to_b, self.by_b = _length(tag - anchors[seen.b])
+        to_a, self.by_a = _length(tag - anchors[problem.first])
+        of_tag = columns[problem.of_flight + 5][seen.bin]
+        other = np.where(problem.two, to_a + delay[problem.first], -of_tag)
+        self.radio = to_b + delay[seen.b] - other - seen.d
+        flight = problem.of_flight[problem.middle]
+        yaw = columns[flight] + columns[flight + 1] * seen.t[problem.middle]
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        x, y, z = problem.accel.T
+        self.turned = np.column_stack([cos * x - sin * y, sin * x + cos * y, z])
+        bias = columns[flight[:, None] + [2, 3, 4]] * problem.measured[:, None]
+        second = np.diff(path, 2, axis=0)[problem.middle - 1] if len(path) else path
+        self.accel = second / STEP**2 - self.turned - bias
+        self.height = path[problem.high, 2] - seen.height[problem.high]
+        one, other_end = problem.ends
+        length, self.along = _length(anchors[one] - anchors[other_end])
+        self.distance = length + between[one] + between[other_end] - seen.distances[:, 2]
+        known = problem.coordinates
+        self.coordinate = columns[known] - seen.coordinates[: len(known), 2]
+        self.coordinate_std = seen.coordinates[: len(known), 3]
+        self.cost = self._cost()
+
+    def _cost(self) -> float:
+        problem = self.problem
+        return float(
+            _student(self.radio / problem.std)
+            + _student(self.height / HEIGHT_STD)
+            + _student(self.distance / problem.distance_std)
+            + 0.5 * np.sum(problem.motion_weight[:, None] * self.accel**2)
+            + 0.5 * np.sum((self.coordinate / self.coordinate_std) ** 2)
+            + 0.5 * np.sum(problem.prior * self.columns**2)
+        )
+
+    def moved(self, path: np.ndarray, columns: np.ndarray) -> _State:
+        """Return the state after a step."""
+        return _State(self.problem, self.path + path, self.columns + columns)
+
+    def equations(self) -> _Equations:
+        """Return the normal equations here."""
+        return _Equations(self)
+
+
+class _Equations:
+    """Normal equations of a _State."""
+
+    def __init__(self, state: _State) -> None:
+        self.state = state
+        problem = state.problem
+        self.gram = np.diag(problem.prior)
+        self.gradient = problem.prior * state.columns
+        self.cross = np.zeros((3 * problem.bins, problem.layout.size))
+        self.path_gradient = np.zeros(3 * problem.bins)
+        self.bands = problem.smooth.copy()
+        self._add_radio()
+        self._add_motion()
+        self._add_anchors()
+
+    def _add_radio(self) -> None:
+        state, problem = self.state, self.state.problem
+        seen, layout, two = problem.seen, problem.layout, problem.two
+        row = np.arange(len(seen.d))
+        self.weight = _weight(state.radio, problem.std)
+        out = np.zeros((len(row), layout.size))
+        for axis in range(3):
+            out[row, 3 * seen.b + axis] = -state.by_b[:, axis]
+            out[row[two], 3 * seen.a[two] + axis] = state.by_a[two, axis]
+        out[row, layout.delays.start + seen.b] = 1.0
+        out[row[two], layout.delays.start + seen.a[two]] = -1.0
+        out[row[~two], problem.of_flight[seen.bin[~two]] + 5] = 1.0
+        self.by_columns = out
+        by_tag = state.by_b - np.where(two[:, None], state.by_a, 0.0)
+        order, pattern = problem.pattern
+        self.by_tag = csr_matrix(
+            (by_tag.ravel()[order], pattern.indices, pattern.indptr), shape=pattern.shape
+        )
+        weighted = out * self.weight[:, None]
+        self.gram += out.T @ weighted
+        self.gradient = self.gradient + weighted.T @ state.radio
+        self.cross += self.by_tag @ weighted
+        self.path_gradient += self.by_tag @ (self.weight * state.radio)
+        for i, k in ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2)):
+            sums = np.bincount(
+                seen.bin, self.weight * by_tag[:, i] * by_tag[:, k], minlength=problem.bins
+            )
+            self.bands[6 + i - k, k::3] += sums
+
+    def _add_motion(self) -> None:
+        state, problem = self.state, self.state.problem
+        seen = problem.seen
+        weight = problem.motion_weight[:, None] * state.accel
+        self.path_gradient += problem.spread(weight).ravel()
+        height = _weight(state.height, np.full(len(problem.high), HEIGHT_STD))
+        self.bands[6, 3 * problem.high + 2] += height
+        self.path_gradient[3 * problem.high + 2] += height * state.height
+        for number, first in enumerate(problem.layout.of_flights):
+            chosen = problem.measured & (seen.flight[problem.middle] == number)
+            rows = np.flatnonzero(chosen)
+            by = np.zeros((len(chosen), 3, 5))
+            x, y, _ = state.turned[rows].T
+            by[rows, 0, 0], by[rows, 1, 0] = y, -x
+            by[rows, :, 1] = by[rows, :, 0] * seen.t[problem.middle[rows], None]
+            for axis in range(3):
+                by[rows, axis, 2 + axis] = -1.0
+            columns = first + np.arange(5)
+            weighted = by * problem.accel_weight[:, None, None]
+            self.gram[np.ix_(columns, columns)] += np.einsum("nki,nkj->ij", by, weighted)
+            self.gradient[columns] += np.einsum("nki,nk->i", weighted, state.accel)
+            self.cross[:, columns] += problem.spread(weighted).reshape(-1, 5)
+
+    def _add_anchors(self) -> None:
+        state, problem = self.state, self.state.problem
+        one, other = problem.ends
+        row = np.arange(len(one))
+        by = np.zeros((len(one), problem.layout.size))
+        for axis in range(3):
+            by[row, 3 * one + axis] = state.along[:, axis]
+            by[row, 3 * other + axis] = -state.along[:, axis]
+        by[row, problem.layout.between.start + one] = 1.0
+        by[row, problem.layout.between.start + other] = 1.0
+        weighted = by * _weight(state.distance, problem.distance_std)[:, None]
+        self.gram += by.T @ weighted
+        self.gradient = self.gradient + weighted.T @ state.distance
+        self.by_distances = weighted
+        known, information = problem.coordinates, state.coordinate_std**-2.0
+        np.add.at(self.gram, (known, known), information)
+        np.add.at(self.gradient, known, information * state.coordinate)
+
+    def step(self, damping: float) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the step of path and columns; None if the equations are singular."""
+        bands = self.bands.copy()
+        bands[6] *= 1.0 + damping
+        gram = self.gram + damping * np.diag(np.diag(self.gram))
+        try:
+            factor = cholesky_banded(bands, check_finite=False) if bands.size else bands
+            solved = self._solved(factor, np.column_stack([self.cross, self.path_gradient]))
+            reduced = cho_factor(gram - self.cross.T @ solved[:, :-1], check_finite=False)
+        except LinAlgError:
+            return None
+        columns = -cho_solve(reduced, self.gradient - self.cross.T @ solved[:, -1])
+        path = -(solved[:, -1] + solved[:, :-1] @ columns)
+        return path.reshape(-1, 3), columns
+
+    @staticmethod
+    def _solved(factor: np.ndarray, values: np.ndarray) -> np.ndarray:
+        if not factor.size:
+            return values
+        solved: np.ndarray = cho_solve_banded((factor, False), values, check_finite=False)
+        return solved
+
+    def linear(self) -> Linear:
+        """Return the Linear problem."""
+        state, problem = self.state, self.state.problem
+        factor = cholesky_banded(self.bands) if self.bands.size else self.bands
+        solved = self._solved(factor, self.cross)
+        flight = problem.seen.flight[problem.middle]
+        square = (state.accel**2).mean(axis=1) / ACCEL_STD**2
+        misfit = [
+            square[problem.measured & (flight == number)].mean()
+            if (problem.measured & (flight == number)).any()
+            else np.nan
+            for number in range(problem.layout.flights)
+        ]
+        return Linear(
+            problem,
+            state.radio,
+            self.weight,
+            self.by_columns,
+            np.array(misfit),
+            state.distance / problem.seen.distances[:, 3],
+            np.linalg.inv(self.gram - self.cross.T @ solved),
+            factor,
+            solved,
+            self.cross,
+            self.by_tag,
+            self.by_distances,
+        )
+
+
+def _length(line: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return lengths (n,) of lines (n, 3), and their directions."""
+    length = np.sqrt(np.sum(line**2, axis=1) + 1e-9)
+    return length, line / length[:, None]
+
+
+def _student(value: np.ndarray) -> float:
+    """Return the negative log-likelihood of normalized residuals under Student's t."""
+    return 0.5 * (NU + 1.0) * float(np.log1p(value**2 / NU).sum())
+
+
+def _weight(residual: np.ndarray, std: np.ndarray) -> np.ndarray:
+    """Return the weights of Student's t, 1/m^2."""
+    weight: np.ndarray = (NU + 1.0) / (NU + (residual / std) ** 2) / std**2
+    return weight
