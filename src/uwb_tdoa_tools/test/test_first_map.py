@@ -249,7 +249,7 @@ def test_the_command_writes_a_map_and_the_next_line(desk, flight, capsys):
     words = [str(desk / "flight.bag"), "--survey", str(desk / "two.yaml"), "--out", str(out)]
     assert main(words) == 0
     told = capsys.readouterr().out
-    assert "a first map" in told and "survey" in told.split("next: ")[1]
+    assert "a first map" in told and "localize" in told.split("next: ")[1]
     assert (out / "map.png").stat().st_size > 1000
     content = json.loads((out / "map.json").read_text())
     assert content["accepted"] and len(content["covariance"]) == 3 * len(flight.anchors)

@@ -25,7 +25,7 @@ sensor, which settles what is up and which of two mirror images is right. Withou
 --coordinates: heights of anchors, and a rough coordinate of one anchor off the line of the known ones.
 
 The command writes a map only if one map alone explains the data, and if its standard deviations are below --accuracy.
-Otherwise it prints what is open and what would settle it. survey starts from the map.
+Otherwise it prints what is open and what would settle it.
 
 Writes anchors.yaml and anchors.csv (a map that is accepted), map.json (covariance, other maps) and map.png to --out.
 
@@ -116,11 +116,9 @@ def _map_anchors(args: Namespace) -> int:
     write_text(args.out / "anchors.csv", "\n".join(["id,x,y,z", *rows, ""]))
     cli.show(f"wrote anchors.yaml, anchors.csv, map.json and map.png to {args.out}")
     if args.flights:
-        trusted = [str(i) for row, i in enumerate(found.ids) if found.trusted[row].all()]
-        words = ["--std", f"{found.usual_std:.2f}", *(["--trusted", *trusted] if trusted else [])]
-        words += [*options.words_of_reading(args), "--out", "surveyed/"]
         survey = "--survey", args.out / "anchors.yaml"
-        line = command_lines.tool("survey", *args.flights, *survey, *words)
+        words = [*options.words_of_reading(args), "--out", "localized/"]
+        line = command_lines.tool("localize", *args.flights, *survey, *words)
         cli.show(f"next: {line}")
     return 0
 

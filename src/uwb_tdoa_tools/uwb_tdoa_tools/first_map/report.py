@@ -52,7 +52,7 @@ def as_text(found: FirstMap) -> str:
         off = np.linalg.norm(found.std[~found.trusted.all(axis=1)], axis=1)
         lines.append(
             f"{len(off)} anchors are known to {np.median(off):.2f} m (median), {off.max():.2f} m at "
-            "most: a first map, from which survey starts"
+            "most: a first map; heights and distances make it better"
         )
     return "\n".join(lines)
 

@@ -62,11 +62,6 @@ class FirstMap:
         out: np.ndarray = np.sqrt(np.diag(self.covariance)).reshape(-1, 3)
         return out
 
-    @property
-    def usual_std(self) -> float:
-        """Return the root mean square of the standard deviations that are not trusted, m."""
-        return float(np.sqrt(np.mean(self.std[~self.trusted] ** 2)))
-
     def anchors(self, frame: str = "map") -> Anchors:
         """Return the Anchors in a frame of this name."""
         return Anchors.from_positions(self.positions, self.ids, frame)
