@@ -4,6 +4,7 @@
 
 from dataclasses import replace
 import json
+import shlex
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -15,6 +16,7 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Imu
 from uwb_tdoa_tools.bags.bag import write_bag
+from uwb_tdoa_tools.commands import localize
 from uwb_tdoa_tools.commands.map_anchors import main
 from uwb_tdoa_tools.first_map import map_anchors, observe
 from uwb_tdoa_tools.first_map.least_squares import Problem, Stage, _State
@@ -244,12 +246,16 @@ def desk(tmp_path_factory, flight):
     return folder
 
 
-def test_the_command_writes_a_map_and_the_next_line(desk, flight, capsys):
+def test_the_command_writes_a_map_and_a_next_line_that_runs(desk, flight, capsys, monkeypatch):
+    monkeypatch.chdir(desk)
     out = desk / "map"
     words = [str(desk / "flight.bag"), "--survey", str(desk / "two.yaml"), "--out", str(out)]
     assert main(words) == 0
     told = capsys.readouterr().out
-    assert "a first map" in told and "localize" in told.split("next: ")[1]
+    assert "a first map" in told
+    words = shlex.split(told.split("next: ")[1])
+    assert localize.main(words[words.index("localize") + 1 :]) == 0
+    assert any((desk / "localized").iterdir())
     assert (out / "map.png").stat().st_size > 1000
     content = json.loads((out / "map.json").read_text())
     assert content["accepted"] and len(content["covariance"]) == 3 * len(flight.anchors)

@@ -104,8 +104,11 @@ PACKAGES = [
 TOOLS = tuple(
     path.stem for path in (PACKAGES[2] / "commands").glob("*.py") if path.stem != "__init__"
 )
-# Whose lines tests below, and test_demo.py, run
-PRINT = {"commands/calibrate.py", "commands/diagnose.py", "commands/survey.py", "flying/demo.py"}
+# Whose lines tests below, test_demo.py and test_first_map.py run
+PRINT = {
+    *(f"commands/{name}.py" for name in ("calibrate", "diagnose", "map_anchors", "survey")),
+    "flying/demo.py",
+}
 
 
 @cache

@@ -104,7 +104,7 @@ def _report_once(sentence: str, about: str | Path | None = None) -> None:
 
 
 def survey_for(path: str | Path, survey: str | Path | None) -> str | Path | None:
-    """Return the survey of a recording; from a folder, the survey with the longest KEY in the path."""
+    """Return the survey of a recording; from a folder, the one whose KEY ends last in the path."""
     if survey is None or not Path(survey).is_dir():
         return survey
     keys = {
