@@ -69,7 +69,7 @@ def run(tmp_path):
         file = tmp_path / "program" / "program.py"
         file.parent.mkdir(exist_ok=True)
         if not file.exists() or file.read_text() != text:
-            file.write_text(text)  # numba before 0.62 goes by the time of a file
+            file.write_text(text)  # older versions of numba go by the time of a file
         done = subprocess.run(
             [sys.executable, str(file)],
             env={"PATH": "/usr/bin:/bin", "NUMBA_CACHE_DIR": str(tmp_path / cache)}
@@ -136,76 +136,3 @@ def test_another_version_of_numba_compiles_as_usual(monkeypatch):
         monkeypatch.setattr(callees, "version_info", version)
         assert not callees.install()
     assert callees.dispatcher.Dispatcher.compile is usual
-
-
-APART = """
-import numpy as np
-from uwb_tdoa_bias.common.compiled import compiled, compiled_apart
-
-PAIR = np.dtype([("count", int), ("value", float, 2)], align=True)
-
-@compiled
-def scaled(pair, factor):
-    return pair.value * factor
-
-@compiled_apart
-def grow(pair, others, factor) -> bool:
-    if factor < 0.0:
-        raise ValueError("a factor below 0")
-    pair.value[:] = scaled(pair, factor) + np.median(others)
-    return pair.value[0] > 2.0
-
-@compiled_apart
-def count(pair, more) -> None:
-    pair.count += more
-
-@compiled
-def root(pairs, others, factor):
-    grown = 0
-    for k in range(len(pairs)):
-        count(pairs[k], 2)
-        grown += grow(pairs[k], others, factor)
-    return grown
-"""
-USES = """
-import gc
-import numpy as np
-import with_apart
-before = gc.get_threshold()
-pairs = np.ones(3, with_apart.PAIR)
-pairs["value"] = [[3.0, 0.1], [0.2, 0.3], [0.4, 5.0]]
-print(with_apart.root(pairs, np.arange(4.0), 0.7), pairs["count"].tolist())
-print([value.hex() for value in pairs["value"].ravel()])
-try:
-    with_apart.root(pairs, np.ones(2), -1.0)
-except ValueError as error:
-    print(error)
-with_apart.count(pairs[0], 1)  # Python calls it, too
-print(pairs["count"].tolist(), gc.get_threshold() == before)
-print(sum(with_apart.root.stats.cache_hits.values()) > 0)
-"""
-ONE_PROCESSOR = "from uwb_tdoa_bias.common import callees\ncallees._processors = lambda: 1\n"
-
-
-@pytest.mark.parametrize("before", ["", ONE_PROCESSOR])
-def test_functions_apart_give_the_bits_that_numba_gives_as_usual_also_from_the_cache(
-    run, tmp_path, before
-):
-    (tmp_path / "with_apart.py").write_text(APART)
-    path = f"import sys\nsys.path.append({str(tmp_path)!r})\n"
-    usual = run("import numba\nnumba.version_info = (9, 9)\n" + path + USES, "usual")[0]
-    assert usual[-1].endswith("True")
-    assert (usual, False) == run(path + before + USES, "cache")
-    assert (usual, True) == run(path + before + USES, "cache")
-    kept = {path.name.split("-")[0] for path in (tmp_path / "cache").rglob("*.nbi")}
-    assert kept == {f"with_apart.{name}" for name in ("root", "grow", "count")}
-
-
-def test_the_other_process_takes_no_module_from_the_present_folder(run, tmp_path, monkeypatch):
-    """It would run whatever an archive has put there."""
-    (tmp_path / "with_apart.py").write_text(APART)
-    (tmp_path / "here").mkdir()
-    (tmp_path / "here" / "pickle.py").write_text(f"open({str(tmp_path / 'run')!r}, 'w')")
-    monkeypatch.chdir(tmp_path / "here")
-    run(f"import sys\nsys.path.append({str(tmp_path)!r})\n" + USES, "cache")
-    assert not (tmp_path / "run").exists()

@@ -3,6 +3,7 @@
 """Compiled code is read from no folder in which anybody else may have put it: what is there is run."""
 
 import ast
+import gc
 import os
 from pathlib import Path
 
@@ -123,3 +124,13 @@ def test_a_link_is_followed_once(named):
     true.mkdir()
     named.symlink_to(true)
     assert place() == true / NAME
+
+
+def test_garbage_is_collected_as_before_after_a_compilation():
+    before, listener = gc.get_threshold(), compiled._Listener()
+    listener.on_start(None)
+    listener.on_start(None)  # a function that the first one calls
+    listener.on_end(None)
+    assert gc.get_threshold() == compiled.COLLECT
+    listener.on_end(None)
+    assert gc.get_threshold() == before

@@ -61,8 +61,7 @@ Function = TypeVar("Function", bound="Callable[..., Any]")
 
 # numba would otherwise look for settings in the present folder before each compilation.
 config._config_fname = "/dev/null/.numba_config.yaml"
-# whether callers may call a function by its address
-APART = callees.install() and not config.DISABLE_JIT  # type: ignore[attr-defined]  # as above
+callees.install()
 
 
 def compiled(function: Function) -> Function:
@@ -81,15 +80,6 @@ def compiled(function: Function) -> Function:
         return made
     finally:
         config.CACHE_DIR = before  # type: ignore[attr-defined]  # as above
-
-
-def compiled_apart(function: Function) -> Function:
-    """Compile a function in another process than its callers, if they are not in the cache.
-
-    The function must return None, a bool or a float, as annotated. It is called by its address: mark one
-    that is called seldom, and that takes long to compile.
-    """
-    return callees.apart(compiled(function), compiled(function)) if APART else compiled(function)
 
 
 class _Listener(event.Listener):

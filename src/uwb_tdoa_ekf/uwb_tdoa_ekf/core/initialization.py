@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from uwb_tdoa_bias.common.compiled import Record, compiled, compiled_apart
+from uwb_tdoa_bias.common.compiled import Record, compiled
 
 from . import (
     auxiliary,
@@ -120,7 +120,7 @@ def _look_for_places(
     return share
 
 
-@compiled_apart
+@compiled
 def start(
     ekf: Record,
     anchors: np.ndarray,
@@ -184,7 +184,7 @@ def start(
     add_reset(ekf, t, history)
 
 
-@compiled_apart
+@compiled
 def start_slowly(
     ekf: Record, anchors: np.ndarray, parameters: Record, t: float, history: np.ndarray
 ) -> None:
@@ -288,7 +288,7 @@ def waits(
     return True
 
 
-@compiled_apart
+@compiled
 def relocate(
     ekf: Record, anchors: np.ndarray, parameters: Record, t: float, history: np.ndarray
 ) -> None:
@@ -516,7 +516,7 @@ def _turn(hypothesis: Record, yaw: float, std: float) -> None:
     hypothesis.P[8, 8] = std**2
 
 
-@compiled_apart
+@compiled
 def recover(
     ekf: Record,
     anchors: np.ndarray,

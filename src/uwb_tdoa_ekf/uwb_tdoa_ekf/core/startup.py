@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uwb_tdoa_bias.common.compiled import Record, compiled, compiled_apart
+from uwb_tdoa_bias.common.compiled import Record, compiled
 from uwb_tdoa_bias.common.geometry import linearized_tdoa
 from uwb_tdoa_bias.common.robust_loss import GEMAN_MCCLURE, geman_mcclure_loss, weight
 
@@ -51,7 +51,7 @@ def room_for(count: int) -> Places:
     return Places(np.empty((count, 6)), np.empty((count, 6, 6)), np.empty(count))
 
 
-@compiled_apart
+@compiled
 def locate(
     window: np.ndarray,
     anchors: np.ndarray,

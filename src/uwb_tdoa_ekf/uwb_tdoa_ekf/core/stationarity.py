@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from uwb_tdoa_bias.common.compiled import Record, compiled, compiled_apart
+from uwb_tdoa_bias.common.compiled import Record, compiled
 
 from . import ground, hypotheses, stationary_position
 from .history import add_update, replace_velocity
@@ -93,7 +93,7 @@ def detect_liftoff(ekf: Record, sample: Record, dt: float, records: np.ndarray) 
     ekf.resting, ekf.next_look = False, sample.t + AWAY
 
 
-@compiled_apart
+@compiled
 def check_stationarity(
     ekf: Record,
     anchors: np.ndarray,
