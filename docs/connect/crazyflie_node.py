@@ -59,6 +59,7 @@ def main():
         rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
+    node.destroy_node()  # before the interpreter ends, in whatever order it frees what is left
     rclpy.try_shutdown()
 
 
