@@ -27,7 +27,7 @@ from uwb_tdoa_bias.common.sensors import SENSORS
 
 from . import choices
 from .choices import ALIGN, NONE, STORAGES
-from .outputs import OutputFile
+from .outputs import OutputFile, OutputFolder
 from .parallel import whole_number
 
 if TYPE_CHECKING:
@@ -347,6 +347,17 @@ def add_align(parser: ArgumentParser, judges: bool = False) -> None:
             "The result is printed in any case, with the error of each"
         )
     parser.add_argument("--align", choices=ALIGN if judges else ALIGN[:2], default=NONE, help=text)
+
+
+def add_out(parser: ArgumentParser, required: bool = True) -> None:
+    """Add --out, a folder for everything that the command writes."""
+    parser.add_argument(
+        "--out",
+        metavar="DIR",
+        type=OutputFolder,
+        required=required,
+        help="where to write; made if it is not there",
+    )
 
 
 def add_rerun(parser: ArgumentParser) -> None:

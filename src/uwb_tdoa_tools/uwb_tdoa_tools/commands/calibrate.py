@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli, command_lines, options
-from ..outputs import OutputFolder
 from ..parallel import Progress
 
 if TYPE_CHECKING:
@@ -73,7 +72,7 @@ def parser() -> ArgumentParser:
         help="say within a minute what to expect of a calibration, and of more flights",
     )
     add("--keep", action="store_true", help="use flights in which check finds an error, too")
-    add("--out", metavar="DIR", type=OutputFolder, help="where to write; made if it is not there")
+    options.add_out(made, required=False)
     return made
 
 

@@ -14,7 +14,6 @@ from uwb_tdoa_bias.common.files import write_text
 
 from .. import cli, command_lines, options, parallel
 from ..choices import DRIFT, NONE, PLAN_SPEED, PLAN_TIME, REFERENCES
-from ..outputs import OutputFolder
 from ..parallel import Progress
 
 if TYPE_CHECKING:
@@ -135,13 +134,7 @@ def parser() -> ArgumentParser:
     options.add_align(made)
     options.add_rerun(made)
     parallel.add_options(made)
-    add(
-        "--out",
-        metavar="DIR",
-        type=OutputFolder,
-        required=True,
-        help="where to write; made if it is not there",
-    )
+    options.add_out(made)
     return made
 
 

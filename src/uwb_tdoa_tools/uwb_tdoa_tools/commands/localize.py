@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli, options, parallel
-from ..outputs import OutputFile, OutputFolder
+from ..outputs import OutputFile
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
@@ -62,13 +62,7 @@ def parser() -> ArgumentParser:
     options.add_rerun(made)
     add("--json", metavar="FILE", type=OutputFile, help="write all figures")
     parallel.add_options(made)
-    add(
-        "--out",
-        metavar="DIR",
-        type=OutputFolder,
-        required=True,
-        help="where to write; made if it is not there",
-    )
+    options.add_out(made)
     return made
 
 

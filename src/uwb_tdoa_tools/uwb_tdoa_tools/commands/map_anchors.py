@@ -11,7 +11,6 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_text
 
 from .. import choices, cli, command_lines, options
-from ..outputs import OutputFolder
 from ..parallel import Progress
 
 if TYPE_CHECKING:
@@ -77,13 +76,7 @@ def parser() -> ArgumentParser:
         help="m, largest 3D standard deviation of an anchor in a map that is written (default %(default)s)",
     )
     add("--seed", type=int, default=0, metavar="N", help="of the search (default 0)")
-    add(
-        "--out",
-        metavar="DIR",
-        type=OutputFolder,
-        required=True,
-        help="where to write; made if it is not there",
-    )
+    options.add_out(made)
     return made
 
 

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 from uwb_tdoa_bias.common.files import write_text
 
 from .. import cli, command_lines, options, parallel
-from ..outputs import OutputFolder
 from ..parallel import Progress
 
 if TYPE_CHECKING:
@@ -64,17 +63,10 @@ def parser() -> ArgumentParser:
         "effects.yaml: effects in the model already; the file of an earlier survey is the prior",
     )
     options.add_parameters(made)
-    add = made.add_argument
     options.add_tape(made)
     options.add_known(made)
     parallel.add_options(made)
-    add(
-        "--out",
-        metavar="DIR",
-        type=OutputFolder,
-        required=True,
-        help="where to write; made if it is not there",
-    )
+    options.add_out(made)
     return made
 
 
