@@ -26,7 +26,13 @@ from uwb_tdoa_tools.diagnosis.comparison import (
 )
 from uwb_tdoa_tools.diagnosis.detectors import Detection
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
-from uwb_tdoa_tools.diagnosis.validation import cross_fitted, select_by_error, validation_cases
+from uwb_tdoa_tools.diagnosis.validation import (
+    Displacements,
+    _dropped,
+    cross_fitted,
+    select_by_error,
+    validation_cases,
+)
 from uwb_tdoa_tools.scoring.gains import NO_DIFFERENCE
 
 TRUTH = GroundTruth()
@@ -275,6 +281,34 @@ def test_noise_is_described_alike_in_both_directions(after, interval, sentence):
     assert why_not(*sides, 0.0).startswith(sentence)
 
 
+def displacements(**moved):
+    """Of one case with an error of 1 m along x: metres by which the error along x grows."""
+    error = np.tile([1.0, 0.0, 0.0], (4, 1))
+    changes = {name: [np.tile([by, 0.0, 0.0], (4, 1))] for name, by in moved.items()}
+    return Displacements([error], changes)
+
+
+@pytest.mark.parametrize(
+    "moved, alone, gone",
+    [
+        ({"a": 0.05, "b": -0.0001, "c": 0.0004}, False, "bc"),
+        ({"a": 0.05, "b": 0.0006}, False, ""),
+        ({"a": 0.0}, False, "a"),
+        ({"a": -0.3, "b": 0.2}, False, "a"),
+        ({"a": 0.04, "b": 0.06}, True, "a"),
+        # either may go, but not both: each does the work of the other
+        ({"a": 0.0003, "b": 0.0003}, False, "a"),
+        ({"a": -0.1, "b": -0.1}, False, "ab"),
+    ],
+)
+def test_what_makes_the_error_larger_or_is_worth_nothing_is_dropped(moved, alone, gone):
+    dropped = _dropped(displacements(**moved), list(moved), alone)
+    assert sorted(dropped) == list(gone)
+    assert all(
+        after - before == pytest.approx(moved[one]) for one, (before, after) in dropped.items()
+    )
+
+
 class Some(str):
     """The label of a candidate that nodes can take out."""
 
@@ -282,65 +316,30 @@ class Some(str):
     terms = (SimpleNamespace(effect=SimpleNamespace(usable=True), function=None),)
 
 
-@pytest.mark.parametrize(
-    "worth, kept",
-    [
-        ({"a": 0.05, "b": -0.0001, "c": 0.0004}, "a"),
-        ({"a": 0.05, "b": 0.0006}, "ab"),
-        ({"a": 0.0}, ""),
-    ],
-)
-def test_what_is_worth_nothing_is_not_written(monkeypatch, worth, kept):
-    """Of several flights, too, where it does no harm either."""
+def test_fewer_are_dropped_where_displacements_do_not_add_up(monkeypatch):
+    """Without both, the error is larger than displacements predict; without either it is not."""
+    worth = {"a": -0.1, "b": -0.05, "c": 0.2}
 
-    class Trials(_Figures):
-        costly, runs = False, ()
+    class Trials:
+        runs = ()
 
         def __init__(self, *_):
-            super().__init__({})
-
-        def errors(self, models):
-            return [
-                0.2 + sum(value for name, value in worth.items() if name not in candidates)
-                for candidates, _ in models
-            ]
+            pass
 
         def start(self, candidates, detections):
-            return self.errors([(candidates, detections)])[0]
+            lost = sum(by for name, by in worth.items() if name not in candidates)
+            return 1.0 + lost + 0.5 * (not {"a", "b"} & set(candidates))
+
+        def displacements(self, candidates, each):
+            changes = {one: self.start(set(candidates) - {one}, ()) for one in each}
+            now = self.start(candidates, ())
+            off = {one: [np.array([[error - now, 0.0, 0.0]])] for one, error in changes.items()}
+            return Displacements([np.array([[now, 0.0, 0.0]])], off)
 
     monkeypatch.setattr(validation, "_Trials", Trials)
     selection = SimpleNamespace(chosen=tuple(map(Some, worth)), kept=tuple)
     attribution = SimpleNamespace(selection=selection, detections=())
     found = select_by_error(attribution, [None, None], Baseline(NONE))
-    assert "".join(found.selection) == kept
-    assert {one.what for one in found.refused} == set(worth) - set(kept)
-    assert all("it is worth nothing for the position" in one.why for one in found.refused)
-
-
-class _Figures:
-    """Trials of models whose error grows by what each candidate, that is not in them, is worth."""
-
-    def __init__(self, worth):
-        self.worth, self.tried = worth, 0
-
-    def errors(self, models):
-        self.tried += len(models)
-        return [
-            1.0 + sum(value for name, value in self.worth.items() if name not in candidates)
-            for candidates, _ in models
-        ]
-
-
-def test_as_many_go_at_once_as_may_together():
-    names = list("abcdefghij")
-    nothing = _Figures(dict.fromkeys(names, 0.001))
-    assert validation._gone(nothing, (names, []), names, 1.05) == names and nothing.tried == 1
-    one = _Figures({**dict.fromkeys(names, 0.001), "h": 0.049})
-    assert validation._gone(one, (names, []), names, 1.05) == [
-        name for name in names if name != "h"
-    ] and one.tried < len(names)
-    both = _Figures({"a": 0.04, "b": 0.04})
-    assert validation._gone(both, (["a", "b"], []), ["a", "b"], 1.05) == [
-        "a"
-    ]  # either may go, but not both
-    assert validation._gone(both, (["a", "b"], []), [], 1.05) == []
+    assert found.selection == ("b", "c")
+    assert found.worth == {"a": pytest.approx(-0.1), "b": pytest.approx(0.45), "c": pytest.approx(0.2)}
+    assert "the filter does better without it" in found.refused[0].why

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import partial, reduce
 from itertools import chain, cycle
 from typing import TYPE_CHECKING, TypeVar
 
@@ -16,7 +16,7 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf.frames import poses_of
 from uwb_tdoa_ekf.offline import run_offline
 
-from ..scoring.metrics import EVERYTHING
+from ..scoring.metrics import EVERYTHING, Score, rms
 from .comparison import Baseline, ValidationCase, score
 from .deviations import with_deviations
 from .findings import Refused, usable
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from .detectors import Detection
     from .regression.terms import Candidate
 
-    Model = tuple[Sequence[Candidate], Sequence[Detection]]
     Poses = tuple[np.ndarray, ...]  # return value of `poses_of`
 
 Made = TypeVar("Made")
@@ -150,68 +149,43 @@ def select_by_error(
 ) -> ValidatedSelection:
     """Return the ValidatedSelection of effects that do not make the filter worse on hold-out data.
 
-    Candidates are dropped one by one if the error falls without them. In a single flight they are
-    also dropped if the error hardly grows. Detections stay only if the error falls with them. At
-    most TRIAL_FLIGHTS flights are judged. Trials correct measurements at the poses of a run with
-    all effects.
-
-    After a drop, the other candidates that seemed harmful are tried again first. At the end all
-    candidates are tried with the final model, and those without worth are dropped, as many together
-    as leave the error as it is. If trials are costly, several candidates are dropped at once.
-    Events at a time of a single flight are tried for their worth, but not kept.
+    The filter runs without each candidate. The displacements of the position by all candidates
+    then predict the error without several of them, and candidates are dropped one by one by this
+    prediction. The filter runs again with the rest, until no candidate is dropped. Detections stay
+    only if the error falls with them. At most TRIAL_FLIGHTS flights are judged. Trials correct
+    measurements at the poses of a run with all effects. Events at a time of a single flight are
+    tried for their worth, but not kept.
 
     map_function : as of `attribute`
     """
     candidates, refused = list(attribution.selection.chosen), []
     detections: list[Detection] = []
-    least = WORTH_OF_ONE if len(flights) == 1 else -WORSE
+    alone = len(flights) == 1
     trials = _Trials(attribution, flights, baseline, progress, map_function)
-    error = trials.start(candidates, detections)
-    without: dict[Candidate, float] = {}
     worth: dict[Candidate | Detection, float] = {}
-    suspects = _applicable(candidates)
-    while suspects:
-        less = [([c for c in candidates if c is not one], detections) for one in suspects]
-        without = dict(zip(suspects, trials.errors(less)))
-        harmful = sorted(
-            (one for one in suspects if without[one] <= error * (1.0 + least)),
-            key=without.__getitem__,
-        )
-        gone = (
-            _gone(trials, (candidates, detections), harmful, error * (1.0 + least))
-            if trials.costly
-            else harmful[:1]
-        )
-        if gone:
-            refused += [Refused(one.label, _why_without(error, without[one])) for one in gone]
-            worth.update((one, without[one] - error) for one in gone)
-            candidates = [one for one in candidates if one not in gone]
-            error, without = trials.start(candidates, detections), {}
-        elif len(suspects) == len(_applicable(candidates)):
-            break
-        suspects = (
-            _applicable(candidates) if trials.costly else harmful[1:] or _applicable(candidates)
-        )
-    while without:
-        limit = error + min(LEAST_WORTH, LEAST_SHARE * error)
-        idle = sorted((one for one in without if without[one] < limit), key=without.__getitem__)
-        gone = _gone(trials, (candidates, detections), idle, limit)
+    error = trials.start(candidates, detections)
+    while applicable := _applicable(candidates):
+        displacements = trials.displacements(candidates, applicable)
+        gone = _dropped(displacements, applicable, alone)
         if not gone:
+            all_of_them = displacements.error([])
+            worth.update((one, displacements.error([one]) - all_of_them) for one in applicable)
             break
-        refused += [Refused(one.label, _why_without(error, without[one])) for one in gone]
-        worth.update((one, without[one] - error) for one in gone)
-        candidates = [one for one in candidates if one not in gone]
-        suspects = _applicable(candidates)
-        models = [(candidates, detections)]
-        models += [([c for c in candidates if c is not one], detections) for one in suspects]
-        error, *tried = trials.errors(models)
-        without = dict(zip(suspects, tried))
-    worth.update((candidate, trial - error) for candidate, trial in without.items())
+        kept = [one for one in candidates if one not in gone]
+        error = trials.start(kept, detections)
+        while len(gone) > 1 and error > _limit(displacements.error(list(gone)), alone):
+            gone = dict(list(gone.items())[: len(gone) // 2])  # displacements do not add up
+            kept = [one for one in candidates if one not in gone]
+            error = trials.start(kept, detections)
+        for one, (before, after) in gone.items():
+            refused.append(Refused(one.label, _why_without(before, after)))
+            worth[one] = after - before
+        candidates = kept
     for detection in attribution.detections:
         if not detection.effect.usable:
             continue
-        (trial,) = trials.errors([(candidates, [*detections, detection])])
-        if trial < error * (1.0 - max(least, WORSE)):
+        trial = trials.error(candidates, [*detections, detection])
+        if trial < error * (1.0 - max(WORTH_OF_ONE if alone else 0.0, WORSE)):
             detections.append(detection)
             worth[detection] = error - trial
             error = trial
@@ -219,7 +193,7 @@ def select_by_error(
             useless = f"does not make the filter better: {error:.3f} m without, {trial:.3f} m with"
             why = useless if trial >= error * (1.0 - WORSE) else _why_without(trial, error)
             refused.append(Refused(detection.effect.label, why))
-    for momentary in (one for one in candidates if len(flights) == 1 and _momentary(one)):
+    for momentary in (one for one in candidates if alone and _momentary(one)):
         refused.append(
             Refused(
                 momentary.label,
@@ -234,26 +208,50 @@ def select_by_error(
     return ValidatedSelection(selection, tuple(detections), tuple(refused), worth, trials.runs)
 
 
-def _gone(
-    trials: _Trials, model: Model, harmful: Sequence[Candidate], limit: float
-) -> Sequence[Candidate]:
-    """Return the Candidates that can be dropped together with an error of at most `limit`, m.
+def _dropped(
+    displacements: Displacements, candidates: Sequence[Candidate], alone: bool
+) -> dict[Candidate, tuple[float, float]]:
+    """Return the Candidates to drop, with the predicted errors before and after, m.
 
-    They are tried together. If the error is too large, each half is tried separately, and so on.
+    The one without which the error is smallest goes first.
 
-    harmful : Candidates of the model, the least worth first
+    alone : whether the flight is a single one
     """
-    candidates, detections = model
-    gone: list[Candidate] = []
-    parts = [list(harmful)] if harmful else []
-    while parts:
-        part = parts.pop(0)
-        rest = [one for one in candidates if one not in (*gone, *part)]
-        if (len(part) == 1 and not gone) or trials.errors([(rest, detections)])[0] <= limit:
-            gone += part
-        elif len(part) > 1:
-            parts[:0] = [part[: len(part) // 2], part[len(part) // 2 :]]
+    gone: dict[Candidate, tuple[float, float]] = {}
+    error = lowest = displacements.error([])
+    while len(gone) < len(candidates):
+        tried = {one: displacements.error([*gone, one]) for one in candidates if one not in gone}
+        one = min(tried, key=tried.__getitem__)
+        if tried[one] > _limit(error if alone else lowest, alone):
+            break
+        gone[one] = error, tried[one]
+        error = tried[one]
+        lowest = min(lowest, error)
     return gone
+
+
+def _limit(error: float, alone: bool) -> float:
+    """Return up to which error without it, m, an effect is dropped; error : with it."""
+    return error + (WORTH_OF_ONE * error if alone else min(LEAST_WORTH, LEAST_SHARE * error))
+
+
+@dataclass(frozen=True, eq=False)
+class Displacements:
+    """Position errors of trials, and how they change without each effect.
+
+    errors : [(n, 3)] m, of each case; changes : {candidate: [(n, 3)] m}
+    """
+
+    errors: list[np.ndarray]
+    changes: dict[Candidate, list[np.ndarray]]
+
+    def error(self, gone: Sequence[Candidate]) -> float:
+        """Return the mean 3D RMSE of the cases without some effects, m, to first order."""
+        several = []
+        for k, error in enumerate(self.errors):
+            moved = error + sum(self.changes[one][k] for one in gone)
+            several.append(rms(np.linalg.norm(moved, axis=1)))
+        return float(np.mean(several))
 
 
 def _applicable(candidates: Sequence[Candidate]) -> list[Candidate]:
@@ -308,26 +306,37 @@ class _Trials:
         )
         self._map_function = map_function
         self._poses: Sequence[Poses | None] = [None]
+        self._now: list[tuple[Run, Score]] = []
         self.runs: KnownRuns = ()
 
-    @property
-    def costly(self) -> bool:
-        """Return whether trials are costly: a single flight with MANY anchors is long."""
-        return len(self._flights) == 1 and self._attribution.selection.table.sparse
-
     def start(self, candidates: Sequence[Candidate], detections: Sequence[Detection]) -> float:
-        """Return the error of a model, m, and keep the poses of its runs for later trials."""
+        """Return the error of a model, m, and keep its runs and their poses for later trials."""
         cases = self._cases(candidates, detections)
-        (results,) = self._tried(_judged, [cases])
+        self._now = self._tried(_judged, cases)
         if self._poses == [None]:
-            self.runs = tuple((case, run) for case, (run, _) in zip(cases, results))
-        self._poses = [poses_of(run.odometry) for run, _ in results]
-        return float(np.mean([error for _, error in results]))
+            self.runs = tuple((case, run) for case, (run, _) in zip(cases, self._now))
+        self._poses = [poses_of(run.odometry) for run, _ in self._now]
+        return float(np.mean([judged.rmse_3d for _, judged in self._now]))
 
-    def errors(self, models: Sequence[Model]) -> list[float]:
-        """Return the errors of models [(candidates, detections)], in m."""
-        results = self._tried(error_of, [self._cases(*model) for model in models])
-        return [float(np.mean(errors)) for errors in results]
+    def error(self, candidates: Sequence[Candidate], detections: Sequence[Detection]) -> float:
+        """Return the error of a model, m."""
+        tried = self._tried(_scored, self._cases(candidates, detections))
+        return float(np.mean([judged.rmse_3d for judged in tried]))
+
+    def displacements(
+        self, candidates: Sequence[Candidate], each: Sequence[Candidate]
+    ) -> Displacements:
+        """Return the Displacements by each of some candidates of the model of the last `start`."""
+        models = [self._cases([c for c in candidates if c is not one], ()) for one in each]
+        tried = self._tried(_scored, list(chain.from_iterable(models)))
+        errors, changes = [], {one: [] for one in each}
+        for k, (_, now) in enumerate(self._now):
+            without = tried[k :: len(self._now)]
+            t = reduce(np.intersect1d, [judged.t for judged in without], now.t)
+            errors.append(now.error[np.isin(now.t, t)])
+            for one, judged in zip(each, without):
+                changes[one].append(judged.error[np.isin(judged.t, t)] - errors[-1])
+        return Displacements(errors, changes)
 
     def _cases(
         self, candidates: Sequence[Candidate], detections: Sequence[Detection]
@@ -338,26 +347,30 @@ class _Trials:
     def _tried(
         self,
         function: Callable[[FilterConfig | None, tuple[ValidationCase, Poses | None]], Made],
-        cases: Sequence[list[ValidationCase]],
-    ) -> list[list[Made]]:
-        """Return [[function of each trial] of each model], computed in one map."""
+        cases: Sequence[ValidationCase],
+    ) -> list[Made]:
+        """Return function of each trial; several models follow each other."""
         results = []
-        trials = zip(chain.from_iterable(cases), cycle(self._poses))
+        trials = zip(cases, cycle(self._poses))
         for of_case in self._map_function(partial(function, self._baseline.config), trials):
             results.append(of_case)
             self._progress()
-        return [results[k : k + len(cases[0])] for k in range(0, len(results), len(cases[0]))]
+        return results
 
 
 def error_of(config: FilterConfig | None, trial: tuple[ValidationCase, Poses | None]) -> float:
     """Return the 3D RMSE of a trial, m."""
+    return _scored(config, trial).rmse_3d
+
+
+def _scored(config: FilterConfig | None, trial: tuple[ValidationCase, Poses | None]) -> Score:
     return _judged(config, trial)[1]
 
 
 def _judged(
     config: FilterConfig | None, trial: tuple[ValidationCase, Poses | None]
-) -> tuple[Run, float]:
-    """Return the Run and the 3D RMSE, m, of a trial.
+) -> tuple[Run, Score]:
+    """Return the Run and the Score of a trial.
 
     trial : ValidationCase, and the poses for corrections, None to use the poses of the run
     """
@@ -369,7 +382,7 @@ def _judged(
         else FixedPoseCorrector(anchors, effects, poses)
     )
     run = run_offline(case.flight, config, corrector)
-    return run, score(case, run).rmse_3d
+    return run, score(case, run)
 
 
 def validation_cases(
