@@ -58,7 +58,7 @@ if TYPE_CHECKING:
     from .detectors import Detection, Detector
     from .references import Reference
     from .regression.fit import Fit
-    from .regression.select import Rival
+    from .regression.select import Rival, Search
     from .regression.table import RegressionTable
 
 # Flights, fewest for a map. With fewer, the map depends on their paths and does not generalize; two
@@ -182,104 +182,164 @@ def attribute(
     map_function : function
         Like map(function, items), possibly in parallel processes.
     """
-    known: list[tuple[tuple[Effect, ...], list[ChannelResiduals]]] = []
-
-    def at(model: Sequence[Effect]) -> list[ChannelResiduals]:
-        """Return the residuals under a model.
-
-        Residuals of the last and of the empty model are kept. If the path is unknown, computing
-        them runs the filter.
-        """
-        again = [made for other, made in known if other == tuple(model)]
-        if not again:
-            again = [
-                residuals_of(
-                    flights, reference, EffectSet((*base.effects, *model)), progress, map_function
-                )
-            ]
-            known[1:] = [(tuple(model), again[0])]  # the first call, of the empty model, stays
-        return again[0]
-
-    under_base = at(())
-    shown = {name for flight in under_base for name in flight}
-    wanted = [
-        one
-        for name, one in DETECTORS.items()
-        if (kinds is None or name in kinds) and shown & set(one.effect.channels)
-    ]
-    detectors = [detector for detector in wanted if not detector.on_floor]
-    search = partial(_search, detectors)
-    installation = _installation(flights)
-    declared = _declared(under_base, reference, kinds, installation)
-    unmoved = linearised(under_base, declared, ())
-    disguises = partial(_search, [detector for detector in detectors if detector.searched_first])
-    inflation = inflation_of(unmoved, declared, disguises)
-    progress()
-    selection = select(unmoved, declared, inflation, search, progress=progress)
-    current, found = under_base, effects_of(selection)
-    for _ in range(ROUNDS - 1):
-        if not found:
-            break
-        current = at(found)
-        progress()
-        selection = select(
-            linearised(current, declared, found), declared, inflation, search, progress=progress
-        )
-        found = effects_of(selection)
+    searching = _Searching(_ModelResiduals(flights, reference, base, progress, map_function), kinds)
     refused: list[Refused] = []
-    selection = cross_validated(selection, refused)
-    smooth: list[Candidate] = []
-    scans: dict[int, Scan] = {}
-
-    def scan_of(
-        table: RegressionTable,
-    ) -> Scan:  # one per number of rows, because stamp offsets change it
-        if len(table.y) not in scans:
-            scans[len(table.y)] = Scan(table, _views(table))
-        return scans[len(table.y)]
-
+    selection = cross_validated(searching.named(), refused)
     if undeclared:
-        smooth = _smooth(current, installation)
-        selection = with_measured_noise(selection, declared, scan_of(selection.table), progress)
-        selection = with_smooth(selection, unmoved, declared, smooth, search, scan_of, progress)
-        selection = relinearised(selection, at, declared + smooth)
-        selection = cross_validated(selection, refused)
-    selection = with_rivals(
-        selection, declared + smooth, scan_of(selection.table) if undeclared else None, progress
-    )
+        selection = cross_validated(searching.with_functions(selection), refused)
+    selection = searching.with_alternatives(selection, undeclared)
     if undeclared and len(flights) >= FOR_MAPS:
-        selection = with_maps(selection, smooth, refused)
-    remaining, selection = at(effects_of(selection)), with_deviations(selection)
-    detected = (detector.detect(remaining) for detector in detectors)
-    detections = tuple(detection for detection in detected if detection is not None)
+        selection = with_maps(selection, searching.smooth, refused)
+    remaining = searching.residuals(effects_of(selection))
     names = tuple(flight.name for flight in flights)
     alone: tuple[tuple[str, Selection], ...] = ()
     if undeclared and len(flights) > 1 and all(reference.positions_known):
-        alone = tuple(
-            (names[k], own) for k, own in of_one(remaining, inflation, _views, search, map_function)
-        )
+        found = of_one(remaining, searching.inflation, _views, searching.search, map_function)
+        alone = tuple((names[k], own) for k, own in found)
     near = [(name, part) for name, part in zip(names, map(near_floor, remaining)) if part]
     floor = None
     if near:
-        floor = on_floor(
-            [part for _, part in near],
-            [one for one in wanted if one.on_floor],
-            undeclared,
-            refused,
-            progress,
-        )
-    floor_names = tuple(name for name, _ in near)
+        parts = [part for _, part in near]
+        floor = on_floor(parts, searching.floor_detectors, undeclared, refused, progress)
     return Attribution(
-        under_base,
-        selection,
-        detections,
-        declared,
+        searching.under_base,
+        with_deviations(selection),
+        searching.detections(remaining),
+        searching.declared,
         tuple(refused),
         names,
         alone,
         floor,
-        floor_names,
+        tuple(name for name, _ in near),
     )
+
+
+class _ModelResiduals:
+    """The residuals of Flights under models.
+
+    Those of the last and of the empty model are kept. If the path is unknown, computing them runs
+    the filter.
+    """
+
+    def __init__(
+        self,
+        flights: Sequence[Flight],
+        reference: Reference,
+        base: EffectSet,
+        progress: Callable[[], object],
+        map_function: MapFunction,
+    ) -> None:
+        """Take the arguments of `attribute`."""
+        self.flights = flights
+        self.reference = reference
+        self.progress = progress
+        self._base = base
+        self._map_function = map_function
+        self._known: list[tuple[tuple[Effect, ...], list[ChannelResiduals]]] = []
+
+    def __call__(self, model: Sequence[Effect]) -> list[ChannelResiduals]:
+        """Return the residuals under a model, one dict per flight. The first model is empty."""
+        for other, made in self._known:
+            if other == tuple(model):
+                return made
+        effects = EffectSet((*self._base.effects, *model))
+        made = residuals_of(
+            self.flights, self.reference, effects, self.progress, self._map_function
+        )
+        self._known[1:] = [(tuple(model), made)]
+        return made
+
+
+class _Searching:
+    """The steps of the search for effects in the residuals of some flights.
+
+    under_base : residuals under the base model; declared : Candidates of declared effects
+    inflation : (groups,) variance inflation of the noise
+    floor_detectors : Detectors of effects near the floor
+    """
+
+    def __init__(self, residuals: _ModelResiduals, kinds: Collection[str] | None) -> None:
+        """Measure the noise.
+
+        kinds : names of the declared effects to search for, None for all
+        """
+        self.residuals = residuals
+        self.progress = residuals.progress
+        self.under_base = residuals(())
+        self._current = self.under_base
+        shown = {name for flight in self.under_base for name in flight}
+        wanted = [
+            detector
+            for name, detector in DETECTORS.items()
+            if (kinds is None or name in kinds) and shown & set(detector.effect.channels)
+        ]
+        self._detectors = [detector for detector in wanted if not detector.on_floor]
+        self.floor_detectors = [detector for detector in wanted if detector.on_floor]
+        self._installation = _installation(residuals.flights)
+        self.declared = _declared(self.under_base, residuals.reference, kinds, self._installation)
+        self._unmoved = linearised(self.under_base, self.declared, ())
+        first = [detector for detector in self._detectors if detector.searched_first]
+        self.inflation = inflation_of(self._unmoved, self.declared, partial(_search, first))
+        self._scans: dict[int, Scan] = {}
+        self.progress()
+
+    @property
+    def search(self) -> Search:
+        """Return the search of the detectors."""
+        return partial(_search, self._detectors)
+
+    @cached_property
+    def smooth(self) -> list[Candidate]:
+        """Return the Candidates of functions without a name."""
+        return _smooth(self._current, self._installation)
+
+    def named(self) -> Selection:
+        """Select declared effects, ROUNDS times, each time linearized at the values found before."""
+        table = self._unmoved
+        for step in range(ROUNDS):
+            selection = select(
+                table, self.declared, self.inflation, self.search, progress=self.progress
+            )
+            found = effects_of(selection)
+            if not found or step == ROUNDS - 1:
+                break
+            self._current = self.residuals(found)
+            self.progress()
+            table = linearised(self._current, self.declared, found)
+        return selection
+
+    def with_functions(self, selection: Selection) -> Selection:
+        """Return the Selection after a search that includes functions without a name."""
+        scan = self._scan_of(selection.table)
+        selection = with_measured_noise(selection, self.declared, scan, self.progress)
+        selection = with_smooth(
+            selection,
+            self._unmoved,
+            self.declared,
+            self.smooth,
+            self.search,
+            self._scan_of,
+            self.progress,
+        )
+        return relinearised(selection, self.residuals, self.declared + self.smooth)
+
+    def with_alternatives(self, selection: Selection, undeclared: bool) -> Selection:
+        """Return the Selection with the rivals of each effect; undeclared : as of `attribute`."""
+        if not undeclared:
+            return with_rivals(selection, self.declared, None, self.progress)
+        candidates = self.declared + self.smooth
+        return with_rivals(selection, candidates, self._scan_of(selection.table), self.progress)
+
+    def detections(self, remaining: list[ChannelResiduals]) -> tuple[Detection, ...]:
+        """Return what the detectors find in the residuals under the whole model."""
+        detected = (detector.detect(remaining) for detector in self._detectors)
+        return tuple(detection for detection in detected if detection is not None)
+
+    def _scan_of(self, table: RegressionTable) -> Scan:
+        """Return the Scan of a table, one per number of rows: stamp offsets change the number."""
+        if len(table.y) not in self._scans:
+            self._scans[len(table.y)] = Scan(table, _views(table))
+        return self._scans[len(table.y)]
 
 
 def first_fit(

@@ -46,7 +46,7 @@ Made = TypeVar("Made")
 TRIAL_FLIGHTS = 3  # largest number of flights, or halves of one, in trials
 # shapes of a function of the time that can recur, like the warm-up of a clock
 DRIFTS = ("line", "beyond", "below", "parabola")
-# An effect is dropped if the error falls by at least this share without it.
+# Smallest share by which an error is larger than another.
 WORSE = 0.005
 # In a single flight an effect stays only if the error grows by this share without it, because
 # flights differ.
@@ -173,8 +173,9 @@ def select_by_error(
             break
         kept = [one for one in candidates if one not in gone]
         error = trials.start(kept, detections)
-        while len(gone) > 1 and error > _limit(displacements.error(list(gone)), alone):
-            gone = dict(list(gone.items())[: len(gone) // 2])  # displacements do not add up
+        while len(gone) > 1 and error > displacements.error(list(gone)) * (1.0 + WORSE):
+            # Displacements do not add up: drop half of the effects.
+            gone = dict(list(gone.items())[: len(gone) // 2])
             kept = [one for one in candidates if one not in gone]
             error = trials.start(kept, detections)
         for one, (before, after) in gone.items():
