@@ -16,6 +16,7 @@ from uwb_tdoa_tools.diagnosis.over_flights import (
     GROWS,
     Share,
     course,
+    harm,
     in_words,
     shares,
 )
@@ -84,3 +85,18 @@ def test_what_came_in_one_flight_is_said_of_that_flight_and_not_applied():
     assert any(key.startswith("3.") for key in finding.effect.values)
     assert f"belongs to {flights[1].name} alone" in output.as_text(result)
     assert f"belongs to {flights[1].name} alone" in html(result)
+
+
+def test_what_flights_show_alike_does_no_harm_and_what_one_of_three_lacks_may():
+    assert harm(several(1.0, 1.0)) < 0.06
+    assert harm(several(1.0, 1.1, 0.9)) < 0.03
+    assert harm(several(1.0, 0.2, 1.0)) > 0.25
+    assert harm(several(1.5, 0.0)) > 0.2
+    # of an equal spread, more flights are more certain
+    assert harm(several(*[1.2, 0.8] * 3)) < harm(several(1.2, 0.8))
+
+
+def test_flights_that_do_not_determine_a_share_tell_nothing_of_harm():
+    assert harm(()) == harm(several(0.0)) == harm(several(0.0, 0.0, std=0.5)) == 0.0
+    undetermined = Share("unknown", -3.0, 0.9)
+    assert harm([*several(1.0, 1.1, 0.9), undetermined]) == harm(several(1.0, 1.1, 0.9))

@@ -25,6 +25,7 @@ from uwb_tdoa_tools.diagnosis.comparison import (
     why_not,
 )
 from uwb_tdoa_tools.diagnosis.detectors import Detection
+from uwb_tdoa_tools.diagnosis.over_flights import Share
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.validation import (
     Displacements,
@@ -316,30 +317,55 @@ class Some(str):
     terms = (SimpleNamespace(effect=SimpleNamespace(usable=True), function=None),)
 
 
+class Worth:
+    """Trials of effects with a known worth; without both "a" and "b" the error is 0.5 m larger."""
+
+    runs = ()
+
+    def __init__(self, worth):
+        self.worth = worth
+
+    def start(self, candidates, detections):
+        lost = sum(by for name, by in self.worth.items() if name not in candidates)
+        return 1.0 + lost + 0.5 * (not {"a", "b"} & set(candidates))
+
+    def displacements(self, candidates, each):
+        without = {one: self.start(set(candidates) - {one}, ()) for one in each}
+        now = self.start(candidates, ())
+        off = {one: [np.array([[error - now, 0.0, 0.0]])] for one, error in without.items()}
+        return Displacements([np.array([[now, 0.0, 0.0]])], off)
+
+
+def selected(monkeypatch, worth, shares=((1.0, 1.0),)):
+    """The ValidatedSelection of effects by their worth; shares : of each in two flights."""
+    trials = Worth(worth)
+    of_each = dict(zip(worth, [*shares, *[(1.0, 1.0)] * len(worth)]))
+    monkeypatch.setattr(validation, "_Trials", lambda *_: trials)
+    monkeypatch.setattr(
+        validation,
+        "shares",
+        lambda _, one, names: [Share(*of) for of in zip("fg", of_each[one], (0.05, 0.05))],
+    )
+    selection = SimpleNamespace(chosen=tuple(map(Some, worth)), kept=tuple)
+    attribution = SimpleNamespace(selection=selection, detections=(), names=("f", "g"))
+    return select_by_error(attribution, [None, None], Baseline(NONE))
+
+
 def test_fewer_are_dropped_where_displacements_do_not_add_up(monkeypatch):
     """Without both, the error is larger than displacements predict; without either it is not."""
-    worth = {"a": -0.1, "b": -0.05, "c": 0.2}
-
-    class Trials:
-        runs = ()
-
-        def __init__(self, *_):
-            pass
-
-        def start(self, candidates, detections):
-            lost = sum(by for name, by in worth.items() if name not in candidates)
-            return 1.0 + lost + 0.5 * (not {"a", "b"} & set(candidates))
-
-        def displacements(self, candidates, each):
-            changes = {one: self.start(set(candidates) - {one}, ()) for one in each}
-            now = self.start(candidates, ())
-            off = {one: [np.array([[error - now, 0.0, 0.0]])] for one, error in changes.items()}
-            return Displacements([np.array([[now, 0.0, 0.0]])], off)
-
-    monkeypatch.setattr(validation, "_Trials", Trials)
-    selection = SimpleNamespace(chosen=tuple(map(Some, worth)), kept=tuple)
-    attribution = SimpleNamespace(selection=selection, detections=())
-    found = select_by_error(attribution, [None, None], Baseline(NONE))
+    found = selected(monkeypatch, {"a": -0.1, "b": -0.05, "c": 0.2})
     assert found.selection == ("b", "c")
-    assert found.worth == {"a": pytest.approx(-0.1), "b": pytest.approx(0.45), "c": pytest.approx(0.2)}
+    assert found.worth == {
+        "a": pytest.approx(-0.1),
+        "b": pytest.approx(0.45),
+        "c": pytest.approx(0.2),
+    }
     assert "the filter does better without it" in found.refused[0].why
+
+
+def test_what_another_flight_may_not_have_is_said_and_not_kept(monkeypatch):
+    found = selected(monkeypatch, {"c": 0.2, "d": 0.1}, [(1.6, 0.0)])
+    assert found.selection == ("d",)
+    assert found.worth == {"c": pytest.approx(0.2), "d": pytest.approx(0.1)}
+    (why,) = [refused.why for refused in found.refused]
+    assert why.startswith("another flight may not have it (probability 37%). Belongs to")

@@ -187,11 +187,11 @@ def attribute(
     selection = cross_validated(searching.named(), refused)
     if undeclared:
         selection = cross_validated(searching.with_functions(selection), refused)
+    names = tuple(flight.name for flight in flights)
     selection = searching.with_alternatives(selection, undeclared)
     if undeclared and len(flights) >= FOR_MAPS:
         selection = with_maps(selection, searching.smooth, refused)
     remaining = searching.residuals(effects_of(selection))
-    names = tuple(flight.name for flight in flights)
     alone: tuple[tuple[str, Selection], ...] = ()
     if undeclared and len(flights) > 1 and all(reference.positions_known):
         found = of_one(remaining, searching.inflation, _views, searching.search, map_function)

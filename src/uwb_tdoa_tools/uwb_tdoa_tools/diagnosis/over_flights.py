@@ -9,6 +9,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.stats import t as student_t
 
 from .regression.scan import Scan
 from .regression.select import select
@@ -29,6 +30,10 @@ SURE = 4.0  # standard deviations of a significant difference
 # largest difference of equal shares; no model is more accurate
 ALIKE = 0.3
 GROWN = 0.5  # smallest growth of the share, from the first flight to the last
+# Prior of the spread of shares between flights: standard deviation, and how many flights it counts
+# for.
+SPREAD, SPREAD_FLIGHTS = (0.2, 2)
+HALF = 0.5  # a correction does harm if a flight has a smaller share of the effect
 
 ALL, ALONE, GROWS, DIFFERS = "all", "alone", "grows", "differs"
 
@@ -92,6 +97,22 @@ def _shares(
             )
         )
     return tuple(out)
+
+
+def harm(several: Sequence[Share]) -> float:
+    """Return the probability that an effect, corrected in full, does harm to another flight.
+
+    It does so if that flight has less than HALF of it. Shares of flights are normal, with unknown
+    mean and spread (Gelman et al., Bayesian Data Analysis, section 3.3). 0 if fewer than two
+    flights determine a share.
+    """
+    share = np.array([each.share for each in several if each.determined])
+    n = len(share)
+    if n < 2:
+        return 0.0
+    freedom = SPREAD_FLIGHTS + n - 1
+    spread = np.sqrt((SPREAD_FLIGHTS * SPREAD**2 + n * np.var(share)) / freedom)
+    return float(student_t.cdf((HALF - share.mean()) / (spread * np.sqrt(1.0 + 1.0 / n)), freedom))
 
 
 def course(several: Sequence[Share]) -> str | None:

@@ -20,6 +20,7 @@ from ..scoring.metrics import EVERYTHING, Score, rms
 from .comparison import Baseline, ValidationCase, score
 from .deviations import with_deviations
 from .findings import Refused, usable
+from .over_flights import harm, in_words, shares
 from .refinement import effects_of, recurs
 from .regression.fit import refit
 from .regression.select import Selection
@@ -48,6 +49,8 @@ TRIAL_FLIGHTS = 3  # largest number of flights, or halves of one, in trials
 DRIFTS = ("line", "beyond", "below", "parabola")
 # Smallest share by which an error is larger than another.
 WORSE = 0.005
+# largest probability that an effect of several flights does harm to another flight
+MOST_HARM = 0.2
 # In a single flight an effect stays only if the error grows by this share without it, because
 # flights differ.
 WORTH_OF_ONE = 0.05
@@ -167,6 +170,14 @@ def select_by_error(
     while applicable := _applicable(candidates):
         displacements = trials.displacements(candidates, applicable)
         gone = _dropped(displacements, applicable, alone)
+        harmful = None if gone else _harmful(attribution, candidates, applicable)
+        if harmful:
+            one, why = harmful
+            refused.append(Refused(one.label, why))
+            worth[one] = displacements.error([one]) - error
+            candidates.remove(one)
+            error = trials.start(candidates, detections)
+            continue
         if not gone:
             all_of_them = displacements.error([])
             worth.update((one, displacements.error([one]) - all_of_them) for one in applicable)
@@ -207,6 +218,25 @@ def select_by_error(
         candidates = [one for one in candidates if one is not momentary]
     selection = attribution.selection.kept(candidates)  # with the weights of the trials
     return ValidatedSelection(selection, tuple(detections), tuple(refused), worth, trials.runs)
+
+
+def _harmful(
+    attribution: Attribution, candidates: Sequence[Candidate], applicable: Sequence[Candidate]
+) -> tuple[Candidate, str] | None:
+    """Return the Candidate that most likely does harm to another flight, and why; None without one.
+
+    Flights show different shares of it, beside the other candidates.
+    """
+    selection = attribution.selection.kept(candidates)
+    several = {one: shares(selection, one, attribution.names) for one in applicable}
+    worst = max(several, key=lambda one: harm(several[one]))
+    probability = harm(several[worst])
+    if probability <= MOST_HARM:
+        return None
+    return worst, (
+        f"another flight may not have it (probability {probability:.0%}). "
+        f"{in_words(several[worst])}"
+    )
 
 
 def _dropped(
