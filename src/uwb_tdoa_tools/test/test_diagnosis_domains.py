@@ -1,6 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
 
+from dataclasses import replace
+
 from known_effects import clean_flight
 import numpy as np
 import pytest
@@ -47,3 +49,22 @@ def test_a_domain_is_of_the_flights_that_were_fitted_and_of_the_air(flight):
     delay = EFFECTS["anchor_delay"]({"1": 0.1})
     known = EFFECTS["anchor_clock_drift"]({"1": 0.01}, domain={"time": (0.0, 5.0)})
     assert seen.limited([delay, known]) == [delay, known]
+
+
+def test_functions_of_the_place_know_the_heights_that_were_seen(flight):
+    """A flight at one height tells nothing of another one, but of a few centimetres more."""
+    seen = Seen([residual(flight, 5.0, 30.0)])
+    height = SmoothTerm({"c0": 0.1}, covariate="height", knots=(0.0, 2.0))
+    heights = seen.limited([height])[0].domain["height"]
+
+    over_x = SmoothTerm({"c0": 0.1}, covariate="x", knots=(-2.0, 2.0))
+    low, high = seen.limited([over_x])[0].domain["height"]
+    assert high - low == pytest.approx(max(heights[1] - heights[0], 1.0))
+
+    truth = replace(flight.truth, p=flight.truth.p * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.2])
+    level = Seen([residual(replace(flight, truth=truth), 5.0, 30.0)])
+    assert level.limited([over_x])[0].domain["height"] == pytest.approx((0.7, 1.7))
+    assert level.limited([height])[0].domain["height"] == pytest.approx((1.2, 1.2))
+
+    turned = SmoothTerm({"c0": 0.1}, covariate="bearing_in_tag", form="arrival", knots=(-3.0, 3.0))
+    assert list(seen.limited([turned])[0].domain) == ["bearing_in_tag"]

@@ -188,7 +188,10 @@ class SmoothTerm(Effect):
 
     @property
     def covariates(self) -> tuple[str, ...]:  # type: ignore[override]  # of a term
-        return (self.covariate,) if has_domain(self.covariate) else ()
+        """Return its covariate, and the height where it is a function of the place."""
+        own = (self.covariate,) if has_domain(self.covariate) else ()
+        of_place = self.channel in RADIO and self.covariate in OF_PLACE
+        return (*own, "height") if of_place and self.covariate != "height" else own
 
     @property
     def uses_attitude(self) -> bool:  # type: ignore[override]  # of a term

@@ -17,6 +17,11 @@ if TYPE_CHECKING:
     from .channels import ChannelResiduals
 
 
+# m, smallest width of a domain of heights of a function of something else: errors of the place
+# change over such a distance
+HEIGHTS = 1.0
+
+
 class Seen:
     """Ranges of covariates in the residuals of some flights, computed on demand."""
 
@@ -49,8 +54,13 @@ class Seen:
                 for channel in effect.channels
             ]
             ranges = [one for one in asked if one is not None]
-            if ranges:
-                out[covariate] = min(low for low, _ in ranges), max(high for _, high in ranges)
+            if not ranges:
+                continue
+            low, high = min(low for low, _ in ranges), max(high for _, high in ranges)
+            if covariate == "height" and effect.covariates[0] != covariate:
+                more = max(0.5 * (HEIGHTS - (high - low)), 0.0)
+                low, high = float(f"{low - more:.6g}"), float(f"{high + more:.6g}")
+            out[covariate] = low, high
         return out
 
     def _range(self, number: int, channel: str, covariate: str) -> tuple[float, float] | None:
