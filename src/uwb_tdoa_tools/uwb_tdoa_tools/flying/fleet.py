@@ -20,7 +20,7 @@ from ..results_file import ResultsFile
 from ..scoring.metrics import position_at
 from .rover import drive
 from .trial import fly
-from .verdict import reached, summary, text, verdict_of, wording_of
+from .verdict import reached, sampled, summary, text, verdict_of, wording_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -65,22 +65,16 @@ class DrawnFlight:
 def drawn_flight(result: TrialResult, verdict: dict[str, Any]) -> DrawnFlight:
     """Return the figures of a TrialResult to draw."""
     assert result.flight.truth is not None
-    truth, odometry = result.flight.truth, result.odometry
+    truth, odometry = result.flight.truth, sampled(result.odometry, SPACING)
     every = max(1, round(SPACING / (truth.t[1] - truth.t[0])))
     t, p = truth.t[::every], truth.p[::every]
     wanted = np.full(p.shape, np.nan)
     for mission in (mission for mission in result.missions if mission.started is not None):
         inside = (t >= mission.started) & (t <= (mission.ended or np.inf))
         wanted[inside] = mission.wanted(t[inside])[:, 0]
-    rows: np.ndarray = np.empty(0, int)
-    if len(odometry):
-        rows = np.unique(
-            np.searchsorted(odometry.t, np.arange(odometry.t[0], odometry.t[-1], SPACING))
-        )
-    stamps = odometry.t[rows]
-    error = odometry.p[rows] - position_at(stamps, truth)
-    sigma = np.sqrt(np.einsum("nii->ni", odometry.covariance[rows, :3, :3]))
-    return DrawnFlight(t, p, wanted, stamps, error, sigma, verdict)
+    error = odometry.p - position_at(odometry.t, truth)
+    sigma = np.sqrt(np.einsum("nii->ni", odometry.covariance[:, :3, :3]))
+    return DrawnFlight(t, p, wanted, odometry.t, error, sigma, verdict)
 
 
 def plot(flights: Sequence[DrawnFlight], anchors: Anchors, path: str | Path) -> None:

@@ -34,7 +34,7 @@ from uwb_tdoa_ekf.reorder_buffer import TRIAL
 from uwb_tdoa_msgs.msg import EstimatorStatus, Tdoa
 
 from ..bags.messages import BODY_FRAME
-from .estimates import NO_ODOMETRY, odometry_of
+from .estimates import EstimateSource
 from .simulator import DT
 from .vehicle import ATTITUDE, POSITION
 
@@ -149,8 +149,8 @@ STREAMS: dict[str, tuple[str, type, Callable[[Any], dict[str, Any]]]] = {
 } | {name: (of.topics[0][0], message_class(of.message), of.content) for name, of in SENSORS.items()}
 
 
-class OverTopics:
-    """Exchange samples and estimates with a filter over topics, as an EstimateSource.
+class OverTopics(EstimateSource):
+    """Exchange samples and estimates with a filter over topics.
 
     Attributes
     ----------
@@ -172,7 +172,10 @@ class OverTopics:
         clock : bool
             Publish /clock and count stamps from 0. Otherwise stamps count from the present time.
         """
-        self._node, self._pace, self._anchors = node, pace, world.anchors
+        super().__init__()
+        self._node = node
+        self._pace = pace
+        self._anchors = world.anchors
         self._begin = 0 if clock else None  # ns, stamp of the start
         self._now = 0.0
         self._pending_pose: tuple[float, np.ndarray, float, float] | None = None
@@ -194,8 +197,6 @@ class OverTopics:
         ):
             self._latched = node.create_publisher(type(content), topic, qos)
             self._latched.publish(content)
-        # (t s, p, v, q, covariance (3, 3)) of each odometry
-        self._rows: list[tuple[float, np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
 
     def is_connected(self) -> bool:
         """Return whether a filter subscribes to the samples and publishes odometry."""
@@ -278,23 +279,13 @@ class OverTopics:
         self.status = message
 
     @property
-    def pose(self) -> Pose | None:
-        """Return (t s, p (3,) m, v (3,) m/s, q (4,)) of the newest estimate, or None."""
-        return self._rows[-1][:4] if self._rows else None
-
-    @property
     def deviation(self) -> float:
         """Return the largest standard deviation of a coordinate, m.
 
         It is inf without an estimate, and unless the filter reports STATUS_RUNNING.
         """
-        if (
-            not self._rows
-            or self.status is None
-            or self.status.status != EstimatorStatus.STATUS_RUNNING
-        ):
-            return math.inf
-        return math.sqrt(np.diag(self._rows[-1][4]).max())
+        is_running = self.status and self.status.status == EstimatorStatus.STATUS_RUNNING
+        return super().deviation if is_running else math.inf
 
     @property
     def why(self) -> str:
@@ -302,16 +293,6 @@ class OverTopics:
         if self.status is None:
             return "nothing came on status: start ekf_node"
         return self.status.why if self.status.status != EstimatorStatus.STATUS_RUNNING else ""
-
-    @property
-    def odometry(self) -> Odometry:
-        """Return all estimates. Only the position has a covariance."""
-        if not self._rows:
-            return NO_ODOMETRY
-        t, p, v, q, covariance = map(np.array, zip(*self._rows))
-        whole = np.zeros((len(t), 9, 9))
-        whole[:, :3, :3] = covariance
-        return odometry_of(t, p, v, q, whole)
 
     def _parts(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return seconds and nanoseconds (n,) of the stamps t (n,) s."""

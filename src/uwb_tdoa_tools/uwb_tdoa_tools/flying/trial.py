@@ -144,24 +144,15 @@ class Trial:
         duration : float, optional
             s. The default is the longest duration of the task.
         """
-        world, seed, rules = task.world, task.seed, task.rules
-        longest = (
-            rules.rest + rules.patience + task.path.duration + rules.longest_descent + REST_AFTER
-        )
-        duration = duration or longest * (2 if task.again else 1) + (
-            PAUSE + CARRY_TIME if task.again else 0.0
-        )
+        world, seed = task.world, task.seed
         self.task = task
-        self.simulator = self._simulator(duration)
+        self.simulator = self._simulator(duration or self._longest())
         self._rng = random(seed, "task")
         rng = random(seed, "told")
-        place, off = (
-            self.simulator.state[POSITION] + GIVEN_STD * rng.standard_normal(3),
-            GIVEN_STD * rng.standard_normal(),
-        )
-        yaw = self.simulator.yaw + off
-        self.source: EstimateSource | PeerFilter = source or _filter_of(task, place, yaw)
-        if task.given == "place" and not isinstance(self.source, PeerFilter):
+        place = self.simulator.state[POSITION] + GIVEN_STD * rng.standard_normal(3)
+        yaw = self.simulator.yaw + GIVEN_STD * rng.standard_normal()
+        self.source = source or _filter_of(task, place, yaw)
+        if task.given == "place":
             self.source.set_pose(
                 GIVEN_AT, place, GIVEN_STD, yaw if task.yaw == "known" else math.nan
             )
@@ -170,6 +161,13 @@ class Trial:
         self.missions: list[Any] = []
         self.crash = ""
         self._arrived: list[SensorReadings] = []
+
+    def _longest(self) -> float:
+        """Return the longest duration of the task, s."""
+        rules = self.task.rules
+        path = self.task.path.duration
+        once = rules.rest + rules.patience + path + rules.longest_descent + REST_AFTER
+        return 2.0 * once + (PAUSE + CARRY_TIME) if self.task.again else once
 
     def _simulator(self, duration: float) -> Simulator:
         """Return the simulated vehicle for `duration`, s."""
@@ -271,13 +269,10 @@ class Trial:
 
     def _predicted_attitude(self, attitude: np.ndarray, since: float) -> np.ndarray:
         """Return an attitude (4,) of the time `since`, s, rotated by the gyroscope until now."""
-        times, samples, k, attitude = (
-            self.simulator.times,
-            self.simulator.samples,
-            self.simulator.done,
-            attitude.copy(),
-        )
-        for j in range(max(int(np.searchsorted(times[: k + 1], since, side="right")), 1), k + 1):
+        k = self.simulator.done
+        times, samples = self.simulator.times[: k + 1], self.simulator.samples
+        attitude = attitude.copy()
+        for j in range(max(int(np.searchsorted(times, since, side="right")), 1), k + 1):
             rotate_attitude(attitude, samples[j, :3], times[j] - max(times[j - 1], since))
         return attitude
 
@@ -287,23 +282,18 @@ class Trial:
         simulator, world = self.simulator, self.task.world
         end = simulator.done + 1
         states = simulator.states[:end]
-        parts = [
-            concatenated([getattr(one, name) for one in self._arrived]) for name in ("imu", "tdoa")
-        ]
-        sensors: dict[str, Any] = {
-            name: concatenated([one.sensors[name] for one in self._arrived])
-            for name in world.sensors
+        streams: dict[str, Any] = {
+            name: concatenated([one.streams[name] for one in self._arrived])
+            for name in ("tdoa", "imu", *world.sensors)
         }
         truth = Truth(simulator.times[:end], states[:, POSITION], states[:, ATTITUDE])
         meta = {"source": "fly", "format": "simulation", "protocol": world.protocol}
         flight = Flight(
             f"flown-{self.task.seed}",
             world.anchors,
-            parts[1],
-            parts[0],
-            truth,
+            truth=truth,
             meta=meta,
-            **sensors,
+            **streams,
         )
         return TrialResult(
             self.task,
@@ -329,19 +319,19 @@ def fly(task: Task) -> TrialResult:
     return trial.result
 
 
-def _filter_of(task: Task, place: np.ndarray, yaw: float) -> OwnFilter | PeerFilter:
+def _filter_of(task: Task, place: np.ndarray, yaw: float) -> EstimateSource:
     """Return the estimate source of a Task. `place` (3,) m and `yaw`, rad, are given if the task says so."""
     anchors = task.world.anchors
     if task.peer is not None:
         given = place if task.given == "place" else None
         return PeerFilter(task.peer, anchors, yaw, given, task.correction)
-    known: dict[str, Any] = (
-        {"initial_yaw": yaw, "initial_yaw_std": GIVEN_STD} if task.yaw == "known" else {}
-    )
+    config = task.config
+    if task.yaw == "known":
+        config = replace(config, initial_yaw=yaw, initial_yaw_std=GIVEN_STD)
     model = load_network(task.model)
     if model is not None:
         model.require(anchors)
-    return OwnFilter(anchors, replace(task.config, **known), task.effects, model)
+    return OwnFilter(anchors, config, task.effects, model)
 
 
 def _silence_start(
