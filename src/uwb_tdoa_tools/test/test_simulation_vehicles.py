@@ -24,7 +24,7 @@ YAWS = {"circle": "along_track", "sines": "along_track", "square": "rotating"}
 
 def fly(config):
     filled, room = config.complete()
-    return Trajectory(filled, room, filled.random("trajectory")), filled, room
+    return Trajectory.of_config(filled, room, filled.random("trajectory")), filled, room
 
 
 @pytest.fixture(

@@ -39,7 +39,7 @@ from uwb_tdoa_msgs.msg import EstimatorStatus
 from .autopilot.crazyflie import POSE, POSITION, CrazyflieLink
 from .autopilot.estimate import FRD, WORLDS, Estimate
 from .autopilot.gate import Gate, Limits
-from .autopilot.link import Link, NoLink
+from .autopilot.link import Link
 from .autopilot.mavlink import FORMS, MavlinkLink
 from .autopilot.topics import TOPICS, VehicleTopics
 
@@ -146,7 +146,7 @@ class AutopilotNode(StreamNode):
             return CrazyflieLink(
                 own["connection"], own["content"], streams, self._topics, self._now
             )
-        return NoLink()
+        return Link()
 
     def _now(self) -> int:
         return self.get_clock().now().nanoseconds

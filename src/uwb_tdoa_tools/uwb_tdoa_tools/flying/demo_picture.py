@@ -7,7 +7,6 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING
 
-import matplotlib.pyplot as plt
 import numpy as np
 
 from uwb_tdoa_bias.common.files import write_filled
@@ -29,13 +28,14 @@ if TYPE_CHECKING:
 
 COLOURS = ("tab:red", "tab:blue")  # of a flight without and with the correction
 SIZE = 14  # points: legible if the picture is shrunk to 700 pixels
+NAMED = 8  # pairs in the legend: those with the largest residuals
 ROOM = 1.3  # of the largest error, the end of the axis: the legend covers no line
 
 
 def draw(
     path: Path, flight: Flight, residuals: Sequence[PairResiduals], scores: Sequence[Score]
 ) -> None:
-    """Draw the residuals, the path and the error of a Flight to an image file.
+    """Draw the residuals of TDOAs, the path and the error of a Flight to an image file.
 
     Parameters
     ----------
@@ -44,28 +44,28 @@ def draw(
     residuals, scores : sequence
         Without a correction, and with it, if there is one.
     """
-    with plt.rc_context({"font.size": SIZE, "axes.titlesize": SIZE, "legend.fontsize": SIZE - 2}):
-        figure, axes = plt.subplots(2, 2, figsize=(12, 9.5), layout="constrained")
-        limit = _limit(residuals[0])
+    from matplotlib import rc_context  # takes a second to import
+    from matplotlib.figure import Figure
+
+    with rc_context({"font.size": SIZE, "axes.titlesize": SIZE, "legend.fontsize": SIZE - 2}):
+        figure = Figure(figsize=(12, 9.5), layout="constrained")
+        axes = figure.subplots(2, 2)
+        values = np.abs(np.concatenate(list(residuals[0].median.values())))
+        limit = 1.1 * CM * max(float(np.nanmax(values)), 0.05)
         for ax, one, score in zip(axes[0], residuals, scores):
-            _residuals(ax, one, limit)
-            ax.set_title(f"TDOAs {score.name} bias.onnx: {CM * one.size:.1f} cm off")
+            _residuals(ax, one)
+            ax.set(title=f"TDOAs {score.name}: {CM * one.size:.1f} cm off", ylim=(-limit, limit))
         ax.legend(title="pair of anchors", ncols=4, loc="lower center", handlelength=1.0)
         _path(axes[1, 0], flight, scores)
         _error(axes[1, 1], scores)
         write_filled(path, partial(figure.savefig, dpi=100))
-        plt.close(figure)
 
 
-def _limit(residuals: PairResiduals) -> float:
-    values = np.abs(np.concatenate(list(residuals.median.values())))
-    return float(1.1 * CM * max(np.nanmax(values), 0.05))
-
-
-def _residuals(ax: Axes, residuals: PairResiduals, limit: float) -> None:
+def _residuals(ax: Axes, residuals: PairResiduals) -> None:
+    named = residuals.largest(NAMED)
     for pair, values in residuals.median.items():
-        ax.plot(residuals.t, CM * values, lw=1.8, label=pair)
-    ax.set(xlabel="time in the air [s]", ylabel="residual [cm]", ylim=(-limit, limit))
+        ax.plot(residuals.t, CM * values, lw=1.8, label=pair if pair in named else None)
+    ax.set(xlabel="time in the air [s]", ylabel="residual [cm]")
     ax.grid(alpha=0.3)
 
 

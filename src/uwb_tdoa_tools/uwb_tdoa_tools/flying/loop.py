@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.common.geometry import tdoa
-from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import true_samples
 from uwb_tdoa_bias.effects.base import listed, rounded
 
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from uwb_tdoa_bias.common.flight import Flight
-    from uwb_tdoa_bias.correction.model import Model
+    from uwb_tdoa_bias.correction.corrector import Corrector
 
     from ..diagnosis.result import Diagnosis
     from ..exporting.correction import TracedCorrection
@@ -98,7 +97,7 @@ class PairResiduals:
     @property
     def size(self) -> float:
         """Return the root mean square, m."""
-        return rms(self._all)
+        return _known_rms(*self.median.values())
 
     @property
     def constant(self) -> float:
@@ -108,24 +107,18 @@ class PairResiduals:
     @property
     def changing(self) -> float:
         """Return the root mean square around the mean of each pair, m."""
-        around = [values - np.nanmean(values) for values in self.median.values()]
-        found = np.concatenate(around)
-        return rms(found[np.isfinite(found)])
+        return _known_rms(*(values - np.nanmean(values) for values in self.median.values()))
 
-    @property
-    def largest(self) -> list[str]:
+    def largest(self, count: int) -> list[str]:
         """Return the pairs with the largest residuals."""
-        sizes = {pair: rms(values[np.isfinite(values)]) for pair, values in self.median.items()}
-        return sorted(sizes, key=lambda pair: -sizes[pair])[:LARGEST]
-
-    @property
-    def _all(self) -> np.ndarray:
-        together = np.concatenate(list(self.median.values()))
-        return together[np.isfinite(together)]
+        sizes = {pair: _known_rms(values) for pair, values in self.median.items()}
+        return sorted(sizes, key=lambda pair: -sizes[pair])[:count]
 
     def sentences(self) -> list[str]:
         """Return the residuals in words: their size, and over what they change."""
-        named = listed(f"{pair} ({_signed_cm(self.median[pair])})" for pair in self.largest)
+        named = listed(
+            f"{pair} ({_signed_cm(self.median[pair])})" for pair in self.largest(LARGEST)
+        )
         return [
             f"TDOAs are {CM * self.size:.1f} cm off (RMS over pairs of anchors and seconds)",
             f"{CM * self.constant:.1f} cm of it stays the same for a pair, "
@@ -133,18 +126,24 @@ class PairResiduals:
         ]
 
 
+def _known_rms(*parts: np.ndarray) -> float:
+    """Return the root mean square of all values that are known."""
+    together = np.concatenate(parts)
+    return rms(together[np.isfinite(together)])
+
+
 def _signed_cm(values: np.ndarray) -> str:
     low, high = (CM * value for value in np.nanquantile(values, [0.1, 0.9]))
     return f"{low:+.0f} to {high:+.0f} cm"
 
 
-def residuals_of(flight: Flight, model: Model | None = None) -> PairResiduals:
-    """Return the PairResiduals of a Flight with ground truth in the air, corrected by a Model."""
+def residuals_of(flight: Flight, corrector: Corrector | None = None) -> PairResiduals:
+    """Return the PairResiduals of a Flight with ground truth in the air, corrected if asked."""
     assert flight.truth is not None
     samples, rows = true_samples(flight)
     off = flight.tdoa.d[rows] - tdoa(samples.p, samples.position_a, samples.position_b)
-    if model is not None:
-        off = off - Corrector(flight.anchors, network=model).prediction(samples).bias
+    if corrector is not None:
+        off = off - corrector.prediction(samples).bias
     _, first, last = scored_phase(flight.truth)
     number = np.floor((samples.t - first) / PERIOD).astype(int)
     count = int((last - first) / PERIOD)

@@ -43,9 +43,7 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.ros.cdr import CdrTemplate
     from uwb_tdoa_bias.ros.node import StreamNode
-    from uwb_tdoa_ekf.results import Odometry
 
-    from .mission import Pose
     from .simulator import SensorReadings
     from .world import World
 

@@ -238,7 +238,7 @@ def write_zones(path: Path, zones: list[Zone]) -> None:
 
 def draw_zones(path: Path, zones: list[Zone], anchors: Anchors, size: float, title: str) -> None:
     """Draw maps of the number of heard anchors and of the standard deviation of the position."""
-    from ..scoring.plots import plt  # takes a second to import
+    import matplotlib.pyplot as plt  # takes a second to import
 
     figure, axes = plt.subplots(1, 2, figsize=(13.0, 5.5), layout="constrained")
     heard = {anchor for zone in zones for anchor, _ in zone.anchors}

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 RATIO = 1.01  # ratio of the limits of a bin
 SMALLEST = 1e-9  # smaller samples count as this
+COVERAGE = ("coverage_3sigma_x", "coverage_3sigma_y", "coverage_3sigma_z")
 FIGURES = 3  # version of the content of a Result
 
 
@@ -221,10 +222,8 @@ class Pool:
             name: known[name] + part if name in known else part
             for name, part in result.distributions.items()
         }
-        self._total, self._largest = (
-            self._total + row["rmse_3d"],
-            float(np.max([self._largest, row["rmse_3d"]])),
-        )
+        self._total += row["rmse_3d"]
+        self._largest = float(np.max([self._largest, row["rmse_3d"]]))
         self._row["start_delay"] = max(self._row["start_delay"], row["start_delay"])
         self._ready = float(np.fmax(self._ready, row["ready_delay"]))  # NaN if unknown
         for key in ("diverged", "late_start"):
@@ -262,15 +261,10 @@ class Pool:
         for name in ("nees", "nis"):
             part = self._distributions[name]
             out |= {f"{name}_mean": part.mean, f"{name}_median": part.median}
-        out |= (
-            {name: shares.get(name, math.nan) for name in coverage_figures(np.zeros(3))}
-            | self._row
-            | {"ready_delay": self._ready}
-        )
-        out["rmse_3d_mean_of_runs"], out["rmse_3d_max_of_runs"] = (
-            self._total / self._runs,
-            self._largest,
-        )
+        out |= {name: shares.get(name, math.nan) for name in COVERAGE}
+        out |= self._row | {"ready_delay": self._ready}
+        out["rmse_3d_mean_of_runs"] = self._total / self._runs
+        out["rmse_3d_max_of_runs"] = self._largest
         return {**out, "phases": self.phases()}
 
 
@@ -287,8 +281,3 @@ def _from_texts(numbers: dict[str, Any]) -> dict[str, Any]:
         key: float(value) if isinstance(value, str) and key not in ("flight", "part") else value
         for key, value in numbers.items()
     }
-
-
-def coverage_figures(shares: np.ndarray) -> dict[str, float]:
-    """Name the shares (3,) of `coverage` for a dict of figures."""
-    return {f"coverage_3sigma_{axis}": float(share) for axis, share in zip("xyz", shares)}
