@@ -13,16 +13,12 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, fields
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.common.compiled import compiled
 
-from .vehicle import CORNERS, GRAVITY, ROTORS, SPIN, Vehicle
-
-if TYPE_CHECKING:
-    from .vehicle import Record
+from .vehicle import CORNERS, GRAVITY, ROTORS, SPIN, Record, Vehicle
 
 SUPPORT_TIME = 0.1  # s over which the support by the ground is averaged
 

@@ -17,14 +17,14 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf.offline import run_offline
 
 from .. import command_lines
-from ..bags.bag import read_odometry, write_bag
+from ..bags.bag import RecordedOdometry, read_odometry, write_bag
 from ..diagnosis import diagnose
 from ..live.run import accounts, run_live
 from ..localizing.pictures import write_rerun
 from ..outputs import as_json
 from ..parallel import Progress
 from ..scoring.gains import change_in_words
-from ..scoring.metrics import Score
+from ..scoring.metrics import Estimate, Score
 from . import loop
 from .demo_picture import draw
 
@@ -33,9 +33,7 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.common.flight import Flight
 
-    from ..bags.bag import RecordedOdometry
     from ..diagnosis.result import Diagnosis
-    from ..scoring.metrics import Estimate
 
 CORRECTION = "bias.onnx"  # file of the correction of a simulated hall
 MISSING = ("lost", "late", "imu_late", "imu_lost")  # outcomes of messages

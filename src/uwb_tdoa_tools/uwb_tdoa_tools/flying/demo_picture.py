@@ -12,8 +12,8 @@ import numpy as np
 from uwb_tdoa_bias.common.files import write_filled
 from uwb_tdoa_bias.effects.base import listed
 
-from ..scoring.metrics import position_at
-from .loop import CM
+from ..scoring.metrics import Score, position_at
+from .loop import CM, PairResiduals
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.common.flight import Flight
 
-    from ..scoring.metrics import Score
-    from .loop import PairResiduals
 
 COLOURS = ("tab:red", "tab:blue")  # of a flight without and with the correction
 SIZE = 14  # points: legible if the picture is shrunk to 700 pixels

@@ -17,7 +17,7 @@ from .. import parallel
 from ..bags.bag import write_bag
 from ..scoring.metrics import position_at
 from .rover import drive
-from .trial import fly
+from .trial import Task, TrialResult, fly
 from .verdict import reached, sampled, summary, text, verdict_of, wording_of
 
 if TYPE_CHECKING:
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.common.anchors import Anchors
 
     from ..results_file import ResultsFile
-    from .trial import Task, TrialResult
 
 
 SPACING = 0.05  # s

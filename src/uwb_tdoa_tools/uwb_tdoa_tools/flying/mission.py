@@ -9,15 +9,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import math
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
 
-if TYPE_CHECKING:
-    # t s, p (3,) m, v (3,) m/s, both world frame, q (4,) x y z w
-    Pose = tuple[float, np.ndarray, np.ndarray, np.ndarray]
-
+# t s, p (3,) m, v (3,) m/s, both world frame, q (4,) x y z w
+Pose = tuple[float, np.ndarray, np.ndarray, np.ndarray]
 
 KNOT, FINE = 0.02, 0.0025  # s, between knots of the spline and points of its table
 SPEED_UP = 1.5  # s, from hovering to the circle and back

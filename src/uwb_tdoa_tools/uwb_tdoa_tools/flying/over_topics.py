@@ -26,25 +26,21 @@ from sensor_msgs.msg import Imu
 from uwb_tdoa_bias.anchors_node import markers, transforms
 from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS, anchors_to_message
-from uwb_tdoa_bias.ros.cdr import CdrCodec, message_class
+from uwb_tdoa_bias.ros.cdr import CdrCodec, CdrTemplate, message_class
 from uwb_tdoa_bias.ros.frames import TF_STATIC_QOS
-from uwb_tdoa_bias.ros.node import StreamOutput
+from uwb_tdoa_bias.ros.node import StreamNode, StreamOutput
 from uwb_tdoa_bias.ros.topics import OUTPUT_QOS, Input, StreamInput
 from uwb_tdoa_ekf.reorder_buffer import TRIAL
 from uwb_tdoa_msgs.msg import EstimatorStatus, Tdoa
 
 from ..bags.messages import BODY_FRAME
 from .estimates import EstimateSource
-from .simulator import DT
+from .simulator import DT, SensorReadings
 from .vehicle import ATTITUDE, POSITION
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from uwb_tdoa_bias.ros.cdr import CdrTemplate
-    from uwb_tdoa_bias.ros.node import StreamNode
-
-    from .simulator import SensorReadings
     from .world import World
 
 

@@ -16,17 +16,15 @@ from uwb_tdoa_bias.common.sensors import SENSORS
 
 from ..simulation.config import WHEELS_RATE
 from ..simulation.sensors import YAW_RATE_STD, slips
-from .mission import LOST, Journey, Polyline, Rules, Waypoints, yaw_of
+from .mission import LOST, Journey, Polyline, Pose, Rules, Waypoints, yaw_of
 from .sensors import AuxiliarySensor, random
 from .simulator import Simulator
-from .trial import REST_AFTER, Trial
+from .trial import REST_AFTER, Task, Trial, TrialResult
 from .vehicle import GRAVITY, IMU_RATE
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.common.sensors.sensor import Stream
 
-    from .mission import Pose
-    from .trial import Task, TrialResult
     from .world import World
 
 MAST = 0.4  # m

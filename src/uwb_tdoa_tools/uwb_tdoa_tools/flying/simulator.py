@@ -17,7 +17,7 @@ from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_ekf.results import concatenated, rows_of
 
 from .controller import inner
-from .sensors import SENSOR_NAMES, InertialErrors, Radio, gusts, random
+from .sensors import SENSOR_NAMES, AuxiliarySensor, InertialErrors, Radio, gusts, random
 from .vehicle import (
     ATTITUDE,
     GRAVITY,
@@ -26,6 +26,7 @@ from .vehicle import (
     STATE,
     STEP,
     VELOCITY,
+    Record,
     Vehicle,
     ground_at,
     specific_force,
@@ -35,8 +36,6 @@ from .vehicle import (
 if TYPE_CHECKING:
     from uwb_tdoa_bias.common.sensors.sensor import Stream
 
-    from .sensors import AuxiliarySensor
-    from .vehicle import Record
     from .world import World
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -20,17 +20,12 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.results import Odometry, concatenated
 
 from .controller import SUPPORT_TIME, Controller, rotate_attitude
-from .estimates import OwnFilter, PeerFilter
-from .mission import DONE, REFUSED, Circles, Mission, Rules, Waypoints
+from .estimates import EstimateSource, OwnFilter, PeerFilter
+from .mission import DONE, REFUSED, Circles, Mission, Plan, Rules, Waypoints
 from .sensors import random
-from .simulator import DT, Simulator, Transport
+from .simulator import DT, SensorReadings, Simulator, Transport
 from .vehicle import ATTITUDE, IMU_RATE, POSITION
 from .world import World
-
-if TYPE_CHECKING:
-    from .estimates import EstimateSource
-    from .mission import Plan
-    from .simulator import SensorReadings
 
 REST_AFTER = 3.0  # s, recording after the rotors have stopped
 # s at rest between two flights, then distance, m, and duration, s, of carrying

@@ -11,21 +11,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from uwb_tdoa_ekf.results import rows_of
+from uwb_tdoa_ekf.results import Odometry, rows_of
 
 from ..scoring.metrics import nees, position_at, rms
-from .mission import DONE, REFUSED
+from .mission import DONE, REFUSED, Journey, Mission
 from .rover import Drive
-from .trial import REST_AFTER
+from .trial import REST_AFTER, TrialResult
 from .vehicle import POSITION, VELOCITY
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
-
-    from uwb_tdoa_ekf.results import Odometry
-
-    from .mission import Journey, Mission
-    from .trial import TrialResult
 
 
 AIR = 0.3  # m above the ground, least height in the air

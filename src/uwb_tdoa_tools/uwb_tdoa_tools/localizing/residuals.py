@@ -7,20 +7,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.files import write_filled, write_text
 from uwb_tdoa_ekf.core.memory import USED
-from uwb_tdoa_ekf.results import VERDICTS
+from uwb_tdoa_ekf.results import VERDICTS, Odometry, Residuals
 
 from ..scoring.metrics import has_innovation
-
-if TYPE_CHECKING:
-    from uwb_tdoa_ekf.results import Odometry, Residuals
-
 
 RESIDUAL_COLUMNS = "t", "a", "b", "residual", "std", "weight", "verdict"
 SHOWN = 20  # pairs in the picture at most, those with the most TDOAs

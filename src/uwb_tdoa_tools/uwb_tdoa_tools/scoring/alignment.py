@@ -24,7 +24,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from ..checking.imu_rules import ARRANGEMENTS, signed_axis
 from ..checking.motion_rules import FEWEST, TrueMotion
 from ..checking.pair_rules import KnownPath
-from ..checking.time_rules import delays_of_tdoas
+from ..checking.time_rules import Delays, delays_of_tdoas
 from ..choices import NONE, TIME
 from ..clock import grid
 from .metrics import position_at, scored_phase
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.common.flight import Flight, Truth
     from uwb_tdoa_bias.effects.samples import PoseColumns
 
-    from ..checking.time_rules import Delays
 
 # Limits beside measured values were set on 37 recordings with a correct ground truth.
 OVERLAP = 1.0  # s that ground truth and TDOAs must have in common

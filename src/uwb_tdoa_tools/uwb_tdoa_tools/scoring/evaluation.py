@@ -16,6 +16,7 @@ from ..choices import FRAME, NONE, TIME
 from ..estimate import FlightEstimator
 from ..readers.inputs import report_remarks
 from .alignment import (
+    Alignment,
     common_paths,
     estimate_alignment,
     median_distance,
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
     from uwb_tdoa_ekf.core.config import FilterConfig
     from uwb_tdoa_ekf.offline import Run
 
-    from .alignment import Alignment
 
 # largest ratio of the distances with repaired ids and signs, and with another frame
 LARGEST_LABEL_RATIO = 1.5

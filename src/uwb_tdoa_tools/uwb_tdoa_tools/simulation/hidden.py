@@ -14,13 +14,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.effects import EFFECTS, SmoothTerm
+from uwb_tdoa_bias.effects import EFFECTS, Effect, SmoothTerm
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.effects import Effect
 
 MIDDLE = 1.0  # m, farthest place of an obstacle from the middle of the hall, along x and y
 TURN = np.pi  # rad, half a turn

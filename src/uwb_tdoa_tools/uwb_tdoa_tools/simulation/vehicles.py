@@ -15,13 +15,12 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.common.errors import InputError
 
 from .paths import KNOT, SPEED_UP, STEP, path_of, path_time, yaw_along
-from .rooms import REST_HEIGHT
+from .rooms import REST_HEIGHT, Room
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from .config import SimulationConfig
-    from .rooms import Room
 
 
 GRAVITY = 9.81  # m/s^2
