@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_ekf.core.config import FilterConfig
 
     from .mission import Pose
-    from .simulator import SensorReadings
+    from .simulator import Streams
 
 
 VERSION = 1
@@ -218,7 +218,7 @@ class EstimateSource:
         """
         raise NotImplementedError
 
-    def take(self, measured: SensorReadings) -> None:
+    def take(self, streams: Streams) -> None:
         """Process the samples that have arrived."""
         raise NotImplementedError
 
@@ -288,8 +288,8 @@ class OwnFilter(EstimateSource):
     def set_pose(self, t: float, p: np.ndarray, std: float, yaw: float) -> None:
         self.estimator.set_pose(t, p, std**2 * np.eye(3), yaw, std)
 
-    def take(self, measured: SensorReadings) -> None:
-        for name, part in measured.streams.items():
+    def take(self, streams: Streams) -> None:
+        for name, part in streams.items():
             if len(part.t):
                 self._add(name, self._streams.correct(name, part))
         odometry, _ = self.estimator.advance()
@@ -380,9 +380,9 @@ class PeerFilter(EstimateSource):
     def set_pose(self, t: float, p: np.ndarray, std: float, yaw: float) -> None:
         """Do nothing: the peer has its start."""
 
-    def take(self, measured: SensorReadings) -> None:
+    def take(self, streams: Streams) -> None:
         """Process the inertial samples and TDOAs that have arrived."""
-        both = np.concatenate(events(measured.imu, measured.tdoa, self._anchors))
+        both = np.concatenate(events(streams["imu"], streams["tdoa"], self._anchors))
         if not len(both):
             return
         self._peer.run(both[np.argsort(both["t"], kind="stable")])

@@ -35,7 +35,7 @@ from uwb_tdoa_msgs.msg import EstimatorStatus, Tdoa
 
 from ..bags.messages import BODY_FRAME
 from .estimates import EstimateSource
-from .simulator import DT, SensorReadings
+from .simulator import DT, Streams
 from .vehicle import ATTITUDE, POSITION
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ class RealTime:
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock, self._began, self._now = clock, clock(), 0.0
 
-    def sent(self, now: float, measured: SensorReadings) -> None:
+    def sent(self, now: float, streams: Streams) -> None:
         """Note that all samples up to `now`, s, were published."""
         self._now = now
 
@@ -89,11 +89,9 @@ class Lockstep:
         self._heard: float | None = None
         self._periods, self._silent = deque([DT], REMEMBERED), True
 
-    def sent(self, now: float, measured: SensorReadings) -> None:
+    def sent(self, now: float, streams: Streams) -> None:
         """Note that all samples up to `now`, s, were published."""
-        self._newest |= {
-            stream: part.t[-1] for stream, part in measured.streams.items() if len(part.t)
-        }
+        self._newest |= {name: part.t[-1] for name, part in streams.items() if len(part.t)}
         self._first = now if self._first is None else self._first
         unordered_wait = 0.0 if now > self._first + TRIAL + UNTRUSTED else UNTRUSTED
         self._reach = (
@@ -205,15 +203,15 @@ class OverTopics(EstimateSource):
         """Set the initial pose. It is published before the next samples."""
         self._pending_pose = t, p, std, yaw
 
-    def take(self, measured: SensorReadings) -> None:
+    def take(self, streams: Streams) -> None:
         """Publish samples."""
         if self._begin is None:
             self._begin = self._node.get_clock().now().nanoseconds
         if self._pending_pose:
             self._pose.publish(self._pose_of(*self._pending_pose))
             self._pending_pose = None
-        self._measured = measured
-        for name, part in measured.streams.items():
+        self._sent = streams
+        for name, part in streams.items():
             self._outputs[name].publish(*self._parts(part.t), part)
 
     def publish_truth(self, t: float, state: np.ndarray) -> None:
@@ -228,7 +226,7 @@ class OverTopics(EstimateSource):
         )
         if self._clock is not None:
             self._clock.publish(Clock(clock=self._stamp(t)))
-        self._pace.sent(t, self._measured)
+        self._pace.sent(t, self._sent)
 
     def receive(self) -> None:
         """Store the odometry that has come."""

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 import math
 from typing import TYPE_CHECKING, Any
 
@@ -145,26 +144,8 @@ CARRY_HEIGHT = 0.5  # m, height at which it is carried
 RECENT = round(0.3 * IMU_RATE)  # samples of the truth that effects use
 
 
-@dataclass(frozen=True)
-class SensorReadings:
-    """Hold the sensor samples of one turn.
-
-    Parameters
-    ----------
-    imu : Imu
-    tdoa : Tdoas
-    sensors : dict of str to Stream
-        Streams of the other sensors of the world, by name.
-    """
-
-    imu: Imu
-    tdoa: Tdoas
-    sensors: dict[str, Stream]
-
-    @property
-    def streams(self) -> dict[str, Any]:
-        """Return all streams by name."""
-        return {"imu": self.imu, "tdoa": self.tdoa, **self.sensors}
+# the samples of one turn by streams: imu, tdoa, and the further sensors of the world
+Streams = dict[str, Any]
 
 
 class Simulator:
@@ -241,7 +222,7 @@ class Simulator:
         """Return the height of the ground or table below the vehicle, m."""
         return ground_at(self._record, self.state[0], self.state[1])
 
-    def advance(self, controller: Any) -> SensorReadings:
+    def advance(self, controller: Any) -> Streams:
         """Move for one turn and return the sensor samples.
 
         Parameters
@@ -251,7 +232,7 @@ class Simulator:
 
         Returns
         -------
-        SensorReadings
+        Streams
         """
         k = self.done
         rows, lately = slice(k + 1, k + TICK + 1), slice(k, k + TICK + 1)
@@ -268,11 +249,10 @@ class Simulator:
         tdoa = Tdoas(
             radio.t[new][heard], ids[radio.a[new][heard]], ids[radio.b[new][heard]], d[heard]
         )
-        sensors = {
-            name: self._sensor_measured(name, sensor, lately)
-            for name, sensor in self._sensors.items()
-        }
-        return self._with_effects(SensorReadings(imu, tdoa, sensors))
+        streams: Streams = {"imu": imu, "tdoa": tdoa}
+        for name, sensor in self._sensors.items():
+            streams[name] = self._sensor_measured(name, sensor, lately)
+        return self._with_effects(streams)
 
     def _move(self, controller: Any, rows: slice) -> None:
         """Fly the samples in `rows` with the outputs of a Controller."""
@@ -345,11 +325,11 @@ class Simulator:
             sensor.t[new], *sensor.measured(new, p, q, inside, p[:, 2] - self.ground)
         )
 
-    def _with_effects(self, measured: SensorReadings) -> SensorReadings:
+    def _with_effects(self, streams: Streams) -> Streams:
         """Return the samples with the effects of the world added by `Effect.inject`."""
-        if not len(self.world.effects) or not len(measured.tdoa):
-            return measured
-        tdoa = measured.tdoa
+        tdoa = streams["tdoa"]
+        if not len(self.world.effects) or not len(tdoa):
+            return streams
         self._first = self._first if self._first is not None else (tdoa, self.states[0])
         first, at = self._first  # effects count time from the first TDOA
         columns = (
@@ -357,20 +337,15 @@ class Simulator:
             for name in ("t", "a", "b", "d")
         )
         recent = slice(max(self.done - RECENT, 0), self.done + 1)
-        states, t = (
-            np.concatenate([at[None], self.states[recent]]),
-            np.concatenate([first.t[:1] - 1e-3, self.times[recent]]),
-        )
+        states = np.concatenate([at[None], self.states[recent]])
+        t = np.concatenate([first.t[:1] - 1e-3, self.times[recent]])
         truth = Truth(t, states[:, POSITION], states[:, ATTITUDE])
-        sensors: dict[str, Any] = measured.sensors
-        flight = Flight("turn", self.world.anchors, Tdoas(*columns), measured.imu, truth, **sensors)
+        measured = streams | {"tdoa": Tdoas(*columns), "truth": truth}
+        flight = Flight("turn", self.world.anchors, **measured)
         for effect in self.world.effects.effects:
             flight = effect.inject(flight, self._rng)
-        assert flight.imu is not None  # no effect removes it
-        sensors = {name: getattr(flight, name) for name in measured.sensors}
-        return replace(
-            measured, tdoa=rows_of(flight.tdoa, slice(1, None)), imu=flight.imu, sensors=sensors
-        )
+        changed = {name: getattr(flight, name) for name in streams}
+        return changed | {"tdoa": rows_of(flight.tdoa, slice(1, None))}
 
 
 def _along(way: np.ndarray, share: np.ndarray) -> np.ndarray:
@@ -405,12 +380,11 @@ class Transport:
         # by stream: (waiting rows, their arrivals (n,) s, the last arrival)
         self._waiting: dict[str, tuple[Any, np.ndarray, float]] = {}
 
-    def arrived(self, measured: SensorReadings, now: float) -> SensorReadings:
+    def arrived(self, streams: Streams, now: float) -> Streams:
         """Add new samples and return the samples that have arrived by `now`, s."""
         if not self._latency and not self._jitter:
-            return measured
-        parts = {stream: self._due(stream, part, now) for stream, part in measured.streams.items()}
-        return SensorReadings(parts.pop("imu"), parts.pop("tdoa"), parts)
+            return streams
+        return {name: self._due(name, part, now) for name, part in streams.items()}
 
     def _due(self, stream: str, part: Any, now: float) -> Any:
         """Return the rows of one stream that have arrived."""

@@ -23,7 +23,7 @@ from .controller import SUPPORT_TIME, Controller, rotate_attitude
 from .estimates import EstimateSource, OwnFilter, PeerFilter
 from .mission import DONE, REFUSED, Circles, Mission, Plan, Rules, Waypoints
 from .sensors import random
-from .simulator import DT, SensorReadings, Simulator, Transport
+from .simulator import DT, Simulator, Streams, Transport
 from .vehicle import ATTITUDE, IMU_RATE, POSITION
 from .world import World
 
@@ -155,7 +155,7 @@ class Trial:
         self.transport = Transport(world.latency, world.jitter, random(seed, "transport"))
         self.missions: list[Any] = []
         self.crash = ""
-        self._arrived: list[SensorReadings] = []
+        self._arrived: list[Streams] = []
 
     def _longest(self) -> float:
         """Return the longest duration of the task, s."""
@@ -243,11 +243,10 @@ class Trial:
             self._turn()
 
     def _turn(self) -> None:
-        measured = self.transport.arrived(
-            self.simulator.advance(self.controller), self.simulator.now
-        )
-        self._arrived.append(measured)
-        self.source.take(measured)
+        measured = self.simulator.advance(self.controller)
+        arrived = self.transport.arrived(measured, self.simulator.now)
+        self._arrived.append(arrived)
+        self.source.take(arrived)
         self.crash = self._crash()
 
     def _crash(self) -> str:
@@ -277,8 +276,8 @@ class Trial:
         simulator, world = self.simulator, self.task.world
         end = simulator.done + 1
         states = simulator.states[:end]
-        streams: dict[str, Any] = {
-            name: concatenated([one.streams[name] for one in self._arrived])
+        streams = {
+            name: concatenated([one[name] for one in self._arrived])
             for name in ("tdoa", "imu", *world.sensors)
         }
         truth = Truth(simulator.times[:end], states[:, POSITION], states[:, ATTITUDE])
