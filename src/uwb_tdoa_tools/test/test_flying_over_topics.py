@@ -142,9 +142,12 @@ def test_what_is_none_is_passed_over(topics, bad):
 def test_by_a_status_that_is_not_running_it_neither_starts_nor_goes_on(topics, status):
     hear(topics, odometry(5.0))
     assert topics.deviation == pytest.approx(0.2)
-    topics.status = status and EstimatorStatus(status=status, yaw_known=True, why="a sign is wrong")
-    assert topics.deviation == np.inf
-    assert topics.why == ("a sign is wrong" if status else "nothing came on status: start ekf_node")
+    expected = "nothing came on status: start ekf_node"
+    topics.status = None
+    if status is not None:
+        expected = "the sign of all TDOAs is wrong"
+        topics.status = EstimatorStatus(status=status, yaw_known=True, why=expected)
+    assert topics.deviation == np.inf and topics.why == expected
 
 
 def test_odometry_from_before_anything_was_measured_is_not_taken(topics):

@@ -181,7 +181,7 @@ def flown_of_controller(wanted, yaw, seconds, turn=0.0, nominal=None):
             state,
             gyro,
             (controller.thrust, controller.rates),
-            (controller.record, controller.vehicle.record()),
+            controller.vehicle.record(),
             vehicle.record(),
             (still[rows, :3], still[rows], still[rows, :3]),
             (states[rows], samples[rows], contact[rows]),

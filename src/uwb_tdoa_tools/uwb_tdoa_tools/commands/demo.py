@@ -127,7 +127,6 @@ def _measured(args: Namespace) -> int:
     """Take a measured flight through both nodes."""
     from ..evaluating import lines_of_errors
     from ..flying import demo, loop
-    from ..flying.demo_picture import draw
     from ..scoring.alignment import require_truth
 
     started = time.monotonic()
@@ -148,7 +147,7 @@ def _measured(args: Namespace) -> int:
         cli.say("demo", f"messages lost or late: too much load for --rate {args.rate:g}; try less.")
     cli.show(*lines_of_errors(scores), demo.change_of_scores(scores))
     residuals = [loop.residuals_of(flight, by) for by in (None, correction)[: len(scores) - 1]]
-    draw(args.out / "error.png", flight, residuals, scores[:-1])
+    loop.draw(args.out / "error.png", flight, residuals, scores[:-1])
     cli.show(f"plot       {args.out / 'error.png'}")
     if args.rerun is not None:
         cli.show(f"rerun      {args.rerun}")

@@ -26,7 +26,6 @@ from ..parallel import Progress
 from ..scoring.gains import change_in_words
 from ..scoring.metrics import Estimate, Score
 from . import loop
-from .demo_picture import draw
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -380,7 +379,7 @@ def close_loop(
     clock.lap("both nodes, twice" if correction else "both nodes")
     show("flown", [result.arrived_in_words()])
     show("error", [result.error_in_words()])
-    draw(picture, result.flight, result.residuals, result.scores)
+    loop.draw(picture, result.flight, result.residuals, result.scores)
     clock.lap("picture")
     show("really", [loop.truth_in_words(seed, result.flight)])
     show("picture", [str(picture)])

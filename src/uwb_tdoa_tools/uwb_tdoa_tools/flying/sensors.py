@@ -70,15 +70,11 @@ class Radio:
         self.positions, n = anchors.positions, len(anchors)
         schedule = make_schedule(world.protocol, n, duration, random(seed, "schedule"), world.rate)
         self.t, self.a, self.b = schedule.t, schedule.a, schedule.b
-        self.silent, self.changed, self.other = (
-            NEVER,
-            np.inf,
-            int(random(seed, "change").integers(n)),
-        )
-        self._world, rng = (
-            world,
-            random(seed if world.installation is None else world.installation, "anchors"),
-        )
+        self.silent = NEVER
+        self.changed = np.inf
+        self.other = int(random(seed, "change").integers(n))
+        self._world = world
+        rng = random(seed if world.installation is None else world.installation, "anchors")
         self._error = tdoa_noise(
             schedule, np.full(n, world.noise / math.sqrt(2.0)), False, random(seed, "tdoa noise")
         )
@@ -163,10 +159,8 @@ class Radio:
     def _near_floor(self, rows: slice, p: np.ndarray) -> np.ndarray:
         """Return the error (k,), m, near the floor. Each anchor is late with the probability of FloorMultipath."""
         t, a, b = self.t[rows], self.a[rows], self.b[rows]
-        samples, both = (
-            Samples(t, a, b, p, np.full((len(p), 4), np.nan), self._anchors),
-            np.concatenate([a, b]),
-        )
+        samples = Samples(t, a, b, p, np.full((len(p), 4), np.nan), self._anchors)
+        both = np.concatenate([a, b])
         late = self.floor.of_each(self._anchors)[0][both]
         late = np.where(
             self._at_times[rows].T.ravel() * late < self.floor.delays(samples, both), late, 0.0

@@ -47,7 +47,7 @@ def interval(
     state: np.ndarray,
     gyro: np.ndarray,
     wanted: tuple[float, np.ndarray],
-    controller: tuple[Record, Record],
+    assumed: Record,
     vehicle: Record,
     disturbances: tuple[np.ndarray, np.ndarray, np.ndarray],
     measured: tuple[np.ndarray, np.ndarray, np.ndarray],
@@ -63,10 +63,8 @@ def interval(
         The last two measured body rates (2, 3), rad/s, newest first, updated in place.
     wanted : tuple
         Thrust, N, and body rates (3,), rad/s.
-    controller : tuple
-        Records of the gains and of the vehicle that the controller assumes.
-    vehicle : Record
-        Record of the true vehicle.
+    assumed, vehicle : Record
+        Records of the vehicle that the controller assumes, and of the true vehicle.
     disturbances : tuple
         Wind (n, 3) m/s. Sensor errors (n, 6) of rates, rad/s, and specific force, m/s^2. Vibration
         (n, 3) m/s^2 while rotors turn.
@@ -75,7 +73,6 @@ def interval(
         largest number of feet on the ground in that time (n,).
     """
     thrust, rates = wanted[0], wanted[1]
-    gains, assumed = controller[0], controller[1]
     wind, errors, shaking = disturbances[0], disturbances[1], disturbances[2]
     truth, samples, contact = measured[0], measured[1], measured[2]
     dt = STEP * STEPS
@@ -86,7 +83,7 @@ def interval(
         np.empty(STATE),
     )
     for i in range(len(truth)):
-        inner(thrust, rates, gyro, dt, gains, assumed, speeds)  # writes speeds, of the rotors
+        inner(thrust, rates, gyro, dt, assumed, speeds)  # writes speeds, of the rotors
         earlier[:] = state
         feet = 0
         turn = np.zeros(3)
@@ -187,20 +184,18 @@ class Simulator:
         self.nominal = Vehicle(mass=mass * (1.0 + rng.uniform(-MASS_ERROR, MASS_ERROR)))
         self.yaw, self.state = yaw, self.vehicle.at_rest(x, y, yaw)
         self._record, self._nominal_record = self.vehicle.record(), self.nominal.record()
-        self.radio, self._inertial = (
-            Radio(world, seed, duration),
-            InertialErrors(world, seed, duration),
-        )
+        self.radio = Radio(world, seed, duration)
+        self._inertial = InertialErrors(world, seed, duration)
         self._sensors = {name: SENSOR_NAMES[name](world, seed, duration) for name in world.sensors}
         self._wind, self._rng = gusts(world, seed, duration), random(seed, "effects")
         n = len(self._wind)
-        self.times, self.states, self.contact = (
-            np.arange(n) / IMU_RATE,
-            np.empty((n, STATE)),
-            np.zeros(n),
-        )
+        self.times = np.arange(n) / IMU_RATE
+        self.states = np.empty((n, STATE))
+        self.states[0] = self.state
+        self.contact = np.zeros(n)
         self.samples = np.zeros((n, 6))
-        self.done, self.states[0], self._gyro = 0, self.state, np.zeros((2, 3))
+        self.done = 0
+        self._gyro = np.zeros((2, 3))
         # state and time at the start, time at the end, path
         self._carrying: tuple[np.ndarray, float, float, np.ndarray] | None = None
         self._heard = dict.fromkeys(("tdoa", *world.sensors), 0)
@@ -260,7 +255,7 @@ class Simulator:
             self.state,
             self._gyro,
             (controller.thrust, controller.rates),
-            (controller.record, self._nominal_record),
+            self._nominal_record,
             self._record,
             (self._wind[rows], self._inertial.errors[rows], self._inertial.shaking[rows]),
             (self.states[rows], self.samples[rows], self.contact[rows]),

@@ -149,10 +149,8 @@ def _alignment(flight: Flight, effects: EffectSet, config: FilterConfig | None) 
 
     If wrong ids and signs explain the difference of the frames as well, they are repaired first.
     """
-    straight, odometry = (
-        effects.correct_streams(flight),
-        FlightEstimator(config, effects)(flight).odometry,
-    )
+    straight = effects.correct_streams(flight)
+    odometry = FlightEstimator(config, effects)(flight).odometry
     assert straight.truth is not None
     found = estimate_alignment(straight, odometry)
     if found.frame_differs and _ranges_fit(straight, effects, found):

@@ -16,10 +16,10 @@ from uwb_tdoa_ekf.core.memory import COMPENSATED, REJECTED, USED
 from uwb_tdoa_ekf.results import Residuals, concatenated, rows_of
 
 from .phases import in_the_air, motion, phases
-from .pooling import COVERAGE, Distribution, Pool, Result
+from .pooling import COVERAGE, Distribution, Pool, Result, or_nan
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Iterable, Sequence
 
     from uwb_tdoa_bias.common.flight import Flight, Truth
     from uwb_tdoa_ekf.offline import Run
@@ -49,11 +49,6 @@ class Estimate(PoseColumns, Protocol):
 def rms(values: np.ndarray) -> float:
     """Return the root mean square; NaN without values."""
     return or_nan(lambda v: np.sqrt(np.mean(v**2)), values)
-
-
-def or_nan(function: Callable[[np.ndarray], float], values: np.ndarray) -> float:
-    """Return function(values); NaN without values."""
-    return float(function(values)) if len(values) else math.nan
 
 
 def scored_phase(truth: Truth) -> tuple[str, float, float]:
