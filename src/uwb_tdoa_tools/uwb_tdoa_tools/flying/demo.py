@@ -28,7 +28,7 @@ from ..scoring.metrics import Estimate, Score
 from . import loop
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from uwb_tdoa_bias.common.flight import Flight
 
@@ -38,7 +38,9 @@ CORRECTION = "bias.onnx"  # file of the correction of a simulated hall
 MISSING = ("lost", "late", "imu_late", "imu_lost")  # outcomes of messages
 
 
-def corrector_of(flight: Flight, effects: str | Path | None, model: str | None) -> Corrector | None:
+def corrector_of(
+    flight: Flight, effects: str | Path | None, model: str | Path | None
+) -> Corrector | None:
     """Return the Corrector of a Flight by two files, or None if neither is given.
 
     Raises
@@ -87,7 +89,7 @@ def through_nodes(
     bag: Path,
     folder: Path,
     rate: float,
-    files: dict[str, str | Path | None],
+    files: Mapping[str, str | Path | None],
     say: Callable[[str], object],
 ) -> LivePass:
     """Play the bag of a flight to both nodes.
@@ -124,7 +126,7 @@ def through_nodes(
 def fly(
     flight: Flight,
     correction: Corrector | None,
-    files: dict[str, str | Path | None],
+    files: Mapping[str, str | Path | None],
     folder: Path,
     rate: float,
     rerun: Path | None = None,

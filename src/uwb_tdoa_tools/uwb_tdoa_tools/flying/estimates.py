@@ -185,11 +185,14 @@ def _pointer(array: np.ndarray) -> ctypes.c_void_p:
     return array.ctypes.data_as(ctypes.c_void_p)
 
 
+_NO_VECTORS = np.empty((0, 3))
 NO_ODOMETRY = Odometry(
     np.empty(0),
-    *np.empty((2, 0, 3)),
+    _NO_VECTORS,
+    _NO_VECTORS,
     np.empty((0, 4)),
-    *np.empty((2, 0, 3)),
+    _NO_VECTORS,
+    _NO_VECTORS,
     np.empty((0, 9, 9)),
     np.empty((0, 3, 3)),
 )

@@ -44,7 +44,7 @@ HALL = SimulationConfig(
 )
 YAWS = ("along_track", "rotating", "along_track")  # of the flights
 PERIOD = 1.0  # s, of one residual of a pair
-FEWEST = 10  # TDOAs of a pair in it
+FEWEST = 3  # TDOAs of a pair in it
 CM = 100.0  # cm per metre
 LARGEST = 2  # pairs that are named
 COLOURS = ("tab:red", "tab:blue")  # of a flight without and with the correction
@@ -136,7 +136,7 @@ class PairResiduals:
 
 def _known_rms(*parts: np.ndarray) -> float:
     """Return the root mean square of all values that are known."""
-    together = np.concatenate(parts)
+    together = np.concatenate([*parts, []])
     return rms(together[np.isfinite(together)])
 
 
@@ -224,7 +224,7 @@ def draw(
     with rc_context({"font.size": SIZE, "axes.titlesize": SIZE, "legend.fontsize": SIZE - 2}):
         figure = Figure(figsize=(12, 9.5), layout="constrained")
         axes = figure.subplots(2, 2)
-        values = np.abs(np.concatenate(list(residuals[0].median.values())))
+        values = np.abs(np.concatenate([*residuals[0].median.values(), [0.0]]))
         limit = 1.1 * CM * max(float(np.nanmax(values)), 0.05)
         for ax, one, score in zip(axes[0], residuals, scores):
             _residuals(ax, one)
