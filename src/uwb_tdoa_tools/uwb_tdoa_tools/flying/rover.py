@@ -220,15 +220,9 @@ class RoverTrial(Trial):
         way = path.starting_at(self.simulator.state[:2].copy(), MAST)
         return Drive(way, path.speed, rules, self.simulator.now)
 
-    def turn(self) -> None:
-        """Execute one turn of the controller."""
-        self.controller.stop()
-        if self.missions:
-            drive: Any = self.missions[-1]
-            self._schedule_faults(drive)
-            source = self.source
-            drive.decide(self.simulator.now, source.pose, source.deviation, self.controller)
-        self._turn()
+    def _control(self, mission: Any) -> None:
+        source = self.source
+        mission.decide(self.simulator.now, source.pose, source.deviation, self.controller)
 
     def _crash(self) -> str:
         half = 0.5 * np.array(self.task.world.size[:2])

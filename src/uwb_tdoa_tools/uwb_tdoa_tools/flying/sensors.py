@@ -28,13 +28,16 @@ if TYPE_CHECKING:
     from .world import World
 
 NEAR_FLOOR = 0.5  # m, largest height at which the floor acts
+FLOOR_DELAY, FLOOR_HEIGHT = (3.0, 3.9), (0.06, 0.2)  # m, of low anchors, and up to which height
+CHANGED_DELAY = 0.3  # m, of an anchor that becomes late
 LOW = 1.0  # m, largest height of a low anchor
 GUST_TIME = 1.0  # s, correlation time of gusts
 PERSON = 0.25, 1.8, 1.0  # m, radius and height of a person; m/s
 # m, delay behind a person; s, between draws of it
 BLOCKED, BLOCK_TIME = ((0.2, 2.0), 0.5)
-# noise of barometer, m, velocity, m/s, and distances, m
-ALTITUDE_STD, VELOCITY_STD, RANGE_STD = (0.08, 0.05, 0.1)
+# noise of range finder, m, barometer, m, velocity, m/s, and distances, m
+HEIGHT_STD, ALTITUDE_STD, VELOCITY_STD, RANGE_STD = (0.01, 0.08, 0.05, 0.1)
+HIGHEST = 4.0  # m, largest distance of the range finder
 NEVER = np.inf, np.inf
 
 
@@ -88,7 +91,7 @@ class Radio:
             ],
             axis=1,
         )
-        late, height = rng.uniform(*world.floor_delay, n), rng.uniform(*world.floor_height, n)
+        late, height = rng.uniform(*FLOOR_DELAY, n), rng.uniform(*FLOOR_HEIGHT, n)
         low = anchors.ids[self.positions[:, 2] < LOW].tolist() if world.floor_effect else ()
         self.floor = FloorMultipath(
             {
@@ -148,9 +151,7 @@ class Radio:
                 d += sign * np.where(through, late[np.arange(len(t)), anchor], 0.0)
         mine = (t >= self.changed) & ((a == self.other) | (b == self.other))
         if self._world.change == "late":
-            d += np.where(
-                mine, np.where(b == self.other, 1.0, -1.0) * self._world.changed_delay, 0.0
-            )
+            d += np.where(mine, np.where(b == self.other, 1.0, -1.0) * CHANGED_DELAY, 0.0)
         elif self._world.change == "silent":
             d[mine] = np.nan
         d[(t >= self.silent[0]) & (t < self.silent[1])] = np.nan
@@ -299,13 +300,9 @@ class AuxiliarySensor:
 
     def __init__(self, world: World, seed: int, duration: float) -> None:
         """Draw stamps and noise for `duration`, s."""
-        self.world, rate = world, self.rate_in(world)
-        self.t = np.arange(0.5, duration * rate) / rate
+        self.world = world
+        self.t = np.arange(0.5, duration * self.rate) / self.rate
         self.noise = random(seed, type(self).__name__).standard_normal((len(self.t), self.width))
-
-    def rate_in(self, world: World) -> float:
-        """Return the rate in a world, Hz."""
-        return self.rate
 
     def measured(
         self, rows: slice, p: np.ndarray, q: np.ndarray, v: np.ndarray, height: np.ndarray
@@ -327,17 +324,14 @@ class AuxiliarySensor:
 class RangeFinder(AuxiliarySensor):
     """Simulate a range finder along -z of the body, m, with inf beyond its range."""
 
-    def rate_in(self, world: World) -> float:
-        return world.height_rate
+    rate = 20.0
 
     def measured(
         self, rows: slice, p: np.ndarray, q: np.ndarray, v: np.ndarray, height: np.ndarray
     ) -> tuple[np.ndarray, ...]:
         up = 1.0 - 2.0 * (q[:, 0] ** 2 + q[:, 1] ** 2)
-        seen = height / np.maximum(up, 1e-3) + self.world.height_noise * self.noise[rows, 0]
-        return (
-            np.where((up > 0.0) & (seen <= self.world.height_range), np.maximum(seen, 0.0), np.inf),
-        )
+        seen = height / np.maximum(up, 1e-3) + HEIGHT_STD * self.noise[rows, 0]
+        return (np.where((up > 0.0) & (seen <= HIGHEST), np.maximum(seen, 0.0), np.inf),)
 
 
 class Barometer(AuxiliarySensor):

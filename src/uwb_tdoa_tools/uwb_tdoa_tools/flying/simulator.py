@@ -135,6 +135,7 @@ def poses_at(
 TICK = 4  # inertial samples per turn of the controller
 DT = TICK / IMU_RATE  # s
 START_SPREAD = 0.5  # m, largest offset of the path from the middle of the hall along each axis
+MASS = 0.027, 0.033  # kg, least and largest mass
 MASS_ERROR = 0.05  # largest relative error of the mass in the controller
 TABLE_RADIUS = 0.4  # m
 CARRY_HEIGHT = 0.5  # m, height at which it is carried
@@ -173,7 +174,7 @@ class Simulator:
         """
         self.world, rng = world, random(seed, "place")
         middle, yaw = rng.uniform(-START_SPREAD, START_SPREAD, 2), rng.uniform(-np.pi, np.pi)
-        mass = rng.uniform(*world.mass)
+        mass = rng.uniform(*MASS)
         x, y = middle[0] + radius, middle[1]
         table = (
             {"table": world.table, "table_x": x, "table_y": y, "table_radius": TABLE_RADIUS}

@@ -205,28 +205,26 @@ class Trial:
 
     def turn(self) -> None:
         """Execute one turn of the controller."""
-        wanted = self._decide(self.missions[-1]) if self.missions else None
-        if wanted is None:
-            self.controller.stop()
+        if self.missions:
+            self._schedule_faults(self.missions[-1])
+            self._control(self.missions[-1])
         else:
-            pose = self.source.pose
-            assert pose is not None  # a mission starts with a pose
-            since, p, v, q = pose
-            self.controller.fly(
-                p, v, self._predicted_attitude(q, since), wanted, self.missions[-1].yaw, DT
-            )
+            self.controller.stop()
         self._turn()
 
-    def _decide(self, mission: Mission) -> np.ndarray | None:
-        """Return the wanted motion of a mission."""
-        simulator, k = self.simulator, self.simulator.done
-        self._schedule_faults(mission)
-        force = float(
-            np.mean(simulator.samples[max(k - int(SUPPORT_TIME * IMU_RATE), 0) : k + 1, 5])
-        )
-        return mission.decide(
-            simulator.now, self.source.pose, self.source.deviation, self.controller.support(force)
-        )
+    def _control(self, mission: Any) -> None:
+        """Set the outputs of the controller as a mission wants."""
+        now, k, pose = self.simulator.now, self.simulator.done, self.source.pose
+        lately = slice(max(k - int(SUPPORT_TIME * IMU_RATE), 0), k + 1)
+        support = self.controller.support(float(np.mean(self.simulator.samples[lately, 5])))
+        wanted = mission.decide(now, pose, self.source.deviation, support)
+        if wanted is None:
+            self.controller.stop()
+            return
+        assert pose is not None  # a mission starts with a pose
+        since, p, v, q = pose
+        attitude = self._predicted_attitude(q, since)
+        self.controller.fly(p, v, attitude, wanted, mission.yaw, DT)
 
     def _schedule_faults(self, mission: Any) -> None:
         """Set the times of the gap and of the anchor change for a mission."""
