@@ -258,7 +258,9 @@ def _flown(seed, path, room, anchors=None, bias=True):
         seed=seed, constellation=room, anchors=anchors, duration=SECONDS, bias=bias
     )
     filled, of_path = SimulationConfig(seed=seed, constellation=room, duration=SECONDS).complete()
-    return simulate(config, Trajectory(filled, of_path, np.random.default_rng([seed, path])))
+    return simulate(
+        config, Trajectory.of_config(filled, of_path, np.random.default_rng([seed, path]))
+    )
 
 
 def said(flight, estimator):

@@ -6,10 +6,10 @@ from functools import partial
 from pathlib import Path
 
 from matplotlib.figure import Figure
+import matplotlib.pyplot as plt
 import numpy as np
 
 from uwb_tdoa_bias.common.files import write_filled
-from uwb_tdoa_tools.scoring.plots import plt
 
 COLOURS = "0.55", "tab:red", "tab:cyan", "tab:olive", "tab:green"
 LONG = 35.0  # s of a flight that are drawn at most

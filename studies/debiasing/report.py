@@ -4,10 +4,10 @@
 
 from functools import partial
 
+import matplotlib.pyplot as plt
 import numpy as np
 
 from uwb_tdoa_bias.common.files import write_filled
-from uwb_tdoa_tools.scoring.plots import plt
 
 
 def set_up_tables(figures):

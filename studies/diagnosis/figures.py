@@ -11,6 +11,7 @@ import json
 from pathlib import Path
 import time
 
+import matplotlib.pyplot as plt
 import numpy as np
 from tqdm import tqdm
 
@@ -23,7 +24,6 @@ from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
 from uwb_tdoa_tools.outputs import OutputFolder
 from uwb_tdoa_tools.parallel import over, whole_number
 from uwb_tdoa_tools.results_file import ResultsFile
-from uwb_tdoa_tools.scoring.plots import plt
 from uwb_tdoa_tools.surveying.report import with_blocked
 
 from . import bank, blind, faults, floor, measured, processes, referenced, undeclared

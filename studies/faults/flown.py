@@ -26,7 +26,7 @@ from uwb_tdoa_ekf.monitoring.stream_watch import StreamWatch
 from uwb_tdoa_ekf.results import concatenated, rows_of
 from uwb_tdoa_tools import parallel
 from uwb_tdoa_tools.flying.estimates import OwnFilter
-from uwb_tdoa_tools.flying.simulator import SensorReadings
+from uwb_tdoa_tools.flying.simulator import Streams
 from uwb_tdoa_tools.flying.trial import Task, Trial
 from uwb_tdoa_tools.flying.verdict import verdict_of
 from uwb_tdoa_tools.flying.world import world_of
@@ -150,18 +150,18 @@ class FaultyFilter:
         """As of OwnFilter."""
         self._ours.set_pose(t, p, std, yaw)
 
-    def take(self, measured: SensorReadings) -> None:
+    def take(self, measured: Streams) -> None:
         """Take what arrived, and look at it as ekf_node does."""
-        if len(measured.imu.t):
-            self._now = float(measured.imu.t[-1])
-        streams = {name: self._changed(name, part) for name, part in measured.streams.items()}
+        if len(measured["imu"].t):
+            self._now = float(measured["imu"].t[-1])
+        streams = {name: self._changed(name, part) for name, part in measured.items()}
         for name, part in streams.items():
             self._received[name] += len(part.t)
-        imu, tdoa = streams.pop("imu"), streams.pop("tdoa")
+        imu, tdoa = streams["imu"], streams["tdoa"]
         self._watch.add_imu(imu.t, np.full(len(imu.t), self._now), imu.gyro, imu.accel)
         self._watch.add_tdoa(tdoa.t, np.full(len(tdoa.t), self._now), tdoa.a, tdoa.b, tdoa.d)
         before = self._ours.newest
-        self._ours.take(SensorReadings(imu, tdoa, streams))
+        self._ours.take(streams)
         if self._ours.newest is not before:
             self._last = self._now
         if self._now >= self._looked + LOOK:

@@ -9,7 +9,6 @@ import pytest
 
 from studies.faults.flown import BEGIN, END, FAULTS, FaultyFilter, flown, table
 from uwb_tdoa_bias.common.flight import Imu, Tdoas
-from uwb_tdoa_tools.flying.simulator import SensorReadings
 from uwb_tdoa_tools.flying.trial import Task, Trial
 from uwb_tdoa_tools.flying.world import world_of
 
@@ -17,22 +16,21 @@ SAMPLES = 20
 
 
 def readings(t):
-    """SensorReadings of a tenth of a second that begins at t, s."""
+    """Streams of a tenth of a second that begins at t, s."""
     times = t + np.arange(SAMPLES) / 200.0
     rng = np.random.default_rng(0)
     tdoa = Tdoas(
         times, rng.integers(0, 4, SAMPLES), rng.integers(4, 8, SAMPLES), rng.normal(size=SAMPLES)
     )
-    return SensorReadings(
-        Imu(times, np.zeros((SAMPLES, 3)), np.tile([0.0, 0.0, 9.81], (SAMPLES, 1))), tdoa, {}
-    )
+    imu = Imu(times, np.zeros((SAMPLES, 3)), np.tile([0.0, 0.0, 9.81], (SAMPLES, 1)))
+    return {"imu": imu, "tdoa": tdoa}
 
 
 def taken(name, t):
     """The streams that the filter of a flight with such a fault takes, of `readings`."""
     source = FaultyFilter(Trial(Task(world_of("hall"), 1)).source, FAULTS[name])
     source._now = t
-    return {stream: source._changed(stream, part) for stream, part in readings(t).streams.items()}
+    return {stream: source._changed(stream, part) for stream, part in readings(t).items()}
 
 
 @pytest.mark.parametrize(
@@ -41,9 +39,9 @@ def taken(name, t):
 def test_a_fault_changes_its_stream_while_it_lasts_and_no_other(name):
     before, during = taken(name, BEGIN - 0.5), taken(name, BEGIN + 0.1)
     for stream in ("imu", "tdoa"):
-        np.testing.assert_equal(vars(before[stream]), vars(readings(BEGIN - 0.5).streams[stream]))
+        np.testing.assert_equal(vars(before[stream]), vars(readings(BEGIN - 0.5)[stream]))
         same = [
-            np.array_equal(column, vars(readings(BEGIN + 0.1).streams[stream])[key])
+            np.array_equal(column, vars(readings(BEGIN + 0.1)[stream])[key])
             for key, column in vars(during[stream]).items()
         ]
         assert all(same) == (stream != FAULTS[name].stream)

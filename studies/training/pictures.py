@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 from scipy.stats import norm
 
 from uwb_tdoa_bias.common.files import write_filled
-from uwb_tdoa_tools.scoring.plots import plt
 
 COLOURS = {
     "none": "0.6",

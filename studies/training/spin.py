@@ -7,6 +7,7 @@ of Zhao et al. (2021).
 
 from functools import partial
 
+import matplotlib.pyplot as plt
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -15,7 +16,6 @@ from uwb_tdoa_bias.common.files import write_filled
 from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_bias.effects import true_samples
 from uwb_tdoa_tools.outputs import OutputFile
-from uwb_tdoa_tools.scoring.plots import plt
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 POSITIONS = ((0.0, 0.0, 1.2), (5.0, 0.0, 1.2))  # m, of the anchors 0 and 1

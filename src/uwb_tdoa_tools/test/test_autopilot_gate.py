@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.sensors.sensor import UNKNOWN_VARIANCE
 from uwb_tdoa_tools.autopilot.estimate import FRD, NED, UPPER, WORLDS, Estimate
-from uwb_tdoa_tools.autopilot.gate import NOT_HEARD, Gate, Limits, jumped
+from uwb_tdoa_tools.autopilot.gate import NOT_HEARD, Gate, jumped
 
 NOW = 1_700_000_000 * 10**9  # ns
 RUNNING, STARTING, LOST, FAULT = 2, 1, 3, 4
@@ -129,7 +129,7 @@ def test_numbers_of_a_message_become_an_estimate_or_none():
 
 
 def opened(rate=200.0, deviation=1.5, yaw=True):
-    gate = Gate(Limits(rate, deviation, yaw))
+    gate = Gate(rate, deviation, yaw)
     gate.set_status(RUNNING, True, "")
     return gate
 
@@ -153,14 +153,14 @@ def test_no_more_come_than_the_rate_allows_and_none_less(rate):
 
 
 def test_nothing_passes_before_a_status_and_without_a_yaw():
-    gate = Gate(Limits(200.0, 1.5))
+    gate = Gate(200.0, 1.5)
     assert passed(gate, steady(3)) == [] and gate.why == NOT_HEARD
     gate.set_status(RUNNING, False, "the yaw is not known yet")
     assert passed(gate, steady(3, 0.1)) == [] and gate.why == "the yaw is not known yet"
     gate.set_status(RUNNING, True, "")
     assert len(passed(gate, steady(3, 0.2))) == 3 and gate.why == ""
     assert gate.resets == 0  # the first ones are no jump to anybody
-    position = Gate(Limits(200.0, 1.5, yaw=False))
+    position = Gate(200.0, 1.5, needs_yaw=False)
     position.set_status(RUNNING, False, "the yaw is not known yet")
     assert len(passed(position, steady(3))) == 3
 

@@ -20,8 +20,9 @@ from uwb_tdoa_tools.diagnosis import diagnose  # noqa: E402
 from uwb_tdoa_tools.estimate import FlightEstimator  # noqa: E402
 from uwb_tdoa_tools.flying import loop  # noqa: E402
 from uwb_tdoa_tools.flying.demo import (  # noqa: E402
-    DemoFlight,
     change_of_scores,
+    correction_in_words,
+    corrector_of,
     next_steps,
 )
 from uwb_tdoa_tools.scoring.evaluation import score_of  # noqa: E402
@@ -73,12 +74,14 @@ class ErrorOnly:
 
 
 def test_it_says_what_corrects_and_that_nothing_does_unless_it_is_asked_for(tmp_path):
-    plain = DemoFlight(None, None, None)
-    assert plain.corrector() is None and plain.correction().startswith(
+    flight = SimpleNamespace(anchors=corners())
+    nothing = corrector_of(flight, None, None)
+    assert nothing is None
+    assert correction_in_words(nothing).startswith(
         "nothing: neither --effects nor --model is given"
     )
     model = known_answer.write(tmp_path)
-    given = DemoFlight(SimpleNamespace(anchors=corners()), None, str(model)).correction()
+    given = correction_in_words(corrector_of(flight, None, str(model)), None, model)
     assert given == f"known_answer ({model})"
 
 
@@ -147,9 +150,10 @@ def test_the_correction_takes_the_residual_of_the_third_flight_away(recorded, di
     assert [effect.name for effect in written.effects] == ["anchor_delay"]
     (third,) = loop.read(recorded[2:])
     model = load_network(tmp_path / "bias.onnx")
-    before, after = loop.residuals_of(third), loop.residuals_of(third, model)
+    corrector = corrector_of(third, None, tmp_path / "bias.onnx")
+    before, after = loop.residuals_of(third), loop.residuals_of(third, corrector)
     ((anchor, late),) = hidden.hidden_effect(LATE, third.anchors).values.items()
-    assert all(anchor in pair.split("-") for pair in before.largest)
+    assert all(anchor in pair.split("-") for pair in before.largest(2))
     assert before.constant == pytest.approx(late * np.sqrt(2 / 8), rel=0.1)  # 2 of 8 pairs
     assert before.size > 5 * after.size and before.changing < 0.03 and after.size < 0.03
     raw, corrected = (

@@ -42,7 +42,8 @@ def flown(positions=None):
     moved = None if positions is None else filled.anchors.at(positions)
     return replace(
         simulate(
-            replace(CONFIG, anchors=moved), Trajectory(filled, room, np.random.default_rng(1))
+            replace(CONFIG, anchors=moved),
+            Trajectory.of_config(filled, room, np.random.default_rng(1)),
         ),
         anchors=filled.anchors,
     )
@@ -91,7 +92,7 @@ def far_moved():
     positions = anchors.positions.copy()
     shift = np.array([0.45, 0.1, 0.1])
     positions[row] += shift
-    path = Trajectory(filled, room, np.random.default_rng([2, 1]))
+    path = Trajectory.of_config(filled, room, np.random.default_rng([2, 1]))
     flight = simulate(replace(config, anchors=anchors.at(positions)), path)
     return replace(flight, anchors=anchors, truth=None), row, shift
 

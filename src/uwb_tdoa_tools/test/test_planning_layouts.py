@@ -5,6 +5,7 @@
 from dataclasses import replace
 import time
 
+import matplotlib.pyplot as plt
 import numpy as np
 from PIL import Image
 import pytest
@@ -36,7 +37,7 @@ from uwb_tdoa_tools.planning.optimisation import (
 )
 from uwb_tdoa_tools.planning.report import TOPICS, map_messages, write_messages
 from uwb_tdoa_tools.readers import read_survey
-from uwb_tdoa_tools.scoring.plots import draw_labels, plt
+from uwb_tdoa_tools.scoring.plots import draw_labels
 from uwb_tdoa_tools.simulation.rooms import Room, corners, facing
 
 # --- planning optimisation ---

@@ -9,7 +9,8 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.effects import AnchorDelay
+from uwb_tdoa_bias.correction.corrector import Corrector
+from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
 from uwb_tdoa_tools import diagnosis
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands import diagnose, evaluate, localize
@@ -97,18 +98,16 @@ def test_diagnose_writes_before_and_after_and_what_was_found(desk, viewer):
     assert "anchor 3" in verdict(viewer)
 
 
-def test_demo_writes_what_the_nodes_said(flight, viewer, tmp_path):
+def test_demo_writes_what_the_nodes_said(flight, viewer, tmp_path, monkeypatch):
     pytest.importorskip("rclpy")
-    from uwb_tdoa_tools.flying.demo import DemoResult, LivePass
+    from uwb_tdoa_tools.flying import demo
 
-    run = FlightEstimator()(flight)
-    DemoResult(LivePass({}, run.odometry), [], run, run.odometry).show(
-        tmp_path / "flight.rrd", flight, ["landed"]
-    )
-    assert (
-        ALWAYS | {"world/truth", "world/before", "error", "error/before"} <= names(viewer)
-        and verdict(viewer) == "landed"
-    )
+    nodes = demo.LivePass({}, FlightEstimator()(flight).odometry)
+    monkeypatch.setattr(demo, "through_nodes", lambda *_: nodes)
+    correction = Corrector(flight.anchors, EffectSet())
+    demo.fly(flight, correction, {}, tmp_path, 1.0, tmp_path / "flight.rrd")
+    assert ALWAYS | {"world/truth", "world/before", "error", "error/before"} <= names(viewer)
+    assert "3D RMSE raw" in verdict(viewer)
 
 
 def test_errors_are_those_of_each_path(flight, viewer, tmp_path):

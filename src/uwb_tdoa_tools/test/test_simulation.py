@@ -6,7 +6,6 @@ from dataclasses import replace
 import json
 import subprocess
 import sys
-import time
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -28,6 +27,7 @@ from uwb_tdoa_tools.simulation.rooms import CONSTELLATIONS, Walls, constellation
 
 
 SHORT = ["--duration", "20", "--trajectory", "circle"]
+ACROSS = Walls(((4.0, -10.0, 4.0, 2.0, np.inf),))
 
 
 def test_list_names_everything(capsys):
@@ -191,15 +191,10 @@ def test_rates_and_names():
         and 12_000 < len(flight.tdoa) < 16_200
     )
     assert np.diff(flight.imu.t) == pytest.approx(1e-3)
-    assert flight.meta["protocol"] == "tdoa3" and flight.meta["source"] == "simulation"
-
-
-def test_meta_is_plain_and_tells_the_whole_configuration():
-    flight = simulate(SimulationConfig(duration=20.0, noise_std=0.07))
     meta = json.loads(json.dumps(flight.meta))
-    assert meta["config"]["noise_std"] == 0.07
+    assert meta["protocol"] == "tdoa3" and meta["source"] == "simulation"
     assert meta["config"]["imu_errors"]["gyro_noise"] == SimulationConfig().imu_errors.gyro_noise
-    assert meta["parameters"]["take_off"] == 3.0 and meta["parameters"]["landing"] == 17.0
+    assert meta["parameters"]["take_off"] == 3.0 and meta["parameters"]["landing"] == 57.0
     assert sorted(meta["parameters"]["anchor_delays"]) == [str(k) for k in range(8)]
 
 
@@ -222,35 +217,49 @@ def test_state_truth_is_the_velocity():
     )
 
 
-def test_a_minute_takes_no_time():
-    simulate(SimulationConfig(duration=20.0))
-    start = time.process_time()
-    simulate(SimulationConfig(constellation="random-1-64"))
-    assert time.process_time() - start < 1.5
-
-
 @pytest.mark.parametrize(
     ("change", "field"),
     [
         ({"trajectory": "loop"}, "trajectory"),
+        ({"trajectory": "circle", "radius": 20.0}, "trajectory"),
+        ({"trajectory": "hover", "height": 5.0}, "trajectory"),
+        ({"trajectory": "circle", "radius": 0.5, "speed": 5.0}, "speed"),
+        ({"vehicle": "submarine"}, "vehicle"),
+        ({"path": ((0.0, 0.0),)}, "path"),
+        ({"path": ((0.0, 0.0), (1.0, float("nan")))}, "path"),
+        ({"path": ((0.0, 0.0), (1.0, 1.0, 1.0))}, "path"),
+        ({"poses": ((0.0, 0.0, 0.0, 1.0, 0.0),)}, "poses"),
+        ({"poses": ((1.0, 0.0, 0.0, 1.0, 0.0), (1.0, 0.0, 0.0, 1.0, 0.0))}, "poses"),
+        ({"area": ((1.0, 0.0), (0.0, 1.0))}, "area"),
         ({"protocol": "tdoa4"}, "protocol"),
+        ({"tdoa_rate": 0.0}, "tdoa_rate"),
         ({"yaw": "wild"}, "yaw"),
         ({"seed": -1}, "seed"),
         ({"seed": 0.5}, "seed"),
         ({"duration": float("nan")}, "duration"),
+        ({"duration": 10.0}, "duration"),
+        ({"vehicle": "rover", "duration": 5.0}, "duration"),
+        ({"vehicle": "hand", "duration": 5.0}, "duration"),
         ({"noise_std": -0.1}, "noise_std"),
         ({"outlier_probability": 1.5}, "outlier_probability"),
+        ({"wheel_slip": -1.0}, "wheel_slip"),
         ({"place": (1.0, 2.0, 3.0)}, "place"),
         ({"tag_lever_arm": (0.0, float("inf"), 0.0)}, "tag_lever_arm"),
         ({"anchor_noise_std": (0.1, 0.1)}, "anchor_noise_std"),
         ({"constellation": "nowhere"}, "constellation"),
+        ({"constellation": "random-x"}, "constellation"),
+        ({"constellation": "random-1-3"}, "constellation"),
+        ({"constellation": "random-1-65"}, "constellation"),
         ({"anchors": Anchors.from_positions(np.eye(3) * 4.0)}, "anchors"),
         ({"anchors": Anchors.from_positions(np.eye(3)[:1]), "bias": False}, "anchors"),
+        ({"walls": ACROSS}, "walls"),
+        ({"cell_ids": 256}, "cell_ids"),
+        ({"cell_ids": 1, "radio_reach": 9.0}, "cell_ids"),
     ],
 )
-def test_bad_values_are_refused_by_name(change, field):
+def test_what_cannot_be_is_refused_by_name(change, field):
     with pytest.raises(InputError, match=f"^{field}: "):
-        simulate(SimulationConfig(**change))
+        simulate(SimulationConfig.of(**{"vehicle": "quadrotor", **change}))
 
 
 def test_anchors_without_orientation_do_without_bias():
@@ -309,16 +318,6 @@ def test_is_a_usable_constellation_that_faces_the_middle(name):
     assert (high - low > 1.0).all()
 
 
-def test_corners_are_like_the_surveyed_ones():
-    anchors = constellation("corners")
-    np.testing.assert_allclose(np.ptp(anchors.positions[:, :2], axis=0), [7.0, 8.0])
-    assert np.count_nonzero(anchors.positions[:, 2] < 0.5) == 4
-    up = Rotation.from_quat(anchors.orientations).apply([0.0, 0.0, 1.0])
-    np.testing.assert_allclose(
-        up[:, 2], np.where(anchors.positions[:, 2] < 0.5, 1.0, -1.0), atol=1e-12
-    )
-
-
 def test_random_is_seeded():
     one, same, other = (
         constellation("random-7-12"),
@@ -330,13 +329,6 @@ def test_random_is_seeded():
     assert np.abs(one.positions - other.positions).max() > 0.1
 
 
-@pytest.mark.parametrize("name", ["nowhere", "random", "random-x", "random-1-3", "random-1-65", ""])
-def test_unknown_names_are_refused(name):
-    with pytest.raises(InputError, match="^constellation: "):
-        constellation(name)
-
-
-ACROSS = Walls(((4.0, -10.0, 4.0, 2.0, np.inf),))
 SHELF = Walls(((4.0, -10.0, 4.0, 20.0, 3.0),))
 
 
@@ -449,19 +441,6 @@ def test_walls_of_a_file(tmp_path):
     )
 
 
-@pytest.mark.parametrize(
-    "kind, wrong",
-    [
-        ({"walls": ACROSS}, "radio_reach"),
-        ({"cell_ids": 256}, "radio_reach"),
-        ({"cell_ids": 1, "radio_reach": 9.0}, "cell_ids"),
-    ],
-)
-def test_what_does_not_fit_together_is_refused(kind, wrong):
-    with pytest.raises(InputError, match=wrong):
-        SimulationConfig(**kind)
-
-
 # --- simulation sensors ---
 
 
@@ -517,14 +496,6 @@ def test_vibration_only_while_the_motors_turn():
     assert accel[flying].std() == pytest.approx(2.0, rel=0.02)
     np.testing.assert_array_equal(accel[~flying], 0.0)
     np.testing.assert_array_equal(gyro, 0.0)
-
-
-def test_no_two_errors_draw_the_same_numbers():
-    gyro, accel, flight = errors_of(replace(NO_IMU_ERRORS, gyro_noise=1.0, accel_noise=1.0))
-    tdoa = flight.extra["tdoa_truth"]["noise"]
-    n = len(tdoa)
-    draws = [gyro.ravel()[:n], accel.ravel()[:n], tdoa]
-    assert np.abs(np.corrcoef(draws) - np.eye(3)).max() < 0.05
 
 
 def test_bad_values_are_refused():

@@ -38,8 +38,8 @@ from uwb_tdoa_msgs.msg import EstimatorStatus
 
 from .autopilot.crazyflie import POSE, POSITION, CrazyflieLink
 from .autopilot.estimate import FRD, WORLDS, Estimate
-from .autopilot.gate import Gate, Limits
-from .autopilot.link import Link, NoLink
+from .autopilot.gate import Gate
+from .autopilot.link import Link
 from .autopilot.mavlink import FORMS, MavlinkLink
 from .autopilot.topics import TOPICS, VehicleTopics
 
@@ -107,7 +107,7 @@ class AutopilotNode(StreamNode):
         own = declare_all(self, PARAMETERS)
         refuse_unknown(self)
         needs_yaw = own["protocol"] != CRAZYFLIE or own["content"] == POSE
-        self._gate = Gate(Limits(own["rate"], own["largest_deviation"], needs_yaw))
+        self._gate = Gate(own["rate"], own["largest_deviation"], needs_yaw)
         self._codec, self._rate = CdrCodec(Odometry, "pose", "twist"), Rate()
         self._waiting: list[bytes] = []
         self._received = self._invalid = self._received_before = 0
@@ -146,7 +146,7 @@ class AutopilotNode(StreamNode):
             return CrazyflieLink(
                 own["connection"], own["content"], streams, self._topics, self._now
             )
-        return NoLink()
+        return Link()
 
     def _now(self) -> int:
         return self.get_clock().now().nanoseconds

@@ -11,17 +11,18 @@ import logging
 from queue import SimpleQueue
 import re
 import time
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from uwb_tdoa_bias.common.errors import InputError
 
 from ..crazyflie import BLOCKS, LogBlock
-from .link import missing
+from .link import Link, missing
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from .estimate import Estimate
+    from .topics import VehicleTopics
 
 ADDRESS = re.compile(r"(radio|usb|udp|tcp)://\S+")
 CONNECTING, AGAIN = 60.0, 2.0  # s to connect at most; s until the next attempt
@@ -35,19 +36,7 @@ POSE, POSITION = "pose", "position"
 NOT_YET = "connecting to the Crazyflie: it is not known yet whether it answers"
 
 
-class Samples(Protocol):
-    """What takes the messages of log blocks, as VehicleTopics does."""
-
-    def restart(self) -> None:
-        """Forget the clock of the vehicle, which may have been switched off."""
-
-    def take(
-        self, block: LogBlock, timestamp: float, values: Sequence[float], arrival: float
-    ) -> None:
-        """Take a message: ms of the vehicle, values of the variables, s since 1970."""
-
-
-class CrazyflieLink:
+class CrazyflieLink(Link):
     """A link to one Crazyflie, which is opened again after it was lost."""
 
     def __init__(
@@ -55,7 +44,7 @@ class CrazyflieLink:
         uri: str,
         content: str,
         streams: Sequence[str],
-        samples: Samples,
+        topics: VehicleTopics,
         clock: Callable[[], int],
     ) -> None:
         """Start to connect.
@@ -68,7 +57,7 @@ class CrazyflieLink:
             POSE, or POSITION without the attitude.
         streams : sequence of str
             Names from BLOCKS of what the vehicle is to log.
-        samples : Samples
+        topics : VehicleTopics
             Gets each message of a log block.
         clock : callable
             Returns the time that stamps refer to, in ns since 1970.
@@ -87,7 +76,7 @@ class CrazyflieLink:
         logging.getLogger("cflib").setLevel(logging.CRITICAL)  # `report` says what is wrong
         crtp.init_drivers()
         self._log_config, self._uri, self._content = LogConfig, uri, content
-        self._streams, self._samples, self._clock = streams, samples, clock
+        self._streams, self._topics, self._clock = streams, topics, clock
         self._events: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._is_open, self._since = False, 0.0  # time.monotonic() of the last attempt, s
         self._due: float | None = 0.0  # time.monotonic() of the next attempt, s; None during one
@@ -122,7 +111,7 @@ class CrazyflieLink:
         """Start the log blocks of the vehicle, which is connected now."""
         self._is_open, self._trouble, self._missing = True, "", ""
         self._asked.clear()
-        self._samples.restart()
+        self._topics.restart()
         for stream in self._streams:
             variables, period = BLOCKS[stream]
             config = self._log_config(stream, round(1e3 * period))
@@ -152,7 +141,7 @@ class CrazyflieLink:
         self, block: LogBlock, timestamp: float, values: dict[str, float], arrival: float
     ) -> None:
         self._logged += 1
-        self._samples.take(block, timestamp, list(values.values()), arrival)
+        self._topics.take(block, timestamp, list(values.values()), arrival)
 
     def send(self, estimate: Estimate, resets: int) -> None:
         """Send the position, or the pose, once the Crazyflie does not trust it too much."""

@@ -8,7 +8,6 @@ estimate that may not be flown by is not sent at all.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 import math
 from typing import TYPE_CHECKING
 
@@ -29,25 +28,6 @@ ACCELERATION, TURN_RATE = 20.0, 10.0
 NOT_HEARD = "nothing came on status: start ekf_node in this namespace"
 
 
-@dataclass(frozen=True)
-class Limits:
-    """What an autopilot gets.
-
-    Attributes
-    ----------
-    rate : float
-        Most estimates per second of their stamps.
-    deviation : float
-        Largest standard deviation of a coordinate, in m.
-    yaw : bool
-        Whether the yaw is sent, and so must be known.
-    """
-
-    rate: float
-    deviation: float
-    yaw: bool = True
-
-
 class Gate:
     """Pass estimates on while the filter may be flown by.
 
@@ -61,9 +41,21 @@ class Gate:
         Number of estimates that were passed.
     """
 
-    def __init__(self, limits: Limits) -> None:
+    def __init__(self, rate: float, largest_deviation: float, needs_yaw: bool = True) -> None:
+        """Wait for a status.
+
+        Parameters
+        ----------
+        rate : float
+            Most estimates per second of their stamps.
+        largest_deviation : float
+            Largest standard deviation of a coordinate, in m.
+        needs_yaw : bool
+            Whether the yaw is sent, and so must be known.
+        """
         self.why, self.resets, self.passed = NOT_HEARD, 0, 0
-        self._limits, self._closed = limits, NOT_HEARD
+        self._period, self._largest, self._needs_yaw = 1e9 / rate, largest_deviation, needs_yaw
+        self._closed = NOT_HEARD
         self._before: Estimate | None = None
         self._due = -math.inf  # ns, stamp of the next estimate
         self._silent = False  # True from an estimate that was held back to the next that passes
@@ -73,7 +65,7 @@ class Gate:
         self._closed = ""
         if status != RUNNING:
             self._closed = why or "the filter is not running"
-        elif self._limits.yaw and not yaw_known:
+        elif self._needs_yaw and not yaw_known:
             self._closed = why or "the yaw is not known"
 
     def admit(self, estimate: Estimate, now: int) -> bool:
@@ -95,11 +87,10 @@ class Gate:
             self.resets += bool(self.passed)
             self._due = -math.inf
         self._silent = False
-        period = 1e9 / self._limits.rate
-        if estimate.stamp < self._due - SLACK * period:
+        if estimate.stamp < self._due - SLACK * self._period:
             return False
-        late = estimate.stamp >= self._due + period
-        self._due = (estimate.stamp if late else self._due) + period
+        late = estimate.stamp >= self._due + self._period
+        self._due = (estimate.stamp if late else self._due) + self._period
         self.passed += 1
         return True
 
@@ -111,10 +102,10 @@ class Gate:
                 f"odometry is stamped {abs(age):.1f} s {'before' if age > 0.0 else 'after'} the clock "
                 "of this node: set the clocks alike, or use_sim_time for a recording"
             )
-        if estimate.deviation > self._limits.deviation:
+        if estimate.deviation > self._largest:
             return (
                 f"the position has a deviation of {estimate.deviation:.1f} m, above "
-                f"largest_deviation ({self._limits.deviation:g} m): see status"
+                f"largest_deviation ({self._largest:g} m): see status"
             )
         return ""
 

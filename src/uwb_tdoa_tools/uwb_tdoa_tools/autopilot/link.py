@@ -1,10 +1,10 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What a link to an autopilot can do, whatever it speaks."""
+"""Define what a link to an autopilot can do, whatever it speaks."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from uwb_tdoa_bias.common.errors import InputError
 
@@ -21,8 +21,8 @@ def missing(protocol: str, error: ImportError, package: str) -> InputError:
     )
 
 
-class Link(Protocol):
-    """A link to one autopilot."""
+class Link:
+    """A link to an autopilot. This one leads to nobody: odometry goes out on a topic alone."""
 
     def send(self, estimate: Estimate, resets: int) -> None:
         """Send an estimate, which is in the frames of ROS.
@@ -40,23 +40,7 @@ class Link(Protocol):
 
     def report(self) -> tuple[str, dict[str, Any]]:
         """Return (sentence on what is wrong with the link or "", {key: value} for /diagnostics)."""
-
-    def close(self) -> None:
-        """End the link."""
-
-
-class NoLink:
-    """The link of nobody: what may be flown by goes out on a topic alone."""
-
-    def send(self, estimate: Estimate, resets: int) -> None:
-        """Do nothing."""
-
-    def turn(self) -> None:
-        """Do nothing."""
-
-    def report(self) -> tuple[str, dict[str, Any]]:
-        """Return no trouble."""
         return "", {}
 
     def close(self) -> None:
-        """Do nothing."""
+        """End the link."""

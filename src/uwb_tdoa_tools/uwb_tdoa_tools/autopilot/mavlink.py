@@ -15,13 +15,12 @@ from typing import TYPE_CHECKING, Any
 
 from uwb_tdoa_bias.common.errors import InputError
 
-from .estimate import FRD, UPPER
-from .link import missing
+from .estimate import FRD, UPPER, Estimate
+from .link import Link, missing
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from .estimate import Estimate
 
 CONNECTION = re.compile(r"(udpin|udpout|tcp|tcpin):[^:\s]+:\d{1,5}|/dev/[\w./-]+")
 FORMS = "udpout:HOST:PORT, udpin:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT or /dev/NAME"
@@ -32,7 +31,7 @@ NAMES = {3: "ArduPilot", 12: "PX4"}  # MAV_AUTOPILOT
 INVALID = 8  # MAV_AUTOPILOT of what is none, e.g. a ground station
 
 
-class MavlinkLink:
+class MavlinkLink(Link):
     """A link to PX4 or ArduPilot."""
 
     def __init__(

@@ -14,14 +14,13 @@ from uwb_tdoa_bias.ros.topics import OUTPUT_QOS
 from uwb_tdoa_msgs.msg import Tdoa
 
 from ..bags.messages import BODY_FRAME
-from ..crazyflie import VehicleClock
+from ..crazyflie import LogBlock, VehicleClock
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
 
     from rclpy.node import Node
 
-    from ..crazyflie import LogBlock
 
 TOPICS = {
     "tdoa": ("uwb/tdoa", Tdoa),

@@ -118,38 +118,42 @@ def _show(title: str, lines: Sequence[str], keep: bool = False) -> None:
         cli.show(textwrap.fill(line, width, initial_indent=begin, subsequent_indent=" " * INDENT))
 
 
+def _progress(text: str) -> None:
+    """Print a line of progress of the nodes."""
+    cli.show(f"nodes      {text}")
+
+
 def _measured(args: Namespace) -> int:
     """Take a measured flight through both nodes."""
     from ..evaluating import lines_of_errors
-    from ..flying import demo
+    from ..flying import demo, loop
+    from ..scoring.alignment import require_truth
 
     started = time.monotonic()
-    chosen = demo.measured(args.flight, options.reading_of(args), args.effects, args.model)
-    flight = chosen.flight
+    flight = options.reading_of(args).one(args.flight)
+    require_truth(flight)
     assert flight.truth is not None
+    correction = demo.corrector_of(flight, args.effects, args.model)
     length = flight.truth.t[-1] - flight.truth.t[0]
     cli.show(
         f"flight     {flight.name}: {length:.1f} s, {len(flight.tdoa)} TDOAs, "
         f"{len(flight.anchors)} anchors"
     )
-    cli.show(f"correction {chosen.correction()}")
-    flown = demo.fly(chosen, args.out, args.rate, lambda text: cli.show(f"nodes      {text}"))
-    scores = flown.scores
-    _show("nodes", demo.arrivals_in_words(flight, flown.live.outcome))
-    if flown.live.missing:
+    cli.show(f"correction {demo.correction_in_words(correction, args.effects, args.model)}")
+    files = {"effects_file": args.effects, "model_file": args.model}
+    live, scores = demo.fly(flight, correction, files, args.out, args.rate, args.rerun, _progress)
+    _show("nodes", demo.arrivals_in_words(flight, live.outcome))
+    if live.missing:
         cli.say("demo", f"messages lost or late: too much load for --rate {args.rate:g}; try less.")
-    change = demo.change_of_scores(scores)
-    cli.show(*lines_of_errors(scores), change)
-    from ..scoring.plots import plot_comparison  # takes a second to import
-
-    plot_comparison(flight, scores[:-1], args.out / "error.png")
+    cli.show(*lines_of_errors(scores), demo.change_of_scores(scores))
+    residuals = [loop.residuals_of(flight, by) for by in (None, correction)[: len(scores) - 1]]
+    loop.draw(args.out / "error.png", flight, residuals, scores[:-1])
     cli.show(f"plot       {args.out / 'error.png'}")
     if args.rerun is not None:
-        flown.show(args.rerun, flight, [change])
         cli.show(f"rerun      {args.rerun}")
     cli.show(f"took {time.monotonic() - started:.0f} s")
     _show("next", demo.next_steps(args.flight, args.survey), keep=True)
-    return int(scores[-2].row()["diverged"] or flown.live.missing > 0)  # of the nodes
+    return int(scores[-2].row()["diverged"] or live.missing > 0)  # of the nodes
 
 
 main = cli.executable(_demo, parser)

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import nullcontext
 from dataclasses import replace
 import sys
 from typing import TYPE_CHECKING
@@ -17,6 +18,8 @@ from ..choices import FLOWN, MOMENTS, WORLDS
 from ..outputs import OutputFile, OutputFolder
 
 if TYPE_CHECKING:
+    from contextlib import AbstractContextManager
+
     from ..flying.mission import Circles, Waypoints
 
 # Options without influence on a flight.
@@ -194,12 +197,11 @@ def _fly(args: argparse.Namespace) -> int:
     from uwb_tdoa_bias.correction.network import load_network
 
     from ..flying import fleet, rover
-    from ..flying.fleet import plot
     from ..flying.mission import Circles, Waypoints
     from ..flying.trial import Task
     from ..flying.verdict import summary, text, wording_of
     from ..flying.world import world_of
-    from ..results_file import settings_of
+    from ..results_file import ResultsFile, settings_of
 
     if args.record is not None:
         args.record.mkdir(parents=True, exist_ok=True)
@@ -240,19 +242,18 @@ def _fly(args: argparse.Namespace) -> int:
         )
         for seed in seeds
     ]
-    verdicts, pictures = [], []
-    with fleet.verdict_store(args.resume, settings_of(args, WITHOUT_INFLUENCE, INPUTS)) as done:
-        for verdict, picture in fleet.fly_all(
-            tasks, done, args.record, args.plot is not None, args.jobs, args.dask
-        ):
-            verdicts.append(verdict)
-            pictures += [] if picture is None else [picture]
+    kept: AbstractContextManager[ResultsFile | None] = nullcontext()
+    if args.resume is not None:
+        kept = ResultsFile(args.resume, settings_of(args, WITHOUT_INFLUENCE, INPUTS))
+    with kept as done:
+        flown = fleet.fly_all(tasks, done, args.record, args.plot is not None, args.jobs, args.dask)
+        verdicts, pictures = zip(*flown)
     summed = summary(verdicts)
     cli.show(text(summed))
     if args.json is not None:
         cli.write_json(args.json, {"summary": summed, "flights": verdicts})
     if args.plot is not None:
-        plot(pictures, world.anchors, args.plot)
+        fleet.plot(pictures, world.anchors, args.plot)
     return int(summed[wording_of(summed).goal] < args.at_least)
 
 

@@ -425,7 +425,7 @@ class Forecast:
 
     def _predicted(self, path: TimedPath) -> ChannelResiduals:
         """Return the residuals of a TimedPath without errors and noise, whose regressors count."""
-        flown = Trajectory.along(path.t, path.p, path.yaw)
+        flown = Trajectory(path.t, path.p, path.yaw)
         count = len(self._pairs)
         cells = np.arange(0.0, path.duration, CELL)
         t = (cells[:, None] + CELL * np.arange(count) / count).ravel()

@@ -11,70 +11,30 @@ is compiled and needs no ROS.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.common.compiled import compiled
 
-from .vehicle import CORNERS, GRAVITY, ROTORS, SPIN, Vehicle
-
-if TYPE_CHECKING:
-    from .vehicle import Record
+from .vehicle import CORNERS, GRAVITY, ROTORS, SPIN, Record, Vehicle
 
 SUPPORT_TIME = 0.1  # s over which the support by the ground is averaged
 
 
-@dataclass(frozen=True)
-class Gains:
-    """Set the gains and limits of the controller.
-
-    Parameters
-    ----------
-    position : float
-        From a position error to a velocity, 1/s.
-    reach : float
-        Limit of the position error, m.
-    velocity : float
-        From a velocity error to an acceleration, 1/s.
-    integral : float
-        From the integrated velocity error to an acceleration, 1/s^2.
-    most_integral : float
-        Limit of the integral part, m/s^2.
-    attitude, yaw : float
-        From an attitude error to body rates, 1/s.
-    rate, yaw_rate : float
-        From a rate error to angular accelerations, 1/s.
-    damping : float
-        Factor of the measured angular acceleration that acts against it; no unit.
-    most_tilt, most_rate : float
-        Limits of tilt and body rate, rad and rad/s.
-    least_thrust, most_thrust : float
-        Limits of the thrust, in units of the weight.
-    """
-
-    position: float = 1.5
-    reach: float = 0.75
-    velocity: float = 4.5
-    integral: float = 0.7
-    most_integral: float = 2.0
-    attitude: float = 8.0
-    yaw: float = 3.0
-    rate: float = 40.0
-    yaw_rate: float = 8.0
-    damping: float = 1.6
-    most_tilt: float = 0.5
-    most_rate: float = 6.0
-    least_thrust: float = 0.3
-    most_thrust: float = 1.8
-
-
+# gains, from an error to the first derivative of the next quantity
+POSITION_GAIN = 1.5  # 1/s, position to velocity
+VELOCITY_GAIN = 4.5  # 1/s, velocity to acceleration
+INTEGRAL_GAIN = 0.7  # 1/s^2, integrated velocity error to acceleration
+ATTITUDE_GAIN, YAW_GAIN = 8.0, 3.0  # 1/s, attitude to body rates
+RATE_GAIN, YAW_RATE_GAIN = 40.0, 8.0  # 1/s, body rates to angular accelerations
+DAMPING = 1.6  # share of the measured angular acceleration that acts against it
+REACH = 0.75  # m, limit of the position error
+MOST_INTEGRAL = 2.0  # m/s^2, limit of the integral part
+MOST_TILT, MOST_RATE = 0.5, 6.0  # rad and rad/s
+LEAST_THRUST, MOST_THRUST = 0.3, 1.8  # limits of the thrust, in units of the weight
 YAW_SHARE = 0.1  # of the full thrust of a rotor: the yaw has the lowest priority
 LEAST_SHARE = 0.01  # of the full thrust of a rotor, so that rotors do not stop in the air
-
-RECORD = np.dtype([(field.name, float) for field in fields(Gains)], align=True)
 
 
 class Controller:
@@ -101,7 +61,6 @@ class Controller:
             Vehicle as the controller assumes it.
         """
         self.vehicle = vehicle or Vehicle()
-        self.record = np.array([tuple(asdict(Gains()).values())], RECORD)[0]
         self.weight = self.vehicle.mass * GRAVITY
         self.rates, self.integral = np.zeros(3), np.zeros(3)
         self.thrust = self.lift = 0.0
@@ -125,9 +84,7 @@ class Controller:
         self.lift += min(1.0, dt / (self.vehicle.motor_time + 0.5 * SUPPORT_TIME)) * (
             self.thrust - self.lift
         )
-        self.thrust = outer(
-            (p, v, q), wanted, yaw, dt, (self.weight, self.record), self.integral, self.rates
-        )
+        self.thrust = outer((p, v, q), wanted, yaw, dt, self.weight, self.integral, self.rates)
 
     def support(self, force: float) -> float:
         """Return the share of the weight that the ground carries.
@@ -151,7 +108,7 @@ def outer(
     wanted: np.ndarray,
     yaw: float,
     dt: float,
-    known: tuple[float, Record],
+    weight: float,
     integral: np.ndarray,
     rates: np.ndarray,
 ) -> float:
@@ -163,29 +120,26 @@ def outer(
         Position, velocity and attitude, as in `Controller.fly`.
     wanted, yaw, dt
         As in `Controller.fly`.
-    known : tuple
-        Weight, N, and the record of the gains.
+    weight : float
+        N.
     integral, rates : numpy.ndarray
         Integral part (3,) m/s^2 and body rates (3,) rad/s. Both are written.
     """
     p, v, q = estimate[0], estimate[1], estimate[2]
-    weight, gains = known[0], known[1]
     a, error = np.empty(3), np.empty(3)
     far = 0.0
     for k in range(3):
         off = wanted[0, k] - p[k]
         error[k] = 0.0 if math.isnan(off) else off
         far += error[k] ** 2
-    shorter = gains.position * min(1.0, gains.reach / max(math.sqrt(far), 1e-9))
+    shorter = POSITION_GAIN * min(1.0, REACH / max(math.sqrt(far), 1e-9))
     for k in range(3):
         slow = wanted[1, k] + shorter * error[k] - v[k]
-        most = gains.most_integral
-        integral[k] = min(
-            max(integral[k] + gains.integral * min(max(slow, -0.5), 0.5) * dt, -most), most
-        )
-        a[k] = wanted[2, k] + gains.velocity * slow + integral[k]
-    a[2] = max(a[2] + GRAVITY, gains.least_thrust * GRAVITY)
-    level, most = math.hypot(a[0], a[1]), math.tan(gains.most_tilt) * a[2]
+        grown = integral[k] + INTEGRAL_GAIN * min(max(slow, -0.5), 0.5) * dt
+        integral[k] = min(max(grown, -MOST_INTEGRAL), MOST_INTEGRAL)
+        a[k] = wanted[2, k] + VELOCITY_GAIN * slow + integral[k]
+    a[2] = max(a[2] + GRAVITY, LEAST_THRUST * GRAVITY)
+    level, most = math.hypot(a[0], a[1]), math.tan(MOST_TILT) * a[2]
     if level > most:
         a[0] *= most / level
         a[1] *= most / level
@@ -205,17 +159,13 @@ def outer(
     yz_, zy_ = yx * r02 + yy * r12 + yz * r22, zx * r01 + zy * r11 + zz * r21
     zx_, xz_ = zx * r00 + zy * r10 + zz * r20, xx * r02 + xy * r12 + xz * r22
     xy_, yx_ = xx * r01 + xy * r11 + xz * r21, yx * r00 + yy * r10 + yz * r20
-    rates[0] = -gains.attitude * 0.5 * (zy_ - yz_)
-    rates[1] = -gains.attitude * 0.5 * (xz_ - zx_)
-    rates[2] = -gains.yaw * 0.5 * (yx_ - xy_)
+    rates[0] = -ATTITUDE_GAIN * 0.5 * (zy_ - yz_)
+    rates[1] = -ATTITUDE_GAIN * 0.5 * (xz_ - zx_)
+    rates[2] = -YAW_GAIN * 0.5 * (yx_ - xy_)
     for k in range(3):
-        rates[k] = min(max(rates[k], -gains.most_rate), gains.most_rate)
+        rates[k] = min(max(rates[k], -MOST_RATE), MOST_RATE)
     along = a[0] * r02 + a[1] * r12 + a[2] * r22
-    return (
-        weight
-        / GRAVITY
-        * min(max(along, gains.least_thrust * GRAVITY), gains.most_thrust * GRAVITY)
-    )
+    return weight / GRAVITY * min(max(along, LEAST_THRUST * GRAVITY), MOST_THRUST * GRAVITY)
 
 
 @compiled
@@ -224,7 +174,6 @@ def inner(
     rates: np.ndarray,
     gyro: np.ndarray,
     dt: float,
-    gains: Record,
     vehicle: Record,
     speeds: np.ndarray,
 ) -> None:
@@ -243,8 +192,8 @@ def inner(
         Measured body rates (2, 3), rad/s, now and `dt` ago.
     dt : float
         Time between samples, s.
-    gains, vehicle : Record
-        Records of Gains and Vehicle.
+    vehicle : Record
+        Record of the Vehicle that the controller assumes.
     speeds : numpy.ndarray
         Rotor speeds (4,), rad/s. They are written.
     """
@@ -252,12 +201,12 @@ def inner(
         speeds[:] = 0.0
         return
     mx = vehicle.inertia_xy * (
-        gains.rate * (rates[0] - gyro[0, 0]) - gains.damping * (gyro[0, 0] - gyro[1, 0]) / dt
+        RATE_GAIN * (rates[0] - gyro[0, 0]) - DAMPING * (gyro[0, 0] - gyro[1, 0]) / dt
     )
     my = vehicle.inertia_xy * (
-        gains.rate * (rates[1] - gyro[0, 1]) - gains.damping * (gyro[0, 1] - gyro[1, 1]) / dt
+        RATE_GAIN * (rates[1] - gyro[0, 1]) - DAMPING * (gyro[0, 1] - gyro[1, 1]) / dt
     )
-    mz = vehicle.inertia_z * gains.yaw_rate * (rates[2] - gyro[0, 2])
+    mz = vehicle.inertia_z * YAW_RATE_GAIN * (rates[2] - gyro[0, 2])
     full = vehicle.thrust * vehicle.top_speed**2  # N, of one rotor
     for k in range(ROTORS):
         # forces, N: each square of CORNERS is 0.5, so 0.5 arm is the lever of a rotor over CORNERS

@@ -5,114 +5,63 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 import os
 from pathlib import Path
 import time
 from typing import TYPE_CHECKING, Any
 
-from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.correction.network import load_network
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_ekf.offline import Run, run_offline
-from uwb_tdoa_ekf.results import Odometry
+from uwb_tdoa_ekf.offline import run_offline
 
 from .. import command_lines
-from ..bags.bag import read_odometry, write_bag
+from ..bags.bag import RecordedOdometry, read_odometry, write_bag
 from ..diagnosis import diagnose
 from ..live.run import accounts, run_live
 from ..localizing.pictures import write_rerun
 from ..outputs import as_json
 from ..parallel import Progress
 from ..scoring.gains import change_in_words
-from ..scoring.metrics import Score
+from ..scoring.metrics import Estimate, Score
 from . import loop
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
-    from uwb_tdoa_bias.correction.model import Model
+    from uwb_tdoa_bias.common.flight import Flight
 
-    from ..bags.bag import RecordedOdometry
     from ..diagnosis.result import Diagnosis
-    from ..readers.inputs import Reading
-    from ..scoring.metrics import Estimate
 
+CORRECTION = "bias.onnx"  # file of the correction of a simulated hall
 MISSING = ("lost", "late", "imu_late", "imu_lost")  # outcomes of messages
 
 
-@dataclass(frozen=True)
-class DemoFlight:
-    """Describe a measured flight of a demo.
-
-    Parameters
-    ----------
-    flight : Flight
-    effects_file, model : str or None
-        Corrections.
-    """
-
-    flight: Flight
-    effects_file: str | Path | None
-    model: str | None
-
-    def corrector(self) -> Corrector | None:
-        """Return the Corrector of the flight, or None without corrections.
-
-        Raises
-        ------
-        InputError
-            If a file cannot be used.
-        """
-        if not (self.effects_file or self.model):
-            return None
-        effects = EffectSet.from_yaml(self.effects_file) if self.effects_file else EffectSet()
-        return Corrector(self.flight.anchors, effects, load_network(self.model))
-
-    def correction(self) -> str:
-        """Return the corrections of the flight as text."""
-        corrector = self.corrector()
-        if corrector is None:
-            return (
-                "nothing: neither --effects nor --model is given, and corrections of other flights "
-                "may harm this one"
-            )
-        sources = [str(path) for path in (self.effects_file, self.model) if path]
-        return f"{corrector.model} ({', '.join(sources)})"
-
-
-def measured(
-    path: str | Path,
-    reading: Reading,
-    effects_file: str | Path | None = None,
-    model: str | None = None,
-) -> DemoFlight:
-    """Read a recording with the given corrections.
-
-    Parameters
-    ----------
-    path : str or Path
-    reading : Reading
-    effects_file : str or Path, optional
-    model : str, optional
-
-    Returns
-    -------
-    DemoFlight
+def corrector_of(
+    flight: Flight, effects: str | Path | None, model: str | Path | None
+) -> Corrector | None:
+    """Return the Corrector of a Flight by two files, or None if neither is given.
 
     Raises
     ------
     InputError
-        If the recording has no ground truth or a file cannot be used.
+        If a file cannot be used.
     """
-    flight = reading.one(path)
-    if flight.truth is None:
-        raise InputError(
-            f"{path}: holds no ground truth to compare with; take a flight that has it."
+    if not (effects or model):
+        return None
+    known = EffectSet.from_yaml(effects) if effects else EffectSet()
+    return Corrector(flight.anchors, known, load_network(model))
+
+
+def correction_in_words(corrector: Corrector | None, *files: str | Path | None) -> str:
+    """Return what corrects a flight, and by which files."""
+    if corrector is None:
+        return (
+            "nothing: neither --effects nor --model is given, and corrections of other flights "
+            "may harm this one"
         )
-    return DemoFlight(flight, effects_file, model)
+    return f"{corrector.model} ({', '.join(str(file) for file in files if file)})"
 
 
 @dataclass(frozen=True)
@@ -135,47 +84,12 @@ class LivePass:
         return sum(self.outcome[name] for name in MISSING)
 
 
-@dataclass(frozen=True)
-class DemoResult:
-    """Hold the results of a demo.
-
-    Parameters
-    ----------
-    live : LivePass
-        Flight through the nodes.
-    scores : list of Score
-        With corrections: filter without correction, nodes, filter with correction. Without corrections:
-        nodes and filter.
-    without_ros : Run
-        Filter with the corrections of the nodes.
-    raw : Odometry or None
-        Filter without correction, if there are corrections.
-    """
-
-    live: LivePass
-    scores: list[Score]
-    without_ros: Run
-    raw: Odometry | None
-
-    def show(self, path: Path, flight: Flight, sentences: Sequence[str]) -> None:
-        """Write a file for Rerun with the output of the nodes and sentences."""
-        write_rerun(
-            path,
-            flight,
-            self.live.odometry,
-            self.without_ros.residuals,
-            list(sentences),
-            flight.truth,
-            self.raw,
-        )
-
-
 def through_nodes(
     flight: Flight,
     bag: Path,
     folder: Path,
     rate: float,
-    bias: dict[str, Any],
+    files: Mapping[str, str | Path | None],
     say: Callable[[str], object],
 ) -> LivePass:
     """Play the bag of a flight to both nodes.
@@ -188,8 +102,8 @@ def through_nodes(
         For the output of the nodes.
     rate : float
         Speed of the replay.
-    bias : dict
-        Parameters of bias_node.
+    files : dict
+        {parameter of bias_node: file or None}.
     say : callable
         Called with lines of progress.
 
@@ -203,54 +117,70 @@ def through_nodes(
         If the flight cannot be played.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    # a node runs in another directory
+    bias = {name: str(Path(file).resolve()) for name, file in files.items() if file}
     live = run_live(bag, folder, rate, bias, {"use_imu": flight.imu is not None}, say)
     return LivePass(accounts(live.bias, live.ekf, flight), read_odometry(live.recorded))
 
 
 def fly(
-    planned: DemoFlight, folder: Path, rate: float = 1.0, say: Callable[[str], object] = print
-) -> DemoResult:
+    flight: Flight,
+    correction: Corrector | None,
+    files: Mapping[str, str | Path | None],
+    folder: Path,
+    rate: float,
+    rerun: Path | None = None,
+    say: Callable[[str], object] = print,
+) -> tuple[LivePass, list[Score]]:
     """Play a flight to both nodes, and run the filter without ROS.
 
     Parameters
     ----------
-    planned : DemoFlight
+    flight : Flight
+        With ground truth.
+    correction : Corrector or None
+    files : dict
+        {parameter of bias_node: file or None} of the same correction.
     folder : Path
         For the bag and the output of the nodes.
     rate : float
         Speed of the replay.
+    rerun : Path, optional
+        Write the output of the nodes for Rerun.
     say : callable
         Called with lines of progress.
 
     Returns
     -------
-    DemoResult
+    LivePass
+    list of Score
+        With a correction: filter without it, nodes, filter with it. Without: nodes and filter.
 
     Raises
     ------
     InputError, LiveError
         If the flight cannot be played.
     """
-    flight, bag, correction = planned.flight, folder / "flight.bag", planned.corrector()
     assert flight.truth is not None
+    bag = folder / "flight.bag"
     write_bag(flight, bag, force=True)
-    bias = {
-        "effects_file": _absolute(planned.effects_file),
-        "model_file": _absolute(planned.model),
-    }
-    passed = through_nodes(flight, bag, folder, rate, bias, say)
-    nodes, raw = passed.odometry, run_offline(flight)
-    estimates: dict[str, Estimate] = {"nodes": nodes, "without ROS": raw.odometry}
-    if correction:
-        corrected = run_offline(flight, corrector=correction)
+    live = through_nodes(flight, bag, folder, rate, files, say)
+    raw = run_offline(flight)
+    estimates: dict[str, Estimate] = {"nodes": live.odometry, "without ROS": raw.odometry}
+    same = raw
+    if correction is not None:
+        same = run_offline(flight, corrector=correction)
         estimates = {
             "raw": raw.odometry,
-            "corrected": nodes,
-            "corrected, without ROS": corrected.odometry,
+            "corrected": live.odometry,
+            "corrected, without ROS": same.odometry,
         }
     scores = [Score(name, one, flight.truth) for name, one in estimates.items()]
-    without_ros, before = (corrected, raw.odometry) if correction else (raw, None)
-    return DemoResult(passed, scores, without_ros, before)
+    if rerun is not None:
+        words = [change_of_scores(scores)]
+        before = None if correction is None else raw.odometry
+        write_rerun(rerun, flight, live.odometry, same.residuals, words, flight.truth, before)
+    return live, scores
 
 
 class Stopwatch:
@@ -269,7 +199,13 @@ class Stopwatch:
     def lap(self, name: str) -> None:
         """End a part."""
         now = time.monotonic()
-        self.laps[name], self._last = now - self._last, now
+        self.laps[name] = now - self._last
+        self._last = now
+
+    @property
+    def processor_time(self) -> float:
+        """Return the processor time of this process and of those that it ran, s."""
+        return sum(os.times()[:4])
 
     def in_words(self) -> str:
         """Return the time of all parts and of each, and the processor time of all processes."""
@@ -279,11 +215,6 @@ class Stopwatch:
             "time"
         )
 
-    @property
-    def processor_time(self) -> float:
-        """Return the processor time of this process and of those that it ran, s."""
-        return sum(os.times()[:4])
-
 
 @dataclass(frozen=True)
 class LoopResult:
@@ -292,34 +223,18 @@ class LoopResult:
     Parameters
     ----------
     flight : Flight
-    passes : tuple of LivePass
+    passes : list of LivePass
         Without the model, and with it. Only the first if there is no model.
-    model : Model or None
+    scores : list of Score
+        Of each pass.
+    residuals : list of PairResiduals
+        Of the TDOAs of each pass.
     """
 
     flight: Flight
-    passes: tuple[LivePass, ...]
-    model: Model | None
-
-    @cached_property
-    def scores(self) -> list[Score]:
-        """Return the score of each pass."""
-        assert self.flight.truth is not None
-        names = ("without", "with")
-        return [
-            Score(name, one.odometry, self.flight.truth) for name, one in zip(names, self.passes)
-        ]
-
-    @cached_property
-    def residuals(self) -> list[loop.PairResiduals]:
-        """Return the residuals of TDOAs of each pass."""
-        models = (None, self.model)[: len(self.passes)]
-        return [loop.residuals_of(self.flight, model) for model in models]
-
-    @property
-    def errors(self) -> list[float]:
-        """Return the 3D RMSE of each pass, m."""
-        return [float(score.row()["rmse_3d"]) for score in self.scores]
+    passes: list[LivePass]
+    scores: list[Score]
+    residuals: list[loop.PairResiduals]
 
     @property
     def missing(self) -> int:
@@ -343,7 +258,7 @@ class LoopResult:
 
     def error_in_words(self) -> str:
         """Return the position error of each pass."""
-        before, *more = (loop.CM * error for error in self.errors)
+        before, *more = (loop.CM * score.rmse_3d for score in self.scores)
         if not more:
             return f"3D RMSE {before:.1f} cm: nothing is corrected"
         (after,) = more
@@ -400,14 +315,19 @@ def fly_both(
         If the flight cannot be played.
     """
     (flight,) = loop.read([bag])
-    parameters: dict[str, dict[str, Any]] = {"without": {}}
-    if model is not None:
-        parameters["with"] = {"model_file": _absolute(model)}
-    passes = [
-        through_nodes(flight, bag, bag.parent / name, rate, one, partial(_named, say, name))
-        for name, one in parameters.items()
-    ]
-    return LoopResult(flight, tuple(passes), load_network(model))
+    assert flight.truth is not None
+    models = {"without": None, "with": model} if model else {"without": None}
+    passes, scores, residuals = [], [], []
+    for name, file in models.items():
+        title = f"{name} {CORRECTION}"
+        files = {"model_file": file}
+        live = through_nodes(
+            flight, bag, bag.parent / name, rate, files, partial(_titled, say, title)
+        )
+        passes.append(live)
+        scores.append(Score(title, live.odometry, flight.truth))
+        residuals.append(loop.residuals_of(flight, corrector_of(flight, None, file)))
+    return LoopResult(flight, passes, scores, residuals)
 
 
 def close_loop(
@@ -443,7 +363,8 @@ def close_loop(
     InputError, LiveError
         If the third flight cannot be played.
     """
-    clock, onnx, picture = Stopwatch(), folder / "bias.onnx", folder / "demo.png"
+    clock = Stopwatch()
+    onnx, picture = folder / CORRECTION, folder / "demo.png"
     with Progress("demo") as progress:
         progress("flying")
         bags = loop.record(seed, folder)
@@ -460,9 +381,7 @@ def close_loop(
     clock.lap("both nodes, twice" if correction else "both nodes")
     show("flown", [result.arrived_in_words()])
     show("error", [result.error_in_words()])
-    from .demo_picture import draw  # takes a second to import
-
-    draw(picture, result.flight, result.residuals, result.scores)
+    loop.draw(picture, result.flight, result.residuals, result.scores)
     clock.lap("picture")
     show("really", [loop.truth_in_words(seed, result.flight)])
     show("picture", [str(picture)])
@@ -470,9 +389,9 @@ def close_loop(
     return result, result.figures(seed, diagnosis, clock)
 
 
-def _named(say: Callable[[str], object], name: str, text: str) -> None:
+def _titled(say: Callable[[str], object], title: str, text: str) -> None:
     """Say a line of progress of one pass."""
-    say(f"{name} bias.onnx: {text}")
+    say(f"{title}: {text}")
 
 
 def change_of_scores(scores: Sequence[Score]) -> str:
@@ -522,8 +441,3 @@ def next_steps(recording: str | Path, survey: str | Path | None = None) -> list[
     words = [recording, *(("--survey", survey) if survey else ())]
     lines = [("check",), ("localize", "--out", "localized/"), ("calibrate", "--out", "calibrated/")]
     return [command_lines.tool(name, *words, *more) for name, *more in lines]
-
-
-def _absolute(path: str | Path | None) -> str:
-    """Return an absolute path, or "" for None: a node runs in another directory."""
-    return str(Path(path).resolve()) if path else ""

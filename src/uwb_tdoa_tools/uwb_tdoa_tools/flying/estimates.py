@@ -28,7 +28,7 @@ import math
 from pathlib import Path
 import shutil
 import time
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -43,8 +43,6 @@ from uwb_tdoa_ekf.results import Odometry, concatenated
 from .exported import CompiledCorrection
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from numpy.typing import ArrayLike
 
     from uwb_tdoa_bias.common.anchors import Anchors
@@ -53,7 +51,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_ekf.core.config import FilterConfig
 
     from .mission import Pose
-    from .simulator import SensorReadings
+    from .simulator import Streams
 
 
 VERSION = 1
@@ -187,56 +185,74 @@ def _pointer(array: np.ndarray) -> ctypes.c_void_p:
     return array.ctypes.data_as(ctypes.c_void_p)
 
 
-def odometry_of(
-    t: np.ndarray, p: np.ndarray, v: np.ndarray, q: np.ndarray, covariance: np.ndarray
-) -> Odometry:
-    """Return odometry of poses and velocities, without rates.
-
-    Parameters
-    ----------
-    t, p, v, q : numpy.ndarray
-        Stamps (n,) s, positions (n, 3) m, velocities (n, 3) m/s and attitudes (n, 4) x y z w.
-    covariance : numpy.ndarray
-        Of position, velocity and attitude (n, 9, 9).
-    """
-    zero = np.zeros(p.shape)
-    return Odometry(t, p, v, q, zero, zero, covariance, np.zeros((len(t), 3, 3)))
-
-
-NO_ODOMETRY = odometry_of(
-    np.empty(0), np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 4)), np.empty((0, 9, 9))
+_NO_VECTORS = np.empty((0, 3))
+NO_ODOMETRY = Odometry(
+    np.empty(0),
+    _NO_VECTORS,
+    _NO_VECTORS,
+    np.empty((0, 4)),
+    _NO_VECTORS,
+    _NO_VECTORS,
+    np.empty((0, 9, 9)),
+    np.empty((0, 3, 3)),
 )
 
 
-class EstimateSource(Protocol):
-    """Provide the estimate that a vehicle flies by.
+class EstimateSource:
+    """Provide the estimate that a vehicle flies by."""
 
-    `why` is the reason for which the estimate cannot be used, or "".
-    """
-
-    @property
-    def why(self) -> str: ...
+    def __init__(self) -> None:
+        # (t s, p (3,), v (3,), q (4,), covariance of p (3, 3)) of each estimate
+        self._rows: list[tuple[float, np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
 
     def set_pose(self, t: float, p: np.ndarray, std: float, yaw: float) -> None:
-        """Set the initial position and yaw, see `OwnFilter.set_pose`."""
+        """Set the position and the yaw at a time.
 
-    def take(self, measured: SensorReadings) -> None:
+        Parameters
+        ----------
+        t : float
+            s.
+        p : numpy.ndarray
+            (3,), m.
+        std : float
+            Standard deviation of position, m, and yaw, rad.
+        yaw : float
+            rad, NaN if unknown.
+        """
+        raise NotImplementedError
+
+    def take(self, streams: Streams) -> None:
         """Process the samples that have arrived."""
+        raise NotImplementedError
+
+    @property
+    def why(self) -> str:
+        """Return the reason for which the estimate cannot be used, or ""."""
+        return ""
 
     @property
     def pose(self) -> Pose | None:
-        """Return the newest estimate."""
+        """Return (t s, p (3,) m, v (3,) m/s, q (4,)) of the newest estimate, or None."""
+        return self._rows[-1][:4] if self._rows else None
 
     @property
     def deviation(self) -> float:
         """Return its largest standard deviation of a coordinate, m, or inf without an estimate."""
+        return math.sqrt(self._rows[-1][4].diagonal().max()) if self._rows else math.inf
 
     @property
     def odometry(self) -> Odometry:
-        """Return all estimates."""
+        """Return all estimates, without rates. Only the position has a covariance."""
+        if not self._rows:
+            return NO_ODOMETRY
+        t, p, v, q, of_position = map(np.array, zip(*self._rows))
+        covariance = np.zeros((len(t), 9, 9))
+        covariance[:, :3, :3] = of_position
+        zero = np.zeros(p.shape)
+        return Odometry(t, p, v, q, zero, zero, covariance, np.zeros((len(t), 3, 3)))
 
 
-class OwnFilter:
+class OwnFilter(EstimateSource):
     """Run `Corrector` and `Estimator` as bias_node and ekf_node do.
 
     Attributes
@@ -245,8 +261,6 @@ class OwnFilter:
     newest : Odometry or None
         The last output.
     """
-
-    why = ""
 
     def __init__(
         self,
@@ -265,43 +279,38 @@ class OwnFilter:
         network : Model, optional
             Corrections of the measurements.
         """
+        super().__init__()
         effects = effects or EffectSet()
-        self._anchors, self._streams, self._corrector = (
-            anchors,
-            StreamCorrector(effects.effects),
-            Corrector(anchors, effects, network),
-        )
+        self._anchors = anchors
+        self._streams = StreamCorrector(effects.effects)
+        self._corrector = Corrector(anchors, effects, network)
         self.estimator = Estimator(anchors, config, effects=effects)
         self._parts = [NO_ODOMETRY]
         self.newest: Odometry | None = None
 
     def set_pose(self, t: float, p: np.ndarray, std: float, yaw: float) -> None:
-        """Set the position and the yaw at a time.
-
-        Parameters
-        ----------
-        t : float
-            s.
-        p : numpy.ndarray
-            (3,), m.
-        std : float
-            Standard deviation of position, m, and yaw, rad.
-        yaw : float
-            rad, NaN if unknown.
-        """
         self.estimator.set_pose(t, p, std**2 * np.eye(3), yaw, std)
 
-    def take(self, measured: SensorReadings) -> None:
-        """Process the samples that have arrived."""
-        for name, part in measured.streams.items():
+    def take(self, streams: Streams) -> None:
+        for name, part in streams.items():
             if len(part.t):
                 self._add(name, self._streams.correct(name, part))
         odometry, _ = self.estimator.advance()
-        if len(odometry):
-            self._parts.append(odometry)
-            self.newest = odometry
-            if not self._corrector.idle:
-                self._corrector.add_pose(*poses_of(odometry))
+        if not len(odometry):
+            return
+        self._parts.append(odometry)
+        self.newest = odometry
+        self._rows = [  # the newest alone: _parts hold all
+            (
+                odometry.t[-1],
+                odometry.p[-1],
+                odometry.v[-1],
+                odometry.q[-1],
+                odometry.covariance[-1, :3, :3],
+            )
+        ]
+        if not self._corrector.idle:
+            self._corrector.add_pose(*poses_of(odometry))
 
     def _add(self, name: str, part: Any) -> None:
         """Give a part of one stream to the filter, and correct the bias of TDOAs."""
@@ -324,34 +333,18 @@ class OwnFilter:
             self.estimator.add(name, part)
 
     @property
-    def pose(self) -> Pose | None:
-        """Return (t s, p (3,) m, v (3,) m/s, q (4,)) of the newest estimate, or None."""
-        if self.newest is None:
-            return None
-        return self.newest.t[-1], self.newest.p[-1], self.newest.v[-1], self.newest.q[-1]
-
-    @property
-    def deviation(self) -> float:
-        """Return the largest standard deviation of a coordinate, m, or inf without an estimate."""
-        if self.newest is None:
-            return math.inf
-        P = self.newest.covariance[-1]
-        return math.sqrt(max(P[0, 0], P[1, 1], P[2, 2]))
-
-    @property
     def odometry(self) -> Odometry:
         """Return all estimates."""
         return concatenated(self._parts)
 
 
-class PeerFilter:
+class PeerFilter(EstimateSource):
     """Run a Peer as an estimate source.
 
     It gets place and yaw at the start. It gives no covariance.
     """
 
     deviation = 0.0  # m; a peer gives none
-    why = ""
 
     def __init__(
         self,
@@ -379,31 +372,29 @@ class PeerFilter:
         InputError
             If the library or the correction cannot be used.
         """
+        super().__init__()
         known = None if correction is None else CompiledCorrection(correction)
-        self._peer, self._anchors = Peer(library, own=True, correction=known), anchors
+        self._peer = Peer(library, own=True, correction=known)
+        self._anchors = anchors
+        self._finite: Pose | None = None
         q = np.array([0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw)])
         self._peer.start(anchors, np.full(3, np.nan) if place is None else place, q)
-        self._states: list[Pose] = []
-        self._newest: Pose | None = None
 
-    def take(self, measured: SensorReadings) -> None:
+    def set_pose(self, t: float, p: np.ndarray, std: float, yaw: float) -> None:
+        """Do nothing: the peer has its start."""
+
+    def take(self, streams: Streams) -> None:
         """Process the inertial samples and TDOAs that have arrived."""
-        both = np.concatenate(events(measured.imu, measured.tdoa, self._anchors))
-        if len(both):
-            self._peer.run(both[np.argsort(both["t"], kind="stable")])
-            self._states.append((float(both["t"].max()), *self._peer.state()))
-            if all(np.isfinite(part).all() for part in self._states[-1]):
-                self._newest = self._states[-1]
+        both = np.concatenate(events(streams["imu"], streams["tdoa"], self._anchors))
+        if not len(both):
+            return
+        self._peer.run(both[np.argsort(both["t"], kind="stable")])
+        state = (float(both["t"].max()), *self._peer.state())
+        self._rows.append((*state, np.full((3, 3), np.nan)))
+        if all(np.isfinite(part).all() for part in state):
+            self._finite = state
 
     @property
     def pose(self) -> Pose | None:
         """Return (t s, p (3,) m, v (3,) m/s, q (4,)) of the newest finite estimate, or None."""
-        return self._newest
-
-    @property
-    def odometry(self) -> Odometry:
-        """Return all estimates, with covariances of NaN."""
-        if not self._states:
-            return NO_ODOMETRY
-        t, p, v, q = map(np.array, zip(*self._states))
-        return odometry_of(t, p, v, q, np.full((len(t), 9, 9), np.nan))
+        return self._finite

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,22 +15,17 @@ from uwb_tdoa_bias.common.files import write_filled
 
 from .. import parallel
 from ..bags.bag import write_bag
-from ..results_file import ResultsFile
 from ..scoring.metrics import position_at
 from .rover import drive
-from .trial import fly
-from .verdict import reached, summary, text, verdict_of, wording_of
+from .trial import Task, TrialResult, fly
+from .verdict import reached, sampled, summary, text, verdict_of, wording_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from contextlib import AbstractContextManager
-    from pathlib import Path
+    from collections.abc import Iterable, Iterator, Sequence
 
     from uwb_tdoa_bias.common.anchors import Anchors
 
-    from .trial import Task, TrialResult
-
-    Verdicts = ResultsFile | dict[str, dict[str, Any]]  # {seed: verdict}
+    from ..results_file import ResultsFile
 
 
 SPACING = 0.05  # s
@@ -65,22 +59,16 @@ class DrawnFlight:
 def drawn_flight(result: TrialResult, verdict: dict[str, Any]) -> DrawnFlight:
     """Return the figures of a TrialResult to draw."""
     assert result.flight.truth is not None
-    truth, odometry = result.flight.truth, result.odometry
+    truth, odometry = result.flight.truth, sampled(result.odometry, SPACING)
     every = max(1, round(SPACING / (truth.t[1] - truth.t[0])))
     t, p = truth.t[::every], truth.p[::every]
     wanted = np.full(p.shape, np.nan)
     for mission in (mission for mission in result.missions if mission.started is not None):
         inside = (t >= mission.started) & (t <= (mission.ended or np.inf))
         wanted[inside] = mission.wanted(t[inside])[:, 0]
-    rows: np.ndarray = np.empty(0, int)
-    if len(odometry):
-        rows = np.unique(
-            np.searchsorted(odometry.t, np.arange(odometry.t[0], odometry.t[-1], SPACING))
-        )
-    stamps = odometry.t[rows]
-    error = odometry.p[rows] - position_at(stamps, truth)
-    sigma = np.sqrt(np.einsum("nii->ni", odometry.covariance[rows, :3, :3]))
-    return DrawnFlight(t, p, wanted, stamps, error, sigma, verdict)
+    error = odometry.p - position_at(odometry.t, truth)
+    sigma = np.sqrt(np.einsum("nii->ni", odometry.covariance[:, :3, :3]))
+    return DrawnFlight(t, p, wanted, odometry.t, error, sigma, verdict)
 
 
 def plot(flights: Sequence[DrawnFlight], anchors: Anchors, path: str | Path) -> None:
@@ -129,28 +117,9 @@ def _error_key(one: DrawnFlight) -> tuple[bool, float]:
     return not reached(one.verdict), one.verdict["tracking"] or 0.0
 
 
-def verdict_store(
-    path: str | Path | None, asked: dict[str, Any]
-) -> AbstractContextManager[Verdicts]:
-    """Return a context of a ResultsFile, or of a dict if `path` is None.
-
-    Parameters
-    ----------
-    path : str or Path or None
-    asked : dict
-        See `ResultsFile`.
-
-    Raises
-    ------
-    InputError
-        If the file belongs to other options.
-    """
-    return nullcontext({}) if path is None else ResultsFile(path, asked)
-
-
 def fly_all(
     tasks: Sequence[Task],
-    done: Verdicts,
+    done: ResultsFile | None = None,
     record: str | Path | None = None,
     draw: bool = False,
     jobs: int | None = None,
@@ -161,8 +130,8 @@ def fly_all(
     Parameters
     ----------
     tasks : sequence of Task
-    done : ResultsFile or dict
-        Verdicts by seed. Their tasks are not flown again.
+    done : ResultsFile, optional
+        Verdicts by seed. Their tasks are not flown again, and nothing is drawn.
     record : str or Path, optional
         Folder for a bag of each flight.
     draw : bool
@@ -170,14 +139,16 @@ def fly_all(
     jobs, dask
         See `parallel.over`.
     """
-    missing = [task for task in tasks if str(task.seed) not in done]
-    made = parallel.over(partial(fly_task, record, draw), missing, jobs, dask)
-    for task in tasks:
-        key, picture = str(task.seed), None
-        if key not in done:
-            done[key], picture = next(made)
-        yield (done.read(key, _validated) if isinstance(done, ResultsFile) else done[key]), picture
-    next(made, None)  # to its end: the processes can be used again
+    over = partial(parallel.over, partial(fly_task, record, draw), jobs=jobs, dask=dask)
+    if done is None:
+        yield from over(tasks)
+        return
+
+    def verdicts(missing: Iterable[Task]) -> Iterator[dict[str, Any]]:
+        return (verdict for verdict, _ in over(missing))
+
+    for key in done.keys_done([str(task.seed) for task in tasks], tasks, verdicts, "flights"):
+        yield done.read(key, _validated), None
 
 
 def _validated(verdict: dict[str, Any]) -> dict[str, Any]:

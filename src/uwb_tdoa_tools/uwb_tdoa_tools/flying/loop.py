@@ -9,19 +9,20 @@ that reads the recordings only: no file, no argument and no stream declares the 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.common.files import write_filled
 from uwb_tdoa_bias.common.geometry import tdoa
-from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import true_samples
 from uwb_tdoa_bias.effects.base import listed, rounded
 
 from ..bags.bag import write_bag
 from ..diagnosis.report.entries import entries, worth_in_words
 from ..readers.inputs import Reading
-from ..scoring.metrics import rms, scored_phase
+from ..scoring.metrics import Score, position_at, rms, scored_phase
 from ..simulation import SimulationConfig, simulate
 from ..simulation.hidden import hidden_effect
 
@@ -29,8 +30,10 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
+    from matplotlib.axes import Axes
+
     from uwb_tdoa_bias.common.flight import Flight
-    from uwb_tdoa_bias.correction.model import Model
+    from uwb_tdoa_bias.correction.corrector import Corrector
 
     from ..diagnosis.result import Diagnosis
     from ..exporting.correction import TracedCorrection
@@ -41,9 +44,13 @@ HALL = SimulationConfig(
 )
 YAWS = ("along_track", "rotating", "along_track")  # of the flights
 PERIOD = 1.0  # s, of one residual of a pair
-FEWEST = 10  # TDOAs of a pair in it
+FEWEST = 3  # TDOAs of a pair in it
 CM = 100.0  # cm per metre
 LARGEST = 2  # pairs that are named
+COLOURS = ("tab:red", "tab:blue")  # of a flight without and with the correction
+SIZE = 14  # points: legible if the picture is shrunk to 700 pixels
+NAMED = 8  # pairs in the legend: those with the largest residuals
+ROOM = 1.3  # of the largest error, the end of the axis: the legend covers no line
 
 
 def flight_of(seed: int, number: int) -> Flight:
@@ -98,7 +105,7 @@ class PairResiduals:
     @property
     def size(self) -> float:
         """Return the root mean square, m."""
-        return rms(self._all)
+        return _known_rms(*self.median.values())
 
     @property
     def constant(self) -> float:
@@ -108,24 +115,18 @@ class PairResiduals:
     @property
     def changing(self) -> float:
         """Return the root mean square around the mean of each pair, m."""
-        around = [values - np.nanmean(values) for values in self.median.values()]
-        found = np.concatenate(around)
-        return rms(found[np.isfinite(found)])
+        return _known_rms(*(values - np.nanmean(values) for values in self.median.values()))
 
-    @property
-    def largest(self) -> list[str]:
+    def largest(self, count: int) -> list[str]:
         """Return the pairs with the largest residuals."""
-        sizes = {pair: rms(values[np.isfinite(values)]) for pair, values in self.median.items()}
-        return sorted(sizes, key=lambda pair: -sizes[pair])[:LARGEST]
-
-    @property
-    def _all(self) -> np.ndarray:
-        together = np.concatenate(list(self.median.values()))
-        return together[np.isfinite(together)]
+        sizes = {pair: _known_rms(values) for pair, values in self.median.items()}
+        return sorted(sizes, key=lambda pair: -sizes[pair])[:count]
 
     def sentences(self) -> list[str]:
         """Return the residuals in words: their size, and over what they change."""
-        named = listed(f"{pair} ({_signed_cm(self.median[pair])})" for pair in self.largest)
+        named = listed(
+            f"{pair} ({_signed_cm(self.median[pair])})" for pair in self.largest(LARGEST)
+        )
         return [
             f"TDOAs are {CM * self.size:.1f} cm off (RMS over pairs of anchors and seconds)",
             f"{CM * self.constant:.1f} cm of it stays the same for a pair, "
@@ -133,18 +134,24 @@ class PairResiduals:
         ]
 
 
+def _known_rms(*parts: np.ndarray) -> float:
+    """Return the root mean square of all values that are known."""
+    together = np.concatenate([*parts, []])
+    return rms(together[np.isfinite(together)])
+
+
 def _signed_cm(values: np.ndarray) -> str:
     low, high = (CM * value for value in np.nanquantile(values, [0.1, 0.9]))
     return f"{low:+.0f} to {high:+.0f} cm"
 
 
-def residuals_of(flight: Flight, model: Model | None = None) -> PairResiduals:
-    """Return the PairResiduals of a Flight with ground truth in the air, corrected by a Model."""
+def residuals_of(flight: Flight, corrector: Corrector | None = None) -> PairResiduals:
+    """Return the PairResiduals of a Flight with ground truth in the air, corrected if asked."""
     assert flight.truth is not None
     samples, rows = true_samples(flight)
     off = flight.tdoa.d[rows] - tdoa(samples.p, samples.position_a, samples.position_b)
-    if model is not None:
-        off = off - Corrector(flight.anchors, network=model).prediction(samples).bias
+    if corrector is not None:
+        off = off - corrector.prediction(samples).bias
     _, first, last = scored_phase(flight.truth)
     number = np.floor((samples.t - first) / PERIOD).astype(int)
     count = int((last - first) / PERIOD)
@@ -197,3 +204,67 @@ def truth_in_words(seed: int, flight: Flight) -> str:
     effect = hidden_effect(seed, flight.anchors)
     values = ", ".join(f"{key} = {rounded(value)}" for key, value in effect.values.items())
     return f"{effect.label}: {values} ({effect.unit})"
+
+
+def draw(
+    path: Path, flight: Flight, residuals: Sequence[PairResiduals], scores: Sequence[Score]
+) -> None:
+    """Draw the residuals of TDOAs, the path and the error of a Flight to an image file.
+
+    Parameters
+    ----------
+    path : Path
+    flight : Flight
+    residuals, scores : sequence
+        Without a correction, and with it, if there is one.
+    """
+    from matplotlib import rc_context  # takes a second to import
+    from matplotlib.figure import Figure
+
+    with rc_context({"font.size": SIZE, "axes.titlesize": SIZE, "legend.fontsize": SIZE - 2}):
+        figure = Figure(figsize=(12, 9.5), layout="constrained")
+        axes = figure.subplots(2, 2)
+        values = np.abs(np.concatenate([*residuals[0].median.values(), [0.0]]))
+        limit = 1.1 * CM * max(float(np.nanmax(values)), 0.05)
+        for ax, one, score in zip(axes[0], residuals, scores):
+            _residuals(ax, one)
+            ax.set(title=f"TDOAs {score.name}: {CM * one.size:.1f} cm off", ylim=(-limit, limit))
+        ax.legend(title="pair of anchors", ncols=4, loc="lower center", handlelength=1.0)
+        _path(axes[1, 0], flight, scores)
+        _error(axes[1, 1], scores)
+        write_filled(path, partial(figure.savefig, dpi=100))
+
+
+def _residuals(ax: Axes, residuals: PairResiduals) -> None:
+    named = residuals.largest(NAMED)
+    for pair, values in residuals.median.items():
+        ax.plot(residuals.t, CM * values, lw=1.8, label=pair if pair in named else None)
+    ax.set(xlabel="time in the air [s]", ylabel="residual [cm]")
+    ax.grid(alpha=0.3)
+
+
+def _path(ax: Axes, flight: Flight, scores: Sequence[Score]) -> None:
+    truth = flight.truth
+    assert truth is not None
+    first, last = scores[0].first, scores[0].last
+    flown = (truth.t >= first) & (truth.t <= last)
+    ax.plot(*truth.p[flown, :2].T, "k", lw=2.5, label="true")
+    for score, colour in zip(scores, COLOURS):
+        estimate = position_at(score.t, truth) + score.error
+        ax.plot(*estimate[:, :2].T, color=colour, lw=1.2, label=score.name)
+    ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", title="Path from above")
+    ax.legend(loc="best")
+    ax.grid(alpha=0.3)
+
+
+def _error(ax: Axes, scores: Sequence[Score]) -> None:
+    for score, colour in zip(scores, COLOURS):
+        size = CM * np.linalg.norm(score.error, axis=1)
+        ax.plot(score.t - score.first, size, color=colour, lw=1.5, label=score.name)
+    sizes = [f"{CM * score.row()['rmse_3d']:.1f}" for score in scores]
+    highest = CM * max(np.linalg.norm(score.error, axis=1).max() for score in scores)
+    ax.set(xlabel="time in the air [s]", ylabel="3D position error [cm]")
+    ax.set_ylim(0.0, ROOM * highest)
+    ax.set_title(f"Position: {listed(sizes)} cm off")
+    ax.legend(loc="upper right", ncols=2)
+    ax.grid(alpha=0.3)

@@ -9,15 +9,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import math
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
 
-if TYPE_CHECKING:
-    # t s, p (3,) m, v (3,) m/s, both world frame, q (4,) x y z w
-    Pose = tuple[float, np.ndarray, np.ndarray, np.ndarray]
-
+# t s, p (3,) m, v (3,) m/s, both world frame, q (4,) x y z w
+Pose = tuple[float, np.ndarray, np.ndarray, np.ndarray]
 
 KNOT, FINE = 0.02, 0.0025  # s, between knots of the spline and points of its table
 SPEED_UP = 1.5  # s, from hovering to the circle and back
@@ -39,8 +37,6 @@ class Circles:
     turns : int
     turn_time : float
         Duration of a turn, s.
-    swing : float
-        Amplitude of the height in each turn, m.
     """
 
     height: float = 1.2
@@ -49,7 +45,6 @@ class Circles:
     fall: float = 4.0
     turns: int = 2
     turn_time: float = 8.0
-    swing: float = 0.0
 
     @property
     def duration(self) -> float:
@@ -74,9 +69,7 @@ class Circles:
         p = np.empty((len(knots), 3))
         p[:, 0] = place[0] + self.radius * (np.cos(angle) - 1.0)
         p[:, 1] = place[1] + self.radius * np.sin(angle)
-        p[:, 2] = (
-            ground + self.height * up - (self.height - SETTLE) * down + self.swing * np.sin(angle)
-        )
+        p[:, 2] = ground + self.height * up - (self.height - SETTLE) * down
         return ReferenceTrajectory(p)
 
 
@@ -284,25 +277,83 @@ class Plan(Protocol):
         """Return the path from `place` (2,) m with the body at rest at height `ground`, m."""
 
 
-# m, largest distance of the wanted height below the estimated height
-DESCENT_LEAD = 0.15
-# s, averaging time of the support in the air, where an offset of the accelerometer is all of it
-SUPPORT_OFFSET_TIME = 2.0
-
-
-class Mission:
-    """Run one flight along a path.
-
-    A lost mission stops and descends. It continues if the estimate recovers in the air.
+class Journey:
+    """Wait for a good estimate, move, and stop while the estimate is lost.
 
     Attributes
     ----------
     state : str
         WAITING, FLYING, LOST, DONE or REFUSED.
     started, ended : float or None
-        Times at which the rotors started and stopped, s.
+        Times of the start and of the end, s.
     lost : float or None
         First time at which the estimate was too uncertain, s.
+    """
+
+    def __init__(self, rules: Rules | None, begin: float) -> None:
+        """Wait.
+
+        Parameters
+        ----------
+        rules : Rules or None
+        begin : float
+            Time of switching on, s.
+        """
+        self.rules = rules or Rules()
+        self.begin = begin
+        self.state = WAITING
+        self.started: float | None = None
+        self.ended: float | None = None
+        self.lost: float | None = None
+        self._clock: list[tuple[float, float]] = []  # (s, s or m along the path) of each step
+
+    def _judge(self, t: float, pose: Pose | None, deviation: float) -> bool:
+        """Set the state at t, s, by the newest estimate, and return whether the vehicle moves."""
+        rules = self.rules
+        good = pose is not None and t - pose[0] <= rules.stale
+        if self.state == WAITING and t >= self.begin + rules.rest:
+            if good and deviation <= rules.arm:
+                self.state = FLYING
+                self.started = t
+            elif t >= self.begin + rules.rest + rules.patience:
+                self.state = REFUSED
+        if self.state not in (FLYING, LOST):
+            return False
+        if not good or deviation > rules.lost:
+            self.state = LOST
+            self.lost = t if self.lost is None else self.lost
+        elif deviation <= rules.arm:
+            self.state = FLYING
+        return True
+
+    def _end(self, t: float) -> None:
+        """End at t, s."""
+        self.state = DONE
+        self.ended = t
+
+    @property
+    def path_time(self) -> float:
+        """Return the time on the path, s, or the way along it, m."""
+        return self._clock[-1][1] if self._clock else 0.0
+
+    def _along(self, t: np.ndarray) -> np.ndarray:
+        """Return the time on the path, s, or the way along it, m, at t (n,) s."""
+        return np.interp(t, *np.transpose(self._clock))
+
+
+# m, largest distance of the wanted height below the estimated height
+DESCENT_LEAD = 0.15
+# s, averaging time of the support in the air, where an offset of the accelerometer is all of it
+SUPPORT_OFFSET_TIME = 2.0
+
+
+class Mission(Journey):
+    """Run one flight along a path.
+
+    A lost mission stops and descends. It continues if the estimate recovers in the air.
+
+    Attributes
+    ----------
     yaw : float
         Wanted yaw, rad.
     """
@@ -328,14 +379,12 @@ class Mission:
         begin : float
             Time of switching on, s.
         """
-        self.ground, self.rules, self.begin = ground, rules or Rules(), begin
+        super().__init__(rules, begin)
+        self.ground = ground
         self._path = path.starting_at(place, ground)
-        self._clock: list[tuple[float, float]] = []  # (s, time on the path, s) of each call
-        self.state = WAITING
-        self.started: float | None = None
-        self.ended: float | None = None
-        self.lost: float | None = None
         self.yaw = self._first_yaw = 0.0
+        self._last = 0.0  # s, of the step before
+        self._descent_began = 0.0  # s
         self._support_offset = 0.0  # support, of the weight
         self._descent: tuple[float, float] | None = None  # (s, m) at the start of the final descent
 
@@ -357,45 +406,40 @@ class Mission:
         support : float
             Share of the weight that the ground carries.
         """
-        rules = self.rules
-        good = pose is not None and t - pose[0] <= rules.stale
-        if self.state == WAITING and t >= self.begin + rules.rest:
-            if pose is not None and good and deviation <= rules.arm:
-                self.state, self.started, self._last, self._descent_began = FLYING, t, t, t
-                self._first_yaw = yaw_of(pose[3])
-            elif t >= self.begin + rules.rest + rules.patience:
-                self.state = REFUSED
-        if self.state not in (FLYING, LOST):
+        before = self.state
+        if not self._judge(t, pose, deviation):
             return None
-        if not good or deviation > rules.lost:
-            self.lost = t if self.lost is None else self.lost
-            self._descent_began = t if self.state != LOST else self._descent_began
-            self.state = LOST
-        elif self.state == LOST and good and deviation <= rules.arm:
-            self.state = FLYING
-        along = self.path_time + (0.0 if self.state == LOST else t - self._last)
+        lost = self.state == LOST
+        if before == WAITING:
+            assert pose is not None  # the start needs a pose
+            self._last = t
+            self._first_yaw = yaw_of(pose[3])
+        if before == WAITING or (lost and before != LOST):
+            self._descent_began = t
+        along = self.path_time + (0.0 if lost else t - self._last)
         self._clock.append((t, along))
-        if self.state != LOST and along < self._path.duration - rules.near_end:
+        on_the_way = not lost and along < self._path.duration - self.rules.near_end
+        if on_the_way:
             self._support_offset += min(1.0, (t - self._last) / SUPPORT_OFFSET_TIME) * (
                 support - self._support_offset
             )
         self._last = t
-        near_end = self.state == LOST or along > self._path.duration - rules.near_end
-        if near_end and (
-            support - self._support_offset > rules.ground_support
-            or t - self._descent_began > rules.longest_descent
-        ):
-            self.state, self.ended = DONE, t
+        on_ground = support - self._support_offset > self.rules.ground_support
+        too_long = t - self._descent_began > self.rules.longest_descent
+        if not on_the_way and (on_ground or too_long):
+            self._end(t)
             return None
-        if self.state != LOST:
-            assert pose is not None  # without a pose the state is LOST
-            self._descent_began = t if along < self._path.duration else self._descent_began
-            self.yaw = self._first_yaw + self._path.yaw_offset(along)
-            wanted = self._path.at(np.array([along]))[0]
-            return self._descend(t, wanted, pose[1][2]) if math.isnan(wanted[0, 2]) else wanted
-        wanted = np.zeros((3, 3))
-        wanted[0], wanted[1, 2] = math.nan, -rules.descent_speed
-        return wanted
+        if lost:
+            wanted = np.zeros((3, 3))
+            wanted[0] = math.nan
+            wanted[1, 2] = -self.rules.descent_speed
+            return wanted
+        assert pose is not None  # without a pose the state is LOST
+        if along < self._path.duration:
+            self._descent_began = t
+        self.yaw = self._first_yaw + self._path.yaw_offset(along)
+        wanted = self._path.at(np.array([along]))[0]
+        return self._descend(t, wanted, pose[1][2]) if math.isnan(wanted[0, 2]) else wanted
 
     def _descend(self, t: float, wanted: np.ndarray, height: float) -> np.ndarray:
         """Add a height, m, that falls at half of the wanted speed if the estimated height does not fall.
@@ -413,14 +457,9 @@ class Mission:
         """Return the wanted place of the landing (2,), m."""
         return self._path.end
 
-    @property
-    def path_time(self) -> float:
-        """Return the time on the path, s."""
-        return self._clock[-1][1] if self._clock else 0.0
-
     def wanted(self, t: np.ndarray) -> np.ndarray:
         """Return the wanted motion (n, 3, 3) at t (n,) s."""
-        return self._path.at(np.interp(t, *np.transpose(self._clock)))
+        return self._path.at(self._along(t))
 
 
 def yaw_of(q: np.ndarray) -> float:

@@ -26,27 +26,21 @@ from sensor_msgs.msg import Imu
 from uwb_tdoa_bias.anchors_node import markers, transforms
 from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS, anchors_to_message
-from uwb_tdoa_bias.ros.cdr import CdrCodec, message_class
+from uwb_tdoa_bias.ros.cdr import CdrCodec, CdrTemplate, message_class
 from uwb_tdoa_bias.ros.frames import TF_STATIC_QOS
-from uwb_tdoa_bias.ros.node import StreamOutput
+from uwb_tdoa_bias.ros.node import StreamNode, StreamOutput
 from uwb_tdoa_bias.ros.topics import OUTPUT_QOS, Input, StreamInput
 from uwb_tdoa_ekf.reorder_buffer import TRIAL
 from uwb_tdoa_msgs.msg import EstimatorStatus, Tdoa
 
 from ..bags.messages import BODY_FRAME
-from .estimates import NO_ODOMETRY, odometry_of
-from .simulator import DT
+from .estimates import EstimateSource
+from .simulator import DT, Streams
 from .vehicle import ATTITUDE, POSITION
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from uwb_tdoa_bias.ros.cdr import CdrTemplate
-    from uwb_tdoa_bias.ros.node import StreamNode
-    from uwb_tdoa_ekf.results import Odometry
-
-    from .mission import Pose
-    from .simulator import SensorReadings
     from .world import World
 
 
@@ -66,7 +60,7 @@ class RealTime:
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock, self._began, self._now = clock, clock(), 0.0
 
-    def sent(self, now: float, measured: SensorReadings) -> None:
+    def sent(self, now: float, streams: Streams) -> None:
         """Note that all samples up to `now`, s, were published."""
         self._now = now
 
@@ -95,11 +89,9 @@ class Lockstep:
         self._heard: float | None = None
         self._periods, self._silent = deque([DT], REMEMBERED), True
 
-    def sent(self, now: float, measured: SensorReadings) -> None:
+    def sent(self, now: float, streams: Streams) -> None:
         """Note that all samples up to `now`, s, were published."""
-        self._newest |= {
-            stream: part.t[-1] for stream, part in measured.streams.items() if len(part.t)
-        }
+        self._newest |= {name: part.t[-1] for name, part in streams.items() if len(part.t)}
         self._first = now if self._first is None else self._first
         unordered_wait = 0.0 if now > self._first + TRIAL + UNTRUSTED else UNTRUSTED
         self._reach = (
@@ -149,8 +141,8 @@ STREAMS: dict[str, tuple[str, type, Callable[[Any], dict[str, Any]]]] = {
 } | {name: (of.topics[0][0], message_class(of.message), of.content) for name, of in SENSORS.items()}
 
 
-class OverTopics:
-    """Exchange samples and estimates with a filter over topics, as an EstimateSource.
+class OverTopics(EstimateSource):
+    """Exchange samples and estimates with a filter over topics.
 
     Attributes
     ----------
@@ -172,7 +164,10 @@ class OverTopics:
         clock : bool
             Publish /clock and count stamps from 0. Otherwise stamps count from the present time.
         """
-        self._node, self._pace, self._anchors = node, pace, world.anchors
+        super().__init__()
+        self._node = node
+        self._pace = pace
+        self._anchors = world.anchors
         self._begin = 0 if clock else None  # ns, stamp of the start
         self._now = 0.0
         self._pending_pose: tuple[float, np.ndarray, float, float] | None = None
@@ -194,8 +189,6 @@ class OverTopics:
         ):
             self._latched = node.create_publisher(type(content), topic, qos)
             self._latched.publish(content)
-        # (t s, p, v, q, covariance (3, 3)) of each odometry
-        self._rows: list[tuple[float, np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
 
     def is_connected(self) -> bool:
         """Return whether a filter subscribes to the samples and publishes odometry."""
@@ -210,15 +203,15 @@ class OverTopics:
         """Set the initial pose. It is published before the next samples."""
         self._pending_pose = t, p, std, yaw
 
-    def take(self, measured: SensorReadings) -> None:
+    def take(self, streams: Streams) -> None:
         """Publish samples."""
         if self._begin is None:
             self._begin = self._node.get_clock().now().nanoseconds
         if self._pending_pose:
             self._pose.publish(self._pose_of(*self._pending_pose))
             self._pending_pose = None
-        self._measured = measured
-        for name, part in measured.streams.items():
+        self._sent = streams
+        for name, part in streams.items():
             self._outputs[name].publish(*self._parts(part.t), part)
 
     def publish_truth(self, t: float, state: np.ndarray) -> None:
@@ -233,7 +226,7 @@ class OverTopics:
         )
         if self._clock is not None:
             self._clock.publish(Clock(clock=self._stamp(t)))
-        self._pace.sent(t, self._measured)
+        self._pace.sent(t, self._sent)
 
     def receive(self) -> None:
         """Store the odometry that has come."""
@@ -278,23 +271,13 @@ class OverTopics:
         self.status = message
 
     @property
-    def pose(self) -> Pose | None:
-        """Return (t s, p (3,) m, v (3,) m/s, q (4,)) of the newest estimate, or None."""
-        return self._rows[-1][:4] if self._rows else None
-
-    @property
     def deviation(self) -> float:
         """Return the largest standard deviation of a coordinate, m.
 
         It is inf without an estimate, and unless the filter reports STATUS_RUNNING.
         """
-        if (
-            not self._rows
-            or self.status is None
-            or self.status.status != EstimatorStatus.STATUS_RUNNING
-        ):
-            return math.inf
-        return math.sqrt(np.diag(self._rows[-1][4]).max())
+        is_running = self.status and self.status.status == EstimatorStatus.STATUS_RUNNING
+        return super().deviation if is_running else math.inf
 
     @property
     def why(self) -> str:
@@ -302,16 +285,6 @@ class OverTopics:
         if self.status is None:
             return "nothing came on status: start ekf_node"
         return self.status.why if self.status.status != EstimatorStatus.STATUS_RUNNING else ""
-
-    @property
-    def odometry(self) -> Odometry:
-        """Return all estimates. Only the position has a covariance."""
-        if not self._rows:
-            return NO_ODOMETRY
-        t, p, v, q, covariance = map(np.array, zip(*self._rows))
-        whole = np.zeros((len(t), 9, 9))
-        whole[:, :3, :3] = covariance
-        return odometry_of(t, p, v, q, whole)
 
     def _parts(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return seconds and nanoseconds (n,) of the stamps t (n,) s."""

@@ -16,12 +16,11 @@ from scipy.interpolate import BPoly
 
 from uwb_tdoa_bias.common.errors import InputError
 
-from .mission import FLYING, LOST, SETTLE, with_descent, yaw_of
+from .mission import FLYING, LOST, SETTLE, Mission, with_descent, yaw_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from .mission import Mission
     from .trial import Trial
 
 

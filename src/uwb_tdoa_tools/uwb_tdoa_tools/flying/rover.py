@@ -16,18 +16,15 @@ from uwb_tdoa_bias.common.sensors import SENSORS
 
 from ..simulation.config import WHEELS_RATE
 from ..simulation.sensors import YAW_RATE_STD, slips
-from .mission import DONE, FLYING, LOST, REFUSED, WAITING, Polyline, Rules, Waypoints, yaw_of
+from .mission import LOST, Journey, Polyline, Pose, Rules, Waypoints, yaw_of
 from .sensors import AuxiliarySensor, random
 from .simulator import Simulator
-from .trial import REST_AFTER, Trial
+from .trial import REST_AFTER, Task, Trial, TrialResult
 from .vehicle import GRAVITY, IMU_RATE
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.common.sensors.sensor import Stream
 
-    from .estimates import EstimateSource
-    from .mission import Pose
-    from .trial import Task, TrialResult
     from .world import World
 
 MAST = 0.4  # m
@@ -134,11 +131,8 @@ def _unicycle(wheels: Any) -> tuple[Any, Any]:
     return 0.5 * (left + right), (right - left) / TRACK
 
 
-class Drive:
-    """Run one drive along a polyline.
-
-    The rover stands while its estimate is lost. State, started, ended and lost are those of Mission.
-    """
+class Drive(Journey):
+    """Run one drive along a polyline. The rover stands while its estimate is lost."""
 
     def __init__(
         self, path: Polyline, speed: float, rules: Rules | None = None, begin: float = 0.0
@@ -154,13 +148,11 @@ class Drive:
         begin : float
             Time of switching on, s.
         """
-        self.path, self.rules, self.begin, self._speed = path, rules or Rules(), begin, speed
-        self.state = WAITING
-        self.started: float | None = None
-        self.ended: float | None = None
-        self.lost: float | None = None
+        super().__init__(rules, begin)
+        self.path = path
+        self.place = path.end
+        self._speed = speed
         self._last_good = begin
-        self._clock: list[tuple[float, float]] = []  # (s, m along the path) of each call
 
     def decide(self, t: float, pose: Pose | None, deviation: float, steering: Steering) -> None:
         """Set the wanted motion in `steering`.
@@ -176,21 +168,11 @@ class Drive:
         steering : Steering
         """
         steering.stop()
-        rules, good = self.rules, pose is not None and t - pose[0] <= self.rules.stale
-        if self.state == WAITING and t >= self.begin + rules.rest:
-            if good and deviation <= rules.arm:
-                self.state, self.started = FLYING, t
-            elif t >= self.begin + rules.rest + rules.patience:
-                self.state = REFUSED
-        if self.state not in (FLYING, LOST):
+        if not self._judge(t, pose, deviation):
             return
-        if not good or deviation > rules.lost:
-            self.lost, self.state = t if self.lost is None else self.lost, LOST
-        elif deviation <= rules.arm:
-            self.state = FLYING
         if self.state == LOST:
             if t - self._last_good > LOST_TIMEOUT:
-                self.state, self.ended = DONE, t
+                self._end(t)
             return
         self._last_good = t
         assert pose is not None  # without a pose the state is LOST
@@ -199,12 +181,12 @@ class Drive:
     def _steer(self, t: float, pose: Pose, steering: Steering) -> None:
         """Steer to a point ahead on the path (pure pursuit)."""
         p = pose[1][:2]
-        before = self._clock[-1][1] if self._clock else 0.0
+        before = self.path_time
         along = float(self.path.nearest(p[None], before, before + WINDOW)[0])
         self._clock.append((t, along))
         left = float(np.linalg.norm(self.path.end - p))
         if left < STOP or (along >= self.path.length and left < 2.0 * STOP):
-            self.state, self.ended = DONE, t
+            self._end(t)
             return
         target = self.path.at(np.array([along + LOOK_AHEAD]))[0, :2]
         x, y = target - p
@@ -213,27 +195,20 @@ class Drive:
         steering.speed = min(self._speed, APPROACH_GAIN * to_go) * max(math.cos(off), 0.0)
         steering.turning = min(max(TURN * off, -MAX_YAW_RATE), MAX_YAW_RATE)
 
-    @property
-    def place(self) -> np.ndarray:
-        """Return the last place of the path (2,), m."""
-        return self.path.end
-
     def wanted(self, t: np.ndarray) -> np.ndarray:
         """Return the points of the path that were nearest (n, 1, 3), m, at t (n,) s."""
         if not self._clock:
             return np.full((len(t), 1, 3), np.nan)
-        return self.path.at(np.interp(t, *np.transpose(self._clock)))[:, None]
+        return self.path.at(self._along(t))[:, None]
 
 
 class RoverTrial(Trial):
     """Run a Task with Waypoints."""
 
-    def __init__(
-        self, task: Task, source: EstimateSource | None = None, duration: float | None = None
-    ) -> None:
-        rules = task.rules
-        longest = rules.rest + rules.patience + 2.0 * task.path.duration + LOST_TIMEOUT + REST_AFTER
-        super().__init__(task, source, duration or longest)
+    def _longest(self) -> float:
+        rules = self.task.rules
+        drive = 2.0 * self.task.path.duration
+        return rules.rest + rules.patience + drive + LOST_TIMEOUT + REST_AFTER
 
     def _simulator(self, duration: float) -> RoverSimulator:
         return RoverSimulator(self.task.world, self.task.seed, duration)
@@ -245,15 +220,9 @@ class RoverTrial(Trial):
         way = path.starting_at(self.simulator.state[:2].copy(), MAST)
         return Drive(way, path.speed, rules, self.simulator.now)
 
-    def turn(self) -> None:
-        """Execute one turn of the controller."""
-        self.controller.stop()
-        if self.missions:
-            drive: Any = self.missions[-1]
-            self._schedule_faults(drive)
-            source = self.source
-            drive.decide(self.simulator.now, source.pose, source.deviation, self.controller)
-        self._turn()
+    def _control(self, mission: Any) -> None:
+        source = self.source
+        mission.decide(self.simulator.now, source.pose, source.deviation, self.controller)
 
     def _crash(self) -> str:
         half = 0.5 * np.array(self.task.world.size[:2])

@@ -28,13 +28,16 @@ if TYPE_CHECKING:
     from .world import World
 
 NEAR_FLOOR = 0.5  # m, largest height at which the floor acts
+FLOOR_DELAY, FLOOR_HEIGHT = (3.0, 3.9), (0.06, 0.2)  # m, of low anchors, and up to which height
+CHANGED_DELAY = 0.3  # m, of an anchor that becomes late
 LOW = 1.0  # m, largest height of a low anchor
 GUST_TIME = 1.0  # s, correlation time of gusts
 PERSON = 0.25, 1.8, 1.0  # m, radius and height of a person; m/s
 # m, delay behind a person; s, between draws of it
 BLOCKED, BLOCK_TIME = ((0.2, 2.0), 0.5)
-# noise of barometer, m, velocity, m/s, and distances, m
-ALTITUDE_STD, VELOCITY_STD, RANGE_STD = (0.08, 0.05, 0.1)
+# noise of range finder, m, barometer, m, velocity, m/s, and distances, m
+HEIGHT_STD, ALTITUDE_STD, VELOCITY_STD, RANGE_STD = (0.01, 0.08, 0.05, 0.1)
+HIGHEST = 4.0  # m, largest distance of the range finder
 NEVER = np.inf, np.inf
 
 
@@ -70,15 +73,11 @@ class Radio:
         self.positions, n = anchors.positions, len(anchors)
         schedule = make_schedule(world.protocol, n, duration, random(seed, "schedule"), world.rate)
         self.t, self.a, self.b = schedule.t, schedule.a, schedule.b
-        self.silent, self.changed, self.other = (
-            NEVER,
-            np.inf,
-            int(random(seed, "change").integers(n)),
-        )
-        self._world, rng = (
-            world,
-            random(seed if world.installation is None else world.installation, "anchors"),
-        )
+        self.silent = NEVER
+        self.changed = np.inf
+        self.other = int(random(seed, "change").integers(n))
+        self._world = world
+        rng = random(seed if world.installation is None else world.installation, "anchors")
         self._error = tdoa_noise(
             schedule, np.full(n, world.noise / math.sqrt(2.0)), False, random(seed, "tdoa noise")
         )
@@ -92,7 +91,7 @@ class Radio:
             ],
             axis=1,
         )
-        late, height = rng.uniform(*world.floor_delay, n), rng.uniform(*world.floor_height, n)
+        late, height = rng.uniform(*FLOOR_DELAY, n), rng.uniform(*FLOOR_HEIGHT, n)
         low = anchors.ids[self.positions[:, 2] < LOW].tolist() if world.floor_effect else ()
         self.floor = FloorMultipath(
             {
@@ -152,9 +151,7 @@ class Radio:
                 d += sign * np.where(through, late[np.arange(len(t)), anchor], 0.0)
         mine = (t >= self.changed) & ((a == self.other) | (b == self.other))
         if self._world.change == "late":
-            d += np.where(
-                mine, np.where(b == self.other, 1.0, -1.0) * self._world.changed_delay, 0.0
-            )
+            d += np.where(mine, np.where(b == self.other, 1.0, -1.0) * CHANGED_DELAY, 0.0)
         elif self._world.change == "silent":
             d[mine] = np.nan
         d[(t >= self.silent[0]) & (t < self.silent[1])] = np.nan
@@ -163,10 +160,8 @@ class Radio:
     def _near_floor(self, rows: slice, p: np.ndarray) -> np.ndarray:
         """Return the error (k,), m, near the floor. Each anchor is late with the probability of FloorMultipath."""
         t, a, b = self.t[rows], self.a[rows], self.b[rows]
-        samples, both = (
-            Samples(t, a, b, p, np.full((len(p), 4), np.nan), self._anchors),
-            np.concatenate([a, b]),
-        )
+        samples = Samples(t, a, b, p, np.full((len(p), 4), np.nan), self._anchors)
+        both = np.concatenate([a, b])
         late = self.floor.of_each(self._anchors)[0][both]
         late = np.where(
             self._at_times[rows].T.ravel() * late < self.floor.delays(samples, both), late, 0.0
@@ -305,13 +300,9 @@ class AuxiliarySensor:
 
     def __init__(self, world: World, seed: int, duration: float) -> None:
         """Draw stamps and noise for `duration`, s."""
-        self.world, rate = world, self.rate_in(world)
-        self.t = np.arange(0.5, duration * rate) / rate
+        self.world = world
+        self.t = np.arange(0.5, duration * self.rate) / self.rate
         self.noise = random(seed, type(self).__name__).standard_normal((len(self.t), self.width))
-
-    def rate_in(self, world: World) -> float:
-        """Return the rate in a world, Hz."""
-        return self.rate
 
     def measured(
         self, rows: slice, p: np.ndarray, q: np.ndarray, v: np.ndarray, height: np.ndarray
@@ -333,17 +324,14 @@ class AuxiliarySensor:
 class RangeFinder(AuxiliarySensor):
     """Simulate a range finder along -z of the body, m, with inf beyond its range."""
 
-    def rate_in(self, world: World) -> float:
-        return world.height_rate
+    rate = 20.0
 
     def measured(
         self, rows: slice, p: np.ndarray, q: np.ndarray, v: np.ndarray, height: np.ndarray
     ) -> tuple[np.ndarray, ...]:
         up = 1.0 - 2.0 * (q[:, 0] ** 2 + q[:, 1] ** 2)
-        seen = height / np.maximum(up, 1e-3) + self.world.height_noise * self.noise[rows, 0]
-        return (
-            np.where((up > 0.0) & (seen <= self.world.height_range), np.maximum(seen, 0.0), np.inf),
-        )
+        seen = height / np.maximum(up, 1e-3) + HEIGHT_STD * self.noise[rows, 0]
+        return (np.where((up > 0.0) & (seen <= HIGHEST), np.maximum(seen, 0.0), np.inf),)
 
 
 class Barometer(AuxiliarySensor):

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 import math
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +16,7 @@ from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_ekf.results import concatenated, rows_of
 
 from .controller import inner
-from .sensors import SENSOR_NAMES, InertialErrors, Radio, gusts, random
+from .sensors import SENSOR_NAMES, AuxiliarySensor, InertialErrors, Radio, gusts, random
 from .vehicle import (
     ATTITUDE,
     GRAVITY,
@@ -26,6 +25,7 @@ from .vehicle import (
     STATE,
     STEP,
     VELOCITY,
+    Record,
     Vehicle,
     ground_at,
     specific_force,
@@ -35,8 +35,6 @@ from .vehicle import (
 if TYPE_CHECKING:
     from uwb_tdoa_bias.common.sensors.sensor import Stream
 
-    from .sensors import AuxiliarySensor
-    from .vehicle import Record
     from .world import World
 
 
@@ -49,7 +47,7 @@ def interval(
     state: np.ndarray,
     gyro: np.ndarray,
     wanted: tuple[float, np.ndarray],
-    controller: tuple[Record, Record],
+    assumed: Record,
     vehicle: Record,
     disturbances: tuple[np.ndarray, np.ndarray, np.ndarray],
     measured: tuple[np.ndarray, np.ndarray, np.ndarray],
@@ -65,10 +63,8 @@ def interval(
         The last two measured body rates (2, 3), rad/s, newest first, updated in place.
     wanted : tuple
         Thrust, N, and body rates (3,), rad/s.
-    controller : tuple
-        Records of the gains and of the vehicle that the controller assumes.
-    vehicle : Record
-        Record of the true vehicle.
+    assumed, vehicle : Record
+        Records of the vehicle that the controller assumes, and of the true vehicle.
     disturbances : tuple
         Wind (n, 3) m/s. Sensor errors (n, 6) of rates, rad/s, and specific force, m/s^2. Vibration
         (n, 3) m/s^2 while rotors turn.
@@ -77,7 +73,6 @@ def interval(
         largest number of feet on the ground in that time (n,).
     """
     thrust, rates = wanted[0], wanted[1]
-    gains, assumed = controller[0], controller[1]
     wind, errors, shaking = disturbances[0], disturbances[1], disturbances[2]
     truth, samples, contact = measured[0], measured[1], measured[2]
     dt = STEP * STEPS
@@ -88,7 +83,7 @@ def interval(
         np.empty(STATE),
     )
     for i in range(len(truth)):
-        inner(thrust, rates, gyro, dt, gains, assumed, speeds)  # writes speeds, of the rotors
+        inner(thrust, rates, gyro, dt, assumed, speeds)  # writes speeds, of the rotors
         earlier[:] = state
         feet = 0
         turn = np.zeros(3)
@@ -140,32 +135,15 @@ def poses_at(
 TICK = 4  # inertial samples per turn of the controller
 DT = TICK / IMU_RATE  # s
 START_SPREAD = 0.5  # m, largest offset of the path from the middle of the hall along each axis
+MASS = 0.027, 0.033  # kg, least and largest mass
 MASS_ERROR = 0.05  # largest relative error of the mass in the controller
 TABLE_RADIUS = 0.4  # m
 CARRY_HEIGHT = 0.5  # m, height at which it is carried
 RECENT = round(0.3 * IMU_RATE)  # samples of the truth that effects use
 
 
-@dataclass(frozen=True)
-class SensorReadings:
-    """Hold the sensor samples of one turn.
-
-    Parameters
-    ----------
-    imu : Imu
-    tdoa : Tdoas
-    sensors : dict of str to Stream
-        Streams of the other sensors of the world, by name.
-    """
-
-    imu: Imu
-    tdoa: Tdoas
-    sensors: dict[str, Stream]
-
-    @property
-    def streams(self) -> dict[str, Any]:
-        """Return all streams by name."""
-        return {"imu": self.imu, "tdoa": self.tdoa, **self.sensors}
+# the samples of one turn by streams: imu, tdoa, and the further sensors of the world
+Streams = dict[str, Any]
 
 
 class Simulator:
@@ -196,7 +174,7 @@ class Simulator:
         """
         self.world, rng = world, random(seed, "place")
         middle, yaw = rng.uniform(-START_SPREAD, START_SPREAD, 2), rng.uniform(-np.pi, np.pi)
-        mass = rng.uniform(*world.mass)
+        mass = rng.uniform(*MASS)
         x, y = middle[0] + radius, middle[1]
         table = (
             {"table": world.table, "table_x": x, "table_y": y, "table_radius": TABLE_RADIUS}
@@ -207,20 +185,18 @@ class Simulator:
         self.nominal = Vehicle(mass=mass * (1.0 + rng.uniform(-MASS_ERROR, MASS_ERROR)))
         self.yaw, self.state = yaw, self.vehicle.at_rest(x, y, yaw)
         self._record, self._nominal_record = self.vehicle.record(), self.nominal.record()
-        self.radio, self._inertial = (
-            Radio(world, seed, duration),
-            InertialErrors(world, seed, duration),
-        )
+        self.radio = Radio(world, seed, duration)
+        self._inertial = InertialErrors(world, seed, duration)
         self._sensors = {name: SENSOR_NAMES[name](world, seed, duration) for name in world.sensors}
         self._wind, self._rng = gusts(world, seed, duration), random(seed, "effects")
         n = len(self._wind)
-        self.times, self.states, self.contact = (
-            np.arange(n) / IMU_RATE,
-            np.empty((n, STATE)),
-            np.zeros(n),
-        )
+        self.times = np.arange(n) / IMU_RATE
+        self.states = np.empty((n, STATE))
+        self.states[0] = self.state
+        self.contact = np.zeros(n)
         self.samples = np.zeros((n, 6))
-        self.done, self.states[0], self._gyro = 0, self.state, np.zeros((2, 3))
+        self.done = 0
+        self._gyro = np.zeros((2, 3))
         # state and time at the start, time at the end, path
         self._carrying: tuple[np.ndarray, float, float, np.ndarray] | None = None
         self._heard = dict.fromkeys(("tdoa", *world.sensors), 0)
@@ -242,7 +218,7 @@ class Simulator:
         """Return the height of the ground or table below the vehicle, m."""
         return ground_at(self._record, self.state[0], self.state[1])
 
-    def advance(self, controller: Any) -> SensorReadings:
+    def advance(self, controller: Any) -> Streams:
         """Move for one turn and return the sensor samples.
 
         Parameters
@@ -252,7 +228,7 @@ class Simulator:
 
         Returns
         -------
-        SensorReadings
+        Streams
         """
         k = self.done
         rows, lately = slice(k + 1, k + TICK + 1), slice(k, k + TICK + 1)
@@ -269,11 +245,10 @@ class Simulator:
         tdoa = Tdoas(
             radio.t[new][heard], ids[radio.a[new][heard]], ids[radio.b[new][heard]], d[heard]
         )
-        sensors = {
-            name: self._sensor_measured(name, sensor, lately)
-            for name, sensor in self._sensors.items()
-        }
-        return self._with_effects(SensorReadings(imu, tdoa, sensors))
+        streams: Streams = {"imu": imu, "tdoa": tdoa}
+        for name, sensor in self._sensors.items():
+            streams[name] = self._sensor_measured(name, sensor, lately)
+        return self._with_effects(streams)
 
     def _move(self, controller: Any, rows: slice) -> None:
         """Fly the samples in `rows` with the outputs of a Controller."""
@@ -281,7 +256,7 @@ class Simulator:
             self.state,
             self._gyro,
             (controller.thrust, controller.rates),
-            (controller.record, self._nominal_record),
+            self._nominal_record,
             self._record,
             (self._wind[rows], self._inertial.errors[rows], self._inertial.shaking[rows]),
             (self.states[rows], self.samples[rows], self.contact[rows]),
@@ -346,11 +321,11 @@ class Simulator:
             sensor.t[new], *sensor.measured(new, p, q, inside, p[:, 2] - self.ground)
         )
 
-    def _with_effects(self, measured: SensorReadings) -> SensorReadings:
+    def _with_effects(self, streams: Streams) -> Streams:
         """Return the samples with the effects of the world added by `Effect.inject`."""
-        if not len(self.world.effects) or not len(measured.tdoa):
-            return measured
-        tdoa = measured.tdoa
+        tdoa = streams["tdoa"]
+        if not len(self.world.effects) or not len(tdoa):
+            return streams
         self._first = self._first if self._first is not None else (tdoa, self.states[0])
         first, at = self._first  # effects count time from the first TDOA
         columns = (
@@ -358,20 +333,15 @@ class Simulator:
             for name in ("t", "a", "b", "d")
         )
         recent = slice(max(self.done - RECENT, 0), self.done + 1)
-        states, t = (
-            np.concatenate([at[None], self.states[recent]]),
-            np.concatenate([first.t[:1] - 1e-3, self.times[recent]]),
-        )
+        states = np.concatenate([at[None], self.states[recent]])
+        t = np.concatenate([first.t[:1] - 1e-3, self.times[recent]])
         truth = Truth(t, states[:, POSITION], states[:, ATTITUDE])
-        sensors: dict[str, Any] = measured.sensors
-        flight = Flight("turn", self.world.anchors, Tdoas(*columns), measured.imu, truth, **sensors)
+        measured = streams | {"tdoa": Tdoas(*columns), "truth": truth}
+        flight = Flight("turn", self.world.anchors, **measured)
         for effect in self.world.effects.effects:
             flight = effect.inject(flight, self._rng)
-        assert flight.imu is not None  # no effect removes it
-        sensors = {name: getattr(flight, name) for name in measured.sensors}
-        return replace(
-            measured, tdoa=rows_of(flight.tdoa, slice(1, None)), imu=flight.imu, sensors=sensors
-        )
+        changed = {name: getattr(flight, name) for name in streams}
+        return changed | {"tdoa": rows_of(flight.tdoa, slice(1, None))}
 
 
 def _along(way: np.ndarray, share: np.ndarray) -> np.ndarray:
@@ -406,12 +376,11 @@ class Transport:
         # by stream: (waiting rows, their arrivals (n,) s, the last arrival)
         self._waiting: dict[str, tuple[Any, np.ndarray, float]] = {}
 
-    def arrived(self, measured: SensorReadings, now: float) -> SensorReadings:
+    def arrived(self, streams: Streams, now: float) -> Streams:
         """Add new samples and return the samples that have arrived by `now`, s."""
         if not self._latency and not self._jitter:
-            return measured
-        parts = {stream: self._due(stream, part, now) for stream, part in measured.streams.items()}
-        return SensorReadings(parts.pop("imu"), parts.pop("tdoa"), parts)
+            return streams
+        return {name: self._due(name, part, now) for name, part in streams.items()}
 
     def _due(self, stream: str, part: Any, now: float) -> Any:
         """Return the rows of one stream that have arrived."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -20,17 +20,12 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.results import Odometry, concatenated
 
 from .controller import SUPPORT_TIME, Controller, rotate_attitude
-from .estimates import OwnFilter, PeerFilter
-from .mission import DONE, REFUSED, Circles, Mission, Rules, Waypoints
+from .estimates import EstimateSource, OwnFilter, PeerFilter
+from .mission import DONE, REFUSED, Circles, Mission, Plan, Rules, Waypoints
 from .sensors import random
-from .simulator import DT, Simulator, Transport
+from .simulator import DT, Simulator, Streams, Transport
 from .vehicle import ATTITUDE, IMU_RATE, POSITION
 from .world import World
-
-if TYPE_CHECKING:
-    from .estimates import EstimateSource
-    from .mission import Plan
-    from .simulator import SensorReadings
 
 REST_AFTER = 3.0  # s, recording after the rotors have stopped
 # s at rest between two flights, then distance, m, and duration, s, of carrying
@@ -144,24 +139,15 @@ class Trial:
         duration : float, optional
             s. The default is the longest duration of the task.
         """
-        world, seed, rules = task.world, task.seed, task.rules
-        longest = (
-            rules.rest + rules.patience + task.path.duration + rules.longest_descent + REST_AFTER
-        )
-        duration = duration or longest * (2 if task.again else 1) + (
-            PAUSE + CARRY_TIME if task.again else 0.0
-        )
+        world, seed = task.world, task.seed
         self.task = task
-        self.simulator = self._simulator(duration)
+        self.simulator = self._simulator(duration or self._longest())
         self._rng = random(seed, "task")
         rng = random(seed, "told")
-        place, off = (
-            self.simulator.state[POSITION] + GIVEN_STD * rng.standard_normal(3),
-            GIVEN_STD * rng.standard_normal(),
-        )
-        yaw = self.simulator.yaw + off
-        self.source: EstimateSource | PeerFilter = source or _filter_of(task, place, yaw)
-        if task.given == "place" and not isinstance(self.source, PeerFilter):
+        place = self.simulator.state[POSITION] + GIVEN_STD * rng.standard_normal(3)
+        yaw = self.simulator.yaw + GIVEN_STD * rng.standard_normal()
+        self.source = source or _filter_of(task, place, yaw)
+        if task.given == "place":
             self.source.set_pose(
                 GIVEN_AT, place, GIVEN_STD, yaw if task.yaw == "known" else math.nan
             )
@@ -169,7 +155,14 @@ class Trial:
         self.transport = Transport(world.latency, world.jitter, random(seed, "transport"))
         self.missions: list[Any] = []
         self.crash = ""
-        self._arrived: list[SensorReadings] = []
+        self._arrived: list[Streams] = []
+
+    def _longest(self) -> float:
+        """Return the longest duration of the task, s."""
+        rules = self.task.rules
+        path = self.task.path.duration
+        once = rules.rest + rules.patience + path + rules.longest_descent + REST_AFTER
+        return 2.0 * once + (PAUSE + CARRY_TIME) if self.task.again else once
 
     def _simulator(self, duration: float) -> Simulator:
         """Return the simulated vehicle for `duration`, s."""
@@ -212,28 +205,26 @@ class Trial:
 
     def turn(self) -> None:
         """Execute one turn of the controller."""
-        wanted = self._decide(self.missions[-1]) if self.missions else None
-        if wanted is None:
-            self.controller.stop()
+        if self.missions:
+            self._schedule_faults(self.missions[-1])
+            self._control(self.missions[-1])
         else:
-            pose = self.source.pose
-            assert pose is not None  # a mission starts with a pose
-            since, p, v, q = pose
-            self.controller.fly(
-                p, v, self._predicted_attitude(q, since), wanted, self.missions[-1].yaw, DT
-            )
+            self.controller.stop()
         self._turn()
 
-    def _decide(self, mission: Mission) -> np.ndarray | None:
-        """Return the wanted motion of a mission."""
-        simulator, k = self.simulator, self.simulator.done
-        self._schedule_faults(mission)
-        force = float(
-            np.mean(simulator.samples[max(k - int(SUPPORT_TIME * IMU_RATE), 0) : k + 1, 5])
-        )
-        return mission.decide(
-            simulator.now, self.source.pose, self.source.deviation, self.controller.support(force)
-        )
+    def _control(self, mission: Any) -> None:
+        """Set the outputs of the controller as a mission wants."""
+        now, k, pose = self.simulator.now, self.simulator.done, self.source.pose
+        lately = slice(max(k - int(SUPPORT_TIME * IMU_RATE), 0), k + 1)
+        support = self.controller.support(float(np.mean(self.simulator.samples[lately, 5])))
+        wanted = mission.decide(now, pose, self.source.deviation, support)
+        if wanted is None:
+            self.controller.stop()
+            return
+        assert pose is not None  # a mission starts with a pose
+        since, p, v, q = pose
+        attitude = self._predicted_attitude(q, since)
+        self.controller.fly(p, v, attitude, wanted, mission.yaw, DT)
 
     def _schedule_faults(self, mission: Any) -> None:
         """Set the times of the gap and of the anchor change for a mission."""
@@ -250,11 +241,10 @@ class Trial:
             self._turn()
 
     def _turn(self) -> None:
-        measured = self.transport.arrived(
-            self.simulator.advance(self.controller), self.simulator.now
-        )
-        self._arrived.append(measured)
-        self.source.take(measured)
+        measured = self.simulator.advance(self.controller)
+        arrived = self.transport.arrived(measured, self.simulator.now)
+        self._arrived.append(arrived)
+        self.source.take(arrived)
         self.crash = self._crash()
 
     def _crash(self) -> str:
@@ -271,13 +261,10 @@ class Trial:
 
     def _predicted_attitude(self, attitude: np.ndarray, since: float) -> np.ndarray:
         """Return an attitude (4,) of the time `since`, s, rotated by the gyroscope until now."""
-        times, samples, k, attitude = (
-            self.simulator.times,
-            self.simulator.samples,
-            self.simulator.done,
-            attitude.copy(),
-        )
-        for j in range(max(int(np.searchsorted(times[: k + 1], since, side="right")), 1), k + 1):
+        k = self.simulator.done
+        times, samples = self.simulator.times[: k + 1], self.simulator.samples
+        attitude = attitude.copy()
+        for j in range(max(int(np.searchsorted(times, since, side="right")), 1), k + 1):
             rotate_attitude(attitude, samples[j, :3], times[j] - max(times[j - 1], since))
         return attitude
 
@@ -287,23 +274,18 @@ class Trial:
         simulator, world = self.simulator, self.task.world
         end = simulator.done + 1
         states = simulator.states[:end]
-        parts = [
-            concatenated([getattr(one, name) for one in self._arrived]) for name in ("imu", "tdoa")
-        ]
-        sensors: dict[str, Any] = {
-            name: concatenated([one.sensors[name] for one in self._arrived])
-            for name in world.sensors
+        streams = {
+            name: concatenated([one[name] for one in self._arrived])
+            for name in ("tdoa", "imu", *world.sensors)
         }
         truth = Truth(simulator.times[:end], states[:, POSITION], states[:, ATTITUDE])
         meta = {"source": "fly", "format": "simulation", "protocol": world.protocol}
         flight = Flight(
             f"flown-{self.task.seed}",
             world.anchors,
-            parts[1],
-            parts[0],
-            truth,
+            truth=truth,
             meta=meta,
-            **sensors,
+            **streams,
         )
         return TrialResult(
             self.task,
@@ -329,19 +311,19 @@ def fly(task: Task) -> TrialResult:
     return trial.result
 
 
-def _filter_of(task: Task, place: np.ndarray, yaw: float) -> OwnFilter | PeerFilter:
+def _filter_of(task: Task, place: np.ndarray, yaw: float) -> EstimateSource:
     """Return the estimate source of a Task. `place` (3,) m and `yaw`, rad, are given if the task says so."""
     anchors = task.world.anchors
     if task.peer is not None:
         given = place if task.given == "place" else None
         return PeerFilter(task.peer, anchors, yaw, given, task.correction)
-    known: dict[str, Any] = (
-        {"initial_yaw": yaw, "initial_yaw_std": GIVEN_STD} if task.yaw == "known" else {}
-    )
+    config = task.config
+    if task.yaw == "known":
+        config = replace(config, initial_yaw=yaw, initial_yaw_std=GIVEN_STD)
     model = load_network(task.model)
     if model is not None:
         model.require(anchors)
-    return OwnFilter(anchors, replace(task.config, **known), task.effects, model)
+    return OwnFilter(anchors, config, task.effects, model)
 
 
 def _silence_start(

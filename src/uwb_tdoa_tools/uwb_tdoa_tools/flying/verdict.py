@@ -11,22 +11,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from uwb_tdoa_ekf.results import rows_of
+from uwb_tdoa_ekf.results import Odometry, rows_of
 
 from ..scoring.metrics import nees, position_at, rms
-from .mission import DONE, REFUSED
+from .mission import DONE, REFUSED, Journey, Mission
 from .rover import Drive
-from .trial import REST_AFTER
+from .trial import REST_AFTER, TrialResult
 from .vehicle import POSITION, VELOCITY
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
-
-    from uwb_tdoa_bias.common.flight import Truth
-    from uwb_tdoa_ekf.results import Odometry
-
-    from .mission import Mission
-    from .trial import TrialResult
 
 
 AIR = 0.3  # m above the ground, least height in the air
@@ -85,53 +79,61 @@ def verdict_of(flown: TrialResult) -> dict[str, Any]:
 def _of_mission(flown: TrialResult, mission: Mission, end: float) -> dict[str, Any]:
     """Return the figures of one Mission until `end`, s."""
     assert flown.flight.truth is not None
-    truth = flown.flight.truth
-    inside = slice(*np.searchsorted(truth.t, (mission.begin, end)))
-    truth = rows_of(truth, inside)
+    times = flown.flight.truth.t
+    inside = slice(*np.searchsorted(times, (mission.begin, end)))
+    truth = rows_of(flown.flight.truth, inside)
     states, contact = flown.states[inside], flown.contact[inside]
-    odometry = rows_of(
-        flown.odometry, slice(*np.searchsorted(flown.odometry.t, (mission.begin, end)))
-    )
+    mine = slice(*np.searchsorted(flown.odometry.t, (mission.begin, end)))
+    odometry = sampled(rows_of(flown.odometry, mine), SPACING)
     crash = flown.crash if mission is flown.missions[-1] else ""
-    t, height = truth.t, states[:, 2] - mission.ground
     tilt = np.arccos(np.clip(1.0 - 2.0 * (states[:, 6] ** 2 + states[:, 7] ** 2), -1.0, 1.0))
-    aloft = np.flatnonzero(height > AIR)
+    aloft = np.flatnonzero(states[:, 2] - mission.ground > AIR)
     took_off = bool(len(aloft))
-    first: int | None = None
-    last: int | None = None
-    tracking: float | None = None
     touchdown: float | None = None
+    tracking: float | None = None
+    stop = truth.t[-1]
+    started, ended = mission.started or stop, mission.ended or stop
+    up = down = ended
     if took_off:
         first, last = int(aloft[0]), int(aloft[-1])
-        touched = last + np.flatnonzero(contact[last:] > 0)
-        if len(touched):
-            speeds = np.linalg.norm(states[last : touched[-1] + 1, VELOCITY], axis=1)
-            onset = touched[(contact[touched - 1] == 0)]
-            touchdown = float(speeds[np.maximum(onset - 1 - last, 0)].max())
-        inside = slice(first, last + 1, 8)
-        wanted = mission.wanted(t[inside])[:, 0]
-        off = np.nan_to_num(states[inside, POSITION] - wanted)  # the descent has no wanted height
+        up, down = float(truth.t[first]), float(truth.t[last])
+        touchdown = _touchdown(states[last:], contact[last:])
+        air = slice(first, last + 1, 8)
+        wanted = mission.wanted(truth.t[air])[:, 0]
+        off = np.nan_to_num(states[air, POSITION] - wanted)  # the descent has no wanted height
         tracking = rms(np.linalg.norm(off, axis=1))
-    place = float(np.linalg.norm(states[-1, :2] - mission.place))
+    begins = [-math.inf, started, max(up, started), max(down, started), max(ended, down)]
+    error = odometry.p - position_at(odometry.t, truth)
+    under_way = (odometry.t >= started) & (odometry.t < ended)
+    far = odometry.t[(np.linalg.norm(error, axis=1) > LOST) & under_way]
     figures = {
+        **_common(flown, mission, float(truth.t[-1])),
+        **_estimation(odometry, error, dict(zip(PHASES, begins)), "air"),
         "took_off": took_off,
-        "place": place,
+        "place": float(np.linalg.norm(states[-1, :2] - mission.place)),
         "touchdown": touchdown,
         "upright": bool(tilt[-1] < UPRIGHT),
         "tracking": tracking,
-        "started": mission.started,
-        "ended": mission.ended,
-        "reported_lost": mission.lost,
-        "duration": float(t[-1]),
-        **_armed(flown.odometry, flown.flight.truth, mission.started),
-        **_estimation(odometry, truth, mission, first, last),
+        "lost": float(far[0]) if len(far) else None,
     }
     figures["why"] = _why(crash, mission, figures)
-    gentle = not took_off or (
-        mission.state == DONE and touchdown is not None and touchdown < GENTLE
-    )
-    figures["safe"] = bool(gentle and figures["upright"] and not crash)
+    gentle = mission.state == DONE and touchdown is not None and touchdown < GENTLE
+    figures["safe"] = bool((gentle or not took_off) and figures["upright"] and not crash)
     return figures
+
+
+def _touchdown(states: np.ndarray, contact: np.ndarray) -> float | None:
+    """Return the largest speed, m/s, before feet touch the ground, or None if none do.
+
+    Parameters
+    ----------
+    states, contact : numpy.ndarray
+        States (n, 17) and numbers of feet on the ground (n,), from the last instant in the air on.
+    """
+    before = np.flatnonzero((contact[:-1] == 0) & (contact[1:] > 0))
+    if not len(before):
+        return None
+    return float(np.linalg.norm(states[before, VELOCITY], axis=1).max())
 
 
 def _of_drive(flown: TrialResult) -> dict[str, Any]:
@@ -148,9 +150,15 @@ def _of_drive(flown: TrialResult) -> dict[str, Any]:
         why = "did not arrive in time"
     if not why and place >= NEAR:
         why = "arrived elsewhere"
-    kept = flown.odometry.t <= end
-    odometry = rows_of(flown.odometry, kept)
-    figures = {
+    odometry = sampled(rows_of(flown.odometry, flown.odometry.t <= end), SPACING)
+    error = (odometry.p - position_at(odometry.t, truth))[:, :2]
+    under_way = (odometry.t >= started) & (odometry.t <= ended)
+    yaw = np.interp(odometry.t, truth.t, np.unwrap(yaws_of(truth.q)))
+    off_yaw = ((yaws_of(odometry.q) - yaw + np.pi) % (2.0 * np.pi) - np.pi)[under_way]
+    variance = odometry.covariance[under_way, 8, 8]  # about the vertical, for a planar vehicle
+    has_variance = len(off_yaw) > 0 and bool((variance > 0.0).all())
+    begins = dict(zip(DRIVE_PHASES, (-math.inf, started, ended)))
+    return {
         "seed": flown.task.seed,
         "arrived": not why,
         "why": why,
@@ -158,37 +166,34 @@ def _of_drive(flown: TrialResult) -> dict[str, Any]:
         "place": place,
         "tracking": rms(off) if len(off) else None,
         "farthest": float(off.max()) if len(off) else None,
+        **_common(flown, mission, end),
+        **_estimation(odometry, error, begins, "drive"),
+        "yaw": math.degrees(rms(off_yaw)) if len(off_yaw) else None,
+        "yaw_nees": float(np.mean(off_yaw**2 / variance)) if has_variance else None,
+    }
+
+
+def _common(flown: TrialResult, mission: Journey, end: float) -> dict[str, Any]:
+    """Return the times of a mission that was recorded until `end`, s, and the error at its start."""
+    figures: dict[str, Any] = {
         "started": mission.started,
         "ended": mission.ended,
         "reported_lost": mission.lost,
         "duration": end,
-        **_armed(flown.odometry, truth, mission.started),
+        "armed_off": None,
+        "armed_deviations": None,
     }
-    if not len(odometry):
-        return {**figures, "estimation": None, "yaw": None, "yaw_nees": None, "phases": {}}
-    rows = np.unique(np.searchsorted(odometry.t, np.arange(odometry.t[0], odometry.t[-1], SPACING)))
-    odometry = rows_of(odometry, rows)
-    error = (odometry.p - position_at(odometry.t, truth))[:, :2]
-    normalised = nees(error, odometry.covariance[:, :2, :2])
-    phases = _by_phase(
-        odometry.t,
-        np.linalg.norm(error, axis=1),
-        normalised,
-        dict(zip(DRIVE_PHASES, (-math.inf, started, ended))),
-    )
-    under_way = (odometry.t >= started) & (odometry.t <= ended)
-    yaw = np.interp(odometry.t, truth.t, np.unwrap(yaws_of(truth.q)))
-    off_yaw = ((yaws_of(odometry.q) - yaw + np.pi) % (2.0 * np.pi) - np.pi)[under_way]
-    variance = odometry.covariance[under_way, 8, 8]  # about the vertical, for a planar vehicle
-    has_variance = len(off_yaw) > 0 and bool((variance > 0.0).all())
-    drive = phases.get("drive")
-    return {
-        **figures,
-        "estimation": drive and drive["rmse"],
-        "yaw": math.degrees(rms(off_yaw)) if len(off_yaw) else None,
-        "yaw_nees": float(np.mean(off_yaw**2 / variance)) if has_variance else None,
-        "phases": phases,
-    }
+    if mission.started is None:
+        return figures
+    odometry, truth = flown.odometry, flown.flight.truth
+    assert truth is not None
+    k = int(np.searchsorted(odometry.t, mission.started, side="right")) - 1
+    error = odometry.p[k] - position_at(odometry.t[k : k + 1], truth)[0]
+    deviations = float(np.max(np.abs(error) / np.sqrt(np.diag(odometry.covariance[k])[:3])))
+    figures["armed_off"] = float(np.linalg.norm(error))
+    if math.isfinite(deviations):
+        figures["armed_deviations"] = deviations
+    return figures
 
 
 def yaws_of(q: np.ndarray) -> np.ndarray:
@@ -215,62 +220,42 @@ def _why(crash: str, mission: Mission, figures: dict[str, Any]) -> str:
     return "landed elsewhere" if figures["place"] >= NEAR else ""
 
 
-def _armed(odometry: Odometry, truth: Truth, started: float | None) -> dict[str, float | None]:
-    """Return the error of the estimate at the start of the rotors."""
-    if started is None:
-        return {"armed_off": None, "armed_deviations": None}
-    k = int(np.searchsorted(odometry.t, started, side="right")) - 1
-    error = odometry.p[k] - position_at(odometry.t[k : k + 1], truth)[0]
-    deviations = float(np.max(np.abs(error) / np.sqrt(np.diag(odometry.covariance[k])[:3])))
-    return {
-        "armed_off": float(np.linalg.norm(error)),
-        "armed_deviations": deviations if math.isfinite(deviations) else None,
-    }
+def sampled(odometry: Odometry, spacing: float) -> Odometry:
+    """Return the finite estimates of an Odometry, `spacing`, s, apart."""
+    if not len(odometry):
+        return odometry
+    stamps = np.arange(odometry.t[0], odometry.t[-1], spacing)
+    odometry = rows_of(odometry, np.unique(np.searchsorted(odometry.t, stamps)))
+    return rows_of(odometry, np.isfinite(odometry.p).all(axis=1))  # those of a peer may be NaN
 
 
 def _estimation(
-    odometry: Odometry, truth: Truth, mission: Mission, first: int | None, last: int | None
+    odometry: Odometry, error: np.ndarray, begins: dict[str, float], scored: str
 ) -> dict[str, Any]:
-    """Return the figures of the estimate per phase, and the time at which it was lost."""
-    if not len(odometry):
-        return {"lost": None, "estimation": None, "phases": {}}
-    stamps = np.arange(odometry.t[0], odometry.t[-1], SPACING)
-    rows = np.unique(np.searchsorted(odometry.t, stamps))
-    rows = rows[np.isfinite(odometry.p[rows]).all(axis=1)]  # estimates of a peer may be NaN
-    t = odometry.t[rows]
-    error = odometry.p[rows] - position_at(t, truth)
-    distance, covariance = np.linalg.norm(error, axis=1), odometry.covariance[rows, :3, :3]
-    normalised = (
-        nees(error, covariance) if np.isfinite(covariance).all() else np.full(len(error), np.nan)
-    )  # a peer gives no covariance
-    end = truth.t[-1]
-    started, ended = mission.started or end, mission.ended or end
-    up, down = (float(truth.t[k]) if k is not None else ended for k in (first, last))
-    limits = [-math.inf, started, max(up, started), max(down, started), max(ended, down)]
-    phases = _by_phase(t, distance, normalised, dict(zip(PHASES, limits)))
-    far = np.flatnonzero((distance > LOST) & (t >= started) & (t < ended))
-    air = phases.get("air")
-    return {
-        "lost": float(t[far[0]]) if len(far) else None,
-        "estimation": air and air["rmse"],
-        "phases": phases,
-    }
+    """Return the figures of the estimate for each phase, and the error of one phase.
 
-
-def _by_phase(
-    t: np.ndarray, distance: np.ndarray, normalised: np.ndarray, begins: dict[str, float]
-) -> dict[str, dict[str, float | None]]:
-    """Return figures per phase of estimates at t (n,) s.
-
-    `begins` holds the start of each phase, s. A phase lasts until the next.
+    Parameters
+    ----------
+    odometry : Odometry
+    error : numpy.ndarray
+        Errors of k coordinates (n, k), m.
+    begins : dict
+        {phase: begin, s}. A phase lasts until the next.
+    scored : str
+        The phase of the error.
     """
+    t, axes = odometry.t, error.shape[1]
+    distance, covariance = np.linalg.norm(error, axis=1), odometry.covariance[:, :axes, :axes]
+    has_covariance = np.isfinite(covariance).all()  # a peer gives none
+    normalised = nees(error, covariance) if has_covariance else np.full(len(t), np.nan)
     stops = [*list(begins.values())[1:], math.inf]
     inside = {name: (t >= begins[name]) & (t < stop) for name, stop in zip(begins, stops)}
-    return {
+    phases = {
         name: _figures(distance[rows], normalised[rows])
         for name, rows in inside.items()
         if rows.any()
     }
+    return {"estimation": phases[scored]["rmse"] if scored in phases else None, "phases": phases}
 
 
 def _figures(distance: np.ndarray, normalised: np.ndarray) -> dict[str, float | None]:

@@ -42,8 +42,7 @@ class World:
     low_first : bool
         Ids 0 to 3 are the low anchors. Otherwise low and high alternate, as in the measured flights.
     floor_effect : bool
-        Low anchors are late while the tag is near the floor (effect floor_multipath). The delay is in
-        `floor_delay`, its limit in height near `floor_height`.
+        Low anchors are late while the tag is near the floor (effect floor_multipath).
     protocol, rate
         Of the TDOAs.
     noise : float
@@ -64,8 +63,6 @@ class World:
         A person walks through the hall and blocks signals.
     change : str
         "silent" or "late": change of one random anchor from the middle of the path. "" for none.
-    changed_delay : float
-        Delay of that anchor if it is "late".
     effects : EffectSet
         Further effects, added as by `inject`.
     latency, jitter : float
@@ -77,25 +74,19 @@ class World:
         Largest frequency of the vibration. 0 means white noise.
     rectified : float
         Accelerometer offset while rotors turn, in units of the vibration.
-    mass : tuple
-        Least and largest mass, kg.
     gust : float
         Standard deviation of the wind along each axis, m/s.
     table : float
         Height of a round table of 0.4 m radius at the start. 0 for none.
     sensors : tuple of str
         Further sensors: "height" (a range finder along -z of the body), "pressure", "velocity",
-        "range" (distances to anchors). Rates and noises are those of `simulate`.
-    height_rate, height_noise, height_range : float
-        Rate, noise and largest distance of the range finder.
+        "range" (distances to anchors).
     """
 
     size: tuple[float, float, float] = (6.4, 6.2, 3.0)
     layout: Anchors | None = None
     low_first: bool = False
     floor_effect: bool = True
-    floor_delay: tuple[float, float] = (3.0, 3.9)
-    floor_height: tuple[float, float] = (0.06, 0.2)
     protocol: str = "tdoa2"
     rate: float = 360.0
     noise: float = 0.08
@@ -108,7 +99,6 @@ class World:
     silence: tuple[str, float] | None = None
     person: bool = False
     change: str = ""
-    changed_delay: float = 0.3
     effects: EffectSet = EffectSet()
     latency: float = 0.0
     jitter: float = 0.0
@@ -116,13 +106,9 @@ class World:
     vibration: tuple[float, float, float] = (0.6, 0.6, 0.6)
     vibration_band: float = 0.0
     rectified: float = 0.0
-    mass: tuple[float, float] = (0.027, 0.033)
     gust: float = 0.0
     table: float = 0.0
     sensors: tuple[str, ...] = ()
-    height_rate: float = 20.0
-    height_noise: float = 0.01
-    height_range: float = 4.0
 
     @cached_property
     def anchors(self) -> Anchors:

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 GOOD, DOUBTFUL, BAD = "good", "doubtful", "bad"
 # standard deviations that contain the 3D position for 95 % of the time; 1.6 to 2.0 by its shape
 SIGMAS = 2.0
+LOCATING = (("tdoas", "TDOAs"), ("ranges", "ranges"))  # figures that count measurements, in words
 GAP = 1.0  # s without an estimate: the tag is lost
 LARGEST_LOST_SHARE = 0.05  # largest share of lost time in a good estimate
 SMALLEST_EXPLAINED_SHARE = 0.9  # smallest share of explained TDOAs in a good estimate
@@ -74,18 +75,14 @@ class Assessment:
             f"{figures['explained']:.1%} of {_counted(figures)} fit it within three standard "
             f"deviations (NIS {figures['nis']:.2f}: with outliers in full, 1 if there were none)"
         )
-        off = figures.get("range_offset")
-        offset = (
-            []
-            if off is None or abs(off) < REPORTED_OFFSET
-            else [
-                (
-                    f"all ranges are {100 * abs(off):.0f} cm too "
-                    f"{'long' if off > 0.0 else 'short'}: that was found, and taken out"
-                )
-            ]
-        )
-        return [f"{self.level}: {within}; {fits}", *offset, *self.reasons, *self.remedies]
+        lines = [f"{self.level}: {within}; {fits}"]
+        off = figures.get("range_offset", 0.0)
+        if abs(off) >= REPORTED_OFFSET:
+            lines.append(
+                f"all ranges are {100 * abs(off):.0f} cm too "
+                f"{'long' if off > 0.0 else 'short'}: that was found, and taken out"
+            )
+        return [*lines, *self.reasons, *self.remedies]
 
 
 def assess(
@@ -101,7 +98,7 @@ def assess(
     odometry, left = run.odometry, radio_residuals(flight, run)
     there = has_innovation(left)
     figures = {
-        "seconds": _length(left),
+        "seconds": float(np.ptp(left.t)) if len(left) else 0.0,
         "estimates": len(odometry),
         "tdoas": len(flight.tdoa),
         "recoveries": run.recoveries,
@@ -125,34 +122,24 @@ def assess(
     figures["nis"] = float(nis(left).mean())
     lost = lost_spans(left.t, odometry)
     figures["lost"] = float(sum(end - begin for begin, end in lost))
-    worse = (
-        BAD if faults or figures["lost"] > 0.5 * figures["seconds"] else DOUBTFUL if moved else GOOD
-    )
-    for reason in _doubts(flight, left, figures, lost):
-        reasons.append(reason)
-        worse = BAD if worse == BAD else DOUBTFUL
+    doubts = list(_doubts(flight, left, figures, lost))
+    level = GOOD
+    if faults or figures["lost"] > 0.5 * figures["seconds"]:
+        level = BAD
+    elif moved or doubts:
+        level = DOUBTFUL
     remedies += _remedies(flight, left, figures, estimator.effects is not None)
-    return Assessment(worse, figures, lost, tuple(reasons), tuple(remedies))
+    return Assessment(level, figures, lost, tuple(reasons + doubts), tuple(remedies))
 
 
 def _measured(figures: Mapping[str, Any]) -> str:
     """Return the name of the measurements that locate the tag."""
-    return (
-        "TDOAs"
-        if not figures.get("ranges")
-        else "TDOAs and ranges"
-        if figures["tdoas"]
-        else "ranges"
-    )
+    return " and ".join(words for name, words in LOCATING if figures.get(name)) or "TDOAs"
 
 
 def _counted(figures: Mapping[str, Any]) -> str:
     """Return the measurements that locate the tag, with their numbers."""
-    counts = [
-        f"{figures[name]} {words}"
-        for name, words in (("tdoas", "TDOAs"), ("ranges", "ranges"))
-        if figures.get(name)
-    ]
+    counts = [f"{figures[name]} {words}" for name, words in LOCATING if figures.get(name)]
     return " and ".join(counts) or "0 TDOAs"
 
 
@@ -172,10 +159,6 @@ def lost_spans(heard: np.ndarray, odometry: Odometry) -> list[tuple[float, float
         else:
             spans.append((begin, end))
     return [(begin, end) for begin, end in spans if end > begin]
-
-
-def _length(left: Residuals) -> float:
-    return float(np.ptp(left.t)) if len(left) else 0.0
 
 
 def _deviation(odometry: Odometry) -> dict[str, float]:

@@ -19,7 +19,7 @@ from uwb_tdoa_ekf.results import Odometry, Residuals
 
 from ..diagnosis.output import as_text
 from ..estimate import FlightEstimator
-from ..scoring.metrics import position_at
+from ..scoring.metrics import position_at, within
 from .residuals import by_pair
 
 if TYPE_CHECKING:
@@ -75,11 +75,7 @@ def estimate_figure(
 
     figure = Figure(figsize=(13.0, 6.6), layout="constrained")
     grid = figure.add_gridspec(3, 3, width_ratios=(1.4, 1.4, 1.0))
-    lost = np.any(
-        [(odometry.t >= begin) & (odometry.t <= end) for begin, end in spans]
-        or [np.zeros(len(odometry), bool)],
-        axis=0,
-    )
+    lost = within(odometry.t, spans)
     for column, (u, v, name) in enumerate(((0, 1, "from above"), (0, 2, "from the side"))):
         _plane(figure.add_subplot(grid[:, column]), odometry, anchors, lost, (u, v, name))
     std = np.sqrt(np.einsum("nii->ni", odometry.covariance[:, :3, :3]))

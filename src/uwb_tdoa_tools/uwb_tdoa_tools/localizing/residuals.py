@@ -7,20 +7,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.files import write_filled, write_text
 from uwb_tdoa_ekf.core.memory import USED
-from uwb_tdoa_ekf.results import VERDICTS
+from uwb_tdoa_ekf.results import VERDICTS, Odometry, Residuals
 
 from ..scoring.metrics import has_innovation
-
-if TYPE_CHECKING:
-    from uwb_tdoa_ekf.results import Odometry, Residuals
-
 
 RESIDUAL_COLUMNS = "t", "a", "b", "residual", "std", "weight", "verdict"
 SHOWN = 20  # pairs in the picture at most, those with the most TDOAs
@@ -238,7 +234,7 @@ def write_zones(path: Path, zones: list[Zone]) -> None:
 
 def draw_zones(path: Path, zones: list[Zone], anchors: Anchors, size: float, title: str) -> None:
     """Draw maps of the number of heard anchors and of the standard deviation of the position."""
-    from ..scoring.plots import plt  # takes a second to import
+    import matplotlib.pyplot as plt  # takes a second to import
 
     figure, axes = plt.subplots(1, 2, figsize=(13.0, 5.5), layout="constrained")
     heard = {anchor for zone in zones for anchor, _ in zone.anchors}

@@ -12,6 +12,7 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.patheffects import withStroke
+import matplotlib.pyplot as plt
 import numpy as np
 from PIL import Image
 from scipy.spatial import ConvexHull
@@ -19,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.files import write_filled
 
-from ..scoring.plots import draw_labels, plt
+from ..scoring.plots import draw_labels
 from .bifurcation import Subsets
 from .maps import FLYABLE, IMPRECISE, OUTSIDE, TOO_FEW, TWO_SOLUTIONS
 from .precision import ellipses

@@ -13,6 +13,7 @@ only the difference between the clocks of ground truth and TDOAs is known.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from ..checking.imu_rules import ARRANGEMENTS, signed_axis
 from ..checking.motion_rules import FEWEST, TrueMotion
 from ..checking.pair_rules import KnownPath
-from ..checking.time_rules import delays_of_tdoas
+from ..checking.time_rules import Delays, delays_of_tdoas
 from ..choices import NONE, TIME
 from ..clock import grid
 from .metrics import position_at, scored_phase
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.common.flight import Flight, Truth
     from uwb_tdoa_bias.effects.samples import PoseColumns
 
-    from ..checking.time_rules import Delays
 
 # Limits beside measured values were set on 37 recordings with a correct ground truth.
 OVERLAP = 1.0  # s that ground truth and TDOAs must have in common
@@ -173,12 +173,10 @@ class Alignment:
         """Return a sentence on a frame that differs, else None."""
         if not self.frame_differs:
             return None
-        parts = (
-            [f"its axes x, y, z are {_axes_in_words(self.axes)} of the survey"]
-            if self.axes_differ
-            else []
-        )
-        parts.append(self.frame_in_words())
+        parts = [self.frame_in_words()]
+        if self.axes_differ:
+            axes = ", ".join(map(signed_axis, self.axes.T))
+            parts.insert(0, f"its axes x, y, z are {axes} of the survey")
         return "the ground truth is in another frame than the survey: " + "; ".join(parts)
 
     def frame_in_words(self) -> str:
@@ -393,16 +391,14 @@ def _epoch(flight: Flight, odometry: PoseColumns) -> float:
     ours, theirs = (
         position_at(grid(one.t[0], one.t[-1], EPOCH_STEP, one.t), one) for one in (odometry, truth)
     )
-    lags, size, tried = (
-        np.arange(-len(theirs) + 1, len(ours)),
-        np.sqrt(np.sum(ours.var(axis=0))),
-        [],
-    )
-    for pair, arrangements in (
-        ((ours, theirs), (np.eye(3),)),
-        ((ours - ours.mean(axis=0), theirs - theirs.mean(axis=0)), ARRANGEMENTS),
+    lags = np.arange(-len(theirs) + 1, len(ours))
+    size = np.sqrt(np.sum(ours.var(axis=0)))
+    tried = []
+    for one, other, arrangements in (
+        (ours, theirs, (np.eye(3),)),
+        (ours - ours.mean(axis=0), theirs - theirs.mean(axis=0), ARRANGEMENTS),
     ):
-        error = _distance_by_lag(pair[0], pair[1], lags, arrangements)
+        error = _distance_by_lag(one, other, lags, arrangements)
         best = int(np.argmin(error))
         others = np.min(
             error[np.abs(lags - lags[best]) > DISTINCT_EPOCHS / EPOCH_STEP], initial=np.inf
@@ -425,20 +421,15 @@ def _distance_by_lag(
     The paths are (n, 3) and (m, 3) m. The best arrangement (3, 3) of the axes counts. Too little
     overlap gives inf.
     """
+    sums = partial(np.correlate, mode="full")  # of products, over the overlap at each lag
     common = np.minimum(lags + len(theirs), len(ours)) - np.maximum(lags, 0)
-    square = _cross_correlation(np.sum(ours**2, axis=1), np.ones(len(theirs))) + _cross_correlation(
-        np.ones(len(ours)), np.sum(theirs**2, axis=1)
-    )
-    products = np.array([[_cross_correlation(mine, its) for its in theirs.T] for mine in ours.T])
+    square = sums(np.sum(ours**2, axis=1), np.ones(len(theirs)))
+    square += sums(np.ones(len(ours)), np.sum(theirs**2, axis=1))
+    products = np.array([[sums(mine, its) for its in theirs.T] for mine in ours.T])
     square -= 2.0 * np.max([np.tensordot(axes, products) for axes in arrangements], axis=0)
     error = np.sqrt(np.maximum(square, 0.0) / common)
     error[common < COMMON * min(len(ours), len(theirs))] = np.inf
     return error
-
-
-def _cross_correlation(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
-    """Return the sums of products over the overlap at each lag."""
-    return np.correlate(ours, theirs, mode="full")
 
 
 def transform_truth(truth: Truth, axes: np.ndarray, shift: np.ndarray) -> Truth:
@@ -451,8 +442,3 @@ def transform_truth(truth: Truth, axes: np.ndarray, shift: np.ndarray) -> Truth:
     if np.linalg.det(axes) > 0.0 and known.any():
         q[known] = (Rotation.from_matrix(axes) * Rotation.from_quat(truth.q[known])).as_quat()
     return replace(truth, p=p, q=q)
-
-
-def _axes_in_words(axes: np.ndarray) -> str:
-    """Return the survey axis of each axis of the ground truth: "x, y, -z"."""
-    return ", ".join(map(signed_axis, axes.T))

@@ -16,6 +16,7 @@ from ..choices import FRAME, NONE, TIME
 from ..estimate import FlightEstimator
 from ..readers.inputs import report_remarks
 from .alignment import (
+    Alignment,
     common_paths,
     estimate_alignment,
     median_distance,
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
     from uwb_tdoa_ekf.core.config import FilterConfig
     from uwb_tdoa_ekf.offline import Run
 
-    from .alignment import Alignment
 
 # largest ratio of the distances with repaired ids and signs, and with another frame
 LARGEST_LABEL_RATIO = 1.5
@@ -149,10 +149,8 @@ def _alignment(flight: Flight, effects: EffectSet, config: FilterConfig | None) 
 
     If wrong ids and signs explain the difference of the frames as well, they are repaired first.
     """
-    straight, odometry = (
-        effects.correct_streams(flight),
-        FlightEstimator(config, effects)(flight).odometry,
-    )
+    straight = effects.correct_streams(flight)
+    odometry = FlightEstimator(config, effects)(flight).odometry
     assert straight.truth is not None
     found = estimate_alignment(straight, odometry)
     if found.frame_differs and _ranges_fit(straight, effects, found):
@@ -180,21 +178,18 @@ def _ranges_fit(flight: Flight, effects: EffectSet, found: Alignment) -> bool:
     Delays of anchors distort the estimate, but are only constants in ranges. False without ranges.
     """
     assert flight.truth is not None
-    for channel in (
+    channels = [
         name for name, kind in RADIO.items() if kind.ends == 1 and getattr(flight, name) is not None
-    ):
-        stream = getattr(flight, channel)
-        away = []
-        for how in (TIME, FRAME):
-            samples, rows = true_samples(
-                replace(flight, truth=found.significant().applied_to(flight.truth, how)),
-                RADIO[channel],
-            )
-            left = stream.d[rows] - samples.predicted() - effects.bias(samples)
-            apart = [
-                np.abs(left[samples.b == anchor] - np.median(left[samples.b == anchor]))
-                for anchor in np.unique(samples.b)
-            ]
-            away.append(np.median(np.concatenate(apart)) if apart else np.nan)
-        return bool(away[0] <= away[1])
-    return False
+    ]
+    if not channels:
+        return False
+    away = []
+    for how in (TIME, FRAME):
+        moved = replace(flight, truth=found.significant().applied_to(flight.truth, how))
+        samples, rows = true_samples(moved, RADIO[channels[0]])
+        measured = getattr(flight, channels[0]).d[rows]
+        left = measured - samples.predicted() - effects.bias(samples)
+        of_anchors = [left[samples.b == anchor] for anchor in np.unique(samples.b)]
+        apart = [np.abs(some - np.median(some)) for some in of_anchors]
+        away.append(np.median(np.concatenate(apart)) if apart else np.nan)
+    return bool(away[0] <= away[1])

@@ -16,10 +16,10 @@ from uwb_tdoa_ekf.core.memory import COMPENSATED, REJECTED, USED
 from uwb_tdoa_ekf.results import Residuals, concatenated, rows_of
 
 from .phases import in_the_air, motion, phases
-from .pooling import Distribution, Pool, Result, coverage_figures
+from .pooling import COVERAGE, Distribution, Pool, Result, or_nan
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Iterable, Sequence
 
     from uwb_tdoa_bias.common.flight import Flight, Truth
     from uwb_tdoa_ekf.offline import Run
@@ -49,11 +49,6 @@ class Estimate(PoseColumns, Protocol):
 def rms(values: np.ndarray) -> float:
     """Return the root mean square; NaN without values."""
     return or_nan(lambda v: np.sqrt(np.mean(v**2)), values)
-
-
-def or_nan(function: Callable[[np.ndarray], float], values: np.ndarray) -> float:
-    """Return function(values); NaN without values."""
-    return float(function(values)) if len(values) else math.nan
 
 
 def scored_phase(truth: Truth) -> tuple[str, float, float]:
@@ -114,16 +109,12 @@ def _known_spans(known: np.ndarray) -> np.ndarray:
     return np.column_stack([known[np.append(True, last[:-1])], known[last]])
 
 
-def _inside(part: Any, spans: Spans) -> Any:
-    """Return the rows of a Truth or an Odometry within spans ((first, last), ...), s."""
-    if not (np.diff(part.t) >= 0.0).all():
-        return rows_of(
-            part, np.any([(part.t >= first) & (part.t <= last) for first, last in spans], axis=0)
-        )
-    inside = np.zeros(len(part.t), bool)
+def within(t: np.ndarray, spans: Spans) -> np.ndarray:
+    """Return which stamps t (n,) s lie within spans ((first, last), ...), s: (n,) bool."""
+    inside = np.zeros(len(t), bool)
     for first, last in spans:
-        inside[np.searchsorted(part.t, first) : np.searchsorted(part.t, last, side="right")] = True
-    return rows_of(part, inside)
+        inside |= (t >= first) & (t <= last)
+    return inside
 
 
 def nees(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
@@ -187,24 +178,20 @@ def summary(errors: np.ndarray, normalised: np.ndarray, innovations: np.ndarray)
     out["median_3d"], out["max_3d"] = or_nan(np.median, distance), or_nan(np.max, distance)
     out["frac_gt_1m"] = float(np.mean(~(distance <= LOST))) if len(distance) else 1.0
     out["diverged"] = bool(out["frac_gt_1m"] > LOST_SHARE or not finite.all())
-    out["nees_mean"], out["nees_median"] = (
-        or_nan(np.mean, normalised),
-        or_nan(np.median, normalised),
-    )
-    out["nis_mean"], out["nis_median"] = (
-        or_nan(np.mean, innovations),
-        or_nan(np.median, innovations),
-    )
+    for name, values in (("nees", normalised), ("nis", innovations)):
+        out[f"{name}_mean"] = or_nan(np.mean, values)
+        out[f"{name}_median"] = or_nan(np.median, values)
     return out
 
 
-def coverage(error: np.ndarray, covariance: np.ndarray, sigmas: float = 3.0) -> np.ndarray:
-    """Return the share of errors within `sigmas` predicted standard deviations, per axis: (3,).
+def coverage(error: np.ndarray, covariance: np.ndarray) -> dict[str, float]:
+    """Return the share of errors within 3 predicted standard deviations, for each of COVERAGE.
 
-    An honest Gaussian estimate gives 0.997 for 3 sigmas.
+    An honest Gaussian estimate gives 0.997.
     """
     std = np.sqrt(np.einsum("nii->ni", covariance))
-    return np.mean(np.abs(error) <= sigmas * std, axis=0) if len(error) else np.full(3, np.nan)
+    inside = np.abs(error) <= 3.0 * std
+    return {name: or_nan(np.mean, inside[:, k]) for k, name in enumerate(COVERAGE)}
 
 
 class ErrorSeries:
@@ -221,24 +208,15 @@ class ErrorSeries:
     covered : (m, 2) s, spans with an estimate.
     """
 
-    def __init__(
-        self,
-        t: np.ndarray,
-        error: np.ndarray,
-        covariance: np.ndarray,
-        normalised: np.ndarray,
-        stamps: np.ndarray,
-        known: np.ndarray,
-    ) -> None:
-        """Keep the errors. `stamps` (m,) s also holds the estimates without ground truth."""
-        self.t, self.error, self.covariance, self.nees, self.known = (
-            t,
-            error,
-            covariance,
-            normalised,
-            known,
+    def __init__(self, odometry: Estimate, truth: Truth) -> None:
+        """Compare an odometry with the whole truth."""
+        self.t, self.error, self.covariance = position_errors(
+            odometry, truth, truth.t[0], truth.t[-1]
         )
-        self.step = np.linalg.norm(np.diff(error, axis=0, prepend=error[:1]), axis=1)
+        self.nees = nees(self.error, self.covariance)
+        self.step = np.linalg.norm(np.diff(self.error, axis=0, prepend=self.error[:1]), axis=1)
+        self.known = _known_spans(truth.t)
+        stamps = odometry.t
         usual = np.median(np.diff(stamps)) if len(stamps) > 1 else 0.0
         ends = stamps + max(VALID_FOR, SPARSE * usual)
         self.covered = np.column_stack([stamps, np.minimum(ends, np.append(stamps[1:], np.inf))])
@@ -250,12 +228,8 @@ class ErrorSeries:
         """
         parts = [(max(begin, first), min(end, last)) for first, last in spans]
         parts = [(first, last) for first, last in parts if last > first]
-        chosen = (
-            np.any([(self.t >= first) & (self.t <= last) for first, last in parts], axis=0)
-            if parts
-            else np.zeros(len(self.t), bool)
-        )
-        error, duration = self.error[chosen], sum(last - first for first, last in parts)
+        chosen, duration = within(self.t, parts), sum(last - first for first, last in parts)
+        error = self.error[chosen]
         distance = np.linalg.norm(error, axis=1)
         out: dict[str, Any] = {"begin": begin, "duration": duration, "count": int(chosen.sum())}
         out |= {f"rmse_{axis}": rms(error[:, k]) for k, axis in enumerate("xyz")}
@@ -263,10 +237,8 @@ class ErrorSeries:
         out["std_3d"] = or_nan(
             lambda P: np.sqrt(np.mean(np.einsum("nii->n", P))), self.covariance[chosen]
         )
-        out["nees_mean"], out["step"] = (
-            or_nan(np.mean, self.nees[chosen]),
-            or_nan(np.max, self.step[chosen]),
-        )
+        out["nees_mean"] = or_nan(np.mean, self.nees[chosen])
+        out["step"] = or_nan(np.max, self.step[chosen])
         for name, covered in (("without_estimate", self.covered), ("without_truth", self.known)):
             out[name] = max(
                 0.0, duration - sum(_overlap(covered, first, last) for first, last in parts)
@@ -316,7 +288,9 @@ class Score:
         """
         self.name, self._whole, self._heard, self._reach = name, (odometry, truth), heard, reach
         if spans is not None:  # the truth must not be interpolated between spans
-            truth, odometry = (_inside(part, spans) for part in (truth, odometry))
+            estimates: Any = odometry
+            odometry = rows_of(estimates, within(odometry.t, spans))
+            truth = rows_of(truth, within(truth.t, spans))
         self.part, self.first, self.last = scored_phase(truth)
         self.t, self.error, self.covariance = position_errors(
             odometry, truth, self.first, self.last
@@ -337,11 +311,7 @@ class Score:
     @cached_property
     def series(self) -> ErrorSeries:
         """Return the errors of the whole recording."""
-        odometry, truth = self._whole
-        t, error, covariance = position_errors(odometry, truth, truth.t[0], truth.t[-1])
-        return ErrorSeries(
-            t, error, covariance, nees(error, covariance), odometry.t, _known_spans(truth.t)
-        )
+        return ErrorSeries(*self._whole)
 
     def phases(self) -> dict[str, dict[str, Any]]:
         """Return {name of the phase: figures, see `ErrorSeries.figures`}."""
@@ -362,7 +332,7 @@ class Score:
         out["diverged"], out["late_start"] = bool(lost or late), bool(late and not lost)
         out["start_delay"] = float(max(0.0, self.t[0] - self.first)) if len(self.t) else math.inf
         out["ready_delay"] = self._ready_delay()
-        return {**out, **coverage_figures(coverage(self.error, self.covariance))}
+        return {**out, **coverage(self.error, self.covariance)}
 
     def _ready_delay(self) -> float:
         """Return the seconds from the 100th TDOA to the first estimate.
@@ -380,22 +350,14 @@ class Score:
         sums = {
             f"square_{axis}": float(np.sum(self.error[:, k] ** 2)) for k, axis in enumerate("xyz")
         }
-        sums |= {
-            "square_3d": float(np.sum(distance**2)),
-            "lost": float(np.sum(~(distance <= LOST))),
-        }
+        sums["square_3d"] = float(np.sum(distance**2))
+        sums["lost"] = float(np.sum(~(distance <= LOST)))
         if count:
-            sums |= {
-                name: count * share
-                for name, share in coverage_figures(coverage(self.error, self.covariance)).items()
-            }
+            shares = coverage(self.error, self.covariance)
+            sums |= {name: count * share for name, share in shares.items()}
         samples = {"distance": distance, "nees": self.nees, "nis": self.nis}
-        return Result(
-            self.row(),
-            sums,
-            {name: Distribution.of(values) for name, values in samples.items()},
-            self.phases(),
-        )
+        of_samples = {name: Distribution.of(values) for name, values in samples.items()}
+        return Result(self.row(), sums, of_samples, self.phases())
 
 
 def pooled(scores: Iterable[Score]) -> dict[str, Any]:

@@ -9,12 +9,10 @@ from typing import TYPE_CHECKING
 
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
-import matplotlib.pyplot as plt
 import numpy as np
 
 from uwb_tdoa_bias.common.files import write_filled
 
-from .metrics import position_at
 from .phases import TITLES
 
 if TYPE_CHECKING:
@@ -23,7 +21,7 @@ if TYPE_CHECKING:
 
     from matplotlib.axes import Axes
 
-    from uwb_tdoa_bias.common.flight import Flight, Truth
+    from uwb_tdoa_bias.common.flight import Truth
 
     from .metrics import Estimate, Score
 
@@ -96,32 +94,6 @@ def error_figure(score: Score, odometry: Estimate, truth: Truth) -> Figure:
         f"{found['whole']['rmse_3d']:.3f} m of all"
     )
     return figure
-
-
-def plot_comparison(flight: Flight, scores: Sequence[Score], path: str | Path) -> None:
-    """Draw the 3D errors of several Scores of one Flight, and their paths, to an image file."""
-    assert flight.truth is not None
-    figure, (over_time, above) = plt.subplots(
-        1, 2, figsize=(13, 5), width_ratios=(3, 2), layout="constrained"
-    )
-    flown = (flight.truth.t >= scores[0].first) & (flight.truth.t <= scores[0].last)
-    above.plot(*flight.truth.p[flown, :2].T, "k", lw=1.2, label="ground truth")
-    for score in scores:
-        name = f"{score.name}: RMSE {score.row()['rmse_3d']:.3f} m"
-        over_time.plot(
-            score.t - score.first, np.linalg.norm(score.error, axis=1), lw=0.8, label=name
-        )
-        above.plot(
-            *(position_at(score.t, flight.truth) + score.error)[:, :2].T, lw=0.8, label=score.name
-        )
-    over_time.set(xlabel="time in the air [s]", ylabel="3D position error [m]", ylim=(0, None))
-    above.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
-    for axes in (over_time, above):
-        axes.grid(alpha=0.3)
-        axes.legend()
-    figure.suptitle(flight.name)
-    write_filled(path, partial(figure.savefig, dpi=110))
-    plt.close(figure)
 
 
 def labels(ids: Sequence[int], places: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 import math
 from typing import TYPE_CHECKING, Any
@@ -16,14 +16,20 @@ from ..outputs import as_json
 from .phases import TITLES
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    Spans = Sequence[tuple[float, float]]  # from when to when, s
+    from collections.abc import Callable, Sequence
 
 
 RATIO = 1.01  # ratio of the limits of a bin
 SMALLEST = 1e-9  # smaller samples count as this
+WHOLE = ("duration", "count", "without_estimate", "without_truth")  # sums over runs
+ROOTS = ("rmse_x", "rmse_y", "rmse_z", "rmse_3d", "std_3d")  # root mean squares
+COVERAGE = ("coverage_3sigma_x", "coverage_3sigma_y", "coverage_3sigma_z")
 FIGURES = 3  # version of the content of a Result
+
+
+def or_nan(function: Callable[[np.ndarray], float], values: np.ndarray) -> float:
+    """Return function(values); NaN without values."""
+    return float(function(values)) if len(values) else math.nan
 
 
 @dataclass
@@ -100,52 +106,31 @@ class PooledErrors:
     """The figures of one phase, pooled over runs."""
 
     def __init__(self) -> None:
-        self._runs, self._largest = 0, {"max_3d": math.nan, "step": math.nan}
-        self._sums: dict[str, Any] = Counter()  # numbers, some of them float
-        self._of_runs = {name: Distribution.of([]) for name in ("rmse_3d", "nees_mean")}
+        self._columns: dict[str, list[float]] = defaultdict(list)  # of the runs
 
     def add(self, figures: dict[str, Any]) -> None:
         """Count the figures of one run, see `ErrorSeries.figures`."""
-        count, self._runs = figures["count"], self._runs + 1
-        added = {
-            name: figures[name]
-            for name in ("duration", "count", "without_estimate", "without_truth")
-        }
-        if count:
-            added |= {
-                name: count * figures[name] ** 2
-                for name in ("rmse_x", "rmse_y", "rmse_z", "rmse_3d", "std_3d")
-            }
-            added["nees_mean"] = count * figures["nees_mean"]
-            self._largest = {
-                name: _larger(known, figures[name]) for name, known in self._largest.items()
-            }
-            self._of_runs = {
-                name: known + Distribution.of([figures[name]])
-                for name, known in self._of_runs.items()
-            }
-        self._sums.update(added)
+        for name in (*WHOLE, *ROOTS, "nees_mean", "max_3d", "step"):
+            self._columns[name].append(figures[name])
 
     def figures(self) -> dict[str, Any]:
-        """Return the figures of all samples, and median and maximum over the runs, as a dict.
-
-        Medians are accurate to 1 %.
-        """
-        sums, count = self._sums, self._sums["count"]
-        out: dict[str, Any] = {"runs": self._runs, "duration": sums["duration"], "count": count}
-        for name in ("rmse_x", "rmse_y", "rmse_z", "rmse_3d", "std_3d"):
-            out[name] = math.sqrt(sums[name] / count) if count else math.nan
-        out["nees_mean"] = sums["nees_mean"] / count if count else math.nan
-        out |= self._largest | {name: sums[name] for name in ("without_estimate", "without_truth")}
-        for name, part in self._of_runs.items():
-            out[f"{name}_median_of_runs"] = part.median
-            out[f"{name}_max_of_runs"] = part.largest if part.count else math.nan
+        """Return the figures of all samples, and median and maximum over the runs, as a dict."""
+        of_runs = {name: np.array(values) for name, values in self._columns.items()}
+        count = of_runs["count"]
+        total = count.sum()
+        out: dict[str, Any] = {"runs": len(count)}
+        out |= {name: of_runs[name].sum().item() for name in WHOLE}
+        some = {name: values[count > 0] for name, values in of_runs.items()}
+        shares = some["count"] / max(total, 1)
+        for name in ROOTS:
+            out[name] = math.sqrt(shares @ some[name] ** 2) if total else math.nan
+        out["nees_mean"] = float(shares @ some["nees_mean"]) if total else math.nan
+        for name in ("max_3d", "step"):
+            out[name] = or_nan(np.max, some[name])
+        for name in ("rmse_3d", "nees_mean"):
+            out[f"{name}_median_of_runs"] = or_nan(np.median, some[name])
+            out[f"{name}_max_of_runs"] = or_nan(np.max, some[name])
         return out
-
-
-def _larger(one: float, other: float) -> float:
-    """Return the larger number; a NaN in `one` means that there was none yet."""
-    return other if math.isnan(one) else float(np.max([one, other]))
 
 
 @dataclass(frozen=True)
@@ -204,42 +189,29 @@ class Pool:
     """Pool the samples of several runs, one run after the other."""
 
     def __init__(self) -> None:
+        self._rows: dict[str, list[float]] = defaultdict(list)  # figures of the runs
         self._sums: dict[str, Any] = Counter()  # numbers, some of them float
-        self._distributions: dict[str, Distribution] = {}
-        self._runs, self._total, self._largest = 0, 0.0, 0.0
-        self._row: dict[str, Any] = {"start_delay": 0.0, "diverged": 0, "late_start": 0}
-        self._ready = math.nan
-        self._phases: dict[str, PooledErrors] = {}
+        self._distributions = {name: Distribution.of([]) for name in ("distance", "nees", "nis")}
+        self._phases: dict[str, PooledErrors] = defaultdict(PooledErrors)
         self._aligned: dict[str, Any] = Counter()
 
     def add(self, result: Result) -> None:
         """Count the Result of one run."""
-        row, known = result.row, self._distributions
-        self._runs += 1
+        for name in ("rmse_3d", "start_delay", "ready_delay", "diverged", "late_start"):
+            self._rows[name].append(result.row[name])
         self._sums.update(result.sums)
-        self._distributions = {
-            name: known[name] + part if name in known else part
-            for name, part in result.distributions.items()
-        }
-        self._total, self._largest = (
-            self._total + row["rmse_3d"],
-            float(np.max([self._largest, row["rmse_3d"]])),
-        )
-        self._row["start_delay"] = max(self._row["start_delay"], row["start_delay"])
-        self._ready = float(np.fmax(self._ready, row["ready_delay"]))  # NaN if unknown
-        for key in ("diverged", "late_start"):
-            self._row[key] += row[key]
-
+        for name, part in result.distributions.items():
+            self._distributions[name] += part
+        for name, figures in result.phases.items():
+            self._phases[name].add(figures)
         for how in ALIGN if result.aligned else ():
             error = result.aligned[f"rmse_3d_{how}"]
             self._aligned[how] += math.nan if error is None else error
-        for name, figures in result.phases.items():
-            self._phases.setdefault(name, PooledErrors()).add(figures)
 
     @property
     def aligned(self) -> dict[str, float]:
         """Return {one of ALIGN: mean 3D RMSE of the runs, m}; NaN for a truth on another clock."""
-        return {how: total / self._runs for how, total in self._aligned.items()}
+        return {how: total / len(self._rows["rmse_3d"]) for how, total in self._aligned.items()}
 
     def phases(self) -> dict[str, dict[str, Any]]:
         """Return {name: figures, see `PooledErrors.figures`} of the phases that any run has."""
@@ -249,11 +221,12 @@ class Pool:
         """Return the figures of at least one run as a dict.
 
         They are those of `summary`, the coverage, mean and maximum of the 3D RMSE over runs, and
-        the phases. Medians are accurate to 1 %.
+        the phases. Medians of samples are accurate to 1 %.
         """
-        distance, count = self._distributions["distance"], self._distributions["distance"].count
+        distance, errors = self._distributions["distance"], self._rows["rmse_3d"]
+        count = distance.count
         shares = {name: total / count if count else math.nan for name, total in self._sums.items()}
-        out: dict[str, Any] = {"flight": f"{self._runs} pooled"}
+        out: dict[str, Any] = {"flight": f"{len(errors)} pooled"}
         out |= {
             f"rmse_{name}": math.sqrt(shares[f"square_{name}"]) for name in ("x", "y", "z", "3d")
         }
@@ -262,15 +235,12 @@ class Pool:
         for name in ("nees", "nis"):
             part = self._distributions[name]
             out |= {f"{name}_mean": part.mean, f"{name}_median": part.median}
-        out |= (
-            {name: shares.get(name, math.nan) for name in coverage_figures(np.zeros(3))}
-            | self._row
-            | {"ready_delay": self._ready}
-        )
-        out["rmse_3d_mean_of_runs"], out["rmse_3d_max_of_runs"] = (
-            self._total / self._runs,
-            self._largest,
-        )
+        out |= {name: shares.get(name, math.nan) for name in COVERAGE}
+        out["start_delay"] = max(self._rows["start_delay"])
+        out["ready_delay"] = float(np.fmax.reduce(self._rows["ready_delay"]))  # NaN if unknown
+        out |= {name: sum(self._rows[name]) for name in ("diverged", "late_start")}
+        out["rmse_3d_mean_of_runs"] = sum(errors) / len(errors)
+        out["rmse_3d_max_of_runs"] = float(np.max(errors))
         return {**out, "phases": self.phases()}
 
 
@@ -287,8 +257,3 @@ def _from_texts(numbers: dict[str, Any]) -> dict[str, Any]:
         key: float(value) if isinstance(value, str) and key not in ("flight", "part") else value
         for key, value in numbers.items()
     }
-
-
-def coverage_figures(shares: np.ndarray) -> dict[str, float]:
-    """Name the shares (3,) of `coverage` for a dict of figures."""
-    return {f"coverage_3sigma_{axis}": float(share) for axis, share in zip("xyz", shares)}

@@ -8,18 +8,13 @@ flight = simulate(SimulationConfig(trajectory="circle", protocol="tdoa3", seed=3
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from uwb_tdoa_bias.common.flight import Flight, Truth
 
 from . import sensors, tdoas
 from .config import NO_IMU_ERRORS, ImuErrors, SimulationConfig
-from .vehicles import VEHICLES
-
-if TYPE_CHECKING:
-    from .vehicles import Flyable
+from .vehicles import VEHICLES, Flyable
 
 __all__ = ["NO_IMU_ERRORS", "ImuErrors", "SimulationConfig", "simulate"]
 

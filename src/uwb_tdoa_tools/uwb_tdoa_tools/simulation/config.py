@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, make_dataclass, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -15,11 +15,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.sensors import SENSORS
 
 from ..choices import PROTOCOLS, YAW_PROFILES
-from .rooms import Walls, constellation, room_of
-
-if TYPE_CHECKING:
-    from .rooms import Room
-
+from .rooms import Room, Walls, constellation, room_of
 
 MOST_HEARD = 64  # largest number of anchors that a tag hears at once
 WHEELS_RATE = 50.0  # Hz

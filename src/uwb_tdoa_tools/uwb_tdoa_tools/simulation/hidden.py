@@ -9,17 +9,17 @@ correction.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.effects import EFFECTS, SmoothTerm
+from uwb_tdoa_bias.effects import EFFECTS, Effect, SmoothTerm
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.effects import Effect
 
 MIDDLE = 1.0  # m, farthest place of an obstacle from the middle of the hall, along x and y
 TURN = np.pi  # rad, half a turn
@@ -42,14 +42,25 @@ def _some(rng: np.random.Generator, anchors: Anchors, count: int) -> list[str]:
     return [str(one) for one in rng.choice(anchors.ids, count, replace=False)]
 
 
+def _with_sizes(
+    name: str,
+    keys: Sequence[str],
+    least: float,
+    largest: float,
+    rng: np.random.Generator,
+    anchors: Anchors,
+) -> Effect:
+    """Return the Effect of a name. A size is drawn for each key."""
+    return EFFECTS[name]({key: _signed(rng, least, largest) for key in keys})
+
+
 def _late_anchors(rng: np.random.Generator, anchors: Anchors) -> Effect:
     late = _some(rng, anchors, int(rng.integers(1, 3)))
-    return EFFECTS["anchor_delay"]({one: _signed(rng, 0.2, 0.45) for one in late})
+    return _with_sizes("anchor_delay", late, 0.2, 0.45, rng, anchors)
 
 
 def _drifting_clock(rng: np.random.Generator, anchors: Anchors) -> Effect:
-    (one,) = _some(rng, anchors, 1)
-    return EFFECTS["anchor_clock_drift"]({one: _signed(rng, 0.01, 0.015)})
+    return _with_sizes("anchor_clock_drift", _some(rng, anchors, 1), 0.01, 0.015, rng, anchors)
 
 
 def _moved_anchors(rng: np.random.Generator, anchors: Anchors) -> Effect:
@@ -74,29 +85,8 @@ def _obstacle(rng: np.random.Generator, anchors: Anchors) -> Effect:
 def _pairs(rng: np.random.Generator, anchors: Anchors) -> Effect:
     ids = anchors.ids.tolist()
     ring = [f"{first}-{second}" for first, second in zip(ids, [*ids[1:], ids[0]])]
-    chosen = rng.choice(ring, 4, replace=False)
-    return EFFECTS["pair_offset"]({str(pair): _signed(rng, 0.3, 0.45) for pair in chosen})
-
-
-def _distance(rng: np.random.Generator, anchors: Anchors) -> Effect:
-    return EFFECTS["range_bias"]({"quadratic": _signed(rng, 0.01, 0.02)})
-
-
-def _scale(rng: np.random.Generator, anchors: Anchors) -> Effect:
-    return EFFECTS["range_scale"]({"scale": _signed(rng, 0.07, 0.12)})
-
-
-def _power(rng: np.random.Generator, anchors: Anchors) -> Effect:
-    return EFFECTS["received_power_bias"]({"scale": _signed(rng, 3.0, 5.0)})
-
-
-def _antennas(rng: np.random.Generator, anchors: Anchors) -> Effect:
-    values = {end: _signed(rng, 0.5, 0.8) for end in ("tag", "anchor")}
-    return EFFECTS["antenna_pattern"](values)
-
-
-def _lever_arm(rng: np.random.Generator, anchors: Anchors) -> Effect:
-    return EFFECTS["tag_lever_arm"]({axis: _signed(rng, 0.1, 0.2) for axis in "xyz"})
+    chosen = rng.choice(ring, 4, replace=False).tolist()
+    return _with_sizes("pair_offset", chosen, 0.3, 0.45, rng, anchors)
 
 
 def _bearing_at_anchor(rng: np.random.Generator, anchors: Anchors) -> Effect:
@@ -114,16 +104,16 @@ def _heading_of_tag(rng: np.random.Generator, anchors: Anchors) -> Effect:
 
 
 KINDS: dict[str, Callable[[np.random.Generator, Anchors], Effect]] = {
-    "antennas": _antennas,
+    "antennas": partial(_with_sizes, "antenna_pattern", ("tag", "anchor"), 0.5, 0.8),
     "bearing at an anchor": _bearing_at_anchor,
-    "distance": _distance,
+    "distance": partial(_with_sizes, "range_bias", ("quadratic",), 0.01, 0.02),
     "drifting clock": _drifting_clock,
     "heading of the tag": _heading_of_tag,
     "late anchors": _late_anchors,
-    "lever arm": _lever_arm,
+    "lever arm": partial(_with_sizes, "tag_lever_arm", ("x", "y", "z"), 0.1, 0.2),
     "moved anchors": _moved_anchors,
     "obstacle": _obstacle,
     "pairs": _pairs,
-    "received power": _power,
-    "scale": _scale,
+    "received power": partial(_with_sizes, "received_power_bias", ("scale",), 3.0, 5.0),
+    "scale": partial(_with_sizes, "range_scale", ("scale",), 0.07, 0.12),
 }

@@ -124,11 +124,9 @@ def six() -> Anchors:
 
 def six_wide() -> Anchors:
     """Place six anchors on the walls of 12 x 8 m, at 0.8 and 2.8 m in turn, for rovers."""
-    x, y, z = (
-        np.array([-6.0, 0.0, 6.0, 6.0, 0.0, -6.0]),
-        np.repeat([-4.0, 4.0], 3),
-        np.tile([0.8, 2.8], 3),
-    )
+    x = np.array([-6.0, 0.0, 6.0, 6.0, 0.0, -6.0])
+    y = np.repeat([-4.0, 4.0], 3)
+    z = np.tile([0.8, 2.8], 3)
     return facing(np.column_stack([x, y, z]), (0.0, 0.0, 1.0), inverted=z > 1)
 
 
@@ -269,10 +267,8 @@ class Room:
         """Return the Room, extended to points (n, 2 or 3) m."""
         k = points.shape[1]
         lower, upper = self.lower.copy(), self.upper.copy()
-        lower[:k], upper[:k] = (
-            np.minimum(lower[:k], points.min(axis=0)),
-            np.maximum(upper[:k], points.max(axis=0)),
-        )
+        lower[:k] = np.minimum(lower[:k], points.min(axis=0))
+        upper[:k] = np.maximum(upper[:k], points.max(axis=0))
         return replace(self, lower=lower, upper=upper)
 
 

@@ -11,16 +11,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.flight import Imu
-from uwb_tdoa_bias.common.sensors import SENSORS, Velocity
+from uwb_tdoa_bias.common.sensors import SENSORS, Stream, Velocity
 
-from .config import WHEELS_RATE, ImuErrors
+from .config import WHEELS_RATE, ImuErrors, SimulationConfig
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from uwb_tdoa_bias.common.sensors import Stream
-
-    from .config import SimulationConfig
     from .rooms import Room
     from .vehicles import Flyable
 

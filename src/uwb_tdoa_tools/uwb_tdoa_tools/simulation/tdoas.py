@@ -15,13 +15,12 @@ from uwb_tdoa_bias.common.flight import Tdoas
 from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_bias.common.radio import FLAT_MOUNT, Antenna, RadioLink, arrival_bias
 
-from .rooms import heard_at
+from .rooms import Room, heard_at
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from .config import SimulationConfig
-    from .rooms import Room
     from .vehicles import Flyable
 
 

@@ -15,13 +15,12 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.common.errors import InputError
 
 from .paths import KNOT, SPEED_UP, STEP, path_of, path_time, yaw_along
-from .rooms import REST_HEIGHT
+from .rooms import REST_HEIGHT, Room
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from .config import SimulationConfig
-    from .rooms import Room
 
 
 GRAVITY = 9.81  # m/s^2
@@ -71,24 +70,45 @@ class Flyable(Protocol):
 
 
 class Trajectory:
-    """A quadrotor flight over 0 ... config.duration.
+    """A quadrotor flight along splines of position and yaw.
 
-    Position and yaw are splines with exact derivatives; attitude and rates follow from them. Around
-    the path the vehicle takes off, speeds up, slows down and lands.
+    Their derivatives are exact; attitude and rates follow from them.
 
     Attributes
     ----------
     take_off, landing : s; None for a start in the air.
     """
 
-    def __init__(self, config: SimulationConfig, room: Room, rng: np.random.Generator) -> None:
-        """Fit the splines to the path of a complete config in a room; `rng` draws the family.
+    def __init__(self, t: np.ndarray, p: np.ndarray, yaw: np.ndarray, at_rest: bool = True) -> None:
+        """Fit the splines.
 
-        Raises InputError if the flight does not fit the room, the time or the vehicle.
+        Parameters
+        ----------
+        t : (n,) s, rising.
+        p : (n, 3) m.
+        yaw : (n,) rad, without jumps.
+        at_rest : whether it is at rest before and after.
+        """
+        self.take_off: float | None = None
+        self.landing: float | None = None
+        self._start, self._end, self._at_rest = float(t[0]), float(t[-1]), at_rest
+        of_position = ([(k, np.zeros(3)) for k in (1, 2, 3)],) * 2 if at_rest else None
+        of_yaw = ([(k, 0.0) for k in (1, 2, 3)],) * 2 if at_rest else None
+        self._p = make_interp_spline(t, p, k=7, bc_type=of_position)
+        self._yaw = make_interp_spline(t, yaw, k=7, bc_type=of_yaw)
+
+    @classmethod
+    def of_config(
+        cls, config: SimulationConfig, room: Room, rng: np.random.Generator
+    ) -> Trajectory:
+        """Return the flight over 0 ... config.duration, of a complete config in a room.
+
+        Around the path the vehicle takes off, speeds up, slows down and lands. `rng` draws the
+        family of the path. Raises InputError if the flight does not fit the room, the time or the
+        vehicle.
         """
         assert config.height is not None  # complete
-        self.take_off = self.landing = None
-        start, end, clamp = 0.0, config.duration, None
+        start, end = 0.0, config.duration
         if not config.start_in_air:
             rise = max(3.0, 1.5 * config.height)
             shortest = 2.0 * (config.floor_time + rise + SPEED_UP)
@@ -99,41 +119,25 @@ class Trajectory:
                     "a shorter floor_time, or start in the air."
                 )
             start, end = config.floor_time, config.duration - config.floor_time
-            self.take_off, self.landing = start, end
-            clamp = ([(k, np.zeros(3)) for k in (1, 2, 3)],) * 2  # at rest, smoothly, at both ends
         air = end - start
         tau = np.linspace(0.0, air, max(int(np.ceil(air / KNOT)), 8) + 1)
         s = tau if config.start_in_air else path_time(tau, rise, air)
         p = path_of(s, config, room, rng)
+        yaw = yaw_along(s, p, config)
         if not config.start_in_air:
             lift = STEP(np.clip(tau / rise, 0.0, 1.0)) * STEP(np.clip((air - tau) / rise, 0.0, 1.0))
             ground = room.lower[2] + REST_HEIGHT
             p[:, 2] = ground + lift * (p[:, 2] - ground)
-        yaw = yaw_along(s, p, config)
-        self._start, self._end, self._clamped = start, end, clamp is not None
-        self._p = make_interp_spline(start + tau, p, k=7, bc_type=clamp)
-        scalar = ([(k, 0.0) for k in (1, 2, 3)],) * 2 if clamp else None
-        self._yaw = make_interp_spline(start + tau, yaw, k=7, bc_type=scalar)
-        hardest = np.linalg.norm(self._p.derivative(2)(start + tau), axis=1).max()
+        out = cls(start + tau, p, yaw, not config.start_in_air)
+        if not config.start_in_air:
+            out.take_off, out.landing = start, end
+        hardest = np.linalg.norm(out._p.derivative(2)(start + tau), axis=1).max()
         if hardest > MAX_ACCELERATION:
             raise InputError(
                 f"speed: {config.speed:g} m/s asks for an acceleration of {hardest:.1f} m/s^2 "
                 "on this path, "
                 f"more than {MAX_ACCELERATION:g}; fly slower or wider."
             )
-
-    @classmethod
-    def along(cls, t: np.ndarray, p: np.ndarray, yaw: np.ndarray) -> Trajectory:
-        """Return the flight along poses, at rest at both ends, without take-off and landing.
-
-        t : (n,) s, rising; p : (n, 3) m; yaw : (n,) rad, without jumps
-        """
-        out = cls.__new__(cls)
-        out.take_off = out.landing = None
-        out._start, out._end, out._clamped = float(t[0]), float(t[-1]), True
-        rest = ([(k, np.zeros(3)) for k in (1, 2, 3)],) * 2
-        out._p = make_interp_spline(t, p, k=7, bc_type=rest)
-        out._yaw = make_interp_spline(t, yaw, k=7, bc_type=([(k, 0.0) for k in (1, 2, 3)],) * 2)
         return out
 
     def motion(self, t: ArrayLike) -> ExactMotion:
@@ -145,7 +149,7 @@ class Trajectory:
         """
         t = np.asarray(t, dtype=float)
         inside = np.clip(t, self._start, self._end)
-        moving = ((t > self._start) & (t < self._end))[:, None] if self._clamped else 1.0
+        moving = ((t > self._start) & (t < self._end))[:, None] if self._at_rest else 1.0
         p = self._p(inside)
         v, a, jerk = (self._p.derivative(k)(inside) * moving for k in (1, 2, 3))
         yaw, yaw_rate = self._yaw(inside), self._yaw.derivative()(inside) * np.squeeze(moving)
@@ -179,7 +183,7 @@ class Trajectory:
         t = np.asarray(t)
         return (
             (t >= self._start - SPIN_UP) & (t <= self._end + SPIN_UP)
-            if self._clamped
+            if self._at_rest
             else np.ones(len(t), bool)
         )
 
@@ -367,7 +371,7 @@ def _check_time(config: SimulationConfig) -> None:
 
 
 VEHICLES: dict[str, Callable[[SimulationConfig, Room, np.random.Generator], Flyable]] = {
-    "quadrotor": Trajectory,
+    "quadrotor": Trajectory.of_config,
     "rover": Rover,
     "hand": HandHeld,
 }

@@ -58,12 +58,8 @@ def _mark(where: str, entry: Any, lengths: Mapping[str, float]) -> Mark:
     if not isinstance(flight, str) or flight not in lengths:
         raise InputError(f"{where}: there is no flight {flight!r}; given are {', '.join(lengths)}.")
     try:
-        first, last, std, position = (
-            float(first),
-            float(last),
-            float(std),
-            tuple(map(float, position)),
-        )
+        first, last, std = float(first), float(last), float(std)
+        position = tuple(map(float, position))
     except (TypeError, ValueError) as error:
         raise InputError(f"{where}: {error}; write it as {MARK_EXAMPLE}.") from error
     if not 0.0 <= first < last <= lengths[flight]:

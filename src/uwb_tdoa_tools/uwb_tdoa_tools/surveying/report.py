@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from uwb_tdoa_bias.common.files import write_filled
-from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_bias.effects import Effect, EffectSet
 
 from ..checking.pair_rules import MANY
 from ..diagnosis.attribution import attribute
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from uwb_tdoa_bias.common.flight import Flight
-    from uwb_tdoa_bias.effects import Effect
     from uwb_tdoa_ekf.core.config import FilterConfig
 
     from ..diagnosis.self_calibration import SelfCalibration

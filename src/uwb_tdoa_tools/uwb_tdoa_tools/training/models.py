@@ -385,7 +385,7 @@ def plot_curve(
 
     `label` names the x axis: epochs or number of flights.
     """
-    from ..scoring.plots import plt  # takes a second to import
+    import matplotlib.pyplot as plt  # takes a second to import
 
     figure, ax = plt.subplots(figsize=(7, 4), layout="constrained")
     for name, errors in (("training", training), ("validation", validation)):

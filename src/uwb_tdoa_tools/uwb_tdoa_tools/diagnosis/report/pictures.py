@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
-
-from ...scoring.plots import plt
+import matplotlib.pyplot as plt
 
 if TYPE_CHECKING:
     from collections.abc import Callable
