@@ -18,7 +18,7 @@ from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_ekf.monitoring import health  # noqa: E402
 from uwb_tdoa_ekf.monitoring.finding import Finding  # noqa: E402
 from uwb_tdoa_ekf.monitoring.health import ERROR, OK, WARN  # noqa: E402
-from uwb_tdoa_ekf.monitoring.status import VolumeCheck  # noqa: E402
+from uwb_tdoa_ekf.monitoring.status import flyability  # noqa: E402
 
 # --- health ---
 # The node looks five times a second; here a report is a look, once a second.
@@ -259,9 +259,7 @@ def volume(planar=False):
     ("planar", "claimed", "efficiency"), [(False, "0.400 m", "0.25"), (True, "0.200 m", "1")]
 )
 def test_the_covariance_is_compared_with_the_bound(planar, claimed, efficiency):
-    trouble, values = VolumeCheck(volume(planar)).trouble_at(
-        ANCHORS, np.array([0.5, 0.5, 0.5]), COVARIANCE
-    )
+    trouble, values = flyability(volume(planar), ANCHORS, np.array([0.5, 0.5, 0.5]), COVARIANCE)
     assert trouble is None and values == {
         "flyable": "yes",
         "bound of one round": "0.200 m",
@@ -272,15 +270,15 @@ def test_the_covariance_is_compared_with_the_bound(planar, claimed, efficiency):
 
 @pytest.mark.parametrize("p", [[1.5, 0.5, 0.5], [0.5, 0.5, 9.0], [np.nan, 0.5, 0.5]])
 def test_outside_is_told(p):
-    trouble, values = VolumeCheck(volume()).trouble_at(ANCHORS, np.array(p), COVARIANCE)
+    trouble, values = flyability(volume(), ANCHORS, np.array(p), COVARIANCE)
     assert "outside of the flyable volume" in trouble and values == {"flyable": "no"}
 
 
 def test_a_volume_of_other_anchors_is_told():
     moved = Anchors.from_positions(ANCHORS.positions + 0.5)
-    trouble, values = VolumeCheck(volume()).trouble_at(moved, np.array([0.5, 0.5, 0.5]), COVARIANCE)
+    trouble, values = flyability(volume(), moved, np.array([0.5, 0.5, 0.5]), COVARIANCE)
     assert "other anchors" in trouble and values == {"flyable": "unknown"}
 
 
 def test_without_a_volume_nothing_is_said():
-    assert VolumeCheck().trouble_at(ANCHORS, np.zeros(3), COVARIANCE) == (None, {})
+    assert flyability(None, ANCHORS, np.zeros(3), COVARIANCE) == (None, {})

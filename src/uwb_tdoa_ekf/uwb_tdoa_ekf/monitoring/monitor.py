@@ -524,23 +524,28 @@ class Monitor:
 
     def _swap(self) -> Finding:
         one, other = self._anchors.ids[[*self._swapped]].tolist()
-        what = f"two anchors are exchanged, {one} and {other}"
         evidence, remedy = (
             "each TDOA with one of them fits the place of the other",
             "correct their ids, or their positions on uwb/anchors",
         )
-        return Finding("ids_exchanged", ERROR, what, evidence, remedy, float(one))
+        return Finding(
+            "ids_exchanged",
+            ERROR,
+            cause=f"two anchors are exchanged, {one} and {other}",
+            evidence=evidence,
+            remedy=remedy,
+            value=float(one),
+        )
 
     def _silence(self, row: int) -> Finding:
         number = self._anchors.ids[row]
-        what = f"anchor {number} is not heard any more"
         return Finding(
             "anchor_silent",
             WARNING,
-            what,
-            "others as far away are heard",
-            "check its power and sight",
-            float(number),
+            cause=f"anchor {number} is not heard any more",
+            evidence="others as far away are heard",
+            remedy="check its power and sight",
+            value=float(number),
         )
 
     def _change(self, row: int, found: list[Change]) -> Finding:
@@ -555,10 +560,13 @@ class Monitor:
             what = "it is late: blocked (NLOS), moved, or its delay has changed"
         else:
             what = "it is early: moved, or its delay has changed"
-        cause = f"anchor {number}: {size:+.2f} m since the start of the flight: {what}"
-        remedy = "look at it; survey it again if it was moved"
         return Finding(
-            "anchor_changed", WARNING, cause, "no error of the position explains that", remedy, size
+            "anchor_changed",
+            WARNING,
+            cause=f"anchor {number}: {size:+.2f} m since the start of the flight: {what}",
+            evidence="no error of the position explains that",
+            remedy="look at it; survey it again if it was moved",
+            value=size,
         )
 
     def _displacement(self, one: Displaced) -> Finding:
@@ -582,8 +590,14 @@ class Monitor:
         evidence += "; the TDOAs do not separate these anchors" * bool(some)
         effects = " --effects effects.yaml" if self._calibrated is not None else ""
         again = f"measure {'them' if some else 'it'} again"
-        remedy = f"{SURVEYING} --survey anchors.yaml{effects} --out surveyed/  # or {again}"
-        return Finding("anchor_displaced", WARNING, what, evidence, remedy, off)
+        return Finding(
+            "anchor_displaced",
+            WARNING,
+            cause=what,
+            evidence=evidence,
+            remedy=f"{SURVEYING} --survey anchors.yaml{effects} --out surveyed/  # or {again}",
+            value=off,
+        )
 
     def _axis_alarms(self) -> list[str]:
         """Return sentences on IMU axes whose bias differs from the reference."""

@@ -88,20 +88,16 @@ class SignWatch:
 
         The comparison restarts and decides.
         """
-        line = (
-            "message.distance_difference = distance_to_b - distance_to_a  # always, not only in "
-            "the beginning"
-        )
-        evidence = (
-            "from one moment on, each TDOA is the negative of what the place of the tag makes it"
-        )
         turned = Finding(
             "tdoa_sign",
             ERROR,
-            "the sign of all TDOAs has changed in flight",
-            evidence,
-            line,
-            TURNED,
+            cause="the sign of all TDOAs has changed in flight",
+            evidence="from one moment on, each TDOA is the negative of what the place of the tag makes it",
+            remedy=(
+                "message.distance_difference = distance_to_b - distance_to_a  # always, not only in "
+                "the beginning"
+            ),
+            value=TURNED,
         )
         if self.finding is None:
             self.finding = turned
@@ -153,13 +149,16 @@ class SignWatch:
             self._states, self._stamps, self._innovations = [], [], ([], [])
         elif _better(wrong, right):
             ratio, z = compare(right, wrong)
-            evidence = (
-                f"the other way round {100.0 * (1.0 - ratio):.0f} % less stays unexplained, "
-                f"{z:.0f} standard errors"
-            )
-            line = "message.distance_difference = distance_to_b - distance_to_a  # not a - b"
             self.finding = Finding(
-                "tdoa_sign", ERROR, "the sign of all TDOAs is wrong", evidence, line, ratio
+                "tdoa_sign",
+                ERROR,
+                cause="the sign of all TDOAs is wrong",
+                evidence=(
+                    f"the other way round {100.0 * (1.0 - ratio):.0f} % less stays unexplained, "
+                    f"{z:.0f} standard errors"
+                ),
+                remedy="message.distance_difference = distance_to_b - distance_to_a  # not a - b",
+                value=ratio,
             )
             self._begin()
         elif t[-1] - t[0] > LONGEST:

@@ -132,20 +132,22 @@ class SurveyScale:
     def _found(self, k: int, factor: float, evidence: str) -> Finding | None:
         if self._table[k, 0] == ALONE:
             number = int(self._anchors.ids[int(self._table[k, 3])])
-            line = (
-                f"{number}: {{position: [x, y, z]}}  # what is there now, divided by {factor:.6g}"
+            return Finding(
+                "anchor_scale",
+                ERROR,
+                cause=f"the position of anchor {number} is in {self._names[k]}, not in metres",
+                evidence=evidence,
+                remedy=f"{number}: {{position: [x, y, z]}}  # what is there now, divided by {factor:.6g}",
+                value=factor,
             )
-            cause = f"the position of anchor {number} is in {self._names[k]}, not in metres"
-            return Finding("anchor_scale", ERROR, cause, evidence, line, factor)
         if abs(math.log(factor / NANOSECONDS)) < math.log(RATIO):
-            line = f"message.distance_difference *= {NANOSECONDS}  # of nanoseconds; of feet 0.3048"
             return Finding(
                 "tdoa_unit",
                 ERROR,
-                "TDOAs are in nanoseconds or in feet, not in metres",
-                evidence,
-                line,
-                NANOSECONDS,
+                cause="TDOAs are in nanoseconds or in feet, not in metres",
+                evidence=evidence,
+                remedy=f"message.distance_difference *= {NANOSECONDS}  # of nanoseconds; of feet 0.3048",
+                value=NANOSECONDS,
             )
         line = f"x, y, z = x / {factor:.6g}, y / {factor:.6g}, z / {factor:.6g}  # of every anchor"
         size = (
@@ -159,7 +161,9 @@ class SurveyScale:
                 f"the survey is in {self._names[k]}, not in metres: its positions are "
                 f"{factor:,.5g} times too large"
             )
-        return Finding("survey_scale", ERROR, cause, evidence, line, factor)
+        return Finding(
+            "survey_scale", ERROR, cause=cause, evidence=evidence, remedy=line, value=factor
+        )
 
 
 def _hypotheses(count: int) -> tuple[list[str], list[float], np.ndarray]:

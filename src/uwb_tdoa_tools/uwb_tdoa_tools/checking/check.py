@@ -164,10 +164,16 @@ def _with_trials(
     names = {finding.rule for finding in found}
     places, explained, track = np.empty((0, 3)), set(), None
     if names & NOTHING_TO_TRY:
-        cause = "sign, ids, survey and axes were not tried"
-        evidence = "the streams are of no use for that"
-        remedy = "put the errors right, record again, and check again"
-        found.append(Finding("not_tried", NOTE, cause, evidence, remedy, np.nan))
+        found.append(
+            Finding(
+                "not_tried",
+                NOTE,
+                cause="sign, ids, survey and axes were not tried",
+                evidence="the streams are of no use for that",
+                remedy="put the errors right, record again, and check again",
+                value=np.nan,
+            )
+        )
     else:
         ordered = _without_stream_mistakes(OrderedRecording.of(recording), found)
         tried, places = _try_corrections(ordered, names, others)
@@ -207,10 +213,10 @@ def sensor_findings(recording: Recording) -> Iterator[Finding]:
                 yield Finding(
                     found.rule,
                     ERROR if found.severe else WARNING,
-                    found.cause,
-                    found.evidence,
-                    found.remedy,
-                    found.value,
+                    cause=found.cause,
+                    evidence=found.evidence,
+                    remedy=found.remedy,
+                    value=found.value,
                 )
 
 
@@ -282,11 +288,17 @@ def _other_room(mixed: Finding) -> Finding:
 
     Both are what the survey of another room looks like.
     """
-    cause = (
-        "the survey is of another room, or its ids are mixed up: with many ids exchanged it "
-        "nearly fits, and the inertial sensor does not"
+    return Finding(
+        "survey_misfit",
+        ERROR,
+        cause=(
+            "the survey is of another room, or its ids are mixed up: with many ids exchanged it "
+            "nearly fits, and the inertial sensor does not"
+        ),
+        evidence=mixed.evidence,
+        remedy=OTHER_SURVEY,
+        value=mixed.value,
     )
-    return Finding("survey_misfit", ERROR, cause, mixed.evidence, OTHER_SURVEY, mixed.value)
 
 
 def _misfit(fit: SurveyFit) -> Iterator[Finding]:
@@ -297,15 +309,16 @@ def _misfit(fit: SurveyFit) -> Iterator[Finding]:
             "with the anchors elsewhere each half of the recording fits better, and not the other "
             "half"
         )
-        cause = (
-            "the TDOAs fit the survey less well than usual, and this recording does not determine "
-            "why"
-        )
-        remedy = (
-            "record a minute in which the tag is carried through the whole room, and check again"
-        )
         yield Finding(
-            "misfit_unclear", NOTE, cause, evidence, remedy, tdoa_rules.apparent_gain(fit)
+            "misfit_unclear",
+            NOTE,
+            cause=(
+                "the TDOAs fit the survey less well than usual, and this recording does not determine "
+                "why"
+            ),
+            evidence=evidence,
+            remedy="record a minute in which the tag is carried through the whole room, and check again",
+            value=tdoa_rules.apparent_gain(fit),
         )
     if gain is not None:
         heard, (_, anchors) = fit.heard, fit.all_moved
@@ -316,8 +329,14 @@ def _misfit(fit: SurveyFit) -> Iterator[Finding]:
             f"by {np.median(displacement(fit.positions[heard], anchors[heard])):.1f} m in the "
             "median"
         )
-        cause = "the survey does not fit: of another room, or anchors have been moved"
-        yield Finding("survey_misfit", ERROR, cause, evidence, OTHER_SURVEY, gain)
+        yield Finding(
+            "survey_misfit",
+            ERROR,
+            cause="the survey does not fit: of another room, or anchors have been moved",
+            evidence=evidence,
+            remedy=OTHER_SURVEY,
+            value=gain,
+        )
 
 
 def _facts(recording: Recording, streams: StreamRules) -> dict[str, str]:
@@ -358,6 +377,11 @@ def different_surveys(recordings: Sequence[NamedAnchors]) -> Iterator[Finding]:
                 if np.isfinite(off)
                 else "they have no id in common"
             )
-            cause = f"{one.name} and {two.name} have different surveys"
-            remedy = "diagnose, train and fit maps for each installation by itself"
-            yield Finding("surveys_differ", WARNING, cause, evidence, remedy, off)
+            yield Finding(
+                "surveys_differ",
+                WARNING,
+                cause=f"{one.name} and {two.name} have different surveys",
+                evidence=evidence,
+                remedy="diagnose, train and fit maps for each installation by itself",
+                value=off,
+            )

@@ -77,30 +77,28 @@ def judge_truth(flight: Flight) -> Iterator[Finding]:
     dt = np.diff(t)
     k = int(np.argmax(dt))
     if dt[k] > HOLE:
-        evidence = f"{dt[k]:.1f} s without a pose from {t[k] - flight.tdoa.t[0]:.1f} s on"
         yield Finding(
             "truth_hole",
             WARNING,
-            "the ground truth has a hole",
-            evidence,
-            "judge on what lies before or after",
-            float(dt[k]),
+            cause="the ground truth has a hole",
+            evidence=f"{dt[k]:.1f} s without a pose from {t[k] - flight.tdoa.t[0]:.1f} s on",
+            remedy="judge on what lies before or after",
+            value=float(dt[k]),
         )
     step = np.linalg.norm(np.diff(p, axis=0), axis=1)
     speed = np.where(step > LEAST_LEAP, step / np.maximum(dt, 1e-3), 0.0)
     if (speed > LEAP).any():
         k = int(np.argmax(speed))
-        evidence = (
-            f"{np.linalg.norm(p[k + 1] - p[k]):.2f} m in {dt[k]:.3f} s at "
-            f"{t[k] - flight.tdoa.t[0]:.1f} s"
-        )
         yield Finding(
             "truth_leap",
             WARNING,
-            "the ground truth leaps",
-            evidence,
-            "look for exchanged or hidden markers",
-            float(speed[k]),
+            cause="the ground truth leaps",
+            evidence=(
+                f"{np.linalg.norm(p[k + 1] - p[k]):.2f} m in {dt[k]:.3f} s at "
+                f"{t[k] - flight.tdoa.t[0]:.1f} s"
+            ),
+            remedy="look for exchanged or hidden markers",
+            value=float(speed[k]),
         )
 
 

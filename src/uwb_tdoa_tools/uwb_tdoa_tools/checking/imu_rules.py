@@ -51,13 +51,16 @@ def clipped_axes(flight: Flight) -> Iterator[Finding]:
         unit = "rad/s" if name.startswith("gyro") else "m/s^2"
         for ends, hits in ((values, counts), (values[::-1], counts[::-1])):
             if len(ends) > NEXT and hits[0] >= HITS and hits[0] > MORE * hits[1 : 1 + NEXT].mean():
-                evidence = (
-                    f"{hits[0]} samples of {ends[0]:.2f} {unit}, {hits[1 : 1 + NEXT].mean():.0f} of each "
-                    "of the next values"
-                )
-                remedy = "set the sensor to a larger range"
                 yield Finding(
-                    "imu_clipped", WARNING, f"{name} is clipped", evidence, remedy, float(ends[0])
+                    "imu_clipped",
+                    WARNING,
+                    cause=f"{name} is clipped",
+                    evidence=(
+                        f"{hits[0]} samples of {ends[0]:.2f} {unit}, {hits[1 : 1 + NEXT].mean():.0f} of each "
+                        "of the next values"
+                    ),
+                    remedy="set the sensor to a larger range",
+                    value=float(ends[0]),
                 )
                 return
 
@@ -158,10 +161,14 @@ def _upside_down(base: Unexplained, recording: OrderedRecording, least: float) -
     ratio, z = compare(base, _unexplained(replace(recording, anchors=turned), RATIO * base.mean))
     if not (ratio < min(RATIO, least + NEARLY) and z > DEVIATIONS):
         return None
-    evidence = f"{100.0 * (1.0 - ratio):.0f} % less stays unexplained then, {z:.1f} standard errors"
-    cause = "the survey is upside down: z points down, and the inertial sensor measures where up is"
-    line = "x, y, z = y, x, -z  # of every anchor; in a profile: world: ned"
-    return Finding("survey_upside_down", ERROR, cause, evidence, line, ratio)
+    return Finding(
+        "survey_upside_down",
+        ERROR,
+        cause="the survey is upside down: z points down, and the inertial sensor measures where up is",
+        evidence=f"{100.0 * (1.0 - ratio):.0f} % less stays unexplained then, {z:.1f} standard errors",
+        remedy="x, y, z = y, x, -z  # of every anchor; in a profile: world: ned",
+        value=ratio,
+    )
 
 
 def has_moved(places: np.ndarray) -> bool:
@@ -285,20 +292,29 @@ def _finding(accel: np.ndarray, gyro: np.ndarray, evidence: str, ratio: float) -
     scale = scale_of(gyro)
     unit = next((name for value, name in SCALES.items() if abs(value / scale - 1.0) < 1e-6), None)
     if unit:
-        line = (
-            f"for axis in 'xyz': setattr(w, axis, {scale:.6g} * getattr(w, axis))  # w = "
-            "message.angular_velocity"
+        return Finding(
+            "imu_rate_unit",
+            ERROR,
+            cause=f"the gyroscope is in {unit}",
+            evidence=evidence,
+            remedy=(
+                f"for axis in 'xyz': setattr(w, axis, {scale:.6g} * getattr(w, axis))  # w = "
+                "message.angular_velocity"
+            ),
+            value=scale,
         )
-        return Finding("imu_rate_unit", ERROR, f"the gyroscope is in {unit}", evidence, line, scale)
     if np.array_equal(accel, MIRROR) and np.array_equal(gyro, -MIRROR):
-        cause = (
-            "the survey is the mirror image of the room: an axis has the wrong sign, e.g. z down, "
-            "or two are exchanged"
+        return Finding(
+            "survey_mirrored",
+            ERROR,
+            cause=(
+                "the survey is the mirror image of the room: an axis has the wrong sign, e.g. z down, "
+                "or two are exchanged"
+            ),
+            evidence=evidence,
+            remedy="x, y, z = y, x, z  # of every anchor; or the axis with the wrong sign turned: z = -z",
+            value=ratio,
         )
-        line = (
-            "x, y, z = y, x, z  # of every anchor; or the axis with the wrong sign turned: z = -z"
-        )
-        return Finding("survey_mirrored", ERROR, cause, evidence, line, ratio)
     parts = []
     for name, variable, matrix in (("accelerometer", "a", accel), ("gyroscope", "w", gyro)):
         if not np.array_equal(matrix, UPRIGHT):
@@ -308,8 +324,14 @@ def _finding(accel: np.ndarray, gyro: np.ndarray, evidence: str, ratio: float) -
         f"{v}.x, {v}.y, {v}.z = {', '.join(signed_axis(row, f'{v}.') for row in matrix)}"
         for _, v, matrix in parts
     )
-    cause = f"axes or signs of the {who} are wrong: x forward, y left, z up is needed, right-handed"
-    return Finding("imu_axes", ERROR, cause, evidence, line, ratio)
+    return Finding(
+        "imu_axes",
+        ERROR,
+        cause=f"axes or signs of the {who} are wrong: x forward, y left, z up is needed, right-handed",
+        evidence=evidence,
+        remedy=line,
+        value=ratio,
+    )
 
 
 def scale_of(matrix: np.ndarray) -> float:

@@ -114,9 +114,15 @@ def units(recording: OrderedRecording) -> Iterator[tuple[Finding, OrderedRecordi
         f"successive TDOAs of a pair differ by {noise:.3g}: {scale * noise:.2f} m as {name}, "
     )
     evidence += f"{its * noise:.2g} m as {other}; radios have 0.05 - 0.1 m"
-    line = f"message.distance_difference *= {scale:.10g}"
     yield (
-        Finding("tdoa_unit", ERROR, f"TDOAs are in {name}, not in metres", evidence, line, scale),
+        Finding(
+            "tdoa_unit",
+            ERROR,
+            cause=f"TDOAs are in {name}, not in metres",
+            evidence=evidence,
+            remedy=f"message.distance_difference *= {scale:.10g}",
+            value=scale,
+        ),
         trial,
     )
 
@@ -131,10 +137,13 @@ def successive_difference(tdoa: Tdoas) -> float:
 
 def inverted_signs(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     """Yield the trial with all signs inverted."""
-    line = "message.distance_difference = distance_to_b - distance_to_a  # not a - b"
     yield MistakeTrial(
         recording.with_tdoa(d=-recording.tdoa.d),
-        _finding_of("tdoa_sign", "the sign of all TDOAs is wrong", line),
+        _finding_of(
+            "tdoa_sign",
+            cause="the sign of all TDOAs is wrong",
+            line="message.distance_difference = distance_to_b - distance_to_a  # not a - b",
+        ),
     )
 
 
@@ -144,14 +153,17 @@ def scaled_survey(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     (If the TDOAs show it directly, the rules of streams have reported it before.)
     """
     for name, factor in SURVEY_UNITS.items():
-        cause = (
-            f"the survey is in {name}, not in metres: its positions are {factor:,.5g} times too "
-            "large"
-        )
-        line = f"x, y, z = x / {factor:.6g}, y / {factor:.6g}, z / {factor:.6g}  # of every anchor"
         anchors = recording.anchors.at(recording.anchors.positions / factor)
         yield MistakeTrial(
-            replace(recording, anchors=anchors), _finding_of("survey_scale", cause, line)
+            replace(recording, anchors=anchors),
+            _finding_of(
+                "survey_scale",
+                cause=(
+                    f"the survey is in {name}, not in metres: its positions are {factor:,.5g} times too "
+                    "large"
+                ),
+                line=f"x, y, z = x / {factor:.6g}, y / {factor:.6g}, z / {factor:.6g}  # of every anchor",
+            ),
         )
 
 
@@ -167,10 +179,13 @@ def other_survey(recording: OrderedRecording, others: Sequence[Survey]) -> Itera
         if same_place(anchors, recording.anchors):
             continue
         names = " or ".join([name, *duplicates])
-        cause = f"the survey is of another room or day: {names} fits"
         yield MistakeTrial(
             replace(recording, anchors=anchors),
-            _finding_of("survey_other", cause, f"--survey {name}"),
+            _finding_of(
+                "survey_other",
+                cause=f"the survey is of another room or day: {names} fits",
+                line=f"--survey {name}",
+            ),
         )
 
 
@@ -202,7 +217,9 @@ def renumbered_ids(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     line = f"id -= {shift}" if (heard - known == shift).all() else f"id = {table}[id]"
     cause = f"the ids of the survey are others: what the tag calls {heard[0]} ... {heard[-1]} "
     cause += f"is {known[0]} ... {known[-1]} there"
-    yield MistakeTrial(relabelled(recording, table), _finding_of("ids_renumbered", cause, line))
+    yield MistakeTrial(
+        relabelled(recording, table), _finding_of("ids_renumbered", cause=cause, line=line)
+    )
 
 
 def swapped_ids(recording: OrderedRecording) -> Iterator[MistakeTrial]:
@@ -242,8 +259,8 @@ def swapped_ids(recording: OrderedRecording) -> Iterator[MistakeTrial]:
         trial,
         _finding_of(
             "ids_swapped",
-            f"{cause}: what is called {names}",
-            f"id = {table}.get(id, id)  # or swap them in the survey",
+            cause=f"{cause}: what is called {names}",
+            line=f"id = {table}.get(id, id)  # or swap them in the survey",
         ),
     )
 
@@ -267,12 +284,17 @@ def inverted_pairs(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     pairs = np.unique(np.column_stack([tdoa.a, tdoa.b]), axis=0)
     backward = tdoa.a > tdoa.b
     if 0.2 < backward.mean() < 0.8:
-        line = (
-            "message.distance_difference = distance_to_b - distance_to_a  # in the order of the "
-            "message's ids"
+        yield MistakeTrial(
+            _flipped(recording, backward),
+            _finding_of(
+                "tdoa_one_sign",
+                cause="the sign of the TDOAs does not follow the order of the anchors",
+                line=(
+                    "message.distance_difference = distance_to_b - distance_to_a  # in the order of the "
+                    "message's ids"
+                ),
+            ),
         )
-        cause = "the sign of the TDOAs does not follow the order of the anchors"
-        yield MistakeTrial(_flipped(recording, backward), _finding_of("tdoa_one_sign", cause, line))
     wrong = _contrary(recording.part(LONG), pairs)
     if not 0 < len(wrong) <= MOST_PAIRS:
         return
@@ -284,10 +306,13 @@ def inverted_pairs(recording: OrderedRecording) -> Iterator[MistakeTrial]:
         # With a survey of another room some pairs seem to have the other sign, and it does not fit.
         return
     names = ", ".join(f"({a}, {b})" for a, b in wrong)
-    line = f"if (a, b) in {{{names}}}: message.distance_difference *= -1.0  # and find out why"
     yield MistakeTrial(
         trial,
-        _finding_of("pair_sign", f"the sign of the pairs {names} is wrong", line),
+        _finding_of(
+            "pair_sign",
+            cause=f"the sign of the pairs {names} is wrong",
+            line=f"if (a, b) in {{{names}}}: message.distance_difference *= -1.0  # and find out why",
+        ),
         flip.mean(),
     )
 
@@ -326,13 +351,14 @@ def moved_anchor(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     shift = alone[row][1][row] - fit.positions[row]
     number = int(recording.anchors.ids[row])
     where = ", ".join(f"{s:+.1f}" for s in shift)
-    cause = f"anchor {number} is not where the survey has it, but about ({where}) m from there"
-    line = (
-        f"{number}: {{position: [x, y, z]}}  # measure it again; look for exchanged digits and axes"
-    )
     anchors = recording.anchors.at(alone[row][1])
     yield MistakeTrial(
-        replace(recording, anchors=anchors), _finding_of("anchor_moved", cause, line)
+        replace(recording, anchors=anchors),
+        _finding_of(
+            "anchor_moved",
+            cause=f"anchor {number} is not where the survey has it, but about ({where}) m from there",
+            line=f"{number}: {{position: [x, y, z]}}  # measure it again; look for exchanged digits and axes",
+        ),
     )
 
 
@@ -397,10 +423,14 @@ def best_trial(
 
 def _finding_of(rule: str, cause: str, line: str) -> Callable[[float, float], Finding]:
     def finding(ratio: float, z: float) -> Finding:
-        evidence = (
-            f"{100.0 * (1.0 - ratio):.0f} % less stays unexplained then, {z:.1f} standard errors"
+        return Finding(
+            rule,
+            ERROR,
+            cause=cause,
+            evidence=f"{100.0 * (1.0 - ratio):.0f} % less stays unexplained then, {z:.1f} standard errors",
+            remedy=line,
+            value=ratio,
         )
-        return Finding(rule, ERROR, cause, evidence, line, ratio)
 
     return finding
 
