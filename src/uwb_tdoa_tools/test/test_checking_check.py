@@ -12,8 +12,9 @@ import pytest
 
 from uwb_tdoa_bias.common.flight import Tdoas
 from uwb_tdoa_tools.bags.bag import read_bag, write_bag
-from uwb_tdoa_tools.checking.check import check, different_surveys, sensor_findings, upright
+from uwb_tdoa_tools.checking.check import check, different_surveys, upright
 from uwb_tdoa_tools.checking.recording import of_flight, read_recording
+from uwb_tdoa_tools.checking.recording_rules import sensor_mistakes
 from uwb_tdoa_tools.readers import inputs, read_flight, read_survey
 from uwb_tdoa_tools.readers.inputs import Reading
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
@@ -88,7 +89,7 @@ def test_a_mistake_is_named(name):
 
 def test_ranges_alone_show_a_survey_upside_down():
     flight = simulate(SimulationConfig(seed=0, range_noise=0.1, **QUICK))
-    healthy = replace(of_flight(flight), tdoa=NO_TDOAS)
+    healthy = of_flight(replace(flight, tdoa=NO_TDOAS))
     upside_down = MISTAKES["upside_down_survey"].make(healthy, None, None)
     assert "survey_upside_down" in rules(check(upside_down))
     assert rules(check(healthy)) == set()
@@ -198,7 +199,7 @@ def test_healthy_ranges_without_tdoas_have_no_error(ranged):
 def test_ranges_in_millimetres_are_named(ranged):
     wrong = replace(ranged, range=replace(ranged.range, d=1000.0 * ranged.range.d))
     assert "range_unit" in {finding.rule for finding in check(of_flight(wrong)).findings}
-    assert [finding.rule for finding in sensor_findings(of_flight(wrong))][:1] == ["range_unit"]
+    assert [finding.rule for finding in sensor_mistakes(of_flight(wrong))][:1] == ["range_unit"]
 
 
 def test_a_bag_of_ranges_alone_is_read_and_checked(ranged, tmp_path):

@@ -21,7 +21,7 @@ from uwb_tdoa_bias.common.sensors import Ranges
 from uwb_tdoa_bias.common.survey import UNITS
 from uwb_tdoa_ekf.results import rows_of
 from uwb_tdoa_tools.checking import imu_rules, tdoa_rules
-from uwb_tdoa_tools.checking.check import check, sensor_findings
+from uwb_tdoa_tools.checking.check import check
 from uwb_tdoa_tools.checking.imu_rules import clipped_axes, is_smooth
 from uwb_tdoa_tools.checking.ordered import (
     SPREAD,
@@ -31,6 +31,7 @@ from uwb_tdoa_tools.checking.ordered import (
     spread,
 )
 from uwb_tdoa_tools.checking.recording import of_flight, read_recording
+from uwb_tdoa_tools.checking.recording_rules import sensor_mistakes
 from uwb_tdoa_tools.checking.tdoa_rules import GAIN, SAME, apparent_gain, gained
 from uwb_tdoa_tools.readers import read_flight
 from uwb_tdoa_tools.readers.inputs import Reading
@@ -446,7 +447,7 @@ def test_ranges_that_are_no_distances_are_told(value, share, severity):
     flight = Flight("ranged", ROOM, Tdoas(*np.empty((4, 0))), None, range=ranges)
     found = [
         finding.severity
-        for finding in sensor_findings(of_flight(flight))
+        for finding in sensor_mistakes(of_flight(flight))
         if finding.rule == "range_invalid"
     ]
     assert found == ([severity] if severity else [])

@@ -31,6 +31,8 @@ SHARE, PRESENT = 0.6, 0.1
 # any 10 to 40 s from the start or in the air: healthy flights have 0.98 and 0.2. Flights with the
 # other sign have 0.81 and 2.5 after 30 s in the air, most of them after 12 s.
 RATIO, DEVIATIONS = 0.85, 3.0
+WRONG_SIGN = "the sign of all TDOAs is wrong"
+RIGHT_SIGN = "message.distance_difference = distance_to_b - distance_to_a  # not a - b"
 TURNED = -1.0  # value of a Finding on signs that flipped in flight
 LONGEST = 40.0  # s of stamps after which an undecided comparison restarts
 
@@ -152,12 +154,12 @@ class SignWatch:
             self.finding = Finding(
                 "tdoa_sign",
                 ERROR,
-                cause="the sign of all TDOAs is wrong",
+                cause=WRONG_SIGN,
                 evidence=(
                     f"the other way round {100.0 * (1.0 - ratio):.0f} % less stays unexplained, "
                     f"{z:.0f} standard errors"
                 ),
-                remedy="message.distance_difference = distance_to_b - distance_to_a  # not a - b",
+                remedy=RIGHT_SIGN,
                 value=ratio,
             )
             self._begin()

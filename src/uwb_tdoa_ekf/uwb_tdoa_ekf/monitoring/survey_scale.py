@@ -21,7 +21,7 @@ from uwb_tdoa_bias.common.compiled import compiled
 from uwb_tdoa_bias.common.radio import SPEED_OF_LIGHT
 from uwb_tdoa_bias.common.survey import UNITS
 
-from .explain import SCALE
+from .explain import SCALE, compare_losses, in_words
 from .finding import ERROR, Finding
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ class SurveyScale:
             Number of latest snapshots to keep; None keeps all.
         """
         self._anchors = anchors
-        self._names, self._factors, self._table = _hypotheses(len(anchors))
+        self._names, self._table = _hypotheses(len(anchors))
         self._losses: deque[np.ndarray] = deque(maxlen=kept)  # (h,) losses of each snapshot
         self._places: deque[np.ndarray] = deque(maxlen=kept)  # (h, 3) positions of the tag, in m
 
@@ -100,119 +100,91 @@ class SurveyScale:
         if len(self._losses) < FEWEST:
             return None
         losses = np.array(self._losses)
-        mean, kind = losses.mean(axis=0), self._table[:, 0]
-        chosen = np.flatnonzero((kind == SCALED) | (kind == ALONE))
-        best = int(chosen[np.argmin(mean[chosen])])
-        others = np.flatnonzero((kind == AS_IT_IS) | (kind == SIGN) | (kind == EXCHANGED))
-        rival = int(others[np.argmin(mean[others])])
-        left, z = _compared(losses[:, rival], losses[:, best])
+        mean, kind, factor = losses.mean(axis=0), self._table[:, 0], self._table[:, 1]
+        is_scale = (kind == SCALED) | (kind == ALONE)
+        best = int(np.argmin(np.where(is_scale, mean, np.inf)))
+        rival = int(np.argmin(np.where(is_scale, np.inf, mean)))
+        left, z = compare_losses(losses[:, rival], losses[:, best])
         if left > LEFT or z < DEVIATIONS or mean[best] > GOOD:
             return None
-        if left > CLEARLY and (
-            len(losses) < MANY
-            or _spread(np.array([places[best] for places in self._places])) < MOVED
-        ):
+        moved = _spread(np.array([places[best] for places in self._places]))
+        if left > CLEARLY and (len(losses) < MANY or moved < MOVED):
             return None
-        evidence = (
-            f"{100.0 * (1.0 - left):.0f} % less stays unexplained then, {z:.1f} standard errors, "
-            f"in {len(losses)} snapshots"
-        )
-        near = [
-            k
-            for k in chosen.tolist()
-            if self._names[k] and kind[k] == SCALED == kind[best] and self._near(k, best)
-        ]
-        named = min(near, key=lambda k: mean[k], default=best)
-        return self._found(named, self._factors[named], evidence)
-
-    def _near(self, one: int, other: int) -> bool:
-        """Return whether the data do not distinguish the scales of two hypotheses."""
-        return abs(math.log(self._factors[one] / self._factors[other])) < 0.7 * math.log(RATIO)
-
-    def _found(self, k: int, factor: float, evidence: str) -> Finding | None:
-        if self._table[k, 0] == ALONE:
-            number = int(self._anchors.ids[int(self._table[k, 3])])
+        evidence = f"{in_words(left, z)}, in {len(losses)} snapshots"
+        if kind[best] == ALONE:
+            number = int(self._anchors.ids[int(self._table[best, 3])])
             return Finding(
                 "anchor_scale",
                 ERROR,
-                cause=f"the position of anchor {number} is in {self._names[k]}, not in metres",
+                cause=f"the position of anchor {number} is in {self._names[best]}, not in metres",
                 evidence=evidence,
-                remedy=f"{number}: {{position: [x, y, z]}}  # what is there now, divided by {factor:.6g}",
-                value=factor,
+                remedy=(
+                    f"{number}: {{position: [x, y, z]}}  # what is there now, divided by "
+                    f"{factor[best]:.6g}"
+                ),
+                value=float(factor[best]),
             )
-        if abs(math.log(factor / NANOSECONDS)) < math.log(RATIO):
-            return Finding(
-                "tdoa_unit",
-                ERROR,
-                cause="TDOAs are in nanoseconds or in feet, not in metres",
-                evidence=evidence,
-                remedy=f"message.distance_difference *= {NANOSECONDS}  # of nanoseconds; of feet 0.3048",
-                value=NANOSECONDS,
-            )
-        line = f"x, y, z = x / {factor:.6g}, y / {factor:.6g}, z / {factor:.6g}  # of every anchor"
-        size = (
-            f"about {factor:.3g} times too large"
-            if factor > 1.0
-            else f"about {1.0 / factor:.3g} times too small"
-        )
-        cause = f"the survey is not in metres: its positions are {size}"
-        if self._names[k]:
-            cause = (
-                f"the survey is in {self._names[k]}, not in metres: its positions are "
-                f"{factor:,.5g} times too large"
-            )
+        # the data do not distinguish close scales: prefer that of a unit
+        close = np.abs(np.log(factor / factor[best])) < 0.7 * math.log(RATIO)
+        units = [k for k in np.flatnonzero(close & (kind == SCALED)).tolist() if self._names[k]]
+        named = min(units, key=lambda k: mean[k], default=best)
+        return _of_scale(self._names[named], float(factor[named]), evidence)
+
+
+def _of_scale(name: str, factor: float, evidence: str) -> Finding:
+    """Return the Finding on a survey that is too large by a factor, the unit `name` or ""."""
+    if abs(math.log(factor / NANOSECONDS)) < math.log(RATIO):
         return Finding(
-            "survey_scale", ERROR, cause=cause, evidence=evidence, remedy=line, value=factor
+            "tdoa_unit",
+            ERROR,
+            cause="TDOAs are in nanoseconds or in feet, not in metres",
+            evidence=evidence,
+            remedy=f"message.distance_difference *= {NANOSECONDS}  # of nanoseconds; of feet 0.3048",
+            value=NANOSECONDS,
         )
+    cause, remedy = wrong_unit(name, factor)
+    if not name:
+        size = f"{factor:.3g} times too large"
+        if factor < 1.0:
+            size = f"{1.0 / factor:.3g} times too small"
+        cause = f"the survey is not in metres: its positions are about {size}"
+    return Finding(
+        "survey_scale", ERROR, cause=cause, evidence=evidence, remedy=remedy, value=factor
+    )
 
 
-def _hypotheses(count: int) -> tuple[list[str], list[float], np.ndarray]:
+def wrong_unit(name: str, factor: float) -> tuple[str, str]:
+    """Return (cause, remedy) of a survey in another unit, whose positions are too large."""
+    cause = (
+        f"the survey is in {name}, not in metres: its positions are {factor:,.5g} times too large"
+    )
+    line = f"x, y, z = x / {factor:.6g}, y / {factor:.6g}, z / {factor:.6g}  # of every anchor"
+    return cause, line
+
+
+def _hypotheses(count: int) -> tuple[list[str], np.ndarray]:
     """Return the hypotheses for a number of anchors.
 
     Returns
     -------
     names : list of str
         Units that the factors stand for, or "".
-    factors : list of float
-        Factors by which the survey is too large: positions / factor are in m.
     table : (h, 5) array
-        Kind; factor of all anchors, or of one (ALONE); sign of the TDOAs; rows of that anchor, or of
-        both (EXCHANGED), else 0.
+        Kind; factor by which all anchors, or one (ALONE), are too far from the origin; sign of the
+        TDOAs; rows of that anchor, or of both (EXCHANGED), else 0.
     """
-    hypotheses: list[tuple[str, float, tuple[float, ...]]] = [
-        ("", 1.0, (AS_IT_IS, 1.0, 1.0, 0, 0)),
-        ("", 1.0, (SIGN, 1.0, -1.0, 0, 0)),
-    ]
-    scales = SMALLEST * RATIO ** np.arange(
-        math.floor(math.log(LARGEST / SMALLEST) / math.log(RATIO)) + 1
-    )
-    hypotheses += [
-        ("", factor, (SCALED, factor, 1.0, 0, 0))
-        for factor in [*scales.tolist(), *(1.0 / scales).tolist()]
-    ]
-    hypotheses += [(name, factor, (SCALED, factor, 1.0, 0, 0)) for name, factor in UNITS.items()]
+    count_of_scales = math.floor(math.log(LARGEST / SMALLEST) / math.log(RATIO)) + 1
+    scales = SMALLEST * RATIO ** np.arange(count_of_scales)
+    made: list[tuple] = [("", AS_IT_IS, 1.0, 1.0, 0, 0), ("", SIGN, 1.0, -1.0, 0, 0)]
+    made += [("", SCALED, factor, 1.0, 0, 0) for factor in np.append(scales, 1.0 / scales)]
+    made += [(name, SCALED, factor, 1.0, 0, 0) for name, factor in UNITS.items()]
     if count <= SINGLE:
-        hypotheses += [
-            (name, factor, (ALONE, factor, 1.0, row, 0))
-            for row in range(count)
-            for name, factor in UNITS.items()
-        ]
-        hypotheses += [
-            ("", 1.0, (EXCHANGED, 1.0, 1.0, one, two)) for one, two in combinations(range(count), 2)
-        ]
-    names, factors, table = zip(*hypotheses)
-    return [*names], [*factors], np.array(table, dtype=float)
-
-
-def _compared(one: np.ndarray, other: np.ndarray) -> tuple[float, float]:
-    """Return (mean of `other` over mean of `one`, standard errors of the reduction).
-
-    Both are losses (n,) of the same snapshots.
-    """
-    error = float(np.std(one - other, ddof=1)) / math.sqrt(len(one))
-    return float(np.mean(other) / max(np.mean(one), 1e-9)), float(np.mean(one - other)) / max(
-        error, 1e-9
-    )
+        for row in range(count):
+            made += [(name, ALONE, factor, 1.0, row, 0) for name, factor in UNITS.items()]
+        pairs = combinations(range(count), 2)
+        made += [("", EXCHANGED, 1.0, 1.0, one, two) for one, two in pairs]
+    names = [name for name, *_ in made]
+    return names, np.array([values for _, *values in made], dtype=float)
 
 
 def _spread(places: np.ndarray) -> float:

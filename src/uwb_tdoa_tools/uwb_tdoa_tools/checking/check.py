@@ -5,12 +5,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.common.sensors import SENSORS, Ranges
-from uwb_tdoa_ekf.monitoring.finding import ERROR, NOTE, WARNING, Finding, most_severe_first
+from uwb_tdoa_ekf.monitoring.finding import (
+    ERROR,
+    NOTE,
+    WARNING,
+    Finding,
+    explained_by,
+    most_severe_first,
+)
 from uwb_tdoa_ekf.monitoring.stream_rules import StreamRules
 
 from ..estimate import FlightEstimator
@@ -21,9 +28,9 @@ from .tdoa_rules import SAME, largest_displacement
 from .watch import found_by_monitor, together
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
-    from uwb_tdoa_bias.common.anchors import Anchors
+    from uwb_tdoa_bias.common.flight import Flight
 
     from ..live.record import End
     from .ordered import SurveyFit
@@ -61,16 +68,6 @@ EXPLAINS = {
     "tdoa_one_sign": {"tdoa_one_sign"},
     "survey_scale": {"tdoa_large", "tdoa_outliers"},
 }
-
-
-class NamedAnchors(Protocol):
-    """A Recording or a Flight: an object with a name and Anchors."""
-
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def anchors(self) -> Anchors: ...
 
 
 @dataclass(frozen=True)
@@ -120,11 +117,10 @@ def check(
         Command line that surveys the anchors with the recording.
     """
     streams = processed_streams(recording)
-    found = [*streams.findings(), *sensor_findings(recording)]
+    found = streams.findings()
     for rule in recording_rules.RULES:
         found += rule(recording)
-    if any(finding.rule == "clock_silence" for finding in found):  # the gap of all streams
-        found = [finding for finding in found if finding.rule != "gap"]
+    found = _without(found, explained_by(found, {"clock_silence": {"gap"}}))
     if len(recording.tdoa):
         found = _with_trials(recording, streams, found, others, estimator, line)
     else:
@@ -162,7 +158,8 @@ def _with_trials(
 ) -> list[Finding]:
     """Return the findings of the streams, of trials, and about coverage, without those explained."""
     names = {finding.rule for finding in found}
-    places, explained, track = np.empty((0, 3)), set(), None
+    places, track = np.empty((0, 3)), None
+    explained: set[str] = set()
     if names & NOTHING_TO_TRY:
         found.append(
             Finding(
@@ -182,16 +179,20 @@ def _with_trials(
         track = run.odometry.t, run.odometry.p
         events = found_by_monitor(flight, run, estimator)
         tried = together(ordered, tried, events, line)
-        explained = set().union(*(EXPLAINS.get(finding.rule, ()) for finding in tried))
-        found = [finding for finding in found if finding.rule not in explained] + tried
+        explained = explained_by(tried, EXPLAINS)
+        found = _without(found, explained) + tried
     if "survey_scale" in names:  # of a room of another size
         places = np.empty((0, 3))
     view = coverage.CoverageView(
         recording.anchors, list(streams.tdoa), places, "height" in recording.sensors, track
     )
     for rule in coverage.RULES:
-        found += (finding for finding in rule(view) if finding.rule not in explained)
+        found += _without(rule(view), explained)
     return found
+
+
+def _without(findings: Iterable[Finding], explained: set[str]) -> list[Finding]:
+    return [finding for finding in findings if finding.rule not in explained]
 
 
 def processed_streams(recording: Recording) -> StreamRules:
@@ -202,22 +203,6 @@ def processed_streams(recording: Recording) -> StreamRules:
     streams.feed_tdoa(tdoa.t, recording.tdoa_arrival, tdoa.a, tdoa.b, tdoa.d)
     streams.finish()
     return streams
-
-
-def sensor_findings(recording: Recording) -> Iterator[Finding]:
-    """Yield findings about the Streams of a Recording, by the rules of their SENSORS."""
-    for name, stream in recording.sensors.items():
-        for rule in SENSORS[name].rules:
-            found = rule(stream, recording.anchors)
-            if found is not None:
-                yield Finding(
-                    found.rule,
-                    ERROR if found.severe else WARNING,
-                    cause=found.cause,
-                    evidence=found.evidence,
-                    remedy=found.remedy,
-                    value=found.value,
-                )
 
 
 def _without_stream_mistakes(ordered: OrderedRecording, found: list[Finding]) -> OrderedRecording:
@@ -364,7 +349,7 @@ def _facts(recording: Recording, streams: StreamRules) -> dict[str, str]:
     return facts
 
 
-def different_surveys(recordings: Sequence[NamedAnchors]) -> Iterator[Finding]:
+def different_surveys(recordings: Sequence[Recording | Flight]) -> Iterator[Finding]:
     """Yield findings about Recordings with different surveys: an id at two places.
 
     Such flights do not belong together.
@@ -372,16 +357,12 @@ def different_surveys(recordings: Sequence[NamedAnchors]) -> Iterator[Finding]:
     for one, two in zip(recordings, recordings[1:]):
         off = largest_displacement(one.anchors, two.anchors)
         if off > SAME:
-            evidence = (
-                f"the same ids are up to {off:.2f} m apart"
-                if np.isfinite(off)
-                else "they have no id in common"
-            )
+            apart = f"the same ids are up to {off:.2f} m apart"
             yield Finding(
                 "surveys_differ",
                 WARNING,
                 cause=f"{one.name} and {two.name} have different surveys",
-                evidence=evidence,
+                evidence=apart if np.isfinite(off) else "they have no id in common",
                 remedy="diagnose, train and fit maps for each installation by itself",
                 value=off,
             )

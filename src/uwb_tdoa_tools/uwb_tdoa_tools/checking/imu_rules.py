@@ -19,7 +19,7 @@ from uwb_tdoa_bias.common.flight import Imu
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.measurements import imu_rows
 from uwb_tdoa_ekf.core.memory import TDOA, structured
-from uwb_tdoa_ekf.monitoring.explain import Unexplained, compare, unexplained
+from uwb_tdoa_ekf.monitoring.explain import Unexplained, compare, in_words, unexplained
 from uwb_tdoa_ekf.monitoring.finding import ERROR, WARNING, Finding
 from uwb_tdoa_ekf.monitoring.inertial_rules import AXES
 
@@ -143,7 +143,7 @@ def find_imu_mistake(recording: OrderedRecording) -> Finding | None:
     if not near or not least < RATIO:
         return None
     ratio, z, accel, gyro = min(near, key=lambda trial: _complexity(trial[2], trial[3]))
-    evidence = f"{100.0 * (1.0 - ratio):.0f} % less stays unexplained then, {z:.1f} standard errors"
+    evidence = in_words(ratio, z)
     if len(near) > 1:
         evidence += f"; {len(near) - 1} other arrangements fit about as well"
     return _finding(accel, gyro, evidence, ratio)
@@ -165,7 +165,7 @@ def _upside_down(base: Unexplained, recording: OrderedRecording, least: float) -
         "survey_upside_down",
         ERROR,
         cause="the survey is upside down: z points down, and the inertial sensor measures where up is",
-        evidence=f"{100.0 * (1.0 - ratio):.0f} % less stays unexplained then, {z:.1f} standard errors",
+        evidence=in_words(ratio, z),
         remedy="x, y, z = y, x, -z  # of every anchor; in a profile: world: ned",
         value=ratio,
     )

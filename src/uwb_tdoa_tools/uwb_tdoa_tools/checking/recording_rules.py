@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.common.sensors import Ranges
+from uwb_tdoa_bias.common.sensors import SENSORS, Ranges
 from uwb_tdoa_ekf.monitoring.finding import ERROR, NOTE, WARNING, Finding
 
 from ..bags.frames import is_body
@@ -33,6 +33,22 @@ if TYPE_CHECKING:
 
 WHEELS = "velocity/odometry"
 TURNED, SHIFTED = np.deg2rad(2.0), 0.02  # rad and m that a frame may be off the body frame
+
+
+def sensor_mistakes(recording: Recording) -> Iterator[Finding]:
+    """Yield findings about the Streams of the SENSORS, by their own rules."""
+    for name, stream in recording.sensors.items():
+        for rule in SENSORS[name].rules:
+            found = rule(stream, recording.anchors)
+            if found is not None:
+                yield Finding(
+                    found.rule,
+                    ERROR if found.severe else WARNING,
+                    cause=found.cause,
+                    evidence=found.evidence,
+                    remedy=found.remedy,
+                    value=found.value,
+                )
 
 
 def frames(recording: Recording) -> Iterator[Finding]:
@@ -484,6 +500,7 @@ def _offset(positions: np.ndarray, d: np.ndarray) -> float | None:
 
 
 RULES = (
+    sensor_mistakes,
     frames,
     senders,
     no_imu,
