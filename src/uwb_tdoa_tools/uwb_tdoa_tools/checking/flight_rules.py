@@ -41,17 +41,13 @@ def judge_against_truth(flight: Flight) -> list[Finding]:
 def _of_tdoas(path: KnownPath) -> list[Finding]:
     """Return findings about ids, then other values, then stamps if ids and values are right."""
     repairs = repairs_of(path)
-    found = (
-        list(pair_rules.exchanged_ids(path))
-        if any(effect.name == AnchorIds.name for effect in repairs)
-        else []
-    )
+    found: list[Finding] = []
+    if any(effect.name == AnchorIds.name for effect in repairs):
+        found += pair_rules.exchanged_ids(path)
     found += pair_rules.wrong_values(path.without(repairs[0]) if found else path)
-    return (
-        found
-        if any(finding.rule.startswith(("ids", "tdoa")) for finding in found)
-        else [*found, *time_rules.wrong_stamps(path)]
-    )
+    if not any(finding.rule.startswith(("ids", "tdoa")) for finding in found):
+        found += time_rules.wrong_stamps(path)
+    return found
 
 
 def _of_imu(flight: Flight) -> list[Finding]:

@@ -114,6 +114,17 @@ SCALES = {
 }
 
 
+# The most frequent mistakes: matrices of the accelerometer and of the gyroscope that undo each.
+USUAL = [
+    *((UPRIGHT, np.diag(signs)) for signs in list(product((1.0, -1.0), repeat=3))[1:]),
+    (UPRIGHT, UPRIGHT[[1, 0, 2]]),
+    (MIRROR, UPRIGHT),
+    (MIRROR, MIRROR),
+    (MIRROR, -MIRROR),
+    *((UPRIGHT, scale * UPRIGHT) for scale in SCALES),
+]
+
+
 def find_imu_mistake(recording: OrderedRecording) -> Finding | None:
     """Return the Finding about axes or units of the IMU that do not fit the TDOAs, or None.
 
@@ -128,7 +139,7 @@ def find_imu_mistake(recording: OrderedRecording) -> Finding | None:
     ):
         return None
     base = _unexplained(brief)
-    trials = [_tried(base, brief, accel, gyro) for accel, gyro in _usual()]
+    trials = [_tried(base, brief, accel, gyro) for accel, gyro in USUAL]
     least = min(ratio for ratio, _, _, _ in trials)
     if not least < RATIO:
         return None
@@ -202,20 +213,6 @@ def averaged(imu: Imu | None) -> Imu | None:
         for column in (imu.t, imu.gyro, imu.accel)
     )
     return Imu(*map(np.ascontiguousarray, columns))
-
-
-def _usual() -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield the most frequent mistakes as (3, 3) matrices that undo them: accelerometer, gyroscope."""
-    for signs in product((1.0, -1.0), repeat=3):
-        if signs != (1.0, 1.0, 1.0):
-            yield UPRIGHT, np.diag(signs)
-    exchanged = UPRIGHT[[1, 0, 2]]
-    yield UPRIGHT, exchanged
-    yield MIRROR, UPRIGHT
-    yield MIRROR, MIRROR
-    yield MIRROR, -MIRROR
-    for scale in SCALES:
-        yield UPRIGHT, scale * UPRIGHT
 
 
 def _scaled(trials: Sequence[Arrangement]) -> np.ndarray | None:

@@ -342,11 +342,9 @@ def repairs(flight: Flight) -> tuple[LabelEffect, ...]:
 
     () without ground truth or TDOAs.
     """
-    return (
-        ()
-        if flight.truth is None or len(flight.truth) < 2 or not len(flight.tdoa)
-        else repairs_of(KnownPath(flight))
-    )
+    if flight.truth is None or len(flight.truth) < 2 or not len(flight.tdoa):
+        return ()
+    return repairs_of(KnownPath(flight))
 
 
 def repairs_of(path: KnownPath) -> tuple[LabelEffect, ...]:
