@@ -179,27 +179,21 @@ def test_a_survey_of_another_room_is_named_with_a_measured_log(log, survey, shar
     assert "survey_misfit" in found and not found & OF_ANOTHER_ROOM
 
 
-NONE = Tdoas(*(np.empty(0, kind) for kind in (float, int, int, float)))
-
-
 @pytest.fixture(scope="module")
 def ranged():
     """A Flight of ranges alone."""
     config = SimulationConfig(
         duration=20.0, imu_rate=200.0, truth_rate=20.0, start_in_air=True, range_noise=0.1
     )
-    return replace(simulate(config), tdoa=NONE)
+    return replace(simulate(config), tdoa=NO_TDOAS)
 
 
-def test_healthy_ranges_without_tdoas_have_no_error(ranged):
+def test_ranges_without_tdoas_are_judged(ranged):
     report = check(of_flight(ranged))
     assert not report.faulty and report.facts["range"] == "ranges 100 Hz"
-
-
-def test_ranges_in_millimetres_are_named(ranged):
-    wrong = replace(ranged, range=replace(ranged.range, d=1000.0 * ranged.range.d))
-    assert "range_unit" in {finding.rule for finding in check(of_flight(wrong)).findings}
-    assert [finding.rule for finding in sensor_mistakes(of_flight(wrong))][:1] == ["range_unit"]
+    wrong = of_flight(replace(ranged, range=replace(ranged.range, d=1000.0 * ranged.range.d)))
+    assert "range_unit" in rules(check(wrong))
+    assert [finding.rule for finding in sensor_mistakes(wrong)][:1] == ["range_unit"]
 
 
 def test_a_bag_of_ranges_alone_is_read_and_checked(ranged, tmp_path):

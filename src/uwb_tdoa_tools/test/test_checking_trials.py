@@ -279,6 +279,8 @@ CASES = {
 
 @pytest.fixture
 def shared(shared_data):
+    if not (shared_data.parent / "cases").is_dir():
+        pytest.skip("no cases in ../shared/cases")
     return shared_data.parent
 
 
@@ -295,8 +297,6 @@ def shared(shared_data):
 )
 def test_every_command_refuses_the_cases(command, shared, tmp_path, monkeypatch, capsys):
     """Before it starts workers or writes."""
-    if not (shared / "cases").is_dir():
-        pytest.skip("no cases in ../shared/cases")
     name, *rest = command.split()
     main = importlib.import_module(f"uwb_tdoa_tools.commands.{name}").main
     monkeypatch.chdir(tmp_path)
@@ -308,8 +308,6 @@ def test_every_command_refuses_the_cases(command, shared, tmp_path, monkeypatch,
 
 
 def test_the_case_in_feet_names_its_factor(shared):
-    if not (shared / "cases").is_dir():
-        pytest.skip("no cases in ../shared/cases")
     flight = read_flight(shared / "data/flights/0426/0426-traj5", shared / "cases/anchors/feet.csv")
     report = check(of_flight(flight))
     assert rules(report, "error") == {"survey_scale"}, report.findings
@@ -317,8 +315,6 @@ def test_the_case_in_feet_names_its_factor(shared):
 
 
 def test_the_case_of_another_room_has_no_error(shared):
-    if not (shared / "cases").is_dir():
-        pytest.skip("no cases in ../shared/cases")
     flight = read_flight(
         shared / "cases/recordings/other_room", shared / "data/surveys/anchor_0425.txt"
     )

@@ -60,8 +60,13 @@ def restarted(cause: Restart) -> Finding:
     return Finding(
         "restarted",
         WARNING,
-        cause=f"the filter has started anew, because the stamps of {topic} {how} by {-cause.step:.3g} s",
-        evidence=f"the new time begins at {cause.at:.3f} s, from the whole second of the first stamp on",
+        cause=(
+            f"the filter has started anew, because the stamps of {topic} {how} by "
+            f"{-cause.step:.3g} s"
+        ),
+        evidence=(
+            f"the new time begins at {cause.at:.3f} s, from the whole second of the first stamp on"
+        ),
         remedy=(
             "keep the clocks of all drivers in step (chronyc tracking); replaying a recording also "
             "causes this"

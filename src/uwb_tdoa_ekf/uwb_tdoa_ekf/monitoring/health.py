@@ -116,10 +116,8 @@ class Health:
         """
         now = time.monotonic()
         self.look(estimator, counts)
-        imu_rate, tdoa_rate = (
-            self._imu_rate.of(self.received["imu"]),
-            self._tdoa_rate.of(self.received["tdoa"]),
-        )
+        imu_rate = self._imu_rate.of(self.received["imu"])
+        tdoa_rate = self._tdoa_rate.of(self.received["tdoa"])
         located = self._located_rate.of(
             self.received["tdoa"] + sum(self.received[name] for name in LOCATING)
         )
@@ -128,36 +126,34 @@ class Health:
             self._starting = None
         elif self._starting is None:
             self._starting = now
-        at_position: dict[str, str] = {}
         missing = refused or self._missing(estimator, bool(imu_rate), bool(located))
+        outside, at_position = None, {}
+        if estimator is not None and running and self.last_position is not None:
+            outside, at_position = flyability(self._volume, estimator.anchors, *self.last_position)
         if missing:
             level, text = ERROR, missing
         elif wiring or findings:
             level, text = _worst(wiring, findings)
-        elif running:
-            level, text = OK, "running"
+        elif estimator is not None and running:
+            troubles = self._troubles(estimator, counts, outside)
+            trouble = next(filter(None, troubles), None)
+            level, text = (WARN, trouble) if trouble else (OK, "running")
         else:
             level, text = self._not_running(estimator, now)
-        if estimator is not None and running:
-            outside = None
-            if self.last_position is not None:
-                outside, at_position = flyability(
-                    self._volume, estimator.anchors, *self.last_position
-                )
-            if level == OK:
-                troubles = self._troubles(estimator, counts, outside)
-                trouble = next(filter(None, troubles), None)
-                level, text = (WARN, trouble) if trouble else (OK, text)
-        age = "none yet" if self.last_odometry is None else f"{now - self.last_odometry:.3f} s"
         state = "running" if running else "starting"
         if estimator is not None and not running and estimator.lost:
             state = "lost"
-        values = {"state": state, "age of last odometry": age}
-        values |= {"odometry behind the clock": _behind(self.behind)}
-        values |= {"IMU rate": f"{imu_rate:.1f} Hz", "TDOA rate": f"{tdoa_rate:.1f} Hz"}
+        age = "none yet" if self.last_odometry is None else f"{now - self.last_odometry:.3f} s"
         sentences = [*wiring, *(finding.sentence for finding in findings)]
-        values |= {"wrong with the streams": "; ".join(sentences) or "nothing"}
-        values |= {f"found {finding.rule}": f"{finding.value:.4g}" for finding in findings}
+        values = {
+            "state": state,
+            "age of last odometry": age,
+            "odometry behind the clock": _behind(self.behind),
+            "IMU rate": f"{imu_rate:.1f} Hz",
+            "TDOA rate": f"{tdoa_rate:.1f} Hz",
+            "wrong with the streams": "; ".join(sentences) or "nothing",
+            **{f"found {finding.rule}": f"{finding.value:.4g}" for finding in findings},
+        }
         return level, text, values | at_position
 
     def _missing(self, estimator: Estimator | None, imu: bool, located: bool) -> str | None:

@@ -165,7 +165,9 @@ def no_gravity(windows: list[ImuWindow]) -> Iterator[Finding]:
         yield Finding(
             "imu_no_gravity",
             ERROR,
-            cause="gravity was taken out of the acceleration; specific force, with gravity, is needed",
+            cause=(
+                "gravity was taken out of the acceleration; specific force, with gravity, is needed"
+            ),
             evidence=(
                 f"the specific force is {length:.2g} on average, and deviates by {motion:.2g}; it "
                 "should be 9.81 m/s^2"
@@ -219,7 +221,8 @@ def rate_unit(windows: list[ImuWindow]) -> Iterator[Finding]:
             "imu_rate_offset",
             WARNING,
             cause=(
-                "the gyroscope turns at rest: its bias is large, or it is not in rad/s; a tag at rest "
+                "the gyroscope turns at rest: its bias is large, or it is not in rad/s; a tag at "
+                "rest "
                 "does not determine which"
             ),
             evidence=evidence,

@@ -58,7 +58,8 @@ def fixed_step(windows: list[TdoaWindow]) -> Iterator[Finding]:
                 "size"
             ),
             remedy=(
-                "d = (d + step / 2) % step - step / 2  # step as above; or subtract the time stamps "
+                "d = (d + step / 2) % step - step / 2  # step as above; or subtract the time "
+                "stamps "
                 "with all their bits, modulo their range"
             ),
             value=step,
@@ -84,7 +85,8 @@ def impossible(windows: list[TdoaWindow]) -> Iterator[Finding]:
             cause="TDOAs are impossibly large: not in metres, or of another room",
             evidence=evidence,
             remedy=(
-                "message.distance_difference = ...  # metres: seconds times 299792458, DW1000 ticks "
+                "message.distance_difference = ...  # metres: seconds times 299792458, DW1000 "
+                "ticks "
                 "times 0.0046918"
             ),
             value=share,
@@ -95,7 +97,9 @@ def impossible(windows: list[TdoaWindow]) -> Iterator[Finding]:
             WARNING,
             cause="many TDOAs are outliers",
             evidence=evidence,
-            remedy="keep radio and anchors clear of metal; drop TDOAs that the radio marks as doubtful",
+            remedy=(
+                "keep radio and anchors clear of metal; drop TDOAs that the radio marks as doubtful"
+            ),
             value=share,
         )
 
@@ -162,7 +166,10 @@ def two_tags(windows: list[TdoaWindow]) -> Iterator[Finding]:
             ERROR,
             cause="two tags share uwb/tdoa",
             evidence=f"{100.0 * share:.0f} % leap by more than 0.5 m and back within 0.1 s",
-            remedy="give each tag a namespace of its own: start its driver with --ros-args -r __ns:=/tag2",
+            remedy=(
+                "give each tag a namespace of its own: start its driver with --ros-args -r "
+                "__ns:=/tag2"
+            ),
             value=share,
         )
 
@@ -174,8 +181,14 @@ def one_sign(windows: list[TdoaWindow]) -> Iterator[Finding]:
             "tdoa_one_sign",
             ERROR,
             cause="the sign of the TDOAs does not follow the order of the anchors",
-            evidence=f"{100.0 * share:.0f} % of the pairs that come as (a, b) and (b, a) have the same sign",
-            remedy="message.distance_difference = distance_b - distance_a  # for the anchors in this order",
+            evidence=(
+                f"{100.0 * share:.0f} % of the pairs that come as (a, b) and (b, a) have the same "
+                "sign"
+            ),
+            remedy=(
+                "message.distance_difference = distance_b - distance_a  # for the anchors in this "
+                "order"
+            ),
             value=share,
         )
 

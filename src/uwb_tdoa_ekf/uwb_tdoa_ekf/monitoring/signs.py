@@ -94,9 +94,13 @@ class SignWatch:
             "tdoa_sign",
             ERROR,
             cause="the sign of all TDOAs has changed in flight",
-            evidence="from one moment on, each TDOA is the negative of what the place of the tag makes it",
+            evidence=(
+                "from one moment on, each TDOA is the negative of what the place of the tag makes "
+                "it"
+            ),
             remedy=(
-                "message.distance_difference = distance_to_b - distance_to_a  # always, not only in "
+                "message.distance_difference = distance_to_b - distance_to_a  # always, not only "
+                "in "
                 "the beginning"
             ),
             value=TURNED,

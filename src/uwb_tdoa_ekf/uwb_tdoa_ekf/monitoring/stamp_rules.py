@@ -171,7 +171,8 @@ def falls(name: str, windows: list[StampWindow]) -> Iterator[Finding]:
             cause=f"messages of {name} are out of order",
             evidence=f"{100.0 * share:.1f} % come after a later one, by up to {depth:.3f} s",
             remedy=(
-                f"-p reorder:={1.2 * depth:.3f} -p lag:={max(LAG, 2.0 * depth):.2f}  # of ekf_node, "
+                f"-p reorder:={1.2 * depth:.3f} -p lag:={max(LAG, 2.0 * depth):.2f}  # of "
+                "ekf_node, "
                 "or publish them in order"
             ),
             value=depth,
@@ -351,7 +352,8 @@ def offset(imu: list[StampWindow], tdoa: list[StampWindow]) -> Iterator[Finding]
             ),
             evidence=evidence,
             remedy=(
-                f"-p lag:={1.5 * by_arrival:.2f}  # of ekf_node, if the TDOAs are stamped when they "
+                f"-p lag:={1.5 * by_arrival:.2f}  # of ekf_node, if the TDOAs are stamped when "
+                "they "
                 "are measured; else stamp them so"
             ),
             value=ahead,

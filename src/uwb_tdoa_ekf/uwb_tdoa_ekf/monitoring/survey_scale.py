@@ -139,7 +139,9 @@ def _of_scale(name: str, factor: float, evidence: str) -> Finding:
             ERROR,
             cause="TDOAs are in nanoseconds or in feet, not in metres",
             evidence=evidence,
-            remedy=f"message.distance_difference *= {NANOSECONDS}  # of nanoseconds; of feet 0.3048",
+            remedy=(
+                f"message.distance_difference *= {NANOSECONDS}  # of nanoseconds; of feet 0.3048"
+            ),
             value=NANOSECONDS,
         )
     cause, remedy = wrong_unit(name, factor)

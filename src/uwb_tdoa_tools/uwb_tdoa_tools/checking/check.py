@@ -298,11 +298,15 @@ def _misfit(fit: SurveyFit) -> Iterator[Finding]:
             "misfit_unclear",
             NOTE,
             cause=(
-                "the TDOAs fit the survey less well than usual, and this recording does not determine "
+                "the TDOAs fit the survey less well than usual, and this recording does not "
+                "determine "
                 "why"
             ),
             evidence=evidence,
-            remedy="record a minute in which the tag is carried through the whole room, and check again",
+            remedy=(
+                "record a minute in which the tag is carried through the whole room, and check "
+                "again"
+            ),
             value=tdoa_rules.apparent_gain(fit),
         )
     if gain is not None:

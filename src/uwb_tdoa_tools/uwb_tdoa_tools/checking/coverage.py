@@ -213,7 +213,8 @@ def flat_anchors(view: CoverageView) -> Iterator[Finding]:
             cause="the anchors lie in a plane: the direction across it is hardly told",
             evidence=f"they are within {thickness:.2f} m (rms) of a plane and {size:.1f} m across",
             remedy=(
-                "put half of the anchors low, and half of them high; plan --improve move says which "
+                "put half of the anchors low, and half of them high; plan --improve move says "
+                "which "
                 "where"
             ),
             value=float(thickness),
@@ -282,7 +283,9 @@ def tag_outside(view: CoverageView) -> Iterator[Finding]:
             "outside",
             WARNING,
             cause="the tag is outside of its anchors, where it is hardly located",
-            evidence=f"{100.0 * share:.0f} % of the places are more than {MARGIN} m beyond the anchors",
+            evidence=(
+                f"{100.0 * share:.0f} % of the places are more than {MARGIN} m beyond the anchors"
+            ),
             remedy="look where a tag can be located: plan --volume draws it",
             value=share,
         )
@@ -301,7 +304,8 @@ def little_motion(view: CoverageView) -> Iterator[Finding]:
             cause="sign, ids, survey and axes can hardly be told from this recording",
             evidence=f"{duration:.0f} s, {moved:.2f} m (rms) off a straight line",
             remedy=(
-                "record a minute in which the tag is carried through the whole room, turned, lifted "
+                "record a minute in which the tag is carried through the whole room, turned, "
+                "lifted "
                 "and lowered"
             ),
             value=moved,

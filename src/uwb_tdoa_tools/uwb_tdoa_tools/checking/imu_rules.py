@@ -56,7 +56,8 @@ def clipped_axes(flight: Flight) -> Iterator[Finding]:
                     WARNING,
                     cause=f"{name} is clipped",
                     evidence=(
-                        f"{hits[0]} samples of {ends[0]:.2f} {unit}, {hits[1 : 1 + NEXT].mean():.0f} of each "
+                        f"{hits[0]} samples of {ends[0]:.2f} {unit}, "
+                        f"{hits[1 : 1 + NEXT].mean():.0f} of each "
                         "of the next values"
                     ),
                     remedy="set the sensor to a larger range",
@@ -175,7 +176,9 @@ def _upside_down(base: Unexplained, recording: OrderedRecording, least: float) -
     return Finding(
         "survey_upside_down",
         ERROR,
-        cause="the survey is upside down: z points down, and the inertial sensor measures where up is",
+        cause=(
+            "the survey is upside down: z points down, and the inertial sensor measures where up is"
+        ),
         evidence=in_words(ratio, z),
         remedy="x, y, z = y, x, -z  # of every anchor; in a profile: world: ned",
         value=ratio,
@@ -305,11 +308,15 @@ def _finding(accel: np.ndarray, gyro: np.ndarray, evidence: str, ratio: float) -
             "survey_mirrored",
             ERROR,
             cause=(
-                "the survey is the mirror image of the room: an axis has the wrong sign, e.g. z down, "
+                "the survey is the mirror image of the room: an axis has the wrong sign, e.g. z "
+                "down, "
                 "or two are exchanged"
             ),
             evidence=evidence,
-            remedy="x, y, z = y, x, z  # of every anchor; or the axis with the wrong sign turned: z = -z",
+            remedy=(
+                "x, y, z = y, x, z  # of every anchor; or the axis with the wrong sign turned: z = "
+                "-z"
+            ),
             value=ratio,
         )
     parts = []
@@ -324,7 +331,9 @@ def _finding(accel: np.ndarray, gyro: np.ndarray, evidence: str, ratio: float) -
     return Finding(
         "imu_axes",
         ERROR,
-        cause=f"axes or signs of the {who} are wrong: x forward, y left, z up is needed, right-handed",
+        cause=(
+            f"axes or signs of the {who} are wrong: x forward, y left, z up is needed, right-handed"
+        ),
         evidence=evidence,
         remedy=line,
         value=ratio,

@@ -214,7 +214,8 @@ def wrong_axes(motion: TrueMotion) -> Iterator[Finding]:
     for sensor in wrong:
         remaining, correction = best[sensor]
         evidence = (
-            f"{100 * (1 - remaining / base[sensor]):.0f} % less mean square difference to the ground "
+            f"{100 * (1 - remaining / base[sensor]):.0f} % less mean square difference to the "
+            "ground "
             "truth"
         )
         yield _of_axes(sensor, correction, evidence, remaining)
@@ -255,7 +256,8 @@ def _of_axes(sensor: str, change: np.ndarray, evidence: str, power: float) -> Fi
             "imu_rate_unit",
             ERROR,
             cause=(
-                f"the gyroscope is in another unit than rad/s: it reads {1.0 / scale:.3g} times the "
+                f"the gyroscope is in another unit than rad/s: it reads {1.0 / scale:.3g} times "
+                "the "
                 "turns of the ground truth"
             ),
             evidence=evidence,
@@ -271,7 +273,8 @@ def _of_axes(sensor: str, change: np.ndarray, evidence: str, power: float) -> Fi
         f"{sensor}_axes",
         ERROR,
         cause=(
-            f"axes of the {SENSORS[sensor]} are exchanged or mirrored: {', '.join(words)} of what it "
+            f"axes of the {SENSORS[sensor]} are exchanged or mirrored: {', '.join(words)} of what "
+            "it "
             "reads"
         ),
         evidence=evidence,
@@ -306,7 +309,8 @@ def low_passes(motion: TrueMotion) -> Iterator[Finding]:
                 "imu_filtered",
                 ERROR,
                 cause=(
-                    f"the {SENSORS[sensor]} is filtered: what it reads is {slowness:g} s late and too "
+                    f"the {SENSORS[sensor]} is filtered: what it reads is {slowness:g} s late and "
+                    "too "
                     "small"
                 ),
                 evidence=f"{less} behind a low pass of {slowness:g} s",

@@ -269,7 +269,8 @@ def exchanged_ids(path: KnownPath) -> Iterator[Finding]:
             cause=f"the ids of anchors are exchanged: what is called {names}",
             evidence=f"median error of their TDOAs {before:.2f} m, exchanged {after:.2f} m",
             remedy=(
-                f"id = {{{', '.join(f'{wrong}: {right}' for wrong, right in table.items())}}}.get(id, "
+                "id = "
+                f"{{{', '.join(f'{wrong}: {right}' for wrong, right in table.items())}}}.get(id, "
                 "id)"
             ),
             value=after,

@@ -64,7 +64,9 @@ def _frame(topic: str, frame: str, place: Place | None) -> Iterator[Finding]:
         yield Finding(
             "frame_unknown",
             WARNING,
-            cause=f"{topic} is in the frame {frame}, and nothing says how that sits on {BODY_FRAME}",
+            cause=(
+                f"{topic} is in the frame {frame}, and nothing says how that sits on {BODY_FRAME}"
+            ),
             evidence=f"no transform to {frame} in /tf_static",
             remedy=(
                 f"publish on /tf_static how {frame} sits on {BODY_FRAME}, or have the driver write "
@@ -83,7 +85,8 @@ def _frame(topic: str, frame: str, place: Place | None) -> Iterator[Finding]:
         "frame_turned",
         NOTE,
         cause=(
-            f"{topic} is in the frame {frame}, which /tf_static places on {BODY_FRAME}; its samples "
+            f"{topic} is in the frame {frame}, which /tf_static places on {BODY_FRAME}; its "
+            "samples "
             "are taken there"
         ),
         evidence=evidence,
@@ -134,7 +137,8 @@ def no_imu(recording: Recording) -> Iterator[Finding]:
             cause=f"no inertial samples on {IMU}",
             evidence=f"but on {', '.join(there)}",
             remedy=(
-                f"give --topic {IMU}={there[0]} to tools that read the bag, and -r {IMU}:={there[0]} "
+                f"give --topic {IMU}={there[0]} to tools that read the bag, and -r "
+                f"{IMU}:={there[0]} "
                 "to ekf_node"
             ),
             value=0.0,
@@ -198,7 +202,8 @@ def other_anchors(recording: Recording) -> Iterator[Finding]:
         ),
         evidence=evidence,
         remedy=(
-            "give both nodes the survey as anchors_file, or replay a bag that `convert --survey` has "
+            "give both nodes the survey as anchors_file, or replay a bag that `convert --survey` "
+            "has "
             "made of this bag"
         ),
         value=off,
@@ -295,7 +300,8 @@ def sensors_apart(recording: Recording) -> Iterator[Finding]:
                 f"{'ahead of' if ahead > 0.0 else 'behind'} those of uwb/tdoa"
             ),
             evidence=(
-                f"none of its {count} messages is stamped within the time of the TDOAs: none can be "
+                f"none of its {count} messages is stamped within the time of the TDOAs: none can "
+                "be "
                 "used"
             ),
             remedy="stamp all sensors with the clock of one machine",
@@ -335,7 +341,9 @@ def different_types(recording: Recording) -> Iterator[Finding]:
                 ERROR,
                 cause=f"{topic} has several types",
                 evidence=evidence,
-                remedy=f"start the driver of the other type with --ros-args -r {topic}:={topic}_other",
+                remedy=(
+                    f"start the driver of the other type with --ros-args -r {topic}:={topic}_other"
+                ),
                 value=float(len(found)),
             )
 
@@ -353,7 +361,8 @@ def incompatible_qos(recording: Recording) -> Iterator[Finding]:
                 "qos_unmatched",
                 ERROR,
                 cause=(
-                    f"{end.node} hears nothing of what {publisher.node} publishes on {topic}: it asks "
+                    f"{end.node} hears nothing of what {publisher.node} publishes on {topic}: it "
+                    "asks "
                     "for more than is offered"
                 ),
                 evidence=f"published {publisher.qos}; asked for: {end.qos}",
@@ -445,7 +454,8 @@ def tag_delay(recording: Recording) -> Iterator[Finding]:
                 "antenna delay of the tag"
             ),
             evidence=(
-                f"{offset:.2f} m in the median of {len(offsets)} windows of {WINDOW:g} s, {low:.2f} "
+                f"{offset:.2f} m in the median of {len(offsets)} windows of {WINDOW:g} s, "
+                f"{low:.2f} "
                 f"to {high:.2f} m in half of them"
             ),
             remedy=REMEDY,

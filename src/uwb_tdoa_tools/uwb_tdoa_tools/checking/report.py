@@ -173,7 +173,8 @@ def nothing_comes_first(
     if found:
         cli.say(
             command,
-            "stopped, and nothing is written: ids, signs, units and scale first, as said above; then "
+            "stopped, and nothing is written: ids, signs, units and scale first, as said above; "
+            "then "
             "anchors.",
         )
     return not found

@@ -293,7 +293,8 @@ def inverted_pairs(recording: OrderedRecording) -> Iterator[MistakeTrial]:
             _flipped(recording, backward),
             cause="the sign of the TDOAs does not follow the order of the anchors",
             remedy=(
-                "message.distance_difference = distance_to_b - distance_to_a  # in the order of the "
+                "message.distance_difference = distance_to_b - distance_to_a  # in the order of "
+                "the "
                 "message's ids"
             ),
         )
