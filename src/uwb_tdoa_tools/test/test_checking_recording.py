@@ -306,7 +306,7 @@ def without_3(t, a, b):
         (
             {"heard": lambda t, a, b: without_3(t, a, b) | (t < 8.0) | (t > 16.0)},
             "anchor_silent",
-            "anchor 3 falls silent (8 s from 8",
+            "anchor 3 falls silent (7 s from 8.1 s on",
         ),
         (
             {"positions": BOX * [1.0, 1.0, -1.0], "places": PLACES * [1.0, 1.0, -1.0]},

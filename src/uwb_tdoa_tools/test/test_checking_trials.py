@@ -180,7 +180,7 @@ def test_a_turn_about_the_vertical_cannot_be_seen(healthy):
     ],
 )
 def test_the_remedy_is_the_matrix_in_words(accel, gyro, words):
-    assert imu_rules._finding(accel, gyro, "", 0.5).remedy == words
+    assert imu_rules._finding(imu_rules.Arrangement(0.5, 9.0, accel, gyro), "").remedy == words
 
 
 # --- checking ordered ---

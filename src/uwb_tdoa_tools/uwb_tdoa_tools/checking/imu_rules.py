@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import permutations, product
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -24,14 +24,11 @@ from uwb_tdoa_ekf.monitoring.finding import ERROR, WARNING, Finding
 from uwb_tdoa_ekf.monitoring.inertial_rules import AXES
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator
 
     from uwb_tdoa_bias.common.flight import Flight
 
     from .ordered import OrderedRecording
-
-    # ratio of the losses, its standard errors; (3, 3) for the accelerometer, for the gyroscope
-    Arrangement = tuple[float, float, np.ndarray, np.ndarray]
 
 
 # Clipped: at least HITS samples have the extreme value, more than MORE times the mean count of the
@@ -126,6 +123,23 @@ USUAL = [
 ]
 
 
+class Arrangement(NamedTuple):
+    """A trial of axes and units of the inertial sensor.
+
+    Attributes
+    ----------
+    ratio, z : float
+        Ratio of the losses, and its number of standard errors.
+    accel, gyro : (3, 3) array
+        Matrices that are applied to the specific force and to the rates.
+    """
+
+    ratio: float
+    z: float
+    accel: np.ndarray
+    gyro: np.ndarray
+
+
 def find_imu_mistake(recording: OrderedRecording) -> Finding | None:
     """Return the Finding about axes or units of the IMU that do not fit the TDOAs, or None.
 
@@ -141,24 +155,23 @@ def find_imu_mistake(recording: OrderedRecording) -> Finding | None:
         return None
     base = _unexplained(brief)
     trials = [_tried(base, brief, accel, gyro) for accel, gyro in USUAL]
-    least = min(ratio for ratio, _, _, _ in trials)
-    if not least < RATIO:
+    best = min(trials, key=_ratio)
+    if not best.ratio < RATIO:
         return None
-    upside_down = _upside_down(base, brief, least)
+    upside_down = _upside_down(base, brief, best.ratio)
     if upside_down is not None:
         return upside_down
-    scale = _scaled(trials)
-    if scale is None:
+    if abs(scale_of(best.gyro) - 1.0) < 0.03:  # no other unit
         trials += _all(brief, base)
-    least = min(ratio for ratio, _, _, _ in trials)
-    near = [trial for trial in trials if trial[0] < least + TIE and trial[1] > DEVIATIONS]
-    if not near or not least < RATIO:
+    least = min(trials, key=_ratio).ratio
+    near = [trial for trial in trials if trial.ratio < least + TIE and trial.z > DEVIATIONS]
+    if not near:
         return None
-    ratio, z, accel, gyro = min(near, key=lambda trial: _complexity(trial[2], trial[3]))
-    evidence = in_words(ratio, z)
+    found = min(near, key=lambda trial: _complexity(trial.accel, trial.gyro))
+    evidence = in_words(found.ratio, found.z)
     if len(near) > 1:
         evidence += f"; {len(near) - 1} other arrangements fit about as well"
-    return _finding(accel, gyro, evidence, ratio)
+    return _finding(found, evidence)
 
 
 def _upside_down(base: Unexplained, recording: OrderedRecording, least: float) -> Finding | None:
@@ -218,12 +231,6 @@ def averaged(imu: Imu | None) -> Imu | None:
     return Imu(*map(np.ascontiguousarray, columns))
 
 
-def _scaled(trials: Sequence[Arrangement]) -> np.ndarray | None:
-    """Return the matrix of the gyroscope of the best trial if that is another unit, else None."""
-    gyro = min(trials, key=lambda trial: trial[0])[3]
-    return gyro if abs(abs(np.linalg.det(gyro)) - 1.0) > 0.1 else None
-
-
 def _all(recording: OrderedRecording, base: Unexplained) -> list[Arrangement]:
     """Return trials of all arrangements of the gyroscope, and of their mirror images.
 
@@ -231,31 +238,33 @@ def _all(recording: OrderedRecording, base: Unexplained) -> list[Arrangement]:
     """
     short = recording.part(BRIEF)
     of_short = _unexplained(short)
-    ratios: list[float] = []
-    arrangements = list(product((UPRIGHT, MIRROR), ARRANGEMENTS))
-    for accel, gyro in arrangements:
-        chosen = sorted(ratios)[CHOSEN - 1] if len(ratios) >= CHOSEN else np.inf  # of those so far
-        ratio, _ = compare(
-            of_short, _unexplained(_arranged(short, accel, gyro), chosen * of_short.mean)
-        )
-        ratios.append(ratio if np.isfinite(ratio) else np.inf)
-    return [
-        _tried(base, recording, *arrangements[k])
-        for k in np.argsort(ratios, kind="stable")[:CHOSEN]
-    ]
+    tried: list[Arrangement] = []
+    for accel, gyro in product((UPRIGHT, MIRROR), ARRANGEMENTS):
+        best = sorted(map(_ratio, tried))[:CHOSEN]  # of those so far
+        limit = best[-1] if len(best) == CHOSEN else np.inf
+        tried.append(_tried(of_short, short, accel, gyro, limit))
+    chosen = sorted(tried, key=_ratio)[:CHOSEN]
+    return [_tried(base, recording, one.accel, one.gyro) for one in chosen]
 
 
 def _tried(
-    base: Unexplained, recording: OrderedRecording, accel: np.ndarray, gyro: np.ndarray
+    base: Unexplained,
+    recording: OrderedRecording,
+    accel: np.ndarray,
+    gyro: np.ndarray,
+    limit: float = RATIO + TIE,
 ) -> Arrangement:
     """Return the loss of an arrangement in comparison with `base`.
 
-    The ratio is infinite if the loss is too large for the arrangement to be taken, or to tie.
+    The ratio is infinite if it exceeds the limit: by default, if the loss is too large for the
+    arrangement to be taken, or to tie.
     """
-    ratio, z = compare(
-        base, _unexplained(_arranged(recording, accel, gyro), (RATIO + TIE) * base.mean)
-    )
-    return ratio if np.isfinite(ratio) else np.inf, z, accel, gyro
+    ratio, z = compare(base, _unexplained(_arranged(recording, accel, gyro), limit * base.mean))
+    return Arrangement(ratio if np.isfinite(ratio) else np.inf, z, accel, gyro)
+
+
+def _ratio(trial: Arrangement) -> float:
+    return trial.ratio
 
 
 def _arranged(recording: OrderedRecording, accel: np.ndarray, gyro: np.ndarray) -> OrderedRecording:
@@ -288,7 +297,8 @@ def _complexity(accel: np.ndarray, gyro: np.ndarray) -> float:
     return wrong_signs + moved + 1.0 * np.array_equal(accel, MIRROR)
 
 
-def _finding(accel: np.ndarray, gyro: np.ndarray, evidence: str, ratio: float) -> Finding:
+def _finding(found: Arrangement, evidence: str) -> Finding:
+    ratio, _, accel, gyro = found
     scale = scale_of(gyro)
     unit = next((name for value, name in SCALES.items() if abs(value / scale - 1.0) < 1e-6), None)
     if unit:
