@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections import deque
 from itertools import combinations
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -55,6 +55,38 @@ NANOSECONDS = SPEED_OF_LIGHT / 1e9
 AS_IT_IS, SCALED, SIGN, EXCHANGED, ALONE = range(5)  # kinds of hypotheses
 
 
+class Hypothesis(NamedTuple):
+    """A mistake of the survey, or of the TDOAs.
+
+    Attributes
+    ----------
+    kind : int
+        AS_IT_IS, SCALED, SIGN, EXCHANGED or ALONE.
+    name : str
+        Unit that the factor stands for, or "".
+    factor : float
+        Factor by which all anchors, or one (ALONE), are too far from the origin.
+    rows : tuple of int
+        Row of that anchor, or of both (EXCHANGED).
+    """
+
+    kind: int
+    name: str = ""
+    factor: float = 1.0
+    rows: tuple[int, ...] = ()
+
+    def positions(self, surveyed: np.ndarray) -> np.ndarray:
+        """Return where the anchors are if the hypothesis is right, (N, 3) m.
+
+        EXCHANGED anchors have the factor 1, and the order of a single one is its own.
+        """
+        if not self.rows:
+            return surveyed / self.factor
+        moved, rows = surveyed.copy(), list(self.rows)
+        moved[rows] = surveyed[rows[::-1]] / self.factor
+        return moved
+
+
 class SurveyScale:
     """Store the loss of each hypothesis on the scale of Anchors, for each snapshot."""
 
@@ -69,7 +101,7 @@ class SurveyScale:
             Number of latest snapshots to keep; None keeps all.
         """
         self._anchors = anchors
-        self._names, self._table = _hypotheses(len(anchors))
+        self._hypotheses = _hypotheses(len(anchors))
         self._losses: deque[np.ndarray] = deque(maxlen=kept)  # (h,) losses of each snapshot
         self._places: deque[np.ndarray] = deque(maxlen=kept)  # (h, 3) positions of the tag, in m
 
@@ -77,20 +109,15 @@ class SurveyScale:
         """Add TDOAs that were heard together, (k, 3): rows of both anchors, and value in m."""
         if len(np.unique(snapshot[:, :2])) < HEARD or not np.median(np.abs(snapshot[:, 2])) > SMALL:
             return
-        some = snapshot[
-            np.linspace(0, len(snapshot) - 1, min(PAIRS, len(snapshot))).round().astype(int)
-        ]
-        losses, places = np.empty(len(self._table)), np.empty((len(self._table), 3))
-        rows = np.ascontiguousarray(some[:, :2].astype(np.int64))
-        for k, hypothesis in enumerate(self._table):
-            losses[k] = locate(
-                self._anchors.positions,
-                hypothesis,
-                rows,
-                np.ascontiguousarray(some[:, 2]),
-                STARTS,
-                places[k],
-            )
+        count = min(PAIRS, len(snapshot))
+        some = snapshot[np.linspace(0, len(snapshot) - 1, count).round().astype(int)]
+        rows, d = some[:, :2].astype(np.int64), some[:, 2].copy()
+        losses = np.empty(len(self._hypotheses))
+        places = np.empty((len(self._hypotheses), 3))
+        for k, one in enumerate(self._hypotheses):
+            positions = one.positions(self._anchors.positions)
+            signed = -d if one.kind == SIGN else d
+            losses[k] = locate(positions, rows, signed, STARTS, places[k])
         self._losses.append(losses)
         self._places.append(places)
 
@@ -100,8 +127,8 @@ class SurveyScale:
         if len(self._losses) < FEWEST:
             return None
         losses = np.array(self._losses)
-        mean, kind, factor = losses.mean(axis=0), self._table[:, 0], self._table[:, 1]
-        is_scale = (kind == SCALED) | (kind == ALONE)
+        mean = losses.mean(axis=0)
+        is_scale = np.array([one.kind in (SCALED, ALONE) for one in self._hypotheses])
         best = int(np.argmin(np.where(is_scale, mean, np.inf)))
         rival = int(np.argmin(np.where(is_scale, np.inf, mean)))
         left, z = compare_losses(losses[:, rival], losses[:, best])
@@ -111,24 +138,30 @@ class SurveyScale:
         if left > CLEARLY and (len(losses) < MANY or moved < MOVED):
             return None
         evidence = f"{in_words(left, z)}, in {len(losses)} snapshots"
-        if kind[best] == ALONE:
-            number = int(self._anchors.ids[int(self._table[best, 3])])
+        found = self._hypotheses[best]
+        if found.kind == ALONE:
+            number = int(self._anchors.ids[found.rows[0]])
             return Finding(
                 "anchor_scale",
                 ERROR,
-                cause=f"the position of anchor {number} is in {self._names[best]}, not in metres",
+                cause=f"the position of anchor {number} is in {found.name}, not in metres",
                 evidence=evidence,
                 remedy=(
                     f"{number}: {{position: [x, y, z]}}  # what is there now, divided by "
-                    f"{factor[best]:.6g}"
+                    f"{found.factor:.6g}"
                 ),
-                value=float(factor[best]),
+                value=found.factor,
             )
         # the data do not distinguish close scales: prefer that of a unit
-        close = np.abs(np.log(factor / factor[best])) < 0.7 * math.log(RATIO)
-        units = [k for k in np.flatnonzero(close & (kind == SCALED)).tolist() if self._names[k]]
-        named = min(units, key=lambda k: mean[k], default=best)
-        return _of_scale(self._names[named], float(factor[named]), evidence)
+        close = [
+            k
+            for k, one in enumerate(self._hypotheses)
+            if one.kind == SCALED
+            and one.name
+            and abs(math.log(one.factor / found.factor)) < 0.7 * math.log(RATIO)
+        ]
+        named = self._hypotheses[min(close, key=lambda k: mean[k], default=best)]
+        return _of_scale(named.name, named.factor, evidence)
 
 
 def _of_scale(name: str, factor: float, evidence: str) -> Finding:
@@ -164,29 +197,18 @@ def wrong_unit(name: str, factor: float) -> tuple[str, str]:
     return cause, line
 
 
-def _hypotheses(count: int) -> tuple[list[str], np.ndarray]:
-    """Return the hypotheses for a number of anchors.
-
-    Returns
-    -------
-    names : list of str
-        Units that the factors stand for, or "".
-    table : (h, 5) array
-        Kind; factor by which all anchors, or one (ALONE), are too far from the origin; sign of the
-        TDOAs; rows of that anchor, or of both (EXCHANGED), else 0.
-    """
+def _hypotheses(count: int) -> list[Hypothesis]:
+    """Return the hypotheses for a number of anchors."""
     count_of_scales = math.floor(math.log(LARGEST / SMALLEST) / math.log(RATIO)) + 1
     scales = SMALLEST * RATIO ** np.arange(count_of_scales)
-    made: list[tuple] = [("", AS_IT_IS, 1.0, 1.0, 0, 0), ("", SIGN, 1.0, -1.0, 0, 0)]
-    made += [("", SCALED, factor, 1.0, 0, 0) for factor in np.append(scales, 1.0 / scales)]
-    made += [(name, SCALED, factor, 1.0, 0, 0) for name, factor in UNITS.items()]
+    made = [Hypothesis(AS_IT_IS), Hypothesis(SIGN)]
+    made += [Hypothesis(SCALED, "", factor) for factor in np.append(scales, 1.0 / scales).tolist()]
+    made += [Hypothesis(SCALED, name, factor) for name, factor in UNITS.items()]
     if count <= SINGLE:
         for row in range(count):
-            made += [(name, ALONE, factor, 1.0, row, 0) for name, factor in UNITS.items()]
-        pairs = combinations(range(count), 2)
-        made += [("", EXCHANGED, 1.0, 1.0, one, two) for one, two in pairs]
-    names = [name for name, *_ in made]
-    return names, np.array([values for _, *values in made], dtype=float)
+            made += [Hypothesis(ALONE, name, factor, (row,)) for name, factor in UNITS.items()]
+        made += [Hypothesis(EXCHANGED, rows=rows) for rows in combinations(range(count), 2)]
+    return made
 
 
 def _spread(places: np.ndarray) -> float:
@@ -196,12 +218,7 @@ def _spread(places: np.ndarray) -> float:
 
 @compiled
 def locate(
-    positions: np.ndarray,
-    hypothesis: np.ndarray,
-    rows: np.ndarray,
-    d: np.ndarray,
-    starts: np.ndarray,
-    place: np.ndarray,
+    positions: np.ndarray, rows: np.ndarray, d: np.ndarray, starts: np.ndarray, place: np.ndarray
 ) -> float:
     """Return the mean Geman-McClure loss, 0 to 1, at the best position of the tag.
 
@@ -212,8 +229,6 @@ def locate(
     ----------
     positions : (N, 3) array
         Anchor positions, in m.
-    hypothesis : (5,) array
-        Row of the table of `_hypotheses`.
     rows : (k, 2) int array
         Rows of both anchors of each TDOA.
     d : (k,) array
@@ -227,27 +242,11 @@ def locate(
     ends, low, high = np.empty((n, 2, 3)), np.full(3, np.inf), np.full(3, -np.inf)
     for i in range(n):
         for side in range(2):
-            row, factor = rows[i, side], hypothesis[1]
-            if hypothesis[0] == EXCHANGED:
-                row = (
-                    int(hypothesis[4])
-                    if row == hypothesis[3]
-                    else int(hypothesis[3])
-                    if row == hypothesis[4]
-                    else row
-                )
-            elif hypothesis[0] == ALONE and row != hypothesis[3]:
-                factor = 1.0
             for j in range(3):
-                ends[i, side, j] = positions[row, j] / factor
+                ends[i, side, j] = positions[rows[i, side], j]
                 low[j], high[j] = min(low[j], ends[i, side, j]), max(high[j], ends[i, side, j])
-    size, least, p, g, system = (
-        math.sqrt(np.sum((high - low) ** 2)),
-        np.inf,
-        np.empty(3),
-        np.empty(3),
-        np.empty((3, 4)),
-    )
+    size = math.sqrt(np.sum((high - low) ** 2))
+    least, p, g, system = np.inf, np.empty(3), np.empty(3), np.empty((3, 4))
     for start in range(len(starts)):
         for j in range(3):
             p[j] = 0.5 * (low[j] + high[j]) + 0.5 * starts[start, j] * (high[j] - low[j])
@@ -255,7 +254,7 @@ def locate(
             scale, loss = max(0.3 * size * 0.5**step, SCALE) if step < STEPS else SCALE, 0.0
             system[:, :] = 0.0
             for i in range(n):
-                r = hypothesis[2] * d[i]
+                r = d[i]
                 for side in range(2):
                     length = 1e-18
                     for j in range(3):
