@@ -127,7 +127,8 @@ class Health:
         elif self._starting is None:
             self._starting = now
         missing = refused or self._missing(estimator, bool(imu_rate), bool(located))
-        outside, at_position = None, {}
+        outside: str | None = None
+        at_position: dict[str, str] = {}
         if estimator is not None and running and self.last_position is not None:
             outside, at_position = flyability(self._volume, estimator.anchors, *self.last_position)
         if missing:
