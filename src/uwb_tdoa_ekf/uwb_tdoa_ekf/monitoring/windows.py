@@ -326,7 +326,8 @@ class TdoaWindow(NamedTuple):
     repeated : int
         Successive, with an equal value.
     returns : int
-        Successive, with a jump of more than LEAP, back to the value before.
+        Successive, with a jump of more than LEAP back to the value before, which came in this window
+        or in the one before.
     opposed : int
         TDOAs longer than LEAP whose pair came in the other order less than FOLLOWING before.
     even : int
@@ -392,13 +393,9 @@ def tdoa_window(columns: list[np.ndarray], own: int, positions: np.ndarray) -> T
     apart = np.linalg.norm(positions[a[mine]] - positions[b[mine]], axis=1)
     off_grid = size[:, None] - GRIDS * np.round(size[:, None] / GRIDS)
 
-    # pair by pair, and the TDOAs of a pair in the order of arrival
     pair = a * len(positions) + b
-    order = known[np.argsort(pair[known], kind="stable")]
-    twice = np.zeros(len(order), bool)
-    here, last = order[1:], order[:-1]
-    twice[1:] = (pair[here] == pair[last]) & (t[here] == t[last]) & (d[here] == d[last])
-    duplicates, order = order[twice], order[~twice]
+    order, duplicates = _by_pair(known, pair, t, d)
+    # each TDOA beside the last one of its pair, and the value before that
     here, last = order[1:], order[:-1]
     before_last = np.full(len(d), np.nan)
     third = pair[order[2:]] == pair[order[:-2]]
@@ -407,9 +404,12 @@ def tdoa_window(columns: list[np.ndarray], own: int, positions: np.ndarray) -> T
     here, last = here[soon], last[soon]
     step = np.abs(d[here] - d[last])
     leaps = step > LEAP
+    returns = leaps & (np.abs(d[here] - before_last[here]) < 0.5 * LEAP)
+
     one, other = _opposite(np.sort(order), a, b)
     opposed = _follows(t[one] - t[other]) & (np.abs(d[one]) > LEAP) & (one >= own)
     one, other = one[opposed], other[opposed]
+    even = np.abs(d[one] - d[other]) < np.abs(d[one] + d[other])
 
     latest = order[np.flatnonzero(np.diff(pair[order], append=-1))]
     newest = t[np.isfinite(t)][-1:]
@@ -424,9 +424,9 @@ def tdoa_window(columns: list[np.ndarray], own: int, positions: np.ndarray) -> T
         duplicates=int((duplicates >= own).sum()),
         successive=len(here),
         repeated=int((step == 0.0).sum()),
-        returns=int((leaps & (np.abs(d[here] - before_last[here]) < 0.5 * LEAP)).sum()),
+        returns=int(returns.sum()),
         opposed=len(one),
-        even=int((np.abs(d[one] - d[other]) < np.abs(d[one] + d[other])).sum()),
+        even=int(even.sum()),
         size=float(size.mean()) if len(size) else 0.0,
         ceiling=ceiling,
         hits=int((size == ceiling).sum()),
@@ -435,6 +435,27 @@ def tdoa_window(columns: list[np.ndarray], own: int, positions: np.ndarray) -> T
         steps=step[leaps],
         latest=np.column_stack([a[latest], b[latest], d[latest]]),
     )
+
+
+def _by_pair(
+    rows: np.ndarray, pair: np.ndarray, t: np.ndarray, d: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return TDOAs pair by pair, those of a pair in the order of arrival, and the duplicates.
+
+    Parameters
+    ----------
+    rows : (k,) int array
+        TDOAs in the order of arrival.
+    pair : (n,) int array
+        Number of the pair of each TDOA.
+    t, d : (n,) array
+        Stamps, in s, and values, in m.
+    """
+    order = rows[np.argsort(pair[rows], kind="stable")]
+    here, last = order[1:], order[:-1]
+    twice = np.zeros(len(order), bool)
+    twice[1:] = (pair[here] == pair[last]) & (t[here] == t[last]) & (d[here] == d[last])
+    return order[~twice], order[twice]
 
 
 def _follows(since: np.ndarray) -> np.ndarray:
