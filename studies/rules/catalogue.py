@@ -13,8 +13,6 @@ COUNTS = {
     "ground.STILL_SWEEPS",
     "ground.SWEEPS",
     "height.STEP_COUNT",
-    "monitoring.stamp_rules.MAXIMUM",
-    "monitoring.stamp_rules.MINIMUM",
     "monitoring.survey_scale.STEPS",
     "initialization.MINIMUM",
     "initialization.SLOW_TDOAS",

@@ -37,17 +37,17 @@ KINDS_OF = {
         "stamp_rules",
         "inertial_rules",
         "ranging_rules",
-        "ranging_windows",
         "stream_rules",
         "stream_watch",
+        "windows",
     ),
     ("streams",),
 )
 NO_TUNING = {  # what nature gives, and what nothing returns
-    "inertial_rules.ABSURD",
-    "ranging_windows.ABSURD",
-    "stamp_rules.ABSURD",
     "survey_scale.NANOSECONDS",
+    "windows.NO_SAMPLE",
+    "windows.NO_STAMP",
+    "windows.NO_TDOA",
 }
 LISTS = (  # of rules, by module
     ("monitoring.stamp_rules", "OF_ONE"),
@@ -112,7 +112,7 @@ SWITCHES: dict[str, tuple[str, Any]] = {
     "findings end with their cause": ("stream_watch.LATEST", 0),
     "a finding needs several windows": ("stream_watch.FEWEST", 1),
     "windows are checked together": ("stream_watch.KEPT", 2),
-    "unknown ids": ("stream_rules.StreamRules._unknown", lambda *_: None),
+    "unknown ids": ("stream_rules.StreamRules._unknown", lambda *_: ()),
     "order of stamps comes first": ("stamp_rules.orderly", lambda *_: True),
     "TDOAs that are late": ("stamp_rules._late", lambda *_: False),
     "a tag at rest": ("inertial_rules.resting", lambda *_: False),

@@ -138,7 +138,7 @@ def test_patches_change_modules_only_while_they_are_applied(made):
     # a constant that Python and compiled code use changes in both; a size does not change
     both = named["monitoring.slices.DELAY_STD x 2"]
     assert both.changed and both.entry.name == "monitoring.slices.DELAY_STD"
-    assert "monitoring.ranging_windows.PROBES x 2" not in named
+    assert "monitoring.windows.NO_TDOA x 2" not in named
 
 
 def test_every_switch_of_a_rule_over_streams_and_residuals_is_there(made):

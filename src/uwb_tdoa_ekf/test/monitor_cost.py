@@ -20,6 +20,29 @@ RATE = 400  # Hz, of TDOAs
 CASES = ((8, 8), (100, 30), (100, 100), (1000, 30), (1000, 200))
 
 
+def odometry_of(t, p, v=(1.0, 0.0, 0.0), gyro_bias=0.0):
+    """Odometry at places p (n, 3); gyro_bias about z, (n,) or one for all."""
+    n = len(t)
+    zeros = np.zeros((n, 3))
+    bias = np.column_stack([np.zeros((n, 2)), np.broadcast_to(gyro_bias, n)])
+    return Odometry(
+        t,
+        p,
+        np.broadcast_to(v, (n, 3)),
+        np.tile([0.0, 0.0, 0.0, 1.0], (n, 1)),
+        zeros,
+        bias,
+        np.zeros((n, 9, 9)),
+        np.zeros((n, 3, 3)),
+    )
+
+
+def residuals_of(t, a, b, innovation, verdict=USED):
+    """Residuals of TDOAs between anchors with ids a and b."""
+    one = np.ones(len(t))
+    return Residuals(t, a, b, innovation, one, one, np.broadcast_to(verdict, len(t)))
+
+
 def fly(monitor, anchors, heard, slices, first=0, seed=0):
     """Give a Monitor so many slices of a flight along a row of Anchors, of which it hears the
     nearest `heard`.
@@ -31,25 +54,8 @@ def fly(monitor, anchors, heard, slices, first=0, seed=0):
         near = np.argsort(np.linalg.norm(anchors.positions - p[0], axis=1))[:heard]
         one_of = rng.permutation(n) % heard
         a, b = near[one_of], near[(one_of + 1 + rng.integers(heard - 1, size=n)) % heard]
-        one, zeros = np.ones(n), np.zeros((n, 3))
-        state = (
-            p,
-            np.tile([1.0, 0.0, 0.0], (n, 1)),
-            np.tile([0.0, 0.0, 0.0, 1.0], (n, 1)),
-            zeros,
-            zeros,
-            np.zeros((n, 9, 9)),
-            np.zeros((n, 3, 3)),
-        )
-        rows = (
-            anchors.ids[a],
-            anchors.ids[b],
-            0.1 * rng.standard_normal(n),
-            one,
-            one,
-            np.full(n, USED),
-        )
-        monitor.add(Odometry(t, *state), Residuals(t, *rows))
+        innovation = 0.1 * rng.standard_normal(n)
+        monitor.add(odometry_of(t, p), residuals_of(t, anchors.ids[a], anchors.ids[b], innovation))
         monitor.update(t[-1])
 
 

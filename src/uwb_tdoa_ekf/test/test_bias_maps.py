@@ -16,7 +16,7 @@ from scipy.stats import norm
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_ekf.debias import INTERPOLATORS, BiasMap, Part, fit
-from uwb_tdoa_ekf.debias.bias_map import FADE, INTERPOLATORS
+from uwb_tdoa_ekf.debias.bias_map import FADE
 from uwb_tdoa_ekf.debias.markers import Markers, collect, corrected_bias
 from uwb_tdoa_ekf.debias.network import AngularNetwork
 
@@ -95,8 +95,8 @@ STEP = 0.5
 
 def nodes(n, d, values, wobble=0.0):
     """Cells, places and one column of values; values(at) -> (n,)."""
-    cell = np.stack(np.meshgrid(*[np.arange(n)] * d, indexing="ij"), axis=-1).reshape(-1, d)
-    at = STEP * cell + wobble * np.random.default_rng(2).standard_normal(cell.shape)
+    cell, at = grid(n, d)
+    at = at + wobble * np.random.default_rng(2).standard_normal(cell.shape)
     return cell, at, values(at)[:, None]
 
 
@@ -171,8 +171,7 @@ def test_a_node_without_neighbours_and_columns_apart():
 
 
 def make_map(d=3, n=4, step=0.5, bias=None, **fields):
-    cell = np.stack(np.meshgrid(*[np.arange(n)] * d, indexing="ij"), axis=-1).reshape(-1, d)
-    at = step * cell
+    cell, at = grid(n, d, step)
     bias = np.tile([0.1, -0.2, 0.3][:d], (len(at), 1)) if bias is None else bias(at)
     added = 0.01 * np.eye(d)
     return BiasMap(
@@ -202,19 +201,16 @@ def test_inside_the_bias_is_taken_out_and_the_map_s_own_error_added(d):
 def test_outside_of_the_hull_the_correction_fades_and_the_covariance_grows(interpolator):
     one = make_map(interpolator=interpolator)
     before = 0.04 * np.eye(3)[None]
-    corrections, traces = [], []
-    for x in (-0.1, 0.25 * FADE, 0.5 * FADE, 0.75 * FADE, FADE, 10.0):
-        p = outside(x)
-        found, covariance, validity = one.correct(p, before)
-        corrections.append(np.linalg.norm(found - p))
-        traces.append(np.trace(covariance[0]))
-        assert validity == pytest.approx(np.clip(1.0 - x / FADE, 0.0, 1.0))
-        assert (np.linalg.eigvalsh(covariance[0] - before[0]) > -1e-12).all()
+    x = np.array([-0.1, 0.25 * FADE, 0.5 * FADE, 0.75 * FADE, FADE, 10.0])
+    p = np.concatenate([outside(far) for far in x])
+    found, covariance, validity = one.correct(p, np.repeat(before, len(x), axis=0))
+    np.testing.assert_allclose(validity, np.clip(1.0 - x / FADE, 0.0, 1.0), atol=1e-12)
+    assert (np.linalg.eigvalsh(covariance - before) > -1e-12).all()
+    corrections = np.linalg.norm(found - p, axis=1)
     assert (np.diff(corrections) <= 1e-12).all() and corrections[-2] == corrections[-1] == 0.0
-    assert traces[-1] == pytest.approx(
-        0.12 + 0.1**2 + 0.2**2 + 0.3**2
-    )  # the bias that was not taken out
-    assert traces[-1] > traces[0]
+    traces = np.trace(covariance, axis1=1, axis2=2)
+    # the bias that was not taken out
+    assert traces[-1] == pytest.approx(0.12 + 0.1**2 + 0.2**2 + 0.3**2) and traces[-1] > traces[0]
 
 
 def test_a_hole_in_the_markers_is_not_known():
@@ -381,9 +377,7 @@ def test_covariances_become_honest_but_never_smaller(claimed, honest):
 
 
 def test_points_without_covariance_add_the_map_s_whole_error():
-    places = np.stack(np.meshgrid(*[np.arange(0.0, 3.1, 0.5)] * 2, indexing="ij"), axis=-1).reshape(
-        -1, 2
-    )
+    _, places = grid(7, 2)
     true = np.column_stack([places, np.zeros(len(places))])
     parts = [Part(row + field(row[None]), row[None]) for row in true]
     found = fit(parts, 0.5, planar=True)

@@ -18,7 +18,7 @@ from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_ekf.monitoring import health  # noqa: E402
 from uwb_tdoa_ekf.monitoring.finding import Finding  # noqa: E402
 from uwb_tdoa_ekf.monitoring.health import ERROR, OK, WARN  # noqa: E402
-from uwb_tdoa_ekf.monitoring.status import VolumeCheck  # noqa: E402
+from uwb_tdoa_ekf.monitoring.status import flyability  # noqa: E402
 
 # --- health ---
 # The node looks five times a second; here a report is a look, once a second.
@@ -28,89 +28,86 @@ STARTING, RUNNING = (
 )
 
 
-class Clock:
-    """time.monotonic by hand."""
+class Judge(health.Health):
+    """Health with time.monotonic by hand."""
 
-    def __init__(self, monkeypatch):
+    def __init__(self, monkeypatch, config=FilterConfig(), volume=None):
         self.now = 1000.0
         monkeypatch.setattr("time.monotonic", lambda: self.now)
+        super().__init__(config, 0.25, volume)
+
+    def second(self, estimator, imu=1000, tdoa=400, wrong=(None, (), ()), **counts):
+        """Let one second pass with so many messages; returns (level, text, values).
+
+        wrong : what is refused, wiring, findings.
+        """
+        self.now += 1.0
+        self.received.update(imu=imu, tdoa=tdoa)
+        return self.report(wrong[0], estimator, Counter(counts), *wrong[1:])
 
 
 @pytest.fixture
-def clock(monkeypatch):
-    return Clock(monkeypatch)
+def judge(monkeypatch):
+    return Judge(monkeypatch)
 
 
-def second(clock, judge, estimator, imu=1000, tdoa=400, refused=None, **counts):
-    """Let one second pass with so many messages; returns (level, text, values)."""
-    clock.now += 1.0
-    judge.received["imu"] += imu
-    judge.received["tdoa"] += tdoa
-    return judge.report(refused, estimator, Counter(counts))
+LOST = SimpleNamespace(running=False, lost="the tag is lost")
+NO_SIDE = SimpleNamespace(running=True, side_unknown="set tag_side to below or above")
 
 
-def test_says_what_is_missing(clock):
-    judge = health.Health(FilterConfig(), lag=0.25)
-    level, text, _ = second(clock, judge, None)
-    assert level == ERROR and "uwb/anchors" in text
-    assert second(clock, judge, STARTING, refused="anchor 3 is nowhere")[:2] == (
-        ERROR,
-        "anchor 3 is nowhere",
-    )
-    level, text, _ = second(clock, judge, RUNNING, tdoa=0)
-    assert level == ERROR and "uwb/tdoa_corrected" in text
-    level, text, _ = second(clock, judge, RUNNING, imu=0)
-    assert level == ERROR and "imu/data" in text
-    assert second(clock, health.Health(FilterConfig(use_imu=False), 0.25), RUNNING, imu=0)[0] == OK
+@pytest.mark.parametrize(
+    ("estimator", "options", "level", "words"),
+    [
+        (None, {}, ERROR, "uwb/anchors"),
+        (STARTING, {"wrong": ("anchor 3 is nowhere", (), ())}, ERROR, "anchor 3 is nowhere"),
+        (RUNNING, {"tdoa": 0}, ERROR, "uwb/tdoa_corrected"),
+        (RUNNING, {"imu": 0}, ERROR, "imu/data"),
+        (LOST, {}, WARN, "the tag is lost"),
+        (NO_SIDE, {"used": 400}, WARN, "set tag_side to below or above"),
+        (RUNNING, {"used": 400}, OK, "running"),
+    ],
+)
+def test_says_what_is_missing(judge, estimator, options, level, words):
+    said = judge.second(estimator, **options)
+    assert said[0] == level and words in said[1]
+    assert said[2]["state"] == ("lost" if estimator is LOST else said[2]["state"])
 
 
-def test_a_lost_tag_is_a_warning_and_no_start(clock):
-    judge = health.Health(FilterConfig(), lag=0.25)
-    level, text, values = second(
-        clock, judge, SimpleNamespace(running=False, lost="the tag is lost")
-    )
-    assert (level, text, values["state"]) == (WARN, "the tag is lost", "lost")
+def test_without_use_of_an_imu_none_is_missing(monkeypatch):
+    judge = Judge(monkeypatch, FilterConfig(use_imu=False))
+    assert judge.second(RUNNING, imu=0)[0] == OK
 
 
-def test_a_start_that_takes_long_is_a_warning(clock):
-    judge = health.Health(FilterConfig(), lag=0.25)
-    levels = [second(clock, judge, STARTING)[0] for _ in range(8)]
+def test_a_start_that_takes_long_is_a_warning(judge):
+    levels = [judge.second(STARTING)[0] for _ in range(8)]
     assert levels == [OK] * 6 + [WARN] * 2
-    second(clock, judge, STARTING, tdoa=0)  # without data nothing can start
-    assert second(clock, judge, STARTING)[0] == OK
+    judge.second(STARTING, tdoa=0)  # without data nothing can start
+    assert judge.second(STARTING)[0] == OK
 
 
 @pytest.mark.parametrize("name", ["late", "invalid"])
-def test_most_tdoas_lost_for_one_reason_is_a_warning(clock, name):
-    judge = health.Health(FilterConfig(), lag=0.25)
+def test_most_tdoas_lost_for_one_reason_is_a_warning(judge, name):
     for k in range(3):
-        assert second(clock, judge, RUNNING, used=400 * (k + 1))[:2] == (OK, "running")
-    assert second(clock, judge, RUNNING, used=1400, **{name: 199})[0] == OK
-    level, text, _ = second(clock, judge, RUNNING, used=1500, **{name: 1500})
+        assert judge.second(RUNNING, used=400 * (k + 1))[:2] == (OK, "running")
+    assert judge.second(RUNNING, used=1400, **{name: 199})[0] == OK
+    level, text, _ = judge.second(RUNNING, used=1500, **{name: 1500})
     assert level == WARN and name in text and "load" not in text
     for _ in range(2):
-        last = second(clock, judge, RUNNING, used=9500, **{name: 1500})
+        last = judge.second(RUNNING, used=9500, **{name: 1500})
     assert last[0] == OK  # that was then
 
 
-def test_most_tdoas_rejected_for_seconds_is_a_warning(clock):
-    judge, said = health.Health(FilterConfig(), lag=0.25), []
-    for k in range(20):
-        said.append(
-            second(clock, judge, RUNNING, used=400 * min(k, 10) + 1, rejected=400 * max(k - 10, 0))[
-                :2
-            ]
-        )
-    assert (
-        [level for level, _ in said[:11]] == [OK] * 11
-        and said[-1][0] == WARN
-        and "contradict" in said[-1][1]
-    )
+def test_most_tdoas_rejected_for_seconds_is_a_warning(judge):
+    said = [
+        judge.second(RUNNING, used=400 * min(k, 10) + 1, rejected=400 * max(k - 10, 0))[:2]
+        for k in range(20)
+    ]
+    assert [level for level, _ in said[:11]] == [OK] * 11
+    assert said[-1][0] == WARN and "contradict" in said[-1][1]
 
 
-def test_a_filter_that_starts_anew_again_and_again_is_not_blamed_on_the_anchors(clock):
-    judge = health.Health(FilterConfig(), lag=0.25)
-    said = [second(clock, judge, STARTING, startup=100 * k, restarts=k) for k in range(10)]
+def test_a_filter_that_starts_anew_again_and_again_is_not_blamed_on_the_anchors(judge):
+    said = [judge.second(STARTING, startup=100 * k, restarts=k) for k in range(10)]
     assert (
         said[-1][0] == WARN
         and "starts anew" in said[-1][1]
@@ -118,12 +115,11 @@ def test_a_filter_that_starts_anew_again_and_again_is_not_blamed_on_the_anchors(
     )
 
 
-def test_rates_and_age(clock):
-    judge = health.Health(FilterConfig(), lag=0.25)
-    values = second(clock, judge, STARTING)[2]
+def test_rates_and_age(judge):
+    values = judge.second(STARTING)[2]
     assert (values["state"], values["age of last odometry"]) == ("starting", "none yet")
-    judge.last_odometry = clock.now
-    values = second(clock, judge, RUNNING, imu=500, tdoa=20)[2]
+    judge.last_odometry = judge.now
+    values = judge.second(RUNNING, imu=500, tdoa=20)[2]
     assert values == {
         "state": "running",
         "age of last odometry": "1.000 s",
@@ -135,63 +131,61 @@ def test_rates_and_age(clock):
 
 
 @pytest.mark.parametrize(
-    "behind, level", [(-0.5, OK), (0.9, OK), (1.1, WARN), (59.0, WARN), (3600.0, OK)]
+    ("behind", "level", "words", "value"),
+    [
+        (-0.5, OK, "running", "-0.500 s"),
+        (0.9, OK, "running", "0.900 s"),
+        (1.1, WARN, "too slow", "1.100 s"),
+        (59.0, WARN, "too slow", "59.000 s"),
+        (3600.0, OK, "running", "not comparable: the stamps are of another time"),
+        (-9.5, WARN, "9.5 s ahead of the clock", "-9.500 s"),
+    ],
 )
-def test_odometry_that_falls_behind_the_clock_is_a_warning(clock, behind, level):
-    judge = health.Health(FilterConfig(), lag=0.25)
+def test_odometry_that_is_behind_or_ahead_of_the_clock_is_a_warning(
+    judge, behind, level, words, value
+):
     judge.behind = behind
-    said, text, values = second(clock, judge, RUNNING, used=400)
-    assert said == level and ("too slow" in text) == (level == WARN)
-    expected = (
-        f"{behind:.3f} s" if behind < 60.0 else "not comparable: the stamps are of another time"
-    )
-    assert values["odometry behind the clock"].startswith(expected)
-    judge.behind = 2.0
-    said = [second(clock, judge, RUNNING, used=400, invalid=400 * (k + 1))[1] for k in range(3)]
-    assert "invalid" in said[-1]  # what matters more is said
+    said, text, values = judge.second(RUNNING, used=400)
+    assert said == level and words in text
+    assert values["odometry behind the clock"].startswith(value)
+    for k in range(3):
+        text = judge.second(RUNNING, used=400, invalid=400 * (k + 1))[1]
+    assert "invalid" in text  # what matters more is said
 
 
-def test_a_tag_outside_of_the_flyable_volume_is_a_warning(clock):
-    anchors = Anchors.from_positions([[0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 3]])
-    cells = np.ones((2, 2, 2)), np.full((2, 2, 2), 0.1)
-    volume = FlyableVolume([0, 0, 0], [1, 1, 1], *cells, anchors.ids, anchors.positions)
-    judge = health.Health(FilterConfig(), 0.25, volume)
-    running = SimpleNamespace(running=True, anchors=anchors, side_unknown=None)
-    assert second(clock, judge, running)[0] == OK  # no odometry yet
-    judge.last_position = np.array([0.5, 1.5, 0.5]), np.diag([0.01, 0.01, 0.02])
-    level, text, values = second(clock, judge, running)
+def test_a_tag_outside_of_the_flyable_volume_is_a_warning(monkeypatch):
+    judge = Judge(monkeypatch, volume=volume())
+    running = SimpleNamespace(running=True, anchors=ANCHORS, side_unknown=None)
+    assert judge.second(running)[0] == OK  # no odometry yet
+    judge.last_position = np.array([0.5, 0.5, 0.5]), COVARIANCE
+    level, text, values = judge.second(running)
     assert (level, text, values["flyable"], values["efficiency"]) == (OK, "running", "yes", "0.25")
-    judge.last_position = np.array([0.5, 2.5, 0.5]), np.eye(3)
-    level, text, values = second(clock, judge, running)
+    judge.last_position = np.array([1.5, 0.5, 0.5]), COVARIANCE
+    level, text, values = judge.second(running)
     assert level == WARN and "outside of the flyable volume" in text and values["flyable"] == "no"
     for k in range(3):
         # what matters more is said
-        level, text, values = second(clock, judge, running, used=1, invalid=99 * (k + 1))
+        level, text, values = judge.second(running, used=1, invalid=99 * (k + 1))
     assert level == WARN and "invalid" in text and values["flyable"] == "no"
-    judge.last_position = np.array([0.5, 0.5, 0.5]), np.eye(3)
-    for _ in range(2):
-        last = second(clock, judge, running, used=5000, invalid=297)
-    assert last[0] == OK  # it has come back
 
 
-def test_an_sensor_that_stops_is_told_and_so_is_one_that_contradicts(clock):
-    judge, counts = health.Health(FilterConfig(), 0.25), Counter(used=1)
+def test_a_sensor_that_stops_is_told_and_so_is_one_that_contradicts(judge):
+    counts = Counter(used=1)
     for _ in range(3):
         judge.received["height"] += 25
         counts.update(used=400, height_used=25)
-        assert second(clock, judge, RUNNING, **counts)[:2] == (OK, "running")
-    said = [second(clock, judge, RUNNING, **counts) for _ in range(3)]
+        assert judge.second(RUNNING, **counts)[:2] == (OK, "running")
+    said = [judge.second(RUNNING, **counts) for _ in range(3)]
     assert said[-1][0] == WARN and "no messages on height any more" in said[-1][1]
     for expected in (OK, WARN):  # for a second even a sound one may contradict
         judge.received["height"] += 25
         counts.update(used=400, height_rejected=25)
-        level, text, _ = second(clock, judge, RUNNING, **counts)
+        level, text, _ = judge.second(RUNNING, **counts)
         assert level == expected
     assert "more than half of the messages on height" in text
 
 
-def test_what_is_wrong_with_the_streams_is_said_before_what_comes_of_it(clock):
-    judge = health.Health(FilterConfig(), lag=0.25)
+def test_what_is_wrong_with_the_streams_is_said_before_what_comes_of_it(judge):
     units = Finding(
         "imu_force_unit", "error", "the accelerometer is in g", "it is 1.0", "multiply\n  it", 9.81
     )
@@ -199,9 +193,7 @@ def test_what_is_wrong_with_the_streams_is_said_before_what_comes_of_it(clock):
     publishers = "2 publish on imu/data (/a, /b): stop all but one"
 
     def said(estimator, wiring=(), findings=(), **counts):
-        clock.now += 1.0
-        judge.received.update(imu=1000, tdoa=400)
-        return judge.report(None, estimator, Counter(counts), wiring, findings)
+        return judge.second(estimator, wrong=(None, wiring, findings), **counts)
 
     level, text, values = said(STARTING, [publishers], [units, slow])
     first = "the accelerometer is in g (it is 1.0): multiply it"
@@ -223,24 +215,6 @@ def test_what_is_wrong_with_the_streams_is_said_before_what_comes_of_it(clock):
     assert (level, text, values["wrong with the streams"]) == (OK, "running", "nothing")
 
 
-def test_odometry_that_is_ahead_of_the_clock_is_a_warning(clock):
-    judge = health.Health(FilterConfig(), lag=0.25)
-    judge.behind = -9.5
-    level, text, _ = second(clock, judge, RUNNING, used=400)
-    assert level == WARN and "9.5 s ahead of the clock" in text
-
-
-def test_a_side_that_nobody_knows_is_a_warning(clock):
-    judge = health.Health(FilterConfig(), lag=0.25)
-    level, text, _ = second(
-        clock,
-        judge,
-        SimpleNamespace(running=True, side_unknown="set tag_side to below or above"),
-        used=400,
-    )
-    assert (level, text) == (WARN, "set tag_side to below or above")
-
-
 # --- volume ---
 ANCHORS = Anchors.from_positions([[0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 3]])
 COVARIANCE = np.diag([0.01, 0.03, 0.12])
@@ -259,9 +233,7 @@ def volume(planar=False):
     ("planar", "claimed", "efficiency"), [(False, "0.400 m", "0.25"), (True, "0.200 m", "1")]
 )
 def test_the_covariance_is_compared_with_the_bound(planar, claimed, efficiency):
-    trouble, values = VolumeCheck(volume(planar)).trouble_at(
-        ANCHORS, np.array([0.5, 0.5, 0.5]), COVARIANCE
-    )
+    trouble, values = flyability(volume(planar), ANCHORS, np.array([0.5, 0.5, 0.5]), COVARIANCE)
     assert trouble is None and values == {
         "flyable": "yes",
         "bound of one round": "0.200 m",
@@ -272,15 +244,15 @@ def test_the_covariance_is_compared_with_the_bound(planar, claimed, efficiency):
 
 @pytest.mark.parametrize("p", [[1.5, 0.5, 0.5], [0.5, 0.5, 9.0], [np.nan, 0.5, 0.5]])
 def test_outside_is_told(p):
-    trouble, values = VolumeCheck(volume()).trouble_at(ANCHORS, np.array(p), COVARIANCE)
+    trouble, values = flyability(volume(), ANCHORS, np.array(p), COVARIANCE)
     assert "outside of the flyable volume" in trouble and values == {"flyable": "no"}
 
 
 def test_a_volume_of_other_anchors_is_told():
     moved = Anchors.from_positions(ANCHORS.positions + 0.5)
-    trouble, values = VolumeCheck(volume()).trouble_at(moved, np.array([0.5, 0.5, 0.5]), COVARIANCE)
+    trouble, values = flyability(volume(), moved, np.array([0.5, 0.5, 0.5]), COVARIANCE)
     assert "other anchors" in trouble and values == {"flyable": "unknown"}
 
 
 def test_without_a_volume_nothing_is_said():
-    assert VolumeCheck().trouble_at(ANCHORS, np.zeros(3), COVARIANCE) == (None, {})
+    assert flyability(None, ANCHORS, np.zeros(3), COVARIANCE) == (None, {})

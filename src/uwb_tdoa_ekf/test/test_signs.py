@@ -13,15 +13,17 @@ from uwb_tdoa_ekf.monitoring.signs import SignWatch
 from uwb_tdoa_ekf.monitoring.stream_watch import StreamWatch
 
 
-def watched(flight, sign):
+def watched(flight, sign, doubted=np.inf):
     """[(s, finding or None, certain)] of a Flight, second by second, with such a sign: callable of
-    the stamps.
+    the stamps. From `doubted` s on the filter doubts it.
     """
     watch, tdoa, said = SignWatch(flight.anchors), flight.tdoa, []
     second = np.floor(tdoa.t - tdoa.t[0])
     for k in range(int(second[-1])):
         rows = second == k
         t = tdoa.t[rows]
+        if k >= doubted:
+            watch.doubt()
         watch.feed(t, tdoa.a[rows], tdoa.b[rows], tdoa.d[rows] * sign(t))
         said.append((k + 1.0, watch.finding, watch._certain))
     return said
@@ -61,16 +63,8 @@ def test_disorder_and_nonsense():
 
 
 def test_doubts_make_it_compare_again():
-    flight = fly(0, 40.0)
-    watch, tdoa, said = SignWatch(flight.anchors), flight.tdoa, []
-    for k in range(40):
-        rows = (tdoa.t >= k) & (tdoa.t < k + 1.0)
-        sign = -1.0 if k >= 16 else 1.0
-        if k >= 17:
-            watch.doubt()
-        watch.feed(tdoa.t[rows], tdoa.a[rows], tdoa.b[rows], sign * tdoa.d[rows])
-        said.append(watch.finding)
-    assert not any(said[:17]) and said[-1].rule == "tdoa_sign"
+    said = watched(fly(0, 40.0), lambda t: np.where(t < 16.0, 1.0, -1.0), doubted=17)
+    assert not any(finding for _, finding, _ in said[:17]) and said[-1][1].rule == "tdoa_sign"
 
 
 def flown(flight, sign, seconds):

@@ -147,20 +147,20 @@ def _both_orders(columns, sign):
     return t, arrival, np.where(odd, b, a), np.where(odd, a, b), np.where(odd, sign * d, d)
 
 
-@pytest.mark.parametrize("rule", IMU_FAULTS)
-def test_a_fault_of_the_imu_is_named(rule):
-    imu, tdoa = streams()
-    found = judged(IMU_FAULTS[rule](imu, np.random.default_rng(1)), tdoa)
+@pytest.mark.parametrize(
+    ("stream", "rule"),
+    [*(("imu", rule) for rule in IMU_FAULTS), *(("tdoa", rule) for rule in TDOA_FAULTS)],
+)
+def test_a_fault_of_a_stream_is_named(stream, rule):
+    (imu, tdoa), rng = streams(), np.random.default_rng(1)
+    if stream == "imu":
+        found = judged(IMU_FAULTS[rule](imu, rng), tdoa)
+    else:
+        found = judged(imu, TDOA_FAULTS[rule](tdoa, rng))
     assert rule in found, found
-    _is_whole(found[rule])
-
-
-@pytest.mark.parametrize("rule", TDOA_FAULTS)
-def test_a_fault_of_the_tdoas_is_named(rule):
-    imu, tdoa = streams()
-    found = judged(imu, TDOA_FAULTS[rule](tdoa, np.random.default_rng(1)))
-    assert rule in found, found
-    _is_whole(found[rule])
+    one = found[rule]
+    assert one.severity in SEVERITIES and math.isfinite(one.value)
+    assert one.cause and one.evidence and one.remedy
 
 
 # m, after which 32 bits of the clock of a DW1000 begin anew
@@ -199,12 +199,6 @@ def test_at_rest_no_unit_of_the_gyroscope_is_alleged(bias):
     found = judged(at_rest(imu, np.array(bias)), tdoa)
     assert not any(finding.severity == "error" for finding in found.values()), found
     assert found.keys() == ({"imu_rate_offset"} if np.hypot(*bias[:2]) > 0.35 else set())
-
-
-def _is_whole(finding):
-    assert finding.severity in SEVERITIES
-    assert finding.cause and finding.evidence and finding.remedy
-    assert math.isfinite(finding.value)
 
 
 def test_pairs_in_both_orders_with_both_signs_are_healthy():
@@ -293,41 +287,37 @@ def finding(rule, severity=ERROR, value=1.0):
 
 
 @pytest.mark.parametrize(
-    "rule",
+    ("found", "with_imu", "without_imu"),
     [
-        "tdoa_sign",
-        "tdoa_large",
-        "tdoa_unit",
-        "two_tags",
-        "ids_exchanged",
-        "survey_misfit",
-        "survey_unit",
+        *(
+            (finding(rule), True, True)
+            for rule in (
+                "tdoa_sign",
+                "tdoa_large",
+                "tdoa_unit",
+                "two_tags",
+                "ids_exchanged",
+                "survey_misfit",
+                "survey_unit",
+            )
+        ),
+        (finding("tdoa_sign", WARNING), False, False),
+        (finding("survey_misfit", NOTE), False, False),
+        # the filter goes without the IMU
+        (finding("imu_turned"), True, False),
+        (finding("imu_left_out"), False, False),
+        # unknown ids, where they are most
+        *((finding("ids_unknown", value=share), False, False) for share in (0.05, 0.49)),
+        *((finding("ids_unknown", value=share), True, True) for share in (0.51, 1.0)),
+        # what is dropped or slow
+        *(
+            (finding(rule), False, False)
+            for rule in ("tdoa_twice", "gap", "rate", "blocks", "few_anchors", "tdoa_of_one")
+        ),
     ],
 )
-def test_what_the_position_is_computed_from_makes_it_wrong(rule):
-    assert finding(rule).position_wrong(True) and finding(rule).position_wrong(False)
-    assert not finding(rule, WARNING).position_wrong() and not finding(rule, NOTE).position_wrong()
-
-
-def test_an_imu_that_is_left_out_does_not():
-    assert finding("imu_turned").position_wrong(True) and not finding("imu_turned").position_wrong(
-        False
-    )
-    assert not finding("imu_left_out").position_wrong(True)
-
-
-@pytest.mark.parametrize(
-    ("share", "wrong"), [(0.05, False), (0.49, False), (0.51, True), (1.0, True)]
-)
-def test_unknown_ids_do_where_they_are_most(share, wrong):
-    assert finding("ids_unknown", value=share).position_wrong() == wrong
-
-
-def test_what_is_dropped_or_slow_does_not():
-    assert not any(
-        finding(rule).position_wrong()
-        for rule in ("tdoa_twice", "gap", "rate", "blocks", "few_anchors", "tdoa_of_one")
-    )
+def test_what_the_position_is_computed_from_makes_it_wrong(found, with_imu, without_imu):
+    assert (found.position_wrong(True), found.position_wrong(False)) == (with_imu, without_imu)
 
 
 def test_the_text_of_what_goes_on_stays_until_it_is_over_or_much_else():

@@ -12,8 +12,9 @@ import pytest
 
 from uwb_tdoa_bias.common.flight import Tdoas
 from uwb_tdoa_tools.bags.bag import read_bag, write_bag
-from uwb_tdoa_tools.checking.check import check, different_surveys, sensor_findings, upright
+from uwb_tdoa_tools.checking.check import check, different_surveys, upright
 from uwb_tdoa_tools.checking.recording import of_flight, read_recording
+from uwb_tdoa_tools.checking.recording_rules import sensor_mistakes
 from uwb_tdoa_tools.readers import inputs, read_flight, read_survey
 from uwb_tdoa_tools.readers.inputs import Reading
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
@@ -88,7 +89,7 @@ def test_a_mistake_is_named(name):
 
 def test_ranges_alone_show_a_survey_upside_down():
     flight = simulate(SimulationConfig(seed=0, range_noise=0.1, **QUICK))
-    healthy = replace(of_flight(flight), tdoa=NO_TDOAS)
+    healthy = of_flight(replace(flight, tdoa=NO_TDOAS))
     upside_down = MISTAKES["upside_down_survey"].make(healthy, None, None)
     assert "survey_upside_down" in rules(check(upside_down))
     assert rules(check(healthy)) == set()
@@ -178,27 +179,21 @@ def test_a_survey_of_another_room_is_named_with_a_measured_log(log, survey, shar
     assert "survey_misfit" in found and not found & OF_ANOTHER_ROOM
 
 
-NONE = Tdoas(*(np.empty(0, kind) for kind in (float, int, int, float)))
-
-
 @pytest.fixture(scope="module")
 def ranged():
     """A Flight of ranges alone."""
     config = SimulationConfig(
         duration=20.0, imu_rate=200.0, truth_rate=20.0, start_in_air=True, range_noise=0.1
     )
-    return replace(simulate(config), tdoa=NONE)
+    return replace(simulate(config), tdoa=NO_TDOAS)
 
 
-def test_healthy_ranges_without_tdoas_have_no_error(ranged):
+def test_ranges_without_tdoas_are_judged(ranged):
     report = check(of_flight(ranged))
     assert not report.faulty and report.facts["range"] == "ranges 100 Hz"
-
-
-def test_ranges_in_millimetres_are_named(ranged):
-    wrong = replace(ranged, range=replace(ranged.range, d=1000.0 * ranged.range.d))
-    assert "range_unit" in {finding.rule for finding in check(of_flight(wrong)).findings}
-    assert [finding.rule for finding in sensor_findings(of_flight(wrong))][:1] == ["range_unit"]
+    wrong = of_flight(replace(ranged, range=replace(ranged.range, d=1000.0 * ranged.range.d)))
+    assert "range_unit" in rules(check(wrong))
+    assert [finding.rule for finding in sensor_mistakes(wrong)][:1] == ["range_unit"]
 
 
 def test_a_bag_of_ranges_alone_is_read_and_checked(ranged, tmp_path):

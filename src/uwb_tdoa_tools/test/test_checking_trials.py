@@ -21,7 +21,7 @@ from uwb_tdoa_bias.common.sensors import Ranges
 from uwb_tdoa_bias.common.survey import UNITS
 from uwb_tdoa_ekf.results import rows_of
 from uwb_tdoa_tools.checking import imu_rules, tdoa_rules
-from uwb_tdoa_tools.checking.check import check, sensor_findings
+from uwb_tdoa_tools.checking.check import check
 from uwb_tdoa_tools.checking.imu_rules import clipped_axes, is_smooth
 from uwb_tdoa_tools.checking.ordered import (
     SPREAD,
@@ -31,6 +31,7 @@ from uwb_tdoa_tools.checking.ordered import (
     spread,
 )
 from uwb_tdoa_tools.checking.recording import of_flight, read_recording
+from uwb_tdoa_tools.checking.recording_rules import sensor_mistakes
 from uwb_tdoa_tools.checking.tdoa_rules import GAIN, SAME, apparent_gain, gained
 from uwb_tdoa_tools.readers import read_flight
 from uwb_tdoa_tools.readers.inputs import Reading
@@ -179,7 +180,7 @@ def test_a_turn_about_the_vertical_cannot_be_seen(healthy):
     ],
 )
 def test_the_remedy_is_the_matrix_in_words(accel, gyro, words):
-    assert imu_rules._finding(accel, gyro, "", 0.5).remedy == words
+    assert imu_rules._finding(imu_rules.Arrangement(0.5, 9.0, accel, gyro), "").remedy == words
 
 
 # --- checking ordered ---
@@ -278,6 +279,8 @@ CASES = {
 
 @pytest.fixture
 def shared(shared_data):
+    if not (shared_data.parent / "cases").is_dir():
+        pytest.skip("no cases in ../shared/cases")
     return shared_data.parent
 
 
@@ -294,8 +297,6 @@ def shared(shared_data):
 )
 def test_every_command_refuses_the_cases(command, shared, tmp_path, monkeypatch, capsys):
     """Before it starts workers or writes."""
-    if not (shared / "cases").is_dir():
-        pytest.skip("no cases in ../shared/cases")
     name, *rest = command.split()
     main = importlib.import_module(f"uwb_tdoa_tools.commands.{name}").main
     monkeypatch.chdir(tmp_path)
@@ -307,8 +308,6 @@ def test_every_command_refuses_the_cases(command, shared, tmp_path, monkeypatch,
 
 
 def test_the_case_in_feet_names_its_factor(shared):
-    if not (shared / "cases").is_dir():
-        pytest.skip("no cases in ../shared/cases")
     flight = read_flight(shared / "data/flights/0426/0426-traj5", shared / "cases/anchors/feet.csv")
     report = check(of_flight(flight))
     assert rules(report, "error") == {"survey_scale"}, report.findings
@@ -316,8 +315,6 @@ def test_the_case_in_feet_names_its_factor(shared):
 
 
 def test_the_case_of_another_room_has_no_error(shared):
-    if not (shared / "cases").is_dir():
-        pytest.skip("no cases in ../shared/cases")
     flight = read_flight(
         shared / "cases/recordings/other_room", shared / "data/surveys/anchor_0425.txt"
     )
@@ -446,7 +443,7 @@ def test_ranges_that_are_no_distances_are_told(value, share, severity):
     flight = Flight("ranged", ROOM, Tdoas(*np.empty((4, 0))), None, range=ranges)
     found = [
         finding.severity
-        for finding in sensor_findings(of_flight(flight))
+        for finding in sensor_mistakes(of_flight(flight))
         if finding.rule == "range_invalid"
     ]
     assert found == ([severity] if severity else [])

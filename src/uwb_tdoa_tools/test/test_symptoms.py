@@ -62,7 +62,7 @@ def _of_mistake(arguments, _):
 
 MAKERS = {  # {what makes a finding: severities by its arguments}
     "Finding": lambda arguments, given: _severities(arguments[1], given),
-    "_finding_of": lambda arguments, given: {"error"},
+    "MistakeTrial": lambda arguments, given: {"error"},
     "Mistake": _of_mistake,
 }
 

@@ -101,13 +101,13 @@ class ChangeDetector:
         self._rows: np.ndarray = np.empty(0, int)
         self._columns: dict[int, int] = {}
         self._t, self._p = np.zeros(room), np.zeros((room, 3))
-        self._delays: np.ndarray
-        self._white: np.ndarray
         # delays minus compensated changes; number of independent combinations measured
-        self._delays, self._freedom = (np.zeros((room, 0)), np.zeros(room))
-        # Cholesky factor; whitened errors
-        self._factor, self._white = (np.zeros((room, room)), np.zeros((room, 0)))
-        self._squares = np.zeros(room)  # normalised squares
+        self._delays: np.ndarray = np.zeros((room, 0))
+        self._freedom = np.zeros(room)
+        # Cholesky factor; whitened errors; their normalised squares
+        self._factor = np.zeros((room, room))
+        self._white: np.ndarray = np.zeros((room, 0))
+        self._squares = np.zeros(room)
         # ring buffer over the latest slices: responses of the anchors that were heard
         self._response: np.ndarray = np.zeros((WINDOW, 0, 0))
         # ring buffer: index of each column's anchor in its slice, -1 if it was not heard
@@ -176,19 +176,21 @@ class ChangeDetector:
         ratio[onsets:][np.abs(value[onsets:]) > FASTEST_DRIFT] = 0.0
         ratio[onsets:] /= CLEARLY
         shape, column = np.unravel_index(np.argmax(ratio), ratio.shape)
-        best, scale, later = (
-            float(ratio[shape, column]),
-            scales[shape],
-            slice(first + shape % onsets, self._count),
+        is_ramp = bool(shape >= onsets)
+        onset = first + int(shape) % onsets
+        best, change = float(ratio[shape, column]), float(value[shape, column])
+        explained = best * scales[shape] * (CLEARLY if is_ramp else 1.0)
+        left = np.sum(self._white[onset : self._count] ** 2) - explained
+        expected = np.sum(self._freedom[onset : self._count]) * scales[shape]
+        return Change(
+            row=int(self._rows[column]),
+            since=float(self._t[onset] - 0.5 * LENGTH),
+            size=0.0 if is_ramp else change,
+            slope=change if is_ramp else 0.0,
+            ratio=best,
+            rival=float(np.max(np.delete(ratio, column, axis=1), initial=0.0)),
+            left=float(left / max(expected, 1e-9)),
         )
-        explained = best * scale * (CLEARLY if shape >= onsets else 1.0)
-        left = (np.sum(self._white[later] ** 2) - explained) / max(
-            np.sum(self._freedom[later]) * scale, 1e-9
-        )
-        rival = float(np.max(np.delete(ratio, column, axis=1), initial=0.0))
-        since, change = self._t[first + shape % onsets] - 0.5 * LENGTH, float(value[shape, column])
-        size, slope = (change, 0.0) if shape < onsets else (0.0, change)
-        return Change(int(self._rows[column]), float(since), size, slope, best, rival, float(left))
 
     def refined(self, change: Change) -> Change | None:
         """Return the last compensated step with its new size, or None, and compensate that."""

@@ -88,12 +88,23 @@ def compare(one: Unexplained, other: Unexplained) -> tuple[float, float]:
     both = one.blocks.keys() & other.blocks.keys()
     if len(both) < LEAST:
         return math.nan, 0.0
-    a, b = (
-        np.array([blocks[number] for number in sorted(both)])
-        for blocks in (one.blocks, other.blocks)
+    numbers = sorted(both)
+    return compare_losses(
+        np.array([one.blocks[number] for number in numbers]),
+        np.array([other.blocks[number] for number in numbers]),
     )
-    error = np.std(a - b, ddof=1) / math.sqrt(len(a))
-    return float(np.mean(b) / max(np.mean(a), 1e-9)), float(np.mean(a - b) / max(error, 1e-9))
+
+
+def compare_losses(one: np.ndarray, other: np.ndarray) -> tuple[float, float]:
+    """Return the same (ratio, z) of two losses (n,) of the same data."""
+    error = np.std(one - other, ddof=1) / math.sqrt(len(one))
+    ratio = np.mean(other) / max(np.mean(one), 1e-9)
+    return float(ratio), float(np.mean(one - other) / max(error, 1e-9))
+
+
+def in_words(ratio: float, z: float) -> str:
+    """Return a phrase on (ratio, z), the evidence of a Finding."""
+    return f"{100.0 * (1.0 - ratio):.0f} % less stays unexplained then, {z:.1f} standard errors"
 
 
 def unexplained(

@@ -37,12 +37,16 @@ def clock_ahead(stream: str, lead: float, count: int) -> Finding:
     count : int
         Invalid messages of the stream so far.
     """
-    what = (
-        f"the stamps of {TOPICS[stream]} are {lead:.3g} s ahead of those of the other streams; "
-        "its messages are not used"
-    )
     return Finding(
-        "clock_ahead", WARNING, what, f"{count} invalid messages so far", STAMP_LINE, lead
+        "clock_ahead",
+        WARNING,
+        cause=(
+            f"the stamps of {TOPICS[stream]} are {lead:.3g} s ahead of those of the other streams; "
+            "its messages are not used"
+        ),
+        evidence=f"{count} invalid messages so far",
+        remedy=STAMP_LINE,
+        value=lead,
     )
 
 
@@ -53,17 +57,22 @@ def restarted(cause: Restart) -> Finding:
     """
     topic = TOPICS[cause.stream]
     how = "are behind those of the other streams" if cause.overtaken else "fell back"
-    evidence = (
-        f"the new time begins at {cause.at:.3f} s, from the whole second of the first stamp on"
+    return Finding(
+        "restarted",
+        WARNING,
+        cause=(
+            f"the filter has started anew, because the stamps of {topic} {how} by "
+            f"{-cause.step:.3g} s"
+        ),
+        evidence=(
+            f"the new time begins at {cause.at:.3f} s, from the whole second of the first stamp on"
+        ),
+        remedy=(
+            "keep the clocks of all drivers in step (chronyc tracking); replaying a recording also "
+            "causes this"
+        ),
+        value=cause.step,
     )
-    remedy = (
-        "keep the clocks of all drivers in step (chronyc tracking); replaying a recording also "
-        "causes this"
-    )
-    what = (
-        f"the filter has started anew, because the stamps of {topic} {how} by {-cause.step:.3g} s"
-    )
-    return Finding("restarted", WARNING, what, evidence, remedy, cause.step)
 
 
 SAID = {
@@ -96,6 +105,12 @@ SAID = {
 def implausible(check: Record) -> Finding:
     """Return the Finding for the imu_fault_detector of a filter that ignores the IMU."""
     cause, evidence, remedy = SAID[int(check.reason)]
-    cause = f"{cause}: the filter goes without the IMU"
     size = float(check["size"])  # `.size` of a numpy record is its number of elements
-    return Finding("imu_left_out", ERROR, cause, evidence.format(size), remedy, size)
+    return Finding(
+        "imu_left_out",
+        ERROR,
+        cause=f"{cause}: the filter goes without the IMU",
+        evidence=evidence.format(size),
+        remedy=remedy,
+        value=size,
+    )

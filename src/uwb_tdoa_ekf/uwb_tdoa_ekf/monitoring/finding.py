@@ -9,7 +9,7 @@ import math
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Collection, Iterable, Mapping
 
 # ERROR: the estimate is wrong. WARNING: it may be worse than possible. NOTE: information.
 ERROR, WARNING, NOTE = "error", "warning", "note"
@@ -110,6 +110,19 @@ class Finding:
 def most_severe_first(findings: Iterable[Finding]) -> list[Finding]:
     """Return the findings in order of severity, and in the given order within one severity."""
     return sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity))
+
+
+def explained_by(findings: Iterable[Finding], explains: Mapping[str, Collection[str]]) -> set[str]:
+    """Return the rules whose findings other findings explain.
+
+    Parameters
+    ----------
+    findings : iterable of Finding
+        Findings that hold.
+    explains : mapping
+        {rule: rules that its finding explains}.
+    """
+    return {rule for finding in findings for rule in explains.get(finding.rule, ())}
 
 
 class Steady:

@@ -15,10 +15,10 @@ from uwb_tdoa_bias.common.sensors import LOCATING, SENSORS
 from uwb_tdoa_bias.ros.diagnostics import Rate
 
 from .finding import ERROR as SEVERE
-from .status import LARGEST_UNUSED, Use, VolumeCheck
+from .status import LARGEST_UNUSED, Use, flyability
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from uwb_tdoa_bias.common.flyable import FlyableVolume
     from uwb_tdoa_bias.ros.diagnostics import Report
@@ -64,18 +64,14 @@ class Health:
         self.last_position: tuple[np.ndarray, np.ndarray] | None = None
         # s from the stamp of the newest odometry to the current ROS time
         self.behind: float | None = None
-        self._use_imu, self._lag = config.use_imu, lag
-        self._volume = VolumeCheck(volume)
+        self._use_imu, self._lag, self._volume = config.use_imu, lag, volume
         self._imu_rate, self._tdoa_rate, self._located_rate = Rate(), Rate(), Rate()
-        self._sensors_before: dict[
-            str, dict[str, int]
-        ] = {}  # by sensor: messages received and not used at the last report
-        self._sensors_bad: dict[
-            tuple[str, str], int
-        ] = {}  # consecutive reports in which most messages of a sensor were not used, by reason
-        self._sensors_heard: dict[
-            str, tuple[int, float]
-        ] = {}  # by sensor: messages so far, and time.monotonic() of the last change, s
+        # at the last report: messages of each stream, and totals by verdict
+        self._received_before: Counter[str] = Counter()
+        self._counts_before: Counter[str] = Counter()
+        # consecutive reports in which most messages of a sensor were not used, by (sensor, reason)
+        self._bad: Counter[tuple[str, str]] = Counter()
+        self._heard: dict[str, float] = {}  # by sensor: time.monotonic() of its last message, s
         self._starting: float | None = None  # time.monotonic(), s
         self.use = Use(lag)
 
@@ -120,10 +116,8 @@ class Health:
         """
         now = time.monotonic()
         self.look(estimator, counts)
-        imu_rate, tdoa_rate = (
-            self._imu_rate.of(self.received["imu"]),
-            self._tdoa_rate.of(self.received["tdoa"]),
-        )
+        imu_rate = self._imu_rate.of(self.received["imu"])
+        tdoa_rate = self._tdoa_rate.of(self.received["tdoa"])
         located = self._located_rate.of(
             self.received["tdoa"] + sum(self.received[name] for name in LOCATING)
         )
@@ -132,92 +126,110 @@ class Health:
             self._starting = None
         elif self._starting is None:
             self._starting = now
-        status: tuple[bytes, str]
-        if refused:
-            status = ERROR, refused
-        elif estimator is None:
-            status = (
-                ERROR,
-                "no anchors yet: publish them on uwb/anchors, reliable and transient local",
-            )
-        elif not located:
-            status = (
-                ERROR,
-                (
-                    "no TDOAs on uwb/tdoa_corrected: start bias_node in this namespace and the "
-                    "tag's driver"
-                ),
-            )
-        elif self._use_imu and not imu_rate:
-            status = (
-                ERROR,
-                "no samples on imu/data: check the IMU's driver, or set use_imu to false",
-            )
-        elif wiring or findings:
-            status = _worst(wiring, findings)
-        elif running:
-            status = (WARN, self.use.trouble) if self.use.trouble else (OK, "running")
-        elif estimator.lost:
-            status = WARN, estimator.lost
-        elif self._starting is not None and now - self._starting > START_TIMEOUT:
-            status = WARN, self.use.trouble or self._no_start()
-        else:
-            status = OK, "looking for the start position"
-        if status == (OK, "running"):
-            status = self._status_of_sensors(now, counts)
-        if status == (OK, "running") and estimator is not None and estimator.side_unknown:
-            status = WARN, estimator.side_unknown
+        missing = refused or self._missing(estimator, bool(imu_rate), bool(located))
+        outside: str | None = None
         at_position: dict[str, str] = {}
         if estimator is not None and running and self.last_position is not None:
-            trouble, at_position = self._volume.trouble_at(estimator.anchors, *self.last_position)
-            if trouble and status[0] == OK:
-                status = WARN, trouble
-        if (
-            running
-            and self.behind is not None
-            and BEHIND[0] < self.behind < BEHIND[1]
-            and status[0] == OK
-        ):
-            reason = "this machine is too slow for all it receives, or clocks differ"
-            status = WARN, f"the odometry is {self.behind:.1f} s behind: {reason}"
-        if (
-            running
-            and self.behind is not None
-            and -BEHIND[1] < self.behind < -BEHIND[0]
-            and status[0] == OK
-        ):
-            status = (
-                WARN,
-                (
-                    f"the odometry is {-self.behind:.1f} s ahead of the clock: correct the "
-                    "stamps, or the clock"
-                ),
-            )
+            outside, at_position = flyability(self._volume, estimator.anchors, *self.last_position)
+        if missing:
+            level, text = ERROR, missing
+        elif wiring or findings:
+            level, text = _worst(wiring, findings)
+        elif estimator is not None and running:
+            troubles = self._troubles(estimator, counts, outside)
+            trouble = next(filter(None, troubles), None)
+            level, text = (WARN, trouble) if trouble else (OK, "running")
+        else:
+            level, text = self._not_running(estimator, now)
+        state = "running" if running else "starting"
+        if estimator is not None and not running and estimator.lost:
+            state = "lost"
         age = "none yet" if self.last_odometry is None else f"{now - self.last_odometry:.3f} s"
-        state = (
-            "running"
-            if running
-            else "lost"
-            if estimator is not None and estimator.lost
-            else "starting"
-        )
-        values = {"state": state, "age of last odometry": age}
-        values |= {"odometry behind the clock": _behind(self.behind)}
-        values |= {"IMU rate": f"{imu_rate:.1f} Hz", "TDOA rate": f"{tdoa_rate:.1f} Hz"}
         sentences = [*wiring, *(finding.sentence for finding in findings)]
-        values |= {"wrong with the streams": "; ".join(sentences) or "nothing"}
-        values |= {f"found {finding.rule}": f"{finding.value:.4g}" for finding in findings}
-        return *status, values | at_position
+        values = {
+            "state": state,
+            "age of last odometry": age,
+            "odometry behind the clock": _behind(self.behind),
+            "IMU rate": f"{imu_rate:.1f} Hz",
+            "TDOA rate": f"{tdoa_rate:.1f} Hz",
+            "wrong with the streams": "; ".join(sentences) or "nothing",
+            **{f"found {finding.rule}": f"{finding.value:.4g}" for finding in findings},
+        }
+        return level, text, values | at_position
 
-    def _status_of_sensors(self, now: float, counts: Mapping[str, int]) -> tuple[bytes, str]:
-        """Return the status of sensors that went silent or whose messages are mostly not used."""
-        status = OK, "running"
+    def _missing(self, estimator: Estimator | None, imu: bool, located: bool) -> str | None:
+        """Return a sentence on missing input, or None.
+
+        Parameters
+        ----------
+        estimator : Estimator or None
+            None before the anchors arrive.
+        imu, located : bool
+            Whether inertial samples, and TDOAs or distances, arrive.
+        """
+        if estimator is None:
+            return "no anchors yet: publish them on uwb/anchors, reliable and transient local"
+        if not located:
+            return (
+                "no TDOAs on uwb/tdoa_corrected: start bias_node in this namespace and the tag's "
+                "driver"
+            )
+        if self._use_imu and not imu:
+            return "no samples on imu/data: check the IMU's driver, or set use_imu to false"
+        return None
+
+    def _not_running(self, estimator: Estimator | None, now: float) -> tuple[bytes, str]:
+        """Return (level, text) of a filter without a position at `now`, time.monotonic() in s."""
+        if estimator is not None and estimator.lost:
+            return WARN, estimator.lost
+        if self._starting is None or now - self._starting <= START_TIMEOUT:
+            return OK, "looking for the start position"
+        if self.use.trouble:
+            return WARN, self.use.trouble
+        if self.use.restart_age < START_TIMEOUT:
+            return WARN, (
+                "the filter starts anew again and again, because stamps of a stream fall back: "
+                "see restarts, and correct its clock"
+            )
+        return WARN, (
+            "no start position found: check ids and positions of the anchors, and that four are "
+            "heard"
+        )
+
+    def _troubles(
+        self, estimator: Estimator, counts: Mapping[str, int], outside: str | None
+    ) -> Iterator[str | None]:
+        """Yield sentences on the trouble of a running filter, the most important first, or None.
+
+        Parameters
+        ----------
+        estimator : Estimator
+            The filter.
+        counts : mapping
+            Totals by verdict.
+        outside : str or None
+            Sentence on a position outside of the flyable volume.
+        """
+        yield self.use.trouble
+        yield self._trouble_of_sensors(counts)
+        yield estimator.side_unknown
+        yield outside
+        behind = self.behind or 0.0
+        if BEHIND[0] < behind < BEHIND[1]:
+            reason = "this machine is too slow for all it receives, or clocks differ"
+            yield f"the odometry is {behind:.1f} s behind: {reason}"
+        if BEHIND[0] < -behind < BEHIND[1]:
+            remedy = "correct the stamps, or the clock"
+            yield f"the odometry is {-behind:.1f} s ahead of the clock: {remedy}"
+
+    def _trouble_of_sensors(self, counts: Mapping[str, int]) -> str | None:
+        """Return a sentence on a sensor that went silent or whose messages are mostly not used."""
+        trouble, now = None, time.monotonic()
         for stream, sensor in SENSORS.items():
-            received = self.received[stream]
-            heard, since = self._sensors_heard.get(stream, (0, now))
-            if received != heard:
-                since = now
-            self._sensors_heard[stream] = received, since
+            topic = sensor.topics[0][0]
+            new = self.received[stream] - self._received_before[stream]
+            if new or stream not in self._heard:
+                self._heard[stream] = now
             reasons = {
                 "rejected": (
                     "contradict everything else and are not used: check the sensor, "
@@ -226,44 +238,21 @@ class Health:
                 "late": f"are late: check its stamps, or raise lag (now {self._lag} s)",
                 "invalid": f"are invalid: {sensor.invalid}",
             }
-            totals = {"received": received} | {
-                reason: counts[f"{stream}_{reason}"] for reason in reasons
-            }
-            before = self._sensors_before.get(stream, dict.fromkeys(totals, 0))
-            recent = {name: total - before[name] for name, total in totals.items()}
-            self._sensors_before[stream] = totals
-            if received and now - since > STOPPED:
-                status = (
-                    WARN,
-                    (
-                        f"no messages on {sensor.topics[0][0]} any more: done without; check the "
-                        "sensor and its driver"
-                    ),
+            if self.received[stream] and now - self._heard[stream] > STOPPED:
+                trouble = (
+                    f"no messages on {topic} any more: done without; check the sensor and its "
+                    "driver"
                 )
                 continue
             for reason, words in reasons.items():
-                bad = recent[reason] > LARGEST_UNUSED * recent["received"]
-                repeats = self._sensors_bad[stream, reason] = (
-                    self._sensors_bad.get((stream, reason), 0) + 1 if bad else 0
-                )
-                if repeats >= REPEATS:
-                    status = (
-                        WARN,
-                        f"more than half of the messages on {sensor.topics[0][0]} {words}",
-                    )
-        return status
-
-    def _no_start(self) -> str:
-        """Return a sentence on why the filter does not initialize."""
-        if self.use.restart_age < START_TIMEOUT:
-            return (
-                "the filter starts anew again and again, because stamps of a stream fall back: "
-                "see restarts, and correct its clock"
-            )
-        return (
-            "no start position found: check ids and positions of the anchors, and that four are "
-            "heard"
-        )
+                name = f"{stream}_{reason}"
+                unused = counts[name] - self._counts_before[name]
+                bad = unused > LARGEST_UNUSED * new
+                self._bad[stream, reason] = self._bad[stream, reason] + 1 if bad else 0
+                if self._bad[stream, reason] >= REPEATS:
+                    trouble = f"more than half of the messages on {topic} {words}"
+        self._received_before, self._counts_before = Counter(self.received), Counter(counts)
+        return trouble
 
 
 def _worst(wiring: Sequence[str], findings: Sequence[Finding]) -> tuple[bytes, str]:

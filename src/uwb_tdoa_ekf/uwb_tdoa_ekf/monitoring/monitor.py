@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import replace
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from uwb_tdoa_bias.common.geometry import tdoa
 
 from ..core.initialization import LOST_TIME
 from ..core.memory import REJECTED
+from ..results import concatenated, rows_of
 from .change import ChangeDetector
 from .finding import ERROR, WARNING, Finding
 from .reference import Displaced, SurveyComparison
@@ -84,9 +85,8 @@ BIAS_LIMITS = {"gyroscope": (0.03, "rad/s"), "accelerometer": (0.6, "m/s^2")}
 
 SURVEYING = "survey RECORDING"  # command that estimates anchor positions
 
-NO_ODOMETRY = [np.empty(0), *[np.empty((0, 3))] * 4]  # t, p, v, gyro_bias, accel_bias
-# t, a, b, innovation, accepted
-NO_RESIDUALS = [np.empty(0), *[np.empty(0, int)] * 2, np.empty(0), np.empty(0, bool)]
+
+Part = TypeVar("Part", "Odometry", "Residuals")
 
 
 class Heard(NamedTuple):
@@ -153,8 +153,8 @@ class Monitor:
     def _forget(self) -> None:
         # Reset everything that belongs to one flight; the history stays.
         # data of the current slice and later
-        self._odometry: list[list[np.ndarray]] = [NO_ODOMETRY]
-        self._residuals: list[list[np.ndarray]] = [NO_RESIDUALS]
+        self._odometry: list[Odometry] = []
+        self._residuals: list[Residuals] = []
         self._past += self._standing.values()
         self._standing = {}
         self._end: float | None = None  # s, stamp of the end of the current slice
@@ -196,9 +196,9 @@ class Monitor:
             Rows of the anchors.
         """
         rows, ids = set(gone.tolist()), self._anchors.ids[gone]
-        kept = [~(np.isin(part[1], ids) | np.isin(part[2], ids)) for part in self._residuals]
         self._residuals = [
-            [column[some] for column in part] for part, some in zip(self._residuals, kept)
+            rows_of(part, ~(np.isin(part.a, ids) | np.isin(part.b, ids)))
+            for part in self._residuals
         ]
         self._heard = {row: was for row, was in self._heard.items() if row not in rows}
         self._changes = {row: found for row, found in self._changes.items() if row not in rows}
@@ -234,55 +234,37 @@ class Monitor:
         if self._end is not None and len(residuals.t) and residuals.t[0] > self._last + LOST_TIME:
             # finish the flight before, so that no empty slices of the gap are tested
             self.update(math.inf)
-        if len(odometry):
-            self._odometry.append(
-                [odometry.t, odometry.p, odometry.v, odometry.gyro_bias, odometry.accel_bias]
-            )
-        # True if the filter computed an innovation
-        began, reached = self._end is not None, np.isfinite(residuals.innovation)
-        if reached.any():
-            columns = (
-                residuals.t,
-                residuals.a,
-                residuals.b,
-                residuals.innovation,
-                residuals.verdict != REJECTED,
-            )
-            self._residuals.append([column[reached] for column in columns])
-            t = self._residuals[-1][0]
-            self._last = float(t[-1])
+        self._odometry.append(odometry)
+        began = self._end is not None
+        # those for which the filter computed an innovation
+        reached = rows_of(residuals, np.isfinite(residuals.innovation))
+        if len(reached):
+            self._residuals.append(reached)
+            self._last = float(reached.t[-1])
             if self._end is None:
-                self._end = (math.floor(t[0] / LENGTH) + 1.0) * LENGTH
+                self._end = (math.floor(reached.t[0] / LENGTH) + 1.0) * LENGTH
         if not began:
             self._keep_one_slice()
 
     def _keep_one_slice(self) -> None:
         """Drop odometry older than the current slice, or than the slice of a TDOA that came now."""
-        odometry = [np.concatenate(columns) for columns in zip(*self._odometry)]
-        if len(odometry[0]):
-            begin = (
-                math.floor(odometry[0][-1] / LENGTH) * LENGTH
-                if self._end is None
-                else self._end - LENGTH
-            )
-            self._odometry = [[column[odometry[0] >= begin] for column in odometry]]
+        odometry, begin = concatenated(self._odometry), -math.inf
+        if self._end is not None:
+            begin = self._end - LENGTH
+        elif len(odometry):
+            begin = math.floor(odometry.t[-1] / LENGTH) * LENGTH
+        self._odometry = [rows_of(odometry, odometry.t >= begin)]
 
     def update(self, until: float) -> None:
         """Test all slices that end by `until`, in s; all data up to then must be added."""
         if self._end is None or until < self._end:
             return
-        residuals, odometry = (
-            [np.concatenate(columns) for columns in zip(*parts)]
-            for parts in (self._residuals, self._odometry)
-        )
+        residuals, odometry = concatenated(self._residuals), concatenated(self._odometry)
         while self._end <= min(until, self._last + LOST_TIME):
-            now, of_now = residuals[0] < self._end, odometry[0] < self._end
-            self._test(
-                self._end,
-                [column[now] for column in residuals],
-                [column[of_now] for column in odometry],
-            )
-            residuals, odometry = [c[~now] for c in residuals], [c[~of_now] for c in odometry]
+            now, residuals = _split(residuals, self._end)
+            of_now, odometry = _split(odometry, self._end)
+            self._judge(self._end, now, of_now)
+            self._keep_history(self._end)
             self._end += LENGTH
         self._residuals, self._odometry = [residuals], [odometry]
         if self._end <= until:  # no TDOA came for too long
@@ -290,38 +272,32 @@ class Monitor:
             self._odometry = [odometry]
             self._keep_one_slice()
 
-    def _test(self, end: float, residuals: list[np.ndarray], odometry: list[np.ndarray]) -> None:
-        """Test the slice that ends at `end`, in s, given its columns."""
-        self._judge(end, residuals, odometry)
-        self._keep_history(end)
-
-    def _judge(self, end: float, residuals: list[np.ndarray], odometry: list[np.ndarray]) -> None:
-        # Test one slice for exchanges, changes and deviations, and update the IMU biases.
-        _, a, b, innovation, accepted = residuals
-        a, b = self._anchors.index(a), self._anchors.index(b)
-        t, p, v, gyro_bias, accel_bias = odometry
-        self._listen(a, b, p.mean(axis=0) if len(t) else None)
-        if len(t) and len(a):
+    def _judge(self, end: float, residuals: Residuals, odometry: Odometry) -> None:
+        # Test the slice that ends at `end`, in s, for exchanges, changes and deviations, and update
+        # the IMU biases.
+        a, b = self._anchors.index(residuals.a), self._anchors.index(residuals.b)
+        place = odometry.p.mean(axis=0) if len(odometry) else None
+        self._listen(a, b, place)
+        accepted = float(np.mean(residuals.verdict != REJECTED)) if len(a) else 0.0
+        innovation, positions = residuals.innovation, self._anchors.positions
+        if place is not None and len(a):
             recent = end <= self._agreed + AGREED and end > self._turned + TURN_APART
-            if recent and turned(
-                innovation,
-                tdoa(p.mean(axis=0), self._anchors.positions[a], self._anchors.positions[b]),
-            ):
+            if recent and turned(innovation, tdoa(place, positions[a], positions[b])):
                 self.turns, self._turned = self.turns + 1, end
-            if np.mean(accepted) > MOST:
+            if accepted > MOST:
                 self._agreed = end
-        if math.isnan(self._moving_since) and (np.linalg.norm(v, axis=1) > MOVING).any():
+        speed = np.linalg.norm(odometry.v, axis=1).max(initial=0.0)
+        if math.isnan(self._moving_since) and speed > MOVING:
             self._moving_since = end
-        if math.isnan(self._moving_since) or not (len(t) and len(a)):
+        if math.isnan(self._moving_since) or place is None or not len(a):
             return
-        self._follow_biases(end, np.concatenate([gyro_bias[-1], accel_bias[-1]]))
-        place = p.mean(axis=0)
+        self._follow_biases(end, np.concatenate([odometry.gyro_bias[-1], odometry.accel_bias[-1]]))
         swap = self._look_for_swap(a, b, innovation, place) or self._swapped
-        if not swap and accepted.mean() >= FEWEST_ACCEPTED:
-            piece = reduced(end - 0.5 * LENGTH, place, self._anchors.positions, a, b, innovation)
+        if not swap and accepted >= FEWEST_ACCEPTED:
+            piece = reduced(end - 0.5 * LENGTH, place, positions, a, b, innovation)
             self._detector.add(piece)
             self._look_for_change(end)
-            if np.linalg.norm(v, axis=1).max() > MOVING:
+            if speed > MOVING:
                 self._compare(piece)
 
     def _compare(self, piece: Slice) -> None:
@@ -524,23 +500,28 @@ class Monitor:
 
     def _swap(self) -> Finding:
         one, other = self._anchors.ids[[*self._swapped]].tolist()
-        what = f"two anchors are exchanged, {one} and {other}"
         evidence, remedy = (
             "each TDOA with one of them fits the place of the other",
             "correct their ids, or their positions on uwb/anchors",
         )
-        return Finding("ids_exchanged", ERROR, what, evidence, remedy, float(one))
+        return Finding(
+            "ids_exchanged",
+            ERROR,
+            cause=f"two anchors are exchanged, {one} and {other}",
+            evidence=evidence,
+            remedy=remedy,
+            value=float(one),
+        )
 
     def _silence(self, row: int) -> Finding:
         number = self._anchors.ids[row]
-        what = f"anchor {number} is not heard any more"
         return Finding(
             "anchor_silent",
             WARNING,
-            what,
-            "others as far away are heard",
-            "check its power and sight",
-            float(number),
+            cause=f"anchor {number} is not heard any more",
+            evidence="others as far away are heard",
+            remedy="check its power and sight",
+            value=float(number),
         )
 
     def _change(self, row: int, found: list[Change]) -> Finding:
@@ -555,10 +536,13 @@ class Monitor:
             what = "it is late: blocked (NLOS), moved, or its delay has changed"
         else:
             what = "it is early: moved, or its delay has changed"
-        cause = f"anchor {number}: {size:+.2f} m since the start of the flight: {what}"
-        remedy = "look at it; survey it again if it was moved"
         return Finding(
-            "anchor_changed", WARNING, cause, "no error of the position explains that", remedy, size
+            "anchor_changed",
+            WARNING,
+            cause=f"anchor {number}: {size:+.2f} m since the start of the flight: {what}",
+            evidence="no error of the position explains that",
+            remedy="look at it; survey it again if it was moved",
+            value=size,
         )
 
     def _displacement(self, one: Displaced) -> Finding:
@@ -582,8 +566,14 @@ class Monitor:
         evidence += "; the TDOAs do not separate these anchors" * bool(some)
         effects = " --effects effects.yaml" if self._calibrated is not None else ""
         again = f"measure {'them' if some else 'it'} again"
-        remedy = f"{SURVEYING} --survey anchors.yaml{effects} --out surveyed/  # or {again}"
-        return Finding("anchor_displaced", WARNING, what, evidence, remedy, off)
+        return Finding(
+            "anchor_displaced",
+            WARNING,
+            cause=what,
+            evidence=evidence,
+            remedy=f"{SURVEYING} --survey anchors.yaml{effects} --out surveyed/  # or {again}",
+            value=off,
+        )
 
     def _axis_alarms(self) -> list[str]:
         """Return sentences on IMU axes whose bias differs from the reference."""
@@ -598,6 +588,12 @@ class Monitor:
                         f"{CALIBRATE:g} s in motion"
                     )
         return out
+
+
+def _split(part: Part, end: float) -> tuple[Part, Part]:
+    """Return the rows of Odometry or Residuals before the stamp `end`, in s, and the others."""
+    count = int(np.searchsorted(part.t, end))
+    return rows_of(part, slice(count)), rows_of(part, slice(count, None))
 
 
 def _surest(displaced: Iterable[Displaced]) -> dict[int, Displaced]:

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check windows of a TDOA stream for wrong values.
 
-Each rule takes windows and returns a Finding or None.
+A rule takes windows and yields Findings.
 """
 
 from __future__ import annotations
@@ -14,11 +14,13 @@ import numpy as np
 from uwb_tdoa_bias.common.radio import SPEED_OF_LIGHT, TICK
 
 from .finding import ERROR, NOTE, WARNING, Finding
-from .ranging_windows import GRIDS
-from .stamp_rules import median
+from .stamp_rules import median, share_of, total
+from .windows import GRIDS
 
 if TYPE_CHECKING:
-    from .ranging_windows import TdoaWindow
+    from collections.abc import Iterator
+
+    from .windows import TdoaWindow
 
 LARGE = 0.2  # share of TDOAs longer than the distance of their anchors; healthy 0.008 at most
 OUTLIERS = 0.05  # the same, from which on many TDOAs count as outliers
@@ -36,207 +38,204 @@ WRAPS = {
 FEW = 4  # anchors: three differences of distances determine a position
 
 
-def share_of(windows: list[TdoaWindow], field: str, among: str = "known") -> float:
-    """Return the sum of one count over the windows divided by the sum of another."""
-    return sum(getattr(w, field) for w in windows) / max(sum(getattr(w, among) for w in windows), 1)
-
-
-def fixed_step(windows: list[TdoaWindow]) -> Finding | None:
-    """Return a Finding if jumps have one size, because a time stamp wraps or is truncated."""
+def fixed_step(windows: list[TdoaWindow]) -> Iterator[Finding]:
+    """Yield a Finding if jumps have one size, because a time stamp wraps or is truncated."""
     steps = np.concatenate([w.steps for w in windows])
     step = float(np.median(steps)) if len(steps) >= FEWEST else 0.0
     if step < STEP:
-        return None
+        return
     alike = float(np.mean(np.abs(steps - step) < NEAR))
-    share = share_of(windows, "impossible")
-    if alike < ALIKE or share < 0.5 * OUTLIERS:
-        return None
-    known = next(
-        (name for name, size in WRAPS.items() if abs(size - step) < max(NEAR, 1e-5 * size)), None
-    )
-    cause = f"TDOAs are off by a fixed step of {step:.8g} m"
-    cause += (
-        f": a time stamp wraps at {known}"
-        if known
-        else ": a time stamp wraps or loses its upper bits"
-    )
-    evidence = (
-        f"{100.0 * share:.0f} % of the TDOAs; {100.0 * alike:.0f} % of the leaps have this size"
-    )
-    remedy = (
-        "d = (d + step / 2) % step - step / 2  # step as above; or subtract the time stamps with "
-        "all their bits, modulo their range"
-    )
-    return Finding("tdoa_wraps", WARNING, cause, evidence, remedy, step)
+    share = share_of(windows, "impossible", "known")
+    if alike >= ALIKE and share >= 0.5 * OUTLIERS:
+        wraps = [name for name, size in WRAPS.items() if abs(size - step) < max(NEAR, 1e-5 * size)]
+        how = f"wraps at {wraps[0]}" if wraps else "wraps or loses its upper bits"
+        yield Finding(
+            "tdoa_wraps",
+            WARNING,
+            cause=f"TDOAs are off by a fixed step of {step:.8g} m: a time stamp {how}",
+            evidence=(
+                f"{100.0 * share:.0f} % of the TDOAs; {100.0 * alike:.0f} % of the leaps have this "
+                "size"
+            ),
+            remedy=(
+                "d = (d + step / 2) % step - step / 2  # step as above; or subtract the time "
+                "stamps "
+                "with all their bits, modulo their range"
+            ),
+            value=step,
+        )
 
 
 def share_beside_known(windows: list[TdoaWindow], field: str) -> float:
     """Return the share of unusable TDOAs of one kind among these and the known TDOAs, 0 to 1."""
-    count = sum(getattr(w, field) for w in windows)
-    return count / max(count + sum(w.known for w in windows), 1)
+    count = total(windows, field)
+    return count / max(count + total(windows, "known"), 1)
 
 
-def impossible(windows: list[TdoaWindow]) -> Finding | None:
-    if fixed_step(windows):
-        return None
-    share = share_of(windows, "impossible")
+def impossible(windows: list[TdoaWindow]) -> Iterator[Finding]:
+    share = share_of(windows, "impossible", "known")
     size = median(w.size for w in windows)
     evidence = (
         f"{100.0 * share:.1f} % are longer than their anchors are apart, mean size {size:.3g}"
     )
     if share > LARGE:
-        remedy = (
-            "message.distance_difference = ...  # metres: seconds times 299792458, DW1000 ticks "
-            "times 0.0046918"
-        )
-        return Finding(
+        yield Finding(
             "tdoa_large",
             ERROR,
-            "TDOAs are impossibly large: not in metres, or of another room",
-            evidence,
-            remedy,
-            share,
+            cause="TDOAs are impossibly large: not in metres, or of another room",
+            evidence=evidence,
+            remedy=(
+                "message.distance_difference = ...  # metres: seconds times 299792458, DW1000 "
+                "ticks "
+                "times 0.0046918"
+            ),
+            value=share,
         )
-    if share > OUTLIERS:
-        remedy = (
-            "keep radio and anchors clear of metal; drop TDOAs that the radio marks as doubtful"
+    elif share > OUTLIERS:
+        yield Finding(
+            "tdoa_outliers",
+            WARNING,
+            cause="many TDOAs are outliers",
+            evidence=evidence,
+            remedy=(
+                "keep radio and anchors clear of metal; drop TDOAs that the radio marks as doubtful"
+            ),
+            value=share,
         )
-        return Finding("tdoa_outliers", WARNING, "many TDOAs are outliers", evidence, remedy, share)
-    return None
 
 
-def of_one(windows: list[TdoaWindow]) -> Finding | None:
+def of_one(windows: list[TdoaWindow]) -> Iterator[Finding]:
     share = share_beside_known(windows, "of_one")
     if share > 1e-3:
-        remedy = "message.anchor_a, message.anchor_b = ...  # the two anchors of the difference"
-        return Finding(
+        yield Finding(
             "tdoa_of_one",
             ERROR,
-            "TDOAs name one anchor twice",
-            f"{100.0 * share:.1f} %",
-            remedy,
-            share,
+            cause="TDOAs name one anchor twice",
+            evidence=f"{100.0 * share:.1f} %",
+            remedy="message.anchor_a, message.anchor_b = ...  # the two anchors of the difference",
+            value=share,
         )
-    return None
 
 
-def invalid(windows: list[TdoaWindow]) -> Finding | None:
+def invalid(windows: list[TdoaWindow]) -> Iterator[Finding]:
     share = share_beside_known(windows, "invalid")
     if share > 1e-3:
-        remedy = "do not publish what is not finite"
-        return Finding(
-            "tdoa_invalid", WARNING, "TDOAs are not finite", f"{100.0 * share:.1f} %", remedy, share
+        yield Finding(
+            "tdoa_invalid",
+            WARNING,
+            cause="TDOAs are not finite",
+            evidence=f"{100.0 * share:.1f} %",
+            remedy="do not publish what is not finite",
+            value=share,
         )
-    return None
 
 
-def duplicates(windows: list[TdoaWindow]) -> Finding | None:
-    share = share_of([w for w in windows if w.stamps.same < 0.9 * w.stamps.count], "duplicates")
+def duplicates(windows: list[TdoaWindow]) -> Iterator[Finding]:
+    share = share_of(
+        [w for w in windows if w.stamps.same < 0.9 * w.stamps.count], "duplicates", "known"
+    )
     if share > DUPLICATES:
-        evidence = f"{100.0 * share:.0f} % come twice with stamp and value"
-        remedy = "ros2 topic info --verbose uwb/tdoa  # one publisher only"
-        return Finding("tdoa_twice", ERROR, "TDOAs are published twice", evidence, remedy, share)
-    return None
+        yield Finding(
+            "tdoa_twice",
+            ERROR,
+            cause="TDOAs are published twice",
+            evidence=f"{100.0 * share:.0f} % come twice with stamp and value",
+            remedy="ros2 topic info --verbose uwb/tdoa  # one publisher only",
+            value=share,
+        )
 
 
-def repeated(windows: list[TdoaWindow]) -> Finding | None:
+def repeated(windows: list[TdoaWindow]) -> Iterator[Finding]:
     share = share_of(windows, "repeated", "successive")
-    if share > REPEATS and rounded(windows) is None and clipped(windows) is None:
-        evidence = f"{100.0 * share:.0f} % have the value that their pair had before"
-        remedy = "publish a TDOA when there is a new one, not by a timer"
-        return Finding(
+    if share > REPEATS:
+        yield Finding(
             "tdoa_repeated",
             WARNING,
-            "TDOAs are sampled faster than they are measured",
-            evidence,
-            remedy,
-            share,
+            cause="TDOAs are sampled faster than they are measured",
+            evidence=f"{100.0 * share:.0f} % have the value that their pair had before",
+            remedy="publish a TDOA when there is a new one, not by a timer",
+            value=share,
         )
-    return None
 
 
-def two_tags(windows: list[TdoaWindow]) -> Finding | None:
+def two_tags(windows: list[TdoaWindow]) -> Iterator[Finding]:
     share = share_of(windows, "returns", "successive")
-    if share > RETURNS and fixed_step(windows) is None:
-        evidence = f"{100.0 * share:.0f} % leap by more than 0.5 m and back within 0.1 s"
-        remedy = (
-            "give each tag a namespace of its own: start its driver with --ros-args -r __ns:=/tag2"
+    if share > RETURNS:
+        yield Finding(
+            "two_tags",
+            ERROR,
+            cause="two tags share uwb/tdoa",
+            evidence=f"{100.0 * share:.0f} % leap by more than 0.5 m and back within 0.1 s",
+            remedy=(
+                "give each tag a namespace of its own: start its driver with --ros-args -r "
+                "__ns:=/tag2"
+            ),
+            value=share,
         )
-        return Finding("two_tags", ERROR, "two tags share uwb/tdoa", evidence, remedy, share)
-    return None
 
 
-def one_sign(windows: list[TdoaWindow]) -> Finding | None:
+def one_sign(windows: list[TdoaWindow]) -> Iterator[Finding]:
     share = share_of(windows, "even", "opposed")
-    if share > EVEN and sum(w.opposed for w in windows) > 20:
-        evidence = (
-            f"{100.0 * share:.0f} % of the pairs that come as (a, b) and (b, a) have the same sign"
-        )
-        remedy = (
-            "message.distance_difference = distance_b - distance_a  # for the anchors in this order"
-        )
-        return Finding(
+    if share > EVEN and total(windows, "opposed") > 20:
+        yield Finding(
             "tdoa_one_sign",
             ERROR,
-            "the sign of the TDOAs does not follow the order of the anchors",
-            evidence,
-            remedy,
-            share,
+            cause="the sign of the TDOAs does not follow the order of the anchors",
+            evidence=(
+                f"{100.0 * share:.0f} % of the pairs that come as (a, b) and (b, a) have the same "
+                "sign"
+            ),
+            remedy=(
+                "message.distance_difference = distance_b - distance_a  # for the anchors in this "
+                "order"
+            ),
+            value=share,
         )
-    return None
 
 
-def rounded(windows: list[TdoaWindow]) -> Finding | None:
+def rounded(windows: list[TdoaWindow]) -> Iterator[Finding]:
     shares = np.median([w.grids for w in windows], axis=0)
     on = np.flatnonzero(shares > ON_GRID)
-    if not len(on) or sum(w.known for w in windows) < 100:
-        return None
-    grid = float(GRIDS[on[0]])
-    severity = WARNING if grid >= 0.05 else NOTE
-    evidence = f"{100.0 * shares[on[0]]:.0f} % are multiples of {grid:g} m"
-    return Finding(
-        "tdoa_rounded",
-        severity,
-        "TDOAs are rounded",
-        evidence,
-        "publish them as float64, as measured",
-        grid,
-    )
+    if len(on) and total(windows, "known") >= 100:
+        grid = float(GRIDS[on[0]])
+        yield Finding(
+            "tdoa_rounded",
+            WARNING if grid >= 0.05 else NOTE,
+            cause="TDOAs are rounded",
+            evidence=f"{100.0 * shares[on[0]]:.0f} % are multiples of {grid:g} m",
+            remedy="publish them as float64, as measured",
+            value=grid,
+        )
 
 
-def clipped(windows: list[TdoaWindow]) -> Finding | None:
+def clipped(windows: list[TdoaWindow]) -> Iterator[Finding]:
     ceiling = max(w.ceiling for w in windows)
     hits = [w.hits for w in windows if w.ceiling == ceiling]
-    share = sum(hits) / max(sum(w.known for w in windows), 1)
+    share = sum(hits) / max(total(windows, "known"), 1)
     repeats = sum(hits) > len(hits)  # the largest of few values is a large share of them
-    if share > CLIPPED and repeats and rounded(windows) is None and ceiling > 0.0:
-        evidence = f"{100.0 * share:.0f} % are {ceiling:.3f} m or its negative"
-        return Finding(
+    if share > CLIPPED and repeats and ceiling > 0.0:
+        yield Finding(
             "tdoa_clipped",
             ERROR,
-            "TDOAs are clipped",
-            evidence,
-            "widen the limit of the driver",
-            ceiling,
+            cause="TDOAs are clipped",
+            evidence=f"{100.0 * share:.0f} % are {ceiling:.3f} m or its negative",
+            remedy="widen the limit of the driver",
+            value=ceiling,
         )
-    return None
 
 
-def heard(windows: list[TdoaWindow]) -> Finding | None:
-    """Return a Finding if too few anchors are heard in a window."""
+def heard(windows: list[TdoaWindow]) -> Iterator[Finding]:
+    """Yield a Finding if too few anchors are heard in a window."""
     count = median(np.count_nonzero(w.heard) for w in windows)
     if count < FEW:
-        evidence = f"{count:.0f} anchors in a second; four are needed, five or more are good"
-        remedy = "switch on more anchors, or bring the tag among them"
-        return Finding(
+        yield Finding(
             "few_anchors",
             ERROR,
-            "too few anchors are heard for a position",
-            evidence,
-            remedy,
-            count,
+            cause="too few anchors are heard for a position",
+            evidence=f"{count:.0f} anchors in a second; four are needed, five or more are good",
+            remedy="switch on more anchors, or bring the tag among them",
+            value=count,
         )
-    return None
 
 
 RULES = (

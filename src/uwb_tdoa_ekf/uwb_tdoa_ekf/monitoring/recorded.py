@@ -12,7 +12,7 @@ import numpy as np
 
 from ..core.initialization import LOST_TIME
 from ..results import rows_of
-from .monitor import Event, Monitor
+from .monitor import Event, Monitor, Part
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -45,21 +45,23 @@ def watched(
     restarts : sequence of float
         Stamps at which the filter restarts, in s.
     """
+    odometry, residuals = _sorted(odometry), _sorted(residuals)
     events: list[Event] = []
     for low, high in pairwise([-math.inf, *restarts, math.inf]):
-        monitor, t = (
-            Monitor(anchors, calibrated),
-            np.sort(residuals.t[(residuals.t >= low) & (residuals.t < high)]),
-        )
+        monitor, t = Monitor(anchors, calibrated), _between(residuals, low, high).t
         for begin, end in pairwise([low, *t[1:][np.diff(t) > LOST_TIME].tolist(), high]):
-            heard = rows_of(residuals, _between(residuals.t, begin, end))
-            monitor.add(rows_of(odometry, _between(odometry.t, begin, end)), heard)
+            heard = _between(residuals, begin, end)
+            monitor.add(_between(odometry, begin, end), heard)
             monitor.update(float(heard.t[-1]) if len(heard) else low)
         events += monitor.history
     return events
 
 
-def _between(t: np.ndarray, low: float, high: float) -> np.ndarray:
-    """Return the places of stamps t (n,), in s, with low <= t < high, sorted by stamp."""
-    order = np.argsort(t, kind="stable")
-    return np.asarray(order[(t[order] >= low) & (t[order] < high)])
+def _sorted(part: Part) -> Part:
+    """Return Odometry or Residuals in the order of their stamps."""
+    return rows_of(part, np.argsort(part.t, kind="stable"))
+
+
+def _between(part: Part, low: float, high: float) -> Part:
+    """Return the rows of sorted Odometry or Residuals with stamps from `low` to `high`, in s."""
+    return rows_of(part, slice(*np.searchsorted(part.t, [low, high])))

@@ -31,6 +31,8 @@ SHARE, PRESENT = 0.6, 0.1
 # any 10 to 40 s from the start or in the air: healthy flights have 0.98 and 0.2. Flights with the
 # other sign have 0.81 and 2.5 after 30 s in the air, most of them after 12 s.
 RATIO, DEVIATIONS = 0.85, 3.0
+WRONG_SIGN = "the sign of all TDOAs is wrong"
+RIGHT_SIGN = "message.distance_difference = distance_to_b - distance_to_a  # not a - b"
 TURNED = -1.0  # value of a Finding on signs that flipped in flight
 LONGEST = 40.0  # s of stamps after which an undecided comparison restarts
 
@@ -88,20 +90,20 @@ class SignWatch:
 
         The comparison restarts and decides.
         """
-        line = (
-            "message.distance_difference = distance_to_b - distance_to_a  # always, not only in "
-            "the beginning"
-        )
-        evidence = (
-            "from one moment on, each TDOA is the negative of what the place of the tag makes it"
-        )
         turned = Finding(
             "tdoa_sign",
             ERROR,
-            "the sign of all TDOAs has changed in flight",
-            evidence,
-            line,
-            TURNED,
+            cause="the sign of all TDOAs has changed in flight",
+            evidence=(
+                "from one moment on, each TDOA is the negative of what the place of the tag makes "
+                "it"
+            ),
+            remedy=(
+                "message.distance_difference = distance_to_b - distance_to_a  # always, not only "
+                "in "
+                "the beginning"
+            ),
+            value=TURNED,
         )
         if self.finding is None:
             self.finding = turned
@@ -153,13 +155,16 @@ class SignWatch:
             self._states, self._stamps, self._innovations = [], [], ([], [])
         elif _better(wrong, right):
             ratio, z = compare(right, wrong)
-            evidence = (
-                f"the other way round {100.0 * (1.0 - ratio):.0f} % less stays unexplained, "
-                f"{z:.0f} standard errors"
-            )
-            line = "message.distance_difference = distance_to_b - distance_to_a  # not a - b"
             self.finding = Finding(
-                "tdoa_sign", ERROR, "the sign of all TDOAs is wrong", evidence, line, ratio
+                "tdoa_sign",
+                ERROR,
+                cause=WRONG_SIGN,
+                evidence=(
+                    f"the other way round {100.0 * (1.0 - ratio):.0f} % less stays unexplained, "
+                    f"{z:.0f} standard errors"
+                ),
+                remedy=RIGHT_SIGN,
+                value=ratio,
             )
             self._begin()
         elif t[-1] - t[0] > LONGEST:

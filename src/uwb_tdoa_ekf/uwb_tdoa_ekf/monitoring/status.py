@@ -181,55 +181,47 @@ class Use:
         return f"more than half of the TDOAs {reasons[reason]}"
 
 
-class VolumeCheck:
-    """Check positions against a FlyableVolume, if there is one."""
+def flyability(
+    volume: FlyableVolume | None, anchors: Anchors, position: np.ndarray, covariance: np.ndarray
+) -> tuple[str | None, dict[str, str]]:
+    """Return a sentence on a position that may not be flown, or None, and {key: text}.
 
-    def __init__(self, volume: FlyableVolume | None = None) -> None:
-        self._volume = volume
+    The efficiency is the bound's variance for one round of TDOAs divided by the filter's stated
+    variance. The filter also uses earlier rounds and the IMU. An efficiency of n means the precision
+    of n independent rounds.
 
-    def trouble_at(
-        self, anchors: Anchors, position: np.ndarray, covariance: np.ndarray
-    ) -> tuple[str | None, dict[str, str]]:
-        """Return a sentence on the position, or None, and {key: text} for /diagnostics.
-
-        The efficiency is the bound's variance for one round of TDOAs divided by the filter's stated
-        variance. The filter also uses earlier rounds and the IMU. An efficiency of n means the
-        precision of n independent rounds.
-
-        Parameters
-        ----------
-        anchors : Anchors
-            Present anchors.
-        position : (3,) array
-            Position in the world frame, in m.
-        covariance : (3, 3) array
-            Covariance of the position, in m^2.
-        """
-        if self._volume is None:
-            return None, {}
-        if not self._volume.belongs_to(anchors):
-            return "flyable_volume was made for other anchors: make it anew with plan", {
-                "flyable": "unknown"
-            }
-        flyable = bool(self._volume.contains(position))
-        bound, used = float(self._volume.bound_at(position)), 2 if self._volume.planar else 3
-        values = {"flyable": "yes" if flyable else "no"}
-        if np.isfinite(bound):
-            claimed = float(np.sqrt(np.trace(covariance[:used, :used])))
-            values |= {
-                "bound of one round": f"{bound:.3f} m",
-                "claimed by the filter": f"{claimed:.3f} m",
-            }
-            values |= {"efficiency": f"{(bound / max(claimed, 1e-9)) ** 2:.3g}"}
-        if flyable:
-            return None, values
-        return (
-            (
-                "the tag is outside of the flyable volume: its position may be wrong by metres; "
-                "fly it back"
-            ),
-            values,
-        )
+    Parameters
+    ----------
+    volume : FlyableVolume or None
+        Volume in which the tag may fly; without one there is nothing to say.
+    anchors : Anchors
+        Present anchors.
+    position : (3,) array
+        Position in the world frame, in m.
+    covariance : (3, 3) array
+        Covariance of the position, in m^2.
+    """
+    if volume is None:
+        return None, {}
+    if not volume.belongs_to(anchors):
+        trouble = "flyable_volume was made for other anchors: make it anew with plan"
+        return trouble, {"flyable": "unknown"}
+    flyable = bool(volume.contains(position))
+    bound, used = float(volume.bound_at(position)), 2 if volume.planar else 3
+    values = {"flyable": "yes" if flyable else "no"}
+    if np.isfinite(bound):
+        claimed = float(np.sqrt(np.trace(covariance[:used, :used])))
+        values |= {
+            "bound of one round": f"{bound:.3f} m",
+            "claimed by the filter": f"{claimed:.3f} m",
+            "efficiency": f"{(bound / max(claimed, 1e-9)) ** 2:.3g}",
+        }
+    if flyable:
+        return None, values
+    trouble = (
+        "the tag is outside of the flyable volume: its position may be wrong by metres; fly it back"
+    )
+    return trouble, values
 
 
 @dataclass(frozen=True)

@@ -1,39 +1,50 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Count both streams of a tag in windows and apply all rules to the windows."""
+"""Cut both streams of a tag into windows and apply all rules to the windows."""
 
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from . import inertial_rules, ranging_rules, ranging_windows, stamp_rules
-from .finding import ERROR, Finding, most_severe_first
+from . import inertial_rules, ranging_rules, stamp_rules
+from .finding import ERROR, Finding, explained_by, most_severe_first
 from .survey_scale import KEPT, SurveyScale
+from .windows import Cutter, imu_window, tdoa_window
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
     from uwb_tdoa_bias.common.anchors import Anchors
 
-    from .inertial_rules import ImuWindow
-    from .ranging_windows import TdoaWindow
+    from .windows import ImuWindow, TdoaWindow
 
 Window = TypeVar("Window", "ImuWindow", "TdoaWindow")
 
-LOOKS_LIKE = {"tdoa_large", "tdoa_outliers"}
+# Rules whose findings another finding explains: only that one is reported.
+EXPLAINS = {
+    "imu_silent": {"imu_no_gravity", "imu_force_unit", "imu_turned", "imu_tilted"},
+    "imu_no_gravity": {"imu_force_unit", "imu_turned", "imu_tilted"},
+    "tdoa_wraps": {"tdoa_large", "tdoa_outliers", "two_tags"},
+    "tdoa_rounded": {"tdoa_repeated", "tdoa_clipped"},
+    "tdoa_clipped": {"tdoa_repeated"},
+    "survey_scale": {"tdoa_large", "tdoa_outliers"},
+    "anchor_scale": {"tdoa_large", "tdoa_outliers"},
+    "tdoa_unit": {"tdoa_large", "tdoa_outliers"},
+}
 FULL = 20  # fewest messages of a window with reliable statistics
 
 
 class StreamRules:
     """Check the inertial samples and the TDOAs of one tag without a filter.
 
-    A window is one second of arrival, or of stamps if the arrival is unknown. Messages are counted
-    as they come, and the rules check windows.
+    The streams are cut into windows as they come, and the rules check windows.
     """
 
     def __init__(self, anchors: Anchors, kept: int | None = None) -> None:
-        """Create the counters.
+        """Start without messages.
 
         Parameters
         ----------
@@ -46,7 +57,7 @@ class StreamRules:
         self.imu: list[ImuWindow] = []
         self.tdoa: list[TdoaWindow] = []
         self.unknown: Counter[int] = Counter()  # ids that are not in the survey
-        self._imu, self._tdoa = inertial_rules.new_imu(), ranging_windows.new_tdoa(anchors)
+        self._imu, self._tdoa = Cutter(), Cutter()
         self._scale = SurveyScale(anchors, kept and KEPT)
 
     def feed_imu(
@@ -63,14 +74,9 @@ class StreamRules:
         force : (n, 3) array
             Specific force in the body frame, in m/s^2.
         """
-        t, arrival, gyro, force = (
-            np.ascontiguousarray(column, dtype=float) for column in (t, arrival, gyro, force)
-        )
-        row = 0
-        while row < len(t):
-            row, complete = inertial_rules.feed_imu(self._imu, t, arrival, gyro, force, row)
-            if complete:
-                self._close_imu()
+        columns = (np.asarray(column, dtype=float) for column in (t, arrival, gyro, force))
+        for window in self._imu.cut(*columns):
+            self._keep(self.imu, imu_window(*window))
 
     def feed_tdoa(
         self, t: np.ndarray, arrival: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray
@@ -90,18 +96,21 @@ class StreamRules:
         for ids, known in ((a, row_a), (b, row_b)):
             values, counts = np.unique(np.asarray(ids)[known < 0], return_counts=True)
             self.unknown.update(dict(zip(values.tolist(), counts.tolist())))
-        t, arrival, d = (np.ascontiguousarray(column, dtype=float) for column in (t, arrival, d))
-        row = 0
-        while row < len(t):
-            row, complete = ranging_windows.feed_tdoa(self._tdoa, t, arrival, row_a, row_b, d, row)
-            if complete:
-                self._close_tdoa()
+        t, arrival, d = (np.asarray(column, dtype=float) for column in (t, arrival, d))
+        for window in self._tdoa.cut(t, arrival, row_a, row_b, d):
+            self._add_tdoa(*window)
+
+    def _add_tdoa(self, columns: list[np.ndarray], own: int) -> None:
+        window = tdoa_window(columns, own, self.anchors.positions)
+        self._keep(self.tdoa, window)
+        self._scale.add(window.latest)
 
     def finish(self) -> None:
         """Close the windows at the end of a recording, unless they are almost empty."""
-        for counters, close in ((self._imu, self._close_imu), (self._tdoa, self._close_tdoa)):
-            if counters.stamps[stamp_rules.COUNT] >= FULL:
-                close()
+        if len(self._imu) >= FULL:
+            self._keep(self.imu, imu_window(*self._imu.rest()))
+        if len(self._tdoa) >= FULL:
+            self._add_tdoa(*self._tdoa.rest())
 
     def findings(self, latest: int = 0) -> list[Finding]:
         """Return the Findings that hold, the most severe first.
@@ -113,64 +122,41 @@ class StreamRules:
         """
         imu, tdoa = self.imu[-latest:], self.tdoa[-latest:]
         of_imu, of_tdoa = [window.stamps for window in imu], [window.stamps for window in tdoa]
-        found: list[Finding | None] = []
+        found = [*filter(None, [self._scale.finding])]
         if imu:
-            found += [rule("imu/data", of_imu) for rule in stamp_rules.OF_ONE] + [
-                rule(imu) for rule in inertial_rules.RULES
-            ]
+            found += _found(stamp_rules.OF_ONE, "imu/data", of_imu)
+            found += _found(inertial_rules.RULES, imu)
         if tdoa:
-            found += [rule("uwb/tdoa", of_tdoa) for rule in stamp_rules.OF_ONE] + [
-                rule(tdoa) for rule in ranging_rules.RULES
-            ]
+            found += _found(stamp_rules.OF_ONE, "uwb/tdoa", of_tdoa)
+            found += _found(ranging_rules.RULES, tdoa)
         if imu and tdoa:
-            found += [rule(of_imu, of_tdoa) for rule in stamp_rules.OF_BOTH]
-        if (
-            scale := self._scale.finding
-        ) is not None:  # a wrong scale also makes TDOAs impossible: report the cause only
-            found = [
-                scale,
-                *(
-                    finding
-                    for finding in found
-                    if finding is None or finding.rule not in LOOKS_LIKE
-                ),
-            ]
-        found.append(self._unknown(tdoa))
-        return most_severe_first(finding for finding in found if finding is not None)
+            found += _found(stamp_rules.OF_BOTH, of_imu, of_tdoa)
+        found += self._unknown(tdoa)
+        explained = explained_by(found, EXPLAINS)
+        return most_severe_first(one for one in found if one.rule not in explained)
 
-    def _unknown(self, windows: list[TdoaWindow]) -> Finding | None:
+    def _unknown(self, windows: list[TdoaWindow]) -> Iterator[Finding]:
         count = sum(window.unknown for window in windows)
-        if not count:
-            return None
-        share = count / sum(window.stamps.count for window in windows)
-        ids = ", ".join(map(str, sorted(self.unknown)))
-        evidence = (
-            f"{100.0 * share:.1f} % of the TDOAs are with {ids}; the survey has "
-            f"{', '.join(map(str, self.anchors.ids))}"
-        )
-        line = "".join(
-            f"  {number}: {{position: [x, y, z]}}\n" for number in sorted(self.unknown)
-        ).rstrip("\n")
-        return Finding(
-            "ids_unknown",
-            ERROR,
-            "the tag hears anchors that the survey does not have",
-            evidence,
-            line,
-            share,
-        )
-
-    def _close_imu(self) -> None:
-        self._keep(self.imu, inertial_rules.imu_window(self._imu))
-        inertial_rules.restart_imu(self._imu)
-
-    def _close_tdoa(self) -> None:
-        window = ranging_windows.tdoa_window(self._tdoa)
-        self._keep(self.tdoa, window)
-        self._scale.add(window.latest)
-        ranging_windows.restart_tdoa(self._tdoa)
+        if count:
+            share = count / sum(window.stamps.count for window in windows)
+            ids = sorted(self.unknown)
+            yield Finding(
+                "ids_unknown",
+                ERROR,
+                cause="the tag hears anchors that the survey does not have",
+                evidence=(
+                    f"{100.0 * share:.1f} % of the TDOAs are with {', '.join(map(str, ids))}; the "
+                    f"survey has {', '.join(map(str, self.anchors.ids))}"
+                ),
+                remedy="\n".join(f"  {number}: {{position: [x, y, z]}}" for number in ids),
+                value=share,
+            )
 
     def _keep(self, windows: list[Window], window: Window) -> None:
         windows.append(window)
         if self._kept is not None:
             del windows[: -self._kept]
+
+
+def _found(rules: Sequence[Callable[..., Iterator[Finding]]], *windows: Any) -> list[Finding]:
+    return [finding for rule in rules for finding in rule(*windows)]

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections import deque
 from itertools import combinations
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from uwb_tdoa_bias.common.compiled import compiled
 from uwb_tdoa_bias.common.radio import SPEED_OF_LIGHT
 from uwb_tdoa_bias.common.survey import UNITS
 
-from .explain import SCALE
+from .explain import SCALE, compare_losses, in_words
 from .finding import ERROR, Finding
 
 if TYPE_CHECKING:
@@ -55,6 +55,38 @@ NANOSECONDS = SPEED_OF_LIGHT / 1e9
 AS_IT_IS, SCALED, SIGN, EXCHANGED, ALONE = range(5)  # kinds of hypotheses
 
 
+class Hypothesis(NamedTuple):
+    """A mistake of the survey, or of the TDOAs.
+
+    Attributes
+    ----------
+    kind : int
+        AS_IT_IS, SCALED, SIGN, EXCHANGED or ALONE.
+    name : str
+        Unit that the factor stands for, or "".
+    factor : float
+        Factor by which all anchors, or one (ALONE), are too far from the origin.
+    rows : tuple of int
+        Row of that anchor, or of both (EXCHANGED).
+    """
+
+    kind: int
+    name: str = ""
+    factor: float = 1.0
+    rows: tuple[int, ...] = ()
+
+    def positions(self, surveyed: np.ndarray) -> np.ndarray:
+        """Return where the anchors are if the hypothesis is right, (N, 3) m.
+
+        EXCHANGED anchors have the factor 1, and the order of a single one is its own.
+        """
+        if not self.rows:
+            return surveyed / self.factor
+        moved, rows = surveyed.copy(), list(self.rows)
+        moved[rows] = surveyed[rows[::-1]] / self.factor
+        return moved
+
+
 class SurveyScale:
     """Store the loss of each hypothesis on the scale of Anchors, for each snapshot."""
 
@@ -69,7 +101,7 @@ class SurveyScale:
             Number of latest snapshots to keep; None keeps all.
         """
         self._anchors = anchors
-        self._names, self._factors, self._table = _hypotheses(len(anchors))
+        self._hypotheses = _hypotheses(len(anchors))
         self._losses: deque[np.ndarray] = deque(maxlen=kept)  # (h,) losses of each snapshot
         self._places: deque[np.ndarray] = deque(maxlen=kept)  # (h, 3) positions of the tag, in m
 
@@ -77,20 +109,15 @@ class SurveyScale:
         """Add TDOAs that were heard together, (k, 3): rows of both anchors, and value in m."""
         if len(np.unique(snapshot[:, :2])) < HEARD or not np.median(np.abs(snapshot[:, 2])) > SMALL:
             return
-        some = snapshot[
-            np.linspace(0, len(snapshot) - 1, min(PAIRS, len(snapshot))).round().astype(int)
-        ]
-        losses, places = np.empty(len(self._table)), np.empty((len(self._table), 3))
-        rows = np.ascontiguousarray(some[:, :2].astype(np.int64))
-        for k, hypothesis in enumerate(self._table):
-            losses[k] = locate(
-                self._anchors.positions,
-                hypothesis,
-                rows,
-                np.ascontiguousarray(some[:, 2]),
-                STARTS,
-                places[k],
-            )
+        count = min(PAIRS, len(snapshot))
+        some = snapshot[np.linspace(0, len(snapshot) - 1, count).round().astype(int)]
+        rows, d = some[:, :2].astype(np.int64), some[:, 2].copy()
+        losses = np.empty(len(self._hypotheses))
+        places = np.empty((len(self._hypotheses), 3))
+        for k, one in enumerate(self._hypotheses):
+            positions = one.positions(self._anchors.positions)
+            signed = -d if one.kind == SIGN else d
+            losses[k] = locate(positions, rows, signed, STARTS, places[k])
         self._losses.append(losses)
         self._places.append(places)
 
@@ -100,115 +127,88 @@ class SurveyScale:
         if len(self._losses) < FEWEST:
             return None
         losses = np.array(self._losses)
-        mean, kind = losses.mean(axis=0), self._table[:, 0]
-        chosen = np.flatnonzero((kind == SCALED) | (kind == ALONE))
-        best = int(chosen[np.argmin(mean[chosen])])
-        others = np.flatnonzero((kind == AS_IT_IS) | (kind == SIGN) | (kind == EXCHANGED))
-        rival = int(others[np.argmin(mean[others])])
-        left, z = _compared(losses[:, rival], losses[:, best])
+        mean = losses.mean(axis=0)
+        is_scale = np.array([one.kind in (SCALED, ALONE) for one in self._hypotheses])
+        best = int(np.argmin(np.where(is_scale, mean, np.inf)))
+        rival = int(np.argmin(np.where(is_scale, np.inf, mean)))
+        left, z = compare_losses(losses[:, rival], losses[:, best])
         if left > LEFT or z < DEVIATIONS or mean[best] > GOOD:
             return None
-        if left > CLEARLY and (
-            len(losses) < MANY
-            or _spread(np.array([places[best] for places in self._places])) < MOVED
-        ):
+        moved = _spread(np.array([places[best] for places in self._places]))
+        if left > CLEARLY and (len(losses) < MANY or moved < MOVED):
             return None
-        evidence = (
-            f"{100.0 * (1.0 - left):.0f} % less stays unexplained then, {z:.1f} standard errors, "
-            f"in {len(losses)} snapshots"
-        )
-        near = [
-            k
-            for k in chosen.tolist()
-            if self._names[k] and kind[k] == SCALED == kind[best] and self._near(k, best)
-        ]
-        named = min(near, key=lambda k: mean[k], default=best)
-        return self._found(named, self._factors[named], evidence)
-
-    def _near(self, one: int, other: int) -> bool:
-        """Return whether the data do not distinguish the scales of two hypotheses."""
-        return abs(math.log(self._factors[one] / self._factors[other])) < 0.7 * math.log(RATIO)
-
-    def _found(self, k: int, factor: float, evidence: str) -> Finding | None:
-        if self._table[k, 0] == ALONE:
-            number = int(self._anchors.ids[int(self._table[k, 3])])
-            line = (
-                f"{number}: {{position: [x, y, z]}}  # what is there now, divided by {factor:.6g}"
-            )
-            cause = f"the position of anchor {number} is in {self._names[k]}, not in metres"
-            return Finding("anchor_scale", ERROR, cause, evidence, line, factor)
-        if abs(math.log(factor / NANOSECONDS)) < math.log(RATIO):
-            line = f"message.distance_difference *= {NANOSECONDS}  # of nanoseconds; of feet 0.3048"
+        evidence = f"{in_words(left, z)}, in {len(losses)} snapshots"
+        found = self._hypotheses[best]
+        if found.kind == ALONE:
+            number = int(self._anchors.ids[found.rows[0]])
             return Finding(
-                "tdoa_unit",
+                "anchor_scale",
                 ERROR,
-                "TDOAs are in nanoseconds or in feet, not in metres",
-                evidence,
-                line,
-                NANOSECONDS,
+                cause=f"the position of anchor {number} is in {found.name}, not in metres",
+                evidence=evidence,
+                remedy=(
+                    f"{number}: {{position: [x, y, z]}}  # what is there now, divided by "
+                    f"{found.factor:.6g}"
+                ),
+                value=found.factor,
             )
-        line = f"x, y, z = x / {factor:.6g}, y / {factor:.6g}, z / {factor:.6g}  # of every anchor"
-        size = (
-            f"about {factor:.3g} times too large"
-            if factor > 1.0
-            else f"about {1.0 / factor:.3g} times too small"
+        # the data do not distinguish close scales: prefer that of a unit
+        close = [
+            k
+            for k, one in enumerate(self._hypotheses)
+            if one.kind == SCALED
+            and one.name
+            and abs(math.log(one.factor / found.factor)) < 0.7 * math.log(RATIO)
+        ]
+        named = self._hypotheses[min(close, key=lambda k: mean[k], default=best)]
+        return _of_scale(named.name, named.factor, evidence)
+
+
+def _of_scale(name: str, factor: float, evidence: str) -> Finding:
+    """Return the Finding on a survey that is too large by a factor, the unit `name` or ""."""
+    if abs(math.log(factor / NANOSECONDS)) < math.log(RATIO):
+        return Finding(
+            "tdoa_unit",
+            ERROR,
+            cause="TDOAs are in nanoseconds or in feet, not in metres",
+            evidence=evidence,
+            remedy=(
+                f"message.distance_difference *= {NANOSECONDS}  # of nanoseconds; of feet 0.3048"
+            ),
+            value=NANOSECONDS,
         )
-        cause = f"the survey is not in metres: its positions are {size}"
-        if self._names[k]:
-            cause = (
-                f"the survey is in {self._names[k]}, not in metres: its positions are "
-                f"{factor:,.5g} times too large"
-            )
-        return Finding("survey_scale", ERROR, cause, evidence, line, factor)
-
-
-def _hypotheses(count: int) -> tuple[list[str], list[float], np.ndarray]:
-    """Return the hypotheses for a number of anchors.
-
-    Returns
-    -------
-    names : list of str
-        Units that the factors stand for, or "".
-    factors : list of float
-        Factors by which the survey is too large: positions / factor are in m.
-    table : (h, 5) array
-        Kind; factor of all anchors, or of one (ALONE); sign of the TDOAs; rows of that anchor, or of
-        both (EXCHANGED), else 0.
-    """
-    hypotheses: list[tuple[str, float, tuple[float, ...]]] = [
-        ("", 1.0, (AS_IT_IS, 1.0, 1.0, 0, 0)),
-        ("", 1.0, (SIGN, 1.0, -1.0, 0, 0)),
-    ]
-    scales = SMALLEST * RATIO ** np.arange(
-        math.floor(math.log(LARGEST / SMALLEST) / math.log(RATIO)) + 1
+    cause, remedy = wrong_unit(name, factor)
+    if not name:
+        size = f"{factor:.3g} times too large"
+        if factor < 1.0:
+            size = f"{1.0 / factor:.3g} times too small"
+        cause = f"the survey is not in metres: its positions are about {size}"
+    return Finding(
+        "survey_scale", ERROR, cause=cause, evidence=evidence, remedy=remedy, value=factor
     )
-    hypotheses += [
-        ("", factor, (SCALED, factor, 1.0, 0, 0))
-        for factor in [*scales.tolist(), *(1.0 / scales).tolist()]
-    ]
-    hypotheses += [(name, factor, (SCALED, factor, 1.0, 0, 0)) for name, factor in UNITS.items()]
+
+
+def wrong_unit(name: str, factor: float) -> tuple[str, str]:
+    """Return (cause, remedy) of a survey in another unit, whose positions are too large."""
+    cause = (
+        f"the survey is in {name}, not in metres: its positions are {factor:,.5g} times too large"
+    )
+    line = f"x, y, z = x / {factor:.6g}, y / {factor:.6g}, z / {factor:.6g}  # of every anchor"
+    return cause, line
+
+
+def _hypotheses(count: int) -> list[Hypothesis]:
+    """Return the hypotheses for a number of anchors."""
+    count_of_scales = math.floor(math.log(LARGEST / SMALLEST) / math.log(RATIO)) + 1
+    scales = SMALLEST * RATIO ** np.arange(count_of_scales)
+    made = [Hypothesis(AS_IT_IS), Hypothesis(SIGN)]
+    made += [Hypothesis(SCALED, "", factor) for factor in np.append(scales, 1.0 / scales).tolist()]
+    made += [Hypothesis(SCALED, name, factor) for name, factor in UNITS.items()]
     if count <= SINGLE:
-        hypotheses += [
-            (name, factor, (ALONE, factor, 1.0, row, 0))
-            for row in range(count)
-            for name, factor in UNITS.items()
-        ]
-        hypotheses += [
-            ("", 1.0, (EXCHANGED, 1.0, 1.0, one, two)) for one, two in combinations(range(count), 2)
-        ]
-    names, factors, table = zip(*hypotheses)
-    return [*names], [*factors], np.array(table, dtype=float)
-
-
-def _compared(one: np.ndarray, other: np.ndarray) -> tuple[float, float]:
-    """Return (mean of `other` over mean of `one`, standard errors of the reduction).
-
-    Both are losses (n,) of the same snapshots.
-    """
-    error = float(np.std(one - other, ddof=1)) / math.sqrt(len(one))
-    return float(np.mean(other) / max(np.mean(one), 1e-9)), float(np.mean(one - other)) / max(
-        error, 1e-9
-    )
+        for row in range(count):
+            made += [Hypothesis(ALONE, name, factor, (row,)) for name, factor in UNITS.items()]
+        made += [Hypothesis(EXCHANGED, rows=rows) for rows in combinations(range(count), 2)]
+    return made
 
 
 def _spread(places: np.ndarray) -> float:
@@ -218,12 +218,7 @@ def _spread(places: np.ndarray) -> float:
 
 @compiled
 def locate(
-    positions: np.ndarray,
-    hypothesis: np.ndarray,
-    rows: np.ndarray,
-    d: np.ndarray,
-    starts: np.ndarray,
-    place: np.ndarray,
+    positions: np.ndarray, rows: np.ndarray, d: np.ndarray, starts: np.ndarray, place: np.ndarray
 ) -> float:
     """Return the mean Geman-McClure loss, 0 to 1, at the best position of the tag.
 
@@ -234,8 +229,6 @@ def locate(
     ----------
     positions : (N, 3) array
         Anchor positions, in m.
-    hypothesis : (5,) array
-        Row of the table of `_hypotheses`.
     rows : (k, 2) int array
         Rows of both anchors of each TDOA.
     d : (k,) array
@@ -249,27 +242,11 @@ def locate(
     ends, low, high = np.empty((n, 2, 3)), np.full(3, np.inf), np.full(3, -np.inf)
     for i in range(n):
         for side in range(2):
-            row, factor = rows[i, side], hypothesis[1]
-            if hypothesis[0] == EXCHANGED:
-                row = (
-                    int(hypothesis[4])
-                    if row == hypothesis[3]
-                    else int(hypothesis[3])
-                    if row == hypothesis[4]
-                    else row
-                )
-            elif hypothesis[0] == ALONE and row != hypothesis[3]:
-                factor = 1.0
             for j in range(3):
-                ends[i, side, j] = positions[row, j] / factor
+                ends[i, side, j] = positions[rows[i, side], j]
                 low[j], high[j] = min(low[j], ends[i, side, j]), max(high[j], ends[i, side, j])
-    size, least, p, g, system = (
-        math.sqrt(np.sum((high - low) ** 2)),
-        np.inf,
-        np.empty(3),
-        np.empty(3),
-        np.empty((3, 4)),
-    )
+    size = math.sqrt(np.sum((high - low) ** 2))
+    least, p, g, system = np.inf, np.empty(3), np.empty(3), np.empty((3, 4))
     for start in range(len(starts)):
         for j in range(3):
             p[j] = 0.5 * (low[j] + high[j]) + 0.5 * starts[start, j] * (high[j] - low[j])
@@ -277,7 +254,7 @@ def locate(
             scale, loss = max(0.3 * size * 0.5**step, SCALE) if step < STEPS else SCALE, 0.0
             system[:, :] = 0.0
             for i in range(n):
-                r = hypothesis[2] * d[i]
+                r = d[i]
                 for side in range(2):
                     length = 1e-18
                     for j in range(3):

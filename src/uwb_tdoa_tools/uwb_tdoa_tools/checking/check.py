@@ -5,12 +5,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.common.sensors import SENSORS, Ranges
-from uwb_tdoa_ekf.monitoring.finding import ERROR, NOTE, WARNING, Finding, most_severe_first
+from uwb_tdoa_ekf.monitoring.finding import (
+    ERROR,
+    NOTE,
+    WARNING,
+    Finding,
+    explained_by,
+    most_severe_first,
+)
 from uwb_tdoa_ekf.monitoring.stream_rules import StreamRules
 
 from ..estimate import FlightEstimator
@@ -21,9 +28,9 @@ from .tdoa_rules import SAME, largest_displacement
 from .watch import found_by_monitor, together
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
-    from uwb_tdoa_bias.common.anchors import Anchors
+    from uwb_tdoa_bias.common.flight import Flight
 
     from ..live.record import End
     from .ordered import SurveyFit
@@ -61,16 +68,6 @@ EXPLAINS = {
     "tdoa_one_sign": {"tdoa_one_sign"},
     "survey_scale": {"tdoa_large", "tdoa_outliers"},
 }
-
-
-class NamedAnchors(Protocol):
-    """A Recording or a Flight: an object with a name and Anchors."""
-
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def anchors(self) -> Anchors: ...
 
 
 @dataclass(frozen=True)
@@ -120,11 +117,10 @@ def check(
         Command line that surveys the anchors with the recording.
     """
     streams = processed_streams(recording)
-    found = [*streams.findings(), *sensor_findings(recording)]
+    found = streams.findings()
     for rule in recording_rules.RULES:
         found += rule(recording)
-    if any(finding.rule == "clock_silence" for finding in found):  # the gap of all streams
-        found = [finding for finding in found if finding.rule != "gap"]
+    found = _without(found, explained_by(found, {"clock_silence": {"gap"}}))
     if len(recording.tdoa):
         found = _with_trials(recording, streams, found, others, estimator, line)
     else:
@@ -162,12 +158,19 @@ def _with_trials(
 ) -> list[Finding]:
     """Return the findings of the streams, of trials, and about coverage, without those explained."""
     names = {finding.rule for finding in found}
-    places, explained, track = np.empty((0, 3)), set(), None
+    places, track = np.empty((0, 3)), None
+    explained: set[str] = set()
     if names & NOTHING_TO_TRY:
-        cause = "sign, ids, survey and axes were not tried"
-        evidence = "the streams are of no use for that"
-        remedy = "put the errors right, record again, and check again"
-        found.append(Finding("not_tried", NOTE, cause, evidence, remedy, np.nan))
+        found.append(
+            Finding(
+                "not_tried",
+                NOTE,
+                cause="sign, ids, survey and axes were not tried",
+                evidence="the streams are of no use for that",
+                remedy="put the errors right, record again, and check again",
+                value=np.nan,
+            )
+        )
     else:
         ordered = _without_stream_mistakes(OrderedRecording.of(recording), found)
         tried, places = _try_corrections(ordered, names, others)
@@ -176,16 +179,20 @@ def _with_trials(
         track = run.odometry.t, run.odometry.p
         events = found_by_monitor(flight, run, estimator)
         tried = together(ordered, tried, events, line)
-        explained = set().union(*(EXPLAINS.get(finding.rule, ()) for finding in tried))
-        found = [finding for finding in found if finding.rule not in explained] + tried
+        explained = explained_by(tried, EXPLAINS)
+        found = _without(found, explained) + tried
     if "survey_scale" in names:  # of a room of another size
         places = np.empty((0, 3))
     view = coverage.CoverageView(
         recording.anchors, list(streams.tdoa), places, "height" in recording.sensors, track
     )
     for rule in coverage.RULES:
-        found += (finding for finding in rule(view) if finding.rule not in explained)
+        found += _without(rule(view), explained)
     return found
+
+
+def _without(findings: Iterable[Finding], explained: set[str]) -> list[Finding]:
+    return [finding for finding in findings if finding.rule not in explained]
 
 
 def processed_streams(recording: Recording) -> StreamRules:
@@ -196,22 +203,6 @@ def processed_streams(recording: Recording) -> StreamRules:
     streams.feed_tdoa(tdoa.t, recording.tdoa_arrival, tdoa.a, tdoa.b, tdoa.d)
     streams.finish()
     return streams
-
-
-def sensor_findings(recording: Recording) -> Iterator[Finding]:
-    """Yield findings about the Streams of a Recording, by the rules of their SENSORS."""
-    for name, stream in recording.sensors.items():
-        for rule in SENSORS[name].rules:
-            found = rule(stream, recording.anchors)
-            if found is not None:
-                yield Finding(
-                    found.rule,
-                    ERROR if found.severe else WARNING,
-                    found.cause,
-                    found.evidence,
-                    found.remedy,
-                    found.value,
-                )
 
 
 def _without_stream_mistakes(ordered: OrderedRecording, found: list[Finding]) -> OrderedRecording:
@@ -282,11 +273,17 @@ def _other_room(mixed: Finding) -> Finding:
 
     Both are what the survey of another room looks like.
     """
-    cause = (
-        "the survey is of another room, or its ids are mixed up: with many ids exchanged it "
-        "nearly fits, and the inertial sensor does not"
+    return Finding(
+        "survey_misfit",
+        ERROR,
+        cause=(
+            "the survey is of another room, or its ids are mixed up: with many ids exchanged it "
+            "nearly fits, and the inertial sensor does not"
+        ),
+        evidence=mixed.evidence,
+        remedy=OTHER_SURVEY,
+        value=mixed.value,
     )
-    return Finding("survey_misfit", ERROR, cause, mixed.evidence, OTHER_SURVEY, mixed.value)
 
 
 def _misfit(fit: SurveyFit) -> Iterator[Finding]:
@@ -297,15 +294,20 @@ def _misfit(fit: SurveyFit) -> Iterator[Finding]:
             "with the anchors elsewhere each half of the recording fits better, and not the other "
             "half"
         )
-        cause = (
-            "the TDOAs fit the survey less well than usual, and this recording does not determine "
-            "why"
-        )
-        remedy = (
-            "record a minute in which the tag is carried through the whole room, and check again"
-        )
         yield Finding(
-            "misfit_unclear", NOTE, cause, evidence, remedy, tdoa_rules.apparent_gain(fit)
+            "misfit_unclear",
+            NOTE,
+            cause=(
+                "the TDOAs fit the survey less well than usual, and this recording does not "
+                "determine "
+                "why"
+            ),
+            evidence=evidence,
+            remedy=(
+                "record a minute in which the tag is carried through the whole room, and check "
+                "again"
+            ),
+            value=tdoa_rules.apparent_gain(fit),
         )
     if gain is not None:
         heard, (_, anchors) = fit.heard, fit.all_moved
@@ -316,8 +318,14 @@ def _misfit(fit: SurveyFit) -> Iterator[Finding]:
             f"by {np.median(displacement(fit.positions[heard], anchors[heard])):.1f} m in the "
             "median"
         )
-        cause = "the survey does not fit: of another room, or anchors have been moved"
-        yield Finding("survey_misfit", ERROR, cause, evidence, OTHER_SURVEY, gain)
+        yield Finding(
+            "survey_misfit",
+            ERROR,
+            cause="the survey does not fit: of another room, or anchors have been moved",
+            evidence=evidence,
+            remedy=OTHER_SURVEY,
+            value=gain,
+        )
 
 
 def _facts(recording: Recording, streams: StreamRules) -> dict[str, str]:
@@ -345,7 +353,7 @@ def _facts(recording: Recording, streams: StreamRules) -> dict[str, str]:
     return facts
 
 
-def different_surveys(recordings: Sequence[NamedAnchors]) -> Iterator[Finding]:
+def different_surveys(recordings: Sequence[Recording | Flight]) -> Iterator[Finding]:
     """Yield findings about Recordings with different surveys: an id at two places.
 
     Such flights do not belong together.
@@ -353,11 +361,12 @@ def different_surveys(recordings: Sequence[NamedAnchors]) -> Iterator[Finding]:
     for one, two in zip(recordings, recordings[1:]):
         off = largest_displacement(one.anchors, two.anchors)
         if off > SAME:
-            evidence = (
-                f"the same ids are up to {off:.2f} m apart"
-                if np.isfinite(off)
-                else "they have no id in common"
+            apart = f"the same ids are up to {off:.2f} m apart"
+            yield Finding(
+                "surveys_differ",
+                WARNING,
+                cause=f"{one.name} and {two.name} have different surveys",
+                evidence=apart if np.isfinite(off) else "they have no id in common",
+                remedy="diagnose, train and fit maps for each installation by itself",
+                value=off,
             )
-            cause = f"{one.name} and {two.name} have different surveys"
-            remedy = "diagnose, train and fit maps for each installation by itself"
-            yield Finding("surveys_differ", WARNING, cause, evidence, remedy, off)

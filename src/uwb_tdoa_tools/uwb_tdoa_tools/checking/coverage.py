@@ -23,7 +23,7 @@ from .pair_rules import MANY
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from uwb_tdoa_ekf.monitoring.ranging_windows import TdoaWindow
+    from uwb_tdoa_ekf.monitoring.windows import TdoaWindow
 
 
 CEILING = 1.5  # m; anchors whose mean height is larger hang at a ceiling
@@ -131,33 +131,29 @@ def unheard_anchors(view: CoverageView) -> Iterator[Finding]:
     lost = view.anchors.ids[(counts == 0) & (many | near.any(axis=0))].tolist()
     if many:
         if lost:
-            cause = (
-                f"the tag never hears {len(lost)} of {len(counts)} anchors, such as "
-                f"{', '.join(map(str, lost[:NAMED]))}"
-            )
-            remedy = (
-                "look whether they are on, if the tag was near them: localize --zones says who "
-                "was heard where"
-            )
             yield Finding(
                 "anchor_missing",
                 NOTE,
-                cause,
-                f"{len(lost)} of {len(counts)}",
-                remedy,
-                float(len(lost)),
+                cause=(
+                    f"the tag never hears {len(lost)} of {len(counts)} anchors, such as "
+                    f"{', '.join(map(str, lost[:NAMED]))}"
+                ),
+                evidence=f"{len(lost)} of {len(counts)}",
+                remedy=(
+                    "look whether they are on, if the tag was near them: localize --zones says who "
+                    "was heard where"
+                ),
+                value=float(len(lost)),
             )
         return
     if lost:
-        cause = f"anchors of the survey that the tag never hears: {', '.join(map(str, lost))}"
-        remedy = "switch them on, or take them out of the survey"
         yield Finding(
             "anchor_missing",
             WARNING,
-            cause,
-            f"{len(lost)} of {len(counts)}",
-            remedy,
-            float(len(lost)),
+            cause=f"anchors of the survey that the tag never hears: {', '.join(map(str, lost))}",
+            evidence=f"{len(lost)} of {len(counts)}",
+            remedy="switch them on, or take them out of the survey",
+            value=float(len(lost)),
         )
     rates = counts / np.maximum(near.sum(axis=0), 1)
     for row in np.flatnonzero((counts > 0) & near.any(axis=0)):
@@ -166,19 +162,22 @@ def unheard_anchors(view: CoverageView) -> Iterator[Finding]:
         remedy = f"look at anchor {number}: power, line of sight"
         since, until = _silence(view.windows, (heard[:, row] > 0) | ~near[:, row])
         if until - since > SILENT:
-            evidence = f"{until - since:.0f} s from {since:.1f} s on"
             yield Finding(
                 "anchor_silent",
                 WARNING,
-                f"anchor {number} falls silent",
-                evidence,
-                remedy,
-                until - since,
+                cause=f"anchor {number} falls silent",
+                evidence=f"{until - since:.0f} s from {since:.1f} s on",
+                remedy=remedy,
+                value=until - since,
             )
         elif share < RARE:
-            evidence = f"{100.0 * share:.0f} % of what is heard of the one in the middle"
             yield Finding(
-                "anchor_rare", NOTE, f"anchor {number} is hardly heard", evidence, remedy, share
+                "anchor_rare",
+                NOTE,
+                cause=f"anchor {number} is hardly heard",
+                evidence=f"{100.0 * share:.0f} % of what is heard of the one in the middle",
+                remedy=remedy,
+                value=share,
             )
 
 
@@ -208,13 +207,18 @@ def flat_anchors(view: CoverageView) -> Iterator[Finding]:
     found = [(size, thickness) for size, thickness in sizes if thickness < FLAT_SHARE * size]
     if len(found) > PART * len(sizes):
         size, thickness = np.median(found, axis=0)
-        evidence = f"they are within {thickness:.2f} m (rms) of a plane and {size:.1f} m across"
-        remedy = (
-            "put half of the anchors low, and half of them high; plan --improve move says which "
-            "where"
+        yield Finding(
+            "anchors_flat",
+            WARNING,
+            cause="the anchors lie in a plane: the direction across it is hardly told",
+            evidence=f"they are within {thickness:.2f} m (rms) of a plane and {size:.1f} m across",
+            remedy=(
+                "put half of the anchors low, and half of them high; plan --improve move says "
+                "which "
+                "where"
+            ),
+            value=float(thickness),
         )
-        cause = "the anchors lie in a plane: the direction across it is hardly told"
-        yield Finding("anchors_flat", WARNING, cause, evidence, remedy, float(thickness))
 
 
 def _size_and_thickness(positions: np.ndarray) -> tuple[float, float]:
@@ -239,18 +243,17 @@ def unknown_side(view: CoverageView) -> Iterator[Finding]:
     most = max(sorted(set(needed)), key=needed.count)
     if view.height_known and most[0] in ("below", "above"):
         return
-    evidence = (
-        f"in {100.0 * len(needed) / len(sides):.0f} % of the seconds those that are heard have "
-        f"one {'height' if len(most) == 1 else most[0][1:]}"
-    )
     remedy = to_copy(most)
     yield Finding(
         "side_unknown",
         WARNING,
-        "TDOAs do not tell on which side of its anchors the tag is",
-        evidence,
-        remedy,
-        len(needed) / len(sides),
+        cause="TDOAs do not tell on which side of its anchors the tag is",
+        evidence=(
+            f"in {100.0 * len(needed) / len(sides):.0f} % of the seconds those that are heard have "
+            f"one {'height' if len(most) == 1 else most[0][1:]}"
+        ),
+        remedy=remedy,
+        value=len(needed) / len(sides),
     )
 
 
@@ -258,14 +261,13 @@ def survey_below_zero(view: CoverageView) -> Iterator[Finding]:
     """Yield a finding if all anchors are below zero: z points down."""
     z = view.anchors.positions[:, 2]
     if z.max() <= 0.05 and np.ptp(z) > 0.5:
-        evidence = f"heights from {z.min():.2f} to {z.max():.2f} m"
         yield Finding(
             "survey_z_down",
             WARNING,
-            "all anchors are below zero: z seems to point down in the survey",
-            evidence,
-            "x, y, z = y, x, -z  # of every anchor",
-            float(z.max()),
+            cause="all anchors are below zero: z seems to point down in the survey",
+            evidence=f"heights from {z.min():.2f} to {z.max():.2f} m",
+            remedy="x, y, z = y, x, -z  # of every anchor",
+            value=float(z.max()),
         )
 
 
@@ -277,16 +279,15 @@ def tag_outside(view: CoverageView) -> Iterator[Finding]:
     low, high = p.min(axis=0) - MARGIN, p.max(axis=0) + MARGIN
     share = float(np.mean(((view.places < low) | (view.places > high)).any(axis=1)))
     if share > OUTSIDE:
-        evidence = (
-            f"{100.0 * share:.0f} % of the places are more than {MARGIN} m beyond the anchors"
-        )
         yield Finding(
             "outside",
             WARNING,
-            "the tag is outside of its anchors, where it is hardly located",
-            evidence,
-            "look where a tag can be located: plan --volume draws it",
-            share,
+            cause="the tag is outside of its anchors, where it is hardly located",
+            evidence=(
+                f"{100.0 * share:.0f} % of the places are more than {MARGIN} m beyond the anchors"
+            ),
+            remedy="look where a tag can be located: plan --volume draws it",
+            value=share,
         )
 
 
@@ -297,18 +298,17 @@ def little_motion(view: CoverageView) -> Iterator[Finding]:
     moved = spread(view.places)
     duration = view.windows[-1].stamps.end - view.windows[0].stamps.begin
     if duration < SHORT or moved < SPREAD:
-        evidence = f"{duration:.0f} s, {moved:.2f} m (rms) off a straight line"
-        remedy = (
-            "record a minute in which the tag is carried through the whole room, turned, lifted "
-            "and lowered"
-        )
         yield Finding(
             "little_motion",
             NOTE,
-            "sign, ids, survey and axes can hardly be told from this recording",
-            evidence,
-            remedy,
-            moved,
+            cause="sign, ids, survey and axes can hardly be told from this recording",
+            evidence=f"{duration:.0f} s, {moved:.2f} m (rms) off a straight line",
+            remedy=(
+                "record a minute in which the tag is carried through the whole room, turned, "
+                "lifted "
+                "and lowered"
+            ),
+            value=moved,
         )
 
 

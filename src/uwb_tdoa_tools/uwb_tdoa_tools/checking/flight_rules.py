@@ -41,17 +41,13 @@ def judge_against_truth(flight: Flight) -> list[Finding]:
 def _of_tdoas(path: KnownPath) -> list[Finding]:
     """Return findings about ids, then other values, then stamps if ids and values are right."""
     repairs = repairs_of(path)
-    found = (
-        list(pair_rules.exchanged_ids(path))
-        if any(effect.name == AnchorIds.name for effect in repairs)
-        else []
-    )
+    found: list[Finding] = []
+    if any(effect.name == AnchorIds.name for effect in repairs):
+        found += pair_rules.exchanged_ids(path)
     found += pair_rules.wrong_values(path.without(repairs[0]) if found else path)
-    return (
-        found
-        if any(finding.rule.startswith(("ids", "tdoa")) for finding in found)
-        else [*found, *time_rules.wrong_stamps(path)]
-    )
+    if not any(finding.rule.startswith(("ids", "tdoa")) for finding in found):
+        found += time_rules.wrong_stamps(path)
+    return found
 
 
 def _of_imu(flight: Flight) -> list[Finding]:
@@ -77,30 +73,28 @@ def judge_truth(flight: Flight) -> Iterator[Finding]:
     dt = np.diff(t)
     k = int(np.argmax(dt))
     if dt[k] > HOLE:
-        evidence = f"{dt[k]:.1f} s without a pose from {t[k] - flight.tdoa.t[0]:.1f} s on"
         yield Finding(
             "truth_hole",
             WARNING,
-            "the ground truth has a hole",
-            evidence,
-            "judge on what lies before or after",
-            float(dt[k]),
+            cause="the ground truth has a hole",
+            evidence=f"{dt[k]:.1f} s without a pose from {t[k] - flight.tdoa.t[0]:.1f} s on",
+            remedy="judge on what lies before or after",
+            value=float(dt[k]),
         )
     step = np.linalg.norm(np.diff(p, axis=0), axis=1)
     speed = np.where(step > LEAST_LEAP, step / np.maximum(dt, 1e-3), 0.0)
     if (speed > LEAP).any():
         k = int(np.argmax(speed))
-        evidence = (
-            f"{np.linalg.norm(p[k + 1] - p[k]):.2f} m in {dt[k]:.3f} s at "
-            f"{t[k] - flight.tdoa.t[0]:.1f} s"
-        )
         yield Finding(
             "truth_leap",
             WARNING,
-            "the ground truth leaps",
-            evidence,
-            "look for exchanged or hidden markers",
-            float(speed[k]),
+            cause="the ground truth leaps",
+            evidence=(
+                f"{np.linalg.norm(p[k + 1] - p[k]):.2f} m in {dt[k]:.3f} s at "
+                f"{t[k] - flight.tdoa.t[0]:.1f} s"
+            ),
+            remedy="look for exchanged or hidden markers",
+            value=float(speed[k]),
         )
 
 

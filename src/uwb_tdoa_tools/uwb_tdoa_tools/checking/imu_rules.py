@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import permutations, product
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -19,19 +19,16 @@ from uwb_tdoa_bias.common.flight import Imu
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.measurements import imu_rows
 from uwb_tdoa_ekf.core.memory import TDOA, structured
-from uwb_tdoa_ekf.monitoring.explain import Unexplained, compare, unexplained
+from uwb_tdoa_ekf.monitoring.explain import Unexplained, compare, in_words, unexplained
 from uwb_tdoa_ekf.monitoring.finding import ERROR, WARNING, Finding
 from uwb_tdoa_ekf.monitoring.inertial_rules import AXES
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator
 
     from uwb_tdoa_bias.common.flight import Flight
 
     from .ordered import OrderedRecording
-
-    # ratio of the losses, its standard errors; (3, 3) for the accelerometer, for the gyroscope
-    Arrangement = tuple[float, float, np.ndarray, np.ndarray]
 
 
 # Clipped: at least HITS samples have the extreme value, more than MORE times the mean count of the
@@ -51,13 +48,17 @@ def clipped_axes(flight: Flight) -> Iterator[Finding]:
         unit = "rad/s" if name.startswith("gyro") else "m/s^2"
         for ends, hits in ((values, counts), (values[::-1], counts[::-1])):
             if len(ends) > NEXT and hits[0] >= HITS and hits[0] > MORE * hits[1 : 1 + NEXT].mean():
-                evidence = (
-                    f"{hits[0]} samples of {ends[0]:.2f} {unit}, {hits[1 : 1 + NEXT].mean():.0f} of each "
-                    "of the next values"
-                )
-                remedy = "set the sensor to a larger range"
                 yield Finding(
-                    "imu_clipped", WARNING, f"{name} is clipped", evidence, remedy, float(ends[0])
+                    "imu_clipped",
+                    WARNING,
+                    cause=f"{name} is clipped",
+                    evidence=(
+                        f"{hits[0]} samples of {ends[0]:.2f} {unit}, "
+                        f"{hits[1 : 1 + NEXT].mean():.0f} of each "
+                        "of the next values"
+                    ),
+                    remedy="set the sensor to a larger range",
+                    value=float(ends[0]),
                 )
                 return
 
@@ -111,6 +112,34 @@ SCALES = {
 }
 
 
+# The most frequent mistakes: matrices of the accelerometer and of the gyroscope that undo each.
+USUAL = [
+    *((UPRIGHT, np.diag(signs)) for signs in list(product((1.0, -1.0), repeat=3))[1:]),
+    (UPRIGHT, UPRIGHT[[1, 0, 2]]),
+    (MIRROR, UPRIGHT),
+    (MIRROR, MIRROR),
+    (MIRROR, -MIRROR),
+    *((UPRIGHT, scale * UPRIGHT) for scale in SCALES),
+]
+
+
+class Arrangement(NamedTuple):
+    """A trial of axes and units of the inertial sensor.
+
+    Attributes
+    ----------
+    ratio, z : float
+        Ratio of the losses, and its number of standard errors.
+    accel, gyro : (3, 3) array
+        Matrices that are applied to the specific force and to the rates.
+    """
+
+    ratio: float
+    z: float
+    accel: np.ndarray
+    gyro: np.ndarray
+
+
 def find_imu_mistake(recording: OrderedRecording) -> Finding | None:
     """Return the Finding about axes or units of the IMU that do not fit the TDOAs, or None.
 
@@ -125,25 +154,24 @@ def find_imu_mistake(recording: OrderedRecording) -> Finding | None:
     ):
         return None
     base = _unexplained(brief)
-    trials = [_tried(base, brief, accel, gyro) for accel, gyro in _usual()]
-    least = min(ratio for ratio, _, _, _ in trials)
-    if not least < RATIO:
+    trials = [_tried(base, brief, accel, gyro) for accel, gyro in USUAL]
+    best = min(trials, key=_ratio)
+    if not best.ratio < RATIO:
         return None
-    upside_down = _upside_down(base, brief, least)
+    upside_down = _upside_down(base, brief, best.ratio)
     if upside_down is not None:
         return upside_down
-    scale = _scaled(trials)
-    if scale is None:
+    if abs(scale_of(best.gyro) - 1.0) < 0.03:  # no other unit
         trials += _all(brief, base)
-    least = min(ratio for ratio, _, _, _ in trials)
-    near = [trial for trial in trials if trial[0] < least + TIE and trial[1] > DEVIATIONS]
-    if not near or not least < RATIO:
+    least = min(trials, key=_ratio).ratio
+    near = [trial for trial in trials if trial.ratio < least + TIE and trial.z > DEVIATIONS]
+    if not near:
         return None
-    ratio, z, accel, gyro = min(near, key=lambda trial: _complexity(trial[2], trial[3]))
-    evidence = f"{100.0 * (1.0 - ratio):.0f} % less stays unexplained then, {z:.1f} standard errors"
+    found = min(near, key=lambda trial: _complexity(trial.accel, trial.gyro))
+    evidence = in_words(found.ratio, found.z)
     if len(near) > 1:
         evidence += f"; {len(near) - 1} other arrangements fit about as well"
-    return _finding(accel, gyro, evidence, ratio)
+    return _finding(found, evidence)
 
 
 def _upside_down(base: Unexplained, recording: OrderedRecording, least: float) -> Finding | None:
@@ -158,10 +186,16 @@ def _upside_down(base: Unexplained, recording: OrderedRecording, least: float) -
     ratio, z = compare(base, _unexplained(replace(recording, anchors=turned), RATIO * base.mean))
     if not (ratio < min(RATIO, least + NEARLY) and z > DEVIATIONS):
         return None
-    evidence = f"{100.0 * (1.0 - ratio):.0f} % less stays unexplained then, {z:.1f} standard errors"
-    cause = "the survey is upside down: z points down, and the inertial sensor measures where up is"
-    line = "x, y, z = y, x, -z  # of every anchor; in a profile: world: ned"
-    return Finding("survey_upside_down", ERROR, cause, evidence, line, ratio)
+    return Finding(
+        "survey_upside_down",
+        ERROR,
+        cause=(
+            "the survey is upside down: z points down, and the inertial sensor measures where up is"
+        ),
+        evidence=in_words(ratio, z),
+        remedy="x, y, z = y, x, -z  # of every anchor; in a profile: world: ned",
+        value=ratio,
+    )
 
 
 def has_moved(places: np.ndarray) -> bool:
@@ -197,26 +231,6 @@ def averaged(imu: Imu | None) -> Imu | None:
     return Imu(*map(np.ascontiguousarray, columns))
 
 
-def _usual() -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield the most frequent mistakes as (3, 3) matrices that undo them: accelerometer, gyroscope."""
-    for signs in product((1.0, -1.0), repeat=3):
-        if signs != (1.0, 1.0, 1.0):
-            yield UPRIGHT, np.diag(signs)
-    exchanged = UPRIGHT[[1, 0, 2]]
-    yield UPRIGHT, exchanged
-    yield MIRROR, UPRIGHT
-    yield MIRROR, MIRROR
-    yield MIRROR, -MIRROR
-    for scale in SCALES:
-        yield UPRIGHT, scale * UPRIGHT
-
-
-def _scaled(trials: Sequence[Arrangement]) -> np.ndarray | None:
-    """Return the matrix of the gyroscope of the best trial if that is another unit, else None."""
-    gyro = min(trials, key=lambda trial: trial[0])[3]
-    return gyro if abs(abs(np.linalg.det(gyro)) - 1.0) > 0.1 else None
-
-
 def _all(recording: OrderedRecording, base: Unexplained) -> list[Arrangement]:
     """Return trials of all arrangements of the gyroscope, and of their mirror images.
 
@@ -224,31 +238,33 @@ def _all(recording: OrderedRecording, base: Unexplained) -> list[Arrangement]:
     """
     short = recording.part(BRIEF)
     of_short = _unexplained(short)
-    ratios: list[float] = []
-    arrangements = list(product((UPRIGHT, MIRROR), ARRANGEMENTS))
-    for accel, gyro in arrangements:
-        chosen = sorted(ratios)[CHOSEN - 1] if len(ratios) >= CHOSEN else np.inf  # of those so far
-        ratio, _ = compare(
-            of_short, _unexplained(_arranged(short, accel, gyro), chosen * of_short.mean)
-        )
-        ratios.append(ratio if np.isfinite(ratio) else np.inf)
-    return [
-        _tried(base, recording, *arrangements[k])
-        for k in np.argsort(ratios, kind="stable")[:CHOSEN]
-    ]
+    tried: list[Arrangement] = []
+    for accel, gyro in product((UPRIGHT, MIRROR), ARRANGEMENTS):
+        best = sorted(map(_ratio, tried))[:CHOSEN]  # of those so far
+        limit = best[-1] if len(best) == CHOSEN else np.inf
+        tried.append(_tried(of_short, short, accel, gyro, limit))
+    chosen = sorted(tried, key=_ratio)[:CHOSEN]
+    return [_tried(base, recording, one.accel, one.gyro) for one in chosen]
 
 
 def _tried(
-    base: Unexplained, recording: OrderedRecording, accel: np.ndarray, gyro: np.ndarray
+    base: Unexplained,
+    recording: OrderedRecording,
+    accel: np.ndarray,
+    gyro: np.ndarray,
+    limit: float = RATIO + TIE,
 ) -> Arrangement:
     """Return the loss of an arrangement in comparison with `base`.
 
-    The ratio is infinite if the loss is too large for the arrangement to be taken, or to tie.
+    The ratio is infinite if it exceeds the limit: by default, if the loss is too large for the
+    arrangement to be taken, or to tie.
     """
-    ratio, z = compare(
-        base, _unexplained(_arranged(recording, accel, gyro), (RATIO + TIE) * base.mean)
-    )
-    return ratio if np.isfinite(ratio) else np.inf, z, accel, gyro
+    ratio, z = compare(base, _unexplained(_arranged(recording, accel, gyro), limit * base.mean))
+    return Arrangement(ratio if np.isfinite(ratio) else np.inf, z, accel, gyro)
+
+
+def _ratio(trial: Arrangement) -> float:
+    return trial.ratio
 
 
 def _arranged(recording: OrderedRecording, accel: np.ndarray, gyro: np.ndarray) -> OrderedRecording:
@@ -281,24 +297,38 @@ def _complexity(accel: np.ndarray, gyro: np.ndarray) -> float:
     return wrong_signs + moved + 1.0 * np.array_equal(accel, MIRROR)
 
 
-def _finding(accel: np.ndarray, gyro: np.ndarray, evidence: str, ratio: float) -> Finding:
+def _finding(found: Arrangement, evidence: str) -> Finding:
+    ratio, _, accel, gyro = found
     scale = scale_of(gyro)
     unit = next((name for value, name in SCALES.items() if abs(value / scale - 1.0) < 1e-6), None)
     if unit:
-        line = (
-            f"for axis in 'xyz': setattr(w, axis, {scale:.6g} * getattr(w, axis))  # w = "
-            "message.angular_velocity"
+        return Finding(
+            "imu_rate_unit",
+            ERROR,
+            cause=f"the gyroscope is in {unit}",
+            evidence=evidence,
+            remedy=(
+                f"for axis in 'xyz': setattr(w, axis, {scale:.6g} * getattr(w, axis))  # w = "
+                "message.angular_velocity"
+            ),
+            value=scale,
         )
-        return Finding("imu_rate_unit", ERROR, f"the gyroscope is in {unit}", evidence, line, scale)
     if np.array_equal(accel, MIRROR) and np.array_equal(gyro, -MIRROR):
-        cause = (
-            "the survey is the mirror image of the room: an axis has the wrong sign, e.g. z down, "
-            "or two are exchanged"
+        return Finding(
+            "survey_mirrored",
+            ERROR,
+            cause=(
+                "the survey is the mirror image of the room: an axis has the wrong sign, e.g. z "
+                "down, "
+                "or two are exchanged"
+            ),
+            evidence=evidence,
+            remedy=(
+                "x, y, z = y, x, z  # of every anchor; or the axis with the wrong sign turned: z = "
+                "-z"
+            ),
+            value=ratio,
         )
-        line = (
-            "x, y, z = y, x, z  # of every anchor; or the axis with the wrong sign turned: z = -z"
-        )
-        return Finding("survey_mirrored", ERROR, cause, evidence, line, ratio)
     parts = []
     for name, variable, matrix in (("accelerometer", "a", accel), ("gyroscope", "w", gyro)):
         if not np.array_equal(matrix, UPRIGHT):
@@ -308,8 +338,16 @@ def _finding(accel: np.ndarray, gyro: np.ndarray, evidence: str, ratio: float) -
         f"{v}.x, {v}.y, {v}.z = {', '.join(signed_axis(row, f'{v}.') for row in matrix)}"
         for _, v, matrix in parts
     )
-    cause = f"axes or signs of the {who} are wrong: x forward, y left, z up is needed, right-handed"
-    return Finding("imu_axes", ERROR, cause, evidence, line, ratio)
+    return Finding(
+        "imu_axes",
+        ERROR,
+        cause=(
+            f"axes or signs of the {who} are wrong: x forward, y left, z up is needed, right-handed"
+        ),
+        evidence=evidence,
+        remedy=line,
+        value=ratio,
+    )
 
 
 def scale_of(matrix: np.ndarray) -> float:

@@ -202,20 +202,20 @@ def wrong_axes(motion: TrueMotion) -> Iterator[Finding]:
             "turns then, "
         )
         evidence += f"{100 * (1 - powers['accel'] / base['accel']):.0f} % less of the accelerations"
-        cause = f"the attitude of the ground truth is {attitude}"
         yield Finding(
             "truth_attitude",
             ERROR,
-            cause,
-            evidence,
-            "write body to world, right-handed, x y z w",
-            powers["gyro"],
+            cause=f"the attitude of the ground truth is {attitude}",
+            evidence=evidence,
+            remedy="write body to world, right-handed, x y z w",
+            value=powers["gyro"],
         )
         return
     for sensor in wrong:
         remaining, correction = best[sensor]
         evidence = (
-            f"{100 * (1 - remaining / base[sensor]):.0f} % less mean square difference to the ground "
+            f"{100 * (1 - remaining / base[sensor]):.0f} % less mean square difference to the "
+            "ground "
             "truth"
         )
         yield _of_axes(sensor, correction, evidence, remaining)
@@ -252,29 +252,34 @@ def _with_attitude(motion: TrueMotion, name: str) -> dict[str, float]:
 def _of_axes(sensor: str, change: np.ndarray, evidence: str, power: float) -> Finding:
     scale = scale_of(change)
     if abs(scale - 1.0) > 0.1:
-        cause = (
-            f"the gyroscope is in another unit than rad/s: it reads {1.0 / scale:.3g} times the "
-            "turns of the ground truth"
-        )
         return Finding(
-            "imu_rate_unit", ERROR, cause, evidence, f"angular_velocity *= {scale:.6g}", scale
+            "imu_rate_unit",
+            ERROR,
+            cause=(
+                f"the gyroscope is in another unit than rad/s: it reads {1.0 / scale:.3g} times "
+                "the "
+                "turns of the ground truth"
+            ),
+            evidence=evidence,
+            remedy=f"angular_velocity *= {scale:.6g}",
+            value=scale,
         )
     words = [
         f"{axis} is {found}"
         for axis, found in zip("xyz", map(signed_axis, change))
         if found != axis
     ]
-    cause = (
-        f"axes of the {SENSORS[sensor]} are exchanged or mirrored: {', '.join(words)} of what it "
-        "reads"
-    )
     return Finding(
         f"{sensor}_axes",
         ERROR,
-        cause,
-        evidence,
-        "put the driver right: x forward, y left, z up",
-        power,
+        cause=(
+            f"axes of the {SENSORS[sensor]} are exchanged or mirrored: {', '.join(words)} of what "
+            "it "
+            "reads"
+        ),
+        evidence=evidence,
+        remedy="put the driver right: x forward, y left, z up",
+        value=power,
     )
 
 
@@ -296,22 +301,21 @@ def low_passes(motion: TrueMotion) -> Iterator[Finding]:
         power, backwards, slowness = min(powers)
         backwards = min(backwards, motion.power(sensor, true))
         if power < limit * backwards:
-            cause = (
-                f"the {SENSORS[sensor]} is filtered: what it reads is {slowness:g} s late and too "
-                "small"
-            )
             less = (
                 f"{100 * (1 - power / backwards):.0f} % less mean square difference to the ground "
                 "truth"
             )
-            evidence = f"{less} behind a low pass of {slowness:g} s"
             yield Finding(
                 "imu_filtered",
                 ERROR,
-                cause,
-                evidence,
-                "set the low pass of the sensor to 20 Hz or more",
-                slowness,
+                cause=(
+                    f"the {SENSORS[sensor]} is filtered: what it reads is {slowness:g} s late and "
+                    "too "
+                    "small"
+                ),
+                evidence=f"{less} behind a low pass of {slowness:g} s",
+                remedy="set the low pass of the sensor to 20 Hz or more",
+                value=slowness,
             )
 
 

@@ -25,7 +25,7 @@ from uwb_tdoa_ekf.core.memory import TDOA, new_state, structured
 from uwb_tdoa_ekf.core.ranges import APART
 from uwb_tdoa_ekf.core.startup import locate, room_for
 from uwb_tdoa_ekf.monitoring.explain import SCALE, unexplained
-from uwb_tdoa_ekf.monitoring.ranging_windows import BEYOND
+from uwb_tdoa_ekf.monitoring.windows import BEYOND
 from uwb_tdoa_ekf.results import rows_of
 
 if TYPE_CHECKING:

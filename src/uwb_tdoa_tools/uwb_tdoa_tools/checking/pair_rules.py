@@ -120,24 +120,23 @@ def wrong_values(path: KnownPath) -> Iterator[Finding]:
     for name, of_pairs in found.items():
         if len(of_pairs) >= MOST * len(path.pairs):
             _, (what, evidence, remedy, value) = next(iter(of_pairs.items()))
-            evidence = f"{len(of_pairs)} of {len(path.pairs)} pairs; of the first: {evidence}"
             yield Finding(
                 f"tdoa_{name}",
                 ERROR,
-                f"the TDOAs of all pairs are wrong: each {what}",
-                evidence,
-                remedy,
-                value,
+                cause=f"the TDOAs of all pairs are wrong: each {what}",
+                evidence=f"{len(of_pairs)} of {len(path.pairs)} pairs; of the first: {evidence}",
+                remedy=remedy,
+                value=value,
             )
             continue
         for pair, (what, evidence, remedy, value) in of_pairs.items():
             yield Finding(
                 f"pair_{name}",
                 ERROR,
-                f"the TDOA of the pair ({pair[0]}, {pair[1]}) {what}",
-                evidence,
-                remedy,
-                value,
+                cause=f"the TDOA of the pair ({pair[0]}, {pair[1]}) {what}",
+                evidence=evidence,
+                remedy=remedy,
+                value=value,
             )
 
 
@@ -264,18 +263,17 @@ def exchanged_ids(path: KnownPath) -> Iterator[Finding]:
     table, before, after = find_exchanges(path)
     if table:
         names = ", ".join(f"{wrong} is {right}" for wrong, right in table.items())
-        evidence = f"median error of their TDOAs {before:.2f} m, exchanged {after:.2f} m"
-        line = (
-            f"id = {{{', '.join(f'{wrong}: {right}' for wrong, right in table.items())}}}.get(id, "
-            "id)"
-        )
         yield Finding(
             "ids_exchanged",
             ERROR,
-            f"the ids of anchors are exchanged: what is called {names}",
-            evidence,
-            line,
-            after,
+            cause=f"the ids of anchors are exchanged: what is called {names}",
+            evidence=f"median error of their TDOAs {before:.2f} m, exchanged {after:.2f} m",
+            remedy=(
+                "id = "
+                f"{{{', '.join(f'{wrong}: {right}' for wrong, right in table.items())}}}.get(id, "
+                "id)"
+            ),
+            value=after,
         )
 
 
@@ -345,11 +343,9 @@ def repairs(flight: Flight) -> tuple[LabelEffect, ...]:
 
     () without ground truth or TDOAs.
     """
-    return (
-        ()
-        if flight.truth is None or len(flight.truth) < 2 or not len(flight.tdoa)
-        else repairs_of(KnownPath(flight))
-    )
+    if flight.truth is None or len(flight.truth) < 2 or not len(flight.tdoa):
+        return ()
+    return repairs_of(KnownPath(flight))
 
 
 def repairs_of(path: KnownPath) -> tuple[LabelEffect, ...]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.common.sensors import Ranges
+from uwb_tdoa_bias.common.sensors import SENSORS, Ranges
 from uwb_tdoa_ekf.monitoring.finding import ERROR, NOTE, WARNING, Finding
 
 from ..bags.frames import is_body
@@ -35,6 +35,22 @@ WHEELS = "velocity/odometry"
 TURNED, SHIFTED = np.deg2rad(2.0), 0.02  # rad and m that a frame may be off the body frame
 
 
+def sensor_mistakes(recording: Recording) -> Iterator[Finding]:
+    """Yield findings about the Streams of the SENSORS, by their own rules."""
+    for name, stream in recording.sensors.items():
+        for rule in SENSORS[name].rules:
+            found = rule(stream, recording.anchors)
+            if found is not None:
+                yield Finding(
+                    found.rule,
+                    ERROR if found.severe else WARNING,
+                    cause=found.cause,
+                    evidence=found.evidence,
+                    remedy=found.remedy,
+                    value=found.value,
+                )
+
+
 def frames(recording: Recording) -> Iterator[Finding]:
     """Yield frames other than the body's: /tf_static places them on the body, or nothing does."""
     for topic, counts in recording.frames.items():
@@ -45,13 +61,18 @@ def frames(recording: Recording) -> Iterator[Finding]:
 
 def _frame(topic: str, frame: str, place: Place | None) -> Iterator[Finding]:
     if place is None:
-        cause = f"{topic} is in the frame {frame}, and nothing says how that sits on {BODY_FRAME}"
-        line = (
-            f"publish on /tf_static how {frame} sits on {BODY_FRAME}, or have the driver write "
-            f"frame_id {BODY_FRAME}"
-        )
         yield Finding(
-            "frame_unknown", WARNING, cause, f"no transform to {frame} in /tf_static", line, np.nan
+            "frame_unknown",
+            WARNING,
+            cause=(
+                f"{topic} is in the frame {frame}, and nothing says how that sits on {BODY_FRAME}"
+            ),
+            evidence=f"no transform to {frame} in /tf_static",
+            remedy=(
+                f"publish on /tf_static how {frame} sits on {BODY_FRAME}, or have the driver write "
+                f"frame_id {BODY_FRAME}"
+            ),
+            value=np.nan,
         )
         return
     turn, arm = place
@@ -60,12 +81,18 @@ def _frame(topic: str, frame: str, place: Place | None) -> Iterator[Finding]:
     roll, pitch, yaw = turn.as_euler("xyz", degrees=True)
     evidence = f"roll {roll:.0f}, pitch {pitch:.0f}, yaw {yaw:.0f} degrees and "
     evidence += f"({arm[0]:.2f}, {arm[1]:.2f}, {arm[2]:.2f}) m on {BODY_FRAME}"
-    cause = (
-        f"{topic} is in the frame {frame}, which /tf_static places on {BODY_FRAME}; its samples "
-        "are taken there"
+    yield Finding(
+        "frame_turned",
+        NOTE,
+        cause=(
+            f"{topic} is in the frame {frame}, which /tf_static places on {BODY_FRAME}; its "
+            "samples "
+            "are taken there"
+        ),
+        evidence=evidence,
+        remedy="ros2 topic echo /tf_static  # nothing to do if that is how it is mounted",
+        value=turn.magnitude(),
     )
-    line = "ros2 topic echo /tf_static  # nothing to do if that is how it is mounted"
-    yield Finding("frame_turned", NOTE, cause, evidence, line, turn.magnitude())
 
 
 def senders(recording: Recording) -> Iterator[Finding]:
@@ -75,17 +102,16 @@ def senders(recording: Recording) -> Iterator[Finding]:
             names = ", ".join(
                 f"{frame or '(none)'}: {count}" for frame, count in sorted(counts.items())
             )
-            line = (
-                "give each tag a namespace of its own: start its driver with --ros-args -r "
-                "__ns:=/tag2"
-            )
             yield Finding(
                 "senders",
                 ERROR,
-                f"{topic} comes from several senders",
-                f"messages by frame_id: {names}",
-                line,
-                float(len(counts)),
+                cause=f"{topic} comes from several senders",
+                evidence=f"messages by frame_id: {names}",
+                remedy=(
+                    "give each tag a namespace of its own: start its driver with --ros-args -r "
+                    "__ns:=/tag2"
+                ),
+                value=float(len(counts)),
             )
 
 
@@ -96,36 +122,35 @@ def no_imu(recording: Recording) -> Iterator[Finding]:
     of_type = [topic for topic, kind in recording.topics.items() if kind == "sensor_msgs/msg/Imu"]
     there = sorted({*of_type} - recording.read)
     if of_type and not there:
-        line = f"see that the driver publishes: ros2 topic hz {of_type[0]}"
         yield Finding(
             "imu_empty",
             WARNING,
-            f"no inertial samples on {IMU}",
-            f"the topic {of_type[0]} is there, without a message",
-            line,
-            0.0,
+            cause=f"no inertial samples on {IMU}",
+            evidence=f"the topic {of_type[0]} is there, without a message",
+            remedy=f"see that the driver publishes: ros2 topic hz {of_type[0]}",
+            value=0.0,
         )
     elif there:
-        line = (
-            f"give --topic {IMU}={there[0]} to tools that read the bag, and -r {IMU}:={there[0]} "
-            "to ekf_node"
-        )
         yield Finding(
             "imu_elsewhere",
             WARNING,
-            f"no inertial samples on {IMU}",
-            f"but on {', '.join(there)}",
-            line,
-            0.0,
+            cause=f"no inertial samples on {IMU}",
+            evidence=f"but on {', '.join(there)}",
+            remedy=(
+                f"give --topic {IMU}={there[0]} to tools that read the bag, and -r "
+                f"{IMU}:={there[0]} "
+                "to ekf_node"
+            ),
+            value=0.0,
         )
     elif recording.topics:
         yield Finding(
             "imu_missing",
             WARNING,
-            f"no inertial samples on {IMU}",
-            "no topic of the type sensor_msgs/Imu",
-            "-p use_imu:=false  # of ekf_node, if there is no IMU",
-            0.0,
+            cause=f"no inertial samples on {IMU}",
+            evidence="no topic of the type sensor_msgs/Imu",
+            remedy="-p use_imu:=false  # of ekf_node, if there is no IMU",
+            value=0.0,
         )
 
 
@@ -147,13 +172,17 @@ def odometry_unread(recording: Recording) -> Iterator[Finding]:
         if kind == "nav_msgs/msg/Odometry" and topic not in known
     )
     if there and "velocity" not in recording.sensors:
-        line = (
-            f"if it is of wheels or a camera: --topic {WHEELS}={there[0]} for tools, and -r "
-            f"{WHEELS}:={there[0]} for ekf_node"
+        yield Finding(
+            "odometry_unread",
+            WARNING,
+            cause=f"the odometry on {', '.join(there)} is not used",
+            evidence=f"velocities are read from velocity and {WHEELS}",
+            remedy=(
+                f"if it is of wheels or a camera: --topic {WHEELS}={there[0]} for tools, and -r "
+                f"{WHEELS}:={there[0]} for ekf_node"
+            ),
+            value=float(len(there)),
         )
-        cause = f"the odometry on {', '.join(there)} is not used"
-        evidence = f"velocities are read from velocity and {WHEELS}"
-        yield Finding("odometry_unread", WARNING, cause, evidence, line, float(len(there)))
 
 
 def other_anchors(recording: Recording) -> Iterator[Finding]:
@@ -164,20 +193,20 @@ def other_anchors(recording: Recording) -> Iterator[Finding]:
     evidence = (
         f"the same ids are up to {off:.2f} m apart" if np.isfinite(off) else "no id in common"
     )
-    line = (
-        "give both nodes the survey as anchors_file, or replay a bag that `convert --survey` has "
-        "made of this bag"
-    )
     yield Finding(
         "survey_differs",
         NOTE,
-        (
+        cause=(
             "the bag holds other anchors than the survey, which counts here; nodes without an "
             "anchors_file take those of the bag"
         ),
-        evidence,
-        line,
-        off,
+        evidence=evidence,
+        remedy=(
+            "give both nodes the survey as anchors_file, or replay a bag that `convert --survey` "
+            "has "
+            "made of this bag"
+        ),
+        value=off,
     )
 
 
@@ -187,10 +216,10 @@ def falling_stamps(recording: Recording) -> Iterator[Finding]:
         yield Finding(
             "stamps_fall",
             WARNING,
-            "messages in the file are out of order",
-            f"the stamps fall {recording.falls} times",
-            "-p reorder:=0.02 -p lag:=0.3  # of ekf_node, for the same driver live",
-            float(recording.falls),
+            cause="messages in the file are out of order",
+            evidence=f"the stamps fall {recording.falls} times",
+            remedy="-p reorder:=0.02 -p lag:=0.3  # of ekf_node, for the same driver live",
+            value=float(recording.falls),
         )
 
 
@@ -199,36 +228,58 @@ def clock_jumps(recording: Recording) -> Iterator[Finding]:
     for jump in recording.jumps:
         cause, done = in_words(jump)
         if jump.kind == SILENCE:
-            remedy = "record with ros2 bag record, whose arrival times tell one from the other"
-            yield Finding("clock_silence", WARNING, cause, done, remedy, jump.by)
-        elif jump.kind == WRAP:
-            remedy = "count the wraps in the driver: live, ekf_node starts anew at each of them"
-            yield Finding("clock_wrap", ERROR, cause, done, remedy, jump.by)
-        elif jump.kind == SET:
-            remedy = (
-                "set the clock before the recording begins (chronyc waitsync), or stamp with a "
-                "clock that nobody sets"
+            yield Finding(
+                "clock_silence",
+                WARNING,
+                cause=cause,
+                evidence=done,
+                remedy="record with ros2 bag record, whose arrival times tell one from the other",
+                value=jump.by,
             )
-            yield Finding("clock_set", ERROR, cause, done, remedy, jump.by)
+        elif jump.kind == WRAP:
+            yield Finding(
+                "clock_wrap",
+                ERROR,
+                cause=cause,
+                evidence=done,
+                remedy="count the wraps in the driver: live, ekf_node starts anew at each of them",
+                value=jump.by,
+            )
+        elif jump.kind == SET:
+            yield Finding(
+                "clock_set",
+                ERROR,
+                cause=cause,
+                evidence=done,
+                remedy=(
+                    "set the clock before the recording begins (chronyc waitsync), or stamp with a "
+                    "clock that nobody sets"
+                ),
+                value=jump.by,
+            )
         else:
-            remedy = "record each start of the tag by itself; live, ekf_node starts anew there"
-            yield Finding("clock_restart", ERROR, cause, done, remedy, jump.by)
+            yield Finding(
+                "clock_restart",
+                ERROR,
+                cause=cause,
+                evidence=done,
+                remedy="record each start of the tag by itself; live, ekf_node starts anew there",
+                value=jump.by,
+            )
     for name, count in recording.outliers.items():
-        cause = (
-            f"{count} messages of {WORDS.get(name, name)} have stamps far from those of their "
-            "neighbours"
-        )
-        remedy = (
-            "stamp when the sample is measured; look for a field that is not initialised, or a "
-            "transfer that is not checked"
-        )
         yield Finding(
             "stamps_wild",
             WARNING,
-            cause,
-            "they are left out here, and by the nodes",
-            remedy,
-            float(count),
+            cause=(
+                f"{count} messages of {WORDS.get(name, name)} have stamps far from those of their "
+                "neighbours"
+            ),
+            evidence="they are left out here, and by the nodes",
+            remedy=(
+                "stamp when the sample is measured; look for a field that is not initialised, or a "
+                "transfer that is not checked"
+            ),
+            value=float(count),
         )
 
 
@@ -241,28 +292,29 @@ def sensors_apart(recording: Recording) -> Iterator[Finding]:
         {"tdoa": recording.tdoa.t, **{name: of.t for name, of in recording.sensors.items()}}
     ):
         topic = WORDS.get(name, name)
-        cause = (
-            f"the stamps of {topic} are {abs(ahead):.3f} s "
-            f"{'ahead of' if ahead > 0.0 else 'behind'} those of uwb/tdoa"
-        )
-        evidence = (
-            f"none of its {count} messages is stamped within the time of the TDOAs: none can be "
-            "used"
-        )
         yield Finding(
             "sensor_apart",
             ERROR,
-            cause,
-            evidence,
-            "stamp all sensors with the clock of one machine",
-            ahead,
+            cause=(
+                f"the stamps of {topic} are {abs(ahead):.3f} s "
+                f"{'ahead of' if ahead > 0.0 else 'behind'} those of uwb/tdoa"
+            ),
+            evidence=(
+                f"none of its {count} messages is stamped within the time of the TDOAs: none can "
+                "be "
+                "used"
+            ),
+            remedy="stamp all sensors with the clock of one machine",
+            value=ahead,
         )
 
 
 def unused_data(recording: Recording) -> Iterator[Finding]:
     """Yield data that the reader of the recording did not use."""
     for cause, evidence, remedy in recording.losses:
-        yield Finding("imu_lost", WARNING, cause, evidence, remedy, np.nan)
+        yield Finding(
+            "imu_lost", WARNING, cause=cause, evidence=evidence, remedy=remedy, value=np.nan
+        )
 
 
 def _by_topic(recording: Recording) -> Iterator[tuple[str, list[End], list[End]]]:
@@ -284,9 +336,16 @@ def different_types(recording: Recording) -> Iterator[Finding]:
             evidence = ", ".join(
                 sorted(f"{end.node}: {end.kind}" for end in (*publishers, *subscriptions))
             )
-            cause = f"{topic} has several types"
-            line = f"start the driver of the other type with --ros-args -r {topic}:={topic}_other"
-            yield Finding("type_other", ERROR, cause, evidence, line, float(len(found)))
+            yield Finding(
+                "type_other",
+                ERROR,
+                cause=f"{topic} has several types",
+                evidence=evidence,
+                remedy=(
+                    f"start the driver of the other type with --ros-args -r {topic}:={topic}_other"
+                ),
+                value=float(len(found)),
+            )
 
 
 def incompatible_qos(recording: Recording) -> Iterator[Finding]:
@@ -298,13 +357,17 @@ def incompatible_qos(recording: Recording) -> Iterator[Finding]:
             if not any(other.gets(publisher) for other in subscriptions if other.node == end.node)
         }
         for publisher, end in deaf.values():
-            cause = (
-                f"{end.node} hears nothing of what {publisher.node} publishes on {topic}: it asks "
-                "for more than is offered"
-            )
-            evidence = f"published {publisher.qos}; asked for: {end.qos}"
             yield Finding(
-                "qos_unmatched", ERROR, cause, evidence, _stronger(publisher, end), np.nan
+                "qos_unmatched",
+                ERROR,
+                cause=(
+                    f"{end.node} hears nothing of what {publisher.node} publishes on {topic}: it "
+                    "asks "
+                    "for more than is offered"
+                ),
+                evidence=f"published {publisher.qos}; asked for: {end.qos}",
+                remedy=_stronger(publisher, end),
+                value=np.nan,
             )
 
 
@@ -324,17 +387,16 @@ def several_publishers(recording: Recording) -> Iterator[Finding]:
     for topic, publishers, _ in _by_topic(recording):
         if len(publishers) > 1 and not topic.startswith("/tf"):
             names = ", ".join(sorted(end.node for end in publishers))
-            line = (
-                "give each tag a namespace of its own: start its driver with --ros-args -r "
-                "__ns:=/tag2, or stop all but one"
-            )
             yield Finding(
                 "publishers_several",
                 ERROR,
-                f"{len(publishers)} publish on {topic}",
-                names,
-                line,
-                float(len(publishers)),
+                cause=f"{len(publishers)} publish on {topic}",
+                evidence=names,
+                remedy=(
+                    "give each tag a namespace of its own: start its driver with --ros-args -r "
+                    "__ns:=/tag2, or stop all but one"
+                ),
+                value=float(len(publishers)),
             )
 
 
@@ -346,13 +408,13 @@ def volatile_anchors(recording: Recording) -> Iterator[Finding]:
                 yield Finding(
                     "anchors_volatile",
                     WARNING,
-                    "nodes that start later get no anchors, unless they are repeated",
-                    f"{publisher.node} publishes {topic} {publisher.qos}",
-                    (
+                    cause="nodes that start later get no anchors, unless they are repeated",
+                    evidence=f"{publisher.node} publishes {topic} {publisher.qos}",
+                    remedy=(
                         "qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)  "
                         "# or anchors_file of both nodes"
                     ),
-                    np.nan,
+                    value=np.nan,
                 )
 
 
@@ -383,16 +445,22 @@ def tag_delay(recording: Recording) -> Iterator[Finding]:
         return
     offset = float(np.median(offsets))
     if LARGE < abs(offset) < LARGEST and np.mean(np.sign(offsets) == np.sign(offset)) > AGREE:
-        cause = (
-            f"all ranges are too {'long' if offset > 0.0 else 'short'} by about as much: the "
-            "antenna delay of the tag"
-        )
         low, high = np.quantile(offsets, [0.25, 0.75])
-        evidence = (
-            f"{offset:.2f} m in the median of {len(offsets)} windows of {WINDOW:g} s, {low:.2f} "
-            f"to {high:.2f} m in half of them"
+        yield Finding(
+            "tag_delay",
+            NOTE,
+            cause=(
+                f"all ranges are too {'long' if offset > 0.0 else 'short'} by about as much: the "
+                "antenna delay of the tag"
+            ),
+            evidence=(
+                f"{offset:.2f} m in the median of {len(offsets)} windows of {WINDOW:g} s, "
+                f"{low:.2f} "
+                f"to {high:.2f} m in half of them"
+            ),
+            remedy=REMEDY,
+            value=offset,
         )
-        yield Finding("tag_delay", NOTE, cause, evidence, REMEDY, offset)
 
 
 def window_offsets(ranges: Ranges, anchors: Anchors) -> np.ndarray:
@@ -442,6 +510,7 @@ def _offset(positions: np.ndarray, d: np.ndarray) -> float | None:
 
 
 RULES = (
+    sensor_mistakes,
     frames,
     senders,
     no_imu,

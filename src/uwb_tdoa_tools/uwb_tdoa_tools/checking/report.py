@@ -11,13 +11,14 @@ import numpy as np
 
 from uwb_tdoa_bias.common.errors import InputError
 
-from .. import command_lines
+from .. import cli, command_lines
 from ..outputs import as_json
+from ..parallel import Progress
 from .check import check, different_surveys
 from .ordered import OrderedRecording
-from .recording import of_flight
+from .recording import of_flight, read_recording
 from .tdoa_rules import gained
-from .watch import BEFORE_TRUTH
+from .watch import BEFORE_TRUTH, EXCHANGED, FIRST
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_ekf.monitoring.finding import Finding
 
+    from ..estimate import FlightEstimator
+    from ..readers.inputs import Reading
     from .check import Report
 
 
@@ -146,3 +149,32 @@ def remarks_on(flights: Sequence[Flight]) -> Iterator[str]:
         f"{finding.cause}: {finding.evidence}; {finding.remedy}."
         for finding in different_surveys(flights)
     )
+
+
+def nothing_comes_first(
+    command: str, reading: Reading, paths: Sequence[str], estimator: FlightEstimator
+) -> bool:
+    """Return whether `check` finds no mistake of ids, signs, units or the scale of the survey.
+
+    Such mistakes look like misplaced anchors: they are printed, and a command that estimates anchors
+    must stop.
+
+    command : name of the command, for its messages; reading : how recordings are read
+    paths : files and folders to read; raises InputError
+    """
+    found = []
+    with Progress(command) as progress:
+        for path, survey in progress.over(reading.find(paths), "checking recordings"):
+            recording = read_recording(reading, path, survey)
+            findings = check(recording, others=(), estimator=estimator).findings
+            found += [finding for finding in findings if finding.rule in (*FIRST, EXCHANGED)]
+    for finding in found:
+        cli.show(*lines(finding))
+    if found:
+        cli.say(
+            command,
+            "stopped, and nothing is written: ids, signs, units and scale first, as said above; "
+            "then "
+            "anchors.",
+        )
+    return not found

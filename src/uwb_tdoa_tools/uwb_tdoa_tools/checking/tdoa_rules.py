@@ -18,15 +18,17 @@ from uwb_tdoa_bias.common.radio import SPEED_OF_LIGHT, TICK
 from uwb_tdoa_bias.common.survey import UNITS as SURVEY_UNITS
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.memory import TDOA, new_state, structured
-from uwb_tdoa_ekf.monitoring.explain import SCALE, compare, innovations
+from uwb_tdoa_ekf.monitoring.explain import SCALE, compare, in_words, innovations
 from uwb_tdoa_ekf.monitoring.finding import ERROR, Finding
+from uwb_tdoa_ekf.monitoring.signs import RIGHT_SIGN, WRONG_SIGN
+from uwb_tdoa_ekf.monitoring.survey_scale import wrong_unit
 from uwb_tdoa_ekf.offline import run_offline
 
 from .ordered import LONG, SHORT, SPREAD, OrderedRecording, spread
 from .pair_rules import MANY, OFF
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
 
     from uwb_tdoa_bias.common.anchors import Anchors
     from uwb_tdoa_bias.common.flight import Tdoas
@@ -74,17 +76,32 @@ class MistakeTrial:
 
     Attributes
     ----------
+    rule : str
+        Name of the rule.
     recording : OrderedRecording
         The corrected recording.
-    finding : callable
-        (ratio of the losses, its standard errors) -> Finding.
+    cause, remedy : str
+        As of the Finding if the correction explains much more.
     share : float
         Share of the TDOAs that it changes.
     """
 
+    rule: str
     recording: OrderedRecording
-    finding: Callable[[float, float], Finding]
+    cause: str
+    remedy: str
     share: float = 1.0
+
+    def finding(self, ratio: float, z: float) -> Finding:
+        """Return the Finding for the ratio of the losses and its number of standard errors."""
+        return Finding(
+            self.rule,
+            ERROR,
+            cause=self.cause,
+            evidence=in_words(ratio, z),
+            remedy=self.remedy,
+            value=ratio,
+        )
 
 
 def in_metres(recording: OrderedRecording) -> bool:
@@ -92,33 +109,36 @@ def in_metres(recording: OrderedRecording) -> bool:
     return NOISE[0] <= successive_difference(recording.tdoa) <= NOISE[1]
 
 
-def units(recording: OrderedRecording) -> Iterator[tuple[Finding, OrderedRecording]]:
-    """Yield (Finding, OrderedRecording in metres) if the TDOAs have another unit.
+def other_unit(recording: OrderedRecording) -> tuple[Finding, OrderedRecording] | None:
+    """Return (Finding, OrderedRecording in metres) if the TDOAs have another unit, or None.
 
     The noise of the radio is known, and a motion must explain most of the TDOAs.
     """
     noise = successive_difference(recording.tdoa)
-    if not noise > 0.0 or (
-        in_metres(recording) and recording.part(LONG).unexplained(WELL).mean < WELL
-    ):
-        return
+    if not noise > 0.0 or (in_metres(recording) and _is_explained(recording)):
+        return None
     near = sorted(UNITS.items(), key=lambda unit: abs(np.log(unit[1] * noise / USUAL)))[:2]
     (name, scale), (other, its) = near
     trial = recording.with_tdoa(d=recording.tdoa.d * scale)
-    if (
-        not NOISE[0] <= scale * noise <= NOISE[1]
-        or not trial.part(LONG).unexplained(WELL).mean < WELL
-    ):
-        return
-    evidence = (
-        f"successive TDOAs of a pair differ by {noise:.3g}: {scale * noise:.2f} m as {name}, "
+    if not NOISE[0] <= scale * noise <= NOISE[1] or not _is_explained(trial):
+        return None
+    found = Finding(
+        "tdoa_unit",
+        ERROR,
+        cause=f"TDOAs are in {name}, not in metres",
+        evidence=(
+            f"successive TDOAs of a pair differ by {noise:.3g}: {scale * noise:.2f} m as {name}, "
+            f"{its * noise:.2g} m as {other}; radios have 0.05 - 0.1 m"
+        ),
+        remedy=f"message.distance_difference *= {scale:.10g}",
+        value=scale,
     )
-    evidence += f"{its * noise:.2g} m as {other}; radios have 0.05 - 0.1 m"
-    line = f"message.distance_difference *= {scale:.10g}"
-    yield (
-        Finding("tdoa_unit", ERROR, f"TDOAs are in {name}, not in metres", evidence, line, scale),
-        trial,
-    )
+    return found, trial
+
+
+def _is_explained(recording: OrderedRecording) -> bool:
+    """Return whether a motion explains most of the TDOAs."""
+    return recording.part(LONG).unexplained(WELL).mean < WELL
 
 
 def successive_difference(tdoa: Tdoas) -> float:
@@ -131,10 +151,11 @@ def successive_difference(tdoa: Tdoas) -> float:
 
 def inverted_signs(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     """Yield the trial with all signs inverted."""
-    line = "message.distance_difference = distance_to_b - distance_to_a  # not a - b"
     yield MistakeTrial(
+        "tdoa_sign",
         recording.with_tdoa(d=-recording.tdoa.d),
-        _finding_of("tdoa_sign", "the sign of all TDOAs is wrong", line),
+        cause=WRONG_SIGN,
+        remedy=RIGHT_SIGN,
     )
 
 
@@ -144,14 +165,10 @@ def scaled_survey(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     (If the TDOAs show it directly, the rules of streams have reported it before.)
     """
     for name, factor in SURVEY_UNITS.items():
-        cause = (
-            f"the survey is in {name}, not in metres: its positions are {factor:,.5g} times too "
-            "large"
-        )
-        line = f"x, y, z = x / {factor:.6g}, y / {factor:.6g}, z / {factor:.6g}  # of every anchor"
         anchors = recording.anchors.at(recording.anchors.positions / factor)
+        cause, remedy = wrong_unit(name, factor)
         yield MistakeTrial(
-            replace(recording, anchors=anchors), _finding_of("survey_scale", cause, line)
+            "survey_scale", replace(recording, anchors=anchors), cause=cause, remedy=remedy
         )
 
 
@@ -167,10 +184,11 @@ def other_survey(recording: OrderedRecording, others: Sequence[Survey]) -> Itera
         if same_place(anchors, recording.anchors):
             continue
         names = " or ".join([name, *duplicates])
-        cause = f"the survey is of another room or day: {names} fits"
         yield MistakeTrial(
+            "survey_other",
             replace(recording, anchors=anchors),
-            _finding_of("survey_other", cause, f"--survey {name}"),
+            cause=f"the survey is of another room or day: {names} fits",
+            remedy=f"--survey {name}",
         )
 
 
@@ -199,10 +217,15 @@ def renumbered_ids(recording: OrderedRecording) -> Iterator[MistakeTrial]:
         return
     table = dict(zip(heard.tolist(), known.tolist()))
     shift = heard[0] - known[0]
-    line = f"id -= {shift}" if (heard - known == shift).all() else f"id = {table}[id]"
-    cause = f"the ids of the survey are others: what the tag calls {heard[0]} ... {heard[-1]} "
-    cause += f"is {known[0]} ... {known[-1]} there"
-    yield MistakeTrial(relabelled(recording, table), _finding_of("ids_renumbered", cause, line))
+    yield MistakeTrial(
+        "ids_renumbered",
+        relabelled(recording, table),
+        cause=(
+            f"the ids of the survey are others: what the tag calls {heard[0]} ... {heard[-1]} is "
+            f"{known[0]} ... {known[-1]} there"
+        ),
+        remedy=f"id -= {shift}" if (heard - known == shift).all() else f"id = {table}[id]",
+    )
 
 
 def swapped_ids(recording: OrderedRecording) -> Iterator[MistakeTrial]:
@@ -239,12 +262,10 @@ def swapped_ids(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     names = ", ".join(f"{i} is {k}" for i, k in sorted(table.items()))
     cause = "the ids of two anchors are swapped" if len(table) == 2 else MIXED_UP
     yield MistakeTrial(
+        "ids_swapped",
         trial,
-        _finding_of(
-            "ids_swapped",
-            f"{cause}: what is called {names}",
-            f"id = {table}.get(id, id)  # or swap them in the survey",
-        ),
+        cause=f"{cause}: what is called {names}",
+        remedy=f"id = {table}.get(id, id)  # or swap them in the survey",
     )
 
 
@@ -267,12 +288,16 @@ def inverted_pairs(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     pairs = np.unique(np.column_stack([tdoa.a, tdoa.b]), axis=0)
     backward = tdoa.a > tdoa.b
     if 0.2 < backward.mean() < 0.8:
-        line = (
-            "message.distance_difference = distance_to_b - distance_to_a  # in the order of the "
-            "message's ids"
+        yield MistakeTrial(
+            "tdoa_one_sign",
+            _flipped(recording, backward),
+            cause="the sign of the TDOAs does not follow the order of the anchors",
+            remedy=(
+                "message.distance_difference = distance_to_b - distance_to_a  # in the order of "
+                "the "
+                "message's ids"
+            ),
         )
-        cause = "the sign of the TDOAs does not follow the order of the anchors"
-        yield MistakeTrial(_flipped(recording, backward), _finding_of("tdoa_one_sign", cause, line))
     wrong = _contrary(recording.part(LONG), pairs)
     if not 0 < len(wrong) <= MOST_PAIRS:
         return
@@ -284,11 +309,12 @@ def inverted_pairs(recording: OrderedRecording) -> Iterator[MistakeTrial]:
         # With a survey of another room some pairs seem to have the other sign, and it does not fit.
         return
     names = ", ".join(f"({a}, {b})" for a, b in wrong)
-    line = f"if (a, b) in {{{names}}}: message.distance_difference *= -1.0  # and find out why"
     yield MistakeTrial(
+        "pair_sign",
         trial,
-        _finding_of("pair_sign", f"the sign of the pairs {names} is wrong", line),
-        flip.mean(),
+        cause=f"the sign of the pairs {names} is wrong",
+        remedy=f"if (a, b) in {{{names}}}: message.distance_difference *= -1.0  # and find out why",
+        share=flip.mean(),
     )
 
 
@@ -326,13 +352,15 @@ def moved_anchor(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     shift = alone[row][1][row] - fit.positions[row]
     number = int(recording.anchors.ids[row])
     where = ", ".join(f"{s:+.1f}" for s in shift)
-    cause = f"anchor {number} is not where the survey has it, but about ({where}) m from there"
-    line = (
-        f"{number}: {{position: [x, y, z]}}  # measure it again; look for exchanged digits and axes"
-    )
     anchors = recording.anchors.at(alone[row][1])
     yield MistakeTrial(
-        replace(recording, anchors=anchors), _finding_of("anchor_moved", cause, line)
+        "anchor_moved",
+        replace(recording, anchors=anchors),
+        cause=f"anchor {number} is not where the survey has it, but about ({where}) m from there",
+        remedy=(
+            f"{number}: {{position: [x, y, z]}}  # measure it again; look for exchanged digits and "
+            "axes"
+        ),
     )
 
 
@@ -371,8 +399,9 @@ def best_trial(
     contradicts metres, else only if no other trial helps.
     """
     if not in_metres(recording):
-        for found in units(recording):
-            return found
+        unit = other_unit(recording)
+        if unit is not None:
+            return unit
     base, trials = recording.part(LONG).unexplained(), []
     for rule in (
         inverted_signs,
@@ -392,17 +421,7 @@ def best_trial(
     if trials:
         ratio, z, trial = min(trials, key=lambda entry: entry[0])
         return trial.finding(ratio, z), trial.recording
-    return next(units(recording), (None, recording))
-
-
-def _finding_of(rule: str, cause: str, line: str) -> Callable[[float, float], Finding]:
-    def finding(ratio: float, z: float) -> Finding:
-        evidence = (
-            f"{100.0 * (1.0 - ratio):.0f} % less stays unexplained then, {z:.1f} standard errors"
-        )
-        return Finding(rule, ERROR, cause, evidence, line, ratio)
-
-    return finding
+    return other_unit(recording) or (None, recording)
 
 
 def relabelled(recording: OrderedRecording, table: dict[int, int]) -> OrderedRecording:

@@ -74,11 +74,10 @@ class Delays:
 
     def constant(self) -> tuple[float, float]:
         """Return (ratio, s): power with the best common delay over power without delay, and that delay."""
+        if not self._tells:
+            return 1.0, 0.0
         total = self.power.sum(axis=(0, 1))
-        best = int(np.argmin(total))
-        return (
-            (float(total[best] / total[NONE]), float(DELAYS[best])) if self._tells else (1.0, 0.0)
-        )
+        return float(total[self._common] / total[NONE]), float(DELAYS[self._common])
 
     @property
     def _tells(self) -> bool:
@@ -89,13 +88,11 @@ class Delays:
         if not self._tells:
             return 0.0
         total = self.power.sum(axis=(0, 1))
-        k = int(np.clip(np.argmin(total), 1, len(total) - 2))
+        k = int(np.clip(self._common, 1, len(total) - 2))
         before, here, after = total[k - 1 : k + 2]
         bend = before - 2.0 * here + after
-        return float(
-            DELAYS[k]
-            + (0.5 * STEP * np.clip((before - after) / bend, -1.0, 1.0) if bend > 0.0 else 0.0)
-        )
+        shift = np.clip((before - after) / bend, -1.0, 1.0) if bend > 0.0 else 0.0
+        return float(DELAYS[k] + 0.5 * STEP * shift)
 
     def drift(self) -> tuple[float, float]:
         """Return (ratio, s): power with a linear delay over power with a constant delay, and its change.
@@ -238,15 +235,13 @@ def wrong_stamps(path: KnownPath) -> Iterator[Finding]:
 
 
 def _late(rule: str, who: str, ratio: float, delay: float) -> Finding:
-    cause = f"{who} {abs(delay):.2f} s {'late' if delay > 0.0 else 'early'}"
-    evidence = f"{100 * (1 - ratio):.0f} % less mean square error with the geometry of that time"
     return Finding(
         rule,
         ERROR,
-        cause,
-        evidence,
-        "publish a TDOA when it is taken, stamped with that instant",
-        delay,
+        cause=f"{who} {abs(delay):.2f} s {'late' if delay > 0.0 else 'early'}",
+        evidence=f"{100 * (1 - ratio):.0f} % less mean square error with the geometry of that time",
+        remedy="publish a TDOA when it is taken, stamped with that instant",
+        value=delay,
     )
 
 
@@ -256,26 +251,25 @@ def drift_or_jump(stream: str, name: str, of: Delays) -> Iterator[Finding]:
     jumps = jump < JUMPS and abs(step) >= LEAST
     # A jump has one more parameter, and needs a larger gain.
     if drift < DRIFTS and abs(by) >= LEAST and not (jumps and jump / JUMPS < drift / DRIFTS):
-        evidence = (
-            f"{by:+.2f} s over the flight; {100 * (1 - drift):.0f} % less mean square error then"
-        )
         yield Finding(
             f"{stream}_drift",
             ERROR,
-            f"the stamps of the {name} drift against the ground truth",
-            evidence,
-            CLOCK,
-            by,
+            cause=f"the stamps of the {name} drift against the ground truth",
+            evidence=(
+                f"{by:+.2f} s over the flight; {100 * (1 - drift):.0f} % less mean square error "
+                "then"
+            ),
+            remedy=CLOCK,
+            value=by,
         )
     elif jumps:
-        evidence = f"{step:+.2f} s; {100 * (1 - jump):.0f} % less mean square error then"
         yield Finding(
             f"{stream}_jump",
             ERROR,
-            f"the stamps of the {name} jump against the ground truth",
-            evidence,
-            CLOCK,
-            step,
+            cause=f"the stamps of the {name} jump against the ground truth",
+            evidence=f"{step:+.2f} s; {100 * (1 - jump):.0f} % less mean square error then",
+            remedy=CLOCK,
+            value=step,
         )
 
 
@@ -301,16 +295,15 @@ def _reordered(path: KnownPath) -> Iterator[Finding]:
     )
     scatter = np.sqrt(max(growth, 0.0) / 2.0)
     if ratio > MORE and scatter > SHUFFLED:
-        evidence = (
-            f"{ratio:.1f} times the mean square difference of successive errors in quick motion: "
-            f"{scatter:.2f} s out of place"
-        )
-        cause = "TDOAs are stamped out of their order"
         yield Finding(
             "tdoa_reordered",
             ERROR,
-            cause,
-            evidence,
-            "stamp a TDOA when it is taken, not when it is passed on",
-            scatter,
+            cause="TDOAs are stamped out of their order",
+            evidence=(
+                f"{ratio:.1f} times the mean square difference of successive errors in quick "
+                "motion: "
+                f"{scatter:.2f} s out of place"
+            ),
+            remedy="stamp a TDOA when it is taken, not when it is passed on",
+            value=scatter,
         )

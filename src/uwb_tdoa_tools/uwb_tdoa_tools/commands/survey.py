@@ -73,7 +73,7 @@ def parser() -> ArgumentParser:
 def _survey(args: Namespace) -> int:
     from uwb_tdoa_bias.effects import EffectSet
 
-    from ..checking.before_anchors import nothing_comes_first
+    from ..checking.report import nothing_comes_first
     from ..diagnosis.noise import write_parameters
     from ..diagnosis.self_calibration import self_calibrate
     from ..estimate import FlightEstimator

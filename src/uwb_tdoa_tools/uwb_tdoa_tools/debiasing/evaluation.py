@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from uwb_tdoa_bias.effects import EffectSet
     from uwb_tdoa_ekf.debias import BiasMap
 
 
@@ -190,19 +189,22 @@ def print_rows(title: str, found: Sequence[Mapping[str, Any]]) -> None:
             + "".join(_side(row[side]) for side in ("before", "after"))
             + f"{row['known']:8.0%}"
         )
-    before, after = (
-        np.mean([row[side]["rmse_3d"] for row in found]) for side in ("before", "after")
-    )
+    before, after = mean_errors(found)
     print(
         f"mean 3D RMSE {before:.3f} m before, {after:.3f} m after: it {change_in_words(before, after)}"
     )
 
 
+def mean_errors(found: Sequence[Mapping[str, Any]]) -> tuple[float, float]:
+    """Return the mean 3D RMSE of rows before and after the map, in m."""
+    before = float(np.mean([row["before"]["rmse_3d"] for row in found]))
+    after = float(np.mean([row["after"]["rmse_3d"] for row in found]))
+    return before, after
+
+
 def mean_gain(found: Sequence[Mapping[str, Any]]) -> float:
     """Return the gain of the mean 3D RMSE of rows."""
-    return gain(
-        *(float(np.mean([row[side]["rmse_3d"] for row in found])) for side in ("before", "after"))
-    )
+    return gain(*mean_errors(found))
 
 
 def verdict(gained: float, on: str) -> str:

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_ekf.results import Odometry
 
     from ..scoring.metrics import Score
-    from .evaluation import PositionEstimator, Scored
+    from .evaluation import Scored
 
 
 LEAST = 10  # positions of flights, 5 ms apart, least number for a marker
@@ -198,7 +198,6 @@ def cross_validated(
         name = flight.name if flight.name not in errors else f"{flight.name} ({number})"
         errors[name] = {None: score.row()["rmse_3d"]}
         for share in SHARES:
-            errors[name][share] = evaluate_map(one, made.scaled(share), estimator.effects).row()[
-                "rmse_3d"
-            ]
+            after = evaluate_map(one, made.scaled(share), estimator.effects)
+            errors[name][share] = after.row()["rmse_3d"]
     return Shrinkage(best_share(errors), errors)
