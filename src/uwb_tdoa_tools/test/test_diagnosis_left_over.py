@@ -11,7 +11,7 @@ import pytest
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
-from uwb_tdoa_tools.diagnosis.report.left_over import left_over
+from uwb_tdoa_tools.diagnosis.report.reasons import left_over
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.motions import ANCHOR_CLEARANCE, RATE, Limits, motions, route
 from uwb_tdoa_tools.diagnosis.next_flight import Model, NextFlight, Rivalry, plan_flight
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
-from uwb_tdoa_tools.diagnosis.report import next_flight as report
+from uwb_tdoa_tools.diagnosis.report import maps
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.rooms import Room, corners, pillars, room_of
 from uwb_tdoa_tools.simulation_options import POSE, add_options, config_of
@@ -178,7 +178,7 @@ def test_its_files_are_flown_and_read(planned, tmp_path):
     assert lines[0] == "x,y,z,yaw,t,motion" and lines[-1].endswith('"end"')
     words = " ".join(plan.sentences)
     assert f"{plan.path.duration:.0f} s" in words and "m/s" in words
-    picture = report.picture(SimpleNamespace(next_flight=plan, flights=[first]))
+    picture = maps.planned(SimpleNamespace(next_flight=plan, flights=[first]))
     assert picture.source.startswith("data:image/") and picture.alt
 
 
