@@ -9,7 +9,7 @@ from uwb_tdoa_bias.effects import EFFECTS, SmoothTerm
 from uwb_tdoa_bias.effects.samples import samples_at
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.channels import TdoaResidual
-from uwb_tdoa_tools.diagnosis.domains import Seen
+from uwb_tdoa_tools.diagnosis.channels.base import Seen
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 
 

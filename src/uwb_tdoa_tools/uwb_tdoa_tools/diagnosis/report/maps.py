@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
@@ -269,7 +269,7 @@ def planned(diagnosis: Diagnosis) -> Picture:
     colours = iter(COLOURS * len(plan.parts))
     for (first, what), last in zip(plan.parts, ends[1:]):
         inside = (path.t >= first) & (path.t <= last)
-        style = {"color": "0.6", "ls": ":"}
+        style: dict[str, Any] = {"color": "0.6", "ls": ":"}
         if what != "way":
             style = {"color": next(colours), "label": f"{first:.0f} s: {what}"}
         for ax, view in zip(axes, VIEWS.values()):

@@ -226,13 +226,13 @@ def health(figures: Figures) -> Iterator[Table]:
         for item in figures["cross_correlation"]
     ]
     yield Table(("pairs that err together", "correlation"), crossed, (1,))
-    head = ("flight", "NIS", "NEES", "NIS within its 95 % bound", "NEES within its 95 % bound")
     rows = []
     for item in figures["filter"]:
         means = [f"{item[key]:.2f}" for key in ("nis_mean", "nees_mean")]
         shares = [f"{item[key]:.0%}" for key in ("nis_below_3.84", "nees_below_7.81")]
         rows.append((item["flight"], *means, *shares))
-    yield Table(head, rows, range(1, 5))
+    titles = ("flight", "NIS", "NEES", "NIS within its 95 % bound", "NEES within its 95 % bound")
+    yield Table(titles, rows, range(1, 5))
 
 
 def _of_channel(item: dict[str, Any], name: str) -> tuple[Any, ...]:
