@@ -15,10 +15,9 @@ from .. import outputs
 from .findings import prefixes_of
 from .over_flights import course
 from .report.entries import doubts, entries, worth_in_words
-from .report.reasons import cause
 from .report.tables import ANCHORS, SURE, anchors, by_reason
 from .report.unclear import by_remedy, undetermined
-from .report.verdict import faults_in_words, truth_in_words, verdict
+from .report.verdict import cause, faults_in_words, truth_in_words, verdict
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.effects import SmoothTerm

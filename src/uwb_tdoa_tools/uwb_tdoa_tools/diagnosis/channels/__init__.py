@@ -43,6 +43,7 @@ __all__ = [
     "Rows",
     "TdoaResidual",
     "health",
+    "of_comparison",
     "residuals",
     "tdoa_parts",
 ]
@@ -54,7 +55,11 @@ def residuals(flight: Flight, reference: Reference, effects: EffectSet) -> Chann
     Channels that the flight or the reference lacks are left out. Raises InputError if the flight is
     too short.
     """
-    comparison = Comparison.of(flight, reference, effects)
+    return of_comparison(Comparison.of(flight, reference, effects))
+
+
+def of_comparison(comparison: Comparison) -> ChannelResiduals:
+    """Return {name of a channel: ChannelResidual} of a Comparison."""
     parts = {name: channel.residual(comparison) for name, channel in CHANNELS.items()}
     return {name: part for name, part in parts.items() if part is not None}
 

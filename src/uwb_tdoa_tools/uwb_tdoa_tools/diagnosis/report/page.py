@@ -11,7 +11,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from uwb_tdoa_bias.effects import EFFECTS
 
-from . import curves, entries, maps, reasons, tables, verdict
+from . import curves, entries, maps, tables, verdict
 
 if TYPE_CHECKING:
     from ..result import Diagnosis
@@ -93,7 +93,6 @@ _TEMPLATES.globals |= {
     "entries": entries,
     "maps": maps,
     "meanings": meanings,
-    "reasons": reasons,
     "tables": tables,
     "verdict": verdict,
 }
