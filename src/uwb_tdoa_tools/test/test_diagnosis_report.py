@@ -624,12 +624,6 @@ def test_values_of_many_anchors_are_in_a_table_alone(result, count):
     assert table.rows[2][1] == "+20 ± 1" and table.rows[2][3] == "+12 ± 1"
 
 
-def test_angles_are_in_degrees(result):
-    effect = EFFECTS["imu_misalignment"]({"z": 0.075}, {"z": 0.01})
-    changed = replace(result, findings=[finding(effect)], effects=EffectSet((effect,)))
-    assert "imu_misalignment z 4.3 0.6 degrees yes" in said(html(changed))
-
-
 def test_labels_of_anchors_lie_on_nothing(result, monkeypatch):
     drawn = []
     monkeypatch.setattr(maps, "embedded", lambda figure, *_: drawn.append(figure))

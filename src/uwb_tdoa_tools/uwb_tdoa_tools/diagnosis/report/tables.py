@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Make the tables of the page: values, errors, health, and undetermined parameters."""
+"""Make the tables of the page: anchors, errors, and what was not added or not determined."""
 
 from __future__ import annotations
 
@@ -9,24 +9,21 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from uwb_tdoa_bias.effects.base import listed, rounded
+from uwb_tdoa_bias.effects.base import listed
 from uwb_tdoa_ekf.evidence import OF_ANCHORS
 
 from ...scoring.phases import TITLES
-from ..channels import CHANNELS
-from .entries import CM, for_people
+from .entries import CM
 from .unclear import by_remedy, undetermined
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterable, Sequence
 
     from uwb_tdoa_bias.effects import Effect
 
-    from ..channels.base import Figures
     from ..result import Diagnosis
     from .entries import Entry
 
-UNITS = ", ".join(f"{channel.unit} for {name}" for name, channel in CHANNELS.items())
 ANCHORS = "Values that make these data fit; measure again before you move an anchor"
 SURE = 2.0  # standard deviations of a value of an anchor that is not marked with "?"
 MANY = 3  # largest number of anchors whose positions or delays stand in a sentence
@@ -113,25 +110,6 @@ def remedies(diagnosis: Diagnosis) -> Table:
     return Table(("what would tell", "effects that could be there unseen"), rows)
 
 
-def values(diagnosis: Diagnosis) -> Table:
-    """Return the values of effects.yaml."""
-    rows = []
-    for effect in (effect for effect in diagnosis.effects.effects if not effect.settings):
-        known = effect.significant()
-        for key, value in effect.values.items():
-            unit, factor = for_people(effect.unit, key)
-            std = effect.std.get(key)
-            if std is None:
-                rows.append((effect.name, key, rounded(factor * value), "", unit, ""))
-                continue
-            spread = factor * std
-            sure = "yes" if key in known else "no"
-            number, error = rounded(factor * value, spread), rounded(spread, spread)
-            rows.append((effect.name, key, number, error, unit, sure))
-    head = ("effect", "parameter", "value", "standard deviation", "unit", "significant")
-    return Table(head, rows, (2, 3))
-
-
 def errors(diagnosis: Diagnosis) -> Table:
     """Return the figures of each run, before and after."""
     sides = [[*side["runs"], side["pooled"]] for side in (diagnosis.before, diagnosis.after)]
@@ -184,15 +162,6 @@ def _interval(row: dict[str, Any]) -> str:
     return " to ".join(f"{bound * CM:.1f}" for bound in row["rmse_3d_ci"] or ()) or "?"
 
 
-def refused(diagnosis: Diagnosis) -> Table:
-    """Return the candidates that were not added, by reason."""
-    added = {finding.effect.label for finding in diagnosis.findings if finding.added}
-    return by_reason(
-        (f"a further part of {item.what}" if item.what in added else item.what, item.why)
-        for item in diagnosis.refused
-    )
-
-
 def not_added(found: Sequence[Entry]) -> Table:
     """Return the found entries that were not added, by reason."""
     return by_reason(
@@ -214,29 +183,3 @@ def by_reason(items: Iterable[tuple[str, str]]) -> Table:
     return Table(
         ("why not", "what"), [(reason, "; ".join(whats)) for reason, whats in rows.items()]
     )
-
-
-def health(figures: Figures) -> Iterator[Table]:
-    """Yield the health figures of channels and of the filter."""
-    for group, name in (("pairs", "pair"), ("anchors", "anchor"), ("axes", "axis")):
-        head = (name, "samples", "offset", "scatter", "far off", "likeness")
-        yield Table(head, [_of_channel(item, name) for item in figures[group]], range(1, 6))
-    crossed = [
-        (" and ".join(item["pairs"]), f"{item['correlation']:.2f}")
-        for item in figures["cross_correlation"]
-    ]
-    yield Table(("pairs that err together", "correlation"), crossed, (1,))
-    rows = []
-    for item in figures["filter"]:
-        means = [f"{item[key]:.2f}" for key in ("nis_mean", "nees_mean")]
-        shares = [f"{item[key]:.0%}" for key in ("nis_below_3.84", "nees_below_7.81")]
-        rows.append((item["flight"], *means, *shares))
-    titles = ("flight", "NIS", "NEES", "NIS within its 95 % bound", "NEES within its 95 % bound")
-    yield Table(titles, rows, range(1, 5))
-
-
-def _of_channel(item: dict[str, Any], name: str) -> tuple[Any, ...]:
-    near = next(iter((item.get("autocorrelation") or {}).values()), None)
-    offset, scatter, far = f"{item['bias']:.2g}", f"{item['spread']:.2g}", f"{item['tails']:.1%}"
-    likeness = "" if near is None else f"{near:.2f}"
-    return item[name], item["count"], offset, scatter, far, likeness
