@@ -56,7 +56,7 @@ class RadioResidual(ChannelResidual):
     samples : Samples of the whole recording; residual : (n,) m
     airborne : (n,) bool, False near the floor before and after the flight
     fitted : (n,) bool, measurements that a fit uses: those in the air, or of `of_floor`
-    floor_known : whether the reference is valid near the floor too
+    floor_known : whether they are TDOAs, and the reference is valid near the floor too
     innovations : Innovations if the path is an estimate: they are the residual, and the part of an
         effect that the path follows is removed from regressors
     """
