@@ -3,10 +3,9 @@
 """Place anchors from the path that the others give, and test whether a single one has moved.
 
 A single moved anchor is tested before its error is spread over all anchors. The filter rejects
-TDOAs with large innovations. Equations about the given anchors then hold few
-TDOAs of a moved anchor, and the other anchors absorb its shift. Therefore each anchor is placed
-from the path that the others give, and the filter runs again. All innovations count, also rejected
-ones.
+TDOAs with large innovations. Equations about the given anchors then hold few TDOAs of a moved
+anchor, and the other anchors absorb its shift. Therefore each anchor is placed from the path that
+the others give, and the filter runs again. All innovations count, also rejected ones.
 """
 
 from __future__ import annotations
