@@ -9,7 +9,10 @@ import pytest
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, SmoothTerm
 from uwb_tdoa_bias.effects.covariates import ImuFeatures
-from uwb_tdoa_tools.diagnosis.channels import CHANNELS, base, residuals
+from uwb_tdoa_bias.effects.samples import samples_at
+from uwb_tdoa_tools.diagnosis.attribution import attribute
+from uwb_tdoa_tools.diagnosis.channels import CHANNELS, TdoaResidual, base, residuals
+from uwb_tdoa_tools.diagnosis.channels.base import Seen
 from uwb_tdoa_tools.diagnosis.references import GroundTruth, Nothing
 
 
@@ -129,3 +132,58 @@ def test_a_component_of_the_velocity_that_is_not_measured_has_no_rows():
     assert len(part.columns(EFFECTS["velocity_scale"](), ("scale",))) == len(rows.y)
     series = part.series()
     assert len(series) == 2 and all(np.isfinite(values).all() for _, values in series.values())
+
+
+def test_a_drift_that_is_found_knows_for_how_long_it_was_seen():
+    drift = EFFECTS["anchor_clock_drift"]({"1": 0.02})
+    (found,) = attribute(
+        [drift.inject(clean_flight(100, 40.0))],
+        GroundTruth(),
+        undeclared=False,
+        kinds=["anchor_clock_drift"],
+    ).effects
+    low, high = found.domain["time"]
+    assert 0.0 <= low < 5.0 and 30.0 < high < 40.0
+
+
+def residual(flight, low, high):
+    """A residual, looked at between two times after the first TDOA."""
+    t = flight.tdoa.t
+    a, b = (flight.anchors.index(side) for side in (flight.tdoa.a, flight.tdoa.b))
+    samples = samples_at(t, a, b, flight.truth, flight.anchors, t[0], lag=None)
+    fitted = (t >= t[0] + low) & (t <= t[0] + high)
+    return {"tdoa": TdoaResidual(samples, np.zeros(len(t)), fitted, fitted)}
+
+
+def test_a_domain_is_of_the_flights_that_were_fitted_and_of_the_air():
+    flight = clean_flight(100, 40.0)
+    seen = Seen([residual(flight, 5.0, 10.0), residual(flight, 8.0, 30.0)])
+    time = SmoothTerm({"c0": 0.1}, covariate="time", knots=(0.0, 20.0))
+    span = [seen.limited([time], numbers)[0].domain["time"] for numbers in (None, [0], [1])]
+    assert np.round(span).tolist() == [[5.0, 30.0], [5.0, 10.0], [8.0, 30.0]]
+    near = SmoothTerm({"c0": 0.1}, covariate="range", form="arrival", knots=(0.0, 20.0))
+    low, high = seen.limited([near])[0].domain["range"]
+    assert 0.0 < low < high < 15.0
+    delay = EFFECTS["anchor_delay"]({"1": 0.1})
+    known = EFFECTS["anchor_clock_drift"]({"1": 0.01}, domain={"time": (0.0, 5.0)})
+    assert seen.limited([delay, known]) == [delay, known]
+
+
+def test_functions_of_the_place_know_the_heights_that_were_seen():
+    """A flight at one height tells nothing of another one, but of a few centimetres more."""
+    flight = clean_flight(100, 40.0)
+    seen = Seen([residual(flight, 5.0, 30.0)])
+    height = SmoothTerm({"c0": 0.1}, covariate="height", knots=(0.0, 2.0))
+    heights = seen.limited([height])[0].domain["height"]
+
+    over_x = SmoothTerm({"c0": 0.1}, covariate="x", knots=(-2.0, 2.0))
+    low, high = seen.limited([over_x])[0].domain["height"]
+    assert high - low == pytest.approx(max(heights[1] - heights[0], 1.0))
+
+    truth = replace(flight.truth, p=flight.truth.p * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.2])
+    level = Seen([residual(replace(flight, truth=truth), 5.0, 30.0)])
+    assert level.limited([over_x])[0].domain["height"] == pytest.approx((0.7, 1.7))
+    assert level.limited([height])[0].domain["height"] == pytest.approx((1.2, 1.2))
+
+    turned = SmoothTerm({"c0": 0.1}, covariate="bearing_in_tag", form="arrival", knots=(-3.0, 3.0))
+    assert list(seen.limited([turned])[0].domain) == ["bearing_in_tag"]

@@ -16,9 +16,9 @@ from uwb_tdoa_bias.effects import EFFECTS
 from uwb_tdoa_tools.commands import diagnose
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.motions import ANCHOR_CLEARANCE, RATE, Limits, motions, route
-from uwb_tdoa_tools.diagnosis.next_flight import Model, NextFlight, Rivalry, plan_flight
+from uwb_tdoa_tools.diagnosis.next_flight import Model, Rivalry, plan_flight
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
-from uwb_tdoa_tools.diagnosis.report import next_flight as report
+from uwb_tdoa_tools.diagnosis.report import maps
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.rooms import Room, corners, pillars, room_of
 from uwb_tdoa_tools.simulation_options import POSE, add_options, config_of
@@ -178,7 +178,10 @@ def test_its_files_are_flown_and_read(planned, tmp_path):
     assert lines[0] == "x,y,z,yaw,t,motion" and lines[-1].endswith('"end"')
     words = " ".join(plan.sentences)
     assert f"{plan.path.duration:.0f} s" in words and "m/s" in words
-    picture = report.picture(SimpleNamespace(next_flight=plan, flights=[first]))
+    told = plan.as_json()
+    assert told["probability"] == plan.probability and told["settles"] == list(plan.answers)
+    assert told["parts"][0] == {"from": 0.0, "motion": plan.parts[0][1]}
+    picture = maps.planned(SimpleNamespace(next_flight=plan, flights=[first]))
     assert picture.source.startswith("data:image/") and picture.alt
 
 
@@ -203,11 +206,3 @@ def test_it_needs_ground_truth(tmp_path, capsys):
     assert (
         "--plan-flight: no part of it is used with --reference nothing" in capsys.readouterr().err
     )
-
-
-def test_a_plan_is_a_part_of_the_result():
-    path = route(np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0]]), [0.0, 1.0], Limits())
-    plan = NextFlight(path, ((0.0, "line"),), ("It distinguishes a from b.",), 0.9)
-    told = plan.as_json()
-    assert told["probability"] == 0.9 and told["settles"] == ["It distinguishes a from b."]
-    assert told["parts"] == [{"from": 0.0, "motion": "line"}]

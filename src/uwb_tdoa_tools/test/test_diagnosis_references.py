@@ -11,7 +11,13 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_bias.effects.truth import TruthTimeOffset
 from uwb_tdoa_tools.diagnosis import diagnose, output
-from uwb_tdoa_tools.diagnosis.references import GroundTruth, Heights, Marks, Nothing
+from uwb_tdoa_tools.diagnosis.references import (
+    REFERENCES,
+    GroundTruth,
+    Heights,
+    Marks,
+    Nothing,
+)
 from uwb_tdoa_tools.scoring.evaluation import evaluate
 
 NONSENSE = np.array([100.0, -50.0, 7.0])
@@ -65,6 +71,11 @@ def test_what_a_reference_does_without_is_taken_out_first(aided, reference):
         for each in prepared:
             np.testing.assert_array_equal(each.truth.p, prepared[0].truth.p)
             assert each.height is None
+
+
+@pytest.mark.parametrize("name", set(REFERENCES) - {"truth"})
+def test_only_a_recorded_ground_truth_is_moved_to_another_clock_or_frame(flight, name):
+    assert REFERENCES[name]().settled(flight, EffectSet()) == (flight, ())
 
 
 def test_a_path_by_heights_is_at_the_right_height(aided):

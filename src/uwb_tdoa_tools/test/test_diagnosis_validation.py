@@ -249,13 +249,13 @@ def test_a_flight_that_the_filter_gives_no_estimate_of_ends_in_a_sentence(flight
 
 def test_a_gain_that_a_shift_of_the_reference_can_feign_is_none():
     rng = np.random.default_rng(0)
-    errors = [rng.normal(size=(12, 3)) * 0.02 + off for off in ([0.0, 0.0, 0.15], [0.0, 0.0, 0.02])]
-    before, after = (
-        [np.column_stack([100 * np.sum(e**2, axis=1), np.full(12, 100.0), 100 * e])] for e in errors
-    )
+    sides = []
+    for off in (0.15, 0.02):
+        error = np.repeat(rng.normal(size=(12, 3)) * 0.02 + [0.0, 0.0, off], 100, axis=0)
+        score = SimpleNamespace(name="a", t=0.05 * np.arange(len(error)), error=error)
+        sides.append({"scores": [score]})
     sure, unsure = (
-        _gain_interval(before, after, ["a"], lambda name, std=std: np.full(3, std))
-        for std in (0.0, 0.1)
+        _gain_interval(*sides, lambda name, std=std: np.full(3, std)) for std in (0.0, 0.1)
     )
     assert sure[0] > 0.5 and unsure[0] < 0.0 < unsure[1]
     sides = [{"pooled": {"rmse_3d": 0.15}}, {"pooled": {"rmse_3d": 0.04, "rmse_3d_gain_ci": sure}}]

@@ -20,7 +20,7 @@ from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands.survey import main
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
 from uwb_tdoa_tools.diagnosis.self_calibration.equations import delay_effect, tdoa_std_of
-from uwb_tdoa_tools.diagnosis.self_calibration.placing import place
+from uwb_tdoa_tools.diagnosis.self_calibration.single import place
 from uwb_tdoa_tools.scoring.evaluation import evaluate
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.surveying.known import read_marks

@@ -18,10 +18,10 @@ from uwb_tdoa_bias.effects.samples import RADIO
 from uwb_tdoa_ekf.evidence import OF_ANCHORS
 
 from .channels import CHANNELS, residuals
+from .channels.base import Seen
 from .channels.views import MOST_LINKS
 from .detectors import DETECTORS
 from .deviations import with_deviations
-from .domains import Seen
 from .findings import EffectFinding, Refused
 from .over_flights import of_one, shares
 from .refinement import (

@@ -18,7 +18,7 @@ from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.stamps import shifted
 from uwb_tdoa_ekf.offline import run_offline
-from uwb_tdoa_ekf.results import OF_ROW, VERDICTS
+from uwb_tdoa_ekf.results import VERDICTS
 from uwb_tdoa_ekf.sensitivity import RANGES
 
 from ..clock import numbered
@@ -113,7 +113,7 @@ def compare(
     """
     sides = _both_sides(cases, baseline, progress, map_function, known)
     before, after = (_side(runs) for runs in sides)
-    _add_gain(before, after, shift_std)
+    after["pooled"]["rmse_3d_gain_ci"] = _gain_interval(before, after, shift_std)
     return before, after
 
 
@@ -129,7 +129,7 @@ def with_config(
     before : side of `compare` that the gain is counted from; shift_std, map_function : as there
     """
     after = _side(zip(cases, map_function(partial(_run, config), cases)))
-    _add_gain(before, after, shift_std)
+    after["pooled"]["rmse_3d_gain_ci"] = _gain_interval(before, after, shift_std)
     return after
 
 
@@ -148,15 +148,6 @@ def _side(runs: Iterable[tuple[ValidationCase, Run]]) -> dict[str, Any]:
         "rmse_3d_ci": _interval([_blocks(one) for one in scores]),
     }
     return {"runs": rows, "pooled": together, "scores": scores}
-
-
-def _add_gain(
-    before: dict[str, Any], after: dict[str, Any], shift_std: Callable[[str], np.ndarray]
-) -> None:
-    """Add the interval of the gain to the side `after`."""
-    blocks, others = ([_blocks(one) for one in side["scores"]] for side in (before, after))
-    names = [one.name for one in before["scores"]]
-    after["pooled"]["rmse_3d_gain_ci"] = _gain_interval(blocks, others, names, shift_std)
 
 
 def innovations(
@@ -279,13 +270,11 @@ def _scale(innovation: np.ndarray) -> float:
 
 def _used(run: Run) -> np.ndarray:
     """Return innovations of the used TDOAs of a Run, or of its ranges without TDOAs, (n,) m."""
-    residuals, ranges = run.residuals, run.sensors.get(RANGES)
-    rows = (
-        {name: getattr(residuals, name) for name in OF_ROW}
-        if len(residuals) or ranges is None
-        else ranges
-    )
-    return np.asarray(rows["innovation"][rows["verdict"] == USED])
+    residuals = run.residuals
+    if len(residuals) or RANGES not in run.sensors:
+        return residuals.innovation[residuals.verdict == USED]
+    ranges = run.sensors[RANGES]
+    return np.asarray(ranges["innovation"][ranges["verdict"] == USED])
 
 
 def _blocks(judged: Score) -> np.ndarray:
@@ -294,23 +283,14 @@ def _blocks(judged: Score) -> np.ndarray:
         return np.zeros((1, 5))
     block = numbered(judged.t, BLOCK)
     power = np.sum(judged.error**2, axis=1)
-    return np.stack(
-        [
-            np.bincount(block, power),
-            np.bincount(block),
-            *(np.bincount(block, e) for e in judged.error.T),
-        ],
-        axis=1,
-    )
+    sums = [np.bincount(block, e) for e in judged.error.T]
+    return np.stack([np.bincount(block, power), np.bincount(block), *sums], axis=1)
 
 
 def _interval(blocks: Sequence[np.ndarray]) -> list[float] | None:
     """Return the 95 % interval of the 3D RMSE, [low, high] m."""
     together = np.concatenate(blocks)
-    draws = _draws(together, np.zeros((BOOTSTRAPS, len(together), 3)))
-    return (
-        [float(x) for x in np.quantile(draws, [0.025, 0.975])] if np.isfinite(draws).all() else None
-    )
+    return _quantiles(_draws(together, np.zeros((BOOTSTRAPS, len(together), 3))))
 
 
 def _draws(blocks: np.ndarray, shifts: np.ndarray) -> np.ndarray:
@@ -326,31 +306,32 @@ def _draws(blocks: np.ndarray, shifts: np.ndarray) -> np.ndarray:
 
 
 def _gain_interval(
-    before: Sequence[np.ndarray],
-    after: Sequence[np.ndarray],
-    names: Sequence[str],
-    shift_std: Callable[[str], np.ndarray],
+    before: dict[str, Any], after: dict[str, Any], shift_std: Callable[[str], np.ndarray]
 ) -> list[float] | None:
-    """Return the 95 % interval of the relative decrease of the 3D RMSE.
+    """Return the 95 % interval of the relative decrease of the 3D RMSE between two sides.
 
     Both sides use the same bootstrap samples. Each sample shifts the reference of each flight.
-
-    before, after : [(b, 5)], blocks of each case; names : of their flights
     """
-    blocks, others = np.concatenate(before), np.concatenate(after)
+    each = [_blocks(one) for one in before["scores"]]
+    blocks = np.concatenate(each)
+    others = np.concatenate([_blocks(one) for one in after["scores"]])
     if len(blocks) != len(others):
         return None
     rng = np.random.default_rng(1)
+    names = [one.name for one in before["scores"]]
     off = {
         name: rng.standard_normal((BOOTSTRAPS, 3)) * shift_std(name)
         for name in dict.fromkeys(names)
     }
-    shifts = np.concatenate(
-        [np.repeat(off[name][:, None], len(some), axis=1) for name, some in zip(names, before)],
-        axis=1,
-    )
+    of_case = [np.repeat(off[name][:, None], len(some), axis=1) for name, some in zip(names, each)]
+    shifts = np.concatenate(of_case, axis=1)
     # The same random seed draws the same blocks for both sides.
     gain = 1.0 - _draws(others, shifts) / np.maximum(_draws(blocks, shifts), 1e-12)
-    return (
-        [float(x) for x in np.quantile(gain, [0.025, 0.975])] if np.isfinite(gain).all() else None
-    )
+    return _quantiles(gain)
+
+
+def _quantiles(draws: np.ndarray) -> list[float] | None:
+    """Return the 95 % interval of draws, [low, high]; None if a draw is not finite."""
+    if not np.isfinite(draws).all():
+        return None
+    return np.quantile(draws, [0.025, 0.975]).tolist()

@@ -18,6 +18,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.special import softmax
 
 from uwb_tdoa_bias.effects.samples import RADIO
 from uwb_tdoa_ekf.evidence import DELAY, OF_ANCHORS, POSITION, Part, eliminated
@@ -71,11 +72,9 @@ def _beside_others(table: RegressionTable, model: Fit) -> tuple[np.ndarray, np.n
 
     Parameters that can replace anchor errors are marginalized.
     """
-    rows, known, near = (
-        table.radio_rows,
-        {column.effect for column in model.columns},
-        _heard_with(table, model),
-    )
+    rows = table.radio_rows
+    known = {column.effect for column in model.columns}
+    near = _heard_with(table, model)
     mine = table.matrix(model.columns, rows)
     beside = [
         column
@@ -110,11 +109,9 @@ def _beside_others(table: RegressionTable, model: Fit) -> tuple[np.ndarray, np.n
         max((solution(std, size) for size in FUNCTION_STDS), key=lambda one: one.evidence)
         for std in (COORDINATE_STDS if free.any() else (UNSAID,))
     ]
-    evidences = np.array([one.evidence for one in several])
-    shares = np.exp(evidences - evidences.max()) / np.exp(evidences - evidences.max()).sum()
-    steps, covariances = (
-        np.stack([getattr(one, name) for one in several]) for name in ("step", "covariance")
-    )
+    shares = softmax([one.evidence for one in several])
+    steps = np.stack([one.step for one in several])
+    covariances = np.stack([one.covariance for one in several])
     step = shares @ steps
     spread = (steps - step).T @ (shares[:, None] * (steps - step))
     return step - model.beta, np.tensordot(shares, covariances, axes=1) + spread
@@ -148,14 +145,8 @@ def _heard_with(table: RegressionTable, model: Fit) -> set[str] | None:
     ids = parts[0].samples.anchors.ids
     if not table.sparse or not all(np.array_equal(part.samples.anchors.ids, ids) for part in parts):
         return None
-    known, rows = (
-        {_anchor(column) for column in model.columns if column.effect[0] in OF_ANCHORS},
-        table.radio_rows,
-    )
-    ends, block, names = (
-        np.stack(parts[0].arrivals(table.series[rows])),
-        table.block[rows],
-        ids.astype(str),
-    )
+    known = {_anchor(column) for column in model.columns if column.effect[0] in OF_ANCHORS}
+    rows, names = table.radio_rows, ids.astype(str)
+    ends, block = np.stack(parts[0].arrivals(table.series[rows])), table.block[rows]
     mine = np.isin(names, list(known))[ends].any(axis=0)
     return known | set(names[np.unique(ends[:, np.isin(block, block[mine])])].tolist())

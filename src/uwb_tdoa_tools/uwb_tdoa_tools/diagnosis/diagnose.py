@@ -21,9 +21,8 @@ from ..checking.flight_rules import judge_flight
 from ..scoring.metrics import Score, radio_residuals
 from . import comparison, repairing, validation
 from .attribution import Attribution, attribute, residuals_of
-from .channels import CHANNELS
+from .channels import CHANNELS, health
 from .findings import EffectFinding, Refused, usable
-from .health import health
 from .noise import DECIMALS
 from .references import GroundTruth, Reference
 from .refinement import written

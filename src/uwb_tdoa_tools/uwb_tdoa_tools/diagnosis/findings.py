@@ -79,6 +79,11 @@ class Refused:
     why: str
 
 
+def prefixes_of(term: SmoothTerm) -> list[str]:
+    """Return the prefixes of the parameters of each curve: "" or an anchor or pair with a dot."""
+    return sorted({key.rpartition("c")[0] for key in term.values})
+
+
 def usable(effects: Iterable[Effect]) -> EffectSet:
     """Return the EffectSet of the Effects that nodes can correct."""
     return EffectSet(tuple(effect for effect in effects if effect.usable))

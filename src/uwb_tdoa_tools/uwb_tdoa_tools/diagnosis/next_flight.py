@@ -13,6 +13,7 @@ second. The worth of a finding, in metres, is the weight of its gain.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -23,18 +24,20 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.base import listed
 
 from ..simulation.vehicles import Trajectory
-from .channels import CHANNELS, Comparison
+from .channels import CHANNELS, Comparison, of_comparison
 from .motions import RATE, continued, is_clear
 from .references import GroundTruth
 from .refinement import recurs
 from .regression.algebra import dense, product, weighted
 from .regression.fit import NU, prior_sizes, refit
 from .regression.select import AMBIGUOUS
-from .regression.table import table_of
+from .regression.table import AXES, table_of
 from .regression.terms import columns_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
+
+    from uwb_tdoa_bias.common.anchors import Anchors
 
     from .attribution import Attribution
     from .channels import ChannelResiduals
@@ -309,8 +312,8 @@ def plan_flight(
     if not found.selection.chosen:
         return None
     rivalries, values, known, told = questions_of(found, findings)
-    forecast = Forecast(flights, found.selection, known, told)
-    gains = forecast.information(library.paths)
+    information_of = partial(forecast, flights, found.selection, known, told)
+    gains = information_of(library.paths)
     apart = [one.without_twins(gains.sum(axis=0)) for one in rivalries]
     twins = [sentence for _, sentences in apart for sentence in sentences]
     open_ones = [one for one, _ in apart if len(one.models) > 1]
@@ -321,7 +324,7 @@ def plan_flight(
 
     worth = sum(question.worth for question in questions)
     path, parts = _joined(library, gains, value, worth)
-    information = forecast.information([path])[0]
+    (information,) = information_of([path])
     most = sorted(questions, key=lambda one: -one.worth * one.value(information))
     answers = [f"{one.answer(information)} (worth {100.0 * one.worth:.1f} cm)." for one in most]
     chances = [one.probability(information) for one in open_ones]
@@ -385,68 +388,64 @@ def questions_of(
     return rivalries, values, known, told
 
 
-class Forecast:
-    """Predicts the information of paths about the columns of a diagnosis."""
+def forecast(
+    flights: Sequence[Flight],
+    selection: Selection,
+    known: _Known,
+    told: Sequence[Candidate],
+    paths: Sequence[TimedPath],
+) -> np.ndarray:
+    """Return the information of each TimedPath on the columns of `known`, (len(paths), k, k).
 
-    def __init__(
-        self,
-        flights: Sequence[Flight],
-        selection: Selection,
-        known: _Known,
-        told: Sequence[Candidate],
-    ) -> None:
-        """Take the old flights, their Selection, and the Candidates of the columns of `known`.
+    New rows have the mean curvature of old rows of the same axis and channel.
 
-        New rows have the mean curvature of old rows of the same axis and channel.
-        """
-        self._selection, self._known, self._told = selection, known, told
-        self._anchors = flights[0].anchors
-        self._pairs, self._reach = _links(flights)
-        self._with_imu = any(CHANNELS[name].stream == "imu" for name in selection.table.present)
-        group = selection.table.group
-        most = 3 * len(CHANNELS)
-        total = np.bincount(group, _curvature(selection), most)
-        self._mean = total / np.maximum(np.bincount(group, minlength=most), 1)
+    flights : the old ones, with their Selection; told : Candidates of the columns
+    """
+    pairs, reach = _links(flights)
+    with_imu = any(CHANNELS[name].stream == "imu" for name in selection.table.present)
+    table = table_of(
+        [_predicted(path, flights[0].anchors, pairs, reach, with_imu) for path in paths]
+    )
+    table = table.with_terms([term for one in told for term in one.terms])
+    x = dense(table.matrix(known.columns))
+    # An event of an old flight is not in another one.
+    x[:, known.places([one for one in told if not recurs(one)])] = 0.0
+    old = selection.table.group
+    most = AXES * len(CHANNELS)
+    total = np.bincount(old, _curvature(selection), most)
+    mean = total / np.maximum(np.bincount(old, minlength=most), 1)
+    weighted_x = x * mean[table.group][:, None]
+    of_path = [table.flight == number for number in range(len(paths))]
+    return np.array([x[rows].T @ weighted_x[rows] for rows in of_path])
 
-    def information(self, paths: Sequence[TimedPath]) -> np.ndarray:
-        """Return the information of each TimedPath on all columns, (len(paths), k, k)."""
-        table = table_of([self._predicted(path) for path in paths])
-        table = table.with_terms([term for one in self._told for term in one.terms])
-        x = dense(table.matrix(self._known.columns))
-        # An event of an old flight is not in another one.
-        events = [one for one in self._told if not recurs(one)]
-        x[:, self._known.places(events)] = 0.0
-        weight = self._mean[table.group]
-        out = []
-        for number in range(len(paths)):
-            rows = table.flight == number
-            out.append(x[rows].T @ (x[rows] * weight[rows, None]))
-        return np.array(out)
 
-    def _predicted(self, path: TimedPath) -> ChannelResiduals:
-        """Return the residuals of a TimedPath without errors and noise, whose regressors count."""
-        flown = Trajectory(path.t, path.p, path.yaw)
-        count = len(self._pairs)
-        cells = np.arange(0.0, path.duration, CELL)
-        t = (cells[:, None] + CELL * np.arange(count) / count).ravel()
-        a, b = np.tile(self._pairs, (len(cells), 1)).T
-        p = flown.motion(t).p
-        rows = self._anchors.index(a), self._anchors.index(b)
-        to = [np.linalg.norm(p - self._anchors.positions[row], axis=1) for row in rows]
-        heard = (np.maximum(*to) <= self._reach) & (t <= path.duration)
-        tdoa = Tdoas(t[heard], a[heard], b[heard], (to[1] - to[0])[heard])
-        t_truth = np.arange(0.0, path.duration, 1.0 / TRUTH_RATE)
-        motion = flown.motion(t_truth)
-        imu = None
-        if self._with_imu:
-            t_imu = np.arange(0.0, path.duration, 1.0 / IMU_RATE)
-            felt = flown.motion(t_imu)
-            imu = Imu(t_imu, felt.body_rates, felt.specific_force)
-        flight = Flight("next", self._anchors, tdoa, imu, Truth(t_truth, motion.p, motion.q))
-        span = MARGIN, path.duration - MARGIN
-        comparison = Comparison.of(flight, GroundTruth(), EffectSet(), span)
-        parts = {name: channel.residual(comparison) for name, channel in CHANNELS.items()}
-        return {name: part for name, part in parts.items() if part is not None}
+def _predicted(
+    path: TimedPath, anchors: Anchors, pairs: np.ndarray, reach: float, with_imu: bool
+) -> ChannelResiduals:
+    """Return the residuals of a TimedPath without errors and noise, whose regressors count.
+
+    pairs : (m, 2) ids of the anchors that are heard together, up to `reach`, m
+    """
+    flown = Trajectory(path.t, path.p, path.yaw)
+    cells = np.arange(0.0, path.duration, CELL)
+    t = (cells[:, None] + CELL * np.arange(len(pairs)) / len(pairs)).ravel()
+    a, b = np.tile(pairs, (len(cells), 1)).T
+    p = flown.motion(t).p
+    to_a, to_b = (
+        np.linalg.norm(p - anchors.positions[anchors.index(ids)], axis=1) for ids in (a, b)
+    )
+    heard = (np.maximum(to_a, to_b) <= reach) & (t <= path.duration)
+    tdoa = Tdoas(t[heard], a[heard], b[heard], (to_b - to_a)[heard])
+    t_truth = np.arange(0.0, path.duration, 1.0 / TRUTH_RATE)
+    motion = flown.motion(t_truth)
+    imu = None
+    if with_imu:
+        t_imu = np.arange(0.0, path.duration, 1.0 / IMU_RATE)
+        felt = flown.motion(t_imu)
+        imu = Imu(t_imu, felt.body_rates, felt.specific_force)
+    flight = Flight("next", anchors, tdoa, imu, Truth(t_truth, motion.p, motion.q))
+    span = MARGIN, path.duration - MARGIN
+    return of_comparison(Comparison.of(flight, GroundTruth(), EffectSet(), span))
 
 
 def _curvature(selection: Selection) -> np.ndarray:
@@ -455,11 +454,11 @@ def _curvature(selection: Selection) -> np.ndarray:
     On average it is below `Fit.information`, whose weights belong to iterations of a fit: a row of
     Student's t distinguishes explanations less than a Gaussian row.
     """
-    model, table = selection.fit, selection.table
-    scale = model.scale[table.group]
+    model, group = selection.fit, selection.table.group
+    scale = model.scale[group]
     power = (model.residual / scale) ** 2
     each = (NU + 1.0) * (NU - power) / (NU + power) ** 2
-    out: np.ndarray = each / (scale**2 * model.inflation[table.group])
+    out: np.ndarray = each / (scale**2 * model.inflation[group])
     return out
 
 

@@ -12,13 +12,12 @@ import numpy as np
 from uwb_tdoa_bias.effects.base import listed
 
 from .. import outputs
+from .findings import prefixes_of
 from .over_flights import course
-from .report import anchors
 from .report.entries import doubts, entries, worth_in_words
-from .report.reasons import cause
-from .report.tables import by_reason
+from .report.tables import ANCHORS, SURE, anchors, by_reason
 from .report.unclear import by_remedy, undetermined
-from .report.verdict import faults_in_words, truth_in_words, verdict
+from .report.verdict import cause, faults_in_words, truth_in_words, verdict
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.effects import SmoothTerm
@@ -93,7 +92,7 @@ def as_text(diagnosis: Diagnosis) -> str:
         what = f"{entry.title}: {entry.values}" if entry.findings[0].declared else cause(entry)
         label = "found" if entry.findings[0].declared else "no name"
         lines.append((label, f"{what}; worth {worth_in_words(entry)}."))
-        lines += [("", sentence) for sentence in [entry.shared, *others[entry.title]] if sentence]
+        lines += [("", sentence) for sentence in (entry.shared, *others[entry.title]) if sentence]
     for remedy, several in by_remedy(undetermined(diagnosis)).items():
         lines.append(("not told", f"{listed(several)}; what would tell: {remedy}."))
     if added:
@@ -103,7 +102,12 @@ def as_text(diagnosis: Diagnosis) -> str:
         lines += [("fly", first), *(("", sentence) for sentence in others_of_it)]
     left_out = [(entry.title, entry.why_not) for entry in found if not entry.added]
     lines += [("not added", "{1}: {0}.".format(*row)) for row in by_reason(left_out).rows]
-    return "\n".join([*(_wrapped(*line) for line in lines), *anchors.lines(diagnosis)])
+    text = [_wrapped(*line) for line in lines]
+    values = anchors(diagnosis)
+    if values.rows:
+        text.append(f"{ANCHORS} (? less than {SURE:g} standard deviations):")
+        text += ["".join(f"{cell:>12s}" for cell in row) for row in (values.head, *values.rows)]
+    return "\n".join(text)
 
 
 def _wrapped(label: str, text: str) -> str:
@@ -144,7 +148,6 @@ def _finding(finding: EffectFinding) -> dict[str, Any]:
 
 def _function(finding: EffectFinding, effect: SmoothTerm) -> dict[str, Any]:
     at = np.linspace(effect.knots[0], effect.knots[-1], 25)
-    prefixes = sorted({key.rpartition("c")[0] for key in effect.values})
     return {
         "channel": effect.channel,
         "covariate": effect.covariate,
@@ -158,7 +161,9 @@ def _function(finding: EffectFinding, effect: SmoothTerm) -> dict[str, Any]:
         "together_with": list(finding.together_with),
         "shape": {
             "at": at,
-            "values": {prefix.rstrip("."): effect.curve(at, prefix) for prefix in prefixes},
+            "values": {
+                prefix.rstrip("."): effect.curve(at, prefix) for prefix in prefixes_of(effect)
+            },
         },
         "usable": effect.usable,
         **_over_flights(finding),

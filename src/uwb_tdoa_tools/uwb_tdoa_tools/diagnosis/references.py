@@ -60,23 +60,31 @@ class Reference:
     """The path that flights are compared with; REFERENCES lists all kinds.
 
     `prepare` removes from a recording all that the reference must not use, before anything else
-    reads it.
+    reads it. By default it replaces the ground truth by the path that flights are compared with.
     """
 
     positions_known: ClassVar[tuple] = (True, True, True)  # x, y, z, world
-    attitude_known: ClassVar[bool] = True
+    attitude_known: ClassVar[bool] = False
     knows_floor: ClassVar[bool] = False  # True: also before take-off and after landing
     tells_errors: ClassVar[bool] = True  # errors of the filter's positions are known with it
-    constraints: tuple[Constraint, ...] = ()
     left_out: ClassVar[tuple[str, ...]] = ()  # sensors that flights are not judged with
     words: str  # the reference, in reports
+
+    def __init__(
+        self,
+        config: FilterConfig | None = None,
+        constraints: Sequence[Constraint | OdometryPath] = (),
+    ) -> None:
+        """Take the FilterConfig of the filter that gives a path, and constraints."""
+        self._config = config or FilterConfig()
+        self.constraints = [one for one in constraints if not isinstance(one, OdometryPath)]
 
     def prepare(self, flight: Flight) -> Flight:
         """Return the Flight without all that must not be used.
 
         Raises InputError if it lacks the reference.
         """
-        return flight
+        raise NotImplementedError
 
     def settled(
         self, flight: Flight, base: EffectSet, config: FilterConfig | None = None
@@ -89,7 +97,9 @@ class Reference:
 
     def view(self, flight: Flight, effects: EffectSet) -> ReferenceView:
         """Return the ReferenceView of a prepared Flight under the EffectSet `effects`."""
-        raise NotImplementedError
+        truth = shifted(flight, "truth", -effects.stamp_offset("truth")).truth
+        assert truth is not None  # `prepare` has refused a flight without
+        return ReferenceView(truth)
 
     def shift_std(self, name: str) -> np.ndarray:
         """Return the standard deviation of the common shift of a prepared flight, (3,) m.
@@ -118,8 +128,9 @@ class Reference:
 class GroundTruth(Reference):
     """The ground truth that the recording holds."""
 
-    words = "the recorded ground truth"
+    attitude_known = True
     knows_floor = True
+    words = "the recorded ground truth"
 
     def __init__(
         self,
@@ -131,6 +142,7 @@ class GroundTruth(Reference):
 
         The other arguments are not used.
         """
+        super().__init__()
         self._align = align
 
     def prepare(self, flight: Flight) -> Flight:
@@ -144,11 +156,6 @@ class GroundTruth(Reference):
         self, flight: Flight, base: EffectSet, config: FilterConfig | None = None
     ) -> tuple[Flight, tuple[str, ...]]:
         return align_truth(flight, base, config, self._align)
-
-    def view(self, flight: Flight, effects: EffectSet) -> ReferenceView:
-        truth = shifted(flight, "truth", -effects.stamp_offset("truth")).truth
-        assert truth is not None  # `prepare` has refused a flight without
-        return ReferenceView(truth)
 
 
 def without_truth(flight: Flight) -> Flight:
@@ -166,7 +173,6 @@ class Nothing(Reference):
     """
 
     positions_known = (False, False, False)
-    attitude_known = False
     tells_errors = False
     words = "nothing but the flights themselves"
 
@@ -181,8 +187,8 @@ class Nothing(Reference):
         streams : with innovations that are residuals, as of `record_innovations`; the offset of
             ranges is kept then. By default as described above.
         """
-        self._config, self._streams = config or FilterConfig(), tuple(streams)
-        self.constraints = tuple(constraints)
+        super().__init__(config, constraints)
+        self._streams = tuple(streams)
 
     def prepare(self, flight: Flight) -> Flight:
         return without_truth(flight)
@@ -222,7 +228,7 @@ class Marks(Nothing):
     words = "places measured beforehand where the tag stood or passed, and the flights themselves"
 
 
-class Heights(GroundTruth):
+class Heights(Reference):
     """The smoothed path of a filter that uses the height; the diagnosed flight does not use it.
 
     Anchors at walls err mostly in z, and a height shows that. x and y of the path follow from
@@ -230,20 +236,11 @@ class Heights(GroundTruth):
     """
 
     positions_known = (False, False, True)
-    attitude_known = False
     left_out = SENSOR_NAMES
     words = "heights that a range finder measured; x and y are the filter's own"
 
-    def __init__(
-        self,
-        config: FilterConfig | None = None,
-        constraints: Sequence[Constraint | OdometryPath] = (),
-    ) -> None:
-        """Run the filter with a FilterConfig; constraints are not needed."""
-        self._config = config
-
     def prepare(self, flight: Flight) -> Flight:
-        if self._config is not None and not vars(self._config)["use_height"]:
+        if not self._config.use_height:  # type: ignore[attr-defined]  # as of SENSORS
             raise InputError(
                 "--without height: --reference heights compares with it; give one of the two."
             )
@@ -257,15 +254,12 @@ class Heights(GroundTruth):
         return replace(alone.without(*self.left_out), truth=Truth(path.t, path.p, path.q))
 
 
-class OdometryReference(GroundTruth):
+class OdometryReference(Reference):
     """The path of another odometry, fitted to the path of the filter and to marks.
 
     Without marks a common shift and yaw of a flight are not observable: the filter sets them. Marks
     at take-off and landing are enough.
     """
-
-    attitude_known = False
-    knows_floor = False  # the path begins and ends above it
 
     def __init__(
         self,
@@ -276,15 +270,13 @@ class OdometryReference(GroundTruth):
 
         constraints : OdometryPaths, and Marks on them
         """
-        self._config = config
+        super().__init__(config, constraints)
         self._paths = {path.flight: path for path in constraints if isinstance(path, OdometryPath)}
         self._marks = [mark for mark in constraints if isinstance(mark, Mark)]
-        through = (
-            "laid through marks"
-            if self._marks
-            else "laid beside the filter's path: a shift of all of a flight is not seen"
-        )
         self._shift_std: dict[str, float] = {}
+        through = "laid beside the filter's path: a shift of all of a flight is not seen"
+        if self._marks:
+            through = "laid through marks"
         self.words = f"another odometry in a frame of its own, {through}"
 
     def prepare(self, flight: Flight) -> Flight:
@@ -293,7 +285,7 @@ class OdometryReference(GroundTruth):
             raise InputError(
                 f"{flight.name}: --odometry holds no path of it; record one, or give --no-truth."
             )
-        alone, begin = without_truth(flight), float(flight.tdoa.t[0])
+        alone = without_truth(flight)
         own = smooth(alone, self._config, Corrector(flight.anchors)).odometry
         # By the path alone: after a fit that is too high, the floor would count as air.
         first, last = path.aloft or (0.0, 0.0)
@@ -308,6 +300,7 @@ class OdometryReference(GroundTruth):
             )
         estimate = np.stack([np.interp(t, own.t, column) for column in own.p.T], axis=1)
         marks = [mark for mark in self._marks if mark.flight == flight.name]
+        begin = float(flight.tdoa.t[0])
         p, self._shift_std[flight.name] = path.laid(t, estimate, marks, begin, own.t[chosen])
         return replace(alone, truth=Truth(own.t[chosen], p, own.q[chosen]))
 

@@ -6,6 +6,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from uwb_tdoa_bias.common.sensors import BY_POSE, DIAGNOSED
 
 from .base import Channel, ChannelResidual, ChannelResiduals, Comparison, Rows
@@ -14,12 +16,14 @@ from .radio import RadioResidual, Ranging, Tdoa, TdoaResidual
 from .sensor import Sensor
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_bias.effects import EffectSet
 
+    from ...scoring.metrics import Score
     from ..references import Reference
+    from .base import Figures
 
 _ALL: tuple[Channel[Any], ...] = (
     Tdoa(),
@@ -38,6 +42,8 @@ __all__ = [
     "RadioResidual",
     "Rows",
     "TdoaResidual",
+    "health",
+    "of_comparison",
     "residuals",
     "tdoa_parts",
 ]
@@ -49,7 +55,11 @@ def residuals(flight: Flight, reference: Reference, effects: EffectSet) -> Chann
     Channels that the flight or the reference lacks are left out. Raises InputError if the flight is
     too short.
     """
-    comparison = Comparison.of(flight, reference, effects)
+    return of_comparison(Comparison.of(flight, reference, effects))
+
+
+def of_comparison(comparison: Comparison) -> ChannelResiduals:
+    """Return {name of a channel: ChannelResidual} of a Comparison."""
     parts = {name: channel.residual(comparison) for name, channel in CHANNELS.items()}
     return {name: part for name, part in parts.items() if part is not None}
 
@@ -62,3 +72,29 @@ def tdoa_parts(residuals: Iterable[ChannelResiduals]) -> list[TdoaResidual]:
         for part in of_flight.values()
         if isinstance(part, TdoaResidual)
     ]
+
+
+def health(residuals: Sequence[ChannelResiduals], scores: Sequence[Score] = ()) -> Figures:
+    """Return figures of residuals and of the filter, each a list of dicts.
+
+    The keys are "pairs", "anchors", "axes", "cross_correlation" and "filter".
+
+    residuals : [{channel: ChannelResidual}], one per flight
+    scores : Score of each flight, for NIS (expected 1) and NEES (expected 3)
+    """
+    out: Figures = {key: [] for key in ("pairs", "anchors", "axes", "cross_correlation")}
+    for name, channel in CHANNELS.items():
+        parts = [flight[name] for flight in residuals if name in flight]
+        for key, items in channel.health(parts).items() if parts else ():
+            out[key] += items
+    return {**out, "filter": [_filter(score) for score in scores]}
+
+
+def _filter(score: Score) -> dict[str, Any]:
+    return {
+        "flight": score.name,
+        "nis_mean": float(score.nis.mean()),
+        "nis_below_3.84": float(np.mean(score.nis < 3.84)),  # 95 % if the filter is consistent
+        "nees_mean": float(np.mean(score.nees)),
+        "nees_below_7.81": float(np.mean(score.nees < 7.81)),
+    }

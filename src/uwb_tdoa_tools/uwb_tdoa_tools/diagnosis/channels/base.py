@@ -17,7 +17,7 @@ from uwb_tdoa_bias.effects.covariates import OF_IMU, ImuFeatures
 from ..references import Reference, ReferenceView
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from uwb_tdoa_bias.common.flight import Truth
     from uwb_tdoa_bias.effects import Effect, ImuSamples, Samples, SensorSamples, SmoothTerm
@@ -157,6 +157,64 @@ class ChannelResidual:
 
 
 ChannelResiduals = dict[str, ChannelResidual]  # of one flight, by the name of the channel
+
+
+# m, smallest width of a domain of heights of a function of something else: errors of the place
+# change over such a distance
+HEIGHTS = 1.0
+
+
+class Seen:
+    """Ranges of covariates in the residuals of some flights, computed on demand."""
+
+    def __init__(self, residuals: Sequence[ChannelResiduals]) -> None:
+        """Take [{channel: ChannelResidual}], one dict per flight."""
+        self._residuals = residuals
+        self._ranges: dict[tuple[int, str, str], list[float]] = {}
+
+    def limited(
+        self, effects: Iterable[Effect], flights: Sequence[int] | None = None
+    ) -> list[Effect]:
+        """Return Effects with their domain: the range of each covariate in some flights.
+
+        Effects without covariates, and effects with a domain, stay unchanged.
+
+        flights : their numbers; all by default
+        """
+        numbers = range(len(self._residuals)) if flights is None else flights
+        return [
+            effect if effect.domain else replace(effect, domain=self._domain(effect, numbers))
+            for effect in effects
+        ]
+
+    def _domain(self, effect: Effect, numbers: Sequence[int]) -> dict[str, tuple[float, float]]:
+        out = {}
+        for covariate in effect.covariates:
+            ends = []
+            for number in numbers:
+                for channel in effect.channels:
+                    ends += self._range(number, channel, covariate)
+            if not ends:
+                continue
+            low, high = min(ends), max(ends)
+            if covariate == "height" and effect.covariates[0] != covariate:
+                more = max(0.5 * (HEIGHTS - (high - low)), 0.0)
+                low, high = float(f"{low - more:.6g}"), float(f"{high + more:.6g}")
+            out[covariate] = low, high
+        return out
+
+    def _range(self, number: int, channel: str, covariate: str) -> list[float]:
+        """Return [least, largest] of a covariate in a channel of a flight; [] if unknown."""
+        key = number, channel, covariate
+        if key not in self._ranges:
+            part = self._residuals[number].get(channel)
+            values = None if part is None else part.covariate(covariate)
+            known = np.empty(0) if values is None else values[np.isfinite(values)]
+            ends = [known.min(), known.max()] if len(known) else []
+            self._ranges[key] = [float(f"{end:.6g}") for end in ends]
+        return self._ranges[key]
+
+
 Own = TypeVar("Own", bound=ChannelResidual)
 
 

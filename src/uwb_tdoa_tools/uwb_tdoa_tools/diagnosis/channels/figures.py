@@ -4,15 +4,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.sparse import csr_array
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from uwb_tdoa_bias.effects import Samples
+    from collections.abc import Iterator
 
     from .base import Figures
 
@@ -21,19 +19,6 @@ LAG_TIMES = (0.1, 0.5, 1.0, 2.0)  # s, lags of the autocorrelation
 TAIL = 4.0  # spreads, beyond which a residual belongs to the tails
 FEWEST = 20  # fewest pairs of samples for a correlation
 STRONGEST = 10  # largest number of reported correlations between pairs of anchors
-
-
-class RadioLike(Protocol):
-    """Residuals of TDOAs, as of TdoaResidual."""
-
-    @property
-    def samples(self) -> Samples: ...
-
-    @property
-    def residual(self) -> np.ndarray: ...
-
-    @property
-    def airborne(self) -> np.ndarray: ...
 
 
 def rows_by_value(values: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
@@ -67,10 +52,9 @@ def autocorrelation(t: np.ndarray, r: np.ndarray, lag: float) -> float | None:
 
     t : (n,) s, rising
     """
-    r = np.clip(
-        r - np.median(r),
-        *np.array([-5.0, 5.0]) * max(1.4826 * np.median(np.abs(r - np.median(r))), 1e-12),
-    )
+    r = r - np.median(r)
+    limit = 5.0 * max(1.4826 * np.median(np.abs(r)), 1e-12)
+    r = np.clip(r, -limit, limit)
     later = np.searchsorted(t, t + lag)
     inside = later < len(t)
     first, second = np.flatnonzero(inside), later[inside]
@@ -80,14 +64,19 @@ def autocorrelation(t: np.ndarray, r: np.ndarray, lag: float) -> float | None:
     return float(np.mean(r[first[near]] * r[second[near]]) / np.mean(r**2))
 
 
-def health_of_pairs(parts: Sequence[RadioLike]) -> Figures:
-    """Return {"pairs", "anchors", "cross_correlation"} of TDOA residuals of flights in the air."""
-    ids = parts[0].samples.anchors.ids
-    t, r, a, b = (np.concatenate(column) for column in zip(*map(_columns, enumerate(parts))))
-    pairs, each = [], []
+def health_of_pairs(
+    ids: np.ndarray, t: np.ndarray, r: np.ndarray, a: np.ndarray, b: np.ndarray
+) -> Figures:
+    """Return {"pairs", "anchors", "cross_correlation"} of TDOA residuals r (n,), m.
+
+    ids : of the anchors; t : (n,) s, APART between flights; a, b : (n,) rows of the anchors
+    """
     label = a * len(ids) + b
-    for number, mine in rows_by_value(label):
-        pairs.append({"pair": _name(number, ids), **figures(t[mine], r[mine])})
+    pairs = [
+        {"pair": _name(number, ids), **figures(t[mine], r[mine])}
+        for number, mine in rows_by_value(label)
+    ]
+    each = []
     for row, anchor in enumerate(ids.tolist()):
         late = np.concatenate([r[b == row], -r[a == row]])
         if len(late):
@@ -98,14 +87,6 @@ def health_of_pairs(parts: Sequence[RadioLike]) -> Figures:
 def _name(label: int, ids: np.ndarray) -> str:
     """Return a pair, as "1-2", by its number among anchors with these ids."""
     return "-".join(str(ids[row]) for row in divmod(label, len(ids)))
-
-
-def _columns(
-    numbered: tuple[int, RadioLike],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    number, part = numbered
-    rows, samples = part.airborne, part.samples
-    return samples.t[rows] + APART * number, part.residual[rows], samples.a[rows], samples.b[rows]
 
 
 def _crossed(

@@ -4,30 +4,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.effects import ImuSamples, SmoothTerm
-from uwb_tdoa_bias.effects.covariates import OF_IMU, sensor_covariate
+from uwb_tdoa_bias.effects import ImuSamples
+from uwb_tdoa_bias.effects.covariates import OF_IMU
 from uwb_tdoa_ekf.core.state import GRAVITY
 
-from .base import Channel, ChannelResidual, Rows
-from .figures import APART, figures
-from .views import extra_at, extra_names, knots_of, views_of_axes
+from .sensor import CELL, AxesChannel, AxesResidual
+from .views import extra_at, extra_names, views_of_axes
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from uwb_tdoa_bias.common.flight import Imu, Truth
-    from uwb_tdoa_bias.effects import Effect
 
-    from .base import Comparison, Figures
+    from .base import Comparison
     from .views import CovariateView
 
-CELL = 0.25  # s, length of a cell; both sides of a residual are averaged over it
 # s, half the step of time derivatives of measured rates: true rates are noisy, and noise in
 # a regressor shrinks the estimate
 SHIFT = 0.05
@@ -41,74 +37,22 @@ FEWEST_CELLS = 4  # cells at the start that define the rate at rest; fewest cell
 OF_POSE = ("x", "y", "height", "speed", "climb_rate", "acceleration")  # covariates of TDOAs too
 
 
-@dataclass(frozen=True)
-class ImuResidual(ChannelResidual):
-    """Residual (n, 3), body, of ImuSamples of cells, in the unit of the channel."""
-
-    samples: ImuSamples
-    residual: np.ndarray
-    unit: str
-
-    def rows(self) -> Rows:
-        samples, n = self.samples, len(self.samples)
-        t, place = np.tile(samples.t - samples.start, 3), np.tile(samples.p, (3, 1))
-        axis = np.repeat(np.arange(3), n)
-        return Rows(self.residual.T.ravel(), axis, axis, t, np.ones(3 * n), place)
-
-    def columns(self, effect: Effect, keys: Sequence[str]) -> np.ndarray:
-        values = effect.regressors(self.samples, list(keys))
-        return values.transpose(1, 0, 2).reshape(-1, len(keys))
-
-    def covariate(self, name: str) -> np.ndarray | None:
-        return sensor_covariate(name, self.samples)
-
-    def series(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        name = self.samples.channel
-        return {
-            f"{name}.{axis} [{self.unit}]": (self.samples.t, self.residual[:, k])
-            for k, axis in enumerate("xyz")
-        }
-
-
-class Inertial(Channel[ImuResidual]):
+class Inertial(AxesChannel):
     """The channel of an inertial sensor."""
 
-    axes: ClassVar[str] = "xyz"
+    stream = "imu"
+    axes = (".x", ".y", ".z")
 
-    def smooth_terms(self, residuals: Sequence[ImuResidual]) -> list[SmoothTerm]:
-        out = []
-        for name in self._covariates(residuals):
-            if knots := knots_of(name, [part.covariate(name) for part in residuals]):
-                out += [
-                    SmoothTerm(channel=f"{self.name}.{axis}", covariate=name, knots=knots)
-                    for axis in self.axes
-                ]
-        return out
-
-    def views(self, residuals: Sequence[ImuResidual]) -> list[CovariateView]:
-        channels, names = [f"{self.name}.{axis}" for axis in self.axes], self._covariates(residuals)
-        axis = np.concatenate([np.repeat(np.arange(3), len(part.samples)) for part in residuals])
-        values = {}
-        for name in names:
-            known = (part.covariate(name) for part in residuals)
-            values[name] = np.concatenate([np.tile(one, 3) for one in known if one is not None])
-        return views_of_axes(channels, values, axis)
-
-    @staticmethod
-    def _covariates(residuals: Sequence[ImuResidual]) -> tuple[str, ...]:
+    def covariates(self, residuals: Sequence[AxesResidual]) -> Sequence[str]:
         return (*OF_IMU, *OF_POSE, *extra_names([part.samples for part in residuals]))
 
-    def health(self, residuals: Sequence[ImuResidual]) -> Figures:
-        t = np.concatenate(
-            [part.samples.t + APART * number for number, part in enumerate(residuals)]
-        )
-        r = np.concatenate([part.residual for part in residuals])
-        return {
-            "axes": [
-                {"axis": f"{self.name}.{axis}", **figures(t, r[:, k])}
-                for k, axis in enumerate(self.axes)
-            ]
-        }
+    def views(self, residuals: Sequence[AxesResidual]) -> list[CovariateView]:
+        axis = np.concatenate([np.repeat(np.arange(3), len(part.samples)) for part in residuals])
+        values = {}
+        for name in self.covariates(residuals):
+            known = (part.covariate(name) for part in residuals)
+            values[name] = np.concatenate([np.tile(one, 3) for one in known if one is not None])
+        return views_of_axes(self.labels, values, axis)
 
     def _samples(
         self,
@@ -125,19 +69,17 @@ class Inertial(Channel[ImuResidual]):
         known = np.isfinite(q).all(axis=1)
         if known.any():
             up[known] = Rotation.from_quat(q[known]).inv().apply([0.0, 0.0, 1.0])
-        place, motion = track.positions(t), track.motion(t)
-        extra = extra_at(comparison.flight, t)
         return ImuSamples(
             self.name,
             t,
-            place,
+            track.positions(t),
             comparison.start,
             reading,
             time_derivative,
             up,
             features,
-            motion,
-            extra,
+            track.motion(t),
+            extra_at(comparison.flight, t),
         )
 
 
@@ -150,10 +92,9 @@ class Gyro(Inertial):
     name = "gyro"
     unit = "rad/s"
     needs = "a gyroscope, and ground truth of the attitude or some seconds at rest before take-off"
-    stream = "imu"
     negligible = 5e-4
 
-    def residual(self, comparison: Comparison) -> ImuResidual | None:
+    def residual(self, comparison: Comparison) -> AxesResidual | None:
         imu, poses = comparison.flight.imu, comparison.poses
         if imu is None:
             return None
@@ -161,38 +102,33 @@ class Gyro(Inertial):
             return self._at_rest(comparison, imu)
         if not comparison.attitude_known:
             return None
-        edges = cells_in_the_air(comparison, imu, SHIFT)
-        measured, true = means(imu.t, imu.gyro, edges), _true_rates(poses, edges)
+        edges = cells_in_the_air(comparison, imu)
+        measured = means(imu.t, imu.gyro, edges)
+        true = _true_rates(poses, edges)
+        features = means(imu.t, comparison.imu_features, edges)
         before, after = (means(imu.t, imu.gyro, edges + shift) for shift in (-SHIFT, SHIFT))
-        middles = 0.5 * (edges[:-1] + edges[1:])
-        features, derivative = (
-            means(imu.t, comparison.imu_features, edges),
-            (after - before) / (2 * SHIFT),
-        )
+        derivative = (after - before) / (2 * SHIFT)
         # About an axis without turns the measured rate is the residual: a function of itself.
         still = ~_turns(measured, true)
         reading = np.where(still, 0.0, measured)
-        features[:, RATES], derivative[:, still] = np.where(still, 0.0, features[:, RATES]), 0.0
-        if not _turns(
-            *(np.linalg.norm(rates, axis=1, keepdims=True) for rates in (measured, true))
-        )[0]:
+        derivative[:, still] = 0.0
+        features[:, RATES] = np.where(still, 0.0, features[:, RATES])
+        speeds = (np.linalg.norm(rates, axis=1, keepdims=True) for rates in (measured, true))
+        if not _turns(*speeds)[0]:
             features[:, OF_IMU.index("turning_rate")] = 0.0
+        middles = 0.5 * (edges[:-1] + edges[1:])
         samples = self._samples(comparison, middles, reading, features, derivative)
-        return ImuResidual(
-            samples, measured - true - comparison.effects.uncorrected(samples), self.unit
-        )
+        error = measured - true - comparison.effects.uncorrected(samples)
+        return AxesResidual(samples, error, self.labels, self.unit)
 
-    def _at_rest(self, comparison: Comparison, imu: Imu) -> ImuResidual | None:
+    def _at_rest(self, comparison: Comparison, imu: Imu) -> AxesResidual | None:
         edges = np.arange(imu.t[0], imu.t[-1], CELL)
-        features, measured = (
-            means(imu.t, comparison.imu_features, edges),
-            means(imu.t, imu.gyro, edges),
-        )
+        features = means(imu.t, comparison.imu_features, edges)
+        measured = means(imu.t, imu.gyro, edges)
+        change = measured - np.median(measured[:FEWEST_CELLS], axis=0)
         moving = features[:, OF_IMU.index("vibration")] > STILL_FORCE
         moving |= np.abs(measured).max(axis=1) > STILL_RATE
-        moving |= (
-            np.abs(measured - np.median(measured[:FEWEST_CELLS], axis=0)).max(axis=1) > STILL_CHANGE
-        )
+        moving |= np.abs(change).max(axis=1) > STILL_CHANGE
         still = np.flatnonzero(np.cumsum(moving) == 0)[:-BEGINNING]
         if len(still) < FEWEST_CELLS:
             return None
@@ -201,7 +137,8 @@ class Gyro(Inertial):
         features[:, TURNING] = 0.0  # the measured rate is the residual
         nothing = np.zeros_like(measured)
         samples = self._samples(comparison, middles, nothing, features, nothing)
-        return ImuResidual(samples, measured - comparison.effects.uncorrected(samples), self.unit)
+        error = measured - comparison.effects.uncorrected(samples)
+        return AxesResidual(samples, error, self.labels, self.unit)
 
 
 def _turns(measured: np.ndarray, true: np.ndarray) -> np.ndarray:
@@ -231,16 +168,15 @@ class Accel(Inertial):
     name = "accel"
     unit = "m/s^2"
     needs = "an accelerometer, and ground truth of position and attitude"
-    stream = "imu"
     negligible = 0.01
 
-    def residual(self, comparison: Comparison) -> ImuResidual | None:
+    def residual(self, comparison: Comparison) -> AxesResidual | None:
         imu = comparison.flight.imu
         if imu is None or not (
             comparison.attitude_known and all(comparison.reference.positions_known)
         ):
             return None
-        track, edges = comparison.track, cells_in_the_air(comparison, imu, SHIFT)
+        track, edges = comparison.track, cells_in_the_air(comparison, imu)
         middles = edges[1:-1]
         to_body = Rotation.from_quat(track.attitudes(middles)).inv()
         positions = track.positions(edges)
@@ -252,7 +188,7 @@ class Accel(Inertial):
         features = means(imu.t, comparison.imu_features, edges)
         samples = self._samples(comparison, middles, true, 0.5 * (features[1:] + features[:-1]))
         measured = measured - comparison.effects.uncorrected(samples)
-        return ImuResidual(samples, measured - true, self.unit)
+        return AxesResidual(samples, measured - true, self.labels, self.unit)
 
 
 def _triangular_means(t: np.ndarray, values: np.ndarray, edges: np.ndarray) -> np.ndarray:
@@ -272,14 +208,14 @@ def _triangular_means(t: np.ndarray, values: np.ndarray, edges: np.ndarray) -> n
     return out[1:-1] / np.maximum(total[1:-1, None], 1e-9)
 
 
-def cells_in_the_air(comparison: Comparison, imu: Imu, shift: float) -> np.ndarray:
+def cells_in_the_air(comparison: Comparison, imu: Imu) -> np.ndarray:
     """Return the edges of cells, s, within the span, the Imu and the reference.
 
-    shift : s, that must be covered beyond both ends
+    These also cover SHIFT beyond both ends.
     """
     poses, (first, last) = comparison.poses, comparison.span
-    low = max(first, imu.t[0], poses.t[0]) + CELL + shift
-    high = min(last, imu.t[-1], poses.t[-1]) - CELL - shift
+    low = max(first, imu.t[0], poses.t[0]) + CELL + SHIFT
+    high = min(last, imu.t[-1], poses.t[-1]) - CELL - SHIFT
     return np.arange(low, high, CELL)
 
 

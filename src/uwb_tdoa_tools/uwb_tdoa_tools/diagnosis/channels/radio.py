@@ -26,8 +26,8 @@ from ...checking.pair_rules import MANY
 from ...scoring.phases import in_the_air
 from ..regression.algebra import Matrix
 from .base import Channel, ChannelResidual, Rows
-from .figures import APART, figures, health_of_pairs
-from .views import OF_EACH, extra_at, extra_names, knots_of, views_of_anchors, views_of_pairs
+from .figures import APART, figures, health_of_pairs, rows_by_value
+from .views import OF_EACH, extra_at, extra_names, knots_of, views_of_arrivals
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -45,9 +45,6 @@ OF_ANCHORS = "anchor_delay", "anchor_position", "anchor_clock_drift", "pair_offs
 WILD = 20.0  # m, largest residual of a valid measurement
 FEWEST_ON_FLOOR = 50  # TDOAs near the floor; fewer are not fitted
 QUICK = ("interval", *CATEGORIES)  # covariates that change from one TDOA to the next
-# Covariates of ranges: a node corrects them without a history of the motion
-OF_RANGE = tuple(name for name in OF_TDOA if name not in OF_MOTION)
-
 
 Radio = TypeVar("Radio", bound="RadioResidual")
 
@@ -59,7 +56,7 @@ class RadioResidual(ChannelResidual):
     samples : Samples of the whole recording; residual : (n,) m
     airborne : (n,) bool, False near the floor before and after the flight
     fitted : (n,) bool, measurements that a fit uses: those in the air, or of `of_floor`
-    floor_known : whether the reference is valid near the floor too
+    floor_known : whether they are TDOAs, and the reference is valid near the floor too
     innovations : Innovations if the path is an estimate: they are the residual, and the part of an
         effect that the path follows is removed from regressors
     """
@@ -122,9 +119,19 @@ class RadioResidual(ChannelResidual):
     def series(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         return {self.label: (self.samples.t[self.airborne], self.residual[self.airborne])}
 
+    @property
+    def ends(self) -> np.ndarray:
+        """Return the ids of the anchors of each cell, both of a TDOA or one, (e, m)."""
+        rows = np.stack(self.arrivals(self.cells.pair))
+        return self.samples.anchors.ids[rows][-self.samples.ends :]
+
     def arrivals(self, series: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the rows of anchors (a, b) for series numbers (m,) of Rows."""
         return np.divmod(series, len(self.samples.anchors))
+
+    def place_in_room(self, series: int) -> str:
+        rows = divmod(series, len(self.samples.anchors))[-self.samples.ends :]
+        return "-".join(str(self.samples.anchors.ids[row]) for row in rows)
 
 
 class Cells:
@@ -210,8 +217,10 @@ def compared(comparison: Comparison, kind: type[Samples], made: type[Radio]) -> 
         residual = raw.d[usable] - samples.predicted() - comparison.effects.bias(samples)
     else:
         residual = innovations.value[places]
-    # A vehicle that never takes off has no separate time on the floor.
-    floor_known = comparison.reference.knows_floor and in_the_air(poses) is not None
+    # A vehicle that never takes off has no separate time on the floor. Late anchors near the floor
+    # are searched in TDOAs only.
+    knows_floor = comparison.reference.knows_floor and kind is Samples
+    floor_known = knows_floor and in_the_air(poses) is not None
     return made(samples, residual, airborne, airborne, floor_known, innovations)
 
 
@@ -254,90 +263,92 @@ class TdoaResidual(RadioResidual):
 
     label = "TDOA [m]"
 
-    def place_in_room(self, series: int) -> str:
-        return "-".join(
-            str(self.samples.anchors.ids[row]) for row in divmod(series, len(self.samples.anchors))
-        )
-
-
-class Tdoa(Channel[TdoaResidual]):
-    """Differences of the distances to two anchors."""
-
-    name = "tdoa"
-    unit = "m"
-    needs = "TDOAs"
-    negligible = 0.004
-    maps = ("x", "y", "height", "range")
-
-    def residual(self, comparison: Comparison) -> TdoaResidual | None:
-        return compared(comparison, Samples, TdoaResidual)
-
-    def smooth_terms(self, residuals: Sequence[TdoaResidual]) -> list[SmoothTerm]:
-        out, many = [], are_many(residuals)
-        for name in (*OF_TDOA, *extra_names([part.samples for part in residuals])):
-            if knots := knots_of(name, [part.covariate(name) for part in residuals]):
-                out.append(SmoothTerm(covariate=name, form="common", knots=knots))
-                if name not in CATEGORIES and not name.startswith(EXTRA) and not many:
-                    out.append(SmoothTerm(covariate=name, form="anchor", knots=knots))
-        for name in OF_ARRIVAL:
-            if knots := knots_of(name, [part.covariate(name) for part in residuals]):
-                out += [
-                    SmoothTerm(covariate=name, form=form, knots=knots)
-                    for form in ("arrival", "anchor")[: 1 if many else 2]
-                ]
-        return out
-
-    def views(self, residuals: Sequence[TdoaResidual]) -> list[CovariateView]:
-        if any(part.innovations is not None for part in residuals):
-            return []  # what the path follows is not left in them
-        cells, many = [part.cells for part in residuals], are_many(residuals)
-        ends = [
-            np.stack([part.samples.anchors.ids[rows] for rows in part.arrivals(part.cells.pair)])
-            for part in residuals
-        ]
-        of_tdoa, of_arrival, quick = {}, {}, {}
-        for name in (*OF_TDOA, *extra_names([part.samples for part in residuals])):
-            if many and name in CATEGORIES:
-                continue
-            known = [
-                v for v in (covariate_at(name, part.samples) for part in residuals) if v is not None
-            ]
-            if len(known) < len(residuals):
-                continue
-            if name in QUICK:
-                quick[name] = np.concatenate([v[cell.chosen] for cell, v in zip(cells, known)])
-            else:
-                of_tdoa[name] = np.concatenate([cell.mean(v) for cell, v in zip(cells, known)])
-        for name, function in OF_ARRIVAL.items():
-            both = [of_arrivals(function, part.samples) for part in residuals]
-            means = [[cell.mean(v) for v in values] for cell, values in zip(cells, both)]
-            of_arrival[name] = np.concatenate(means, axis=1)
-        a, b = np.concatenate(ends, axis=1)
-        slow = views_of_pairs(a, b, of_tdoa, of_arrival, many=many)
-        first = np.cumsum([0, *(len(cell.size) for cell in cells)])
-        cell = np.concatenate([part.group + start for part, start in zip(cells, first)])
-        return slow + views_of_pairs(a[cell], b[cell], quick, {}, cell, many)
-
-    def health(self, residuals: Sequence[TdoaResidual]) -> Figures:
-        return health_of_pairs(residuals)
-
 
 class RangeResidual(RadioResidual):
     """Residuals of distances to anchors."""
 
     label = "range [m]"
 
-    def place_in_room(self, series: int) -> str:
-        return str(self.samples.anchors.ids[self.arrivals(np.array(series))[1]])
 
-    def of_floor(self) -> None:
-        """Return None: late anchors near the floor are searched in TDOAs only."""
+class RadioChannel(Channel[Radio]):
+    """The channel of measurements between the tag and anchors.
+
+    covariates : names of its covariates that are not of an arrival
+    """
+
+    unit: str = "m"
+    covariates: tuple[str, ...]
+
+    def by_anchor(self, covariate: str) -> bool:
+        """Return whether each anchor may have a function of a covariate of its own."""
+        return True
+
+    def smooth_terms(self, residuals: Sequence[Radio]) -> list[SmoothTerm]:
+        out = []
+        extra = extra_names([part.samples for part in residuals])
+        for name in (*self.covariates, *extra, *OF_ARRIVAL):
+            knots = knots_of(name, [part.covariate(name) for part in residuals])
+            if knots is None:
+                continue
+            forms = ["arrival" if name in OF_ARRIVAL else "common"]
+            if self.by_anchor(name) and not are_many(residuals):
+                forms.append("anchor")
+            for form in forms:
+                out.append(SmoothTerm(channel=self.name, covariate=name, form=form, knots=knots))
+        return out
+
+    def views(self, residuals: Sequence[Radio]) -> list[CovariateView]:
+        if any(part.innovations is not None for part in residuals):
+            return []  # what the path follows is not left in them
+        cells = [part.cells for part in residuals]
+        many = are_many(residuals)
+        ends = np.concatenate([part.ends for part in residuals], axis=1)
+        slow, quick, of_arrival = {}, {}, {}
+        for name in (*self.covariates, *extra_names([part.samples for part in residuals])):
+            found = (covariate_at(name, part.samples) for part in residuals)
+            known = [values for values in found if values is not None]
+            if len(known) < len(residuals) or (many and name in CATEGORIES):
+                continue
+            if name in QUICK:
+                quick[name] = np.concatenate([v[cell.chosen] for cell, v in zip(cells, known)])
+            else:
+                slow[name] = np.concatenate([cell.mean(v) for cell, v in zip(cells, known)])
+        for name, function in OF_ARRIVAL.items():
+            both = [of_arrivals(function, part.samples) for part in residuals]
+            means = [[cell.mean(v) for v in values] for cell, values in zip(cells, both)]
+            of_arrival[name] = np.concatenate(means, axis=1)
+        out = views_of_arrivals(self.name, ends, slow, of_arrival, many=many)
+        if quick:
+            first = np.cumsum([0, *(len(cell.size) for cell in cells)])
+            row = np.concatenate([part.group + start for part, start in zip(cells, first)])
+            out += views_of_arrivals(self.name, ends[:, row], quick, {}, row, many)
+        return out
 
 
-class Ranging(Channel[RangeResidual]):
+class Tdoa(RadioChannel[TdoaResidual]):
+    """Differences of the distances to two anchors."""
+
+    name = "tdoa"
+    needs = "TDOAs"
+    negligible = 0.004
+    maps = ("x", "y", "height", "range")
+    covariates = tuple(OF_TDOA)
+
+    def residual(self, comparison: Comparison) -> TdoaResidual | None:
+        return compared(comparison, Samples, TdoaResidual)
+
+    def by_anchor(self, covariate: str) -> bool:
+        return covariate not in CATEGORIES and not covariate.startswith(EXTRA)
+
+    def health(self, residuals: Sequence[TdoaResidual]) -> Figures:
+        return health_of_pairs(residuals[0].samples.anchors.ids, *_flown(residuals))
+
+
+class Ranging(RadioChannel[RangeResidual]):
     """The channel of a sensor that measures distances to anchors."""
 
-    unit: str
+    # A node corrects them without a history of the motion.
+    covariates = tuple(name for name in OF_TDOA if name not in OF_MOTION)
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -349,55 +360,22 @@ class Ranging(Channel[RangeResidual]):
             return None
         return compared(comparison, RADIO[self.name], RangeResidual)
 
-    def smooth_terms(self, residuals: Sequence[RangeResidual]) -> list[SmoothTerm]:
-        out = []
-        for name in (*OF_RANGE, *extra_names([part.samples for part in residuals]), *OF_ARRIVAL):
-            if knots := knots_of(name, [part.covariate(name) for part in residuals]):
-                forms = ("arrival" if name in OF_ARRIVAL else "common", "anchor")[
-                    : 1 if are_many(residuals) else 2
-                ]
-                out += [
-                    SmoothTerm(channel=self.name, covariate=name, form=form, knots=knots)
-                    for form in forms
-                ]
-        return out
-
-    def views(self, residuals: Sequence[RangeResidual]) -> list[CovariateView]:
-        if any(part.innovations is not None for part in residuals):
-            return []  # what the path follows is not left in them
-        cells = [part.cells for part in residuals]
-        anchor = np.concatenate(
-            [part.samples.anchors.ids[part.arrivals(part.cells.pair)[1]] for part in residuals]
-        )
-        common, of_each = {}, {}
-        for name in (*OF_RANGE, *extra_names([part.samples for part in residuals])):
-            known = [
-                v for v in (covariate_at(name, part.samples) for part in residuals) if v is not None
-            ]
-            if len(known) == len(residuals):
-                common[name] = np.concatenate([cell.mean(v) for cell, v in zip(cells, known)])
-        for name, function in OF_ARRIVAL.items():
-            of_each[name] = np.concatenate(
-                [
-                    cell.mean(of_arrivals(function, part.samples)[0])
-                    for cell, part in zip(cells, residuals)
-                ]
-            )
-        return views_of_anchors(self.name, anchor, common, of_each, are_many(residuals))
-
     def health(self, residuals: Sequence[RangeResidual]) -> Figures:
-        flown = [part.airborne for part in residuals]
-        t = np.concatenate(
-            [part.samples.t[air] + APART * k for k, (part, air) in enumerate(zip(residuals, flown))]
-        )
-        r = np.concatenate([part.residual[air] for part, air in zip(residuals, flown)])
-        anchor = np.concatenate(
-            [part.samples.anchors.ids[part.samples.b[air]] for part, air in zip(residuals, flown)]
-        )
-        each = np.unique(anchor).tolist()
+        ids = residuals[0].samples.anchors.ids
+        t, r, _, b = _flown(residuals)
         return {
             "axes": [
-                {"axis": f"{self.name} {i}", **figures(t[anchor == i], r[anchor == i])}
-                for i in each
+                {"axis": f"{self.name} {ids[row]}", **figures(t[mine], r[mine])}
+                for row, mine in rows_by_value(b)
             ]
         }
+
+
+def _flown(parts: Sequence[RadioResidual]) -> tuple[np.ndarray, ...]:
+    """Return stamps, residuals and rows of both anchors, (n,) each, of flights in the air."""
+    columns = []
+    for number, part in enumerate(parts):
+        samples, rows = part.samples, part.airborne
+        t = samples.t[rows] + APART * number
+        columns.append((t, part.residual[rows], samples.a[rows], samples.b[rows]))
+    return tuple(np.concatenate(column) for column in zip(*columns))

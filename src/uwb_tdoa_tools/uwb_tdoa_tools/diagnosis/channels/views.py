@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Covariates of a channel: views of its rows over one covariate, knots, and columns of logs."""
+"""Covariates of a channel: views of its rows over one, knots, and columns of logs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from uwb_tdoa_bias.common.flight import Flight
-    from uwb_tdoa_bias.effects import ImuSamples, Samples
+    from uwb_tdoa_bias.effects import ImuSamples, Samples, SensorSamples
 
 
 MOST_LINKS = 400  # pairs, both directions, whose functions are searched: as of 20 anchors
@@ -52,109 +52,60 @@ def views_of_axes(
 
     covariates : {name: (m,)}; axis : (m,) number of the axis
     """
-    return [
-        CovariateView(channel, "common", "", name, ((np.ones(len(rows)), values[rows]),), rows)
-        for channel, rows in zip(
-            channels, map(np.flatnonzero, axis == np.arange(len(channels))[:, None])
-        )
-        for name, values in covariates.items()
-    ]
-
-
-def views_of_anchors(
-    channel: str,
-    anchor: np.ndarray,
-    common: Mapping[str, np.ndarray],
-    of_each: Mapping[str, np.ndarray],
-    many: bool = False,
-) -> list[CovariateView]:
-    """Return the views of distances to anchors of ids `anchor` (n,).
-
-    common, of_each : {name: (n,)}, of the tag and of the anchor; many : as in `views_of_pairs`
-    """
-    everywhere, ones, both = np.arange(len(anchor)), np.ones(len(anchor)), {**common, **of_each}
-    out = [
-        CovariateView(
-            channel,
-            "common" if name in common else "arrival",
-            "",
-            name,
-            ((ones, values),),
-            everywhere,
-        )
-        for name, values in both.items()
-    ]
-    for i in np.unique(anchor).tolist():
-        chosen = np.flatnonzero(anchor == i)
-        names = [name for name in both if name in OF_EACH or not many]
-        out += [
-            CovariateView(
-                channel, "anchor", str(i), name, ((ones[chosen], both[name][chosen]),), chosen
-            )
-            for name in names
-        ]
+    out = []
+    for number, channel in enumerate(channels):
+        rows = np.flatnonzero(axis == number)
+        for name, values in covariates.items():
+            sides = ((np.ones(len(rows)), values[rows]),)
+            out.append(CovariateView(channel, "common", "", name, sides, rows))
     return out
 
 
-def views_of_pairs(
-    a: np.ndarray,
-    b: np.ndarray,
-    of_tdoa: Mapping[str, np.ndarray],
+def views_of_arrivals(
+    channel: str,
+    ends: np.ndarray,
+    common: Mapping[str, np.ndarray],
     of_arrival: Mapping[str, np.ndarray],
     cell: np.ndarray | None = None,
     many: bool = False,
 ) -> list[CovariateView]:
-    """Return the views of TDOAs between anchors of ids a, b (n,).
+    """Return the views of TDOAs, or of distances to anchors.
 
-    of_tdoa : {name: (n,)}; of_arrival : {name: (2, n)}, at a and at b
-    cell : (n,) row of each TDOA, if rows have several
+    ends : (e, n) ids of the anchors of n measurements: both of a TDOA, or one
+    common : {name: (n,)}; of_arrival : {name: (e, n)}, at each end
+    cell : (n,) row of each measurement, if rows have several
     many : whether there are many anchors: single ones are viewed over OF_EACH only
     """
     out: list[CovariateView] = []
-    n = len(a)
-    row = np.arange(n) if cell is None else cell
+    everywhere = np.arange(ends.shape[1])
+    row = everywhere if cell is None else cell
+    signs = (-1.0, 1.0)[-len(ends) :]  # of the arrival at each end
 
     def add(
         form: str, key: str, name: str, chosen: np.ndarray, *sides: tuple[np.ndarray, np.ndarray]
     ) -> None:
-        out.append(
-            CovariateView(
-                "tdoa",
-                form,
-                key,
-                name,
-                tuple((signs, values[chosen]) for signs, values in sides),
-                row[chosen],
-                cell is not None,
-            )
-        )
+        there = tuple((weights, values[chosen]) for weights, values in sides)
+        out.append(CovariateView(channel, form, key, name, there, row[chosen], cell is not None))
 
-    everywhere, ones = np.arange(n), np.ones(n)
-    for name, values in of_tdoa.items():
+    ones = np.ones(len(everywhere))
+    for name, values in common.items():
         add("common", "", name, everywhere, (ones, values))
-    for name, (at_a, at_b) in of_arrival.items():
-        add("arrival", "", name, everywhere, (-ones, at_a), (ones, at_b))
+    for name, at in of_arrival.items():
+        add("arrival", "", name, everywhere, *zip([sign * ones for sign in signs], at))
     if many:
-        of_tdoa, of_arrival = (
-            {name: values for name, values in some.items() if name in OF_EACH}
-            for some in (of_tdoa, of_arrival)
-        )
-    for anchor, chosen in _members(a, b):
-        from_a, to_b = -1.0 * (a[chosen] == anchor), 1.0 * (b[chosen] == anchor)
-        for name, values in of_tdoa.items():
-            add("anchor", str(anchor), name, chosen, (from_a + to_b, values))
-        for name, (at_a, at_b) in of_arrival.items():
-            add("anchor", str(anchor), name, chosen, (from_a, at_a), (to_b, at_b))
-    for form, first, second, chosen, signs in _links(a, b):
-        for name, values in of_tdoa.items():
-            add(form, f"{first}-{second}", name, chosen, (signs, values))
+        common = {name: values for name, values in common.items() if name in OF_EACH}
+        of_arrival = {name: values for name, values in of_arrival.items() if name in OF_EACH}
+    for anchor in np.unique(ends).tolist():
+        chosen = np.flatnonzero((ends == anchor).any(axis=0))
+        own = [sign * (its[chosen] == anchor) for sign, its in zip(signs, ends)]
+        for name, values in common.items():
+            add("anchor", str(anchor), name, chosen, (np.sum(own, axis=0), values))
+        for name, at in of_arrival.items():
+            add("anchor", str(anchor), name, chosen, *zip(own, at))
+    for form, first, second, chosen, signs_there in _links(*ends) if len(ends) == 2 else ():
+        for name, values in common.items():
+            add(form, f"{first}-{second}", name, chosen, (signs_there, values))
     return out
-
-
-def _members(a: np.ndarray, b: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-    """Return (anchor, its rows (m,)) for every anchor."""
-    for anchor in np.unique(np.concatenate([a, b])).tolist():
-        yield anchor, np.flatnonzero((a == anchor) | (b == anchor))
 
 
 def _links(a: np.ndarray, b: np.ndarray) -> Iterator[tuple[str, int, int, np.ndarray, np.ndarray]]:
@@ -220,7 +171,7 @@ def extra_at(flight: Flight, t: np.ndarray) -> dict[str, np.ndarray]:
     return out
 
 
-def extra_names(parts: Sequence[Samples] | Sequence[ImuSamples]) -> list[str]:
+def extra_names(parts: Sequence[Samples | ImuSamples | SensorSamples]) -> list[str]:
     """Return the covariates "extra.STREAM.COLUMN" that all samples have."""
-    common = set.intersection(*(set(part.extra or ()) for part in parts))
+    common = set.intersection(*(set(getattr(part, "extra", None) or ()) for part in parts))
     return [EXTRA + name for name in sorted(common)]

@@ -109,8 +109,9 @@ class _Trials:
     """
 
     def __init__(self, columns: np.ndarray, residual: np.ndarray, count: np.ndarray) -> None:
-        self._columns, self._y, self._count = columns, residual, np.minimum(count, ENOUGH)
-        self._fits: dict[bytes, tuple[float, np.ndarray]] = {}  # by heights, for reuse
+        self._columns = columns
+        self._y = residual
+        self._count = np.minimum(count, ENOUGH)
 
     def best(self) -> tuple[np.ndarray, np.ndarray]:
         """Return (delays (anchors,) m, indices of the heights (anchors,))."""
@@ -135,12 +136,6 @@ class _Trials:
 
     def _fit(self, at: np.ndarray) -> tuple[float, np.ndarray]:
         """Return (loss, delays) of robust least squares with delays of 0 or more."""
-        key = at.tobytes()
-        if key not in self._fits:
-            self._fits[key] = self._fitted(at)
-        return self._fits[key]
-
-    def _fitted(self, at: np.ndarray) -> tuple[float, np.ndarray]:
         x, weight = self._columns[at, :, np.arange(len(at))].T, self._count
         for _ in range(ITERATIONS):
             root = np.linalg.cholesky((x * weight[:, None]).T @ x + LITTLE * np.eye(x.shape[1])).T

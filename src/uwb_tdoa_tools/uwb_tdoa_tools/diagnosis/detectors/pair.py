@@ -47,7 +47,8 @@ class Series:
     """TDOA residuals in the air, sorted by pair and time.
 
     t : (n,) s; residual : (n,) m; a, b : (n,) rows of anchors
-    pair : (n,) number of the ordered pair; block : (n,) number of the block of 5 s
+    pair : (n,) number of the ordered pair, from 0 without gaps
+    block : (n,) number of the block of 5 s
     """
 
     t: np.ndarray
@@ -61,20 +62,17 @@ class Series:
     def of(cls, part: TdoaResidual) -> Series:
         """Return the Series of a TdoaResidual."""
         samples, rows = part.samples, np.flatnonzero(part.airborne)
-        pair = samples.a * 100000 + samples.b
-        order = rows[np.lexsort((samples.t[rows], pair[rows]))]
-        t = samples.t[order]
-        block = numbered(t, BLOCK)
-        return cls(t, part.residual[order], samples.a[order], samples.b[order], pair[order], block)
+        label = samples.a[rows] * 100000 + samples.b[rows]
+        order = np.lexsort((samples.t[rows], label))
+        rows, label = rows[order], label[order]
+        t, a, b = samples.t[rows], samples.a[rows], samples.b[rows]
+        pair = np.unique(label, return_inverse=True)[1]
+        return cls(t, part.residual[rows], a, b, pair, numbered(t, BLOCK))
 
     def steps(self, lag: int = 1) -> tuple[np.ndarray, np.ndarray]:
         """Return (rows, later rows) of the same pair, `lag` apart in order."""
         first = np.flatnonzero(self.pair[lag:] == self.pair[:-lag])
         return first, first + lag
-
-    def label(self) -> np.ndarray:
-        """Return pairs numbered from 0 without gaps, (n,)."""
-        return np.unique(self.pair, return_inverse=True)[1]
 
 
 def series_of(residuals: Sequence[ChannelResiduals]) -> list[Series]:
@@ -122,7 +120,7 @@ class NoiseCorrelationDetector(Detector):
 def _products(series: Series) -> tuple[np.ndarray, np.ndarray]:
     """Return sums of products of residuals of one pair by block and lag, and their counts."""
     scale = 1.4826 * np.median(np.abs(series.residual))
-    label = series.label()
+    label = series.pair
     r = np.clip(series.residual, -CLIP * scale, CLIP * scale)
     r = r - (np.bincount(label, r) / np.bincount(label))[label]
     shape = series.block.max() + 1, len(LAGS) - 1
@@ -201,7 +199,7 @@ def _shares(series: Series) -> list[float]:
     """Return the share of outliers in every block."""
     r = series.residual
     away = np.abs(r - np.median(np.stack([np.roll(r, k) for k in AROUND]), axis=0))
-    label = series.label()
+    label = series.pair
     order, count = np.lexsort((away, label)), np.bincount(label)
     middle = order[np.cumsum(count) - (count + 1) // 2]  # the median of each pair
     limit = np.maximum(SPREADS * 1.4826 * away[middle], LEAST)[label]

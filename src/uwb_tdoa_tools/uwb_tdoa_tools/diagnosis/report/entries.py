@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-import re
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,14 +17,11 @@ from ..over_flights import ALL, course, in_words
 if TYPE_CHECKING:
     from collections.abc import Hashable, Iterable, Sequence
 
-    from uwb_tdoa_bias.effects import Effect
-
     from ..findings import EffectFinding, Refused
     from ..regression.confounding import Alternative
     from ..result import Diagnosis
 
 CM = 100.0  # cm per metre
-OR = "or"
 LEAST_WORTH = 0.0005  # m, smallest difference
 WORTH_DOING = 0.005  # m, smallest gain in position that is worth an action
 DEGREES = float(np.degrees(1.0))  # degrees per radian
@@ -39,14 +35,13 @@ class Entry:
     """Findings that entered the model together.
 
     title : of all findings; values : significant values, in words
-    why_not : reason for not being in the model, "" if added; alternatives : (Alternative, ...)
+    why_not : reason for not being in the model, "" if added
     """
 
     findings: tuple[EffectFinding, ...]
     title: str
     values: str
     why_not: str
-    alternatives: tuple[Alternative, ...]
 
     @property
     def added(self) -> bool:
@@ -69,42 +64,35 @@ class Entry:
 
         An unknown gain counts as a gain.
         """
-        fault = any(
-            isinstance(finding.effect, LabelEffect) for finding in self.findings
-        )  # a fault is corrected whatever its worth
+        # a fault is corrected whatever its worth
+        fault = any(isinstance(finding.effect, LabelEffect) for finding in self.findings)
         return self.added and (fault or self.worth is None or self.worth >= WORTH_DOING)
 
     @property
     def physics(self) -> str:
         """Return the physical cause, in words."""
         first = self.findings[0]
-        return (
-            first.effect.physics
-            if first.declared
-            else "structure that no effect of the catalogue explains"
-        )
-
-    @property
-    def over_flights(self) -> str:
-        """Return a sentence on differences between flights; "" for a single flight."""
-        return in_words(self.findings[0].shares)
+        if first.declared:
+            return first.effect.physics
+        return "structure that no effect of the catalogue explains"
 
     @property
     def shared(self) -> str:
         """Return in a few words how flights differ; "" for a single flight."""
-        words = self.over_flights
-        return "the same in all flights" if course(self.findings[0].shares) == ALL else words
+        shares = self.findings[0].shares
+        return "the same in all flights" if course(shares) == ALL else in_words(shares)
+
+    @property
+    def alternatives(self) -> list[Alternative]:
+        """Return the alternatives of all findings."""
+        several = [other for finding in self.findings for other in finding.alternatives]
+        return list({other.effect: other for other in several}.values())
 
     @property
     def undecided(self) -> list[Alternative]:
         """Return the alternatives that fit nearly equally well, the nearest first."""
         gaps = [(other.gap, other) for other in self.alternatives if other.gap is not None]
         return [other for _, other in sorted(gaps, key=lambda pair: pair[0])]
-
-    @property
-    def imitators(self) -> list[Alternative]:
-        """Return the alternatives that explain as much with more, or less plausible, values."""
-        return [other for other in self.alternatives if other.gap is None]
 
 
 def entries(diagnosis: Diagnosis) -> list[Entry]:
@@ -116,7 +104,15 @@ def entries(diagnosis: Diagnosis) -> list[Entry]:
     for finding in diagnosis.findings:
         key = finding.key if finding.declared or not finding.candidates else finding.candidates[0]
         groups.setdefault(key, []).append(finding)
-    out = [_entry(tuple(group), diagnosis.refused) for group in groups.values()]
+    out = [
+        Entry(
+            tuple(group),
+            _title(group),
+            _values(group[0]),
+            _why_not(group[0], diagnosis.refused),
+        )
+        for group in groups.values()
+    ]
 
     def place(entry: Entry) -> tuple[bool, float, float]:
         worth = entry.worth or 0.0
@@ -131,28 +127,25 @@ def worth_in_words(entry: Entry) -> str:
         return "not told by errors in the air" if entry.findings[0].on_floor else "not known"
     if abs(entry.worth) < LEAST_WORTH:
         return "less than 0.1 cm"
-    return (
-        f"{entry.worth * CM:.1f} cm"
-        if entry.worth > 0.0
-        else f"nothing ({entry.worth * CM:.1f} cm)"
-    )
-
-
-def undecided_in_words(entry: Entry) -> list[str]:
-    """Return one sentence per flight that would decide between alternatives."""
-    return [
-        f"Could as well be {names}; to tell: {flight}."
-        for names, flight in by_flight(entry.undecided)
-    ]
+    words = f"{entry.worth * CM:.1f} cm"
+    return words if entry.worth > 0.0 else f"nothing ({words})"
 
 
 def doubt_in_words(entry: Entry) -> list[str]:
     """Return sentences on all alternatives, and flights that would decide."""
-    imitated = by_flight(entry.imitators)
-    return undecided_in_words(entry) + [
-        f"Could be imitated by {names}, less plausibly; to tell: {flight}."
-        for names, flight in imitated
+    imitators = [other for other in entry.alternatives if other.gap is None]
+    return [
+        *_doubts("Could as well be {}; to tell: {}.", entry.undecided),
+        *_doubts("Could be imitated by {}, less plausibly; to tell: {}.", imitators),
     ]
+
+
+def _doubts(sentence: str, alternatives: Iterable[Alternative]) -> list[str]:
+    """Return one sentence per flight that would decide between alternatives."""
+    groups: dict[str, list[str]] = {}
+    for other in alternatives:
+        groups.setdefault(other.tell_apart, []).append(other.effect)
+    return [sentence.format(listed(names, "or"), flight) for flight, names in groups.items()]
 
 
 def doubts(found: Iterable[Entry]) -> dict[str, list[str]]:
@@ -166,10 +159,8 @@ def doubts(found: Iterable[Entry]) -> dict[str, list[str]]:
         sentences = doubt_in_words(entry)
         if not sentences and not entry.findings[0].candidates:
             like = entry.findings[0].effect.confounded_with
-            sentences = [f"not compared{f'; like {listed(like, OR)}' if like else ''}"]
-        told = [
-            sentence if sentence not in first else f"as {first[sentence]}" for sentence in sentences
-        ]
+            sentences = [f"not compared; like {listed(like, 'or')}" if like else "not compared"]
+        told = [f"as {first[one]}" if one in first else one for one in sentences]
         out[entry.title] = list(dict.fromkeys(told))
         for sentence in sentences:
             first.setdefault(sentence, entry.title)
@@ -178,10 +169,14 @@ def doubts(found: Iterable[Entry]) -> dict[str, list[str]]:
 
 def known_with(entry: Entry) -> list[str]:
     """Return sentences that qualify its advice: worth and doubt."""
-    together = ", together" * (len(entry.advice) > 1)
-    worth = [] if entry.worth is None else [f"Worth {worth_in_words(entry)} of position{together}."]
-    doubt = " ".join(undecided_in_words(entry))
-    return worth + ([f"Make sure first: this {doubt[0].lower()}{doubt[1:]}"] if doubt else [])
+    together = ", together" if len(entry.advice) > 1 else ""
+    out = []
+    if entry.worth is not None:
+        out.append(f"Worth {worth_in_words(entry)} of position{together}.")
+    doubt = " ".join(_doubts("could as well be {}; to tell: {}.", entry.undecided))
+    if doubt:
+        out.append(f"Make sure first: this {doubt}")
+    return out
 
 
 def bar(entry: Entry, found: Iterable[Entry]) -> float:
@@ -190,19 +185,9 @@ def bar(entry: Entry, found: Iterable[Entry]) -> float:
     The largest worth of the added entries has length LONGEST.
     """
     largest = max((other.worth or 0.0 for other in found if other.added), default=0.0)
-    return (
-        LONGEST * entry.worth / largest
-        if entry.worth and entry.worth >= LEAST_WORTH and largest > 0.0
-        else 0.0
-    )
-
-
-def by_flight(alternatives: Iterable[Alternative]) -> list[tuple[str, str]]:
-    """Return [(names of effects, flight that decides between them)]."""
-    groups: dict[str, list[str]] = {}
-    for other in alternatives:
-        groups.setdefault(other.tell_apart, []).append(other.effect)
-    return [(listed(names, "or"), flight) for flight, names in groups.items()]
+    if not entry.worth or entry.worth < LEAST_WORTH or largest <= 0.0:
+        return 0.0
+    return LONGEST * entry.worth / largest
 
 
 def for_people(unit: str, key: str = "") -> tuple[str, float]:
@@ -213,29 +198,6 @@ def for_people(unit: str, key: str = "") -> tuple[str, float]:
     if unit == "m, rad":
         unit = "m" if key in ("x", "y", "z") else "rad"
     return (unit.replace("rad", "degrees"), DEGREES) if unit in ("rad", "rad/s") else (unit, 1.0)
-
-
-def by_anchor(effect: Effect) -> dict[int, dict[str, tuple[float, float | None]]]:
-    """Return the significant values of an Effect per anchor, in the order of anchors.
-
-    The form is {anchor: {"x", "y", "z" or "": (value, std or None)}}. It is {} if a value is not of
-    one anchor.
-    """
-    out: dict[int, dict[str, tuple[float, float | None]]] = {}
-    for key in effect.significant():
-        parts = re.fullmatch(r"(\d+)(?:\.([xyz]))?", key)
-        if not parts:
-            return {}
-        out.setdefault(int(parts[1]), {})[parts[2] or ""] = effect.values[key], effect.std.get(key)
-    return dict(sorted(out.items()))
-
-
-def _entry(findings: tuple[EffectFinding, ...], refused: Sequence[Refused]) -> Entry:
-    first = findings[0]
-    others = {other.effect: other for finding in findings for other in finding.alternatives}
-    return Entry(
-        findings, _title(findings), _values(first), _why_not(first, refused), tuple(others.values())
-    )
 
 
 def _title(findings: Sequence[EffectFinding]) -> str:
@@ -254,25 +216,21 @@ def _values(finding: EffectFinding) -> str:
     if finding.function:
         return f"a function without a name ({finding.function.shape})"
     significant = effect.significant()
-    fitted_first = sorted(effect.values.items(), key=lambda item: not effect.std.get(item[0]))
-    unit, factors = (
-        effect.unit.replace("rad", "degrees"),
-        {key: for_people(effect.unit, key)[1] for key in effect.values},
-    )
     vague = len(effect.values) - len(significant)
     if not significant and vague > SHOWN:
         return f"{vague} values, none twice its standard deviation"
-    named = significant or effect.values  # without significant values, all are named
-    shown = [
-        f"{key} = {measured(value * factors[key], (effect.std.get(key) or 0.0) * factors[key])}"
-        for key, value in fitted_first
-        if key in named
-    ]
-    rest = shown[SHOWN:]
-    words = ", ".join(shown[:SHOWN] + ([f"{len(rest)} more"] if rest else []))
+    shown = []
+    for key, value in sorted(effect.values.items(), key=lambda item: not effect.std.get(item[0])):
+        if key in (significant or effect.values):  # without significant values, all are named
+            factor = for_people(effect.unit, key)[1]
+            std = factor * (effect.std.get(key) or 0.0)
+            shown.append(f"{key} = {measured(factor * value, std)}")
+    if len(shown) > SHOWN:
+        shown[SHOWN:] = [f"{len(shown) - SHOWN} more"]
+    words = f"{', '.join(shown)} ({effect.unit.replace('rad', 'degrees')})"
     if not significant:
-        return f"{words} ({unit}); not twice the standard deviation"
-    return f"{words} ({unit})" + (f"; {vague} not significant" if vague else "")
+        return f"{words}; not twice the standard deviation"
+    return f"{words}; {vague} not significant" if vague else words
 
 
 def _why_not(finding: EffectFinding, refused: Sequence[Refused]) -> str:

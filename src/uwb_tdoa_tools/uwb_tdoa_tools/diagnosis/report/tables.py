@@ -1,44 +1,34 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Make the tables of the page: values, errors, health, and undetermined parameters."""
+"""Make the tables of the page: anchors, errors, and what was not added or not determined."""
 
 from __future__ import annotations
 
 import re
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from uwb_tdoa_bias.effects.base import listed, measured, rounded
+import numpy as np
+
+from uwb_tdoa_bias.effects.base import listed
+from uwb_tdoa_ekf.evidence import OF_ANCHORS
 
 from ...scoring.phases import TITLES
-from ..channels import CHANNELS
-from .entries import by_anchor, for_people
-from .runs import CM, labels
+from .entries import CM
 from .unclear import by_remedy, undetermined
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Sequence
 
     from uwb_tdoa_bias.effects import Effect
 
-    from ..channels.base import Figures
     from ..result import Diagnosis
     from .entries import Entry
 
-UNITS = ", ".join(f"{channel.unit} for {name}" for name, channel in CHANNELS.items())
+ANCHORS = "Values that make these data fit; measure again before you move an anchor"
+SURE = 2.0  # standard deviations of a value of an anchor that is not marked with "?"
+MANY = 3  # largest number of anchors whose positions or delays stand in a sentence
 # a reason, and its figures: after ": ", or in brackets at the end
 FIGURES_OF_REASON = re.compile(r"(.*?)(?:: (.*\d.*)| \(([^()]*\d[^()]*)\))?")
-MANY = 3  # largest number of anchors whose values stand in a sentence
-SIDE_BY_SIDE = 2  # largest number of runs side by side on a phone
-EVIDENCE = {  # key of EffectFinding.evidence: title of the column
-    "criterion": "criterion (twice a log-likelihood)",
-    "held_out_gain": "gain on data held out",
-    "held_out_t": "t value of that gain",
-    "standard_errors": "standard errors",
-    "slow_before": "slow innovations before, m",
-    "slow_left": "slow innovations after, m",
-    "median_error": "median error with it, m",
-    "median_error_without": "median error without it, m",
-}
 FIGURES = (  # key, title, factor
     ("rmse_x", "x", CM),
     ("rmse_y", "y", CM),
@@ -63,35 +53,55 @@ class Table(NamedTuple):
     numbers: Sequence[int] = ()
 
 
-def advice(effect: Effect) -> tuple[Sequence[str], Table]:
-    """Return (sentences, table) that advise what to do about an Effect.
-
-    With more than MANY anchors the table holds their values, lengths in cm.
-    """
-    anchors, sentences = by_anchor(effect), effect.advice()
-    if len(anchors) <= MANY or not sentences:
-        return sentences, Table()
-    first, _, rest = sentences[0].partition(": ")
-    last = rest.rpartition("; ")[2].partition(". ")[2]
-    unit, factor = ("cm", 100.0) if effect.unit == "m" else for_people(effect.unit)
-    parts = sorted({part for values in anchors.values() for part in values})
-    head = ("anchor", *(f"{part} [{unit}]".lstrip() for part in parts))
-    rows = [
-        (anchor, *(_signed(values.get(part), factor) for part in parts))
-        for anchor, values in anchors.items()
+def labels(diagnosis: Diagnosis) -> list[str]:
+    """Return one name per judged run: its flight, plus its time if a flight was judged in parts."""
+    runs = [run["flight"] for run in diagnosis.before["runs"]]
+    if len(set(runs)) == len(runs):
+        return runs
+    return [
+        f"{score.name}, {score.first:.0f} to {score.last:.0f} s"
+        for score in diagnosis.before["scores"]
     ]
-    return [f"{first}.", *filter(None, [last]), *sentences[1:]], Table(
-        head, rows, range(1, len(head))
-    )
 
 
-def _signed(found: tuple[float, float | None] | None, factor: float) -> str:
-    """Return a value with sign and deviation, such as "+12.3 ± 0.5"; "" for None."""
-    if found is None:
-        return ""
-    value, std = found
-    text = measured(factor * value, factor * std if std else None)
-    return text if text.startswith("-") else f"+{text}"
+def anchors(diagnosis: Diagnosis) -> Table:
+    """Return estimated positions and delays of anchors, an anchor in each row.
+
+    The values fit the data. They do not replace a survey.
+    """
+    found: dict[str, dict[str, str]] = {}
+    for finding in diagnosis.findings:
+        effect = finding.effect
+        if effect.name not in OF_ANCHORS or finding.on_floor or finding.flight is not None:
+            continue
+        for key, value in effect.values.items():
+            anchor, _, axis = key.partition(".")
+            std = effect.std.get(key, np.nan)
+            sure = "" if abs(value) >= SURE * std else " ?"
+            found.setdefault(anchor, {})[axis] = f"{CM * value:+.0f} ± {CM * std:.0f}{sure}"
+    columns = {"x, cm": "x", "y, cm": "y", "z, cm": "z", "late by, cm": ""}
+    names = sorted(found, key=int)
+    cells = {
+        title: [found[anchor].get(axis, "") for anchor in names] for title, axis in columns.items()
+    }
+    filled = {title: column for title, column in cells.items() if any(column)}
+    rows = list(zip(names, *filled.values()))
+    return Table(("anchor", *filled), rows, range(1, 1 + len(filled)))
+
+
+def advice(effect: Effect) -> Sequence[str]:
+    """Return sentences that advise what to do about an Effect.
+
+    Positions and delays of more than MANY anchors are left to the table of anchors.
+    """
+    sentences = effect.advice()
+    several = {key.partition(".")[0] for key in effect.significant()}
+    if effect.name not in OF_ANCHORS or len(several) <= MANY:
+        return sentences
+    what, _, its_values = sentences[0].partition(": ")
+    _, _, after = its_values.partition(". ")
+    rest = [after] if after else []
+    return [f"{what}: the table of anchors has the values.", *rest, *sentences[1:]]
 
 
 def remedies(diagnosis: Diagnosis) -> Table:
@@ -100,118 +110,46 @@ def remedies(diagnosis: Diagnosis) -> Table:
     return Table(("what would tell", "effects that could be there unseen"), rows)
 
 
-def untraced(diagnosis: Diagnosis) -> Table:
-    """Return all combinations of parameters that the flights do not determine, by remedy."""
-    rows: dict[str, list[str]] = {}
-    for item in undetermined(diagnosis):
-        if item.what or not item.harmless:
-            what = f"{item.effect}: {item.what or 'all of it'}"
-            rows.setdefault(item.remedy, []).append(what)
-    return Table(
-        ("what would tell", "parameters"),
-        [(remedy, "; ".join(whats)) for remedy, whats in rows.items()],
-    )
-
-
-def values(diagnosis: Diagnosis) -> Table:
-    """Return the values of effects.yaml."""
-    rows = []
-    for effect in (effect for effect in diagnosis.effects.effects if not effect.settings):
-        known = effect.significant()
-        for key, value in effect.values.items():
-            std, (unit, factor) = effect.std.get(key), for_people(effect.unit, key)
-            sure = "" if std is None else ("yes" if key in known else "no")
-            spread = None if std is None else factor * std
-            error = "" if spread is None else rounded(spread, spread)
-            rows.append((effect.name, key, rounded(factor * value, spread), error, unit, sure))
-    return Table(
-        ("effect", "parameter", "value", "standard deviation", "unit", "significant"), rows, (2, 3)
-    )
-
-
-def evidence(diagnosis: Diagnosis, found: Sequence[Entry]) -> Table:
-    """Return a row for each Entry: its channel and the figures of its first finding.
-
-    A cell is empty where the finding has no such figure. found : Entries of the Diagnosis
-    """
-    used = [
-        key for key in EVIDENCE if any(key in finding.evidence for finding in diagnosis.findings)
-    ]
-    firsts = [(entry.title, entry.findings[0]) for entry in found]
-    rows = [
-        (title, first.channel, *(_cell(first.evidence.get(key)) for key in used))
-        for title, first in firsts
-    ]
-    head = ("finding", "channel", *(EVIDENCE[key] for key in used))
-    return Table(head, rows, range(2, len(head)))
-
-
-def _cell(value: object) -> object:
-    return "" if value is None else value
-
-
 def errors(diagnosis: Diagnosis) -> Table:
     """Return the figures of each run, before and after."""
-    before, after = diagnosis.before, diagnosis.after
-    shown = [item for item in FIGURES if before["pooled"].get(item[0]) is not None]
-    names = [*labels(diagnosis), "all"]
+    sides = [[*side["runs"], side["pooled"]] for side in (diagnosis.before, diagnosis.after)]
+    shown = [item for item in FIGURES if diagnosis.before["pooled"].get(item[0]) is not None]
     rows = []
-    for name, first, second in zip(
-        names, [*before["runs"], before["pooled"]], [*after["runs"], after["pooled"]]
-    ):
-        intervals = [_interval(side) for side in (first, second)] if first.get("rmse_3d_ci") else []
-        figures = (
-            f"{_figure(first, key, factor)} → {_figure(second, key, factor)}"
-            for key, _, factor in shown
-        )
-        rows.append((name, *figures, *intervals))
+    for name, before, after in zip([*labels(diagnosis), "all"], *sides):
+        row = [name]
+        for key, _, factor in shown:
+            row.append(f"{_figure(before, key, factor)} → {_figure(after, key, factor)}")
+        if before.get("rmse_3d_ci"):
+            row += [_interval(before), _interval(after)]
+        rows.append(row)
     bounds = ("95 % of 3D RMSE before", "after") if len(rows[0]) > 1 + len(shown) else ()
     head = ("run", *(title for _, title, _ in shown), *bounds)
     return Table(head, rows, range(1, len(head)))
 
 
-def phases(diagnosis: Diagnosis) -> tuple[Table, Table]:
-    """Return the errors in each phase of a recording, before and after, as two tables.
-
-    With few runs the first holds them and the second is empty. Else the first holds the total and
-    the second each run.
-    """
-    sides = [[*side["runs"], side["pooled"]] for side in (diagnosis.before, diagnosis.after)]
-    found = [[row.get("phases", {}) for row in side] for side in sides]
-    names = [
-        name
-        for name in TITLES
-        if any(phases.get(name, {}).get("rmse_3d") is not None for side in found for phases in side)
-    ]
-    runs = labels(diagnosis)
-    columns = dict(zip([*runs, "all"], zip(*found)))
-    if len(runs) == 1:
-        del columns["all"]
-    if len(columns) <= SIDE_BY_SIDE:
-        return _of_phases(names, columns), Table()
-    return _of_phases(names, {"all": columns["all"]}), _of_phases(names, columns)
-
-
-def _of_phases(names: Sequence[str], columns: Mapping[str, Sequence[dict[str, Any]]]) -> Table:
-    """Return a table with a row per phase and a column per run."""
-    rows = [
-        (
-            TITLES[name],
-            *(_phase(first.get(name), second.get(name)) for first, second in columns.values()),
-        )
-        for name in names
-    ]
-    return Table(("", *columns), rows, numbers=range(1, 1 + len(columns)))
+def phases(diagnosis: Diagnosis) -> Table:
+    """Return the errors in each phase of a recording, before and after: all runs, then each run."""
+    names = ["all", *labels(diagnosis)]
+    sides = [[side["pooled"], *side["runs"]] for side in (diagnosis.before, diagnosis.after)]
+    if len(names) == 2:
+        names, sides = names[1:], [side[1:] for side in sides]
+    rows = []
+    for phase, title in TITLES.items():
+        cells = [
+            _phase(before.get("phases", {}).get(phase), after.get("phases", {}).get(phase))
+            for before, after in zip(*sides)
+        ]
+        if any(cells):
+            rows.append((title, *cells))
+    return Table(("", *names), rows, range(1, 1 + len(names)))
 
 
 def _phase(before: dict[str, Any] | None, after: dict[str, Any] | None) -> str:
     """Return the cell of one phase, before and after."""
-    if before is None or after is None:
+    if before is None or after is None or before["rmse_3d"] is after["rmse_3d"] is None:
         return ""
-    errors, nees = (
-        " → ".join(_figure(side, key, factor) for side in (before, after))
-        for key, factor in (("rmse_3d", CM), ("nees_mean", 1.0))
-    )
+    errors = " → ".join(_figure(side, "rmse_3d", CM) for side in (before, after))
+    nees = " → ".join(_figure(side, "nees_mean", 1.0) for side in (before, after))
     return f"{errors}; NEES {nees}"
 
 
@@ -222,15 +160,6 @@ def _figure(row: dict[str, Any], key: str, factor: float) -> str:
 
 def _interval(row: dict[str, Any]) -> str:
     return " to ".join(f"{bound * CM:.1f}" for bound in row["rmse_3d_ci"] or ()) or "?"
-
-
-def refused(diagnosis: Diagnosis) -> Table:
-    """Return the candidates that were not added, by reason."""
-    added = {finding.effect.label for finding in diagnosis.findings if finding.added}
-    return by_reason(
-        (f"a further part of {item.what}" if item.what in added else item.what, item.why)
-        for item in diagnosis.refused
-    )
 
 
 def not_added(found: Sequence[Entry]) -> Table:
@@ -253,44 +182,4 @@ def by_reason(items: Iterable[tuple[str, str]]) -> Table:
         rows.setdefault(reason, []).append(f"{what} ({figures})" if figures else what)
     return Table(
         ("why not", "what"), [(reason, "; ".join(whats)) for reason, whats in rows.items()]
-    )
-
-
-def health(figures: Figures) -> Iterator[Table]:
-    """Yield the health figures of channels and of the filter."""
-    for group, name in (("pairs", "pair"), ("anchors", "anchor"), ("axes", "axis")):
-        head = (name, "samples", "offset", "scatter", "far off", "likeness")
-        yield Table(head, [_of_channel(item, name) for item in figures[group]], range(1, 6))
-    crossed = [
-        (" and ".join(item["pairs"]), f"{item['correlation']:.2f}")
-        for item in figures["cross_correlation"]
-    ]
-    yield Table(("pairs that err together", "correlation"), crossed, (1,))
-    rows = []
-    for item in figures["filter"]:
-        means = [f"{item[key]:.2f}" for key in ("nis_mean", "nees_mean")]
-        rows.append(
-            (
-                item["flight"],
-                *means,
-                *(f"{item[key]:.0%}" for key in ("nis_below_3.84", "nees_below_7.81")),
-            )
-        )
-    yield Table(
-        ("flight", "NIS", "NEES", "NIS within its 95 % bound", "NEES within its 95 % bound"),
-        rows,
-        range(1, 5),
-    )
-
-
-def _of_channel(item: dict[str, Any], name: str) -> tuple[Any, ...]:
-    near = next(iter((item.get("autocorrelation") or {}).values()), None)
-    offset, scatter = (f"{item[key]:.2g}" for key in ("bias", "spread"))
-    return (
-        item[name],
-        item["count"],
-        offset,
-        scatter,
-        f"{item['tails']:.1%}",
-        "" if near is None else f"{near:.2f}",
     )

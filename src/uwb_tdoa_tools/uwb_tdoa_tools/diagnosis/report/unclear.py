@@ -35,30 +35,27 @@ class Undetermined:
     """An undetermined effect or combination of its parameters.
 
     effect : name; what : parameters, in words, "" for the whole effect
-    remedy : flight, mark or sensor that would determine it, in words
-    harmless : whether it cancels in every measurement
+    remedy : flight, mark or sensor that would determine it, in words; CANCELS if it does no harm
     """
 
     effect: str
     what: str
     remedy: str
-    harmless: bool
 
 
 def undetermined(diagnosis: Diagnosis) -> list[Undetermined]:
     """Return one Undetermined per entry of diagnosis.unobservable."""
-    out = []
-    for item in diagnosis.unobservable:
-        remedy = _remedy(item, diagnosis)
-        out.append(Undetermined(item.effect, _what(item), remedy, remedy is CANCELS))
-    return out
+    return [
+        Undetermined(item.effect, _what(item.direction or {}), _remedy(item, diagnosis))
+        for item in diagnosis.unobservable
+    ]
 
 
 def by_remedy(items: Iterable[Undetermined]) -> dict[str, list[str]]:
     """Return {remedy: [effect and parameters, in words]} of items that are not harmless."""
     groups: dict[str, dict[str, list[str]]] = {}
     for item in items:
-        if not item.harmless:
+        if item.remedy != CANCELS:
             groups.setdefault(item.remedy, {}).setdefault(item.effect, []).append(item.what)
     return {remedy: [_few(*each) for each in effects.items()] for remedy, effects in groups.items()}
 
@@ -66,23 +63,23 @@ def by_remedy(items: Iterable[Undetermined]) -> dict[str, list[str]]:
 def _few(effect: str, whats: list[str]) -> str:
     if whats == [""]:
         return effect
+    words = "; ".join(whats)
     if len(whats) > 2 or "combination" in whats[0]:
-        return (
-            f"{effect} ({len(whats)} combination{'s' if len(whats) > 1 else ''} of its parameters)"
-        )
-    return f"{effect} ({'; '.join(whats)})"
+        plural = "s" if len(whats) > 1 else ""
+        words = f"{len(whats)} combination{plural} of its parameters"
+    return f"{effect} ({words})"
 
 
-def _what(item: Unobservable) -> str:
-    if item.direction is None:
-        return ""
-    if len(item.direction) == 1:
-        return next(iter(item.direction))
-    if len(item.direction) > NAMED and len({abs(weight) for weight in item.direction.values()}) > 1:
-        return f"a combination of {len(item.direction)} parameters"
-    sides = [
-        [key for key, weight in item.direction.items() if weight * sign > 0.0] for sign in (1, -1)
-    ]
+def _what(direction: dict[str, float]) -> str:
+    """Return a combination of parameters in words.
+
+    direction : {key: weight}
+    """
+    if len(direction) <= 1:
+        return "".join(direction)
+    if len(direction) > NAMED and len({abs(weight) for weight in direction.values()}) > 1:
+        return f"a combination of {len(direction)} parameters"
+    sides = [[key for key, weight in direction.items() if weight * sign > 0.0] for sign in (1, -1)]
     first, second = sorted(sides, key=len, reverse=True)
     together = f"{listed(first)} together" if len(first) > 1 else first[0]
     return f"{together} against {listed(second)}" if second else together
@@ -90,21 +87,22 @@ def _what(item: Unobservable) -> str:
 
 def _remedy(item: Unobservable, diagnosis: Diagnosis) -> str:
     effect = EFFECTS[item.effect]
-    alone = not all(diagnosis.reference.positions_known)
+    path_known = all(diagnosis.reference.positions_known)
     if item.direction is None:
-        if alone and effect.needs_reference:
+        if effect.needs_reference and not path_known:
             return GROUND_TRUTH
-        wanted, shown = (
-            (*effect.corroborating_channels, *effect.channels),
-            {name for flight in diagnosis.attribution.residuals for name in flight},
-        )
+        wanted = (*effect.corroborating_channels, *effect.channels)
+        shown = {name for flight in diagnosis.attribution.residuals for name in flight}
         return _lacking(next((name for name in wanted if name not in shown), wanted[0]), diagnosis)
-    size, parts = _contribution(item.effect, item.direction, diagnosis)
+    table = diagnosis.attribution.selection.table
+    columns = {(column.effect[0], column.key): column for column in table.columns}
+    x = table.matrix([columns[item.effect, key] for key in item.direction])
+    size, parts = np.abs(x @ list(item.direction.values())).max(), np.abs(x).max()
     if parts > 0.0 and size <= NOTHING * parts:
         return CANCELS
     if parts == 0.0 and effect.uses_attitude:
         return ORIENTATIONS if _knows_attitude(diagnosis) else ATTITUDE
-    if alone:
+    if not path_known:
         return GROUND_TRUTH
     return "a flight through other places, headings, heights and speeds"
 
@@ -126,16 +124,3 @@ def _lacking(channel: str, diagnosis: Diagnosis) -> str:
     if truth and any(getattr(flight, stream) is not None for flight in diagnosis.flights):
         return truth
     return CHANNELS[channel].needs
-
-
-def _contribution(
-    effect: str, direction: dict[str, float], diagnosis: Diagnosis
-) -> tuple[float, float]:
-    """Return the largest contributions of a combination and of its parts alone to any row.
-
-    direction : {key: weight}
-    """
-    table = diagnosis.attribution.selection.table
-    columns = {(column.effect[0], column.key): column for column in table.columns}
-    x = table.matrix([columns[effect, key] for key in direction])
-    return float(np.abs(x @ list(direction.values())).max()), float(np.abs(x).max())

@@ -1,30 +1,45 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""State the verdict: the error before and after, the data, and the uncertainty."""
+"""State the verdict: the error before and after, why, where errors remain, and the uncertainty."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from uwb_tdoa_bias.effects.base import listed
+import numpy as np
+
+from uwb_tdoa_bias.effects.base import listed, measured
+from uwb_tdoa_bias.effects.smooth_term import causes, described
 
 from ...scoring.gains import NO_DIFFERENCE, difference
 from ...scoring.phases import TITLES
+from ..channels.figures import rows_by_value
+from ..findings import prefixes_of
+from ..regression.table import BLOCK
 from ..self_calibration.solve import CLEARLY, CLEARLY_OF_RANGES, LEFT
-from .left_over import left_over
-from .reasons import reasons
+from .entries import CM, LEAST_WORTH, WORTH_DOING, entries, for_people
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from uwb_tdoa_bias.effects import SmoothTerm
     from uwb_tdoa_ekf.monitoring.finding import Finding as NumbersFinding
 
+    from ..channels import ChannelResidual
     from ..result import Diagnosis
+    from .entries import Entry
 
-CM = 100.0  # cm per metre
 MOST_NAMES = 6  # largest number of named flights
+NAMED = 3  # largest number of named reasons, and of named places
+MOST = 0.5  # share of the gain from which an effect is most of it
+POINTS = 60  # at which a function is evaluated
+# smallest RMS residual of a named pair over BLOCK s: m, and relative to the RMS of all rows
+LARGE, ABOVE = (0.15, 3.0)
+FEWEST = 3  # fewest rows of such a pair
 ERROR = "The position error (3D RMSE)"
+NOTHING_FOUND = "Nothing was found: what the model leaves of the measurements looks like noise."
+UNKNOWN = "Without ground truth nobody knows the position error, neither before nor after."
 
 
 @dataclass(frozen=True)
@@ -48,11 +63,10 @@ class Verdict:
 
 def verdict(diagnosis: Diagnosis) -> Verdict:
     """Return the Verdict of a Diagnosis."""
+    added = any(finding.added for finding in diagnosis.findings)
     if diagnosis.after["pooled"].get("rmse_3d") is None:
-        return _without_truth(diagnosis)
-    if not any(finding.added for finding in diagnosis.findings):
-        return _nothing_added(diagnosis)
-    return _with_errors(diagnosis)
+        return _without_truth(diagnosis, added)
+    return _with_errors(diagnosis) if added else _nothing_added(diagnosis)
 
 
 def faults_in_words(diagnosis: Diagnosis) -> list[str]:
@@ -90,20 +104,19 @@ def percent(interval: Sequence[float]) -> str:
     return f"{interval[0] * 100:.0f} to {interval[1] * 100:.0f} %"
 
 
-def _share(value: float) -> str:
-    return f"{value * 100:.0f} %"
-
-
-def _bounds(interval: Sequence[float] | None) -> str:
+def _bounds(pooled: dict[str, Any]) -> str:
+    """Return the 95 % interval of the 3D RMSE as text."""
+    interval = pooled["rmse_3d_ci"]
     return f"{interval[0] * CM:.1f} to {interval[1] * CM:.1f}" if interval else "unknown"
 
 
 def _with_errors(diagnosis: Diagnosis) -> Verdict:
     before, after = diagnosis.before["pooled"], diagnosis.after["pooled"]
-    gain, interval = 1.0 - after["rmse_3d"] / before["rmse_3d"], after.get("rmse_3d_gain_ci")
-    change = f"from {centimetres(before['rmse_3d'])} to {centimetres(after['rmse_3d'])}"
-    more = [
-        _intervals(before, after, interval),
+    interval = after.get("rmse_3d_gain_ci")
+    share = f"{100 * (1.0 - after['rmse_3d'] / before['rmse_3d']):.0f} %"
+    sure = f"; gain {share} ({percent(interval)})" if interval else ""
+    more = (
+        f"95 % intervals: {_bounds(before)} cm before, {_bounds(after)} cm after{sure}.",
         f"Judged on {diagnosis.judged_on}: {_flights(diagnosis)}; {_named(diagnosis)}.",
         *reasons(diagnosis),
         *_worse_phases(diagnosis),
@@ -111,53 +124,34 @@ def _with_errors(diagnosis: Diagnosis) -> Verdict:
         *_over_phases(diagnosis),
         *_shared(diagnosis),
         *_caveats(diagnosis),
-        *_worse(diagnosis),
+        *_worse_runs(diagnosis),
         *_diverged(diagnosis),
         *left_over(diagnosis),
-    ]
+    )
+    change = f"from {centimetres(before['rmse_3d'])} to {centimetres(after['rmse_3d'])}"
     if all(finding.on_floor for finding in diagnosis.findings if finding.added):
-        stays = (
+        headline = (
             f"{ERROR} stays {centimetres(after['rmse_3d'])}: what is added acts near the floor "
             "alone, where the filter weighs it."
         )
-        return Verdict(stays, tuple(more), "same")
+        return Verdict(headline, more, "same")
     if interval and interval[0] > 0.0:
-        return Verdict(
-            f"{ERROR} falls {change}: {_share(gain)} of it is gone.", tuple(more), "better"
-        )
-    more.append(
+        return Verdict(f"{ERROR} falls {change}: {share} of it is gone.", more, "better")
+    unsure = (
         "More flights to judge on (--holdout) make that certain; until then compare before "
         "relying on effects.yaml."
     )
+    headline = f"There is {NO_DIFFERENCE}: the position error (3D RMSE) goes {change}."
     if interval and interval[1] < 0.0:
-        return Verdict(f"{ERROR} rises {change}.", tuple(more), "unsure")
-    return Verdict(
-        f"There is {NO_DIFFERENCE}: the position error (3D RMSE) goes {change}.",
-        tuple(more),
-        "unsure",
-    )
-
-
-def _intervals(before: dict[str, Any], after: dict[str, Any], gain: Sequence[float] | None) -> str:
-    sides = [
-        f"{_bounds(side['rmse_3d_ci'])} cm {name}"
-        for side, name in ((before, "before"), (after, "after"))
-    ]
-    share = 1.0 - after["rmse_3d"] / before["rmse_3d"]
-    return (
-        f"95 % intervals: {', '.join(sides)}; gain {_share(share)} ({percent(gain)})."
-        if gain
-        else f"95 % intervals: {', '.join(sides)}."
-    )
+        headline = f"{ERROR} rises {change}."
+    return Verdict(headline, (*more, unsure), "unsure")
 
 
 def _nothing_added(diagnosis: Diagnosis) -> Verdict:
-    pooled, found = diagnosis.before["pooled"], len({finding.key for finding in diagnosis.findings})
-    interval = f"95 % interval {_bounds(pooled['rmse_3d_ci'])} cm"
-    data = f"{_flights(diagnosis)}; {_named(diagnosis)}"
-    error = f"{ERROR} is {centimetres(pooled['rmse_3d'])}, {interval}: {data}."
+    pooled = diagnosis.before["pooled"]
+    error = f"{centimetres(pooled['rmse_3d'])}, 95 % interval {_bounds(pooled)} cm"
     more = (
-        error,
+        f"{ERROR} is {error}: {_flights(diagnosis)}; {_named(diagnosis)}.",
         *(f"Not added: {item.why}." for item in diagnosis.refused if item.what == "all"),
         *_with_noise(diagnosis),
         *_over_phases(diagnosis),
@@ -165,59 +159,52 @@ def _nothing_added(diagnosis: Diagnosis) -> Verdict:
         *_diverged(diagnosis),
         *left_over(diagnosis),
     )
+    found = len({finding.key for finding in diagnosis.findings})
     if not found:
-        return Verdict(
-            "Nothing was found: what the model leaves of the measurements looks like noise.",
-            more,
-            "nothing",
-        )
-    what = (
-        "One effect was found, but taking it out does"
-        if found == 1
-        else f"{found} effects were found, but taking them out does"
-    )
+        return Verdict(NOTHING_FOUND, more, "nothing")
+    what = "One effect was found, but taking it out does"
+    if found > 1:
+        what = f"{found} effects were found, but taking them out does"
     return Verdict(
         f"{what} not make the position better; nothing is added to the model.", more, "same"
     )
 
 
-def _without_truth(diagnosis: Diagnosis) -> Verdict:
+def _without_truth(diagnosis: Diagnosis, added: bool) -> Verdict:
     before, after = (
         side["pooled"]["residual_spread"] for side in (diagnosis.before, diagnosis.after)
     )
     measured = "TDOAs" if any(len(flight.tdoa) for flight in diagnosis.flights) else "ranges"
     scatter = f"Innovations (measured minus predicted {measured}) scatter by {centimetres(before)}"
     if not diagnosis.findings:
-        headline = "Nothing was found: what the model leaves of the measurements looks like noise."
-        return Verdict(headline, (_UNKNOWN, f"{scatter}."), "nothing")
-    if not any(finding.added for finding in diagnosis.findings):
+        return Verdict(NOTHING_FOUND, (UNKNOWN, f"{scatter}."), "nothing")
+    if not added:
         headline = (
             "Nothing of what was found is added to the model: nobody can tell whether it would "
             "help the position."
         )
         decided = diagnosis.refused[len(diagnosis.attribution.refused) :]
-        why = tuple(f"Not added, {item.what}: {item.why}." for item in decided)
-        return Verdict(headline, (_UNKNOWN, *why, f"{scatter}."), "unknown")
+        why = (f"Not added, {item.what}: {item.why}." for item in decided)
+        return Verdict(headline, (UNKNOWN, *why, f"{scatter}."), "unknown")
     headline = (
         "What was found makes measurements agree better; what that is worth for the position is "
         "unknown."
     )
     limit = (
-        f"not above {100 * LEFT:.1f} cm, or {CLEARLY:g} times smaller than it was, limits that "
-        "were set on measured flights"
-        if measured == "TDOAs"
-        else f"{CLEARLY_OF_RANGES:g} times smaller than it was, a limit that was set on simulated "
+        f"{CLEARLY_OF_RANGES:g} times smaller than it was, a limit that was set on simulated "
         "flights"
     )
+    if measured == "TDOAs":
+        limit = (
+            f"not above {CM * LEFT:.1f} cm, or {CLEARLY:g} times smaller than it was, limits that "
+            "were set on measured flights"
+        )
     validated = (
         "It is added because what is slow in the innovations becomes small: what it leaves is "
         f"{limit}."
     )
     change = f"{scatter} before and {centimetres(after)} after, on {diagnosis.judged_on}."
-    return Verdict(headline, (_UNKNOWN, validated, change), "unknown")
-
-
-_UNKNOWN = "Without ground truth nobody knows the position error, neither before nor after."
+    return Verdict(headline, (UNKNOWN, validated, change), "unknown")
 
 
 def _names(diagnosis: Diagnosis) -> list[str]:
@@ -226,12 +213,12 @@ def _names(diagnosis: Diagnosis) -> list[str]:
 
 
 def _flights(diagnosis: Diagnosis) -> str:
-    ends: dict[
-        str, list[float]
-    ] = {}  # first and last stamp per flight, since judged parts of a flight alternate
+    # first and last stamp per flight, since judged parts of a flight alternate
+    ends: dict[str, list[float]] = {}
     for score in diagnosis.before["scores"]:
         ends.setdefault(score.name, []).extend([score.first, score.last])
-    count, seconds = len(_names(diagnosis)), sum(max(of) - min(of) for of in ends.values())
+    count = len(_names(diagnosis))
+    seconds = sum(max(of) - min(of) for of in ends.values())
     parts = " or ".join(sorted({TITLES[score.part] for score in diagnosis.before["scores"]}))
     return f"{count} flight{'s' if count > 1 else ''}, {seconds:.0f} s {parts}"
 
@@ -245,17 +232,17 @@ def _named(diagnosis: Diagnosis) -> str:
 
 def _worse_phases(diagnosis: Diagnosis) -> list[str]:
     """Return a sentence on phases in which the error grows."""
-    worse = list(worse_phases(diagnosis.before["pooled"], diagnosis.after["pooled"]))
-    return [f"Worse: {'; '.join(worse)}."] if worse else []
+    worse = "; ".join(worse_phases(diagnosis.before["pooled"], diagnosis.after["pooled"]))
+    return [f"Worse: {worse}."] if worse else []
 
 
 def _with_noise(diagnosis: Diagnosis) -> list[str]:
     """Return a sentence on the error with all files as they are written."""
     if diagnosis.written is None or diagnosis.tdoa_std is None:
         return []
-    before, after = diagnosis.before["pooled"], diagnosis.written["pooled"]
-    worse = list(worse_phases(before, after))
-    also = f"; worse: {'; '.join(worse)}" if worse else ""
+    after = diagnosis.written["pooled"]
+    worse = "; ".join(worse_phases(diagnosis.before["pooled"], after))
+    also = f"; worse: {worse}" if worse else ""
     return [
         f"With tdoa_std {diagnosis.tdoa_std:.3f} m of ekf_node.yaml too it is "
         f"{centimetres(after['rmse_3d'])}{also}."
@@ -267,7 +254,8 @@ def _over_phases(diagnosis: Diagnosis) -> list[str]:
     before, after = (
         side["pooled"].get("phases", {}) for side in (diagnosis.before, diagnosis.after)
     )
-    parts, judged = [], {score.part for score in diagnosis.before["scores"]}
+    judged = {score.part for score in diagnosis.before["scores"]}
+    parts = []
     for name in (name for name in TITLES if name in before and name not in judged):
         sides = [_of_phase(side[name]) for side in (before, after)]
         parts.append(f"{TITLES[name]} {' to '.join(dict.fromkeys(sides))}")
@@ -291,9 +279,8 @@ def _of_phase(figures: dict[str, Any]) -> str:
     """Return the 3D RMSE and the NEES of a phase, as text."""
     if figures["rmse_3d"] is None:
         return "unknown"
-    return centimetres(figures["rmse_3d"]) + (
-        "" if figures["nees_mean"] is None else f" (NEES {figures['nees_mean']:.1f})"
-    )
+    nees = "" if figures["nees_mean"] is None else f" (NEES {figures['nees_mean']:.1f})"
+    return f"{centimetres(figures['rmse_3d'])}{nees}"
 
 
 def _shared(diagnosis: Diagnosis) -> list[str]:
@@ -306,12 +293,11 @@ def _shared(diagnosis: Diagnosis) -> list[str]:
 
 
 def _caveats(diagnosis: Diagnosis) -> list[str]:
-    out, base = [], len(diagnosis.effects) - sum(finding.added for finding in diagnosis.findings)
+    out = []
+    base = len(diagnosis.effects) - sum(finding.added for finding in diagnosis.findings)
     if base > 0:
-        out.append(
-            f"Before is with the {base} effect{'s' if base > 1 else ''} that the model held "
-            "already."
-        )
+        effects = "effects" if base > 1 else "effect"
+        out.append(f"Before is with the {base} {effects} that the model held already.")
     if set(_names(diagnosis)) & {flight.name for flight in diagnosis.flights}:
         out.append(
             "Which effects to add was decided on these same flights; flights given as "
@@ -322,14 +308,15 @@ def _caveats(diagnosis: Diagnosis) -> list[str]:
     return out
 
 
-def _worse(diagnosis: Diagnosis) -> list[str]:
-    runs = list(zip(diagnosis.before["runs"], diagnosis.after["runs"]))
-    worse = [
-        (b["rmse_3d"], a["rmse_3d"], b["flight"]) for b, a in runs if a["rmse_3d"] > b["rmse_3d"]
+def _worse_runs(diagnosis: Diagnosis) -> list[str]:
+    runs = [
+        (after["rmse_3d"] - before["rmse_3d"], before["rmse_3d"], after["rmse_3d"], after["flight"])
+        for before, after in zip(diagnosis.before["runs"], diagnosis.after["runs"])
     ]
+    worse = [run for run in runs if run[0] > 0.0]
     if not worse or len(runs) == 1:
         return []
-    before, after, name = max(worse, key=lambda run: run[1] - run[0])
+    _, before, after, name = max(worse, key=lambda run: run[0])
     much = f"most on {name}, from {centimetres(before)} to {centimetres(after)}"
     return [f"On {len(worse)} of {len(runs)} runs the error grows, {much}."]
 
@@ -341,3 +328,95 @@ def _diverged(diagnosis: Diagnosis) -> list[str]:
     if not before and not after:
         return []
     return [f"Of {len(diagnosis.before['runs'])} runs, {before} diverged before and {after} after."]
+
+
+def reasons(diagnosis: Diagnosis) -> list[str]:
+    """Return sentences on what makes the error, the largest worth first; [] if nothing is known.
+
+    An effect without a name is described by its largest part, with its most likely causes.
+    """
+    before, after = (side["pooled"]["rmse_3d"] for side in (diagnosis.before, diagnosis.after))
+    out: list[str] = []
+    for entry in entries(diagnosis):
+        worth = entry.worth or 0.0
+        if entry.added and worth >= (WORTH_DOING if out else LEAST_WORTH):
+            out.append(_sentence(entry, len(out), before - after))
+    return out[:NAMED]
+
+
+def _sentence(entry: Entry, place: int, gain: float) -> str:
+    worth = entry.worth or 0.0
+    begin = "Then" if place else "Mostly" if worth >= MOST * gain else "In part"
+    much = f"{CM * worth:.1f} cm"
+    if not place and worth <= gain:
+        much = f"{CM * worth:.1f} of {CM * gain:.1f} cm"
+    sentence = f"{begin} {cause(entry)}, worth {much}."
+    if entry.findings[0].declared:
+        return sentence
+    others = [other.effect for other in entry.undecided[:1]]
+    return f"{sentence} Likely causes: {listed([causes(_largest(entry)[0])[0], *others], 'or')}."
+
+
+def cause(entry: Entry) -> str:
+    """Return what is wrong, as a clause: for a function without a name its largest part."""
+    if not entry.findings[0].declared:
+        said = described(*_largest(entry))
+        terms = _functions(entry)
+        if sum(len(prefixes_of(term)) for term in terms) == 1:
+            return said
+        covariates = listed(dict.fromkeys(term.covariate.replace("_", " ") for term in terms))
+        return f"errors that depend on {covariates}, anchor by anchor; at most {said}"
+    effect = entry.findings[0].effect
+    significant = effect.significant() or effect.values
+    key = max(significant, key=lambda name: abs(significant[name]))
+    unit, factor = for_people(effect.unit, key)
+    std = effect.std.get(key)
+    largest = measured(factor * effect.values[key], std and factor * std, unit)
+    most = "largest " if len(effect.values) > 1 else ""
+    return f"{effect.physics.partition(':')[0]} ({effect.name}; {most}{key} = {largest})"
+
+
+def _functions(entry: Entry) -> list[SmoothTerm]:
+    return [finding.function for finding in entry.findings if finding.function]
+
+
+def _largest(entry: Entry) -> tuple[SmoothTerm, str]:
+    """Return the function with the largest swing, and its anchor or pair."""
+    parts = []
+    for term in _functions(entry):
+        at = np.linspace(term.knots[0], term.knots[-1], POINTS)
+        for prefix in prefixes_of(term):
+            parts.append((np.ptp(term.curve(at, prefix)), term, prefix.rstrip(".")))
+    _, term, part = max(parts, key=lambda each: each[0])
+    return term, part
+
+
+def left_over(diagnosis: Diagnosis) -> tuple[str, ...]:
+    """Return sentences on the pairs, times and places of the largest remaining residuals.
+
+    It is () if none stands out.
+    """
+    found: list[tuple[float, str]] = []
+    for flight, residuals in zip(diagnosis.flights, diagnosis.remaining):
+        of = f" of {flight.name}" if len(diagnosis.flights) > 1 else ""
+        for part in residuals.values():
+            found += _left_over(part, of)
+    places = [f"{said} ({CM * size:.0f} cm)" for size, said in sorted(found, reverse=True)[:NAMED]]
+    return (f"What is left is largest for {'; '.join(places)}.",) if places else ()
+
+
+def _left_over(part: ChannelResidual, of: str) -> Iterator[tuple[float, str]]:
+    """Yield (RMS residual m, pair, time and place, in words)."""
+    rows = part.rows()
+    block = (rows.t / BLOCK).astype(int)
+    # the median of squares is 0.455 of their mean, for Gaussian noise
+    usual = np.sqrt(np.median(rows.y**2) / 0.455)
+    count = int(block.max()) + 1
+    for label, mine in rows_by_value(rows.series * count + block):
+        series, number = divmod(label, count)
+        size = float(np.sqrt(np.mean(rows.y[mine] ** 2)))
+        name = part.place_in_room(series)
+        if name and len(mine) >= FEWEST and size > max(LARGE, ABOVE * usual):
+            x, y, z = rows.place[mine].mean(axis=0)
+            when = f"{number * BLOCK:.0f} to {(number + 1) * BLOCK:.0f} s"
+            yield size, f"{name} from {when}{of}, around ({x:.1f}, {y:.1f}, {z:.1f}) m"

@@ -6,7 +6,7 @@
 position errors are unknown.
 """
 
+from .prior import Tape
 from .solve import SelfCalibration, self_calibrate
-from .tape import Tape
 
 __all__ = ["SelfCalibration", "Tape", "self_calibrate"]

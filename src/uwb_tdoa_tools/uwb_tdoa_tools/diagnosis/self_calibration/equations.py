@@ -20,7 +20,6 @@ import numpy as np
 from scipy.sparse import csr_array, hstack
 
 from uwb_tdoa_bias.common.anchors import Anchors
-from uwb_tdoa_bias.common.compiled import compiled
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
@@ -114,33 +113,14 @@ def slow_innovations(
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """Normal equations of all flights.
+    """Normal equations of one flight, or of all flights.
 
-    gram : (k, k); vector : (k,); marks : [_Mark] included in them
-    slow : m, scale of the slow innovations
+    gram : (k, k); vector : (k,); marks : [_Mark] that add to them
+    slow : (n,) m, slow innovations
     inflation : variance of score sums over blocks, relative to independent errors
-    seconds : s of data used
-    flights : [FlightEquations]; empty above MANY anchors, where they would take gigabytes
-    """
-
-    gram: np.ndarray
-    vector: np.ndarray
-    marks: list[_Mark]
-    slow: float
-    inflation: float
-    seconds: float
-    flights: list[FlightEquations]
-
-    def tdoa_std(self, config: FilterConfig) -> float:
-        """Return the tdoa_std, m, at which the filter's information matches the inflated noise."""
-        return config.tdoa_std * float(np.sqrt(self.inflation / config.tdoa_correlation_length))
-
-
-@dataclass(frozen=True, eq=False)
-class FlightEquations:
-    """Normal equations of one flight, with the fields of Equations.
-
-    slow : (n,) m, slow innovations; grounded : number of marks left out, on the floor
+    seconds : s of data used; grounded : number of marks left out, on the floor
+    flights : [Equations] of single flights; empty above MANY anchors, where they would take
+        gigabytes
     """
 
     gram: np.ndarray
@@ -150,6 +130,16 @@ class FlightEquations:
     inflation: float
     seconds: float
     grounded: int
+    flights: Sequence[Equations] = ()
+
+    @property
+    def slow_scale(self) -> float:
+        """Return the scale of the slow innovations, m."""
+        return student_scale(self.slow)
+
+    def tdoa_std(self, config: FilterConfig) -> float:
+        """Return the tdoa_std, m, at which the filter's information matches the inflated noise."""
+        return config.tdoa_std * float(np.sqrt(self.inflation / config.tdoa_correlation_length))
 
 
 class Runs:
@@ -157,8 +147,6 @@ class Runs:
 
     spans : {flight: (first, last) s} in the air, or in motion on the floor, from the first run.
         Later runs keep it: other anchors can move the estimate to the floor, but not the tag.
-    grounded : number of marks left out because they are on the floor; marks of a ground vehicle
-        count
     """
 
     def __init__(
@@ -174,16 +162,13 @@ class Runs:
         base : EffectSet of the model; config : FilterConfig
         constraints : marks and distances; streams : names in RADIO that are used
         """
-        self._base, self._config, self._reference = (
-            base,
-            config or FilterConfig(),
-            Nothing(config, streams=streams),
-        )
+        self._base = base
+        self._config = config or FilterConfig()
+        self._reference = Nothing(config, streams=streams)
         self.spans: dict[str, tuple[float, float]] = {}
         self.flights = [self._reference.prepare(flight) for flight in flights]
         self._of_anchors = [one for one in constraints if isinstance(one, Distance)]
         self._marks = [one for one in constraints if isinstance(one, Mark)]
-        self.grounded = 0
 
     def slow_innovations(self, anchors: Anchors, delays: np.ndarray) -> float:
         """Return the scale of the slow innovations of all flights under Anchors, m.
@@ -192,17 +177,13 @@ class Runs:
 
         delays : (N,) m
         """
-        about, by = (
-            (self._base, self._reference, anchors, delays),
-            Corrector(anchors, _with_delays(self._base, anchors, delays)),
-        )
-        found = [
-            without_unknown_offset(replace(one, anchors=anchors), self._config, by)
-            for one in self.flights
-        ]
-        return _scale(
-            [_slow(_residuals(*about, one, self.spans.get(one.name))[1]) for one in found]
-        )
+        by = Corrector(anchors, _with_delays(self._base, anchors, delays))
+        slow = []
+        for one in self.flights:
+            flight = without_unknown_offset(replace(one, anchors=anchors), self._config, by)
+            about = self._base, self._reference, anchors, delays
+            slow.append(_slow(_residuals(*about, flight, self.spans.get(one.name))[1]))
+        return student_scale(_joined(slow))
 
     def equations(
         self,
@@ -218,53 +199,47 @@ class Runs:
         delays : (N,) m; loose : (4N,) m, prior standard deviations of the preliminary solution
         functions : whether to include functions of the place; the inflation does not need them
         """
-        gram: np.ndarray = np.zeros(())
-        vector: np.ndarray = np.zeros(())
-        self.grounded = 0
-        marks: list[_Mark] = []
-        several: list[FlightEquations] = []
-        here = [
-            [one for one in self._marks if one.flight == flight.name] for flight in self.flights
-        ]
         items = [
-            (flight, self.spans.get(flight.name), some) for flight, some in zip(self.flights, here)
+            (
+                flight,
+                self.spans.get(flight.name),
+                [one for one in self._marks if one.flight == flight.name],
+            )
+            for flight in self.flights
         ]
-        results = map_function(
-            partial(_of_flight, self._base, self._reference, (anchors, delays), loose, functions),
-            items,
+        of_flight = partial(
+            _of_flight, self._base, self._reference, (anchors, delays), loose, functions
         )
-        for (one, span), flight in zip(results, self.flights):
+        several = []
+        for (one, span), flight in zip(map_function(of_flight, items), self.flights):
             self.spans[flight.name] = span
-            marks += one.marks
-            self.grounded += one.grounded
             several.append(one)
-            gram, vector = gram + one.gram, vector + one.vector
             progress()
-        of_anchors = [one.equations(anchors, len(vector)) for one in self._of_anchors]
-        for more, right in [*((mark.gram, mark.vector) for mark in marks), *of_anchors]:
-            gram, vector = gram + more, vector + right
-        slow = _scale([one.slow for one in several])
-        inflation, seconds = (
-            float(np.mean([one.inflation for one in several])),
-            sum(one.seconds for one in several),
-        )
+        marks = [mark for one in several for mark in one.marks]
+        pieces = [(one.gram, one.vector) for one in several]
+        pieces += [(mark.gram, mark.vector) for mark in marks]
+        pieces += [one.equations(anchors, len(several[0].vector)) for one in self._of_anchors]
         return Equations(
-            gram, vector, marks, slow, inflation, seconds, several if len(anchors) <= MANY else []
+            gram=sum((gram for gram, _ in pieces), np.zeros(())),
+            vector=sum((vector for _, vector in pieces), np.zeros(())),
+            marks=marks,
+            slow=_joined([one.slow for one in several]),
+            inflation=float(np.mean([one.inflation for one in several])),
+            seconds=sum(one.seconds for one in several),
+            grounded=sum(one.grounded for one in several),
+            flights=several if len(anchors) <= MANY else (),
         )
 
 
-def _scale(slow: Sequence[np.ndarray]) -> float:
-    """Return the scale of the slow innovations of flights, m.
-
-    Raises InputError without any.
-    """
-    together = np.concatenate(slow)
-    if not len(together):
+def _joined(several: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the slow innovations of all flights, (n,) m; raise InputError without any."""
+    slow = np.concatenate(several)
+    if not len(slow):
         raise InputError(
             f"no pair of anchors, and no anchor, is measured {FEWEST} times in half a second: "
             "raise the rate of the radio."
         )
-    return student_scale(together)
+    return slow
 
 
 def _residuals(
@@ -302,8 +277,8 @@ def _of_flight(
     loose: np.ndarray,
     functions: bool,
     item: tuple[Flight, tuple[float, float] | None, list[Mark]],
-) -> tuple[FlightEquations, tuple[float, float]]:
-    """Return the FlightEquations and the span of one flight.
+) -> tuple[Equations, tuple[float, float]]:
+    """Return the Equations and the span of one flight.
 
     about : Anchors and their delays (N,) m; loose, functions : as of `Runs.equations`
     item : Flight, span or None, its marks
@@ -316,10 +291,16 @@ def _of_flight(
     n = len(loose)
     inflation = _inflation(gram[:n, :n], vector[:n], blocks, loose)
     less = SYSTEMATIC * inflation
-    slow, seconds, grounded = _slow(parts), BLOCK * len(blocks), len(marks) - len(some)
-    return FlightEquations(
-        gram / less, vector / less, known, slow, inflation, seconds, grounded
-    ), comparison.span
+    made = Equations(
+        gram=gram / less,
+        vector=vector / less,
+        marks=known,
+        slow=_slow(parts),
+        inflation=inflation,
+        seconds=BLOCK * len(blocks),
+        grounded=len(marks) - len(some),
+    )
+    return made, comparison.span
 
 
 def _with_delays(base: EffectSet, anchors: Anchors, delays: np.ndarray) -> EffectSet:
@@ -351,14 +332,10 @@ def _equations(
     """
     innovations = parts[0].innovations
     assert innovations is not None  # as of a Reference that does not know the path
-    # n : columns of positions and delays, before those of functions; air : innovations in the air;
-    # placed : regressors of each stream in the rows of its innovations
-    n, t, air, placed = (
-        4 * len(flight.anchors),
-        innovations.t,
-        np.zeros(len(innovations.t), bool),
-        [],
-    )
+    n = 4 * len(flight.anchors)  # columns of positions and delays, before those of functions
+    t = innovations.t
+    air = np.zeros(len(t), bool)
+    placed = []  # regressors of each stream in the rows of its innovations
     for part in parts:
         places = innovations.places(part.samples.channel)
         air[places] = part.airborne
@@ -370,7 +347,9 @@ def _equations(
     moved = np.zeros((sum(map(len, stamps)), 3, regressors.shape[1]))
     error = innovations.value[air] / np.sqrt(innovations.variance[air])
     scale = max(1.4826 * np.median(np.abs(error)), 1e-3)  # for the weights alone
-    gram, vector, blocks = np.zeros((regressors.shape[1],) * 2), np.zeros(regressors.shape[1]), []
+    gram = np.zeros((regressors.shape[1],) * 2)
+    vector = np.zeros(regressors.shape[1])
+    blocks = []
     number = np.floor((t - t[air][0]) / BLOCK).astype(int)
     for rows, columns, derivative in innovations.in_blocks(
         regressors, number, np.sort(np.concatenate([[], *stamps])), moved
@@ -378,30 +357,17 @@ def _equations(
         inside = air[rows]
         if not inside.any():
             continue
-        some, value, variance = (
-            derivative[inside],
-            innovations.value[rows][inside],
-            innovations.variance[rows][inside],
-        )
+        some = derivative[inside]
+        value = innovations.value[rows][inside]
+        variance = innovations.variance[rows][inside]
         weight = (NU + 1.0) / (NU + (value / np.sqrt(variance) / scale) ** 2) / variance
         more, right = (some * weight[:, None]).T @ some, some.T @ (weight * value)
-        _add(gram, columns, more)
+        gram[np.ix_(columns, columns)] += more
         vector[columns] += right
         last = np.searchsorted(columns, n)  # without functions
         # a copy, since a view would keep all of `more` in memory: megabytes
         blocks.append(_BlockEquations(columns[:last], more[:last, :last].copy(), right[:last]))
     return gram, vector, blocks, _known(constraints, stamps, moved, innovations.run.odometry)
-
-
-@compiled
-def _add(gram: np.ndarray, columns: np.ndarray, more: np.ndarray) -> None:
-    """Add more (c, c) to the rows and columns (c,) of gram (k, k), in place.
-
-    It loops over entries, because numpy would copy submatrices.
-    """
-    for i in range(len(columns)):
-        for j in range(len(columns)):
-            gram[columns[i], columns[j]] += more[i, j]
 
 
 def _regressors(samples: Samples, functions: bool) -> csr_array:
@@ -410,11 +376,12 @@ def _regressors(samples: Samples, functions: bool) -> csr_array:
     With `functions`, features of the place of each anchor follow, (n, 24 N).
     """
     ids = [str(i) for i in samples.anchors.ids]
-    late = _sparse(AnchorDelay(), samples, ids)
     positions = _sparse(AnchorPosition(), samples, [f"{i}.{axis}" for i in ids for axis in "xyz"])
-    return hstack(
-        [positions, late, *([_of_places(late, samples.p)] if functions else [])], format="csr"
-    )
+    late = _sparse(AnchorDelay(), samples, ids)
+    parts = [positions, late]
+    if functions:
+        parts.append(_of_places(late, samples.p))
+    return hstack(parts, format="csr")
 
 
 def _of_places(late: csr_array, p: np.ndarray) -> csr_array:
@@ -424,14 +391,10 @@ def _of_places(late: csr_array, p: np.ndarray) -> csr_array:
     """
     values = np.nan_to_num(features(p))
     n, times = late.shape[0], values.shape[1]
-    return csr_array(
-        (
-            (late.data[:, None] * values[np.repeat(np.arange(n), np.diff(late.indptr))]).ravel(),
-            (late.indices[:, None] * times + np.arange(times)).ravel(),
-            late.indptr * times,
-        ),
-        shape=(n, late.shape[1] * times),
-    )
+    row = np.repeat(np.arange(n), np.diff(late.indptr))
+    data = (late.data[:, None] * values[row]).ravel()
+    indices = (late.indices[:, None] * times + np.arange(times)).ravel()
+    return csr_array((data, indices, late.indptr * times), shape=(n, late.shape[1] * times))
 
 
 def _selection(places: np.ndarray, n: int) -> csr_array:

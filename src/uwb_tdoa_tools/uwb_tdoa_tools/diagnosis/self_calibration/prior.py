@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.effects import Covariance, EffectSet
 from uwb_tdoa_ekf.evidence import (
     MOVED,
@@ -29,6 +30,7 @@ from uwb_tdoa_ekf.evidence import (
 )
 
 from ...checking.pair_rules import MANY
+from ...choices import TAPE_STD, TRUSTED_STD
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -45,7 +47,78 @@ TAG_DELAY = 0.5
 FUNCTION_STDS = 0.003, 0.03, 0.06, 0.1, 0.15, 0.22, 0.3
 # m, prior standard deviation of a coordinate of an anchor that has moved
 ANYWHERE = 1.0
+AXES = "xyz"
 LOOSE = 0.05  # m, standard deviation of delays in a preliminary solution
+
+
+@dataclass(frozen=True)
+class Tape:
+    """Prior standard deviations of anchor coordinates that were measured, e.g. with a tape.
+
+    Attributes
+    ----------
+    std : m, of each coordinate
+    height_std : m, of z; None: as `std`
+    trusted : anchors ("3") or coordinates ("3.z") that are known better
+    trusted_std : m, of these
+    unknown : ids of anchors with unknown positions
+    """
+
+    std: float = TAPE_STD
+    height_std: float | None = None
+    trusted: tuple[str, ...] = ()
+    trusted_std: float = TRUSTED_STD
+    unknown: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("std", "height_std", "trusted_std"):
+            value = getattr(self, name)
+            if value is not None and not 0.0 < value <= 5.0:
+                raise InputError(
+                    f"--{name.replace('_', '-')}: {value:g} must be above 0 and at most 5 m."
+                )
+
+    def position_std(self, anchors: Anchors) -> np.ndarray:
+        """Return the standard deviations of the coordinates of Anchors, (N, 3) m, world.
+
+        Raises InputError for a name that is not an anchor or axis.
+        """
+        out = np.full((len(anchors), 3), self.std)
+        if self.height_std is not None:
+            out[:, 2] = self.height_std
+        for name in self.trusted:
+            anchor, dot, axis = name.partition(".")
+            row = self._row(anchors, anchor, f"--trusted {name}")
+            if dot and axis not in tuple(AXES):
+                raise InputError(
+                    f"--trusted: {name!r} has no axis {axis!r}; write {anchor} or {anchor}.x, "
+                    f"{anchor}.y, {anchor}.z."
+                )
+            out[row, AXES.index(axis) if dot else slice(None)] = self.trusted_std
+        return out
+
+    def unknown_rows(self, anchors: Anchors) -> list[int]:
+        """Return the rows of the unknown anchors.
+
+        Raises InputError if fewer than four other anchors are left.
+        """
+        rows = [self._row(anchors, anchor, f"--unknown {anchor}") for anchor in self.unknown]
+        if len(anchors) - len(rows) < 4:
+            raise InputError(
+                f"--unknown: {len(anchors) - len(rows)} of {len(anchors)} anchors are left; "
+                "four must be known roughly."
+            )
+        return rows
+
+    @staticmethod
+    def _row(anchors: Anchors, text: str, option: str) -> int:
+        ids = [str(i) for i in anchors.ids]
+        if text not in ids:
+            raise InputError(
+                f"{option}: there is no anchor {text!r}; the survey has {', '.join(ids)}: add it "
+                "there, roughly."
+            )
+        return ids.index(text)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,21 +223,14 @@ def with_calibration(
         `base`
     """
     effects = list(base.effects)
+    places = {one.name: k for k, one in enumerate(effects) if one.name in OF_ANCHORS}
     for effect in found:
-        same = next(
-            (
-                k
-                for k, one in enumerate(effects)
-                if one.name == effect.name and effect.name in OF_ANCHORS
-            ),
-            None,
-        )
-        if same is None:
+        if effect.name not in places:
             effects.append(effect)
             continue
-        known = effects[same]
+        known = effects[places[effect.name]]
         values = {key: known.values.get(key, 0.0) + value for key, value in effect.values.items()}
-        effects[same] = replace(
+        effects[places[effect.name]] = replace(
             effect, values={**known.values, **values}, std={**known.std, **effect.std}
         )
     return EffectSet(tuple(effects), covariance or base.covariance)
@@ -177,23 +243,19 @@ def solve(gram: np.ndarray, vector: np.ndarray, prior: Prior, offset: np.ndarray
         others are functions of the place.
     offset : (4N,) m, point of linearization minus prior mean
     """
-    parts, unchanged, delay_std = _parts(gram, vector, prior, offset), prior.covariance, DELAY_STD
+    parts = _parts(gram, vector, prior, offset)
+    unchanged, delay_std = prior.covariance, DELAY_STD
     if not prior.known.any():
         delay_std = smallest_delays(parts, prior.with_delays, offset)
         unchanged = prior.with_delays(delay_std)
-    changes, possible = (
-        most_likely_changes(parts, unchanged, offset, prior.changes()),
-        prior.changes(),
-    )
+    possible = prior.changes()
+    changes = most_likely_changes(parts, unchanged, offset, possible)
     covariance = changes.covariance.copy()
     for places in (possible[key][0] for key in changes.found if key[0] == POSITION):
         covariance[places, places] += ANYWHERE**2
     found = posterior(parts[changes.number], covariance, offset)
-    return replace(
-        found,
-        delay_std=delay_std,
-        changed={key: rivals for key, (_, rivals) in changes.found.items()},
-    )
+    changed = {key: rivals for key, (_, rivals) in changes.found.items()}
+    return replace(found, delay_std=delay_std, changed=changed)
 
 
 def _parts(gram: np.ndarray, vector: np.ndarray, prior: Prior, offset: np.ndarray) -> list[Part]:

@@ -19,10 +19,8 @@ from uwb_tdoa_ekf.evidence import DELAY, ODDS, POSITION, eliminated, keys_of
 from ...checking.pair_rules import MANY
 from ..over_flights import Share
 from .equations import SYSTEMATIC, Runs
-from .placing import PLACED_STD, place
-from .prior import ANYWHERE, TAG_DELAY, Prior, solve, to_keep, with_calibration
-from .single import Misfit
-from .tape import Tape
+from .prior import ANYWHERE, TAG_DELAY, Prior, Tape, solve, to_keep, with_calibration
+from .single import PLACED_STD, Misfit, place
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -35,7 +33,6 @@ if TYPE_CHECKING:
     from .equations import Equations
     from .prior import Solution
 
-ROUNDS = 2  # linear solutions, each linearized at the previous one
 LEAST = 30.0  # s in the air, fewest; fewer do not show how correlated errors are
 SAME_PLACE = 0.05  # m, largest difference of an anchor between flights of one installation
 NOTHING_KNOWN = 1e3  # m, reported standard deviation of a coordinate of an unknown anchor
@@ -192,14 +189,13 @@ class SelfCalibration:
 
     def found(self, shifts: np.ndarray) -> tuple[AnchorPosition, AnchorDelay]:
         """Return the effects of position errors `shifts`, (N, 3) m, and of the estimated delays."""
-        n, keys = shifts.size, [key for _, key in keys_of(self.given.ids)]
+        keys = [key for _, key in keys_of(self.given.ids)]
         values = np.concatenate([shifts.ravel(), self.delays]).tolist()
         std = np.sqrt(np.diag(self.solution.covariance)).tolist()
-        position, delay = (
-            (dict(zip(keys[some], values[some])), dict(zip(keys[some], std[some])))
-            for some in (slice(n), slice(n, None))
-        )
-        return AnchorPosition(*position, source="survey"), AnchorDelay(*delay, source="survey")
+        n = shifts.size
+        places = dict(zip(keys[:n], values[:n])), dict(zip(keys[:n], std[:n]))
+        delays = dict(zip(keys[n:], values[n:])), dict(zip(keys[n:], std[n:]))
+        return AnchorPosition(*places, source="survey"), AnchorDelay(*delays, source="survey")
 
     @property
     def tag_delay(self) -> tuple[float, float] | None:
@@ -210,10 +206,8 @@ class SelfCalibration:
         """
         if not self.prior.common:
             return None
-        first = self.shifts.size
-        return float(self.delays.mean()), float(
-            np.sqrt(self.solution.covariance[first:, first:].mean())
-        )
+        common = self.solution.covariance[self.shifts.size :, self.shifts.size :].mean()
+        return float(self.delays.mean()), float(np.sqrt(common))
 
     @property
     def covariance(self) -> Covariance:
@@ -224,6 +218,11 @@ class SelfCalibration:
     def shifts(self) -> np.ndarray:
         """Return the estimated minus the given positions, (N, 3) m, world."""
         return self.surveyed.positions - self.given.positions
+
+    @property
+    def offset(self) -> np.ndarray:
+        """Return the shifts, anchor by anchor, then the delays, (4N,) m."""
+        return np.concatenate([self.shifts.ravel(), self.delays])
 
     @property
     def given_std(self) -> np.ndarray:
@@ -310,12 +309,9 @@ def _calibrated(
     known : the Tape, and Anchors with its unknown ones placed; None to place them
     """
     tape, placed = known
-    given, names = flights[0].anchors, tuple(flight.name for flight in flights)
-    std, rows, tdoas = (
-        tape.position_std(given),
-        tape.unknown_rows(given),
-        any(len(flight.tdoa) for flight in flights),
-    )
+    given = flights[0].anchors
+    std, rows = tape.position_std(given), tape.unknown_rows(given)
+    tdoas = any(len(flight.tdoa) for flight in flights)
     if rows and not tdoas:
         raise InputError(
             f"--unknown {given.ids[rows[0]]}: only TDOAs place an anchor; measure it roughly, "
@@ -330,55 +326,46 @@ def _calibrated(
     runs = Runs([replace(flight, anchors=start) for flight in flights], base, config, constraints)
     ranged = config.use_range and any(flight.range is not None for flight in flights)  # type: ignore[attr-defined]  # as of SENSORS
     common = TAG_DELAY if ranged else 0.0
-    n, prior = len(given), Prior.of(given, start_std, base.covariance, common)
-    mean = np.concatenate([start.positions.ravel(), np.zeros(n)])
+    prior = Prior.of(given, start_std, base.covariance, common)
+    n = len(given)
+    no_delays = np.zeros(n)
+    mean = np.concatenate([start.positions.ravel(), no_delays])
 
-    def linearised(about: np.ndarray) -> Equations:
-        return runs.equations(
-            given.at(about[: 3 * n].reshape(n, 3)),
-            about[3 * n :],
-            prior.loose,
-            progress,
-            map_function,
-        )
+    def parts(x: np.ndarray) -> tuple[Anchors, np.ndarray]:
+        return given.at(x[: 3 * n].reshape(n, 3)), x[3 * n :]
 
-    best, first = mean, linearised(mean)
-    last = first
+    first = runs.equations(*parts(mean), prior.loose, progress, map_function)
     found = solve(first.gram, first.vector, prior, np.zeros(4 * n))
-    for _ in range(ROUNDS - 1):
-        best = best + found.step
-        last = linearised(best)
-        found = solve(last.gram, last.vector, prior, best - mean)
+    best = mean + found.step
+    # The second solution is linearized at the first one.
+    last = runs.equations(*parts(best), prior.loose, progress, map_function)
+    found = solve(last.gram, last.vector, prior, best - mean)
     if last.seconds < LEAST:
         raise InputError(
             f"the flights are {last.seconds:g} s in the air, or in motion on the floor, together; "
             f"{LEAST:g} s are needed: record motion for longer."
         )
+    names = tuple(flight.name for flight in flights)
     shares = _shares(last, best - mean, found, names) if n <= MANY else {}
     best = best + found.step
-    moved, delays, tdoa_std = (
-        given.at(best[: 3 * n].reshape(n, 3)),
-        best[3 * n :],
-        last.tdoa_std(config) if tdoas else None,
-    )
-    before = runs.slow_innovations(start, np.zeros(n)) if ranged else first.slow
+    moved, delays = parts(best)
     return SelfCalibration(
-        given,
-        Prior.of(given, std, base.covariance, common),
-        names,
-        base,
-        moved,
-        delays,
-        found,
-        last.seconds,
-        before,
-        runs.slow_innovations(moved, delays),
-        tdoa_std,
-        _changes(prior, found, best - mean),
-        _left_out(first, prior),
-        runs.grounded,
-        shares,
-        last.inflation,
+        given=given,
+        prior=Prior.of(given, std, base.covariance, common),
+        flights=names,
+        base=base,
+        surveyed=moved,
+        delays=delays,
+        solution=found,
+        seconds=last.seconds,
+        before=runs.slow_innovations(start, no_delays) if ranged else first.slow_scale,
+        left=runs.slow_innovations(moved, delays),
+        tdoa_std=last.tdoa_std(config) if tdoas else None,
+        changes=_changes(prior, found, best - mean),
+        marks=_left_out(first, prior),
+        grounded=last.grounded,
+        shares=shares,
+        inflation=last.inflation,
     )
 
 
@@ -432,20 +419,20 @@ def _log_evidence(found: SelfCalibration, alone: int | None) -> float:
 
     alone : row of the anchor that was unknown, or None
     """
-    prior = found.prior.covariance
+    prior = found.prior.covariance.copy()
     if not found.prior.known.any():
         prior = found.prior.with_delays(found.solution.delay_std)
-    prior = prior.copy()
-    free = {alone} if alone is not None else set()
-    free |= {found.prior.ids.index(one.anchor) for one in found.changes if one.effect == POSITION}
-    for row in free:
+    free = {found.prior.ids.index(one.anchor) for one in found.changes if one.effect == POSITION}
+    for row in free if alone is None else {alone, *free}:
         places = slice(3 * row, 3 * row + 3)
         prior[places], prior[:, places] = 0.0, 0.0
         prior[places, places] = ANYWHERE**2 * np.eye(3)
-    offset = np.concatenate([found.shifts.ravel(), found.delays])
     # Laplace: half of log|posterior| - log|prior| - squared distance from the prior mean.
-    volumes = [np.linalg.slogdet(one)[1] for one in (found.solution.covariance, prior)]
-    return float(0.5 * (volumes[0] - volumes[1] - offset @ np.linalg.solve(prior, offset)))
+    posterior_volume = np.linalg.slogdet(found.solution.covariance)[1]
+    prior_volume = np.linalg.slogdet(prior)[1]
+    offset = found.offset
+    distance = offset @ np.linalg.solve(prior, offset)
+    return float(0.5 * (posterior_volume - prior_volume - distance))
 
 
 def _with_rivals(
@@ -457,11 +444,10 @@ def _with_rivals(
 
     likely : {row: log-evidence}
     """
-    one, total = found[best], 0.0
-    covariance = np.zeros_like(one.solution.covariance)
-    whole = {row: np.concatenate([found[row].shifts.ravel(), found[row].delays]) for row in likely}
+    one = found[best]
+    covariance, total = np.zeros_like(one.solution.covariance), 0.0
     for row, value in likely.items():
-        weight, off = np.exp(value - likely[best]), whole[row] - whole[best]
+        weight, off = np.exp(value - likely[best]), found[row].offset - one.offset
         covariance = covariance + weight * (found[row].solution.covariance + np.outer(off, off))
         total += weight
     solution = replace(one.solution, covariance=covariance / total)
@@ -500,18 +486,15 @@ def _left_out(equations: Equations, prior: Prior) -> tuple[float, float, float] 
     """
     if not equations.marks:
         return None
-    n, off = len(prior.covariance), []
+    n = len(prior.covariance)
+    off = []
     for one in equations.marks:
-        step = solve(
-            equations.gram - one.gram, equations.vector - one.vector, prior, np.zeros(n)
-        ).step
+        gram, vector = equations.gram - one.gram, equations.vector - one.vector
+        step = solve(gram, vector, prior, np.zeros(n)).step
         off.append((one.off, one.off - one.columns[:, :n] @ step))
     before, after = np.sum(np.square(off), axis=2).T
-    return (
-        float(np.sqrt(before.mean())),
-        float(np.sqrt(after.mean())),
-        float(np.mean(after < before)),
-    )
+    rms = float(np.sqrt(before.mean())), float(np.sqrt(after.mean()))
+    return (*rms, float(np.mean(after < before)))
 
 
 def _changes(prior: Prior, found: Solution, offset: np.ndarray) -> tuple[AnchorChange, ...]:
@@ -519,14 +502,14 @@ def _changes(prior: Prior, found: Solution, offset: np.ndarray) -> tuple[AnchorC
 
     offset : (4N,) m, point of linearization minus prior mean
     """
-    std, out = np.sqrt(np.diag(found.covariance)), []
+    std = np.sqrt(np.diag(found.covariance))
+    out = []
     for (effect, anchor), others in found.changed.items():
         places, _ = prior.changes()[effect, anchor]
         rivals = tuple(other for other, row in others if row == anchor)
         instead = tuple(dict.fromkeys(prior.ids[row] for _, row in others if row != anchor))
-        out.append(
-            AnchorChange(effect, prior.ids[anchor], offset[places], std[places], rivals, instead)
-        )
+        values = offset[places], std[places]
+        out.append(AnchorChange(effect, prior.ids[anchor], *values, rivals, instead))
     return tuple(out)
 
 
@@ -539,18 +522,16 @@ def _shares(
 
     offset : (4N,) m, point of linearization minus prior mean
     """
-    n, whole, out = len(offset), offset + found.step, {}
-    reduced = [
-        eliminated(SYSTEMATIC * one.gram, SYSTEMATIC * one.vector, n, found.function_std)[:2]
-        for one in equations.flights
-    ]
-    for name, columns in ((POSITION, slice(3 * n // 4)), (DELAY, slice(3 * n // 4, n))):
-        part = np.zeros(n)
-        part[columns] = whole[columns]
-        out[name] = tuple(
-            Share.fitted(
-                flight, part @ gram @ part, part @ (vector + gram @ (offset - whole + part))
-            )
-            for flight, (gram, vector) in zip(names, reduced)
-        )
-    return out
+    n = len(offset)
+    whole = offset + found.step
+    kinds = {POSITION: slice(3 * n // 4), DELAY: slice(3 * n // 4, n)}
+    out: dict[str, list[Share]] = {name: [] for name in kinds}
+    for flight, one in zip(names, equations.flights):
+        whole_gram, whole_vector = SYSTEMATIC * one.gram, SYSTEMATIC * one.vector
+        gram, vector, *_ = eliminated(whole_gram, whole_vector, n, found.function_std)
+        for name, columns in kinds.items():
+            part = np.zeros(n)
+            part[columns] = whole[columns]
+            score = part @ (vector + gram @ (offset - whole + part))
+            out[name].append(Share.fitted(flight, part @ gram @ part, score))
+    return {name: tuple(shares) for name, shares in out.items()}
