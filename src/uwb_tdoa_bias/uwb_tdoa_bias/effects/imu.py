@@ -17,7 +17,6 @@ from .samples import Track
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
 
-    from ..common.anchors import Anchors
     from ..common.flight import Flight
     from .samples import ImuSamples
 
@@ -29,9 +28,7 @@ BESIDE_BIAS = 2.0
 class ImuEffect(SensorEffect):
     """An effect with a vector (x, y, z), body, on the gyroscope, the accelerometer or both."""
 
-    @classmethod
-    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
-        return [("x", "y", "z"), ("x",), ("y",), ("z",)]
+    parameters = ("x", "y", "z")
 
     def vector(self) -> np.ndarray:
         """Return the values of x, y and z, (3,)."""
@@ -206,11 +203,8 @@ class ImuGravity(ImuEffect):
         ways=("too much", "too little"),
     )
     channels = ("accel",)
+    parameters = ("excess",)
     penalty = BESIDE_BIAS
-
-    @classmethod
-    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
-        return [("excess",)]
 
     def model(self) -> Affine:
         return Affine(np.eye(3), np.array([0.0, 0.0, self.values.get("excess", 0.0)]))
