@@ -65,7 +65,7 @@ def test_tdoas_of_two_antennas_are_corrected_each_by_its_own_place_and_none_is_d
     codec = CdrCodec(Tdoa, *MEASURED)
     for k in range(200):
         t, frame = 0.01 * k, ("left", "right")[k % 2]
-        node._corrector.add_pose(t, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
+        node._known_poses.add(t, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), 0.0)
         node._poses.take_all([t])
         rows = codec.template(Tdoa(anchor_a=0, anchor_b=1)).rows(1)
         rows["sec"], rows["nanosec"] = (

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
 from dataclasses import fields
-from functools import partial
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -16,21 +15,24 @@ from uwb_tdoa_bias.correction.corrector import (
     FADED,
     NETWORK,
     PASSED,
-    START,
     Correction,
 )
 from uwb_tdoa_bias.correction.corrector import (
     Corrector as LateCorrector,
 )
 from uwb_tdoa_bias.correction.network import Network
-from uwb_tdoa_bias.correction.poses import known_yaw_std, parts_of, rotated_in_yaw
+from uwb_tdoa_bias.correction.poses import START, Poses, known_yaw_std, parts_of, rotated_in_yaw
 from uwb_tdoa_bias.effects import EFFECTS as CATALOGUE
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm
 
 ANCHORS = Anchors.from_positions([[0, 0, 0], [8, 0, 0], [0, 8, 0], [0, 0, 3]], ids=[4, 5, 6, 7])
-Corrector = partial(LateCorrector, start=0.0)  # uses the first pose at once
 DELAYS = EffectSet((AnchorDelay({4: 0.1, 6: -0.2}),))
 ARM = EffectSet((TagLeverArm({"z": 0.3}),))
+
+
+def Corrector(*model, history=100, **options):
+    """A Corrector that uses the first pose at once."""
+    return LateCorrector(*model, **options, poses=Poses(history, start=0.0))
 
 
 class Height(Network):

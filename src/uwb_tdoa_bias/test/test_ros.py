@@ -10,12 +10,10 @@ rclpy = pytest.importorskip("rclpy")
 
 from dataclasses import replace  # noqa: E402
 from fractions import Fraction  # noqa: E402
-import math  # noqa: E402
 import time  # noqa: E402
 
 from builtin_interfaces.msg import Time  # noqa: E402
 from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
-from geometry_msgs.msg import Quaternion  # noqa: E402
 from hypothesis import given  # noqa: E402
 from hypothesis import strategies as st  # noqa: E402
 import numpy as np  # noqa: E402
@@ -41,7 +39,7 @@ from uwb_tdoa_bias.ros.anchors import (  # noqa: E402
 )
 from uwb_tdoa_bias.ros.diagnostics import Saying, SimulatedClock  # noqa: E402
 from uwb_tdoa_bias.ros.log import BURST, REFILL, Log  # noqa: E402
-from uwb_tdoa_bias.ros.topics import OUTPUT_QOS, STREAM_QOS, Epoch, orientation_of  # noqa: E402  # noqa: E402
+from uwb_tdoa_bias.ros.topics import OUTPUT_QOS, STREAM_QOS, Epoch  # noqa: E402
 
 # --- ros stamps ---
 NANOSECONDS = st.integers(0, 10**9 - 1)
@@ -78,17 +76,6 @@ def test_seconds_are_the_nearest_float(first, second, nanosecond):
     assert epoch.seconds(Time(sec=first + second, nanosec=nanosecond)) == nearest
     columns = np.array([first + second]), np.array([nanosecond])
     assert epoch.seconds_of(*columns).tolist() == [nearest]
-
-
-def test_an_orientation_of_zeros_is_not_known():
-    assert orientation_of(Quaternion(x=0.1, y=0.2, z=0.3, w=0.4)) == (0.1, 0.2, 0.3, 0.4)
-    assert orientation_of(Quaternion()) == (
-        0.0,
-        0.0,
-        0.0,
-        1.0,
-    )  # the default of ROS is the identity
-    assert all(map(math.isnan, orientation_of(Quaternion(w=0.0))))
 
 
 # --- ros topics ---

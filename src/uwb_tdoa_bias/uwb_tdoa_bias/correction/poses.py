@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 
 
 POSE_NUMBERS, TWIST_NUMBERS = 3 + 4 + 36, 6 + 36  # of PoseWithCovariance and TwistWithCovariance
+HISTORY = 4096  # poses kept at least
+# s after the first pose. Earlier TDOAs are corrected without a pose, which costs accuracy.
+START = 0.2
 TILT = 0.5  # rad; with a larger tilt std the filter estimates no attitude
 
 
@@ -45,14 +48,22 @@ class Columns(NamedTuple):
 class Poses:
     """Poses in the order of their stamps; at least the last `history` are kept.
 
+    No pose is used in the first `start` s after the first pose. The first pose may arrive that much
+    later than its stamp without changing a result.
+
     begin : stamp, s, from which poses are used: `start` s after the first pose; inf before it
     """
 
-    def __init__(self, history: int, start: float) -> None:
-        self._history, self._count, self._start, self.begin = history, 0, start, math.inf
+    def __init__(self, history: int = HISTORY, start: float = START) -> None:
+        self._start = start
         self._columns = Columns(
             *(np.empty((2 * history, *shape)) for shape in ((), (3,), (4,), (3,), ()))
         )
+        self.clear()
+
+    def clear(self) -> None:
+        """Delete all poses."""
+        self._count, self.begin = 0, math.inf
 
     @property
     def t(self) -> np.ndarray:
@@ -259,6 +270,13 @@ class PoseQueue:
         newest = t if self._newest is None else self._newest
         self._items.append((t, min(t, newest), item))
         self._newest = max(newest, t)
+
+    def shorten(self, most: int) -> int:
+        """Remove the oldest of more than `most` items, and return their number."""
+        removed = max(len(self._items) - most, 0)
+        for _ in range(removed):
+            self._items.popleft()
+        return removed
 
     def take(self, ready: Callable[[float], bool]) -> list[tuple[float, Any, bool]]:
         """Remove and return the items that may leave: a list of (t, item, ready(before)).
