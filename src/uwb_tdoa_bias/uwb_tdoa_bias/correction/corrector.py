@@ -253,11 +253,12 @@ class Corrector:
         samples = Samples(t, a, b, p, q, self.anchors, self._first, yaw_std=yaw_std)
         if not (self.effects.needs_motion or (self.network and self.network.needs_motion)):
             return samples
+        kept = self._poses.kept
         last_t, last_b = self._last or (t[0], -1)
         self._last = (t[-1], self.anchors.ids[b[-1]])
         return replace(
             samples,
-            motion=motion_at(self._poses.t, self._poses.v, self._poses.q, places),
+            motion=motion_at(kept.t, kept.v, kept.q, places),
             interval=t - np.concatenate([[last_t], t[:-1]]),
             previous=np.concatenate([[last_b], self.anchors.ids[b[:-1]]]),
         )

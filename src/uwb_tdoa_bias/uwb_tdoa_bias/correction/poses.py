@@ -34,7 +34,7 @@ class Columns(NamedTuple):
     t : (m,) s
     p : (m, 3) m, world
     q : (m, 4) x y z w, body to world
-    v : (m, 3) m/s, world
+    v : (m, 3) m/s, world; NaN if unknown
     yaw_std : (m,) rad
     """
 
@@ -66,29 +66,14 @@ class Poses:
         self._count, self.begin = 0, math.inf
 
     @property
-    def t(self) -> np.ndarray:
-        """Stamps, (m,) s."""
-        return self._columns.t[: self._count]
-
-    @property
-    def p(self) -> np.ndarray:
-        """Positions, (m, 3) m."""
-        return self._columns.p[: self._count]
-
-    @property
-    def q(self) -> np.ndarray:
-        """Attitudes, (m, 4) x y z w, body to world."""
-        return self._columns.q[: self._count]
-
-    @property
-    def v(self) -> np.ndarray:
-        """Velocities, (m, 3) m/s, world, NaN where not known."""
-        return self._columns.v[: self._count]
+    def kept(self) -> Columns:
+        """All kept poses."""
+        return Columns(*(column[: self._count] for column in self._columns))
 
     @property
     def newest(self) -> float:
         """Stamp of the last pose, s; -inf if there is none."""
-        return self.t[-1] if self._count else -np.inf
+        return self._columns.t[self._count - 1] if self._count else -np.inf
 
     def add(
         self, t: ArrayLike, p: ArrayLike, q: ArrayLike, v: ArrayLike, yaw_std: ArrayLike
