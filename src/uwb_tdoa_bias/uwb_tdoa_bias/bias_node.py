@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import groupby
 import math
 import sys
@@ -168,8 +169,7 @@ class BiasNode(StreamNode):
         self._hold = PoseQueue(self._limit)
         self._tdoas, self._poses = StampGate(), StampGate()
         self._codec = CdrCodec(TdoaCorrected, *CORRECTED)
-        self._templates: dict[tuple[str, str], CdrTemplate] = {}  # latest, by frame and model
-        self._frames_said: set[str] = set()
+        self._template = lru_cache(MOST_FRAMES)(self._new_template)
         self.output = StreamOutput(self, TdoaCorrected, "uwb/tdoa_corrected")
         self._frames = FramesInput(self, self._epoch.seconds, self._on_frames)
         self._anchors = AnchorsInput(self, self._on_anchors, own["anchors_file"])
@@ -244,14 +244,11 @@ class BiasNode(StreamNode):
 
     def _antenna(self, frame: str) -> Antenna:
         """Return the Antenna of TDOAs of a frame."""
-        if (
-            frame in ("", self._body)
-            or frame not in self._antennas
-            and len(self._antennas) >= MOST_FRAMES
-        ):
+        if frame in self._antennas:
+            return self._antennas[frame]
+        if frame in ("", self._body) or len(self._antennas) >= MOST_FRAMES:
             return self._body_antenna
-        if frame not in self._antennas:
-            self._place_antenna(frame)
+        self._place_antenna(frame)
         return self._antennas[frame]
 
     def _place_antenna(self, frame: str) -> None:
@@ -279,9 +276,8 @@ class BiasNode(StreamNode):
                     f"uwb/tdoa: the place of '{frame}' on '{self._body}' in /tf_static is not "
                     f"taken: {error}"
                 )
-        if trouble and frame not in self._frames_said:
-            self._frames_said.add(frame)
-            self.get_logger().warning(trouble)
+        if trouble:
+            self.warn_at_times(f"antenna {frame}", trouble)
         if known is not None and effects.effects == known.effects.effects:
             known.trouble = trouble
             return
@@ -423,31 +419,27 @@ class BiasNode(StreamNode):
         items : as in `_take`; correction : of these
         stamps : seconds and nanoseconds, (n,) each, that replace their own
         """
-        columns = [np.array(column) for column in list(zip(*items))[1:]]
+        frames, *columns = zip(*items)
         measured = columns if stamps is None else (*stamps, *columns[2:])  # up to the variance
-        values = *measured, *vars(correction).values()
+        values = [np.array(column) for column in (*measured, *vars(correction).values())]
         status = correction.status.tolist()
-        kinds, first = (
-            [(item[0], self._antenna(item[0]).models[one]) for item, one in zip(items, status)],
-            0,
-        )
-        for kind, same in groupby(kinds):
-            some = slice(first, first := first + len(list(same)))
-            rows = self._template(*kind).rows(some.stop - some.start)
+        models = [self._antenna(frame).models[one] for frame, one in zip(frames, status)]
+        first = 0
+        for (frame, model), same in groupby(zip(frames, models)):
+            end = first + len(list(same))
+            template = self._template(frame, model)
+            rows = template.rows(end - first)
             for name, column in zip(("sec", "nanosec", *CORRECTED), values):
-                rows[name] = column[some]
-            self.output.publish(kind[0], self._template(*kind), rows)
+                rows[name] = column[first:end]
+            self.output.publish(frame, template, rows)
+            first = end
         self._counts["published"] += len(items)
         self._counts.update(STATUS[one] for one in status)
 
-    def _template(self, frame: str, model: str) -> CdrTemplate:
-        if (frame, model) not in self._templates:
-            if len(self._templates) >= MOST_FRAMES:
-                self._templates.clear()
-            message = TdoaCorrected(model=model)
-            message.header.frame_id = frame
-            self._templates[frame, model] = self._codec.template(message)
-        return self._templates[frame, model]
+    def _new_template(self, frame: str, model: str) -> CdrTemplate:
+        message = TdoaCorrected(model=model)
+        message.header.frame_id = frame
+        return self._codec.template(message)
 
     def _report(self) -> Report:
         counts, inputs = self._counts, self.streams.inputs

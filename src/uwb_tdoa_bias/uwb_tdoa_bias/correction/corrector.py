@@ -220,16 +220,12 @@ class Corrector:
         bias, noise = self.effects.state_independent.bias(samples), self.effects.noise_std(samples)
         if len(steep):
             of_steep, slope, curved = steep.bias_jacobian(samples)
-            bias, noise, state = (
-                bias + of_steep,
-                np.hypot(noise, curved),
-                samples.linearization_point,
-            )
-        unknown = (
-            np.zeros(len(samples), bool)
-            if samples.yaw_std is None
-            else samples.yaw_std > LARGEST_YAW_STD
-        )
+            bias = bias + of_steep
+            noise = np.hypot(noise, curved)
+            state = samples.linearization_point
+        unknown: np.ndarray = np.zeros(len(samples), bool)
+        if samples.yaw_std is not None:
+            unknown = samples.yaw_std > LARGEST_YAW_STD
         turning = self.effects.of_attitude
         if len(turning) and unknown.any():
             headings = np.concatenate(

@@ -127,12 +127,11 @@ def _append(count: int, kept: Columns, new: Columns) -> int:
         if not new.t[i] > (kept.t[count - 1] if count else -np.inf):
             continue
         if count == 2 * history:
-            kept.t[:history], kept.yaw_std[:history] = kept.t[history:], kept.yaw_std[history:]
-            kept.p[:history], kept.q[:history], kept.v[:history] = (
-                kept.p[history:],
-                kept.q[history:],
-                kept.v[history:],
-            )
+            kept.t[:history] = kept.t[history:]
+            kept.p[:history] = kept.p[history:]
+            kept.q[:history] = kept.q[history:]
+            kept.v[:history] = kept.v[history:]
+            kept.yaw_std[:history] = kept.yaw_std[history:]
             count = history
         kept.t[count], kept.yaw_std[count] = new.t[i], new.yaw_std[i]
         kept.p[count], kept.q[count], kept.v[count] = new.p[i], new.q[i], new.v[i]

@@ -24,6 +24,7 @@ from .base import (
     interval_words,
     is_within,
     require,
+    undoing,
 )
 from .samples import Track, sensor_samples
 
@@ -363,17 +364,9 @@ class SensorCorrector:
             stream: sum(effect.stamp_offset(stream) for effect in effects)
             for stream in SENSOR_NAMES
         }
-        self._undo = {channel: self._inverse(effects, channel) for channel in STREAM_OF}
-        self.idle = not any(self._late.values()) and not any(self._undo.values())
-
-    @staticmethod
-    def _inverse(effects: Collection[Effect], channel: str) -> Affine | None:
-        undo = None
-        for effect in effects:
-            model = effect.sensor_model(channel)
-            if model is not IDENTITY:
-                undo = model.inverse() if undo is None else model.inverse().after(undo)
-        return undo
+        self._undo = {channel: undoing(effects, channel) for channel in STREAM_OF}
+        undone = any(undo is not IDENTITY for undo in self._undo.values())
+        self.idle = not undone and not any(self._late.values())
 
     def correct(self, name: str, stream: Stream) -> Stream:
         """Return the corrected Stream of the sensor `name`."""
@@ -385,7 +378,7 @@ class SensorCorrector:
 
     def _undone(self, channel: str, stream: Stream) -> Stream:
         undo = self._undo[channel]
-        if undo is None:
+        if undo is IDENTITY:
             return stream
         std = getattr(stream, "std", None)
         if std is None:

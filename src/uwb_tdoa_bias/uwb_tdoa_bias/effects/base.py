@@ -660,6 +660,16 @@ def central_differences(
     return np.stack(columns, axis=-1)
 
 
+def undoing(effects: Iterable[Effect], channel: str) -> Affine:
+    """Return the Affine that undoes the sensor models of effects in their order, or IDENTITY."""
+    undo = IDENTITY
+    for effect in effects:
+        model = effect.sensor_model(channel)
+        if model is not IDENTITY:
+            undo = model.inverse() if undo is IDENTITY else model.inverse().after(undo)
+    return undo
+
+
 def require(effect: Effect, flight: Flight, name: str) -> Any:
     """Return the Stream of a channel of a sensor, "tdoa", "imu" or "truth"; raise InputError."""
     part = measured_on(flight, name) if name in STREAM_OF else getattr(flight, name)
