@@ -133,7 +133,7 @@ def main():
     with tempfile.TemporaryDirectory() as folder:
         folder = Path(folder)
         corners().to_yaml(folder / "anchors.yaml")
-        write("anchors", 0, (folder / "anchors.yaml").read_bytes())
+        write("survey", "written", (folder / "anchors.yaml").read_bytes())
         known = [
             EFFECTS["anchor_delay"]({"3": 0.1, "5": -0.05}),
             EFFECTS["tag_lever_arm"]({"z": 0.1}),

@@ -367,7 +367,6 @@ STRUCTURES = {
     **dict.fromkeys(
         (
             "yaml",
-            "anchors",
             "effects",
             "config",
             "places",

@@ -92,10 +92,6 @@ def yaml(data):
     parse_yaml(data, "input")
 
 
-def anchors(data):
-    Anchors.from_yaml(_file(data))
-
-
 def effects(data):
     EffectSet.from_yaml(_file(data))
 
@@ -392,7 +388,6 @@ TARGETS = {
     function.__name__: function
     for function in (
         yaml,
-        anchors,
         effects,
         config,
         antenna,

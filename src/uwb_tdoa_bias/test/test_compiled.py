@@ -114,16 +114,13 @@ def test_no_compiled_function_unpacks_an_argument_by_a_bare_name():
     assert looked > 200 and not unpacked
 
 
-def test_by_default_it_is_in_the_cache_of_the_user(named, monkeypatch):
-    monkeypatch.delenv("NUMBA_CACHE_DIR")
-    assert place() == named.parents[1] / "uwb_tdoa" / NAME
-
-
-def test_a_link_is_followed_once(named):
+def test_a_link_is_followed_once_and_the_default_is_the_cache_of_the_user(named, monkeypatch):
     true = named.parents[1] / "true"
     true.mkdir()
     named.symlink_to(true)
     assert place() == true / NAME
+    monkeypatch.delenv("NUMBA_CACHE_DIR")
+    assert place() == named.parents[1] / "uwb_tdoa" / NAME
 
 
 def test_garbage_is_collected_as_before_after_a_compilation():

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
 from dataclasses import fields
-from functools import partial
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -16,21 +15,24 @@ from uwb_tdoa_bias.correction.corrector import (
     FADED,
     NETWORK,
     PASSED,
-    START,
     Correction,
 )
 from uwb_tdoa_bias.correction.corrector import (
     Corrector as LateCorrector,
 )
 from uwb_tdoa_bias.correction.network import Network
-from uwb_tdoa_bias.correction.poses import known_yaw_std, parts_of, rotated_in_yaw
+from uwb_tdoa_bias.correction.poses import START, Poses, parts_of, rotated_in_yaw
 from uwb_tdoa_bias.effects import EFFECTS as CATALOGUE
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm
 
 ANCHORS = Anchors.from_positions([[0, 0, 0], [8, 0, 0], [0, 8, 0], [0, 0, 3]], ids=[4, 5, 6, 7])
-Corrector = partial(LateCorrector, start=0.0)  # uses the first pose at once
 DELAYS = EffectSet((AnchorDelay({4: 0.1, 6: -0.2}),))
 ARM = EffectSet((TagLeverArm({"z": 0.3}),))
+
+
+def Corrector(*model, history=100, **options):
+    """A Corrector that uses the first pose at once."""
+    return LateCorrector(*model, **options, poses=Poses(history, start=0.0))
 
 
 class Height(Network):
@@ -161,7 +163,7 @@ def test_poses_told_together_are_poses_told_one_by_one(batches, asked):
         correctors[1].add_pose(
             t, np.stack([t, t, t], axis=1), np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1))
         )
-    one, other = (corrector._poses for corrector in correctors)
+    one, other = (corrector._poses.kept for corrector in correctors)
     np.testing.assert_array_equal(one.t[-5:], other.t[-5:])
     np.testing.assert_array_equal(one.p[-5:, 2], other.p[-5:, 2])
     newest = [t for t in np.array(asked) / 8.0 if len(one.t) == 0 or t >= one.t[-5:][0]]
@@ -186,11 +188,6 @@ def test_effects_are_those_of_the_mean_heading_while_the_yaw_is_unknown():
     assert told[0.1].std[0] == 0.0 and told[2.0].std[0] > 0.03
 
 
-def test_without_an_estimated_attitude_the_yaw_is_what_everybody_assumes():
-    std = np.array([[0.1, 0.1, 2.0], [1.2, 1.2, 2.5], [0.1, 0.1, 0.3]])
-    np.testing.assert_array_equal(known_yaw_std(std), [2.0, 0.0, 0.3])
-
-
 @given(st.integers(-4, 4), st.integers(0, 1000))
 def test_rotated_in_yaw_turns_about_the_vertical(quarters, seed):
     q = Rotation.random(3, random_state=seed)
@@ -209,7 +206,10 @@ def test_parts_of_odometry_hold_the_velocity_in_the_world(seed):
     poses, twists = rng.normal(size=(3, 43)), rng.normal(size=(3, 42))
     poses[:, 3:7] /= np.linalg.norm(poses[:, 3:7], axis=1)[:, None]
     poses[2, 3:7] = 0.0  # not known
-    p, q, v, _ = parts_of(poses, twists)
+    poses[:, [28, 35, 42]] = [[0.01, 0.01, 4.0], [1.44, 1.44, 6.25], [0.01, 0.01, 0.09]]
+    p, q, v, yaw_std = parts_of(poses, twists)
+    # without an estimated attitude the yaw is what everybody assumes
+    np.testing.assert_allclose(yaw_std, [2.0, 0.0, 0.3])
     np.testing.assert_array_equal(p, poses[:, :3])
     np.testing.assert_allclose(v[:2], Rotation.from_quat(q[:2]).apply(twists[:2, :3]), atol=1e-12)
     assert np.isnan(v[2]).all() and np.isnan(q[2]).all()
@@ -249,4 +249,4 @@ def test_forgets_old_poses_and_keeps_the_last_ones():
     )
     found = correct(corrector, [0.001, 0.990, 0.995, 0.999], dense=True)
     np.testing.assert_allclose(found.bias, [0.0, 0.990, 0.995, 0.999], atol=1e-12)
-    assert len(corrector._poses.t) == len(corrector._poses.p) == len(corrector._poses.q) <= 20
+    assert all(len(column) <= 20 for column in corrector._poses.kept)

@@ -153,8 +153,9 @@ def test_is_declared_in_full(effect):
     for wrong in (np.nan, np.inf, 1.01 * bound, -1.01 * bound, "much", None, [0.1]):
         with pytest.raises(InputError, match="values"):
             effect({effect.example: wrong})
-    with pytest.raises(InputError, match=f"effects: {effect.name}: parameter 'sideways'"):
-        effect({"sideways": 0.1})
+    for wrong in ("sideways", "0.sideways", "1-2-3", "123456", "²"):
+        with pytest.raises(InputError, match=f"effects: {effect.name}: parameter '{wrong}' is not"):
+            effect({wrong: 0.1})
 
 
 @pytest.mark.parametrize("effect", ALL)

@@ -14,11 +14,23 @@ from uwb_tdoa_bias.common.executable import executable, node_executable
 
 SLOW = """
 import time
-print("importing", flush=True)
+print("in", flush=True)
 try:
     time.sleep(600)
 except BaseException:  # as some libraries do
     time.sleep(600)
+"""
+LOSSY = """
+import ctypes, time
+def work():
+    print("in", flush=True)
+    time.sleep(600)
+def main():
+    try:
+        ctypes.CFUNCTYPE(None)(work)()  # C code loses the interrupt: it comes again
+        time.sleep(600)
+    except KeyboardInterrupt:
+        return 7
 """
 START = (
     "import sys; from uwb_tdoa_bias.common.executable import executable; "
@@ -57,45 +69,13 @@ def test_an_import_that_takes_long_is_said(write, monkeypatch, capsys):
     assert capsys.readouterr().err == "takes_long: starting\n"
 
 
-def test_an_interrupt_while_it_imports_is_quiet_whatever_is_imported(write):
-    write("swallows", SLOW)
-    process = start("swallows")
-    assert process.stdout.readline() == "importing\n"
-    process.send_signal(SIGINT)
-    assert process.communicate(timeout=120) == ("", "") and process.returncode == 130
-
-
-def test_an_interrupt_afterwards_is_the_affair_of_main(write):
-    write(
-        "careful",
-        "import time\ndef main():\n    try:\n        print('in', flush=True)\n        "
-        "time.sleep(600)\n"
-        "    except KeyboardInterrupt:\n        return 7\n",
-    )
-    process = start("careful")
+@pytest.mark.parametrize("module, code", [(SLOW, 130), (LOSSY, 7)])
+def test_an_interrupt_is_quiet_while_it_imports_and_then_the_affair_of_main(write, module, code):
+    write("module", module)
+    process = start("module")
     assert process.stdout.readline() == "in\n"
     process.send_signal(SIGINT)
-    assert process.communicate(timeout=120) == ("", "") and process.returncode == 7
-
-
-def test_an_interrupt_that_c_code_loses_comes_again(write):
-    write(
-        "lossy",
-        "import ctypes, time\n"
-        "def work():\n"
-        "    print('in', flush=True)\n"
-        "    time.sleep(600)\n"
-        "def main():\n"
-        "    try:\n"
-        "        ctypes.CFUNCTYPE(None)(work)()\n"
-        "        time.sleep(600)\n"
-        "    except KeyboardInterrupt:\n"
-        "        return 7\n",
-    )
-    process = start("lossy")
-    assert process.stdout.readline() == "in\n"
-    process.send_signal(SIGINT)
-    assert process.communicate(timeout=120) == ("", "") and process.returncode == 7
+    assert process.communicate(timeout=120) == ("", "") and process.returncode == code
 
 
 @pytest.mark.parametrize(

@@ -34,21 +34,17 @@ from uwb_tdoa_bias.common.text import printable, sanitize
 # --- files ---
 
 
-def test_text_is_utf8_whatever_the_locale(tmp_path):
-    write_text(tmp_path / "a.md", "Höhe ± 0.1 m, σ\n")
-    assert (tmp_path / "a.md").read_bytes() == "Höhe ± 0.1 m, σ\n".encode()
-
-
 @pytest.mark.parametrize(
     "text, content",
     [
+        ("Höhe ± 0.1 m, σ\n", "Höhe ± 0.1 m, σ\n".encode()),
         (os.fsdecode("flüge".encode()), "flüge".encode()),
         ("fl\udcc3\udcbcge", "flüge".encode()),  # as Python gets an argument in an ASCII locale
         ("a\udcffb", "a\ufffdb".encode()),
         ("a\ud800b", b"a?b"),
     ],
 )
-def test_a_name_that_python_could_not_decode_is_written_in_utf8(tmp_path, text, content):
+def test_text_is_written_in_utf8_even_if_python_could_not_decode_it(tmp_path, text, content):
     write_text(tmp_path / "a.txt", text)
     assert (tmp_path / "a.txt").read_bytes() == content
 
@@ -296,34 +292,23 @@ def test_a_saved_one_comes_back(tmp_path):
 
 
 def test_it_knows_its_anchors():
-    assert volume().belongs_to(ANCHORS)
-    order = [2, 0, 3, 1]
-    assert volume().belongs_to(
-        Anchors.from_positions(ANCHORS.positions[order] + 0.05, ANCHORS.ids[order])
-    )
-    assert not volume().belongs_to(Anchors.from_positions(ANCHORS.positions + 0.2, ANCHORS.ids))
-    assert not volume().belongs_to(Anchors.from_positions(ANCHORS.positions, [3, 1, 7, 6]))
-    assert not volume().belongs_to(Anchors.from_positions(ANCHORS.positions[:3], ANCHORS.ids[:3]))
-    assert not volume().belongs_to(
-        Anchors.from_positions(ANCHORS.positions, ANCHORS.ids, frame="hall")
-    )
+    positions, ids, order = ANCHORS.positions, ANCHORS.ids, [2, 0, 3, 1]
+    assert volume().belongs_to(Anchors.from_positions(positions[order] + 0.05, ids[order]))
+    for other in (
+        Anchors.from_positions(positions + 0.2, ids),
+        Anchors.from_positions(positions, [3, 1, 7, 6]),
+        Anchors.from_positions(positions[:3], ids[:3]),
+        Anchors.from_positions(positions, ids, frame="hall"),
+    ):
+        assert not volume().belongs_to(other)
 
 
 def test_other_files_are_refused(tmp_path):
-    for name, content in (
-        ("none", None),
-        ("empty", b""),
-        ("text", b"flyable: all"),
-        ("zip", b"PK\x03\x04 cut"),
-    ):
-        file = tmp_path / name
-        if content is not None:
-            file.write_bytes(content)
-        with pytest.raises(InputError, match="is no flyable volume"):
-            FlyableVolume.load(file)
+    (tmp_path / "text").write_bytes(b"flyable: all")
     np.savez(tmp_path / "other.npz", lower=np.zeros(3))
-    with pytest.raises(InputError, match="is no flyable volume"):
-        FlyableVolume.load(tmp_path / "other.npz")
+    for name in ("none", "text", "other.npz"):
+        with pytest.raises(InputError, match="is no flyable volume"):
+            FlyableVolume.load(tmp_path / name)
     for wrong in ({"step": [0.1, 0.1]}, {"bound": np.ones((5, 4, 2))}):
         with pytest.raises(InputError, match="do not fit together"):
             volume(**wrong)
@@ -409,15 +394,6 @@ def test_numbers_are_those_that_people_mean():
 def test_what_could_be_misread_is_refused(text, said):
     with pytest.raises(InputError, match=f"^f: .*{said}"):
         parse_yaml(text, "f")
-
-
-def test_aliases_cannot_unfold(tmp_path):
-    lines = [f"{b}: &{b} [{('*' + a + ',') * 9}]\n" for a, b in zip("abcdefgh", "bcdefghi")]
-    bomb = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(lines)
-    began = time.process_time()
-    with pytest.raises(InputError, match="alias"):
-        parse_yaml(bomb, "f")
-    assert time.process_time() - began < 10.0
 
 
 def test_files(tmp_path):

@@ -69,12 +69,12 @@ def looping():
     return model(NODE("Loop", ["count", "", "x"], ["y"], body=body), constants=[count])
 
 
-def read_elsewhere():
+def read_elsewhere(file="../../etc/passwd"):
     """The weights are bytes of a file of the user."""
     weights = onnx.TensorProto(
         name="column", data_type=TensorProto.FLOAT, dims=[2, 1], data_location=TensorProto.EXTERNAL
     )
-    weights.external_data.add(key="location", value="../../etc/passwd")
+    weights.external_data.add(key="location", value=file)
     return model(NODE("MatMul", ["x", "column"], ["y"]), constants=[weights])
 
 
@@ -165,24 +165,13 @@ def test_refused_at_once(tmp_path, made, said):
     assert len(str(refused.value)) < 1000 and str(refused.value).isprintable()
 
 
-def test_a_file_that_is_too_large_is_not_tried(tmp_path, monkeypatch):
-    monkeypatch.setattr(trial, "tried_out", None)
-    (tmp_path / "model.onnx").write_bytes(bytes(MODEL_BYTES + 1))
-    with pytest.raises(InputError, match="more than 4000000 bytes"):
-        Network(tmp_path / "model.onnx")
-
-
 def test_a_model_opens_no_file_in_its_trial(tmp_path, monkeypatch):
     """Weights in another file are bytes of a file of the user; a pipe in its place would hang.
 
     Here the file is there, and fits.
     """
     (tmp_path / "weights").write_bytes(np.ones(2, np.float32).tobytes())
-    weights = onnx.TensorProto(
-        name="column", data_type=TensorProto.FLOAT, dims=[2, 1], data_location=TensorProto.EXTERNAL
-    )
-    weights.external_data.add(key="location", value="weights")
-    made = model(NODE("MatMul", ["x", "column"], ["y"]), constants=[weights]).SerializeToString()
+    made = read_elsewhere("weights").SerializeToString()
     monkeypatch.chdir(tmp_path)
     options = trial.onnxruntime.SessionOptions()
     options.graph_optimization_level = trial.onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
@@ -258,13 +247,14 @@ def test_a_name_goes_into_messages_and_tables(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "content",
+    ("content", "said"),
     [
-        b"\xff" * 1_000_000,
-        b"",
+        (b"\xff" * 1_000_000, "onnxruntime: "),
+        (b"", "is empty"),
+        (bytes(MODEL_BYTES + 1), "more than 4000000 bytes"),
     ],
 )
-def test_bytes_that_are_no_model(tmp_path, content):
+def test_bytes_that_are_no_model(tmp_path, content, said):
     (tmp_path / "model.onnx").write_bytes(content)
-    with pytest.raises(InputError, match="onnxruntime: |is empty|no table|more than one input"):
+    with pytest.raises(InputError, match=said):
         Network(tmp_path / "model.onnx")

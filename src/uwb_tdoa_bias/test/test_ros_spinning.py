@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 import time
+from unittest.mock import Mock
 
 import pytest
 
@@ -9,6 +10,7 @@ rclpy = pytest.importorskip("rclpy")
 
 from builtin_interfaces.msg import Time  # noqa: E402
 from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
+import numpy as np  # noqa: E402
 from rcl_interfaces.srv import GetParameters  # noqa: E402
 from rclpy.qos import QoSProfile  # noqa: E402
 from rclpy.task import Future  # noqa: E402
@@ -46,21 +48,17 @@ def surroundings(request, monkeypatch):
     rclpy.shutdown()
 
 
-def until(condition, seconds=120.0):
+def until(condition):
     """Wait for what needs nobody to be spun."""
-    end = time.monotonic() + seconds
+    end = time.monotonic() + 120.0
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.01)
 
 
-def spin_until(spinner, condition, seconds=120.0):
+def spin_until(spinner, condition):
     """Serve until condition() holds."""
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        spinner._serve()
-        time.sleep(0.01)
+    until(lambda: spinner._serve() or condition())
 
 
 def test_nothing_waits_behind_what_comes_often(surroundings):
@@ -70,10 +68,8 @@ def test_nothing_waits_behind_what_comes_often(surroundings):
     node.create_service(
         GetParameters, "ask", lambda request, response: asked.append(len(flood)) or response
     )
-    publisher, client = (
-        other.create_publisher(DiagnosticStatus, "flood", DEEP),
-        other.create_client(GetParameters, "ask"),
-    )
+    publisher = other.create_publisher(DiagnosticStatus, "flood", DEEP)
+    client = other.create_client(GetParameters, "ask")
     spinner = Spinner([node])
     until(lambda: publisher.get_subscription_count() and client.service_is_ready())
     spinner._serve()
@@ -102,9 +98,8 @@ def test_what_waits_is_measured(surroundings):
     until(publisher.get_subscription_count)
 
     def nothing_waited():
-        spinner.longest_wait = 0.0
-        spinner._serve()
-        return spinner.longest_wait < 0.2
+        waited, spinner.longest_wait = spinner.longest_wait, 0.0
+        return waited < 0.2
 
     # a loaded machine may have kept this process waiting in between
     spin_until(spinner, nothing_waited)
@@ -113,22 +108,26 @@ def test_what_waits_is_measured(surroundings):
     spinner.close()
 
 
+def pressures(node, take):
+    """The Streams of a node with one stream."""
+    streams = Streams(node, Epoch(), lambda: None)
+    streams.add(CdrCodec(FluidPressure, "fluid_pressure"), "pressure", take)
+    return streams
+
+
 def test_streams_are_taken_together_and_the_newest_of_the_clock(surroundings):
     node, other = surroundings
     node.set_parameters([rclpy.Parameter("use_sim_time", value=True)])
-    taken, epoch, stop = [], Epoch(), Future()
+    taken, stop = [], Future()
 
     def take(frame, t, rows, arrival):
         taken.append(len(t))
         if sum(taken) == MANY:
             stop.set_result(None)
 
-    streams = Streams(node, epoch, lambda: None)
-    streams.add(CdrCodec(FluidPressure, "fluid_pressure"), "pressure", take)
-    publisher, clock = (
-        other.create_publisher(FluidPressure, "pressure", DEEP),
-        other.create_publisher(Clock, "/clock", DEEP),
-    )
+    streams = pressures(node, take)
+    publisher = other.create_publisher(FluidPressure, "pressure", DEEP)
+    clock = other.create_publisher(Clock, "/clock", DEEP)
     until(lambda: publisher.get_subscription_count() and clock.get_subscription_count())
     assert not {Clock, FluidPressure} & {each.msg_type for each in node.subscriptions}
     spinner = Spinner([node], StreamPoller([streams]))
@@ -155,8 +154,7 @@ def test_a_stream_that_begins_after_a_silence_is_taken(surroundings):
         heard.append(time.time() - arrival[0])
         stop.set_result(None)
 
-    streams = Streams(node, Epoch(), lambda: None)
-    streams.add(CdrCodec(FluidPressure, "fluid_pressure"), "pressure", take)
+    streams = pressures(node, take)
     publisher = other.create_publisher(FluidPressure, "pressure", DEEP)
     until(publisher.get_subscription_count)
     # the process sleeps in its executor until then
@@ -168,20 +166,15 @@ def test_a_stream_that_begins_after_a_silence_is_taken(surroundings):
 
 
 def test_turns_rest_as_long_as_they_took_and_only_if_there_was_something():
-    class Slow:
-        def __init__(self, seconds, busy):
-            self.seconds, self.busy = seconds, busy
+    def rest(*streams):
+        """The rest after a turn with streams: (s that it takes, whether anything arrived)."""
+        taking = [Mock(take=lambda one=one: time.sleep(one[0]) or one[1]) for one in streams]
+        return StreamPoller(taking).take()
 
-        def take(self):
-            time.sleep(self.seconds)
-            return self.busy
-
-    assert StreamPoller([Slow(0.0, False)]).take() is None
-    assert (
-        PERIOD <= StreamPoller([Slow(0.0, True), Slow(0.0, False)]).take() <= 0.01
-    )  # a busy computer takes its time
-    assert 0.004 <= StreamPoller([Slow(0.005, True)]).take() <= 0.01
-    assert StreamPoller([Slow(0.05, True)]).take() == 0.01
+    assert rest((0.0, False)) is None
+    assert PERIOD <= rest((0.0, True), (0.0, False)) <= 0.01  # a busy computer takes its time
+    assert 0.004 <= rest((0.005, True)) <= 0.01
+    assert rest((0.05, True)) == 0.01
 
 
 def test_a_flood_of_requests_does_not_keep_streams_waiting(surroundings, monkeypatch):
@@ -194,12 +187,10 @@ def test_a_flood_of_requests_does_not_keep_streams_waiting(surroundings, monkeyp
         client.call_async(GetParameters.Request(names=["use_sim_time"] * MOST_ASKED))
     client.call_async(GetParameters.Request(names=["use_sim_time"] * (MOST_ASKED + 1)))
     spin_until(spinner, lambda: asked)
-    counts = [len(asked)]
+    counts = [0, len(asked)]
     for _ in range(10):
         spinner._serve()
         counts.append(len(asked))
-    steps = [after - before for before, after in zip([0, *counts], counts)]
-    assert 0 < max(steps) <= MOST_REQUESTS * MOST_ASKED and not any(
-        step % MOST_ASKED for step in steps
-    )
+    steps = np.diff(counts)
+    assert 0 < max(steps) <= MOST_REQUESTS * MOST_ASKED and not (steps % MOST_ASKED).any()
     spinner.close()

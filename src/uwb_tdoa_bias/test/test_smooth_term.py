@@ -35,8 +35,9 @@ def term(**changes):
         "covariate": "range",
         "form": "arrival",
         "knots": [1.0, 4.0, 9.0],
+        "values": {"c0": 0.1, "c1": -0.2, "c2": 0.05, "c3": 0.3},
     }
-    return SmoothTerm({"c0": 0.1, "c1": -0.2, "c2": 0.05, "c3": 0.3}, **{**settings, **changes})
+    return SmoothTerm(**{**settings, **changes})
 
 
 def test_a_function_of_ranges_adds_nothing_to_tdoas_nor_the_other_way_round():
@@ -87,6 +88,8 @@ def test_the_bias_is_what_its_regressors_are_times_its_coefficients(channel, sha
         {"shape": "odd"},
         {"shape": "step", "knots": [0.0, 1.0]},
         {"shape": "line", "knots": [0.0, 1.0], "form": "pair"},
+        {"form": "common", "covariate": "range"},
+        {"values": {"0": 0.1}},
     ],
 )
 def test_smooth_term_refuses_nonsense(changes):

@@ -4,6 +4,7 @@
 
 from hypothesis import given
 from hypothesis import strategies as st
+import pytest
 
 from uwb_tdoa_bias.common.stamps import (
     CONTRADICTED,
@@ -38,27 +39,23 @@ def test_a_stream_that_goes_on_is_accepted_at_once():
         assert gate.take(t, "x") == ([(t, "x")], [], False) and len(gate) == 0
 
 
-def test_a_jump_that_persists_is_another_time():
-    assert through([50.0, 1.0, 1.1]) == ([(50.0, 0), (1.0, 1), (1.1, 2)], [], [2])
-    assert through([0.0, 60.0, 60.0, 60.1]) == ([(0.0, 0), (60.0, 1), (60.0, 2), (60.1, 3)], [], [])
-
-
-def test_a_jump_must_persist_for_longer_where_another_stream_goes_on():
-    assert through([50.0, 1.0, 1.1, 1.2, 1.3], [50.1]) == (
-        [(50.0, 0), (1.0, 1), (1.1, 2), (1.2, 3), (1.3, 4)],
-        [],
-        [4],
-    )
-    assert through([50.0, 1.0, 1.1, 1.2, 50.1], [50.1]) == (
-        [(50.0, 0), (50.1, 4)],
-        [(1.0, 1), (1.1, 2), (1.2, 3)],
-        [],
-    )
-
-
-def test_a_jump_that_another_stream_has_made_is_another_time_at_once():
-    assert through([0.0, 60.0], [60.1]) == ([(0.0, 0), (60.0, 1)], [], [])
-    assert through([50.0, 1.0, 1.1], [1.0]) == ([(50.0, 0), (1.0, 1), (1.1, 2)], [], [2])
+@pytest.mark.parametrize(
+    "stamps, reached, outliers, back",
+    [
+        ([50.0, 1.0, 1.1], [], [], [2]),
+        ([0.0, 60.0, 60.0, 60.1], [], [], []),
+        # it must persist for longer where another stream goes on
+        ([50.0, 1.0, 1.1, 1.2, 1.3], [50.1], [], [4]),
+        ([50.0, 1.0, 1.1, 1.2, 50.1], [50.1], [1, 2, 3], []),
+        # at once where another stream has made it
+        ([0.0, 60.0], [60.1], [], []),
+        ([50.0, 1.0, 1.1], [1.0], [], [2]),
+    ],
+)
+def test_a_jump_that_persists_is_another_time(stamps, reached, outliers, back):
+    items = list(zip(stamps, range(len(stamps))))
+    accepted = [item for item in items if item[1] not in outliers]
+    assert through(stamps, reached) == (accepted, [items[place] for place in outliers], back)
 
 
 @given(st.floats(0.6, 1e6) | st.floats(-1e6, -1.3), st.integers(1, 25))

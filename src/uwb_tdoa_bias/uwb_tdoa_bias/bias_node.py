@@ -10,14 +10,14 @@ Every parameter is documented in config/bias_node.yaml.
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import groupby
 import math
 import sys
 from typing import TYPE_CHECKING, Any
 
-from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 import numpy as np
@@ -29,7 +29,7 @@ from .common.stamps import LARGEST_STEP_BACK, StampGate
 from .correction.corrector import Correction, Corrector, warm_up
 from .correction.model import EFFECTS, FADED, NETWORK, PASSED
 from .correction.network import load_network
-from .correction.poses import PoseQueue, parts_of
+from .correction.poses import PoseQueue, Poses, parts_of
 from .effects import EffectSet, LabelCorrector
 from .effects.tag import TagLeverArm
 from .ros import process
@@ -106,7 +106,7 @@ CORRECTED = (  # fields written of a TdoaCorrected
     "bias_state",
 )
 MOST_FRAMES = 100  # limit, since a topic may carry any number of names
-EARLY, EARLY_POSES = 2000, 500  # TDOAs and poses kept until anchors arrive
+EARLY = 2000  # TDOAs kept until anchors arrive
 Item = tuple[Any, ...]  # one TDOA: frame, sec, nanosec, and MEASURED
 STATUS = {PASSED: "passed", EFFECTS: "effects", NETWORK: "network", FADED: "faded"}
 
@@ -121,7 +121,7 @@ class Antenna:
     models : {status: name of the bias model in messages}
     trouble : why the place of the antenna is unknown, or None
     corrector : Corrector, once there are anchors
-    heard, reported : number of TDOAs so far, and at the last report
+    heard : number of TDOAs since the last report
     """
 
     effects: EffectSet
@@ -129,7 +129,6 @@ class Antenna:
     trouble: str | None = None
     corrector: Corrector | None = None
     heard: int = 0
-    reported: int = 0
 
 
 class BiasNode(StreamNode):
@@ -161,20 +160,16 @@ class BiasNode(StreamNode):
         self._late = self._effects.stamp_offset("tdoa")  # s
         self._labels = LabelCorrector(self._effects.effects)
         self._network = load_network(model_file)
-        self._corrector: Corrector = None  # type: ignore[assignment]  # of the body, owns all poses; None until anchors arrive
+        self._known_poses = Poses()  # of all correctors
         self._antennas: dict[str, Antenna] = {}  # by frame of the TDOAs
         self._body_antenna = Antenna(self._effects, self._models(self._effects))
         self._epoch, self._rate = Epoch(), Rate()
         self._counts: Counter[str] = Counter()
-        self._early: deque[Item] = deque()
-        # Arguments of `_take_poses`.
-        self._early_poses: deque[tuple[str, np.ndarray, np.ndarray]] = deque()
+        self._reported: Counter[str] = Counter()  # at the last report
         self._hold = PoseQueue(self._limit)
         self._tdoas, self._poses = StampGate(), StampGate()
-        self._reported_unready = self._reported_received = self._reported_poses = 0
         self._codec = CdrCodec(TdoaCorrected, *CORRECTED)
-        self._templates: dict[tuple[str, str], CdrTemplate] = {}  # latest, by frame and model
-        self._frames_said: set[str] = set()
+        self._template = lru_cache(MOST_FRAMES)(self._new_template)
         self.output = StreamOutput(self, TdoaCorrected, "uwb/tdoa_corrected")
         self._frames = FramesInput(self, self._epoch.seconds, self._on_frames)
         self._anchors = AnchorsInput(self, self._on_anchors, own["anchors_file"])
@@ -196,16 +191,19 @@ class BiasNode(StreamNode):
         return len(self._hold)
 
     @property
+    def _all_antennas(self) -> list[Antenna]:
+        """All antennas, that of the body first."""
+        return [self._body_antenna, *self._antennas.values()]
+
+    @property
     def _model(self) -> str:
         """Name of the bias model that corrects the TDOAs."""
-        return next(iter((*self._antennas.values(), self._body_antenna))).models[NETWORK]
+        placed = [*self._antennas.values(), self._body_antenna]
+        return placed[0].models[NETWORK]
 
     @property
     def _idle(self) -> bool:
-        return all(
-            antenna.models[NETWORK] == "none"
-            for antenna in (self._body_antenna, *self._antennas.values())
-        )
+        return all(antenna.models[NETWORK] == "none" for antenna in self._all_antennas)
 
     def _models(self, effects: EffectSet) -> dict[int, str]:
         """Compile the functions of an EffectSet, and return {status: name of the bias model}."""
@@ -215,31 +213,28 @@ class BiasNode(StreamNode):
         """Delete the poses and all TDOAs that wait for one."""
         self._counts["dropped"] += len(self._hold)
         self._hold = PoseQueue(self._limit)
-        self._corrector = self._body_antenna.corrector = self._new_corrector(self._effects)
-        for antenna in self._antennas.values():
-            self._give_corrector(antenna)
-
-    def _new_corrector(self, effects: EffectSet) -> Corrector:
-        anchors: Any = self._anchors.anchors  # called only after anchors arrived
-        return Corrector(anchors, effects, self._network, self._lag)
+        self._known_poses.clear()
+        for antenna in self._all_antennas:
+            if antenna.corrector is not None:
+                antenna.corrector.reset()
 
     def _give_corrector(self, antenna: Antenna) -> None:
-        """Give an Antenna a Corrector with the known poses."""
-        if self._corrector is not None:
-            antenna.corrector = self._new_corrector(antenna.effects)
-            antenna.corrector.share_poses(self._corrector)
+        """Give an Antenna its Corrector, once there are anchors."""
+        anchors = self._anchors.anchors
+        if anchors is not None:
+            antenna.corrector = Corrector(
+                anchors, antenna.effects, self._network, self._lag, self._known_poses
+            )
 
     def _on_anchors(self, anchors: Anchors) -> None:
-        if self._corrector is not None and self._corrector.anchors.frame == anchors.frame:
-            for antenna in (self._body_antenna, *self._antennas.values()):
-                if antenna.corrector is not None:
-                    antenna.corrector.change_anchors(anchors)
-            return
-        self._start_over()
-        while self._early_poses:
-            self._take_poses(*self._early_poses.popleft())
-        early, self._early = self._early, deque()
-        self._take([self._seconds(item) for item in early], early)
+        known = self._body_antenna.corrector
+        if known is not None and known.anchors.frame != anchors.frame:
+            self._start_over()
+        for antenna in self._all_antennas:
+            if antenna.corrector is None:
+                self._give_corrector(antenna)
+            else:
+                antenna.corrector.change_anchors(anchors)
         self._release()
 
     def _on_frames(self) -> None:
@@ -249,14 +244,11 @@ class BiasNode(StreamNode):
 
     def _antenna(self, frame: str) -> Antenna:
         """Return the Antenna of TDOAs of a frame."""
-        if (
-            frame in ("", self._body)
-            or frame not in self._antennas
-            and len(self._antennas) >= MOST_FRAMES
-        ):
+        if frame in self._antennas:
+            return self._antennas[frame]
+        if frame in ("", self._body) or len(self._antennas) >= MOST_FRAMES:
             return self._body_antenna
-        if frame not in self._antennas:
-            self._place_antenna(frame)
+        self._place_antenna(frame)
         return self._antennas[frame]
 
     def _place_antenna(self, frame: str) -> None:
@@ -284,9 +276,8 @@ class BiasNode(StreamNode):
                     f"uwb/tdoa: the place of '{frame}' on '{self._body}' in /tf_static is not "
                     f"taken: {error}"
                 )
-        if trouble and frame not in self._frames_said:
-            self._frames_said.add(frame)
-            self.get_logger().warning(trouble)
+        if trouble:
+            self.warn_at_times(f"antenna {frame}", trouble)
         if known is not None and effects.effects == known.effects.effects:
             known.trouble = trouble
             return
@@ -305,20 +296,12 @@ class BiasNode(StreamNode):
         self._counts["poses"] += len(t)
         if self._idle:
             return
-        if self._corrector is None:
-            self._early_poses.append((frame, t[-EARLY_POSES:], rows[-EARLY_POSES:]))
-            while sum(len(part[1]) for part in self._early_poses) > EARLY_POSES:
-                self._early_poses.popleft()
-        else:
-            self._take_poses(frame, t, rows)
-
-    def _take_poses(self, frame: str, t: np.ndarray, rows: np.ndarray) -> None:
-        if frame != self._corrector.anchors.frame:
+        anchors = self._anchors.anchors
+        if anchors is not None and frame != anchors.frame:
             self.warn_at_times(
                 "frame of odometry",
-                f"odometry is in frame '{frame}', the anchors in "
-                f"'{self._corrector.anchors.frame}': "
-                "taken as the same frame",
+                f"odometry is in frame '{frame}', the anchors in '{anchors.frame}': taken as the "
+                "same frame",
             )
         if self._poses.take_all(t.tolist()):
             self._add_poses(t, rows)
@@ -339,7 +322,7 @@ class BiasNode(StreamNode):
             self._add_poses(np.array([stamp]), row)
 
     def _add_poses(self, t: np.ndarray, rows: np.ndarray) -> None:
-        self._corrector.add_pose(t, *parts_of(*(np.array(rows[name]) for name in POSE)))
+        self._known_poses.add(t, *parts_of(*(np.array(rows[name]) for name in POSE)))
 
     def _on_tdoa(self, frame: str, t: np.ndarray, rows: np.ndarray, arrival: np.ndarray) -> None:
         self._counts["received"] += len(t)
@@ -350,11 +333,6 @@ class BiasNode(StreamNode):
         items = [(frame, *row) for row in rows.tolist()]
         if self._idle:
             self._publish(items, Correction.none(rows["distance_difference"]))
-        elif self._corrector is None:
-            self._early.extend(items)
-            while len(self._early) > EARLY:
-                self._early.popleft()
-                self._counts["dropped"] += 1
         else:
             self._take(t.tolist(), items)
 
@@ -364,10 +342,6 @@ class BiasNode(StreamNode):
         for name, column in zip(names, self._labels.correct(*(rows[name] for name in names))):
             rows[name] = column
         return rows
-
-    def _seconds(self, item: Item) -> float:
-        _, sec, nanosec, *_ = item
-        return self._epoch.seconds(Time(sec=sec, nanosec=nanosec))
 
     def _take(self, stamps: Sequence[float], items: Iterable[Item | None]) -> None:
         """Queue TDOAs for their poses.
@@ -405,14 +379,14 @@ class BiasNode(StreamNode):
 
     def _release(self) -> None:
         """Publish all TDOAs that need not wait longer."""
-        released = self._hold.take(self._is_ready) if self._corrector is not None else []
-        if not released:
+        corrector = self._body_antenna.corrector
+        if corrector is None:
+            self._counts["dropped"] += self._hold.shorten(EARLY)
             return
+        has_poses = self._poses.newest > -math.inf
+        released = self._hold.take(lambda before: not has_poses or corrector.ready(before))
         for _, same in groupby(released, lambda one: one[1][0]):  # by frame
             self._release_alike(*zip(*same))
-
-    def _is_ready(self, before: float) -> bool:
-        return self._poses.newest == -math.inf or self._corrector.ready(before)
 
     def _release_alike(
         self, stamps: Sequence[float], items: Sequence[Item], ready: Sequence[bool]
@@ -445,90 +419,70 @@ class BiasNode(StreamNode):
         items : as in `_take`; correction : of these
         stamps : seconds and nanoseconds, (n,) each, that replace their own
         """
-        columns = [np.array(column) for column in list(zip(*items))[1:]]
+        frames, *columns = zip(*items)
         measured = columns if stamps is None else (*stamps, *columns[2:])  # up to the variance
-        values = *measured, *vars(correction).values()
+        values = [np.array(column) for column in (*measured, *vars(correction).values())]
         status = correction.status.tolist()
-        kinds, first = (
-            [(item[0], self._antenna(item[0]).models[one]) for item, one in zip(items, status)],
-            0,
-        )
-        for kind, same in groupby(kinds):
-            some = slice(first, first := first + len(list(same)))
-            rows = self._template(*kind).rows(some.stop - some.start)
+        models = [self._antenna(frame).models[one] for frame, one in zip(frames, status)]
+        first = 0
+        for (frame, model), same in groupby(zip(frames, models)):
+            end = first + len(list(same))
+            template = self._template(frame, model)
+            rows = template.rows(end - first)
             for name, column in zip(("sec", "nanosec", *CORRECTED), values):
-                rows[name] = column[some]
-            self.output.publish(kind[0], self._template(*kind), rows)
+                rows[name] = column[first:end]
+            self.output.publish(frame, template, rows)
+            first = end
         self._counts["published"] += len(items)
         self._counts.update(STATUS[one] for one in status)
 
-    def _template(self, frame: str, model: str) -> CdrTemplate:
-        if (frame, model) not in self._templates:
-            if len(self._templates) >= MOST_FRAMES:
-                self._templates.clear()
-            message = TdoaCorrected(model=model)
-            message.header.frame_id = frame
-            self._templates[frame, model] = self._codec.template(message)
-        return self._templates[frame, model]
+    def _new_template(self, frame: str, model: str) -> CdrTemplate:
+        message = TdoaCorrected(model=model)
+        message.header.frame_id = frame
+        return self._codec.template(message)
 
     def _report(self) -> Report:
-        counts = self._counts
+        counts, inputs = self._counts, self.streams.inputs
         rate = self._rate.of(counts["received"])
-        received, self._reported_received = (
-            counts["received"] - self._reported_received,
-            counts["received"],
-        )
-        poses, self._reported_poses = counts["poses"] - self._reported_poses, counts["poses"]
-        recent = {"uwb/tdoa": received, "odometry": poses}
-        wiring = [end.trouble(recent[name]) for name, end in self.streams.inputs.items()]
-        wiring.append(several_publishers(self, "uwb/tdoa_corrected"))
+        new = counts - self._reported
+        self._reported = counts.copy()
+        recent = {"uwb/tdoa": new["received"], "odometry": new["poses"]}
         others = [*self._anchors.refusals, *self._frames.refusals]
-        wiring += [*(refusals.trouble() for refusals in others), self._frames.trouble]
-        unready, self._reported_unready = (
-            counts["unready"] - self._reported_unready,
-            counts["unready"],
-        )
+        wiring = [
+            *(end.trouble(recent[name]) for name, end in inputs.items()),
+            several_publishers(self, "uwb/tdoa_corrected"),
+            *(refusals.trouble() for refusals in others),
+            self._frames.trouble,
+        ]
+        correctors = [antenna.corrector for antenna in self._all_antennas]
+        outside = [phrase for one in correctors if one is not None for phrase in one.outside]
         values = {
             "model": self._model,
             "received": counts["received"],
             "published": counts["published"],
-        }
-        values |= {
-            "waiting": len(self._hold) + len(self._tdoas) + len(self._early),
+            "waiting": len(self._hold) + len(self._tdoas),
             "dropped": counts["dropped"],
+            **{name: counts[name] for name in STATUS.values()},
+            "released before their pose": counts["unready"],
+            "invalid": counts["invalid"],
+            "beyond where effects were seen": "; ".join(outside) or "nothing",
+            "poses": counts["poses"],
+            "TDOA rate": f"{rate:.1f} Hz",
+            **{f"publishers of {name}": end.get_publisher_count() for name, end in inputs.items()},
+            "subscribers of uwb/tdoa_corrected": self.output.publisher.get_subscription_count(),
+            **{f"lost on {name}": end.lost for name, end in inputs.items()},
+            **{
+                f"unreadable on {end.topic}": end.count for end in (*self.streams.refusals, *others)
+            },
         }
-        values |= {name: counts[name] for name in STATUS.values()}
-        values |= {"released before their pose": counts["unready"], "invalid": counts["invalid"]}
-        correctors = [
-            antenna.corrector for antenna in (self._body_antenna, *self._antennas.values())
-        ]
-        outside = [
-            phrase
-            for corrector in correctors
-            if corrector is not None
-            for phrase in corrector.outside
-        ]
-        values |= {"beyond where effects were seen": "; ".join(outside) or "nothing"}
-        values |= {"poses": counts["poses"], "TDOA rate": f"{rate:.1f} Hz"}
-        values |= {
-            f"publishers of {name}": end.get_publisher_count()
-            for name, end in self.streams.inputs.items()
-        }
-        values |= {
-            "subscribers of uwb/tdoa_corrected": self.output.publisher.get_subscription_count()
-        }
-        values |= {f"lost on {name}": end.lost for name, end in self.streams.inputs.items()}
-        values |= {
-            f"unreadable on {end.topic}": end.count for end in (*self.streams.refusals, *others)
-        }
-        level, text = self._health(rate, unready)
+        level, text = self._health(rate, new["unready"])
         if level != DiagnosticStatus.ERROR and any(wiring):
             level, text = DiagnosticStatus.WARN, next(filter(None, wiring))
         return level, text, values
 
     def _health(self, rate: float, unready: int) -> tuple[bytes, str]:
         for antenna in self._antennas.values():
-            heard, antenna.reported = antenna.heard - antenna.reported, antenna.heard
+            heard, antenna.heard = antenna.heard, 0
             if antenna.trouble and heard:
                 return DiagnosticStatus.WARN, antenna.trouble
         if self._idle:
@@ -538,7 +492,7 @@ class BiasNode(StreamNode):
             )
         if self._anchors.refused:
             return DiagnosticStatus.ERROR, self._anchors.refused
-        if self._corrector is None:
+        if self._anchors.anchors is None:
             return (
                 DiagnosticStatus.ERROR,
                 "no anchors yet: publish them on uwb/anchors, reliable and transient local",
@@ -548,7 +502,7 @@ class BiasNode(StreamNode):
                 DiagnosticStatus.WARN,
                 "no TDOAs on uwb/tdoa: check that the tag's driver runs in this namespace",
             )
-        trouble = self._network and self._network.trouble(self._corrector.anchors)
+        trouble = self._network and self._network.trouble(self._anchors.anchors)
         if trouble:
             return DiagnosticStatus.WARN, f"model_file {trouble}"
         if self._poses.newest == -math.inf:

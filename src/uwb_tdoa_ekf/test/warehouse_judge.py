@@ -15,6 +15,7 @@ from halls import Hall, fly
 import numpy as np
 
 from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.survey import read_survey
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_ekf.core.memory import STARTUP
 from uwb_tdoa_ekf.estimator import Estimator
@@ -146,7 +147,7 @@ def cost(n, duration=30.0, repeat=3):
     with tempfile.TemporaryDirectory() as folder:
         anchors.to_yaml(path := Path(folder) / "anchors.yaml")
         began = time.process_time()
-        Tag(Anchors.from_yaml(path))
+        Tag(read_survey(path))
         start = time.process_time() - began
     flight = flight_among(anchors, duration)
     for _ in range(repeat):

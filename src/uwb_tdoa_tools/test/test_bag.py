@@ -22,7 +22,7 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
 from uwb_tdoa_bias.common.sensors import Height, Pressure, Velocity
-from uwb_tdoa_bias.common.survey import survey_faults
+from uwb_tdoa_bias.common.survey import survey_fault
 from uwb_tdoa_tools.bags.bag import read_bag, read_fields, read_odometry, write_bag
 from uwb_tdoa_tools.bags.files import messages, new_bag, open_bag
 from uwb_tdoa_tools.bags.message_types import typestore
@@ -99,7 +99,7 @@ def flights(draw):
     n = len(ids)
     positions = draw(arrays(float, (n, 3), elements=st.floats(-100.0, 100.0)))
     anchors = Anchors(ids, positions, draw(st.lists(unit, min_size=n, max_size=n)))
-    assume(not survey_faults(anchors))  # or the bag is refused
+    assume(not survey_fault(anchors))  # or the bag is refused
     t = stamps(1)
     a, variance = (
         draw(arrays(np.int64, len(t), elements=st.sampled_from(ids))),

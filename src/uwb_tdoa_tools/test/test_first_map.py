@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Imu
+from uwb_tdoa_bias.common.survey import read_survey
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands import localize
 from uwb_tdoa_tools.commands.map_anchors import main
@@ -259,7 +259,7 @@ def test_the_command_writes_a_map_and_a_next_line_that_runs(desk, flight, capsys
     assert (out / "map.png").stat().st_size > 1000
     content = json.loads((out / "map.json").read_text())
     assert content["accepted"] and len(content["covariance"]) == 3 * len(flight.anchors)
-    mapped = Anchors.from_yaml(out / "anchors.yaml")
+    mapped = read_survey(out / "anchors.yaml")
     assert mapped.ids.tolist() == flight.anchors.ids.tolist()
     off = np.linalg.norm(mapped.positions - flight.anchors.positions, axis=1)
     assert off.max() < 1.0

@@ -13,6 +13,7 @@ import pytest
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.flyable import FlyableVolume
+from uwb_tdoa_bias.common.survey import read_survey
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands import plan
 from uwb_tdoa_tools.planning import optimisation, run
@@ -270,7 +271,7 @@ def test_improve(how, turned, tmp_path, capsys):
     assert f"{100 * found['after']['flyable_share']:8.1f}" in next(
         line for line in text.splitlines() if line.startswith("flyable, %")
     )
-    better = Anchors.from_yaml(out / "improved.yaml")
+    better = read_survey(out / "improved.yaml")
     assert set(better.ids) == set(ids) | ({0} if how == "add" else set()) and better.frame == "hall"
     np.testing.assert_allclose(
         better.positions, better.positions.round(2), atol=1e-4 if how == "add" else 1e-12

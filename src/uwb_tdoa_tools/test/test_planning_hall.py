@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.survey import read_survey
 from uwb_tdoa_tools.commands.plan import main
 from uwb_tdoa_tools.planning.hall import Hall
 from uwb_tdoa_tools.planning.installation import Installation
@@ -208,7 +209,7 @@ def test_anchors_of_a_hall_are_designed_and_give_what_was_wanted(tmp_path, capsy
     asked += ["--walls", str(tmp_path / "walls.yaml"), "--jobs", "1"]
     assert main(["--hall", *asked, "--share", "0.9", "--out", str(tmp_path / "out")]) == 0
     found, said = json.loads((tmp_path / "out" / "plan.json").read_text()), capsys.readouterr().out
-    anchors = Anchors.from_yaml(tmp_path / "out" / "hall.yaml")
+    anchors = read_survey(tmp_path / "out" / "hall.yaml")
     steps = found["design"]
     assert found["map"]["flyable_share"] >= 0.9 and len(anchors) == found["anchors"]
     counts = [step["count"] for step in steps]

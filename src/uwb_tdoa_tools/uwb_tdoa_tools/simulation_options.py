@@ -206,8 +206,7 @@ def add_options(made: argparse.ArgumentParser) -> None:
 
 def config_of(args: argparse.Namespace) -> SimulationConfig:
     """Return the SimulationConfig of the options; most have the names of its fields."""
-    from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.common.survey import refuse_faulty
+    from uwb_tdoa_bias.common.survey import read_survey, refuse_faulty
 
     from .readers.tables import read_numbers
     from .simulation.config import NO_IMU_ERRORS, ImuErrors, SimulationConfig
@@ -225,7 +224,7 @@ def config_of(args: argparse.Namespace) -> SimulationConfig:
     values["anchors"] = (
         None
         if args.anchors is None
-        else refuse_faulty(Anchors.from_yaml(args.anchors), str(args.anchors))
+        else refuse_faulty(read_survey(args.anchors), str(args.anchors))
     )
     values["imu_errors"] = (
         NO_IMU_ERRORS if args.perfect_imu else ImuErrors(vibration=args.vibration)

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,11 +12,11 @@ import yaml
 
 from .errors import InputError
 from .files import write_text
-from .safe_yaml import read_yaml
 from .text import written_by
 
 if TYPE_CHECKING:
-    from geometry_msgs.msg import Point, Quaternion
+    from pathlib import Path
+
     from numpy.typing import ArrayLike
 
 SAME_PLACE = 0.01  # m; a smaller change of a repeated anchor is no change
@@ -148,57 +147,17 @@ class Anchors:
 
         The orientation (0, 0, 0, 0) means unknown. An empty frame_id means "map". Raises InputError.
         """
-        poses = [anchor.pose for anchor in message.anchors]
+        positions = [anchor.pose.position for anchor in message.anchors]
+        orientations = [anchor.pose.orientation for anchor in message.anchors]
         return cls(
             np.array([anchor.id for anchor in message.anchors]),
-            np.array([_numbers(pose.position, "xyz") for pose in poses]).reshape(-1, 3),
-            np.array([_numbers(pose.orientation, "xyzw") for pose in poses]).reshape(-1, 4),
+            np.array([[p.x, p.y, p.z] for p in positions]).reshape(-1, 3),
+            np.array([[q.x, q.y, q.z, q.w] for q in orientations]).reshape(-1, 4),
             message.header.frame_id or "map",
         )
 
-    @classmethod
-    def from_yaml(cls, path: str | Path) -> Anchors:
-        """Read Anchors from a YAML file.
-
-        The file holds `frame` and
-        `anchors: {id: {position: [x, y, z], orientation: [x, y, z, w]}}`, positions in m.
-        Raises InputError.
-        """
-        content = read_yaml(path)
-        entries = content.get("anchors") if isinstance(content, dict) else None
-        if not isinstance(entries, dict) or not entries:
-            raise InputError(
-                f"{path}: expected a mapping 'anchors' of id to position and orientation."
-            )
-        frame = content.get("frame", "map")
-        if not isinstance(frame, str):
-            raise InputError(
-                f"{path}: frame: {frame!r} is no name; write the name of the world frame, e.g. map."
-            )
-        ids, positions, orientations = [], [], []
-        for key, entry in entries.items():
-            try:
-                anchor, position, orientation = _entry(key, entry)
-            except ValueError as error:
-                raise InputError(
-                    f"{path}: anchors: {key}: {error}; write it as "
-                    "'0: {position: [x, y, z], orientation: [x, y, z, w]}' (orientation optional)."
-                ) from error
-            ids.append(anchor)
-            positions.append(position)
-            orientations.append(orientation)
-        try:
-            return cls(
-                np.array(ids),
-                np.array(positions, dtype=float),
-                np.array(orientations, dtype=float),
-                frame,
-            )
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from error
-
     def to_yaml(self, path: str | Path) -> None:
-        """Write a YAML file that `from_yaml` reads."""
+        """Write a YAML file that `read_survey` reads."""
         entries = {}
         for i, p, q in zip(self.ids.tolist(), self.positions.tolist(), self.orientations.tolist()):
             entries[i] = {"position": p, **({"orientation": q} if np.isfinite(q).all() else {})}
@@ -219,24 +178,3 @@ def _whole(ids: ArrayLike) -> np.ndarray:
     if bad:
         raise InputError(f"anchors: id {bad[0]!r} is not a whole number 0 ... 65535.")
     return values.astype(np.int64)
-
-
-def _numbers(message: Point | Quaternion, names: str) -> list[float]:
-    return [getattr(message, name) for name in names]
-
-
-def _entry(key: Any, entry: Any) -> tuple[int, list[float], list[float]]:
-    """Return (id, position, orientation) of an entry; raise ValueError with the reason."""
-    if isinstance(key, bool) or not str(key).isascii() or not str(key).isdigit():
-        raise ValueError(f"the id is {key!r}, not a whole number 0 ... 65535")
-    if not isinstance(entry, dict):
-        raise ValueError(f"{entry!r} is not an anchor")
-    if unknown := [name for name in entry if name not in ("position", "orientation")]:
-        raise ValueError(f"{unknown[0]!r} is not one of position, orientation")
-    position: Any = entry.get("position")
-    orientation: Any = entry.get("orientation")
-    for name, value, count in (("position", position, 3), ("orientation", orientation, 4)):
-        numbers = isinstance(value, list) and all(type(number) in (int, float) for number in value)
-        if not (numbers and len(value) == count) and not (name == "orientation" and value is None):
-            raise ValueError(f"{name} is {value!r}, not {count} numbers")
-    return int(key), position, [np.nan] * 4 if orientation is None else orientation

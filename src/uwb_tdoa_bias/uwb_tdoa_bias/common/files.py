@@ -104,7 +104,7 @@ def write_bytes(path: str | Path, content: bytes) -> None:
     if path.exists() and (
         path.is_symlink() or not (path.is_file() and os.access(path.parent, os.W_OK))
     ):
-        _write_in_place(path, content)
+        path.write_bytes(content)
         return
     sibling = path.with_name(f".{secrets.token_hex(8)}.partial")
     try:
@@ -149,11 +149,6 @@ def refuse_output(path: str | Path) -> None:
             )
         if where.is_relative_to(its_place) and (state is not None or is_bag):
             raise InputError(f"{path}: lies in {kept}, which is read; give another place.")
-
-
-def _write_in_place(path: Path, content: bytes) -> None:
-    with open(path, "wb") as file:
-        file.write(content)
 
 
 def open_file(path: str | Path) -> BinaryIO:
@@ -244,7 +239,8 @@ def read_arrays(
                 ARRAYS_BYTES,
             )
             return {
-                name: _array(name, file, member, kinds[name]) for name, member in members.items()
+                name: _array(name, file.read(member), kinds[name])
+                for name, member in members.items()
             }
     except InputError:
         raise
@@ -270,19 +266,14 @@ def _member(file: ZipFile, name: str) -> ZipInfo:
         raise KeyError(f"it holds no {name}") from None
 
 
-def _array(name: str, file: ZipFile, member: ZipInfo, kinds: str) -> np.ndarray:
-    with file.open(member) as opened:
-        data = opened.read(member.file_size + 1)
+def _array(name: str, data: bytes, kinds: str) -> np.ndarray:
+    """Return the array of a member of an .npz file; its size is checked before memory is taken."""
     stream = io.BytesIO(data)
     version = np.lib.format.read_magic(stream)
-    read_header = {
-        (1, 0): np.lib.format.read_array_header_1_0,
-        (2, 0): np.lib.format.read_array_header_2_0,
-    }
-    if version not in read_header:
+    if version != (1, 0):  # numpy writes others for very long headers only
         raise ValueError(f"{name} is of format {version}")
     try:
-        shape, fortran, dtype = read_header[version](stream)
+        shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
     except Exception as error:  # numpy parses it as Python, with many exceptions
         raise ValueError(f"{name} has a header that cannot be read ({error})") from error
     if dtype.hasobject or dtype.kind not in kinds:
@@ -290,15 +281,11 @@ def _array(name: str, file: ZipFile, member: ZipInfo, kinds: str) -> np.ndarray:
     size, rest = math.prod(shape) * dtype.itemsize, len(data) - stream.tell()
     if min(shape, default=0) < 0 or size != rest:
         raise ValueError(f"{name} claims {size} bytes, {rest} are there")
-    array = np.frombuffer(data, dtype, offset=stream.tell()) if size else np.empty(0, dtype)
+    array: np.ndarray = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
     if dtype.kind == "f" and np.isnan(array).any():
         raise ValueError(f"{name} holds NaN")
-    if dtype.kind == "U" and size:
-        if (
-            np.frombuffer(
-                data, np.dtype(np.uint32).newbyteorder(dtype.byteorder), offset=stream.tell()
-            ).max()
-            > 0x10FFFF
-        ):
+    if dtype.kind == "U":
+        characters = np.frombuffer(array.tobytes(), np.dtype("u4").newbyteorder(dtype.byteorder))
+        if (characters > 0x10FFFF).any():
             raise ValueError(f"{name} holds no text")
-    return array.reshape(shape, order="F" if fortran else "C").copy()
+    return array

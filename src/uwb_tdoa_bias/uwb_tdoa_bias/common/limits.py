@@ -84,11 +84,9 @@ class Budget:
         path : for messages
         size : bytes of the file; the time limit grows with them
         """
-        self._path, self._spent, self._seconds = (
-            path,
-            Counter[str](),
-            SECONDS + SECONDS_PER_BYTE * size,
-        )
+        self._path = path
+        self._spent = Counter[str]()
+        self._seconds = SECONDS + SECONDS_PER_BYTE * size
         self.restart()
 
     def restart(self) -> None:

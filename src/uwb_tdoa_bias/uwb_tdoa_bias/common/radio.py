@@ -121,14 +121,10 @@ class Antenna:
         return tuple(out)
 
     @cached_property
-    def _peak(self) -> float:
-        fine = np.linspace(0.0, 2.0 * np.pi, 721)
-        return float(max(cut(fine).max() for cut in self._cuts))
-
-    @property
     def peak_gain(self) -> float:
         """Largest gain on the three cuts, dBi."""
-        return self._peak + self.gain_offset
+        fine = np.linspace(0.0, 2.0 * np.pi, 721)
+        return float(max(cut(fine).max() for cut in self._cuts)) + self.gain_offset
 
     def gain(self, direction: ArrayLike) -> np.ndarray:
         """Return the gain towards a direction, (...) dBi.

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -41,41 +41,26 @@ FARTHEST_OFF = 200  # anchors farthest from the median whose neighbours are sear
 MOST_NAMED = 10  # anchors in a sentence
 
 
-class SurveyFault(NamedTuple):
-    """A fault of a survey.
-
-    Attributes
-    ----------
-    rule : its name
-    cause : what is wrong, a clause
-    evidence : numbers
-    remedy : what to do
-    value : the number that decided
-    """
-
-    rule: str
-    cause: str
-    evidence: str
-    remedy: str
-    value: float
-
-    @property
-    def sentence(self) -> str:
-        """Cause, evidence and remedy in one line."""
-        return f"{self.cause} ({self.evidence}); {self.remedy}."
-
-
-def survey_faults(anchors: Anchors) -> list[SurveyFault]:
-    """Return the certain faults of Anchors: list of SurveyFault, empty for a usable survey."""
+def survey_fault(anchors: Anchors) -> str:
+    """Return what is certainly wrong with Anchors: cause, evidence and remedy; "" for a usable survey."""
     if len(anchors) < 2:
-        return []
-    together = _together(anchors)
-    if together and len(together[0]) == len(anchors):
-        x, y, z = anchors.positions[0]
-        cause, remedy = "all anchors are at one place", "write the measured position of each anchor"
-        evidence = f"all {len(anchors)} are at ({x:g}, {y:g}, {z:g})"
-        return [SurveyFault("survey_one_place", cause, evidence, remedy, float(len(anchors)))]
-    return [*_same_place(anchors, together), *_far(anchors)]
+        return ""
+    cells = np.round(anchors.positions / SAME_PLACE)
+    _, group, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    together = np.flatnonzero(counts > 1)
+    if not len(together):
+        return _far(anchors)
+    rows = np.flatnonzero(group.reshape(-1) == together[0])
+    x, y, z = anchors.positions[rows[0]]
+    place = f"at ({x:g}, {y:g}, {z:g})"
+    if len(rows) == len(anchors):
+        return (
+            f"all anchors are at one place (all {len(anchors)} are {place}); write the measured "
+            "position of each anchor."
+        )
+    more = f", and {len(together) - 1} more groups are" if len(together) > 1 else ""
+    names = _listed(anchors.ids[rows])
+    return f"anchors {names} are at one place ({place}{more}); measure each of them again."
 
 
 def refuse_faulty(anchors: Anchors, source: str = "anchors") -> Anchors:
@@ -83,60 +68,35 @@ def refuse_faulty(anchors: Anchors, source: str = "anchors") -> Anchors:
 
     source : origin of the anchors, for the message
     """
-    faults = survey_faults(anchors)
-    if faults:
-        raise InputError(f"{source}: {faults[0].sentence}")
+    fault = survey_fault(anchors)
+    if fault:
+        raise InputError(f"{source}: {fault}")
     return anchors
 
 
-def _together(anchors: Anchors) -> list[np.ndarray]:
-    """Return groups of rows (k,) of anchors at one place."""
-    cells = np.round(anchors.positions / SAME_PLACE)
-    _, group, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    return [np.flatnonzero(group.reshape(-1) == number) for number in np.flatnonzero(counts > 1)]
-
-
-def _same_place(anchors: Anchors, together: list[np.ndarray]) -> list[SurveyFault]:
-    if not together:
-        return []
-    rows = together[0]
-    x, y, z = anchors.positions[rows[0]]
-    cause = f"anchors {_listed(anchors.ids[rows])} are at one place"
-    evidence = f"at ({x:g}, {y:g}, {z:g})" + (
-        f", and {len(together) - 1} more groups are" if len(together) > 1 else ""
-    )
-    return [
-        SurveyFault(
-            "survey_same_place", cause, evidence, "measure each of them again", float(len(rows))
-        )
-    ]
-
-
-def _far(anchors: Anchors) -> list[SurveyFault]:
-    """Return faults of anchors without neighbours within radio reach: all, or single anchors."""
+def _far(anchors: Anchors) -> str:
+    """Return the fault of anchors without neighbours within radio reach, all or single ones, or ""."""
     positions = anchors.positions
     off = np.abs(positions - np.median(positions, axis=0)).max(axis=1)
     rows = np.argsort(off)[-FARTHEST_OFF:]
     distances = np.linalg.norm(positions[rows, None] - positions, axis=2)
     # to the second nearest other anchor, as place 0 is the anchor itself: the nearest may be misplaced
     # with it
-    nearest = np.partition(distances, min(NEIGHBOURS, len(anchors) - 1), axis=1)[
-        :, min(NEIGHBOURS, len(anchors) - 1)
-    ]
+    place = min(NEIGHBOURS, len(anchors) - 1)
+    nearest = np.partition(distances, place, axis=1)[:, place]
     lonely = rows[nearest > LONELY]
     if not len(lonely):
-        return []
-    spacing, one = float(np.median(nearest[nearest > LONELY])), len(lonely) == 1
+        return ""
+    spacing = float(np.median(nearest[nearest > LONELY]))
+    who, looks, them = "the survey", "looks", "it"
     if len(lonely) > 0.5 * len(rows):
-        who, looks, evidence = (
-            "the survey",
-            "looks",
-            f"neighbouring anchors are {spacing:.0f} m apart",
-        )
+        evidence = f"neighbouring anchors are {spacing:.0f} m apart"
         unit = min(UNITS, key=lambda name: abs(np.log(spacing / UNITS[name] / USUAL)))
     else:
-        names, looks = _listed(np.sort(anchors.ids[lonely])), "looks" if one else "look"
-        who = f"the position of anchor {names}" if one else f"the positions of anchors {names}"
+        names = _listed(np.sort(anchors.ids[lonely]))
+        who = f"the position of anchor {names}"
+        if len(lonely) > 1:
+            who, looks, them = f"the positions of anchors {names}", "look", "them"
         evidence = f"{spacing:.0f} m from the second nearest anchor"
         rest = positions[np.setdiff1d(np.arange(len(anchors)), lonely)]
         inside = {
@@ -144,24 +104,15 @@ def _far(anchors: Anchors) -> list[SurveyFault]:
             for name, count in UNITS.items()
         }
         # the smallest divisor that puts the farthest one within two room sizes of the rest
-        unit = next(
-            (name for name in reversed(UNITS) if inside[name] < 2.0 * np.ptp(rest, axis=0).max()),
-            "",
-        )
+        room = 2.0 * np.ptp(rest, axis=0).max()
+        unit = next((name for name in reversed(UNITS) if inside[name] < room), "")
     evidence += ", and a radio reaches 300 m"
     # after the division the spacing must be one of anchors
     if not unit or not 0.05 < spacing / UNITS[unit] < 0.5 * LONELY:
-        return [
-            SurveyFault(
-                "survey_unit",
-                f"{who} cannot be in metres",
-                evidence,
-                "give metres, in one frame for all anchors",
-                spacing,
-            )
-        ]
-    remedy = f"give metres: divide {'it' if looks == 'looks' else 'them'} by {UNITS[unit]:.6g}"
-    return [SurveyFault("survey_unit", f"{who} {looks} like {unit}", evidence, remedy, UNITS[unit])]
+        return f"{who} cannot be in metres ({evidence}); give metres, in one frame for all anchors."
+    return (
+        f"{who} {looks} like {unit} ({evidence}); give metres: divide {them} by {UNITS[unit]:.6g}."
+    )
 
 
 def _listed(ids: np.ndarray) -> str:
@@ -203,10 +154,8 @@ def anchors_of(
     path: str | Path, entries: Sequence[Entry], ids: Sequence[int], frame: str
 ) -> Anchors:
     """Return the Anchors of entries of a file, with these ids; raise InputError."""
-    positions, orientations = (
-        np.array([entry.position for entry in entries]),
-        np.array([entry.orientation for entry in entries]),
-    )
+    positions = np.array([entry.position for entry in entries])
+    orientations = np.array([entry.orientation for entry in entries])
     try:
         return Anchors(np.array(ids), positions, orientations, frame)
     except InputError as error:
@@ -281,17 +230,15 @@ def orientation_from_tips(tips: np.ndarray) -> tuple[np.ndarray, float]:
 def _total_station(path: str | Path, lines: Lines) -> list[Entry]:
     antennas: dict[Any, list[float]] = {}
     tips: dict[Any, list[float]] = {}
+    key: Any
     for number, cells in lines:
         antenna, tip = _ANTENNA.match(cells[0]), _TIP.match(cells[0])
-        points, key = (
-            (antennas, int(antenna[1]))
-            if antenna
-            else (tips, (int(tip[1]), int(tip[2])))
-            if tip
-            else (None, None)
-        )
         point = _point(path, number, cells)
-        if points is None:
+        if antenna:
+            points, key = antennas, int(antenna[1])
+        elif tip:
+            points, key = tips, (int(tip[1]), int(tip[2]))
+        else:
             continue
         if key in points:
             raise InputError(f"{path}: line {number}: {cells[0]} is there twice; keep one.")

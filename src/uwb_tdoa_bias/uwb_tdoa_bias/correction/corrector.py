@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from .model import Model
 
 
-# s after the first pose. Earlier TDOAs are corrected without a pose, which costs accuracy.
-START = 0.2
 # rad. A yaw with a larger standard deviation is unknown: then the filter follows four yaws,
 # 90 degrees apart.
 LARGEST_YAW_STD = 1.0
@@ -77,9 +75,6 @@ class Corrector:
     - It depends on stamps alone, so a recording gives the same result at any speed.
     - The filter has `lag` s to report the pose.
     - The filter needs nothing later than the preceding measurement for it, even after a gap.
-
-    No pose is used in the first `start` s after the first pose. The first pose may arrive that much
-    later than its stamp without changing a result.
     """
 
     def __init__(
@@ -88,8 +83,7 @@ class Corrector:
         effects: EffectSet | None = None,
         network: Model | None = None,
         lag: float = POSE_LAG,
-        history: int = 4096,
-        start: float = START,
+        poses: Poses | None = None,
     ) -> None:
         """Set the bias model.
 
@@ -99,8 +93,7 @@ class Corrector:
         effects : EffectSet or None; hypotheses, which the filter weighs, are not corrected: see `weighed`
         network : Model or None
         lag : s
-        history : number of poses kept
-        start : s
+        poses : Poses that other Correctors use, too; by default its own
         """
         self.anchors = anchors
         effects = EffectSet() if effects is None else effects
@@ -119,12 +112,15 @@ class Corrector:
         self.model = _joined(own, network.name if network else "")
         of_effects = _joined(own, network.of_effects if network else "")
         self.models = {PASSED: "none", EFFECTS: of_effects, NETWORK: self.model, FADED: self.model}
-        self._history, self._start = history, start
-        self.reset()
+        self._poses = Poses() if poses is None else poses
+        self._begin()
 
     def reset(self) -> None:
         """Delete all poses."""
-        self._poses = Poses(self._history, self._start)
+        self._poses.clear()
+        self._begin()
+
+    def _begin(self) -> None:
         self._latest: Samples | None = None  # of the latest TDOAs
         self._newest: float = None  # type: ignore[assignment]  # latest stamp of a TDOA, once there is one
         self._first = math.nan  # stamp of the first TDOA, once there is one
@@ -135,9 +131,13 @@ class Corrector:
         self.anchors, self._latest, self._last = anchors, None, None
 
     @property
+    def _has_model(self) -> bool:
+        return len(self.effects) > 0 or self.network is not None
+
+    @property
     def idle(self) -> bool:
         """True without effects and network."""
-        return not len(self.effects) and self.network is None
+        return not self._has_model
 
     @property
     def outside(self) -> list[str]:
@@ -180,10 +180,6 @@ class Corrector:
             or before < self._poses.begin < math.inf
         )
 
-    def share_poses(self, other: Corrector) -> None:
-        """Use the poses of another Corrector; from now on only that one gets new poses."""
-        self._poses = other._poses
-
     def correct(self, t: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray) -> Correction:
         """Return the Correction of a batch.
 
@@ -195,7 +191,7 @@ class Corrector:
         a, b : (n,) rows of `anchors`
         d : (n,) m, raw d_ab
         """
-        if self.idle or len(t) == 0:
+        if not self._has_model or len(t) == 0:
             return Correction.none(d)
         self._latest = samples = self.samples(t, a, b)
         bias, std, status, slope, state = self.prediction(samples)
@@ -224,16 +220,12 @@ class Corrector:
         bias, noise = self.effects.state_independent.bias(samples), self.effects.noise_std(samples)
         if len(steep):
             of_steep, slope, curved = steep.bias_jacobian(samples)
-            bias, noise, state = (
-                bias + of_steep,
-                np.hypot(noise, curved),
-                samples.linearization_point,
-            )
-        unknown = (
-            np.zeros(len(samples), bool)
-            if samples.yaw_std is None
-            else samples.yaw_std > LARGEST_YAW_STD
-        )
+            bias = bias + of_steep
+            noise = np.hypot(noise, curved)
+            state = samples.linearization_point
+        unknown: np.ndarray = np.zeros(len(samples), bool)
+        if samples.yaw_std is not None:
+            unknown = samples.yaw_std > LARGEST_YAW_STD
         turning = self.effects.of_attitude
         if len(turning) and unknown.any():
             headings = np.concatenate(
@@ -257,11 +249,12 @@ class Corrector:
         samples = Samples(t, a, b, p, q, self.anchors, self._first, yaw_std=yaw_std)
         if not (self.effects.needs_motion or (self.network and self.network.needs_motion)):
             return samples
+        kept = self._poses.kept
         last_t, last_b = self._last or (t[0], -1)
         self._last = (t[-1], self.anchors.ids[b[-1]])
         return replace(
             samples,
-            motion=motion_at(self._poses.t, self._poses.v, self._poses.q, places),
+            motion=motion_at(kept.t, kept.v, kept.q, places),
             interval=t - np.concatenate([[last_t], t[:-1]]),
             previous=np.concatenate([[last_b], self.anchors.ids[b[:-1]]]),
         )
@@ -298,16 +291,9 @@ class FixedPoseCorrector(Corrector):
         poses : (t (k,) s, p (k, 3) m, q (k, 4), v (k, 3) m/s, yaw_std (k,) rad), as for `add_pose`
         """
         self._known = poses
-        super().__init__(anchors, effects, history=max(len(poses[0]), 1))
+        super().__init__(anchors, effects, poses=Poses(max(len(poses[0]), 1)))
+        self.reset()
 
     def reset(self) -> None:
         super().reset()
         self.add_pose(*self._known)
-
-    def correct(self, t: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray) -> Correction:
-        if len(t) == 0:
-            return Correction.none(d)
-        bias, noise, slope, state = self.contribution(self.samples(t, a, b))
-        return Correction(
-            bias, noise, d - bias, np.full(len(t), EFFECTS, dtype=np.uint8), slope, state
-        )

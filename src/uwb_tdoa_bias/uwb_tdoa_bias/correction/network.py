@@ -85,6 +85,7 @@ class Network(Model):
     )
 
     def __init__(self, path: str | Path, session: Session | None = None) -> None:
+        """Load a file as Model does, and run it on the mean of all features."""
         super().__init__(path, session)
         width, n = self._model.width, len(self._inputs)
         if not (n == len(self._offset) == len(self._scale) == width) or (self._scale == 0).any():
@@ -93,14 +94,7 @@ class Network(Model):
                 f"{len(self._offset)} offsets and {len(self._scale)} scales; they must agree, "
                 "and no scale may be 0."
             )
-        self._ask(path)
-
-    def _ask(self, path: str | Path) -> None:
-        """Run the model on the mean of all features.
-
-        Raises InputError unless it returns one to three finite numbers per row.
-        """
-        out = self._model.run(np.zeros((1, len(self._inputs))))
+        out = self._model.run(np.zeros((1, n)))
         if out.shape[1] > 3 or not np.isfinite(out).all():
             raise InputError(
                 f"model: {path}: gives (n, {out.shape[1]}), or no finite numbers; the output "
@@ -108,13 +102,9 @@ class Network(Model):
             )
 
     def _read(self, meta: dict[str, str]) -> None:
-        names, self._offset, self._scale = (
-            json.loads(meta[key]) for key in ("features", "offset", "scale")
-        )
-        self._offset, self._scale = (
-            np.array(self._offset, dtype=float),
-            np.array(self._scale, dtype=float),
-        )
+        names = json.loads(meta["features"])
+        self._offset = np.array(json.loads(meta["offset"]), dtype=float)
+        self._scale = np.array(json.loads(meta["scale"]), dtype=float)
         self.clip = float(json.loads(meta["clip"]))
         self.name = sanitize(json.loads(meta["name"]))
         self.trained_with = tuple(map(sanitize, json.loads(meta.get("trained_with", "[]"))))
@@ -122,9 +112,8 @@ class Network(Model):
         self._fade_std = float(json.loads(meta["fade_std"])) if limits else 0.0
         self._largest_yaw_std = float(json.loads(meta.get("largest_yaw_std", "Infinity")))
         self.share = float(json.loads(meta.get("share", "1.0")))
-        self._inputs, limited = (
-            np.array([_COLUMN[name] for name in some], dtype=int) for some in (names, limits)
-        )
+        self._inputs = np.array([_COLUMN[name] for name in names], dtype=int)
+        limited = np.array([_COLUMN[name] for name in limits], dtype=int)
         lower, upper, margin = np.array([*limits.values()], dtype=float).reshape(-1, 3).T
         self._validity = Validity(limited, lower, upper, margin)
         if not ((margin > 0.0) & (upper >= lower)).all():

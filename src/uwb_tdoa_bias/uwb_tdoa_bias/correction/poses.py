@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 
 
 POSE_NUMBERS, TWIST_NUMBERS = 3 + 4 + 36, 6 + 36  # of PoseWithCovariance and TwistWithCovariance
+HISTORY = 4096  # poses kept at least
+# s after the first pose. Earlier TDOAs are corrected without a pose, which costs accuracy.
+START = 0.2
 TILT = 0.5  # rad; with a larger tilt std the filter estimates no attitude
 
 
@@ -31,7 +34,7 @@ class Columns(NamedTuple):
     t : (m,) s
     p : (m, 3) m, world
     q : (m, 4) x y z w, body to world
-    v : (m, 3) m/s, world
+    v : (m, 3) m/s, world; NaN if unknown
     yaw_std : (m,) rad
     """
 
@@ -45,39 +48,32 @@ class Columns(NamedTuple):
 class Poses:
     """Poses in the order of their stamps; at least the last `history` are kept.
 
+    No pose is used in the first `start` s after the first pose. The first pose may arrive that much
+    later than its stamp without changing a result.
+
     begin : stamp, s, from which poses are used: `start` s after the first pose; inf before it
     """
 
-    def __init__(self, history: int, start: float) -> None:
-        self._history, self._count, self._start, self.begin = history, 0, start, math.inf
+    def __init__(self, history: int = HISTORY, start: float = START) -> None:
+        self._start = start
         self._columns = Columns(
             *(np.empty((2 * history, *shape)) for shape in ((), (3,), (4,), (3,), ()))
         )
+        self.clear()
+
+    def clear(self) -> None:
+        """Delete all poses."""
+        self._count, self.begin = 0, math.inf
 
     @property
-    def t(self) -> np.ndarray:
-        """Stamps, (m,) s."""
-        return self._columns.t[: self._count]
-
-    @property
-    def p(self) -> np.ndarray:
-        """Positions, (m, 3) m."""
-        return self._columns.p[: self._count]
-
-    @property
-    def q(self) -> np.ndarray:
-        """Attitudes, (m, 4) x y z w, body to world."""
-        return self._columns.q[: self._count]
-
-    @property
-    def v(self) -> np.ndarray:
-        """Velocities, (m, 3) m/s, world, NaN where not known."""
-        return self._columns.v[: self._count]
+    def kept(self) -> Columns:
+        """All kept poses."""
+        return Columns(*(column[: self._count] for column in self._columns))
 
     @property
     def newest(self) -> float:
         """Stamp of the last pose, s; -inf if there is none."""
-        return self.t[-1] if self._count else -np.inf
+        return self._columns.t[self._count - 1] if self._count else -np.inf
 
     def add(
         self, t: ArrayLike, p: ArrayLike, q: ArrayLike, v: ArrayLike, yaw_std: ArrayLike
@@ -131,12 +127,11 @@ def _append(count: int, kept: Columns, new: Columns) -> int:
         if not new.t[i] > (kept.t[count - 1] if count else -np.inf):
             continue
         if count == 2 * history:
-            kept.t[:history], kept.yaw_std[:history] = kept.t[history:], kept.yaw_std[history:]
-            kept.p[:history], kept.q[:history], kept.v[:history] = (
-                kept.p[history:],
-                kept.q[history:],
-                kept.v[history:],
-            )
+            kept.t[:history] = kept.t[history:]
+            kept.p[:history] = kept.p[history:]
+            kept.q[:history] = kept.q[history:]
+            kept.v[:history] = kept.v[history:]
+            kept.yaw_std[:history] = kept.yaw_std[history:]
             count = history
         kept.t[count], kept.yaw_std[count] = new.t[i], new.yaw_std[i]
         kept.p[count], kept.q[count], kept.v[count] = new.p[i], new.q[i], new.v[i]
@@ -259,6 +254,13 @@ class PoseQueue:
         newest = t if self._newest is None else self._newest
         self._items.append((t, min(t, newest), item))
         self._newest = max(newest, t)
+
+    def shorten(self, most: int) -> int:
+        """Remove the oldest of more than `most` items, and return their number."""
+        removed = max(len(self._items) - most, 0)
+        for _ in range(removed):
+            self._items.popleft()
+        return removed
 
     def take(self, ready: Callable[[float], bool]) -> list[tuple[float, Any, bool]]:
         """Remove and return the items that may leave: a list of (t, item, ready(before)).

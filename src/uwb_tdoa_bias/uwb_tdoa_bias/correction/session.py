@@ -55,10 +55,8 @@ class Session:
         self._name, (rows, self.width) = inputs[0].name, inputs[0].shape
         if not isinstance(self.width, int):
             raise Unplayable("an input of unknown width")
-        self.alone, self.meta = (
-            alone or rows == 1,
-            dict(self._session.get_modelmeta().custom_metadata_map),
-        )
+        self.alone = alone or rows == 1
+        self.meta = dict(self._session.get_modelmeta().custom_metadata_map)
         self.outputs = self._play(np.zeros((1, self.width), np.float32)).shape[1]
 
     def run(self, x: np.ndarray) -> np.ndarray:

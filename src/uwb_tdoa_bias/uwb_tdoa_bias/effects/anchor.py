@@ -4,13 +4,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..common.errors import InputError
 from ..common.geometry import ranges
 from .base import (
+    ANCHOR,
+    OF_ANCHOR,
+    UNLIMITED,
     ArrivalEffect,
     Effect,
     GeometryEffect,
@@ -19,11 +21,13 @@ from .base import (
     Row,
     Shift,
     cached_by_anchors,
-    check_anchor,
     counted,
     id_texts,
+    interval_words,
+    is_within,
     listed,
     measured,
+    with_each,
 )
 from .samples import RADIO, tile
 
@@ -33,22 +37,16 @@ if TYPE_CHECKING:
     from ..common.anchors import Anchors
     from .samples import Samples
 
-UNLIMITED = 1e6  # bound of stamps and places, s and m
-
 
 class AnchorEffect(Effect):
     """An effect with one parameter per anchor, delay_i = values[i] * delay_per_unit."""
 
     channels = tuple(RADIO)
-
-    @classmethod
-    def check_key(cls, key: str) -> None:
-        check_anchor(cls.name, key, key)
+    key_form = OF_ANCHOR
 
     @classmethod
     def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
-        ids = id_texts(anchors)
-        return [ids, *((key,) for key in ids)]
+        return with_each(id_texts(anchors))
 
     def delay_per_unit(self, samples: Samples) -> np.ndarray | float:
         """Return the delay of an anchor per unit of its parameter, (n,) or a scalar, m."""
@@ -204,16 +202,7 @@ class AnchorPosition(GeometryEffect):
         },
     )
     portable = False
-
-    @classmethod
-    def check_key(cls, key: str) -> None:
-        anchor, _, axis = key.partition(".")
-        if axis not in ("x", "y", "z"):
-            raise InputError(
-                f"effects: {cls.name}: parameter {key!r} is not an anchor and an axis; write "
-                "'3.x: 0.05'."
-            )
-        check_anchor(cls.name, anchor, key)
+    key_form = rf"{ANCHOR}\.[xyz]", "an anchor and an axis; write '3.x: 0.05'"
 
     @classmethod
     def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
@@ -279,25 +268,7 @@ class SearchedDelay(ArrivalEffect):
     channels = ("tdoa",)
     portable = False
     fitted = False
-    parts: ClassVar[tuple[str, ...]]  # parameters of an anchor
-    common: ClassVar[tuple[str, ...]] = ()  # parameters of all anchors together
-
-    @classmethod
-    def check_key(cls, key: str) -> None:
-        anchor, _, part = key.partition(".")
-        if key in cls.common:
-            return
-        if part not in cls.parts:
-            common = "".join(f"{name}, " for name in cls.common)
-            raise InputError(
-                f"effects: {cls.name}: parameter {key!r} is not {common}{'or ' if common else ''}"
-                f"an anchor and one of {', '.join(cls.parts)}."
-            )
-        check_anchor(cls.name, anchor, key)
-
-    @classmethod
-    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
-        return [()]
+    parameters = ()
 
     @property
     def merge_key(self) -> tuple[Hashable, ...]:
@@ -339,7 +310,10 @@ class Nlos(SearchedDelay):
             "anchor_delay": "the same path again without the obstacle, or from another side",
         },
     )
-    parts = ("delay", "start", "end", "x", "y", "z", "radius")
+    key_form = (
+        rf"{ANCHOR}\.(delay|start|end|x|y|z|radius)",
+        "an anchor and one of delay, start, end, x, y, z, radius",
+    )
 
     @classmethod
     def bound_of(cls, key: str) -> float:
@@ -363,11 +337,9 @@ class Nlos(SearchedDelay):
 
     def _blocked(self, samples: Samples, rows: np.ndarray, anchor: str) -> np.ndarray:
         """Return whether arrivals are of the anchor and within its limits, (k * n,) bool."""
-        get, since = self.values.get, tile(samples, samples.t) - samples.start
         blocked = samples.anchors.ids[rows] == int(anchor)
-        blocked &= since >= get(f"{anchor}.start", -np.inf)
-        blocked &= since <= get(f"{anchor}.end", np.inf)
-        radius = get(f"{anchor}.radius")
+        blocked &= is_within(self, anchor, tile(samples, samples.t) - samples.start)
+        radius = self.values.get(f"{anchor}.radius")
         if radius is not None:
             distance = np.linalg.norm(samples.p - self._centre(anchor), axis=1)
             blocked &= tile(samples, distance <= radius)  # False where the position is unknown
@@ -382,7 +354,8 @@ class Nlos(SearchedDelay):
         delays = self.significant_delays()
         for anchor, delay in sorted(delays.items(), key=lambda item: -item[1]):
             late = measured(delay, self.std.get(f"{anchor}.delay"), "m")
-            radius, when = self.values.get(f"{anchor}.radius"), self._interval_words(anchor)
+            radius, when = self.values.get(f"{anchor}.radius"), interval_words(self, anchor)
+            when = f", {when}" if when else ""
             if radius is None:
                 out.append(
                     f"Look what stood between anchor {anchor} and the tag{when}: it was heard "
@@ -395,17 +368,6 @@ class Nlos(SearchedDelay):
                     f"{late} late while the tag is within {radius:.1f} m of there{when}."
                 )
         return tuple(out)
-
-    def _interval_words(self, anchor: str) -> str:
-        """Return the interval as the end of a clause; "" without limits."""
-        start, end = (self.values.get(f"{anchor}.{part}") for part in ("start", "end"))
-        if start is None and end is None:
-            return ""
-        if start is None:
-            return f", until {end:.0f} s after the first TDOA"
-        if end is None:
-            return f", from {start:.0f} s on after the first TDOA"
-        return f", from {start:.0f} to {end:.0f} s after the first TDOA"
 
     def marks(self, anchors: Anchors) -> tuple[Region, ...]:
         return tuple(
@@ -436,11 +398,8 @@ class AnchorIds(LabelEffect):
         confounded_with=("anchor_position",),
     )
     separable = False
+    key_form = OF_ANCHOR
     expected = "the id of an anchor, a whole number"
-
-    @classmethod
-    def check_key(cls, key: str) -> None:
-        check_anchor(cls.name, key, key)
 
     @staticmethod
     def possible(value: float) -> bool:
@@ -455,8 +414,8 @@ class AnchorIds(LabelEffect):
     def mislabelled(
         self, a: np.ndarray, b: np.ndarray, d: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        table = {int(value): int(key) for key, value in self.values.items()}
-        return _replaced(a, table), _replaced(b, table), d
+        back = AnchorIds({f"{value:.0f}": float(key) for key, value in self.values.items()})
+        return back.relabelled(a, b, d)
 
     def advice(self) -> tuple[str, ...]:
         if not self.values:

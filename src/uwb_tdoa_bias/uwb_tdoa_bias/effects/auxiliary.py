@@ -10,23 +10,32 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from ..common.errors import InputError
 from ..common.flight import SENSOR_NAMES
 from ..common.sensors import STREAM_OF, with_measured
 from ..common.sensors.sensor import UNKNOWN_STD, UNKNOWN_VARIANCE
-from .base import IDENTITY, Affine, Effect, Row, SensorEffect, finite, require
+from .base import (
+    IDENTITY,
+    UNLIMITED,
+    Affine,
+    Effect,
+    Row,
+    SensorEffect,
+    finite,
+    interval_words,
+    is_within,
+    require,
+    undoing,
+)
 from .samples import Track, sensor_samples
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Hashable, Sequence
 
-    from ..common.anchors import Anchors
     from ..common.flight import Flight
     from ..common.sensors.sensor import Stream
     from .samples import SensorSamples
 
 LIMITS = ("start", "end")  # s after the first TDOA
-UNLIMITED = 1e6  # s, bound of these
 
 
 class AuxiliaryEffect(SensorEffect):
@@ -37,6 +46,16 @@ class AuxiliaryEffect(SensorEffect):
         part = require(self, flight, channel)
         changed: Flight = with_measured(flight, channel, part.sensed(self.model()(part.values)))
         return changed
+
+
+class ScaleEffect(AuxiliaryEffect):
+    """Measured = (1 + `scale`) true."""
+
+    dimensions: ClassVar[int] = 1  # numbers of a measurement
+
+    def model(self) -> Affine:
+        scale = 1.0 + self.values.get("scale", 0.0)
+        return Affine(scale * np.eye(self.dimensions), np.zeros(self.dimensions))
 
 
 class HeightOffset(AuxiliaryEffect):
@@ -70,7 +89,7 @@ class HeightOffset(AuxiliaryEffect):
         return Affine(np.eye(1), np.array([self.values.get("offset", 0.0)]))
 
 
-class HeightScale(AuxiliaryEffect):
+class HeightScale(ScaleEffect):
     """Measured range = (1 + `scale`) true range."""
 
     row = Row(
@@ -94,11 +113,8 @@ class HeightScale(AuxiliaryEffect):
     )
     channels = ("height",)
 
-    def model(self) -> Affine:
-        return Affine((1.0 + self.values.get("scale", 0.0)) * np.eye(1), np.zeros(1))
 
-
-class VelocityScale(AuxiliaryEffect):
+class VelocityScale(ScaleEffect):
     """Measured velocity = (1 + `scale`) true velocity."""
 
     row = Row(
@@ -123,12 +139,10 @@ class VelocityScale(AuxiliaryEffect):
         shown=("%", 100.0),
     )
     channels = ("velocity",)
-
-    def model(self) -> Affine:
-        return Affine((1.0 + self.values.get("scale", 0.0)) * np.eye(3), np.zeros(3))
+    dimensions = 3
 
 
-class YawRateScale(AuxiliaryEffect):
+class YawRateScale(ScaleEffect):
     """Measured yaw rate = (1 + `scale`) true yaw rate."""
 
     row = Row(
@@ -151,9 +165,6 @@ class YawRateScale(AuxiliaryEffect):
         shown=("%", 100.0),
     )
     channels = ("yaw_rate",)
-
-    def model(self) -> Affine:
-        return Affine((1.0 + self.values.get("scale", 0.0)) * np.eye(1), np.zeros(1))
 
 
 class VelocityMisalignment(AuxiliaryEffect):
@@ -234,6 +245,7 @@ class IntervalEffect(Effect):
     """
 
     part: ClassVar[str]
+    parameters = ()
     portable = False
     fitted = False
     usable = False
@@ -243,21 +255,8 @@ class IntervalEffect(Effect):
         raise NotImplementedError
 
     @classmethod
-    def check_key(cls, key: str) -> None:
-        number, _, part = key.partition(".")
-        if not number.isdigit() or part not in (cls.part, *LIMITS):
-            raise InputError(
-                f"effects: {cls.name}: parameter {key!r} is not a number and {cls.part}, "
-                f"start or end, as 1.{cls.part}."
-            )
-
-    @classmethod
     def bound_of(cls, key: str) -> float:
         return UNLIMITED if key.endswith(LIMITS) else cls.bound
-
-    @classmethod
-    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
-        return [()]
 
     @property
     def merge_key(self) -> tuple[Hashable, ...]:
@@ -267,12 +266,10 @@ class IntervalEffect(Effect):
         )
 
     def regressors(self, samples: SensorSamples, keys: Sequence[str]) -> np.ndarray:
-        get, since, unit = self.values.get, samples.t - samples.start, self.per_unit(samples)
+        since, unit = samples.t - samples.start, self.per_unit(samples)
         out = np.zeros((*unit.shape, len(keys)))
         for column, key in enumerate(keys):
-            number = key.partition(".")[0]
-            inside = since >= get(f"{number}.start", -np.inf)
-            inside &= since <= get(f"{number}.end", np.inf)
+            inside = is_within(self, key.partition(".")[0], since)
             out[inside, :, column] = unit[inside]
         return out
 
@@ -295,12 +292,8 @@ class IntervalEffect(Effect):
         )
 
     def _when(self, key: str) -> str:
-        """Return the interval of a size as the end of a clause; "" if it is not limited."""
-        number = key.partition(".")[0]
-        start, end = (self.values.get(f"{number}.{limit}") for limit in LIMITS)
-        if start is None or end is None:
-            return ""
-        return f" from {start:.0f} to {end:.0f} s after the first TDOA"
+        when = interval_words(self, key.partition(".")[0])
+        return f" {when}" if when else ""
 
 
 class FloorStep(IntervalEffect):
@@ -324,6 +317,7 @@ class FloorStep(IntervalEffect):
         shown=("m", 1.0),
     )
     part = "height"
+    key_form = r"[0-9]+\.(height|start|end)", "a number and height, start or end, as 1.height"
     channels = ("height",)
 
     def per_unit(self, samples: SensorSamples) -> np.ndarray:
@@ -354,6 +348,7 @@ class VelocitySlip(IntervalEffect):
         shown=("%", 100.0),
     )
     part = "share"
+    key_form = r"[0-9]+\.(share|start|end)", "a number and share, start or end, as 1.share"
     channels = ("velocity",)
 
     def per_unit(self, samples: SensorSamples) -> np.ndarray:
@@ -369,17 +364,9 @@ class SensorCorrector:
             stream: sum(effect.stamp_offset(stream) for effect in effects)
             for stream in SENSOR_NAMES
         }
-        self._undo = {channel: self._inverse(effects, channel) for channel in STREAM_OF}
-        self.idle = not any(self._late.values()) and not any(self._undo.values())
-
-    @staticmethod
-    def _inverse(effects: Collection[Effect], channel: str) -> Affine | None:
-        undo = None
-        for effect in effects:
-            model = effect.sensor_model(channel)
-            if model is not IDENTITY:
-                undo = model.inverse() if undo is None else model.inverse().after(undo)
-        return undo
+        self._undo = {channel: undoing(effects, channel) for channel in STREAM_OF}
+        undone = any(undo is not IDENTITY for undo in self._undo.values())
+        self.idle = not undone and not any(self._late.values())
 
     def correct(self, name: str, stream: Stream) -> Stream:
         """Return the corrected Stream of the sensor `name`."""
@@ -391,7 +378,7 @@ class SensorCorrector:
 
     def _undone(self, channel: str, stream: Stream) -> Stream:
         undo = self._undo[channel]
-        if undo is None:
+        if undo is IDENTITY:
             return stream
         std = getattr(stream, "std", None)
         if std is None:

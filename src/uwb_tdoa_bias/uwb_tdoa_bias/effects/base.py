@@ -7,6 +7,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields, replace
 from functools import wraps
 import math
+import re
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
@@ -29,6 +30,11 @@ FADED_BELOW = 0.5  # weight of an effect below which nodes report it as faded
 ROUNDED = 0.1  # share by which a printed standard deviation may be rounded
 LARGEST = 3  # values in one sentence
 TABLE_STEPS = 256  # intervals in the table of a SensorFunction
+UNLIMITED = 1e6  # bound of stamps and places, s and m
+ANCHOR = "[0-9]{1,5}"  # regular expression of the id of an anchor in a parameter
+# (regular expression of a parameter, what a parameter is, in words)
+OF_ANCHOR = ANCHOR, "an anchor id; write for example '3: 0.05'"
+OF_PAIR = f"{ANCHOR}-{ANCHOR}", "a pair of anchors; write for example '0-1'"
 STREAM_WORDS = {"imu": "inertial samples", "truth": "ground truth"}  # others by their names
 
 Made = TypeVar("Made")
@@ -232,6 +238,9 @@ class Effect:
     ways: ClassVar[tuple[str, str]]
     shown: ClassVar[tuple[str, float] | None] = None
 
+    # Parameters of a fixed set; None: the example alone. An effect with `key_form` has no fixed set.
+    parameters: ClassVar[tuple[str, ...] | None] = None
+    key_form: ClassVar[tuple[str, str] | None] = None
     channels: ClassVar[tuple[str, ...]] = ("tdoa",)  # channels of `diagnose` on which it shows
     fitted: ClassVar[bool] = True  # False: a detector finds it, not linear regression
     portable: ClassVar[bool] = True  # True: stays valid in another installation of anchors
@@ -279,11 +288,13 @@ class Effect:
     @classmethod
     def check_key(cls, key: str) -> None:
         """Raise InputError if `key` is no parameter of this effect."""
-        known = cls.groups(None, None)[0]
-        if key not in known:
-            raise InputError(
-                f"effects: {cls.name}: parameter {key!r} is not one of {', '.join(known)}."
-            )
+        if cls.key_form is None:
+            known = cls.groups(None, None)[0]
+            pattern, words = "|".join(known), f"one of {', '.join(known)}"
+        else:
+            pattern, words = cls.key_form
+        if not re.fullmatch(pattern, key):
+            raise InputError(f"effects: {cls.name}: parameter {key!r} is not {words}.")
 
     @classmethod
     def bound_of(cls, key: str) -> float:
@@ -306,7 +317,7 @@ class Effect:
 
         anchors : Anchors; pairs : (m, 2) ids of the pairs that were heard. Both may be None.
         """
-        return [(cls.example,)]
+        return with_each((cls.example,) if cls.parameters is None else cls.parameters)
 
     @property
     def label(self) -> str:
@@ -404,10 +415,7 @@ class Effect:
         It is NaN where unknown. A time is held at the end of its domain: no growth beyond it was
         observed.
         """
-        if not self.domain:
-            return self.bias(samples)
-        weight, bias = self._in_domain(samples)
-        return weight * bias
+        return self.faded_bias(samples)[0]
 
     def faded_bias(
         self, samples: Samples
@@ -421,12 +429,8 @@ class Effect:
         """
         if not self.domain:
             return self.bias(samples), 0.0, 1.0
-        weight, bias = self._in_domain(samples)
-        return weight * bias, (1.0 - weight) * np.abs(np.nan_to_num(bias)), weight
-
-    def _in_domain(self, samples: Samples) -> tuple[np.ndarray, np.ndarray]:
-        """Return the weight and the bias, (n,) each, of an effect with a domain."""
-        weight, n = np.ones(len(samples)), len(samples)
+        n = len(samples)
+        weight = np.ones(n)
         for covariate, limits in self.domain.items():
             if covariate in OF_ARRIVAL:
                 of_arrivals = fade_weight(covariate_of(samples, covariate), limits)
@@ -434,8 +438,10 @@ class Effect:
             elif (values := covariate_of(samples, covariate)) is not None:
                 weight *= fade_weight(values, limits)
         if "time" in self.domain:
-            samples = samples.until(samples.start + self.domain["time"][1])
-        return weight, self.bias(samples)
+            last = samples.start + self.domain["time"][1]
+            samples = replace(samples, t=np.minimum(samples.t, last))
+        bias = self.bias(samples)
+        return weight * bias, (1.0 - weight) * np.abs(np.nan_to_num(bias)), weight
 
     @property
     def domain_words(self) -> str:
@@ -584,6 +590,7 @@ class LabelEffect(Effect):
 
     fitted = False
     portable = False
+    parameters = ()
     separable: ClassVar[bool] = True  # each value is meaningful without the others
     expected: ClassVar[str]  # possible values, in words
 
@@ -594,10 +601,6 @@ class LabelEffect(Effect):
                 raise InputError(
                     f"effects: {self.name}: values: {key} is {value:g}; expected {self.expected}."
                 )
-
-    @classmethod
-    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
-        return [()]
 
     @staticmethod
     def possible(value: float) -> bool:
@@ -614,7 +617,7 @@ class LabelEffect(Effect):
         self, a: np.ndarray, b: np.ndarray, d: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return TDOAs with the mistake: ids a, b (n,) and d (n,) m."""
-        raise NotImplementedError
+        return self.relabelled(a, b, d)
 
     def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
         tdoa = flight.tdoa
@@ -657,6 +660,16 @@ def central_differences(
     return np.stack(columns, axis=-1)
 
 
+def undoing(effects: Iterable[Effect], channel: str) -> Affine:
+    """Return the Affine that undoes the sensor models of effects in their order, or IDENTITY."""
+    undo = IDENTITY
+    for effect in effects:
+        model = effect.sensor_model(channel)
+        if model is not IDENTITY:
+            undo = model.inverse() if undo is IDENTITY else model.inverse().after(undo)
+    return undo
+
+
 def require(effect: Effect, flight: Flight, name: str) -> Any:
     """Return the Stream of a channel of a sensor, "tdoa", "imu" or "truth"; raise InputError."""
     part = measured_on(flight, name) if name in STREAM_OF else getattr(flight, name)
@@ -675,12 +688,31 @@ def finite(effect: Effect, flight: Flight, error: np.ndarray) -> np.ndarray:
     return error
 
 
-def check_anchor(name: str, text: str, key: str) -> None:
-    """Raise InputError if `text`, of the parameter `key` of effect `name`, is no anchor id."""
-    if not (text.isdigit() and int(text) <= 65535):
-        raise InputError(
-            f"effects: {name}: parameter {key!r} is not an anchor id; write for example '3: 0.05'."
-        )
+def with_each(keys: tuple[str, ...]) -> list[tuple[str, ...]]:
+    """Return a set of parameters, and each of several alone."""
+    return [keys, *((key,) for key in keys if len(keys) > 1)]
+
+
+def is_within(effect: Effect, part: str, since: np.ndarray) -> np.ndarray:
+    """Return whether times (n,) lie between "<part>.start" and "<part>.end" of an effect: (n,) bool.
+
+    A limit that is not given does not apply. since : s after the first TDOA
+    """
+    start = effect.values.get(f"{part}.start", -np.inf)
+    end = effect.values.get(f"{part}.end", np.inf)
+    return (since >= start) & (since <= end)
+
+
+def interval_words(effect: Effect, part: str) -> str:
+    """Return the interval of `is_within` as the end of a clause; "" without limits."""
+    start, end = (effect.values.get(f"{part}.{limit}") for limit in ("start", "end"))
+    if start is None and end is None:
+        return ""
+    if start is None:
+        return f"until {end:.0f} s after the first TDOA"
+    if end is None:
+        return f"from {start:.0f} s on after the first TDOA"
+    return f"from {start:.0f} to {end:.0f} s after the first TDOA"
 
 
 def id_texts(anchors: Anchors | None) -> tuple[str, ...]:

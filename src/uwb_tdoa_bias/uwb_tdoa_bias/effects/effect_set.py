@@ -51,7 +51,7 @@ from .imu import (
     ImuMisalignment,
 )
 from .pair import NoiseCorrelation, NoiseLevel, OutlierRate, PairOffset, PairSign
-from .samples import N_STATES, RADIO
+from .samples import N_STATES
 from .smooth_term import SmoothTerm
 from .stamps import RangeDelay, TdoaTimeOffset, VelocityDelay
 from .tag import AntennaPattern, RangeBias, RangeScale, ReceivedPowerBias, TagLeverArm
@@ -331,11 +331,7 @@ class EffectSet:
 
     @cached_property
     def _limited(self) -> list[Effect]:
-        return [
-            effect
-            for effect in self.effects
-            if effect.domain and RADIO.keys() & set(effect.channels)
-        ]
+        return [effect for effect in self.effects if effect.domain]
 
     @cached_property
     def _noisy(self) -> list[Effect]:

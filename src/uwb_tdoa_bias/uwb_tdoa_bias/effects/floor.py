@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .anchor import UNLIMITED, SearchedDelay
-from .base import Row, cached_by_anchors, counted, id_texts, measured
+from .anchor import SearchedDelay
+from .base import ANCHOR, UNLIMITED, Row, cached_by_anchors, counted, id_texts, measured
 from .samples import tile
 
 if TYPE_CHECKING:
@@ -53,8 +53,10 @@ class FloorMultipath(SearchedDelay):
         distinguished_by={"nlos": "the same place half a metre higher"},
     )
     is_hypothesis = True  # correcting it would keep a wrong estimate on the floor
-    parts = ("delay", "height", "noise")
-    common = PLACE
+    key_form = (
+        rf"x|y|{ANCHOR}\.(delay|height|noise)",
+        "x, y, or an anchor and one of delay, height, noise",
+    )
 
     @classmethod
     def bound_of(cls, key: str) -> float:
@@ -70,7 +72,7 @@ class FloorMultipath(SearchedDelay):
         """Return (delays, heights, noises) of some Anchors, each (anchors,) m."""
         return tuple(
             np.array([self.values.get(f"{i}.{part}", default) for i in id_texts(anchors)])
-            for part, default in zip(self.parts, (0.0, HEIGHT, 0.0))
+            for part, default in (("delay", 0.0), ("height", HEIGHT), ("noise", 0.0))
         )
 
     def near_ground_delays(self, anchors: Anchors) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -5,19 +5,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from ..common.lazy import rotations
-from .base import FADED_BELOW, IDENTITY, Affine, Effect, Row, SensorEffect, require
+from .base import FADED_BELOW, IDENTITY, Affine, Effect, Row, SensorEffect, require, undoing
 from .covariates import OF_IMU, ImuFeatures, fade_weight
 from .samples import Track
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
 
-    from ..common.anchors import Anchors
     from ..common.flight import Flight
     from .samples import ImuSamples
 
@@ -29,9 +28,7 @@ BESIDE_BIAS = 2.0
 class ImuEffect(SensorEffect):
     """An effect with a vector (x, y, z), body, on the gyroscope, the accelerometer or both."""
 
-    @classmethod
-    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
-        return [("x", "y", "z"), ("x",), ("y",), ("z",)]
+    parameters: ClassVar[tuple[str, ...] | None] = ("x", "y", "z")
 
     def vector(self) -> np.ndarray:
         """Return the values of x, y and z, (3,)."""
@@ -206,11 +203,8 @@ class ImuGravity(ImuEffect):
         ways=("too much", "too little"),
     )
     channels = ("accel",)
+    parameters = ("excess",)
     penalty = BESIDE_BIAS
-
-    @classmethod
-    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
-        return [("excess",)]
 
     def model(self) -> Affine:
         return Affine(np.eye(3), np.array([0.0, 0.0, self.values.get("excess", 0.0)]))
@@ -237,12 +231,7 @@ class ImuCorrector:
 
     def __init__(self, effects: Collection[Effect]) -> None:
         """Select the effects on inertial samples among `effects`."""
-        self._undo = []
-        for channel in SENSORS:
-            undo = IDENTITY
-            for effect in effects:
-                undo = effect.sensor_model(channel).inverse().after(undo)
-            self._undo.append(undo)
+        self._undo = [undoing(effects, channel) for channel in SENSORS]
         still = np.zeros((1, len(OF_IMU)))
         self._additive = [
             effect
@@ -250,9 +239,7 @@ class ImuCorrector:
             if any(effect.sensor_bias(channel, still) is not None for channel in SENSORS)
         ]
         self._features, self._latest = ImuFeatures(), still[:0]
-        self.idle = not self._additive and all(
-            effect.sensor_model(channel) is IDENTITY for effect in effects for channel in SENSORS
-        )
+        self.idle = not self._additive and all(undo is IDENTITY for undo in self._undo)
 
     @property
     def outside(self) -> list[str]:

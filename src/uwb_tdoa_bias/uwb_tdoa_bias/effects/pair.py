@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..common.errors import InputError
-from .base import Effect, LabelEffect, Row, listed
+from .base import OF_PAIR, Effect, LabelEffect, Row, listed, with_each
 from .samples import Samples
 
 if TYPE_CHECKING:
@@ -28,10 +27,7 @@ class PairEffect(Effect):
     """An effect with one parameter per pair of anchors, "a-b"."""
 
     portable = False
-
-    @classmethod
-    def check_key(cls, key: str) -> None:
-        check_pair(cls.name, key)
+    key_form = OF_PAIR
 
     @classmethod
     def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
@@ -39,7 +35,7 @@ class PairEffect(Effect):
         for a, b in [] if pairs is None else np.asarray(pairs).tolist():
             if f"{b}-{a}" not in keys and f"{a}-{b}" not in keys:
                 keys.append(f"{a}-{b}")
-        return [tuple(keys), *((key,) for key in keys)]
+        return with_each(tuple(keys))
 
     def where(self) -> str:
         return listed(key.replace("-", " and ") for key in self.significant())
@@ -96,11 +92,8 @@ class PairSign(LabelEffect):
         ),
         reference="Tdoa.msg: d_ab = |p - b| - |p - a|",
     )
+    key_form = OF_PAIR
     expected = "-1 for the other sign, or 1"
-
-    @classmethod
-    def check_key(cls, key: str) -> None:
-        check_pair(cls.name, key)
 
     @staticmethod
     def possible(value: float) -> bool:
@@ -114,11 +107,6 @@ class PairSign(LabelEffect):
             first, second = ids_of(key)
             sign[(np.asarray(a) == first) & (np.asarray(b) == second)] *= value
         return a, b, sign * d
-
-    def mislabelled(
-        self, a: np.ndarray, b: np.ndarray, d: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return self.relabelled(a, b, d)
 
     def advice(self) -> tuple[str, ...]:
         wrong = [key for key, value in self.values.items() if value < 0.0]
@@ -187,12 +175,9 @@ class NoiseCorrelation(Effect):
         reference="third-party analysis of the UTIL identification data: noise correlated in time",
         confounded_with=("noise_level",),
     )
+    parameters = ("std", "time")
     portable = False
     fitted = False
-
-    @classmethod
-    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
-        return [("std", "time")]
 
     def noise_std(self, samples: Samples) -> np.ndarray:
         return np.full(len(samples), np.sqrt(2.0) * abs(self.values.get("std", 0.0)))
@@ -252,15 +237,6 @@ class OutlierRate(Effect):
         hit = rng.random(len(tdoa)) < self.values.get("share", 0.0)
         size = np.copysign(rng.uniform(*OUTLIERS, len(tdoa)), rng.uniform(-1.0, 1.0, len(tdoa)))
         return replace(flight, tdoa=replace(tdoa, d=tdoa.d + np.where(hit, size, 0.0)))
-
-
-def check_pair(name: str, key: str) -> None:
-    """Raise InputError if `key` of the effect `name` is no pair of anchors, "a-b"."""
-    parts = key.split("-")
-    if len(parts) != 2 or not all(part.isdigit() for part in parts):
-        raise InputError(
-            f"effects: {name}: parameter {key!r} is not a pair of anchors; write for example '0-1'."
-        )
 
 
 def ids_of(key: str) -> tuple[int, int]:

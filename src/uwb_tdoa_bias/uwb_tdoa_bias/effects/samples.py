@@ -153,10 +153,6 @@ class Samples:
             **{name: _repeated(getattr(self, name), times) for name in names},
         )
 
-    def until(self, t: float) -> Samples:
-        """Return Samples with stamps limited to t, s."""
-        return replace(self, t=np.minimum(self.t, t))
-
     @classmethod
     def measured(cls, flight: Flight) -> tuple[Any, np.ndarray, np.ndarray]:
         """Return (stream of a Flight, rows of first anchors (n,), rows of second anchors (n,)).

@@ -31,6 +31,7 @@ from .covariates import (
     CATEGORIES,
     EXTRA,
     FADE,
+    OF_ACCEL,
     OF_ARRIVAL,
     OF_IMU,
     OF_MOTION,
@@ -111,6 +112,7 @@ class SmoothTerm(Effect):
     penalty: ClassVar[float] = 6.0  # a declared effect wins if it explains as much
     settings: ClassVar[tuple] = ("channel", "covariate", "form", "knots", "shape")
     fitted: ClassVar[bool] = False
+    key_form: ClassVar[tuple[str, str]] = r"(.+\.)?c[0-9]+", "a coefficient such as c0 or 3.c0"
 
     def __post_init__(self) -> None:
         try:
@@ -149,7 +151,7 @@ class SmoothTerm(Effect):
                 f"effects: smooth_term: form: {self.form} acts on two anchors, {self.channel} "
                 "is of one; write form: anchor."
             )
-        if self.form in OF_LINKS and self.covariate in OF_ARRIVAL:
+        if self.form in ("common", *OF_LINKS) and self.covariate in OF_ARRIVAL:
             raise InputError(
                 f"effects: smooth_term: form: {self.form} acts on both anchors, "
                 f"{self.covariate} is of one; write form: anchor."
@@ -159,13 +161,6 @@ class SmoothTerm(Effect):
     @classmethod
     def within_bounds(cls, values: dict[str, float]) -> bool:
         return True
-
-    @classmethod
-    def check_key(cls, key: str) -> None:
-        if not key.rpartition(".")[2].removeprefix("c").isdigit():
-            raise InputError(
-                f"effects: smooth_term: parameter {key!r} is not a coefficient such as c0 or 3.c0."
-            )
 
     # The following depend on the settings of a term; other effects have them as a class.
     def prior_std_of(self, key: str) -> float:  # type: ignore[override]  # of a term
@@ -364,22 +359,19 @@ class SmoothTerm(Effect):
             return self.basis(values)[:, [int(key[1:]) for key in keys]]
         if self.form in OF_LINKS:
             basis = self.basis(values)
-            parts = [
-                (basis[:, int(c[1:])], link) for link, _, c in (key.rpartition(".") for key in keys)
-            ]
-            return np.stack([part * self._of_link(samples, link) for part, link in parts], axis=1)
+            for column, key in enumerate(keys):
+                link, _, coefficient = key.rpartition(".")
+                out[:, column] = basis[:, int(coefficient[1:])] * self._of_link(samples, link)
+            return out
         basis, ids = self.basis(both), samples.anchors.ids[samples.rows]
         unknown = np.isnan(basis).any(axis=1)
-        columns: dict[str, list[int]] = {}
+        basis[unknown] = np.nan
         for column, key in enumerate(keys):
-            columns.setdefault(key.rpartition(".")[0], []).append(column)
-        for anchor, some in columns.items():
-            mine = ids == int(anchor) if anchor else np.ones(len(ids), dtype=bool)
-            of_arrivals = np.zeros((len(ids), len(some)))
-            numbers = [int(keys[column].rpartition(".")[2][1:]) for column in some]
-            of_arrivals[mine] = basis[mine][:, numbers]
-            of_arrivals[unknown] = np.nan
-            out[:, some] = samples.difference(of_arrivals)
+            anchor, _, coefficient = key.rpartition(".")
+            of_arrivals = basis[:, int(coefficient[1:])]
+            if anchor:
+                of_arrivals = np.where(unknown | (ids == int(anchor)), of_arrivals, 0.0)
+            out[:, column] = samples.difference(of_arrivals)
         return out
 
     def groups(  # type: ignore[override]  # of a term
@@ -494,8 +486,39 @@ OF_PLACE = (
     "elevation_in_anchor",
 )
 OF_DIRECTION = ("bearing_in_tag", "elevation_in_tag", "tilt")
+INERTIAL = ("inertial",)  # in place of the form of functions on gyroscope and accelerometer
 # (forms, covariates, causes, trial that distinguishes them); the first row that fits is used.
 _CAUSES = (
+    (
+        INERTIAL,
+        ("time",),
+        "warming up (BMI088 data sheet)",
+        "leave the vehicle switched on and at rest for as long",
+    ),
+    (
+        INERTIAL,
+        ("vibration",),
+        "vibration that it rectifies",
+        "mount it softer and fly again",
+    ),
+    (
+        INERTIAL,
+        ("turning_rate", "rate_x", "rate_y", "rate_z"),
+        "its scale, its axes, or a place off the centre of turns",
+        "turn the vehicle by hand about one axis at a time",
+    ),
+    (
+        INERTIAL,
+        OF_ACCEL,
+        "its scale, its axes, or acceleration that it takes for turning (BMI088 data sheet)",
+        "lay the vehicle on each side",
+    ),
+    (
+        INERTIAL,
+        None,
+        "air flow, magnetism or load that go with the motion",
+        "carry the vehicle by hand along the same path",
+    ),
     (
         ("pair", "direction"),
         None,
@@ -572,66 +595,33 @@ _CAUSES = (
         "fly where this changes and all else does not",
     ),
 )
-_SENSOR_CAUSES = {
-    "time": (
-        "warming up (BMI088 data sheet)",
-        "leave the vehicle switched on and at rest for as long",
-    ),
-    "vibration": ("vibration that it rectifies", "mount it softer and fly again"),
-    "turning": (
-        "its scale, its axes, or a place off the centre of turns",
-        "turn the vehicle by hand about one axis at a time",
-    ),
-    "force": (
-        "its scale, its axes, or acceleration that it takes for turning (BMI088 data sheet)",
-        "lay the vehicle on each side",
-    ),
-    "motion": (
-        "air flow, magnetism or load that go with the motion",
-        "carry the vehicle by hand along the same path",
-    ),
-}
 
 
 def described(term: SmoothTerm, part: str = "") -> str:
     """Return the function of an anchor "3", of a pair "0-1" or of all, "", as a clause."""
     prefix = f"{part}." if part else ""
     name, unit = _named(term.covariate), UNITS.get(term.covariate, "")
-    level, *more = (term.values.get(f"{prefix}c{k}", 0.0) for k in range(term.count))
-    std = term.std.get(f"{prefix}c1")
     knots = [f"{rounded(knot)} {unit}".strip() for knot in term.knots]
-    seen = f" (seen from {knots[0]} to {knots[-1]})" if term.shape != "wave" else ""
-    if term.shape == "step":
-        return _off(
-            term,
-            part,
-            more[0],
-            std,
-            f" {_where(name, f'above {knots[1]}', f'after {knots[1]}')}{seen}",
-        )
-    if term.shape == "interval":
-        return _off(
-            term,
-            part,
-            more[0],
-            std,
-            (
-                " "
-                f"{_where(name, f'between {knots[1]} and {knots[2]}', f'from {knots[1]} to {knots[2]}')}{seen}"
-            ),
-        )
+    seen = f" (seen from {knots[0]} to {knots[-1]})"
+    size = term.values.get(f"{prefix}c1", 0.0)
+    std = term.std.get(f"{prefix}c1")
+    if term.shape in ("step", "interval"):
+        if name == "time":
+            where = (
+                f"after {knots[1]}" if term.shape == "step" else f"from {knots[1]} to {knots[2]}"
+            )
+        elif term.shape == "step":
+            where = f"where {name} is above {knots[1]}"
+        else:
+            where = f"where {name} is between {knots[1]} and {knots[2]}"
+        return _off(term, part, size, std, f" {where}{seen}")
     if term.shape in ("line", "beyond", "below"):
         first, last = {"line": (0, 1), "beyond": (1, 2), "below": (1, 0)}[term.shape]
-        slope = more[0] / (term.knots[last] - term.knots[first])
-        error = None if std is None else std / abs(term.knots[last] - term.knots[first])
-        reach = (
-            ""
-            if term.shape == "line"
-            else f", {'above' if term.shape == 'beyond' else 'below'} {knots[1]}"
-        )
-        return _off(
-            term, part, slope, error, f" for each {unit or 'unit'} more of {name}{reach}{seen}"
-        )
+        width = term.knots[last] - term.knots[first]
+        error = None if std is None else std / abs(width)
+        side = {"line": "", "beyond": f", above {knots[1]}", "below": f", below {knots[1]}"}
+        how = f" for each {unit or 'unit'} more of {name}{side[term.shape]}{seen}"
+        return _off(term, part, size / width, error, how)
     at = np.linspace(term.knots[0], term.knots[-1], 60)
     course = term.curve(at, prefix)
     top, bottom = int(np.argmax(course)), int(np.argmin(course))
@@ -640,43 +630,28 @@ def described(term: SmoothTerm, part: str = "") -> str:
         length = f"{rounded(term.knots[1] - term.knots[0])} {unit}".strip()
         return _off(term, part, swing, None, f" and less in turn, every {length} of {name}")
     where = (
-        f" where {name} is {rounded(at[top])} {unit} than where it is {rounded(at[bottom])} {unit}"
+        f"where {name} is {rounded(at[top])} {unit} than where it is {rounded(at[bottom])} {unit}"
     )
-    return _off(term, part, swing, None, f"{where}{seen}")
+    return _off(term, part, swing, None, f" {where}{seen}")
 
 
 def causes(term: SmoothTerm) -> tuple[str, str]:
     """Return (possible causes, trial that distinguishes them)."""
-    sensor = term.channel.partition(".")[0]
     if term.covariate.startswith(EXTRA):
         return (
             "what warms, loads or supplies it",
             f"keep the vehicle at rest and change {_named(term.covariate)} alone",
         )
-    if sensor in SENSOR_UNITS:
-        return _SENSOR_CAUSES[_kind(term.covariate)]
-    for forms, covariates, cause, trial in _CAUSES:
-        if (forms is None or term.form in forms) and (
-            covariates is None or term.covariate in covariates
-        ):
-            return cause, trial
-    raise AssertionError
+    form = term.form if term.channel not in IMU_CHANNELS else "inertial"
+    return next(
+        (cause, trial)
+        for forms, covariates, cause, trial in _CAUSES
+        if (forms is None or form in forms) and (covariates is None or term.covariate in covariates)
+    )
 
 
 def _named(covariate: str) -> str:
     return covariate.removeprefix(EXTRA).replace("_", " ").replace(".", " ")
-
-
-def _where(name: str, over: str, during: str) -> str:
-    return during if name == "time" else f"where {name} is {over}"
-
-
-def _kind(covariate: str) -> str:
-    if covariate in ("time", "vibration"):
-        return covariate
-    if covariate.startswith("rate") or covariate == "turning_rate":
-        return "turning"
-    return "force" if covariate.startswith("accel") and covariate != "acceleration" else "motion"
 
 
 def _off(term: SmoothTerm, part: str, value: float, std: float | None, how: str) -> str:
@@ -691,11 +666,8 @@ def _off(term: SmoothTerm, part: str, value: float, std: float | None, how: str)
     if term.form in ("anchor", "arrival"):
         who = f"anchor {part}" if part else "each anchor"
         return f"{who} seems {amount} {'farther' if value > 0.0 else 'nearer'}{how}"
-    subject = (
-        f"the TDOA of {part}"
-        if part
-        else f"each value of {term.channel}"
-        if sensor != "tdoa"
-        else "every TDOA"
-    )
+    if part:
+        subject = f"the TDOA of {part}"
+    else:
+        subject = "every TDOA" if sensor == "tdoa" else f"each value of {term.channel}"
     return f"{subject} is {amount} {'larger' if value > 0.0 else 'smaller'}{how}"

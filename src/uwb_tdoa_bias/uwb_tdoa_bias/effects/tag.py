@@ -25,7 +25,6 @@ from .samples import RADIO, tile
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ..common.anchors import Anchors
     from .samples import Samples
 
 EXAMPLES = 4.0, 8.0  # m, distances in the advice of range_bias
@@ -62,11 +61,8 @@ class TagLeverArm(GeometryEffect):
         phrase="{size} towards {way}{key}",
         ways=("+", "-"),
     )
+    parameters = ("x", "y", "z")
     uses_attitude = True
-
-    @classmethod
-    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
-        return [("x", "y", "z"), ("x",), ("y",), ("z",)]
 
     def antennas(self, samples: Samples) -> dict[str, np.ndarray]:
         arm = np.array([self.values.get(key, 0.0) for key in "xyz"])
@@ -240,11 +236,8 @@ class AntennaPattern(ArrivalEffect):
         phrase="{size} {way} in the nulls of the {key}'s antenna",
         ways=("later", "earlier"),
     )
+    parameters = ("tag", "anchor")
     uses_attitude = True
-
-    @classmethod
-    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
-        return [("tag", "anchor"), ("tag",), ("anchor",)]
 
     def delay_regressors(
         self, samples: Samples, rows: np.ndarray, keys: Sequence[str]

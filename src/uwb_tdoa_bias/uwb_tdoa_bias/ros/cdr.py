@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
 Message = TypeVar("Message")
+Leaves = list[tuple[str, str, int]]  # names, codes and counts, see `_leaves`
 STAMP, FRAME = ("sec", "nanosec"), "header.frame_id"
 ENCAPSULATION = b"\x00\x01\x00\x00"  # plain CDR, little endian
 # Plain CDR in big and little endian. The fourth byte holds options.
@@ -88,7 +89,7 @@ class CdrCodec:
         }
         self._leaves, self._whole = _leaves(kind)
         self._paths = {
-            name: [leaf for leaf, *_ in self._leaves if _is_in(leaf, path)]
+            name: [leaf for leaf, *_ in self._leaves if f"{leaf}.".startswith(f"{path}.")]
             for name, path in paths.items()
         }
         spaces = {leaf: (code, count) for leaf, code, count in self._leaves}
@@ -141,20 +142,13 @@ class CdrCodec:
         """
         if data[:4] != ENCAPSULATION:
             raise Unreadable("it is not plain CDR in little endian")
-        place, places, texts, frame = 4, {}, [], ""
-        for leaf, code, count in self._leaves:
+        places, texts, end = {}, [], len(ENCAPSULATION)
+        for leaf, code, place, end in _walk(data, self._leaves):
+            places[leaf] = place
             if code == TEXT:
-                begin = aligned(place, 4)
-                text, place = read_text(data, begin, leaf)
-                texts.append((begin, place, data[begin:place]))
-                if leaf == FRAME:
-                    frame = text
-            else:
-                size = np.dtype(code).itemsize
-                place = aligned(place, size)
-                places[leaf] = place
-                place += size * count
-        check_length(data, place, self.kind, exactly=self._whole)
+                texts.append((place, end, data[place:end]))
+        frame, _ = read_text(data, places[FRAME], FRAME)
+        check_length(data, end, self.kind, exactly=self._whole)
         formats = [self.dtype[name] for name in self._paths]
         offsets = [places[leaves[0]] for leaves in self._paths.values()]
         dtype = np.dtype(
@@ -323,14 +317,10 @@ def _check_size(data: bytes, kind: type) -> None:
         raise Unreadable(f"{len(data)} bytes are too many for {limit}")
     if whole or data[:4] != ENCAPSULATION:
         return
-    place = 4
-    for leaf, code, count in leaves:
-        if code == TEXT:
-            _, place = read_text(data, aligned(place, 4), leaf)
-        else:
-            size = np.dtype(code).itemsize
-            place = aligned(place, size) + size * count
-    place = aligned(place, 4)
+    end = len(ENCAPSULATION)
+    for *_, end in _walk(data, leaves):
+        pass
+    place = aligned(end, 4)
     if place + 4 > len(data):
         raise Unreadable(f"it ends after {len(data)} bytes, before its list")
     (count,) = LENGTH.unpack_from(data, place)
@@ -345,14 +335,31 @@ def name_of(kind: type) -> str:
     return f"{kind.__module__.partition('.')[0]}/{kind.__name__}"
 
 
+def _walk(data: bytes, leaves: Leaves) -> Iterator[tuple[str, str, int, int]]:
+    """Yield (name, code, place, place behind it) of leaves in plain little-endian CDR.
+
+    Raises Unreadable for a text that is none.
+    """
+    end = len(ENCAPSULATION)
+    for leaf, code, count in leaves:
+        if code == TEXT:
+            place = aligned(end, 4)
+            _, end = read_text(data, place, leaf)
+        else:
+            size = np.dtype(code).itemsize
+            place = aligned(end, size)
+            end = place + size * count
+        yield leaf, code, place, end
+
+
 @cache
-def _leaves(kind: Any) -> tuple[list[tuple[str, str, int]], bool]:
+def _leaves(kind: Any) -> tuple[Leaves, bool]:
     """Return the leaves of a message class up to the first field without fixed size.
 
     Returns ([(name of a number, an array of numbers or a string; code out of CODES, or TEXT; count)],
     whether these are all fields).
     """
-    out: list[tuple[str, str, int]] = []
+    out: Leaves = []
     for name, slot in zip(kind.get_fields_and_field_types(), kind.SLOT_TYPES):
         count, slot = (slot.size, slot.value_type) if isinstance(slot, Array) else (1, slot)
         if isinstance(slot, BasicType) and slot.typename in CODES:
@@ -367,10 +374,6 @@ def _leaves(kind: Any) -> tuple[list[tuple[str, str, int]], bool]:
         else:
             return out, False
     return out, True
-
-
-def _is_in(leaf: str, path: str) -> bool:
-    return leaf == path or leaf.startswith(path + ".")
 
 
 def aligned(place: int, size: int) -> int:

@@ -85,10 +85,8 @@ class Diagnostics:
             spinner.longest_wait = 0.0  # one value per process: the first node reports it
             values |= {"longest wait of a request": f"{late:.3f} s"}
             if late > BEHIND and level == DiagnosticStatus.OK:
-                level, text = (
-                    DiagnosticStatus.WARN,
-                    f"this node answers up to {late:.1f} s late: check the load of this machine",
-                )
+                level = DiagnosticStatus.WARN
+                text = f"this node answers up to {late:.1f} s late: check the load of this machine"
         values |= {
             "frozen": "yes" if self._node.frozen else "no",
             "refused because frozen": self._node.refused,

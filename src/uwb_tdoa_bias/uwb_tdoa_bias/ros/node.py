@@ -73,15 +73,16 @@ class Streams:
 
     def __init__(self, node: StreamNode, epoch: Epoch, on_taken: Callable[[], None]) -> None:
         """Start without streams; on_taken() is called after messages were delivered."""
-        self.inputs: dict[
-            str, StreamInput | InMemoryReceiver
-        ] = {}  # by topic, in the order of taking
         self._node, self._epoch, self._on_taken = node, epoch, on_taken
-        self._streams: list[_Stream] = []
-        self._by_topic: dict[str, _Stream] = {}
+        self._streams: dict[str, _Stream] = {}  # by topic, in the order of taking
         self._awaited: _Stream | None = None
         self._due: Callable[[], float] = lambda: -np.inf  # of the message, s since 1970
         self._until = -np.inf
+
+    @property
+    def inputs(self) -> dict[str, StreamInput | InMemoryReceiver]:
+        """Input of each topic, in the order of taking."""
+        return {topic: stream.source for topic, stream in self._streams.items()}
 
     @property
     def refusals(self) -> list[Refusals]:
@@ -95,7 +96,7 @@ class Streams:
 
         due : callable -> s since 1970
         """
-        self._awaited, self._due = self._by_topic[topic], due
+        self._awaited, self._due = self._streams[topic], due
 
     def add(self, codec: CdrCodec, topic: str, take: Take, handed: bool = False) -> None:
         """Subscribe to a stream.
@@ -109,9 +110,7 @@ class Streams:
         handed : whether a node of this process hands the messages over in memory
         """
         kind = InMemoryReceiver if handed else StreamInput
-        self.inputs[topic] = kind(self._node, codec.kind, topic)
-        stream = self._by_topic[topic] = _Stream(codec, take, self.inputs[topic])
-        self._streams.append(stream)
+        self._streams[topic] = _Stream(codec, take, kind(self._node, codec.kind, topic))
 
     def take(self, at_once: bool = False) -> bool:
         """Deliver all arrived messages, and return whether any arrived or still wait.
@@ -125,14 +124,13 @@ class Streams:
             ):
                 return bool(self._awaited.waiting)
             self._until = now + LONGEST_WAIT
-        for stream in self._streams:
+        streams = self._streams.values()
+        for stream in streams:
             stream.fetch()
-        parts = [
-            part for stream in self._streams if stream.waiting for part in stream.parts(self._epoch)
-        ]
+        parts = [part for stream in streams if stream.waiting for part in stream.parts(self._epoch)]
         if not parts:
             return False
-        if any(stream.fell for stream in self._streams):  # then the order of arrival matters
+        if any(stream.fell for stream in streams):  # then the order of arrival matters
             parts = sorted(
                 (piece for part in parts for piece in _pieces(part)), key=lambda piece: piece[-1][0]
             )
@@ -197,21 +195,20 @@ class InMemoryReceiver:
 class _Stream:
     """Arrived messages of one stream.
 
-    waiting : parts; fell : whether stamps of the last taken messages fell back
+    source : its input; waiting : parts; fell : whether stamps of the last taken messages fell back
     """
 
     def __init__(self, codec: CdrCodec, take: Take, source: StreamInput | InMemoryReceiver) -> None:
         self.waiting: list[Part] = []
         self.fell = False
-        self._codec, self._take, self._source, self._newest = codec, take, source, -np.inf
+        self.source = source
+        self._codec, self._take, self._newest = codec, take, -np.inf
 
     def fetch(self) -> bool:
         """Fetch messages, and return whether any arrived since the last call."""
-        parts = self._source.fetch(self._codec)
-        if not parts:
-            return False
+        parts = self.source.fetch(self._codec)
         self.waiting += parts
-        return True
+        return bool(parts)
 
     @property
     def newest_waiting(self) -> float:

@@ -270,10 +270,8 @@ def say_unused(nodes: Sequence[Node], files: Iterable[str]) -> None:
 
     Call it when the nodes of a process have all topics. files : paths
     """
-    given, logger = (
-        {name for node in nodes for name in node._parameter_overrides},
-        nodes[0].get_logger(),
-    )
+    given = {name for node in nodes for name in node._parameter_overrides}
+    logger = nodes[0].get_logger()
     for file in files:
         names = _names(file)
         if names and not names & given:

@@ -17,9 +17,8 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from .cdr import Message, Unreadable, decode, name_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
 
-    from geometry_msgs.msg import Quaternion
     from rclpy.event_handler import QoSMessageLostInfo
     from rclpy.node import Node
     from rclpy.publisher import Publisher
@@ -83,15 +82,6 @@ class Epoch:
         """Return the builtin_interfaces/Time of t s; the inverse of `seconds`, exact to 1 ns."""
         second, nanosecond = divmod(round(t * 1e9), 10**9)
         return Time(sec=self._second + second, nanosec=nanosecond)
-
-
-def orientation_of(q: Quaternion) -> tuple[float, float, float, float]:
-    """Return the tuple x y z w of a geometry_msgs/Quaternion.
-
-    NaN for (0, 0, 0, 0), which means unknown.
-    """
-    values = (q.x, q.y, q.z, q.w)
-    return values if any(values) else (np.nan, np.nan, np.nan, np.nan)
 
 
 # Inputs are best effort: such subscriptions receive from every publisher. They are deep, since a
@@ -163,20 +153,16 @@ class Refusals:
         """Return the names of publishers with another definition of the type, as text."""
         name = self._node.resolve_topic_name(self.topic)
         own = {
-            _hash(end)
+            str(end.topic_type_hash)
             for end in self._node.get_subscriptions_info_by_topic(name)
             if end.node_name == self._node.get_name()
         }
-        ends = [
-            end for end in self._node.get_publishers_info_by_topic(name) if _hash(end) not in own
-        ]
-        return ", ".join(
-            sorted({f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in ends})
-        )
+        ends = self._node.get_publishers_info_by_topic(name)
+        return _names(end for end in ends if str(end.topic_type_hash) not in own)
 
 
-def _hash(end: TopicEndpointInfo) -> str:
-    return str(end.topic_type_hash)
+def _names(ends: Iterable[TopicEndpointInfo]) -> str:
+    return ", ".join(sorted({f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in ends}))
 
 
 class Input:
@@ -328,7 +314,7 @@ def several_publishers(node: ParameterNode, topic: str) -> str | None:
     ends = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
     if len(ends) < 2:
         return None
-    names = ", ".join(sorted(f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in ends))
     return (
-        f"{len(ends)} publish on {topic} ({names}): stop all but one, or give each tag a namespace"
+        f"{len(ends)} publish on {topic} ({_names(ends)}): stop all but one, or give each tag a "
+        "namespace"
     )

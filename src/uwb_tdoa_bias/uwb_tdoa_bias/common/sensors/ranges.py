@@ -89,10 +89,8 @@ def _unknown(ranges: Ranges, anchors: Anchors) -> Mistake | None:
 
 def _unit(ranges: Ranges, anchors: Anchors) -> Mistake | None:
     """Return a Mistake if the unit is not metres, else None."""
-    extent, middle = (
-        float(np.linalg.norm(np.ptp(anchors.positions, axis=0))),
-        float(np.median(ranges.d)),
-    )
+    extent = float(np.linalg.norm(np.ptp(anchors.positions, axis=0)))
+    middle = float(np.median(ranges.d))
     if middle > BEYOND * extent or middle < 0.001 * extent:
         evidence = (
             f"their median is {middle:.4g} m, and the anchors are {extent:.1f} m apart at most"

@@ -87,10 +87,8 @@ def _columns(fields: dict) -> tuple:
     A variance of 0 means that the driver states none. A yaw rate counts as not measured if its value
     and variance are 0 while the velocity has a variance.
     """
-    variance, rate = (
-        fields["twist.covariance"][:, [0, 7, 14, 35]],
-        fields["twist.twist.angular"][:, 2],
-    )
+    variance = fields["twist.covariance"][:, [0, 7, 14, 35]]
+    rate = fields["twist.twist.angular"][:, 2]
     std = np.sqrt(np.where((variance >= 0.0) & (variance < UNKNOWN_VARIANCE), variance, np.inf))
     linear = std[:, :3]
     silent = (
@@ -131,10 +129,8 @@ def _sound(fields: dict) -> dict:
 
 
 def _measured(velocity: Velocity) -> tuple[dict, np.ndarray]:
-    v, std = (
-        np.column_stack([velocity.v, velocity.yaw_rate]),
-        np.column_stack([velocity.std, velocity.yaw_rate_std]),
-    )
+    v = np.column_stack([velocity.v, velocity.yaw_rate])
+    std = np.column_stack([velocity.std, velocity.yaw_rate_std])
     known = np.isfinite(std)
     sane = np.where(known, (np.abs(v) < FASTEST) & (std >= 0.0), True).all(axis=1)
     rows = {"value": np.where(known, v, 0.0), "std": np.where(known, std, UNKNOWN_STD)}
