@@ -109,6 +109,16 @@ def recording(seconds=4.0, imu_rate=200.0, tdoa_rate=100.0):
     return replace(flight, imu=imu, tdoa=tdoa)
 
 
+def vector(v):
+    """Its coordinates."""
+    return v.x, v.y, v.z
+
+
+def positions(messages):
+    """Positions (n, 3) m of messages of odometry."""
+    return np.array([vector(message.pose.pose.position) for message in messages])
+
+
 def stamp(t, epoch=EPOCH):
     """Stamp of t s after the epoch."""
     second, nanosecond = divmod(round(t * 1e9), 10**9)

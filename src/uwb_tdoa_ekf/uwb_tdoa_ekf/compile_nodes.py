@@ -26,11 +26,11 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.tag import TagLeverArm
 
 from .estimator import Estimator
-from .frames import pose_and_twist, rotation_std
 from .monitoring.change import YOUNGEST, ChangeDetector
 from .monitoring.slices import LENGTH, Slice
 from .monitoring.stream_watch import StreamWatch
 from .monitoring.survey_scale import SurveyScale
+from .results import pose_and_twist, rotation_std
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser

@@ -21,7 +21,7 @@ from uwb_tdoa_bias.ros.node import StreamOutput
 from uwb_tdoa_msgs.msg import EstimatorStatus, TdoaResidual
 
 from .ekf_parameters import NONE, ODOM
-from .frames import pose_and_twist
+from .results import pose_and_twist
 
 if TYPE_CHECKING:
     import numpy as np

@@ -131,9 +131,8 @@ def _smoothed_run(flight: Flight, config: FilterConfig, corrector: Corrector | N
     records: list[np.ndarray] = []
     result = run_offline(flight, config, corrector, records)
     records = [part for part in records if len(part)]
-    before = [-math.inf] + [
-        part["t"][-1] for part in records
-    ]  # stamp of the record before each array of records
+    # stamp of the record before each array of records
+    before = [-math.inf, *(part["t"][-1] for part in records)]
     adjoint, information = np.zeros(ERROR_STATES), np.zeros((ERROR_STATES, ERROR_STATES))
     rows = [np.empty(0, ODOMETRY)]
     for k in reversed(range(len(records))):
