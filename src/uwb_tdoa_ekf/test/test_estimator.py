@@ -34,7 +34,8 @@ from uwb_tdoa_ekf.core.memory import COMPENSATED, LATE, REPEATED, STARTUP
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.reorder_buffer import MOST_WAITING
-from uwb_tdoa_ekf.results import VERDICTS, rotation_std, rows_of
+from uwb_tdoa_ekf.results import VERDICTS, rotation_std
+from uwb_tdoa_ekf.smoother import smooth
 
 # --- estimator ---
 seeds = st.integers(0, 2**32 - 1)
@@ -254,30 +255,26 @@ def test_falling_back_by_less_is_late_not_a_restart():
     )
 
 
-def test_rates_are_those_measured_last():
-    flight = fly(8, 1.0)
-    estimator = Estimator(flight.anchors)
-    odometry, _ = feed(estimator, flight)
-    last, t = rows_of(odometry, slice(-2, None)), flight.imu.t[-1]
-    assert np.isnan(Estimator(flight.anchors).rates_at(last)[0]).all()
-    rates, variances = estimator.rates_at(replace(last, t=np.array([t, t + 1.0])))
-    np.testing.assert_array_equal(rates, [flight.imu.gyro[-1] - last.gyro_bias[0], [np.nan] * 3])
-    one = FilterConfig().gyro_noise ** 2 * 200.0  # of one sample at 200 Hz
-    np.testing.assert_allclose(variances, [[one] * 3, [np.nan] * 3])
-
-
-@pytest.mark.parametrize("compensating", [False, True])
-def test_rates_are_known_for_all_odometry_that_waited(compensating):
+@pytest.mark.parametrize("engine", [run_offline, smooth])
+def test_rates_are_those_measured_last(engine):
     flight = fly(8, 2.0)
-    estimator = Estimator(flight.anchors, FilterConfig(compensate_changes=compensating))
-    for _t, stream, i in messages(flight):
-        send(estimator, flight, stream, i)
-    for give in (estimator.advance, estimator.reset):
-        odometry, _ = give()
-        rates, variances = estimator.rates_at(odometry)
-        last = np.searchsorted(flight.imu.t, odometry.t, side="right") - 1
-        assert len(odometry) and np.isfinite(variances).all()
-        np.testing.assert_array_equal(rates, flight.imu.gyro[last] - odometry.gyro_bias)
+    odometry = engine(flight).odometry
+    if engine is smooth:  # the smoother estimates none
+        assert np.isnan(odometry.rate).all() and np.isnan(odometry.rate_variance).all()
+        return
+    last = np.searchsorted(flight.imu.t, odometry.t, side="right") - 1
+    np.testing.assert_array_equal(odometry.rate, flight.imu.gyro[last] - odometry.gyro_bias)
+    of_one = FilterConfig().gyro_noise ** 2 * 200.0  # of one sample at 200 Hz
+    np.testing.assert_allclose(odometry.rate_variance, of_one)
+
+
+def test_no_rate_is_known_without_a_recent_sample():
+    flight, config = fly(8, 2.0), FilterConfig()
+    flight = replace(flight, imu=kept(flight.imu, flight.imu.t < 1.5))
+    odometry = run_offline(flight).odometry
+    silent = odometry.t > flight.imu.t[-1] + config.imu_timeout
+    assert silent.any() and np.isnan(odometry.rate[silent]).all()
+    assert np.isfinite(odometry.rate[~silent]).all()
 
 
 def test_the_order_of_the_anchors_changes_nothing():

@@ -192,24 +192,18 @@ def test_the_yaw_rate_of_wheels_is_that_of_the_odometry_where_they_predict():
         (short, WHEELS, 0.0),
         (replace(short, imu=imu), PLANAR, silent + PLANAR.imu_timeout),
     ):
-        estimator = Estimator(flight.anchors, config)
-        for _t, stream, i in messages(flight):
-            send(estimator, flight, stream, i)
-        odometry, _ = estimator.finish()
-        kept = odometry.t > max(since, flight.truth.t[0] + 3.0)
-        rates, variances = (of[kept] for of in estimator.rates_at(odometry))
-        last = np.searchsorted(wheels.t, odometry.t[kept], side="right") - 1
-        assert kept.sum() > 100 and np.isnan(rates[:, :2]).all()
-        same = rates[:, 2] == wheels.yaw_rate[last]
+        odometry = run_offline(flight, config).odometry
+        odometry = rows_of(odometry, odometry.t > max(since, flight.truth.t[0] + 3.0))
+        last = np.searchsorted(wheels.t, odometry.t, side="right") - 1
+        assert len(odometry) > 100 and np.isnan(odometry.rate[:, :2]).all()
+        same = odometry.rate[:, 2] == wheels.yaw_rate[last]
         assert same.mean() > 0.95  # of the others the last wheels were refused
-        np.testing.assert_allclose(variances[same, 2], config.yaw_rate_std**2)
+        np.testing.assert_allclose(odometry.rate_variance[same, 2], config.yaw_rate_std**2)
 
 
 def test_no_yaw_rate_is_stated_where_nothing_measures_one(rover):
-    estimator = Estimator(rover.anchors, WHEELS)
-    odometry, _ = feed(estimator, rover.without("velocity"), advance=lambda: False)
-    rates, variances = estimator.rates_at(odometry)
-    assert np.isnan(rates).all() and np.isnan(variances).all()
+    odometry = run_offline(rover.without("velocity"), WHEELS).odometry
+    assert np.isnan(odometry.rate).all() and np.isnan(odometry.rate_variance).all()
 
 
 def test_without_an_imu_time_goes_on_by_wheels_while_no_tdoas_come():

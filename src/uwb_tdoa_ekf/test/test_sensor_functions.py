@@ -13,8 +13,8 @@ import pytest
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet, SmoothTerm
 from uwb_tdoa_bias.effects.covariates import OF_STATE
+from uwb_tdoa_ekf.core.inertial import rows_of, subtract
 from uwb_tdoa_ekf.core.memory import IMU_SAMPLE
-from uwb_tdoa_ekf.core.sensor_functions import rows_of, subtract
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.offline import run_offline
 

@@ -62,7 +62,7 @@ def warm_up() -> None:
                 ),
             )
         odometry, _ = estimator.advance()
-    pose_and_twist(odometry, *estimator.rates_at(odometry))
+    pose_and_twist(odometry, odometry.rate, odometry.rate_variance)
     rotation_std(odometry.q[-1:], odometry.covariance[-1:])
     watch.findings()
     SurveyScale(Anchors.from_positions(np.eye(5, 3))).add(

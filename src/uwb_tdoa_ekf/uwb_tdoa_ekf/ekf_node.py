@@ -444,9 +444,7 @@ class EkfNode(StreamNode):
         if len(odometry.t):
             if self._fault:
                 odometry = doubted(odometry, self._estimator.workspace)
-            rates, variances = self._estimator.rates_at(odometry)
-            held = self._estimator.unsure is not None
-            self.outputs.publish_odometry(odometry, rates, variances, held)
+            self.outputs.publish_odometry(odometry, self._estimator.unsure is not None)
             self._health.last_odometry = time.monotonic()
             self._health.last_position = odometry.p[-1], odometry.covariance[-1, :3, :3]
             self._attitude = odometry.q[-1:], odometry.covariance[-1:]

@@ -13,9 +13,9 @@ from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.samples import RADIO
 
-from .anchor_table import AnchorTable, forget, new_state_of
+from .anchor_table import AnchorTable
 from .core.engine import feed, set_pose
-from .core.memory import ODOMETRY, RESIDUAL, TDOA, FilterState, Measurements, joined
+from .core.memory import ODOMETRY, RESIDUAL, TDOA, FilterState, Measurements, joined, new_state
 from .core.sensors import STREAMS
 from .monitoring.monitor import Monitor
 from .monitoring.slices import LENGTH
@@ -24,9 +24,6 @@ from .results import Odometry, Residuals, poses_of
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from uwb_tdoa_bias.effects import EffectSet
-
-    from .anchor_table import AnchorTable
     from .core.config import FilterConfig
     from .reorder_buffer import ReorderBuffer
 
@@ -190,11 +187,16 @@ class Pipeline:
             self.state.anchors["delay"] = self.state.anchors["delay_variance"] = 0.0
 
     def _new_state(self) -> FilterState:
-        return new_state_of(
-            self._anchors,
-            self._effects.sensor_functions,
-            self._effects.near_ground_delays(self._anchors.anchors),
-        )
+        """Return the state of a filter without measurements, one row for each of the AnchorTable.
+
+        Rows of absent anchors are placeholders: no TDOA refers to them.
+        """
+        anchors, present = self._anchors.anchors, self._anchors.present
+        floor = self._effects.near_ground_delays(anchors)
+        state = new_state(anchors.positions, self._effects.sensor_functions, floor)
+        places = np.zeros(len(self._anchors), int)
+        places[present] = np.arange(len(present))
+        return state._replace(anchors=state.anchors[places])
 
     def change_anchors(self, gone: np.ndarray) -> None:
         """Adapt the filter to a changed AnchorTable.
@@ -209,9 +211,20 @@ class Pipeline:
             anchors=np.concatenate([self.state.anchors, more.anchors[first:]])
         )
         self.state.record.extent[:] = more.record.extent
-        forget(self.state, gone)
+        self._forget(gone)
         if self.monitor is not None:
             self.monitor.forget(gone)
+
+    def _forget(self, gone: np.ndarray) -> None:
+        """Remove all measurements of the anchors in rows (k,) from the state of the filter."""
+        ekf = self.state.record
+        self.state.anchors["heard"][gone] = -np.inf
+        window = ekf["window"][: ekf["kept"]]
+        others = window[~(np.isin(window["a"], gone) | np.isin(window["b"], gone))]
+        if len(others):  # an empty window has no stamps to keep
+            ekf["window"][: len(others)], ekf["kept"] = others, len(others)
+        if ekf["ranged"]["anchor"][0] in gone:
+            ekf["ranged"]["t"] = -np.inf
 
     def run(self, buffer: ReorderBuffer, until: float) -> list[PipelineOutput]:
         """Process the rows that a ReorderBuffer holds up to the stamp `until`, in s.

@@ -123,6 +123,8 @@ class Odometry:
         Covariance of [p, v, attitude], the attitude error in the body frame, in rad.
     consider_covariance : (n, 3, 3) array
         Part of the position covariance from errors that do not average out, in m^2.
+    rate, rate_variance : (n, 3) array
+        Angular rate in the body frame, in rad/s, and its variances; NaN where nothing measures it.
     """
 
     t: np.ndarray
@@ -133,6 +135,13 @@ class Odometry:
     gyro_bias: np.ndarray
     covariance: np.ndarray
     consider_covariance: np.ndarray
+    rate: np.ndarray = None  # type: ignore[assignment]  # becomes NaN
+    rate_variance: np.ndarray = None  # type: ignore[assignment]  # becomes NaN
+
+    def __post_init__(self) -> None:
+        for name in ("rate", "rate_variance"):
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, np.full((len(self.t), 3), math.nan))
 
     @classmethod
     def from_rows(cls, rows: np.ndarray) -> Odometry:
@@ -147,6 +156,8 @@ class Odometry:
             x[:, 13:],
             rows["covariance"],
             rows["consider_covariance"],
+            rows["rate"],
+            rows["rate_variance"],
         )
 
     def __len__(self) -> int:
@@ -303,6 +314,7 @@ def pose_and_twist(
     velocity, covariance = to_odometry(odometry.q, odometry.v, odometry.covariance)
     pose, twist = np.empty((len(odometry), POSE)), np.zeros((len(odometry), TWIST))
     pose[:, :3], pose[:, 3:7], twist[:, :3] = odometry.p, odometry.q, velocity
+    rates, rate_variances = map(np.ascontiguousarray, (rates, rate_variances))
     _fill(covariance, rates, rate_variances, pose, twist)
     return pose, twist
 

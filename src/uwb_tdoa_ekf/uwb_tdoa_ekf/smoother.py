@@ -236,6 +236,7 @@ def _smoothed(record: Record, adjoint: np.ndarray, information: np.ndarray, row:
         for k in range(ERROR_STATES):
             correction[j] -= P[j, k] * adjoint[k]
     row.t = record.t
+    row.rate[:], row.rate_variance[:] = np.nan, np.nan
     row.x[:] = record.x
     inject(row.x, correction, 1.0)
     for i in range(9):

@@ -57,7 +57,6 @@ from .memory import (
     Measurements,
     Output,
 )
-from .sensor_functions import subtract
 from .startup import INLIER
 from .state import CONSTRAINT_PERIOD, coast, predict, turn_about_vertical
 from .update import project
@@ -89,11 +88,12 @@ def run(
     Parameters
     ----------
     state : FilterState
-        Updated in place. Its sensor functions are subtracted from the inertial samples in place.
+        Updated in place.
     parameters : (1,) PARAMETERS
         Tuning of the filter.
     measurements : Measurements
-        Inertial samples, TDOAs and other measurements, each by rising stamp.
+        Inertial samples, TDOAs and other measurements, each by rising stamp. The sensor functions
+        are subtracted from the samples in place, and the delays of the anchors from the TDOAs.
     output : Output
         Filled by this function.
 
@@ -117,7 +117,7 @@ def run(
         t = min(of_imu, of_tdoa, of_sensor)
         if of_imu == t and i < len(imu):
             if len(state.functions) and ekf.running:
-                subtract(state.functions, ekf.hypotheses[ekf.best].x, imu[i])
+                inertial.subtract(state.functions, ekf.hypotheses[ekf.best].x, imu[i])
             _on_imu(ekf, values, imu[i], output.history)
             i += 1
         elif of_tdoa == t and k < len(tdoa):
@@ -685,8 +685,25 @@ def _report(ekf: Record, parameters: Record, t: float, row: Record) -> None:
     row.covariance[:3, :3] += row.consider_covariance
     if t < ekf.rival_until:
         _widen(ekf, best.x, row.covariance)
+    _report_rate(ekf, parameters, t, row)
     if parameters.planar:
         plane.flatten(row, parameters, wrong)
+
+
+@compiled
+def _report_rate(ekf: Record, parameters: Record, t: float, row: Record) -> None:
+    """Write the angular rate at stamp t (s) to an ODOMETRY row.
+
+    It is the rate of the last inertial sample minus the bias of the gyroscope. White noise of the
+    density gyro_noise has the variance gyro_noise^2 / period in each sample. Without a recent
+    sample, wheels give the rate about z.
+    """
+    row.rate[:], row.rate_variance[:] = np.nan, np.nan
+    if t - ekf.imu.t <= parameters.imu_timeout:
+        row.rate[:] = ekf.imu.gyro - row.x[13:]
+        row.rate_variance[:] = parameters.gyro_noise**2 / ekf.imu.period
+    elif t - ekf.velocity.agreed <= velocity.HELD:
+        row.rate[2], row.rate_variance[2] = ekf.velocity.yaw_rate, ekf.velocity.yaw_rate_variance
 
 
 @compiled

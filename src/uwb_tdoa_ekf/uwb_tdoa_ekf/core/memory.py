@@ -18,7 +18,7 @@ from uwb_tdoa_bias.effects.samples import N_STATES
 
 from .auxiliary import OFFSET_STATES
 from .ground import MOST_PAIRS, PAIR
-from .sensor_functions import rows_of
+from .inertial import rows_of
 from .state import ERROR_STATES, GRAVITY, NOMINAL_STATES, TRANSITION
 from .update import INNOVATION
 
@@ -74,6 +74,7 @@ HYPOTHESIS = _record(
 # Statistics of the inertial sensor, body frame.
 IMU_STATE = _record(
     ("t", float),  # s, stamp of the last sample
+    ("period", float),  # s, between samples, mean of the recent ones; 0: unknown
     ("gyro", float, 3),  # rad/s
     ("accel", float, 3),  # m/s^2; both are the input of the prediction until the next sample
     ("slow_accel", float, 3),  # m/s^2, after a low pass
@@ -264,6 +265,8 @@ ODOMETRY = _record(
     ("covariance", float, (9, 9)),  # of [p, v, attitude]
     # m^2, share of the position covariance that persisting errors cause, see noise.py
     ("consider_covariance", float, (3, 3)),
+    ("rate", float, 3),  # rad/s, angular rate in the body frame; NaN: not measured
+    ("rate_variance", float, 3),  # rad^2/s^2, of the rate
 )
 # Innovation and its variance in the unit of the measurement, weight 0 to 1, and verdict.
 RESIDUAL = _record(
