@@ -74,18 +74,18 @@ RULES = (
     Rule("a TDOA heard at rest repeats", "stationarity", "repetition", "ekf.resting"),
     Rule(
         "robust weight",
-        "robust",
-        "by_innovation",
+        "update",
+        "weigh",
         "weight(parameters.loss, innovation.value / math.sqrt(prior + noise), "
         "parameters.measurement_scale)",
         "1.0",
     ),
-    Rule("a negligible weight is none", "robust", "by_innovation", "w < NEGLIGIBLE"),
+    Rule("a negligible weight is none", "update", "weigh", "w < NEGLIGIBLE"),
     Rule(
         "a repeated TDOA is refused",
         "engine",
         "_on_tdoa",
-        "initialization.is_repeat(ekf, tdoa, anchors)",
+        "initialization.is_repeat(ekf, tdoa)",
     ),
     Rule("a repeated range is refused", "engine", "_on_range", "ranges.is_repeat(ekf, sensor)"),
     # Late anchors near the ground
@@ -378,7 +378,7 @@ RULES = (
         "covariance of persistent errors",
         "noise",
         "fill",
-        "share == 0.0 or not solve(both)",
+        "share == 0.0",
         "True",
     ),
     Rule(
@@ -557,7 +557,7 @@ RULES = (
         "TDOAs of another place wait",
         "engine",
         "_update",
-        "tdoa.t < ekf.rival_until and _is_of_rival(ekf, a, b, tdoa, known, residual)",
+        "tdoa.t < ekf.rival_until and _is_of_rival(ekf, a, b, tdoa, known)",
     ),
     Rule("stop after a long pause", "engine", "_predict", "t - ekf.t > LOST_TIME"),
     Rule(

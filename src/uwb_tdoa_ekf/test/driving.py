@@ -3,7 +3,7 @@
 """Feed a flight to the core, and judge what comes out."""
 
 from covariances import assert_covariance
-from flights import measurements, position_at
+from flights import kept, measurements, position_at
 import numpy as np
 
 from uwb_tdoa_ekf.core.config import FilterConfig
@@ -57,5 +57,4 @@ def assert_sound(state, odometry):
 
 def cut(stream, low, high):
     """The part of an Imu or Tdoas between two stamps."""
-    kept = (stream.t >= low) & (stream.t < high)
-    return type(stream)(*(getattr(stream, name)[kept] for name in stream.__dataclass_fields__))
+    return kept(stream, (stream.t >= low) & (stream.t < high))

@@ -156,8 +156,7 @@ def with_ranges(flight, seed=0, rate=200.0, std=0.02):
 
 def only_ranges(std=0.1, rate=100.0):
     """A Flight of `fly` with distances to its anchors instead of TDOAs."""
-    flight = with_ranges(fly(seed=1), 3, rate, std)
-    return replace(flight, tdoa=kept(flight.tdoa, slice(0)))
+    return without_tdoas(with_ranges(fly(seed=1), 3, rate, std))
 
 
 def kept(stream, rows):
@@ -166,10 +165,22 @@ def kept(stream, rows):
     return replace(stream, **columns)
 
 
+def without_tdoas(flight, low=-np.inf, high=np.inf):
+    """The Flight without its TDOAs between two stamps, s."""
+    return replace(flight, tdoa=kept(flight.tdoa, (flight.tdoa.t < low) | (flight.tdoa.t > high)))
+
+
+def errors_of(flight, odometry, after=-np.inf):
+    """Position errors (n, 3) m from the stamp `after` on, and their NEES (n,)."""
+    late = odometry.t > after
+    error = odometry.p[late] - position_at(flight, odometry.t[late])
+    information = np.linalg.inv(odometry.covariance[late, :3, :3])
+    return error, np.einsum("ni,nij,nj->n", error, information, error)
+
+
 def rms_error(flight, odometry, after=2.0):
     """RMS error of positions, m, from `after` s after the first on."""
-    late = odometry.t > odometry.t[0] + after
-    error = (odometry.p - position_at(flight, odometry.t))[late]
+    error, _ = errors_of(flight, odometry, odometry.t[0] + after)
     return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
 
 

@@ -58,9 +58,9 @@ class Prior:
 
 
 def kalman(P, h, innovation, noise):
-    """Error (15,) and covariance of the textbook update, by matrices."""
+    """Error (n,) and covariance of the textbook update, by matrices."""
     gain = P @ h / (h @ P @ h + noise)
-    return gain * innovation, (np.eye(15) - np.outer(gain, h)) @ P
+    return gain * innovation, (np.eye(len(h)) - np.outer(gain, h)) @ P
 
 
 def with_offset(prior):

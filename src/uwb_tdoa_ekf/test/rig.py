@@ -109,6 +109,16 @@ def recording(seconds=4.0, imu_rate=200.0, tdoa_rate=100.0):
     return replace(flight, imu=imu, tdoa=tdoa)
 
 
+def vector(v):
+    """Its coordinates."""
+    return v.x, v.y, v.z
+
+
+def positions(messages):
+    """Positions (n, 3) m of messages of odometry."""
+    return np.array([vector(message.pose.pose.position) for message in messages])
+
+
 def stamp(t, epoch=EPOCH):
     """Stamp of t s after the epoch."""
     second, nanosecond = divmod(round(t * 1e9), 10**9)
@@ -404,7 +414,8 @@ class Rig:
         message.header.stamp, message.header.frame_id = stamp(t, epoch), frame
         self._publishers[topic].publish(message)
 
-    def imu_message(self, gyro=(0.0, 0.0, 0.0), accel=(0.0, 0.0, 9.81)):
+    @staticmethod
+    def imu_message(gyro=(0.0, 0.0, 0.0), accel=(0.0, 0.0, 9.81)):
         message = Imu()
         rate, acceleration = message.angular_velocity, message.linear_acceleration
         rate.x, rate.y, rate.z = map(float, gyro)
@@ -414,11 +425,14 @@ class Rig:
     def send_imu(self, t, gyro=(0.0, 0.0, 0.0), accel=(0.0, 0.0, 9.81), epoch=EPOCH):
         self.send("imu/data", self.imu_message(gyro, accel), t, epoch=epoch)
 
-    def send_tdoa(self, t, a, b, d, epoch=EPOCH, variance=0.0):
-        message = Tdoa(
+    @staticmethod
+    def tdoa_message(a, b, d, variance=0.0):
+        return Tdoa(
             anchor_a=int(a), anchor_b=int(b), distance_difference=float(d), variance=float(variance)
         )
-        self.send("uwb/tdoa", message, t, epoch=epoch)
+
+    def send_tdoa(self, t, a, b, d, epoch=EPOCH, variance=0.0):
+        self.send("uwb/tdoa", self.tdoa_message(a, b, d, variance), t, epoch=epoch)
 
     def send_corrected(self, t, a, b, d, epoch=EPOCH, variance=0.0):
         message = TdoaCorrected(

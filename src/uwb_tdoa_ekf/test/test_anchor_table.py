@@ -4,7 +4,8 @@
 
 from dataclasses import replace
 
-from flights import corners, fly, position_at
+from driving import cut as part
+from flights import corners, fly, kept, position_at
 import numpy as np
 
 from uwb_tdoa_bias.common.anchors import Anchors
@@ -53,11 +54,7 @@ def flight_through(seed=3, seconds=8.0, everything=False):
 
 
 def cut(flight, low, high):
-    def part(stream):
-        rows = (stream.t >= low) & (stream.t < high)
-        return type(stream)(*(getattr(stream, name)[rows] for name in stream.__dataclass_fields__))
-
-    return replace(flight, tdoa=part(flight.tdoa), imu=part(flight.imu))
+    return replace(flight, tdoa=part(flight.tdoa, low, high), imu=part(flight.imu, low, high))
 
 
 def fed(estimator, flight):
@@ -138,9 +135,7 @@ def test_nothing_is_said_of_an_anchor_that_was_taken_away():
     """It is not heard any more; as long as it should be there, the monitor says so."""
     flight = fly(5, 16.0, tdoa_rate=400.0)
     quiet = (flight.tdoa.t > 6.0) & ((flight.tdoa.a == GONE) | (flight.tdoa.b == GONE))
-    flight = replace(
-        flight, tdoa=Tdoas(*(getattr(flight.tdoa, name)[~quiet] for name in ("t", "a", "b", "d")))
-    )
+    flight = replace(flight, tdoa=kept(flight.tdoa, ~quiet))
     for taken in (False, True):
         estimator = Estimator(BOX)
         fed(estimator, cut(flight, -np.inf, 6.0))

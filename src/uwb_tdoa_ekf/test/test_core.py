@@ -4,7 +4,7 @@
 
 from dataclasses import replace
 
-from flights import corners, fly
+from flights import corners, errors_of, fly, rms_error
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
@@ -28,19 +28,17 @@ from uwb_tdoa_ekf.core.measurements import (
     FARTHEST,
     LARGEST_ERROR,
     STEEPEST,
-    usable,
-    usable_all,
-    usable_slopes,
+    usable_tdoas,
 )
-from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, new_state
-from uwb_tdoa_ekf.core.noise import excess_variance, learn
+from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, TDOA, new_state, structured
+from uwb_tdoa_ekf.core.noise import learn
 from uwb_tdoa_ekf.core.state import GRAVITY
 from uwb_tdoa_ekf.core.update import SMALLEST, variance
 from uwb_tdoa_ekf.core.workspace import SMALLEST as WORKSPACE_SMALLEST
 from uwb_tdoa_ekf.core.workspace import STD as WORKSPACE_STD
 from uwb_tdoa_ekf.core.workspace import constrain, contains, set_bounds
-from uwb_tdoa_ekf.frames import rotation_std, to_odometry
 from uwb_tdoa_ekf.offline import run_offline
+from uwb_tdoa_ekf.results import rotation_std, to_odometry
 
 # --- measurements ---
 
@@ -68,14 +66,10 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize("a, b, d, variance, expected", CASES)
-def test_one(a, b, d, variance, expected):
-    assert usable(a, b, d, variance, POSITIONS) == expected
-
-
-def test_all_is_one_for_each():
+def test_a_tdoa_that_cannot_be_a_measurement_is_not_usable():
     a, b, d, variance, expected = (np.array(column) for column in zip(*CASES))
-    assert usable_all(a, b, d, variance, POSITIONS).tolist() == expected.tolist()
+    rows = structured(TDOA, np.zeros(len(d)), a, b, d, variance)
+    assert usable_tdoas(rows, POSITIONS).tolist() == expected.tolist()
 
 
 @pytest.mark.parametrize(
@@ -91,10 +85,10 @@ def test_all_is_one_for_each():
         (0.0, np.inf, False),
     ],
 )
-def test_slopes(slope, state, expected):
-    slopes, states = np.zeros((2, 3, 6))
-    slopes[1, 5], states[1, 0] = slope, state
-    assert usable_slopes(slopes, states).tolist() == [True, expected, True]
+def test_a_tdoa_with_an_absurd_slope_is_not_usable(slope, state, expected):
+    rows = structured(TDOA, np.zeros(3), np.zeros(3), np.ones(3))
+    rows["slope"][1, 5], rows["state"][1, 0] = slope, state
+    assert usable_tdoas(rows, POSITIONS).tolist() == [True, expected, True]
 
 
 # --- curvature ---
@@ -133,7 +127,8 @@ def taught(std, noise, seconds=20.0, seed=0):
         a = rng.integers(n)
         b = (a + 1 + rng.integers(n - 1)) % n
         innovation.value = rng.standard_normal() * np.hypot(noise[a], noise[b])
-        innovation.noise_variance = std**2 + excess_variance(anchors[a], anchors[b])
+        excess = anchors["excess_variance"][[a, b]].sum()
+        innovation.noise_variance = std**2 + excess
         learn(anchors[a], anchors[b], k / 400.0, innovation, parameters)
         sampled.append(anchors["excess_variance"].copy())
     return np.mean(sampled[len(sampled) // 2 :], axis=0)
@@ -158,7 +153,8 @@ def test_variances_stay_finite_and_not_negative(values, prior_variance):
     innovation, innovation.prior_variance = state.record.innovation, prior_variance
     for k, value in enumerate(values):
         a, b = state.anchors[k % 3], state.anchors[(k + 1) % 3]
-        innovation.value, innovation.noise_variance = value, 0.01 + excess_variance(a, b)
+        innovation.value = value
+        innovation.noise_variance = 0.01 + a["excess_variance"] + b["excess_variance"]
         learn(a, b, 0.01 * k, innovation, parameters)
         learned = state.anchors["excess_variance"]
         assert np.isfinite(learned).all() and (learned >= 0.0).all()
@@ -179,10 +175,7 @@ def test_an_anchor_that_is_late_for_a_while_disturbs_less():
             result = run_offline(
                 replace(flight, tdoa=replace(flight.tdoa, d=d)), FilterConfig(adapt_noise=adapt)
             )
-            odometry = result.odometry
-            after = odometry.t > 3.0
-            off = odometry.p[after] - flight.meta["wave"].motion(odometry.t[after])[0]
-            found.append(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+            found.append(rms_error(flight, result.odometry))
         errors[adapt] = np.mean(found)
     assert errors[True] < 0.9 * errors[False]
 
@@ -325,13 +318,12 @@ def test_a_tag_outside_is_right_or_says_how_wrong_it_is(beyond):
     for seed in range(5):
         flight = fly(seed, 6.0, hover=True, anchors=corners((8.0, 8.0, 3.0)), tdoa_rate=300.0)
         p = np.array([8.0 + MARGIN + beyond, 3.0, 1.2])
+        flight.truth.p[:] = p
         a, b = flight.anchors.index(flight.tdoa.a), flight.anchors.index(flight.tdoa.b)
         d = tdoa(p, flight.anchors.positions[a], flight.anchors.positions[b])
         d += 0.1 * np.random.default_rng(seed).standard_normal(len(d))
         odometry = run_offline(replace(flight, tdoa=replace(flight.tdoa, d=d))).odometry
-        error = (odometry.p - p)[odometry.t > 3.0]
-        P = odometry.covariance[odometry.t > 3.0, :3, :3]
-        found.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(P), error).mean())
+        found.append(errors_of(flight, odometry, 3.0)[1].mean())
     assert np.mean(found) < 6.0
 
 

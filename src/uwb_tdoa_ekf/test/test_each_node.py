@@ -12,11 +12,10 @@ import pytest
 pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
-from dataclasses import replace  # noqa: E402
 
 from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
 from flights import corners, with_sensors  # noqa: E402
-from rig import MODULES, PATIENCE, make_rig, recording, seconds_of, stamp  # noqa: E402, F401
+from rig import MODULES, PATIENCE, make_rig, positions, recording, seconds_of, stamp  # noqa: E402, F401
 from sensor_msgs.msg import Imu  # noqa: E402
 
 from uwb_tdoa_bias.common.flyable import FlyableVolume  # noqa: E402
@@ -206,31 +205,17 @@ MOUNTED = """effects: {height_offset: {values: {offset: 0.1}}, height_scale: {va
   {values: {scale: 0.1}}, velocity_misalignment: {values: {yaw: 1.5}}, velocity_delay: {values: {offset: 0.02}}}"""
 
 
-@pytest.mark.parametrize(
-    "topic, effects", [("velocity", MOUNTED), ("velocity/odometry", "effects: {}")]
-)
-def test_height_pressure_and_velocity_are_used_where_they_are_there(
-    make_rig, tmp_path, topic, effects
-):
+def test_height_pressure_and_velocity_are_used_where_they_are_there(make_rig, tmp_path):
     rig, file = make_rig(), tmp_path / "effects.yaml"
-    file.write_text(effects)
+    file.write_text(MOUNTED)
     rig.start("ekf_node", ekf_node=["-p", f"effects_file:={file}"])
     effects, flight = EffectSet.from_yaml(file), with_sensors(recording(3.0), rate=50.0)
     for effect in effects.effects:
         flight = effect.inject(flight)
-    if topic == "velocity/odometry":  # wheels whose driver states no variance
-        n, gyro = (
-            len(flight.velocity),
-            np.interp(flight.velocity.t, flight.imu.t, flight.imu.gyro[:, 2]),
-        )
-        wheels = replace(
-            flight.velocity, std=np.zeros((n, 3)), yaw_rate=gyro, yaw_rate_std=np.zeros(n)
-        )
-        flight = replace(flight, velocity=wheels)
     # a sensor_msgs/Range is not more precise
     flight.height.range[:] = np.float32(flight.height.range)
     flight.height.range[20] = np.inf
-    topics = ["height", "pressure", topic]
+    topics = ["height", "pressure", "velocity"]
     for each in topics:
         rig.add_publisher(each)
     rig.send_anchors(flight.anchors)
@@ -245,16 +230,10 @@ def test_height_pressure_and_velocity_are_used_where_they_are_there(
         )
         assert counts[f"{sensor}_used"] > 50
     assert counts["height_invalid"] == 1
-    values = {entry.key: entry.value for entry in rig.fresh_status("ekf_node").values}
-    said = {"velocity": "the messages", "velocity/odometry": "velocity_std, yaw_rate_std"}
-    assert values["velocity deviations of"] == said[topic]
+    assert rig.values("ekf_node")["velocity deviations of"] == "the messages"
     expected = run_offline(flight, None, Corrector(flight.anchors, effects)).odometry
     place = np.searchsorted(expected.t, [seconds_of(m.header.stamp) for m in rig.odometry])
-    p = [
-        (m.pose.pose.position.x, m.pose.pose.position.y, m.pose.pose.position.z)
-        for m in rig.odometry
-    ]
-    np.testing.assert_allclose(p, expected.p[place], atol=1e-3)
+    np.testing.assert_allclose(positions(rig.odometry), expected.p[place], atol=1e-3)
 
 
 BAD = [  # node, arguments, what is named

@@ -170,8 +170,7 @@ def odometry(t, p, yaw, tilt=0.0):
 
 
 def publish(out, estimates, held=False):
-    n = len(estimates)
-    out.publish_odometry(estimates, np.full((n, 3), np.nan), np.full((n, 3), np.nan), held)
+    out.publish_odometry(estimates, held)
 
 
 def test_world_to_odom_stays_while_the_position_is_unsure(monkeypatch):

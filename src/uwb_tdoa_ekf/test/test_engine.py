@@ -9,13 +9,13 @@ import time
 
 from covariances import assert_covariance
 from driving import assert_equal, assert_sound, cut, drive, errors, state_for
-from flights import fly, leaving, measurements, position_at
+from flights import fly, kept, leaving, measurements, position_at, without_tdoas
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.common.flight import Imu, Tdoas
+from uwb_tdoa_bias.common.flight import Imu
 from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_ekf.core import memory
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
@@ -39,10 +39,7 @@ def test_verdicts_are_those_of_the_message():
 
 def without_imu(flight, low=-np.inf, high=np.inf):
     """The flight with no inertial samples between two stamps."""
-    kept = (flight.imu.t < low) | (flight.imu.t >= high)
-    return replace(
-        flight, imu=Imu(flight.imu.t[kept], flight.imu.gyro[kept], flight.imu.accel[kept])
-    )
+    return replace(flight, imu=kept(flight.imu, (flight.imu.t < low) | (flight.imu.t >= high)))
 
 
 @settings(max_examples=20)
@@ -122,21 +119,12 @@ def test_bridges_seconds_without_imu_or_tdoas():
         assert_sound(state, drive(gap, state=state)[0])
     odometry, _ = drive(without_imu(flight, 8.0, 11.0))
     assert errors(flight, odometry[odometry.t > 3.0]).max() < 0.6
-    silent = replace(
-        flight,
-        tdoa=Tdoas(*np.concatenate([_columns(flight, 0, 8), _columns(flight, 10, 20)], axis=1)),
-    )
-    odometry, _ = drive(silent)
+    odometry, _ = drive(without_tdoas(flight, 8.0, 10.0))
     blind = odometry[(odometry.t > 8.0) & (odometry.t < 10.0)]
     std = np.sqrt(np.einsum("nii->ni", blind.covariance[:, :3, :3]))
     assert (np.diff(std.sum(axis=1)) > 0.0).all()  # it says that it knows less and less
     assert (np.abs(blind.x[:, :3] - position_at(flight, blind.t)) < 4.0 * std).all()
     assert errors(flight, odometry[odometry.t > 11.0]).max() < 0.4
-
-
-def _columns(flight, low, high):
-    part = cut(flight.tdoa, low, high)
-    return np.stack([part.t, part.a, part.b, part.d])
 
 
 def nasty(seed, imu_size):
@@ -180,28 +168,6 @@ def test_nothing_but_finite_states_and_covariances_comes_out(seed, robust, use_i
     assert_sound(state, odometry)
 
 
-def test_motion_between_samples_is_their_mean():
-    """Two seconds blind with every 20th sample of a perfect sensor end near where those with all of
-    them do: 3.6 cm, where holding each sample instead of their mean gives 7.2 cm.
-    """
-    flight = fly(15, 5.0, imu_rate=1000.0)
-    state = state_for(flight)
-    early = replace(flight, imu=cut(flight.imu, 0.0, 3.0), tdoa=cut(flight.tdoa, 0.0, 3.0))
-    drive(early, state=state)
-    ends = []
-    for every in (1, 20):
-        blind = cut(flight.imu, 3.0, 5.0)
-        blind = Imu(
-            blind.t[every - 1 :: every],
-            blind.gyro[every - 1 :: every],
-            blind.accel[every - 1 :: every],
-        )
-        twin = state.copy()
-        drive(replace(flight, imu=blind, tdoa=cut(flight.tdoa, 9.0, 9.0)), state=twin)
-        ends.append(twin.record.hypotheses["x"][twin.record.best].copy())
-    np.testing.assert_allclose(ends[1][:6], ends[0][:6], atol=0.045)
-
-
 def test_the_zero_of_time_changes_nothing():
     """Nor does how long before the first message it lies."""
     flight = fly(16, 4.0, tdoa_std=0.5)
@@ -216,9 +182,7 @@ def test_the_zero_of_time_changes_nothing():
 def test_stamps_that_repeat_are_used_and_move_nothing():
     flight = fly(12, 3.0)
     doubled = np.repeat(np.arange(len(flight.imu)), 2)
-    twice = replace(
-        flight, imu=Imu(flight.imu.t[doubled], flight.imu.gyro[doubled], flight.imu.accel[doubled])
-    )
+    twice = replace(flight, imu=kept(flight.imu, doubled))
     odometry, _ = drive(flight)
     again, _ = drive(twice)
     # the sample repeated is averaged with itself, not with the one before: a difference of half a
@@ -344,11 +308,3 @@ def test_a_history_that_is_full_is_an_error_and_no_silence():
     output = Output(np.empty(n + k, ODOMETRY), np.empty(k, RESIDUAL), np.empty(k // 2, RECORD))
     with pytest.raises(IndexError, match="history is full"):
         run(state, FilterConfig().parameters(), fed, output)
-
-
-def test_nothing_is_recorded_unless_asked_for():
-    flight = fly(8, 2.0)
-    state = new_state(flight.anchors.positions)
-    feed(state, FilterConfig().parameters(), measurements(flight))
-    assert state.record.recorded == 0
-    np.testing.assert_array_equal(state.record.since_record, np.eye(15))

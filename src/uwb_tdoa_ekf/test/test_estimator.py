@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The live filter: arrival in any order gives what the recording gives."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 import math
 
-from flights import corners, fly, position_at, with_sensors
+from flights import corners, errors_of, fly, kept, position_at, with_sensors, without_tdoas
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from live import (
@@ -30,12 +30,12 @@ from uwb_tdoa_bias.common.flight import Imu
 from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_bias.common.stamps import LARGEST_STEP_BACK
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.core.memory import COMPENSATED, INVALID, LATE, REPEATED, STARTUP
+from uwb_tdoa_ekf.core.memory import COMPENSATED, LATE, REPEATED, STARTUP
 from uwb_tdoa_ekf.estimator import Estimator
-from uwb_tdoa_ekf.frames import rotation_std
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.reorder_buffer import MOST_WAITING
-from uwb_tdoa_ekf.results import VERDICTS, rows_of
+from uwb_tdoa_ekf.results import VERDICTS, rotation_std
+from uwb_tdoa_ekf.smoother import smooth
 
 # --- estimator ---
 seeds = st.integers(0, 2**32 - 1)
@@ -176,30 +176,6 @@ def test_what_is_older_than_what_was_used_is_late_and_harmless():
     assert np.isnan(residuals.innovation[late]).all() and (residuals.weight[late] == 0.0).all()
 
 
-@pytest.mark.parametrize(
-    "t, a, b, d, variance",
-    [
-        (1.0, FIRST, SECOND, np.nan, 0.0),
-        (1.0, FIRST, SECOND, np.inf, 0.0),
-        (1.0, FIRST, SECOND, 0.0, np.nan),
-        (1.0, FIRST, SECOND, 0.0, -1.0),
-        (np.nan, FIRST, SECOND, 0.0, 0.0),
-        (np.inf, FIRST, SECOND, 0.0, 0.0),
-        (1.0, 999, SECOND, 0.0, 0.0),
-        (1.0, FIRST, 999, 0.0, 0.0),
-        (1.0, FIRST, FIRST, 0.0, 0.0),
-        (1.0, FIRST, SECOND, 12.0, 0.0),
-    ],
-)
-def test_what_cannot_be_a_measurement_is_invalid(t, a, b, d, variance):
-    estimator = Estimator(corners())
-    estimator.add_tdoa(t, a, b, d, variance)
-    _, residuals = estimator.advance()
-    assert residuals.verdict.tolist() == [INVALID]
-    assert (residuals.a[0], residuals.b[0]) == (a, b) and residuals.weight[0] == 0.0
-    assert estimator.counts["invalid"] == 1 and received(estimator) == (0, 1)
-
-
 def test_an_inertial_sample_that_is_not_finite_is_as_if_it_had_never_come():
     flight, rng = fly(6, 3.0), np.random.default_rng(0)
     bad = rng.choice(len(flight.imu), 30, replace=False)
@@ -251,14 +227,9 @@ def test_every_message_is_accounted_for_once(seed, use_imu):
 def test_a_clock_that_falls_back_starts_anew_and_keeps_the_accounts():
     first, again = fly(7, 3.0, begin=1000.0), fly(7, 3.0)
     estimator = Estimator(first.anchors)
-    for t, stream, i in messages(
-        first
-    ):  # not finished: some are still waiting when the clock falls back
-        if stream == IMU:
-            estimator.add_imu(t, first.imu.gyro[i], first.imu.accel[i])
-        else:
-            estimator.add_tdoa(t, int(first.tdoa.a[i]), int(first.tdoa.b[i]), first.tdoa.d[i])
-    estimator.advance()
+    for _t, stream, i in messages(first):
+        send(estimator, first, stream, i)
+    estimator.advance()  # not finished: some are still waiting when the clock falls back
     waiting = estimator.waiting
     assert estimator.running and waiting[TDOA] > 0
     odometry, residuals = feed(estimator, again)
@@ -284,30 +255,26 @@ def test_falling_back_by_less_is_late_not_a_restart():
     )
 
 
-def test_rates_are_those_measured_last():
-    flight = fly(8, 1.0)
-    estimator = Estimator(flight.anchors)
-    odometry, _ = feed(estimator, flight)
-    last, t = rows_of(odometry, slice(-2, None)), flight.imu.t[-1]
-    assert np.isnan(Estimator(flight.anchors).rates_at(last)[0]).all()
-    rates, variances = estimator.rates_at(replace(last, t=np.array([t, t + 1.0])))
-    np.testing.assert_array_equal(rates, [flight.imu.gyro[-1] - last.gyro_bias[0], [np.nan] * 3])
-    one = FilterConfig().gyro_noise ** 2 * 200.0  # of one sample at 200 Hz
-    np.testing.assert_allclose(variances, [[one] * 3, [np.nan] * 3])
-
-
-@pytest.mark.parametrize("compensating", [False, True])
-def test_rates_are_known_for_all_odometry_that_waited(compensating):
+@pytest.mark.parametrize("engine", [run_offline, smooth])
+def test_rates_are_those_measured_last(engine):
     flight = fly(8, 2.0)
-    estimator = Estimator(flight.anchors, FilterConfig(compensate_changes=compensating))
-    for _t, stream, i in messages(flight):
-        send(estimator, flight, stream, i)
-    for give in (estimator.advance, estimator.reset):
-        odometry, _ = give()
-        rates, variances = estimator.rates_at(odometry)
-        last = np.searchsorted(flight.imu.t, odometry.t, side="right") - 1
-        assert len(odometry) and np.isfinite(variances).all()
-        np.testing.assert_array_equal(rates, flight.imu.gyro[last] - odometry.gyro_bias)
+    odometry = engine(flight).odometry
+    if engine is smooth:  # the smoother estimates none
+        assert np.isnan(odometry.rate).all() and np.isnan(odometry.rate_variance).all()
+        return
+    last = np.searchsorted(flight.imu.t, odometry.t, side="right") - 1
+    np.testing.assert_array_equal(odometry.rate, flight.imu.gyro[last] - odometry.gyro_bias)
+    of_one = FilterConfig().gyro_noise ** 2 * 200.0  # of one sample at 200 Hz
+    np.testing.assert_allclose(odometry.rate_variance, of_one)
+
+
+def test_no_rate_is_known_without_a_recent_sample():
+    flight, config = fly(8, 2.0), FilterConfig()
+    flight = replace(flight, imu=kept(flight.imu, flight.imu.t < 1.5))
+    odometry = run_offline(flight).odometry
+    silent = odometry.t > flight.imu.t[-1] + config.imu_timeout
+    assert silent.any() and np.isnan(odometry.rate[silent]).all()
+    assert np.isfinite(odometry.rate[~silent]).all()
 
 
 def test_the_order_of_the_anchors_changes_nothing():
@@ -374,10 +341,7 @@ def test_without_an_imu_that_cannot_be_right_the_filter_knows_how_well_it_does_w
     order = arriving(harmed, rng, tdoa_delay=0.05)
     assert_same_as_offline(harmed, order=order, advance=lambda: rng.random() < 0.2)
     odometry = run_offline(harmed).odometry
-    error = odometry.p - position_at(flight, odometry.t)
-    nees = np.einsum(
-        "ni,ni->n", error, np.linalg.solve(odometry.covariance[:, :3, :3], error[..., None])[..., 0]
-    )
+    error, nees = errors_of(flight, odometry)
     assert nees[odometry.t > 1.0].max() < 8.0
     assert np.linalg.norm(error, axis=1)[odometry.t > BEGIN].max() < 0.6
     assert np.linalg.norm(error, axis=1)[odometry.t > END + 1.0].max() < 0.2
@@ -385,10 +349,7 @@ def test_without_an_imu_that_cannot_be_right_the_filter_knows_how_well_it_does_w
 
 def twice(flight):
     """The Flight with every TDOA twice, the second one right after the first."""
-    repeated = {
-        field.name: np.repeat(getattr(flight.tdoa, field.name), 2) for field in fields(flight.tdoa)
-    }
-    return replace(flight, tdoa=replace(flight.tdoa, **repeated))
+    return replace(flight, tdoa=kept(flight.tdoa, np.repeat(np.arange(len(flight.tdoa)), 2)))
 
 
 def test_what_is_sent_twice_counts_once_whenever_the_second_comes():
@@ -427,14 +388,6 @@ def test_a_stream_whose_stamps_do_not_go_on_is_used_and_does_not_grow(step=1e-9)
 
 
 # --- estimator lost ---
-
-
-def without_tdoas(flight, low, high):
-    """The Flight without its TDOAs between two stamps, s."""
-    kept = (flight.tdoa.t < low) | (flight.tdoa.t > high)
-    return replace(
-        flight, tdoa=type(flight.tdoa)(*(column[kept] for column in vars(flight.tdoa).values()))
-    )
 
 
 def test_a_tag_without_tdoas_is_lost_once_it_may_be_anywhere_and_found_when_they_are_back():
@@ -602,10 +555,7 @@ def test_a_delay_that_comes_in_flight_is_taken_out_if_asked_for_whatever_the_arr
         "on": (harmed, config),
     }.items():
         run = run_offline(run_of, of)
-        late = run.odometry.t > 25.0
-        errors[name] = np.sqrt(
-            np.mean((run.odometry.p[late] - position_at(flight, run.odometry.t[late])) ** 2)
-        )
+        errors[name] = np.sqrt(np.mean(errors_of(flight, run.odometry, 25.0)[0] ** 2))
         of_anchor = (run.residuals.a == FIRST) | (run.residuals.b == FIRST)
         compensated = run.residuals.verdict == COMPENSATED
         assert compensated.any() == (name == "on") and not compensated[~of_anchor].any()
@@ -647,11 +597,7 @@ def flown(turn):
 
 
 def errors(flight, run):
-    late = run.odometry.t > flight.imu.t[0] + 3.0
-    error = run.odometry.p[late] - position_at(flight, run.odometry.t[late])
-    nees = np.einsum(
-        "ni,nij,nj->n", error, np.linalg.inv(run.odometry.covariance[late, :3, :3]), error
-    )
+    error, nees = errors_of(flight, run.odometry, flight.imu.t[0] + 3.0)
     return np.sqrt(np.mean(np.sum(error**2, axis=1))), np.mean(nees)
 
 

@@ -4,13 +4,13 @@
 
 from dataclasses import replace
 
-from flights import corners, fly
+from flights import corners, errors_of, fly, without_tdoas
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.common.flight import Imu, Tdoas
+from uwb_tdoa_bias.common.flight import Imu
 from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
@@ -268,11 +268,7 @@ def on_floor(seed, duration, late=3.3, shaking=0.0, lift=np.inf, back=np.inf, kn
 def run(flight, corrector=None, **config):
     """(t, error (n, 3) m, NEES (n,)) of the odometry."""
     odometry = run_offline(flight, FilterConfig(**config), corrector).odometry
-    error = odometry.p - np.stack(
-        [np.interp(odometry.t, flight.truth.t, flight.truth.p[:, k]) for k in range(3)], axis=1
-    )
-    nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(odometry.covariance[:, :3, :3]), error)
-    return odometry.t, error, nees
+    return odometry.t, *errors_of(flight, odometry)
 
 
 @pytest.mark.parametrize("shaking", [0.0, 0.6])
@@ -330,12 +326,7 @@ def test_delays_that_are_known_of_the_floor_make_it_sharp():
 def test_a_tag_that_lies_still_stays_where_it_is_without_tdoas():
     """One second of TDOAs, then nothing for ten: the firmware's own test asks for 5 m."""
     for seed in range(4):
-        flight = on_floor(seed, 11.0, late=0.0)
-        heard = flight.tdoa.t < 1.0
-        flight = replace(
-            flight, tdoa=Tdoas(*(column[heard] for column in vars(flight.tdoa).values()))
-        )
-        t, error, nees = run(flight)
+        t, error, nees = run(without_tdoas(on_floor(seed, 11.0, late=0.0), 1.0))
         assert t[-1] > 10.9 and np.linalg.norm(error, axis=1).max() < 0.5 and nees.max() < 20.0
 
 

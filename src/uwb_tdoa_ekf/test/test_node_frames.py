@@ -18,7 +18,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped  # noq
 from rcl_interfaces.msg import Parameter, ParameterValue  # noqa: E402
 from rcl_interfaces.srv import SetParameters  # noqa: E402
 from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
-from rig import STREAMS, make_rig, recording, seconds_of, stamp  # noqa: E402, F401
+from rig import STREAMS, make_rig, positions, recording, seconds_of, stamp  # noqa: E402, F401
 from scipy.spatial.transform import Rotation  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 from tf2_msgs.msg import TFMessage  # noqa: E402
@@ -51,12 +51,6 @@ def call(rig, kind, service, request):
     client = rig.node.create_client(kind, service)
     rig.wait(client.service_is_ready, f"{service} to be there")
     return rig.answer(lambda: client.call_async(request), service)
-
-
-def positions(messages):
-    return np.array(
-        [(m.pose.pose.position.x, m.pose.pose.position.y, m.pose.pose.position.z) for m in messages]
-    )
 
 
 def test_sensors_in_frames_of_their_own_among_frames_that_move(make_rig, tmp_path):

@@ -11,29 +11,24 @@ import pytest
 pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
+from flights import kept  # noqa: E402
 import known_answer  # noqa: E402
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy  # noqa: E402
-from rig import OUTPUTS, make_rig, recording, seconds_of, stamp  # noqa: E402, F401
+from rig import OUTPUTS, make_rig, positions, recording, seconds_of, stamp, vector  # noqa: E402, F401
 from rovers import HEIGHT, drive  # noqa: E402
 
-from uwb_tdoa_bias.common.flight import Tdoas  # noqa: E402
 from uwb_tdoa_bias.correction.corrector import Corrector  # noqa: E402
 from uwb_tdoa_bias.correction.network import Network  # noqa: E402
 from uwb_tdoa_bias.effects import EffectSet  # noqa: E402
 from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
-from uwb_tdoa_ekf.frames import to_odometry  # noqa: E402
 from uwb_tdoa_ekf.offline import run_offline  # noqa: E402
-from uwb_tdoa_ekf.results import rows_of  # noqa: E402
+from uwb_tdoa_ekf.results import rows_of, to_odometry  # noqa: E402
 
 SOURCES = Path(__file__).resolve().parents[2]
 EFFECTS = (
     "effects: {anchor_delay: {values: {10: 0.1, 14: -0.05}}, tag_lever_arm: {values: {x: 0.05, z: "
     "0.1}}}"
 )
-
-
-def vector(v):
-    return v.x, v.y, v.z
 
 
 def quaternion(q):
@@ -48,9 +43,7 @@ def test_odometry_is_that_of_the_offline_engine(make_rig, tmp_path, what, proces
     flight = recording()
     heard = np.abs(flight.tdoa.t - 2.0) > 0.06  # nothing, for longer than a pose lag
     doubt = np.where(np.arange(len(flight.tdoa)) % 5, 0.0, 0.5)  # m^2, that the tag tells
-    columns = vars(replace(flight.tdoa, variance=doubt)).values()
-    tdoa = Tdoas(*(column[heard] for column in columns))
-    flight = replace(flight, tdoa=tdoa)
+    flight = replace(flight, tdoa=kept(replace(flight.tdoa, variance=doubt), heard))
     model = known_answer.write(tmp_path)
     effects = tmp_path / "effects.yaml"
     effects.write_text(EFFECTS)
@@ -115,7 +108,7 @@ def test_odometry_is_that_of_the_offline_engine(make_rig, tmp_path, what, proces
     )
     poses, twists = [m.pose.pose for m in rig.odometry], [m.twist.twist for m in rig.odometry]
     velocity, covariance = to_odometry(odometry.q, odometry.v, odometry.covariance)
-    np.testing.assert_allclose([vector(p.position) for p in poses], odometry.p[:n], atol=1e-6)
+    np.testing.assert_allclose(positions(rig.odometry), odometry.p[:n], atol=1e-6)
     np.testing.assert_allclose(
         [quaternion(p.orientation) for p in poses], odometry.q[:n], atol=1e-6
     )
@@ -185,6 +178,8 @@ def test_a_rover_over_topics_is_that_of_the_offline_engine_to_the_bit(make_rig):
     rig.play(flight, sensors=["velocity/odometry"])
     ekf = rig.counts("ekf_node", TDOAs_received=len(flight.tdoa))
     assert ekf["velocity_used"] > 0.8 * len(flight.velocity) and ekf["velocity_late"] == 0
+    # the driver of the wheels states no variance
+    assert rig.values("ekf_node")["velocity deviations of"] == "velocity_std, yaw_rate_std"
     assert ekf["late"] == ekf["invalid"] == ekf["restarts"] == 0
 
     odometry = run_offline(flight, config).odometry
@@ -195,7 +190,7 @@ def test_a_rover_over_topics_is_that_of_the_offline_engine_to_the_bit(make_rig):
     np.testing.assert_array_equal(stamps, odometry.t)
     poses, twists = [m.pose.pose for m in rig.odometry], [m.twist.twist for m in rig.odometry]
     velocity, covariance = to_odometry(odometry.q, odometry.v, odometry.covariance)
-    np.testing.assert_array_equal([vector(p.position) for p in poses], odometry.p)
+    np.testing.assert_array_equal(positions(rig.odometry), odometry.p)
     np.testing.assert_array_equal([quaternion(p.orientation) for p in poses], odometry.q)
     np.testing.assert_array_equal([vector(t.linear) for t in twists], velocity)
     stated = np.array([m.pose.covariance for m in rig.odometry]).reshape(n, 6, 6)

@@ -5,14 +5,13 @@
 from dataclasses import dataclass, replace
 import math
 
-from flights import fly
+from flights import fly, kept
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from live import IMU, TDOA, arriving, assert_same, assert_same_as_offline, feed, messages, send
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.common.flight import Tdoas
 from uwb_tdoa_bias.common.stamps import MOST_HELD
 from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, INVALID, LATE, SENSOR_ROW
 from uwb_tdoa_ekf.core.memory import TDOA as TDOA_ROW
@@ -59,10 +58,8 @@ def on_grid(flight, until):
     imu, tdoa = (
         replace(part, t=np.round(100.0 * part.t) / 100.0) for part in (flight.imu, flight.tdoa)
     )
-    kept = np.append(True, np.diff(tdoa.t) > 0.0) | (tdoa.t > until)
-    return replace(
-        flight, imu=imu, tdoa=Tdoas(*(column[kept] for column in (tdoa.t, tdoa.a, tdoa.b, tdoa.d)))
-    )
+    apart = np.append(True, np.diff(tdoa.t) > 0.0) | (tdoa.t > until)
+    return replace(flight, imu=imu, tdoa=kept(tdoa, apart))
 
 
 def test_an_odometry_waits_for_nothing_where_no_stamp_comes_twice():

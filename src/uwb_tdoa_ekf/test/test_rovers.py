@@ -7,7 +7,7 @@ wheels.
 from dataclasses import replace
 import math
 
-from flights import corners, fly, with_sensors
+from flights import corners, fly, with_sensors, without_tdoas
 from hypothesis import given
 from hypothesis import strategies as st
 from live import assert_same, feed, joined, messages, send
@@ -100,10 +100,8 @@ def test_a_yaw_without_a_yaw_rate_is_known_by_motion_alone(rover):
 
 
 def test_wheels_carry_the_tag_while_no_tdoas_come(rover):
-    kept = np.abs(rover.tdoa.t - rover.truth.t[0] - 32.5) > 7.5
-    silent = rover.replaced(
-        tdoa=type(rover.tdoa)(*(column[kept] for column in vars(rover.tdoa).values()))
-    )
+    begin = rover.truth.t[0]
+    silent = without_tdoas(rover, begin + 25.0, begin + 40.0)
     for config, share in ((PLANAR, 0.1), (WHEELS, 0.2)):  # of the way
         found = errors(silent, config)
         assert found.xy.max() < share * 15.0 * 0.5 and np.mean(found.nees_xy) < 5.0
@@ -111,13 +109,7 @@ def test_wheels_carry_the_tag_while_no_tdoas_come(rover):
 
 @pytest.mark.parametrize("config", [PLANAR, WHEELS, replace(WHEELS, use_velocity=False)])
 def test_a_planar_vehicle_is_flat_and_says_how_well_that_is_known(rover, config):
-    kept = rover.tdoa.t - rover.truth.t[0] < 30.0
-    odometry = run_offline(
-        rover.replaced(
-            tdoa=type(rover.tdoa)(*(column[kept] for column in vars(rover.tdoa).values()))
-        ),
-        config,
-    ).odometry
+    odometry = run_offline(without_tdoas(rover, rover.truth.t[0] + 30.0), config).odometry
     np.testing.assert_array_equal(odometry.p[:, 2], HEIGHT)
     np.testing.assert_array_equal(odometry.q[:, :2], 0.0)
     np.testing.assert_array_equal(odometry.v[:, 2], 0.0)
@@ -200,42 +192,29 @@ def test_the_yaw_rate_of_wheels_is_that_of_the_odometry_where_they_predict():
         (short, WHEELS, 0.0),
         (replace(short, imu=imu), PLANAR, silent + PLANAR.imu_timeout),
     ):
-        estimator = Estimator(flight.anchors, config)
-        for _t, stream, i in messages(flight):
-            send(estimator, flight, stream, i)
-        odometry, _ = estimator.finish()
-        kept = odometry.t > max(since, flight.truth.t[0] + 3.0)
-        rates, variances = (of[kept] for of in estimator.rates_at(odometry))
-        last = np.searchsorted(wheels.t, odometry.t[kept], side="right") - 1
-        assert kept.sum() > 100 and np.isnan(rates[:, :2]).all()
-        same = rates[:, 2] == wheels.yaw_rate[last]
+        odometry = run_offline(flight, config).odometry
+        odometry = rows_of(odometry, odometry.t > max(since, flight.truth.t[0] + 3.0))
+        last = np.searchsorted(wheels.t, odometry.t, side="right") - 1
+        assert len(odometry) > 100 and np.isnan(odometry.rate[:, :2]).all()
+        same = odometry.rate[:, 2] == wheels.yaw_rate[last]
         assert same.mean() > 0.95  # of the others the last wheels were refused
-        np.testing.assert_allclose(variances[same, 2], config.yaw_rate_std**2)
+        np.testing.assert_allclose(odometry.rate_variance[same, 2], config.yaw_rate_std**2)
 
 
 def test_no_yaw_rate_is_stated_where_nothing_measures_one(rover):
-    estimator = Estimator(rover.anchors, WHEELS)
-    odometry, _ = feed(estimator, rover.without("velocity"), advance=lambda: False)
-    rates, variances = estimator.rates_at(odometry)
-    assert np.isnan(rates).all() and np.isnan(variances).all()
+    odometry = run_offline(rover.without("velocity"), WHEELS).odometry
+    assert np.isnan(odometry.rate).all() and np.isnan(odometry.rate_variance).all()
 
 
 def test_without_an_imu_time_goes_on_by_wheels_while_no_tdoas_come():
     flight = drive(1, 20.0)
-    since = flight.tdoa.t - flight.truth.t[0]
-    tdoas = type(flight.tdoa)(
-        *(column[(since < 12.0) | (since > 17.0)] for column in vars(flight.tdoa).values())
-    )
-    flight = replace(
-        flight,
-        tdoa=tdoas,
-        imu=replace(flight.imu, **{name: column[:0] for name, column in vars(flight.imu).items()}),
-    )
+    begin = flight.truth.t[0]
+    flight = without_tdoas(flight, begin + 12.0, begin + 17.0).without("imu")
     estimator, parts = Estimator(flight.anchors, WHEELS), []
     for t, stream, i in messages(flight):
         send(estimator, flight, stream, i)
         parts.append(estimator.advance()[0])
-        if 14.0 < t - flight.truth.t[0] < 16.9:
+        if 14.0 < t - begin < 16.9:
             newest = max(part.t[-1] for part in parts[-200:] if len(part))
             assert t - newest < LAG + 0.1
     parts.append(estimator.finish()[0])

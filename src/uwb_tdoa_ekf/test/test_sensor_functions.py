@@ -3,7 +3,7 @@
 
 from dataclasses import replace
 
-from flights import fly
+from flights import fly, rms_error
 from hypothesis import given
 from hypothesis import strategies as st
 from live import assert_same
@@ -13,8 +13,8 @@ import pytest
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet, SmoothTerm
 from uwb_tdoa_bias.effects.covariates import OF_STATE
+from uwb_tdoa_ekf.core.inertial import rows_of, subtract
 from uwb_tdoa_ekf.core.memory import IMU_SAMPLE
-from uwb_tdoa_ekf.core.sensor_functions import rows_of, subtract
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.offline import run_offline
 
@@ -93,13 +93,8 @@ def test_the_filter_takes_it_out():
     wrong = with_error(flight, effect)
 
     def error(flight, *effects):
-        odometry = run_offline(flight, None, Corrector(flight.anchors, EffectSet(effects))).odometry
-        late = odometry.t > odometry.t[0] + 3.0
-        truth = np.stack(
-            [np.interp(odometry.t[late], flight.truth.t, column) for column in flight.truth.p.T],
-            axis=1,
-        )
-        return np.sqrt(np.mean((odometry.p[late] - truth) ** 2))
+        run = run_offline(flight, None, Corrector(flight.anchors, EffectSet(effects)))
+        return rms_error(flight, run.odometry, 3.0)
 
     plain, before, after = error(flight), error(wrong), error(wrong, effect)
     assert before > 1.5 * plain and after < plain + 0.1 * (before - plain)

@@ -4,7 +4,7 @@
 from dataclasses import replace
 
 from covariances import assert_covariance
-from flights import WORKSPACE, corners, fly, kept, leaving, position_at, with_ranges
+from flights import WORKSPACE, corners, errors_of, fly, kept, leaving, with_ranges, without_tdoas
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -15,15 +15,15 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf import smoother
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
 from uwb_tdoa_ekf.offline import run_offline, without_offset
+from uwb_tdoa_ekf.results import rows_of
 from uwb_tdoa_ekf.smoother import smooth
 
 NOISE = dict(accel_noise=0.05, gyro_noise=0.003)
 
 
-def rmse(flight, odometry, after=1.0):
-    chosen = odometry.t > after
-    off = odometry.p[chosen] - position_at(flight, odometry.t[chosen])
-    return np.sqrt(np.mean(np.sum(off**2, axis=1)))
+def rmse(flight, odometry):
+    error, _ = errors_of(flight, odometry, 1.0)
+    return np.sqrt(np.mean(np.sum(error**2, axis=1)))
 
 
 def batch(t, a, b, d, positions, p0, prior_std, q, tdoa_std):
@@ -101,10 +101,8 @@ def test_its_covariance_is_honest_and_never_larger_than_the_filters(use_imu):
         ]
         common = np.isin(filtered.t, smoothed.t), np.isin(smoothed.t, filtered.t)
         assert (variance[1][common[1]] <= variance[0][common[0]] * (1 + 1e-6)).all()
-        middle = (smoothed.t > 2.0) & (smoothed.t < 11.0)
-        error = smoothed.p[middle] - flight.meta["wave"].motion(smoothed.t[middle])[0]
-        inverse = np.linalg.inv(smoothed.covariance[middle, :3, :3])
-        nees.append(np.einsum("ni,nij,nj->n", error, inverse, error).mean())
+        middle = rows_of(smoothed, (smoothed.t > 2.0) & (smoothed.t < 11.0))
+        nees.append(errors_of(flight, middle)[1].mean())
     assert 2.0 < np.mean(nees) < (4.0 if use_imu else 6.0)  # the wave is no white acceleration
 
 
@@ -145,17 +143,12 @@ def test_its_covariance_holds_what_an_offset_of_all_ranges_may_be_off_by():
         flight = with_ranges(
             fly(seed, 5.0, anchors=corners((7.0, 8.0, 0.3)), **NOISE), seed, 100.0, 0.1
         )
-        none = Tdoas(*(column[:0] for column in vars(flight.tdoa).values()))
-        smoothed = smooth(without_offset(replace(flight, tdoa=none), -0.3), config).odometry
-        middle = (smoothed.t > 1.5) & (smoothed.t < 4.5)
-        error, covariance = (
-            smoothed.p[middle] - position_at(flight, smoothed.t[middle]),
-            smoothed.covariance[middle, :3, :3],
-        )
-        both = covariance, covariance - smoothed.consider_covariance[middle]
-        nees.append(
-            [np.einsum("ni,nij,nj->n", error, np.linalg.inv(one), error).mean() for one in both]
-        )
+        smoothed = smooth(without_offset(without_tdoas(flight), -0.3), config).odometry
+        middle = rows_of(smoothed, (smoothed.t > 1.5) & (smoothed.t < 4.5))
+        covariance = middle.covariance.copy()
+        covariance[:, :3, :3] -= middle.consider_covariance
+        both = middle, replace(middle, covariance=covariance)
+        nees.append([errors_of(flight, one)[1].mean() for one in both])
     honest, less = np.mean(nees, axis=0)
     assert 2.0 < honest < 5.0 and less > 2.0 * honest
 
@@ -272,8 +265,7 @@ def ranged(seed, time, size=0.1):
         for row in np.flatnonzero(own):
             error = stays * error + size * np.sqrt(1.0 - stays**2) * rng.standard_normal()
             d[row] += error
-    none = Tdoas(*np.empty((4, 0)))
-    return replace(flight, tdoa=none, range=replace(flight.range, d=d))
+    return without_tdoas(replace(flight, range=replace(flight.range, d=d)))
 
 
 def test_the_correlation_of_ranges_is_measured():
@@ -305,5 +297,5 @@ def test_white_ranges_and_ranges_beside_tdoas_are_smoothed_as_configured(monkeyp
 
 def test_a_flight_too_short_to_start():
     flight = with_ranges(fly(5, 0.2))
-    for short in (flight.without("range"), replace(flight, tdoa=Tdoas(*np.empty((4, 0))))):
+    for short in (flight.without("range"), without_tdoas(flight)):
         assert len(smooth(short).odometry) == 0

@@ -18,8 +18,8 @@ from uwb_tdoa_ekf.core.memory import new_state
 from uwb_tdoa_ekf.core.state import ERROR_STATES
 from uwb_tdoa_ekf.core.yaw_check import evidence
 from uwb_tdoa_ekf.estimator import Estimator
-from uwb_tdoa_ekf.frames import rotation_std
 from uwb_tdoa_ekf.offline import run_offline
+from uwb_tdoa_ekf.results import rotation_std
 from uwb_tdoa_ekf.smoother import smooth
 
 

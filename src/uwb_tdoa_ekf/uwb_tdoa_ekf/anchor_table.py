@@ -7,18 +7,9 @@ Each anchor has its own row. State that is stored by row stays valid after a cha
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from uwb_tdoa_bias.common.anchors import SAME_PLACE, Anchors
-
-from .core.memory import FilterState, Floor, new_state
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from uwb_tdoa_bias.effects.base import SensorFunction
 
 # Twice the anchors that one message may hold. Beyond this number of rows the filter restarts.
 MOST_ROWS = 20_000
@@ -77,47 +68,3 @@ class AnchorTable:
         self.positions = np.concatenate([self.positions, anchors.positions[~stay]])
         self.anchors, self._rows = anchors.at(self.positions[rows]), rows
         return np.setdiff1d(before, rows)
-
-
-def new_state_of(
-    anchor_table: AnchorTable, functions: Sequence[SensorFunction], floor: Floor | None
-) -> FilterState:
-    """Return `new_state` with one row for each row of an AnchorTable.
-
-    Rows of absent anchors are placeholders: no TDOA refers to them.
-
-    Parameters
-    ----------
-    anchor_table : AnchorTable
-        Anchors and their rows.
-    functions : sequence of SensorFunction
-        State-dependent errors of the IMU.
-    floor : Floor or None
-        Excess delays near the floor, of the present anchors.
-    """
-    state, places = (
-        new_state(anchor_table.anchors.positions, functions, floor),
-        np.zeros(len(anchor_table), int),
-    )
-    places[anchor_table.present] = np.arange(len(anchor_table.present))
-    return state._replace(anchors=state.anchors[places])
-
-
-def forget(state: FilterState, gone: np.ndarray) -> None:
-    """Remove from the state of a filter all measurements of anchors that are gone.
-
-    Parameters
-    ----------
-    state : FilterState
-        Changed in place.
-    gone : (k,) int array
-        Rows of the anchors.
-    """
-    state.anchors["heard"][gone] = -np.inf
-    ekf = state.ekf[0]
-    window = ekf["window"][: ekf["kept"]]
-    others = window[~(np.isin(window["a"], gone) | np.isin(window["b"], gone))]
-    if len(others):  # an empty window has no stamps to keep
-        ekf["window"][: len(others)], ekf["kept"] = others, len(others)
-    if ekf["ranged"]["anchor"][0] in gone:
-        ekf["ranged"]["t"] = -np.inf

@@ -26,11 +26,11 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.tag import TagLeverArm
 
 from .estimator import Estimator
-from .frames import pose_and_twist, rotation_std
 from .monitoring.change import YOUNGEST, ChangeDetector
 from .monitoring.slices import LENGTH, Slice
 from .monitoring.stream_watch import StreamWatch
 from .monitoring.survey_scale import SurveyScale
+from .results import pose_and_twist, rotation_std
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser
@@ -62,7 +62,7 @@ def warm_up() -> None:
                 ),
             )
         odometry, _ = estimator.advance()
-    pose_and_twist(odometry, *estimator.rates_at(odometry))
+    pose_and_twist(odometry, odometry.rate, odometry.rate_variance)
     rotation_std(odometry.q[-1:], odometry.covariance[-1:])
     watch.findings()
     SurveyScale(Anchors.from_positions(np.eye(5, 3))).add(

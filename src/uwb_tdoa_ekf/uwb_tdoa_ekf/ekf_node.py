@@ -46,14 +46,14 @@ from .compile_nodes import warm_up
 from .core.memory import INVALID
 from .ekf_parameters import ODOM, declare_parameters, follow_changes
 from .estimator import Estimator
-from .frames import ImuMount, pose_from_message, rotation_std
+from .frames import ImuMount, pose_from_message
 from .monitoring.finding import most_severe_first
 from .monitoring.health import OK, WARN, Health, together
 from .monitoring.status import FAULT, Status, doubted, status_of, yaw_in_words
 from .monitoring.stream_watch import FEW_ANCHORS, StreamWatch
 from .outputs import Outputs, StatusOutput
 from .reorder_buffer import STREAMS
-from .results import VERDICTS, Residuals
+from .results import VERDICTS, Residuals, rotation_std
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
@@ -444,9 +444,7 @@ class EkfNode(StreamNode):
         if len(odometry.t):
             if self._fault:
                 odometry = doubted(odometry, self._estimator.workspace)
-            rates, variances = self._estimator.rates_at(odometry)
-            held = self._estimator.unsure is not None
-            self.outputs.publish_odometry(odometry, rates, variances, held)
+            self.outputs.publish_odometry(odometry, self._estimator.unsure is not None)
             self._health.last_odometry = time.monotonic()
             self._health.last_position = odometry.p[-1], odometry.covariance[-1, :3, :3]
             self._attitude = odometry.q[-1:], odometry.covariance[-1:]
@@ -553,46 +551,40 @@ class EkfNode(StreamNode):
         others = [*filter(None, [*frames, self.outputs.trouble, refused, unsure, *alarms])]
         if level == OK and others:
             level, text = WARN, together(others)
-        values |= {"not to be flown by": self._judge().why or "nothing"}
-        values |= {"yaw": yaw_in_words(self._yaw_std()), "frames of imu/data": heard or "none yet"}
-        values |= {"changed since the start": "; ".join(alarms) or "nothing"}
         outside: list[str] = self._imu_corrector.outside if estimator is not None else []
-        values |= {"beyond where effects were seen": "; ".join(outside) or "nothing"}
-        values |= {"TDOAs received": self._health.received["tdoa"]} | {
-            name: counts[name] for name in VERDICTS.values()
+        values |= {
+            "not to be flown by": self._judge().why or "nothing",
+            "yaw": yaw_in_words(self._yaw_std()),
+            "frames of imu/data": heard or "none yet",
+            "changed since the start": "; ".join(alarms) or "nothing",
+            "beyond where effects were seen": "; ".join(outside) or "nothing",
+            "TDOAs received": self._health.received["tdoa"],
+            **{name: counts[name] for name in VERDICTS.values()},
+            "waiting": waiting["tdoa"],
+            "IMU samples received": self._health.received["imu"],
+            **{name: counts[name] for name in ("imu_used", "imu_late", "imu_invalid")},
+            "imu_waiting": waiting["imu"],
+            "odometry published": self.outputs.published,
+            **{name: counts[name] for name in ("recoveries", "restarts", "yaw_doubts")},
         }
-        values |= {"waiting": waiting["tdoa"], "IMU samples received": self._health.received["imu"]}
-        values |= {name: counts[name] for name in ("imu_used", "imu_late", "imu_invalid")}
-        values |= {"imu_waiting": waiting["imu"], "odometry published": self.outputs.published}
-        values |= {name: counts[name] for name in ("recoveries", "restarts", "yaw_doubts")}
         for stream in SENSORS:
+            names = [f"{stream}_{verdict}" for verdict in VERDICTS.values()]
             values |= {
                 f"{stream}_received": self._health.received[stream],
                 f"{stream}_waiting": waiting[stream],
+                **{name: counts[name] for name in names},
             }
-            values |= {
-                f"{stream}_{verdict}": counts[f"{stream}_{verdict}"]
-                for verdict in VERDICTS.values()
-            }
-        values |= {
-            f"{stream} deviations of": ", ".join(names) or "the messages"
-            for stream, names in self._assumed.items()
-        }
-        values |= {f"lost on {name}": end.lost for name, end in self.streams.inputs.items()}
-        values |= {
-            f"unreadable on {refusals.topic}": refusals.count
-            for refusals in (*self.streams.refusals, *self._single)
-        }
-        values |= {
-            f"publishers of {name}": end.get_publisher_count()
-            for name, end in self.streams.inputs.items()
-        }
-        values |= {
-            "subscribers of odometry": self.outputs.odometry.publisher.get_subscription_count()
-        }
-        values |= {
-            "subscribers of uwb/residual": self.outputs.residual.publisher.get_subscription_count()
-        }
+        for stream, parameters in self._assumed.items():
+            values[f"{stream} deviations of"] = ", ".join(parameters) or "the messages"
+        inputs = self.streams.inputs
+        values |= {f"lost on {name}": end.lost for name, end in inputs.items()}
+        for refusals in (*self.streams.refusals, *self._single):
+            values[f"unreadable on {refusals.topic}"] = refusals.count
+        for name, end in inputs.items():
+            values[f"publishers of {name}"] = end.get_publisher_count()
+        odometry, residual = self.outputs.odometry.publisher, self.outputs.residual.publisher
+        values["subscribers of odometry"] = odometry.get_subscription_count()
+        values["subscribers of uwb/residual"] = residual.get_subscription_count()
         return level, text, values
 
 

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.common.compiled import Record, compiled
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.stamps import LARGEST_STEP_BACK
 from uwb_tdoa_bias.effects import EffectSet
@@ -20,19 +19,14 @@ from .core.config import FilterConfig
 from .core.initialization import LOST_TIME
 from .core.measurements import imu_rows, sensor_rows, usable_tdoas
 from .core.memory import (
-    IMU_SAMPLE,
     INVALID,
     N_YAWS,
     ODOMETRY,
     POSE,
-    SENSOR_ROW,
     TDOA,
-    USED,
-    joined,
     structured,
 )
 from .core.startup import APART
-from .core.velocity import HELD, LONGEST_STD, YAW_RATE
 from .monitoring.filter_findings import clock_ahead, implausible, restarted
 from .monitoring.finding import Steady
 from .pipeline import Pipeline, odometry_of
@@ -43,13 +37,13 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from uwb_tdoa_bias.common.anchors import Anchors
+    from uwb_tdoa_bias.common.compiled import Record
     from uwb_tdoa_bias.common.sensors import Stream
 
     from .monitoring.finding import Finding
     from .pipeline import PipelineOutput
     from .reorder_buffer import Restart
 
-RATE_SAMPLES = 10  # inertial samples over which their rate is averaged
 # s, largest lead of a pose that the user sets over the newest measurement
 LARGEST_POSE_AHEAD = 10.0
 RESTART_NAMED = 10.0  # s of stamps for which /diagnostics reports a restart
@@ -99,9 +93,6 @@ class Estimator:
         names = [*VERDICTS.values(), "imu_used", "imu_late", "imu_invalid", "restarts", *of_sensors]
         self.counts = dict.fromkeys(names, 0)
         self._refused: list[Residuals] = []
-        # the inertial samples used last, and RATE_SAMPLES before them
-        self._sensed = np.empty(0, IMU_SAMPLE)
-        self._wheels = np.empty(0, SENSOR_ROW)  # yaw rates of wheels that were used last
         self._buffer = ReorderBuffer(
             reorder, lag, self.config.use_imu, self._refuse, self._start_anew
         )
@@ -440,40 +431,6 @@ class Estimator:
         self._buffer.finish()
         return self._use(math.inf)
 
-    def rates_at(self, odometry: Odometry) -> tuple[np.ndarray, np.ndarray]:
-        """Return angular velocities at the stamps of the Odometry that was returned last.
-
-        The rate is the measured angular velocity minus the estimated gyroscope bias. Where no
-        inertial sample is used, wheels give the rate about z. White noise of density gyro_noise has
-        the variance gyro_noise^2 / dt in samples dt apart. Here dt is the mean over the last
-        RATE_SAMPLES.
-
-        Parameters
-        ----------
-        odometry : Odometry
-            n estimates, as returned last.
-
-        Returns
-        -------
-        rates : (n, 3) array
-            Angular velocity in the body frame, in rad/s; NaN without a recent measurement.
-        variances : (n, 3) array
-            Their variances, in rad^2/s^2.
-        """
-        t = np.ascontiguousarray(odometry.t)
-        rates, variance = np.empty((len(t), 3)), np.empty(len(t))
-        sensed = self._sensed if self.config.use_imu else self._sensed[:0]
-        _look_up(t, sensed, self.config.imu_timeout, self.config.gyro_noise, rates, variance)
-        rates -= odometry.gyro_bias
-        variances = np.repeat(variance[:, None], 3, axis=1)
-        if len(self._wheels):
-            last = np.searchsorted(self._wheels["t"], t, side="right") - 1
-            near = t - self._wheels["t"][last] <= HELD
-            rows = np.isnan(rates[:, 2]) & (last >= 0) & near
-            rates[rows, 2] = self._wheels["value"][last[rows], YAW_RATE]
-            variances[rows, 2] = self._wheels["std"][last[rows], YAW_RATE] ** 2
-        return rates, variances
-
     def _refuse(self, stream: int, rows: np.ndarray, verdict: int) -> None:
         """Count rows that the filter will not use."""
         if stream == TDOA_STREAM:
@@ -509,12 +466,6 @@ class Estimator:
                 part.measured.sensors["kind"].tolist(), part.sensors["verdict"].tolist()
             ):
                 self.counts[f"{sensors.STREAMS[kind]}_{VERDICTS[verdict]}"] += 1
-        self._sensed = joined(
-            IMU_SAMPLE, [self._sensed[-RATE_SAMPLES:], *(part.measured.imu for part in parts)]
-        )
-        self._wheels = joined(
-            SENSOR_ROW, [self._wheels[-1:], *(_of_wheels(part) for part in parts)]
-        )
         residuals = concatenated([self._pipeline.residuals(parts), *self._refused])
         self._refused = []
         for verdict in residuals.verdict.tolist():
@@ -541,54 +492,3 @@ class Estimator:
 
     def _has_begun(self) -> bool:
         return self._buffer.began < math.inf
-
-
-def _of_wheels(part: PipelineOutput) -> np.ndarray:
-    """Return the velocities with a yaw rate that the filter used, (n,) of SENSOR_ROW."""
-    rows = part.measured.sensors
-    used = (rows["kind"] == sensors.VELOCITY) & (part.sensors["verdict"] == USED)
-    out: np.ndarray = rows[used & (rows["std"][:, YAW_RATE] <= LONGEST_STD)]
-    return out
-
-
-@compiled
-def _look_up(
-    t: np.ndarray,
-    sensed: np.ndarray,
-    timeout: float,
-    noise: float,
-    rates: np.ndarray,
-    variances: np.ndarray,
-) -> None:
-    """Write the rate and variance of the last inertial sample up to each stamp.
-
-    Parameters
-    ----------
-    t : (n,) array
-        Stamps, in s.
-    sensed : (m,) array of IMU_SAMPLE
-        Inertial samples in the order of their stamps.
-    timeout : float
-        Largest age of a sample, in s; beyond it the result is NaN.
-    noise : float
-        Noise density of the gyroscope, in rad/s/sqrt(Hz).
-    rates : (n, 3) array
-        Filled with angular velocities, in rad/s.
-    variances : (n,) array
-        Filled with their variances, in rad^2/s^2.
-    """
-    k = len(sensed) - 1
-    for i in range(len(t) - 1, -1, -1):
-        while k >= 0 and sensed[k].t > t[i]:
-            k -= 1
-        rates[i], variances[i] = np.nan, np.nan
-        if k < 0 or t[i] - sensed[k].t > timeout:
-            continue
-        rates[i] = sensed[k].gyro
-        apart = intervals = 0.0
-        for j in range(max(1, k - RATE_SAMPLES + 1), k + 1):
-            if 0.0 < sensed[j].t - sensed[j - 1].t <= timeout:
-                apart += sensed[j].t - sensed[j - 1].t
-                intervals += 1.0
-        if intervals > 0.0:
-            variances[i] = noise**2 * intervals / apart

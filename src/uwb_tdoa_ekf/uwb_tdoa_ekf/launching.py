@@ -15,6 +15,7 @@ import os
 from pathlib import Path
 import signal
 import socket
+from typing import NamedTuple
 
 import yaml
 
@@ -287,6 +288,24 @@ def tag(
     ]
 
 
+class FleetTag(NamedTuple):
+    """Store one tag of a YAML file of tags.
+
+    Attributes
+    ----------
+    parameters : dict
+        {parameter: value} of its nodes.
+    host : str or None
+        Name of the machine that runs its nodes; None if the file gives no host.
+    remaps : dict
+        {topic: name}.
+    """
+
+    parameters: dict
+    host: str | None
+    remaps: dict[str, str]
+
+
 @dataclass(frozen=True)
 class Fleet:
     """Store the content of a YAML file of tags.
@@ -299,19 +318,13 @@ class Fleet:
     path : str
         Path of the file.
     tags : dict
-        {namespace: {parameter: value}}.
-    hosts : dict
-        {namespace: name of the machine that runs its nodes, or None if the file gives no host}.
-    remaps : dict
-        {namespace: {topic: name}}.
+        {namespace: FleetTag}.
     processes : str
         Number of processes, or "" if the file does not give it.
     """
 
     path: str
-    tags: dict[str, dict]
-    hosts: dict[str, str | None]
-    remaps: dict[str, dict[str, str]]
+    tags: dict[str, FleetTag]
     processes: str
 
     @classmethod
@@ -324,55 +337,48 @@ class Fleet:
                 f"{path}: expected a mapping 'tags' of namespace to parameters, e.g. 'tags: "
                 f"{{tag1: {{}}}}'."
             )
-        merged, hosts, remaps, processes = {}, {}, {}, content.pop("processes", "")
-        shared = content.pop("remaps", None)
+        tags: dict[str, FleetTag] = {}
+        processes = content.pop("processes", "")
+        shared = _remaps(path, content.pop("remaps", None))
         for namespace, own in listed.items():
             if not isinstance(own or {}, dict):
                 raise InputError(
                     f"{path}: tags: {namespace}: {own!r} must be a mapping of parameters, or {{}}."
                 )
             parameters = {"body_frame": f"{namespace}/base_link", **content, **(own or {})}
-            host, renamed = parameters.pop("host", None), parameters.pop("remaps", None)
-            remaps[str(namespace)] = {**_remaps(path, shared), **_remaps(path, renamed)}
+            host = parameters.pop("host", None)
+            remaps = shared | _remaps(path, parameters.pop("remaps", None))
             if not isinstance(host, str | None):
                 raise InputError(
                     f"{path}: tags: {namespace}: host: {host!r} is no name of a machine; "
                     "write a text."
                 )
-            merged[str(namespace)], hosts[str(namespace)] = parameters, host
-        if None in hosts.values() and set(hosts.values()) != {None}:
-            lacks = next(namespace for namespace, name in hosts.items() if name is None)
+            tags[str(namespace)] = FleetTag(parameters, host, remaps)
+        without = [namespace for namespace, tag in tags.items() if tag.host is None]
+        if without and len(without) < len(tags):
             raise InputError(
-                f"{path}: tags: {lacks}: names no host, and other tags do; name it, or a host "
+                f"{path}: tags: {without[0]}: names no host, and other tags do; name it, or a host "
                 "for all beside 'tags'."
             )
-        return cls(str(path), merged, hosts, remaps, str(processes))
+        return cls(str(path), tags, str(processes))
 
     def at(self, host: str) -> Fleet:
         """Return the tags whose nodes the machine `host` runs: all, if the file names no host.
 
         Raise InputError if there is none.
         """
-        if set(self.hosts.values()) == {None}:
+        hosts = dict.fromkeys(tag.host for tag in self.tags.values())
+        if None in hosts:
             return self
-        here = [
-            namespace
-            for namespace, name in self.hosts.items()
-            if name in (host, host.partition(".")[0])
-        ]
+        names = host, host.partition(".")[0]
+        here = {namespace: tag for namespace, tag in self.tags.items() if tag.host in names}
         if not here:
-            known = ", ".join(dict.fromkeys(str(name) for name in self.hosts.values()))
+            known = ", ".join(map(str, hosts))
             raise InputError(
                 f"{self.path}: no tag has the host {host}; those named are {known}: correct "
                 "the file, or give host:=NAME."
             )
-        tags, hosts = (
-            {name: self.tags[name] for name in here},
-            {name: self.hosts[name] for name in here},
-        )
-        return Fleet(
-            self.path, tags, hosts, {name: self.remaps[name] for name in here}, self.processes
-        )
+        return replace(self, tags=here)
 
     def starts(self, values: Mapping, log_level: str = "info") -> list[Start]:
         """Return the Starts of bias_node and ekf_node of each tag.
@@ -394,7 +400,7 @@ class Fleet:
         starts = []
         try:
             for namespace, own in self.tags.items():
-                merged = {**own, **values}
+                merged = {**own.parameters, **values}
                 file = merged.pop("params_file", None)
                 files = (
                     {name: [_beside(self.path, file)] for name in ("bias_node", "ekf_node")}
@@ -407,7 +413,7 @@ class Fleet:
                     if merged.get(name) not in (None, "")
                 }
                 starts += [
-                    replace(each, remaps=self.remaps[namespace])
+                    replace(each, remaps=own.remaps)
                     for each in tag(namespace, merged, files, log_level)
                 ]
         except InputError as error:

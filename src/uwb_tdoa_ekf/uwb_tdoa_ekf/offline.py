@@ -19,10 +19,9 @@ from .core.hypotheses import yaw_offset
 from .core.measurements import imu_rows, sensor_rows, usable_tdoas
 from .core.memory import INVALID, RESIDUAL, SENSOR_ROW, TDOA, joined, structured
 from .core.sensors import STREAMS as SENSOR_NAMES
-from .frames import poses_of
 from .pipeline import Pipeline, odometry_of
 from .reorder_buffer import FIRST_SENSOR, IMU_STREAM, TDOA_STREAM, ReorderBuffer
-from .results import VERDICTS, Odometry, Residuals
+from .results import VERDICTS, Odometry, Residuals, poses_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -175,11 +174,9 @@ def without_unknown_offset(
 
     The parameters are as for run_offline.
     """
-    offset = (
-        run_offline(flight, config, corrector).range_offset
-        if may_have_offset(flight, config)
-        else None
-    )
+    if not may_have_offset(flight, config):
+        return flight
+    offset = run_offline(flight, config, corrector).range_offset
     return flight if offset is None else without_offset(flight, offset[0])
 
 
@@ -274,21 +271,17 @@ def _batches(
     if not (np.diff(t[known]) > 0.0).all():
         # TDOAs of one stamp are in the same order as in the nodes
         known = known[np.lexsort((d[known], b[known], a[known], t[known]))]
-    stamps, lag, first = t[known], math.inf if corrector.idle else corrector.lag, 0
+    stamps, first = t[known], 0
+    lag = math.inf if corrector.idle else corrector.lag
     for number, bound in enumerate([*sorted(restarts), math.inf]):
         last, anew = int(np.searchsorted(stamps, bound)), number > 0
-        while first < last or anew or not number:
-            end = (
-                min(int(np.searchsorted(stamps, stamps[first] + lag)), first + longest, last)
-                if first < last
-                else last
-            )
+        while True:
+            end = last
+            if first < last:
+                old = int(np.searchsorted(stamps, stamps[first] + lag))
+                end = min(old, first + longest, last)
             before = stamps[end] if end < last else bound
-            yield (
-                known[first:end],
-                math.nextafter(before, -math.inf) if before < math.inf else before,
-                anew,
-            )
+            yield known[first:end], math.nextafter(before, -math.inf), anew
             first, anew = end, False
             if first >= last:
                 break

@@ -21,7 +21,7 @@ from uwb_tdoa_bias.ros.node import StreamOutput
 from uwb_tdoa_msgs.msg import EstimatorStatus, TdoaResidual
 
 from .ekf_parameters import NONE, ODOM
-from .frames import pose_and_twist
+from .results import pose_and_twist
 
 if TYPE_CHECKING:
     import numpy as np
@@ -175,26 +175,21 @@ class Outputs:
             rows[name] = column
         self.residual.publish(self.world, self._residual, rows)
 
-    def publish_odometry(
-        self, odometry: Odometry, rates: np.ndarray, rate_variances: np.ndarray, held: bool = False
-    ) -> None:
+    def publish_odometry(self, odometry: Odometry, held: bool = False) -> None:
         """Publish Odometry and its transforms.
 
         Parameters
         ----------
         odometry : Odometry
             n estimates.
-        rates : (n, 3) array
-            Angular velocity in the body frame, in rad/s; NaN if unknown.
-        rate_variances : (n, 3) array
-            Their variances, in rad^2/s^2.
         held : bool
             Keep the last world -> odom transform.
         """
         n = len(odometry)
         rows = self._odometry.rows(n)
         rows["sec"], rows["nanosec"] = self._epoch.parts(odometry.t)
-        rows["pose"], rows["twist"] = pose_and_twist(odometry, rates, rate_variances)
+        numbers = pose_and_twist(odometry, odometry.rate, odometry.rate_variance)
+        rows["pose"], rows["twist"] = numbers
         transformed = self._tf_publisher is not None and (
             self._odom or self._tf_publisher.get_subscription_count()
         )

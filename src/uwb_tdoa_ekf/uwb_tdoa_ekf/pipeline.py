@@ -13,21 +13,17 @@ from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.samples import RADIO
 
-from .anchor_table import AnchorTable, forget, new_state_of
+from .anchor_table import AnchorTable
 from .core.engine import feed, set_pose
-from .core.memory import ODOMETRY, RESIDUAL, TDOA, FilterState, Measurements, joined
+from .core.memory import ODOMETRY, RESIDUAL, TDOA, FilterState, Measurements, joined, new_state
 from .core.sensors import STREAMS
-from .frames import poses_of
 from .monitoring.monitor import Monitor
 from .monitoring.slices import LENGTH
-from .results import Odometry, Residuals
+from .results import Odometry, Residuals, poses_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from uwb_tdoa_bias.effects import EffectSet
-
-    from .anchor_table import AnchorTable
     from .core.config import FilterConfig
     from .reorder_buffer import ReorderBuffer
 
@@ -63,12 +59,6 @@ class RadioCorrections:
         self._anchor_table, self._slice, self._start = anchor_table, -math.inf, math.nan
         # (1,) of ODOMETRY; its position is NaN until there is odometry
         self._pose = self._latest = _NOWHERE
-        self._together = False  # True if the last part may hold several slices
-
-    @property
-    def idle(self) -> bool:
-        """Return whether no effect needs correction."""
-        return not self._correctors
 
     def add_odometry(self, rows: np.ndarray) -> None:
         """Store the pose for the next correction.
@@ -78,23 +68,17 @@ class RadioCorrections:
         rows : (n,) array of ODOMETRY
             Odometry of the last part, in the order of its stamps.
         """
-        if not len(rows):
-            return
-        before = (
-            int(np.searchsorted(np.floor(rows["t"] / SLICE), self._slice)) if self._together else 0
-        )
-        if before:
-            self._pose = rows[before - 1 : before]
-        self._latest, self._together = rows[-1:], False
+        if len(rows):
+            self._latest = rows[-1:]
 
     def slices(self, measured: Measurements) -> Iterator[Measurements]:
-        """Yield Measurements in corrected parts.
+        """Yield Measurements in corrected parts, or all at once if no effect needs correction.
 
         The caller must pass the odometry of each part to `add_odometry` before it asks for the
-        next. Measurements without distances are one part, even a whole recording.
+        next.
         """
-        if not len(measured.sensors) or not self._ranged(measured.sensors).any():
-            yield self._unchanged(measured)
+        if not self._correctors:
+            yield measured
             return
         of_rows = [np.floor(part["t"] / SLICE) for part in measured]
         for number in np.unique(np.concatenate(of_rows)).tolist():
@@ -106,39 +90,18 @@ class RadioCorrections:
             now = Measurements(*(part[rows] for part, rows in zip(measured, inside)))
             yield now._replace(sensors=self._corrected(now))
 
-    @staticmethod
-    def _ranged(sensors: np.ndarray) -> np.ndarray:
-        """Return which of (m,) of SENSOR_ROW are distances to anchors, (m,) bool."""
-        return np.isin(sensors["kind"], list(KINDS))
-
-    def _unchanged(self, measured: Measurements) -> Measurements:
-        """Return Measurements without distances unchanged and store their last slice."""
-        number = max(float(np.floor(part["t"][-1] / SLICE)) for part in measured if len(part))
-        if number != self._slice:
-            self._slice, self._pose, self._together = number, self._latest, True
-        self._begin(measured, np.zeros(0, bool))
-        return measured
-
-    def _begin(self, measured: Measurements, ranged: np.ndarray) -> None:
-        """Store the stamp of the first TDOA or distance as the start of the recording.
-
-        Parameters
-        ----------
-        measured : Measurements
-            Measurements of one part.
-        ranged : (m,) bool array
-            Result of `_ranged`.
-        """
-        if math.isnan(self._start) and (len(measured.tdoa) or ranged.any()):
-            self._start = float(min([*measured.tdoa["t"][:1], *measured.sensors["t"][ranged][:1]]))
-
     def _corrected(self, measured: Measurements) -> np.ndarray:
         """Return the (m,) of SENSOR_ROW of one slice, with the distances corrected."""
         sensors = measured.sensors
-        self._begin(measured, self._ranged(sensors))
+        if math.isnan(self._start):
+            # the recording starts with its first TDOA or distance
+            ranged = np.isin(sensors["kind"], list(KINDS))
+            stamps = [*measured.tdoa["t"][:1], *sensors["t"][ranged][:1]]
+            self._start = float(min(stamps, default=math.nan))
         _, p, q, _, yaw_std = poses_of(Odometry.from_rows(self._pose))
         for kind, corrector in self._correctors.items():
-            anchors, (rows,) = self._anchor_table.anchors, np.nonzero(sensors["kind"] == kind)
+            anchors = self._anchor_table.anchors
+            rows = np.flatnonzero(sensors["kind"] == kind)
             at = anchors.index(self._anchor_table.ids[sensors["anchor"][rows]])
             rows, at = rows[at >= 0], at[at >= 0]
             if not len(rows):
@@ -224,11 +187,16 @@ class Pipeline:
             self.state.anchors["delay"] = self.state.anchors["delay_variance"] = 0.0
 
     def _new_state(self) -> FilterState:
-        return new_state_of(
-            self._anchors,
-            self._effects.sensor_functions,
-            self._effects.near_ground_delays(self._anchors.anchors),
-        )
+        """Return the state of a filter without measurements, one row for each of the AnchorTable.
+
+        Rows of absent anchors are placeholders: no TDOA refers to them.
+        """
+        anchors, present = self._anchors.anchors, self._anchors.present
+        floor = self._effects.near_ground_delays(anchors)
+        state = new_state(anchors.positions, self._effects.sensor_functions, floor)
+        places = np.zeros(len(self._anchors), int)
+        places[present] = np.arange(len(present))
+        return state._replace(anchors=state.anchors[places])
 
     def change_anchors(self, gone: np.ndarray) -> None:
         """Adapt the filter to a changed AnchorTable.
@@ -243,9 +211,20 @@ class Pipeline:
             anchors=np.concatenate([self.state.anchors, more.anchors[first:]])
         )
         self.state.record.extent[:] = more.record.extent
-        forget(self.state, gone)
+        self._forget(gone)
         if self.monitor is not None:
             self.monitor.forget(gone)
+
+    def _forget(self, gone: np.ndarray) -> None:
+        """Remove all measurements of the anchors in rows (k,) from the state of the filter."""
+        ekf = self.state.record
+        self.state.anchors["heard"][gone] = -np.inf
+        window = ekf["window"][: ekf["kept"]]
+        others = window[~(np.isin(window["a"], gone) | np.isin(window["b"], gone))]
+        if len(others):  # an empty window has no stamps to keep
+            ekf["window"][: len(others)], ekf["kept"] = others, len(others)
+        if ekf["ranged"]["anchor"][0] in gone:
+            ekf["ranged"]["t"] = -np.inf
 
     def run(self, buffer: ReorderBuffer, until: float) -> list[PipelineOutput]:
         """Process the rows that a ReorderBuffer holds up to the stamp `until`, in s.
@@ -281,11 +260,10 @@ class Pipeline:
         if not any(map(len, measured)):
             return []
         parts = []
-        for part in [measured] if self._corrections.idle else self._corrections.slices(measured):
+        for part in self._corrections.slices(measured):
             used = part if self._config.use_imu else part._replace(imu=part.imu[:0])
             fed = PipelineOutput(part, *feed(self.state, self._parameters, used, self._records))
-            if not self._corrections.idle:
-                self._corrections.add_odometry(fed.odometry)
+            self._corrections.add_odometry(fed.odometry)
             parts.append(fed)
         if self.monitor is not None:
             self.monitor.add(odometry_of(parts), self.residuals(parts))
@@ -293,10 +271,8 @@ class Pipeline:
 
     def residuals(self, parts: Sequence[PipelineOutput]) -> Residuals:
         """Return the Residuals of the TDOAs of several PipelineOutputs, in order of use."""
-        tdoa, rows = (
-            joined(TDOA, [part.measured.tdoa for part in parts]),
-            joined(RESIDUAL, [part.tdoas for part in parts]),
-        )
+        tdoa = joined(TDOA, [part.measured.tdoa for part in parts])
+        rows = joined(RESIDUAL, [part.tdoas for part in parts])
         ids = self._anchors.ids
         return Residuals.from_rows(tdoa["t"], ids[tdoa["a"]], ids[tdoa["b"]], rows)
 

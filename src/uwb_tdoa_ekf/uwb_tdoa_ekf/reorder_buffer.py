@@ -223,10 +223,11 @@ class ReorderBuffer:
                 elif t <= self._limit(place):
                     # pass the time on: bias_node may wait for the pose of this stamp
                     self._streams[place].gate.pass_time(t, self._reached(place))
+        stream = self._streams[place]
         if place in self._leading:
             self._judge(place)
-        else:
-            self._refuse_too_many(place)
+        elif len(stream) > MOST_WAITING:  # the leading streams are silent
+            self._refuse(place, stream.take_first(len(stream) - MOST_WAITING), LATE)
 
     def load(self, place: int, rows: np.ndarray) -> None:
         """Add rows of a recorded stream, sorted by stamp and not before earlier rows.
@@ -250,7 +251,8 @@ class ReorderBuffer:
         imu, tdoa, *parts = (stream.take(until) for stream in self._streams)
         parts = [part for part in parts if len(part)]
         felt = joined(SENSOR_ROW, parts) if parts else NO_SENSORS
-        felt = felt[np.lexsort((felt["kind"], felt["t"]))] if len(parts) > 1 else felt
+        if len(parts) > 1:
+            felt = felt[np.lexsort((felt["kind"], felt["t"]))]
         for part in (imu, tdoa, felt):
             if len(part):
                 self.used_until = max(self.used_until, float(part["t"][-1]))
@@ -312,12 +314,6 @@ class ReorderBuffer:
                 stream.ahead, stream.refused = True, compared
                 self._refuse(other, stream.drop_after(compared + LARGEST_LEADS[other]), INVALID)
 
-    def _refuse_too_many(self, place: int) -> None:
-        """Limit the number of waiting rows of a sensor while the leading streams are silent."""
-        stream = self._streams[place]
-        if len(stream) > MOST_WAITING:
-            self._refuse(place, stream.take_first(len(stream) - MOST_WAITING), LATE)
-
     def _take_in(self, place: int, t: float, row: np.ndarray) -> None:
         """Add one row if its stamp is accepted, with rows that were held because of their stamps.
 
@@ -337,24 +333,25 @@ class ReorderBuffer:
         stream.ahead = False
         newest, before = stream.gate.newest, self.newest
         accepted, outliers, jumped_back = stream.gate.take(t, row, self._reached(place))
-        if len(accepted) > 1 and place != self._reference and self._is_heard(newest):
-            self._refuse_outliers(place, outliers)
-            self._jump(place, accepted, newest)
-            return
-        if jumped_back and place == self._reference:
-            self._start_anew(
-                place, Restart(STREAMS[place], accepted[0][0] - newest, accepted[0][0])
-            )
-            newest = -math.inf
-            stream = self._streams[place]
         self._refuse_outliers(place, outliers)
-        if accepted and self._is_overtaken(place, accepted[-1][0]):
+        # the reference is heard while the clock of this stream has jumped: it defines the time
+        heard = self._streams[self._reference].gate.newest > newest - SILENT
+        jumped = len(accepted) > 1 and place != self._reference and heard
+        if jumped and self._refuse_jump(place, accepted, newest):
+            return
+        cause: Restart | None = None
+        if jumped_back and place == self._reference:
+            cause = Restart(STREAMS[place], accepted[0][0] - newest, accepted[0][0])
+        elif accepted and self._is_overtaken(place, accepted[-1][0]):
             cause = Restart(STREAMS[place], accepted[0][0] - before, accepted[0][0], overtaken=True)
+        if cause is not None:
             self._start_anew(place, cause)
-            newest = -math.inf
-            stream = self._streams[place]
+            newest, stream = -math.inf, self._streams[place]
         for t, row in accepted:
-            self._merge(place, t, row, newest)
+            if stream.policy.is_late(t, newest) or t < self.used_until:
+                self._refuse(place, row, LATE)
+            else:
+                stream.merge(row)
             newest = max(newest, t)
 
     def _refuse_ahead(self, place: int, t: float, row: np.ndarray) -> None:
@@ -363,14 +360,10 @@ class ReorderBuffer:
         stream.ahead, stream.lead, stream.refused = True, t - compared, compared
         self._refuse(place, row, INVALID)
 
-    def _is_heard(self, newest: float) -> bool:
-        """Return whether the reference has reached the stamp `newest`, in s, within SILENT."""
-        return self._streams[self._reference].gate.newest > newest - SILENT
-
-    def _jump(self, place: int, accepted: list[tuple[float, np.ndarray]], newest: float) -> None:
-        """Add rows of a stream whose clock has jumped while the clock of the reference has not.
-
-        The reference defines the time. A stream that is ahead does not move it.
+    def _refuse_jump(
+        self, place: int, accepted: list[tuple[float, np.ndarray]], newest: float
+    ) -> bool:
+        """Refuse rows of a stream whose clock has jumped ahead; return whether it has.
 
         Parameters
         ----------
@@ -383,34 +376,12 @@ class ReorderBuffer:
         """
         stream, compared = self._streams[place], self._compared(place)
         stream.lead = max(0.0, accepted[-1][0] - compared)
-        if stream.lead > LARGEST_LEADS[place]:
-            stream.gate.newest = newest
-            for t, row in accepted:
-                self._refuse_ahead(place, t, row)
-            return
+        if stream.lead <= LARGEST_LEADS[place]:
+            return False
+        stream.gate.newest = newest
         for t, row in accepted:
-            self._merge(place, t, row, newest)
-            newest = max(newest, t)
-
-    def _merge(self, place: int, t: float, row: np.ndarray, newest: float) -> None:
-        """Sort one row into the waiting rows, unless it is late.
-
-        Parameters
-        ----------
-        place : int
-            Place of the stream in STREAMS.
-        t : float
-            Stamp of the row, in s.
-        row : (1,) array
-            Row of the type in KINDS.
-        newest : float
-            Newest stamp of the stream before this row, in s.
-        """
-        stream = self._streams[place]
-        if stream.policy.is_late(t, newest) or t < self.used_until:
-            self._refuse(place, row, LATE)
-        else:
-            stream.merge(row)
+            self._refuse_ahead(place, t, row)
+        return True
 
     def _reached(self, place: int) -> list[float]:
         """Return the stamps, in s, that other leading streams have reached or may jump to."""
@@ -430,9 +401,10 @@ class ReorderBuffer:
         t : float
             Stamp of the last row, in s.
         """
-        if place != self._reference or t >= self.used_until - LARGEST_STEP_BACK:
-            if place == self._reference:
-                self._overtaken = None
+        if place != self._reference:
+            return False
+        if t >= self.used_until - LARGEST_STEP_BACK:
+            self._overtaken = None
             return False
         seen = self._streams[self._moving].seen
         if self._overtaken is None or t < self._overtaken[0]:

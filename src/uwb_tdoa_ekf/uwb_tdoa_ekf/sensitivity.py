@@ -93,29 +93,12 @@ class Innovations:
         regressors : (n, k) array
             Derivative of the measured values by parameters that the run did not model.
         """
-        return self.and_positions(regressors, ())[0]
-
-    def and_positions(
-        self, regressors: np.ndarray, stamps: ArrayLike
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the result of `by_bias` and the derivative of the estimated position, (m, 3, k).
-
-        Parameters
-        ----------
-        regressors : (n, k) array
-            As for `by_bias`.
-        stamps : (m,) array
-            Ascending stamps of the positions, in s.
-        """
-        regressors, stamps = (
-            np.ascontiguousarray(regressors, dtype=float),
-            np.asarray(stamps, dtype=float),
-        )
-        out, positions = np.zeros_like(regressors), np.zeros((len(stamps), 3, regressors.shape[1]))
-        states, passed = np.zeros((2, ERROR_STATES, regressors.shape[1])), 0
+        regressors = np.ascontiguousarray(regressors, dtype=float)
+        out, states = np.zeros_like(regressors), np.zeros((2, ERROR_STATES, regressors.shape[1]))
+        nowhere = np.empty(0), np.empty((0, 3, regressors.shape[1]))
         for records, of in zip(self.records, self.of):
-            passed = _through(records, of, regressors, states, out, (stamps, positions), passed)
-        return out, positions
+            _through(records, of, regressors, states, out, nowhere, 0)
+        return out
 
     def in_blocks(
         self,
@@ -138,7 +121,7 @@ class Innovations:
         stamps : (m,) array
             Ascending stamps of positions, in s.
         positions : (m, 3, k) array or None
-            Filled with the position derivatives of `and_positions`.
+            Filled with the derivatives of the estimated position at the stamps.
 
         Yields
         ------
@@ -151,10 +134,8 @@ class Innovations:
         """
         stamps, t = np.asarray(stamps, dtype=float), self.t
         ends = np.append(np.flatnonzero(np.diff(block)) + 1, len(block))
-        state, last = (
-            np.zeros((ERROR_STATES, regressors.shape[1])),
-            np.full(regressors.shape[1], -np.inf),
-        )
+        state = np.zeros((ERROR_STATES, regressors.shape[1]))
+        last = np.full(regressors.shape[1], -np.inf)
         pieces, passed, first = _pieces(self.records, self.of, ends), 0, 0
         for end, piece in zip(ends.tolist(), pieces):
             rows = slice(first, end)
@@ -162,24 +143,15 @@ class Innovations:
             columns = np.flatnonzero(last >= t[first] - FORGOTTEN)
             states = np.zeros((2, ERROR_STATES, len(columns)))
             states[0], state[:] = state[:, columns], 0.0
-            known, moved = (
-                regressors[rows][:, columns].toarray(),
-                np.zeros((len(stamps), 3, len(columns))),
-            )
+            known = regressors[rows][:, columns].toarray()
+            path = stamps, np.zeros((len(stamps), 3, len(columns)))
             out, before = np.zeros_like(known), passed
             for records, of in piece:
-                passed = _through(
-                    records,
-                    np.where(of >= 0, of - first, -1),
-                    known,
-                    states,
-                    out,
-                    (stamps, moved),
-                    passed,
-                )
+                own = np.where(of >= 0, of - first, -1)
+                passed = _through(records, own, known, states, out, path, passed)
             state[:, columns] = states[0]
             if positions is not None and passed > before:
-                positions[before:passed, :, columns] = moved[before:passed]
+                positions[before:passed, :, columns] = path[1][before:passed]
             yield rows, columns, out
             first = end
 

@@ -131,9 +131,8 @@ def _smoothed_run(flight: Flight, config: FilterConfig, corrector: Corrector | N
     records: list[np.ndarray] = []
     result = run_offline(flight, config, corrector, records)
     records = [part for part in records if len(part)]
-    before = [-math.inf] + [
-        part["t"][-1] for part in records
-    ]  # stamp of the record before each array of records
+    # stamp of the record before each array of records
+    before = [-math.inf, *(part["t"][-1] for part in records)]
     adjoint, information = np.zeros(ERROR_STATES), np.zeros((ERROR_STATES, ERROR_STATES))
     rows = [np.empty(0, ODOMETRY)]
     for k in reversed(range(len(records))):
@@ -237,6 +236,7 @@ def _smoothed(record: Record, adjoint: np.ndarray, information: np.ndarray, row:
         for k in range(ERROR_STATES):
             correction[j] -= P[j, k] * adjoint[k]
     row.t = record.t
+    row.rate[:], row.rate_variance[:] = np.nan, np.nan
     row.x[:] = record.x
     inject(row.x, correction, 1.0)
     for i in range(9):

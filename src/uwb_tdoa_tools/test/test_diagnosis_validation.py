@@ -12,8 +12,8 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.correction.corrector import Corrector, FixedPoseCorrector
 from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, EffectSet, SmoothTerm, TagLeverArm
 from uwb_tdoa_bias.effects.samples import Track
-from uwb_tdoa_ekf.frames import poses_of
 from uwb_tdoa_ekf.offline import run_offline
+from uwb_tdoa_ekf.results import poses_of
 from uwb_tdoa_tools.diagnosis import comparison, validation
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.comparison import (

@@ -14,7 +14,7 @@ from typing import Any
 
 from uwb_tdoa_bias.common.compiled import Record, compiled
 
-from .state import ERROR_STATES
+from .state import ERROR_STATES, propagate_vector
 
 # offset of the barometer (m), its drift (m/s), offset of all ranges (m)
 PRESSURE, PRESSURE_DRIFT, RANGE = 0, 1, 2
@@ -61,8 +61,7 @@ def add_offset_jacobian(hypothesis: Record, innovation: Record, state: int) -> N
     own = 0.0
     for n in range(innovation.entries):
         own += innovation.row[n] * cross[state, innovation.states[n]]
-    for j in range(ERROR_STATES):
-        innovation.cross_covariance[j] += cross[state, j]
+    innovation.cross_covariance[:] += cross[state]
     innovation.prior_variance += 2.0 * own + P[state, state]
     innovation.offset_jacobian[state] = 1.0
 
@@ -95,30 +94,15 @@ def predict(hypothesis: Record, transition: Record) -> None:
 
     Call after `state.predict` of a HYPOTHESIS that has auxiliary states, with the same TRANSITION.
     """
-    dt, cross = transition.dt, hypothesis.offset_cross
-    A, B, E = (
-        transition.velocity_attitude,
-        transition.velocity_accel_bias,
-        transition.attitude_attitude,
-    )
     for k in range(OFFSET_STATES):
-        t0, t1, t2 = cross[k, 6], cross[k, 7], cross[k, 8]
-        for r in range(3):
-            cross[k, r] += dt * cross[k, 3 + r]
-            by_attitude = A[r, 0] * t0 + A[r, 1] * t1 + A[r, 2] * t2
-            by_bias = B[r, 0] * cross[k, 9] + B[r, 1] * cross[k, 10] + B[r, 2] * cross[k, 11]
-            cross[k, 3 + r] += by_attitude + by_bias
-            cross[k, 6 + r] = E[r, 0] * t0 + E[r, 1] * t1 + E[r, 2] * t2 - dt * cross[k, 12 + r]
-    _drift(hypothesis, dt)
+        propagate_vector(hypothesis.offset_cross[k], transition)
+    _drift(hypothesis, transition.dt)
 
 
 @compiled
 def coast(hypothesis: Record, dt: float) -> None:
     """Predict the auxiliary states over dt (s), after `state.coast` of the same HYPOTHESIS."""
-    cross = hypothesis.offset_cross
-    for k in range(OFFSET_STATES):
-        for r in range(3):
-            cross[k, r] += dt * cross[k, 3 + r]
+    hypothesis.offset_cross[:, :3] += dt * hypothesis.offset_cross[:, 3:6]
     _drift(hypothesis, dt)
 
 

@@ -12,14 +12,12 @@ import math
 import numpy as np
 
 from uwb_tdoa_bias.common.compiled import Record, compiled
-from uwb_tdoa_bias.common.robust_loss import GEMAN_MCCLURE, weight
 
 from .auxiliary import PRESSURE, PRESSURE_DRIFT, RANGE, add_offset_jacobian
 from .height import GATE, MEMORY
 from .hypotheses import alive
 from .memory import REJECTED, USED
-from .state import ERROR_STATES
-from .update import kalman, project
+from .update import kalman_robust, project
 
 # Set on the six flights of 0425/TDOA2, see docs/notebook/auxiliary_sensors.md.
 AVERAGE = 3.0  # s over which innovations are averaged to inflate the random walk of the offset
@@ -63,10 +61,9 @@ def observe(
         _compare(hypothesis, altitude, parameters, innovation)
         total = innovation.prior_variance + innovation.noise_variance
         normalized = innovation.value / math.sqrt(total)
-        w = weight(GEMAN_MCCLURE, normalized, GATE) if abs(normalized) < GATE else 0.0
-        if w > 0.0:
-            innovation.total_variance = innovation.prior_variance + innovation.noise_variance / w
-            kalman(hypothesis, innovation)
+        w = 0.0
+        if abs(normalized) < GATE:
+            w = kalman_robust(hypothesis, innovation, 1.0, GATE)
         if h == ekf.best:
             step = min(1.0, dt / AVERAGE)
             barometer.nis += step * (min(normalized**2, GATE**2) * excess - barometer.nis)
@@ -95,8 +92,7 @@ def _take_anew(hypothesis: Record, altitude: float, parameters: Record) -> None:
     """Initialize the offset and drift of a HYPOTHESIS from an altitude, in m."""
     hypothesis.offset[PRESSURE], hypothesis.offset[PRESSURE_DRIFT] = altitude - hypothesis.x[2], 0.0
     cross, P = hypothesis.offset_cross, hypothesis.offset_P
-    for j in range(ERROR_STATES):
-        cross[PRESSURE, j], cross[PRESSURE_DRIFT, j] = -hypothesis.P[2, j], 0.0
+    cross[PRESSURE], cross[PRESSURE_DRIFT] = -hypothesis.P[2], 0.0
     P[:RANGE, :] = 0.0
     P[:, :RANGE] = 0.0
     P[PRESSURE, PRESSURE] = hypothesis.P[2, 2] + parameters.pressure_std**2

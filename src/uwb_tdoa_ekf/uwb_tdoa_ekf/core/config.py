@@ -229,14 +229,6 @@ class FilterConfig(_SensorParameters):
             object.__setattr__(self, "fixed_height_std", PLANAR_HEIGHT_STD)
 
     @classmethod
-    def from_parameters(cls, parameters: dict[str, Any]) -> "FilterConfig":
-        """Return the configuration from a dict by name; other names are ignored.
-
-        Raises InputError.
-        """
-        return cls(**{f.name: parameters[f.name] for f in fields(cls) if f.name in parameters})
-
-    @classmethod
     def from_yaml(cls, path: str | Path) -> "FilterConfig":
         """Read the ros__parameters of a node's parameter file.
 
@@ -245,7 +237,8 @@ class FilterConfig(_SensorParameters):
         content = read_yaml(path)
         try:
             (node,) = content.values()
-            return cls.from_parameters(node["ros__parameters"])
+            given = node["ros__parameters"]
+            return cls(**{f.name: given[f.name] for f in fields(cls) if f.name in given})
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
         except (AttributeError, KeyError, TypeError, ValueError) as error:

@@ -8,7 +8,7 @@ FilterState holds the entire state between two calls. Each TDOA or range takes f
    (initialization.start).
 2. `_prepare`: detect rest (stationarity) and a position that is unknown after a silence.
 3. `_update` each hypothesis: innovation and Jacobian row (`_compare`, ranges.compare), weight
-   (robust.weigh), gain (update.kalman), probability (hypotheses.add_log_likelihood).
+   (update.weigh), gain (update.kalman), probability (hypotheses.add_log_likelihood).
 4. `_select` the best hypothesis (hypotheses.select).
 5. `_recover` a filter that its TDOAs contradict (initialization.recover).
 """
@@ -35,7 +35,6 @@ from . import (
     noise,
     plane,
     ranges,
-    robust,
     sensors,
     stationarity,
     update,
@@ -58,7 +57,6 @@ from .memory import (
     Measurements,
     Output,
 )
-from .sensor_functions import subtract
 from .startup import INLIER
 from .state import CONSTRAINT_PERIOD, coast, predict, turn_about_vertical
 from .update import project
@@ -90,11 +88,12 @@ def run(
     Parameters
     ----------
     state : FilterState
-        Updated in place. Its sensor functions are subtracted from the inertial samples in place.
+        Updated in place.
     parameters : (1,) PARAMETERS
         Tuning of the filter.
     measurements : Measurements
-        Inertial samples, TDOAs and other measurements, each by rising stamp.
+        Inertial samples, TDOAs and other measurements, each by rising stamp. The sensor functions
+        are subtracted from the samples in place, and the delays of the anchors from the TDOAs.
     output : Output
         Filled by this function.
 
@@ -118,7 +117,7 @@ def run(
         t = min(of_imu, of_tdoa, of_sensor)
         if of_imu == t and i < len(imu):
             if len(state.functions) and ekf.running:
-                subtract(state.functions, ekf.hypotheses[ekf.best].x, imu[i])
+                inertial.subtract(state.functions, ekf.hypotheses[ekf.best].x, imu[i])
             _on_imu(ekf, values, imu[i], output.history)
             i += 1
         elif of_tdoa == t and k < len(tdoa):
@@ -128,9 +127,8 @@ def run(
             _on_sensor(ekf, anchors, values, sensor[m], output.sensors[m], output.history)
             m += 1
         if ekf.running and t >= ekf.next_odometry:
-            ekf.next_odometry = (
-                math.floor(t * values.odometry_rate + 1e-6) + 1.0
-            ) / values.odometry_rate
+            number = math.floor(t * values.odometry_rate + 1e-6) + 1.0
+            ekf.next_odometry = number / values.odometry_rate
             _report(ekf, values, t, output.odometry[rows])
             rows += 1
     return rows
@@ -183,10 +181,8 @@ def _on_imu(ekf: Record, parameters: Record, sample: Record, records: np.ndarray
     if imu_faulty != ekf.imu_faulty:
         ekf.imu_faulty = imu_faulty
         _switch(ekf, parameters, records)
-    first, averaged = (
-        ekf.imu.t == -np.inf,
-        ekf.attitude_averaged_until > -np.inf and sample.t >= ekf.attitude_averaged_until,
-    )
+    first = ekf.imu.t == -np.inf
+    averaged = -np.inf < ekf.attitude_averaged_until <= sample.t
     if first and ekf.running and parameters.use_imu:
         ekf.attitude_averaged_until = sample.t + AVERAGED
     elif averaged or not ekf.running:
@@ -228,12 +224,12 @@ def _on_tdoa(
     residual: Record,
     records: np.ndarray,
 ) -> None:
-    residual.innovation = residual.variance = np.nan
-    residual.weight, residual.verdict = 0.0, STARTUP
-    if initialization.is_repeat(ekf, tdoa, anchors):
+    _fill(residual, np.nan, np.nan, 0.0, STARTUP)
+    delay = _subtract_delays(tdoa, anchors)
+    if initialization.is_repeat(ekf, tdoa):
         residual.verdict = REPEATED
         return
-    initialization.remember(ekf, tdoa, anchors)
+    initialization.remember(ekf, tdoa)
     t = tdoa.t
     if not _predict_or_initialize(ekf, anchors, parameters, t, records):
         return
@@ -246,11 +242,22 @@ def _on_tdoa(
         return
     late = _update(ekf, anchors, parameters, tdoa, residual, records)
     initialization.relocate(ekf, anchors, parameters, t, records)
-    known = anchors[tdoa.b].delay - anchors[tdoa.a].delay
     _select(ekf, parameters, t, records)
     if not late:
-        _note_agreement(ekf, t, abs(residual.innovation - known) < INLIER)
+        _note_agreement(ekf, t, abs(residual.innovation) < INLIER)
     _recover(ekf, anchors, parameters, t, records)
+    if anchors[tdoa.a].delay != 0.0 or anchors[tdoa.b].delay != 0.0:
+        residual.innovation += delay
+        if residual.verdict == USED:
+            residual.verdict = COMPENSATED
+
+
+@compiled
+def _subtract_delays(tdoa: Record, anchors: np.ndarray) -> float:
+    """Subtract the delays of its anchors from a TDOA, and return their difference, in m."""
+    delay = anchors[tdoa.b].delay - anchors[tdoa.a].delay
+    tdoa.d -= delay
+    return delay
 
 
 @compiled
@@ -270,7 +277,8 @@ def _on_range(
         residual.verdict = REPEATED
         return
     if ranges.pair(ekf, sensor):
-        initialization.remember(ekf, ekf.paired[0], anchors)
+        _subtract_delays(ekf.paired[0], anchors)
+        initialization.remember(ekf, ekf.paired[0])
     t = sensor.t
     if not _predict_or_initialize(ekf, anchors, parameters, t, records):
         return
@@ -301,14 +309,8 @@ def _prepare(
     """
     if parameters.zero_velocity:
         if t >= ekf.next_look:
-            stationarity.check_stationarity(
-                ekf,
-                anchors,
-                parameters,
-                initialization.recent(ekf, stationarity.LOOK_WINDOW),
-                t,
-                records,
-            )
+            window = initialization.recent(ekf, stationarity.LOOK_WINDOW)
+            stationarity.check_stationarity(ekf, anchors, parameters, window, t, records)
         if not parameters.use_imu or t - ekf.imu.t > parameters.imu_timeout:
             stationarity.update_zero_velocity(ekf, t, records)
     if t >= ekf.next_bounds:
@@ -367,16 +369,15 @@ def _on_sensor(
     residual: Record,
     records: np.ndarray,
 ) -> None:
-    residual.innovation = residual.variance = np.nan
-    residual.weight, residual.verdict = 0.0, STARTUP
+    _fill(residual, np.nan, np.nan, 0.0, STARTUP)
     if sensor.kind == sensors.RANGE:
         _on_range(ekf, anchors, parameters, sensor, residual, records)
     elif ekf.running and _predict(ekf, parameters, sensor.t, records):
         if sensor.kind == sensors.VELOCITY and not parameters.use_imu:
             initialization.open_unknown_yaw(ekf, parameters, records)
         sensors.observe(ekf, parameters, sensor, residual, records)
-    else:
-        sensors.record(ekf, sensor)
+    elif sensor.kind == sensors.HEIGHT:
+        height.record(ekf, sensor)
 
 
 @compiled
@@ -477,13 +478,8 @@ def _coast(ekf: Record, hypothesis: Record, parameters: Record, dt: float) -> No
     yaw_psd = alike * wheels.yaw_rate_variance if driven else turn_psd
     if not parameters.use_imu and hypothesis.P[8, 8] > initialization.ANY_YAW**2:
         yaw_psd = 0.0
-    coast(
-        hypothesis,
-        dt,
-        parameters.motion_noise**2,
-        turn_psd if parameters.use_imu else 0.0,
-        yaw_psd,
-    )
+    tilt_psd = turn_psd if parameters.use_imu else 0.0
+    coast(hypothesis, dt, parameters.motion_noise**2, tilt_psd, yaw_psd)
     if driven:
         turn_about_vertical(hypothesis.x, wheels.yaw_rate * dt)
         for k in range(2):
@@ -515,7 +511,7 @@ def _update(
     innovation.noise_variance = (
         parameters.tdoa_std**2 + tdoa.variance + a.delay_variance + b.delay_variance
     )
-    change = known = b.delay - a.delay
+    known = 0.0
     on_floor = ekf.resting and ekf.late_as_known
     if on_floor and not math.isnan(a.floor_delay):
         known -= a.floor_delay
@@ -524,7 +520,7 @@ def _update(
         known += b.floor_delay
         innovation.noise_variance += b.floor_std**2
     if parameters.adapt_noise:
-        innovation.noise_variance += noise.excess_variance(a, b)
+        innovation.noise_variance += a.excess_variance + b.excess_variance
     innovation.noise_variance += ground.blur(ekf.hypotheses[ekf.best], parameters.ground_height)
     if not on_floor and ground.find_lateness(
         a, b, ekf.hypotheses[ekf.best], tdoa.t, parameters.ground_height
@@ -532,13 +528,11 @@ def _update(
         _compare(ekf.hypotheses[ekf.best], a, b, tdoa, known, innovation)
         in_time = ground.in_time(a, b, innovation)
         if in_time < ground.NOT_USED:
-            residual.innovation = innovation.value + change
-            residual.variance = innovation.prior_variance + innovation.noise_variance
-            residual.verdict = REJECTED
+            _reject(residual, innovation)
             return True
         innovation.noise_variance /= in_time
-    if tdoa.t < ekf.rival_until and _is_of_rival(ekf, a, b, tdoa, known, residual):
-        residual.innovation += change
+    if tdoa.t < ekf.rival_until and _is_of_rival(ekf, a, b, tdoa, known):
+        _reject(residual, innovation)
         return False
     for h in range(HYPOTHESES):
         hypothesis = ekf.hypotheses[h]
@@ -552,31 +546,34 @@ def _update(
             height.update_pull(ekf.height, parameters, innovation, tdoa.t)
             if parameters.adapt_noise:
                 noise.learn(a, b, tdoa.t, innovation, parameters)
-    if a.delay != 0.0 or b.delay != 0.0:
-        residual.innovation += change
-        if residual.verdict == USED:
-            residual.verdict = COMPENSATED
     return False
 
 
 @compiled
-def _is_of_rival(
-    ekf: Record, a: Record, b: Record, tdoa: Record, known: float, residual: Record
-) -> bool:
+def _fill(
+    residual: Record, innovation: float, variance: float, weight: float, verdict: int
+) -> None:
+    """Fill in a RESIDUAL."""
+    residual.innovation, residual.variance = innovation, variance
+    residual.weight, residual.verdict = weight, verdict
+
+
+@compiled
+def _reject(residual: Record, innovation: Record) -> None:
+    """Fill in the RESIDUAL of a rejected INNOVATION."""
+    variance = innovation.prior_variance + innovation.noise_variance
+    _fill(residual, innovation.value, variance, 0.0, REJECTED)
+
+
+@compiled
+def _is_of_rival(ekf: Record, a: Record, b: Record, tdoa: Record, known: float) -> bool:
     """Return whether a TDOA contradicts the position of a filter that follows wheels.
 
-    The residual is filled. Wheels outweigh TDOAs that agree on another place for a while. Even with
-    small robust weights, many such TDOAs would pull the position.
+    Wheels outweigh TDOAs that agree on another place for a while. Even with small robust weights,
+    many such TDOAs would pull the position.
     """
-    innovation = ekf.innovation
-    noise_variance = innovation.noise_variance
-    _compare(ekf.hypotheses[ekf.best], a, b, tdoa, known, innovation)
-    residual.innovation, residual.variance = (
-        innovation.value,
-        innovation.prior_variance + noise_variance,
-    )
-    residual.weight, residual.verdict = 0.0, REJECTED
-    return abs(innovation.value) > INLIER
+    _compare(ekf.hypotheses[ekf.best], a, b, tdoa, known, ekf.innovation)
+    return abs(ekf.innovation.value) > INLIER
 
 
 @compiled
@@ -597,13 +594,12 @@ def _compare(
     tdoa : TDOA
         Measurement, m.
     known : float
-        Known error of the TDOA by delays of its anchors, m.
+        Known error of the TDOA by late anchors near the ground, m.
     innovation : INNOVATION
         Filled by this function.
     """
-    innovation.value = (
-        tdoa.d - known - linearized_tdoa(hypothesis.x, a.position, b.position, innovation.row)
-    )
+    predicted = linearized_tdoa(hypothesis.x, a.position, b.position, innovation.row)
+    innovation.value = tdoa.d - known - predicted
     innovation.entries = 3
     for k in range(N_STATES):
         innovation.states[k] = k
@@ -635,23 +631,18 @@ def _update_hypothesis(
     evidence for the yaw. Ranges are not: their common offset looks the same as a wrong yaw.
     """
     hypothesis, innovation = ekf.hypotheses[h], ekf.innovation
-    hypotheses.add_log_likelihood(
-        hypothesis, innovation, parameters.tdoa_correlation_length * innovation.variance_inflation
-    )
-    robust.weigh(hypothesis, innovation, parameters)
+    correlation_length = parameters.tdoa_correlation_length * innovation.variance_inflation
+    hypotheses.add_log_likelihood(hypothesis, innovation, correlation_length)
+    update.weigh(hypothesis, innovation, parameters)
     if innovation.weight > 0.0:
         update.kalman(hypothesis, innovation)
     if h == ekf.best:
-        residual.innovation = innovation.value
-        residual.variance = innovation.prior_variance + innovation.noise_variance
-        residual.weight = innovation.weight
-        residual.verdict = USED if innovation.weight > 0.0 else REJECTED
         if ekf.yaw_test.alone:
-            yaw_check.observe(
-                ekf, parameters.tdoa_correlation_length * innovation.variance_inflation, of_tdoa
-            )
-        if residual.verdict == USED:
-            history.add_update(ekf, t, records)
+            yaw_check.observe(ekf, correlation_length, of_tdoa)
+        _reject(residual, innovation)
+        if innovation.weight > 0.0:
+            residual.weight, residual.verdict = innovation.weight, USED
+            history.add_update(ekf, h, t, records)
 
 
 @compiled
@@ -664,8 +655,8 @@ def _stay_in_workspace(ekf: Record, t: float, records: np.ndarray) -> None:
             history.add_reset(ekf, t, records)
         for axis in range(3):
             outside = workspace.constrain(ekf.hypotheses[h], ekf.innovation, ekf.workspace, axis)
-            if outside and h == ekf.best:
-                history.add_update(ekf, t, records)
+            if outside:
+                history.add_update(ekf, h, t, records)
 
 
 @compiled
@@ -694,8 +685,25 @@ def _report(ekf: Record, parameters: Record, t: float, row: Record) -> None:
     row.covariance[:3, :3] += row.consider_covariance
     if t < ekf.rival_until:
         _widen(ekf, best.x, row.covariance)
+    _report_rate(ekf, parameters, t, row)
     if parameters.planar:
         plane.flatten(row, parameters, wrong)
+
+
+@compiled
+def _report_rate(ekf: Record, parameters: Record, t: float, row: Record) -> None:
+    """Write the angular rate at stamp t (s) to an ODOMETRY row.
+
+    It is the rate of the last inertial sample minus the bias of the gyroscope. White noise of the
+    density gyro_noise has the variance gyro_noise^2 / period in each sample. Without a recent
+    sample, wheels give the rate about z.
+    """
+    row.rate[:], row.rate_variance[:] = np.nan, np.nan
+    if t - ekf.imu.t <= parameters.imu_timeout:
+        row.rate[:] = ekf.imu.gyro - row.x[13:]
+        row.rate_variance[:] = parameters.gyro_noise**2 / ekf.imu.period
+    elif t - ekf.velocity.agreed <= velocity.HELD:
+        row.rate[2], row.rate_variance[2] = ekf.velocity.yaw_rate, ekf.velocity.yaw_rate_variance
 
 
 @compiled
@@ -704,9 +712,7 @@ def _widen(ekf: Record, x: np.ndarray, covariance: np.ndarray) -> None:
 
     x is the position (3,) in m, world frame. covariance is (9, 9), updated in place.
     """
-    square = 0.0
-    for k in range(3):
-        square += (ekf.rival[k] - x[k]) ** 2
+    square = np.sum((ekf.rival - x[:3]) ** 2)
     for k in range(3):
         covariance[k, k] += square
 

@@ -20,7 +20,7 @@ from uwb_tdoa_bias.common.compiled import Record, compiled
 from uwb_tdoa_bias.common.geometry import linearized_tdoa
 
 from .update import GATE
-from .workspace import STD
+from .workspace import STD, rows_heard
 
 # tangent of the elevation below which the ground inverts the phase of a reflection
 GRAZING = math.tan(math.radians(15.0))
@@ -223,6 +223,7 @@ def find_pairs(window: np.ndarray, pairs: np.ndarray) -> int:
     n, count = len(window), 0
     middle = 0.5 * (window[0].t + window[n - 1].t)
     values, deviations, known = np.empty((2, n)), np.empty(n), 0
+    counts, stamps = np.empty(2, np.int64), np.empty(2)  # of a pair in each half
     for i in range(n):
         a, b = window[i].a, window[i].b
         k = 0
@@ -230,16 +231,15 @@ def find_pairs(window: np.ndarray, pairs: np.ndarray) -> int:
             k += 1
         if k < count or count == len(pairs):
             continue
-        m0 = m1 = 0
-        t0 = t1 = 0.0
+        counts[:], stamps[:] = 0, 0.0
         for j in range(i, n):
             tdoa = window[j]
             if _is_of(tdoa, a, b):
-                d = tdoa.d if tdoa.a == a else -tdoa.d
-                if tdoa.t < middle:
-                    values[0, m0], t0, m0 = d, t0 + tdoa.t, m0 + 1
-                else:
-                    values[1, m1], t1, m1 = d, t1 + tdoa.t, m1 + 1
+                half = 0 if tdoa.t < middle else 1
+                values[half, counts[half]] = tdoa.d if tdoa.a == a else -tdoa.d
+                stamps[half] += tdoa.t
+                counts[half] += 1
+        m0, m1 = counts
         pair = pairs[count]
         pair.a, pair.b, pair.change_variance = a, b, np.inf
         if m0 >= STILL_TDOAS and m1 >= STILL_TDOAS:
@@ -248,7 +248,7 @@ def find_pairs(window: np.ndarray, pairs: np.ndarray) -> int:
                 for j in range(m):
                     deviations[known] = abs(values[half, j] - value) * math.sqrt(m / (m - 1.0))
                     known += 1
-            pair.change, pair.apart = second - first, t1 / m1 - t0 / m0
+            pair.change, pair.apart = second - first, stamps[1] / m1 - stamps[0] / m0
             pair.change_variance = 1.57 * (1.0 / m0 + 1.0 / m1)
         for j in range(m1):
             values[0, m0 + j] = values[1, j]
@@ -293,10 +293,8 @@ def judge_motion(
         pair = pairs[k]
         if pair.change_variance < np.inf:
             linearized_tdoa(x, anchors[pair.a].position, anchors[pair.b].position, changes[n, :3])
-            changes[n, 3], changes[n, 4] = (
-                pair.change / pair.apart,
-                pair.change_variance / pair.apart**2,
-            )
+            changes[n, 3] = pair.change / pair.apart
+            changes[n, 4] = pair.change_variance / pair.apart**2
             ratios[n] = pair.change**2 / pair.change_variance
             n += 1
     if n < FEWEST_PAIRS:
@@ -387,11 +385,8 @@ def explain(
             u[j] += min(1.0, 2.0 / max(length, 1e-9)) * step[j]
     cost = _equations(evidence, height, places, late, errors, u, system)
     x[:] = u[:3]
-    both = np.concatenate((system[:, :n], np.eye(n)), axis=1)
-    if not solve(both):
-        return np.inf
-    covariance[:, :] = both[:3, n : n + 3]
-    return cost
+    covariance[:, :] = inverse(system[:, :n])[:3, :3]
+    return cost if covariance[0, 0] > 0.0 else np.inf
 
 
 @compiled
@@ -400,18 +395,14 @@ def heard(pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     An index is -1 beyond MOST_ANCHORS.
     """
-    rows, places, count = np.empty(MOST_ANCHORS, np.int64), np.full((len(pairs), 2), -1), 0
+    rows, places = rows_heard(pairs)[:MOST_ANCHORS], np.full((len(pairs), 2), -1)
     for k in range(len(pairs)):
-        for side in range(2):
-            row = pairs[k].a if side == 0 else pairs[k].b
-            j = 0
-            while j < count and rows[j] != row:
-                j += 1
-            if j == count and count < MOST_ANCHORS:
-                rows[count] = row
-                count += 1
-            places[k, side] = j if j < MOST_ANCHORS else -1
-    return rows[:count], places
+        for j in range(len(rows)):
+            if rows[j] == pairs[k].a:
+                places[k, 0] = j
+            elif rows[j] == pairs[k].b:
+                places[k, 1] = j
+    return rows, places
 
 
 @compiled
@@ -430,13 +421,7 @@ def _equations(
     share (m). system is (n, n + 1). errors is (k, 2), in m: expected error of an anchor that is not
     late, and its standard deviation.
     """
-    pairs, anchors, workspace, prior, parameters = (
-        evidence.pairs,
-        evidence.anchors,
-        evidence.workspace,
-        evidence.prior,
-        evidence.parameters,
-    )
+    pairs, anchors, workspace, prior, parameters = evidence
     n = len(u)
     system[:, :] = 0.0
     row, cost = np.empty(3), 0.0
@@ -462,12 +447,9 @@ def _equations(
         if late[i]:
             apart = u[3 + i] - u[n - 1]
             square = 0.5 * (apart / ALIKE_STD) ** 2
-            alike, other, timely = (
-                1.0 / (1.0 + square),
-                OTHER,
-                TIMELY * math.exp(-0.5 * (u[3 + i] / of_anchor) ** 2),
-            )
-            total = alike + other + timely
+            alike = 1.0 / (1.0 + square)
+            timely = TIMELY * math.exp(-0.5 * (u[3 + i] / of_anchor) ** 2)
+            total = alike + OTHER + timely
             cost -= math.log(total)
             states[0], entries[0], states[1], entries[1] = 3 + i, 1.0, n - 1, -1.0
             _add(
@@ -519,6 +501,16 @@ def _add(
         for j in range(len(states)):
             system[states[i], states[j]] += weight * entries[i] * entries[j]
         system[states[i], last] += weight * entries[i] * r
+
+
+@compiled
+def inverse(matrix: np.ndarray) -> np.ndarray:
+    """Return the inverse of a positive definite matrix; NaN if there is none."""
+    n = len(matrix)
+    both = np.concatenate((matrix, np.eye(n)), axis=1)
+    if not solve(both):
+        both[:, :] = np.nan
+    return both[:, n:]
 
 
 @compiled

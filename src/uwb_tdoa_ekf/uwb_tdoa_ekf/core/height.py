@@ -20,11 +20,11 @@ from uwb_tdoa_bias.common.compiled import Record, compiled
 from uwb_tdoa_bias.common.robust_loss import GEMAN_MCCLURE, weight
 
 from .history import add_reset, add_update
-from .hypotheses import LARGEST_NIS, alive
+from .hypotheses import add_log_likelihood, alive
 from .inertial import UPRIGHT
 from .memory import N_YAWS, REJECTED, USED
 from .state import rotation
-from .update import kalman, project
+from .update import kalman_robust, project
 from .workspace import STD
 
 # Set on the six flights of 0425/TDOA2, see docs/notebook/auxiliary_sensors.md.
@@ -64,10 +64,8 @@ def observe(
     records : (n,) RECORD
         History for the smoother; empty for no recording.
     """
-    height, share = (
-        ekf.height,
-        min(max(sensor.t - ekf.height.heard, 0.0) / (2.0 * CORRELATION_TIME), 1.0),
-    )
+    height = ekf.height
+    share = min(max(sensor.t - height.heard, 0.0) / (2.0 * CORRELATION_TIME), 1.0)
     record(ekf, sensor)
     residual.weight, residual.verdict = 0.0, REJECTED
     innovation, distance = ekf.innovation, sensor.value[0] + parameters.height_arm
@@ -104,23 +102,19 @@ def observe(
         if not _settle(ekf, parameters, sensor.t, base_innovation, limit, records):
             return
     since = sensor.t - height.used
-    height.agreed += min(since, MEMORY) if since < MEMORY else 0.0
+    if since < MEMORY:
+        height.agreed += since
     height.used, height.disagreeing = sensor.t, max(0, height.disagreeing - 1)
+    inflation = max(1.0, 2.0 * CORRELATION_TIME / max(min(since, MEMORY), 1e-3))
     for h in range(len(ekf.hypotheses)):
         hypothesis = ekf.hypotheses[h]
         if not alive(hypothesis):
             continue
         compare(hypothesis, height.level, distance, parameters, ekf.transition.rotation, innovation)
-        total = innovation.prior_variance + innovation.noise_variance
-        w = weight(GEMAN_MCCLURE, innovation.value / math.sqrt(total), GATE)
-        inflation = max(1.0, 2.0 * CORRELATION_TIME / max(min(since, MEMORY), 1e-3))
-        innovation.total_variance = (
-            innovation.prior_variance + innovation.noise_variance * inflation / w
-        )
-        kalman(hypothesis, innovation)
+        w = kalman_robust(hypothesis, innovation, inflation, GATE)
+        add_update(ekf, h, sensor.t, records)
         if h == ekf.best:
             residual.weight, residual.verdict = w, USED
-            add_update(ekf, sensor.t, records)
 
 
 @compiled
@@ -192,12 +186,7 @@ def _weigh_places(ekf: Record, parameters: Record, distance: float, share: float
                 ekf.transition.rotation,
                 innovation,
             )
-            variance = innovation.prior_variance + innovation.noise_variance
-            hypothesis.log_weight -= (
-                0.5
-                * share
-                * (min(innovation.value**2 / variance, LARGEST_NIS) + math.log(variance))
-            )
+            add_log_likelihood(hypothesis, innovation, 1.0, share)
     return several
 
 

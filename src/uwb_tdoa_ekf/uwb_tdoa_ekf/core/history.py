@@ -47,9 +47,7 @@ def add_coasting(ekf: Record, dt: float, history: np.ndarray) -> None:
     dt is the duration in s.
     """
     if len(history) > 0:
-        for r in range(3):
-            for j in range(ERROR_STATES):
-                ekf.since_record[r, j] += dt * ekf.since_record[3 + r, j]
+        ekf.since_record[:3] += dt * ekf.since_record[3:6]
 
 
 @compiled
@@ -63,9 +61,9 @@ def replace_velocity(ekf: Record, history: np.ndarray) -> None:
 
 
 @compiled
-def add_update(ekf: Record, t: float, history: np.ndarray) -> None:
-    """Record a Kalman update of the best hypothesis with ekf.innovation at stamp t (s)."""
-    if len(history) > 0:
+def add_update(ekf: Record, h: int, t: float, history: np.ndarray) -> None:
+    """Record a Kalman update of hypothesis h with ekf.innovation at stamp t (s), if h is the best."""
+    if h == ekf.best and len(history) > 0:
         record = _next(ekf, t, UPDATE, history)
         innovation = ekf.innovation
         record.innovation, record.variance = innovation.value, innovation.total_variance
@@ -103,7 +101,5 @@ def _next(ekf: Record, t: float, kind: int, history: np.ndarray) -> Record:
     record.x[:] = best.x
     record.P[:] = best.P
     ekf.recorded += 1
-    for i in range(ERROR_STATES):
-        for j in range(ERROR_STATES):
-            ekf.since_record[i, j] = 1.0 if i == j else 0.0
+    ekf.since_record[:] = np.eye(ERROR_STATES)
     return record

@@ -17,6 +17,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.compiled import Record, compiled
 
+from . import auxiliary
 from .memory import HYPOTHESES, N_YAWS
 from .state import CHECK_PERIOD, difference
 from .update import GATE
@@ -41,15 +42,55 @@ def alive(hypothesis: Record) -> bool:
 
 
 @compiled
-def add_log_likelihood(hypothesis: Record, innovation: Record, correlation_length: float) -> None:
+def followed(ekf: Record) -> int:
+    """Return the number of hypotheses that are alive."""
+    count = 0
+    for h in range(HYPOTHESES):
+        count += alive(ekf.hypotheses[h])
+    return count
+
+
+@compiled
+def set_state(hypothesis: Record, x: np.ndarray, covariance: np.ndarray) -> None:
+    """Set position and velocity x (6,) of a HYPOTHESIS and their covariance (6, 6).
+
+    They are then independent of attitude and biases, which stay the same.
+    """
+    auxiliary.forget(hypothesis)
+    hypothesis.x[:6] = x
+    hypothesis.P[:6, :] = 0.0
+    hypothesis.P[:, :6] = 0.0
+    hypothesis.P[:6, :6] = covariance
+
+
+@compiled
+def set_yaw_variance(hypothesis: Record, variance: float) -> None:
+    """Set the variance of the yaw of a HYPOTHESIS, in rad^2, independent of all other states."""
+    hypothesis.P[8, :] = 0.0
+    hypothesis.P[:, 8] = 0.0
+    hypothesis.P[8, 8] = variance
+
+
+@compiled
+def add_log_likelihood(
+    hypothesis: Record, innovation: Record, correlation_length: float, share: float = 1.0
+) -> None:
     """Add the Gaussian log likelihood of an INNOVATION to the weight of a HYPOTHESIS.
 
-    correlation_length is the number of measurements that count as a single independent one, see
-    robust.py.
+    Parameters
+    ----------
+    hypothesis : HYPOTHESIS
+        Updated in place.
+    innovation : INNOVATION
+        After `update.project`.
+    correlation_length : float
+        Number of measurements that count as a single independent one, see update.py.
+    share : float
+        Power of the likelihood, 0 to 1.
     """
     variance = innovation.prior_variance + innovation.noise_variance * correlation_length
     nis = min(innovation.value**2 / variance, LARGEST_NIS)
-    hypothesis.log_weight -= 0.5 * (nis + math.log(variance))
+    hypothesis.log_weight -= 0.5 * share * (nis + math.log(variance))
 
 
 @compiled
@@ -68,7 +109,7 @@ def select(ekf: Record, t: float) -> bool:
     bool
         Whether a single hypothesis is left.
     """
-    best = followed = 0
+    best = 0
     for h in range(HYPOTHESES):
         if ekf.hypotheses[h].log_weight > ekf.hypotheses[best].log_weight:
             best = h
@@ -78,10 +119,10 @@ def select(ekf: Record, t: float) -> bool:
         hypothesis.log_weight -= highest
         if hypothesis.log_weight < -IMPROBABLE:
             hypothesis.log_weight = -np.inf
-        followed += alive(hypothesis)
     ekf.best = best
+    alone = followed(ekf) == 1
     if t < ekf.next_merge:
-        return followed == 1
+        return alone
     ekf.next_merge = t + CHECK_PERIOD
     for h in range(HYPOTHESES):
         for other in range(HYPOTHESES):
@@ -89,13 +130,11 @@ def select(ekf: Record, t: float) -> bool:
             if not alive(one) or (better.log_weight, -other) <= (one.log_weight, -h):
                 continue
             apart = difference(better.x, one.x)
-            turned, away = (
-                apart[6] ** 2 + apart[7] ** 2 + apart[8] ** 2,
-                apart[0] ** 2 + apart[1] ** 2 + apart[2] ** 2,
-            )
+            turned = apart[6] ** 2 + apart[7] ** 2 + apart[8] ** 2
+            away = apart[0] ** 2 + apart[1] ** 2 + apart[2] ** 2
             if turned < MERGED_BELOW**2 and away < MERGED_WITHIN**2:
                 one.log_weight = -np.inf
-    return followed == 1
+    return alone
 
 
 @compiled
@@ -117,8 +156,6 @@ def add_spread_of_means(ekf: Record, covariance: np.ndarray) -> None:
     for h in range(HYPOTHESES):
         other = ekf.hypotheses[h]
         if h != ekf.best and alive(other):
-            apart = difference(best.x, other.x)
+            apart = np.array(difference(best.x, other.x))
             share = math.exp(other.log_weight) / weights
-            for i in range(9):
-                for j in range(9):
-                    covariance[i, j] += share * apart[i] * apart[j]
+            covariance += np.outer(share * apart, apart)

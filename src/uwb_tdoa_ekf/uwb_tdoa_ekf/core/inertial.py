@@ -1,15 +1,22 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Statistics of the inertial samples: vibration, rectification, and whether the tag is quiet."""
+"""Inertial samples: their known errors, vibration, rectification, and whether the tag is quiet.
+
+Known errors that depend on the state are subtracted from each sample, evaluated at the state of the
+best hypothesis.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import math
 
 import numpy as np
 
 from uwb_tdoa_bias.common.compiled import Record, compiled
 from uwb_tdoa_bias.common.vibration import VIBRATION_AVERAGE, low_pass, track_vibration
+from uwb_tdoa_bias.effects.base import TABLE_STEPS, SensorFunction
+from uwb_tdoa_bias.effects.covariates import OF_STATE
 
 from .state import GRAVITY
 
@@ -29,6 +36,24 @@ CARRIED_STD = 20.0  # m/s^2, of the specific force of a tag that does not hover,
 SHAKING_MEMORY = 2.0
 LEAST_RECTIFIED = 0.1  # least share of the vibration power that counts as rectified
 QUIET_NOISE = 0.01  # m/s^2/sqrt(Hz), of the accelerometer of a quiet tag
+PERIOD_SAMPLES = 10  # samples over which their period is averaged
+
+SENSORS = ("gyro", "accel")
+# covariates with a smaller index are the position
+SPEED, CLIMB_RATE = (OF_STATE.index("speed"), OF_STATE.index("climb_rate"))
+
+SENSOR_FUNCTION = np.dtype(  # A SensorFunction as a record with the same fields.
+    [
+        ("sensor", np.int64),
+        ("axis", np.int64),
+        ("covariate", np.int64),  # this and `sensor` are indices into OF_STATE and SENSORS
+        ("low", float),
+        ("high", float),
+        ("values", float, TABLE_STEPS + 1),
+        ("periodic", np.bool_),
+    ],
+    align=True,
+)
 
 
 @compiled
@@ -55,6 +80,8 @@ def observe(imu: Record, sample: Record, timeout: float) -> bool:
     if not dt < timeout:
         _restart(imu, sample)
         return False
+    if dt > 0.0:
+        imu.period += (dt - imu.period) / (PERIOD_SAMPLES if imu.period > 0.0 else 1)
     track_vibration(imu.slow_accel, imu.vibration, sample.accel, dt)
     for k in range(3):
         imu.mean_accel[k] = low_pass(imu.mean_accel[k], imu.slow_accel[k], dt, VIBRATION_AVERAGE)
@@ -73,6 +100,7 @@ def observe(imu: Record, sample: Record, timeout: float) -> bool:
 # Reset the statistics of an IMU_STATE to a single IMU_SAMPLE.
 @compiled
 def _restart(imu: Record, sample: Record) -> None:
+    imu.period = 0.0
     for k in range(3):
         imu.slow_accel[k] = imu.mean_accel[k] = imu.accel[k] = sample.accel[k]
         imu.gyro[k] = sample.gyro[k]
@@ -144,3 +172,41 @@ def is_quiet(imu: Record) -> bool:
         if imu.vibration[k] > QUIET_ACCEL**2 or imu.gyro_power[k] > QUIET_GYRO**2:
             return False
     return abs(math.sqrt(squared) - GRAVITY) < QUIET_TILT
+
+
+def rows_of(functions: Sequence[SensorFunction]) -> np.ndarray:
+    """Return SensorFunctions as (k,) SENSOR_FUNCTION."""
+    out = np.zeros(len(functions), SENSOR_FUNCTION)
+    for row, function in zip(out, functions):
+        row["sensor"], row["covariate"] = (
+            SENSORS.index(function.sensor),
+            OF_STATE.index(function.covariate),
+        )
+        for name in ("axis", "low", "high", "values", "periodic"):
+            row[name] = getattr(function, name)
+    return out
+
+
+@compiled
+def subtract(functions: np.ndarray, x: np.ndarray, sample: Record) -> None:
+    """Subtract (k,) SENSOR_FUNCTION, evaluated at a nominal state x (16,), from an IMU_SAMPLE."""
+    for k in range(len(functions)):
+        function = functions[k]
+        if function.covariate == SPEED:
+            at = math.sqrt(x[3] ** 2 + x[4] ** 2 + x[5] ** 2)
+        elif function.covariate == CLIMB_RATE:
+            at = x[5]
+        else:
+            at = x[function.covariate]
+        reading = sample.gyro if function.sensor == 0 else sample.accel
+        reading[function.axis] -= _value(function, at)
+
+
+# Return a SENSOR_FUNCTION at a covariate, by linear interpolation, rad/s or m/s^2.
+@compiled
+def _value(function: Record, at: float) -> float:
+    place = (at - function.low) / (function.high - function.low)
+    place = place - math.floor(place) if function.periodic else min(max(place, 0.0), 1.0)
+    first = min(int(place * TABLE_STEPS), TABLE_STEPS - 1)
+    share = place * TABLE_STEPS - first
+    return (1.0 - share) * function.values[first] + share * function.values[first + 1]

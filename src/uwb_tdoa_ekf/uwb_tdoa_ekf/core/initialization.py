@@ -11,7 +11,6 @@ import numpy as np
 from uwb_tdoa_bias.common.compiled import Record, compiled
 
 from . import (
-    auxiliary,
     ground,
     height,
     hypotheses,
@@ -24,8 +23,8 @@ from . import (
 from .ground import SPEED, KnownHeight
 from .history import add_reset
 from .memory import HYPOTHESES, N_PLACES, N_YAWS, WINDOW
-from .startup import APART, Places, inliers, level, locate, room_for, share_of_inliers, split
-from .state import CHECK_PERIOD, GRAVITY
+from .startup import APART, Places, inliers, level, locate, room_for, split
+from .state import CHECK_PERIOD, GRAVITY, turn_about_vertical, yaw_of
 
 MINIMUM = 12  # least number of TDOAs for a search
 AGREE, AGREE_ANYHOW = 0.7, 0.6  # share of TDOAs that a start, and a recovery, must explain
@@ -60,64 +59,58 @@ RIVAL_TIME, RIVAL_HELD = (1.0, 0.5)
 
 
 @compiled
-def remember(ekf: Record, tdoa: Record, anchors: np.ndarray) -> None:
-    """Append a TDOA to the window, after subtracting the delays of its anchors."""
+def remember(ekf: Record, tdoa: Record) -> None:
+    """Append a TDOA to the window."""
     if ekf.kept == 2 * WINDOW:
         for i in range(WINDOW):
             ekf.window[i] = ekf.window[WINDOW + i]
         ekf.kept = WINDOW
     ekf.window[ekf.kept] = tdoa
-    ekf.window[ekf.kept].d -= anchors[tdoa.b].delay - anchors[tdoa.a].delay
     ekf.kept += 1
 
 
 @compiled
-def is_repeat(ekf: Record, tdoa: Record, anchors: np.ndarray) -> bool:
+def is_repeat(ekf: Record, tdoa: Record) -> bool:
     """Return whether the window already holds a TDOA with this stamp, anchors and value.
 
     Then a driver or network has sent it twice.
     """
-    d = tdoa.d - (anchors[tdoa.b].delay - anchors[tdoa.a].delay)
     for k in range(ekf.kept - 1, -1, -1):
         other = ekf.window[k]
         if other.t != tdoa.t:
             return False
-        if other.a == tdoa.a and other.b == tdoa.b and other.d == d:
+        if other.a == tdoa.a and other.b == tdoa.b and other.d == tdoa.d:
             return True
     return False
 
 
 @compiled
-def _height_at_start(ekf: Record, parameters: Record, t: float) -> KnownHeight:
-    """Return the height by other sensors at stamp t (s), before the filter runs.
-
-    The accelerometer alone gives the attitude.
-    """
-    accel = _mean_accel(ekf.imu, parameters)
-    return _known_height(ekf, parameters, accel[2] / max(math.sqrt(np.sum(accel**2)), 1e-9), t)
-
-
-@compiled
-def _look_for_places(
+def _search(
     ekf: Record,
     anchors: np.ndarray,
     parameters: Record,
+    t: float,
     window: np.ndarray,
-    known: KnownHeight,
     places: Places,
-    near: np.ndarray,
 ) -> float:
-    """Search for the tag near the anchors of a window, and sort the places by probability.
+    """Search for the tag in the surroundings of the anchors of a window (n,) of TDOA.
 
-    The box around these anchors is written to near (2, 3), m, world frame. Return the share of
-    TDOAs that agree with the first place.
+    Places are filled. Return the share of TDOAs that agree with the first place.
     """
+    known = _known_height(ekf, parameters, t)
     _find_surroundings(ekf, window, anchors, parameters)
-    share = locate(window, anchors, ekf.workspace, parameters, known, places)
-    workspace.surround(ekf, stationary_position.NEAR, near)
-    near[0, 2] = min(near[0, 2], parameters.ground_height)
-    stationary_position.sort(places, near)
-    return share
+    return locate(window, anchors, ekf.workspace, parameters, known, places)
+
+
+@compiled
+def _start_at(
+    ekf: Record, parameters: Record, t: float, places: Places, resting: bool, history: np.ndarray
+) -> None:
+    """Start the filter at Places, with the configured yaw."""
+    yaw, yaw_std = parameters.initial_yaw, parameters.initial_yaw_std
+    _begin(ekf, parameters, t, places, yaw, yaw_std, parameters.use_imu)
+    ekf.resting, ekf.rest_since = resting, t
+    add_reset(ekf, t, history)
 
 
 @compiled
@@ -150,8 +143,9 @@ def start(
     if len(window) < MINIMUM:
         return
     ekf.next_search = t + CHECK_PERIOD
-    places, near, known = room_for(N_PLACES), np.empty((2, 3)), _height_at_start(ekf, parameters, t)
-    share = _look_for_places(ekf, anchors, parameters, window, known, places, near)
+    places, known = room_for(N_PLACES), _known_height(ekf, parameters, t)
+    share = _search(ekf, anchors, parameters, t, window, places)
+    stationary_position.sort(places, ekf, parameters)
     x, covariance, cost = places.x, places.covariance, places.cost
     pairs = ekf.pairs[: ground.find_pairs(window, ekf.pairs)]
     at_rest, its = x[0].copy(), covariance[0].copy()
@@ -168,20 +162,10 @@ def start(
         cost[1] = np.inf
     elif wide:
         split(places)
-        stationary_position.sort(places, near)
+        stationary_position.sort(places, ekf, parameters)
     for place in range(N_PLACES if still else 0):
         stationary_position.stop(x[place], covariance[place], ekf.still_covariance)
-    _begin(
-        ekf,
-        parameters,
-        t,
-        places,
-        parameters.initial_yaw,
-        parameters.initial_yaw_std,
-        parameters.use_imu,
-    )
-    ekf.resting, ekf.rest_since = still and parameters.zero_velocity, t
-    add_reset(ekf, t, history)
+    _start_at(ekf, parameters, t, places, still and parameters.zero_velocity, history)
 
 
 @compiled
@@ -217,24 +201,15 @@ def start_slowly(
         or gap > LONGEST_GAP * span
     ):
         return
-    places, near, known = room_for(N_PLACES), np.empty((2, 3)), _height_at_start(ekf, parameters, t)
-    share = _look_for_places(ekf, anchors, parameters, window, known, places, near)
+    places = room_for(N_PLACES)
+    share = _search(ekf, anchors, parameters, t, window, places)
+    stationary_position.sort(places, ekf, parameters)
     if not (enough or (share >= AGREE and workspace.contains(ekf.workspace, places.x[0]))):
         return
     if np.trace(places.covariance[0, :3, :3]) > APART**2:
         split(places)
-        stationary_position.sort(places, near)
-    _begin(
-        ekf,
-        parameters,
-        t,
-        places,
-        parameters.initial_yaw,
-        parameters.initial_yaw_std,
-        parameters.use_imu,
-    )
-    ekf.resting, ekf.rest_since = False, t
-    add_reset(ekf, t, history)
+        stationary_position.sort(places, ekf, parameters)
+    _start_at(ekf, parameters, t, places, False, history)
 
 
 @compiled
@@ -312,11 +287,8 @@ def relocate(
     """
     if not is_unsure(ekf) or len(recent(ekf, parameters.start_window)) >= MINIMUM:
         return
-    best, window = ekf.hypotheses[ekf.best], _last(ekf, t)[0]
-    places, q = room_for(2), best.x[6:10]
-    known = _known_height(ekf, parameters, 1.0 - 2.0 * (q[0] ** 2 + q[1] ** 2), t)
-    _find_surroundings(ekf, window, anchors, parameters)
-    share = locate(window, anchors, ekf.workspace, parameters, known, places)
+    best, places = ekf.hypotheses[ekf.best], room_for(2)
+    share = _search(ekf, anchors, parameters, t, _last(ekf, t)[0], places)
     x, covariance, cost = places.x, places.covariance, places.cost
     variance = np.trace(covariance[0, :3, :3])
     if cost[1] < np.inf:
@@ -328,10 +300,7 @@ def relocate(
     ):
         return
     for h in range(HYPOTHESES):
-        hypothesis = ekf.hypotheses[h]
-        hypothesis.P[:6, :] = 0.0
-        hypothesis.P[:, :6] = 0.0
-        _set_state(hypothesis, x[0], covariance[0])
+        hypotheses.set_state(ekf.hypotheses[h], x[0], covariance[0])
     add_reset(ekf, t, history)
 
 
@@ -422,28 +391,18 @@ def place(
                 covariance[k, j] = covariance[j, k] = pose.covariance[k, j]
     has_yaw = not math.isnan(pose.yaw)
     if not ekf.running:
-        yaw, std = (
-            (pose.yaw, pose.yaw_std)
-            if has_yaw
-            else (parameters.initial_yaw, parameters.initial_yaw_std)
-        )
-        _begin(
-            ekf,
-            parameters,
-            t,
-            Places(x.reshape(1, 6), covariance.reshape(1, 6, 6), np.zeros(1)),
-            yaw,
-            std,
-            parameters.use_imu,
-        )
+        yaw, yaw_std = parameters.initial_yaw, parameters.initial_yaw_std
+        if has_yaw:
+            yaw, yaw_std = pose.yaw, pose.yaw_std
+        places = Places(x.reshape(1, 6), covariance.reshape(1, 6, 6), np.zeros(1))
+        _begin(ekf, parameters, t, places, yaw, yaw_std, parameters.use_imu)
     else:
         for h in range(HYPOTHESES):
             hypothesis = ekf.hypotheses[h]
-            hypothesis.P[:6, 6:] = 0.0
-            hypothesis.P[6:, :6] = 0.0
-            _set_state(hypothesis, x, covariance)
+            hypotheses.set_state(hypothesis, x, covariance)
             if has_yaw:
-                _turn(hypothesis, pose.yaw, pose.yaw_std)
+                turn_about_vertical(hypothesis.x, pose.yaw - yaw_of(hypothesis.x))
+                hypotheses.set_yaw_variance(hypothesis, pose.yaw_std**2)
                 if h != ekf.best:
                     hypothesis.log_weight = -np.inf
     ekf.consistency, ekf.late_as_known = 1.0, False
@@ -491,29 +450,19 @@ def _begin(
             continue
         level(accel, yaw + offset, hypothesis.x)
         hypothesis.x[10:] = 0.0
-        hypothesis.P[:] = 0.0
-        _set_state(hypothesis, x[place], covariance[place])
-        _spread_attitude(
-            hypothesis.P, parameters, min(yaw_std, hypotheses.YAW_STD if steered else ANY_YAW)
-        )
+        P = hypothesis.P
+        P[:] = 0.0
+        hypotheses.set_state(hypothesis, x[place], covariance[place])
+        P[6, 6] = P[7, 7] = TILT_STD**2
+        P[8, 8] = min(yaw_std, hypotheses.YAW_STD if steered else ANY_YAW) ** 2
+        for k in range(3):
+            P[9 + k, 9 + k] = parameters.initial_accel_bias_std**2
+            P[12 + k, 12 + k] = parameters.initial_gyro_bias_std**2
     ekf.best = 0
     noise.begin(ekf.information, ekf.hypotheses[0].P)
     ekf.t = ekf.last_tdoa = ekf.last_agreement = t
     ekf.consistency = 1.0
     ekf.running = True
-
-
-@compiled
-def _turn(hypothesis: Record, yaw: float, std: float) -> None:
-    """Set the yaw of a HYPOTHESIS and its standard deviation, in rad, about the vertical."""
-    x, y, z, w = hypothesis.x[6], hypothesis.x[7], hypothesis.x[8], hypothesis.x[9]
-    half = 0.5 * (yaw - math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
-    s, c = math.sin(half), math.cos(half)
-    hypothesis.x[6], hypothesis.x[7] = c * x - s * y, c * y + s * x
-    hypothesis.x[8], hypothesis.x[9] = c * z + s * w, c * w - s * z
-    hypothesis.P[8, :] = 0.0
-    hypothesis.P[:, 8] = 0.0
-    hypothesis.P[8, 8] = std**2
 
 
 @compiled
@@ -553,12 +502,9 @@ def recover(
     ekf.next_search = t + CHECK_PERIOD
     count = N_PLACES if anywhere else 1
     places = room_for(count)
-    q = ekf.hypotheses[ekf.best].x[6:10]
-    known = _known_height(ekf, parameters, 1.0 - 2.0 * (q[0] ** 2 + q[1] ** 2), t)
-    _find_surroundings(ekf, window, anchors, parameters)
-    share = locate(window, anchors, ekf.workspace, parameters, known, places)
+    share = _search(ekf, anchors, parameters, t, window, places)
     x, covariance, cost = places.x, places.covariance, places.cost
-    explained = share_of_inliers(window, anchors, ekf.hypotheses[ekf.best].x[:6])
+    explained = np.mean(inliers(window, anchors, ekf.hypotheses[ekf.best].x[:6]))
     if (
         workspace.outside(ekf.workspace, x[0]) > (workspace.STD if anywhere else 0.0)
         or share < AGREE_ANYHOW
@@ -573,24 +519,18 @@ def recover(
     if not anywhere and wheels and _outweighs(ekf, anchors, window, x[0], t):
         return
     if not anywhere and (felt or wheels):
-        since, away = t - ekf.last_agreement, 0.0
-        for k in range(3):
-            away += (x[0, k] - ekf.hypotheses[ekf.best].x[k]) ** 2
+        since = t - ekf.last_agreement
+        away = np.sum((x[0, :3] - ekf.hypotheses[ekf.best].x[:3]) ** 2)
         if math.sqrt(away) > REACH + REACH_SPEED * since + REACH_ACCELERATION * since**2:
             return
     for h in range(HYPOTHESES):
         hypothesis, place = ekf.hypotheses[h], min(h // N_YAWS, count - 1)
         if cost[place] == np.inf:
             place = 0
-        hypothesis.P[:6, :] = 0.0
-        hypothesis.P[:, :6] = 0.0
-        _set_state(hypothesis, x[place], covariance[place])
-        if (
-            not parameters.use_imu
-        ):  # if wheels have led to a wrong place, a wrong yaw is a probable cause
-            hypothesis.P[8, :] = 0.0
-            hypothesis.P[:, 8] = 0.0
-            hypothesis.P[8, 8] = ANY_YAW**2
+        hypotheses.set_state(hypothesis, x[place], covariance[place])
+        if not parameters.use_imu:
+            # wheels have led to a wrong place: a wrong yaw is a probable cause
+            hypotheses.set_yaw_variance(hypothesis, ANY_YAW**2)
     ekf.rival_since = -np.inf
     if anywhere:  # the information from before the silence belongs to another place
         noise.begin(ekf.information, ekf.hypotheses[ekf.best].P)
@@ -613,8 +553,7 @@ def _outweighs(
     if t > ekf.rival_until or _are_late(window, anchors, ekf.hypotheses[ekf.best].x[:6]):
         ekf.rival_since = t
     ekf.rival_until = t + RIVAL_HELD
-    for k in range(3):
-        ekf.rival[k] = rival[k]
+    ekf.rival[:] = rival[:3]
     return t - ekf.rival_since < RIVAL_TIME
 
 
@@ -675,10 +614,9 @@ def reset_attitude(ekf: Record, parameters: Record, yaw_std: float, history: np.
     Position and velocity stay the same.
     """
     best = ekf.hypotheses[ekf.best]
-    x, y, z, w = best.x[6], best.x[7], best.x[8], best.x[9]
-    yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     x, covariance = best.x[:6].copy().reshape(1, 6), best.P[:6, :6].copy().reshape(1, 6, 6)
-    _begin(ekf, parameters, ekf.t, Places(x, covariance, np.zeros(1)), yaw, yaw_std, True)
+    place = Places(x, covariance, np.zeros(1))
+    _begin(ekf, parameters, ekf.t, place, yaw_of(best.x), yaw_std, True)
     ekf.attitude_reset = True
     add_reset(ekf, ekf.t, history)
 
@@ -700,10 +638,8 @@ def open_unknown_yaw(ekf: Record, parameters: Record, history: np.ndarray) -> No
 
     From this velocity on, motion can determine the yaw.
     """
-    alive = 0
-    for h in range(HYPOTHESES):
-        alive += hypotheses.alive(ekf.hypotheses[h])
-    if alive == 1 and ekf.hypotheses[ekf.best].P[8, 8] > hypotheses.YAW_STD**2:
+    unknown = ekf.hypotheses[ekf.best].P[8, 8] > hypotheses.YAW_STD**2
+    if unknown and hypotheses.followed(ekf) == 1:
         reset_attitude(ekf, parameters, 2.0 * math.pi, history)
 
 
@@ -714,25 +650,28 @@ def level_first(ekf: Record, parameters: Record, history: np.ndarray) -> None:
     If a single hypothesis is left, the standard deviation of its yaw stays the same. Otherwise the
     yaw becomes unknown.
     """
-    alive = 0
-    for h in range(HYPOTHESES):
-        alive += hypotheses.alive(ekf.hypotheses[h])
-    reset_attitude(
-        ekf,
-        parameters,
-        2.0 * math.pi if alive > 1 else math.sqrt(ekf.hypotheses[ekf.best].P[8, 8]),
-        history,
-    )
+    yaw_std = 2.0 * math.pi
+    if hypotheses.followed(ekf) == 1:
+        yaw_std = math.sqrt(ekf.hypotheses[ekf.best].P[8, 8])
+    reset_attitude(ekf, parameters, yaw_std, history)
 
 
 @compiled
-def _known_height(ekf: Record, parameters: Record, up: float, t: float) -> KnownHeight:
-    """Return the height that another source than TDOAs gives for a tag with cos(tilt) `up`."""
+def _known_height(ekf: Record, parameters: Record, t: float) -> KnownHeight:
+    """Return the height of the tag at stamp t (s) by another source than TDOAs.
+
+    Before the filter runs, the accelerometer alone gives the tilt.
+    """
     if parameters.fixed_height_std > 0.0:
         return KnownHeight(parameters.fixed_height, parameters.fixed_height_std)
-    return KnownHeight(
-        height.at_start(ekf, parameters, up, t), max(parameters.height_std, SMALLEST_STD)
-    )
+    if ekf.running:
+        q = ekf.hypotheses[ekf.best].x[6:10]
+        up = 1.0 - 2.0 * (q[0] ** 2 + q[1] ** 2)
+    else:
+        accel = _mean_accel(ekf.imu, parameters)
+        up = accel[2] / max(math.sqrt(np.sum(accel**2)), 1e-9)
+    z = height.at_start(ekf, parameters, up, t)
+    return KnownHeight(z, max(parameters.height_std, SMALLEST_STD))
 
 
 @compiled
@@ -757,21 +696,3 @@ def _mean_accel(imu: Record, parameters: Record) -> np.ndarray:
         hovering = GRAVITY if k == 2 else 0.0
         accel[k] = hovering + imu.accel_weight[k] * (imu.mean_accel[k] - hovering)
     return accel
-
-
-@compiled
-def _set_state(hypothesis: Record, x: np.ndarray, covariance: np.ndarray) -> None:
-    """Set position and velocity x (6,) and their covariance (6, 6)."""
-    hypothesis.x[:6] = x
-    auxiliary.forget(hypothesis)
-    hypothesis.P[:6, :6] = covariance
-
-
-@compiled
-def _spread_attitude(P: np.ndarray, parameters: Record, yaw_std: float) -> None:
-    """Set the variances of attitude and biases at the start."""
-    P[6, 6] = P[7, 7] = TILT_STD**2
-    P[8, 8] = yaw_std**2
-    for k in range(3):
-        P[9 + k, 9 + k] = parameters.initial_accel_bias_std**2
-        P[12 + k, 12 + k] = parameters.initial_gyro_bias_std**2

@@ -11,6 +11,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.compiled import compiled
 from uwb_tdoa_bias.common.sensors import SENSORS
+from uwb_tdoa_bias.effects.samples import N_STATES
 
 from .memory import IMU_SAMPLE, SENSOR_ROW, structured
 from .sensors import STREAMS
@@ -46,18 +47,39 @@ def imu_rows(t: np.ndarray, gyro: np.ndarray, accel: np.ndarray) -> tuple[np.nda
         (n,) IMU_SAMPLE, and (n,) bool.
     """
     rows = structured(IMU_SAMPLE, t, gyro, accel)
-    return rows, usable_imu(rows["t"], rows["gyro"], rows["accel"])
+    return rows, _usable_imu(rows)
 
 
+@compiled
 def usable_tdoas(rows: np.ndarray, positions: np.ndarray) -> np.ndarray:
     """Return (n,) bool: which TDOAs can be measurements.
 
-    rows is (n,) TDOA, positions are the anchors (N, 3), m, world frame.
+    Refused are an unknown anchor (row -1), a pair of equal anchors, a value that is not finite, an
+    invalid variance, a value longer than the baseline plus LARGEST_ERROR, and an implausible slope
+    of the bias.
+
+    Parameters
+    ----------
+    rows : (n,) TDOA
+        TDOAs.
+    positions : (N, 3) array
+        Positions of the anchors, m, world frame.
     """
-    usable = usable_all(rows["a"], rows["b"], rows["d"], rows["variance"], positions) & np.isfinite(
-        rows["t"]
-    )
-    return usable & usable_slopes(rows["slope"], rows["state"])
+    out = np.empty(len(rows), np.bool_)
+    for i in range(len(rows)):
+        tdoa = rows[i]
+        a, b, d = tdoa.a, tdoa.b, tdoa.d
+        usable = a >= 0 and b >= 0 and a != b and math.isfinite(tdoa.t) and math.isfinite(d)
+        if usable:
+            square = 0.0
+            for k in range(3):
+                square += (positions[a, k] - positions[b, k]) ** 2
+            longest = math.sqrt(square) + LARGEST_ERROR
+            usable = abs(d) <= longest and 0.0 <= tdoa.variance < math.inf
+        for k in range(N_STATES):  # NaN compares false
+            usable = usable and abs(tdoa.slope[k]) < STEEPEST and abs(tdoa.state[k]) < FARTHEST
+        out[i] = usable
+    return out
 
 
 def sensor_rows(
@@ -92,64 +114,12 @@ def sensor_rows(
 
 
 @compiled
-def usable(a: int, b: int, d: float, variance: float, positions: np.ndarray) -> bool:
-    """Return whether a TDOA can be a measurement.
-
-    An unknown anchor (row -1), a pair of equal anchors, and a value that is not finite are refused.
-    A value longer than the baseline plus LARGEST_ERROR and an invalid variance are refused too.
-
-    Parameters
-    ----------
-    a, b : int
-        Rows of the anchors.
-    d : float
-        Difference of the distances to b and a, m.
-    variance : float
-        Variance beyond tdoa_std, m^2.
-    positions : (N, 3) array
-        Positions of the anchors, m, world frame.
-    """
-    if a < 0 or b < 0 or a == b or not (math.isfinite(d) and 0.0 <= variance < math.inf):
-        return False
-    baseline = 0.0
-    for k in range(3):
-        baseline += (positions[a, k] - positions[b, k]) ** 2
-    return abs(d) <= math.sqrt(baseline) + LARGEST_ERROR
-
-
-@compiled
-def usable_all(
-    a: np.ndarray, b: np.ndarray, d: np.ndarray, variance: np.ndarray, positions: np.ndarray
-) -> np.ndarray:
-    """Return `usable` for (n,) arrays, as (n,) bool."""
-    out = np.empty(len(d), np.bool_)
-    for i in range(len(d)):
-        out[i] = usable(a[i], b[i], d[i], variance[i], positions)
-    return out
-
-
-@compiled
-def usable_slopes(slope: np.ndarray, state: np.ndarray) -> np.ndarray:
-    """Return (n,) bool: whether the state dependence of a bias is plausible.
-
-    slope is (n, 6), in m per m or m per m/s. state is its linearization point (n, 6), m or m/s.
-    """
-    out = np.ones(len(slope), np.bool_)
-    for i in range(len(slope)):
-        for k in range(slope.shape[1]):  # NaN compares false
-            out[i] = out[i] and abs(slope[i, k]) < STEEPEST and abs(state[i, k]) < FARTHEST
-    return out
-
-
-@compiled
-def usable_imu(t: np.ndarray, gyro: np.ndarray, accel: np.ndarray) -> np.ndarray:
-    """Return (n,) bool: which samples are finite and within the range of any inertial sensor.
-
-    t is (n,) s, gyro (n, 3) rad/s, and accel (n, 3) m/s^2, both in the body frame.
-    """
-    out = np.empty(len(t), np.bool_)
-    for i in range(len(t)):
-        out[i] = math.isfinite(t[i])
+def _usable_imu(rows: np.ndarray) -> np.ndarray:
+    """Return (n,) bool: which of (n,) IMU_SAMPLE are finite and within the range of any sensor."""
+    out = np.empty(len(rows), np.bool_)
+    for i in range(len(rows)):
+        sample = rows[i]
+        out[i] = math.isfinite(sample.t)
         for k in range(3):  # NaN compares false
-            out[i] = out[i] and abs(gyro[i, k]) < MAX_RATE and abs(accel[i, k]) < MAX_ACCEL
+            out[i] = out[i] and abs(sample.gyro[k]) < MAX_RATE and abs(sample.accel[k]) < MAX_ACCEL
     return out

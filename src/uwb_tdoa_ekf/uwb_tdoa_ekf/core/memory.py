@@ -18,7 +18,7 @@ from uwb_tdoa_bias.effects.samples import N_STATES
 
 from .auxiliary import OFFSET_STATES
 from .ground import MOST_PAIRS, PAIR
-from .sensor_functions import rows_of
+from .inertial import rows_of
 from .state import ERROR_STATES, GRAVITY, NOMINAL_STATES, TRANSITION
 from .update import INNOVATION
 
@@ -74,6 +74,7 @@ HYPOTHESIS = _record(
 # Statistics of the inertial sensor, body frame.
 IMU_STATE = _record(
     ("t", float),  # s, stamp of the last sample
+    ("period", float),  # s, between samples, mean of the recent ones; 0: unknown
     ("gyro", float, 3),  # rad/s
     ("accel", float, 3),  # m/s^2; both are the input of the prediction until the next sample
     ("slow_accel", float, 3),  # m/s^2, after a low pass
@@ -264,6 +265,8 @@ ODOMETRY = _record(
     ("covariance", float, (9, 9)),  # of [p, v, attitude]
     # m^2, share of the position covariance that persisting errors cause, see noise.py
     ("consider_covariance", float, (3, 3)),
+    ("rate", float, 3),  # rad/s, angular rate in the body frame; NaN: not measured
+    ("rate_variance", float, 3),  # rad^2/s^2, of the rate
 )
 # Innovation and its variance in the unit of the measurement, weight 0 to 1, and verdict.
 RESIDUAL = _record(
@@ -316,6 +319,27 @@ class Output(NamedTuple):
     sensors: np.ndarray = np.empty(0, RESIDUAL)
 
 
+# Stamps of an EKF without measurements that are -inf.
+NEVER = (
+    "t",
+    "first_tdoa",
+    "last_tdoa",
+    "next_search",
+    "next_odometry",
+    "next_rest",
+    "next_merge",
+    "next_look",
+    "next_bounds",
+    "next_floor",
+    "last_agreement",
+    "position_unknown_until",
+    "search_waits_until",
+    "rival_since",
+    "rival_until",
+    "attitude_averaged_until",
+)
+
+
 def new_state(
     positions: np.ndarray, functions: Sequence[SensorFunction] = (), floor: Floor | None = None
 ) -> FilterState:
@@ -331,40 +355,25 @@ def new_state(
         Known lateness of anchors at the ground, as in `EffectSet.on_floor`.
     """
     state = FilterState(np.zeros(1, EKF), np.zeros(len(positions), ANCHOR), rows_of(functions))
-    state.anchors["position"] = positions
-    state.record.extent[:] = np.min(positions, axis=0), np.max(positions, axis=0)
-    state.record.within[:] = [[-np.inf] * 3, [np.inf] * 3]
-    for stamp in ("learned", "predicted", "heard"):
-        state.anchors[stamp] = -np.inf
-    ekf = state.record
-    state.anchors["floor_delay"], state.anchors["floor_std"], ekf["floor_place"][:] = floor or (
-        np.nan,
-        0.0,
-        np.nan,
-    )
-    for stamp in (
-        "t",
-        "first_tdoa",
-        "last_tdoa",
-        "next_search",
-        "next_odometry",
-        "next_rest",
-        "next_merge",
-        "next_look",
-        "next_bounds",
-        "last_agreement",
-        "position_unknown_until",
-        "search_waits_until",
-        "rival_since",
-        "rival_until",
+    ekf, anchors = state.record, state.anchors
+    for record, stamps in (
+        (ekf, NEVER),
+        (anchors, ("learned", "predicted", "heard")),
+        (ekf.imu, ("t",)),
+        (ekf.imu_fault_detector, ("contradicted",)),
+        (ekf.height, ("heard", "changed", "used", "compared", "pulls_since", "ignored_until")),
+        (ekf.barometer, ("heard", "agreed")),
+        (ekf.velocity, ("heard", "changed", "agreed")),
+        (ekf.ranged, ("t",)),
+        (ekf.yaw_test, ("t", "next_look")),
     ):
-        ekf[stamp] = -np.inf
-    ekf.imu.t = ekf.imu_fault_detector.contradicted = -np.inf
-    for stamp in ("heard", "changed", "used", "compared", "pulls_since", "ignored_until"):
-        ekf.height[stamp] = -np.inf
-    for stamp in ("heard", "changed", "agreed"):
-        ekf.velocity[stamp] = -np.inf
-    ekf.barometer.heard = ekf.barometer.agreed = ekf.ranged["t"][0] = ekf.next_floor = -np.inf
+        for stamp in stamps:
+            record[stamp] = -np.inf
+    anchors["position"] = positions
+    ekf.extent[:] = np.min(positions, axis=0), np.max(positions, axis=0)
+    ekf.within[:] = [[-np.inf] * 3, [np.inf] * 3]
+    delays, stds, place = floor or (np.nan, 0.0, np.nan)
+    anchors["floor_delay"], anchors["floor_std"], ekf.floor_place[:] = delays, stds, place
     for name in ("accel", "slow_accel", "mean_accel"):
         ekf.imu[name][2] = GRAVITY
     ekf.hypotheses["log_weight"][1:] = -np.inf
@@ -372,7 +381,6 @@ def new_state(
     ekf.hypotheses["P"][:] = np.eye(ERROR_STATES)
     ekf.since_record[:] = np.eye(ERROR_STATES)
     ekf.consistency, ekf.range_offset[1] = 1.0, np.inf
-    ekf.attitude_averaged_until = ekf.yaw_test.t = ekf.yaw_test.next_look = -np.inf
     return state
 
 

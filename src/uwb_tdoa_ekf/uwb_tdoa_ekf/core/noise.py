@@ -11,7 +11,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.compiled import Record, compiled
 
-from .ground import solve
+from .ground import inverse
 
 # Noise of each anchor.
 LARGEST_OUTLIER = 5.0  # standard deviations; limits the effect of an outlier
@@ -29,12 +29,6 @@ LONGEST_STEP = 0.1
 # largest ratio of the added covariance to the covariance of the filter, because anchors are not the
 # only source of position
 MOST = 400.0
-
-
-@compiled
-def excess_variance(a: Record, b: Record) -> float:
-    """Return the learned variance of a TDOA beyond tdoa_std, in m^2, for its two ANCHORs."""
-    return a.excess_variance + b.excess_variance
 
 
 @compiled
@@ -88,9 +82,7 @@ def begin(information: np.ndarray, P: np.ndarray) -> None:
     P : (15, 15) array
         Covariance of the error state. The start has counted each anchor once.
     """
-    both = np.concatenate((P[:3, :3], np.eye(3)), axis=1)
-    solve(both)
-    information[:, :] = SHARE * both[:, 3:]
+    information[:, :] = SHARE * inverse(P[:3, :3])
 
 
 @compiled
@@ -154,17 +146,14 @@ def fill(
     """
     covariance[:, :] = 0.0
     share = SHARE * (1.0 - 1.0 / max(correlation_length, 1.0))
-    both = np.concatenate((P[:3, :3], np.eye(3)), axis=1)
-    if share == 0.0 or not solve(both):
+    if share == 0.0:
         return
-    both[:, :3] = information / share + both[:, 3:] / MOST
+    total = information / share + inverse(P[:3, :3]) / MOST
     if height_std > 0.0:
-        both[2, 2] += 1.0 / height_std**2
-    both[:, 3:] = np.eye(3)
-    if solve(both):
-        covariance[:, :] = both[:, 3:]
+        total[2, 2] += 1.0 / height_std**2
+    of_total = inverse(total)
+    if not of_total[0, 0] > 0.0:
+        return
+    covariance[:, :] = of_total
     if height_std > 0.0:  # a held height adds information but no persisting error
-        share = 1.0 / height_std**2
-        for i in range(3):
-            for j in range(3):
-                covariance[i, j] -= both[i, 5] * share * both[2, 3 + j]
+        covariance -= np.outer(of_total[:, 2] * (1.0 / height_std**2), of_total[2])

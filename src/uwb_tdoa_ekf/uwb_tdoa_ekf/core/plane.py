@@ -15,13 +15,12 @@ import math
 import numpy as np
 
 from uwb_tdoa_bias.common.compiled import Record, compiled
-from uwb_tdoa_bias.common.robust_loss import GEMAN_MCCLURE, weight
 
 from . import hypotheses, velocity
 from .history import add_update
 from .memory import HYPOTHESES
-from .state import CONSTRAINT_PERIOD, rotation
-from .update import GATE, kalman, project, update_state
+from .state import CONSTRAINT_PERIOD, rotation, yaw_of
+from .update import GATE, kalman, kalman_robust, project, update_state
 
 RISE_STD = 0.02  # m/s, of the vertical velocity of a planar vehicle
 # records in a history per application: height, rise, tilt about two axes, velocity along two
@@ -52,38 +51,29 @@ def hold(ekf: Record, parameters: Record, t: float, records: np.ndarray) -> None
     ekf.next_floor = t + CONSTRAINT_PERIOD
     innovation, R, std = ekf.innovation, ekf.transition.rotation, parameters.fixed_height_std
     rolls = parameters.non_holonomic_std > 0.0 and (ekf.sensed or velocity.drives(ekf.velocity, t))
+    alike = 2.0 * velocity.CORRELATION_TIME / CONSTRAINT_PERIOD
     for h in range(HYPOTHESES):
-        hypothesis, best = ekf.hypotheses[h], h == ekf.best
+        hypothesis = ekf.hypotheses[h]
         if not hypotheses.alive(hypothesis):
             continue
         if std > 0.0 and hypothesis.P[2, 2] > std**2:
             update_state(hypothesis, innovation, 2, parameters.fixed_height, std)
-            if best:
-                add_update(ekf, t, records)
+            add_update(ekf, h, t, records)
         if parameters.planar and hypothesis.P[5, 5] > RISE_STD**2:
             update_state(hypothesis, innovation, 5, 0.0, RISE_STD)
-            if best:
-                add_update(ekf, t, records)
+            add_update(ekf, h, t, records)
         for axis in range(2):
             if parameters.planar and _is_tilted(
                 hypothesis, axis, parameters.tilt_std, R, innovation
             ):
                 kalman(hypothesis, innovation)
-                if best:
-                    add_update(ekf, t, records)
+                add_update(ekf, h, t, records)
             if rolls:
                 velocity.compare(
                     hypothesis, 0.0, parameters.non_holonomic_std, 1 + axis, R, innovation
                 )
-                total = innovation.prior_variance + innovation.noise_variance
-                w = weight(GEMAN_MCCLURE, innovation.value / math.sqrt(total), GATE)
-                alike = 2.0 * velocity.CORRELATION_TIME / CONSTRAINT_PERIOD
-                innovation.total_variance = (
-                    innovation.prior_variance + innovation.noise_variance * alike / w
-                )
-                kalman(hypothesis, innovation)
-                if best:
-                    add_update(ekf, t, records)
+                kalman_robust(hypothesis, innovation, alike, GATE)
+                add_update(ekf, h, t, records)
 
 
 @compiled
@@ -138,15 +128,9 @@ def flatten(row: Record, parameters: Record, wrong: float) -> None:
         Difference between the height that TDOAs show and the fixed height, m.
     """
     x, P = row.x, row.covariance
-    yaw = math.atan2(2.0 * (x[9] * x[8] + x[6] * x[7]), 1.0 - 2.0 * (x[7] ** 2 + x[8] ** 2))
-    x[2], x[5], x[6], x[7], x[8], x[9] = (
-        parameters.fixed_height,
-        0.0,
-        0.0,
-        0.0,
-        math.sin(0.5 * yaw),
-        math.cos(0.5 * yaw),
-    )
+    yaw = yaw_of(x)
+    x[2], x[5] = parameters.fixed_height, 0.0
+    x[6], x[7], x[8], x[9] = 0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw)
     row.consider_covariance[2, :] = 0.0
     row.consider_covariance[:, 2] = 0.0
     for state in (2, 5, 6, 7):

@@ -27,17 +27,13 @@ def pair(ekf: Record, sensor: Record) -> bool:
     Return whether the TDOA is valid: two anchors, within APART.
     """
     before, made = ekf.ranged[0], ekf.paired[0]
-    apart = before.anchor != sensor.anchor and sensor.t - before.t < APART
-    made.t, made.a, made.b, made.d = (
-        sensor.t,
-        before.anchor,
-        sensor.anchor,
-        sensor.value[0] - before.value[0],
-    )
+    valid = before.anchor != sensor.anchor and sensor.t - before.t < APART
+    made.t, made.a, made.b = sensor.t, before.anchor, sensor.anchor
+    made.d = sensor.value[0] - before.value[0]
     made.variance = sensor.std[0] ** 2 + before.std[0] ** 2
     made.slope[:], made.state[:] = 0.0, 0.0
     ekf.ranged[0] = sensor
-    return apart
+    return valid
 
 
 @compiled

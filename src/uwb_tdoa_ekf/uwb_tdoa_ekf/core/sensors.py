@@ -61,10 +61,3 @@ def observe(
         velocity.observe(ekf, parameters, sensor, residual, records)
     else:
         raise NotImplementedError("a kind of measurement without a branch in sensors.observe")
-
-
-@compiled
-def record(ekf: Record, sensor: Record) -> None:
-    """Store a SENSOR_ROW that arrives while the filter does not run."""
-    if sensor.kind == HEIGHT:
-        height.record(ekf, sensor)

@@ -17,7 +17,7 @@ from uwb_tdoa_bias.common.compiled import Record, compiled
 from uwb_tdoa_bias.common.geometry import linearized_tdoa
 from uwb_tdoa_bias.common.robust_loss import GEMAN_MCCLURE, geman_mcclure_loss, weight
 
-from .ground import SPEED, KnownHeight, solve
+from .ground import SPEED, KnownHeight, inverse, solve
 from .hypotheses import IMPROBABLE
 from .workspace import configured_side, reflect, rows_heard
 
@@ -97,10 +97,8 @@ def locate(
         ageing[i] = parameters.motion_noise**2 * age**3 / 3.0 / std**2
     mean, prior_std = np.zeros(6), np.full(6, SPEED)
     for k in range(3):
-        mean[k], prior_std[k] = (
-            0.5 * (workspace[0, k] + workspace[1, k]),
-            0.5 * (workspace[1, k] - workspace[0, k]),
-        )
+        mean[k] = 0.5 * (workspace[0, k] + workspace[1, k])
+        prior_std[k] = 0.5 * (workspace[1, k] - workspace[0, k])
     if not math.isnan(height.z):
         mean[2], prior_std[2], prior_std[5] = height.z, height.std, SPEED
     prior_information = 1.0 / prior_std**2
@@ -138,9 +136,7 @@ def locate(
         variance = correlation_length * max(std, 1.5 * np.median(np.abs(residuals))) ** 2
         for k in range(6):
             system[k, k] += variance * prior_information[k]
-        both = np.concatenate((system[:, :6], np.eye(6)), axis=1)
-        solve(both)
-        covariance[place] = both[:, 6:] * variance
+        covariance[place] = inverse(system[:, :6]) * variance
         if place == 0:
             share = float(np.mean(np.abs(residuals) < INLIER))
         for other in range(STARTS):
@@ -159,9 +155,8 @@ def split(places: Places) -> None:
     """
     x, covariance, cost = places.x, places.covariance, places.cost
     axis, variance = np.empty(3), 0.0
-    for start in range(
-        3
-    ):  # power iteration: at least one start is not normal to the principal axis
+    # power iteration: at least one start is not normal to the principal axis
+    for start in range(3):
         trial, its = np.zeros(3), 0.0
         trial[start] = 1.0
         for _ in range(30):
@@ -175,21 +170,10 @@ def split(places: Places) -> None:
     step, cost[1] = np.empty(6), cost[0]
     for i in range(6):  # the velocity moves too, in proportion to its correlation
         step[i] = SPLIT / math.sqrt(variance) * np.sum(covariance[0, i, :3] * axis)
-    for i in range(6):
-        for j in range(6):
-            covariance[0, i, j] -= step[i] * step[j]
+    covariance[0] -= np.outer(step, step)
     x[1], covariance[1] = x[0], covariance[0]
     x[0] -= step
     x[1] += step
-
-
-@compiled
-def share_of_inliers(window: np.ndarray, anchors: np.ndarray, x: np.ndarray) -> float:
-    """Return the share of TDOAs of a window that agree with a state at its end, 0 to 1.
-
-    x is position (m) and velocity (m/s), (6,), world frame.
-    """
-    return float(np.mean(inliers(window, anchors, x)))
 
 
 @compiled
@@ -220,12 +204,8 @@ def level(accel: np.ndarray, yaw: float, x: np.ndarray) -> None:
     """
     roll = math.atan2(accel[1], accel[2])
     pitch = math.atan2(-accel[0], math.hypot(accel[1], accel[2]))
-    cr, sr, cp, sp = (
-        math.cos(roll / 2),
-        math.sin(roll / 2),
-        math.cos(pitch / 2),
-        math.sin(pitch / 2),
-    )
+    cr, sr = math.cos(roll / 2), math.sin(roll / 2)
+    cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
     cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
     x[6] = sr * cp * cy - cr * sp * sy
     x[7] = cr * sp * cy + sr * cp * sy

@@ -184,6 +184,24 @@ def propagate(M: np.ndarray, transition: Record) -> None:
 
 
 @compiled
+def propagate_vector(vector: np.ndarray, transition: Record) -> None:
+    """Multiply a vector (15,) of the error state by Phi in place, see `propagate`."""
+    dt = transition.dt
+    A, B, E = (
+        transition.velocity_attitude,
+        transition.velocity_accel_bias,
+        transition.attitude_attitude,
+    )
+    t0, t1, t2 = vector[6], vector[7], vector[8]
+    for r in range(3):
+        vector[r] += dt * vector[3 + r]
+        by_attitude = A[r, 0] * t0 + A[r, 1] * t1 + A[r, 2] * t2
+        by_bias = B[r, 0] * vector[9] + B[r, 1] * vector[10] + B[r, 2] * vector[11]
+        vector[3 + r] += by_attitude + by_bias
+        vector[6 + r] = E[r, 0] * t0 + E[r, 1] * t1 + E[r, 2] * t2 - dt * vector[12 + r]
+
+
+@compiled
 def _add_noise(
     P: np.ndarray, R: np.ndarray, accel_psd: np.ndarray, parameters: Record, dt: float
 ) -> None:
@@ -233,6 +251,13 @@ def coast(hypothesis: Record, dt: float, accel_psd: float, tilt_psd: float, yaw_
     for i in range(3):  # the part of the noise in the position, dt^3 / 3, is left out
         P[3 + i, 3 + i] += dt * accel_psd
         P[6 + i, 6 + i] += dt * (yaw_psd if i == 2 else tilt_psd)
+
+
+@compiled
+def yaw_of(x: np.ndarray) -> float:
+    """Return the yaw of a nominal state, in rad."""
+    qx, qy, qz, qw = x[6], x[7], x[8], x[9]
+    return math.atan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy * qy + qz * qz))
 
 
 @compiled

@@ -188,17 +188,14 @@ def update_zero_velocity(ekf: Record, t: float, records: np.ndarray) -> None:
         x, P = hypothesis.x, hypothesis.P
         if not hypotheses.alive(hypothesis):
             continue
-        slow = ekf.resting
-        if not slow:
-            slow = ekf.quiet
-            for state in range(3, 6):
-                slow = slow and abs(x[state]) < SPEED_STD and P[state, state] < SPEED_STD**2
-        if not slow:
+        slow = True
+        for state in range(3, 6):
+            slow = slow and abs(x[state]) < SPEED_STD and P[state, state] < SPEED_STD**2
+        if not (slow or ekf.resting):
             continue
         for state in range(3, 6):
             update_state(hypothesis, ekf.innovation, state, 0.0, std)
-            if h == ekf.best:
-                add_update(ekf, t, records)
+            add_update(ekf, h, t, records)
 
 
 @compiled

@@ -14,10 +14,10 @@ import numpy as np
 
 from uwb_tdoa_bias.common.compiled import Record, compiled
 
-from . import auxiliary, ground
+from . import ground
 from .ground import Evidence, KnownHeight
 from .history import add_reset, add_update
-from .hypotheses import alive
+from .hypotheses import alive, set_state
 from .memory import HYPOTHESES
 from .startup import Places
 from .update import GATE, update_state
@@ -80,24 +80,18 @@ def weigh(
     """
     prior, bounds = np.zeros((4, 3)), ekf.workspace
     for k in range(3):
-        prior[0, k], half = 0.5 * (bounds[0, k] + bounds[1, k]), 0.5 * (bounds[1, k] - bounds[0, k])
-        prior[1 + k, k] = 1.0 / half**2
-    evidence, explained = Evidence(pairs, anchors, bounds, prior, parameters), _explanations()
-    explained.x[0] = x[:3]
-    explained.cost[0] = ground.explain(
-        evidence, height, ground.IN_TIME, explained.x[0], explained.covariance[0]
-    )
-    starts, near = np.empty((4, 2)), np.empty((2, 3))
-    surround(ekf, NEAR, near)
-    near[0, 2] = min(near[0, 2], parameters.ground_height)
-    explained.cost[0] += _absurdity(near, x)
-    explained.x[0], explained.covariance[0] = x[:3], covariance[:3, :3]
+        prior[0, k] = 0.5 * (bounds[0, k] + bounds[1, k])
+        prior[1 + k, k] = 1.0 / (0.5 * (bounds[1, k] - bounds[0, k])) ** 2
+    evidence = Evidence(pairs, anchors, bounds, prior, parameters)
+    starts, near = np.empty((4, 2)), _near_anchors(ekf, parameters)
     for start in range(4):
         for k in range(2):
             starts[start, k] = near[0, k] + (near[1, k] - near[0, k]) * (
                 0.75 if (start >> k) & 1 else 0.25
             )
-    _on_ground(ekf, evidence, height, starts, explained)
+    explained = _explanations(ekf, evidence, height, x[:3], starts)
+    explained.cost[0] += _absurdity(near, x)
+    explained.x[0], explained.covariance[0] = x[:3], covariance[:3, :3]
     best = _mix(explained)
     ekf.late_as_known = best == 1 + ground.KNOWN
     x[:3] = explained.x[best]
@@ -107,26 +101,23 @@ def weigh(
     return explained.cost[0] - np.min(explained.cost[1:])
 
 
-# Return Places for EXPLANATIONS positions, to be filled in.
 @compiled
-def _explanations() -> Places:
-    return Places(
-        np.empty((EXPLANATIONS, 3)), np.empty((EXPLANATIONS, 3, 3)), np.empty(EXPLANATIONS)
-    )
+def _near_anchors(ekf: Record, parameters: Record) -> np.ndarray:
+    """Return the bounds (2, 3) of a box around the anchors and the ground, m, world frame."""
+    near = np.empty((2, 3))
+    surround(ekf, NEAR, near)
+    near[0, 2] = min(near[0, 2], parameters.ground_height)
+    return near
 
 
 @compiled
-def sort(places: Places, near: np.ndarray) -> None:
-    """Order two places by probability, the most probable first.
+def sort(places: Places, ekf: Record, parameters: Record) -> None:
+    """Order two Places by probability, the most probable first.
 
-    Parameters
-    ----------
-    places : Places
-        Two places that explain the TDOAs; sorted in place, with costs relative to the first.
-    near : (2, 3) array
-        Lower and upper bounds of the anchors, m, world frame.
+    The costs become relative to the first. A place far above or below the anchors is improbable.
     """
     x, covariance, cost = places.x, places.covariance, places.cost
+    near = _near_anchors(ekf, parameters)
     for place in range(2):
         cost[place] += _absurdity(near, x[place])
     if cost[1] < cost[0]:
@@ -141,14 +132,17 @@ def _absurdity(near: np.ndarray, x: np.ndarray) -> float:
 
 
 @compiled
-def _on_ground(
-    ekf: Record, evidence: Evidence, height: KnownHeight, starts: np.ndarray, explained: Places
-) -> None:
-    """Fill in the explanations from 1 on: on the ground, with each lateness.
+def _explanations(
+    ekf: Record, evidence: Evidence, height: KnownHeight, x: np.ndarray, starts: np.ndarray
+) -> Places:
+    """Return EXPLANATIONS positions: near x (3,), then on the ground with each lateness.
 
-    starts (k, 2) are the horizontal start positions of the search, m, world frame.
+    starts (k, 2) are the horizontal start positions of the search on the ground, m, world frame.
     """
-    position, each, cost = explained.x, explained.covariance, explained.cost
+    position, each = np.empty((EXPLANATIONS, 3)), np.empty((EXPLANATIONS, 3, 3))
+    cost = np.empty(EXPLANATIONS)
+    position[0] = x
+    cost[0] = ground.explain(evidence, height, ground.IN_TIME, position[0], each[0])
     if math.isnan(height.z):
         height = KnownHeight(
             evidence.parameters.ground_height + ground.GROUND_HEIGHT, ground.GROUND_STD
@@ -171,6 +165,7 @@ def _on_ground(
             cost[1 + ground.KNOWN] += (
                 0.5 * ((position[1 + ground.KNOWN, axis] - ekf.floor_place[axis]) / REACH) ** 2
             )
+    return Places(position, each, cost)
 
 
 @compiled
@@ -185,13 +180,8 @@ def _mix(explained: Places) -> int:
     weights /= np.sum(weights)
     for k in range(len(cost)):
         if k != best and weights[k] > 0.0:
-            for i in range(3):
-                for j in range(3):
-                    each[best, i, j] += (
-                        weights[k]
-                        * (position[k, i] - position[best, i])
-                        * (position[k, j] - position[best, j])
-                    )
+            apart = position[k] - position[best]
+            each[best] += np.outer(weights[k] * apart, apart)
     return best
 
 
@@ -211,10 +201,9 @@ def stop(x: np.ndarray, covariance: np.ndarray, of_velocity: np.ndarray) -> None
     x[3:] = 0.0
     covariance[:, 3:] = 0.0
     covariance[3:, :] = 0.0
-    for k in range(3):
-        for j in range(3):
-            covariance[3 + k, 3 + j] = of_velocity[k, j]
-        covariance[3 + k, 3 + k] += SPEED_STD**2
+    covariance[3:, 3:] = of_velocity
+    for k in range(3, 6):
+        covariance[k, k] += SPEED_STD**2
 
 
 @compiled
@@ -275,19 +264,11 @@ def find_landed(
     prior, wide = np.empty((4, 3)), best.P[:3, :3].copy()
     for k in range(3):
         wide[k, k] += LANDING_STD[k] ** 2
-    prior[0], prior[1:] = best.x[:3], _inverse(wide)
-    evidence, nowhere, explained = (
-        Evidence(pairs, anchors, ekf.workspace, prior, parameters),
-        KnownHeight(np.nan, np.nan),
-        _explanations(),
-    )
-    explained.x[0] = best.x[:3]
-    explained.cost[0] = ground.explain(
-        evidence, nowhere, ground.IN_TIME, explained.x[0], explained.covariance[0]
-    )
-    starts = np.empty((1, 2))
-    starts[0, 0], starts[0, 1] = best.x[0], best.x[1]
-    _on_ground(ekf, evidence, nowhere, starts, explained)
+    prior[0], prior[1:] = best.x[:3], ground.inverse(wide)
+    evidence = Evidence(pairs, anchors, ekf.workspace, prior, parameters)
+    starts = best.x[:2].copy().reshape(1, 2)
+    unknown = KnownHeight(np.nan, np.nan)
+    explained = _explanations(ekf, evidence, unknown, best.x[:3], starts)
     k = 1 + int(np.argmin(explained.cost[1:]))
     if explained.cost[k] + DECISIVE > explained.cost[0]:
         return -1
@@ -328,8 +309,7 @@ def set_hovering_position(
             else:
                 std = math.sqrt(ekf.still_covariance[state - 3, state - 3] + SPEED_STD**2)
             update_state(ekf.hypotheses[h], ekf.innovation, state, value, std)
-            if h == ekf.best:
-                add_update(ekf, t, records)
+            add_update(ekf, h, t, records)
 
 
 @compiled
@@ -351,21 +331,10 @@ def set_position(
     records : (n,) RECORD
         History for the smoother; empty for no recording.
     """
+    x, of_x = np.zeros(6), np.zeros((6, 6))
+    x[:3], of_x[:3, :3] = position, covariance
+    stop(x, of_x, ekf.still_covariance)
     for h in range(HYPOTHESES):
-        hypothesis = ekf.hypotheses[h]
-        hypothesis.P[:6, :] = 0.0
-        hypothesis.P[:, :6] = 0.0
-        auxiliary.forget(hypothesis)
-        hypothesis.x[:3] = position
-        hypothesis.P[:3, :3] = covariance
-        stop(hypothesis.x[:6], hypothesis.P[:6, :6], ekf.still_covariance)
+        set_state(ekf.hypotheses[h], x, of_x)
     ekf.consistency = 1.0
     add_reset(ekf, t, records)
-
-
-@compiled
-def _inverse(matrix: np.ndarray) -> np.ndarray:
-    """Return the inverse of a positive definite (3, 3) matrix."""
-    both = np.concatenate((matrix, np.eye(3)), axis=1)
-    ground.solve(both)
-    return both[:, 3:]

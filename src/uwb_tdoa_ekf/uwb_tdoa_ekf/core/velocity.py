@@ -11,19 +11,16 @@ bias of the gyroscope.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from uwb_tdoa_bias.common.compiled import Record, compiled
-from uwb_tdoa_bias.common.robust_loss import GEMAN_MCCLURE, weight
 
 from .height import STUCK_TIME
 from .history import add_update
 from .hypotheses import add_log_likelihood, alive
 from .memory import REJECTED, USED
 from .state import rotation
-from .update import GATE, kalman, project
+from .update import GATE, kalman_robust, project
 
 # Set on the six flights of 0425/TDOA2, see docs/notebook/auxiliary_sensors.md. They have no wheels:
 # SLIP, HELD and STANDING were set on simulated drives.
@@ -81,11 +78,8 @@ def observe(
         return
     residual.weight, residual.verdict = 1.0, USED
     if of_wheels:
-        state.agreed, state.yaw_rate, state.yaw_rate_variance = (
-            sensor.t,
-            sensor.value[YAW_RATE],
-            sensor.std[YAW_RATE] ** 2,
-        )
+        state.agreed, state.yaw_rate = sensor.t, sensor.value[YAW_RATE]
+        state.yaw_rate_variance = sensor.std[YAW_RATE] ** 2
         state.speed_variance = sensor.std[0] ** 2 if sensor.std[0] <= LONGEST_STD else 0.0
     for h in range(len(ekf.hypotheses)):
         hypothesis = ekf.hypotheses[h]
@@ -102,27 +96,16 @@ def observe(
                 ekf.transition.rotation,
                 innovation,
             )
-            total = innovation.prior_variance + innovation.noise_variance
-            w = weight(GEMAN_MCCLURE, innovation.value / math.sqrt(total), GATE)
             add_log_likelihood(hypothesis, innovation, inflation)
-            variance_inflation = 1.0 if leads else inflation
-            innovation.total_variance = (
-                innovation.prior_variance + innovation.noise_variance * variance_inflation / w
-            )
-            kalman(hypothesis, innovation)
+            w = kalman_robust(hypothesis, innovation, 1.0 if leads else inflation, GATE)
+            add_update(ekf, h, sensor.t, records)
             if h == ekf.best:
                 residual.weight = min(residual.weight, w)
-                add_update(ekf, sensor.t, records)
         if of_wheels and ekf.sensed:
             _compare_yaw_rate(hypothesis, sensor, ekf.imu, innovation)
-            white = innovation.prior_variance + GYRO_RATE * parameters.gyro_noise**2
-            w = weight(
-                GEMAN_MCCLURE, innovation.value / math.sqrt(white + innovation.noise_variance), GATE
-            )
-            innovation.total_variance = white + innovation.noise_variance * inflation / w
-            kalman(hypothesis, innovation)
-            if h == ekf.best:
-                add_update(ekf, sensor.t, records)
+            innovation.prior_variance += GYRO_RATE * parameters.gyro_noise**2
+            kalman_robust(hypothesis, innovation, inflation, GATE)
+            add_update(ekf, h, sensor.t, records)
 
 
 @compiled

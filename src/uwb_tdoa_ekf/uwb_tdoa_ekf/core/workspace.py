@@ -66,15 +66,23 @@ def surround(ekf: Record, margin: float, bounds: np.ndarray) -> None:
     """
     set_bounds(ekf.extent, margin, bounds)
     for k in range(3):
-        bounds[0, k], bounds[1, k] = (
-            max(bounds[0, k], ekf.within[0, k]),
-            min(bounds[1, k], ekf.within[1, k]),
-        )
+        bounds[0, k] = max(bounds[0, k], ekf.within[0, k])
+        bounds[1, k] = min(bounds[1, k], ekf.within[1, k])
     axis, sign, plane = ekf.side
     if sign > 0.0:
         bounds[0, int(axis)] = plane
     elif sign < 0.0:
         bounds[1, int(axis)] = plane
+
+
+@compiled
+def _extent(rows: np.ndarray, anchors: np.ndarray, axis: int) -> tuple[float, float]:
+    """Return the least and the largest coordinate of the anchors in rows (k,), in m."""
+    low, high = np.inf, -np.inf
+    for row in rows:
+        at = anchors[row].position[axis]
+        low, high = min(low, at), max(high, at)
+    return low, high
 
 
 @compiled
@@ -103,9 +111,7 @@ def configured_side(
     axis, sign = 2, -1.0 if tag_side == BELOW else 1.0
     if tag_side > ABOVE:
         axis, sign = (tag_side - ABOVE - 1) // 2, -1.0 if (tag_side - ABOVE) % 2 else 1.0
-    low = high = anchors[rows[0]].position[axis]
-    for row in rows:
-        low, high = min(low, anchors[row].position[axis]), max(high, anchors[row].position[axis])
+    low, high = _extent(rows, anchors, axis)
     return float(axis), sign if high - low < FLAT else 0.0, 0.5 * (low + high)
 
 
@@ -166,29 +172,16 @@ def listen(
     rows = rows_heard(window)
     side = configured_side(rows, anchors, tag_side)
     ekf.side[0], ekf.side[1], ekf.side[2] = side
-    for k in range(3):
-        low, high = np.inf, -np.inf
-        for row in rows:
-            low, high = min(low, anchors[row].position[k]), max(high, anchors[row].position[k])
-        ekf.middle[k] = 0.5 * (low + high)
-        ekf.flat[k] = 1.0 if high - low < FLAT and not (side[1] != 0.0 and k == side[0]) else 0.0
     for i in range(len(rows)):
         for j in range(i):
             one, other = anchors[rows[i]].position, anchors[rows[j]].position
-            reach = max(
-                reach,
-                math.sqrt(
-                    (one[0] - other[0]) ** 2 + (one[1] - other[1]) ** 2 + (one[2] - other[2]) ** 2
-                ),
-            )
+            square = (one[0] - other[0]) ** 2 + (one[1] - other[1]) ** 2 + (one[2] - other[2]) ** 2
+            reach = max(reach, math.sqrt(square))
     for k in range(3):
-        ekf.within[0, k], ekf.within[1, k] = -np.inf, np.inf
-        for row in rows:
-            at = anchors[row].position[k]
-            ekf.within[0, k], ekf.within[1, k] = (
-                max(ekf.within[0, k], at - reach),
-                min(ekf.within[1, k], at + reach),
-            )
+        low, high = _extent(rows, anchors, k)
+        ekf.middle[k] = 0.5 * (low + high)
+        ekf.flat[k] = 1.0 if high - low < FLAT and not (side[1] != 0.0 and k == side[0]) else 0.0
+        ekf.within[0, k], ekf.within[1, k] = high - reach, low + reach
 
 
 @compiled
@@ -208,31 +201,20 @@ def add_circle(ekf: Record, height_known: bool, x: np.ndarray, covariance: np.nd
     covariance : (9, 9) array
         Covariance of position, velocity and attitude, updated in place.
     """
-    square, across = 0.0, 0
-    for k in range(3):
-        if ekf.flat[k] > 0.0:
-            square, across = square + (x[k] - ekf.middle[k]) ** 2, across + 1
-    if across != 2 or (height_known and ekf.flat[2] > 0.0):
+    flat = ekf.flat
+    if flat[0] + flat[1] + flat[2] != 2.0 or (height_known and flat[2] > 0.0):
         return
-    for i in range(3):
-        for j in range(3):
-            if ekf.flat[i] > 0.0 and ekf.flat[j] > 0.0:
-                covariance[i, j] += (x[i] - ekf.middle[i]) * (x[j] - ekf.middle[j]) + (
-                    0.5 * square if i == j else 0.0
-                )
+    away = flat * (x[:3] - ekf.middle)
+    covariance[:3, :3] += np.outer(away, away) + np.diag(0.5 * np.sum(away * away) * flat)
 
 
 @compiled
 def rows_heard(window: np.ndarray) -> np.ndarray:
-    """Return the rows of the anchors in a window (n,) of TDOA, each once."""
+    """Return the rows of the anchors in a window (n,) of TDOA or PAIR, each once, as heard first."""
     rows, count = np.empty(2 * len(window), np.int64), 0
     for i in range(len(window)):
-        for side in range(2):
-            row = window[i].a if side == 0 else window[i].b
-            k = 0
-            while k < count and rows[k] != row:
-                k += 1
-            if k == count:
+        for row in (window[i].a, window[i].b):
+            if not np.any(rows[:count] == row):
                 rows[count] = row
                 count += 1
     return rows[:count]
@@ -264,11 +246,7 @@ def is_filled(bounds: np.ndarray, P: np.ndarray) -> bool:
 
     The test is whether its 3D standard deviation exceeds the diagonal of the bounds.
     """
-    spread = size = 0.0
-    for k in range(3):
-        spread += P[k, k]
-        size += (bounds[1, k] - bounds[0, k]) ** 2
-    return spread > size
+    return np.trace(P[:3, :3]) > np.sum((bounds[1] - bounds[0]) ** 2)
 
 
 @compiled

@@ -17,7 +17,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.compiled import Record, compiled
 
-from .state import CHECK_PERIOD, ERROR_STATES
+from .state import CHECK_PERIOD, ERROR_STATES, propagate_vector
 
 MEMORY = 6.0  # s over which innovations count
 YAW_KNOWN = math.radians(20.0)  # rad, standard deviation below which the yaw counts as known
@@ -43,29 +43,11 @@ def predict(ekf: Record, vx: float, vy: float) -> None:
 
     vx and vy are its horizontal velocity before the prediction, m/s, world frame.
     """
-    transition, x = ekf.transition, ekf.hypotheses[ekf.best].x
-    A, B, E, dt = (
-        transition.velocity_attitude,
-        transition.velocity_accel_bias,
-        transition.attitude_attitude,
-        transition.dt,
-    )
+    x, dt = ekf.hypotheses[ekf.best].x, ekf.transition.dt
     along, across = x[3] - vx, x[4] - vy
     for c in range(2):
         response = ekf.yaw_test.response[c]
-        t0, t1, t2 = response[6], response[7], response[8]
-        b0, b1, b2 = response[9], response[10], response[11]
-        for r in range(3):
-            response[r] += dt * response[3 + r]
-            response[3 + r] += (
-                A[r, 0] * t0
-                + A[r, 1] * t1
-                + A[r, 2] * t2
-                + B[r, 0] * b0
-                + B[r, 1] * b1
-                + B[r, 2] * b2
-            )
-            response[6 + r] = E[r, 0] * t0 + E[r, 1] * t1 + E[r, 2] * t2 - dt * response[12 + r]
+        propagate_vector(response, ekf.transition)
         dx, dy = (along, across) if c == 0 else (-across, along)
         response[0] += 0.5 * dt * dx
         response[1] += 0.5 * dt * dy
@@ -82,7 +64,7 @@ def observe(ekf: Record, correlation_length: float, shows: bool) -> None:
     ekf : EKF
         State of the filter; yaw_test is updated.
     correlation_length : float
-        Number of measurements that count as a single independent one, see robust.py.
+        Number of measurements that count as a single independent one, see update.py.
     shows : bool
         Whether the innovation is evidence. Otherwise only the responses follow the update.
     """

@@ -20,7 +20,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Imu, Tdoas, Truth
 from uwb_tdoa_bias.common.sensors import Sensor, Stream
 from uwb_tdoa_bias.common.sensors.sensor import LARGEST_NUMBER
-from uwb_tdoa_ekf.frames import pose_and_twist
+from uwb_tdoa_ekf.results import pose_and_twist
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence

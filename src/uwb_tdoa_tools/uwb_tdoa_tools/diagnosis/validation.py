@@ -13,8 +13,8 @@ import numpy as np
 
 from uwb_tdoa_bias.correction.corrector import Corrector, FixedPoseCorrector
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_ekf.frames import poses_of
 from uwb_tdoa_ekf.offline import run_offline
+from uwb_tdoa_ekf.results import poses_of
 
 from ..scoring.metrics import EVERYTHING, Score, rms
 from .comparison import Baseline, ValidationCase, score

@@ -37,8 +37,7 @@ from uwb_tdoa_bias.common.files import temporary_folder
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet, StreamCorrector
 from uwb_tdoa_ekf.estimator import Estimator
-from uwb_tdoa_ekf.frames import poses_of
-from uwb_tdoa_ekf.results import Odometry, concatenated
+from uwb_tdoa_ekf.results import Odometry, concatenated, poses_of
 
 from .exported import CompiledCorrection
 

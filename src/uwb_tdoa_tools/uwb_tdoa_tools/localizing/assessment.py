@@ -12,10 +12,9 @@ import numpy as np
 
 from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_ekf.core.yaw_check import YAW_KNOWN
-from uwb_tdoa_ekf.frames import rotation_std
 from uwb_tdoa_ekf.monitoring.finding import ERROR
 from uwb_tdoa_ekf.offline import Run
-from uwb_tdoa_ekf.results import Odometry, Residuals
+from uwb_tdoa_ekf.results import Odometry, Residuals, rotation_std
 
 from ..checking.check import check
 from ..checking.recording import of_flight

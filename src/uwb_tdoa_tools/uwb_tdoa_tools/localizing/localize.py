@@ -12,8 +12,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_filled
-from uwb_tdoa_ekf.frames import rotation_std
-from uwb_tdoa_ekf.results import Odometry
+from uwb_tdoa_ekf.results import Odometry, rotation_std
 
 from .. import command_lines
 from ..bags.bag import write_odometry
