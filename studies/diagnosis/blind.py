@@ -175,10 +175,13 @@ def _as_they_are(flights, judge, base, where):
     return _told_as_they_are[key]
 
 
-def run(source, seed, draw=grammar.draw):
-    """dict of the case of a seed; None if it costs too little. draw : as of `case`"""
-    drawn = case(source, seed, draw=draw)
-    return None if drawn is None else {"seed": seed, **_judge(1, *drawn)}
+def run(source, seed, draw=grammar.draw, count=1):
+    """dict of the case of a seed, `count` flights diagnosed; None if it costs too little.
+
+    draw : as of `case`
+    """
+    drawn = case(source, seed, count + 1, draw)
+    return None if drawn is None else {"seed": seed, **_judge(count, *drawn)}
 
 
 def several(source, number, seed):

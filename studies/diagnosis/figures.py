@@ -26,7 +26,7 @@ from uwb_tdoa_tools.parallel import over, whole_number
 from uwb_tdoa_tools.results_file import ResultsFile
 from uwb_tdoa_tools.surveying.report import with_blocked
 
-from . import bank, blind, faults, floor, measured, processes, referenced, undeclared
+from . import bank, blind, faults, floor, measured, processes, referenced, splits, undeclared
 
 PARTS = (
     "bank",
@@ -42,6 +42,7 @@ PARTS = (
     "measured-sensors",
     "floor",
     "references",
+    "splits",
     "speed",
 )
 # flights with the same effect: no measured group of one protocol has more
@@ -58,8 +59,8 @@ def add_options(add):
         type=int,
         default=5,
         help=(
-            "flights for each effect and size, cases of blind, processes and several, or costly "
-            "draws of each of the faults (default: 5)"
+            "flights for each effect and size, cases of blind, processes, several and splits, or "
+            "costly draws of each of the faults (default: 5)"
         ),
     )
     add(
@@ -67,7 +68,10 @@ def add_options(add):
         metavar="SEED",
         type=int,
         default=blind.DEVELOPED_ON,
-        help="first seed of blind, processes, several, faults and no-truth (default: %(default)s)",
+        help=(
+            "first seed of blind, processes, several, splits, faults and no-truth "
+            "(default: %(default)s)"
+        ),
     )
     add("--data", metavar="DIR", type=Path, help="the measured flights: flights/, util/, surveys/")
     add(
@@ -75,7 +79,7 @@ def add_options(add):
         metavar="N",
         type=whole_number,
         default=1,
-        help="cases of blind, processes and several at once (default: %(default)s)",
+        help="cases of blind, processes, several and splits at once (default: %(default)s)",
     )
     add(
         "--cases",
@@ -89,7 +93,16 @@ def run(args):
     """Run a part, and write and print its figures."""
     args.out.mkdir(parents=True, exist_ok=True)
     on_data = dict.fromkeys(
-        ("faults", "injected", "measured", "measured-sensors", "floor", "references"), ("data",)
+        (
+            "faults",
+            "injected",
+            "measured",
+            "measured-sensors",
+            "floor",
+            "references",
+            "splits",
+        ),
+        ("data",),
     )
     for option in {"undeclared": ("cases",), **on_data}.get(args.part, ()):
         if getattr(args, option) is None:
@@ -109,6 +122,7 @@ def run(args):
         "measured-sensors": _measured_sensors,
         "floor": _floor,
         "references": _references,
+        "splits": _splits,
         "speed": _speed,
     }[args.part](args)
     result["seconds"] = round(time.monotonic() - started, 1)
@@ -178,8 +192,10 @@ def _blind(args):
 
 
 def _processes(args):
-    """As blind, with the effects of the second generator, which have no shape that a word names."""
-    results = _drawn(args, partial(blind.run, _source(args), draw=processes.draw))
+    """As blind, of two flights, with the effects of the second generator, which have no shape that a
+    word names.
+    """
+    results = _drawn(args, partial(blind.run, _source(args), draw=processes.draw, count=2))
     figures = blind.figures(results)
     del figures["shape right"]
     kinds = {r["shape"] for r in results}
@@ -270,6 +286,11 @@ def _floor(args):
 def _references(args):
     results = _each(referenced.cases(), lambda *case: referenced.run(args.data, *case))
     return {"figures": referenced.figures(results), "cases": results}
+
+
+def _splits(args):
+    results = _drawn(args, partial(splits.run, args.data))
+    return {"figures": splits.figures(results), "cases": results}
 
 
 def _speed(args):

@@ -9,7 +9,7 @@ from known_effects import clean_flight
 import numpy as np
 import pytest
 
-from studies.diagnosis import blind, grammar
+from studies.diagnosis import blind, grammar, splits
 from studies.diagnosis.claims import claims, truth_of
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, SmoothTerm
 from uwb_tdoa_tools.diagnosis.findings import EffectFinding
@@ -178,3 +178,24 @@ def test_what_is_told_is_removed(flight, covariate):
     plain, before = (blind.rmse(one, EffectSet()) for one in (flight, flown))
     assert before > 1.5 * plain
     assert blind.told(effect, flown, plain, EffectSet()) < plain + 0.25 * (before - plain)
+
+
+def test_a_split_fits_and_judges_other_flights_of_one_day():
+    several = [splits.drawn(seed) for seed in range(100)]
+    assert several[7] == splits.drawn(7)
+    assert {day for day, _, _ in several} == set(splits.DAYS)
+    for day, fit, judge in several:
+        assert fit and judge and not set(fit) & set(judge)
+        assert {*fit, *judge} <= set(splits.DAYS[day])
+
+
+def test_splits_are_summed_up():
+    results = [
+        {"promised": [0.4, 0.2], "judged": [["a", 0.3, 0.15], ["b", 0.1, 0.05]]},
+        {"promised": [0.4, 0.4], "judged": [["a", 0.3, 0.33]]},
+    ]
+    found = splits.figures(results)
+    assert found["obtained for each promised"] == pytest.approx(1.0)
+    assert found["mean obtained gain"] == pytest.approx(0.5 * (0.5 - 0.1))
+    assert (found["judged flights"], found["flights worse by 5 %"]) == (3, 1)
+    assert found["worst, error after over before"] == pytest.approx(1.1)

@@ -8,7 +8,7 @@ import base64
 import io
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from ...scoring.plots import plt
+import matplotlib.pyplot as plt
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -1,0 +1,80 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
+"""Random splits by whole flights: what a diagnosis of some flights of a day promises, and what other
+flights of the day get.
+"""
+
+import numpy as np
+
+from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_tools.diagnosis import diagnose
+
+from . import blind, measured
+
+_UTIL = "util/const{}-trial{}.csv.gz"
+# {installation: paths of its flights}
+DAYS = {
+    "0425": [path for side in measured.SPLITS["0425 a"] for path in side],
+    "0426": [path for side in measured.SPLITS["0426 a"] for path in side],
+    "const1": [_UTIL.format(1, name) for name in ("1-tdoa2", "1-tdoa3", "2-tdoa2", "3-tdoa2")],
+    "const3": [_UTIL.format(3, f"{trial}-tdoa2") for trial in (1, 2, 3, 4)],
+    "const4 trial 1": [_UTIL.format(4, f"1-tdoa2-traj{k}") for k in (1, 2, 3)],
+    "const4 trial 3": [_UTIL.format(4, f"3-tdoa2-traj{k}") for k in (1, 2, 3)],
+}
+SHARES = (0.3, 0.3, 0.1, 0.14, 0.08, 0.08)  # of the draws, by day
+FITTED, JUDGED = (5, 4)  # flights of a split at most
+WORSE = 1.05  # error after over before, above which a flight counts as worse
+
+
+def drawn(seed):
+    """(day, paths to fit, paths to judge) of a seed."""
+    rng = np.random.default_rng([seed, 99])
+    day = str(rng.choice(list(DAYS), p=SHARES))
+    flights = DAYS[day]
+    number = int(rng.integers(1, min(FITTED, len(flights) - 1) + 1))
+    order = [flights[k] for k in rng.permutation(len(flights))]
+    return day, order[:number], order[number : number + JUDGED]
+
+
+def run(data, seed):
+    """dict of a split: the promised errors, and those of each judged flight, m."""
+    day, fit, judge = drawn(seed)
+    result = diagnose(measured.load(data, fit))
+    promised = [
+        float(np.mean([score.rmse_3d for score in side["scores"]]))
+        for side in (result.before, result.after)
+    ]
+    rows = [
+        [flight.name, blind.rmse(flight, EffectSet()), blind.rmse(flight, result.effects)]
+        for flight in measured.load(data, judge)
+    ]
+    names = [effect.label for effect in result.effects]
+    return {
+        "seed": seed,
+        "day": day,
+        "fitted": fit,
+        "promised": promised,
+        "judged": rows,
+        "applied": names,
+    }
+
+
+def figures(results):
+    """Figures of all splits."""
+    promised, obtained, ratios = [], [], []
+    for result in results:
+        before, after = result["promised"]
+        promised.append(1.0 - after / before)
+        errors = np.array([row[1:] for row in result["judged"]])
+        obtained.append(1.0 - errors[:, 1].mean() / errors[:, 0].mean())
+        ratios += (errors[:, 1] / errors[:, 0]).tolist()
+    promised, obtained, ratios = map(np.array, (promised, obtained, ratios))
+    return {
+        "splits": len(results),
+        "judged flights": len(ratios),
+        "mean promised gain": promised.mean(),
+        "mean obtained gain": obtained.mean(),
+        "obtained for each promised": promised @ obtained / max(promised @ promised, 1e-12),
+        "flights worse by 5 %": int(np.sum(ratios > WORSE)),
+        "worst, error after over before": ratios.max(),
+    }
