@@ -151,8 +151,8 @@ def test_options_change_the_bound(anchors, tmp_path, monkeypatch):
     base = median()
     assert median("--protocol", "tdoa3") == pytest.approx(median("--covariance", "all_pairs"))
     # nor is the bound looked for in what follows from it
-    monkeypatch.setattr(run, "draw_map", lambda *_, **__: None)
-    monkeypatch.setattr(run, "room_advice", lambda *_: None)
+    monkeypatch.setattr(run, "draw_map", lambda *_: None)
+    monkeypatch.setattr(run, "advice", lambda *_: None)
     (tmp_path / "weak.yaml").write_text(
         "azimuth: [0,0,0,0]\nelevation_1: [0,0,0,0]\nelevation_2: [0,0,0,0]\ngain_offset: -20\n"
     )

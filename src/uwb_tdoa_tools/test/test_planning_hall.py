@@ -10,13 +10,13 @@ import pytest
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_tools.commands.plan import main
+from uwb_tdoa_tools.parallel import Progress
 from uwb_tdoa_tools.planning.hall import Hall
 from uwb_tdoa_tools.planning.installation import Installation
-from uwb_tdoa_tools.planning.layout import Goal
-from uwb_tdoa_tools.planning.maps import TOO_FEW, Demand, Grid, chart
-from uwb_tdoa_tools.planning.optimisation import with_one
+from uwb_tdoa_tools.planning.maps import TOO_FEW, Demand, Grid
+from uwb_tdoa_tools.planning.optimisation import best_addition, with_one
 from uwb_tdoa_tools.planning.report import summary
-from uwb_tdoa_tools.planning.run import hall_advice
+from uwb_tdoa_tools.planning.run import places_in_hall
 from uwb_tdoa_tools.simulation.rooms import Room, Walls
 
 REACH = 15.0  # m
@@ -37,14 +37,7 @@ def anchors_of(nx, ny, hole=None, spacing=8.0):
 def hall_of(anchors, reach=REACH, accuracy=1.0):
     room = Room(np.array([-4.0, -4.0, 0.0]), np.array([60.0, 60.0, 6.0]))
     return Hall(
-        Goal(
-            np.empty((0, 3)),
-            Installation(anchors, hall=True),
-            "all_pairs",
-            demand=Demand(room, accuracy),
-        ),
-        anchors,
-        reach,
+        Installation(anchors, pairing="all_pairs", hall=True), Demand(room, accuracy), reach
     )
 
 
@@ -79,11 +72,8 @@ def test_cells_hear_nothing_through_a_wall():
 def test_where_all_are_heard_it_is_the_chart_of_a_room():
     anchors = anchors_of(3, 3)
     grid, hall = Grid.slice((1.0, 15.0), (1.0, 15.0), 1.2, 2.0), hall_of(anchors, 100.0)
-    found, whole = (
-        hall.chart(grid, jobs=1),
-        chart(hall.goal.installed(anchors), grid, hall.goal.demand),
-    )
-    assert (found.heard == len(anchors)).all()
+    found, whole = hall.chart(grid, jobs=1), replace(hall, reach=np.inf).chart(grid)
+    np.testing.assert_array_equal(found.heard, whole.heard)
     np.testing.assert_allclose(found.error, whole.error, rtol=1e-9)
     np.testing.assert_array_equal(found.status, whole.status)
 
@@ -93,7 +83,8 @@ def test_one_more_anchor_is_proposed_near_the_hole_and_gains_what_is_promised():
     hall = hall_of(anchors, accuracy=0.4)
     grid = Grid.slice((4.0, 52.0), (4.0, 52.0), 1.2, 4.0)
     found = hall.chart(grid, jobs=1)
-    added = hall_advice(hall, found)
+    places = places_in_hall(hall.demand.room, hall.reach)
+    added = best_addition(hall, found, places, Progress("plan"))
     assert (
         added["gain"] > 0.02 and np.hypot(*(np.array(added["position"][:2]) - 28.0)) < 2.0 * REACH
     )
@@ -151,7 +142,7 @@ def test_a_hall_whose_anchors_all_hang_at_one_height_needs_a_side(tmp_path, caps
     anchors = anchors_of(6, 5)
     flat = anchors.at(np.column_stack([anchors.positions[:, :2], np.full(len(anchors), 5.0)]))
     points = Grid.slice((4.0, 36.0), (4.0, 28.0), 1.2, 8.0).points
-    found = Hall(hall_of(anchors).goal, flat, REACH).side(points)
+    found = hall_of(flat).side(points)
     assert found["tag_side"] == ["below"] and found["share"] > 0.9
     assert hall_of(anchors).side(points) is None
 

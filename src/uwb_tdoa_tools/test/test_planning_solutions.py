@@ -15,8 +15,7 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_tools.planning.bifurcation import MOST_SUBSETS, Subsets, same_place, solutions
 from uwb_tdoa_tools.planning.hall import Hall
-from uwb_tdoa_tools.planning.installation import FixedNoise, Installation, RadioNoise, all_pairs
-from uwb_tdoa_tools.planning.layout import Goal
+from uwb_tdoa_tools.planning.installation import FixedNoise, Installation, RadioNoise
 from uwb_tdoa_tools.planning.maps import (
     IMPRECISE,
     TWO_SOLUTIONS,
@@ -248,12 +247,8 @@ def test_in_a_hall_a_wall_or_a_missing_anchor_gains_a_place_only_by_a_lost_minim
     rng = np.random.default_rng(seed)
     room = box(rng, [30, 20, 4], [60, 40, 8])
     positions = rng.uniform(room.lower, room.upper, (int(rng.integers(10, 25)), 3))
-    goal = Goal(
-        np.empty((0, 3)),
-        Installation(Anchors.from_positions(positions), FixedNoise(0.1), hall=True),
-        demand=Demand(room),
-    )
-    whole = Hall(goal, Anchors.from_positions(positions), 20.0)
+    installation = Installation(Anchors.from_positions(positions), FixedNoise(0.1), hall=True)
+    whole = Hall(installation, Demand(room), 20.0)
     points = rng.uniform(room.lower, room.upper, (300, 3))
     x, y = rng.uniform(room.lower, room.upper)[:2]
     found, heard = whole.judge(points)
@@ -263,7 +258,7 @@ def test_in_a_hall_a_wall_or_a_missing_anchor_gains_a_place_only_by_a_lost_minim
         assert (count <= heard).all() and (found.error <= other.error * (1.0 + 1e-9)).all()
         for row in np.flatnonzero(other.flyable & ~found.flyable):
             rows = whole.heard(points[[row]])[0]
-            among = goal.installed(Anchors.from_positions(positions[rows]))
+            among = installation.with_anchors(Anchors.from_positions(positions[rows]))
             place = other_solutions(points[[row]], among, room)[1][0]
             left = positions[less.heard(points[[row]])[0]]
             assert has_no_minimum_there(points[row], left, FixedNoise(0.1), place, room)
@@ -278,15 +273,7 @@ def test_imprecision_is_no_second_solution():
     anchors = Anchors.from_positions(np.column_stack([x, y, 5.0 + 0.3 * rng.random(len(x))]))
     room = Room(np.zeros(3), np.array([48.0, 36.0, 5.0]))
     points = rng.uniform([6, 6, 0.5], [42, 30, 2.0], (60, 3))
-    status = (
-        Hall(
-            Goal(np.empty((0, 3)), Installation(anchors, hall=True), demand=Demand(room, 0.3)),
-            anchors,
-            25.0,
-        )
-        .judge(points)[0]
-        .status
-    )
+    status = Hall(Installation(anchors, hall=True), Demand(room, 0.3), 25.0).judge(points)[0].status
     assert (status != TWO_SOLUTIONS).all() and (status == IMPRECISE).mean() > 0.5
 
 
@@ -296,22 +283,22 @@ def test_a_second_minimum_predicts_how_often_an_estimator_flips():
     """
     anchors, rng = constellation("random-3-5"), np.random.default_rng(4)
     room = Room(anchors.positions.min(axis=0) - 1.0, anchors.positions.max(axis=0) + 1.0)
-    for pairing, noise in ((None, 0.1), (all_pairs(5), 0.1)):
+    noise = 0.1
+    for pairing in ("ring", "all_pairs"):
         installation = Installation(anchors, FixedNoise(noise), pairing)
         points = rng.uniform(room.lower, room.upper, (2000, 3))
         misfits, places = other_solutions(points, installation, room)
         k = np.argmin(np.abs(misfits - 1.5))
-        d = installation.pairing.incidence()[: 4 if pairing is None else None]
-        root = (
-            np.linalg.cholesky(noise**2 * (d @ d.T))
-            if pairing is None
-            else np.sqrt(2) * noise * np.eye(len(d))
+        (part,) = installation.round(5)
+        d = part.incidence()
+        root = np.sqrt(2) * noise * np.eye(len(d))
+        if part.shared:
+            d = d[:4]
+            root = np.linalg.cholesky(noise**2 * (d @ d.T))
+        true, other = (
+            np.linalg.norm(p - anchors.positions, axis=1) for p in (points[k], places[k])
         )
-        change = d @ (
-            np.linalg.norm(places[k] - anchors.positions, axis=1)
-            - np.linalg.norm(points[k] - anchors.positions, axis=1)
-        )
-        shift = np.linalg.solve(root, change) * np.sqrt(installation.pairing.times)
+        shift = np.linalg.solve(root, d @ (other - true)) * np.sqrt(part.times)
         assert np.linalg.norm(shift) == pytest.approx(misfits[k], rel=1e-6)
         draws = rng.standard_normal((40_000, len(d)))
         flips = np.mean(np.sum((draws - shift) ** 2, axis=1) < np.sum(draws**2, axis=1))
@@ -339,9 +326,7 @@ def test_anchors_in_a_plane_mirror_a_place_in_the_room_and_not_one_beyond_it():
 
 
 def test_ranges_have_one_solution():
-    from uwb_tdoa_tools.planning.installation import every_range
-
-    installation = Installation(corners(), FixedNoise(0.1), every_range(8))
+    installation = Installation(corners(), FixedNoise(0.1), "every_range")
     points = np.random.default_rng(0).uniform([-3, -3, 0.3], [3, 3, 2.5], (300, 3))
     assert (judge(points, installation, Demand()).status != TWO_SOLUTIONS).all()
 

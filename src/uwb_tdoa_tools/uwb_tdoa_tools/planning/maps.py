@@ -22,7 +22,7 @@ from ..scoring.evaluation import evaluate
 from ..scoring.metrics import position_at
 from ..simulation.rooms import Room
 from .bifurcation import Subsets, same_place, solutions
-from .precision import bound, information, position_error, range_weights
+from .precision import bound, information, position_error, round_weights
 from .second_minimum import CLEAR, second_minima
 
 if TYPE_CHECKING:
@@ -89,11 +89,9 @@ class Judged:
 
     def assign(self, rows: np.ndarray, found: Judged) -> None:
         """Set the states of some of its places."""
-        self.covariance[rows], self.error[rows], self.status[rows] = (
-            found.covariance,
-            found.error,
-            found.status,
-        )
+        self.covariance[rows] = found.covariance
+        self.error[rows] = found.error
+        self.status[rows] = found.status
 
 
 def judge(
@@ -114,15 +112,14 @@ def judge(
     error = position_error(covariance)
     status = np.where(error <= demand.accuracy, FLYABLE, IMPRECISE)
     if demand.quick:
-        return Judged(covariance, error, status)
-    if demand.criterion == "pairings":
-        status[Subsets(installation.anchors, installation.unknowns).ambiguous(points) > 0.0] = (
-            TWO_SOLUTIONS
-        )
+        pass
+    elif demand.criterion == "pairings":
+        ambiguous = Subsets(installation.anchors, installation.unknowns).ambiguous(points) > 0.0
+        status[ambiguous] = TWO_SOLUTIONS
         status[~installation.inside_hull(points)] = OUTSIDE
-        return Judged(covariance, error, status)
-    misfit, _ = other_solutions(points, installation, demand.room, columns)
-    status[misfit <= CLEAR] = TWO_SOLUTIONS
+    else:
+        misfit, _ = other_solutions(points, installation, demand.room, columns)
+        status[misfit <= CLEAR] = TWO_SOLUTIONS
     return Judged(covariance, error, status)
 
 
@@ -138,20 +135,15 @@ def other_solutions(
         columns = np.broadcast_to(np.arange(len(anchors)), (len(points), len(anchors)))
     heard = columns.shape[1]
     misfits, places = [np.empty(0)], [np.empty((0, 3))]
-    for rows in np.array_split(
-        np.arange(len(points)), max(1, len(points) * max(heard**2, len(anchors)) // _CHUNK)
-    ):
-        variance = np.take_along_axis(
-            installation.noise.variance(points[rows], anchors), columns[rows], axis=1
-        )
-        weights = np.ascontiguousarray(
-            range_weights(variance, installation.pairing, installation.link_std)
-        )
+    size = len(points) * max(heard**2, len(anchors))
+    for rows in np.array_split(np.arange(len(points)), max(1, size // _CHUNK)):
+        variances = installation.noise.variance(points[rows], anchors)
+        variance = np.take_along_axis(variances, columns[rows], axis=1)
         misfit, place = second_minima(
             points[rows],
             anchors.positions,
             np.ascontiguousarray(columns[rows]),
-            weights,
+            np.ascontiguousarray(round_weights(variance, installation)),
             room,
             installation.unknowns,
         )
@@ -247,19 +239,6 @@ class Chart(Judged):
             anchors.frame,
             dimensions == 2,
         )
-
-
-def chart(installation: Installation, grid: Grid, demand: Demand) -> Chart:
-    """Return the Chart of a Grid if each cell hears all anchors of an Installation."""
-    points = grid.points
-    found = judge(points, installation, demand)
-    return Chart(
-        found.covariance,
-        found.error,
-        found.status,
-        grid,
-        np.full(len(points), len(installation.anchors)),
-    )
 
 
 PLACES_ACROSS = {2: 40, 3: 10}  # places along the longest side of a slice, of a volume, at most
@@ -361,7 +340,7 @@ class AccuracyMap:
 
 def accuracy_map(samples: ErrorSamples, installation: Installation, grid: Grid) -> AccuracyMap:
     """Return the AccuracyMap of ErrorSamples. Estimates outside of the grid are left out."""
-    variances = np.diagonal(bound_along(samples, installation), axis1=1, axis2=2)
+    variances = np.diagonal(bound(information(samples.place, installation)), axis1=1, axis2=2)
     claimed = np.diagonal(samples.covariance, axis1=1, axis2=2)
     cell = np.floor((samples.place - grid.lower) / grid.step).astype(int)
     inside = ((cell >= 0) & (cell < grid.shape)).all(axis=1)
@@ -381,14 +360,6 @@ def accuracy_map(samples: ErrorSamples, installation: Installation, grid: Grid) 
     )
 
 
-def bound_along(samples: ErrorSamples, installation: Installation) -> np.ndarray:
-    """Return the bound of one round at the place of each sample: (n, 3, 3) m^2.
-
-    The installation must have three dimensions.
-    """
-    return bound(information(samples.place, installation))
-
-
 def comparison(samples: ErrorSamples, installation: Installation) -> dict[str, Any]:
     """Return achieved and stated errors against the bound, over all samples: m and ratios.
 
@@ -402,7 +373,8 @@ def comparison(samples: ErrorSamples, installation: Installation) -> dict[str, A
     The filter uses many rounds and the IMU. An efficiency of n means: as good as n rounds with
     independent errors.
     """
-    limit = np.trace(bound_along(samples, installation), axis1=1, axis2=2).mean()
+    limits = bound(information(samples.place, installation))
+    limit = np.trace(limits, axis1=1, axis2=2).mean()
     claim = np.trace(samples.covariance, axis1=1, axis2=2).mean()
     squared = np.mean(np.sum(samples.error**2, axis=1))
     second = np.unique(np.floor(samples.t).astype(np.int64), return_inverse=True)[1]
