@@ -85,10 +85,6 @@ class GraphBuilder:
         """Select columns."""
         return self.op("Gather", value, self.constant(list(columns), np.int64), axis=1)
 
-    def rows(self, value: str, width: int) -> str:
-        """Reshape to rows of another width, with the same order of numbers."""
-        return self.op("Reshape", value, self.constant([-1, width], np.int64))
-
     def reshaped(self, value: str, *shape: int) -> str:
         """Reshape; 0 keeps the length of an axis."""
         return self.op("Reshape", value, self.constant(shape, np.int64))

@@ -123,8 +123,7 @@ def orthogonal(a: np.ndarray, b: np.ndarray, determinant: float) -> np.ndarray:
     """Return the orthogonal (3, 3) matrix of this determinant that turns rows of a onto rows of b."""
     left, _, right = np.linalg.svd(b.T @ a)
     sign = determinant * np.sign(np.linalg.det(left @ right))
-    out: np.ndarray = left @ np.diag([1.0, 1.0, sign]) @ right
-    return out
+    return left @ np.diag([1.0, 1.0, sign]) @ right
 
 
 def _distances(seen: Observations, rng: np.random.Generator) -> list[np.ndarray]:
@@ -174,8 +173,7 @@ def _embedded(distances: np.ndarray) -> np.ndarray:
     centred = np.eye(count) - 1.0 / count
     values, vectors = np.linalg.eigh(-0.5 * centred @ distances**2 @ centred)
     least = FLATTEST * distances.max() ** 2
-    out: np.ndarray = vectors[:, -3:] * np.sqrt(np.maximum(values[-3:], least))
-    return out
+    return vectors[:, -3:] * np.sqrt(np.maximum(values[-3:], least))
 
 
 def _places(
