@@ -17,7 +17,7 @@ from uwb_tdoa_tools.planning.maps import TOO_FEW, Demand, Grid
 from uwb_tdoa_tools.planning.optimisation import best_addition, with_one
 from uwb_tdoa_tools.planning.report import summary
 from uwb_tdoa_tools.planning.run import places_in_hall
-from uwb_tdoa_tools.simulation.rooms import Room, Walls
+from uwb_tdoa_tools.simulation.rooms import Room
 
 REACH = 15.0  # m
 
@@ -56,17 +56,6 @@ def test_cells_hear_the_anchors_within_reach():
         about[f"{name}_share"]
         for name in ("flyable", "two_solutions", "imprecise", "too_few", "outside")
     ) == pytest.approx(1.0)
-
-
-def test_cells_hear_nothing_through_a_wall():
-    anchors, walls = anchors_of(6, 5), Walls(((20.5, -50.0, 20.5, 50.0, np.inf),))
-    grid = Grid.slice((-4.0, 44.0), (-4.0, 36.0), 1.2, 8.0)
-    hall = replace(hall_of(anchors), walls=walls)
-    away = np.linalg.norm(grid.points[:, None] - anchors.positions, axis=2)
-    beside = (grid.points[:, None, 0] > 20.5) == (anchors.positions[:, 0] > 20.5)
-    np.testing.assert_array_equal(
-        [len(rows) for rows in hall.heard(grid.points)], np.sum((away <= REACH) & beside, axis=1)
-    )
 
 
 def test_where_all_are_heard_it_is_the_chart_of_a_room():

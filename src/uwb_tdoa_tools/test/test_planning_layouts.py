@@ -18,10 +18,9 @@ from uwb_tdoa_tools.planning import plots
 from uwb_tdoa_tools.planning.bifurcation import Subsets
 from uwb_tdoa_tools.planning.hall import Hall
 from uwb_tdoa_tools.planning.installation import Installation, RadioNoise
-from uwb_tdoa_tools.planning.layout import UNUSABLE, AnchorPlaces, Goal, Layout, lattice, spread
+from uwb_tdoa_tools.planning.layout import UNUSABLE, AnchorPlaces, Goal, Layout, lattice
 from uwb_tdoa_tools.planning.maps import (
     IMPRECISE,
-    MOST_CELLS,
     OUTSIDE,
     TWO_SOLUTIONS,
     Demand,
@@ -42,16 +41,6 @@ from uwb_tdoa_tools.simulation.rooms import Room, corners, facing
 
 
 ROOM = np.array([0.0, 0.0, 0.0]), np.array([6.0, 5.0, 3.0])
-
-
-def test_places_on_walls():
-    places = AnchorPlaces.walls(*ROOM)
-    assert places.numbers == 2
-    p = places.positions(np.random.default_rng(0).random((2000, 2)))
-    on_x, on_y = np.isin(p[:, 0], (0.0, 6.0)), np.isin(p[:, 1], (0.0, 5.0))
-    assert (on_x | on_y).all() and 0.4 < on_y.mean() < 0.7
-    assert (p >= [0, 0, 0.2]).all() and (p <= ROOM[1]).all()
-    np.testing.assert_allclose(np.ptp(p, axis=0), [6, 5, 2.8], atol=0.02)
 
 
 def test_places_of_all_shapes():
@@ -86,17 +75,6 @@ def test_bad_places(content, tmp_path):
     (tmp_path / "places.yaml").write_text(content)
     with pytest.raises(InputError, match="places"):
         AnchorPlaces.from_yaml(tmp_path / "places.yaml")
-
-
-def test_a_spread_begins_with_the_corners_and_covers_the_rest():
-    p = lattice((0, 0, 1), (5, 4, 2), 0.5)
-    rows = spread(p, 40)
-    assert len(set(rows)) == 40
-    assert set(map(tuple, p[rows[:8]])) == {
-        (x, y, z) for x in (0, 5) for y in (0, 4) for z in (1, 2)
-    }
-    assert np.linalg.norm(p[:, None] - p[rows], axis=-1).min(axis=1).max() <= 1.0
-    assert sorted(spread(p[:5], 40)) == [0, 1, 2, 3, 4] and len(spread(p, 3)) == 3
 
 
 WIDE_ROOM = np.array([-4.0, -4.5, 0.0]), np.array([4.0, 4.5, 3.0])
@@ -233,20 +211,6 @@ def test_cells_are_cubes_that_cover_the_box():
     assert layer.shape == (3, 10) and layer[2, 9] == 29 and layer[1, 0] == 1
 
 
-@pytest.mark.parametrize(
-    ("upper", "step", "says"),
-    [
-        ((1, 1, 0), 0.1, "is empty"),
-        ((1, 1, 1), 0.0, "step: 0"),
-        ((1, 1, 1), float("nan"), "step: nan"),
-        ((9, 9, 9), 1e-3, f"more than {MOST_CELLS}"),
-    ],
-)
-def test_impossible_grids(upper, step, says):
-    with pytest.raises(InputError, match=says):
-        Grid.box((0, 0, 0), upper, step)
-
-
 def test_a_chart_says_the_same_as_its_parts():
     installation = Installation(corners())
     found = chart(installation, Grid.box((-4, -4, 0), (4, 4, 3), 0.8), Demand(criterion="pairings"))
@@ -375,7 +339,12 @@ FLOWN = lattice((-1, -1, 0.5), (1, 1, 2), 1.0)
 def figures(monkeypatch):
     """[(figure, title)] of all pictures that would be written."""
     made = []
-    monkeypatch.setattr(plots, "_save", lambda figure, title, path: made.append((figure, title)))
+
+    def kept(path, write):
+        figure = write.func.__self__
+        made.append((figure, figure.get_suptitle()))
+
+    monkeypatch.setattr(plots, "write_filled", kept)
     return made
 
 

@@ -170,17 +170,6 @@ def test_an_anchor_without_orientation_among_others():
     np.testing.assert_array_equal(np.delete(mixed, 3), np.delete(whole, 3))
 
 
-def test_gradient_against_central_differences():
-    noise, anchors = RadioNoise(), corners()
-    points = np.random.default_rng(0).uniform([-3, -3.5, 0.5], [3, 3.5, 2.5], (50, 3))
-    got = variance_gradient(noise, points, anchors, noise.variance(points, anchors), 3)
-    for k, step in enumerate(1e-4 * np.eye(3)):
-        wanted = (
-            noise.variance(points + step, anchors) - noise.variance(points - step, anchors)
-        ) / 2e-4
-        np.testing.assert_allclose(got[..., k], wanted, rtol=2e-3, atol=1e-6)
-
-
 def test_fixed_noise():
     fixed = FixedNoise(0.1)
     variance = fixed.variance(np.zeros((4, 3)), corners())
@@ -223,6 +212,15 @@ def ranges(points, anchors):
     return np.linalg.norm(points[..., None, :] - anchors.positions, axis=-1)
 
 
+def covariance_of(pairing, variance, link_std=0.0):
+    """The covariance of the measurements of a Pairing, (n, M, M) m^2. variance : (n, N) m^2."""
+    d = pairing.incidence()
+    own = link_std**2 * np.eye(len(d))
+    if pairing.shared or pairing.ranges:
+        return (d * variance[:, None, :]) @ d.T + own
+    return (variance @ np.abs(d).T)[:, :, None] * np.eye(len(d)) + own
+
+
 def without(pairing, k):
     keep = np.arange(len(pairing.a)) != k
     return Pairing(pairing.a[keep], pairing.b[keep], pairing.shared, pairing.times)
@@ -236,7 +234,7 @@ def numerical_information(point, installation, pairing, step=1e-3):
 
     def moments(x):
         variance = installation.noise.variance(x[None], anchors)
-        return d @ ranges(x, anchors), pairing.covariance(variance, installation.link_std)[0]
+        return d @ ranges(x, anchors), covariance_of(pairing, variance, installation.link_std)[0]
 
     true_mean, true_covariance = moments(point)
 
@@ -286,14 +284,6 @@ def test_what_tdoas_and_ranges_tell_adds_up(noise):
     ).all()
 
 
-def test_the_second_term_of_eq_1_counts_here():
-    installation = Installation(corners(), NOISY)
-    with_it, without_it = (
-        bound(information(PLACES, installation, correction=c)) for c in (True, False)
-    )
-    assert (position_error(without_it) > 1.1 * position_error(with_it)).all()
-
-
 def test_it_does_not_matter_which_pair_of_the_ring_is_dropped():
     installation = Installation(corners(), NOISY)
     wanted = information(PLACES, installation, correction=False)
@@ -301,20 +291,15 @@ def test_it_does_not_matter_which_pair_of_the_ring_is_dropped():
     unit /= np.linalg.norm(unit, axis=-1, keepdims=True)
     for pairing in [*(without(ring(8), k) for k in range(8)), common_reference(8)]:
         h = pairing.incidence() @ unit
-        got = h.swapaxes(1, 2) @ np.linalg.inv(pairing.covariance(variance)) @ h
+        got = h.swapaxes(1, 2) @ np.linalg.inv(covariance_of(pairing, variance)) @ h
         np.testing.assert_allclose(got, wanted, rtol=1e-9)
-    h, full = ring(8).incidence() @ unit, ring(8).covariance(variance)
+    h, full = ring(8).incidence() @ unit, covariance_of(ring(8), variance)
     assert np.linalg.matrix_rank(full[0]) == 7
     np.testing.assert_allclose(h.swapaxes(1, 2) @ np.linalg.pinv(full) @ h, wanted, rtol=1e-9)
     np.testing.assert_allclose(
         information(PLACES, replace(installation, pairing="common_reference")),
         information(PLACES, installation),
     )
-
-
-def test_link_noise_that_vanishes_leaves_the_ring():
-    tiny = information(PLACES, Installation(corners(), link_std=1e-5))
-    np.testing.assert_allclose(tiny, information(PLACES, Installation(corners())), rtol=1e-4)
 
 
 def test_dilution_in_the_middle_of_a_square():

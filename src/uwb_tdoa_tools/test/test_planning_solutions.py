@@ -22,9 +22,8 @@ from uwb_tdoa_tools.planning.maps import (
     Demand,
     Grid,
     judge,
-    other_solutions,
 )
-from uwb_tdoa_tools.planning.second_minimum import CLEAR, FLIP
+from uwb_tdoa_tools.planning.second_minimum import CLEAR, FLIP, other_solutions
 from uwb_tdoa_tools.simulation.rooms import Room, Walls, constellation, corners
 
 # --- planning bifurcation ---
@@ -37,22 +36,6 @@ SKEW = Anchors.from_positions([[0.4, 0.3, 0.2], [3.9, 0.9, 0.2], [3.1, 3.7, 0.2]
 def tdoas(points, anchors):
     distances = np.linalg.norm(points[..., None, :] - anchors, axis=-1)
     return np.diff(distances, axis=-1)
-
-
-def test_in_the_plane_it_is_the_polynomial_of_compagnoni_et_al():
-    """|D_1 a_2 - D_2 a_1|^2 - |a_1 ^ a_2|^2, whose sign decides in Inverse Problems 30, 2014,
-    035004.
-    """
-    points = np.column_stack([np.random.default_rng(0).uniform(-3, 7, (300, 2)), np.full(300, 0.2)])
-    subsets = Subsets(SKEW, 2)
-    for rows, got in zip(subsets.rows, subsets.discriminant(points).T):
-        corner = SKEW.positions[rows]
-        d = np.linalg.norm(points[:, None] - corner, axis=-1)
-        (a1, a2), d1, d2 = corner[1:, :2] - corner[0, :2], d[:, 1] - d[:, 0], d[:, 2] - d[:, 0]
-        wedge = a1[0] * a2[1] - a1[1] * a2[0]
-        np.testing.assert_allclose(
-            got, np.sum((d1[:, None] * a2 - d2[:, None] * a1) ** 2, axis=1) / wedge**2 - 1
-        )
 
 
 @settings(max_examples=60, deadline=None)
@@ -323,12 +306,6 @@ def test_anchors_in_a_plane_mirror_a_place_in_the_room_and_not_one_beyond_it():
     )
     assert misfit == pytest.approx(0.0, abs=1e-3)
     np.testing.assert_allclose(place, [4.0, 3.0, 5.0], atol=1e-3)
-
-
-def test_ranges_have_one_solution():
-    installation = Installation(corners(), FixedNoise(0.1), "every_range")
-    points = np.random.default_rng(0).uniform([-3, -3, 0.3], [3, 3, 2.5], (300, 3))
-    assert (judge(points, installation, Demand()).status != TWO_SOLUTIONS).all()
 
 
 def test_an_accuracy_is_a_size():

@@ -29,8 +29,6 @@ from .layout import UNUSABLE
 from .maps import TOO_FEW, Chart, Judged, judge
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from ..parallel import Progress
     from ..simulation.rooms import Room, Walls
     from .installation import Installation
@@ -38,7 +36,6 @@ if TYPE_CHECKING:
 
 PLANE_NEAREST = 10  # anchors that are looked at for a plane through them
 JUDGED_AT_ONCE = 100_000  # times points: anchors that are judged at once, wherever they are
-TILES = 16  # parts of a hall that a process takes at once
 
 
 @dataclass(frozen=True)
@@ -66,21 +63,15 @@ class Hall:
         """Return the Chart of a Grid. jobs, dask : as for `parallel.over`."""
         points = grid.points
         tiles = self._tiles(points)
-        batches = [tiles[at : at + TILES] for at in range(0, len(tiles), TILES)]
-        parts = [[points[cells] for cells in batch] for batch in batches]
-        unit = "part of the hall" if len(parts) > 1 else "map"
-        results = parallel.over(self, parts, jobs, dask, unit=unit)
+        unit = "part of the hall" if len(tiles) > 1 else "map"
+        parts = [points[cells] for cells in tiles]
         whole = self.unheard(points)
         heard = np.zeros(len(points), int)
-        for batch, result in zip(batches, results):
-            for cells, (found, counts) in zip(batch, result):
-                whole.assign(cells, found)
-                heard[cells] = counts
+        results = parallel.over(self.judge, parts, jobs, dask, unit)
+        for cells, (found, counts) in zip(tiles, results):
+            whole.assign(cells, found)
+            heard[cells] = counts
         return Chart(whole.covariance, whole.error, whole.status, grid, heard)
-
-    def __call__(self, batch: Sequence[np.ndarray]) -> list[tuple[Judged, np.ndarray]]:
-        """Return the Judged, and the number of anchors heard, of each part of a hall."""
-        return [self.judge(points) for points in batch]
 
     def judge(self, points: np.ndarray) -> tuple[Judged, np.ndarray]:
         """Return (Judged, anchors heard (n,)) of points (n, 3) m that are near each other."""

@@ -150,8 +150,6 @@ def variance_gradient(
 
     One-sided differences. variance : (n, N) m^2, noise.variance at the points.
     """
-    if isinstance(noise, FixedNoise):
-        return np.zeros((*variance.shape, dimensions))
     steps = _STEP * np.eye(3)[:dimensions]
     return (
         np.stack([noise.variance(points + step, anchors) - variance for step in steps], axis=-1)
@@ -205,21 +203,6 @@ class Pairing:
         matrix = np.zeros((len(rows), 1 + max(self.a.max(), self.b.max())))
         matrix[rows, self.a], matrix[rows, self.b] = -1.0, 1.0
         return matrix
-
-    def covariance(self, variance: np.ndarray, link_std: float = 0.0) -> np.ndarray:
-        """Return the covariance of the TDOAs: (n, M, M) m^2.
-
-        variance : (n, N) m^2 of the receptions. link_std : m, additional error of each TDOA. It
-        includes the anchor's reception of the other anchor's packet.
-        Source: eqs. 4 and 5 of Grasso et al. (Sensors 2022, 22, 9136); A18 for a common reference.
-        """
-        own = link_std**2 * np.eye(len(self.a))
-        if self.ranges:
-            return variance[:, self.a, None] * np.eye(len(self.a)) + own
-        if self.shared:
-            d = self.incidence()
-            return (d * variance[:, None, :]) @ d.T + own
-        return (variance[:, self.a] + variance[:, self.b])[:, :, None] * np.eye(len(self.a)) + own
 
 
 def ring(n: int, shared: bool = True) -> Pairing:

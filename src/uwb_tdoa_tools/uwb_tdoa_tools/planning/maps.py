@@ -22,8 +22,8 @@ from ..scoring.evaluation import evaluate
 from ..scoring.metrics import position_at
 from ..simulation.rooms import Room
 from .bifurcation import Subsets, same_place, solutions
-from .precision import bound, information, position_error, round_weights
-from .second_minimum import CLEAR, second_minima
+from .precision import bound, information, position_error
+from .second_minimum import CLEAR, other_solutions
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -40,7 +40,6 @@ if TYPE_CHECKING:
 
 # States of a place. OUTSIDE of the hull counts with "pairings" only.
 FLYABLE, TWO_SOLUTIONS, IMPRECISE, TOO_FEW, OUTSIDE = range(5)
-_CHUNK = 2_000_000  # numbers in the largest array of one step
 _EVERYWHERE = Room(np.full(3, -np.inf), np.full(3, np.inf))
 
 
@@ -121,35 +120,6 @@ def judge(
         misfit, _ = other_solutions(points, installation, demand.room, columns)
         status[misfit <= CLEAR] = TWO_SOLUTIONS
     return Judged(covariance, error, status)
-
-
-def other_solutions(
-    points: np.ndarray, installation: Installation, room: Room, columns: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the second minimum of a round: (misfit (n,) standard deviations, place (n, 3) m).
-
-    points : (n, 3) m; columns : as for `judge`. See `second_minima`.
-    """
-    anchors = installation.anchors
-    if columns is None:
-        columns = np.broadcast_to(np.arange(len(anchors)), (len(points), len(anchors)))
-    heard = columns.shape[1]
-    misfits, places = [np.empty(0)], [np.empty((0, 3))]
-    size = len(points) * max(heard**2, len(anchors))
-    for rows in np.array_split(np.arange(len(points)), max(1, size // _CHUNK)):
-        variances = installation.noise.variance(points[rows], anchors)
-        variance = np.take_along_axis(variances, columns[rows], axis=1)
-        misfit, place = second_minima(
-            points[rows],
-            anchors.positions,
-            np.ascontiguousarray(columns[rows]),
-            np.ascontiguousarray(round_weights(variance, installation)),
-            room,
-            installation.unknowns,
-        )
-        misfits.append(misfit)
-        places.append(place)
-    return np.concatenate(misfits), np.concatenate(places)
 
 
 MOST_CELLS = 4_000_000

@@ -56,7 +56,7 @@ def _information(
     variances = installation.noise.variance(points, anchors)
     variance = np.take_along_axis(variances, columns, axis=1)
     unit = ranges(points[:, None, :], anchors.positions[columns])[1][..., :k]
-    gradient = np.empty(0)
+    gradient: np.ndarray = np.empty(0)
     if correction:
         gradient = variance_gradient(installation.noise, points, anchors, variances, k)
         gradient = np.take_along_axis(gradient, columns[..., None], axis=1)
@@ -95,14 +95,17 @@ def range_weights(variance: np.ndarray, part: Pairing, link_std: float) -> np.nd
     That is the information of N ranges with one unknown offset, the tag's clock. A closed ring,
     whose D S D' is singular, has the same information. Only independent TDOAs have `times`.
 
-    variance : (n, N) m^2, of the receptions; part : Pairing; link_std : m, as for Installation
+    variance : (n, N) m^2, of the receptions; part : Pairing; link_std : m, additional error of each
+    TDOA. It includes the anchor's reception of the other anchor's packet.
+    Source: eqs. 4 and 5 of Grasso et al. (Sensors 2022, 22, 9136); A18 for a common reference.
     """
     each = np.eye(variance.shape[1])
     if part.ranges:
         return each / (variance + link_std**2)[:, None]
     if part.shared and link_std > 0.0:
         d = part.incidence()
-        return d.T @ np.linalg.inv(part.covariance(variance, link_std)) @ d
+        covariance = (d * variance[:, None, :]) @ d.T + link_std**2 * np.eye(len(d))
+        return d.T @ np.linalg.inv(covariance) @ d
     if part.shared:
         w = 1.0 / variance
         return each * w[:, None] - w[:, :, None] * (w / w.sum(axis=1, keepdims=True))[:, None]

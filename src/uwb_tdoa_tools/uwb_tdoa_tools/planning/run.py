@@ -69,8 +69,9 @@ def plan(args: Namespace) -> bool:
     args.out.mkdir(parents=True, exist_ok=True)
     figures: dict[str, Any] = {"arguments": as_json(args)}
     if anchors is None:
-        whole, figures["design"] = designed(args, whole, grid)
-    found = whole.chart(grid, args.jobs, args.dask)
+        whole, found, figures["design"] = designed(args, whole, grid)
+    else:
+        found = whole.chart(grid, args.jobs, args.dask)
     installation = whole.installation
     about = report.summary(found)
     figures |= {"anchors": len(whole.anchors), "map": about}
@@ -279,8 +280,8 @@ def as_json(args: Namespace) -> dict[str, Any]:
     }
 
 
-def designed(args: Namespace, whole: Hall, grid: Grid) -> tuple[Hall, list[dict[str, Any]]]:
-    """Return (the Hall with the anchors of --hall, steps of the search), and write hall.yaml.
+def designed(args: Namespace, whole: Hall, grid: Grid) -> tuple[Hall, Chart, list[dict[str, Any]]]:
+    """Return (the Hall with the anchors of --hall, its Chart, steps of the search), and write hall.yaml.
 
     It is the layout with the fewest anchors that has the wanted share on all of the Grid.
     """
@@ -293,7 +294,7 @@ def designed(args: Namespace, whole: Hall, grid: Grid) -> tuple[Hall, list[dict[
     chosen = step_of(found, anchors, whole.demand.room)
     report.print_design(steps, chosen, placements(anchors), args.share)
     anchors.to_yaml(args.out / "hall.yaml")
-    return whole.with_anchors(anchors), steps
+    return whole.with_anchors(anchors), found, steps
 
 
 def places_in_hall(room: Room, reach: float) -> np.ndarray:

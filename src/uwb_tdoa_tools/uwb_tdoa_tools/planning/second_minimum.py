@@ -4,7 +4,7 @@
 
 With d(x) the distances from x to the N anchors that are heard at p, D the anchor pairs of the TDOAs
 of a round, F the covariance of these TDOAs, and Q = D' F^-1 D the information matrix of the
-distances, 1/m^2 (`precision.range_weights`),
+distances, 1/m^2 (`precision.round_weights`),
     f(x) = (d(x) - d(p))' Q (d(x) - d(p))
 is the squared misfit, in standard deviations, of a tag at x with the TDOAs of a tag at p. Its
 smallest minimum is p, with 0. Levenberg-Marquardt searches a second one, from the mirrored places
@@ -26,8 +26,11 @@ import numpy as np
 
 from uwb_tdoa_bias.common.compiled import compiled
 
+from .precision import round_weights
+
 if TYPE_CHECKING:
     from ..simulation.rooms import Room
+    from .installation import Installation
 
 FLIP = 0.5  # m; a minimum nearer than this is no failure, but imprecision
 CLEAR = 4.65  # standard deviations of misfit from which on at most 1 % of the estimates flip
@@ -38,27 +41,34 @@ SETTLED = 0.01  # a descent ends where another step would lower f by less than t
 LONGEST = 5.0  # m, of a step
 AROUND = 2.0  # m outside of the room, to which starts farther out are moved
 SAME = 0.5 * FLIP  # m between starts that count as one
+_CHUNK = 2_000_000  # numbers in the largest array of one step
 _FLAT = 1e-6  # of the volume of a cube; k + 1 anchors of less are in one plane (line)
 
 
-def second_minima(
-    points: np.ndarray,
-    positions: np.ndarray,
-    columns: np.ndarray,
-    weights: np.ndarray,
-    room: Room,
-    unknowns: int,
+def other_solutions(
+    points: np.ndarray, installation: Installation, room: Room, columns: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the second minimum of least misfit inside a room: (misfit (n,), place (n, 3) m).
 
     The misfit is in standard deviations; inf and NaN if no descent ends inside the room
     and more than FLIP away.
-    points : (n, 3) m; positions : (N, 3) m of anchors; columns : (n, K) rows of the heard ones;
-    weights : (n, K, K) 1/m^2, Q; room : Room; unknowns : 2 if the height is known, else 3.
+    points : (n, 3) m; columns : (n, K) rows of the anchors that are heard at each point; None for all.
     """
-    choices = np.array(list(combinations(range(min(NEAREST, columns.shape[1])), unknowns + 1)))
+    anchors = installation.anchors
+    if columns is None:
+        columns = np.tile(np.arange(len(anchors)), (len(points), 1))
+    heard = columns.shape[1]
+    choices = np.array(list(combinations(range(min(NEAREST, heard)), installation.unknowns + 1)))
+    corners = np.stack([room.lower, room.upper])
     out = np.empty((len(points), 4))
-    _search(points, positions, columns, weights, np.stack([room.lower, room.upper]), choices, out)
+    at_once = max(1, _CHUNK // max(heard**2, len(anchors)))
+    for begin in range(0, len(points), at_once):
+        some = slice(begin, begin + at_once)
+        variances = installation.noise.variance(points[some], anchors)
+        variance = np.take_along_axis(variances, columns[some], axis=1)
+        weights = np.ascontiguousarray(round_weights(variance, installation))
+        heard_at = np.ascontiguousarray(columns[some])
+        _search(points[some], anchors.positions, heard_at, weights, corners, choices, out[some])
     return np.sqrt(out[:, 0]), out[:, 1:]
 
 
@@ -74,7 +84,8 @@ def _search(
 ) -> None:
     """Fill out (n, 4): misfit squared and place, m; inf and NaN without a second minimum.
 
-    points, positions, columns, weights : as of `second_minima`; room : (2, 3) m, its corners
+    points, columns : as of `other_solutions`; positions : (N, 3) m of anchors
+    weights : (n, K, K) 1/m^2, Q; room : (2, 3) m, its corners
     choices : (C, k + 1) indices into the heard anchors, nearest first
     """
     heard, unknowns = columns.shape[1], choices.shape[1] - 1
