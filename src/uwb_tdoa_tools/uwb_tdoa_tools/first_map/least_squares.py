@@ -67,19 +67,6 @@ class Stage:
     wide: float = 1.0
 
 
-@dataclass(frozen=True, eq=False)
-class Fit:
-    """A minimum: path (J, 3) m, columns (size,), cost (negative log-likelihood)."""
-
-    path: np.ndarray
-    columns: np.ndarray
-    cost: float
-
-    def anchors(self, count: int) -> np.ndarray:
-        """Return positions of the anchors, (N, 3) m."""
-        return self.columns[: 3 * count].reshape(count, 3)
-
-
 class Problem:
     """Observations under a Stage."""
 
@@ -111,7 +98,7 @@ class Problem:
 
     def solve(self, path: np.ndarray, columns: np.ndarray) -> Fit:
         """Return the minimum that Levenberg-Marquardt steps reach from path (J, 3) and columns."""
-        state = _State(self, path, columns)
+        state = Fit(self, path, columns)
         damping = DAMPING
         for _ in range(STEPS):
             equations = Equations(state)
@@ -127,11 +114,11 @@ class Problem:
             damping = max(damping * LESS, 1e-9)
             if gain < CONVERGED:
                 break
-        return Fit(state.path, state.columns, state.cost)
+        return state
 
     def about(self, fit: Fit) -> Equations:
         """Return the normal equations about a Fit."""
-        return Equations(_State(self, fit.path, fit.columns))
+        return Equations(Fit(self, fit.path, fit.columns))
 
     def spread(self, values: np.ndarray) -> np.ndarray:
         """Return the gradient by the path (J, 3, s) of second differences (m, 3, s)."""
@@ -166,13 +153,19 @@ class Problem:
         return matrix.data.astype(int) - 1, matrix
 
 
-class _State:
-    """Residuals of a Problem at a path and columns."""
+class Fit:
+    """Residuals of a Problem at a path and columns; `Problem.solve` returns that of a minimum.
+
+    Attributes
+    ----------
+    path : (J, 3) m; columns : (k,); anchors : (N, 3) m, positions in the columns
+    cost : negative log-likelihood
+    """
 
     def __init__(self, problem: Problem, path: np.ndarray, columns: np.ndarray) -> None:
         self.problem, self.path, self.columns = problem, path, columns
         seen, layout = problem.seen, problem.layout
-        anchors = columns[layout.positions].reshape(-1, 3)
+        self.anchors = anchors = columns[layout.positions].reshape(-1, 3)
         delay, between = columns[layout.delays], columns[layout.between]
         tag = path[seen.bin]
         to_b, self.by_b = _length(tag - anchors[seen.b])
@@ -218,7 +211,7 @@ class Equations:
     by_distances : (m, k) derivatives of distances, weighted
     """
 
-    def __init__(self, state: _State) -> None:
+    def __init__(self, state: Fit) -> None:
         self.state = state
         self.problem = problem = state.problem
         self.gram = np.diag(problem.prior)
@@ -300,7 +293,7 @@ class Equations:
         np.add.at(self.gram, (known, known), information)
         np.add.at(self.gradient, known, information * state.coordinate)
 
-    def following(self, damping: float) -> _State | None:
+    def following(self, damping: float) -> Fit | None:
         """Return the state after a step; None if the equations are singular."""
         bands = self.bands.copy()
         bands[6] *= 1.0 + damping
@@ -314,7 +307,7 @@ class Equations:
         columns = -cho_solve(reduced, self.gradient - self.cross.T @ solved[:, -1])
         path = -(solved[:, -1] + solved[:, :-1] @ columns)
         state = self.state
-        return _State(self.problem, state.path + path.reshape(-1, 3), state.columns + columns)
+        return Fit(self.problem, state.path + path.reshape(-1, 3), state.columns + columns)
 
     @cached_property
     def path_factor(self) -> np.ndarray:

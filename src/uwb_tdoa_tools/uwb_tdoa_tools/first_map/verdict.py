@@ -86,25 +86,24 @@ def map_anchors(
     rng = np.random.default_rng(seed)
     fits, reached = minima(seen, rng, progress)
     progress("estimating how far the map can be off")
-    best, count = fits[0], len(seen.ids)
+    best = fits[0]
     linear = Problem(seen, Stage()).about(best)
     spread, lasting = covariance(linear, best, rng)
     apart = SAME_MAP + BEYOND * np.sqrt(np.diag(spread)).reshape(-1, 3)
     near = [
         fit
         for fit in fits[1:]
-        if fit.cost < best.cost + AMBIGUOUS
-        and (np.abs(fit.anchors(count) - best.anchors(count)) > apart).any()
+        if fit.cost < best.cost + AMBIGUOUS and (np.abs(fit.anchors - best.anchors) > apart).any()
     ]
-    trusted = np.zeros((count, 3), bool)
+    trusted = np.zeros((len(seen.ids), 3), bool)
     row, axis = seen.coordinates[seen.coordinates[:, 3] <= KNOWN, :2].astype(int).T
     trusted[row, axis] = True
     found = FirstMap(
         seen.ids,
-        best.anchors(count),
+        best.anchors,
         spread,
         trusted,
-        tuple(fit.anchors(count) for fit in near),
+        tuple(fit.anchors for fit in near),
         lasting,
         "",
     )

@@ -4,15 +4,16 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import EllipseCollection
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.patheffects import withStroke
 import numpy as np
+from PIL import Image
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
@@ -641,5 +642,14 @@ def _finish(
         draw_labels(
             ax, anchors.ids.tolist(), anchors.positions[:, :2], _fronts(ax, anchors), ANCHOR
         )
-    write_filled(path, partial(figure.savefig, dpi=DPI))
+    _save(figure, title, path)
+
+
+def _save(figure: Figure, title: str, path: str | Path) -> None:
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    image = Image.frombuffer("RGBA", canvas.get_width_height(), canvas.buffer_rgba())
     plt.close(figure)
+    # 256 colours are enough, and a third of the size
+    few = image.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    write_filled(path, lambda file: few.save(file, "PNG", optimize=True))
