@@ -26,7 +26,6 @@ from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.parallel import whole_number
 from uwb_tdoa_tools.planning.hall import Hall
 from uwb_tdoa_tools.planning.installation import FixedNoise, Installation, RadioNoise
-from uwb_tdoa_tools.planning.layout import Goal
 from uwb_tdoa_tools.planning.maps import FLYABLE, IMPRECISE, TOO_FEW, TWO_SOLUTIONS, Demand
 from uwb_tdoa_tools.planning.second_minimum import CLEAR, FLIP
 from uwb_tdoa_tools.simulation.rooms import Room, Walls
@@ -178,8 +177,8 @@ def planned(one, points):
     anchors = Anchors.from_positions(one.anchors)
     installation = Installation(anchors, one.noise, dimensions=one.unknowns, hall=True)
     walls = None if one.wall is None else Walls(((one.wall[0], 0.0, *one.wall, np.inf),))
-    goal = Goal(np.empty((0, 3)), installation, demand=Demand(one.room, ACCURACY))
-    return Hall(goal, anchors, min(one.reach, 1e3), walls).judge(points)[0].status
+    hall = Hall(installation, Demand(one.room, ACCURACY), one.reach, walls)
+    return hall.judge(points)[0].status
 
 
 def solved(one, points, rng):

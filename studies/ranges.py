@@ -17,7 +17,7 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import without_offset
 from uwb_tdoa_tools.estimate import FlightEstimator
-from uwb_tdoa_tools.planning.installation import FixedNoise, Installation, every_range
+from uwb_tdoa_tools.planning.installation import FixedNoise, Installation
 from uwb_tdoa_tools.planning.precision import bound, information, position_error
 from uwb_tdoa_tools.scoring.evaluation import evaluate, score_of
 from uwb_tdoa_tools.scoring.metrics import position_at, scored_phase
@@ -178,7 +178,7 @@ def bound_of(flight: Flight) -> float:
     """
     _, first, last = scored_phase(flight.truth)
     places = position_at(np.arange(first, last, 0.5), flight.truth)
-    installation = Installation(flight.anchors, FixedNoise(STD), every_range(len(flight.anchors)))
+    installation = Installation(flight.anchors, FixedNoise(STD), "every_range")
     return float(np.sqrt(np.mean(position_error(bound(information(places, installation))) ** 2)))
 
 

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compile the C of a correction, run it on this computer or an emulated Cortex-M4F, and measure it."""
 
-import ctypes
+from dataclasses import replace
 import math
 from pathlib import Path
 import shutil
@@ -16,8 +16,7 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.correction.features import FEATURES
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, Samples, SmoothTerm
 from uwb_tdoa_bias.effects.samples import Motion
-from uwb_tdoa_tools.exporting.graph import ELEMENTWISE
-from uwb_tdoa_tools.exporting.vehicle import MEMBERS, STATE
+from uwb_tdoa_tools.exporting.vehicle import STATE
 from uwb_tdoa_tools.training.network import WITHOUT
 
 HERE = Path(__file__).parent / "cortex_m"
@@ -155,46 +154,11 @@ def missing():
     return [name for name, path in needed.items() if path is None]
 
 
-def _libm(name):
-    function = getattr(ctypes.CDLL("libm.so.6"), name)
-    function.restype = ctypes.c_float
-
-    def of_arrays(*arrays):
-        numbers = zip(*(np.ravel(one).tolist() for one in arrays))
-        made = [function(*map(ctypes.c_float, some)) for some in numbers]
-        return np.array(made, dtype=np.float32).reshape(np.shape(arrays[0]))
-
-    return of_arrays
-
-
-# As C computes: the functions that IEEE 754 does not define are those of the C library.
-FUNCTIONS = {
-    **ELEMENTWISE,
-    **{name: _libm(f"{name}f") for name in ("exp", "log", "sin", "cos", "atan2")},
-    "max": lambda x, y: np.where((x >= y) | (x != x), x, y),
-    "min": lambda x, y: np.where((x <= y) | (x != x), x, y),
-}
-
-
-def by_numpy(code, some):
-    """(bias (n,), std (n,)) of cases by numpy in single precision, in the order of the C."""
-    columns = {}
-    for name, member in MEMBERS.items():
-        field, _, place = member.partition("[")
-        values = some["state"][field]
-        columns[name] = values[:, int(place[0])] if place else values
-    rows = [ANCHORS.index(some[end]) for end in "ab"]
-    bias, std = code.level.evaluate(columns, *rows, FUNCTIONS)
-    for program in code.steep.values():
-        bias = bias + program.evaluate(columns, *rows, FUNCTIONS)[0]
-    return bias, std
-
-
 def write(folder, code):
     """Write uwb_bias.h and uwb_bias.c to a folder, which is made."""
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "uwb_bias.h").write_text(code.header)
-    (folder / "uwb_bias.c").write_text(code.source)
+    for name, text in code.files.items():
+        (folder / name).write_text(text)
 
 
 def on_host(folder, some, flags=STRICT):
@@ -245,9 +209,7 @@ def cost_of(folder, code, n=320):
     """
     write(folder, code)
     whole = linked(folder, (*FIRMWARE, "-DWITHOUT_JACOBIAN"), "without.elf")
-    (folder / "without").mkdir(exist_ok=True)
-    (folder / "without" / "uwb_bias.h").write_text(code.header)
-    (folder / "without" / "uwb_bias.c").write_text(STUB)
+    write(folder / "without", replace(code, files={**code.files, "uwb_bias.c": STUB}))
     empty = linked(folder / "without", (*FIRMWARE, "-DWITHOUT_JACOBIAN"))
     symbols = [ARM_GCC, *PROCESSOR, *FIRMWARE, "-c", "uwb_bias.c", "-o", "own.o"]
     subprocess.run(symbols, cwd=folder, check=True)

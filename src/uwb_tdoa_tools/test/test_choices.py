@@ -17,7 +17,7 @@ from uwb_tdoa_tools.bags.files import PLUGINS
 from uwb_tdoa_tools.diagnosis.references import REFERENCES
 from uwb_tdoa_tools.flying.sensors import SENSOR_NAMES
 from uwb_tdoa_tools.flying.world import WORLDS
-from uwb_tdoa_tools.planning.installation import PAIRINGS
+from uwb_tdoa_tools.planning.installation import PARTS
 from uwb_tdoa_tools.simulation import SimulationConfig
 from uwb_tdoa_tools.simulation.config import VEHICLE_DEFAULTS
 from uwb_tdoa_tools.simulation.paths import TRAJECTORIES
@@ -36,7 +36,7 @@ HEAVY = """PIL apsw jinja2 joblib llvmlite matplotlib numba onnx onnxruntime pan
         (choices.TRAJECTORIES, TRAJECTORIES),
         (choices.CARRIERS, VEHICLE_DEFAULTS),
         (choices.WORLDS, WORLDS),
-        (choices.PAIRINGS, PAIRINGS),
+        (choices.PAIRINGS[:5], PARTS),
         (tuple(SENSORS), SENSOR_NAMES),
     ],
 )

@@ -129,7 +129,7 @@ def extra_flags(makefile, folder):
 
 def build(folder, names):
     """A folder with the build and the stand-ins; returns the program."""
-    made = crazyflie.files(vehicle_code(ANCHORS, chosen(*names)), ANCHORS)
+    made = crazyflie.files(vehicle_code(ANCHORS, chosen(*names)).files, ANCHORS)
     made |= {f"firmware/{name}": text for name, text in FIRMWARE.items()}
     made |= {"firmware/src/updates.c": UPDATES, "firmware/src/estimator_kalman.c": ESTIMATOR}
     for name, text in made.items():

@@ -14,7 +14,8 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_tools.commands import export
 from uwb_tdoa_tools.exporting.correction import trace
-from uwb_tdoa_tools.exporting.folders import write_c, write_crazyflie
+from uwb_tdoa_tools.exporting.scalars import Dense
+from uwb_tdoa_tools.exporting.vehicle import write_c, write_crazyflie
 
 SMALL_IDS = Anchors(np.arange(8), ANCHORS.positions, ANCHORS.orientations)
 
@@ -46,17 +47,10 @@ def test_ids_that_the_firmware_does_not_have_are_refused(tmp_path):
 def test_a_network_that_is_no_chain_of_layers_is_refused(tmp_path, monkeypatch):
     network = c.network(tmp_path)
     traced = trace(ANCHORS, None, network)
-    monkeypatch.setattr("uwb_tdoa_tools.exporting.dense.ACTIVATIONS", ())
-    monkeypatch.setattr("uwb_tdoa_tools.exporting.dense._dense", c_dense)
+    monkeypatch.setattr("uwb_tdoa_tools.exporting.scalars.ACTIVATIONS", ())
+    monkeypatch.setattr("uwb_tdoa_tools.exporting.scalars.dense", Dense)  # read anew
     with pytest.raises(InputError, match="has the operator Relu; train"):
         write_c(tmp_path / "c", traced)
-
-
-def c_dense(content):
-    """The network of a file, read anew."""
-    from uwb_tdoa_tools.exporting.dense import Dense
-
-    return Dense(content)
 
 
 def test_names_in_a_file_do_not_end_its_comment(tmp_path):

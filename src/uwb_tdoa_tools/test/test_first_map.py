@@ -19,7 +19,7 @@ from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands import localize
 from uwb_tdoa_tools.commands.map_anchors import main
 from uwb_tdoa_tools.first_map import map_anchors, observe
-from uwb_tdoa_tools.first_map.least_squares import Problem, Stage, _State
+from uwb_tdoa_tools.first_map.least_squares import Equations, Fit, Problem, Stage
 from uwb_tdoa_tools.first_map.observations import STEP, G, _Level
 from uwb_tdoa_tools.first_map.search import rigid_distance
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
@@ -131,18 +131,18 @@ def test_gradient_is_that_of_the_cost(flight, inertial):
     rng = np.random.default_rng(0)
     path = rng.uniform(-2.0, 2.0, (problem.bins, 3))
     columns = rng.uniform(-1.0, 1.0, problem.layout.size)
-    equations = _State(problem, path, columns).equations()
+    equations = Equations(Fit(problem, path, columns))
     step = 1e-5
     for column in range(0, problem.layout.size, 3):
         there = np.zeros(len(columns))
         there[column] = step
-        ends = [_State(problem, path, columns + sign * there).cost for sign in (1, -1)]
+        ends = [Fit(problem, path, columns + sign * there).cost for sign in (1, -1)]
         slope = (ends[0] - ends[1]) / (2.0 * step)
         assert equations.gradient[column] == pytest.approx(slope, rel=1e-3, abs=1e-2)
     for row in (0, 5, problem.bins - 1):
         there = np.zeros_like(path)
         there[row, 1] = step
-        ends = [_State(problem, path + sign * there, columns).cost for sign in (1, -1)]
+        ends = [Fit(problem, path + sign * there, columns).cost for sign in (1, -1)]
         slope = (ends[0] - ends[1]) / (2.0 * step)
         # WEAK is no part of the cost
         assert equations.path_gradient[3 * row + 1] == pytest.approx(slope, rel=1e-3, abs=1e-2)

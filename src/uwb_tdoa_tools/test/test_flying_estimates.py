@@ -187,8 +187,8 @@ def exported(folder, *effects):
     """A folder as export --c writes it."""
     folder.mkdir()
     code = vehicle_code(HALL.anchors, EffectSet(effects))
-    (folder / "uwb_bias.h").write_text(code.header)
-    (folder / "uwb_bias.c").write_text(code.source)
+    for name, text in code.files.items():
+        (folder / name).write_text(text)
     return folder
 
 

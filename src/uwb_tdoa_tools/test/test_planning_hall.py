@@ -11,14 +11,14 @@ import pytest
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.survey import read_survey
 from uwb_tdoa_tools.commands.plan import main
+from uwb_tdoa_tools.parallel import Progress
 from uwb_tdoa_tools.planning.hall import Hall
 from uwb_tdoa_tools.planning.installation import Installation
-from uwb_tdoa_tools.planning.layout import Goal
-from uwb_tdoa_tools.planning.maps import TOO_FEW, Demand, Grid, chart
-from uwb_tdoa_tools.planning.optimisation import with_one
+from uwb_tdoa_tools.planning.maps import TOO_FEW, Demand, Grid
+from uwb_tdoa_tools.planning.optimisation import best_addition, with_one
 from uwb_tdoa_tools.planning.report import summary
-from uwb_tdoa_tools.planning.run import hall_advice
-from uwb_tdoa_tools.simulation.rooms import Room, Walls
+from uwb_tdoa_tools.planning.run import places_in_hall
+from uwb_tdoa_tools.simulation.rooms import Room
 
 REACH = 15.0  # m
 
@@ -38,14 +38,7 @@ def anchors_of(nx, ny, hole=None, spacing=8.0):
 def hall_of(anchors, reach=REACH, accuracy=1.0):
     room = Room(np.array([-4.0, -4.0, 0.0]), np.array([60.0, 60.0, 6.0]))
     return Hall(
-        Goal(
-            np.empty((0, 3)),
-            Installation(anchors, hall=True),
-            "all_pairs",
-            demand=Demand(room, accuracy),
-        ),
-        anchors,
-        reach,
+        Installation(anchors, pairing="all_pairs", hall=True), Demand(room, accuracy), reach
     )
 
 
@@ -66,25 +59,11 @@ def test_cells_hear_the_anchors_within_reach():
     ) == pytest.approx(1.0)
 
 
-def test_cells_hear_nothing_through_a_wall():
-    anchors, walls = anchors_of(6, 5), Walls(((20.5, -50.0, 20.5, 50.0, np.inf),))
-    grid = Grid.slice((-4.0, 44.0), (-4.0, 36.0), 1.2, 8.0)
-    hall = replace(hall_of(anchors), walls=walls)
-    away = np.linalg.norm(grid.points[:, None] - anchors.positions, axis=2)
-    beside = (grid.points[:, None, 0] > 20.5) == (anchors.positions[:, 0] > 20.5)
-    np.testing.assert_array_equal(
-        [len(rows) for rows in hall.heard(grid.points)], np.sum((away <= REACH) & beside, axis=1)
-    )
-
-
 def test_where_all_are_heard_it_is_the_chart_of_a_room():
     anchors = anchors_of(3, 3)
     grid, hall = Grid.slice((1.0, 15.0), (1.0, 15.0), 1.2, 2.0), hall_of(anchors, 100.0)
-    found, whole = (
-        hall.chart(grid, jobs=1),
-        chart(hall.goal.installed(anchors), grid, hall.goal.demand),
-    )
-    assert (found.heard == len(anchors)).all()
+    found, whole = hall.chart(grid, jobs=1), replace(hall, reach=np.inf).chart(grid)
+    np.testing.assert_array_equal(found.heard, whole.heard)
     np.testing.assert_allclose(found.error, whole.error, rtol=1e-9)
     np.testing.assert_array_equal(found.status, whole.status)
 
@@ -94,7 +73,8 @@ def test_one_more_anchor_is_proposed_near_the_hole_and_gains_what_is_promised():
     hall = hall_of(anchors, accuracy=0.4)
     grid = Grid.slice((4.0, 52.0), (4.0, 52.0), 1.2, 4.0)
     found = hall.chart(grid, jobs=1)
-    added = hall_advice(hall, found)
+    places = places_in_hall(hall.demand.room, hall.reach)
+    added = best_addition(hall, found, places, Progress("plan"))
     assert (
         added["gain"] > 0.02 and np.hypot(*(np.array(added["position"][:2]) - 28.0)) < 2.0 * REACH
     )
@@ -152,7 +132,7 @@ def test_a_hall_whose_anchors_all_hang_at_one_height_needs_a_side(tmp_path, caps
     anchors = anchors_of(6, 5)
     flat = anchors.at(np.column_stack([anchors.positions[:, :2], np.full(len(anchors), 5.0)]))
     points = Grid.slice((4.0, 36.0), (4.0, 28.0), 1.2, 8.0).points
-    found = Hall(hall_of(anchors).goal, flat, REACH).side(points)
+    found = hall_of(flat).side(points)
     assert found["tag_side"] == ["below"] and found["share"] > 0.9
     assert hall_of(anchors).side(points) is None
 

@@ -58,8 +58,8 @@ def _export(args: Namespace) -> None:
     if not (args.onnx or args.c or args.crazyflie):
         raise InputError("--onnx, --c, --crazyflie: all are missing; name what to write.")
     from ..exporting.correction import trace
-    from ..exporting.folders import write_c, write_crazyflie  # imports onnx
-    from ..exporting.onnx_file import write_onnx
+    from ..exporting.onnx_file import write_onnx  # imports onnx
+    from ..exporting.vehicle import write_c, write_crazyflie
 
     say = partial(cli.say, "export")
     anchors = read_survey(args.survey)

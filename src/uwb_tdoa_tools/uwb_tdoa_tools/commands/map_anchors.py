@@ -82,7 +82,7 @@ def parser() -> ArgumentParser:
 
 def _map_anchors(args: Namespace) -> int:
     from ..first_map import map_anchors
-    from ..first_map.given import given
+    from ..first_map.observations import given
     from ..first_map.report import as_dict, as_text, picture
 
     _check(args)

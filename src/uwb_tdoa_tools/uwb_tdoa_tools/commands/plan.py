@@ -8,8 +8,6 @@ from pathlib import Path
 import sys
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from uwb_tdoa_bias.common.radio import RadioLink
 from uwb_tdoa_bias.common.sensors import SENSORS
 
@@ -239,28 +237,9 @@ def parser() -> ArgumentParser:
 
 
 def _plan(args: Namespace) -> int:
-    from uwb_tdoa_bias.common.anchors import Anchors
-
     from ..planning import run
-    from ..readers import inputs, read_survey
 
-    run.check_options(args)
-    anchors = None if args.hall else read_survey(args.anchors)
-    room = run.room_of_options(args, anchors)
-    reach = run.reach_of(args, room)
-    installation = run.installation_of(
-        args, Anchors.from_positions([room.centre] * 2) if anchors is None else anchors
-    )
-    demand = run.demand_of(args, installation, room)
-    grid = run.grid_of(args, room)
-    reading = inputs.Reading(args.anchors)
-    recordings = reading.find(args.flights or [], bool(args.dask))
-    if anchors is None or reach < np.inf:
-        figures, outgoing, good = run.plan_hall(args, anchors, installation, demand, grid)
-        run.end(args, figures, outgoing)
-        return 0 if good else 1
-    run.end(args, *run.plan_room(args, anchors, installation, demand, grid, reading, recordings))
-    return 0
+    return 0 if run.plan(args) else 1
 
 
 main = cli.executable(_plan, parser)

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections import Counter
 import re
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,8 +15,7 @@ from .scalars import Program, Scalar, needed
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from .dense import Dense
-    from .scalars import Pieces
+    from .scalars import Dense, Pieces
 
 LONGEST = 72  # characters of an expression that is not given a name
 OPERATORS = {
@@ -113,7 +112,10 @@ class Printer:
 
     Attributes
     ----------
+    anchors, pairs : bytes of (N,) and (N, N) float32, rows of the tables
+    networks, pieces : those that are called
     used : names of FUNCTIONS that were printed
+    inputs : names of inputs that are read
     """
 
     def __init__(self, members: dict[str, str]) -> None:
@@ -122,10 +124,10 @@ class Printer:
         members : {name of an input: member of the state, as "position[0]"}
         """
         self._members = members
-        self._anchors: list[np.ndarray] = []
-        self._pairs: list[np.ndarray] = []
-        self._networks: list[Dense] = []
-        self._pieces: dict[bytes, Pieces] = {}
+        self.anchors: list[bytes] = []
+        self.pairs: list[bytes] = []
+        self.networks: list[Dense] = []
+        self.pieces: list[Pieces] = []
         self.used: set[str] = set()
         self.inputs: set[str] = set()
 
@@ -140,58 +142,30 @@ class Printer:
     def tables(self, count: int) -> str:
         """Return the definitions of all tables and networks. count : N, number of anchors."""
         parts = []
-        if self._anchors:
-            rows = np.stack(self._anchors, axis=1)
+        if self.anchors:
+            rows = np.stack([np.frombuffer(row, np.float32) for row in self.anchors], axis=1)
             lines = ",\n".join(f"    {{\n{listed(row, '        ')}}}" for row in rows)
-            parts.append(
-                f"static const float of_anchor[{count}][{rows.shape[1]}] = {{\n{lines}}};\n"
-            )
-        if self._pairs:
-            flat = ",\n".join(
-                "    {\n"
-                + ",\n".join(f"        {{\n{listed(row, ' ' * 12)}}}" for row in one)
-                + "}"
-                for one in self._pairs
-            )
-            size = f"[{len(self._pairs)}][{count}][{count}]"
-            parts.append(f"static const float of_pair{size} = {{\n{flat}}};\n")
-        parts += [_pieces(k, one) for k, one in enumerate(self._pieces.values())]
-        parts += [_network(k, one) for k, one in enumerate(self._networks)]
+            size = f"[{count}][{len(self.anchors)}]"
+            parts.append(f"static const float of_anchor{size} = {{\n{lines}}};\n")
+        if self.pairs:
+            blocks = []
+            for pair in self.pairs:
+                table = np.frombuffer(pair, np.float32).reshape(count, count)
+                inner = ",\n".join(f"        {{\n{listed(row, ' ' * 12)}}}" for row in table)
+                blocks.append(f"    {{\n{inner}}}")
+            size = f"[{len(self.pairs)}][{count}][{count}]"
+            lines = ",\n".join(blocks)
+            parts.append(f"static const float of_pair{size} = {{\n{lines}}};\n")
+        parts += [_pieces(k, one) for k, one in enumerate(self.pieces)]
+        parts += [_network(k, one) for k, one in enumerate(self.networks)]
         return "\n".join(parts)
 
     def helpers(self) -> str:
         """Return the definitions of functions that C does not have."""
         parts = [HELPERS[name] for name in sorted(self.used & set(HELPERS))]
-        parts += [PIECES] if self._pieces else []
-        parts += [DENSE] if self._networks else []
+        parts += [PIECES] if self.pieces else []
+        parts += [DENSE] if self.networks else []
         return "".join(f"{part}\n" for part in parts)
-
-    def row_of(self, rows: list[np.ndarray], row: np.ndarray) -> int:
-        """Return the number of a row of a table, which is added unless it is there."""
-        for k, known in enumerate(rows):
-            if known.tobytes() == row.tobytes():
-                return k
-        rows.append(row)
-        return len(rows) - 1
-
-    def anchor_row(self, row: np.ndarray) -> int:
-        """Return the column of of_anchor with some constants."""
-        return self.row_of(self._anchors, row)
-
-    def pair_row(self, row: np.ndarray) -> int:
-        """Return the number of a table of of_pair with some constants."""
-        return self.row_of(self._pairs, row)
-
-    def network(self, network: Dense) -> int:
-        """Return the number of a network."""
-        if network not in self._networks:
-            self._networks.append(network)
-        return self._networks.index(network)
-
-    def pieces(self, pieces: Pieces) -> int:
-        """Return the number of a function of pieces."""
-        self._pieces.setdefault(pieces.key, pieces)
-        return list(self._pieces).index(pieces.key)
 
     def member(self, name: str) -> str:
         """Return the expression of an input."""
@@ -242,20 +216,11 @@ class _Function:
         known = {k: f"shared[{number}]" for k, number in self._shared.items()}
         lines = self._statements(self._inner, known, {"a": "of", "b": "of"}, set(self._roots))
         lines += [f"out[{number}] = {known[k]};" for k, number in self._roots.items()]
-        return _body(
-            f"static void {self._name}_at_anchor({self._parameters('one')})",
-            lines,
-            ("of", "s", "shared"),
+        head = (
+            f"static void {self._name}_at_anchor(const float *of, const uwb_bias_state *s,\n"
+            "    const float *shared, float *out)"
         )
-
-    def _parameters(self, which: str) -> str:
-        if which == "one":
-            return (
-                "const float *of, const uwb_bias_state *s, const float *shared,\n"
-                + " " * (len(self._name) + 23)
-                + "float *out"
-            )
-        return "int a, int b, const uwb_bias_state *s, float *out"
+        return _body(head, lines, ("of", "s", "shared"))
 
     def _whole(self) -> str:
         known: dict[int, str] = {}
@@ -279,11 +244,8 @@ class _Function:
         rest = [k for k in self._main if k not in first]
         lines += self._statements(rest, known, tables, set())
         lines += [f"out[{k}] = {known[place]};" for k, place in enumerate(self._program.outputs)]
-        return _body(
-            f"static void {self._name}({self._parameters('both')})",
-            lines,
-            ("a", "b", "s", "of_a", "of_b"),
-        )
+        head = f"static void {self._name}(int a, int b, const uwb_bias_state *s, float *out)"
+        return _body(head, lines, ("a", "b", "s", "of_a", "of_b"))
 
     def _statements(
         self, places: Sequence[int], known: dict[int, str], tables: dict[str, str], kept: set[int]
@@ -301,20 +263,21 @@ class _Function:
                 self._call(k, one, known, lines)
                 continue
             text = self._expression(one, known, tables)
-            named = k in kept or self._uses[k] > 1 or len(text) > LONGEST
+            is_operation = not _is_leaf(one) and one.kind not in (*FUNCTIONS, "pieces")
+            inline = f"({text})" if is_operation else text
+            named = k in kept or self._uses[k] > 1 or len(inline) > LONGEST
             if _is_leaf(one) or not named:
-                known[k] = text
+                known[k] = inline
                 continue
             kind = "int" if one.is_bool else "float"
             known[k] = f"v{k}"
-            text = text[1:-1] if _is_enclosed(text) else text
             lines.append(f"const {kind} v{k} = {text};")
         return lines
 
     def _call(self, place: int, one: Scalar, known: dict[int, str], lines: list[str]) -> None:
         """Append a call of a network, once for all its outputs."""
         network, output = one.value
-        number_of = self._printer.network(network)
+        number_of = _place(self._printer.networks, network)
         outputs = len(network.layers[-1][1])
         call = f"network_{number_of}(x_{number_of}, y_{number_of});"
         if call not in lines:
@@ -328,29 +291,29 @@ class _Function:
             known[place] = number(network.constants[output - outputs])
 
     def _expression(self, one: Scalar, known: dict[int, str], tables: dict[str, str]) -> str:
-        """Return the C of one operation, in parentheses where it needs them."""
-        program, printer = self._program, self._printer
+        """Return the C of one operation, without parentheses around it."""
+        printer = self._printer
         if one.kind == "input":
             return printer.member(one.value)
         if one.kind == "constant":
             return number(one.value)
         if one.kind == "anchor":
             end, row = one.value
-            return f"{tables[end]}[{printer.anchor_row(program.anchors[row])}]"
+            return f"{tables[end]}[{_place(printer.anchors, row)}]"
         if one.kind == "pair":
-            return f"of_pair[{printer.pair_row(program.pairs[one.value])}][a][b]"
+            return f"of_pair[{_place(printer.pairs, one.value)}][a][b]"
         inputs = [known[i] for i in one.inputs]
         if one.kind in OPERATORS:
-            return f"({inputs[0]} {OPERATORS[one.kind]} {inputs[1]})"
+            return f"{inputs[0]} {OPERATORS[one.kind]} {inputs[1]}"
         if one.kind == "neg":
-            return f"(-{inputs[0]})"
+            return f"-{inputs[0]}"
         if one.kind == "not":
-            return f"(!{inputs[0]})"
+            return f"!{inputs[0]}"
         if one.kind == "where":
-            return f"({inputs[0]} ? {inputs[1]} : {inputs[2]})"
+            return f"{inputs[0]} ? {inputs[1]} : {inputs[2]}"
         if one.kind == "pieces":
-            number_of = printer.pieces(one.value)
-            count, terms = one.value.table.shape
+            number_of = _place(printer.pieces, one.value)
+            count, terms = np.shape(one.value.table)
             scale = number(one.value.scale)
             return f"pieces(pieces_{number_of}, {count}, {terms}, {scale}, {inputs[0]})"
         name = FUNCTIONS[one.kind]
@@ -389,20 +352,15 @@ def twins(scalars: Sequence[Scalar], ends: Sequence[frozenset[str]]) -> dict[int
     }
 
 
+def _place(known: list[Any], value: Any) -> int:
+    """Return the place of a value in a list, to which it is added unless it is there."""
+    if value not in known:
+        known.append(value)
+    return known.index(value)
+
+
 def _is_leaf(one: Scalar) -> bool:
     return not one.inputs
-
-
-def _is_enclosed(text: str) -> bool:
-    """Return whether the first parenthesis closes at the end."""
-    if not text.startswith("("):
-        return False
-    depth = 0
-    for place, character in enumerate(text):
-        depth += (character == "(") - (character == ")")
-        if depth == 0:
-            return place == len(text) - 1
-    return False
 
 
 def _body(head: str, lines: Sequence[str], unused: Iterable[str]) -> str:
@@ -419,7 +377,7 @@ def _names(name: str, line: str) -> bool:
 
 def _pieces(number_of: int, pieces: Pieces) -> str:
     """Return the table of a function of pieces."""
-    values = np.concatenate([pieces.breaks, pieces.table.ravel()])
+    values = np.concatenate([pieces.breaks, np.ravel(pieces.table)])
     return f"static const float pieces_{number_of}[{len(values)}] = {{\n{listed(values)}}};\n"
 
 

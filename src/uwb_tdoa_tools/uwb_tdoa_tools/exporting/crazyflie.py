@@ -20,8 +20,6 @@ import yaml
 if TYPE_CHECKING:
     from uwb_tdoa_bias.common.anchors import Anchors
 
-    from .vehicle import VehicleCode
-
 LARGEST_ID = 255  # of an anchor in the firmware
 
 MAKEFILE = """\
@@ -160,8 +158,8 @@ def client_yaml(anchors: Anchors) -> str:
     return yaml.safe_dump(content, sort_keys=True)
 
 
-def files(code: VehicleCode, anchors: Anchors) -> dict[str, str]:
-    """Return {path: text} of the build."""
+def files(code: dict[str, str], anchors: Anchors) -> dict[str, str]:
+    """Return {path: text} of the build. code : {name: text} of the C of the correction."""
     return {
         "Makefile": MAKEFILE,
         "Kbuild": KBUILD,
@@ -170,7 +168,7 @@ def files(code: VehicleCode, anchors: Anchors) -> dict[str, str]:
         "anchors.yaml": client_yaml(anchors),
         "overrides/estimator_kalman.h": OVERRIDE,
         "src/Kbuild": SOURCES,
-        **{f"src/{name}": text for name, text in code.files.items()},
+        **{f"src/{name}": text for name, text in code.items()},
         "src/uwb_bias_firmware.h": HEADER,
         "src/uwb_bias_firmware.c": SOURCE,
     }

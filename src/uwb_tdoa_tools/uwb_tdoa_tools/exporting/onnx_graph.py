@@ -8,7 +8,7 @@ import json
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from onnx import NodeProto, TensorProto, checker, helper, numpy_helper
+from onnx import NodeProto, TensorProto, checker, compose, helper, numpy_helper
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.text import version
@@ -60,34 +60,18 @@ class GraphBuilder:
                 f"{OPSET} to {LAST_OPSET}."
             )
         self._opset = max(self._opset, declared)
-        prefix = f"m{len(self._nodes)}_"
-        inside = {one.name for one in model.graph.initializer}
-        (entry,) = (one.name for one in model.graph.input if one.name not in inside)
-
-        def renamed(name: str) -> str:
-            return value if name == entry else prefix + name if name else ""
-
-        for weights in model.graph.initializer:
-            own = TensorProto()
-            own.CopyFrom(weights)
-            own.name = renamed(weights.name)
-            self._constants.append(own)
-        for node in model.graph.node:
-            copy = NodeProto()
-            copy.CopyFrom(node)
-            copy.name = ""
-            copy.input[:] = map(renamed, node.input)
-            copy.output[:] = map(renamed, node.output)
-            self._nodes.append(copy)
-        return renamed(model.graph.output[0].name)
+        inside = compose.add_prefix(model, f"m{len(self._nodes)}_").graph
+        weights = {one.name for one in inside.initializer}
+        (entry,) = (one.name for one in inside.input if one.name not in weights)
+        for node in inside.node:
+            node.input[:] = [value if name == entry else name for name in node.input]
+        self._constants.extend(inside.initializer)
+        self._nodes.extend(inside.node)
+        return inside.output[0].name
 
     def take(self, value: str, columns: Iterable[int]) -> str:
         """Select columns."""
         return self.op("Gather", value, self.constant(list(columns), np.int64), axis=1)
-
-    def rows(self, value: str, width: int) -> str:
-        """Reshape to rows of another width, with the same order of numbers."""
-        return self.op("Reshape", value, self.constant([-1, width], np.int64))
 
     def reshaped(self, value: str, *shape: int) -> str:
         """Reshape; 0 keeps the length of an axis."""

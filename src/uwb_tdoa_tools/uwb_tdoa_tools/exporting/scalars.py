@@ -7,9 +7,8 @@ Scalars in its order. Its kinds are the elementwise ones of `graph`, and
 
 input     `value` is the name of a column
 constant  `value` is the number
-anchor    `value` is (end, row): the number in a row of the table of constants of the anchors;
-          end is "a" or "b"
-pair      `value` is the row of the table of constants of the pairs
+anchor    `value` is (end, bytes of N float32): the number of the anchor at this end, "a" or "b"
+pair      `value` is the bytes of (N, N) float32: the number of the pair
 network   `value` is (Dense, number of the output); the inputs are those of the network
 pieces    `value` is Pieces, a function of one number that consists of polynomials
 
@@ -18,20 +17,21 @@ Equal Scalars are one. A sum adds its terms one by one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import partial, reduce
+from functools import lru_cache, reduce
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import onnx
+from onnx import numpy_helper
 
-from .dense import Dense
 from .graph import COMPARISONS, ELEMENTWISE, LOGICAL, ordered
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
     from .graph import Node
 
+ACTIVATIONS = ("Relu",)
 SAME = 1e-9  # m; a smaller difference of constants is rounding
 
 ANGLE = 3.1416  # rad, no atan2 is larger in single precision
@@ -51,19 +51,18 @@ class Scalar(NamedTuple):
         return self.kind in (*COMPARISONS, *LOGICAL)
 
 
-@dataclass(frozen=True, eq=False)
-class Pieces:
+class Pieces(NamedTuple):
     """A function that is 0 up to the first break, polynomial between breaks, then constant.
 
     Attributes
     ----------
-    breaks : (k + 1,) float32
-    table : (k, degree + 1) float32; the value at the begin of each piece, then the coefficients of
+    breaks : k + 1 numbers
+    table : k rows of degree + 1; the value at the begin of each piece, then the coefficients of
         the powers of the distance from there
     """
 
-    breaks: np.ndarray
-    table: np.ndarray
+    breaks: tuple[float, ...]
+    table: tuple[tuple[float, ...], ...]
 
     @classmethod
     def of(cls, node: Node) -> tuple[Node, Pieces] | None:
@@ -91,39 +90,70 @@ class Pieces:
         degrees = np.arange(1, len(coefficients) + 1)[:, None]
         gained = np.sum(coefficients * wide**degrees, axis=0)
         begin = np.concatenate([[0.0], np.cumsum(gained)[:-1]])
-        table = np.stack([begin, *coefficients], axis=1)
+        table = np.stack([begin, *coefficients], axis=1).astype(np.float32)
         edges = np.array([*start, start[-1] + wide[-1]], dtype=np.float32)
-        return x, cls(edges, table.astype(np.float32))
+        return x, cls(tuple(edges.tolist()), tuple(map(tuple, table.tolist())))
 
     @property
     def scale(self) -> np.float32:
         """Return the number of pieces per unit if all are equally wide, else 0."""
-        width = np.diff(self.breaks.astype(float))
+        width = np.diff(self.breaks)
         even = np.ptp(width) < EVEN * width.mean()
         return np.float32(1.0 / width.mean() if even else 0.0)
 
-    @property
-    def key(self) -> bytes:
-        """Return bytes that are equal for equal functions."""
-        return self.breaks.tobytes() + self.table.tobytes()
 
-    def __call__(self, x: np.ndarray) -> np.ndarray:
-        """Return the values (n,) float32 at x (n,) float32."""
-        if self.scale:
-            at = (x - self.breaks[0]) * self.scale
-            held = np.clip(np.nan_to_num(at), 0.0, len(self.table) - 1.0)
-            piece = held.astype(int)
-        else:
-            piece = np.searchsorted(self.breaks[1:-1], x, side="right")
-            piece[np.isnan(x)] = 0
-        inside = np.where(x > self.breaks[piece], x - self.breaks[piece], np.float32(0.0))
-        width = self.breaks[piece + 1] - self.breaks[piece]
-        inside = np.where(inside > width, width, inside)
-        row = self.table[piece]
-        value = row[:, -1]
-        for power in range(self.table.shape[1] - 2, 0, -1):
-            value = value * inside + row[:, power]
-        return np.where(x == x, value * inside + row[:, 0], x)
+class Unsupported(ValueError):
+    """The network is not a chain of dense layers."""
+
+
+class Dense:
+    """Layers of a network: y = activation(weights^T x + biases).
+
+    Attributes
+    ----------
+    layers : list of (weights (i, o), biases (o,), name of the activation or "")
+    constants : numbers that are appended to the output of the last layer
+    """
+
+    def __init__(self, content: bytes) -> None:
+        """Read an ONNX file; raise Unsupported."""
+        graph = onnx.load_from_string(content).graph
+        known = {one.name: numpy_helper.to_array(one) for one in graph.initializer}
+        self.layers: list[tuple[np.ndarray, np.ndarray, str]] = []
+        self.constants: list[np.float32] = []
+        chain = graph.input[0].name
+        constant: dict[str, np.float32] = {}
+        for node in graph.node:
+            first, *others = node.input
+            if node.op_type == "Gemm" and first == chain and not node.attribute:
+                weights, biases = (known[name].astype(np.float32) for name in others)
+                self.layers.append((weights, np.ravel(biases), ""))
+                chain = node.output[0]
+            elif node.op_type in ACTIVATIONS and first == chain and self.layers:
+                self.layers[-1] = (*self.layers[-1][:2], node.op_type)
+                chain = node.output[0]
+            elif node.op_type == "Mul" and not known[others[0]].any():
+                constant[node.output[0]] = np.float32(0.0)  # of the shape of its input
+            elif node.op_type == "Add" and first in constant:
+                constant[node.output[0]] = np.float32(known[others[0]].ravel()[0])
+            elif node.op_type == "Concat" and first == chain and set(others) <= set(constant):
+                self.constants = [constant[name] for name in others]
+                chain = node.output[0]
+            else:
+                raise Unsupported(f"it has the operator {node.op_type}")
+        if not self.layers or chain != graph.output[0].name:
+            raise Unsupported("it is no chain of layers")
+
+    @property
+    def widest(self) -> int:
+        """Return the largest number of values of a layer."""
+        return max(len(biases) for _, biases, _ in self.layers)
+
+
+@lru_cache(maxsize=8)
+def dense(content: bytes) -> Dense:
+    """Return the network of an ONNX file; the same object for the same content. Raises Unsupported."""
+    return Dense(content)
 
 
 class Program:
@@ -133,18 +163,12 @@ class Program:
     ----------
     scalars : list of Scalar
     outputs : places of the outputs
-    anchors : list of (N,) float32, rows of the table of the anchors
-    pairs : list of (N, N) float32, rows of the table of the pairs
     """
 
     def __init__(self, outputs: Sequence[Node], count: int) -> None:
         """Take the nodes () of the outputs apart. count : N, number of anchors."""
         self.scalars: list[Scalar] = []
-        self.anchors: list[np.ndarray] = []
-        self.pairs: list[np.ndarray] = []
         self._known: dict[Any, int] = {}
-        self._rows: dict[Any, int] = {}
-        self._known_pieces: dict[bytes, Pieces] = {}
         self._count = count
         places: dict[int, np.ndarray] = {}
         nodes, merged = ordered(outputs)
@@ -169,15 +193,12 @@ class Program:
             found = Pieces.of(node)
             if found is not None:
                 x, pieces = found
-                return _each(partial(self._piecewise, pieces), [places[id(x)][..., 0]])
+                return _each(lambda at: self.add("pieces", (at,), pieces), [places[id(x)][..., 0]])
             return _each(lambda *terms: reduce(self._plus, terms), np.moveaxis(inputs[0], -1, 0))
         if node.kind == "network":
-            network = Dense.of(node.value)
-            made = [
-                self.add("network", tuple(map(int, inputs[0])), (network, k))
-                for k in range(node.size)
-            ]
-            return np.array(made)
+            network = dense(node.value.content)
+            values = [(network, k) for k in range(node.size)]
+            return np.array([self.add("network", tuple(inputs[0]), one) for one in values])
         return _each(lambda *some: self.add(node.kind, some), np.broadcast_arrays(*inputs))
 
     def _constants(self, node: Node) -> np.ndarray:
@@ -199,23 +220,10 @@ class Program:
         if np.abs(values - (of_b - of_b[:, None])).max() < SAME:
             ends = self._of_anchor("b", of_b), self._of_anchor("a", of_b)
             return self.add("sub", ends)
-        return self.add("pair", (), self._row(self.pairs, values))
+        return self.add("pair", (), _bytes(values))
 
     def _of_anchor(self, end: str, values: np.ndarray) -> int:
-        return self.add("anchor", (), (end, self._row(self.anchors, values)))
-
-    def _row(self, rows: list[np.ndarray], values: np.ndarray) -> int:
-        """Return the number of a row of a table, which is added unless it is there."""
-        row = np.array(values, dtype=np.float32)
-        key = row.ndim, row.tobytes()
-        if key not in self._rows:
-            self._rows[key] = len(rows)
-            rows.append(row)
-        return self._rows[key]
-
-    def _piecewise(self, pieces: Pieces, place: int) -> int:
-        known = self._known_pieces.setdefault(pieces.key, pieces)
-        return self.add("pieces", (place,), known)
+        return self.add("anchor", (), (end, _bytes(values)))
 
     def _plus(self, one: int, other: int) -> int:
         return self.add("add", (one, other))
@@ -318,41 +326,9 @@ class Program:
         ]
         self.outputs = [new[k] for k in self.outputs]
 
-    def evaluate(
-        self,
-        columns: Mapping[str, np.ndarray],
-        a: np.ndarray,
-        b: np.ndarray,
-        functions: Mapping[str, Callable[..., Any]] = ELEMENTWISE,
-    ) -> list[np.ndarray]:
-        """Return the values of the outputs, each (n,) float32, by numpy.
 
-        columns : {name of an input: (n,)}; a, b : (n,) rows of the anchors
-        functions : {kind: function of arrays}, of the elementwise kinds
-        """
-        made: list[Any] = []
-        with np.errstate(all="ignore"):
-            for one in self.scalars:
-                inputs = [made[k] for k in one.inputs]
-                value: Any
-                if one.kind == "input":
-                    value = columns[one.value]
-                elif one.kind == "constant":
-                    value = np.full(len(a), one.value)
-                elif one.kind == "anchor":
-                    end, row = one.value
-                    value = self.anchors[row][a if end == "a" else b]
-                elif one.kind == "pair":
-                    value = self.pairs[one.value][a, b]
-                elif one.kind == "network":
-                    network, k = one.value
-                    value = network.evaluate(np.stack(inputs, axis=1))[:, k]
-                elif one.kind == "pieces":
-                    value = one.value(*inputs)
-                else:
-                    value = functions[one.kind](*inputs)
-                made.append(value if one.is_bool else np.asarray(value, dtype=np.float32))
-        return [made[k] for k in self.outputs]
+def _bytes(values: np.ndarray) -> bytes:
+    return values.astype(np.float32).tobytes()
 
 
 def needed(scalars: Sequence[Scalar], outputs: Iterable[int]) -> list[int]:

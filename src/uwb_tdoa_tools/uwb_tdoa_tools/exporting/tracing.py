@@ -195,7 +195,7 @@ class Traced(NDArrayOperatorsMixin, SymbolicArray):
 
         elements = [_node_of(one) for one in _merged(run)]
         blocks = self.node.shape[0]
-        elements = [_with_blocks(one, blocks) for one in elements]
+        elements = [_broadcast(one, (blocks,)) for one in elements]
         index = np.arange(len(elements) * blocks).reshape(len(elements), blocks).T
         return self._of(pick(elements, index.reshape(blocks, *out.shape[1:])))
 
@@ -412,7 +412,7 @@ def _nan_to_num(like: Traced, values: Traced) -> Node:
 
 def _repeat(like: Traced, values: Traced, count: int, axis: int) -> Node:
     assert values.node.shape[axis] == 1
-    return joined([values.node] * count, axis) if count else _empty(like)
+    return joined([values.node] * count, axis) if count else constant(np.zeros((1, 1, 0)))
 
 
 def _einsum(like: Traced, subscripts: str, one: Any, other: Any) -> Node:
@@ -422,10 +422,6 @@ def _einsum(like: Traced, subscripts: str, one: Any, other: Any) -> Node:
 
 def _zeros_like(like: Traced, values: Traced) -> Node:
     return constant(np.zeros((1, *values.node.shape)))
-
-
-def _empty(like: Traced) -> Node:
-    return constant(np.zeros((1, 1, 0)))
 
 
 def _ones_like(like: Traced, values: Traced) -> Node:
@@ -451,11 +447,6 @@ _FUNCTIONS: dict[Any, Callable[..., Node]] = {
 def _broadcast(node: Node, shape: tuple[int, ...]) -> Node:
     index = np.arange(node.size).reshape(node.shape)
     return pick([node], np.broadcast_to(index, shape))
-
-
-def _with_blocks(node: Node, blocks: int) -> Node:
-    """Return a node of shape () or (blocks,) or (1,) as (blocks,)."""
-    return _broadcast(node, (blocks,))
 
 
 # Compiled functions: their Python source runs for one row of symbols

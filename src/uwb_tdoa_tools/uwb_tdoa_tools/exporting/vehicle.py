@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A correction as C for a vehicle: what is printed, and its interface.
+"""A correction as C for a vehicle: what is printed, its interface, and the folders with it.
 
 The bias at one state has two parts: of effects that the filter differentiates by its state, and of
 everything else. Only the first part is computed again for the Jacobian, at states to both sides, as
@@ -14,18 +14,26 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_bias.common.text import version
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.effect_set import REACH
 
+from . import crazyflie
 from .c_code import Printer, number
-from .scalars import Program
+from .correction import left_out
+from .scalars import Program, Unsupported
 from .tracing import nodes_of, samples_of
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from uwb_tdoa_bias.common.anchors import Anchors
     from uwb_tdoa_bias.correction.network import Network
+
+    from .correction import LeftOut, TracedCorrection
 
 MEMBERS = {  # of the state, by the names of inputs
     **{name: f"position[{k}]" for k, name in enumerate(("x", "y", "z"))},
@@ -49,6 +57,7 @@ STATE = np.dtype(
     ]
 )
 RATES = {"ax", "ay", "az", "wx", "wy", "wz"}  # inputs of acceleration and rate
+NOT_ESTIMATED = "the filter of the firmware estimates no acceleration and no rate"
 NO_PAIR, NOT_FINITE = 1, 2  # results of the functions in C
 
 HEADER = """\
@@ -196,6 +205,22 @@ static float slopes(void (*function)(int, int, const uwb_bias_state *, float *),
 }}
 """
 
+JACOBIAN = """\
+    float power = 0.0f;
+{calls}    *curved = sqrtf(power);
+    int finite = is_finite(*curved);
+    for (int k = 0; k < 6; k++) {{
+        finite = finite && is_finite(jacobian[k]);
+    }}
+    if (!finite) {{
+        for (int k = 0; k < 6; k++) {{
+            jacobian[k] = 0.0f;
+        }}
+        *curved = 0.0f;
+        return UWB_BIAS_NOT_FINITE;
+    }}
+"""
+
 
 @dataclass(frozen=True)
 class VehicleCode:
@@ -203,22 +228,12 @@ class VehicleCode:
 
     Attributes
     ----------
-    header, source : text of uwb_bias.h and uwb_bias.c
-    level : Program of bias and standard deviation, without the steep part
-    steep : {states: Program of the bias of the effects that are differentiated by them}
+    files : {name: text} of uwb_bias.h and uwb_bias.c
     inputs : names of the inputs that are read
     """
 
-    header: str
-    source: str
-    level: Program
-    steep: dict[tuple[int, ...], Program]
+    files: dict[str, str]
     inputs: tuple[str, ...]
-
-    @property
-    def files(self) -> dict[str, str]:
-        """Return {name: text} of both files."""
-        return {"uwb_bias.h": self.header, "uwb_bias.c": self.source}
 
     @property
     def reads_rates(self) -> bool:
@@ -271,7 +286,8 @@ def vehicle_code(
         ),
         "slopes": _slopes(steep),
     }
-    return VehicleCode(HEADER.format(**made), SOURCE.format(**made), level_program, steep, inputs)
+    files = {"uwb_bias.h": HEADER.format(**made), "uwb_bias.c": SOURCE.format(**made)}
+    return VehicleCode(files, inputs)
 
 
 def _by_states(effects: EffectSet) -> dict[tuple[int, ...], EffectSet]:
@@ -296,25 +312,58 @@ def _slopes(steep: dict[tuple[int, ...], Program]) -> str:
     """Return the statements that fill in the Jacobian."""
     if not steep:
         return ""
-    lines = ["float power = 0.0f;"]
+    calls = ""
     for k, states in enumerate(steep):
         ends = f"{states[0]}, {states[-1] + 1}"
-        lines.append(f"power += slopes(steep_{k}, a, b, state, {ends}, jacobian);")
-    lines += [
-        "*curved = sqrtf(power);",
-        "int finite = is_finite(*curved);",
-        "for (int k = 0; k < 6; k++) {\n        finite = finite && is_finite(jacobian[k]);\n    }",
-        "if (!finite) {\n"
-        "        for (int k = 0; k < 6; k++) {\n"
-        "            jacobian[k] = 0.0f;\n"
-        "        }\n"
-        "        *curved = 0.0f;\n"
-        "        return UWB_BIAS_NOT_FINITE;\n"
-        "    }",
-    ]
-    return "".join(f"    {line}\n" for line in lines)
+        calls += f"    power += slopes(steep_{k}, a, b, state, {ends}, jacobian);\n"
+    return JACOBIAN.format(calls=calls)
 
 
 def _in_comment(text: str) -> str:
     """Return a text that cannot end a comment of C."""
     return "".join(one if one.isalnum() or one in " _-+.," else "?" for one in text)
+
+
+def write_c(folder: Path, traced: TracedCorrection) -> None:
+    """Write uwb_bias.h and uwb_bias.c of a TracedCorrection. Raises InputError."""
+    _write(folder, _code(traced, traced.effects).files)
+
+
+def write_crazyflie(folder: Path, traced: TracedCorrection) -> tuple[LeftOut, ...]:
+    """Write an out-of-tree build of the firmware; return what it does not hold besides.
+
+    Raises InputError.
+    """
+    anchors = traced.anchors
+    high = anchors.ids[anchors.ids > crazyflie.LARGEST_ID]
+    if len(high):
+        raise InputError(
+            f"anchors: the firmware has ids up to {crazyflie.LARGEST_ID}, and one is {high[0]}; "
+            "give the anchor such an id, or leave it out of the survey."
+        )
+    held = traced.effects.where(
+        lambda effect: not vehicle_code(anchors, EffectSet((effect,))).reads_rates
+    )
+    _write(folder, crazyflie.files(_code(traced, held).files, anchors))
+    return tuple(
+        replace(left_out(effect, anchors), why=NOT_ESTIMATED)
+        for effect in traced.effects
+        if effect not in held.effects
+    )
+
+
+def _code(traced: TracedCorrection, effects: EffectSet) -> VehicleCode:
+    try:
+        return vehicle_code(traced.anchors, effects, traced.network)
+    except Unsupported as error:
+        raise InputError(
+            f"--model: C holds networks of dense layers, and of this one not: {error}; train "
+            "--model paper or paper_no_orientation, or write it by --onnx."
+        ) from error
+
+
+def _write(folder: Path, texts: dict[str, str]) -> None:
+    for name, text in texts.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_text(path, text)

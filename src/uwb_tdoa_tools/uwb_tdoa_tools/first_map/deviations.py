@@ -11,7 +11,7 @@ import numpy as np
 from .least_squares import MOTION
 
 if TYPE_CHECKING:
-    from .least_squares import Fit, Linear
+    from .least_squares import Equations, Fit
 
 LENGTH = 1.2  # m, of the smooth error of each anchor, as in `survey`
 DRAWS = 300  # of the errors
@@ -26,7 +26,7 @@ LEAST_SHARE = 0.1  # of the variance of residuals that lasts at least
 LEAST = 0.01  # m, of a coordinate
 
 
-def covariance(linear: Linear, fit: Fit, rng: np.random.Generator) -> tuple[np.ndarray, float]:
+def covariance(linear: Equations, fit: Fit, rng: np.random.Generator) -> tuple[np.ndarray, float]:
     """Return the covariance of the anchors, (3N, 3N) m^2, and the size of lasting errors, m.
 
     Draws of all errors pass through the linear problem. Each anchor has a smooth error of the place of
@@ -47,9 +47,9 @@ def covariance(linear: Linear, fit: Fit, rng: np.random.Generator) -> tuple[np.n
     still = np.zeros((len(problem.middle), 3, DRAWS))
     nothing = np.zeros((problem.layout.size, DRAWS)), np.zeros((3 * problem.bins, DRAWS))
     lasting, left = linear.response(radio, still, nothing)
-    scale = _scale(linear.residual)
+    scale = _scale(linear.state.radio)
     pairs = _neighbours(linear)
-    clipped = np.clip(linear.residual, -CLIPPED * scale, CLIPPED * scale)
+    clipped = np.clip(linear.state.radio, -CLIPPED * scale, CLIPPED * scale)
     together = max(_lasting(clipped[:, None], pairs), LEAST_SHARE * scale**2)
     std = float(np.sqrt(together / max(_lasting(left, pairs), 1e-9)))
     noise = scale * rng.standard_normal(radio.shape)
@@ -59,7 +59,7 @@ def covariance(linear: Linear, fit: Fit, rng: np.random.Generator) -> tuple[np.n
     return least + MARGIN * total @ total.T / DRAWS, std
 
 
-def _neighbours(linear: Linear) -> tuple[np.ndarray, np.ndarray]:
+def _neighbours(linear: Equations) -> tuple[np.ndarray, np.ndarray]:
     """Return rows (k,) of measurements, and of the next one of the same anchors within NEAR bins."""
     seen = linear.problem.seen
     order = np.lexsort((seen.bin, seen.b, seen.a))
@@ -80,11 +80,10 @@ def _root(path: np.ndarray) -> np.ndarray:
     apart = np.sum((path[:, None] - path) ** 2, axis=2)
     values, vectors = np.linalg.eigh(np.exp(-0.5 * apart / LENGTH**2))
     kept = values > 1e-6 * values[-1]
-    out: np.ndarray = vectors[:, kept] * np.sqrt(values[kept])
-    return out
+    return vectors[:, kept] * np.sqrt(values[kept])
 
 
-def _accelerations(linear: Linear, rng: np.random.Generator) -> np.ndarray:
+def _accelerations(linear: Equations, rng: np.random.Generator) -> np.ndarray:
     """Return draws of the errors of accelerations, (m, 3, s) m/s^2."""
     problem = linear.problem
     flight, t = problem.seen.flight[problem.middle], problem.seen.t[problem.middle]

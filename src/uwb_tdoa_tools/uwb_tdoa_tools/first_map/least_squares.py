@@ -67,77 +67,6 @@ class Stage:
     wide: float = 1.0
 
 
-@dataclass(frozen=True, eq=False)
-class Fit:
-    """A minimum: path (J, 3) m, columns (size,), cost (negative log-likelihood)."""
-
-    path: np.ndarray
-    columns: np.ndarray
-    cost: float
-
-    def anchors(self, count: int) -> np.ndarray:
-        """Return positions of the anchors, (N, 3) m."""
-        return self.columns[: 3 * count].reshape(count, 3)
-
-
-@dataclass(frozen=True, eq=False)
-class Linear:
-    """The problem about a Fit.
-
-    residual, weight : (n,) of TDOAs and ranges, m and 1/m^2; by_tag : (n, 3), by_columns : (n, k)
-    misfit : mean square of accelerations over ACCEL_STD^2, of each flight; NaN without
-    between : (m,) residuals of distances over their std; by_distances : (m, k), weighted
-    covariance : (k, k) of the columns for independent errors
-    """
-
-    problem: Problem
-    residual: np.ndarray
-    weight: np.ndarray
-    by_columns: np.ndarray
-    misfit: np.ndarray
-    between: np.ndarray
-    covariance: np.ndarray
-    path_factor: np.ndarray
-    path_by_columns: np.ndarray
-    cross: np.ndarray
-    by_tag: csr_matrix
-    by_distances: np.ndarray
-
-    def response(
-        self, radio: np.ndarray, accel: np.ndarray, rest: tuple[np.ndarray, np.ndarray]
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return errors of the columns, (k, s), and residuals, (n, s), for errors of measurements.
-
-        radio : (n, s) m; accel : (m, 3, s) m/s^2 at the middle bins
-        rest : gradients by the columns (k, s) and by the path (3J, s) that other errors make
-        """
-        problem = self.problem
-        weighted = -self.weight[:, None] * radio
-        of_columns = rest[0] + self.by_columns.T @ weighted
-        spread = problem.spread(-problem.motion_weight[:, None, None] * accel)
-        of_path = rest[1] + self.by_tag @ weighted + spread.reshape(-1, radio.shape[1])
-        solved = cho_solve_banded((self.path_factor, False), of_path)
-        columns = -self.covariance @ (of_columns - self.cross.T @ solved)
-        path = -(solved + self.path_by_columns @ columns)
-        return columns, self.by_columns @ columns + self.by_tag.T @ path - radio
-
-    def others(self, rng: np.random.Generator, draws: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return draws of the gradients that errors of heights, distances, coordinates and priors make."""
-        problem = self.problem
-        size = problem.layout.size
-        columns = np.sqrt(problem.prior)[:, None] * rng.standard_normal((size, draws))
-        known = problem.coordinates
-        std = problem.seen.coordinates[: len(known), 3]
-        noise = rng.standard_normal((len(known), draws)) / std[:, None]
-        np.add.at(columns, known, noise)
-        between = self.by_distances * problem.distance_std[:, None]
-        columns += between.T @ rng.standard_normal((len(between), draws))
-        path = np.zeros((3 * problem.bins, draws))
-        high = 3 * problem.high + 2
-        path[high] = rng.standard_normal((len(high), draws)) / HEIGHT_STD
-        return columns, path
-
-
 class Problem:
     """Observations under a Stage."""
 
@@ -169,28 +98,27 @@ class Problem:
 
     def solve(self, path: np.ndarray, columns: np.ndarray) -> Fit:
         """Return the minimum that Levenberg-Marquardt steps reach from path (J, 3) and columns."""
-        state = _State(self, path, columns)
+        state = Fit(self, path, columns)
         damping = DAMPING
         for _ in range(STEPS):
-            equations = state.equations()
+            equations = Equations(state)
             for _ in range(TRIES):
-                moved = equations.step(damping)
-                following = None if moved is None else state.moved(*moved)
+                following = equations.following(damping)
                 if following is not None and following.cost < state.cost:
                     break
                 damping *= MORE
             else:
                 break
-            gain, state = state.cost - following.cost, following
+            gain = state.cost - following.cost
+            state = following
             damping = max(damping * LESS, 1e-9)
             if gain < CONVERGED:
                 break
-        return Fit(state.path, state.columns, state.cost)
+        return state
 
-    def about(self, fit: Fit) -> Linear:
-        """Return the linear problem about a Fit."""
-        state = _State(self, fit.path, fit.columns)
-        return state.equations().linear()
+    def about(self, fit: Fit) -> Equations:
+        """Return the normal equations about a Fit."""
+        return Equations(Fit(self, fit.path, fit.columns))
 
     def spread(self, values: np.ndarray) -> np.ndarray:
         """Return the gradient by the path (J, 3, s) of second differences (m, 3, s)."""
@@ -225,13 +153,19 @@ class Problem:
         return matrix.data.astype(int) - 1, matrix
 
 
-class _State:
-    """Residuals of a Problem at a path and columns."""
+class Fit:
+    """Residuals of a Problem at a path and columns; `Problem.solve` returns that of a minimum.
+
+    Attributes
+    ----------
+    path : (J, 3) m; columns : (k,); anchors : (N, 3) m, positions in the columns
+    cost : negative log-likelihood
+    """
 
     def __init__(self, problem: Problem, path: np.ndarray, columns: np.ndarray) -> None:
         self.problem, self.path, self.columns = problem, path, columns
         seen, layout = problem.seen, problem.layout
-        anchors = columns[layout.positions].reshape(-1, 3)
+        self.anchors = anchors = columns[layout.positions].reshape(-1, 3)
         delay, between = columns[layout.delays], columns[layout.between]
         tag = path[seen.bin]
         to_b, self.by_b = _length(tag - anchors[seen.b])
@@ -267,21 +201,19 @@ class _State:
             + 0.5 * np.sum(problem.prior * self.columns**2)
         )
 
-    def moved(self, path: np.ndarray, columns: np.ndarray) -> _State:
-        """Return the state after a step."""
-        return _State(self.problem, self.path + path, self.columns + columns)
 
-    def equations(self) -> _Equations:
-        """Return the normal equations here."""
-        return _Equations(self)
+class Equations:
+    """Normal equations of a Problem at a path and columns.
 
+    Attributes
+    ----------
+    weight : (n,) 1/m^2, of TDOAs and ranges; by_columns : (n, k), by_tag : (3J, n) their derivatives
+    by_distances : (m, k) derivatives of distances, weighted
+    """
 
-class _Equations:
-    """Normal equations of a _State."""
-
-    def __init__(self, state: _State) -> None:
+    def __init__(self, state: Fit) -> None:
         self.state = state
-        problem = state.problem
+        self.problem = problem = state.problem
         self.gram = np.diag(problem.prior)
         self.gradient = problem.prior * state.columns
         self.cross = np.zeros((3 * problem.bins, problem.layout.size))
@@ -361,55 +293,94 @@ class _Equations:
         np.add.at(self.gram, (known, known), information)
         np.add.at(self.gradient, known, information * state.coordinate)
 
-    def step(self, damping: float) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return the step of path and columns; None if the equations are singular."""
+    def following(self, damping: float) -> Fit | None:
+        """Return the state after a step; None if the equations are singular."""
         bands = self.bands.copy()
         bands[6] *= 1.0 + damping
         gram = self.gram + damping * np.diag(np.diag(self.gram))
         try:
-            factor = cholesky_banded(bands, check_finite=False) if bands.size else bands
-            solved = self._solved(factor, np.column_stack([self.cross, self.path_gradient]))
+            factor = _factor(bands)
+            solved = _solved(factor, np.column_stack([self.cross, self.path_gradient]))
             reduced = cho_factor(gram - self.cross.T @ solved[:, :-1], check_finite=False)
         except LinAlgError:
             return None
         columns = -cho_solve(reduced, self.gradient - self.cross.T @ solved[:, -1])
         path = -(solved[:, -1] + solved[:, :-1] @ columns)
-        return path.reshape(-1, 3), columns
+        state = self.state
+        return Fit(self.problem, state.path + path.reshape(-1, 3), state.columns + columns)
 
-    @staticmethod
-    def _solved(factor: np.ndarray, values: np.ndarray) -> np.ndarray:
-        if not factor.size:
-            return values
-        solved: np.ndarray = cho_solve_banded((factor, False), values, check_finite=False)
-        return solved
+    @cached_property
+    def path_factor(self) -> np.ndarray:
+        """Factor of the normal equations of the path."""
+        return _factor(self.bands)
 
-    def linear(self) -> Linear:
-        """Return the Linear problem."""
-        state, problem = self.state, self.state.problem
-        factor = cholesky_banded(self.bands) if self.bands.size else self.bands
-        solved = self._solved(factor, self.cross)
+    @cached_property
+    def path_by_columns(self) -> np.ndarray:
+        """Minus the derivatives of the best path by the columns, (3J, k)."""
+        return _solved(self.path_factor, self.cross)
+
+    @cached_property
+    def covariance(self) -> np.ndarray:
+        """Covariance of the columns, (k, k), for independent errors."""
+        return np.linalg.inv(self.gram - self.cross.T @ self.path_by_columns)
+
+    def misfit(self) -> np.ndarray:
+        """Return the mean square of accelerations over ACCEL_STD^2, of each flight; NaN without."""
+        problem = self.problem
         flight = problem.seen.flight[problem.middle]
-        square = (state.accel**2).mean(axis=1) / ACCEL_STD**2
-        misfit = [
-            square[problem.measured & (flight == number)].mean()
-            if (problem.measured & (flight == number)).any()
-            else np.nan
-            for number in range(problem.layout.flights)
-        ]
-        return Linear(
-            problem,
-            state.radio,
-            self.weight,
-            self.by_columns,
-            np.array(misfit),
-            state.distance / problem.seen.distances[:, 3],
-            np.linalg.inv(self.gram - self.cross.T @ solved),
-            factor,
-            solved,
-            self.cross,
-            self.by_tag,
-            self.by_distances,
-        )
+        square = (self.state.accel**2).mean(axis=1) / ACCEL_STD**2
+        out = np.full(problem.layout.flights, np.nan)
+        for number in range(problem.layout.flights):
+            chosen = problem.measured & (flight == number)
+            if chosen.any():
+                out[number] = square[chosen].mean()
+        return out
+
+    def response(
+        self, radio: np.ndarray, accel: np.ndarray, rest: tuple[np.ndarray, np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return errors of the columns, (k, s), and residuals, (n, s), for errors of measurements.
+
+        radio : (n, s) m; accel : (m, 3, s) m/s^2 at the middle bins
+        rest : gradients by the columns (k, s) and by the path (3J, s) that other errors make
+        """
+        problem = self.problem
+        weighted = -self.weight[:, None] * radio
+        of_columns = rest[0] + self.by_columns.T @ weighted
+        spread = problem.spread(-problem.motion_weight[:, None, None] * accel)
+        of_path = rest[1] + self.by_tag @ weighted + spread.reshape(-1, radio.shape[1])
+        solved = _solved(self.path_factor, of_path)
+        columns = -self.covariance @ (of_columns - self.cross.T @ solved)
+        path = -(solved + self.path_by_columns @ columns)
+        return columns, self.by_columns @ columns + self.by_tag.T @ path - radio
+
+    def others(self, rng: np.random.Generator, draws: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return draws of the gradients that errors of heights, distances, coordinates and priors make."""
+        problem = self.problem
+        size = problem.layout.size
+        columns = np.sqrt(problem.prior)[:, None] * rng.standard_normal((size, draws))
+        known = problem.coordinates
+        std = problem.seen.coordinates[: len(known), 3]
+        noise = rng.standard_normal((len(known), draws)) / std[:, None]
+        np.add.at(columns, known, noise)
+        between = self.by_distances * problem.distance_std[:, None]
+        columns += between.T @ rng.standard_normal((len(between), draws))
+        path = np.zeros((3 * problem.bins, draws))
+        high = 3 * problem.high + 2
+        path[high] = rng.standard_normal((len(high), draws)) / HEIGHT_STD
+        return columns, path
+
+
+def _factor(bands: np.ndarray) -> np.ndarray:
+    """Return the Cholesky factor of upper bands; without a path there are none."""
+    return cholesky_banded(bands, check_finite=False) if bands.size else bands
+
+
+def _solved(factor: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the solution of the equations of a `_factor`."""
+    if not factor.size:
+        return values
+    return cho_solve_banded((factor, False), values, check_finite=False)
 
 
 def _length(line: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -425,5 +396,4 @@ def _student(value: np.ndarray) -> float:
 
 def _weight(residual: np.ndarray, std: np.ndarray) -> np.ndarray:
     """Return the weights of Student's t, 1/m^2."""
-    weight: np.ndarray = (NU + 1.0) / (NU + (residual / std) ** 2) / std**2
-    return weight
+    return (NU + 1.0) / (NU + (residual / std) ** 2) / std**2

@@ -11,12 +11,13 @@ from scipy.optimize import least_squares
 from scipy.sparse.csgraph import shortest_path
 from scipy.spatial.transform import Rotation
 
-from .least_squares import Fit, Problem, Stage
+from .least_squares import Problem, Stage
 from .observations import STEP
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from .least_squares import Fit
     from .observations import Observations
 
 STARTS, MOST_STARTS = 6, 24  # starting points of shapes, and the most if only one reached the best
@@ -61,14 +62,13 @@ def minima(
         fits.sort(key=lambda fit: fit.cost)
         if fits[0].cost > best.cost - BETTER:
             break
-    return _distinct(fits, len(seen.ids)), reached
+    return _distinct(fits), reached
 
 
-def _distinct(fits: list[Fit], count: int) -> list[Fit]:
+def _distinct(fits: list[Fit]) -> list[Fit]:
     out: list[Fit] = []
     for fit in fits:
-        here = fit.anchors(count)
-        if all(np.abs(here - other.anchors(count)).max() > SAME_MAP for other in out):
+        if all(np.abs(fit.anchors - other.anchors).max() > SAME_MAP for other in out):
             out.append(fit)
     return out
 
@@ -78,7 +78,8 @@ def _shapes(
 ) -> tuple[list[Fit], int]:
     """Return distinct shapes, best first, and how many starting points reached the best."""
     problems = [Problem(seen, Stage(False, False, wide)) for wide in WIDTHS]
-    count, fits, reached = len(seen.ids), [], 0
+    fits: list[Fit] = []
+    reached = 0
     for number, distances in enumerate(_distances(seen, rng)):
         if number >= STARTS and reached > 1 and len(seen.t):
             break
@@ -87,24 +88,24 @@ def _shapes(
         columns = np.zeros(problems[0].layout.size)
         columns[problems[0].layout.positions] = anchors.ravel()
         middle = anchors.mean(axis=0) + 0.05 * distances.max() * rng.standard_normal(3)
-        fit = Fit(np.tile(middle, (len(seen.t), 1)), columns, np.inf)
+        path = np.tile(middle, (len(seen.t), 1))
         for problem in problems:
-            fit = problem.solve(fit.path, fit.columns)
+            fit = problem.solve(path, columns)
+            path, columns = fit.path, fit.columns
         fits.append(fit)
         best = min(fits, key=lambda one: one.cost)
-        reached = sum(_alike(one, best, count) for one in fits)
+        reached = sum(_alike(one, best) for one in fits)
     fits.sort(key=lambda fit: fit.cost)
     limit = fits[0].cost * (1.0 + CLOSE[0]) + CLOSE[1]
     out: list[Fit] = []
     for fit in fits:
-        if fit.cost < limit and not any(_alike(fit, other, count) for other in out):
+        if fit.cost < limit and not any(_alike(fit, other) for other in out):
             out.append(fit)
     return out[:SHAPES], reached
 
 
-def _alike(one: Fit, other: Fit, count: int) -> bool:
-    a, b = one.anchors(count), other.anchors(count)
-    return rigid_distance(a, b) < SAME_SHAPE
+def _alike(one: Fit, other: Fit) -> bool:
+    return rigid_distance(one.anchors, other.anchors) < SAME_SHAPE
 
 
 def rigid_distance(a: np.ndarray, b: np.ndarray, mirrored: bool | None = None) -> float:
@@ -123,8 +124,7 @@ def orthogonal(a: np.ndarray, b: np.ndarray, determinant: float) -> np.ndarray:
     """Return the orthogonal (3, 3) matrix of this determinant that turns rows of a onto rows of b."""
     left, _, right = np.linalg.svd(b.T @ a)
     sign = determinant * np.sign(np.linalg.det(left @ right))
-    out: np.ndarray = left @ np.diag([1.0, 1.0, sign]) @ right
-    return out
+    return left @ np.diag([1.0, 1.0, sign]) @ right
 
 
 def _distances(seen: Observations, rng: np.random.Generator) -> list[np.ndarray]:
@@ -174,15 +174,14 @@ def _embedded(distances: np.ndarray) -> np.ndarray:
     centred = np.eye(count) - 1.0 / count
     values, vectors = np.linalg.eigh(-0.5 * centred @ distances**2 @ centred)
     least = FLATTEST * distances.max() ** 2
-    out: np.ndarray = vectors[:, -3:] * np.sqrt(np.maximum(values[-3:], least))
-    return out
+    return vectors[:, -3:] * np.sqrt(np.maximum(values[-3:], least))
 
 
 def _places(
     seen: Observations, shape: Fit, rng: np.random.Generator
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return rotations, with and without a reflection, and shifts that place a shape in the frame."""
-    anchors = shape.anchors(len(seen.ids))
+    anchors = shape.anchors
     middle = seen.middle
     moving = np.isfinite(seen.accel[middle]).all(axis=1) & (seen.flight[middle] == 0)
     upright = int(moving.sum()) > MOVING
@@ -244,7 +243,7 @@ def _placed(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return path and columns of a shape in the frame; yaws come from accelerations."""
     columns, count = shape.columns.copy(), len(seen.ids)
-    columns[: 3 * count] = (shape.anchors(count) @ turn.T + shift).ravel()
+    columns[: 3 * count] = (shape.anchors @ turn.T + shift).ravel()
     path = shape.path @ turn.T + shift
     middle = seen.middle
     for number in range(seen.flights):
@@ -266,8 +265,7 @@ def _reflections(seen: Observations, fit: Fit) -> list[tuple[np.ndarray, np.ndar
     The planes are those of the path, or of the other anchors. A path in a plane, or on a line, gives an
     anchor a second place on the other side.
     """
-    count = len(seen.ids)
-    anchors = fit.anchors(count)
+    count, anchors = len(seen.ids), fit.anchors
     known = np.bincount(seen.coordinates[:, 0].astype(int), minlength=count) >= 3
     groups = [np.array([row]) for row in range(count) if not known[row]]
     out = []

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,7 +20,7 @@ from .search import SAME_MAP, SAME_SHAPE, minima, misfit_of, rigid_distance
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from .least_squares import Fit, Linear
+    from .least_squares import Equations, Fit
     from .observations import Observations
 
 FEWEST = 4  # anchors of a map
@@ -59,8 +59,7 @@ class FirstMap:
     @property
     def std(self) -> np.ndarray:
         """Return the standard deviations of all coordinates, (N, 3) m."""
-        out: np.ndarray = np.sqrt(np.diag(self.covariance)).reshape(-1, 3)
-        return out
+        return np.sqrt(np.diag(self.covariance)).reshape(-1, 3)
 
     def anchors(self, frame: str = "map") -> Anchors:
         """Return the Anchors in a frame of this name."""
@@ -87,25 +86,24 @@ def map_anchors(
     rng = np.random.default_rng(seed)
     fits, reached = minima(seen, rng, progress)
     progress("estimating how far the map can be off")
-    best, count = fits[0], len(seen.ids)
+    best = fits[0]
     linear = Problem(seen, Stage()).about(best)
     spread, lasting = covariance(linear, best, rng)
     apart = SAME_MAP + BEYOND * np.sqrt(np.diag(spread)).reshape(-1, 3)
     near = [
         fit
         for fit in fits[1:]
-        if fit.cost < best.cost + AMBIGUOUS
-        and (np.abs(fit.anchors(count) - best.anchors(count)) > apart).any()
+        if fit.cost < best.cost + AMBIGUOUS and (np.abs(fit.anchors - best.anchors) > apart).any()
     ]
-    trusted = np.zeros((count, 3), bool)
+    trusted = np.zeros((len(seen.ids), 3), bool)
     row, axis = seen.coordinates[seen.coordinates[:, 3] <= KNOWN, :2].astype(int).T
     trusted[row, axis] = True
     found = FirstMap(
         seen.ids,
-        best.anchors(count),
+        best.anchors,
         spread,
         trusted,
-        tuple(fit.anchors(count) for fit in near),
+        tuple(fit.anchors for fit in near),
         lasting,
         "",
     )
@@ -113,7 +111,7 @@ def map_anchors(
 
 
 def _judged(
-    found: FirstMap, seen: Observations, linear: Linear, best: Fit, accuracy: float, reached: int
+    found: FirstMap, seen: Observations, linear: Equations, best: Fit, accuracy: float, reached: int
 ) -> FirstMap:
     """Return the FirstMap with `why_not`."""
     why = (
@@ -129,18 +127,19 @@ def _judged(
             "only one starting point of the search led to this map, so a better one may exist; "
             "record longer flights, high and low and on all sides of the anchors"
         )
-    return FirstMap(**{**vars(found), "why_not": why})
+    return replace(found, why_not=why)
 
 
-def _contradiction(seen: Observations, linear: Linear) -> str:
+def _contradiction(seen: Observations, linear: Equations) -> str:
     """Return a sentence if measurements contradict each other."""
-    bad = np.flatnonzero(np.nan_to_num(linear.misfit) > DEFORMED)
+    bad = np.flatnonzero(np.nan_to_num(linear.misfit()) > DEFORMED)
     if len(bad):
         return (
             f"the accelerations of flight {bad[0] + 1} fit no path that its TDOAs or ranges allow; "
             "a faulty inertial sensor deforms the map: look at the recording with check"
         )
-    scale = 1.4826 * float(np.median(np.abs(linear.between))) if len(seen.distances) else 0.0
+    between = linear.state.distance / seen.distances[:, 3]
+    scale = 1.4826 * float(np.median(np.abs(between))) if len(between) else 0.0
     if scale > CONTRADICTING:
         return (
             f"the distances contradict each other by {scale:.1f} of their standard deviations; "
@@ -243,8 +242,8 @@ def _unchecked(found: FirstMap, seen: Observations, best: Fit, accuracy: float) 
     if len(seen.t):
         return ""
     for number, (a, b, *_) in enumerate(seen.distances):
-        values = {**vars(seen), "distances": np.delete(seen.distances, number, axis=0)}
-        about = Problem(type(seen)(**values), Stage()).about(best)
+        fewer = replace(seen, distances=np.delete(seen.distances, number, axis=0))
+        about = Problem(fewer, Stage()).about(best)
         std = np.sqrt(np.diag(about.covariance)[: found.positions.size]).reshape(-1, 3)
         if np.linalg.norm(std, axis=1).max() > accuracy:
             one, other = found.ids[[int(a), int(b)]]

@@ -95,26 +95,6 @@ class Subsets:
         """Return the share of the subsets with two solutions: (n,)."""
         return np.mean(self.discriminant(points) > 0.0, axis=1)
 
-    def slopes(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Return the derivatives of a weighted sum of discriminants along the anchors: (N, 3) 1/m.
-
-        weights : (n, Q), of each discriminant. With A q = -D and u_j the direction from anchor j to the
-        tag, d|q|^2 / dm_j = 2 c_j (q - u_j). Here c_j is q times the column of j in q = columns @
-        distances. Along a known height, where q has no part, the derivative is -2 c_j u_j.
-        """
-        distances, unit = ranges(points[:, None], self.anchors.positions)
-        size, k = len(self.rows), self.dimensions
-        total = np.zeros_like(self.anchors.positions)
-        for chunk in np.array_split(
-            np.arange(len(points)), max(1, len(points) * size * len(total) // _CHUNK)
-        ):
-            q = (distances[chunk] @ self._q.reshape(size * k, -1).T).reshape(-1, size, k)
-            # 0 for anchors not in q
-            share = 2.0 * weights[chunk, :, None] * np.einsum("nqk,qkj->nqj", q, self._q)
-            total[:, :k] += np.einsum("nqj,nqk->jk", share, q)
-            total -= np.einsum("nqj,njk->jk", share, unit[chunk])
-        return total
-
     def mirrors(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the other positions with the same TDOAs: (point (m,), subset (m,), position (m, 3) m).
 

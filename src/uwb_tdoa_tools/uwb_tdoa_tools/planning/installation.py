@@ -150,8 +150,6 @@ def variance_gradient(
 
     One-sided differences. variance : (n, N) m^2, noise.variance at the points.
     """
-    if isinstance(noise, FixedNoise):
-        return np.zeros((*variance.shape, dimensions))
     steps = _STEP * np.eye(3)[:dimensions]
     return (
         np.stack([noise.variance(points + step, anchors) - variance for step in steps], axis=-1)
@@ -182,7 +180,7 @@ def antenna_from_yaml(path: str | Path) -> Antenna:
 
 @dataclass(frozen=True)
 class Pairing:
-    """The TDOAs and ranges of one round.
+    """TDOAs or ranges of one round, measured independently of its other Pairings.
 
     Attributes
     ----------
@@ -191,7 +189,6 @@ class Pairing:
         their errors are independent.
     times : number of times that each TDOA comes in a round (default 1)
     ranges : True for distances to the anchors of `a`, once a round
-    beside : Pairing that the round holds besides, measured independently; or None
     """
 
     a: np.ndarray
@@ -199,20 +196,6 @@ class Pairing:
     shared: bool
     times: float = 1.0
     ranges: bool = False
-    beside: Pairing | None = None
-
-    @property
-    def parts(self) -> tuple[Pairing, ...]:
-        """The independent parts, each a Pairing."""
-        return (replace(self, beside=None), *(self.beside.parts if self.beside else ()))
-
-    @property
-    def one_solution(self) -> bool:
-        """Whether it holds distances.
-
-        Distances to anchors that are not in a plane have one solution.
-        """
-        return any(part.ranges for part in self.parts)
 
     def incidence(self) -> np.ndarray:
         """Return the (M, N) matrix with -1 at a and +1 at b; the identity for ranges."""
@@ -221,25 +204,15 @@ class Pairing:
         matrix[rows, self.a], matrix[rows, self.b] = -1.0, 1.0
         return matrix
 
-    def covariance(self, variance: np.ndarray, link_std: float = 0.0) -> np.ndarray:
-        """Return the covariance of the TDOAs: (n, M, M) m^2.
-
-        variance : (n, N) m^2 of the receptions. link_std : m, additional error of each TDOA. It
-        includes the anchor's reception of the other anchor's packet.
-        Source: eqs. 4 and 5 of Grasso et al. (Sensors 2022, 22, 9136); A18 for a common reference.
-        """
-        own = link_std**2 * np.eye(len(self.a))
-        if self.ranges:
-            return variance[:, self.a, None] * np.eye(len(self.a)) + own
-        if self.shared:
-            d = self.incidence()
-            return (d * variance[:, None, :]) @ d.T + own
-        return (variance[:, self.a] + variance[:, self.b])[:, :, None] * np.eye(len(self.a)) + own
-
 
 def ring(n: int, shared: bool = True) -> Pairing:
     """Return the N TDOAs of TDOA2: each anchor with the next one, and the last with the first."""
     return Pairing(np.arange(n), (np.arange(n) + 1) % n, shared)
+
+
+def ring_uncorrelated(n: int) -> Pairing:
+    """Return the N TDOAs of TDOA2 with independent errors."""
+    return ring(n, shared=False)
 
 
 def common_reference(n: int) -> Pairing:
@@ -261,19 +234,13 @@ def every_range(n: int) -> Pairing:
     return Pairing(np.arange(n), np.arange(n), False, ranges=True)
 
 
-def _beside_ranges(make: Callable[[int], Pairing]) -> Callable[[int], Pairing]:
-    """Return a maker of Pairings that adds the distance to each anchor."""
-    return lambda n: replace(make(n), beside=every_range(n))
-
-
-PAIRINGS: dict[str, Callable[[int], Pairing]] = {
+# Parts of a round, by the words of choices.PAIRINGS
+PARTS: dict[str, Callable[[int], Pairing]] = {
     "ring": ring,
-    "ring_uncorrelated": lambda n: ring(n, shared=False),
+    "ring_uncorrelated": ring_uncorrelated,
     "common_reference": common_reference,
     "all_pairs": all_pairs,
     "every_range": every_range,
-    "ring+every_range": _beside_ranges(ring),
-    "all_pairs+every_range": _beside_ranges(all_pairs),
 }
 
 
@@ -290,17 +257,17 @@ class Installation:
     ----------
     anchors : Anchors
     noise : RadioNoise or FixedNoise of a reception
-    pairing : Pairing, the TDOAs of one round (default: the ring of TDOA2)
+    pairing : what one round holds, of choices.PAIRINGS (default: the ring of TDOA2)
     link_std : m, additional error of each TDOA (default 0)
     dimensions : 3, or 2 for a tag at a known height
     height_std : m, of a height sensor on the tag, used with each round; inf for none (default)
-    hall : True if each place hears only a part of the anchors, to which `pairing` belongs (default
-        False). The part may be small, or in a plane.
+    hall : True if each place hears only a part of the anchors (default False). The part may be
+        small, or in a plane.
     """
 
     anchors: Anchors
     noise: RadioNoise | FixedNoise = field(default_factory=RadioNoise)
-    pairing: Pairing = None  # type: ignore[assignment]  # __post_init__ puts a ring there
+    pairing: str = "ring"
     link_std: float = 0.0
     dimensions: int = 3
     height_std: float = np.inf
@@ -315,8 +282,6 @@ class Installation:
             )
         if not self.hall:
             check_anchors(self.anchors, self.unknowns)
-        if self.pairing is None:
-            object.__setattr__(self, "pairing", ring(len(self.anchors)))
         if not 0.0 <= self.link_std < 100.0:
             raise InputError(
                 f"link noise: {self.link_std!r} m is not a standard deviation; give 0 or "
@@ -326,6 +291,15 @@ class Installation:
     def with_anchors(self, anchors: Anchors) -> Installation:
         """Return a copy for a hall with other Anchors."""
         return replace(self, anchors=anchors, hall=True)
+
+    def round(self, heard: int) -> list[Pairing]:
+        """Return the parts of a round of so many anchors, measured independently."""
+        return [PARTS[name](heard) for name in self.pairing.split("+")]
+
+    @property
+    def measures_ranges(self) -> bool:
+        """Whether a round holds distances: those to anchors that are not in a plane have one solution."""
+        return "every_range" in self.pairing
 
     @property
     def unknowns(self) -> int:

@@ -15,7 +15,6 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.safe_yaml import read_yaml
 
 from ..simulation.rooms import facing
-from .installation import PAIRINGS
 from .maps import Demand, judge
 from .precision import bound, information, position_error
 
@@ -152,45 +151,32 @@ UNUSABLE = 100.0
 class Goal:
     """Score of a layout of anchors.
 
-    points : (n, 3) m, to be located; installation : everything but the anchors; pairing : name of
-    PAIRINGS; objective : "worst" or "mean" bound over the points; demand : Demand
+    points : (n, 3) m, to be located; installation : everything but the anchors; objective : "worst"
+    or "mean" bound over the points; demand : Demand
     """
 
     points: np.ndarray
     installation: Installation
-    pairing: str = "ring"
     objective: str = "worst"
     demand: Demand = field(default_factory=Demand)
-
-    def installed(self, anchors: Anchors, heard: int | None = None) -> Installation:
-        """Return the Installation with other Anchors. Raises InputError for useless anchors.
-
-        heard : number of anchors that a place of a hall hears.
-        """
-        return replace(
-            self.installation,
-            anchors=anchors,
-            pairing=PAIRINGS[self.pairing](heard or len(anchors)),
-        )
 
     def errors(self, anchors: Anchors) -> np.ndarray:
         """Return the bound at the points: (n,) m. Raises InputError for useless anchors.
 
         The small second term of eq. 1 is left out.
         """
-        found = position_error(
-            bound(information(self.points, self.installed(anchors), correction=False))
-        )
+        installation = replace(self.installation, anchors=anchors)
+        found = position_error(bound(information(self.points, installation, correction=False)))
         return np.minimum(found, UNUSABLE)
 
     def figures(self, anchors: Anchors) -> dict[str, float]:
         """Return {"worst", "mean": m, of the bound; "failing": share that cannot be flown}."""
         errors = self.errors(anchors)
-        failing = 1.0 - np.mean(judge(self.points, self.installed(anchors), self.demand).flyable)
+        judged = judge(self.points, replace(self.installation, anchors=anchors), self.demand)
         return {
             "worst": float(errors.max()),
             "mean": float(errors.mean()),
-            "failing": float(failing),
+            "failing": float(1.0 - np.mean(judged.flyable)),
         }
 
     def score(self, anchors: Anchors) -> float:
@@ -268,14 +254,6 @@ class Layout:
             positions = np.vstack([self.fixed.positions, positions])
             orientations = np.vstack([self.fixed.orientations, orientations])
         return positions, orientations, steps.ravel()
-
-    def free(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the free anchors (count, 3) m, and after each step (count, width, 3) m.
-
-        positions : of `nudged`.
-        """
-        moved = positions[-self.count * (1 + self.width) :].reshape(1 + self.width, self.count, 3)
-        return moved[0], moved[1:].swapaxes(0, 1)
 
     def columns(self) -> np.ndarray:
         """Return the rows of `nudged` of each layout: (1 + len(x), N).

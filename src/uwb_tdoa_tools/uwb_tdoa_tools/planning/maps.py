@@ -22,8 +22,8 @@ from ..scoring.evaluation import evaluate
 from ..scoring.metrics import position_at
 from ..simulation.rooms import Room
 from .bifurcation import Subsets, same_place, solutions
-from .precision import bound, information, position_error, range_weights
-from .second_minimum import CLEAR, second_minima
+from .precision import bound, information, position_error
+from .second_minimum import CLEAR, other_solutions
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -40,7 +40,6 @@ if TYPE_CHECKING:
 
 # States of a place. OUTSIDE of the hull counts with "pairings" only.
 FLYABLE, TWO_SOLUTIONS, IMPRECISE, TOO_FEW, OUTSIDE = range(5)
-_CHUNK = 2_000_000  # numbers in the largest array of one step
 _EVERYWHERE = Room(np.full(3, -np.inf), np.full(3, np.inf))
 
 
@@ -89,11 +88,9 @@ class Judged:
 
     def assign(self, rows: np.ndarray, found: Judged) -> None:
         """Set the states of some of its places."""
-        self.covariance[rows], self.error[rows], self.status[rows] = (
-            found.covariance,
-            found.error,
-            found.status,
-        )
+        self.covariance[rows] = found.covariance
+        self.error[rows] = found.error
+        self.status[rows] = found.status
 
 
 def judge(
@@ -114,50 +111,15 @@ def judge(
     error = position_error(covariance)
     status = np.where(error <= demand.accuracy, FLYABLE, IMPRECISE)
     if demand.quick:
-        return Judged(covariance, error, status)
-    if demand.criterion == "pairings":
-        status[Subsets(installation.anchors, installation.unknowns).ambiguous(points) > 0.0] = (
-            TWO_SOLUTIONS
-        )
+        pass
+    elif demand.criterion == "pairings":
+        ambiguous = Subsets(installation.anchors, installation.unknowns).ambiguous(points) > 0.0
+        status[ambiguous] = TWO_SOLUTIONS
         status[~installation.inside_hull(points)] = OUTSIDE
-        return Judged(covariance, error, status)
-    misfit, _ = other_solutions(points, installation, demand.room, columns)
-    status[misfit <= CLEAR] = TWO_SOLUTIONS
+    else:
+        misfit, _ = other_solutions(points, installation, demand.room, columns)
+        status[misfit <= CLEAR] = TWO_SOLUTIONS
     return Judged(covariance, error, status)
-
-
-def other_solutions(
-    points: np.ndarray, installation: Installation, room: Room, columns: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the second minimum of a round: (misfit (n,) standard deviations, place (n, 3) m).
-
-    points : (n, 3) m; columns : as for `judge`. See `second_minima`.
-    """
-    anchors = installation.anchors
-    if columns is None:
-        columns = np.broadcast_to(np.arange(len(anchors)), (len(points), len(anchors)))
-    heard = columns.shape[1]
-    misfits, places = [np.empty(0)], [np.empty((0, 3))]
-    for rows in np.array_split(
-        np.arange(len(points)), max(1, len(points) * max(heard**2, len(anchors)) // _CHUNK)
-    ):
-        variance = np.take_along_axis(
-            installation.noise.variance(points[rows], anchors), columns[rows], axis=1
-        )
-        weights = np.ascontiguousarray(
-            range_weights(variance, installation.pairing, installation.link_std)
-        )
-        misfit, place = second_minima(
-            points[rows],
-            anchors.positions,
-            np.ascontiguousarray(columns[rows]),
-            weights,
-            room,
-            installation.unknowns,
-        )
-        misfits.append(misfit)
-        places.append(place)
-    return np.concatenate(misfits), np.concatenate(places)
 
 
 MOST_CELLS = 4_000_000
@@ -247,19 +209,6 @@ class Chart(Judged):
             anchors.frame,
             dimensions == 2,
         )
-
-
-def chart(installation: Installation, grid: Grid, demand: Demand) -> Chart:
-    """Return the Chart of a Grid if each cell hears all anchors of an Installation."""
-    points = grid.points
-    found = judge(points, installation, demand)
-    return Chart(
-        found.covariance,
-        found.error,
-        found.status,
-        grid,
-        np.full(len(points), len(installation.anchors)),
-    )
 
 
 PLACES_ACROSS = {2: 40, 3: 10}  # places along the longest side of a slice, of a volume, at most
@@ -361,7 +310,7 @@ class AccuracyMap:
 
 def accuracy_map(samples: ErrorSamples, installation: Installation, grid: Grid) -> AccuracyMap:
     """Return the AccuracyMap of ErrorSamples. Estimates outside of the grid are left out."""
-    variances = np.diagonal(bound_along(samples, installation), axis1=1, axis2=2)
+    variances = np.diagonal(bound(information(samples.place, installation)), axis1=1, axis2=2)
     claimed = np.diagonal(samples.covariance, axis1=1, axis2=2)
     cell = np.floor((samples.place - grid.lower) / grid.step).astype(int)
     inside = ((cell >= 0) & (cell < grid.shape)).all(axis=1)
@@ -381,14 +330,6 @@ def accuracy_map(samples: ErrorSamples, installation: Installation, grid: Grid) 
     )
 
 
-def bound_along(samples: ErrorSamples, installation: Installation) -> np.ndarray:
-    """Return the bound of one round at the place of each sample: (n, 3, 3) m^2.
-
-    The installation must have three dimensions.
-    """
-    return bound(information(samples.place, installation))
-
-
 def comparison(samples: ErrorSamples, installation: Installation) -> dict[str, Any]:
     """Return achieved and stated errors against the bound, over all samples: m and ratios.
 
@@ -402,7 +343,8 @@ def comparison(samples: ErrorSamples, installation: Installation) -> dict[str, A
     The filter uses many rounds and the IMU. An efficiency of n means: as good as n rounds with
     independent errors.
     """
-    limit = np.trace(bound_along(samples, installation), axis1=1, axis2=2).mean()
+    limits = bound(information(samples.place, installation))
+    limit = np.trace(limits, axis1=1, axis2=2).mean()
     claim = np.trace(samples.covariance, axis1=1, axis2=2).mean()
     squared = np.mean(np.sum(samples.error**2, axis=1))
     second = np.unique(np.floor(samples.t).astype(np.int64), return_inverse=True)[1]

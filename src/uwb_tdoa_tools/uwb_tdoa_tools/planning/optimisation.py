@@ -5,38 +5,26 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment, minimize
-from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
-from scipy.special import expit
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.geometry import ranges
 
-from .bifurcation import Subsets
-from .installation import PAIRINGS
 from .layout import UNUSABLE, AnchorPlaces, Layout, free_ids, spread
-from .precision import bound, position_error, weigh
+from .precision import bound, position_error, round_weights, weigh
 from .report import quantiles
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from ..parallel import Progress
+    from .hall import Hall
     from .layout import Goal
     from .maps import Chart, Judged, Wrap
 
-Result = TypeVar("Result")
-
-SOFT = 0.05  # of |q|^2 - 1, over which failure sets in where derivatives are needed
-EDGE = 0.05  # m over which the hull ends, likewise
-FAILED = 10.0  # of the objective, a logarithm
-# of the allowed range: random steps of a start without a defined goal
-SHAKEN = (0.0, 1e-3, 1e-2, 0.1)
 LEAST_GAIN = 1e-4  # of the objective: a step that gains less is the last
 _CHUNK = 1_000_000  # numbers in the largest array of one step
 
@@ -56,20 +44,13 @@ def errors_and_slopes(
     variance = installation.noise.variance(points, every)
     unit = ranges(points[:, None], positions)[1]
     chosen = layout.columns()
-    pairing = PAIRINGS[goal.pairing](chosen.shape[1])
-    information = np.concatenate(
-        [
-            weigh(
-                unit[rows][:, chosen, :k].reshape(-1, chosen.shape[1], k),
-                variance[rows][:, chosen].reshape(-1, chosen.shape[1]),
-                pairing,
-                installation.link_std,
-            )
-            for rows in np.array_split(
-                np.arange(len(points)), max(1, len(points) * chosen.size * k // _CHUNK)
-            )
-        ]
-    ).reshape(len(points), -1, k, k)
+    count = chosen.shape[1]
+    size = len(points) * chosen.size * count
+    parts = []
+    for rows in np.array_split(np.arange(len(points)), max(1, size // _CHUNK)):
+        weights = round_weights(variance[rows][:, chosen].reshape(-1, count), installation)
+        parts.append(weigh(unit[rows][:, chosen, :k].reshape(-1, count, k), weights))
+    information = np.concatenate(parts).reshape(len(points), -1, k, k)
     covariance = bound(installation.with_height(information[:, 0]))
     errors = position_error(covariance)
     lost = ~(errors < UNUSABLE)
@@ -79,164 +60,50 @@ def errors_and_slopes(
     return errors, slopes
 
 
-def failing_and_slopes(
-    goal: Goal, layout: Layout, x: np.ndarray, points: np.ndarray
-) -> tuple[float, np.ndarray]:
-    """Return a smooth share of points (n, 3) m that fail, and its derivatives along x.
-
-    A point fails outside of the anchors' hull. With the criterion "pairings" it also fails if a
-    pairing has two solutions. Raises InputError if two anchors meet, or all are in a plane.
-    """
-    anchors = layout.anchors(x)
-    try:
-        good, along = _inside(anchors.positions, points, goal.installation.unknowns)
-    except QhullError as error:
-        raise InputError(
-            "anchors: they span no hull; take some of them out of the plane of the others."
-        ) from error
-    more: np.ndarray | float
-    if goal.demand.criterion == "pairings":
-        subsets = Subsets(anchors, goal.installation.unknowns)
-        excess = subsets.discriminant(points) / SOFT
-        single = expit(-excess).prod(axis=1)
-        along = along * single[:, None, None]
-        weights = (good * single)[:, None] * expit(excess) / SOFT
-        good, more = good * single, -subsets.slopes(points, weights)
-    else:
-        more = 0.0
-    along = -(along.sum(axis=0) + more) / len(points)
-    positions, _, steps = layout.nudged(x)
-    here, moved = layout.free(positions)
-    return 1.0 - good.mean(), np.einsum(
-        "imk,ik->im", moved - here[:, None], along[-len(here) :]
-    ).ravel() / steps
-
-
-def _inside(positions: np.ndarray, points: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return how far inside the hull points are, 0 to 1, and derivatives along the anchors.
-
-    points : (n, 3) m; positions : (N, 3) m, anchors. Returns (n,) and (n, N, 3) 1/m. h is the
-    distance beyond the facet that is exceeded most. l_j are the barycentric coordinates of the
-    point's foot on that facet. A step dm of corner j moves the facet there by l_j dm: dh = -l_j
-    normal . dm.
-    """
-    hull = ConvexHull(positions[:, :k])
-    beyond = points[:, :k] @ hull.equations[:, :k].T + hull.equations[:, k]
-    facet = np.argmax(beyond, axis=1)
-    h, normal = beyond[np.arange(len(points)), facet], hull.equations[facet, :k]
-    corners = hull.simplices[facet]
-    foot = points[:, :k] - h[:, None] * normal
-    spanned = np.concatenate(
-        [positions[corners][:, :, :k], np.ones((*corners.shape, 1))], axis=2
-    ).swapaxes(1, 2)
-    share = np.einsum(
-        "nij,nj->ni", np.linalg.pinv(spanned), np.hstack([foot, np.ones((len(foot), 1))])
-    )
-    inside = expit(-h / EDGE)
-    along = np.zeros((len(points), len(positions), 3))
-    slope = (inside * (1.0 - inside) / EDGE)[:, None, None] * share[:, :, None] * normal[:, None]
-    along[np.arange(len(points))[:, None], corners, :k] = slope
-    return inside, along
-
-
 def descend(
     goal: Goal, layout: Layout, points: np.ndarray, x: np.ndarray, sweeps: int
 ) -> np.ndarray:
-    """Return x after at most `sweeps` steps of SLSQP towards the goal at points (n, 3) m.
+    """Return x after at most `sweeps` steps of SLSQP towards the goal's bound at points (n, 3) m.
 
     The worst case is not smooth. The smallest s that no log error exceeds is smooth, with one
-    constraint per point. A step to a layout without a defined goal counts as FAILED and is taken
-    back. If SLSQP would continue from there, the best x is returned. A start without a defined goal
-    is shaken until the goal is defined; if it never is, the start is returned.
+    constraint per point. Which layout fails least is no part of a descent: `Goal.score` judges the ends.
     """
     size, (low, high) = len(x), np.transpose(layout.bounds)
-    seen: dict[bytes, tuple[np.ndarray, np.ndarray, float, np.ndarray]] = {}  # of the last x
-    best: list[Any] = [np.inf, x]
+    seen: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}  # of the last x
 
-    def at(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
-        """Return (errors, slopes, failing, its slopes) at x. Raises InputError."""
-        if not np.isfinite(x).all():
-            raise InputError("layout: no numbers")  # SLSQP has been seen to ask for NaN
-        x = np.clip(x, low, high)
+    def at(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return (errors, slopes) at x."""
+        x = np.clip(np.nan_to_num(x), low, high)  # SLSQP has been seen to ask for NaN
         key = x.tobytes()
         if key not in seen:
             seen.clear()
-            errors, slopes = errors_and_slopes(goal, layout, x, points)
-            failing, more = failing_and_slopes(goal, layout, x, points)
-            seen[key] = errors, slopes, failing, more
-            size_of_errors = errors.mean() if goal.objective == "mean" else errors.max()
-            value = size_of_errors * (1.0 + failing)
-            if value < best[0]:
-                best[:] = value, x
+            seen[key] = errors_and_slopes(goal, layout, x, points)
         return seen[key]
 
-    def tried(
-        function: Callable[[np.ndarray], Result], otherwise: Result
-    ) -> Callable[[np.ndarray], Result]:
-        def value(z: np.ndarray) -> Result:
-            try:
-                return function(z)
-            except InputError:
-                return otherwise
+    def mean(x: np.ndarray) -> tuple[float, np.ndarray]:
+        errors, slopes = at(x)
+        return np.log(errors.mean()), slopes.mean(axis=0) / errors.mean()
 
-        return value
+    def below(z: np.ndarray) -> np.ndarray:
+        return z[size] - np.log(at(z[:size])[0])
 
-    def mean(x: np.ndarray) -> float:
-        errors, _, failing, _ = at(x)
-        return np.log(errors.mean() * (1.0 + failing))
+    def below_slopes(z: np.ndarray) -> np.ndarray:
+        errors, slopes = at(z[:size])
+        return np.column_stack([-slopes / errors[:, None], np.ones(len(points))])
 
-    def mean_slopes(x: np.ndarray) -> np.ndarray:
-        errors, slopes, failing, more = at(x)
-        return slopes.mean(axis=0) / errors.mean() + more / (1.0 + failing)
+    def worst(z: np.ndarray) -> tuple[float, np.ndarray]:
+        return z[size], np.append(np.zeros(size), 1.0)
 
-    def worst_slopes(z: np.ndarray) -> np.ndarray:
-        _, _, failing, slopes = at(z[:size])
-        return np.append(slopes / (1.0 + failing), 1.0)
-
-    options = {"method": "SLSQP", "options": {"maxiter": sweeps, "ftol": LEAST_GAIN}}
-    try:
-        x = _defined_near(at, np.clip(x, low, high), low, high)
-        if goal.objective == "mean":
-            found = minimize(
-                tried(mean, FAILED), x, jac=mean_slopes, bounds=layout.bounds, **options
-            )
-        else:
-            below = {
-                "type": "ineq",
-                "fun": tried(
-                    lambda z: z[size] - np.log(at(z[:size])[0]), np.full(len(points), -FAILED)
-                ),
-                "jac": lambda z: np.column_stack(
-                    [-at(z[:size])[1] / at(z[:size])[0][:, None], np.ones(len(points))]
-                ),
-            }
-            worst = tried(lambda z: z[size] + np.log1p(at(z[:size])[2]), FAILED)
-            z, bounds = np.append(x, np.log(at(x)[0].max())), [*layout.bounds, (None, None)]
-            found = minimize(
-                worst, z, jac=worst_slopes, bounds=bounds, constraints=[below], **options
-            )
-        at(found.x[:size])
-    except InputError:
-        return best[1]
-    return np.clip(found.x[:size], low, high)
-
-
-def _defined_near(
-    at: Callable[[np.ndarray], object], x: np.ndarray, low: np.ndarray, high: np.ndarray
-) -> np.ndarray:
-    """Return x, or an x near it at which `at` raises no InputError.
-
-    x is moved at random, by a growing share of the allowed range. Raises InputError.
-    """
-    rng = np.random.default_rng(0)
-    for share in SHAKEN:
-        shaken = np.clip(x + share * (high - low) * rng.uniform(-1.0, 1.0, len(x)), low, high)
-        try:
-            at(shaken)
-            return shaken
-        except InputError as error:
-            last = error
-    raise last
+    x = np.clip(x, low, high)
+    options: dict[str, Any] = {"jac": True, "method": "SLSQP"}
+    options["options"] = {"maxiter": sweeps, "ftol": LEAST_GAIN}
+    if goal.objective == "mean":
+        found = minimize(mean, x, bounds=layout.bounds, **options)
+    else:
+        z, bounds = np.append(x, np.log(at(x)[0].max())), [*layout.bounds, (None, None)]
+        constraint = {"type": "ineq", "fun": below, "jac": below_slopes}
+        found = minimize(worst, z, bounds=bounds, constraints=[constraint], **options)
+    return np.clip(np.nan_to_num(found.x[:size]), low, high)
 
 
 BESIDE = 1.0  # m; no anchor is proposed nearer to another
@@ -421,69 +288,53 @@ LEAST_SHARE = 0.01  # of the room
 LEAST_PRECISION = 0.05  # of the bound
 
 
-class JudgeAddition(Protocol):
-    """Judge points (n, 3) m with one more anchor at a place (3,) m."""
-
-    def __call__(
-        self, before: Judged, points: np.ndarray, anchors: Anchors, place: np.ndarray
-    ) -> Judged:
-        """Return the Judged of the points; `before` is without the anchor. Raises InputError."""
-
-
 def best_addition(
-    found: Chart, anchors: Anchors, places: np.ndarray, judge: JudgeAddition, progress: Progress
+    hall: Hall, found: Chart, places: np.ndarray, progress: Progress
 ) -> dict[str, Any] | None:
     """Return the gain of one more anchor at the best of some places; None if it is not worth it.
 
-    places : (m, 3) m; found : Chart of Anchors. All places are tried on some cells, the best on all.
+    places : (m, 3) m; found : Chart of the Hall. All places are tried on some cells, the best on all.
     Returns {"position" (3,) m, "flyable_share", "bound_flyable": quantiles, m, of a plan with it;
     "gain": share of the cells; "bound_before", "bound_after": m, median where it can be flown
     without it}.
     """
     points = found.grid.points
-    away = np.linalg.norm(places[:, None] - anchors.positions, axis=2).min(axis=1)
+    away = np.linalg.norm(places[:, None] - hall.anchors.positions, axis=2).min(axis=1)
     places = places[away >= BESIDE]
-    rows = (
-        np.sort(spread(points, LOOKED_AT))
-        if len(points) <= 4 * LOOKED_AT
-        else _random_rows(len(points))
-    )
-    some, before = points[rows], found.subset(rows)
-    values = []
+    if len(points) <= 4 * LOOKED_AT:
+        rows = np.sort(spread(points, LOOKED_AT))
+    else:
+        rows = np.sort(np.random.default_rng(0).permutation(len(points))[:LOOKED_AT])
+    before = found.subset(rows)
+
+    def gains(before: Judged, points: np.ndarray, place: np.ndarray) -> dict[str, Any]:
+        more = with_one(hall.anchors, place)
+        return _gains(before, hall.changed(before, points, more, place[None]), place)
+
+    promised = []
     for place in progress.over(places, what="places for one more anchor"):
-        try:
-            values.append(_value(before, judge(before, some, with_one(anchors, place), place)))
-        except InputError:
-            values.append(-np.inf)
-    best: tuple[float, dict[str, Any]] | None = None
-    for number in np.argsort(-np.array(values), kind="stable")[:VERIFIED]:
-        if best is not None and values[number] <= best[0]:  # the others promise less than this gain
-            break
-        if not np.isfinite(values[number]):
-            continue
+        promised.append(_value(gains(before, points[rows], place)))
+    best: dict[str, Any] | None = None
+    for number in np.argsort(-np.array(promised), kind="stable")[:VERIFIED]:
+        if best is not None and promised[number] <= _value(best):
+            break  # the others promise less than this gain
         progress("judging the best place on the whole map")
-        after = judge(found, points, with_one(anchors, places[number]), places[number])
-        if best is None or _value(found, after) > best[0]:
-            best = _value(found, after), _gains(found, after, places[number])
-    return best[1] if best and is_worth_an_anchor(best[1]) else None
+        judged = gains(found, points, places[number])
+        if best is None or _value(judged) > _value(best):
+            best = judged
+    if best is None or (best["gain"] < LEAST_SHARE and _finer(best) < LEAST_PRECISION):
+        return None
+    return best
 
 
-def is_worth_an_anchor(gains: dict[str, Any]) -> bool:
-    """Return whether the gains of `best_addition` are large enough."""
-    finer = 1.0 - gains["bound_after"] / gains["bound_before"] if gains["bound_before"] else 0.0
-    return gains["gain"] >= LEAST_SHARE or finer >= LEAST_PRECISION
+def _finer(gains: dict[str, Any]) -> float:
+    """Return by which share the bound falls where it could be flown before."""
+    return 1.0 - gains["bound_after"] / gains["bound_before"] if gains["bound_before"] else 0.0
 
 
-def _random_rows(count: int) -> np.ndarray:
-    """Return LOOKED_AT of `count` rows, in order."""
-    return np.sort(np.random.default_rng(0).permutation(count)[:LOOKED_AT])
-
-
-def _value(before: Judged, after: Judged) -> float:
+def _value(gains: dict[str, Any]) -> float:
     """Return the value of an anchor: gained share of the cells, and precision where it could be flown."""
-    gains = _gains(before, after, np.zeros(3))
-    finer = 1.0 - gains["bound_after"] / gains["bound_before"] if gains["bound_before"] else 0.0
-    return gains["gain"] + PRECISION_WEIGHT * finer
+    return gains["gain"] + PRECISION_WEIGHT * _finer(gains)
 
 
 def _gains(before: Judged, after: Judged, place: np.ndarray) -> dict[str, Any]:
@@ -493,10 +344,9 @@ def _gains(before: Judged, after: Judged, place: np.ndarray) -> dict[str, Any]:
     as less precise. before, after : Judged of the same cells without and with the anchor
     """
     flyable = before.flyable
-    medians = [
-        float(np.median(judged.error[flyable])) if flyable.any() else None
-        for judged in (before, after)
-    ]
+    medians: list[float | None] = [None, None]
+    if flyable.any():
+        medians = [float(np.median(judged.error[flyable])) for judged in (before, after)]
     return {
         "position": place.tolist(),
         "flyable_share": float(after.flyable.mean()),

@@ -35,137 +35,100 @@ def information(
     A round holds TDOAs or ranges and, if the tag measures it, a height. points : (n, 3) m; k : the
     dimensions of the installation. correction : True adds the second term of eq. 1, the information
     in the size of the errors. columns : (n, K) rows of the anchors that are heard at each point,
-    None for all; the pairing of the installation is of K anchors.
+    None for all.
     Source: eq. 1 of Grasso et al. (Sensors 2022, 22, 9136).
     """
-    anchors, pairing = len(installation.anchors), installation.pairing
-    width = (
-        len(pairing.a) * (anchors if pairing.shared and installation.link_std else 3) + 9 * anchors
-    )
-    chunks = np.array_split(np.arange(len(points)), max(1, len(points) * width // _CHUNK))
+    anchors = installation.anchors
+    if columns is None:
+        columns = np.broadcast_to(np.arange(len(anchors)), (len(points), len(anchors)))
+    size = len(points) * max(columns.shape[1] ** 2, 9 * len(anchors))
     parts = [
-        _information(
-            points[rows], installation, correction, None if columns is None else columns[rows]
-        )
-        for rows in chunks
+        _information(points[rows], installation, correction, columns[rows])
+        for rows in np.array_split(np.arange(len(points)), max(1, size // _CHUNK))
     ]
     return installation.with_height(np.concatenate(parts))
 
 
 def _information(
-    points: np.ndarray, installation: Installation, correction: bool, columns: np.ndarray | None
+    points: np.ndarray, installation: Installation, correction: bool, columns: np.ndarray
 ) -> np.ndarray:
-    anchors, k = installation.anchors, installation.dimensions
-    unit = ranges(points[:, None, :], anchors.positions)[1]
-    variance = installation.noise.variance(points, anchors)
-    gradient = (
-        variance_gradient(installation.noise, points, anchors, variance, k)
-        if correction
-        else np.empty(0)
-    )
-    if columns is not None:
-        unit, variance = (
-            np.take_along_axis(unit, columns[..., None], axis=1),
-            np.take_along_axis(variance, columns, axis=1),
-        )
-        gradient = (
-            np.take_along_axis(gradient, columns[..., None], axis=1) if correction else gradient
-        )
-    total = weigh(unit[..., :k], variance, installation.pairing, installation.link_std)
+    anchors, k, link_std = installation.anchors, installation.dimensions, installation.link_std
+    variances = installation.noise.variance(points, anchors)
+    variance = np.take_along_axis(variances, columns, axis=1)
+    unit = ranges(points[:, None, :], anchors.positions[columns])[1][..., :k]
+    gradient: np.ndarray = np.empty(0)
     if correction:
-        for part in installation.pairing.parts:
-            total += _from_sizes(gradient, variance, part, installation.link_std)
+        gradient = variance_gradient(installation.noise, points, anchors, variances, k)
+        gradient = np.take_along_axis(gradient, columns[..., None], axis=1)
+    total = np.zeros((len(points), k, k))
+    for part in installation.round(columns.shape[1]):
+        weights = range_weights(variance, part, link_std)
+        total += weigh(unit, weights)
+        if correction:
+            total += 0.5 * weigh(gradient, _weights_of_sizes(weights, part))
     return total
 
 
-def weigh(
-    change: np.ndarray, variance: np.ndarray, pairing: Pairing, link_std: float = 0.0
-) -> np.ndarray:
-    """Return the information V' F^-1 V of one round about k unknowns, (n, k, k).
+def weigh(change: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the information change' weights change about k unknowns: (n, k, k).
 
-    V are the derivatives of the measurements of the round: D `change` for TDOAs, `change` for
-    ranges. D (M, N) has -1 at anchor a and +1 at anchor b of each pair. F = D S D' + link_std^2 I
-    is the covariance of the measurements, S = diag(variance). For derivatives by the position the
-    result is the first term of eq. 1, in 1/m^2.
+    change : (n, N, k) derivatives of the ranges to all N anchors; weights : (n, N, N), of
+    `range_weights`. For derivatives by the position it is the first term of eq. 1, in 1/m^2.
+    """
+    return change.swapaxes(1, 2) @ (weights @ change)
+
+
+def round_weights(variance: np.ndarray, installation: Installation) -> np.ndarray:
+    """Return the weights of the ranges in a whole round: (n, N, N) 1/m^2. variance : (n, N) m^2."""
+    parts = installation.round(variance.shape[1])
+    return np.sum([range_weights(variance, part, installation.link_std) for part in parts], axis=0)
+
+
+def range_weights(variance: np.ndarray, part: Pairing, link_std: float) -> np.ndarray:
+    """Return D' F^-1 D, the weights of the ranges in a part of a round: (n, N, N) 1/m^2.
+
+    D (M, N) has -1 at anchor a and +1 at anchor b of each pair; it is the identity for ranges. F = D S D' + link_std^2 I
+    is the covariance of the measurements, S = diag(variance).
 
     If the anchors share one reception each and the pairs connect all of them, the result does not
     depend on the pairs: with W = S^-1 and w its diagonal, D' (D S D')^-1 D = W - w w' / sum(w).
     That is the information of N ranges with one unknown offset, the tag's clock. A closed ring,
     whose D S D' is singular, has the same information. Only independent TDOAs have `times`.
 
-    change : (n, N, k) derivatives of the ranges to all N anchors; variance : (n, N) m^2, of the
-    receptions; pairing : Pairing; link_std : m, as for Installation
+    variance : (n, N) m^2, of the receptions; part : Pairing; link_std : m, additional error of each
+    TDOA. It includes the anchor's reception of the other anchor's packet.
+    Source: eqs. 4 and 5 of Grasso et al. (Sensors 2022, 22, 9136); A18 for a common reference.
     """
-    if pairing.beside:
-        return np.sum([weigh(change, variance, part, link_std) for part in pairing.parts], axis=0)
-    link_variance = link_std**2
-    if pairing.ranges:
-        return _product(change, change / (variance + link_variance)[..., None])
-    if not pairing.shared:
-        v = change[:, pairing.b] - change[:, pairing.a]
-        weight = pairing.times / (variance[:, pairing.a] + variance[:, pairing.b] + link_variance)
-        return _product(v, weight[..., None] * v)
-    if link_variance > 0.0:
-        return _product(change, _inverse(variance, pairing, link_std) @ change)
-    w = 1.0 / variance[..., None]
-    centred = change - (w * change).sum(axis=1, keepdims=True) / w.sum(axis=1, keepdims=True)
-    return _product(centred, w * centred)
+    each = np.eye(variance.shape[1])
+    if part.ranges:
+        return each / (variance + link_std**2)[:, None]
+    if part.shared and link_std > 0.0:
+        d = part.incidence()
+        covariance = (d * variance[:, None, :]) @ d.T + link_std**2 * np.eye(len(d))
+        return d.T @ np.linalg.inv(covariance) @ d
+    if part.shared:
+        w = 1.0 / variance
+        return each * w[:, None] - w[:, :, None] * (w / w.sum(axis=1, keepdims=True))[:, None]
+    between = np.zeros((len(variance), *each.shape))
+    between[:, part.a, part.b] = part.times / (
+        variance[:, part.a] + variance[:, part.b] + link_std**2
+    )
+    between += between.swapaxes(1, 2)
+    return each * between.sum(axis=1)[:, None] - between
 
 
-def range_weights(variance: np.ndarray, pairing: Pairing, link_std: float = 0.0) -> np.ndarray:
-    """Return D' F^-1 D, the weights of the ranges in a round: (n, N, N) 1/m^2.
+def _weights_of_sizes(weights: np.ndarray, part: Pairing) -> np.ndarray:
+    """Return the weights of the variances in the second term of eq. 1, times 2: (n, N, N) 1/m^4.
 
-    variance : (n, N) m^2.
+    weights : P, of `range_weights`. With dF_i = D diag(g_i) D', the trace of eq. 1 is g_i' (P o P)
+    g_j. If the errors are independent, F is diagonal, and a pair adds (g_a + g_b)^2 / F^2.
     """
-    n, anchors = variance.shape
-    if pairing.beside or pairing.shared or pairing.ranges:
-        if pairing.beside:
-            return np.sum(
-                [range_weights(variance, part, link_std) for part in pairing.parts], axis=0
-            )
-        return weigh(
-            np.broadcast_to(np.eye(anchors), (n, anchors, anchors)), variance, pairing, link_std
-        )
-    weight = pairing.times / (variance[:, pairing.a] + variance[:, pairing.b] + link_std**2)
-    out = np.zeros((anchors, anchors, n))
-    for one, other in ((pairing.a, pairing.b), (pairing.b, pairing.a)):
-        np.add.at(out, (one, one), weight.T)
-        np.add.at(out, (one, other), -weight.T)
-    return np.ascontiguousarray(out.transpose(2, 0, 1))
-
-
-def _from_sizes(
-    gradient: np.ndarray, variance: np.ndarray, pairing: Pairing, link_std: float
-) -> np.ndarray:
-    """Return the second term of eq. 1, for the derivatives (n, N, k) m of the variances.
-
-    With F = D S D' + link_std^2 I, dF_i = D diag(g_i) D' and P = D' F^-1 D, half the trace is g_i' (P o P)
-    g_j / 2.
-    """
-    link_variance = link_std**2
-    if pairing.ranges:
-        g = gradient / (variance + link_variance)[..., None]
-        return 0.5 * _product(g, g)
-    if not pairing.shared:
-        weight = 1.0 / (variance[:, pairing.a] + variance[:, pairing.b] + link_variance)
-        g = (gradient[:, pairing.a] + gradient[:, pairing.b]) * weight[..., None]
-        return 0.5 * pairing.times * _product(g, g)
-    if link_variance > 0.0:
-        return 0.5 * _product(gradient, _inverse(variance, pairing, link_std) ** 2 @ gradient)
-    w = 1.0 / variance[..., None]
-    total, g = w.sum(axis=1, keepdims=True), w * gradient
-    mean = (w * g).sum(axis=1, keepdims=True) / total
-    return 0.5 * (_product(g, (1.0 - 2.0 * w / total) * g) + _product(mean, mean))
-
-
-def _inverse(variance: np.ndarray, pairing: Pairing, link_std: float) -> np.ndarray:
-    """Return D' F^-1 D: (n, N, N) 1/m^2."""
-    d = pairing.incidence()
-    return d.T @ np.linalg.inv(pairing.covariance(variance, link_std)) @ d
-
-
-def _product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    return left.swapaxes(1, 2) @ right
+    squared = weights**2
+    if part.shared or part.ranges:
+        return squared
+    each = np.eye(weights.shape[1])
+    squared *= 1.0 - each
+    return (squared + each * squared.sum(axis=1)[:, None]) / part.times
 
 
 def bound(information: np.ndarray) -> np.ndarray:

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -368,63 +367,51 @@ def _markers(store: Typestore, chart: Chart, anchors: Anchors, stamp: int) -> An
     green_to_red = np.column_stack(
         [np.minimum(2 * worse, 1), np.minimum(2 - 2 * worse, 1), 0 * worse, 0 * worse + 0.4]
     )
-    shapes = [
-        _Shape("flyable", _CUBES, grid.step, points=grid.points[surface], colours=green_to_red)
-    ]
-    shapes.append(_Shape("anchors", _SPHERES, 0.15, points=anchors.positions))
-    for number, p in zip(anchors.ids.tolist(), anchors.positions):
-        shapes.append(_Shape("ids", _TEXT, 0.25, number, at=p + [0, 0, 0.25], text=str(number)))
     header = header_of(store, stamp, anchors.frame)
-    return types["visualization_msgs/msg/MarkerArray"](
-        [_marker(store, header, one) for one in shapes]
-    )
+    point, colour = types["geometry_msgs/msg/Point"], types["std_msgs/msg/ColorRGBA"]
+    cells = [point(*p) for p in grid.points[surface].tolist()]
+    colours = [colour(*c) for c in green_to_red.tolist()]
+    places = [point(*p) for p in anchors.positions.tolist()]
+    markers = [
+        _marker(store, header, "flyable", _CUBES, grid.step, points=cells, colors=colours),
+        _marker(store, header, "anchors", _SPHERES, 0.15, points=places),
+    ]
+    for number, p in zip(anchors.ids.tolist(), anchors.positions):
+        above = pose_of(store, p + [0, 0, 0.25])
+        text = {"id": number, "pose": above, "text": str(number)}
+        markers.append(_marker(store, header, "ids", _TEXT, 0.25, **text))
+    return types["visualization_msgs/msg/MarkerArray"](markers)
 
 
-@dataclass(frozen=True)
-class _Shape:
-    """The content of a marker.
-
-    kind : of visualization_msgs/Marker; size : m; points : (n, 3) m of its parts; colours : (n, 4) of
-    these, red, green, blue and opacity; at : (3,) m, its place.
-    """
-
-    namespace: str
-    kind: int
-    size: float
-    number: int = 0
-    points: Sequence[float] | np.ndarray = ()
-    colours: Sequence[float] | np.ndarray = ()
-    at: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0)
-    text: str = ""
-
-
-def _marker(store: Typestore, header: Any, shapes: _Shape) -> Any:
+def _marker(
+    store: Typestore, header: Any, namespace: str, kind: int, size: float, **fields: Any
+) -> Any:
+    """Return a blue Marker at the origin; fields : those of the message that differ. size : m."""
     types = store.types
-    colour, zero = types["std_msgs/msg/ColorRGBA"], types["builtin_interfaces/msg/Duration"](0, 0)
-    nothing = types["sensor_msgs/msg/CompressedImage"](
-        header_of(store, 0, ""), "", np.empty(0, np.uint8)
-    )
-    return types["visualization_msgs/msg/Marker"](
-        header,
-        shapes.namespace,
-        shapes.number,
-        shapes.kind,
-        0,
-        pose_of(store, shapes.at),
-        types["geometry_msgs/msg/Vector3"](*[shapes.size] * 3),
-        colour(0.1, 0.3, 0.9, 1.0),
-        zero,
-        False,
-        [types["geometry_msgs/msg/Point"](*p) for p in np.asarray(shapes.points).tolist()],
-        [colour(*c) for c in np.asarray(shapes.colours).tolist()],
-        "",
-        nothing,
-        [],
-        shapes.text,
-        "",
-        types["visualization_msgs/msg/MeshFile"]("", np.empty(0, np.uint8)),
-        False,
-    )
+    nothing = np.empty(0, np.uint8)
+    empty = types["sensor_msgs/msg/CompressedImage"](header_of(store, 0, ""), "", nothing)
+    usual = {
+        "header": header,
+        "ns": namespace,
+        "id": 0,
+        "type": kind,
+        "action": 0,
+        "pose": pose_of(store, (0.0, 0.0, 0.0)),
+        "scale": types["geometry_msgs/msg/Vector3"](size, size, size),
+        "color": types["std_msgs/msg/ColorRGBA"](0.1, 0.3, 0.9, 1.0),
+        "lifetime": types["builtin_interfaces/msg/Duration"](0, 0),
+        "frame_locked": False,
+        "points": [],
+        "colors": [],
+        "texture_resource": "",
+        "texture": empty,
+        "uv_coordinates": [],
+        "text": "",
+        "mesh_resource": "",
+        "mesh_file": types["visualization_msgs/msg/MeshFile"]("", nothing),
+        "mesh_use_embedded_materials": False,
+    }
+    return types["visualization_msgs/msg/Marker"](**{**usual, **fields})
 
 
 def _surface(cells: np.ndarray) -> np.ndarray:

@@ -1,40 +1,35 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Run the parts of `plan`: read the options, compute, write the pictures, and return the figures."""
+"""Run `plan`: read the options, compute, write the pictures and the figures."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.radio import Antenna
 
 from .. import cli, parallel
 from ..choices import OF_PROTOCOL
 from ..parallel import Progress
+from ..readers import read_survey
 from ..readers.inputs import Reading
 from ..simulation.rooms import Room, Walls, room_of
-from . import hall, maps, optimisation, plots, report
-from .installation import (
-    PAIRINGS,
-    FixedNoise,
-    Installation,
-    RadioNoise,
-    antenna_from_yaml,
-)
+from . import maps, optimisation, plots, report
+from .hall import Hall, design, placements, step_of
+from .installation import FixedNoise, Installation, RadioNoise, antenna_from_yaml
 from .layout import AnchorPlaces, Goal, lattice
-from .maps import Demand, Grid, brute_force, chart, judge
+from .maps import Demand, Grid, brute_force
 
 if TYPE_CHECKING:
     from argparse import Namespace
-    from collections.abc import Iterable, Sequence
-
-    from uwb_tdoa_bias.common.anchors import Anchors
+    from collections.abc import Iterable
 
     from ..readers.inputs import Recording
     from .maps import Chart
@@ -44,20 +39,69 @@ FARTHEST = 30.0  # m, size of a room from which on the radio's reach must be giv
 CELLS_ACROSS = {"slice": 100, "volume": 50}
 # cells of the flown volume; a search for better anchors looks at their corners
 FLOWN_CELLS = 300
+PLACES_TRIED = 60  # places on the walls of a room that are tried for one more anchor, about
+# Places that are tried in a hall:
+HALL_SPACING = 0.35  # of the reach, between them
+HALL_HEIGHTS = (1.0, 4.0)  # m above the floor
 
 
-@dataclass(frozen=True)
-class Aim:
-    """What --improve asks for.
+def plan(args: Namespace) -> bool:
+    """Plan by the options of the command.
 
-    goal : Goal of the search; reported : Goal at more points, for the report; places : AnchorPlaces;
-    count : number of anchors.
+    Returns False if --hall finds no layout with the wanted share. Raises InputError.
     """
+    check_options(args)
+    anchors = None if args.hall else read_survey(args.anchors)
+    room = room_of_options(args, anchors)
+    reach = reach_of(args, room)
+    installation = installation_of(args, anchors or Anchors.from_positions([room.centre]))
+    demand = demand_of(args, installation, room)
+    grid = grid_of(args, room)
+    reading = Reading(args.anchors)
+    recordings = reading.find(args.flights or [], bool(args.dask))
+    walls = None if args.walls is None else Walls.from_yaml(args.walls)
+    aim = aim_of(args, installation, demand, grid.axes[2][0]) if args.improve else None
+    whole = Hall(installation, demand, reach, walls)
 
-    goal: Goal
-    reported: Goal
-    places: AnchorPlaces
-    count: int
+    if not (installation.hall or np.isfinite(installation.anchors.orientations).all()):
+        cli.show("anchors without orientation are taken to radiate alike in all directions")
+    report.print_room(room, args.room is not None)
+    args.out.mkdir(parents=True, exist_ok=True)
+    figures: dict[str, Any] = {"arguments": as_json(args)}
+    if anchors is None:
+        whole, found, figures["design"] = designed(args, whole, grid)
+    else:
+        found = whole.chart(grid, args.jobs, args.dask)
+    installation = whole.installation
+    about = report.summary(found)
+    figures |= {"anchors": len(whole.anchors), "map": about}
+    if installation.hall:
+        figures["side"] = whole.side(grid.points)
+        report.print_heard(about)
+        plots.plot_heard(whole.anchors, found, args.out / "heard.png", walls)
+    else:
+        about |= report.in_hull(found, installation)
+        report.print_in_hull(about)
+    report.print_flyable(about, demand.accuracy)
+    report.print_side(figures.get("side"))
+    if demand.criterion == "round":
+        figures["addition"] = advice(args, whole, found)
+        report.print_addition(figures["addition"], about["flyable_share"])
+    outgoing = draw_map(whole, found, args.out)
+    if args.check:
+        figures["check"] = brute_force_check(installation, grid, args.out)
+        report.print_check(figures["check"])
+    if recordings:
+        read = partial(flight_errors, reading, tuple(args.sensors))
+        flown = parallel.over(read, recordings, args.jobs, args.dask)
+        step = args.step or 0.4
+        figures["flights"] = evaluate_flights(flown, installation, room, step, args.out)
+        report.print_flights(figures["flights"])
+    if aim:
+        figures["improve"] = improve(found, aim, args.improve, args.starts, args.out)
+        report.print_improvement(figures["improve"])
+    end(args, figures, outgoing)
+    return bool(found.flyable.mean() >= args.share) or not args.hall
 
 
 def check_options(args: Namespace) -> None:
@@ -75,6 +119,13 @@ def check_options(args: Namespace) -> None:
         raise InputError(
             "walls: are for a hall of which a tag hears a part; give --radio-reach too."
         )
+    is_hall = args.hall or args.radio_reach is not None
+    for name in ("check", "flights", "improve"):
+        if is_hall and getattr(args, name):
+            raise InputError(
+                f"{name}: is for a room in which every anchor is heard; leave out --{name}, "
+                "or --radio-reach."
+            )
     if args.flights and args.planar:
         raise InputError("flights: are judged in three dimensions; leave out --planar.")
 
@@ -90,13 +141,11 @@ def installation_of(args: Namespace, anchors: Anchors) -> Installation:
     else:
         antenna = antenna_from_yaml(args.antenna) if args.antenna else Antenna()
         noise = RadioNoise(antenna, args.tx_power, args.temperature, args.voltage)
-    # of a single anchor there is none, and Installation refuses it
-    pairing: Any = PAIRINGS[_pairing(args)](len(anchors)) if len(anchors) > 1 else None
     height_std = args.height_std if "height" in args.sensors else np.inf
     return Installation(
         anchors,
         noise,
-        pairing,
+        args.covariance or OF_PROTOCOL[args.protocol],
         args.link_noise,
         2 if args.planar else 3,
         height_std,
@@ -109,7 +158,7 @@ def demand_of(args: Namespace, installation: Installation, room: Room) -> Demand
 
     Raises InputError for a criterion that ranges, or a hall, do not have.
     """
-    if installation.pairing is not None and installation.pairing.one_solution:
+    if installation.measures_ranges:
         for name, asked in (("flyable", args.flyable == "pairings"), ("check", args.check)):
             if asked:
                 raise InputError(
@@ -178,6 +227,20 @@ def grid_of(args: Namespace, room: Room) -> Grid:
     return Grid.slice((room.lower[0], room.upper[0]), (room.lower[1], room.upper[1]), height, step)
 
 
+@dataclass(frozen=True)
+class Aim:
+    """What --improve asks for.
+
+    goal : Goal of the search; reported : Goal at more points, for the report; places : AnchorPlaces;
+    count : number of anchors.
+    """
+
+    goal: Goal
+    reported: Goal
+    places: AnchorPlaces
+    count: int
+
+
 def aim_of(args: Namespace, installation: Installation, demand: Demand, height: float) -> Aim:
     """Return the Aim of --improve. Raises InputError.
 
@@ -196,16 +259,9 @@ def aim_of(args: Namespace, installation: Installation, demand: Demand, height: 
     step = max(0.1, (np.prod((upper - lower)[:k]) / FLOWN_CELLS) ** (1.0 / k))
 
     def goal(step: float) -> Goal:
-        return Goal(
-            lattice(lower, upper, step), installation, _pairing(args), args.objective, demand
-        )
+        return Goal(lattice(lower, upper, step), installation, args.objective, demand)
 
     return Aim(goal(step), goal(0.4 * step), places_of(args, demand.room), count)
-
-
-def goal_of(args: Namespace, installation: Installation, demand: Demand) -> Goal:
-    """Return a Goal without points. Its `installed` gives the Installation of other Anchors."""
-    return Goal(np.empty((0, 3)), installation, _pairing(args), demand=demand)
 
 
 def places_of(args: Namespace, room: Room) -> AnchorPlaces:
@@ -224,173 +280,45 @@ def as_json(args: Namespace) -> dict[str, Any]:
     }
 
 
-def _pairing(args: Namespace) -> str:
-    return args.covariance or OF_PROTOCOL[args.protocol]
-
-
-PLACES_TRIED = 60  # places on the walls of a room that are tried for one more anchor, about
-# Places that are tried in a hall:
-HALL_SPACING = 0.35  # of the reach, between them
-HALL_HEIGHTS = (1.0, 4.0)  # m above the floor
-
-
-def plan_hall(
-    args: Namespace, anchors: Anchors | None, installation: Installation, demand: Demand, grid: Grid
-) -> tuple[dict[str, Any], dict[str, Any], bool]:
-    """Plan a hall, with --radio-reach or --hall. Raises InputError.
-
-    args : the options; anchors : Anchors of the hall, None if --hall asks for them. Returns (figures,
-    messages, whether the wanted share can be flown).
-    """
-    for name in ("check", "flights", "improve"):
-        if getattr(args, name):
-            raise InputError(
-                f"{name}: is for a room in which every anchor is heard; leave out --{name}, "
-                "or --radio-reach."
-            )
-    room, walls = demand.room, None if args.walls is None else Walls.from_yaml(args.walls)
-    goal, reach = goal_of(args, installation, demand), reach_of(args, demand.room)
-    whole = hall.Hall(goal, installation.anchors, reach, walls)
-    args.out.mkdir(parents=True, exist_ok=True)
-    report.print_room(room, args.room is not None)
-    figures: dict[str, Any] = {"arguments": as_json(args)}
-    if anchors is None:
-        anchors, found, figures["design"] = _designed(args, whole, grid)
-        anchors.to_yaml(args.out / "hall.yaml")
-    else:
-        found = whole.chart(grid, args.jobs, args.dask)
-    whole = whole.with_anchors(anchors)
-    figures |= {
-        "anchors": len(anchors),
-        "map": report.summary(found),
-        "side": whole.side(grid.points),
-    }
-    report.print_heard(figures["map"])
-    report.print_flyable(figures["map"], demand.accuracy)
-    report.print_side(figures["side"])
-    figures["addition"] = hall_advice(whole, found)
-    report.print_addition(figures["addition"], figures["map"]["flyable_share"])
-    plots.plot_heard(anchors, found, args.out / "heard.png", walls)
-    outgoing = draw_map(found, installation.with_anchors(anchors), args.out, walls)
-    return figures, outgoing, bool(found.flyable.mean() >= args.share or not args.hall)
-
-
-def _designed(
-    args: Namespace, whole: hall.Hall, grid: Grid
-) -> tuple[Anchors, Chart, list[dict[str, Any]]]:
-    """Return (Anchors, Chart, rows of the table) of --hall.
+def designed(args: Namespace, whole: Hall, grid: Grid) -> tuple[Hall, Chart, list[dict[str, Any]]]:
+    """Return (the Hall with the anchors of --hall, its Chart, steps of the search), and write hall.yaml.
 
     It is the layout with the fewest anchors that has the wanted share on all of the Grid.
     """
-    room = whole.goal.demand.room
     with Progress("plan") as progress:
-        layouts, steps = hall.design(whole, room, grid.points, args.share, progress)
+        layouts, steps = design(whole, grid.points, args.share, progress)
     for anchors in layouts:
         found = whole.with_anchors(anchors).chart(grid, args.jobs, args.dask)
         if found.flyable.mean() >= args.share:
             break
-    rows = [asdict(step) for step in steps]
-    report.print_design(
-        rows, asdict(hall.step_of(found, anchors, room)), hall.placements(anchors), args.share
-    )
-    return anchors, found, rows
+    chosen = step_of(found, anchors, whole.demand.room)
+    report.print_design(steps, chosen, placements(anchors), args.share)
+    anchors.to_yaml(args.out / "hall.yaml")
+    return whole.with_anchors(anchors), found, steps
 
 
-def _places_in_hall(room: Room, reach: float) -> np.ndarray:
+def places_in_hall(room: Room, reach: float) -> np.ndarray:
     """Return the places that are tried for one more anchor in a hall: (n, 3) m."""
-    z = [min(room.lower[2] + height, room.upper[2]) for height in HALL_HEIGHTS]
-    across = lattice([*room.lower[:2], 0.0], [*room.upper[:2], 0.0], HALL_SPACING * reach)[:, :2]
-    return np.unique(
-        np.vstack([np.column_stack([across, np.full(len(across), height)]) for height in z]).round(
-            1
-        ),
-        axis=0,
-    )
+    across = lattice([*room.lower[:2], 0.0], [*room.upper[:2], 0.0], HALL_SPACING * reach)
+    levels = []
+    for height in HALL_HEIGHTS:
+        across[:, 2] = min(room.lower[2] + height, room.upper[2])
+        levels.append(across.round(1))
+    return np.unique(np.vstack(levels), axis=0)
 
 
-def plan_room(
-    args: Namespace,
-    anchors: Anchors,
-    installation: Installation,
-    demand: Demand,
-    grid: Grid,
-    reading: Reading,
-    recordings: Sequence[Recording],
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Plan a room in which each place hears all anchors. Raises InputError.
+def advice(args: Namespace, whole: Hall, found: Chart) -> dict[str, Any] | None:
+    """Return the `best_addition` to a Hall, or on the walls of a room. found : Chart of it.
 
-    args : the options; recordings : of --flights, by Reading. Returns (figures, messages).
+    Places on walls are rounded to the centimetre.
     """
-    aim = aim_of(args, installation, demand, grid.axes[2][0]) if args.improve else None
-    if not np.isfinite(anchors.orientations).all():
-        cli.show("anchors without orientation are taken to radiate alike in all directions")
-    report.print_room(demand.room, args.room is not None)
-    args.out.mkdir(parents=True, exist_ok=True)
+    if whole.installation.hall:
+        tried = places_in_hall(whole.demand.room, min(whole.reach, FARTHEST))
+    else:
+        places = places_of(args, whole.demand.room)
+        tried = np.unique(places.positions(places.grid(PLACES_TRIED)).round(2), axis=0)
     with Progress("plan") as progress:
-        progress("mapping")
-        found = chart(installation, grid, demand)
-    about = {**report.summary(found), **report.in_hull(found, installation)}
-    figures: dict[str, Any] = {
-        "anchors": len(anchors),
-        "arguments": as_json(args),
-        "map": about,
-    }
-    report.print_in_hull(about)
-    report.print_flyable(about, demand.accuracy)
-    if demand.criterion == "round":
-        goal, places = (
-            goal_of(args, installation, demand),
-            places_of(args, demand.room),
-        )
-        figures["addition"] = room_advice(found, anchors, goal, places)
-        report.print_addition(figures["addition"], about["flyable_share"])
-    outgoing = draw_map(found, installation, args.out, pairings=demand.criterion == "pairings")
-    if args.check:
-        figures["check"] = brute_force_check(installation, grid, args.out)
-        report.print_check(figures["check"])
-    if recordings:
-        flown = parallel.over(
-            FlightErrors(reading, tuple(args.sensors)), recordings, args.jobs, args.dask
-        )
-        figures["flights"] = evaluate_flights(
-            flown, installation, demand.room, args.step or 0.4, args.out
-        )
-        report.print_flights(figures["flights"])
-    if aim:
-        figures["improve"] = improve(found, aim, args.improve, args.starts, args.out)
-        report.print_improvement(figures["improve"])
-    return figures, outgoing
-
-
-def hall_advice(whole: hall.Hall, found: Chart) -> dict[str, Any] | None:
-    """Return the `best_addition` of a Hall. found : Chart of it."""
-    places = _places_in_hall(whole.goal.demand.room, min(whole.reach, FARTHEST))
-    with Progress("plan") as progress:
-        return optimisation.best_addition(
-            found,
-            whole.anchors,
-            places,
-            lambda before, points, more, place: whole.changed(before, points, more, place[None]),
-            progress,
-        )
-
-
-def room_advice(
-    found: Chart, anchors: Anchors, goal: Goal, places: AnchorPlaces
-) -> dict[str, Any] | None:
-    """Return the `best_addition` on AnchorPlaces, in a room in which all is heard.
-
-    Places are rounded to the centimetre. found : Chart of Anchors.
-    """
-    tried = np.unique(places.positions(places.grid(PLACES_TRIED)).round(2), axis=0)
-    with Progress("plan") as progress:
-        return optimisation.best_addition(
-            found,
-            anchors,
-            tried,
-            lambda before, points, more, place: judge(points, goal.installed(more), goal.demand),
-            progress,
-        )
+        return optimisation.best_addition(whole, found, tried, progress)
 
 
 def end(args: Namespace, figures: dict[str, Any], outgoing: dict[str, Any]) -> None:
@@ -404,22 +332,15 @@ def end(args: Namespace, figures: dict[str, Any], outgoing: dict[str, Any]) -> N
         report.publish_messages(outgoing)
 
 
-def draw_map(
-    found: Chart,
-    installation: Installation,
-    out: Path,
-    walls: Walls | None = None,
-    pairings: bool = False,
-) -> dict[str, Any]:
+def draw_map(whole: Hall, found: Chart, out: Path) -> dict[str, Any]:
     """Write the pictures, flyable volume and bag of a Chart. Return {topic: message}.
 
-    pairings : True to draw the curves of each choice of anchors.
+    With the criterion "pairings" the curves of each choice of anchors are drawn.
     """
-    anchors = installation.anchors
-    plots.plot_precision(anchors, found, out / "precision.png", walls)
-    plots.plot_flyable(
-        anchors, found, out / "flyable.png", walls, installation if pairings else None
-    )
+    anchors, installation = whole.anchors, whole.installation
+    pairings = installation if whole.demand.criterion == "pairings" else None
+    plots.plot_precision(anchors, found, out / "precision.png", whole.walls)
+    plots.plot_flyable(anchors, found, out / "flyable.png", whole.walls, pairings)
     found.volume(anchors, installation.dimensions).save(out / "flyable.npz")
     outgoing = report.map_messages(found, anchors)
     report.write_messages(outgoing, out / "plan.bag")
@@ -440,25 +361,20 @@ def brute_force_check(installation: Installation, grid: Grid, out: Path) -> dict
     }
 
 
-@dataclass(frozen=True)
-class FlightErrors:
-    """Reads and estimates flights. It can be pickled.
+def flight_errors(
+    reading: Reading, sensors: tuple[str, ...], recording: Recording
+) -> tuple[str, maps.ErrorSamples]:
+    """Return (name, ErrorSamples) of a recording (path, survey). Raises InputError.
 
-    reading : Reading; sensors : names of SENSOR_NAMES that the filter uses.
+    sensors : names of SENSOR_NAMES that the filter uses.
     """
-
-    reading: Reading
-    sensors: tuple[str, ...] = ()
-
-    def __call__(self, recording: Recording) -> tuple[str, maps.ErrorSamples]:
-        """Return (name, ErrorSamples) of a recording (path, survey). Raises InputError."""
-        flight = self.reading.read(recording)
-        for name in self.sensors:
-            if getattr(flight, name) is None:
-                raise InputError(
-                    f"{flight.name}: holds no {name}; leave out --with {name}, or this flight."
-                )
-        return flight.name, maps.error_samples(flight, self.sensors)
+    flight = reading.read(recording)
+    for name in sensors:
+        if getattr(flight, name) is None:
+            raise InputError(
+                f"{flight.name}: holds no {name}; leave out --with {name}, or this flight."
+            )
+    return flight.name, maps.error_samples(flight, sensors)
 
 
 def evaluate_flights(
@@ -507,10 +423,10 @@ def improve(before: Chart, aim: Aim, how: str, starts: int, out: Path) -> dict[s
             )
         better = optimisation.rounded(better, anchors)
         better.to_yaml(out / "improved.yaml")
-        after = goal.installed(better)
-        charted = chart(after, before.grid, goal.demand)
+        after = Hall(replace(installation, anchors=better), goal.demand)
+        charted = after.chart(before.grid)
         plots.plot_layouts(
-            [("before", installation, before), ("after", after, charted)],
+            [("before", installation, before), ("after", after.installation, charted)],
             goal.points,
             out / "layout.png",
         )

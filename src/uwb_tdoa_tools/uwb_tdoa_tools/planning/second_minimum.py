@@ -4,7 +4,7 @@
 
 With d(x) the distances from x to the N anchors that are heard at p, D the anchor pairs of the TDOAs
 of a round, F the covariance of these TDOAs, and Q = D' F^-1 D the information matrix of the
-distances, 1/m^2 (`precision.range_weights`),
+distances, 1/m^2 (`precision.round_weights`),
     f(x) = (d(x) - d(p))' Q (d(x) - d(p))
 is the squared misfit, in standard deviations, of a tag at x with the TDOAs of a tag at p. Its
 smallest minimum is p, with 0. Levenberg-Marquardt searches a second one, from the mirrored places
@@ -26,8 +26,11 @@ import numpy as np
 
 from uwb_tdoa_bias.common.compiled import compiled
 
+from .precision import round_weights
+
 if TYPE_CHECKING:
     from ..simulation.rooms import Room
+    from .installation import Installation
 
 FLIP = 0.5  # m; a minimum nearer than this is no failure, but imprecision
 CLEAR = 4.65  # standard deviations of misfit from which on at most 1 % of the estimates flip
@@ -38,27 +41,34 @@ SETTLED = 0.01  # a descent ends where another step would lower f by less than t
 LONGEST = 5.0  # m, of a step
 AROUND = 2.0  # m outside of the room, to which starts farther out are moved
 SAME = 0.5 * FLIP  # m between starts that count as one
+_CHUNK = 2_000_000  # numbers in the largest array of one step
 _FLAT = 1e-6  # of the volume of a cube; k + 1 anchors of less are in one plane (line)
 
 
-def second_minima(
-    points: np.ndarray,
-    positions: np.ndarray,
-    columns: np.ndarray,
-    weights: np.ndarray,
-    room: Room,
-    unknowns: int,
+def other_solutions(
+    points: np.ndarray, installation: Installation, room: Room, columns: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the second minimum of least misfit inside a room: (misfit (n,), place (n, 3) m).
 
     The misfit is in standard deviations; inf and NaN if no descent ends inside the room
     and more than FLIP away.
-    points : (n, 3) m; positions : (N, 3) m of anchors; columns : (n, K) rows of the heard ones;
-    weights : (n, K, K) 1/m^2, Q; room : Room; unknowns : 2 if the height is known, else 3.
+    points : (n, 3) m; columns : (n, K) rows of the anchors that are heard at each point; None for all.
     """
-    choices = np.array(list(combinations(range(min(NEAREST, columns.shape[1])), unknowns + 1)))
+    anchors = installation.anchors
+    if columns is None:
+        columns = np.tile(np.arange(len(anchors)), (len(points), 1))
+    heard = columns.shape[1]
+    choices = np.array(list(combinations(range(min(NEAREST, heard)), installation.unknowns + 1)))
+    corners = np.stack([room.lower, room.upper])
     out = np.empty((len(points), 4))
-    _search(points, positions, columns, weights, np.stack([room.lower, room.upper]), choices, out)
+    at_once = max(1, _CHUNK // max(heard**2, len(anchors)))
+    for begin in range(0, len(points), at_once):
+        some = slice(begin, begin + at_once)
+        variances = installation.noise.variance(points[some], anchors)
+        variance = np.take_along_axis(variances, columns[some], axis=1)
+        weights = np.ascontiguousarray(round_weights(variance, installation))
+        heard_at = np.ascontiguousarray(columns[some])
+        _search(points[some], anchors.positions, heard_at, weights, corners, choices, out[some])
     return np.sqrt(out[:, 0]), out[:, 1:]
 
 
@@ -74,7 +84,8 @@ def _search(
 ) -> None:
     """Fill out (n, 4): misfit squared and place, m; inf and NaN without a second minimum.
 
-    points, positions, columns, weights : as of `second_minima`; room : (2, 3) m, its corners
+    points, columns : as of `other_solutions`; positions : (N, 3) m of anchors
+    weights : (n, K, K) 1/m^2, Q; room : (2, 3) m, its corners
     choices : (C, k + 1) indices into the heard anchors, nearest first
     """
     heard, unknowns = columns.shape[1], choices.shape[1] - 1
@@ -120,58 +131,52 @@ def _mirror(
     See `bifurcation`. If the anchors are in a plane (line), it is the place on its other side.
     """
     k, first = len(rows) - 1, anchors[rows[0]]
-    matrix, q, p = np.zeros((3, 3)), np.zeros(3), np.zeros(3)
+    matrix, right, q = np.eye(3), np.zeros(3), np.empty(3)
     size = 1e-9
     for i in range(k):
         for j in range(k):
-            matrix[i, j] = anchors[rows[i + 1], j] - first[j]
-            size = max(size, abs(matrix[i, j]))
+            matrix[j, i] = anchors[rows[i + 1], j] - first[j]
+            size = max(size, abs(matrix[j, i]))
     out[:] = point
-    if k == 2:
-        matrix[2, 2] = 1.0
-    volume = _determinant(matrix)
-    if abs(volume) < _FLAT * size**k:
-        normal = (
-            np.cross(matrix[0], matrix[1])
-            if k == 3
-            else np.array([matrix[0, 1], -matrix[0, 0], 0.0])
-        )
+    if abs(_volume(matrix[0], matrix[1], matrix[2])) < _FLAT * size**k:
+        normal = np.cross(matrix[:, 0], matrix[:, 4 - k])
         length = math.sqrt(np.sum(normal**2))
-        if length < _FLAT * size**2 if k == 3 else length < _FLAT * size:
+        if length < _FLAT * size ** (k - 1):
             return False
-        away = 0.0
-        for j in range(k):
-            away += (point[j] - first[j]) * normal[j] / length
-        for j in range(k):
-            out[j] -= 2.0 * away * normal[j] / length
+        normal /= length
+        out -= 2.0 * np.sum((point - first) * normal) * normal
         return True
-    r, squared, product = true[rows[0]], 0.0, 0.0
-    column = matrix.copy()
-    for j in range(k):  # by Cramer's rule
-        column[:] = matrix
-        for i in range(k):
-            column[i, j] = r - true[rows[i + 1]]
-        q[j] = _determinant(column) / volume
-    for j in range(k):
-        p[j] = point[j] - first[j] - q[j] * r
+    r = true[rows[0]]
+    for i in range(k):
+        right[i] = r - true[rows[i + 1]]
+    _solve(matrix, right, q)
+    squared, product = 0.0, 0.0
+    for j in range(3):
         squared += q[j] ** 2
-        product += p[j] ** 2
-    if k == 2:
-        product += (point[2] - first[2]) ** 2
+        product += (point[j] - first[j] - q[j] * r) ** 2
     if squared <= 1.0:
         return False
     other = product / ((squared - 1.0) * max(r, 1e-12))
     for j in range(k):
-        out[j] = first[j] + p[j] + q[j] * other
+        out[j] += q[j] * (other - r)
     return True
 
 
 @compiled
-def _determinant(m: np.ndarray) -> float:
+def _solve(matrix: np.ndarray, right: np.ndarray, out: np.ndarray) -> None:
+    """Put x with sum_j matrix[j] x_j = right into `out`, (3,), by Cramer's rule."""
+    volume = _volume(matrix[0], matrix[1], matrix[2])
+    out[0] = _volume(right, matrix[1], matrix[2]) / volume
+    out[1] = _volume(matrix[0], right, matrix[2]) / volume
+    out[2] = _volume(matrix[0], matrix[1], right) / volume
+
+
+@compiled
+def _volume(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> float:
     return (
-        m[0, 0] * (m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1])
-        - m[0, 1] * (m[1, 0] * m[2, 2] - m[1, 2] * m[2, 0])
-        + m[0, 2] * (m[1, 0] * m[2, 1] - m[1, 1] * m[2, 0])
+        a[0] * (b[1] * c[2] - b[2] * c[1])
+        - a[1] * (b[0] * c[2] - b[2] * c[0])
+        + a[2] * (b[0] * c[1] - b[1] * c[0])
     )
 
 
@@ -207,49 +212,32 @@ def _descend(
 
     Returns inf if the descent does not end, or ends at the point itself.
     """
-    x, step, right = start.copy(), np.zeros(3), np.zeros(3)
-    unit, change, weighed = (
-        np.empty((len(anchors), 3)),
-        np.empty(len(anchors)),
-        np.empty((len(anchors), 4)),
-    )
-    normal, damped = np.zeros((3, 3)), np.zeros((3, 3))
-    f, damping = _misfit(x, anchors, true, weight), 1e-2
+    x, f = start.copy(), _misfit(start, anchors, true, weight)
+    both, weighed = np.empty((len(anchors), 4)), np.empty((len(anchors), 4))
+    normal, damped, right, step = np.empty((4, 4)), np.eye(3), np.zeros(3), np.empty(3)
+    damping = 1e-2
     for _ in range(MAX_STEPS):
         for i in range(len(anchors)):
             r = _distance(x, anchors[i])
-            change[i] = r - true[i]
             for k in range(3):
-                unit[i, k] = (x[k] - anchors[i, k]) / max(r, 1e-9)
-        for i in range(len(anchors)):
-            weighed[i] = 0.0
-            for j in range(len(anchors)):
-                for k in range(unknowns):
-                    weighed[i, k] += weight[i, j] * unit[j, k]
-                weighed[i, 3] += weight[i, j] * change[j]
-        for a in range(unknowns):
-            right[a] = 0.0
-            for i in range(len(anchors)):
-                right[a] -= unit[i, a] * weighed[i, 3]
-            for b in range(unknowns):
-                normal[a, b] = 0.0
-                for i in range(len(anchors)):
-                    normal[a, b] += unit[i, a] * weighed[i, b]
+                both[i, k] = (x[k] - anchors[i, k]) / max(r, 1e-9)
+            both[i, 3] = r - true[i]
+        np.dot(weight, both, weighed)
+        np.dot(both.T, weighed, normal)
+        right[:unknowns] = -normal[:unknowns, 3]
         lower = False
         for _ in range(12):  # until a step leads down
+            damped[:unknowns, :unknowns] = normal[:unknowns, :unknowns]
             for a in range(unknowns):
-                for b in range(unknowns):
-                    damped[a, b] = normal[a, b]
                 damped[a, a] += damping * normal[a, a] + 1e-12
-            gain = _solve(damped, right, unknowns, step)
+            _solve(damped, right, step)
             length = math.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
+            gain = step[0] * right[0] + step[1] * right[1] + step[2] * right[2]
             if gain < SETTLED and damping <= 1e-2 and length < 0.5 * FLIP:
                 end[:] = x
                 return f
-            for a in range(unknowns):
+            for a in range(3):
                 end[a] = x[a] + step[a] * min(1.0, LONGEST / max(length, 1e-12))
-            for a in range(unknowns, 3):
-                end[a] = x[a]
             new = _misfit(end, anchors, true, weight)
             if new < f:
                 lower = True
@@ -263,37 +251,3 @@ def _descend(
         if _distance(x, point) < FLIP:
             return np.inf
     return np.inf
-
-
-@compiled
-def _solve(matrix: np.ndarray, right: np.ndarray, size: int, out: np.ndarray) -> float:
-    """Solve matrix out = right by Cholesky in place; return right . out.
-
-    The matrix has 2 or 3 rows. Returns inf if it is not positive definite.
-    """
-    for i in range(size):
-        for j in range(i + 1):
-            total = matrix[i, j]
-            for k in range(j):
-                total -= matrix[i, k] * matrix[j, k]
-            if i == j:
-                if total <= 0.0:
-                    out[:] = 0.0
-                    return np.inf
-                matrix[i, i] = math.sqrt(total)
-            else:
-                matrix[i, j] = total / matrix[j, j]
-    for i in range(size):
-        total = right[i]
-        for k in range(i):
-            total -= matrix[i, k] * out[k]
-        out[i] = total / matrix[i, i]
-    for i in range(size - 1, -1, -1):
-        total = out[i]
-        for k in range(i + 1, size):
-            total -= matrix[k, i] * out[k]
-        out[i] = total / matrix[i, i]
-    product = 0.0
-    for i in range(size):
-        product += right[i] * out[i]
-    return product

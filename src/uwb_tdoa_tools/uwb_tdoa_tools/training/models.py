@@ -57,13 +57,10 @@ class Recipe(NamedTuple):
         One of MODELS.
     seed : int
         Seed of all random numbers.
-    options : StructuredPriors
-        For structured models.
     """
 
     kind: str
     seed: int
-    options: structured.StructuredPriors = structured.StructuredPriors()
 
 
 @dataclass(frozen=True)
@@ -129,7 +126,7 @@ def train(
     InputError
         If the kind is unknown or a flight cannot be used.
     """
-    kind, seed, _ = recipe
+    kind, seed = recipe
     if kind not in MODELS:
         raise InputError(f"model: {kind!r} is not known; choose {', '.join(MODELS)}.")
     raw = groups = _labels(training, validation)
@@ -201,7 +198,7 @@ def _paper(
     progress: Callable[[str], object],
 ) -> tuple[network.Paper, LearningCurve, list[np.ndarray]]:
     """Return (Paper, learning curve over epochs, remaining errors of each validation flight)."""
-    kind, seed, _ = recipe
+    kind, seed = recipe
     thin, held = (
         labelling.thinned(group, SPACING, np.random.default_rng(seed))
         for group in (training, validation)
@@ -239,7 +236,7 @@ def _structured(
         Linear effects that are fitted together with the maps. For the kind "physics" the maps only
         separate effects from position-dependent errors, and no model is returned.
     """
-    (_, seed, options), alone = recipe, recipe.kind == "physics"
+    seed, alone = recipe.seed, recipe.kind == "physics"
     thin = [
         labelling.thinned(group, SPACING, np.random.default_rng(seed))
         for group in (training, validation)
@@ -250,7 +247,7 @@ def _structured(
 
     curve: list[tuple[int, float, float]] = []
     for some in growing:
-        model, fitted = fit_structured([thin[0][k] for k in some], seed, options, free)
+        model, fitted = fit_structured([thin[0][k] for k in some], seed, free)
         fit_error, error = (
             _rms(map(remaining, group)) for group in ([thin[0][k] for k in some], thin[1])
         )
@@ -261,7 +258,7 @@ def _structured(
         )
     left = [remaining(one) for one in validation]
     explained = np.concatenate([model.variance(one.samples) for one in validation])
-    whole, fitted = fit_structured([*thin[0], *thin[1]], seed, options, free)
+    whole, fitted = fit_structured([*thin[0], *thin[1]], seed, free)
     whole.floor = _deviation(left, explained, validation)
     return None if alone else whole, fitted, _over_flights(curve), left
 
@@ -275,11 +272,10 @@ def _over_flights(curve: Sequence[tuple[int, float, float]]) -> LearningCurve:
 def fit_structured(
     some: Sequence[Labels],
     seed: int,
-    options: structured.StructuredPriors,
     free: EffectSet = EffectSet(),
 ) -> tuple[structured.Structured, EffectSet]:
     """Fit maps and the linear effects `free` together and return (Structured, EffectSet)."""
-    model = structured.prepare(some, options, seed)
+    model = structured.prepare(some, seed)
     parts = [model.design(one.samples, one.error, one.sample_weight) for one in some]
     fields = ("phi", "a", "b", "dense", "y", "sample_weight")
     phi, a, b, dense, y, sample_weight = (
@@ -287,7 +283,7 @@ def fit_structured(
     )
     more = np.concatenate([physics.regressors(free, one.samples) for one in some])
     design = linear.Design(phi, a, b, np.concatenate([dense, more], axis=1), y, sample_weight)
-    posterior = linear.fit(design, len(model.site_ids), options.noise, physics.prior_stds(free))
+    posterior = linear.fit(design, len(model.site_ids), structured.NOISE, physics.prior_stds(free))
     model.set_posterior(posterior)
     own = model.link_columns
     return model, physics.with_values(

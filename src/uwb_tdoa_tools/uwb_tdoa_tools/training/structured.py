@@ -43,6 +43,13 @@ if TYPE_CHECKING:
 
     from .labels import Labels
 
+# Priors, chosen on the validation flights of docs/notebook/bias.md. The data scale those of the maps.
+SITE_STD = (0.1, 0.1)  # m, of the short and the long part of a site map
+LENGTH = (1.0, 1.0, 0.6)  # m, of the short part
+LINK_STD = 0.1  # m, of each link map
+NOISE = 0.1  # m, scale of the remaining errors
+# largest number of Nystroem centres of a site map and of a link map
+CENTRES, LINK_CENTRES = 200, 150
 COARSE = 4.0  # ratio of the long to the short length of the site map
 NEAREST = 0.1  # m; smaller distances are set to this value before the logarithm
 LINK_LENGTH = 0.5  # of the link maps, in unit vectors and logarithms of distance
@@ -53,35 +60,6 @@ SITE_WEIGHTS = 2400
 _DELTA = ("dx", "dy", "dz")
 _PLACE = ("x", "y", "z")
 _END = ("id", "x", "y", "z")
-
-
-@dataclass(frozen=True)
-class StructuredPriors:
-    """Set the priors of the structured model.
-
-    The defaults were chosen on the validation flights of docs/notebook/bias.md.
-
-    Parameters
-    ----------
-    fine, coarse : float
-        Standard deviations of the short and the long part of a site map, m. The data scale both.
-    length : tuple
-        Length scale of the short part (3,), m.
-    link : float
-        Standard deviation of each link map, m. The data scale it.
-    noise : float
-        Scale of the remaining errors, m.
-    centres, link_centres : int
-        Largest number of Nystroem centres of a site map and of a link map.
-    """
-
-    fine: float = 0.1
-    coarse: float = 0.1
-    length: tuple[float, float, float] = (1.0, 1.0, 0.6)
-    link: float = 0.1
-    noise: float = 0.1
-    centres: int = 200
-    link_centres: int = 150
 
 
 @dataclass(frozen=True)
@@ -152,25 +130,19 @@ class Structured:
 
     validity_features = ()  # it fades over positions by itself
 
-    def __init__(
-        self, options: StructuredPriors, site: Map, site_ids: np.ndarray, site_positions: np.ndarray
-    ) -> None:
+    def __init__(self, site: Map, site_ids: np.ndarray, site_positions: np.ndarray) -> None:
         """Store the site map.
 
         Parameters
         ----------
-        options : StructuredPriors
         site : Map
             Over scaled positions.
         site_ids, site_positions : numpy.ndarray
             Ids (s,) and positions (s, 3), m, of the anchors.
         """
-        self.options, self.site, self.site_ids, self.site_positions = (
-            options,
-            site,
-            site_ids,
-            site_positions,
-        )
+        self.site = site
+        self.site_ids = site_ids
+        self.site_positions = site_positions
         # "T": direction of the anchor in the frame of the tag, "A": the opposite. Empty for one place
         self.links: dict[str, Map] = {}
         self.floor = 0.0  # m, standard deviation of the remaining error
@@ -182,7 +154,7 @@ class Structured:
 
         Anchors at no known site get the row after the last. Link maps are the dense part.
         """
-        phi = self.site.features(samples.p / self.options.length)
+        phi = self.site.features(samples.p / LENGTH)
         a, b = (self._site_of(samples.anchors)[rows] for rows in (samples.a, samples.b))
         dense = [np.zeros((len(samples), 0))]
         for viewer, link in self.links.items():
@@ -242,7 +214,7 @@ class Structured:
 
     def variance(self, samples: Samples) -> np.ndarray:
         """Return the variance of the maps (n,), m^2, without the floor."""
-        phi = self.site.features(samples.p / self.options.length)
+        phi = self.site.features(samples.p / LENGTH)
         known, sites = _quadratic(phi, self.site_covariance), self._site_of(samples.anchors)
         at_site = sites < len(self.site_ids)
         at_a, at_b = (
@@ -271,12 +243,15 @@ class Structured:
     def onnx(self, meta: Mapping[str, Any]) -> ModelProto:
         """Return the ONNX model with the outputs bias, standard deviation and known share."""
         graph, names = GraphBuilder(), self.inputs()
-        end = graph.rows(graph.input, len(names) // 2)  # (2n, ...): each row is one end
+        end = graph.reshaped(graph.input, -1, len(names) // 2)  # (2n, ...): each row is one end
         maps = [self._site_graph(graph, end)] if len(self.site_ids) else []
         maps += [self._link_graph(graph, end)] if self.links else []
         means, explained = zip(*maps)
         variance = graph.op("Max", graph.op("Sub", [self.prior], graph.total(explained)), [0.0])
-        both, variances = graph.rows(graph.total(means), 2), graph.rows(variance, 2)  # (n, 2): a, b
+        both, variances = (
+            graph.reshaped(graph.total(means), -1, 2),
+            graph.reshaped(variance, -1, 2),
+        )  # (n, 2): a, b
         bias = graph.op("MatMul", both, [[-1.0], [1.0]])
         std = graph.op("Sqrt", graph.op("Add", graph.row_sum(variances), [self.floor**2]))
         worst = graph.op("ReduceMax", variances, axes=[1])
@@ -292,7 +267,7 @@ class Structured:
     def _site_graph(self, graph: GraphBuilder, end: str) -> tuple[str, str]:
         """Return (mean, explained variance) of the site maps, each (2n, 1), from features of one end."""
         place, who, where = (graph.take(end, some) for some in ([0, 1, 2], [3], [4, 5, 6]))
-        place = graph.op("Div", place, [self.options.length])
+        place = graph.op("Div", place, [LENGTH])
         far = graph.op("Sqrt", graph.distance2(place, self.site.centres))
         parts = [graph.op("Exp", graph.op("Mul", far, [-1.0 / s])) for s in self.site.lengths]
         values = graph.total(
@@ -377,7 +352,7 @@ def _power(graph: GraphBuilder, values: str, directions: np.ndarray) -> str:
     return graph.row_sum(graph.op("Mul", part, part))
 
 
-def prepare(all_labels: Sequence[Labels], options: StructuredPriors, seed: int) -> Structured:
+def prepare(all_labels: Sequence[Labels], seed: int) -> Structured:
     """Return a model without weights: sites, centres and kernels for labels."""
     ids: list[int] = []
     positions: list[np.ndarray] = []
@@ -388,10 +363,10 @@ def prepare(all_labels: Sequence[Labels], options: StructuredPriors, seed: int) 
             ):
                 ids.append(i)
                 positions.append(p)
-    places = np.concatenate([one.samples.p for one in all_labels]) / options.length
-    centres = min(options.centres, SITE_WEIGHTS // len(ids))
-    site = make_map(places, centres, (options.fine, options.coarse), (1.0, COARSE), False, seed)
-    model = Structured(options, site, np.array(ids, dtype=float), np.array(positions))
+    places = np.concatenate([one.samples.p for one in all_labels]) / LENGTH
+    centres = min(CENTRES, SITE_WEIGHTS // len(ids))
+    site = make_map(places, centres, SITE_STD, (1.0, COARSE), False, seed)
+    model = Structured(site, np.array(ids, dtype=float), np.array(positions))
     if len(constellations(all_labels)) > 1:  # in a single one, place and direction are equivalent
         oriented = all(np.isfinite(one.anchors.orientations).all() for one in all_labels)
         for viewer in "TA" if oriented else "T":
@@ -399,6 +374,6 @@ def prepare(all_labels: Sequence[Labels], options: StructuredPriors, seed: int) 
                 [link_inputs(one.samples, side, viewer) for one in all_labels for side in "ab"]
             )
             model.links[viewer] = make_map(
-                inputs, options.link_centres, (options.link,), (LINK_LENGTH,), True, seed
+                inputs, LINK_CENTRES, (LINK_STD,), (LINK_LENGTH,), True, seed
             )
     return model
