@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compile the C of a correction, run it on this computer or an emulated Cortex-M4F, and measure it."""
 
+import ctypes
 from dataclasses import replace
 import math
 from pathlib import Path
@@ -16,7 +17,8 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.correction.features import FEATURES
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, Samples, SmoothTerm
 from uwb_tdoa_bias.effects.samples import Motion
-from uwb_tdoa_tools.exporting.vehicle import STATE
+from uwb_tdoa_tools.exporting.graph import ELEMENTWISE
+from uwb_tdoa_tools.exporting.vehicle import MEMBERS, STATE
 from uwb_tdoa_tools.training.network import WITHOUT
 
 HERE = Path(__file__).parent / "cortex_m"
@@ -152,6 +154,107 @@ def missing():
     """Executables that `cost_of` needs and that are not installed."""
     needed = {"gcc": GCC, "arm-none-eabi-gcc": ARM_GCC, "qemu-system-arm": QEMU}
     return [name for name, path in needed.items() if path is None]
+
+
+def _libm(name):
+    function = getattr(ctypes.CDLL("libm.so.6"), name)
+    function.restype = ctypes.c_float
+
+    def of_arrays(*arrays):
+        numbers = zip(*(one.tolist() for one in arrays))
+        made = [function(*map(ctypes.c_float, some)) for some in numbers]
+        return np.array(made, dtype=np.float32)
+
+    return of_arrays
+
+
+# IEEE 754 does not define these functions: the C library has its own.
+LIBM = {name: _libm(f"{name}f") for name in ("exp", "log", "sin", "cos", "atan2")}
+FUNCTIONS = {
+    **ELEMENTWISE,
+    **LIBM,
+    "max": lambda x, y: np.where((x >= y) | (x != x), x, y),
+    "min": lambda x, y: np.where((x <= y) | (x != x), x, y),
+}
+
+
+def by_numpy(code, some):
+    """(bias (n,), std (n,)) of cases by numpy in single precision, in the order of the C."""
+    columns = {}
+    for name, member in MEMBERS.items():
+        field, _, place = member.partition("[")
+        values = some["state"][field]
+        columns[name] = values[:, int(place[0])] if place else values
+    rows = {end: ANCHORS.index(some[end]) for end in "ab"}
+    bias, std = _outputs(code.level, columns, rows)
+    for program in code.steep.values():
+        (more,) = _outputs(program, columns, rows)
+        bias = bias + more
+    return bias, std
+
+
+def _outputs(program, columns, rows):
+    """The outputs of a Program, each (n,) float32.
+
+    columns : {name of an input: (n,)}; rows : {"a" and "b": rows (n,) of the anchors}
+    """
+    made = []
+    with np.errstate(all="ignore"):
+        for one in program.scalars:
+            inputs = [made[k] for k in one.inputs]
+            value = _value(one, inputs, columns, rows)
+            assert value.dtype == (bool if one.is_bool else np.float32), one.kind
+            made.append(value)
+    return [made[k] for k in program.outputs]
+
+
+def _value(one, inputs, columns, rows):
+    """The value (n,) of a Scalar."""
+    if one.kind == "input":
+        return columns[one.value]
+    if one.kind == "constant":
+        return np.full(len(rows["a"]), one.value)
+    if one.kind == "anchor":
+        end, numbers = one.value
+        return np.frombuffer(numbers, np.float32)[rows[end]]
+    if one.kind == "pair":
+        table = np.frombuffer(one.value, np.float32).reshape(len(ANCHORS), len(ANCHORS))
+        return table[rows["a"], rows["b"]]
+    if one.kind == "network":
+        network, output = one.value
+        return _network_outputs(network, np.stack(inputs, axis=1))[:, output]
+    if one.kind == "pieces":
+        return _piecewise(one.value, *inputs)
+    return FUNCTIONS[one.kind](*inputs)
+
+
+def _network_outputs(network, x):
+    """The outputs (n, k) of a Dense for inputs (n, i); each sum adds its terms one by one."""
+    for weights, biases, activation in network.layers:
+        total = np.tile(biases, (len(x), 1))
+        for column, row in zip(x.T, weights):
+            total = total + column[:, None] * row
+        x = np.where(total <= 0.0, np.float32(0.0), total) if activation else total
+    constants = np.tile(np.float32(network.constants), (len(x), 1))
+    return np.concatenate([x, constants], axis=1)
+
+
+def _piecewise(pieces, x):
+    """The values (n,) of Pieces at x (n,)."""
+    breaks, table = np.float32(pieces.breaks), np.float32(pieces.table)
+    if pieces.scale:
+        at = np.nan_to_num((x - breaks[0]) * pieces.scale)
+        piece = np.clip(at, 0, len(table) - 1).astype(int)
+    else:
+        piece = np.searchsorted(breaks[1:-1], x, side="right")
+    start = breaks[piece]
+    width = breaks[piece + 1] - start
+    inside = np.where(x > start, x - start, np.float32(0.0))
+    inside = np.where(inside > width, width, inside)
+    value, *lower = table[piece].T[::-1]
+    for coefficients in lower:
+        value = value * inside + coefficients
+    return np.where(x == x, value, x)
 
 
 def write(folder, code):

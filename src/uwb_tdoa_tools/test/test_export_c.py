@@ -1,11 +1,11 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The C of a correction: equal to Python, sound with any input, small on a Cortex-M4F."""
+"""The C of a correction: equal to numpy and Python, sound with any input, small on a Cortex-M4F."""
 
 import subprocess
 
 import c_programs as c
-from c_programs import ANCHORS, GCC, cases, chosen, on_board, on_host, write
+from c_programs import ANCHORS, GCC, by_numpy, cases, chosen, on_board, on_host, write
 import numpy as np
 import pytest
 from walking import blocks, section
@@ -22,12 +22,20 @@ SANITIZED = (*c.STRICT, "-O1", "-g", "-fsanitize=address,undefined", "-fno-sanit
 KINDS = tuple(c.effects())
 
 
-def agree(folder, effect_set, network=None):
-    """Check the C of a correction against Python, on this computer."""
-    some = cases(10_000)
-    write(folder, vehicle_code(ANCHORS, effect_set, network))
-    results = on_host(folder, some)
+def same_bits(results, code, some):
+    """Check bias and standard deviation against numpy in single precision, bit by bit."""
     np.testing.assert_array_equal(results["wrong"], 0)
+    for name, expected in zip(("bias", "std"), by_numpy(code, some)):
+        np.testing.assert_array_equal(results[name], expected)
+        np.testing.assert_array_equal(np.signbit(results[name]), np.signbit(expected))  # of 0
+
+
+def agree(folder, effect_set, network=None):
+    """Check the C of a correction against numpy and Python, on this computer."""
+    code, some = vehicle_code(ANCHORS, effect_set, network), cases(10_000)
+    write(folder, code)
+    results = on_host(folder, some)
+    same_bits(results, code, some)
     samples = c.samples_of(some)
     known = Corrector(ANCHORS, effect_set, network)
     expected = known.prediction(samples)
@@ -40,12 +48,12 @@ def agree(folder, effect_set, network=None):
 
 
 @pytest.mark.parametrize("name", [*KINDS, "all"])
-def test_every_effect_is_equal_to_python(tmp_path, name):
+def test_every_effect_is_equal_to_numpy_and_python(tmp_path, name):
     agree(tmp_path, chosen(*(KINDS if name == "all" else (name,))))
 
 
 @pytest.mark.parametrize("orientations", [True, False])
-def test_both_networks_are_equal_to_python(tmp_path, orientations):
+def test_both_networks_are_equal_to_numpy_and_python(tmp_path, orientations):
     held = chosen("anchor_delay", "tag_lever_arm")
     agree(tmp_path, held, c.network(tmp_path, orientations))
 
@@ -95,6 +103,24 @@ def test_no_input_is_a_fault(tmp_path, with_network):
         wrong = results["wrong" if name in ("bias", "std") else "wrong_jacobian"] != 0
         assert not results[name][wrong].any()
     assert (results["wrong"] == 0).any() and results["bias"].any()
+
+
+def calls_libm(name):
+    """Whether the C of an effect calls a function that differs between C libraries."""
+    code = vehicle_code(ANCHORS, chosen(name))
+    programs = [code.level, *code.steep.values()]
+    return any(one.kind in c.LIBM for program in programs for one in program.scalars)
+
+
+@needs_board
+def test_the_board_computes_the_same_bits(tmp_path):
+    """+, -, *, / and the square root are those of IEEE 754; so the effects without libm agree."""
+    names = [name for name in KINDS if not calls_libm(name)]
+    assert {"tag_lever_arm", "nlos", "spline over speed"} <= set(names)
+    code, some = vehicle_code(ANCHORS, chosen(*names)), cases(1000)
+    write(tmp_path, code)
+    results, _ = on_board(tmp_path, some, (*c.FIRMWARE, "-ffp-contract=off"))
+    same_bits(results, code, some)
 
 
 @needs_board

@@ -230,10 +230,14 @@ class VehicleCode:
     ----------
     files : {name: text} of uwb_bias.h and uwb_bias.c
     inputs : names of the inputs that are read
+    level : Program of (bias, standard deviation) of what the filter does not differentiate
+    steep : {states: Program of the bias of the effects that are differentiated by them}
     """
 
     files: dict[str, str]
     inputs: tuple[str, ...]
+    level: Program
+    steep: dict[tuple[int, ...], Program]
 
     @property
     def reads_rates(self) -> bool:
@@ -287,7 +291,7 @@ def vehicle_code(
         "slopes": _slopes(steep),
     }
     files = {"uwb_bias.h": HEADER.format(**made), "uwb_bias.c": SOURCE.format(**made)}
-    return VehicleCode(files, inputs)
+    return VehicleCode(files, inputs, level_program, steep)
 
 
 def _by_states(effects: EffectSet) -> dict[tuple[int, ...], EffectSet]:
