@@ -35,8 +35,8 @@ def flight_with(*effects, seed=100, seconds=40.0):
 
 @pytest.fixture(scope="module")
 def flights():
-    """Two that are late, with 38 s in the air together."""
-    return [flight_with(LATE, seed=seed, seconds=28.0) for seed in (100, 101)]
+    """Two that are late."""
+    return [flight_with(LATE, seed=seed) for seed in (100, 101)]
 
 
 @pytest.fixture(scope="module")
