@@ -90,8 +90,7 @@ def test_marks_tell_which_anchor_is_late_without_the_truth():
     flight = effect_of("anchor_delay", True, 4).inject(clean_flight(100, 40.0))
     reference = Marks(None, marks_of(flight, 6, np.random.default_rng(0)))
     wrong = with_wrong_truth(flight)
-    paths = [reference.prepare(each).truth for each in (replace(flight, truth=None), wrong)]
-    np.testing.assert_array_equal(paths[0].p, paths[1].p)
+    assert reference.prepare(wrong).truth is None
     found = diagnose([wrong], reference=reference)
     assert output.as_json(found)["rests_on"].startswith("places measured")
     assert {"anchor_position", "anchor_delay"} == {effect.name for effect in found.effects.effects}

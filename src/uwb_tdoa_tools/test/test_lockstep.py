@@ -100,7 +100,7 @@ def assert_equal_to_offline(flight, told, recorded):
 def test_ranges_are_used_as_off_line_and_heights_with_holes_do_not_delay_the_replay(tmp_path):
     """In a hole ekf_node waits for a height, and with it all TDOAs."""
     flight = simulate(
-        SimulationConfig(seed=3, duration=12.0, imu_rate=200.0, height_noise=0.01, range_noise=0.1)
+        SimulationConfig(seed=3, duration=16.0, imu_rate=200.0, height_noise=0.01, range_noise=0.1)
     )
     heard = (flight.height.t - flight.height.t[0]) % 2.0 > 0.6
     holed = {name: column[heard] for name, column in vars(flight.height).items()}
@@ -135,7 +135,7 @@ def test_a_measured_flight_beside_three_busy_processes(shared_data, tmp_path, lo
 @pytest.mark.slow
 def test_nodes_that_do_not_wait_long_enough_are_not_followed(tmp_path):
     write_bag(
-        simulate(SimulationConfig(seed=3, duration=12.0, imu_rate=200.0)), tmp_path / "flight.bag"
+        simulate(SimulationConfig(seed=3, duration=16.0, imu_rate=200.0)), tmp_path / "flight.bag"
     )
     nodes = {"bias_node": ("--ros-args", "-p", "hold:=0.08")}
     code, said, _, _ = replayed(tmp_path / "flight.bag", tmp_path, nodes=nodes)
@@ -177,7 +177,7 @@ def delayed(bag, out, count=10, delay=1_000_000_000):
 @pytest.mark.slow
 def test_late_messages_give_code_1(tmp_path):
     write_bag(
-        simulate(SimulationConfig(seed=3, duration=12.0, imu_rate=200.0)), tmp_path / "flight.bag"
+        simulate(SimulationConfig(seed=3, duration=16.0, imu_rate=200.0)), tmp_path / "flight.bag"
     )
     delayed(tmp_path / "flight.bag", tmp_path / "delayed.bag")
     code, said, told, _ = replayed(tmp_path / "delayed.bag", tmp_path, "--rate", 2)
