@@ -19,7 +19,7 @@ from uwb_tdoa_bias.effects.anchor import AnchorDelay
 pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 from studies.__main__ import main  # noqa: E402
-from studies.bench import core, nodes, peer, source, suite, usage  # noqa: E402
+from studies.bench import core, nodes, peer, recordings, source, suite, usage  # noqa: E402
 from studies.bench.figures import Figure  # noqa: E402
 from studies.bench.flights import TDOA_RATE, among, make_flight  # noqa: E402
 from uwb_tdoa_tools.flying.estimates import Peer  # noqa: E402
@@ -136,7 +136,8 @@ def test_bad_usage(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_a_quick_run_of_the_real_nodes(tmp_path, capsys):
+def test_a_quick_run_of_the_real_nodes(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(recordings, "SECONDS", 10.0)
     report = tmp_path / "bench.json"
     before = dict(os.environ)
     only = ["core", "offline", "nodes", "replay"]

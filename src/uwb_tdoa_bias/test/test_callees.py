@@ -61,18 +61,23 @@ print(sum(root.stats.cache_hits.values()) > 0)
 AS_USUAL = "import numba\nnumba.version_info = (9, 9)\n" + PROGRAM  # a version that was not tried
 
 
-@pytest.fixture
-def run(tmp_path):
-    """Run a program with a cache: (what it printed, whether it was cached)."""
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("callees")
+
+
+@pytest.fixture(scope="module")
+def run(folder):
+    """Run a program with a cache of its own: (what it printed, whether it was cached)."""
 
     def one(text, cache):
-        file = tmp_path / "program" / "program.py"
-        file.parent.mkdir(exist_ok=True)
-        if not file.exists() or file.read_text() != text:
-            file.write_text(text)  # older versions of numba go by the time of a file
+        file = folder / f"program of {cache}" / "program.py"
+        if not file.exists():
+            file.parent.mkdir()
+            file.write_text(text)
         done = subprocess.run(
             [sys.executable, str(file)],
-            env={"PATH": "/usr/bin:/bin", "NUMBA_CACHE_DIR": str(tmp_path / cache)}
+            env={"PATH": "/usr/bin:/bin", "NUMBA_CACHE_DIR": str(folder / cache)}
             | {"PYTHONPATH": os.pathsep.join([str(SOURCES), *filter(None, sys.path)])},
             capture_output=True,
             text=True,
@@ -84,15 +89,20 @@ def run(tmp_path):
     return one
 
 
-def test_callees_give_the_bits_that_numba_gives_as_usual_also_from_the_cache(run):
-    usual = run(AS_USUAL, "usual")
-    assert (usual[0], False) == run(PROGRAM, "cache")
-    assert (usual[0], True) == run(PROGRAM, "cache")
+@pytest.fixture(scope="module")
+def first(run):
+    """What PROGRAM gave with an empty cache."""
+    return run(PROGRAM, "cache")
 
 
-def test_only_what_python_calls_has_machine_code(run, tmp_path):
-    run(PROGRAM, "cache")
-    kept = {path.name.split("-")[0] for path in (tmp_path / "cache").rglob("*.nbi")}
+def test_callees_give_the_bits_that_numba_gives_as_usual_also_from_the_cache(run, first):
+    usual, _ = run(AS_USUAL, "usual")
+    assert (usual, False) == first
+    assert (usual, True) == run(PROGRAM, "cache")
+
+
+def test_only_what_python_calls_has_machine_code(first, folder):
+    kept = {path.name.split("-")[0] for path in (folder / "cache").rglob("*.nbi")}
     assert kept == {"program.root", "program.scaled"}
 
 
@@ -125,9 +135,9 @@ print(True)
 """
 
 
-def test_functions_of_other_packages_compile_as_usual_before_and_after_ours(run):
-    printed, _ = run(BEFORE + PROGRAM + AFTER, "cache")
-    assert printed[:-1] == run(PROGRAM, "cache of ours")[0]
+def test_functions_of_other_packages_compile_as_usual_before_and_after_ours(run, first):
+    printed, _ = run(BEFORE + PROGRAM + AFTER, "beside others")
+    assert printed[:-1] == first[0]
 
 
 def test_another_version_of_numba_compiles_as_usual(monkeypatch):

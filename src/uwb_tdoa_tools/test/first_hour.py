@@ -29,8 +29,9 @@ from uwb_tdoa_tools.scoring.evaluation import score_of
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 TAPE = 0.1  # m, standard deviation of each coordinate
-CLEAN = dict(trajectory="sines", imu_rate=200.0, truth_rate=50.0, bias=False)
-MINUTE = 60.0  # s
+CLEAN = dict(trajectory="sines", imu_rate=100.0, truth_rate=50.0, bias=False)
+# s of each flight: 30 s of them in the air are needed
+SIMULATED, MEASURED = 40.0, 45.0
 LATE, EPOCH = 0.4, 1.7e9  # s
 TURNED = Rotation.from_euler("z", 8.0, degrees=True).as_matrix()
 TRUTHS = {  # what may be wrong with a ground truth: function of a Truth
@@ -79,15 +80,17 @@ def off(positions, seed, exact=()):
     return positions + noise
 
 
-def simulated(tape, exact=(), duration=40.0):
-    """The Hall of a tape: anchors that stand elsewhere, and are late. duration : s of each flight."""
+def simulated(tape, exact=()):
+    """The Hall of a tape: anchors that stand elsewhere, and are late."""
     true = tape.at(off(tape.positions, 1, exact))
     rng = np.random.default_rng(2)
     late = AnchorDelay(
         {str(i): float(delay) for i, delay in zip(true.ids, 0.05 * rng.standard_normal(len(true)))}
     )
     flown = [
-        late.inject(simulate(SimulationConfig(seed=seed, anchors=true, duration=duration, **CLEAN)))
+        late.inject(
+            simulate(SimulationConfig(seed=seed, anchors=true, duration=SIMULATED, **CLEAN))
+        )
         for seed in (11, 12, 13)
     ]
     return Hall(flown[:2], flown[2], tape)
@@ -95,14 +98,14 @@ def simulated(tape, exact=(), duration=40.0):
 
 def measured(folder):
     """The Hall of const1 in a folder of measured flights; of the flights that are not judged the
-    first MINUTE.
+    first seconds.
     """
     flown = [
         Reading(folder / "surveys").one(folder / "util" / f"const1-trial{k}.csv.gz")
         for k in ("1-tdoa2", "2-tdoa2", "3-tdoa2")
     ]
     anchors = flown[0].anchors
-    short = [between(flight, flight.tdoa.t[0], flight.tdoa.t[0] + MINUTE) for flight in flown[:2]]
+    short = [between(flight, flight.tdoa.t[0], flight.tdoa.t[0] + MEASURED) for flight in flown[:2]]
     return Hall(short, flown[2], anchors.at(off(anchors.positions, 100, (0, 6))))
 
 

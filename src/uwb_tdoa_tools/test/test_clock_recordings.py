@@ -15,14 +15,17 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import Writer
 
+from uwb_tdoa_bias.common.flight import Imu
 from uwb_tdoa_ekf.offline import run_offline
-from uwb_tdoa_tools.bags.bag import bag_messages, read_bag, typestore, write_bag
+from uwb_tdoa_tools.bags.bag import bag_messages, read_bag, typestore
 from uwb_tdoa_tools.bags.files import PLUGINS
 from uwb_tdoa_tools.checking.check import check
 from uwb_tdoa_tools.checking.recording import read_recording
 from uwb_tdoa_tools.readers.inputs import Reading
 
-FLIGHT = clean_flight(100, 24.0)
+WHOLE = clean_flight(100, 24.0)
+SLOW = Imu(*(column[::10] for column in vars(WHOLE.imu).values()))  # 100 Hz
+FLIGHT = replace(WHOLE, imu=SLOW)
 MIDDLE = 12.0  # s
 YEARS = 55 * 365.25 * 86400.0
 WRAP = 2**32 * 1e-6
@@ -39,7 +42,6 @@ def bag(path, clock, storage="mcap", arrivals=True, imu=lambda t: t):
     """Write FLIGHT as it is recorded by a clock(t): each message in its turn. arrivals : log times
     are of a sound clock, else the stamps.
     """
-    write_bag(FLIGHT, path.with_name(path.name + "_anchors"))  # for its anchors
     store, rows = typestore(), []
     tdoa, samples = FLIGHT.tdoa, FLIGHT.imu
     for topic, kind, true, messages in (

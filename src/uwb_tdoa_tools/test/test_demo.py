@@ -109,6 +109,14 @@ def test_a_correction_that_does_harm_is_called_that(errors, said):
 LATE = 17  # a hall in which one anchor is late
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _short_flights():
+    """Flights of the hall are shorter than those of the demo."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loop, "HALL", replace(loop.HALL, duration=26.0))
+        yield
+
+
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
     """The bags of a hall."""

@@ -7,6 +7,7 @@ import pytest
 import undeclared
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, LabelEffect, SmoothTerm
+from uwb_tdoa_tools.calibrating import between
 from uwb_tdoa_tools.diagnosis import attribution, refinement
 from uwb_tdoa_tools.diagnosis.attribution import attribute, residuals_of
 from uwb_tdoa_tools.diagnosis.channels import residuals
@@ -151,9 +152,10 @@ def test_measured_flight(shared_data):
     from uwb_tdoa_tools.readers import read_flight
 
     survey = shared_data / "surveys" / "anchor_const1.csv"
-    one, two = (
+    whole = (
         read_flight(shared_data / "util" / f"const1-trial{k}-tdoa2.csv.gz", survey) for k in (1, 2)
     )
+    one, two = (between(each, each.tdoa.t[0], each.tdoa.t[0] + 40.0) for each in whole)
     effects = EffectSet(attribute([one], TRUTH).effects)
     before, after = (
         residuals(two, TRUTH, model)["tdoa"] for model in (EffectSet(), effects)

@@ -225,6 +225,13 @@ def test_what_errors_are_against_is_said_where_only_heights_are_known(result):
     assert not any("Errors are against" in sentence for sentence in verdict(result).more)
 
 
+def test_without_ground_truth_anchors_are_found_and_it_is_said_what_is_not(without_truth):
+    added = {finding.effect.name for finding in without_truth.findings if finding.added}
+    assert added == {"anchor_position", "anchor_delay"}
+    hidden = {item.effect for item in without_truth.unobservable}
+    assert {"truth_frame", "accel_bias", "truth_time_offset"} <= hidden
+
+
 def test_without_ground_truth_no_error_is_claimed(without_truth):
     found = verdict(without_truth)
     text = " ".join(found.sentences)

@@ -34,14 +34,20 @@ def flight_with(*effects, seed=100, seconds=40.0):
 
 
 @pytest.fixture(scope="module")
-def late():
-    """Of two flights."""
-    return self_calibrate([flight_with(LATE), flight_with(LATE, seed=101)])
+def flights():
+    """Two that are late."""
+    return [flight_with(LATE, seed=seed) for seed in (100, 101)]
 
 
 @pytest.fixture(scope="module")
-def diagnosis():
-    return diagnose([flight_with(LATE), flight_with(LATE, seed=101)], reference=Nothing())
+def late(flights):
+    """Of two flights."""
+    return self_calibrate(flights)
+
+
+@pytest.fixture(scope="module")
+def diagnosis(flights):
+    return diagnose(flights, reference=Nothing())
 
 
 def test_delays_of_several_anchors_are_told_well_enough_from_the_innovations_alone(late):
@@ -95,7 +101,7 @@ def test_the_noise_that_the_filter_is_told_asks_for_no_functions_of_the_place():
 
 
 def test_a_delay_of_one_flight_is_no_delay_of_the_other():
-    found = self_calibrate([flight_with(LATE), flight_with(seed=101)])
+    found = self_calibrate([flight_with(LATE, seconds=28.0), flight_with(seed=101, seconds=28.0)])
     one, other = (share.share for share in found.shares["anchor_delay"])
     assert one - other > 1.0
 

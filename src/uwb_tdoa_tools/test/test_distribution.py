@@ -6,6 +6,7 @@ The environments lie in build/distribution, always at the same paths: what numba
 wheel serves the next run, too.
 """
 
+from functools import cache
 import json
 import os
 from pathlib import Path
@@ -75,16 +76,18 @@ def wheel(tmp_path_factory):
     return path
 
 
+@cache
 def installed(wheel, number):
     """The folder of the programs of a new environment with the wheel, and what it needs by our pins."""
     place = ROOT / "build" / "distribution" / number
     shutil.rmtree(place, ignore_errors=True)
-    run(python_of(number), "-m", "venv", place)
+    run(python_of(number), "-m", "venv", "--without-pip", place)
     pins = wheel.with_name("pins.txt")
     lines = (ROOT / "requirements.txt").read_text().splitlines()
     pins.write_text("\n".join(line for line in lines if re.match(r"[\w.-]+==", line)))
-    pip = (place / "bin" / "python", "-m", "pip", "install", "--only-binary", ":all:", "-c", pins)
-    run(*pip, wheel)
+    pip = (sys.executable, "-m", "pip", "--python", place / "bin" / "python", "install")
+    # modules that no command imports need no bytecode
+    run(*pip, "--no-compile", "--only-binary", ":all:", "-c", pins, wheel)
     return place / "bin"
 
 
@@ -115,6 +118,23 @@ def test_the_wheel_holds_the_packages_and_our_messages(wheel):
         assert {f"{package}/{name}" for name in files} <= set(names)
 
 
+# A line for each command that ends well with its help.
+HELP_OF_ALL = """
+from contextlib import redirect_stdout
+import io
+from uwb_tdoa_tools import main
+for name in main.NAMES:
+    said = io.StringIO()
+    with redirect_stdout(said):
+        try:
+            main.main([name, "--help"])
+        except SystemExit as ended:
+            assert not ended.code, name
+    assert said.getvalue().startswith(f"usage: uwb-tdoa {name} "), said.getvalue()
+    print(name)
+"""
+
+
 @pytest.mark.parametrize("number", ["3.10", "3.11", "3.12"])
 def test_every_command_starts_in_an_empty_environment(wheel, recording, tmp_path, number):
     programs = installed(wheel, number)
@@ -122,8 +142,9 @@ def test_every_command_starts_in_an_empty_environment(wheel, recording, tmp_path
     assert COMMAND in ours and not ours & set(main.NAMES)  # `convert` is ImageMagick's
     tool = programs / COMMAND
     assert run(tool, "--version") == f"uwb-tdoa of uwb_tdoa {version()}\n"
-    for name in main.NAMES:
-        assert run(tool, name, "--help").startswith(f"usage: uwb-tdoa {name} ")
+    assert run(tool, "check", "--help").startswith("usage: uwb-tdoa check ")
+    helped = run(programs / "python", "-I", "-c", HELP_OF_ALL)
+    assert helped.split() == list(main.NAMES)
     assert "complete " in run(tool, "--completion")
     code = "import uwb_tdoa as uwb; print(len(uwb.read('flight.bag').tdoa) > 1000, uwb.__version__)"
     told = run(programs / "python", "-I", "-c", code, folder=recording)

@@ -99,7 +99,9 @@ def assert_equal_to_offline(flight, told, recorded):
 @pytest.mark.slow
 def test_ranges_are_used_as_off_line_and_heights_with_holes_do_not_delay_the_replay(tmp_path):
     """In a hole ekf_node waits for a height, and with it all TDOAs."""
-    flight = simulate(SimulationConfig(seed=3, duration=16.0, height_noise=0.01, range_noise=0.1))
+    flight = simulate(
+        SimulationConfig(seed=3, duration=16.0, imu_rate=200.0, height_noise=0.01, range_noise=0.1)
+    )
     heard = (flight.height.t - flight.height.t[0]) % 2.0 > 0.6
     holed = {name: column[heard] for name, column in vars(flight.height).items()}
     write_bag(replace(flight, height=replace(flight.height, **holed)), tmp_path / "flight.bag")
@@ -122,7 +124,7 @@ def test_ranges_are_used_as_off_line_and_heights_with_holes_do_not_delay_the_rep
 def test_a_measured_flight_beside_three_busy_processes(shared_data, tmp_path, load):
     log, survey = shared_data / "flights/0426/0426-traj3", shared_data / "surveys/anchor_0426.txt"
     flight = read_flight(log, survey)
-    write_bag(between(flight, -np.inf, flight.imu.t[0] + 24.0), tmp_path / "flight.bag")
+    write_bag(between(flight, -np.inf, flight.imu.t[0] + 16.0), tmp_path / "flight.bag")
     code, said, told, recorded = replayed(
         tmp_path / "flight.bag", tmp_path, "--rate", 4, begin=lambda: load(3)
     )
@@ -132,7 +134,9 @@ def test_a_measured_flight_beside_three_busy_processes(shared_data, tmp_path, lo
 
 @pytest.mark.slow
 def test_nodes_that_do_not_wait_long_enough_are_not_followed(tmp_path):
-    write_bag(simulate(SimulationConfig(seed=3, duration=16.0)), tmp_path / "flight.bag")
+    write_bag(
+        simulate(SimulationConfig(seed=3, duration=16.0, imu_rate=200.0)), tmp_path / "flight.bag"
+    )
     nodes = {"bias_node": ("--ros-args", "-p", "hold:=0.08")}
     code, said, _, _ = replayed(tmp_path / "flight.bag", tmp_path, nodes=nodes)
     assert (
@@ -172,7 +176,9 @@ def delayed(bag, out, count=10, delay=1_000_000_000):
 
 @pytest.mark.slow
 def test_late_messages_give_code_1(tmp_path):
-    write_bag(simulate(SimulationConfig(seed=3, duration=16.0)), tmp_path / "flight.bag")
+    write_bag(
+        simulate(SimulationConfig(seed=3, duration=16.0, imu_rate=200.0)), tmp_path / "flight.bag"
+    )
     delayed(tmp_path / "flight.bag", tmp_path / "delayed.bag")
     code, said, told, _ = replayed(tmp_path / "delayed.bag", tmp_path, "--rate", 2)
     assert told["ekf_node"]["late"] == "10"

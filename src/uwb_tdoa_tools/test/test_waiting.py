@@ -25,7 +25,8 @@ from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.rooms import corners
 
 # s; the last: of computing, after which enough is known of what does not end before
-FIRST, EVERY, LONG_ENOUGH = (2.0, 5.0, 8.0)
+FIRST, EVERY = 2.0, 5.0
+LONG_ENOUGH = FIRST + EVERY
 PATIENCE = 120.0  # s for a command that is interrupted to end
 # of the time that a command has waited for a core, from which on others compute on the same ones
 CROWD = 0.05
