@@ -242,7 +242,7 @@ def followed(path, place=(0.3, -0.2)):
     return reference, t, reference.at(t)
 
 
-@pytest.mark.parametrize("path", [Circles(), Circles(radius=0.0)])
+@pytest.mark.parametrize("path", [Circles(), Circles(swing=0.4), Circles(radius=0.0)])
 def test_it_begins_and_ends_at_rest_in_one_place_and_then_sinks(path):
     reference, t, wanted = followed(path)
     for k, height in ((0, GROUND), (-1, GROUND + 0.4)):

@@ -37,6 +37,8 @@ class Circles:
     turns : int
     turn_time : float
         Duration of a turn, s.
+    swing : float
+        Amplitude of the height in each turn, m.
     """
 
     height: float = 1.2
@@ -45,6 +47,7 @@ class Circles:
     fall: float = 4.0
     turns: int = 2
     turn_time: float = 8.0
+    swing: float = 0.0
 
     @property
     def duration(self) -> float:
@@ -69,7 +72,9 @@ class Circles:
         p = np.empty((len(knots), 3))
         p[:, 0] = place[0] + self.radius * (np.cos(angle) - 1.0)
         p[:, 1] = place[1] + self.radius * np.sin(angle)
-        p[:, 2] = ground + self.height * up - (self.height - SETTLE) * down
+        p[:, 2] = (
+            ground + self.height * up - (self.height - SETTLE) * down + self.swing * np.sin(angle)
+        )
         return ReferenceTrajectory(p)
 
 
