@@ -11,17 +11,22 @@ from uwb_tdoa_tools.diagnosis import diagnose
 
 from . import blind, measured
 
+_T2, _T3 = "flights/0425/TDOA2/0425-traj{}", "flights/0425/TDOA3/0425-traj{}"
 _UTIL = "util/const{}-trial{}.csv.gz"
 # {installation: paths of its flights}
 DAYS = {
-    "0425": [path for side in measured.SPLITS["0425 a"] for path in side],
-    "0426": [path for side in measured.SPLITS["0426 a"] for path in side],
+    "0425": [
+        *(_T2.format(k) for k in (1, 2, 3, 6, 7, 10)),
+        *(_T3.format(k) for k in (13, 14, 17, 21)),
+    ],
+    "0426": [f"flights/0426/0426-traj{k}" for k in (1, 2, 3, 5, 7, 9, 11, 13, 15)],
+    "0422": [f"flights/0422/0422-log0{k}" for k in (0, 2)],
     "const1": [_UTIL.format(1, name) for name in ("1-tdoa2", "1-tdoa3", "2-tdoa2", "3-tdoa2")],
     "const3": [_UTIL.format(3, f"{trial}-tdoa2") for trial in (1, 2, 3, 4)],
     "const4 trial 1": [_UTIL.format(4, f"1-tdoa2-traj{k}") for k in (1, 2, 3)],
     "const4 trial 3": [_UTIL.format(4, f"3-tdoa2-traj{k}") for k in (1, 2, 3)],
 }
-SHARES = (0.3, 0.3, 0.1, 0.14, 0.08, 0.08)  # of the draws, by day
+SHARES = (0.3, 0.3, 0.02, 0.1, 0.12, 0.08, 0.08)  # of the draws, by day
 FITTED, JUDGED = (5, 4)  # flights of a split at most
 WORSE = 1.05  # error after over before, above which a flight counts as worse
 
