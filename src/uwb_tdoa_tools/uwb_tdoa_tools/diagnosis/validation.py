@@ -360,7 +360,8 @@ class _Trials:
         """Return the Displacements by each of some candidates of the model of the last `start`."""
         models = [self._cases([c for c in candidates if c is not one], ()) for one in each]
         tried = self._tried(_scored, list(chain.from_iterable(models)))
-        errors, changes = [], {one: [] for one in each}
+        errors = []
+        changes: dict[Candidate, list[np.ndarray]] = {one: [] for one in each}
         for k, (_, now) in enumerate(self._now):
             without = tried[k :: len(self._now)]
             t = reduce(np.intersect1d, [judged.t for judged in without], now.t)

@@ -59,9 +59,9 @@ def embedded(figure: Figure, alt: str, caption: str = "") -> Picture:
 
     alt, caption : as of Picture
     """
-    buffer = io.BytesIO()
+    file = io.BytesIO()
     with plt.rc_context(_STYLE):
-        figure.savefig(buffer, format="svg", dpi=SHARP, metadata={"Date": None})
+        figure.savefig(file, format="svg", dpi=SHARP, metadata={"Date": None})
     plt.close(figure)
-    image = base64.b64encode(buffer.getvalue()).decode()
+    image = base64.b64encode(file.getvalue()).decode()
     return Picture(alt, f"data:image/svg+xml;base64,{image}", caption)
