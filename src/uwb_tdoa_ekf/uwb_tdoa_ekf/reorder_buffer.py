@@ -535,11 +535,13 @@ class _Stream:
     def append(self, rows: np.ndarray, after: float, limit: float) -> bool:
         """Append rows if they are in order and plausible; return whether they were appended.
 
+        If not, nothing is stored: add the rows one by one. `_append` repeats the rules of the StampGate.
+
         Parameters
         ----------
         rows : (k,) array
-            At least one row. Stamps must rise, follow the newest stamp of the stream, and pass the
-            StampGate.
+            At least one row. Stamps must rise, follow the newest stamp of the stream, and be
+            plausible.
         after, limit : float
             Smallest and largest stamp that is allowed, in s.
         """

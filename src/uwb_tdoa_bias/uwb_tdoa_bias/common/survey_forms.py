@@ -264,10 +264,13 @@ def _without_header(lines: Lines) -> list[Entry]:
 
 
 def _row(number: int, cells: list[str], columns: Columns, count: int) -> Entry:
+    """Return the Entry of line `number`; count : cells of the header, at least 4.
+
+    Anchors checks the quaternion.
+    """
     assert columns.name is not None
-    if len(cells) < max(*columns.axes, columns.name, *columns.turn) + 1 or len(cells) > max(
-        count, 4
-    ):
+    fewest = max(*columns.axes, columns.name, *columns.turn) + 1
+    if not fewest <= len(cells) <= max(count, 4):
         hint = "; decimal commas need ';' between the cells" if len(cells) == 2 * count - 1 else ""
         raise InputError(
             f"line {number}: {','.join(cells)[:60]!r} has {len(cells)} cells, the header "

@@ -58,13 +58,14 @@ def observe(
     parameters : PARAMETERS
         Tuning of the filter.
     sensor : SENSOR_ROW
-        Measurement.
+        Measurement; its first value is the range, m, infinite without a target.
     residual : RESIDUAL
         Filled by this function.
     records : (n,) RECORD
         History for the smoother; empty for no recording.
     """
     height = ekf.height
+    # before `record` sets `heard`
     share = min(max(sensor.t - height.heard, 0.0) / (2.0 * CORRELATION_TIME), 1.0)
     record(ekf, sensor)
     residual.weight, residual.verdict = 0.0, REJECTED
@@ -82,6 +83,7 @@ def observe(
     z = _plausible_z(ekf, parameters, up)
     if math.isnan(z):
         return
+    # A range that stays the same is of a stuck sensor, except at rest. Without an IMU, rest is unknown.
     if (
         not ekf.quiet and sensor.t - height.changed > STUCK_TIME
     ) or sensor.t < height.ignored_until:

@@ -248,7 +248,9 @@ def coast(hypothesis: Record, dt: float, accel_psd: float, tilt_psd: float, yaw_
             P[i, j] += dt * P[i, 3 + j]
         for j in range(i, ERROR_STATES):
             P[j, i] = P[i, j]
-    for i in range(3):  # the part of the noise in the position, dt^3 / 3, is left out
+    # Noise of velocity and attitude alone: its parts in the position (dt^2 / 2, dt^3 / 3) and the
+    # random walks of the biases are left out.
+    for i in range(3):
         P[3 + i, 3 + i] += dt * accel_psd
         P[6 + i, 6 + i] += dt * (yaw_psd if i == 2 else tilt_psd)
 

@@ -165,7 +165,10 @@ class SurveyScale:
 
 
 def _of_scale(name: str, factor: float, evidence: str) -> Finding:
-    """Return the Finding on a survey that is too large by a factor, the unit `name` or ""."""
+    """Return the Finding on a survey that is too large by a factor, the unit `name` or "".
+
+    With a factor near NANOSECONDS, the TDOAs are in another unit, not the survey.
+    """
     if abs(math.log(factor / NANOSECONDS)) < math.log(RATIO):
         return Finding(
             "tdoa_unit",

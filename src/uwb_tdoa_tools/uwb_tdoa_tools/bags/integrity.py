@@ -41,7 +41,8 @@ def check(path: str | Path) -> None:
     """Check the files of a bag.
 
     The check covers the checksums in MCAP files and in metadata.yaml (`write_checksums`). It also
-    covers the structure of SQLite files, and the entries of metadata.yaml.
+    covers the structure of SQLite files, and the entries of metadata.yaml. Files that are compressed as
+    a whole must be unpacked before (`completion.completed`).
 
     Parameters
     ----------

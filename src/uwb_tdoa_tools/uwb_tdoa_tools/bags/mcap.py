@@ -109,6 +109,7 @@ def check(path: str | Path) -> None:
                 footer = record
         if footer is None or footer.size != 20:
             raise Damaged("it has no footer")
+        # The footer holds the start of the summary, 0 without one, and at byte 16 the checksum.
         (start,) = struct.unpack("<Q", _read(file, footer.content, 8))
         _check_sum(file, footer, (start or footer.start,), footer.content + 16, 16)
 

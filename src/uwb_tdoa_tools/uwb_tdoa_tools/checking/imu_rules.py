@@ -43,6 +43,7 @@ FEWEST = 10  # samples within FAR that a judgement needs
 def clipped_axes(flight: Flight) -> Iterator[Finding]:
     """Yield the Finding on the first axis with many samples at its largest or smallest value, if any."""
     assert flight.imu is not None
+    # AXES has the axes of the gyroscope, then of the accelerometer, as these columns.
     for name, column in zip(AXES, np.column_stack([flight.imu.gyro, flight.imu.accel]).T):
         values, counts = np.unique(column, return_counts=True)
         unit = "rad/s" if name.startswith("gyro") else "m/s^2"

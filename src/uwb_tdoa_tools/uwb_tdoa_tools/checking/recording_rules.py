@@ -385,7 +385,7 @@ def _stronger(publisher: End, end: End) -> str:
 def several_publishers(recording: Recording) -> Iterator[Finding]:
     """Yield live topics with several publishers. Many nodes may publish /tf and /tf_static."""
     for topic, publishers, _ in _by_topic(recording):
-        if len(publishers) > 1 and not topic.startswith("/tf"):
+        if len(publishers) > 1 and topic.rpartition("/")[2] not in ("tf", "tf_static"):
             names = ", ".join(sorted(end.node for end in publishers))
             yield Finding(
                 "publishers_several",

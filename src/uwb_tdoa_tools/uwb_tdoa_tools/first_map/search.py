@@ -260,7 +260,7 @@ def _placed(
 
 
 def _reflections(seen: Observations, fit: Fit) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return a fit with each anchor, and all unknown ones, reflected at planes.
+    """Return [(path, unknowns)], starting points with each anchor, and all unknown ones, reflected at planes.
 
     The planes are those of the path, or of the other anchors. A path in a plane, or on a line, gives an
     anchor a second place on the other side.
@@ -268,8 +268,10 @@ def _reflections(seen: Observations, fit: Fit) -> list[tuple[np.ndarray, np.ndar
     count, anchors = len(seen.ids), fit.anchors
     known = np.bincount(seen.coordinates[:, 0].astype(int), minlength=count) >= 3
     groups = [np.array([row]) for row in range(count) if not known[row]]
+    if len(groups) > 1:
+        groups.append(np.flatnonzero(~known))
     out = []
-    for rows in [*groups, np.flatnonzero(~known)]:
+    for rows in groups:
         points = fit.path if len(fit.path) else np.delete(anchors, rows, axis=0)
         if len(points) < 3:
             continue

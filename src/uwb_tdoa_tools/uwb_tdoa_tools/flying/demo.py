@@ -167,19 +167,19 @@ def fly(
     live = through_nodes(flight, bag, folder, rate, files, say)
     raw = run_offline(flight)
     estimates: dict[str, Estimate] = {"nodes": live.odometry, "without ROS": raw.odometry}
-    same = raw
+    offline = raw
     if correction is not None:
-        same = run_offline(flight, corrector=correction)
+        offline = run_offline(flight, corrector=correction)
         estimates = {
             "raw": raw.odometry,
             "corrected": live.odometry,
-            "corrected, without ROS": same.odometry,
+            "corrected, without ROS": offline.odometry,
         }
     scores = [Score(name, one, flight.truth) for name, one in estimates.items()]
     if rerun is not None:
-        words = [change_of_scores(scores)]
+        words = [change_of_scores(scores)]  # of the first two scores
         before = None if correction is None else raw.odometry
-        write_rerun(rerun, flight, live.odometry, same.residuals, words, flight.truth, before)
+        write_rerun(rerun, flight, live.odometry, offline.residuals, words, flight.truth, before)
     return live, scores
 
 

@@ -58,7 +58,10 @@ NEAR = 0.1  # of the size of a map: anchors so close to it are drawn too
 def plot_precision(
     anchors: Anchors, chart: Chart, path: str | Path, walls: Walls | None = None
 ) -> None:
-    """Draw the bound of one round, with 99 % ellipses."""
+    """Draw the bound of one round, with 99 % ellipses, as a PNG.
+
+    The colours span the errors of the flyable places, in cm.
+    """
     layers = _layers(chart.grid)
     figure, axes = _panels(chart.grid, len(layers))
     flown = (

@@ -57,6 +57,9 @@ def make_flight(
 ) -> Flight:
     """Build a Flight from the streams of a recording: SI units, ordered stamps, no empty streams.
 
+    Rows are in the order of the file. Inertial samples are in the body frame (x forward, y left, z up),
+    quaternions turn the body to the world.
+
     Parameters
     ----------
     streams : {stream: {column: (n,) array}}; "t" in s, other columns in the units of the file.
@@ -64,7 +67,7 @@ def make_flight(
         x, y, z (deg/s). "acc": x, y, z (g). "pose": x, y, z (m), and qx, qy, qz, qw (optional). "tof": tof (mm).
         "baro": baro (m above the sea in the standard atmosphere). "flow": x, y (pixel counts),
         which become a velocity if "tof" and IMU exist.
-    extra : further streams for `Flight.extra`.
+    extra : further streams for `Flight.extra`, not checked.
     meta : dict with "source". Added are "protocol", "clock" ([Jump] and {stream: outliers}, see
         `clock.straightened`), "reordered" ({stream: number of falling stamps}),
         "imu_accel_interpolated", "losses" ([(cause, evidence, remedy)] of unused data) and

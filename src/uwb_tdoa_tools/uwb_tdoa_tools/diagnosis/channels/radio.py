@@ -172,12 +172,13 @@ class Cells:
         """
         if rows is None:
             return np.stack([self.mean(column) for column in values.T], axis=1)
-        place = np.full(self.chosen.max(initial=-1) + 1, -1)
-        place[rows[rows < len(place)]] = np.flatnonzero(rows < len(place))
-        inside = np.flatnonzero(place[self.chosen] >= 0)
+        # for each TDOA its row of `values`, or -1
+        row_of = np.full(self.chosen.max(initial=-1) + 1, -1)
+        row_of[rows[rows < len(row_of)]] = np.flatnonzero(rows < len(row_of))
+        inside = np.flatnonzero(row_of[self.chosen] >= 0)
         group = self.group[inside]
         members = csr_array(
-            (1.0 / self.size[group], (group, place[self.chosen[inside]])),
+            (1.0 / self.size[group], (group, row_of[self.chosen[inside]])),
             shape=(len(self.size), len(rows)),
         )
         return (members @ csc_array(values)).tocsc()

@@ -86,6 +86,11 @@ def alternatives(
 def _shares(
     selection: Selection, candidate: Candidate, candidates: Sequence[Candidate]
 ) -> dict[str, float]:
+    """Return {effect: share}, the shares of a Candidate's contribution that other effects explain.
+
+    The contribution is whitened, and what the other chosen Candidates and their priors explain is
+    taken out. Shares below ALIKE are left out.
+    """
     table, model = selection.table, selection.fit
     root = np.sqrt(model.information(table))
     others = columns_of([one for one in selection.chosen if one is not candidate])
@@ -94,6 +99,7 @@ def _shares(
         rest = np.vstack(
             [dense(weighted(table.matrix(others), root)), np.diag(1.0 / prior_sizes(others))]
         )
+        # Without the rows of the priors, its columns are not orthonormal.
         basis = np.linalg.qr(rest)[0][: len(root)]
 
     def free(x: np.ndarray) -> np.ndarray:
@@ -135,10 +141,10 @@ def unobservable(selection: Selection, candidates: Sequence[Candidate]) -> list[
     eigenvalue below 1 means that the prior determines the combination more than the data do.
     """
     table, out = selection.table, []
-    root, whole = selection.fit.information(table), _whole(candidates)
+    weights, whole = selection.fit.information(table), _whole(candidates)
     for name, columns in whole.items():
         x, sizes = table.matrix(columns), prior_sizes(columns)
-        information = product(weighted(x, root), x) * np.outer(sizes, sizes)
+        information = product(weighted(x, weights), x) * np.outer(sizes, sizes)
         values, vectors = np.linalg.eigh(information)
         for value, vector in zip(values, vectors.T):
             if value < 1.0:

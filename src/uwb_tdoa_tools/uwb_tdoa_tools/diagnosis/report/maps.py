@@ -219,6 +219,10 @@ def _estimated(flight: ChannelResiduals) -> np.ndarray:
 
 
 def _alt(diagnosis: Diagnosis, title: str, runs: Sequence[Flown]) -> str:
+    """Return the alternative text of a map.
+
+    title : "", "before" or "after"; runs : empty if the errors are unknown
+    """
     shifts, regions = shifts_and_regions(diagnosis)
     out = [f"Map of {len(diagnosis.flights[0].anchors)} anchors from above and from the side"]
     if runs:
@@ -228,7 +232,7 @@ def _alt(diagnosis: Diagnosis, title: str, runs: Sequence[Flown]) -> str:
             f"at most {worst:.0f} cm"
         )
     if shifts:
-        out.append(f"shifts of {len(shifts)} anchors")
+        out.append(f"shifts of {len(shifts)} anchor{'s' if len(shifts) > 1 else ''}")
     if regions:
         plural = "s" if len(regions) > 1 else ""
         out.append(f"{len(regions)} region{plural} where an anchor is disturbed")
