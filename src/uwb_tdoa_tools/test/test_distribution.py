@@ -175,7 +175,7 @@ def figures(folder):
 def test_figures_are_those_with_ros_bit_by_bit(wheel, recording, tmp_path):
     tool, made = installed(wheel, HERE) / COMMAND, {}
     for name, (words, code) in WORK.items():
-        results = []
+        results, errors = [], []
         for side in ("with", "without"):
             out = tmp_path / side
             out.mkdir(exist_ok=True)
@@ -198,7 +198,8 @@ def test_figures_are_those_with_ros_bit_by_bit(wheel, recording, tmp_path):
             # lines are broken by the length of the folder
             printed = " ".join(done.stdout.replace(str(out), "OUT").split())
             results.append((done.returncode, printed))
-        assert results[0] == results[1], name
+            errors.append(done.stderr)
+        assert results[0] == results[1], (name, errors)
         made[name] = results
     with_ros, without = (figures(tmp_path / side) for side in ("with", "without"))
     assert with_ros.keys() == without.keys()
