@@ -144,10 +144,11 @@ class Process:
         """Signal the group; returns the exit code, and for how many seconds it neither ran nor
         waited for a core before it ended.
         """
-        started, before, slept = time.monotonic(), worked(self.process.pid), 0.0
+        threads = {}
+        started, before, slept = time.monotonic(), worked(self.process.pid, threads), 0.0
         os.killpg(self.process.pid, number)
         while self.process.poll() is None:
-            slept = time.monotonic() - started - (worked(self.process.pid) - before)
+            slept = time.monotonic() - started - (worked(self.process.pid, threads) - before)
             assert time.monotonic() < started + PATIENCE, f"it does not end: {''.join(self.lines)}"
             time.sleep(0.02)
         self.reader.join(timeout=PATIENCE)
@@ -500,12 +501,15 @@ def _collect(stream, lines):
         lines.append(line)
 
 
-def worked(pid):
-    """Seconds that the threads of a process have run, or waited for a core to run on."""
-    total = 0
+def worked(pid, threads=None):
+    """Seconds that the threads of a process have run, or waited for a core to run on.
+
+    threads : {path: nanoseconds}, which is filled; it keeps what threads did that have ended since
+    """
+    threads = {} if threads is None else threads
     for file in Path(f"/proc/{pid}/task").glob("*/schedstat"):
         try:
-            total += sum(map(int, file.read_text().split()[:2]))
+            threads[file] = sum(map(int, file.read_text().split()[:2]))
         except (OSError, ValueError):  # that thread has ended
             continue
-    return 1e-9 * total
+    return 1e-9 * sum(threads.values())
