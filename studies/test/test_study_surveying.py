@@ -50,10 +50,13 @@ def test_an_odometry_is_the_path_in_another_frame_that_drifts(flight):
 
 
 @pytest.mark.slow
-def test_a_draw_makes_a_shaken_survey_better(flight):
-    row = draw([flight], [clean_flight(211, 30.0)], 0.3, 0)
-    assert row["applied"] and row["surveyed"] < 0.5 * row["shaken"]
-    assert row["anchors_surveyed"] < row["anchors_shaken"]
+def test_a_draw_makes_a_shaken_survey_better_and_repeats(flight):
+    first, again = (draw([flight], [clean_flight(211, 30.0)], 0.3, 0) for _ in range(2))
+    assert first == again and first["applied"]
+    assert (
+        first["surveyed"] < 0.5 * first["shaken"]
+        and first["anchors_surveyed"] < first["anchors_shaken"]
+    )
 
 
 def test_its_options_are_read():

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A Crazyflie by cflib: its log blocks to topics, and positions to it.
 
-The vehicle is a thread of the test that speaks CRTP over UDP on loopback, as the firmware does, and
-logs random numbers.
+The vehicle is a process of the test that speaks CRTP over UDP on loopback, as the firmware does, and
+logs what a recording holds.
 """
 
 import socket
@@ -28,6 +28,7 @@ from uwb_tdoa_tools.autopilot import crazyflie  # noqa: E402
 from uwb_tdoa_tools.autopilot.crazyflie import ATTITUDE_STD, POSITION_STD, CrazyflieLink  # noqa: E402
 from uwb_tdoa_tools.autopilot.estimate import Estimate  # noqa: E402
 from uwb_tdoa_tools.crazyflie import BLOCKS, PERIOD, WRAP  # noqa: E402
+from uwb_tdoa_tools.readers import read_flight  # noqa: E402
 from uwb_tdoa_tools.readers.streams import GRAVITY  # noqa: E402
 
 RUNNING = EstimatorStatus.STATUS_RUNNING
@@ -36,14 +37,53 @@ STORED = {"FP16": "float"}  # what the firmware keeps of a variable that is sent
 SECONDS = 3.0
 
 
+class Recording:
+    """Values of log variables at a time of a recording. seconds : its length."""
+
+    def __init__(self, t, columns):
+        """columns : {variable: (n,)}, which hold from t (n,) s on."""
+        self._t, self._columns, self.seconds = t, columns, t[-1] - t[0]
+
+    def __call__(self, variable, t):
+        k = np.searchsorted(self._t, self._t[0] + t, side="right") - 1
+        return float(self._columns[variable][max(k, 0)])
+
+    def values(self, variable):
+        return self._columns[variable]
+
+
 def random_recording():
-    """Return {variable: (800,) numbers, 200 per second}."""
     rng, n = np.random.default_rng(2), 800
+    t = np.arange(n) * PERIOD / 2.0
     columns = {name: np.repeat(rng.normal(0.0, 2.0, n // 4), 4) for name in BLOCKS["tdoa"][0]}
     columns |= {name: rng.normal(0.0, 1.0, n) for name in BLOCKS["imu"][0]}
     columns["range.zrange"] = np.repeat(rng.integers(100, 3000, n // 5), 5)
     columns["baro.pressure"] = np.repeat(950.0 + rng.normal(0.0, 0.1, n // 5), 5)
-    return columns
+    return Recording(t, columns)
+
+
+def measured_recording(folder):
+    """Of a log of a Crazyflie; without heights and pressures that it has not."""
+    flight = read_flight(
+        folder / "flights/0425/TDOA2/0425-traj1", folder / "surveys/anchor_0425.txt"
+    )
+    t = np.arange(flight.imu.t[0] + 20.0, flight.imu.t[0] + 30.0, 1e-3)
+
+    def held(stamps, values):
+        k = np.searchsorted(stamps, t, side="right") - 1
+        return np.where(k < 0, 0.0, values[np.maximum(k, 0)])
+
+    columns, tdoa = {}, flight.tdoa
+    for name in BLOCKS["tdoa"][0]:
+        mine = (tdoa.a == int(name[7])) & (tdoa.b == int(name[9]))
+        columns[name] = held(tdoa.t[mine], tdoa.d[mine])
+    for axis, letter in enumerate("xyz"):
+        columns[f"gyro.{letter}"] = held(flight.imu.t, np.rad2deg(flight.imu.gyro[:, axis]))
+        columns[f"acc.{letter}"] = held(flight.imu.t, flight.imu.accel[:, axis] / GRAVITY)
+    height, pressure = flight.height, flight.pressure
+    columns["range.zrange"] = held(height.t, np.minimum(1e3 * height.range, 32767.0)).astype(int)
+    columns["baro.pressure"] = held(pressure.t, 0.01 * pressure.pressure)
+    return Recording(t, columns)
 
 
 class Vehicle:
@@ -147,8 +187,10 @@ class Vehicle:
                 continue
             values = b""
             for name, code in self._blocks[number]:
-                value = self.recording[name][int(t / (0.5 * PERIOD))]
-                packed = struct.pack("<" + code, int(value) if code == "H" else float(value))
+                packed = struct.pack(
+                    "<" + code,
+                    self.recording(name, t) if code != "H" else int(self.recording(name, t)),
+                )
                 values += packed
                 self.logged.setdefault(name, []).append((now, struct.unpack("<" + code, packed)[0]))
             assert len(values) <= 26  # bytes of a packet
@@ -166,10 +208,17 @@ class Vehicle:
         return found
 
 
-def test_a_crazyflie_logs_to_topics_and_gets_poses():
+@pytest.fixture(params=["random", "measured"])
+def recording(request):
+    if request.param == "random":
+        return random_recording()
+    return measured_recording(request.getfixturevalue("shared_data"))
+
+
+def test_a_crazyflie_logs_to_topics_and_gets_poses(recording):
     """Its clock wraps on the way."""
     pytest.importorskip("cflib")
-    vehicle = Vehicle(random_recording(), WRAP - 0.5 * SECONDS)
+    vehicle = Vehicle(recording, WRAP - 0.5 * SECONDS)
     got = {name: [] for name in BLOCKS}
     try:
         with bench(lambda: None) as rig:

@@ -17,7 +17,7 @@ rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg", reason="needs the built workspace: ./dev build")
 pytest.importorskip("pymavlink")
 
-from autopilots import Px4, usec  # noqa: E402
+from autopilots import Px4, numbers, usec  # noqa: E402
 from geometry_msgs.msg import PoseWithCovarianceStamped  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
@@ -53,7 +53,7 @@ class Player:
     """Plays a flight, and listens to what the nodes make of it."""
 
     def __init__(self, node, processes, flight, px4):
-        self.node, self.px4, self._processes = node, px4, processes
+        self.node, self.px4, self.gated, self._processes = node, px4, [], processes
         self._begin, self._newest, self._silent = flight.imu.t[0], 0.0, False
         self._due = 0.0  # time.monotonic() before which no step ends, s
         make = node.create_publisher
@@ -68,6 +68,7 @@ class Player:
         self._pose = make(PoseWithCovarianceStamped, "initialpose", 10)
         self._reset = node.create_client(Trigger, "ekf_node/reset")
         node.create_subscription(Odometry, "odometry", self._on_odometry, OUTPUT_QOS)
+        node.create_subscription(Odometry, "odometry/gated", self.gated.append, OUTPUT_QOS)
         self._anchors.publish(anchors_to_message(flight.anchors))
         rows = [(t, None, k) for k, t in enumerate(flight.tdoa.t)]
         rows += [(t, k, None) for k, t in enumerate(flight.imu.t) if k % 5 == 0]
@@ -197,6 +198,7 @@ def test_an_autopilot_gets_a_measured_flight(shared_data, tmp_path):
     _check_start(stream, truth)
     _check_jumps(stream, truth)
     _check_silences(stream)
+    _check_for_mavros(player.gated)
 
 
 def _check_start(stream, truth):
@@ -242,3 +244,16 @@ def _check_silences(stream):
     good = next(m for t, m in stream if t > SILENCE[0] - 0.5)
     assert last.quality < 0.5 * good.quality
     assert _resets(stream, RESET, RESET + 3.0)
+
+
+def _check_for_mavros(messages):
+    """Frames that mavros turns by its own transforms; a velocity in the body; covariances."""
+    for message in messages:
+        assert (message.header.frame_id, message.child_frame_id) == ("map", "base_link")
+        *_, pose, twist = numbers(message)
+        assert np.linalg.eigvalsh(pose).min() > 0.0 and np.linalg.eigvalsh(twist).min() > 0.0
+    here = [m for m in messages if 5.0 < 1e-6 * usec(m) - EPOCH < POSE]
+    p, turn, v, *_ = zip(*map(numbers, here))
+    moved = np.diff(p, axis=0) * RATE
+    told = np.array([of.apply(u) for of, u in zip(turn, v)])[1:]
+    assert np.sqrt(np.mean((moved - told) ** 2)) < 0.5

@@ -99,7 +99,10 @@ def test_two_processes_give_the_same_to_the_bit():
     for jobs in (1, 2):
         over = partial(parallel.over, jobs=jobs, unit=None)
         result = with_noise(diagnose(flights, map_function=over), None, over)
-        values = [effect.values for effect in result.effects.effects]
+        values = [
+            (effect.name, effect.values, effect.std, effect.domain)
+            for effect in result.effects.effects
+        ]
         told.append({**output.as_json(result), "std": result.tdoa_std, "values": values})
     assert json.dumps(told[0]) == json.dumps(told[1])
     assert told[0]["findings"][0]["added"]

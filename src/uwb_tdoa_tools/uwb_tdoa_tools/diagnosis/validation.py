@@ -47,7 +47,7 @@ Made = TypeVar("Made")
 TRIAL_FLIGHTS = 3  # largest number of flights, or halves of one, in trials
 # shapes of a function of the time that can recur, like the warm-up of a clock
 DRIFTS = ("line", "beyond", "below", "parabola")
-# Smallest share by which an error is larger than another.
+# Smallest share of an error that counts as a difference.
 WORSE = 0.005
 # largest probability that an effect of several flights does harm to another flight
 MOST_HARM = 0.2
@@ -170,18 +170,19 @@ def select_by_error(
     while applicable := _applicable(candidates):
         displacements = trials.displacements(candidates, applicable)
         gone = _dropped(displacements, applicable, alone)
-        harmful = None if gone else _harmful(attribution, candidates, applicable)
-        if harmful:
+        if not gone:
+            whole = displacements.error([])
+            without = {one: displacements.error([one]) - whole for one in applicable}
+            harmful = _harmful(attribution, candidates, applicable)
+            if harmful is None:
+                worth.update(without)
+                break
             one, why = harmful
             refused.append(Refused(one.label, why))
-            worth[one] = displacements.error([one]) - error
+            worth[one] = without[one]
             candidates.remove(one)
             error = trials.start(candidates, detections)
             continue
-        if not gone:
-            all_of_them = displacements.error([])
-            worth.update((one, displacements.error([one]) - all_of_them) for one in applicable)
-            break
         kept = [one for one in candidates if one not in gone]
         error = trials.start(kept, detections)
         while len(gone) > 1 and error > displacements.error(list(gone)) * (1.0 + WORSE):
@@ -229,12 +230,12 @@ def _harmful(
     """
     selection = attribution.selection.kept(candidates)
     several = {one: shares(selection, one, attribution.names) for one in applicable}
-    worst = max(several, key=lambda one: harm(several[one]))
-    probability = harm(several[worst])
-    if probability <= MOST_HARM:
+    probability = {one: harm(of_flights) for one, of_flights in several.items()}
+    worst = max(probability, key=probability.__getitem__)
+    if probability[worst] <= MOST_HARM:
         return None
     return worst, (
-        f"another flight may not have it (probability {probability:.0%}). "
+        f"another flight may not have it (probability {probability[worst]:.0%}). "
         f"{in_words(several[worst])}"
     )
 
