@@ -172,14 +172,13 @@ def select_by_error(
         gone = _dropped(displacements, applicable, alone)
         if not gone:
             whole = displacements.error([])
-            without = {one: displacements.error([one]) - whole for one in applicable}
+            for one in applicable:
+                worth[one] = displacements.error([one]) - whole
             harmful = _harmful(attribution, candidates, applicable)
             if harmful is None:
-                worth.update(without)
                 break
             one, why = harmful
             refused.append(Refused(one.label, why))
-            worth[one] = without[one]
             candidates.remove(one)
             error = trials.start(candidates, detections)
             continue
