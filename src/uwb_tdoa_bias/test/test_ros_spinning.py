@@ -19,15 +19,10 @@ from sensor_msgs.msg import FluidPressure  # noqa: E402
 
 from uwb_tdoa_bias.ros import process  # noqa: E402
 from uwb_tdoa_bias.ros.cdr import CdrCodec  # noqa: E402
-from uwb_tdoa_bias.ros.node import (  # noqa: E402
-    PERIOD,
-    StreamNode,  # noqa: E402
-    StreamPoller,
-    Streams,
-)
+from uwb_tdoa_bias.ros.node import StreamNode  # noqa: E402
 from uwb_tdoa_bias.ros.parameters import MOST_ASKED, MOST_REQUESTS  # noqa: E402
-from uwb_tdoa_bias.ros.process import Spinner  # noqa: E402
-from uwb_tdoa_bias.ros.topics import Epoch  # noqa: E402
+from uwb_tdoa_bias.ros.process import PERIOD, Spinner, StreamPoller  # noqa: E402
+from uwb_tdoa_bias.ros.topics import Epoch, Streams  # noqa: E402
 
 MANY = 300
 DEEP = QoSProfile(depth=1000)

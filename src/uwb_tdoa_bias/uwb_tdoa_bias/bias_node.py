@@ -37,7 +37,7 @@ from .ros.anchors import ANCHORS_FILE, AnchorsInput
 from .ros.cdr import CdrCodec
 from .ros.diagnostics import Diagnostics, Rate, Report
 from .ros.frames import FramesInput, unknown_frame
-from .ros.node import StreamNode, StreamOutput, StreamPoller, Streams
+from .ros.node import StreamNode
 from .ros.parameters import (
     FROZEN,
     Parameter,
@@ -46,7 +46,7 @@ from .ros.parameters import (
     refuse_unknown,
     say_unused,
 )
-from .ros.topics import Epoch, several_publishers
+from .ros.topics import Epoch, StreamOutput, Streams, several_publishers
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Sequence
@@ -182,7 +182,7 @@ class BiasNode(StreamNode):
         self._anchors.start()
         if member is None:
             say_unused([self], files_of(arguments))
-            self.turns = StreamPoller([self.streams])
+            self.turns = process.StreamPoller([self.streams])
         self.ready = f"ready; correcting with: {self._model}"
 
     @property

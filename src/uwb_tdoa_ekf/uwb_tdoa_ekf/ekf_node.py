@@ -37,9 +37,9 @@ from uwb_tdoa_bias.ros.anchors import AnchorsInput
 from uwb_tdoa_bias.ros.cdr import CdrCodec, message_class
 from uwb_tdoa_bias.ros.diagnostics import Diagnostics
 from uwb_tdoa_bias.ros.frames import FramesInput, unknown_frame
-from uwb_tdoa_bias.ros.node import StreamNode, StreamPoller, Streams
+from uwb_tdoa_bias.ros.node import StreamNode
 from uwb_tdoa_bias.ros.parameters import files_of, refuse_unknown, say_unused
-from uwb_tdoa_bias.ros.topics import Epoch, Input, Refusals, several_publishers
+from uwb_tdoa_bias.ros.topics import Epoch, Input, Refusals, Streams, several_publishers
 from uwb_tdoa_msgs.msg import TdoaCorrected
 
 from .compile_nodes import warm_up
@@ -196,7 +196,7 @@ class EkfNode(StreamNode):
         self._anchors.start()
         if member is None:
             say_unused([self], files_of(arguments))
-            self.turns = StreamPoller([self.streams])
+            self.turns = process.StreamPoller([self.streams])
         self.ready = "ready"
 
     def _remark_height(self) -> None:

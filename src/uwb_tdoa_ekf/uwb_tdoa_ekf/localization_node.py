@@ -29,7 +29,7 @@ from uwb_tdoa_bias.bias_node import BiasNode
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.ros import process
 from uwb_tdoa_bias.ros.diagnostics import Diagnostics
-from uwb_tdoa_bias.ros.node import InMemoryReceiver, StreamNode, StreamPoller
+from uwb_tdoa_bias.ros.node import StreamNode
 from uwb_tdoa_bias.ros.parameters import (
     FROZEN,
     Parameter,
@@ -37,6 +37,7 @@ from uwb_tdoa_bias.ros.parameters import (
     files_of,
     say_unused,
 )
+from uwb_tdoa_bias.ros.topics import InMemoryReceiver
 
 from .ekf_node import EkfNode
 from .ekf_parameters import names_of_parameters
@@ -87,7 +88,7 @@ class LocalizationNode(StreamNode):
             raise refused[0]
         self.members = [node for tag in self._tags for node in tag.members]
         say_unused([self, *self.members], files_of(arguments))
-        self.turns = StreamPoller(self._tags)
+        self.turns = process.StreamPoller(self._tags)
         self._diagnostics = Diagnostics(self, self._report)
         self.ready = f"ready; tags: {', '.join(tags) or 'one'}"
 

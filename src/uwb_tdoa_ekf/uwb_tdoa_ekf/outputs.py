@@ -17,7 +17,7 @@ from uwb_tdoa_bias.common.lazy import rotations
 from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS as STATUS_QOS
 from uwb_tdoa_bias.ros.cdr import CdrCodec
 from uwb_tdoa_bias.ros.frames import TF_QOS
-from uwb_tdoa_bias.ros.node import StreamOutput
+from uwb_tdoa_bias.ros.topics import StreamOutput
 from uwb_tdoa_msgs.msg import EstimatorStatus, TdoaResidual
 
 from .ekf_parameters import NONE, ODOM

@@ -25,7 +25,7 @@ from std_msgs.msg import String
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.ros import process
 from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS
-from uwb_tdoa_bias.ros.node import StreamNode, StreamPoller
+from uwb_tdoa_bias.ros.node import StreamNode
 from uwb_tdoa_bias.ros.parameters import (
     FROZEN,
     Parameter,
@@ -124,7 +124,7 @@ class VehicleNode(StreamNode):
         )
         self._starts: float | None = None  # time.monotonic() of the start, s, after a subscription
         say_unused([self], files_of(arguments))
-        self.turns = StreamPoller([self])
+        self.turns = process.StreamPoller([self])
         self.get_logger().info(
             "ready; waiting for who listens to imu/data and uwb/tdoa, and publishes odometry"
         )

@@ -10,7 +10,7 @@ import math
 import signal
 import sys
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor, TimeoutException
@@ -24,12 +24,12 @@ from ..common.executable import interrupt
 from ..common.text import line_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Collection, Iterable, Sequence
     from types import FrameType
 
     from rclpy import Future
 
-    from .node import StreamNode, StreamPoller
+    from .node import StreamNode
 
 
 try:  # since rclpy 7.1.4; a message takes a quarter of the time
@@ -43,6 +43,36 @@ LONGEST_SLEEP = 0.2  # s, until a process without streams reacts to a signal
 QUIET, LOOK = (1.0, 0.05)
 SERVED = 0.005  # s between services of the graph while streams have messages
 LONGEST_SERVICE = 0.05  # s; only with a SingleThreadedExecutor
+PERIOD = 0.001  # s, smallest rest after a turn
+# s. After a turn the process rests as long as the turn took, at most so long: then a busy process
+# takes more messages per turn.
+LONGEST_REST = 0.01
+
+
+class Taking(Protocol):
+    """Takes arrived messages; `take` returns whether any arrived or still wait."""
+
+    def take(self) -> bool: ...
+
+
+class StreamPoller:
+    """Lets nodes take their arrived messages, one node after the other.
+
+    `run` calls the `turns` of a node, which is a StreamPoller.
+    """
+
+    PERIOD = PERIOD
+
+    def __init__(self, streams: Collection[Taking]) -> None:
+        """Set the streams: Streams, or other objects with take()."""
+        self._streams = streams
+
+    def take(self) -> float | None:
+        """Run one turn, and return the rest after it, s; None if nothing arrived."""
+        began = time.monotonic()
+        if not any([streams.take() for streams in self._streams]):
+            return None
+        return min(max(time.monotonic() - began, PERIOD), LONGEST_REST)
 
 
 class Spinner:

@@ -1,6 +1,10 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Publishers, subscriptions and stamps: QoS, messages read as bytes, faults of topics."""
+"""Topics of a node: single messages, and streams of which a node takes all that arrived at once.
+
+The messages of a stream wait in the middleware, as bytes. `Streams.take` reads them, and hands on
+rows and stamps in s.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +18,7 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
+from ..common.stamps import LARGEST_STEP_BACK
 from .cdr import Message, Unreadable, decode, name_of
 
 if TYPE_CHECKING:
@@ -25,10 +30,14 @@ if TYPE_CHECKING:
     from rclpy.subscription import Subscription
     from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-    from .cdr import CdrCodec
+    from .cdr import CdrCodec, CdrTemplate
     from .parameters import ParameterNode
 
+    # frame, stamps, rows and arrivals
+    Take = Callable[[str, np.ndarray, np.ndarray, np.ndarray], None]
+
 Content = TypeVar("Content")  # what is read of a message
+Part = tuple[str, np.ndarray, np.ndarray]  # frame, rows and arrivals of successive messages
 
 
 class SubscribingNode(Protocol):
@@ -91,6 +100,8 @@ class Epoch:
 STREAM_QOS = QoSProfile(depth=10_000, reliability=ReliabilityPolicy.BEST_EFFORT)
 OUTPUT_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 LARGEST_LOSS = 0.01  # largest lost share of messages per second
+LONGEST_WAIT = 0.02  # s; longest time that `wait_for` delays the streams
+ROUNDING = 1e-6  # s; two computations of a stamp since 1970 differ by less
 # rclpy writes these into the given profile.
 OVERRIDES = QoSOverridingOptions([QoSPolicyKind.RELIABILITY, QoSPolicyKind.DEPTH])
 
@@ -264,7 +275,7 @@ class StreamInput:
             raw=True,
         )
 
-    def fetch(self, codec: CdrCodec) -> list[tuple[str, np.ndarray, np.ndarray]]:
+    def fetch(self, codec: CdrCodec) -> list[Part]:
         """Return the arrived messages as [(frame, rows (n,), arrivals (n,) s since 1970)].
 
         Each entry holds successive messages of one frame; codec : CdrCodec
@@ -307,6 +318,179 @@ class StreamInput:
                 f"qos_overrides.{self._subscription.topic_name}.subscription.reliability"
             )
         return None
+
+
+class InMemoryReceiver:
+    """Replaces the subscription of a stream that another node of this process hands over."""
+
+    lost = 0
+
+    def __init__(self, node: ParameterNode, kind: type, topic: str) -> None:
+        self.refusals = Refusals(node, topic, kind)  # stays empty
+        self._node, self._topic = node, topic
+        self._parts: list[Part] = []
+
+    def hand(self, frame: str, rows: np.ndarray) -> None:
+        """Append rows (n,) with the fields of a CdrCodec, all of one frame."""
+        self._parts.append((frame, rows, np.full(len(rows), 1e-9 * time.time_ns())))
+
+    def __len__(self) -> int:
+        """Return the number of waiting parts."""
+        return len(self._parts)
+
+    def fetch(self, codec: CdrCodec) -> list[Part]:
+        """Return [(frame, rows, arrivals, s since 1970)] since the last call."""
+        parts, self._parts = self._parts, []
+        return parts
+
+    def get_publisher_count(self) -> int:
+        """Return the number of publishers of the topic."""
+        return self._node.count_publishers(self._topic)
+
+    def trouble(self, received: int) -> str | None:
+        """Return a sentence on the fault of the stream in ROS, or None."""
+        return several_publishers(self._node, self._topic)
+
+
+class Streams:
+    """The streams of a node; messages wait until they are taken."""
+
+    def __init__(self, node: ParameterNode, epoch: Epoch, on_taken: Callable[[], None]) -> None:
+        """Start without streams; on_taken() is called after messages were delivered."""
+        self._node, self._epoch, self._on_taken = node, epoch, on_taken
+        self._streams: dict[str, _Stream] = {}  # by topic, in the order of taking
+        self._awaited: _Stream | None = None
+        self._due: Callable[[], float] = lambda: -np.inf  # of the message, s since 1970
+        self._until = -np.inf
+
+    @property
+    def inputs(self) -> dict[str, StreamInput | InMemoryReceiver]:
+        """Input of each topic, in the order of taking."""
+        return {topic: stream.source for topic, stream in self._streams.items()}
+
+    @property
+    def refusals(self) -> list[Refusals]:
+        """Refusals of each stream."""
+        return [end.refusals for end in self.inputs.values()]
+
+    def wait_for(self, topic: str, due: Callable[[], float]) -> None:
+        """Let all streams wait for a message of one topic that is stamped due() or later.
+
+        Before it, nothing could be computed with the other messages. The wait ends after LONGEST_WAIT.
+
+        due : callable -> s since 1970
+        """
+        self._awaited, self._due = self._streams[topic], due
+
+    def add(self, codec: CdrCodec, topic: str, take: Take, handed: bool = False) -> None:
+        """Subscribe to a stream.
+
+        Parameters
+        ----------
+        codec : CdrCodec of its messages
+        topic : its name
+        take : callable of (frame, t, rows, arrival) for successive messages of one frame: stamps (n,) s,
+            rows (n,) of the codec, arrivals (n,) s since 1970
+        handed : whether a node of this process hands the messages over in memory
+        """
+        kind = InMemoryReceiver if handed else StreamInput
+        self._streams[topic] = _Stream(codec, take, kind(self._node, codec.kind, topic))
+
+    def take(self, at_once: bool = False) -> bool:
+        """Deliver all arrived messages, and return whether any arrived or still wait.
+
+        at_once : do not wait as `wait_for` says
+        """
+        if self._awaited is not None and not at_once:
+            arrived, now = self._awaited.fetch(), time.monotonic()
+            if now < self._until and not (
+                arrived and self._awaited.newest_waiting > self._due() - ROUNDING
+            ):
+                return bool(self._awaited.waiting)
+            self._until = now + LONGEST_WAIT
+        streams = self._streams.values()
+        for stream in streams:
+            stream.fetch()
+        parts = [part for stream in streams if stream.waiting for part in stream.parts(self._epoch)]
+        if not parts:
+            return False
+        if any(stream.fell for stream in streams):  # then the order of arrival matters
+            parts = sorted(
+                (piece for part in parts for piece in _pieces(part)), key=lambda piece: piece[-1][0]
+            )
+        for take, *part in parts:
+            take(*part)
+        self._on_taken()
+        return True
+
+
+class _Stream:
+    """Arrived messages of one stream.
+
+    source : its input; waiting : parts; fell : whether stamps of the last taken messages fell back
+    """
+
+    def __init__(self, codec: CdrCodec, take: Take, source: StreamInput | InMemoryReceiver) -> None:
+        self.waiting: list[Part] = []
+        self.fell = False
+        self.source = source
+        self._codec, self._take, self._newest = codec, take, -np.inf
+
+    def fetch(self) -> bool:
+        """Fetch messages, and return whether any arrived since the last call."""
+        parts = self.source.fetch(self._codec)
+        self.waiting += parts
+        return bool(parts)
+
+    @property
+    def newest_waiting(self) -> float:
+        """Stamp of the last fetched message, s since 1970; -inf if none waits."""
+        if not self.waiting:
+            return -np.inf
+        rows = self.waiting[-1][1]
+        return rows["sec"][-1] + 1e-9 * rows["nanosec"][-1]
+
+    def parts(self, epoch: Epoch) -> list[tuple[Any, ...]]:
+        """Return the fetched messages as [(take, frame, stamps, rows, arrivals)]."""
+        self.fell, parts = False, []
+        for frame, rows, arrivals in self.waiting:
+            t = epoch.seconds_of(rows["sec"], rows["nanosec"])
+            parts.append((self._take, frame, t, rows, arrivals))
+            newest = self._newest
+            for stamp in t.tolist():
+                self.fell = self.fell or stamp < newest - LARGEST_STEP_BACK
+                newest = max(newest, stamp)
+            self._newest = stamp
+        self.waiting = []
+        return parts
+
+
+def _pieces(part: tuple[Any, ...]) -> list[tuple[Any, ...]]:
+    """Return the messages of a part one by one."""
+    take, frame, *columns = part
+    return [
+        (take, frame, *(column[k : k + 1] for column in columns)) for k in range(len(columns[0]))
+    ]
+
+
+class StreamOutput:
+    """Publisher of a stream of messages made by templates."""
+
+    def __init__(self, node: Node, kind: type, topic: str) -> None:
+        self.publisher = publish_stream(node, kind, topic)
+        self._receiver: InMemoryReceiver | None = None
+
+    def deliver_to(self, receiver: InMemoryReceiver) -> None:
+        """Set an InMemoryReceiver that also gets all rows."""
+        self._receiver = receiver
+
+    def publish(self, frame: str, template: CdrTemplate, rows: np.ndarray) -> None:
+        """Publish rows (n,) of a CdrTemplate, all of one frame."""
+        if self._receiver is not None:
+            self._receiver.hand(frame, rows)
+        if self.publisher.get_subscription_count():  # late subscribers cannot request them
+            for message in template.messages(rows):
+                self.publisher.publish(message)
 
 
 def several_publishers(node: ParameterNode, topic: str) -> str | None:

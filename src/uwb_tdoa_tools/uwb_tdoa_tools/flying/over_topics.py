@@ -28,8 +28,8 @@ from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS, anchors_to_message
 from uwb_tdoa_bias.ros.cdr import CdrCodec, CdrTemplate, message_class
 from uwb_tdoa_bias.ros.frames import TF_STATIC_QOS
-from uwb_tdoa_bias.ros.node import StreamNode, StreamOutput
-from uwb_tdoa_bias.ros.topics import OUTPUT_QOS, Input, StreamInput
+from uwb_tdoa_bias.ros.node import StreamNode
+from uwb_tdoa_bias.ros.topics import OUTPUT_QOS, Input, StreamInput, StreamOutput
 from uwb_tdoa_ekf.reorder_buffer import TRIAL
 from uwb_tdoa_msgs.msg import EstimatorStatus, Tdoa
 
