@@ -15,13 +15,16 @@ from uwb_tdoa_bias.correction.corrector import (
     FADED,
     NETWORK,
     PASSED,
+    START,
     Correction,
+    Poses,
+    parts_of,
+    rotated_in_yaw,
 )
 from uwb_tdoa_bias.correction.corrector import (
     Corrector as LateCorrector,
 )
 from uwb_tdoa_bias.correction.network import Network
-from uwb_tdoa_bias.correction.poses import START, Poses, parts_of, rotated_in_yaw
 from uwb_tdoa_bias.effects import EFFECTS as CATALOGUE
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm
 

@@ -13,9 +13,9 @@ from uwb_tdoa_bias.common.stamps import (
     MOST_HELD,
     STEP_AHEAD,
     UNCONTRADICTED,
+    PoseQueue,
     StampGate,
 )
-from uwb_tdoa_bias.correction.poses import PoseQueue
 
 # --- stamps ---
 

@@ -25,11 +25,10 @@ import numpy as np
 from uwb_tdoa_msgs.msg import Tdoa, TdoaCorrected
 
 from .common.errors import InputError
-from .common.stamps import LARGEST_STEP_BACK, StampGate
-from .correction.corrector import Correction, Corrector, warm_up
+from .common.stamps import LARGEST_STEP_BACK, PoseQueue, StampGate
+from .correction.corrector import Correction, Corrector, Poses, parts_of, warm_up
 from .correction.model import EFFECTS, FADED, NETWORK, PASSED
 from .correction.network import load_network
-from .correction.poses import PoseQueue, Poses, parts_of
 from .effects import EffectSet, LabelCorrector
 from .effects.tag import TagLeverArm
 from .ros import process

@@ -11,9 +11,8 @@ import pytest
 from scipy.stats import chi2
 
 from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas
-from uwb_tdoa_bias.correction.corrector import Corrector
+from uwb_tdoa_bias.correction.corrector import Corrector, known_yaw_std
 from uwb_tdoa_bias.correction.network import Network
-from uwb_tdoa_bias.correction.poses import known_yaw_std
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, SmoothTerm, TagLeverArm
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.memory import INVALID, STARTUP, USED

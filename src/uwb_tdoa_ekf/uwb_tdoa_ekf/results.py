@@ -17,7 +17,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.compiled import compiled
 from uwb_tdoa_bias.common.sensors.sensor import UNKNOWN_VARIANCE
-from uwb_tdoa_bias.correction.poses import known_yaw_std
+from uwb_tdoa_bias.correction.corrector import known_yaw_std
 
 from .core.memory import COMPENSATED, INVALID, LATE, REJECTED, REPEATED, STARTUP, USED
 from .core.state import rotation

@@ -1,16 +1,17 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Decide whether the stamps of one stream are plausible, and when its clock has jumped."""
+"""Hold items of one stream by their stamps: implausible ones, and those that wait for a pose."""
 
 from __future__ import annotations
 
+from collections import deque
 import math
 from typing import TYPE_CHECKING, Any
 
 from .compiled import compiled
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
 # s behind the newest stamp of a stream. With one clock, messages are out of order by less.
 LARGEST_STEP_BACK = 1.0
@@ -25,6 +26,7 @@ NEAR = 0.25  # s between stamps of two streams that confirm each other
 # the old time, and where none does.
 CONTRADICTED, UNCONTRADICTED = 0.3, 0.05
 MOST_HELD = 1000  # held messages of a stream with a stopped clock
+MOST_WAITING = 10_000  # items; limits a queue whose stamps stand still
 
 
 class StampGate:
@@ -135,6 +137,52 @@ class StampGate:
             return True
         contradicted = any(self.newest < t < self.newest + LARGEST_STEP_BACK for t in reached)
         return last - first >= (CONTRADICTED if contradicted else UNCONTRADICTED)
+
+
+class PoseQueue:
+    """A queue in order of arrival, as of TDOAs that wait for a pose.
+
+    Its first item leaves when it is ready, or has waited too long. Whether an item is ready depends on
+    the stamp of the item before it. An item has waited too long if a newer item is stamped more than
+    `limit` s later. The same holds if more than MOST_WAITING items wait.
+    """
+
+    def __init__(self, limit: float) -> None:
+        """Set the limit of the wait, s."""
+        self.limit = limit
+        self._items: deque[tuple[float, float, Any]] = deque()
+        self._newest: float = None  # type: ignore[assignment]  # latest stamp so far, s, once there is one
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def add(self, t: float, item: Any) -> None:
+        """Append an item stamped t, s."""
+        newest = t if self._newest is None else self._newest
+        self._items.append((t, min(t, newest), item))
+        self._newest = max(newest, t)
+
+    def shorten(self, most: int) -> int:
+        """Remove the oldest of more than `most` items, and return their number."""
+        removed = max(len(self._items) - most, 0)
+        for _ in range(removed):
+            self._items.popleft()
+        return removed
+
+    def take(self, ready: Callable[[float], bool]) -> list[tuple[float, Any, bool]]:
+        """Remove and return the items that may leave: a list of (t, item, ready(before)).
+
+        before : s, the latest stamp added before the item, at most t; t for the first item
+        """
+        out = []
+        while self._items:
+            t, before, item = self._items[0]
+            is_ready = ready(before)
+            if not is_ready and self._newest - t <= self.limit and len(self._items) <= MOST_WAITING:
+                break
+            out.append((t, item, is_ready))
+            self._items.popleft()
+        return out
 
 
 @compiled
