@@ -24,8 +24,7 @@ from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
 from uwb_tdoa_ekf.core.engine import feed
 from uwb_tdoa_ekf.core.history import NOTHING
 from uwb_tdoa_ekf.core.hypotheses import IMPROBABLE
-from uwb_tdoa_ekf.core.measurements import sensor_rows
-from uwb_tdoa_ekf.core.memory import N_YAWS, RESIDUAL, SENSOR_ROW, USED, new_state
+from uwb_tdoa_ekf.core.memory import N_YAWS, RESIDUAL, SENSOR_ROW, USED, new_state, sensor_rows
 from uwb_tdoa_ekf.core.state import TRANSITION, inject
 from uwb_tdoa_ekf.offline import run_offline
 

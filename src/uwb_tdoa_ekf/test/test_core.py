@@ -24,13 +24,16 @@ from uwb_tdoa_ekf.core.inertial import (
     store,
     weigh,
 )
-from uwb_tdoa_ekf.core.measurements import (
+from uwb_tdoa_ekf.core.memory import (
     FARTHEST,
+    IMU_SAMPLE,
     LARGEST_ERROR,
     STEEPEST,
+    TDOA,
+    new_state,
+    structured,
     usable_tdoas,
 )
-from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, TDOA, new_state, structured
 from uwb_tdoa_ekf.core.noise import learn
 from uwb_tdoa_ekf.core.state import GRAVITY
 from uwb_tdoa_ekf.core.update import SMALLEST, variance

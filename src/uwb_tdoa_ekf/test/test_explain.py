@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.core.measurements import imu_rows
-from uwb_tdoa_ekf.core.memory import TDOA, structured
+from uwb_tdoa_ekf.core.memory import TDOA, imu_rows, structured
 from uwb_tdoa_ekf.monitoring.explain import Unexplained, unexplained
 from uwb_tdoa_ekf.offline import run_offline
 

@@ -17,14 +17,16 @@ from .anchor_table import MOST_ROWS, AnchorTable
 from .core import height, sensors
 from .core.config import FilterConfig
 from .core.initialization import LOST_TIME
-from .core.measurements import imu_rows, sensor_rows, usable_tdoas
 from .core.memory import (
     INVALID,
     N_YAWS,
     ODOMETRY,
     POSE,
     TDOA,
+    imu_rows,
+    sensor_rows,
     structured,
+    usable_tdoas,
 )
 from .core.startup import APART
 from .monitoring.filter_findings import clock_ahead, implausible, restarted

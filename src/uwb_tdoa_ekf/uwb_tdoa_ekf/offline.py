@@ -16,8 +16,17 @@ from uwb_tdoa_bias.effects import EffectSet
 from .anchor_table import AnchorTable
 from .core.config import FilterConfig
 from .core.hypotheses import yaw_offset
-from .core.measurements import imu_rows, sensor_rows, usable_tdoas
-from .core.memory import INVALID, RESIDUAL, SENSOR_ROW, TDOA, joined, structured
+from .core.memory import (
+    INVALID,
+    RESIDUAL,
+    SENSOR_ROW,
+    TDOA,
+    imu_rows,
+    joined,
+    sensor_rows,
+    structured,
+    usable_tdoas,
+)
 from .core.sensors import STREAMS as SENSOR_NAMES
 from .pipeline import Pipeline, odometry_of
 from .reorder_buffer import FIRST_SENSOR, IMU_STREAM, TDOA_STREAM, ReorderBuffer

@@ -1,19 +1,21 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""State of a filter between two events: all record types, with named fields.
+"""All record types of the filter: measurements, its state between two events, results.
 
-A copy of its arrays is a copy of the filter. The types are rows of numpy's structured arrays.
+The types are rows of numpy's structured arrays. A copy of a FilterState is a copy of the filter.
 Compiled code reads and writes `ekf.imu.slow_accel[k]` in place, and a function takes an entire
 record as a single pointer. Python sees the same bytes (`FilterState.record`).
 """
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from uwb_tdoa_bias.common.compiled import Record
+from uwb_tdoa_bias.common.compiled import Record, compiled
+from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_bias.effects.samples import N_STATES
 
 from .auxiliary import OFFSET_STATES
@@ -25,7 +27,11 @@ from .update import INNOVATION
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from uwb_tdoa_bias.common.anchors import Anchors
+    from uwb_tdoa_bias.common.sensors import Stream
     from uwb_tdoa_bias.effects.base import SensorFunction
+
+    from ..anchor_table import AnchorTable
 
 
 # Verdict of a measurement.
@@ -36,6 +42,12 @@ N_YAWS, N_PLACES = (4, 2)  # numbers of yaws and places that a start follows in 
 HYPOTHESES = N_YAWS * N_PLACES
 Floor = tuple[np.ndarray, np.ndarray, np.ndarray]  # as in EffectSet.on_floor
 WINDOW = 512  # TDOAs kept for a start
+
+# Limits of what can be a measurement; nothing is tuned.
+MAX_RATE, MAX_ACCEL = 100.0, 1000.0  # rad/s and m/s^2, beyond the range of any inertial sensor
+# largest slope of a bias (m per m or m/s), and largest state (m or m/s) of its linearization
+STEEPEST, FARTHEST = 1e3, 1e6
+LARGEST_ERROR = 1.0  # m by which |d_ab| may exceed the distance between anchors a and b
 
 
 def _record(*columns: tuple[Any, ...]) -> np.dtype:
@@ -406,4 +418,100 @@ def joined(kind: np.dtype, parts: Sequence[np.ndarray]) -> np.ndarray:
     for part in parts:
         out[first : first + len(part)] = part
         first += len(part)
+    return out
+
+
+def imu_rows(t: np.ndarray, gyro: np.ndarray, accel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return inertial samples as rows of IMU_SAMPLE, and which samples are usable.
+
+    Parameters
+    ----------
+    t : (n,) array
+        Stamps, s.
+    gyro : (n, 3) array
+        Angular rate, rad/s, body frame.
+    accel : (n, 3) array
+        Specific force, m/s^2, body frame.
+
+    Returns
+    -------
+    tuple
+        (n,) IMU_SAMPLE, and (n,) bool.
+    """
+    rows = structured(IMU_SAMPLE, t, gyro, accel)
+    return rows, _usable_imu(rows)
+
+
+@compiled
+def usable_tdoas(rows: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """Return (n,) bool: which TDOAs can be measurements.
+
+    Refused are an unknown anchor (row -1), a pair of equal anchors, a value that is not finite, an
+    invalid variance, a value longer than the baseline plus LARGEST_ERROR, and an implausible slope
+    of the bias.
+
+    Parameters
+    ----------
+    rows : (n,) TDOA
+        TDOAs.
+    positions : (N, 3) array
+        Positions of the anchors, m, world frame.
+    """
+    out = np.empty(len(rows), np.bool_)
+    for i in range(len(rows)):
+        tdoa = rows[i]
+        a, b, d = tdoa.a, tdoa.b, tdoa.d
+        usable = a >= 0 and b >= 0 and a != b and math.isfinite(tdoa.t) and math.isfinite(d)
+        if usable:
+            square = 0.0
+            for k in range(3):
+                square += (positions[a, k] - positions[b, k]) ** 2
+            longest = math.sqrt(square) + LARGEST_ERROR
+            usable = abs(d) <= longest and 0.0 <= tdoa.variance < math.inf
+        for k in range(N_STATES):  # NaN compares false
+            usable = usable and abs(tdoa.slope[k]) < STEEPEST and abs(tdoa.state[k]) < FARTHEST
+        out[i] = usable
+    return out
+
+
+def sensor_rows(
+    name: str, stream: Stream, anchors: Anchors | AnchorTable
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the measurements of a sensor as rows of SENSOR_ROW, and which are usable.
+
+    Parameters
+    ----------
+    name : str
+        Name of the sensor in SENSORS.
+    stream : Stream
+        Measurements of the sensor.
+    anchors : Anchors or AnchorTable
+        Gives the rows of anchor ids.
+
+    Returns
+    -------
+    tuple
+        (n,) SENSOR_ROW, and (n,) bool.
+    """
+    columns, usable = SENSORS[name].measured(stream)
+    rows = np.zeros(len(stream), SENSOR_ROW)
+    rows["t"], rows["kind"] = stream.t, list(SENSORS).index(name)
+    if "anchor" in columns:
+        columns["anchor"] = anchors.index(columns["anchor"])
+        usable &= columns["anchor"] >= 0
+    for field, values in columns.items():
+        target = rows[field]
+        target[(slice(None), *map(slice, values.shape[1:]))] = values
+    return rows, usable & np.isfinite(stream.t)
+
+
+@compiled
+def _usable_imu(rows: np.ndarray) -> np.ndarray:
+    """Return (n,) bool: which of (n,) IMU_SAMPLE are finite and within the range of any sensor."""
+    out = np.empty(len(rows), np.bool_)
+    for i in range(len(rows)):
+        sample = rows[i]
+        out[i] = math.isfinite(sample.t)
+        for k in range(3):  # NaN compares false
+            out[i] = out[i] and abs(sample.gyro[k]) < MAX_RATE and abs(sample.accel[k]) < MAX_ACCEL
     return out

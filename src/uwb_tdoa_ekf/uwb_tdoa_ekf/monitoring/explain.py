@@ -17,8 +17,7 @@ import numpy as np
 
 from ..core.config import FilterConfig
 from ..core.engine import feed
-from ..core.measurements import usable_tdoas
-from ..core.memory import IMU_SAMPLE, Measurements, new_state
+from ..core.memory import IMU_SAMPLE, Measurements, new_state, usable_tdoas
 
 if TYPE_CHECKING:
     from ..core.memory import FilterState

@@ -17,8 +17,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.flight import Imu
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.core.measurements import imu_rows
-from uwb_tdoa_ekf.core.memory import TDOA, structured
+from uwb_tdoa_ekf.core.memory import TDOA, imu_rows, structured
 from uwb_tdoa_ekf.monitoring.explain import Unexplained, compare, in_words, unexplained
 from uwb_tdoa_ekf.monitoring.finding import ERROR, WARNING, Finding
 from uwb_tdoa_ekf.monitoring.inertial_rules import AXES
