@@ -606,10 +606,10 @@ RULES = (
         "_settle",
         "(height.agreed >= MEMORY or doubted) and abs(value) < HIGHEST_STEP",
     ),
-    Rule("a worse barometer counts less", "barometer", "observe", "max(1.0, barometer.nis)", "1.0"),
+    Rule("a worse barometer counts less", "pressure", "observe", "max(1.0, barometer.nis)", "1.0"),
     Rule(
         "the offset of a barometer is taken anew",
-        "barometer",
+        "pressure",
         "observe",
         "sensor.t - barometer.agreed > MEMORY",
     ),

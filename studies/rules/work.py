@@ -28,7 +28,7 @@ CHANGED_ROWS = 2  # so many rows that change show that a rule over streams is ne
 NUDGES = 0.999, 0.9995, 0.9998, 1.0002, 1.0005, 1.001  # of all constants at once
 MODULES = {
     "height": "height",
-    "barometer": "pressure",
+    "pressure": "pressure",
     "velocity": "velocity",
     "ranges": "range",
     "plane": "plane",

@@ -21,12 +21,12 @@ import yaml
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
-from uwb_tdoa_bias.common.sensors import Height, Pressure, Velocity
+from uwb_tdoa_bias.common.sensors import SENSORS, Height, Pressure, Velocity
 from uwb_tdoa_bias.common.survey import survey_fault
 from uwb_tdoa_tools.bags.bag import read_bag, read_fields, read_odometry, write_bag
 from uwb_tdoa_tools.bags.files import messages, new_bag, open_bag
 from uwb_tdoa_tools.bags.message_types import typestore
-from uwb_tdoa_tools.bags.messages import tdoa_messages
+from uwb_tdoa_tools.bags.messages import of_sensor, sensor_messages, tdoa_messages
 from uwb_tdoa_tools.checking.recording import read_recording
 from uwb_tdoa_tools.readers.inputs import Reading
 from uwb_tdoa_tools.readers.streams import LARGEST_NUMBER
@@ -43,6 +43,19 @@ def content(path):
                 (stamp, reader.deserialize(data, connection.msgtype))
             )
         return found
+
+
+def test_a_sensor_may_have_a_quaternion_in_its_messages():
+    q = np.linspace(-1.0, 1.0, 12).reshape(3, 4)
+    compass = dataclasses.replace(
+        SENSORS["pressure"],
+        message="sensor_msgs/msg/Imu",
+        fields={"orientation": 4, "orientation_covariance": 9, "angular_velocity": 3},
+        content=lambda _: {"orientation": q, "orientation_covariance": np.full((3, 9), 0.5)},
+    )
+    stream, (row, _, _) = Pressure(np.arange(3.0), np.zeros(3)), of_sensor(compass)
+    for k, (stamp, message) in enumerate(sensor_messages(compass, stream, typestore())):
+        assert row(message) == (stamp, *q[k], *[0.5] * 9, 0.0, 0.0, 0.0)
 
 
 @BOTH

@@ -87,7 +87,7 @@ def test_a_link_that_leads_nowhere_is_found(tmp_path):
 
 def topics():
     """The topics and services of the packages: those that a node makes, and texts that look like one."""
-    found = {topic for sensor in SENSORS.values() for topic in sensor.topics}
+    found = {topic for sensor in SENSORS.values() for topic, _ in sensor.topics}
     for path in ROOT.glob("src/uwb_tdoa_*/uwb_tdoa_*/**/*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Constant) and TOPIC.fullmatch(str(node.value)):

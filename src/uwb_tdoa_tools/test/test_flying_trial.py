@@ -10,9 +10,10 @@ import pytest
 
 from uwb_tdoa_bias.common.flight import Imu, Tdoas
 from uwb_tdoa_bias.common.radio import arrival_bias
+from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_tools.flying.mission import DONE, Circles, Rules
-from uwb_tdoa_tools.flying.sensors import SENSOR_NAMES, InertialErrors, Radio, gusts
+from uwb_tdoa_tools.flying.sensors import SENSOR_NAMES, InertialErrors, OtherSensor, Radio, gusts
 from uwb_tdoa_tools.flying.simulator import IMU_RATE, Transport
 from uwb_tdoa_tools.flying.trial import Task, fly
 from uwb_tdoa_tools.flying.verdict import verdict_of
@@ -168,6 +169,21 @@ def test_other_sensors_say_what_is_true_but_for_their_noise():
     )
     off = d - np.linalg.norm(p - world.anchors.positions[world.anchors.index(ids)], axis=1)
     assert abs(off.mean()) < 0.04 and off.std() == pytest.approx(0.1, rel=0.3)
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_a_sensor_without_a_class_of_its_own_measures_by_its_record(name):
+    n, up = 100, 0.2  # rows, and m of the ground below
+    p, v = np.tile(HIGH, (n, 1)), np.tile([0.5, 0.0, 0.1], (n, 1))
+    q = np.tile([0.0, 0.0, np.sin(0.1), np.cos(0.1)], (n, 1))
+    at = slice(0, n), p, q, v, p[:, 2] - up
+    sensor, own = OtherSensor(name, HALL, 0, 10.0), SENSOR_NAMES[name](HALL, 0, 10.0)
+    assert len(sensor.t) == int(10.0 * SENSORS[name].rate)
+    one, other = (SENSORS[name].stream(sensor.t[:n], *each.measured(*at)) for each in (sensor, own))
+    off = one.values - other.values
+    assert (np.abs(off.mean(axis=0)) < 4.0 * 2**0.5 * SENSORS[name].noise[2] / n**0.5).all()
+    none = slice(0, 0), p[:0], q[:0], v[:0], p[:0, 2]
+    assert len(SENSORS[name].stream(sensor.t[:0], *sensor.measured(*none)).values) == 0
 
 
 def test_what_takes_its_time_arrives_in_order_and_whole():

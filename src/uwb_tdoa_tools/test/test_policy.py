@@ -16,6 +16,7 @@ from cflib_objects import cflib  # noqa: E402, F401
 from uwb_tdoa_bias.anchors_node import AnchorsNode  # noqa: E402
 from uwb_tdoa_bias.bias_node import BiasNode  # noqa: E402
 from uwb_tdoa_bias.common.anchors import Anchors  # noqa: E402
+from uwb_tdoa_bias.common.sensors import SENSORS  # noqa: E402
 from uwb_tdoa_ekf.debias import BiasMap  # noqa: E402
 from uwb_tdoa_ekf.debias_node import DebiasNode  # noqa: E402
 from uwb_tdoa_ekf.ekf_node import EkfNode  # noqa: E402
@@ -81,7 +82,7 @@ def arguments(tmp_path):
             "-p",
             "simulated_time:=true",
             "-p",
-            "sensors:=[height, pressure, velocity]",
+            f"sensors:=[{', '.join(SENSORS)}]",
         ],
     }
     return {name: ["--ros-args", "-p", "use_sim_time:=true", *own.get(name, ())] for name in KINDS}
@@ -99,15 +100,28 @@ def of_graph(observer, node):
     return {role: {name for name, _ in names} for role, names in found.items()}
 
 
+def differences(permitted, used):
+    """What is to be added to the profiles of an enclave, and what is to be removed."""
+    return [
+        f"{verb} {role} {name} of the profile {node}"
+        for node in sorted(permitted.keys() | used.keys())
+        for _, role in ROLES
+        for verb, one, other in (("add", used, permitted), ("remove", permitted, used))
+        for name in sorted(
+            one.get(node, {}).get(role, set()) - other.get(node, {}).get(role, set())
+        )
+    ]
+
+
 @pytest.mark.parametrize("name", KINDS)
 def test_a_node_may_do_what_it_does_and_nothing_else(name, arguments, cflib):  # noqa: F811
     rclpy.init(args=arguments[name])
     node = KINDS[name](arguments[name])
     nodes, observer = [node, *node.members], rclpy.create_node("observer")
     try:
-        assert allowed()[name] == {
-            each.get_fully_qualified_name(): of_graph(observer, each) for each in nodes
-        }
+        used = {each.get_fully_qualified_name(): of_graph(observer, each) for each in nodes}
+        assert not differences(allowed()[name], used), f"mend the enclave {name} of {FILE.name}"
+        assert allowed()[name] == used
     finally:
         for each in (*nodes, observer):
             each.destroy_node()  # or the next test sees it
@@ -123,6 +137,9 @@ def test_nobody_else_may_take_over():
         & {"/uwb/anchors", "/initialpose", "/odometry", "/uwb/tdoa_corrected", "/clock"}
         and not robot["request"]
     )
+    assert {f"/{topic}" for each in SENSORS.values() for topic, _ in each.topics} <= robot[
+        "publish"
+    ]
     offered = {
         name for nodes in policy.values() for roles in nodes.values() for name in roles["reply"]
     }

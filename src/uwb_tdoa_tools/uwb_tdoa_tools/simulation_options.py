@@ -200,7 +200,7 @@ def add_options(made: argparse.ArgumentParser) -> None:
         "what else the vehicle feels, with white noise of this standard deviation"
     ).add_argument
     for name, sensor in SENSORS.items():
-        unit, words = sensor.noise
+        unit, words, _ = sensor.noise
         add(f"--{name}-noise", metavar=unit, type=float, **unless, help=words)
 
 

@@ -6,8 +6,7 @@ odometry (nav_msgs/Odometry), status (EstimatorStatus)
   -> imu/data (sensor_msgs/Imu), uwb/tdoa (Tdoa), uwb/anchors (AnchorArray, latched),
   ground_truth/pose (geometry_msgs/PoseStamped),
      initialpose (geometry_msgs/PoseWithCovarianceStamped, once), verdict (std_msgs/String: JSON,
-     latched); if asked for: height (sensor_msgs/Range), pressure (sensor_msgs/FluidPressure),
-     velocity (geometry_msgs/TwistWithCovarianceStamped), /clock.
+     latched); if asked for: the topics of SENSORS, e.g. height (sensor_msgs/Range), and /clock.
 Services takeoff, go_to, land (Takeoff, GoTo, Land), as users of crazyswarm2 know them.
 Every parameter is documented in config/vehicle_node.yaml.
 """

@@ -4,7 +4,7 @@
 
 The filter estimates them together with the position. `offset_cross` is their covariance with the
 error state. `offset_P` is their own covariance. A variance of 0 means that the state does not
-exist. Without auxiliary states nothing is computed. `barometer` and `ranges` define their meaning
+exist. Without auxiliary states nothing is computed. `pressure` and `ranges` define their meaning
 and initialization.
 """
 

@@ -157,7 +157,7 @@ HEIGHT = _record(
     ("ignore_time", float),  # s, duration of the last such interval
 )
 
-# State of the barometer, see barometer.py.
+# State of the barometer, see pressure.py.
 BAROMETER = _record(
     ("heard", float),  # s, stamp of the last altitude
     ("agreed", float),  # s, stamp of the last altitude that was used

@@ -2,28 +2,69 @@
 # SPDX-License-Identifier: Apache-2.0
 """Dispatch the measurements of all sensors except IMU and TDOA to their modules.
 
-A SENSOR_ROW is a single measurement by a sensor of `SENSORS`.
+The update of a sensor is `observe` in the module of its name, e.g. height.py. A SENSOR_ROW is a
+single measurement by a sensor of `SENSORS`.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from importlib import import_module
+from importlib.util import find_spec
 
 import numpy as np
 
 from uwb_tdoa_bias.common.compiled import Record, compiled
 from uwb_tdoa_bias.common.sensors import SENSORS
 
-from . import barometer, height, velocity
+Update = Callable[[Record, Record, Record, Record, np.ndarray], None]  # `observe` of a sensor
 
 STREAMS = tuple(SENSORS)  # names of the sensors; SENSOR_ROW.kind is an index into them
-# sensors with a branch in `observe`; engine.py has the branch of ranges
-BRANCHES = "height", "pressure", "velocity", "range"
-_missing = set(STREAMS) - set(BRANCHES)
-if _missing:
-    raise NotImplementedError(
-        f"the filter has no branch for {', '.join(sorted(_missing))} of SENSORS: add the name to "
-        f"BRANCHES in {__name__}, and a branch to `observe` there."
-    )
-HEIGHT, PRESSURE, VELOCITY, RANGE = map(STREAMS.index, BRANCHES)
+# kinds that engine.py names
+HEIGHT, VELOCITY, RANGE = map(STREAMS.index, ("height", "velocity", "range"))
+
+
+def _update_of(name: str) -> Update:
+    """Return `observe` of the module of a sensor."""
+    place = f"{__package__}.{name}"
+    if find_spec(place) is None or not hasattr(import_module(place), "observe"):
+        raise NotImplementedError(
+            f"the filter has no branch for {name} of SENSORS: write the compiled function `observe` "
+            f"in the module {place}; docs/add_sensor.md describes it."
+        )
+    update: Update = import_module(place).observe
+    return update
+
+
+def _with_branch(kind: int, update: Update, otherwise: Update) -> Update:
+    """Return a dispatch that calls `update` for measurements of a kind, and `otherwise` for others.
+
+    Compiled code calls no table of functions, but it calls functions of a closure.
+    """
+
+    @compiled
+    def dispatch(
+        ekf: Record, parameters: Record, sensor: Record, residual: Record, records: np.ndarray
+    ) -> None:
+        if sensor.kind == kind:
+            update(ekf, parameters, sensor, residual, records)
+        else:
+            otherwise(ekf, parameters, sensor, residual, records)
+
+    return dispatch
+
+
+@compiled
+def _refuse(
+    ekf: Record, parameters: Record, sensor: Record, residual: Record, records: np.ndarray
+) -> None:
+    raise NotImplementedError("a kind of measurement without a branch in sensors.observe")
+
+
+_dispatch: Update = _refuse
+for _kind in reversed(range(len(STREAMS))):
+    if _kind != RANGE:  # engine.py has the branch of ranges
+        _dispatch = _with_branch(_kind, _update_of(STREAMS[_kind]), _dispatch)
 
 
 @compiled
@@ -53,11 +94,4 @@ def observe(
     NotImplementedError
         If no branch is for the kind of the measurement.
     """
-    if sensor.kind == HEIGHT:
-        height.observe(ekf, parameters, sensor, residual, records)
-    elif sensor.kind == PRESSURE:
-        barometer.observe(ekf, parameters, sensor, residual, records)
-    elif sensor.kind == VELOCITY:
-        velocity.observe(ekf, parameters, sensor, residual, records)
-    else:
-        raise NotImplementedError("a kind of measurement without a branch in sensors.observe")
+    _dispatch(ekf, parameters, sensor, residual, records)

@@ -130,10 +130,12 @@ def _blank(store: Typestore, kind: str) -> Any:
 
 
 def _set(holder: object, name: str, value: np.ndarray) -> None:
-    """Write a number, an array, or the numbers of a Vector3 to a field."""
+    """Write a number, an array, or the numbers of a message (Vector3, Quaternion) to a field."""
     old = getattr(holder, name)
-    if hasattr(old, "x"):
-        old.x, old.y, old.z = value.tolist()
+    parts = _parts(old)
+    if parts:
+        for part, number in zip(parts, value.tolist(), strict=True):
+            setattr(old, part, number)
     else:
         setattr(holder, name, np.ascontiguousarray(value) if np.ndim(value) else value.item())
 
@@ -155,7 +157,15 @@ def of_sensor(sensor: Sensor) -> tuple[RowOfMessage, StreamOfRows, Validity]:
 
 
 def _numbers(value: Any) -> Iterable[float]:
-    return _point(value) if hasattr(value, "x") else np.ravel(value).tolist()
+    """Return the numbers of a field that is a number, an array, or a message of numbers."""
+    parts = _parts(value)
+    return [getattr(value, part) for part in parts] if parts else np.ravel(value).tolist()
+
+
+def _parts(value: Any) -> list[str]:
+    """Return the names of the fields of a message, in order; [] for a number or an array."""
+    every = getattr(value, "__dataclass_fields__", ())
+    return [name for name in every if not name.startswith("__")]
 
 
 def tdoa_messages(

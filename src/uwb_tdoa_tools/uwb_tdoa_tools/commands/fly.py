@@ -112,9 +112,7 @@ def parser() -> argparse.ArgumentParser:
         action="append",
         default=[],
         choices=tuple(SENSORS),
-        help=(
-            "what else it measures: a range finder, a barometer, its velocity, distances to anchors"
-        ),
+        help="what else it measures: " + ", ".join(sensor.plural for sensor in SENSORS.values()),
     )
     add(
         "--floor-effect",

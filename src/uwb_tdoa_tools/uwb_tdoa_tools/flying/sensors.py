@@ -7,10 +7,13 @@ Errors that do not depend on the path are drawn in advance, by seed.
 
 from __future__ import annotations
 
+from functools import partial
 import math
-from typing import TYPE_CHECKING
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.compiled import compiled
 from uwb_tdoa_bias.common.radio import arrival_bias
@@ -25,6 +28,8 @@ from ..simulation.tdoas import make_schedule, outliers, tag_link, tdoa_noise
 from .vehicle import IMU_RATE
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from .world import World
 
 NEAR_FLOOR = 0.5  # m, largest height at which the floor acts
@@ -35,8 +40,7 @@ GUST_TIME = 1.0  # s, correlation time of gusts
 PERSON = 0.25, 1.8, 1.0  # m, radius and height of a person; m/s
 # m, delay behind a person; s, between draws of it
 BLOCKED, BLOCK_TIME = ((0.2, 2.0), 0.5)
-# noise of range finder, m, barometer, m, velocity, m/s, and distances, m
-HEIGHT_STD, ALTITUDE_STD, VELOCITY_STD, RANGE_STD = (0.01, 0.08, 0.05, 0.1)
+STD = {name: sensor.noise[2] for name, sensor in SENSORS.items()}  # of the noise of each sensor
 HIGHEST = 4.0  # m, largest distance of the range finder
 NEVER = np.inf, np.inf
 
@@ -330,7 +334,7 @@ class RangeFinder(AuxiliarySensor):
         self, rows: slice, p: np.ndarray, q: np.ndarray, v: np.ndarray, height: np.ndarray
     ) -> tuple[np.ndarray, ...]:
         up = 1.0 - 2.0 * (q[:, 0] ** 2 + q[:, 1] ** 2)
-        seen = height / np.maximum(up, 1e-3) + HEIGHT_STD * self.noise[rows, 0]
+        seen = height / np.maximum(up, 1e-3) + STD["height"] * self.noise[rows, 0]
         return (np.where((up > 0.0) & (seen <= HIGHEST), np.maximum(seen, 0.0), np.inf),)
 
 
@@ -340,7 +344,7 @@ class Barometer(AuxiliarySensor):
     def measured(
         self, rows: slice, p: np.ndarray, q: np.ndarray, v: np.ndarray, height: np.ndarray
     ) -> tuple[np.ndarray, ...]:
-        return (pressure_at(SITE + p[:, 2] + ALTITUDE_STD * self.noise[rows, 0]),)
+        return (pressure_at(SITE + p[:, 2] + STD["pressure"] * self.noise[rows, 0]),)
 
 
 class Speedometer(AuxiliarySensor):
@@ -351,7 +355,8 @@ class Speedometer(AuxiliarySensor):
     def measured(
         self, rows: slice, p: np.ndarray, q: np.ndarray, v: np.ndarray, height: np.ndarray
     ) -> tuple[np.ndarray, ...]:
-        return v + VELOCITY_STD * self.noise[rows], np.full(v.shape, max(VELOCITY_STD, LEAST_STD))
+        std = STD["velocity"]
+        return v + std * self.noise[rows], np.full(v.shape, max(std, LEAST_STD))
 
 
 class TwoWayRanging(AuxiliarySensor):
@@ -367,13 +372,51 @@ class TwoWayRanging(AuxiliarySensor):
     ) -> tuple[np.ndarray, ...]:
         anchors = self.world.anchors
         row = np.arange(rows.start, rows.stop) % len(anchors)
-        d = np.linalg.norm(p - anchors.positions[row], axis=1) + RANGE_STD * self.noise[rows, 0]
+        d = np.linalg.norm(p - anchors.positions[row], axis=1) + STD["range"] * self.noise[rows, 0]
         return anchors.ids[row], np.maximum(d, 0.0), np.zeros(len(d))
 
 
-SENSOR_NAMES = {
+class OtherSensor(AuxiliarySensor):
+    """Simulate any other sensor of SENSORS by the simulation of its record."""
+
+    def __init__(self, name: str, world: World, seed: int, duration: float) -> None:
+        """Draw stamps for `duration`, s; `name` is that of the sensor."""
+        self.rate = SENSORS[name].rate
+        super().__init__(world, seed, duration)
+        self._simulated, self._random = SENSORS[name].simulated, random(seed, name)
+        noises: dict[str, Any] = {f"{each}_noise": std for each, std in STD.items()}
+        self._config = SimpleNamespace(anchors=world.anchors, tag_lever_arm=np.zeros(3), **noises)
+
+    def measured(
+        self, rows: slice, p: np.ndarray, q: np.ndarray, v: np.ndarray, height: np.ndarray
+    ) -> tuple[np.ndarray, ...]:
+        n = len(p)
+        if not n:  # the columns of one measurement, without it
+            one = np.zeros((1, 3))
+            columns = self._columns(one, np.array([[0.0, 0.0, 0.0, 1.0]]), one, np.zeros(1))
+            return tuple(column[:0] for column in columns)
+        return self._columns(p, q, v, height)
+
+    def _columns(
+        self, p: np.ndarray, q: np.ndarray, v: np.ndarray, height: np.ndarray
+    ) -> tuple[np.ndarray, ...]:
+        turn = Rotation.from_quat(q)
+        motion = SimpleNamespace(p=p, v=turn.apply(v), q=q)
+        room = SimpleNamespace(lower=np.array([-np.inf, -np.inf, p[0, 2] - height[0]]))
+        columns: tuple[np.ndarray, ...] = self._simulated(
+            self._config,
+            room,
+            motion,
+            turn,
+            lambda *shape: self._random.standard_normal((len(p), *shape)),
+        )
+        return columns
+
+
+_OWN: dict[str, Callable[..., AuxiliarySensor]] = {
     "height": RangeFinder,
     "pressure": Barometer,
     "velocity": Speedometer,
     "range": TwoWayRanging,
 }
+SENSOR_NAMES = {name: _OWN.get(name, partial(OtherSensor, name)) for name in SENSORS}

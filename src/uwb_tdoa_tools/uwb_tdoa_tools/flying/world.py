@@ -79,8 +79,7 @@ class World:
     table : float
         Height of a round table of 0.4 m radius at the start. 0 for none.
     sensors : tuple of str
-        Further sensors: "height" (a range finder along -z of the body), "pressure", "velocity",
-        "range" (distances to anchors).
+        Further sensors, names of SENSORS, e.g. "height" (a range finder along -z of the body).
     """
 
     size: tuple[float, float, float] = (6.4, 6.2, 3.0)

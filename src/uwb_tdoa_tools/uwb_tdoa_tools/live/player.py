@@ -176,7 +176,9 @@ class Player:
         """Return how many "TDOAs" or "IMU samples" were published."""
         kind = {"TDOAs": "Tdoa", "IMU samples": "Imu"}[what]
         return sum(
-            n for topic, n in self.played.counts.items() if _kind(self._publishers[topic]) == kind
+            n
+            for topic, n in self.played.counts.items()
+            if _kind(self._publishers[topic]) == kind and topic not in self._sensors
         )
 
     def play(self, recorded: Iterable[tuple[Connection, int, bytes]]) -> None:

@@ -84,7 +84,7 @@ SENSOR = Sensor(
         np.isfinite(height.range) & (height.range >= 0.0),
     ),
     simulated=_simulated,
-    noise=("M", "write ranges to the floor, along the body's -z"),
+    noise=("M", "write ranges to the floor, along the body's -z", 0.01),
     parameters={
         "use_height": parameter(
             True,

@@ -66,7 +66,7 @@ SENSOR = Sensor(
     sound=finite,
     measured=_measured,
     simulated=_simulated,
-    noise=("M", "write pressures; in metres of altitude"),
+    noise=("M", "write pressures; in metres of altitude", 0.08),
     parameters={
         "use_pressure": parameter(
             True, "use pressures of a barometer, if there are any", fixed=True

@@ -139,7 +139,7 @@ SENSOR = Sensor(
     sound=finite,
     measured=_measured,
     simulated=_simulated,
-    noise=("M", "write distances to anchors, as of two-way ranging"),
+    noise=("M", "write distances to anchors, as of two-way ranging", 0.1),
     parameters={
         "use_range": parameter(
             True, "use distances to anchors, as of two-way ranging, if there are any", fixed=True

@@ -119,7 +119,9 @@ class Sensor:
     ----------
     plural : words for several measurements
     stream : class of its Stream
-    message, fields : type of its messages, and {field: count of numbers} of the fields that are read
+    message, fields : type of its messages, and {field: count of numbers} of the fields that are
+        read: numbers, arrays of a fixed length, or messages of numbers (Vector3, Quaternion), with a
+        dot before a field of a field
     columns : callable of {field: (n,) or (n, k)} -> columns of the Stream, without stamps
     content : callable of a Stream -> {field: value, (n,) or (n, k)} of its messages; missing fields
         are 0
@@ -130,7 +132,8 @@ class Sensor:
     simulated : callable of (SimulationConfig, Room, motion, turn, noise) -> columns, without stamps:
         true values and white noise. The motion is of the body, turn holds its Rotations, and
         noise(...) gives standard normal numbers (n, ...).
-    noise : (unit, words) of the standard deviation of that noise, for the options of `simulate`
+    noise : (unit, words, size) of the standard deviation of that noise: unit and words for the
+        options of `simulate`, and its size on the vehicle of `fly`
     parameters : {name: `parameter`} of the filter; use_<name> is the first
     invalid : the content that messages need
     remedy : what to check if the measurements contradict all other data

@@ -168,7 +168,7 @@ SENSOR = Sensor(
     sound=_sound,
     measured=_measured,
     simulated=_simulated,
-    noise=("M/S", "write velocities in the body frame"),
+    noise=("M/S", "write velocities in the body frame", 0.05),
     parameters={
         "use_velocity": parameter(
             True, "use velocities in the body frame, if there are any", fixed=True
