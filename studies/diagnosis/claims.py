@@ -156,7 +156,9 @@ def _covariates(finding):
     """
     own, _, name = finding.effect.label.rpartition(" over ")
     others = (other.effect.rpartition(" over ") for other in finding.alternatives)
-    return tuple(dict.fromkeys((name, *(other for part, _, other in others if part == own))))
+    names = (name, *(other for part, _, other in others if part == own))
+    # a function of two covariates names both
+    return tuple(dict.fromkeys(one for each in names for one in each.split(" and ")))
 
 
 def _declared(effect):

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Functions without a name: splines and shapes, their bias, their refusals and their words."""
 
+from dataclasses import replace
+
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
@@ -11,7 +13,8 @@ import yaml
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.effects import RADIO, EffectSet, SmoothTerm
-from uwb_tdoa_bias.effects.smooth_term import SHAPES, described, shape_basis
+from uwb_tdoa_bias.effects.covariates import fade_weight
+from uwb_tdoa_bias.effects.smooth_term import FACTORS, SHAPES, described, shape_basis
 
 KNOTS = {2: (1.0, 3.0), 3: (1.0, 2.0, 3.0), 4: (1.0, 1.5, 2.5, 3.0)}
 seeds = st.integers(0, 2**32 - 1)
@@ -50,6 +53,16 @@ def test_a_function_of_ranges_adds_nothing_to_tdoas_nor_the_other_way_round():
         term(channel="range", form="common", covariate="previous_anchor")
 
 
+@pytest.mark.parametrize("shape, knots", [("wave", (0.0, 4.0)), ("pulse", (1.0, 2.0, 5.0))])
+def test_what_recurs_goes_on_beyond_its_domain_and_fades(shape, knots):
+    samples = random_samples(3)
+    one = SmoothTerm({"c1": 0.3}, covariate="time", knots=knots, shape=shape, form="common")
+    seen = replace(one, domain={"time": (0.0, 0.5 * np.ptp(samples.t))})
+    weight = fade_weight(samples.t - samples.start, seen.domain["time"])
+    assert weight.min() < 0.9
+    np.testing.assert_allclose(seen.corrected_bias(samples), weight * one.bias(samples), atol=1e-12)
+
+
 def test_a_spline_is_constant_beyond_its_knots():
     at = np.array([-5.0, 1.0, 9.0, 50.0])
     np.testing.assert_allclose(term().curve(at), [0.1, 0.1, 0.3, 0.3], atol=1e-12)
@@ -75,6 +88,95 @@ def test_the_bias_is_what_its_regressors_are_times_its_coefficients(channel, sha
     expected = full.regressors(samples, keys) @ list(values.values())
     np.testing.assert_allclose(full.bias(samples), expected, atol=1e-12)
     assert channel == "tdoa" or np.abs(full.bias(samples)).max() > 1e-3
+
+
+@given(
+    st.sampled_from(list(SHAPES)),
+    st.sampled_from(FACTORS),
+    st.sampled_from(["common", "arrival", "anchor", "pair", "direction"]),
+    seeds,
+)
+def test_a_factor_multiplies_the_function_but_not_its_level(shape, factor_shape, form, seed):
+    samples, rng = random_samples(seed % 100), np.random.default_rng(seed)
+    ids, knots = samples.anchors.ids, KNOTS[SHAPES[shape][0]]
+    several = form in ("arrival", "anchor")
+    factor = "range" if several and seed % 2 else "x"
+    factor_knots = {2: (-2.0, 4.0), 3: (-2.0, 1.0, 4.0), 4: (-2.0, 0.5, 2.0, 4.0)}
+    settings = {
+        "covariate": "height",
+        "form": form,
+        "knots": knots,
+        "shape": shape,
+        "factor": factor,
+        "factor_shape": factor_shape,
+        "factor_knots": factor_knots[SHAPES[factor_shape][0]],
+    }
+    empty = SmoothTerm(**settings)
+    part = {"pair": f"{ids[0]}-{ids[1]}", "direction": f"{ids[1]}-{ids[0]}"}.get(form)
+    keys = empty.keys_of((part,)) if part else empty.keys(samples.anchors)
+    values = dict(zip(keys, rng.standard_normal(len(keys)).tolist()))
+    full = SmoothTerm(values, **settings)
+    bias = full.bias(samples)
+    np.testing.assert_allclose(bias, full.regressors(samples, keys) @ list(values.values()))
+    # by hand: with levels alone the factor counts for nothing, without levels it is a factor
+    alone = {key: value for key, value in settings.items() if not key.startswith("factor")}
+    levels = {key: value for key, value in values.items() if key.endswith("c0")}
+    rest = {key: value for key, value in values.items() if not key.endswith("c0")}
+    if not several:
+        by = shape_basis(factor_shape, settings["factor_knots"], samples.p[:, 0])[:, 1]
+        expected = SmoothTerm(levels, **alone).bias(samples)
+        expected = expected + by * SmoothTerm(rest, **alone).bias(samples)
+        np.testing.assert_allclose(bias, expected, atol=1e-12)
+    assert set(full.covariates) == {"height", factor}
+    assert full.jacobian_states == (0, 1, 2)
+
+
+def test_a_product_is_read_as_it_is_written(tmp_path):
+    one = term(
+        covariate="speed",
+        form="anchor",
+        shape="step",
+        knots=[0.0, 1.0, 2.0],
+        factor="height",
+        factor_shape="interval",
+        factor_knots=[0.0, 1.0, 2.0, 3.0],
+        values={"3.c0": 0.1, "3.c1": 0.8},
+    )
+    EffectSet((one,)).to_yaml(tmp_path / "effects.yaml")
+    (read,) = EffectSet.from_yaml(tmp_path / "effects.yaml").effects
+    assert read == one
+    assert one.label == "tdoa of anchor 3 over speed and height"
+    assert one.needs_motion and one.usable
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        ({"factor": "range"}, "'range' is not one of time, x"),
+        ({"factor": "speed"}, "'speed' is not one of time, x"),
+        ({"factor": "colour"}, "'colour' is not one of"),
+        ({"factor": "previous_anchor"}, "'previous_anchor' is not one of"),
+        ({"shape": "spline"}, "'height' multiplies a spline"),
+        ({"factor_shape": "wave", "factor_knots": [0.0, 1.0]}, "'wave' with 2 knots"),
+        ({"factor_knots": [0.0, 1.0]}, "'step' with 2 knots is not one of line"),
+        ({"factor_knots": [1.0, 0.0, 2.0]}, "factor_knots: .* are not two or more rising"),
+        ({"channel": "gyro.x"}, "acts on 'gyro.x'"),
+    ],
+)
+def test_a_factor_that_cannot_be_is_refused(changes, message):
+    settings = {
+        "covariate": "speed",
+        "form": "common",
+        "shape": "line",
+        "knots": [0.0, 1.0],
+        "factor": "height",
+        "factor_shape": "step",
+        "factor_knots": [0.0, 1.0, 2.0],
+        "values": {"c1": 0.1},
+    }
+    settings |= {"covariate": "turning_rate"} if "channel" in changes else {}
+    with pytest.raises(InputError, match=message):
+        term(**(settings | changes))
 
 
 @pytest.mark.parametrize(
@@ -146,6 +248,7 @@ def test_a_function_of_no_channel_is_refused_with_those_that_there_are():
         ("below", [1.0, 1.5, 2.0, 2.5], [1.0, 0.5, 0.0, 0.0]),
         ("step", [1.9, 2.0, 4.0], [0.0, 1.0, 1.0]),
         ("interval", [1.4, 1.5, 2.4, 2.5], [0.0, 1.0, 1.0, 0.0]),
+        ("pulse", [0.9, 1.0, 1.9, 2.0, 3.1, 4.1, -0.5], [0.0, 1.0, 1.0, 0.0, 1.0, 0.0, 1.0]),
         ("wave", [1.0, 1.5, 2.5], [0.0, 1.0, -1.0]),
     ],
 )
@@ -213,6 +316,27 @@ def found_term(values, covariate, form, knots, shape, channel="tdoa"):
             "",
             "each value of yaw_rate is 0.100 ± 0.005 rad/s larger for each s more of time "
             "(seen from 0 s to 4 s)",
+        ),
+        (
+            found_term({"2.c0": 0.0, "2.c1": 0.4}, "time", "anchor", (3.0, 5.0, 11.0), "pulse"),
+            "2",
+            "anchor 2 seems 0.40 ± 0.02 m farther for 2 s in each 8 s of time, first at 3 s",
+        ),
+        (
+            SmoothTerm(
+                {"2.c0": 0.0, "2.c1": 0.8},
+                {},
+                covariate="speed",
+                form="anchor",
+                knots=(0.0, 1.5, 3.0),
+                shape="step",
+                factor="height",
+                factor_shape="step",
+                factor_knots=(0.5, 2.0, 3.0),
+            ),
+            "2",
+            "anchor 2 seems 0.8 m farther where speed is above 1.5 m/s, while height is above 2 m "
+            "(seen from 0 m/s to 3 m/s)",
         ),
     ],
 )

@@ -42,6 +42,43 @@ def put_in(form, key, covariate, knots, shape, size):
     )
 
 
+def product(key, first, second, size):
+    """A product of two intervals or steps, each (covariate, knots)."""
+    (covariate, knots), (factor, factor_knots) = first, second
+    shapes = {3: "step", 4: "interval"}
+    return SmoothTerm(
+        {f"{key}.c1": size},
+        covariate=covariate,
+        form="anchor",
+        knots=knots,
+        shape=shapes[len(knots)],
+        factor=factor,
+        factor_shape=shapes[len(factor_knots)],
+        factor_knots=factor_knots,
+    )
+
+
+RARE = [
+    product("3", ("x", (-3.0, 0.0, 3.0)), ("height", (0.0, 1.2, 3.0)), 0.5),
+    product("5", ("range", (2.0, 4.5, 8.0)), ("y", (-3.0, -1.0, 1.5, 3.0)), 0.6),
+    put_in("anchor", "2", "time", (1.0, 3.0, 7.5), "pulse", 0.4),
+    put_in("pair", "0-1", "time", (0.0, 5.3), "wave", 0.3),
+]
+
+
+@pytest.mark.parametrize("term", RARE, ids=lambda term: f"{term.covariate}-{term.shape}")
+def test_a_product_of_two_covariates_or_what_recurs_is_proposed_first(flight, term):
+    table, model, scan = scanned(term.inject(flight))
+    proposals = scan._products(model.information(table), model.residual)
+    first = proposals[0]
+    assert {*first.term.arguments} == {*term.arguments}
+    assert first.key[2] == next(iter(term.values)).rpartition(".")[0]
+    assert first.term.shape == term.shape or term.factor
+    simple = scan.gains(table, _held(table, model, ()))[0]
+    assert first.gain > 1.2 * simple[0]  # with the weights of the fit
+    assert first.candidate.label in {one.label for one in scan(table, model, ())}
+
+
 TERMS = [
     put_in("anchor", "3", "x", (-3.0, 0.5, 3.0), "step", 0.3),
     put_in("pair", "0-1", "time", (0.0, 15.0, 22.0, 40.0), "interval", 0.4),

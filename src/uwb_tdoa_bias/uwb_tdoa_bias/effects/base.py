@@ -257,6 +257,7 @@ class Effect:
     needs_reference: ClassVar[bool] = False  # True: innovations alone do not show it
     needs_motion: ClassVar[bool] = False  # True: depends on more than the pose of the tag
     uses_attitude: ClassVar[bool] = False  # True: its bias depends on the attitude of the tag
+    periodic: ClassVar[bool] = False  # True: it recurs in time, and goes on beyond its domain
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
@@ -412,8 +413,8 @@ class Effect:
     def corrected_bias(self, samples: Samples) -> np.ndarray:
         """Return the bias that is corrected, (n,) m: it fades beyond the domain.
 
-        It is NaN where unknown. A time is held at the end of its domain: no growth beyond it was
-        observed.
+        It is NaN where unknown. A time is held at the end of its domain, because no growth beyond
+        it was observed. What recurs goes on.
         """
         return self.faded_bias(samples)[0]
 
@@ -437,7 +438,7 @@ class Effect:
                 weight *= of_arrivals.reshape(-1, n).min(axis=0)
             elif (values := covariate_of(samples, covariate)) is not None:
                 weight *= fade_weight(values, limits)
-        if "time" in self.domain:
+        if "time" in self.domain and not self.periodic:
             last = samples.start + self.domain["time"][1]
             samples = replace(samples, t=np.minimum(samples.t, last))
         bias = self.bias(samples)

@@ -66,16 +66,20 @@ OF_LINKS = ("pair", "direction")  # forms with one function per pair of anchors
 RADIO_PRIOR_STD, PRIOR_STD = 0.3, {"gyro": 0.1, "accel": 0.5}
 MOST_PARTS = 3  # anchors or pairs whose functions are described
 # {shape: (knots, coefficients)}. Knots are the ends, and points between them where a part begins or
-# ends. The knots of a wave are one period apart.
+# ends. The knots of a wave are one period apart. Those of a pulse are its start, its end, and the
+# start of the next one.
 SHAPES = {
     "line": (2, 2),
     "beyond": (3, 2),
     "below": (3, 2),
     "step": (3, 2),
     "interval": (4, 2),
+    "pulse": (3, 2),
     "wave": (2, 3),
     "parabola": (2, 3),
 }
+# Shapes of a factor: those with one function besides the level.
+FACTORS = ("line", "beyond", "below", "step", "interval")
 
 
 @dataclass
@@ -91,6 +95,8 @@ class SmoothTerm(Effect):
         only.
     knots : where pieces meet, rising, ends included; of a covariate of names the names
     shape : "spline", quadratic, or a name of SHAPES
+    factor : a second covariate, or "". A shape of FACTORS over it, with its own knots, multiplies
+        the function without its level c0.
     """
 
     channel: str = "tdoa"
@@ -98,6 +104,9 @@ class SmoothTerm(Effect):
     form: str = "common"
     knots: tuple[float, ...] = field(default_factory=tuple)
     shape: str = "spline"
+    factor: str = ""
+    factor_shape: str = ""
+    factor_knots: tuple[float, ...] = field(default_factory=tuple)
 
     row = Row(
         name="smooth_term",
@@ -110,19 +119,21 @@ class SmoothTerm(Effect):
         reference="found in residuals by diagnose",
     )
     penalty: ClassVar[float] = 6.0  # a declared effect wins if it explains as much
-    settings: ClassVar[tuple] = ("channel", "covariate", "form", "knots", "shape")
+    settings: ClassVar[tuple] = (
+        "channel",
+        "covariate",
+        "form",
+        "knots",
+        "shape",
+        "factor",
+        "factor_shape",
+        "factor_knots",
+    )
     fitted: ClassVar[bool] = False
     key_form: ClassVar[tuple[str, str]] = r"(.+\.)?c[0-9]+", "a coefficient such as c0 or 3.c0"
 
     def __post_init__(self) -> None:
-        try:
-            self.knots = tuple(float(knot) for knot in self.knots)
-        except (TypeError, ValueError):
-            self.knots = ()
-        if len(self.knots) < 2 or not (np.diff(self.knots) > 0.0).all():
-            raise InputError(
-                f"effects: smooth_term: knots: {self.knots!r} are not two or more rising numbers."
-            )
+        self.knots = _rising("knots", self.knots)
         known = known_covariates()
         extra = self.covariate.startswith(EXTRA) and self.channel not in SENSOR_CHANNELS
         if (
@@ -156,7 +167,31 @@ class SmoothTerm(Effect):
                 f"effects: smooth_term: form: {self.form} acts on both anchors, "
                 f"{self.covariate} is of one; write form: anchor."
             )
+        if self.factor:
+            self._check_factor(known[self.channel])
         super().__post_init__()
+
+    def _check_factor(self, known: Sequence[str]) -> None:
+        """Raise InputError if the factor is none; known : covariates of the channel."""
+        self.factor_knots = _rising("factor_knots", self.factor_knots)
+        name = "effects: smooth_term: factor"
+        if self.channel not in RADIO or self.shape == "spline":
+            raise InputError(
+                f"{name}: {self.factor!r} multiplies a spline, or acts on {self.channel!r}; a factor "
+                f"is for shapes on {listed(RADIO)}."
+            )
+        known = [one for one in known if has_domain(one) and one != self.covariate]
+        if self.form in ("common", *OF_LINKS):
+            known = [one for one in known if one not in OF_ARRIVAL]
+        if self.factor not in known:
+            raise InputError(f"{name}: {self.factor!r} is not one of {listed(known)}.")
+        count = SHAPES[self.factor_shape][0] if self.factor_shape in FACTORS else 0
+        if len(self.factor_knots) != count:
+            shapes = ", ".join(f"{shape} ({SHAPES[shape][0]})" for shape in FACTORS)
+            raise InputError(
+                f"{name}_shape: {self.factor_shape!r} with {len(self.factor_knots)} knots is not one "
+                f"of {shapes}."
+            )
 
     @classmethod
     def within_bounds(cls, values: dict[str, float]) -> bool:
@@ -179,32 +214,44 @@ class SmoothTerm(Effect):
     def label_of(self, keys: Iterable[str]) -> str:
         parts = list(dict.fromkeys(key.rpartition(".")[0] for key in keys))
         of = f" of {self.form} {parts[0]}" if len(parts) == 1 and parts[0] else ""
-        return f"{self.channel}{of} over {self.covariate}"
+        return f"{self.channel}{of} over {' and '.join(self.arguments)}"
+
+    @property
+    def arguments(self) -> tuple[str, ...]:
+        """Return its covariate, and that of its factor."""
+        return (self.covariate, self.factor) if self.factor else (self.covariate,)
 
     @property
     def covariates(self) -> tuple[str, ...]:  # type: ignore[override]  # of a term
-        """Return its covariate, and the height where it is a function of the place."""
-        own = (self.covariate,) if has_domain(self.covariate) else ()
-        of_place = self.channel in RADIO and self.covariate in OF_PLACE
-        return (*own, "height") if of_place and self.covariate != "height" else own
+        """Return its arguments, and the height where it is a function of the place."""
+        own = tuple(filter(has_domain, self.arguments))
+        of_place = self.channel in RADIO and set(own) & set(OF_PLACE)
+        return (*own, "height") if of_place and "height" not in own else own
 
     @property
     def uses_attitude(self) -> bool:  # type: ignore[override]  # of a term
-        return self.covariate.endswith("_in_tag") or self.covariate == "tilt"
+        return any(name.endswith("_in_tag") or name == "tilt" for name in self.arguments)
+
+    @property
+    def periodic(self) -> bool:  # type: ignore[override]  # of a term
+        return self.covariate == "time" and self.shape in ("wave", "pulse")
 
     @property
     def jacobian_states(self) -> tuple[int, ...]:
-        return STATES.get(self.covariate, ()) if self.channel == "tdoa" else ()
+        if self.channel != "tdoa":
+            return ()
+        return tuple(sorted({state for name in self.arguments for state in STATES.get(name, ())}))
 
     @property
     def needs_motion(self) -> bool:  # type: ignore[override]  # of a term
-        return self.channel == "tdoa" and self.covariate in OF_MOTION
+        return self.channel == "tdoa" and any(name in OF_MOTION for name in self.arguments)
 
     @property
     def usable(self) -> bool:  # type: ignore[override]  # of a term
         """Return whether nodes can compute the covariate."""
         if self.channel in RADIO:
-            return self.covariate in (*OF_TDOA, *OF_ARRIVAL) and self.covariate != "vibration"
+            computed = {*OF_TDOA, *OF_ARRIVAL} - {"vibration"}
+            return computed.issuperset(self.arguments)
         return self.channel in IMU_CHANNELS and self.covariate in (*OF_IMU, *OF_STATE)
 
     def keys(self, anchors: Anchors | None = None) -> tuple[str, ...]:
@@ -215,27 +262,36 @@ class SmoothTerm(Effect):
         """Return all coefficients of some anchors, "3", or pairs, "0-1"."""
         return tuple(f"{part}.c{k}".lstrip(".") for part in parts for k in range(self.count))
 
-    def basis(self, values: ArrayLike) -> np.ndarray:
+    def basis(self, values: ArrayLike, factor: np.ndarray | None = None) -> np.ndarray:
         """Return the basis functions of c0, c1, ... at values (n,) of the covariate, (n, k).
 
         They are NaN for NaN.
+
+        factor : (n,) by which those of c1, ... are multiplied
         """
         at: np.ndarray = floats(values)
         if self.shape != "spline":
-            return shape_basis(self.shape, self.knots, at)
+            basis = shape_basis(self.shape, self.knots, at)
+            if factor is None:
+                return basis
+            more = (basis[:, k] * factor for k in range(1, self.count))
+            return np.stack([basis[:, 0], *more], axis=1)
         if self.covariate in CATEGORIES:
             return 1.0 * (at[:, None] == self._at)
         out = np.zeros((len(at), self.count))
         _basis(self._at, at, out)
         return out
 
-    def curve(self, values: np.ndarray, prefix: str = "") -> np.ndarray:
+    def curve(
+        self, values: np.ndarray, prefix: str = "", factor: np.ndarray | None = None
+    ) -> np.ndarray:
         """Return the function at covariate values (n,), (n,).
 
         prefix : "3." for anchor 3 of the form "anchor", "0-1." for a pair
+        factor : (n,) values of the factor, 1 if None
         """
         weights = np.array([self._coefficients(prefix)])
-        return self._functions(values, weights, np.zeros(len(values), dtype=np.int64))
+        return self._functions(values, weights, np.zeros(len(values), dtype=np.int64), factor)
 
     def spread(self, values: np.ndarray, prefix: str = "") -> np.ndarray:
         """Return the standard deviation of `curve` without its level, (n,).
@@ -257,10 +313,16 @@ class SmoothTerm(Effect):
             return SHAPES[self.shape][1]
         return len(self.knots) if self.covariate in CATEGORIES else len(self.knots) + DEGREE - 1
 
-    def _functions(self, values: np.ndarray, weights: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    def _functions(
+        self,
+        values: np.ndarray,
+        weights: np.ndarray,
+        rows: np.ndarray,
+        factor: np.ndarray | None = None,
+    ) -> np.ndarray:
         """Return the values (n,) of functions with weights (m, k); function rows (n,)."""
         if self.shape != "spline" or self.covariate in CATEGORIES:
-            return np.einsum("nk,nk->n", self.basis(values), weights[rows])
+            return np.einsum("nk,nk->n", self.basis(values, factor), weights[rows])
 
         def curves(at: np.ndarray) -> np.ndarray:
             return filled(_curves, at.shape, self._at, at, weights, rows)
@@ -276,33 +338,47 @@ class SmoothTerm(Effect):
     def _coefficients(self, prefix: str) -> list[float]:
         return [self.values.get(f"{prefix}c{k}", 0.0) for k in range(self.count)]
 
-    def _covariate(self, samples: Samples) -> tuple[Any, np.ndarray | None]:
-        """Return (values per measurement or None, values per arrival or None)."""
-        if self.covariate in OF_ARRIVAL:
-            return None, covariate_of(samples, self.covariate)
-        if self.covariate in OF_TDOA:
-            values = covariate_of(samples, self.covariate)
+    def _values_of(self, covariate: str, samples: Samples) -> np.ndarray | None:
+        """Return values per arrival, or per measurement if both arrivals have one function."""
+        if covariate in (*OF_TDOA, *OF_ARRIVAL):
+            values = covariate_of(samples, covariate)
         else:
-            values = (samples.extra or {}).get(self.covariate.removeprefix(EXTRA))
-        return values, None if values is None else tile(samples, values)
+            values = (samples.extra or {}).get(covariate.removeprefix(EXTRA))
+        if values is None or covariate in OF_ARRIVAL or self.form in ("common", *OF_LINKS):
+            return values
+        return tile(samples, values)
+
+    def _arguments(self, samples: Samples) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """Return values of the covariate, and of the factor's shape or None, as of `_values_of`.
+
+        The first is None if samples lack a covariate.
+        """
+        values = self._values_of(self.covariate, samples)
+        if not self.factor:
+            return values, None
+        at = self._values_of(self.factor, samples)
+        if at is None:
+            return None, None
+        return values, shape_basis(self.factor_shape, self.factor_knots, at)[:, 1]
 
     def bias(self, samples: Samples) -> np.ndarray:
         n = len(samples)
-        values, both = self._covariate(samples)
-        if self.channel != samples.channel or both is None:
+        values, factor = self._arguments(samples)
+        if self.channel != samples.channel or values is None:
             return np.zeros(n)
         if self.form == "common":
-            return self.curve(values)
+            return self.curve(values, "", factor)
         if self.form in OF_LINKS:
             links = dict.fromkeys(key.rpartition(".")[0] for key in self.values)
-            parts = (self._of_link(samples, k) * self.curve(values, f"{k}.") for k in links)
+            parts = (self._of_link(samples, k) * self.curve(values, f"{k}.", factor) for k in links)
             return sum(parts, np.zeros(n))
         rows, weights = samples.rows, self._weights(samples.anchors)
         mine = np.flatnonzero(np.count_nonzero(weights, axis=1)[rows])
-        if len(mine) == len(rows) or not isinstance(both, np.ndarray):
-            return samples.difference(self._functions(both, weights, rows))
-        late = np.where(np.isnan(both), np.nan, 0.0)  # of anchors without a function
-        late[mine] = self._functions(both[mine], weights, rows[mine])
+        if len(mine) == len(rows) or not isinstance(values, np.ndarray):
+            return samples.difference(self._functions(values, weights, rows, factor))
+        late = np.where(np.isnan(values), np.nan, 0.0)  # of anchors without a function
+        of_mine = None if factor is None else factor[mine]
+        late[mine] = self._functions(values[mine], weights, rows[mine], of_mine)
         return samples.difference(late)
 
     def _of_link(self, samples: Samples, link: str) -> np.ndarray:
@@ -327,9 +403,9 @@ class SmoothTerm(Effect):
             return ()
         low, high = self.domain.get(self.covariate, (self.knots[0], self.knots[-1]))
         beyond = GONE * (high - low) if self.domain else 0.0
-        periodic = self.shape == "wave" and not self.domain
+        endless = self.shape == "wave" and not self.domain
         ends = low - beyond, high + beyond
-        return (SensorFunction.of(self._faded_curve, self.channel, self.covariate, ends, periodic),)
+        return (SensorFunction.of(self._faded_curve, self.channel, self.covariate, ends, endless),)
 
     @property
     def _axis(self) -> int:
@@ -352,18 +428,18 @@ class SmoothTerm(Effect):
                 out[:, self._axis] = self.basis(values)[:, [int(key[1:]) for key in keys]]
             return out
         out = np.zeros((len(samples), len(keys)))
-        values, both = self._covariate(samples)
-        if self.channel != samples.channel or both is None:
+        values, factor = self._arguments(samples)
+        if self.channel != samples.channel or values is None:
             return out
+        basis = self.basis(values, factor)
         if self.form == "common":
-            return self.basis(values)[:, [int(key[1:]) for key in keys]]
+            return basis[:, [int(key[1:]) for key in keys]]
         if self.form in OF_LINKS:
-            basis = self.basis(values)
             for column, key in enumerate(keys):
                 link, _, coefficient = key.rpartition(".")
                 out[:, column] = basis[:, int(coefficient[1:])] * self._of_link(samples, link)
             return out
-        basis, ids = self.basis(both), samples.anchors.ids[samples.rows]
+        ids = samples.anchors.ids[samples.rows]
         unknown = np.isnan(basis).any(axis=1)
         basis[unknown] = np.nan
         for column, key in enumerate(keys):
@@ -389,6 +465,19 @@ class SmoothTerm(Effect):
         cause, trial = causes(self)
         functions = listed(described(self, part) for part in parts)
         return (f"Look for why {functions}: {cause}. To tell: {trial}.",)
+
+
+def _rising(name: str, knots: Any) -> tuple[float, ...]:
+    """Return knots as a tuple of floats; raise InputError if they are not rising."""
+    try:
+        out = tuple(float(knot) for knot in knots)
+    except (TypeError, ValueError):
+        out = ()
+    if len(out) < 2 or not (np.diff(out) > 0.0).all():
+        raise InputError(
+            f"effects: smooth_term: {name}: {knots!r} are not two or more rising numbers."
+        )
+    return out
 
 
 @compiled
@@ -451,6 +540,7 @@ def shape_basis(shape: str, knots: Sequence[float], values: np.ndarray) -> np.nd
     line, parabola : a rise from -1/2 to 1/2 between the knots; a parabola has its square too
     beyond, below : a rise from 0 at the middle knot to 1 at the last, or at the first
     step, interval : 1 beyond the middle knot, or between the two inner knots
+    pulse : 1 from the first knot to the second, and again from the third
     wave : the sine of the period between the knots, and the cosine
     """
     v, one = floats(values), np.ones(len(values))
@@ -467,6 +557,9 @@ def shape_basis(shape: str, knots: Sequence[float], values: np.ndarray) -> np.nd
         second = np.maximum(held - knots[1], 0.0) / (high - knots[1])
     elif shape == "below":
         second = np.maximum(knots[1] - held, 0.0) / (knots[1] - low)
+    elif shape == "pulse":
+        within = np.remainder(v - knots[0], knots[2] - knots[0]) < knots[1] - knots[0]
+        second = np.where(np.isnan(v), np.nan, 1.0 * within)
     else:
         inside = (v >= knots[1]) & (v < knots[2] if shape == "interval" else True)
         second = np.where(np.isnan(v), np.nan, 1.0 * inside)
@@ -602,7 +695,7 @@ def described(term: SmoothTerm, part: str = "") -> str:
     prefix = f"{part}." if part else ""
     name, unit = _named(term.covariate), UNITS.get(term.covariate, "")
     knots = [f"{rounded(knot)} {unit}".strip() for knot in term.knots]
-    seen = f" (seen from {knots[0]} to {knots[-1]})"
+    seen = f"{_where_factor(term)} (seen from {knots[0]} to {knots[-1]})"
     size = term.values.get(f"{prefix}c1", 0.0)
     std = term.std.get(f"{prefix}c1")
     if term.shape in ("step", "interval"):
@@ -615,6 +708,12 @@ def described(term: SmoothTerm, part: str = "") -> str:
         else:
             where = f"where {name} is between {knots[1]} and {knots[2]}"
         return _off(term, part, size, std, f" {where}{seen}")
+    if term.shape == "pulse":
+        on, period = (
+            f"{rounded(value - term.knots[0])} {unit}".strip() for value in term.knots[1:]
+        )
+        where = f" for {on} in each {period} of {name}, first at {knots[0]}{_where_factor(term)}"
+        return _off(term, part, size, std, where)
     if term.shape in ("line", "beyond", "below"):
         first, last = {"line": (0, 1), "beyond": (1, 2), "below": (1, 0)}[term.shape]
         width = term.knots[last] - term.knots[first]
@@ -628,11 +727,27 @@ def described(term: SmoothTerm, part: str = "") -> str:
     swing = course[top] - course[bottom]
     if term.shape == "wave":
         length = f"{rounded(term.knots[1] - term.knots[0])} {unit}".strip()
-        return _off(term, part, swing, None, f" and less in turn, every {length} of {name}")
+        how = f" and less in turn, every {length} of {name}{_where_factor(term)}"
+        return _off(term, part, swing, None, how)
     where = (
         f"where {name} is {rounded(at[top])} {unit} than where it is {rounded(at[bottom])} {unit}"
     )
     return _off(term, part, swing, None, f" {where}{seen}")
+
+
+def _where_factor(term: SmoothTerm) -> str:
+    """Return how the factor changes the function, as a part of a clause; "" without one."""
+    if not term.factor:
+        return ""
+    name, unit = _named(term.factor), UNITS.get(term.factor, "")
+    knots = [f"{rounded(knot)} {unit}".strip() for knot in term.factor_knots]
+    return {
+        "line": f", with opposite signs at a {name} of {knots[0]} and of {knots[-1]}",
+        "beyond": f", growing from none at a {name} of {knots[1]} to this at {knots[-1]}",
+        "below": f", growing from none at a {name} of {knots[1]} to this at {knots[0]}",
+        "step": f", while {name} is above {knots[1]}",
+        "interval": f", while {name} is between {knots[1]} and {knots[-2]}",
+    }[term.factor_shape]
 
 
 def causes(term: SmoothTerm) -> tuple[str, str]:

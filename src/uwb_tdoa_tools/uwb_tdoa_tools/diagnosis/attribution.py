@@ -40,6 +40,7 @@ from .refinement import (
 from .regression.confounding import alternatives
 from .regression.fit import fit, in_common, prior_sizes
 from .regression.held_out import held_out
+from .regression.products import FOR_MAPS
 from .regression.scan import Scan
 from .regression.select import Selection, select, with_rivals
 from .regression.table import table_of
@@ -61,9 +62,6 @@ if TYPE_CHECKING:
     from .regression.select import Rival, Search
     from .regression.table import RegressionTable
 
-# Flights, fewest for a map. With fewer, the map depends on their paths and does not generalize; two
-# similar paths validate each other.
-FOR_MAPS = 3
 ON_FLOOR = 0.5  # m, smallest change of a reported function of UPWARDS near the floor
 RANGED = tuple(
     name for name, kind in RADIO.items() if kind.ends == 1

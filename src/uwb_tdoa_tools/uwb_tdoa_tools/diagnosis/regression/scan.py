@@ -24,6 +24,7 @@ from uwb_tdoa_bias.effects.smooth_term import SHAPES
 
 from .algebra import dense
 from .fit import prior_sizes, refit
+from .products import Products
 from .terms import Candidate, Term, columns_of
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 
     from ..channels.views import CovariateView
     from .fit import Fit
+    from .products import Proposal
     from .table import RegressionTable
 
     _Held = tuple[np.ndarray, np.ndarray, np.ndarray]  # return value of `_held`
@@ -51,6 +53,9 @@ FEWEST = 12  # smallest number of values of a subset
 MANY_VALUES, LEVELS = (4096, 256)
 PROPOSED = 16  # functions that a call returns at most
 SHAPES_FIRST = 3  # shapes of one CovariateView that come first
+# Functions of two covariates, or that recur, that a call returns at most, and the number of simpler
+# ones before them. Their gain is at least MORE times that of a simpler function of the same rows.
+PRODUCTS, FIRST_SINGLE, MORE = 3, 4, 1.05
 # Scales, limit of Huber's loss: outliers count more than in Student's t.
 HUBER = 3.0
 LEAST_GAIN = 20.0  # smallest gain, twice a log-likelihood
@@ -114,6 +119,7 @@ class Scan:
                         _Shapes(view, table.rows_of(channel).start, edges, table.sparse)
                     )
         self._groups = [_Group(several, WIDEST) for several in groups.values()]
+        self._products = Products(table, views)
         # Weights (n,) by the noise of each series, without robust weights.
         self.even = _noise_of_series(table) ** -2.0
         self._price = SmoothTerm.penalty + 2.0 * np.log(
@@ -135,7 +141,28 @@ class Scan:
         held = _held(table, model, chosen)
         found = self.gains(table, held)[:PROPOSED]
         found = _best_first(table, [self._refined(held, item) for item in found])
-        return [self._candidate(*item[1:]) for item in _various(found)]
+        single = [self._candidate(*item[1:]) for item in _various(found)]
+        more = self._worth_more(table, found, self._products(held[1], model.residual))
+        return single[:FIRST_SINGLE] + more + single[FIRST_SINGLE:]
+
+    def _worth_more(
+        self, table: RegressionTable, found: Sequence[_Item], proposals: Sequence[Proposal]
+    ) -> list[Candidate]:
+        """Return the first Proposals that gain clearly more than simple functions of their rows.
+
+        found : items of `gains`
+        """
+        simple: dict[tuple[str, str, str], float] = {}
+        for gain, shapes, *_ in found:
+            view = shapes.view
+            key = view.channel, view.form, view.key
+            simple[key] = max(simple.get(key, 0.0), gain)
+        out, count = [], np.log(len(table.y))
+        for one in proposals:
+            cost = one.price + SHAPES[one.term.shape][1] * count
+            if one.gain > max(cost, MORE * simple.get(one.key, 0.0)):
+                out.append(one.candidate)
+        return out[:PRODUCTS]
 
     def _refined(self, held: _Held, item: _Item) -> _Item:
         """Return an item of `gains` with inner knots moved within their bins.

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from .terms import Candidate
 
 MAX_STEPS = 14  # largest number of forward steps
-FITTED = 6  # proposals of a scan that separate fits score
+FITTED = 9  # proposals of a scan that separate fits score
 # Columns of a small and of a large candidate; share of the criterion that the small one must reach.
 FEW, LARGE, GOOD_PART = (3, 6, 0.5)
 LEAST_DETERMINED = 0.3  # smallest effective number of parameters of a candidate

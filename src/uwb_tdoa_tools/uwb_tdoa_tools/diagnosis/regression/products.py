@@ -1,0 +1,328 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
+"""Scan functions of two covariates, and functions of the time that recur.
+
+A function of two covariates is a product of two simple shapes, as "late while fast and high". A
+function that recurs is a wave, or a pulse, of many periods. The values of a covariate are sorted
+into bins. Two sums of each bin, or of each pair of bins, give the gains of all shapes: the weights,
+and the residuals times their weights. The columns of the model are not projected out, because there
+are too many functions for this. So a gain is a lower bound. Separate fits score the best functions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from uwb_tdoa_bias.effects import RADIO, SmoothTerm
+from uwb_tdoa_bias.effects.covariates import CATEGORIES, has_domain
+from uwb_tdoa_bias.effects.smooth_term import OF_PLACE, shape_basis
+
+from .terms import Candidate, Term
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+    from ..channels.views import CovariateView
+    from .table import RegressionTable
+
+# Flights, fewest for a map. With fewer, the map depends on their paths and does not generalize; two
+# similar paths validate each other.
+FOR_MAPS = 3
+COARSE, FINE = 8, 16  # bins of a covariate in the search, and around its best products
+REFINED = 6  # products that are searched again with FINE bins
+WIDEST = 0.75  # share of the bins, longest interval
+CYCLES = np.arange(1.5, 10.01, 0.1)  # numbers of periods over the range of the time
+TIME_BINS = 240
+PHASES = 24  # places in a period where a pulse begins or ends
+LEAST_GAIN = 30.0  # smallest gain, twice a log-likelihood
+FEWEST = 60  # rows of a subset
+SECOND_PENALTY = 12.0  # more than a function of one covariate, twice a log-likelihood
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A function, its gain and its price without its coefficients, twice a log-likelihood.
+
+    key : the rows that it acts on
+    """
+
+    gain: float
+    price: float
+    key: tuple[str, str, str]
+    term: SmoothTerm
+
+    @property
+    def candidate(self) -> Candidate:
+        """Return the Candidate."""
+        return Candidate((Term(self.term, self.term.keys_of((self.key[2],))),), self.price)
+
+
+@dataclass(frozen=True, eq=False)
+class _Subset:
+    """Rows of a table that functions of one anchor, pair or axis act on.
+
+    signs : (m,) of the function in the rows (m,); values : {covariate: (m,)}
+    prior : information of the prior of a coefficient
+    """
+
+    key: tuple[str, str, str]
+    rows: np.ndarray
+    signs: np.ndarray
+    values: dict[str, np.ndarray]
+
+    prior: float
+
+    def weighted(
+        self, information: np.ndarray, residual: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the weights of its rows, and weighted residuals times signs, (m,) each."""
+        weight = information[self.rows]
+        return weight * self.signs**2, weight * self.signs * residual[self.rows]
+
+
+class Products:
+    """Functions of two covariates, and functions of the time that recur, of the views of a table."""
+
+    def __init__(
+        self, table: RegressionTable, views: Mapping[str, Sequence[CovariateView]]
+    ) -> None:
+        """Sort the rows.
+
+        views : {channel: [CovariateView]}, of the rows of each channel
+        """
+        self._subsets = list(_subsets(table, views))
+        of_two = [subset for subset in self._subsets if subset.key[0] in RADIO]
+        self._of_two = [(subset, _all_binned(subset)) for subset in of_two]
+        # Maps hold functions of several coordinates, and generalize better.
+        self._with_maps = table.flights >= FOR_MAPS
+        pairs = sum(len(self._pairs(binned)) for _, binned in self._of_two)
+        self._price_of_two = SmoothTerm.penalty + SECOND_PENALTY + 2.0 * np.log(max(pairs, 1))
+        timed = sum("time" in subset.values for subset in self._subsets)
+        self._price_of_time = SmoothTerm.penalty + 2.0 * np.log(max(timed, 1))
+
+    def _pairs(self, names: Iterable[str]) -> list[tuple[str, str]]:
+        """Return the pairs of covariates of which products are tried."""
+        pairs = combinations(names, 2)
+        return [pair for pair in pairs if not (self._with_maps and {*pair} <= {*OF_PLACE})]
+
+    def __call__(self, information: np.ndarray, residual: np.ndarray) -> list[Proposal]:
+        """Return Proposals for a residual (n,), the largest gain minus price first.
+
+        information : (n,) of each row
+        """
+        found = []
+        for subset, binned in self._of_two:
+            sums = subset.weighted(information, residual)
+            for pair in self._pairs(binned):
+                gain, place = _best_product(sums, subset.prior, *(binned[name] for name in pair))
+                if gain > LEAST_GAIN:
+                    found.append((gain, subset, pair, place))
+        found.sort(key=lambda item: -item[0])
+        out = []
+        for _, subset, pair, _ in found[:REFINED]:
+            fine = [_Bins.of(name, subset.values[name], FINE) for name in pair]
+            if all(fine):
+                gain, place = _best_product(
+                    subset.weighted(information, residual), subset.prior, *fine
+                )
+                out.append(self._proposal(subset, fine, gain, place))
+        for subset in self._subsets:
+            if "time" in subset.values:
+                out += self._recurring(subset, information, residual)
+        return sorted(out, key=lambda one: one.price - one.gain)
+
+    def _proposal(
+        self, subset: _Subset, pair: Sequence[_Bins], gain: float, place: tuple[int, int]
+    ) -> Proposal:
+        (shape, knots), (factor_shape, factor_knots) = (
+            bins.of_shapes[k] for bins, k in zip(pair, place)
+        )
+        channel, form, _ = subset.key
+        term = SmoothTerm(
+            channel=channel,
+            covariate=pair[0].name,
+            form=form,
+            knots=knots,
+            shape=shape,
+            factor=pair[1].name,
+            factor_shape=factor_shape,
+            factor_knots=factor_knots,
+        )
+        tried = len(pair[0].of_shapes) * len(pair[1].of_shapes)
+        return Proposal(gain, self._price_of_two + 2.0 * np.log(tried), subset.key, term)
+
+    def _recurring(
+        self, subset: _Subset, information: np.ndarray, residual: np.ndarray
+    ) -> Iterator[Proposal]:
+        """Yield the best wave and the best pulse over the time."""
+        t = subset.values["time"]
+        low, high = np.quantile(t, [0.005, 0.995])
+        if not high - low > 1.0:
+            return
+        cell = np.clip((t - low) / (high - low) * TIME_BINS, 0, TIME_BINS - 1).astype(np.int64)
+        power, vector = (
+            np.bincount(cell, part, TIME_BINS) for part in subset.weighted(information, residual)
+        )
+        at = (np.arange(TIME_BINS) + 0.5) / TIME_BINS
+        prior = subset.prior
+        channel, form, _ = subset.key
+        # waves: least squares of a level, a sine and a cosine
+        phase = 2.0 * np.pi * CYCLES[:, None] * at
+        basis = np.stack([np.ones_like(phase), np.sin(phase), np.cos(phase)], axis=2)
+        gram = np.einsum("ctj,t,ctk->cjk", basis, power, basis) + prior * np.eye(3)
+        right = np.einsum("ctj,t->cj", basis, vector)
+        gains = np.einsum("cj,cj->c", right, np.linalg.solve(gram, right[:, :, None])[:, :, 0])
+        best = int(np.argmax(gains))
+        price = self._price_of_time + 2.0 * np.log(len(CYCLES))
+        if gains[best] > LEAST_GAIN:
+            knots = float(low), float(low + (high - low) / CYCLES[best])
+            term = SmoothTerm(
+                channel=channel, covariate="time", form=form, knots=knots, shape="wave"
+            )
+            yield Proposal(float(gains[best]), price, subset.key, term)
+        # pulses: bins of the phase, and each interval of them that may wrap
+        place = (CYCLES[:, None] * at % 1.0 * PHASES).astype(np.int64)
+        labels = (place + PHASES * np.arange(len(CYCLES))[:, None]).ravel()
+        folded = [
+            np.bincount(labels, np.tile(part, len(CYCLES)), PHASES * len(CYCLES)).reshape(
+                -1, PHASES
+            )
+            for part in (power, vector)
+        ]
+        sums = [np.pad(np.cumsum(np.tile(part, 2), axis=1), ((0, 0), (1, 0))) for part in folded]
+        start, length = (part.ravel() for part in np.meshgrid(range(PHASES), range(2, PHASES - 1)))
+        inside, first = (part[:, start + length] - part[:, start] for part in sums)
+        gains = _gain(vector.sum(), power.sum(), first, inside, inside, prior)
+        row, k = np.unravel_index(int(np.argmax(gains)), gains.shape)
+        if gains[row, k] > LEAST_GAIN:
+            period = (high - low) / CYCLES[row]
+            begin = float(low + period * start[k] / PHASES)
+            knots = begin, float(begin + period * length[k] / PHASES), float(begin + period)
+            term = SmoothTerm(
+                channel=channel, covariate="time", form=form, knots=knots, shape="pulse"
+            )
+            yield Proposal(float(gains[row, k]), price + 2.0 * np.log(len(start)), subset.key, term)
+
+
+@dataclass(frozen=True, eq=False)
+class _Bins:
+    """A covariate in bins, and the shapes over it.
+
+    cell : (m,) bin of each row, the number of bins for an unknown value
+    shapes : (b + 1, s) each shape without its level in each bin, 0 for unknown values
+    of_shapes : [(name of the shape, knots)]
+    """
+
+    name: str
+    cell: np.ndarray
+    shapes: np.ndarray
+    of_shapes: list[tuple[str, tuple[float, ...]]]
+
+    @classmethod
+    def of(cls, name: str, values: np.ndarray, bins: int) -> _Bins | None:
+        """Sort values (m,) into bins of equal numbers; None if they hardly vary."""
+        known = np.isfinite(values)
+        if known.sum() < FEWEST:
+            return None
+        edges = np.unique(np.quantile(values[known], np.linspace(0.005, 0.995, bins + 1)))
+        if len(edges) < 4 or edges[-1] - edges[0] < 1e-3 * max(*np.abs(edges[[0, -1]]), 1e-3):
+            return None
+        n = len(edges) - 1
+        cell = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, n - 1)
+        counted = np.bincount(cell[known], minlength=n)
+        sums = np.bincount(cell[known], np.clip(values[known], edges[0], edges[-1]), n)
+        centres = np.where(counted, sums / np.maximum(counted, 1), 0.5 * (edges[:-1] + edges[1:]))
+        of_shapes = list(_shapes(tuple(map(float, edges))))
+        columns = [shape_basis(shape, knots, centres)[:, 1] for shape, knots in of_shapes]
+        shapes = np.pad(np.stack(columns, axis=1), ((0, 1), (0, 0)))
+        return cls(name, np.where(known, cell, n), shapes, of_shapes)
+
+
+def _all_binned(subset: _Subset) -> dict[str, _Bins]:
+    """Return {covariate: its _Bins} of the covariates that vary."""
+    every = {name: _Bins.of(name, values, COARSE) for name, values in subset.values.items()}
+    return {name: bins for name, bins in every.items() if bins is not None}
+
+
+def _best_product(
+    sums: tuple[np.ndarray, np.ndarray], prior: float, one: _Bins, other: _Bins
+) -> tuple[float, tuple[int, int]]:
+    """Return (gain, places of both shapes) of the product that gains most.
+
+    sums : as of `_Subset.weighted`; prior : information of the prior
+    """
+    m, n = len(one.shapes), len(other.shapes)
+    cell = one.cell * n + other.cell
+    power, vector = (np.bincount(cell, part, m * n).reshape(m, n) for part in sums)
+    crossed = one.shapes.T @ power @ other.shapes
+    square = (one.shapes**2).T @ power @ other.shapes**2
+    first = one.shapes.T @ vector @ other.shapes
+    gain = _gain(vector.sum(), power.sum(), first, crossed, square, prior)
+    row, column = np.unravel_index(int(np.argmax(gain)), gain.shape)
+    return float(gain[row, column]), (int(row), int(column))
+
+
+def _shapes(edges: tuple[float, ...]) -> Iterator[tuple[str, tuple[float, ...]]]:
+    """Yield (name, knots) of each shape between edges of bins."""
+    low, high, inner = edges[0], edges[-1], edges[1:-1]
+    yield "line", (low, high)
+    for at in inner:
+        yield "step", (low, at, high)
+        yield "beyond", (low, at, high)
+        yield "below", (low, at, high)
+    widest = WIDEST * (len(edges) - 1)
+    for i, j in combinations(range(len(edges)), 2):
+        if 0 < i and j < len(edges) - 1 and j - i <= widest:
+            yield "interval", (low, edges[i], edges[j], high)
+
+
+def _subsets(
+    table: RegressionTable, views: Mapping[str, Sequence[CovariateView]]
+) -> Iterator[_Subset]:
+    """Yield the rows of each anchor, pair or axis, with all covariates of which rows have one value."""
+    if table.sparse:  # too many anchors
+        return
+    for channel, some in views.items():
+        start = table.rows_of(channel).start
+        several: dict[tuple[str, str, str], list[CovariateView]] = {}
+        for view in some:
+            single = view.form != "arrival" and not view.means
+            if single and view.covariate not in CATEGORIES and has_domain(view.covariate):
+                several.setdefault((view.channel, view.form, view.key), []).append(view)
+        for key, of_key in several.items():
+            rows = of_key[0].rows
+            if len(rows) < FEWEST:
+                continue
+            signs = np.sum([side for side, _ in of_key[-1].sides], axis=0)
+            values = {}
+            for view in of_key:
+                if len(view.sides) == 1:
+                    values[view.covariate] = view.sides[0][1]
+                else:
+                    of_first = view.sides[0][0] != 0.0
+                    values[view.covariate] = np.where(of_first, view.sides[0][1], view.sides[1][1])
+            line = SmoothTerm(channel=key[0], covariate="time", knots=(0.0, 1.0), shape="line")
+            yield _Subset(key, rows + start, signs, values, line.prior_std_of("c0") ** -2)
+
+
+def _gain(
+    level: np.ndarray,
+    power: np.ndarray,
+    first: np.ndarray,
+    crossed: np.ndarray,
+    square: np.ndarray,
+    prior: float,
+) -> np.ndarray:
+    """Return the gain of a level and one column.
+
+    level, first : products of the level and of the column with the residual
+    power, crossed, square : of the level with itself, with the column, and of the column with itself
+    """
+    power = power + prior
+    rest = square + prior - crossed**2 / power
+    more = (first - crossed * level / power) ** 2 / np.maximum(rest, 1e-9 * (square + prior))
+    return level**2 / power + more
