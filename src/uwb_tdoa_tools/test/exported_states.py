@@ -15,7 +15,7 @@ from uwb_tdoa_bias.correction.session import Session
 from uwb_tdoa_bias.effects import EFFECTS, Samples, SmoothTerm
 from uwb_tdoa_bias.effects.covariates import CATEGORIES, OF_ARRIVAL, OF_TDOA
 from uwb_tdoa_bias.effects.samples import Motion
-from uwb_tdoa_bias.effects.smooth_term import OF_LINKS, SHAPES
+from uwb_tdoa_bias.effects.smooth_term import FACTORS, OF_LINKS, SHAPES
 from uwb_tdoa_tools.exporting.correction import is_traceable
 from uwb_tdoa_tools.training import network as training
 
@@ -96,7 +96,18 @@ def smooth_terms(anchors):
                 out[f"{covariate} {form}"] = term(anchors, covariate, form)
     for shape in SHAPES:
         out[f"range {shape}"] = term(anchors, "range", "anchor", shape)
+    for shape in FACTORS:
+        out[f"range step, times height {shape}"] = product(anchors, "anchor", "height", shape)
+    for form in ("common", "pair", "direction"):
+        out[f"speed step, times height step, {form}"] = product(anchors, form, "height", "step")
     return out
+
+
+def product(anchors, form, factor, shape):
+    """A SmoothTerm of random coefficients with a factor."""
+    one = term(anchors, "range" if form == "anchor" else "speed", form, "step")
+    knots = tuple(np.linspace(*RANGES[factor], SHAPES[shape][0]).tolist())
+    return replace(one, factor=factor, factor_shape=shape, factor_knots=knots)
 
 
 def term(anchors, covariate, form, shape="spline"):
