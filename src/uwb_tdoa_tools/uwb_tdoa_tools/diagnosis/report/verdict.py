@@ -137,7 +137,7 @@ def _with_errors(diagnosis: Diagnosis) -> Verdict:
         return Verdict(headline, more, "same")
     if interval and interval[0] > 0.0:
         return Verdict(f"{ERROR} falls {change}: {share} of it is gone.", more, "better")
-    if difference(before["rmse_3d"], after["rmse_3d"], interval) > 0:
+    if interval and difference(before["rmse_3d"], after["rmse_3d"], interval) > 0:
         headline = (
             f"{ERROR} falls {change}: {share} of it is gone. A loss above {LOSS:.0%} has a "
             "probability below 2.5 %."
