@@ -118,7 +118,7 @@ def test_the_report_tells_every_phase_of_the_judged_flights(result, page):
     assert sentence in flat
 
 
-@pytest.mark.parametrize("gain", [[-0.1, 0.4], [0.0, 0.4], None])
+@pytest.mark.parametrize("gain", [[-0.25, 0.4], [-0.02, 0.06], None])
 def test_a_gain_that_may_be_chance_is_not_called_one(result, gain):
     found = verdict(judged(result, {"one": 0.3}, {"one": 0.25}, gain))
     assert (
@@ -126,6 +126,12 @@ def test_a_gain_that_may_be_chance_is_not_called_one(result, gain):
         and NO_DIFFERENCE in found.headline
         and "is gone" not in " ".join(found.sentences)
     )
+
+
+def test_a_gain_that_may_be_small_but_hardly_a_loss_is_called_one(result):
+    found = verdict(judged(result, {"one": 0.3}, {"one": 0.25}, [-0.01, 0.34]))
+    assert found.kind == "better"
+    assert "A loss above 3 % has a probability below 2.5 %." in found.headline
 
 
 def test_a_phase_that_becomes_worse_is_in_the_verdict_with_the_flights_by_name(result):

@@ -3,15 +3,19 @@
 """Figures of a run: errors, consistency, phases, and figures of several runs."""
 
 import json
+import math
 from types import SimpleNamespace
 
 from hand_made import flown, truth_of
+from hypothesis import given
+from hypothesis import strategies as st
 import numpy as np
 import pytest
 
 from uwb_tdoa_bias.common.flight import Truth
 from uwb_tdoa_ekf.core.memory import INVALID, LATE, REJECTED, STARTUP, USED
 from uwb_tdoa_tools.evaluating import line_of_run, lines_of_phases, markdown_of
+from uwb_tdoa_tools.scoring.gains import LOSS, difference
 from uwb_tdoa_tools.scoring.metrics import (
     Score,
     coverage,
@@ -589,3 +593,15 @@ def test_estimates_that_are_not_finite_spoil_their_phase_and_no_other(bad):
         found["whole"]["max_3d"]
     )
     assert found["at_rest_before"]["rmse_3d"] == pytest.approx(0.0, abs=1e-9)
+
+
+@given(st.floats(-0.5, 0.5), st.floats(0.005, 0.2))
+def test_a_gain_counts_if_a_loss_is_unlikely(expected, std):
+    """Against the normal distribution that has the interval."""
+    interval = expected - 1.96 * std, expected + 1.96 * std
+    loss = 0.5 * math.erfc((expected + LOSS) / std / math.sqrt(2.0))
+    sure = expected / std > 1.96
+    if abs(loss - 0.025) > 1e-3 and abs(expected / std - 1.96) > 1e-3:
+        counts = sure or expected > LOSS and loss < 0.025
+        assert (difference(1.0, 1.0 - expected, interval) > 0) == counts
+        assert (difference(1.0, 1.0 - expected, interval) < 0) == (expected / std < -1.96)

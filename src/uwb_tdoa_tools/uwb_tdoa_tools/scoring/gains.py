@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 
 SAME = 0.005  # of the error: what rounds to no per cent
+LOSS = 0.03  # share of the error: a smaller loss may be risked for a larger expected gain
 NO_DIFFERENCE = "no difference that these flights can show"
 SHARES = 0.0, 0.5, 0.75, 1.0
 
@@ -43,8 +44,9 @@ def gain_in_words(gained: float) -> str:
 def difference(before: float, after: float, interval: Sequence[float] | None = None) -> int:
     """Return 1 if an error falls, -1 if it rises, and 0 without a difference that can be shown.
 
-    A difference counts if its `interval` excludes zero. Without one it counts if it does not round
-    to nothing.
+    A difference counts if its `interval` excludes zero. A gain counts, too, if more than LOSS is
+    expected, and the probability of a loss above LOSS is below 2.5 %. Without an interval a
+    difference counts if it does not round to nothing.
 
     Parameters
     ----------
@@ -55,7 +57,9 @@ def difference(before: float, after: float, interval: Sequence[float] | None = N
     """
     gained = gain(before, after) if before else 0.0
     low, high = (gained - SAME, gained + SAME) if interval is None else interval
-    return int(low > 0.0) - int(high < 0.0)
+    expected, half = 0.5 * (low + high), 0.5 * (high - low)
+    worth_it = interval is not None and expected > LOSS and expected + LOSS > half
+    return int(low > 0.0 or worth_it) - int(high < 0.0)
 
 
 @dataclass(frozen=True)

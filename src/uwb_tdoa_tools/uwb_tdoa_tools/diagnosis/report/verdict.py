@@ -12,7 +12,7 @@ import numpy as np
 from uwb_tdoa_bias.effects.base import listed, measured
 from uwb_tdoa_bias.effects.smooth_term import causes, described
 
-from ...scoring.gains import NO_DIFFERENCE, difference
+from ...scoring.gains import LOSS, NO_DIFFERENCE, difference
 from ...scoring.phases import TITLES
 from ..channels.figures import rows_by_value
 from ..findings import prefixes_of
@@ -137,6 +137,12 @@ def _with_errors(diagnosis: Diagnosis) -> Verdict:
         return Verdict(headline, more, "same")
     if interval and interval[0] > 0.0:
         return Verdict(f"{ERROR} falls {change}: {share} of it is gone.", more, "better")
+    if interval and difference(before["rmse_3d"], after["rmse_3d"], interval) > 0:
+        headline = (
+            f"{ERROR} falls {change}: {share} of it is gone. A loss above {LOSS:.0%} has a "
+            "probability below 2.5 %."
+        )
+        return Verdict(headline, more, "better")
     unsure = (
         "More flights to judge on (--holdout) make that certain; until then compare before "
         "relying on effects.yaml."
