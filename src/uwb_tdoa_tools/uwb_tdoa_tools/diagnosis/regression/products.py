@@ -37,6 +37,7 @@ REFINED = 6  # products that are searched again with FINE bins
 WIDEST = 0.75  # share of the bins, longest interval
 CYCLES = np.arange(1.5, 10.01, 0.1)  # numbers of periods over the range of the time
 TIME_BINS = 240
+SHORTEST = 1.0  # s, smallest range of the time
 PHASES = 24  # places in a period where a pulse begins or ends
 LEAST_GAIN = 30.0  # smallest gain, twice a log-likelihood
 FEWEST = 60  # rows of a subset
@@ -124,12 +125,11 @@ class Products:
         found.sort(key=lambda item: -item[0])
         out = []
         for _, subset, pair, _ in found[:REFINED]:
-            fine = [_Bins.of(name, subset.values[name], FINE) for name in pair]
-            if all(fine):
-                gain, place = _best_product(
-                    subset.weighted(information, residual), subset.prior, *fine
-                )
-                out.append(self._proposal(subset, fine, gain, place))
+            first, second = (_Bins.of(name, subset.values[name], FINE) for name in pair)
+            if first and second:
+                sums = subset.weighted(information, residual)
+                gain, place = _best_product(sums, subset.prior, first, second)
+                out.append(self._proposal(subset, (first, second), gain, place))
         for subset in self._subsets:
             if "time" in subset.values:
                 out += self._recurring(subset, information, residual)
@@ -160,52 +160,66 @@ class Products:
     ) -> Iterator[Proposal]:
         """Yield the best wave and the best pulse over the time."""
         t = subset.values["time"]
-        low, high = np.quantile(t, [0.005, 0.995])
-        if not high - low > 1.0:
+        low, high = map(float, np.quantile(t, [0.005, 0.995]))
+        if high - low < SHORTEST:
             return
         cell = np.clip((t - low) / (high - low) * TIME_BINS, 0, TIME_BINS - 1).astype(np.int64)
-        power, vector = (
-            np.bincount(cell, part, TIME_BINS) for part in subset.weighted(information, residual)
-        )
-        at = (np.arange(TIME_BINS) + 0.5) / TIME_BINS
-        prior = subset.prior
+        weighted = subset.weighted(information, residual)
+        power, vector = (np.bincount(cell, part, TIME_BINS) for part in weighted)
         channel, form, _ = subset.key
-        # waves: least squares of a level, a sine and a cosine
-        phase = 2.0 * np.pi * CYCLES[:, None] * at
-        basis = np.stack([np.ones_like(phase), np.sin(phase), np.cos(phase)], axis=2)
-        gram = np.einsum("ctj,t,ctk->cjk", basis, power, basis) + prior * np.eye(3)
-        right = np.einsum("ctj,t->cj", basis, vector)
-        gains = np.einsum("cj,cj->c", right, np.linalg.solve(gram, right[:, :, None])[:, :, 0])
-        best = int(np.argmax(gains))
-        price = self._price_of_time + 2.0 * np.log(len(CYCLES))
-        if gains[best] > LEAST_GAIN:
-            knots = float(low), float(low + (high - low) / CYCLES[best])
-            term = SmoothTerm(
-                channel=channel, covariate="time", form=form, knots=knots, shape="wave"
-            )
-            yield Proposal(float(gains[best]), price, subset.key, term)
-        # pulses: bins of the phase, and each interval of them that may wrap
-        place = (CYCLES[:, None] * at % 1.0 * PHASES).astype(np.int64)
-        labels = (place + PHASES * np.arange(len(CYCLES))[:, None]).ravel()
-        folded = [
-            np.bincount(labels, np.tile(part, len(CYCLES)), PHASES * len(CYCLES)).reshape(
-                -1, PHASES
-            )
-            for part in (power, vector)
-        ]
-        sums = [np.pad(np.cumsum(np.tile(part, 2), axis=1), ((0, 0), (1, 0))) for part in folded]
-        start, length = (part.ravel() for part in np.meshgrid(range(PHASES), range(2, PHASES - 1)))
-        inside, first = (part[:, start + length] - part[:, start] for part in sums)
-        gains = _gain(vector.sum(), power.sum(), first, inside, inside, prior)
-        row, k = np.unravel_index(int(np.argmax(gains)), gains.shape)
-        if gains[row, k] > LEAST_GAIN:
-            period = (high - low) / CYCLES[row]
-            begin = float(low + period * start[k] / PHASES)
-            knots = begin, float(begin + period * length[k] / PHASES), float(begin + period)
-            term = SmoothTerm(
-                channel=channel, covariate="time", form=form, knots=knots, shape="pulse"
-            )
-            yield Proposal(float(gains[row, k]), price + 2.0 * np.log(len(start)), subset.key, term)
+        for shape, function in (("wave", _best_wave), ("pulse", _best_pulse)):
+            gain, places, tried = function(power, vector, subset.prior)
+            if gain > LEAST_GAIN:
+                knots = tuple(low + (high - low) * place for place in places)
+                term = SmoothTerm(
+                    channel=channel, covariate="time", form=form, knots=knots, shape=shape
+                )
+                price = self._price_of_time + 2.0 * np.log(tried)
+                yield Proposal(gain, price, subset.key, term)
+
+
+def _best_wave(
+    power: np.ndarray, vector: np.ndarray, prior: float
+) -> tuple[float, tuple[float, ...], int]:
+    """Return (gain, knots, number tried) of the best wave, by least squares.
+
+    power, vector : (TIME_BINS,) sums over bins of the time
+    returns : knots as shares of the range of the time
+    """
+    at = (np.arange(TIME_BINS) + 0.5) / TIME_BINS
+    phase = 2.0 * np.pi * CYCLES[:, None] * at
+    basis = np.stack([np.ones_like(phase), np.sin(phase), np.cos(phase)], axis=2)
+    gram = np.einsum("ctj,t,ctk->cjk", basis, power, basis) + prior * np.eye(3)
+    right = np.einsum("ctj,t->cj", basis, vector)
+    gains = np.einsum("cj,cj->c", right, np.linalg.solve(gram, right[:, :, None])[:, :, 0])
+    best = int(np.argmax(gains))
+    return float(gains[best]), (0.0, 1.0 / float(CYCLES[best])), len(CYCLES)
+
+
+def _best_pulse(
+    power: np.ndarray, vector: np.ndarray, prior: float
+) -> tuple[float, tuple[float, ...], int]:
+    """Return (gain, knots, number tried) of the best pulse; parameters as of `_best_wave`.
+
+    For each number of periods, the sums are folded into PHASES. A pulse is an interval of phases,
+    which may go on in the next period.
+    """
+    at = (np.arange(TIME_BINS) + 0.5) / TIME_BINS
+    phase = (CYCLES[:, None] * at % 1.0 * PHASES).astype(np.int64)
+    label = (phase + PHASES * np.arange(len(CYCLES))[:, None]).ravel()
+    start, length = (part.ravel() for part in np.meshgrid(range(PHASES), range(2, PHASES - 1)))
+    sums = []
+    for part in (power, vector):
+        folded = np.bincount(label, np.tile(part, len(CYCLES)), PHASES * len(CYCLES))
+        twice = np.tile(folded.reshape(-1, PHASES), 2).cumsum(axis=1)
+        upto = np.pad(twice, ((0, 0), (1, 0)))
+        sums.append(upto[:, start + length] - upto[:, start])
+    inside, first = sums
+    gains = _gain(vector.sum(), power.sum(), first, inside, inside, prior)
+    row, k = np.unravel_index(int(np.argmax(gains)), gains.shape)
+    period = 1.0 / float(CYCLES[row])
+    begin, lasts = period * int(start[k]) / PHASES, period * int(length[k]) / PHASES
+    return float(gains[row, k]), (begin, begin + lasts, begin + period), gains.size
 
 
 @dataclass(frozen=True, eq=False)

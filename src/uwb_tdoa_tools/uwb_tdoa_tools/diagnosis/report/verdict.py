@@ -139,7 +139,7 @@ def _with_errors(diagnosis: Diagnosis) -> Verdict:
         return Verdict(f"{ERROR} falls {change}: {share} of it is gone.", more, "better")
     if interval and difference(before["rmse_3d"], after["rmse_3d"], interval) > 0:
         headline = (
-            f"{ERROR} falls {change}: {share} of it is gone. A loss above {LOSS:.0%} has a "
+            f"{ERROR} falls {change}: {share} of it is gone. A loss above {100 * LOSS:.0f} % has a "
             "probability below 2.5 %."
         )
         return Verdict(headline, more, "better")
