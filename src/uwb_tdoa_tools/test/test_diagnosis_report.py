@@ -704,3 +704,28 @@ def test_a_curve_keeps_its_largest_value():
     values[7_777] = 5.0
     shown = curves._peaks(t, values)
     assert len(shown[0]) <= curves.BINS and shown[1].max() == 5.0
+
+
+@pytest.mark.parametrize("shape, knots", [("step", (0.0, 1.5, 3.0)), ("pulse", (0.0, 2.0, 8.0))])
+def test_a_function_of_two_covariates_is_drawn_as_a_map_of_both(shape, knots):
+    term = SmoothTerm(
+        {"3.c0": 0.1, "3.c1": 0.8},
+        covariate="time" if shape == "pulse" else "speed",
+        form="anchor",
+        shape=shape,
+        knots=knots,
+        domain={"time": (0.0, 40.0)},
+        factor="height",
+        factor_shape="beyond",
+        factor_knots=(0.5, 1.2, 2.5),
+    )
+    picture = curves._product(term)
+    assert picture.alt == f"Function of {term.covariate} and height in tdoa of anchor 3"
+    assert picture.caption.startswith("Anchor 3 seems 0.8 m farther")
+    assert picture.caption.endswith("Beyond these values it fades.")
+    finding = EffectFinding(term, "tdoa", {}, 0.5)
+    assert output._function(finding, term)["factor"] == {
+        "covariate": "height",
+        "course": "beyond",
+        "knots": (0.5, 1.2, 2.5),
+    }

@@ -359,7 +359,11 @@ class SmoothTerm(Effect):
         at = self._values_of(self.factor, samples)
         if at is None:
             return None, None
-        return values, shape_basis(self.factor_shape, self.factor_knots, at)[:, 1]
+        return values, self.factor_course(at)
+
+    def factor_course(self, values: np.ndarray) -> np.ndarray:
+        """Return the shape of the factor at values (n,) of its covariate, (n,)."""
+        return shape_basis(self.factor_shape, self.factor_knots, values)[:, 1]
 
     def bias(self, samples: Samples) -> np.ndarray:
         n = len(samples)

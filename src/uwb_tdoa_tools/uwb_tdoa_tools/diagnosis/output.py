@@ -152,6 +152,7 @@ def _function(finding: EffectFinding, effect: SmoothTerm) -> dict[str, Any]:
         "channel": effect.channel,
         "covariate": effect.covariate,
         "form": effect.form,
+        "factor": _factor(effect),
         "course": effect.shape,
         "strength": finding.explained,
         "advice": effect.advice(),
@@ -169,6 +170,17 @@ def _function(finding: EffectFinding, effect: SmoothTerm) -> dict[str, Any]:
         **_over_flights(finding),
         "added": finding.added,
         "on_floor": finding.on_floor,
+    }
+
+
+def _factor(effect: SmoothTerm) -> dict[str, Any] | None:
+    """Return the factor of a function of two covariates; None without one."""
+    if not effect.factor:
+        return None
+    return {
+        "covariate": effect.factor,
+        "course": effect.factor_shape,
+        "knots": effect.factor_knots,
     }
 
 

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 BINS = 300  # bins of a curve over time; the largest value of each is drawn
 MOST = 12  # largest number of drawn flights
 FUNCTIONS = 12  # that are drawn
+GRID = 120  # values of each covariate in the picture of a product
 POINTS = 3000  # largest number of drawn points of a residual series
 # position of a legend above the axes
 ABOVE = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "ncols": 2}
@@ -119,7 +120,32 @@ def _residuals(name: str, sides: dict[str, tuple[np.ndarray, np.ndarray]]) -> Pi
 def functions(diagnosis: Diagnosis) -> list[Picture]:
     """Draw the functions without a name, in the model or not."""
     found = [finding.function for finding in diagnosis.findings if finding.function]
-    return [_function(term) for term in found[:FUNCTIONS]]
+    return [_product(term) if term.factor else _function(term) for term in found[:FUNCTIONS]]
+
+
+def _product(effect: SmoothTerm) -> Picture:
+    """Draw a function of two covariates, over the values that the flights have."""
+    (low, high), ends = (knots[:: len(knots) - 1] for knots in (effect.knots, effect.factor_knots))
+    if effect.shape in ("wave", "pulse"):  # their knots are one period
+        low, high = effect.domain.get(effect.covariate, (low, high))
+    x, y = np.linspace(low, high, GRID), np.linspace(*ends, GRID)
+    by = np.repeat(effect.factor_course(y), GRID)
+    prefix = prefixes_of(effect)[0]
+    values = effect.curve(np.tile(x, GRID), prefix, by).reshape(GRID, GRID)
+    part = CHANNELS[effect.channel.partition(".")[0]]
+    figure, ax = drawing(2.6)
+    most = np.abs(values).max()
+    mesh = ax.pcolormesh(
+        x, y, values, shading="nearest", cmap="RdBu_r", vmin=-most, vmax=most, rasterized=True
+    )
+    figure.colorbar(mesh, ax=ax, label=f"part of {effect.channel} [{part.unit}]")
+    names = [name.replace("_", " ") for name in effect.arguments]
+    units = (UNITS.get(name, "as recorded") for name in effect.arguments)
+    ax.set(**dict(zip(("xlabel", "ylabel"), (f"{n} [{u}]" for n, u in zip(names, units)))))
+    said = described(effect, prefix.rstrip(".")).capitalize()
+    caption = f"{said}. Beyond these values it fades."
+    subject = effect.label.rpartition(" over ")[0]
+    return embedded(figure, f"Function of {listed(names)} in {subject}", caption)
 
 
 def _function(effect: SmoothTerm) -> Picture:

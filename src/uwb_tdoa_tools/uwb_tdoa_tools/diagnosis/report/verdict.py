@@ -370,7 +370,9 @@ def cause(entry: Entry) -> str:
         terms = _functions(entry)
         if sum(len(prefixes_of(term)) for term in terms) == 1:
             return said
-        covariates = listed(dict.fromkeys(term.covariate.replace("_", " ") for term in terms))
+        covariates = listed(
+            dict.fromkeys(name.replace("_", " ") for term in terms for name in term.arguments)
+        )
         return f"errors that depend on {covariates}, anchor by anchor; at most {said}"
     effect = entry.findings[0].effect
     significant = effect.significant() or effect.values
