@@ -125,10 +125,11 @@ def functions(diagnosis: Diagnosis) -> list[Picture]:
 
 def _product(effect: SmoothTerm) -> Picture:
     """Draw a function of two covariates, over the values that the flights have."""
-    (low, high), ends = (knots[:: len(knots) - 1] for knots in (effect.knots, effect.factor_knots))
+    low, high = effect.knots[0], effect.knots[-1]
     if effect.shape in ("wave", "pulse"):  # their knots are one period
         low, high = effect.domain.get(effect.covariate, (low, high))
-    x, y = np.linspace(low, high, GRID), np.linspace(*ends, GRID)
+    x = np.linspace(low, high, GRID)
+    y = np.linspace(effect.factor_knots[0], effect.factor_knots[-1], GRID)
     by = np.repeat(effect.factor_course(y), GRID)
     prefix = prefixes_of(effect)[0]
     values = effect.curve(np.tile(x, GRID), prefix, by).reshape(GRID, GRID)
