@@ -12,6 +12,7 @@ are too many functions for this. So a gain is a lower bound. Separate fits score
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from itertools import combinations
 from typing import TYPE_CHECKING
 
@@ -138,6 +139,7 @@ class Products:
     def _proposal(
         self, subset: _Subset, pair: Sequence[_Bins], gain: float, place: tuple[int, int]
     ) -> Proposal:
+        """Return the Proposal of a product; place : of the shape in each of both _Bins."""
         (shape, knots), (factor_shape, factor_knots) = (
             bins.of_shapes[k] for bins, k in zip(pair, place)
         )
@@ -178,6 +180,29 @@ class Products:
                 yield Proposal(gain, price, subset.key, term)
 
 
+@cache
+def _waves() -> tuple[np.ndarray, np.ndarray]:
+    """Return a level, sine and cosine of each number of periods, (c, t, 3), and their products.
+
+    The products are (c, t, 3, 3).
+    """
+    at = (np.arange(TIME_BINS) + 0.5) / TIME_BINS
+    phase = 2.0 * np.pi * CYCLES[:, None] * at
+    basis = np.stack([np.ones_like(phase), np.sin(phase), np.cos(phase)], axis=2)
+    return basis, basis[..., :, None] * basis[..., None, :]
+
+
+@cache
+def _phases() -> np.ndarray:
+    """Return the phase of each bin of the time for each number of periods, (c * t,).
+
+    Each number of periods has PHASES labels of its own.
+    """
+    at = (np.arange(TIME_BINS) + 0.5) / TIME_BINS
+    phase = (CYCLES[:, None] * at % 1.0 * PHASES).astype(np.int64)
+    return (phase + PHASES * np.arange(len(CYCLES))[:, None]).ravel()
+
+
 def _best_wave(
     power: np.ndarray, vector: np.ndarray, prior: float
 ) -> tuple[float, tuple[float, ...], int]:
@@ -186,11 +211,9 @@ def _best_wave(
     power, vector : (TIME_BINS,) sums over bins of the time
     returns : knots as shares of the range of the time
     """
-    at = (np.arange(TIME_BINS) + 0.5) / TIME_BINS
-    phase = 2.0 * np.pi * CYCLES[:, None] * at
-    basis = np.stack([np.ones_like(phase), np.sin(phase), np.cos(phase)], axis=2)
-    gram = np.einsum("ctj,t,ctk->cjk", basis, power, basis) + prior * np.eye(3)
-    right = np.einsum("ctj,t->cj", basis, vector)
+    basis, squares = _waves()
+    gram = np.tensordot(squares, power, axes=(1, 0)) + prior * np.eye(3)
+    right = np.tensordot(basis, vector, axes=(1, 0))
     gains = np.einsum("cj,cj->c", right, np.linalg.solve(gram, right[:, :, None])[:, :, 0])
     best = int(np.argmax(gains))
     return float(gains[best]), (0.0, 1.0 / float(CYCLES[best])), len(CYCLES)
@@ -204,13 +227,10 @@ def _best_pulse(
     For each number of periods, the sums are folded into PHASES. A pulse is an interval of phases,
     which may go on in the next period.
     """
-    at = (np.arange(TIME_BINS) + 0.5) / TIME_BINS
-    phase = (CYCLES[:, None] * at % 1.0 * PHASES).astype(np.int64)
-    label = (phase + PHASES * np.arange(len(CYCLES))[:, None]).ravel()
     start, length = (part.ravel() for part in np.meshgrid(range(PHASES), range(2, PHASES - 1)))
     sums = []
     for part in (power, vector):
-        folded = np.bincount(label, np.tile(part, len(CYCLES)), PHASES * len(CYCLES))
+        folded = np.bincount(_phases(), np.tile(part, len(CYCLES)), PHASES * len(CYCLES))
         twice = np.tile(folded.reshape(-1, PHASES), 2).cumsum(axis=1)
         upto = np.pad(twice, ((0, 0), (1, 0)))
         sums.append(upto[:, start + length] - upto[:, start])
