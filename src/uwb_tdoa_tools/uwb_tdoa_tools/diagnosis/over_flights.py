@@ -29,6 +29,7 @@ DETERMINED = 0.25  # largest standard deviation of a share that a flight determi
 SURE = 4.0  # standard deviations of a significant difference
 # largest difference of equal shares; no model is more accurate
 ALIKE = 0.3
+SHOWN = 3.0  # standard deviations of a share that a flight shows
 GROWN = 0.5  # smallest growth of the share, from the first flight to the last
 # Prior of the spread of shares between flights: standard deviation, and how many flights it counts
 # for.
@@ -97,6 +98,14 @@ def _shares(
             )
         )
     return tuple(out)
+
+
+def of_one_flight(selection: Selection, candidate: Candidate) -> bool:
+    """Return whether only one of several flights shows a chosen Candidate."""
+    flights = [str(number) for number in range(selection.table.flights)]
+    several = shares(selection, candidate, flights)
+    shown = [one for one in several if one.share > max(ALIKE, SHOWN * one.std)]
+    return len(flights) > 1 and len(shown) < 2
 
 
 def harm(several: Sequence[Share]) -> float:

@@ -13,6 +13,7 @@ from uwb_tdoa_bias.effects import SmoothTerm
 
 from .channels import CHANNELS
 from .findings import Refused
+from .over_flights import of_one_flight
 from .regression.fit import fit
 from .regression.held_out import held_out
 from .regression.select import criterion_of, select, worth
@@ -36,6 +37,7 @@ MAPS_GAIN, MAPS_SURE = (20.0, 3.0)
 DISGUISED = 4  # searches for effects that look like noise, before the noise is measured
 SAME_STORY = 0.05  # largest share of a model's gain that a simpler model may lack
 MIN_GAIN = 2.0  # smallest gain of a term on hold-out data, twice a log-likelihood
+OF_ONE = "only one of the flights shows it"
 
 
 def effects_of(selection: Selection) -> tuple[Effect, ...]:
@@ -282,11 +284,19 @@ def cross_validated(selection: Selection, refused: list[Refused]) -> Selection:
     """Return the Selection without Candidates that do not improve hold-out rows.
 
     The worst is dropped and the rest fitted again, until all gain more than MIN_GAIN. From three
-    flights on, whole flights are held out too, and the smaller gain counts.
+    flights on, whole flights are held out too, and the smaller gain counts. Of several flights, two
+    at least must show a function without a name.
 
     refused : dropped Candidates are appended
     """
     while selection.chosen:
+        single = [
+            one for one in selection.chosen if not one.declared and of_one_flight(selection, one)
+        ]
+        if single:
+            refused += [Refused(one.label, OF_ONE) for one in single]
+            selection = selection.only([one for one in selection.chosen if one not in single])
+            continue
         scores = held_out(selection)
         if selection.table.flights >= 3:
             across = held_out(selection, by_flight=True)

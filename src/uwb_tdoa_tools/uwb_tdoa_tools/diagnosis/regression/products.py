@@ -12,7 +12,7 @@ are too many functions for this. So a gain is a lower bound. Separate fits score
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 from itertools import combinations
 from typing import TYPE_CHECKING
 
@@ -36,10 +36,12 @@ FOR_MAPS = 3
 COARSE, FINE = 8, 16  # bins of a covariate in the search, and around its best products
 REFINED = 6  # products that are searched again with FINE bins
 WIDEST = 0.75  # share of the bins, longest interval
-CYCLES = np.arange(1.5, 10.01, 0.1)  # numbers of periods over the range of the time
+FINER = 9  # places around a knot of a product that are tried at last
+CYCLES = tuple(np.arange(1.5, 20.01, 0.1).tolist())  # numbers of periods over the range of the time
 TIME_BINS = 240
 SHORTEST = 1.0  # s, smallest range of the time
 PHASES = 24  # places in a period where a pulse begins or ends
+FACTOR = 5  # by how much the best wave and the best pulse are searched more finely
 LEAST_GAIN = 30.0  # smallest gain, twice a log-likelihood
 FEWEST = 60  # rows of a subset
 SECOND_PENALTY = 12.0  # more than a function of one covariate, twice a log-likelihood
@@ -126,20 +128,31 @@ class Products:
         found.sort(key=lambda item: -item[0])
         out = []
         for _, subset, pair, _ in found[:REFINED]:
-            first, second = (_Bins.of(name, subset.values[name], FINE) for name in pair)
-            if first and second:
+            finer = [_Bins.of(name, subset.values[name], FINE) for name in pair]
+            if all(finer):
                 sums = subset.weighted(information, residual)
-                gain, place = _best_product(sums, subset.prior, first, second)
-                out.append(self._proposal(subset, (first, second), gain, place))
+                _, place = _best_product(sums, subset.prior, *finer)
+                tried = len(finer[0].of_shapes) * len(finer[1].of_shapes) * FINER
+                moved = [bins.around(k, subset.values[bins.name]) for bins, k in zip(finer, place)]
+                gain, place = _best_product(sums, subset.prior, *moved)
+                out.append(self._proposal(subset, moved, gain, place, tried))
         for subset in self._subsets:
             if "time" in subset.values:
                 out += self._recurring(subset, information, residual)
         return sorted(out, key=lambda one: one.price - one.gain)
 
     def _proposal(
-        self, subset: _Subset, pair: Sequence[_Bins], gain: float, place: tuple[int, int]
+        self,
+        subset: _Subset,
+        pair: Sequence[_Bins],
+        gain: float,
+        place: tuple[int, int],
+        tried: int,
     ) -> Proposal:
-        """Return the Proposal of a product; place : of the shape in each of both _Bins."""
+        """Return the Proposal of a product.
+
+        place : of the shape in each of both _Bins; tried : number of products that were tried
+        """
         (shape, knots), (factor_shape, factor_knots) = (
             bins.of_shapes[k] for bins, k in zip(pair, place)
         )
@@ -154,7 +167,6 @@ class Products:
             factor_shape=factor_shape,
             factor_knots=factor_knots,
         )
-        tried = len(pair[0].of_shapes) * len(pair[1].of_shapes)
         return Proposal(gain, self._price_of_two + 2.0 * np.log(tried), subset.key, term)
 
     def _recurring(
@@ -165,12 +177,17 @@ class Products:
         low, high = map(float, np.quantile(t, [0.005, 0.995]))
         if high - low < SHORTEST:
             return
-        cell = np.clip((t - low) / (high - low) * TIME_BINS, 0, TIME_BINS - 1).astype(np.int64)
         weighted = subset.weighted(information, residual)
-        power, vector = (np.bincount(cell, part, TIME_BINS) for part in weighted)
+
+        def sums(bins: int) -> _Sums:
+            cell = np.clip((t - low) / (high - low) * bins, 0, bins - 1).astype(np.int64)
+            power, vector = (np.bincount(cell, part, bins) for part in weighted)
+            return _Sums(power, vector, subset.prior)
+
+        coarse, fine = sums(TIME_BINS), sums(FACTOR * TIME_BINS)
         channel, form, _ = subset.key
         for shape, function in (("wave", _best_wave), ("pulse", _best_pulse)):
-            gain, places, tried = function(power, vector, subset.prior)
+            gain, places, tried = function(coarse, fine)
             if gain > LEAST_GAIN:
                 knots = tuple(low + (high - low) * place for place in places)
                 term = SmoothTerm(
@@ -180,78 +197,113 @@ class Products:
                 yield Proposal(gain, price, subset.key, term)
 
 
-@cache
-def _waves() -> tuple[np.ndarray, np.ndarray]:
-    """Return a level, sine and cosine of each number of periods, (c, t, 3), and their products.
+@dataclass(frozen=True, eq=False)
+class _Sums:
+    """Sums over bins of the time.
 
-    The products are (c, t, 3, 3).
+    power, vector : (bins,) of the weights, and of the weighted residuals
+    prior : information of the prior of a coefficient
     """
-    at = (np.arange(TIME_BINS) + 0.5) / TIME_BINS
-    phase = 2.0 * np.pi * CYCLES[:, None] * at
+
+    power: np.ndarray
+    vector: np.ndarray
+    prior: float
+
+    def gains_of_waves(self, cycles: tuple[float, ...]) -> np.ndarray:
+        """Return the gain of a wave of each number of periods, (c,), by least squares."""
+        basis, squares = _waves(cycles, len(self.power))
+        gram = np.tensordot(squares, self.power, axes=(1, 0)) + self.prior * np.eye(3)
+        right = np.tensordot(basis, self.vector, axes=(1, 0))
+        return np.einsum("cj,cj->c", right, np.linalg.solve(gram, right[:, :, None])[:, :, 0])
+
+    def gains_of_pulses(
+        self, cycles: tuple[float, ...], phases: int, start: np.ndarray, length: np.ndarray
+    ) -> np.ndarray:
+        """Return the gain of each pulse of each number of periods, (c, k).
+
+        A pulse is an interval of phases, which may go on in the next period. For each number of
+        periods, the sums are folded into a period.
+
+        phases : number of phases of a period; start, length : (k,) phases
+        """
+        labels, several = _phases(cycles, len(self.power), phases), []
+        for part in (self.power, self.vector):
+            folded = np.bincount(labels, np.tile(part, len(cycles)), phases * len(cycles))
+            twice = np.tile(folded.reshape(-1, phases), 2).cumsum(axis=1)
+            upto = np.pad(twice, ((0, 0), (1, 0)))
+            several.append(upto[:, start + length] - upto[:, start])
+        inside, first = several
+        return _gain(self.vector.sum(), self.power.sum(), first, inside, inside, self.prior)
+
+
+@lru_cache(maxsize=8)
+def _waves(cycles: tuple[float, ...], bins: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return a level, sine and cosine of each number of periods, (c, bins, 3), and their products.
+
+    The products are (c, bins, 3, 3).
+    """
+    phase = 2.0 * np.pi * np.array(cycles)[:, None] * (np.arange(bins) + 0.5) / bins
     basis = np.stack([np.ones_like(phase), np.sin(phase), np.cos(phase)], axis=2)
     return basis, basis[..., :, None] * basis[..., None, :]
 
 
-@cache
-def _phases() -> np.ndarray:
-    """Return the phase of each bin of the time for each number of periods, (c * t,).
+@lru_cache(maxsize=8)
+def _phases(cycles: tuple[float, ...], bins: int, phases: int) -> np.ndarray:
+    """Return the phase of each bin of the time for each number of periods, (c * bins,).
 
-    Each number of periods has PHASES labels of its own.
+    Each number of periods has `phases` labels of its own.
     """
-    at = (np.arange(TIME_BINS) + 0.5) / TIME_BINS
-    phase = (CYCLES[:, None] * at % 1.0 * PHASES).astype(np.int64)
-    return (phase + PHASES * np.arange(len(CYCLES))[:, None]).ravel()
+    several, at = np.array(cycles)[:, None], (np.arange(bins) + 0.5) / bins
+    phase = (several * at % 1.0 * phases).astype(np.int64)
+    return (phase + phases * np.arange(len(several))[:, None]).ravel()
 
 
-def _best_wave(
-    power: np.ndarray, vector: np.ndarray, prior: float
-) -> tuple[float, tuple[float, ...], int]:
-    """Return (gain, knots, number tried) of the best wave, by least squares.
+def _near(cycles: float) -> tuple[float, ...]:
+    """Return numbers of periods around one of CYCLES."""
+    step = CYCLES[1] - CYCLES[0]
+    return tuple((cycles + np.linspace(-step, step, 4 * FACTOR + 1)).tolist())
 
-    power, vector : (TIME_BINS,) sums over bins of the time
-    returns : knots as shares of the range of the time
+
+def _best_wave(coarse: _Sums, fine: _Sums) -> tuple[float, tuple[float, ...], int]:
+    """Return (gain, knots, number tried) of the best wave.
+
+    The knots are shares of the range of the time.
     """
-    basis, squares = _waves()
-    gram = np.tensordot(squares, power, axes=(1, 0)) + prior * np.eye(3)
-    right = np.tensordot(basis, vector, axes=(1, 0))
-    gains = np.einsum("cj,cj->c", right, np.linalg.solve(gram, right[:, :, None])[:, :, 0])
+    near = _near(CYCLES[int(np.argmax(coarse.gains_of_waves(CYCLES)))])
+    gains = fine.gains_of_waves(near)
     best = int(np.argmax(gains))
-    return float(gains[best]), (0.0, 1.0 / float(CYCLES[best])), len(CYCLES)
+    return float(gains[best]), (0.0, 1.0 / near[best]), len(CYCLES) * FACTOR
 
 
-def _best_pulse(
-    power: np.ndarray, vector: np.ndarray, prior: float
-) -> tuple[float, tuple[float, ...], int]:
-    """Return (gain, knots, number tried) of the best pulse; parameters as of `_best_wave`.
-
-    For each number of periods, the sums are folded into PHASES. A pulse is an interval of phases,
-    which may go on in the next period.
-    """
+def _best_pulse(coarse: _Sums, fine: _Sums) -> tuple[float, tuple[float, ...], int]:
+    """Return (gain, knots, number tried) of the best pulse, as `_best_wave`."""
     start, length = (part.ravel() for part in np.meshgrid(range(PHASES), range(2, PHASES - 1)))
-    sums = []
-    for part in (power, vector):
-        folded = np.bincount(_phases(), np.tile(part, len(CYCLES)), PHASES * len(CYCLES))
-        twice = np.tile(folded.reshape(-1, PHASES), 2).cumsum(axis=1)
-        upto = np.pad(twice, ((0, 0), (1, 0)))
-        sums.append(upto[:, start + length] - upto[:, start])
-    inside, first = sums
-    gains = _gain(vector.sum(), power.sum(), first, inside, inside, prior)
+    gains = coarse.gains_of_pulses(CYCLES, PHASES, start, length)
     row, k = np.unravel_index(int(np.argmax(gains)), gains.shape)
-    period = 1.0 / float(CYCLES[row])
-    begin, lasts = period * int(start[k]) / PHASES, period * int(length[k]) / PHASES
-    return float(gains[row, k]), (begin, begin + lasts, begin + period), gains.size
+    tried, near, phases = gains.size * FACTOR, _near(CYCLES[row]), FACTOR * PHASES
+    moved = np.arange(-FACTOR, FACTOR + 1)
+    start, length = (
+        part.ravel() for part in np.meshgrid(FACTOR * start[k] + moved, FACTOR * length[k] + moved)
+    )
+    gains = fine.gains_of_pulses(near, phases, start % phases, length)
+    row, k = np.unravel_index(int(np.argmax(gains)), gains.shape)
+    period = 1.0 / near[row]
+    begin, lasts = period * int(start[k] % phases) / phases, period * int(length[k]) / phases
+    return float(gains[row, k]), (begin, begin + lasts, begin + period), tried
 
 
 @dataclass(frozen=True, eq=False)
 class _Bins:
     """A covariate in bins, and the shapes over it.
 
+    edges : (b + 1,) of the bins
     cell : (m,) bin of each row, the number of bins for an unknown value
     shapes : (b + 1, s) each shape without its level in each bin, 0 for unknown values
     of_shapes : [(name of the shape, knots)]
     """
 
     name: str
+    edges: np.ndarray
     cell: np.ndarray
     shapes: np.ndarray
     of_shapes: list[tuple[str, tuple[float, ...]]]
@@ -265,7 +317,19 @@ class _Bins:
         edges = np.unique(np.quantile(values[known], np.linspace(0.005, 0.995, bins + 1)))
         if len(edges) < 4 or edges[-1] - edges[0] < 1e-3 * max(*np.abs(edges[[0, -1]]), 1e-3):
             return None
-        n = len(edges) - 1
+        return cls.between(name, values, edges)
+
+    def around(self, place: int, values: np.ndarray) -> _Bins:
+        """Return bins of the same values (m,), finer around the inner knots of a shape."""
+        inner = np.searchsorted(self.edges, self.of_shapes[place][1][1:-1])
+        near = [np.linspace(self.edges[k - 1], self.edges[k + 1], FINER) for k in inner]
+        edges = np.unique(np.concatenate([self.edges[[0, -1]], *near])) if near else self.edges
+        return _Bins.between(self.name, values, edges)
+
+    @classmethod
+    def between(cls, name: str, values: np.ndarray, edges: np.ndarray) -> _Bins:
+        """Sort values (m,) into bins between edges (b + 1,)."""
+        known, n = np.isfinite(values), len(edges) - 1
         cell = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, n - 1)
         counted = np.bincount(cell[known], minlength=n)
         sums = np.bincount(cell[known], np.clip(values[known], edges[0], edges[-1]), n)
@@ -273,7 +337,7 @@ class _Bins:
         of_shapes = list(_shapes(tuple(map(float, edges))))
         columns = [shape_basis(shape, knots, centres)[:, 1] for shape, knots in of_shapes]
         shapes = np.pad(np.stack(columns, axis=1), ((0, 1), (0, 0)))
-        return cls(name, np.where(known, cell, n), shapes, of_shapes)
+        return cls(name, edges, np.where(known, cell, n), shapes, of_shapes)
 
 
 def _all_binned(subset: _Subset) -> dict[str, _Bins]:

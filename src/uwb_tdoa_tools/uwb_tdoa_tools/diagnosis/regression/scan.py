@@ -47,6 +47,7 @@ WIDEST = 10  # bins, longest interval; a longer interval equals two steps
 # residual may share that noise.
 CROWDED = 0.02
 NOISY = 1.5  # noise of a series that keeps full weight, relative to its group's median
+DIFFERENCES = 3  # order of the differences that measure the noise of a series
 FINER = 9  # places around a knot that are tried in the refinement
 FEWEST = 12  # smallest number of values of a subset
 # With more values than the first, the covariate is divided into levels, above MANY anchors.
@@ -208,19 +209,21 @@ class Scan:
 def _noise_of_series(table: RegressionTable) -> np.ndarray:
     """Return the noise of the series of each row, (n,), at least 1.
 
-    It is relative to NOISY times the median of its group. Differences of successive rows measure
-    it, because steps and trends contribute little to them.
+    It is relative to NOISY times the median of its group. Third differences of successive rows
+    measure it, because steps, trends and waves contribute little to them.
     """
     order = np.lexsort((table.t, table.series, table.flight, table.channel))
     label = np.unique(
         np.stack([table.channel, table.flight, table.series]), axis=1, return_inverse=True
     )[1].reshape(-1)
-    step, begins = (
-        np.abs(np.diff(table.y[order])),
-        np.searchsorted(label[order], np.arange(label.max() + 1)),
+    y, begins = table.y[order], np.searchsorted(label[order], np.arange(label.max() + 1))
+    several = np.split(y, begins[1:])
+    scatter = np.array(
+        [
+            np.median(np.abs(np.diff(part, n=DIFFERENCES))) if len(part) > DIFFERENCES else 0.0
+            for part in several
+        ]
     )
-    parts = (step[first:last] for first, last in zip(begins, [*begins[1:] - 1, len(step)]))
-    scatter = np.array([np.median(part) if len(part) else 0.0 for part in parts])
     out = scatter[label]
     for _, rows in table.groups:
         out[rows] /= max(float(NOISY * np.median(out[rows])), 1e-12)
