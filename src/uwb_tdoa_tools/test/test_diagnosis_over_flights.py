@@ -21,6 +21,7 @@ from uwb_tdoa_tools.diagnosis.over_flights import (
     shares,
 )
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
+from uwb_tdoa_tools.diagnosis.refinement import OF_ONE
 from uwb_tdoa_tools.diagnosis.report.page import html
 
 
@@ -69,6 +70,25 @@ def test_shares_are_those_that_were_put_in():
         [0.5, 1.0, 1.5], abs=0.05
     )
     assert course(found) == GROWS
+
+
+def test_a_function_that_one_flight_alone_can_show_is_not_applied():
+    """Anchor 3 is late from 26 to 34 s. The other flight ends before."""
+    late = SmoothTerm(
+        {"3.c0": 0.0, "3.c1": 0.5},
+        covariate="time",
+        form="anchor",
+        knots=(0.0, 26.0, 34.0, 40.0),
+        shape="interval",
+    )
+    attribution = attribute(
+        [late.inject(clean_flight(100, 40.0)), clean_flight(101, 24.0)], GroundTruth()
+    )
+    assert not any(effect.name == late.name for effect in attribution.effects)
+    ((name, alone),) = attribution.alone
+    assert name == attribution.names[0]
+    assert {candidate.terms[0].effect.covariate for candidate in alone.chosen} == {"time"}
+    assert OF_ONE in {refused.why for refused in attribution.refused}
 
 
 @pytest.mark.slow

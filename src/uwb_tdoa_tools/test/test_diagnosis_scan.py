@@ -63,6 +63,7 @@ RARE = [
     product("5", ("range", (2.0, 4.5, 8.0)), ("y", (-3.0, -1.0, 1.5, 3.0)), 0.6),
     put_in("anchor", "2", "time", (1.0, 3.0, 7.5), "pulse", 0.4),
     put_in("pair", "0-1", "time", (0.0, 5.3), "wave", 0.3),
+    put_in("anchor", "6", "time", (0.0, 2.63), "wave", 0.3),
 ]
 
 
@@ -77,6 +78,21 @@ def test_a_product_of_two_covariates_or_what_recurs_is_proposed_first(flight, te
     simple = scan.gains(table, _held(table, model, ()))[0]
     assert first.gain > 1.2 * simple[0]  # with the weights of the fit
     assert first.candidate.label in {one.label for one in scan(table, model, ())}
+    if term.periodic:
+        period, found = (knots[-1] - knots[0] for knots in (term.knots, first.term.knots))
+        assert found == pytest.approx(period, rel=0.01)
+    else:  # two explanations of the same rows differ in their knots
+        inner = zip(term.knots[1:-1], first.term.knots[1:-1])
+        alike = first.term.arguments == term.arguments and len(first.term.knots) == len(term.knots)
+        assert all(abs(one - other) < 0.15 for one, other in inner if alike)
+
+
+def test_what_changes_fast_is_no_noise_of_its_series(flight):
+    """A wave of 4 s moves the TDOAs by more than their noise between two rows."""
+    wave = put_in("anchor", "3", "time", (0.0, 4.0), "wave", 0.4)
+    (table, _, scan), (_, _, plain) = scanned(wave.inject(flight)), scanned(flight)
+    rows = table.rows_of("tdoa")
+    assert np.quantile(scan.even[rows] / plain.even[rows], 0.02) > 0.5
 
 
 TERMS = [

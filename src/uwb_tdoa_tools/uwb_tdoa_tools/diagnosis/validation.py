@@ -56,6 +56,8 @@ MOST_HARM = 0.2
 WORTH_OF_ONE = 0.05
 # m, and share of the error: with a smaller worth an effect is not written, as it rounds to nothing.
 LEAST_WORTH, LEAST_SHARE = 0.0005, 0.005
+# Largest relative change of a candidate's contribution with which its displacement is used again.
+SAME_MOVE = 0.1
 SELECTED_ON = ", chosen on all of them (--holdout judges the choice too)"
 HELD_OUT = "flights that took no part in the fit"
 SECOND = "give a second flight with this one"
@@ -339,6 +341,8 @@ class _Trials:
         self._poses: Sequence[Poses | None] = [None]
         self._now: list[tuple[Run, Score]] = []
         self.runs: KnownRuns = ()
+        # {candidate: (return value of `_moved`, [return value of `_change`] of each case)}
+        self._known: dict[Candidate, tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]]] = {}
 
     def start(self, candidates: Sequence[Candidate], detections: Sequence[Detection]) -> float:
         """Return the error of a model, m, and keep its runs and their poses for later trials."""
@@ -357,18 +361,44 @@ class _Trials:
     def displacements(
         self, candidates: Sequence[Candidate], each: Sequence[Candidate]
     ) -> Displacements:
-        """Return the Displacements by each of some candidates of the model of the last `start`."""
-        models = [self._cases([c for c in candidates if c is not one], ()) for one in each]
-        tried = self._tried(_scored, list(chain.from_iterable(models)))
+        """Return the Displacements by each of some candidates of the model of the last `start`.
+
+        A displacement of an earlier model is used again if the corrections without the candidate
+        differ from those of the model as they did then.
+        """
+        moves = {one: self._moved(candidates, one) for one in each}
+        anew = [one for one in each if not self._is_known(one, moves[one])]
+        models = [self._cases([c for c in candidates if c is not one], ()) for one in anew]
+        tried = iter(self._tried(_scored, list(chain.from_iterable(models))))
+        for one in anew:
+            self._known[one] = moves[one], [_change(now, next(tried)) for _, now in self._now]
         errors = []
         changes: dict[Candidate, list[np.ndarray]] = {one: [] for one in each}
         for k, (_, now) in enumerate(self._now):
-            without = tried[k :: len(self._now)]
-            t = reduce(np.intersect1d, [judged.t for judged in without], now.t)
+            several = {one: self._known[one][1][k] for one in each}
+            t = reduce(np.intersect1d, [of_one for of_one, _ in several.values()], now.t)
             errors.append(now.error[np.isin(now.t, t)])
-            for one, judged in zip(each, without):
-                changes[one].append(judged.error[np.isin(judged.t, t)] - errors[-1])
+            for one, (of_one, change) in several.items():
+                changes[one].append(change[np.isin(of_one, t)])
         return Displacements(errors, changes)
+
+    def _moved(self, candidates: Sequence[Candidate], one: Candidate) -> np.ndarray:
+        """Return by how much residuals change without a candidate, (n,), in their deviations."""
+        selection = self._attribution.selection
+        others = [other for other in candidates if other is not one]
+        whole, rest = (
+            refit(selection.table, columns_of(several), selection.fit)
+            for several in (candidates, others)
+        )
+        information = selection.fit.information(selection.table)
+        return (rest.residual - whole.residual) * np.sqrt(information)
+
+    def _is_known(self, one: Candidate, moved: np.ndarray) -> bool:
+        """Return whether the displacement without a candidate is known; moved : as of `_moved`."""
+        if one not in self._known:
+            return False
+        before, _ = self._known[one]
+        return bool(np.linalg.norm(moved - before) < SAME_MOVE * np.linalg.norm(before))
 
     def _cases(
         self, candidates: Sequence[Candidate], detections: Sequence[Detection]
@@ -388,6 +418,12 @@ class _Trials:
             results.append(of_case)
             self._progress()
         return results
+
+
+def _change(now: Score, other: Score) -> tuple[np.ndarray, np.ndarray]:
+    """Return common stamps (n,) s, and by how much the position error differs at them, (n, 3) m."""
+    t = np.intersect1d(now.t, other.t)
+    return t, other.error[np.isin(other.t, t)] - now.error[np.isin(now.t, t)]
 
 
 def error_of(config: FilterConfig | None, trial: tuple[ValidationCase, Poses | None]) -> float:

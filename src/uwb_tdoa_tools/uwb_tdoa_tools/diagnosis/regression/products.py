@@ -109,8 +109,11 @@ class Products:
         self._price_of_time = SmoothTerm.penalty + 2.0 * np.log(max(timed, 1))
 
     def _pairs(self, names: Iterable[str]) -> list[tuple[str, str]]:
-        """Return the pairs of covariates of which products are tried."""
-        pairs = combinations(names, 2)
+        """Return the pairs of covariates of which products are tried.
+
+        What happens at a place, but only for some time, does not recur in another flight.
+        """
+        pairs = combinations([name for name in names if name != "time"], 2)
         return [pair for pair in pairs if not (self._with_maps and {*pair} <= {*OF_PLACE})]
 
     def __call__(self, information: np.ndarray, residual: np.ndarray) -> list[Proposal]:
