@@ -30,6 +30,7 @@ from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.validation import (
     Displacements,
     _dropped,
+    _Trials,
     cross_fitted,
     select_by_error,
     validation_cases,
@@ -73,6 +74,36 @@ def test_a_model_that_no_trial_changes_is_not_run_again(flights, attribution, mo
     monkeypatch.setattr(comparison, "_run", lambda *_: pytest.fail("the filter runs again"))
     _, known = compare(cases, baseline, known=kept.runs)
     assert known["pooled"] == again["pooled"]
+
+
+def test_a_displacement_is_used_again_where_corrections_have_not_changed(monkeypatch):
+    """Dropping an accelerometer bias leaves the correction by an anchor's delay as it was."""
+    flights = [
+        effect_of("accel_bias", True, 1).inject(AnchorDelay({"2": 0.3}).inject(flight))
+        for flight in (clean_flight(100, 30.0), clean_flight(101, 30.0))
+    ]
+    found = attribute(flights, TRUTH, undeclared=False)
+    several = list(found.selection.chosen)
+    assert {one.name for one in several} == {"accel_bias", "anchor_delay"}
+    fewer = [one for one in several if one.name == "anchor_delay"]
+    runs = []
+    judged = validation._judged
+    monkeypatch.setattr(validation, "_judged", lambda *args: runs.append(1) or judged(*args))
+
+    def trials():
+        return _Trials(found, flights, Baseline(NONE), lambda: None, map)
+
+    again = trials()
+    again.start(several, [])
+    again.displacements(several, several)
+    again.start(fewer, [])
+    before = len(runs)
+    used = again.displacements(fewer, fewer)
+    assert len(runs) == before
+    fresh = trials()
+    fresh.start(fewer, [])
+    computed = fresh.displacements(fewer, fewer)
+    assert used.error(fewer) == pytest.approx(computed.error(fewer), rel=0.03)
 
 
 def test_halves_of_a_single_flight_judge_each_other(flights):

@@ -101,11 +101,14 @@ def _shares(
 
 
 def of_one_flight(selection: Selection, candidate: Candidate) -> bool:
-    """Return whether only one of several flights shows a chosen Candidate."""
-    flights = [str(number) for number in range(selection.table.flights)]
-    several = shares(selection, candidate, flights)
-    shown = [one for one in several if one.share > max(ALIKE, SHOWN * one.std)]
-    return len(flights) > 1 and len(shown) < 2
+    """Return whether only one of two flights shows a chosen Candidate.
+
+    False for another number of flights: of three and more, whole flights are held out.
+    """
+    if selection.table.flights != 2:
+        return False
+    several = shares(selection, candidate, ("first", "second"))
+    return not all(one.share > max(ALIKE, SHOWN * one.std) for one in several)
 
 
 def harm(several: Sequence[Share]) -> float:

@@ -37,7 +37,7 @@ MAPS_GAIN, MAPS_SURE = (20.0, 3.0)
 DISGUISED = 4  # searches for effects that look like noise, before the noise is measured
 SAME_STORY = 0.05  # largest share of a model's gain that a simpler model may lack
 MIN_GAIN = 2.0  # smallest gain of a term on hold-out data, twice a log-likelihood
-OF_ONE = "only one of the flights shows it"
+OF_ONE = "only one of both flights shows it"
 
 
 def effects_of(selection: Selection) -> tuple[Effect, ...]:
@@ -284,8 +284,8 @@ def cross_validated(selection: Selection, refused: list[Refused]) -> Selection:
     """Return the Selection without Candidates that do not improve hold-out rows.
 
     The worst is dropped and the rest fitted again, until all gain more than MIN_GAIN. From three
-    flights on, whole flights are held out too, and the smaller gain counts. Of several flights, two
-    at least must show a function without a name.
+    flights on, whole flights are held out too, and the smaller gain counts. Of two flights, both
+    must show a function without a name.
 
     refused : dropped Candidates are appended
     """

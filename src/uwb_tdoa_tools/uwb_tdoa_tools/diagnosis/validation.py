@@ -16,6 +16,7 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.results import poses_of
 
+from ..scoring.gains import LOSS, gain
 from ..scoring.metrics import EVERYTHING, Score, rms
 from .comparison import Baseline, ValidationCase, score
 from .deviations import with_deviations
@@ -158,8 +159,8 @@ def select_by_error(
     then predict the error without several of them, and candidates are dropped one by one by this
     prediction. The filter runs again with the rest, until no candidate is dropped. Detections stay
     only if the error falls with them. At most TRIAL_FLIGHTS flights are judged. Trials correct
-    measurements at the poses of a run with all effects. Events at a time of a single flight are
-    tried for their worth, but not kept.
+    measurements at the poses of a run with all effects. Of several flights none may get worse by an
+    effect. Events at a time of a single flight are tried for their worth, but not kept.
 
     map_function : as of `attribute`
     """
@@ -177,6 +178,8 @@ def select_by_error(
             for one in applicable:
                 worth[one] = displacements.error([one]) - whole
             harmful = _harmful(attribution, candidates, applicable)
+            if harmful is None and not alone:
+                harmful = _worse_in_one(displacements, applicable)
             if harmful is None:
                 break
             one, why = harmful
@@ -241,6 +244,22 @@ def _harmful(
     )
 
 
+def _worse_in_one(
+    displacements: Displacements, applicable: Sequence[Candidate]
+) -> tuple[Candidate, str] | None:
+    """Return the Candidate with the largest loss in a trial flight, and why; None without one.
+
+    A loss counts above LOSS. What helps one flight and does harm to another may do either to a
+    third one.
+    """
+    losses = {one: displacements.largest_loss(one) for one in applicable}
+    worst = max(losses, key=lambda one: losses[one][0])
+    loss, before, after = losses[worst]
+    if loss <= LOSS:
+        return None
+    return worst, f"one of the flights gets worse by it: {before:.3f} m without, {after:.3f} m with"
+
+
 def _dropped(
     displacements: Displacements, candidates: Sequence[Candidate], alone: bool
 ) -> dict[Candidate, tuple[float, float]]:
@@ -285,6 +304,14 @@ class Displacements:
             moved = error + sum(self.changes[one][k] for one in gone)
             several.append(rms(np.linalg.norm(moved, axis=1)))
         return float(np.mean(several))
+
+    def largest_loss(self, one: Candidate) -> tuple[float, float, float]:
+        """Return the largest loss by an effect in a case, and its errors without and with it, m."""
+        losses = []
+        for error, change in zip(self.errors, self.changes[one]):
+            after, before = (rms(np.linalg.norm(part, axis=1)) for part in (error, error + change))
+            losses.append((-gain(before, after), before, after))
+        return max(losses)
 
 
 def _applicable(candidates: Sequence[Candidate]) -> list[Candidate]:
