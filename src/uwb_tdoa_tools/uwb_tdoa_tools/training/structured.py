@@ -29,7 +29,7 @@ from scipy.spatial.distance import cdist
 
 from uwb_tdoa_bias.correction.features import columns
 
-from ..exporting.onnx_graph import GraphBuilder
+from ..exporting.onnx_file import GraphBuilder
 from . import linear
 from .labels import SAME_PLACE, constellations
 
