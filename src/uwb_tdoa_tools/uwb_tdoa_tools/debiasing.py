@@ -33,13 +33,9 @@ from .scoring.metrics import Score, position_at
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
-    from pathlib import Path
 
     from uwb_tdoa_bias.common.anchors import Anchors
     from uwb_tdoa_ekf.debias import BiasMap
-    from uwb_tdoa_ekf.results import Odometry
-
-    from .scoring.metrics import Score
 
 
 Scored = tuple[Flight, Score, Odometry]  # flight, errors, and estimate

@@ -22,7 +22,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_bytes
 from uwb_tdoa_bias.common.limits import MODEL_BYTES
 from uwb_tdoa_bias.common.text import version
-from uwb_tdoa_bias.correction.exported import INPUTS, OUTPUTS
+from uwb_tdoa_bias.correction.model import INPUTS, OUTPUTS
 from uwb_tdoa_bias.correction.trial import Unplayable, tried_out
 
 from .correction import TracedCorrection, trace

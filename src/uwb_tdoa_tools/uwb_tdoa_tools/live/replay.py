@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
     from ..bags.files import BagReader
-    from .follow import Follower
     from .session import Stop
 
 

@@ -31,8 +31,7 @@ from uwb_tdoa_bias.common.limits import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
+    from collections.abc import Sequence
 
 
 GZIP_MAGIC = b"\x1f\x8b"

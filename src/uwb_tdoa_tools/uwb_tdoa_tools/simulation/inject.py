@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.common.anchors import Anchors
     from uwb_tdoa_bias.common.flight import Flight
-    from uwb_tdoa_bias.effects.base import Effect
 
     from ..readers.inputs import Reading
 
