@@ -15,7 +15,7 @@ from uwb_tdoa_tools.flying import loop
 from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.scoring.evaluation import score_of
 from uwb_tdoa_tools.scoring.gains import gain
-from uwb_tdoa_tools.simulation.hidden import hidden_effect
+from uwb_tdoa_tools.simulation.inject import hidden_effect
 
 HARM = -0.05  # smallest gain that is no harm
 

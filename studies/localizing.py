@@ -18,7 +18,7 @@ from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_tools import options, parallel
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.estimate import FlightEstimator
-from uwb_tdoa_tools.localizing.assessment import GOOD, assess
+from uwb_tdoa_tools.localizing.localize import GOOD, assess
 from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.scoring.metrics import position_errors
 

@@ -24,7 +24,7 @@ from uwb_tdoa_ekf.results import concatenated, rows_of
 from uwb_tdoa_tools import options, parallel
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
 from uwb_tdoa_tools.estimate import FlightEstimator
-from uwb_tdoa_tools.localizing.assessment import GOOD, assess
+from uwb_tdoa_tools.localizing.localize import GOOD, assess
 from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.parallel import whole_number
 from uwb_tdoa_tools.scoring.metrics import position_errors

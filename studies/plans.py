@@ -24,10 +24,10 @@ from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_tools import parallel
 from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.parallel import whole_number
+from uwb_tdoa_tools.planning.bifurcation import CLEAR, FLIP
 from uwb_tdoa_tools.planning.hall import Hall
 from uwb_tdoa_tools.planning.installation import FixedNoise, Installation, RadioNoise
 from uwb_tdoa_tools.planning.maps import FLYABLE, IMPRECISE, TOO_FEW, TWO_SOLUTIONS, Demand
-from uwb_tdoa_tools.planning.second_minimum import CLEAR, FLIP
 from uwb_tdoa_tools.simulation.rooms import Room, Walls
 
 STATES = {

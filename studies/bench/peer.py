@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from uwb_tdoa_bias.common.flight import Flight
-    from uwb_tdoa_tools.flying.exported import CompiledCorrection
+    from uwb_tdoa_tools.flying.estimates import CompiledCorrection
 
 REPEATS = 41
 SAMPLED = 0.01  # s, from one position of a peer to the next

@@ -35,8 +35,7 @@ from tqdm import tqdm
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_tools import choices, cli
-from uwb_tdoa_tools.flying.estimates import Peer
-from uwb_tdoa_tools.flying.exported import CompiledCorrection
+from uwb_tdoa_tools.flying.estimates import CompiledCorrection, Peer
 from uwb_tdoa_tools.outputs import OutputFile, OutputFolder
 from uwb_tdoa_tools.readers import inputs
 

@@ -16,8 +16,7 @@ from uwb_tdoa_bias.common.flight import SENSOR_NAMES
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf.debias import fit
 from uwb_tdoa_tools import parallel
-from uwb_tdoa_tools.debiasing.evaluation import estimate_flight, evaluate_map, map_figures
-from uwb_tdoa_tools.debiasing.mapping import LEAST, part_of
+from uwb_tdoa_tools.debiasing import LEAST, estimate_flight, evaluate_map, map_figures, part_of
 from uwb_tdoa_tools.outputs import OutputFolder
 from uwb_tdoa_tools.readers import inputs
 

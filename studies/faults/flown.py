@@ -21,7 +21,7 @@ from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_ekf.monitoring.finding import most_severe_first
 from uwb_tdoa_ekf.monitoring.status import RUNNING, Use, status_of
-from uwb_tdoa_ekf.monitoring.stream_watch import StreamWatch
+from uwb_tdoa_ekf.monitoring.stream_rules import StreamWatch
 from uwb_tdoa_ekf.results import concatenated, rotation_std, rows_of
 from uwb_tdoa_tools import parallel
 from uwb_tdoa_tools.flying.estimates import OwnFilter

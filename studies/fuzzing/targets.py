@@ -49,9 +49,8 @@ from uwb_tdoa_tools.readers import (
     read_usd_log,
     read_util_csv,
 )
-from uwb_tdoa_tools.readers.columns import parse_columns
 from uwb_tdoa_tools.readers.names import NamedAnchors
-from uwb_tdoa_tools.readers.profile import Profile
+from uwb_tdoa_tools.readers.profile import Profile, parse_columns
 from uwb_tdoa_tools.readers.suggest import suggest
 from uwb_tdoa_tools.readers.tables import number, read_table
 from uwb_tdoa_tools.results_file import ResultsFile

@@ -28,8 +28,7 @@ from uwb_tdoa_ekf.evidence import keys_of
 from uwb_tdoa_ekf.monitoring.finding import Finding
 from uwb_tdoa_ekf.monitoring.monitor import Monitor
 from uwb_tdoa_ekf.monitoring.signs import SignWatch
-from uwb_tdoa_ekf.monitoring.stream_rules import StreamRules
-from uwb_tdoa_ekf.monitoring.stream_watch import StreamWatch
+from uwb_tdoa_ekf.monitoring.stream_rules import StreamRules, StreamWatch
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.results import rows_of
 from uwb_tdoa_tools.checking.recording import of_flight

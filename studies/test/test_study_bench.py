@@ -22,8 +22,10 @@ from studies.__main__ import main  # noqa: E402
 from studies.bench import core, nodes, peer, recordings, source, suite, usage  # noqa: E402
 from studies.bench.figures import Figure  # noqa: E402
 from studies.bench.flights import TDOA_RATE, among, make_flight  # noqa: E402
-from uwb_tdoa_tools.flying.estimates import Peer  # noqa: E402
-from uwb_tdoa_tools.flying.exported import CompiledCorrection  # noqa: E402
+from uwb_tdoa_tools.flying.estimates import (
+    CompiledCorrection,
+    Peer,  # noqa: E402
+)
 from uwb_tdoa_tools.flying.world import HALL  # noqa: E402
 
 OTHERS = 0.2  # of the CPU time, from which on nothing can be asked of what is played in real time

@@ -3,9 +3,9 @@
 
 from pathlib import Path
 
+from node_parameters import written_and_declared
 import numpy as np
 import pytest
-import yaml
 
 rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
@@ -28,15 +28,7 @@ def node():
 
 
 def test_every_parameter_is_in_the_parameter_file_with_its_default(node):
-    (parameters,) = (
-        entry["ros__parameters"] for entry in yaml.safe_load(CONFIG.read_text()).values()
-    )
-    general = ("qos_overrides.", "use_sim_time", "start_type_description_service")
-    declared = {
-        name: p.value
-        for name, p in node.get_parameters_by_prefix("").items()
-        if not name.startswith(general)
-    }
+    parameters, declared = written_and_declared(node, CONFIG)
     assert parameters == declared
 
 

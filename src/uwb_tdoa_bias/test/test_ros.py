@@ -28,7 +28,7 @@ from rosgraph_msgs.msg import Clock  # noqa: E402
 from uwb_tdoa_bias.common.anchors import Anchors  # noqa: E402
 from uwb_tdoa_bias.common.errors import InputError  # noqa: E402
 from uwb_tdoa_bias.common.limits import LINE_LENGTH  # noqa: E402
-from uwb_tdoa_bias.ros import log  # noqa: E402
+from uwb_tdoa_bias.ros import parameters  # noqa: E402
 from uwb_tdoa_bias.ros.anchors import (  # noqa: E402
     ANCHORS_QOS,
     ANY_QOS,
@@ -37,7 +37,7 @@ from uwb_tdoa_bias.ros.anchors import (  # noqa: E402
     same_anchors,
 )
 from uwb_tdoa_bias.ros.diagnostics import Saying, SimulatedClock  # noqa: E402
-from uwb_tdoa_bias.ros.log import BURST, REFILL, Log  # noqa: E402
+from uwb_tdoa_bias.ros.parameters import BURST, REFILL, Log
 from uwb_tdoa_bias.ros.topics import OUTPUT_QOS, STREAM_QOS, Epoch  # noqa: E402
 
 # --- ros stamps ---
@@ -176,7 +176,7 @@ class Written:
 def clock(monkeypatch):
     """The time, s, that a Log sees: a list of one."""
     now = [1000.0]
-    monkeypatch.setattr(log.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(parameters.time, "monotonic", lambda: now[0])
     return now
 
 

@@ -16,9 +16,8 @@ from scipy.stats import norm
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_ekf.debias import INTERPOLATORS, BiasMap, Part, fit
-from uwb_tdoa_ekf.debias.bias_map import FADE
-from uwb_tdoa_ekf.debias.markers import Markers, collect, corrected_bias
-from uwb_tdoa_ekf.debias.network import AngularNetwork
+from uwb_tdoa_ekf.debias.bias_map import FADE, AngularNetwork
+from uwb_tdoa_ekf.debias.fit import Markers, collect, corrected_bias
 
 # --- debias markers ---
 

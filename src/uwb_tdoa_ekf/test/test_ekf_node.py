@@ -6,7 +6,6 @@ import pytest
 
 rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
-pytest.importorskip("rclpy")
 
 from dataclasses import fields  # noqa: E402
 import math  # noqa: E402
@@ -15,9 +14,9 @@ import re  # noqa: E402
 
 from builtin_interfaces.msg import Time  # noqa: E402
 from geometry_msgs.msg import PoseWithCovarianceStamped  # noqa: E402
+from node_parameters import written_and_declared  # noqa: E402
 import numpy as np  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
-import yaml  # noqa: E402
 
 from uwb_tdoa_bias.common.errors import InputError  # noqa: E402
 from uwb_tdoa_bias.ros.topics import Epoch  # noqa: E402
@@ -41,15 +40,7 @@ def node():
 
 
 def test_every_parameter_is_in_the_parameter_file_with_its_default(node):
-    (parameters,) = (
-        entry["ros__parameters"] for entry in yaml.safe_load(CONFIG.read_text()).values()
-    )
-    general = ("qos_overrides.", "use_sim_time", "start_type_description_service")
-    declared = {
-        name: p.value
-        for name, p in node.get_parameters_by_prefix("").items()
-        if not name.startswith(general)
-    }
+    parameters, declared = written_and_declared(node, CONFIG)
     assert parameters == declared
     assert {field.name for field in fields(FilterConfig)} < declared.keys()
     assert FilterConfig.from_yaml(CONFIG) == FilterConfig()

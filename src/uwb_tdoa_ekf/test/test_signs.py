@@ -10,7 +10,7 @@ import pytest
 
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.monitoring.signs import SignWatch
-from uwb_tdoa_ekf.monitoring.stream_watch import StreamWatch
+from uwb_tdoa_ekf.monitoring.stream_rules import StreamWatch
 
 
 def watched(flight, sign, doubted=np.inf):

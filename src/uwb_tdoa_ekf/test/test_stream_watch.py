@@ -12,7 +12,7 @@ from test_stream_rules import ANCHORS, streams
 
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.monitoring.status import Use
-from uwb_tdoa_ekf.monitoring.stream_watch import FEW_ANCHORS, StreamWatch
+from uwb_tdoa_ekf.monitoring.stream_rules import FEW_ANCHORS, StreamWatch
 
 LOOK = 0.2  # s
 

@@ -61,7 +61,6 @@ def test_update_state_is_the_textbook_update_with_a_unit_row(seed, state, std):
 # --- robust ---
 losses = st.sampled_from(LOSSES)
 lengths = st.floats(1.0, 8.0)
-HUGE = 1e8
 
 
 def tuned(**config):

@@ -19,7 +19,7 @@ from uwb_tdoa_bias.common.survey import read_survey
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_ekf.core.memory import STARTUP
 from uwb_tdoa_ekf.estimator import Estimator
-from uwb_tdoa_ekf.monitoring.stream_watch import StreamWatch
+from uwb_tdoa_ekf.monitoring.stream_rules import StreamWatch
 
 SPACING = 8.0  # m
 TURN = 0.005  # s of stamps that a node takes at once

@@ -28,7 +28,7 @@ from uwb_tdoa_bias.effects.tag import TagLeverArm
 from .estimator import Estimator
 from .monitoring.change import YOUNGEST, ChangeDetector
 from .monitoring.slices import LENGTH, Slice
-from .monitoring.stream_watch import StreamWatch
+from .monitoring.stream_rules import StreamWatch
 from .monitoring.survey_scale import SurveyScale
 from .results import pose_and_twist, rotation_std
 

@@ -50,7 +50,7 @@ from .frames import ImuMount, pose_from_message
 from .monitoring.finding import most_severe_first
 from .monitoring.health import OK, WARN, Health, together
 from .monitoring.status import FAULT, Status, doubted, status_of, yaw_in_words
-from .monitoring.stream_watch import FEW_ANCHORS, StreamWatch
+from .monitoring.stream_rules import FEW_ANCHORS, StreamWatch
 from .outputs import Outputs, StatusOutput
 from .reorder_buffer import STREAMS
 from .results import VERDICTS, Residuals, rotation_std

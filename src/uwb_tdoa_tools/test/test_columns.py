@@ -9,9 +9,8 @@ from recordings import ANCHORS, SURVEY
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_tools.commands.convert import main
 from uwb_tdoa_tools.readers import read_by_profile, read_flight, read_survey
-from uwb_tdoa_tools.readers.columns import TIME, UNITS, parse_columns
 from uwb_tdoa_tools.readers.names import NamedAnchors, read_named_anchors
-from uwb_tdoa_tools.readers.profile import Profile
+from uwb_tdoa_tools.readers.profile import TIME, UNITS, Profile, parse_columns
 
 NAMED = NamedAnchors(ANCHORS)
 TDOA = "time=t_ms:ms,anchor_a=from,anchor_b=to,tdoa=diff:mm"

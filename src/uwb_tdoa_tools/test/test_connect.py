@@ -75,7 +75,7 @@ def errors(out):
 
 
 def test_the_page_names_every_column_and_unit():
-    columns = import_module("uwb_tdoa_tools.readers.columns")
+    columns = import_module("uwb_tdoa_tools.readers.profile")
     for name, units in columns.UNITS.items():
         stem, _, axis = name.rpartition("_")
         assert (

@@ -11,10 +11,10 @@ import pytest
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_ekf.debias import BiasMap
+from uwb_tdoa_tools import debiasing
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands.debias import main
-from uwb_tdoa_tools.debiasing import mapping
-from uwb_tdoa_tools.debiasing.mapping import part_of, static_parts
+from uwb_tdoa_tools.debiasing import part_of, static_parts
 from uwb_tdoa_tools.scoring.evaluation import evaluate
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.rooms import corners
@@ -175,9 +175,9 @@ def test_a_map_that_does_harm_where_it_took_no_part_is_not_written(
     tmp_path, flights, monkeypatch, capsys
 ):
     one, two, out = str(flights / "one.bag"), str(flights / "two.bag"), tmp_path / "m.npz"
-    made = mapping.fit_map
+    made = debiasing.fit_map
     monkeypatch.setattr(
-        mapping,
+        debiasing,
         "fit_map",
         lambda *args, **options: (m := made(*args, **options)) and replace(m, bias=-5.0 * m.bias),
     )
@@ -277,7 +277,7 @@ def test_help_shows_every_command(capsys):
     assert "debias fit --static points.csv" in capsys.readouterr().out
 
 
-# --- debiasing mapping ---
+# --- fits ---
 
 
 CONFIG = SimulationConfig(

@@ -26,7 +26,7 @@ from uwb_tdoa_tools.flying.demo import (  # noqa: E402
     next_steps,
 )
 from uwb_tdoa_tools.scoring.evaluation import score_of  # noqa: E402
-from uwb_tdoa_tools.simulation import hidden, simulate  # noqa: E402
+from uwb_tdoa_tools.simulation import inject, simulate  # noqa: E402
 from uwb_tdoa_tools.simulation.rooms import corners
 
 
@@ -127,15 +127,15 @@ def recorded(tmp_path_factory):
 def diagnosis(recorded):
     """The Diagnosis of the first two recordings, with nothing there that declares the effect."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in (hidden, loop):
+        for module in (inject, loop):
             patch.delattr(module, "hidden_effect")
-        patch.setattr(hidden, "KINDS", {})
+        patch.setattr(inject, "KINDS", {})
         return diagnose(loop.read(recorded[:2]))
 
 
 def test_the_diagnosis_needs_the_recordings_alone(diagnosis):
     """It finds the effect where its declaration is removed."""
-    really = hidden.hidden_effect(LATE, corners())
+    really = inject.hidden_effect(LATE, corners())
     found = diagnosis.effects.where(lambda effect: "tdoa" in effect.channels)
     assert [effect.name for effect in found] == [really.name] == ["anchor_delay"]
     ((anchor, late),) = really.values.items()
@@ -160,7 +160,7 @@ def test_the_correction_takes_the_residual_of_the_third_flight_away(recorded, di
     model = load_network(tmp_path / "bias.onnx")
     corrector = corrector_of(third, None, tmp_path / "bias.onnx")
     before, after = loop.residuals_of(third), loop.residuals_of(third, corrector)
-    ((anchor, late),) = hidden.hidden_effect(LATE, third.anchors).values.items()
+    ((anchor, late),) = inject.hidden_effect(LATE, third.anchors).values.items()
     assert all(anchor in pair.split("-") for pair in before.largest(2))
     assert before.constant == pytest.approx(late * np.sqrt(2 / 8), rel=0.1)  # 2 of 8 pairs
     assert before.size > 5 * after.size and before.changing < 0.03 and after.size < 0.03
@@ -177,10 +177,10 @@ def test_nothing_is_written_where_nothing_helps(diagnosis, tmp_path):
     assert loop.added_in_words(tmp_path, None, nothing)[0].startswith("nothing: ")
 
 
-@pytest.mark.parametrize("kind", hidden.KINDS)
+@pytest.mark.parametrize("kind", inject.KINDS)
 def test_every_kind_of_hidden_effect_costs_something(kind):
     """And the filter has the position to the error of a hall without it, once it is corrected."""
-    effect = hidden.KINDS[kind](np.random.default_rng(1), corners())
+    effect = inject.KINDS[kind](np.random.default_rng(1), corners())
     flight = simulate(replace(loop.HALL, seed=9, yaw="rotating"))
     effect_in = effect.inject(flight)
     clean, raw, corrected = (
@@ -192,9 +192,9 @@ def test_every_kind_of_hidden_effect_costs_something(kind):
 
 
 def test_a_seed_draws_one_effect_and_seeds_draw_all_kinds():
-    drawn = [hidden.hidden_effect(seed, corners()) for seed in range(1, 101)]
-    assert drawn[3] == hidden.hidden_effect(4, corners())
-    assert len({effect.label.rpartition(" over ")[2] for effect in drawn}) == len(hidden.KINDS)
+    drawn = [inject.hidden_effect(seed, corners()) for seed in range(1, 101)]
+    assert drawn[3] == inject.hidden_effect(4, corners())
+    assert len({effect.label.rpartition(" over ")[2] for effect in drawn}) == len(inject.KINDS)
 
 
 def lines_of(printed, title):

@@ -8,8 +8,8 @@ import pytest
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Imu
 
-from uwb_tdoa_tools.live import player
-from uwb_tdoa_tools.live.player import BATCH, BATCHES_AHEAD, Player, read_ahead
+from uwb_tdoa_tools.live import replay
+from uwb_tdoa_tools.live.replay import BATCH, BATCHES_AHEAD, Player, read_ahead
 
 
 @pytest.mark.parametrize("count", [0, 1, BATCH, 3 * BATCH + 7, BATCH * (BATCHES_AHEAD + 5)])
@@ -39,12 +39,12 @@ def test_closing_early_ends_the_thread():
 
 def test_measurements_of_a_sensor_are_no_imu_samples_even_in_messages_of_the_same_type(monkeypatch):
     compass = SimpleNamespace(topics=(("compass", "sensor_msgs/msg/Imu"),))
-    monkeypatch.setattr(player, "SENSORS", {"compass": compass})
+    monkeypatch.setattr(replay, "SENSORS", {"compass": compass})
     qos = QoSProfile(depth=1)
     publishers = {
         topic: SimpleNamespace(topic_name=f"/tag1{topic}", msg_type=Imu, qos_profile=qos)
         for topic in ("/imu/data", "/compass")
     }
-    replay = Player(None, publishers, 1.0, None, lambda: False)
-    replay.played.counts.update({"/imu/data": 7, "/compass": 5})
-    assert replay.count("IMU samples") == 7 and replay.count("TDOAs") == 0
+    player = Player(None, publishers, 1.0, None, lambda: False)
+    player.played.counts.update({"/imu/data": 7, "/compass": 5})
+    assert player.count("IMU samples") == 7 and player.count("TDOAs") == 0

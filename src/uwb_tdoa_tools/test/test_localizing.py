@@ -14,8 +14,8 @@ from uwb_tdoa_ekf.results import Odometry, Residuals, rows_of
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag
 from uwb_tdoa_tools.commands import evaluate, localize
 from uwb_tdoa_tools.estimate import FlightEstimator
-from uwb_tdoa_tools.localizing import assessment, residuals
-from uwb_tdoa_tools.localizing.localize import check_names, name_of, write_tum
+from uwb_tdoa_tools.localizing import residuals
+from uwb_tdoa_tools.localizing.localize import BAD, GOOD, assess, check_names, name_of, write_tum
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 CLEAN = dict(
@@ -157,12 +157,12 @@ def test_a_tum_file_has_one_line_per_pose(tmp_path):
 
 
 def assessed(flight):
-    return assessment.assess(flight, FlightEstimator()(flight))
+    return assess(flight, FlightEstimator()(flight))
 
 
 def test_a_clean_flight_is_good_and_within_what_is_stated(flight):
     found = assessed(replace(flight, truth=None))
-    assert found.level == assessment.GOOD and not found.reasons and not found.lost
+    assert found.level == GOOD and not found.reasons and not found.lost
     odometry = FlightEstimator()(flight).odometry
     true = np.stack(
         [np.interp(odometry.t, flight.truth.t, flight.truth.p[:, k]) for k in range(3)], axis=1
@@ -179,7 +179,7 @@ def ranged():
 
 def test_ranges_alone_are_assessed_like_tdoas(ranged, tmp_path):
     found = assessed(ranged)
-    assert found.level == assessment.GOOD and not found.reasons and not found.lost
+    assert found.level == GOOD and not found.reasons and not found.lost
     assert (
         f"% of {len(ranged.range)} ranges fit it" in found.sentences()[0]
         and found.figures["seconds"] > 12.0
@@ -199,7 +199,7 @@ def test_ranges_alone_are_assessed_like_tdoas(ranged, tmp_path):
 
 
 def test_an_offset_of_all_ranges_is_reported(ranged):
-    found = assessment.assess(ranged, FlightEstimator(smoothed=True)(without_offset(ranged, -0.25)))
+    found = assess(ranged, FlightEstimator(smoothed=True)(without_offset(ranged, -0.25)))
     assert found.figures["range_offset"] == pytest.approx(0.25, abs=0.02)
     assert "all ranges are 25 cm too long: that was found, and taken out" in found.sentences()
     sound = assessed(ranged)
@@ -211,7 +211,7 @@ def test_an_offset_of_all_ranges_is_reported(ranged):
 def test_ranges_that_contradict_each_other_are_not_good(ranged):
     far = replace(ranged.range, d=ranged.range.d + 20.0 * (ranged.range.anchor % 3))
     found = assessed(replace(ranged, range=far))
-    assert found.level != assessment.GOOD and "ranges" in " ".join(found.reasons)
+    assert found.level != GOOD and "ranges" in " ".join(found.reasons)
 
 
 @pytest.mark.parametrize("stream", ["tdoa", "range"])
@@ -221,7 +221,7 @@ def test_silence_is_where_the_tag_was_lost(flight, ranged, stream):
     begin, end = heard.t[0] + 6.0, heard.t[0] + 10.0
     kept = rows_of(heard, (heard.t < begin) | (heard.t > end))
     found = assessed(replace(recording, imu=None, **{stream: kept}))
-    assert found.level != assessment.GOOD and "the tag was lost for" in " ".join(found.reasons)
+    assert found.level != GOOD and "the tag was lost for" in " ".join(found.reasons)
     assert found.lost[0][0] == pytest.approx(begin, abs=2.1)
     assert found.lost[-1][1] == pytest.approx(end, abs=1.0)
     assert any("inertial" in sentence for sentence in found.remedies)
@@ -230,7 +230,7 @@ def test_silence_is_where_the_tag_was_lost(flight, ranged, stream):
 def test_an_error_of_check_is_bad_with_a_remedy_and_exit_code_1(flight, tmp_path, capsys):
     wrong = replace(flight, tdoa=replace(flight.tdoa, d=-flight.tdoa.d))
     found = assessed(wrong)
-    assert found.level == assessment.BAD and "sign" in " ".join(found.reasons) and found.remedies
+    assert found.level == BAD and "sign" in " ".join(found.reasons) and found.remedies
     write_bag(wrong, tmp_path / "flight.bag")
     run([tmp_path / "flight.bag", "--out", tmp_path / "out"], 1)
     assert "flight: bad: " in capsys.readouterr().out

@@ -24,7 +24,7 @@ from uwb_tdoa_tools.commands import calibrate, diagnose, evaluate, survey
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
 from uwb_tdoa_tools.diagnosis.self_calibration.solve import AnchorChange
 from uwb_tdoa_tools.estimate import FlightEstimator
-from uwb_tdoa_tools.localizing.assessment import GOOD, assess
+from uwb_tdoa_tools.localizing.localize import GOOD, assess
 from uwb_tdoa_tools.readers import read_flight
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.vehicles import Trajectory

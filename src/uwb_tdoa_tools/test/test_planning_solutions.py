@@ -13,7 +13,15 @@ from scipy.stats import norm
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_tools.planning.bifurcation import MOST_SUBSETS, Subsets, same_place, solutions
+from uwb_tdoa_tools.planning.bifurcation import (
+    CLEAR,
+    FLIP,
+    MOST_SUBSETS,
+    Subsets,
+    other_solutions,
+    same_place,
+    solutions,
+)
 from uwb_tdoa_tools.planning.hall import Hall
 from uwb_tdoa_tools.planning.installation import FixedNoise, Installation, RadioNoise
 from uwb_tdoa_tools.planning.maps import (
@@ -23,7 +31,6 @@ from uwb_tdoa_tools.planning.maps import (
     Grid,
     judge,
 )
-from uwb_tdoa_tools.planning.second_minimum import CLEAR, FLIP, other_solutions
 from uwb_tdoa_tools.simulation.rooms import Room, Walls, constellation, corners
 
 # --- planning bifurcation ---

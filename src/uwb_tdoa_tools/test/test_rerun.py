@@ -19,15 +19,6 @@ from uwb_tdoa_tools.localizing import pictures
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 CLEAN = dict(floor_time=1.0, imu_rate=100.0, bias=False, multipath=False, outlier_probability=0.0)
-RESIDUAL_FIELDS = (
-    "t",
-    "anchor_a",
-    "anchor_b",
-    "innovation",
-    "innovation_variance",
-    "weight",
-    "verdict",
-)
 ALWAYS = {
     "world/anchors",
     "world/path",

@@ -17,7 +17,7 @@ from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, EffectSet, TagLeverArm
 from uwb_tdoa_tools.scoring.gains import SHARES, Shrinkage, best_share
 from uwb_tdoa_tools.training import models, network, physics, shrinking, structured
 from uwb_tdoa_tools.training.labels import labels, split, thinned, white_noise
-from uwb_tdoa_tools.training.linear import Design, fit, predict
+from uwb_tdoa_tools.training.structured import Design, fit, predict
 
 # --- training labels ---
 

@@ -360,7 +360,7 @@ def table(part: Any) -> Any:
 
 def plot(flight: Flight, run: Run) -> Figure:
     """Return a matplotlib Figure of a Run: path and anchors from above and the side, and over time."""
-    from uwb_tdoa_tools.localizing.assessment import lost_spans
+    from uwb_tdoa_tools.localizing.localize import lost_spans
     from uwb_tdoa_tools.localizing.pictures import estimate_figure
     from uwb_tdoa_tools.scoring.metrics import radio_residuals
 

@@ -32,9 +32,8 @@ from ..common.arrays import filled, floats
 from ..common.compiled import compiled
 from ..common.errors import InputError
 from ..common.text import sanitize
-from .exported import ExportedCorrection
 from .features import NAMES, everything
-from .model import FADED, FADED_BELOW, NETWORK, Model, Prediction, session_of
+from .model import FADED, FADED_BELOW, NETWORK, ExportedCorrection, Model, Prediction, session_of
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -1,6 +1,10 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of a node with text, unit and range; unknown parameters are refused or reported."""
+"""Parameters and log of a node.
+
+Parameters have a text, unit and range; unknown ones are refused or reported. The log has a limit that
+no peer can exceed.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +12,7 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import wraps
 from pathlib import Path
+import sys
 import time
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -27,14 +32,17 @@ from rclpy.qos import QoSProfile
 import yaml
 
 from ..common.errors import InputError
-from .log import Log
+from ..common.text import line_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+    from types import CodeType
 
+    from rclpy.impl.rcutils_logger import RcutilsLogger
     from rclpy.parameter import Parameter as RosParameter
     from rclpy.service import Service
     from yaml import MappingNode
+
 
 KINDS = {
     float: "a number with a decimal point, e.g. 1.0",
@@ -321,3 +329,49 @@ def _flat(part: MappingNode, prefix: str = "") -> Iterator[str]:
             yield from _flat(value, f"{name}.")
         else:
             yield name
+
+
+# Lines that one statement of the program may write at once, and s until it may write one more.
+BURST, REFILL = (200, 10.0)
+
+
+class Log:
+    """A logger of rclpy with printable lines of bounded length, and a limit per statement.
+
+    Each statement of the program writes BURST lines at once, then one per REFILL seconds. A peer that
+    triggers one statement often cannot hide the others.
+    """
+
+    def __init__(self, logger: RcutilsLogger) -> None:
+        self._logger = logger
+        # {statement: (lines left, s of the last line, lines left out since)}
+        self._left: dict[tuple[CodeType, int], tuple[float, float, int]] = {}
+
+    def info(self, text: str) -> None:
+        """Log as rclpy does; each severity needs its own line of code there."""
+        if line := self._line(text):
+            self._logger.info(line)
+
+    def warning(self, text: str) -> None:
+        """Log as rclpy does."""
+        if line := self._line(text):
+            self._logger.warning(line)
+
+    def error(self, text: str) -> None:
+        """Log as rclpy does."""
+        if line := self._line(text):
+            self._logger.error(line)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._logger, name)
+
+    def _line(self, text: str) -> str | None:
+        """Return the line to write for a text, or None."""
+        frame, now = sys._getframe(2), time.monotonic()
+        key = frame.f_code, frame.f_lineno
+        left, when, hidden = self._left.get(key, (BURST, now, 0))
+        left = min(BURST, left + (now - when) / REFILL)
+        self._left[key] = (left, now, hidden + 1) if left < 1.0 else (left - 1.0, now, 0)
+        if left < 1.0:
+            return None
+        return line_of(text) + (f" ({hidden} such lines were left out before)" if hidden else "")

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from uwb_tdoa_bias.common.errors import InputError
 
 from ..crazyflie import BLOCKS, LogBlock
-from .link import Link, missing
+from .estimate import Link, missing
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from uwb_tdoa_bias.common.errors import InputError
 
-from .estimate import FRD, UPPER, Estimate
-from .link import Link, missing
+from .estimate import FRD, UPPER, Estimate, Link, missing
 
 if TYPE_CHECKING:
     from collections.abc import Callable

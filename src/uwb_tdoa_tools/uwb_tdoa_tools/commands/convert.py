@@ -156,8 +156,7 @@ def _offsets(texts: Iterable[str]) -> dict[str, float]:
 
 def _reading(args: Namespace) -> Reading:
     """Return how to read IN. Raises InputError."""
-    from ..readers import columns
-    from ..readers.profile import Profile
+    from ..readers.profile import Profile, parse_columns
 
     reading = options.reading_of(args)
     if not args.columns:
@@ -173,7 +172,7 @@ def _reading(args: Namespace) -> Reading:
             "--columns: CSV files do not say where the anchors are; give a survey file "
             "(--survey FILE)."
         )
-    return replace(reading, profile=Profile.of_columns(columns.parse_columns(args.columns)))
+    return replace(reading, profile=Profile.of_columns(parse_columns(args.columns)))
 
 
 main = cli.executable(_convert, parser)

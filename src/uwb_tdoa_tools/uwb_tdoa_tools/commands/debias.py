@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_ekf.debias import BiasMap
 
-    from ..debiasing.evaluation import PositionEstimator
+    from ..debiasing import PositionEstimator
     from ..readers.inputs import Recording
 
 DESCRIPTION = """Map the bias of estimated positions over the room, after Grasso et al. (Sensors 2022, 22, 9136), and
@@ -84,9 +84,7 @@ def parser() -> ArgumentParser:
 
 
 def _fit(args: Namespace) -> int:
-    from ..debiasing import evaluation
-    from ..debiasing.evaluation import PositionEstimator
-    from ..debiasing.mapping import cross_validated, fit_map
+    from .. import debiasing
 
     if not (args.flights or args.static):
         raise InputError(
@@ -94,7 +92,9 @@ def _fit(args: Namespace) -> int:
         )
     if not 0.01 <= args.step <= 10.0:
         raise InputError(f"--step: {args.step!r} is outside 0.01 ... 10 m.")
-    estimator = PositionEstimator(options.reading_of(args), *options.filter_of(args), args.align)
+    estimator = debiasing.PositionEstimator(
+        options.reading_of(args), *options.filter_of(args), args.align
+    )
     recordings, held = (
         estimator.reading.find(paths, bool(args.dask)) for paths in (args.flights, args.holdout)
     )
@@ -103,30 +103,30 @@ def _fit(args: Namespace) -> int:
     )
     fitted = list(parallel.over(estimator, recordings, args.jobs, args.dask))
     settings = {"step": args.step, "planar": args.planar, "interpolator": args.interpolator}
-    shrinkage = cross_validated(fitted, args.static, estimator, **settings)
-    made = fit_map(fitted, args.static, estimator, **settings)
+    shrinkage = debiasing.cross_validated(fitted, args.static, estimator, **settings)
+    made = debiasing.fit_map(fitted, args.static, estimator, **settings)
     made = made.scaled(shrinkage.share) if shrinkage else made
-    cli.show(evaluation.map_summary(made))
+    cli.show(debiasing.map_summary(made))
     cli.show(
         shrinkage.as_text()
         if shrinkage
         else "how much of it flights to come bear out is not known: give several flights"
     )
     figures: dict[str, Any] = {
-        "map": evaluation.map_figures(made),
-        "fitted": evaluation.comparison_rows(fitted, made, estimator.effects),
+        "map": debiasing.map_figures(made),
+        "fitted": debiasing.comparison_rows(fitted, made, estimator.effects),
     }
     figures["borne_out"] = shrinkage.as_dict() if shrinkage else None
-    evaluation.print_rows("in sample", figures["fitted"])
+    debiasing.print_rows("in sample", figures["fitted"])
     refusals = []
-    if shrinkage and not shrinkage.gains.mean() >= evaluation.SMALLEST_GAIN:
-        refusals.append(evaluation.verdict(float(shrinkage.gains.mean()), "flights left out"))
+    if shrinkage and not shrinkage.gains.mean() >= debiasing.SMALLEST_GAIN:
+        refusals.append(debiasing.verdict(float(shrinkage.gains.mean()), "flights left out"))
     if held:
         figures["held out"] = _judged(args, estimator, held, made)
-        evaluation.print_rows("held out", figures["held out"])
-        gained = evaluation.mean_gain(figures["held out"])
-        cli.show(evaluation.verdict(gained, "flights held out"))
-        refusals += [evaluation.verdict(gained, "flights held out")] * evaluation.does_harm(gained)
+        debiasing.print_rows("held out", figures["held out"])
+        gained = debiasing.mean_gain(figures["held out"])
+        cli.show(debiasing.verdict(gained, "flights held out"))
+        refusals += [debiasing.verdict(gained, "flights held out")] * debiasing.does_harm(gained)
     figures["written"] = not refusals
     _write(args.json, figures)
     if refusals:
@@ -140,27 +140,29 @@ def _fit(args: Namespace) -> int:
 def _judge(args: Namespace) -> int:
     from uwb_tdoa_ekf.debias import BiasMap
 
-    from ..debiasing import evaluation
-    from ..debiasing.evaluation import PositionEstimator
+    from .. import debiasing
 
-    estimator = PositionEstimator(options.reading_of(args), *options.filter_of(args), args.align)
+    estimator = debiasing.PositionEstimator(
+        options.reading_of(args), *options.filter_of(args), args.align
+    )
     made = BiasMap.load(args.map)
     rows = _judged(args, estimator, estimator.reading.find(args.flights, bool(args.dask)), made)
-    evaluation.print_rows("flight", rows)
-    gained = evaluation.mean_gain(rows)
-    cli.show(evaluation.verdict(gained, "these flights"))
-    _write(args.json, {"map": evaluation.map_figures(made), "runs": rows, "gain": gained})
-    return int(evaluation.does_harm(gained))
+    debiasing.print_rows("flight", rows)
+    gained = debiasing.mean_gain(rows)
+    cli.show(debiasing.verdict(gained, "these flights"))
+    _write(args.json, {"map": debiasing.map_figures(made), "runs": rows, "gain": gained})
+    return int(debiasing.does_harm(gained))
 
 
 def _judged(
     args: Namespace, estimator: PositionEstimator, recordings: Sequence[Recording], made: BiasMap
 ) -> list[dict[str, Any]]:
-    from ..debiasing import evaluation
-    from ..debiasing.evaluation import require_anchors
+    from .. import debiasing
 
     flown = parallel.over(estimator, recordings, args.jobs, args.dask)
-    return evaluation.comparison_rows(require_anchors(flown, made), made, estimator.effects)
+    return debiasing.comparison_rows(
+        debiasing.require_anchors(flown, made), made, estimator.effects
+    )
 
 
 def _write(path: str | Path | None, figures: dict[str, Any]) -> None:

@@ -83,7 +83,7 @@ def parser() -> ArgumentParser:
 def _map_anchors(args: Namespace) -> int:
     from ..first_map import map_anchors
     from ..first_map.observations import given
-    from ..first_map.report import as_dict, as_text, picture
+    from ..first_map.verdict import as_dict, as_text, picture
 
     _check(args)
     reading = options.reading_of(args, truth=False)

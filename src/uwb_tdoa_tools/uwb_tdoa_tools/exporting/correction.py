@@ -13,7 +13,7 @@ import numpy as np
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.text import written_by
 from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.correction.exported import INPUTS, KIND, OUTPUTS
+from uwb_tdoa_bias.correction.model import INPUTS, KIND, OUTPUTS
 from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.effects import Effect, EffectSet, LabelEffect, SmoothTerm
 from uwb_tdoa_bias.effects.base import listed

@@ -3,8 +3,8 @@
 """A first map of anchors whose positions are unknown, from flights or from distances.
 
 `map_anchors` is the only entry point. Recordings and measured distances become an `Observations`.
-`search` finds the maps that explain them, `deviations` states how far a map can be off, and
-`verdict` accepts a map or names what is missing.
+`search` finds the maps that explain them. `verdict` states how far the best map can be off, and
+accepts it or names what is missing.
 """
 
 from .observations import Observations, observe

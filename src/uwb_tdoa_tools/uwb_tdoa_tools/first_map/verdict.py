@@ -1,27 +1,121 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Accept a map, or state what the data leave open and what would settle it."""
+"""Accept a map, or state what the data leave open and what would settle it.
+
+`covariance` states how far the map can be off under errors that last.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.files import write_filled
 
 from ..choices import MAP_ACCURACY
-from .deviations import covariance
-from .least_squares import Problem, Stage
+from .least_squares import MOTION, Problem, Stage
 from .search import SAME_MAP, SAME_SHAPE, minima, misfit_of, rigid_distance
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
 
     from .least_squares import Equations, Fit
     from .observations import Observations
+
+
+LENGTH = 1.2  # m, of the smooth error of each anchor, as in `survey`
+DRAWS = 300  # of the errors
+TILT, TILT_TIME = 0.1, 10.0  # m/s^2 and s, of accelerations by errors of roll and pitch
+SHAKEN = 0.15  # m/s^2, of the acceleration of a bin
+# Factor on the variance that lasting errors make: the fit is linear here, and their size is
+# estimated from the residuals. Set on simulated halls other than those of the study.
+MARGIN = 1.5
+NEAR = 5  # bins, at most between two measurements whose common error lasts
+CLIPPED = 3.0  # robust standard deviations beyond which a residual is an outlier
+LEAST_SHARE = 0.1  # of the variance of residuals that lasts at least
+LEAST = 0.01  # m, of a coordinate
+
+
+def covariance(linear: Equations, fit: Fit, rng: np.random.Generator) -> tuple[np.ndarray, float]:
+    """Return the covariance of the anchors, (3N, 3N) m^2, and the size of lasting errors, m.
+
+    Draws of all errors pass through the linear problem. Each anchor has a smooth error of the place of
+    the tag. Successive residuals of a pair give its size by what they share. Most of such an error
+    disappears in the map, so the errors are larger than the residuals. Accelerations have a slow error.
+    The rest is independent.
+    """
+    problem = linear.problem
+    seen, size = problem.seen, 3 * len(problem.seen.ids)
+    least = LEAST**2 * np.eye(size)
+    if not len(seen.t):
+        return linear.covariance[:size, :size] + least, 0.0
+    root = _root(fit.path)
+    draws = rng.standard_normal((len(seen.ids), root.shape[1], DRAWS))
+    smooth = np.einsum("jr,nrs->njs", root, draws)
+    radio = smooth[seen.b, seen.bin]
+    radio -= np.where(problem.two[:, None], smooth[problem.first, seen.bin], 0.0)
+    still = np.zeros((len(problem.middle), 3, DRAWS))
+    nothing = np.zeros((problem.layout.size, DRAWS)), np.zeros((3 * problem.bins, DRAWS))
+    lasting, left = linear.response(radio, still, nothing)
+    scale = _scale(linear.state.radio)
+    pairs = _neighbours(linear)
+    clipped = np.clip(linear.state.radio, -CLIPPED * scale, CLIPPED * scale)
+    together = max(_lasting(clipped[:, None], pairs), LEAST_SHARE * scale**2)
+    std = float(np.sqrt(together / max(_lasting(left, pairs), 1e-9)))
+    noise = scale * rng.standard_normal(radio.shape)
+    rest = linear.others(rng, DRAWS)
+    independent, _ = linear.response(noise, _accelerations(linear, rng), rest)
+    total = std * lasting[:size] + independent[:size]
+    return least + MARGIN * total @ total.T / DRAWS, std
+
+
+def _neighbours(linear: Equations) -> tuple[np.ndarray, np.ndarray]:
+    """Return rows (k,) of measurements, and of the next one of the same anchors within NEAR bins."""
+    seen = linear.problem.seen
+    order = np.lexsort((seen.bin, seen.b, seen.a))
+    first, second = order[:-1], order[1:]
+    same = (seen.a[first] == seen.a[second]) & (seen.b[first] == seen.b[second])
+    near = same & (seen.bin[second] - seen.bin[first] <= NEAR)
+    return first[near], second[near]
+
+
+def _lasting(residual: np.ndarray, pairs: tuple[np.ndarray, np.ndarray]) -> float:
+    """Return the variance of the part of residuals (n, s) that two successive ones share, m^2."""
+    first, second = pairs
+    return float(np.mean(residual[first] * residual[second])) if len(first) else 0.0
+
+
+def _root(path: np.ndarray) -> np.ndarray:
+    """Return (J, r) whose product with normal numbers is a smooth function along a path (J, 3) m."""
+    apart = np.sum((path[:, None] - path) ** 2, axis=2)
+    values, vectors = np.linalg.eigh(np.exp(-0.5 * apart / LENGTH**2))
+    kept = values > 1e-6 * values[-1]
+    return vectors[:, kept] * np.sqrt(values[kept])
+
+
+def _accelerations(linear: Equations, rng: np.random.Generator) -> np.ndarray:
+    """Return draws of the errors of accelerations, (m, 3, s) m/s^2."""
+    problem = linear.problem
+    flight, t = problem.seen.flight[problem.middle], problem.seen.t[problem.middle]
+    together = flight[:, None] == flight
+    together = together & problem.measured & problem.measured[:, None]
+    slow = TILT**2 * together * np.exp(-np.abs(t[:, None] - t) / TILT_TIME)
+    quick = np.where(problem.measured, SHAKEN, MOTION)
+    root = np.linalg.cholesky(slow + np.diag(quick**2))
+    draws = rng.standard_normal((3, len(t), DRAWS))
+    return np.einsum("ij,kjs->iks", root, draws)
+
+
+def _scale(values: np.ndarray) -> float:
+    """Return the robust standard deviation of values about zero."""
+    return 1.4826 * float(np.median(np.abs(values)))
+
 
 FEWEST = 4  # anchors of a map
 AMBIGUOUS = 12.0  # cost by which another map must be worse
@@ -252,3 +346,77 @@ def _unchecked(found: FirstMap, seen: Observations, best: Fit, accuracy: float) 
                 "is not determined; measure more distances of these anchors"
             )
     return ""
+
+
+CHI2_95 = 5.99  # of two coordinates
+
+
+def as_dict(found: FirstMap) -> dict[str, Any]:
+    """Return the figures for JSON."""
+    return {
+        "accepted": not found.why_not,
+        "why_not": found.why_not,
+        "anchors": {
+            str(i): {
+                "position": found.positions[row].tolist(),
+                "std": found.std[row].tolist(),
+                "trusted": found.trusted[row].tolist(),
+                "others": [other[row].tolist() for other in found.others],
+            }
+            for row, i in enumerate(found.ids)
+        },
+        "covariance": found.covariance.tolist(),
+        "lasting_std": found.lasting,
+    }
+
+
+def as_text(found: FirstMap) -> str:
+    """Return a table of the anchors, and the verdict."""
+    lines = [f"{'anchor':>6}  {'position [m]':>24}  {'std [m]':>18}"]
+    for row, i in enumerate(found.ids):
+        position = "".join(f"{value:8.2f}" for value in found.positions[row])
+        std = "".join(f"{value:6.2f}" for value in found.std[row])
+        mark = "  trusted" if found.trusted[row].all() else ""
+        lines.append(f"{i:>6}  {position}  {std}{mark}")
+    if found.why_not:
+        lines.append(f"no map: {found.why_not}")
+    else:
+        off = np.linalg.norm(found.std[~found.trusted.all(axis=1)], axis=1)
+        lines.append(
+            f"{len(off)} anchors are known to {np.median(off):.2f} m (median), {off.max():.2f} m at "
+            "most: a first map; heights and distances make it better"
+        )
+    return "\n".join(lines)
+
+
+def picture(found: FirstMap, path: str | Path) -> None:
+    """Draw the map from above and from the side, with ellipses of 95 % and other maps."""
+    from matplotlib.figure import Figure  # takes a second to import
+    from matplotlib.patches import Ellipse
+
+    figure = Figure(figsize=(11.0, 5.0), layout="constrained")
+    for ax, axes in zip(figure.subplots(1, 2), ([0, 1], [0, 2])):
+        for other in found.others:
+            ax.plot(*other[:, axes].T, "x", color="tab:red", ms=7)
+        for row, i in enumerate(found.ids):
+            place = found.positions[row, axes]
+            columns = [3 * row + axis for axis in axes]
+            values, vectors = np.linalg.eigh(found.covariance[np.ix_(columns, columns)])
+            width, height = 2.0 * np.sqrt(CHI2_95 * np.maximum(values, 0.0))
+            angle = np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0]))
+            ax.add_patch(
+                Ellipse(tuple(place), width, height, angle=angle, fc="none", ec="tab:blue")
+            )
+            ax.plot(*place, "s" if found.trusted[row].all() else "o", color="tab:blue", ms=5)
+            ax.annotate(str(i), place, textcoords="offset points", xytext=(6, 6))
+        side = axes[1] == 2
+        ax.set(
+            xlabel="x [m]",
+            ylabel="z [m]" if side else "y [m]",
+            title="from the side" if side else "from above",
+        )
+        ax.set_aspect("equal", adjustable="datalim")
+        ax.grid(alpha=0.25)
+    state = f"not accepted; red: {len(found.others)} other maps" if found.why_not else "accepted"
+    figure.suptitle(f"first map: {state}; squares: trusted; ellipses: 95 %")
+    write_filled(path, partial(figure.savefig, dpi=110))

@@ -24,7 +24,7 @@ from ..diagnosis.report.entries import entries, worth_in_words
 from ..readers.inputs import Reading
 from ..scoring.metrics import Score, position_at, rms, scored_phase
 from ..simulation import SimulationConfig, simulate
-from ..simulation.hidden import hidden_effect
+from ..simulation.inject import hidden_effect
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -21,9 +21,8 @@ from ..choices import ACCURACY
 from ..scoring.evaluation import evaluate
 from ..scoring.metrics import position_at
 from ..simulation.rooms import Room
-from .bifurcation import Subsets, same_place, solutions
+from .bifurcation import CLEAR, Subsets, other_solutions, same_place, solutions
 from .precision import bound, information, position_error
-from .second_minimum import CLEAR, other_solutions
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence

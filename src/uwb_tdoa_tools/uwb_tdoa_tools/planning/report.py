@@ -293,8 +293,8 @@ OCCUPIED = {FLYABLE: 0, TWO_SOLUTIONS: 50, IMPRECISE: 75, TOO_FEW: 100, OUTSIDE:
 _CUBES, _SPHERES, _TEXT = 6, 7, 9  # visualization_msgs/msg/Marker
 
 
-def map_messages(chart: Chart, anchors: Anchors, stamp: int = 0) -> dict[str, Any]:
-    """Return {topic: rosbags message} of TOPICS. stamp : ns.
+def map_messages(chart: Chart, anchors: Anchors) -> dict[str, Any]:
+    """Return {topic: rosbags message} of TOPICS, with the stamp 0.
 
     plan/flyable : the middle layer, with values of OCCUPIED
     plan/precision : the same layer, the bound (root of its trace) in cm, at most 100; -1 without one
@@ -307,10 +307,10 @@ def map_messages(chart: Chart, anchors: Anchors, stamp: int = 0) -> dict[str, An
         np.isfinite(chart.error), np.minimum(np.rint(100.0 * np.minimum(chart.error, 1e3)), 100), -1
     )
     return {
-        "plan/flyable": _occupancy(store, chart.grid, status, k, anchors.frame, stamp),
-        "plan/precision": _occupancy(store, chart.grid, cm, k, anchors.frame, stamp),
-        "plan/markers": _markers(store, chart, anchors, stamp),
-        "uwb/anchors": anchors_message(anchors, stamp, store)[1],
+        "plan/flyable": _occupancy(store, chart.grid, status, k, anchors.frame),
+        "plan/precision": _occupancy(store, chart.grid, cm, k, anchors.frame),
+        "plan/markers": _markers(store, chart, anchors),
+        "uwb/anchors": anchors_message(anchors, 0, store)[1],
     }
 
 
@@ -347,19 +347,17 @@ def publish_messages(found: dict[str, Any]) -> None:
             rclpy.spin_once(node, timeout_sec=0.2)
 
 
-def _occupancy(
-    store: Typestore, grid: Grid, values: np.ndarray, k: int, frame: str, stamp: int
-) -> Any:
+def _occupancy(store: Typestore, grid: Grid, values: np.ndarray, k: int, frame: str) -> Any:
     """Return values (n,) of layer k as an OccupancyGrid at the height of the layer's middle."""
     types, (nx, ny, _) = store.types, grid.shape
-    header = header_of(store, stamp, frame)
+    header = header_of(store, 0, frame)
     corner = pose_of(store, (*grid.lower[:2], grid.axes[2][k]))
     info = types["nav_msgs/msg/MapMetaData"](header.stamp, grid.step, nx, ny, corner)
     data = np.ascontiguousarray(grid.layer(values, k).ravel(), dtype=np.int8)
     return types["nav_msgs/msg/OccupancyGrid"](header, info, data)
 
 
-def _markers(store: Typestore, chart: Chart, anchors: Anchors, stamp: int) -> Any:
+def _markers(store: Typestore, chart: Chart, anchors: Anchors) -> Any:
     types, grid = store.types, chart.grid
     surface = _surface(chart.flyable.reshape(grid.shape)).ravel()
     error = chart.error[surface]
@@ -367,7 +365,7 @@ def _markers(store: Typestore, chart: Chart, anchors: Anchors, stamp: int) -> An
     green_to_red = np.column_stack(
         [np.minimum(2 * worse, 1), np.minimum(2 - 2 * worse, 1), 0 * worse, 0 * worse + 0.4]
     )
-    header = header_of(store, stamp, anchors.frame)
+    header = header_of(store, 0, anchors.frame)
     point, colour = types["geometry_msgs/msg/Point"], types["std_msgs/msg/ColorRGBA"]
     cells = [point(*p) for p in grid.points[surface].tolist()]
     colours = [colour(*c) for c in green_to_red.tolist()]

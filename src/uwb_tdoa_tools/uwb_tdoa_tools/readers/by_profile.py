@@ -18,11 +18,10 @@ from uwb_tdoa_bias.common.survey import refuse_faulty
 from uwb_tdoa_bias.common.survey_forms import Entry
 
 from ..bags import is_bag, is_ros_1
-from .columns import ANCHORS, ATTITUDE, EMPTY, MOST_SKIPPED, RADIO, STREAMS, time_column
-from .csv_files import CsvFiles, table_of
 from .names import NamedAnchors, named_anchors
-from .profile import as_text
+from .profile import ANCHORS, ATTITUDE, EMPTY, MOST_SKIPPED, RADIO, STREAMS, as_text, time_column
 from .streams import make_flight
+from .tables import CsvFiles, table_of
 from .ulog import ULogFile, is_ulog
 
 if TYPE_CHECKING:

@@ -15,9 +15,8 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.text import printable
 
 from .by_profile import SINGLE, as_number, open_recording
-from .columns import RADIO, STREAMS
-from .csv_files import CsvFiles, table_of
-from .profile import load_profile, shipped
+from .profile import RADIO, STREAMS, load_profile, shipped
+from .tables import CsvFiles, table_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -18,7 +18,7 @@ from uwb_tdoa_bias.effects import EffectSet
 
 from ..choices import MODELS
 from . import labels as labelling
-from . import linear, network, physics, structured
+from . import network, physics, structured
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -282,8 +282,10 @@ def fit_structured(
         np.concatenate([getattr(part, name) for part in parts]) for name in fields
     )
     more = np.concatenate([physics.regressors(free, one.samples) for one in some])
-    design = linear.Design(phi, a, b, np.concatenate([dense, more], axis=1), y, sample_weight)
-    posterior = linear.fit(design, len(model.site_ids), structured.NOISE, physics.prior_stds(free))
+    design = structured.Design(phi, a, b, np.concatenate([dense, more], axis=1), y, sample_weight)
+    posterior = structured.fit(
+        design, len(model.site_ids), structured.NOISE, physics.prior_stds(free)
+    )
     model.set_posterior(posterior)
     own = model.link_columns
     return model, physics.with_values(

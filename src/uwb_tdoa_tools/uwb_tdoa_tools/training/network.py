@@ -19,7 +19,7 @@ from sklearn.neural_network import MLPRegressor
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.correction.features import FEATURES, columns
 
-from ..exporting.onnx_graph import GraphBuilder
+from ..exporting.onnx_file import GraphBuilder
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

@@ -22,7 +22,7 @@ from ..diagnosis.validation import select_by_error
 from .labels import constellations, with_level_attitude
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Iterable, Sequence
 
     from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_bias.effects import Samples
@@ -103,9 +103,7 @@ def with_values(effects: EffectSet, values: np.ndarray, covariance: np.ndarray) 
     return EffectSet(tuple(out))
 
 
-def find_effects(
-    flights: Sequence[Flight], progress: Callable[[], object] = lambda: None
-) -> Physics:
+def find_effects(flights: Sequence[Flight]) -> Physics:
     """Find the effects of flights with ground truth.
 
     Flights of one constellation can have all effects of `diagnose`. Flights of several constellations can
@@ -115,8 +113,6 @@ def find_effects(
     Parameters
     ----------
     flights : sequence of Flight
-    progress : callable
-        Called now and then.
 
     Returns
     -------
@@ -124,7 +120,7 @@ def find_effects(
     """
     flights, reference = [with_level_attitude(flight) for flight in flights], GroundTruth()
     kinds = PORTABLE if len(constellations(flights)) > 1 else None
-    attribution = attribute(flights, reference, kinds=kinds, undeclared=False, progress=progress)
-    validated = select_by_error(attribution, flights, Baseline(EffectSet()), progress)
+    attribution = attribute(flights, reference, kinds=kinds, undeclared=False)
+    validated = select_by_error(attribution, flights, Baseline(EffectSet()))
     model = validated.applied(attribution)
     return Physics(usable(model.effects), model)

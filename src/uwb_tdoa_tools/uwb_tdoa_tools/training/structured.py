@@ -15,6 +15,11 @@ g of an anchor is a sum of maps:
 All maps are Gaussian processes on Nystroem features of some hundred centres (Williams and Seeger, NIPS
 2000). The fit is one linear regression, and the standard deviation is that of its posterior. Away from
 the training data the mean tends to zero and the deviation to the prior.
+
+The regression is robust and Bayesian. The model of a row is y = w[site_b] . phi - w[site_a] . phi +
+dense . v + noise, with Gaussian priors on the weights. A site is one anchor at one place. It has its own
+weights on features phi of the tag. Only the blocks of two sites meet in a row, so the normal equations
+are summed block by block.
 """
 
 from __future__ import annotations
@@ -24,13 +29,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.cluster.vq import kmeans2
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, cho_factor, cho_solve
+from scipy.linalg.lapack import dpotri, dtrtri
 from scipy.spatial.distance import cdist
 
 from uwb_tdoa_bias.correction.features import columns
 
-from ..exporting.onnx_graph import GraphBuilder
-from . import linear
+from ..exporting.onnx_file import GraphBuilder
 from .labels import SAME_PLACE, constellations
 
 if TYPE_CHECKING:
@@ -42,6 +47,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.effects import Samples
 
     from .labels import Labels
+
 
 # Priors, chosen on the validation flights of docs/notebook/bias.md. The data scale those of the maps.
 SITE_STD = (0.1, 0.1)  # m, of the short and the long part of a site map
@@ -149,7 +155,7 @@ class Structured:
 
     def design(
         self, samples: Samples, error: np.ndarray | None = None, sample_weight: float = 1.0
-    ) -> linear.Design:
+    ) -> Design:
         """Return the design of samples.
 
         Anchors at no known site get the row after the last. Link maps are the dense part.
@@ -161,7 +167,7 @@ class Structured:
             one, other = (link.features(link_inputs(samples, side, viewer)) for side in "ab")
             dense.append(other - one)
         y = np.zeros(len(samples)) if error is None else error
-        return linear.Design(
+        return Design(
             phi,
             a,
             b,
@@ -177,7 +183,7 @@ class Structured:
             np.column_stack([far, np.full(len(far), SAME_PLACE)]), axis=1
         )  # the last row: no site is near
 
-    def set_posterior(self, posterior: linear.Posterior) -> None:
+    def set_posterior(self, posterior: Posterior) -> None:
         """Store the weights and the sizes of the priors."""
         s = posterior.site_std
         self.site = self.site.scaled(s)
@@ -210,7 +216,7 @@ class Structured:
         """Return the predicted errors (n,), m."""
         sites = np.vstack([self.weights, np.zeros(self.weights.shape[1])])
         links = np.concatenate([np.zeros(0), *(self.link_weights[viewer] for viewer in self.links)])
-        return linear.predict(self.design(samples), sites, links)
+        return predict(self.design(samples), sites, links)
 
     def variance(self, samples: Samples) -> np.ndarray:
         """Return the variance of the maps (n,), m^2, without the floor."""
@@ -377,3 +383,167 @@ def prepare(all_labels: Sequence[Labels], seed: int) -> Structured:
                 inputs, LINK_CENTRES, (LINK_STD,), (LINK_LENGTH,), True, seed
             )
     return model
+
+
+ITERATIONS = 8
+PRECISION = (1e-1, 1e4)  # limits of 1 / s^2
+DEGREES = 3.0  # of freedom of the Student t errors
+
+
+@dataclass(frozen=True)
+class Design:
+    """Hold the rows of a regression.
+
+    Parameters
+    ----------
+    phi : numpy.ndarray
+        Features of the tag (n, m).
+    a, b : numpy.ndarray
+        Site of each end (n,).
+    dense : numpy.ndarray
+        Dense columns (n, q).
+    y : numpy.ndarray
+        Errors (n,), m.
+    sample_weight : numpy.ndarray
+        Independent observations per row (n,).
+    """
+
+    phi: np.ndarray
+    a: np.ndarray
+    b: np.ndarray
+    dense: np.ndarray
+    y: np.ndarray
+    sample_weight: np.ndarray
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Hold the fitted weights.
+
+    Parameters
+    ----------
+    site, dense : numpy.ndarray
+        Weights (sites, m) and (q,).
+    site_covariance, dense_covariance : numpy.ndarray
+        Covariances (m, m), the mean over the sites, and (q, q).
+    site_std, dense_std : float
+        Standard deviations of the fitted priors.
+    """
+
+    site: np.ndarray
+    dense: np.ndarray
+    site_covariance: np.ndarray
+    dense_covariance: np.ndarray
+    site_std: float
+    dense_std: float
+
+
+def fit(
+    design: Design, sites: int, noise: float, known_std: Sequence[float] | np.ndarray = ()
+) -> Posterior:
+    """Fit the weights.
+
+    The priors are N(0, s^2). The last dense weights have the standard deviations `known_std`. The other
+    dense weights share one s, and the sites share another. Both maximize the evidence (MacKay, Neural
+    Computation 4, 1992). Iteratively re-weighted least squares give the weights for Student t errors
+    (Lange, Little and Taylor, JASA 84, 1989).
+
+    Parameters
+    ----------
+    design : Design
+    sites : int
+        Number of sites.
+    noise : float
+        Scale of the errors, m.
+    known_std : sequence of float
+
+    Returns
+    -------
+    Posterior
+    """
+    m, q = design.phi.shape[1], design.dense.shape[1]
+    size = sites * m
+    blocks = (slice(0, size), slice(size, size + q - len(known_std)))
+    prior = np.concatenate([np.ones(blocks[1].stop), np.asarray(known_std, dtype=float) ** -2.0])
+    robust, groups = np.ones(len(design.y)), _groups(design.a, design.b, sites)
+    for iteration in range(ITERATIONS):
+        left, right = _normal_equations(
+            design, groups, size, robust * design.sample_weight / noise**2
+        )
+        left[np.diag_indices_from(left)] += prior
+        factor, _ = cho_factor(left, overwrite_a=True)
+        solution = cho_solve((factor, False), right)
+        weights, dense = solution[:size].reshape(sites, m), solution[size:]
+        residual = design.y - predict(design, weights, dense)
+        robust = (DEGREES + 1.0) / (DEGREES + (residual / noise) ** 2)
+        if iteration < ITERATIONS - 1:
+            variance = _inverse_diagonal(factor)
+            for block in blocks:
+                # number of well-determined weights
+                determined = np.sum(1.0 - prior[block] * variance[block])
+                prior[block] = np.clip(
+                    determined / max(np.sum(solution[block] ** 2), 1e-12), *PRECISION
+                )
+    covariance, _ = dpotri(factor, overwrite_c=True)  # its upper triangle
+    covariance = np.triu(covariance) + np.triu(covariance, 1).T
+    site_covariance = np.zeros((m, m))
+    for k in range(sites):
+        site_covariance += covariance[k * m : (k + 1) * m, k * m : (k + 1) * m] / sites
+    std = [float(prior[block][0] ** -0.5) if prior[block].size else 0.0 for block in blocks]
+    return Posterior(weights, dense, site_covariance, covariance[size:, size:], *std)
+
+
+def _inverse_diagonal(factor: np.ndarray) -> np.ndarray:
+    """Return the diagonal (k,) of an inverse from the upper Cholesky factor (k, k).
+
+    The factor is overwritten. This takes half the time of the whole inverse.
+    """
+    inverse, _ = dtrtri(factor, overwrite_c=True)
+    return np.array([row[k:] @ row[k:] for k, row in enumerate(inverse)])
+
+
+def _normal_equations(
+    design: Design, groups: Sequence[tuple[int, int, np.ndarray]], size: int, weight: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return both sides of the normal equations, (size + q, size + q) and (size + q,).
+
+    They lack the priors. groups : of `_groups`; size : sites * m; weight : (n,) 1/m^2, of the rows
+    """
+    m, q = design.phi.shape[1], design.dense.shape[1]
+    left, right = np.zeros((size + q, size + q)), np.zeros(size + q)
+    for a, b, rows in groups:
+        phi, w = design.phi[rows], weight[rows, None]
+        gram = phi.T @ (w * phi)
+        vector = phi.T @ (w[:, 0] * design.y[rows])
+        cross = phi.T @ (w * design.dense[rows])
+        of_a, of_b = slice(a * m, (a + 1) * m), slice(b * m, (b + 1) * m)
+        left[of_a, of_a] += gram
+        left[of_b, of_b] += gram
+        left[of_a, of_b] -= gram
+        left[of_b, of_a] -= gram
+        for block, sign in ((of_a, -1.0), (of_b, 1.0)):
+            right[block] += sign * vector
+            left[block, size:] += sign * cross
+    left[size:, :size] = left[:size, size:].T
+    left[size:, size:] = design.dense.T @ (weight[:, None] * design.dense)
+    right[size:] = design.dense.T @ (weight * design.y)
+    return left, right
+
+
+def predict(design: Design, weights: np.ndarray, dense: np.ndarray) -> np.ndarray:
+    """Return the prediction (n,) of weights (sites, m) and dense (q,)."""
+    return (
+        np.einsum("nm,nm->n", design.phi, weights[design.b] - weights[design.a])
+        + design.dense @ dense
+    )
+
+
+def _groups(a: np.ndarray, b: np.ndarray, sites: int) -> list[tuple[int, int, np.ndarray]]:
+    """Return [(site a, site b, rows with these sites)]."""
+    pair = a * sites + b
+    order = np.argsort(pair, kind="stable")
+    starts = np.flatnonzero(np.diff(pair[order], prepend=-1))
+    return [
+        (int(pair[rows[0]] // sites), int(pair[rows[0]] % sites), rows)
+        for rows in np.split(order, starts[1:])
+    ]
