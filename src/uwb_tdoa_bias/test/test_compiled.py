@@ -123,6 +123,21 @@ def test_a_link_is_followed_once_and_the_default_is_the_cache_of_the_user(named,
     assert place() == named.parents[1] / "uwb_tdoa" / NAME
 
 
+def test_each_state_of_the_sources_and_of_what_compiles_them_has_a_folder(tmp_path, monkeypatch):
+    for name, text in (("one", "x = 1"), ("same", "x = 1"), ("other", "x = 2")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "code.py").write_text(text)
+
+    def name(folder):
+        compiled._digest.cache_clear()
+        return compiled._digest(tmp_path / folder)
+
+    assert name("one") == name("same") != name("other")
+    before = name("one")
+    monkeypatch.setattr(compiled, "VERSIONS", "0.99 3.0")
+    assert name("one") != before
+
+
 def test_garbage_is_collected_as_before_after_a_compilation():
     before, listener = gc.get_threshold(), compiled._Listener()
     listener.on_start(None)
