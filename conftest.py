@@ -4,6 +4,7 @@
 
 from collections import deque
 from functools import cache
+import gc
 import os
 from pathlib import Path
 import random
@@ -13,6 +14,7 @@ import pytest
 
 # A shell that starts us in the background has interrupts ignored, and so would have every process that a test interrupts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+gc.set_threshold(20_000, 5, 100)  # as in commands: modules and tests are many objects that stay
 # Before anything imports rclpy: this session talks to itself only, beside others on the same machine.
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 # before anything imports numpy, as executables do: threads of BLAS only wait for each other
@@ -60,6 +62,12 @@ def pytest_collection_modifyitems(items):
     """The files that take longest come first: no process has one to itself when the others have nothing left to do."""
     place = {f"test_{name}": k for k, name in enumerate(LONGEST)}
     items.sort(key=lambda item: place.get(item.path.stem, len(place)))
+
+
+def pytest_collection_finish():
+    """What is imported until now is never garbage: searching it again and again takes time."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from uwb_tdoa_bias.common import compiled
+from uwb_tdoa_bias.common import compiled, executable
 from uwb_tdoa_bias.common.files import TEMPORARY
 
 SOURCES = Path(__file__).resolve().parents[2]
@@ -143,6 +143,6 @@ def test_garbage_is_collected_as_before_after_a_compilation():
     listener.on_start(None)
     listener.on_start(None)  # a function that the first one calls
     listener.on_end(None)
-    assert gc.get_threshold() == compiled.COLLECT
+    assert gc.get_threshold() == executable.COLLECT
     listener.on_end(None)
     assert gc.get_threshold() == before

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from . import executable  # noqa: F401  # imports numba in another folder
+from . import executable  # it also imports numba in another folder
 from .files import folder_of_process
 
 if TYPE_CHECKING:
@@ -55,9 +55,6 @@ with _hidden("scipy", "coverage"):
 
 _FUNCTIONS: list[Any] = []  # all compiled functions; numba compiles at the first call
 SAY_EVERY = 4.0  # s
-# Thresholds of Python's garbage collection during a compilation, which makes many objects that stay:
-# a tenth of the time less, 60 MB more than with the usual ones.
-COLLECT = 20_000, 5, 100
 # Machine code also depends on these. numba names the version of Python in its files.
 VERSIONS = f"{numba.__version__} {np.__version__}"
 # One row of a structured array. Compiled code reads and writes its fields as attributes. Python
@@ -70,7 +67,7 @@ config._config_fname = "/dev/null/.numba_config.yaml"
 callees.install()
 
 
-class _Locator(caching.CacheImpl._locator_classes[0]):  # type: ignore[misc]  # its name changes
+class _Locator(caching.CacheImpl._locator_classes[0]):  # type: ignore[misc,valid-type]  # its name changes
     """Name the files of a function in config.CACHE_DIR without the path and time of its source."""
 
     @classmethod
@@ -122,7 +119,7 @@ class _Listener(event.Listener):
     def on_start(self, event: Event) -> None:
         if not self._depth:
             self._collect = gc.get_threshold()
-            gc.set_threshold(*COLLECT)
+            gc.set_threshold(*executable.COLLECT)
         self._began = self._began if self._depth else time.monotonic()
         self._depth += 1
         self._tell()
