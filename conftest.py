@@ -4,6 +4,7 @@
 
 from collections import deque
 from functools import cache
+import gc
 import os
 from pathlib import Path
 import random
@@ -13,6 +14,7 @@ import pytest
 
 # A shell that starts us in the background has interrupts ignored, and so would have every process that a test interrupts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+gc.set_threshold(20_000, 5, 100)  # as in commands: modules and tests are many objects that stay
 # Before anything imports rclpy: this session talks to itself only, beside others on the same machine.
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 # before anything imports numpy, as executables do: threads of BLAS only wait for each other
@@ -23,14 +25,14 @@ except ImportError:  # no ROS: the tests of the cores need none
     domain_id = None
 # reservations of domains, oldest first; taken until this process ends, or KEPT others came
 _taken = deque()
-# files of tests: each takes half a minute or more
-LONGEST = """first_hour_without_truth launch_files waiting printed_lines first_hour lockstep diagnosis_diagnose
-    calibrating demo stream_faults checking_check hall surveying_known surveying types study_bench
-    diagnosis_references moved_anchors estimator each_node nodes both_nodes strangers diagnosis_ranging
-    diagnosis_self_calibration vehicle_node flying_trial measured_path localizing warehouse alignment packaging
-    connect offline engine stream_watch evaluate train training checking_report lint study_faults study_radio_link
-    live_replay rerun diagnosis_attribution diagnosis_validation diagnosis_deviations diagnosis_report plan
-    planning_solutions executables study_plans study_blind study_localizing study_checking""".split()
+# files of tests: each takes half a minute or more, the longest first
+LONGEST = """checking_check calibrating launch_files distribution surveying_known first_hour_without_truth
+    moved_anchors first_hour diagnosis_self_calibration diagnosis_attribution waiting surveying diagnosis_diagnose
+    lockstep plan demo hall stream_faults printed_lines diagnosis_references clock_recordings vehicle_node
+    python_api types study_faults localizing diagnosis_validation study_bench checking_report diagnosis_report
+    diagnosis_ranging study_plans first_map live_replay autopilot_flight train diagnosis_deviations alignment
+    warehouse rerun each_node profiles evaluate study_odd_messages stream_watch nodes both_nodes executables
+    checking_trials callees""".split()
 KEPT = 3  # tests for which nobody gets the domain of a test that is over: others see a node that was killed for 20 s more
 
 
@@ -60,6 +62,12 @@ def pytest_collection_modifyitems(items):
     """The files that take longest come first: no process has one to itself when the others have nothing left to do."""
     place = {f"test_{name}": k for k, name in enumerate(LONGEST)}
     items.sort(key=lambda item: place.get(item.path.stem, len(place)))
+
+
+def pytest_collection_finish():
+    """What is imported until now is never garbage: searching it again and again takes time."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -70,10 +70,10 @@ def folder(tmp_path_factory):
 def run(folder):
     """Run a program with a cache of its own: (what it printed, whether it was cached)."""
 
-    def one(text, cache):
-        file = folder / f"program of {cache}" / "program.py"
+    def one(text, cache, place="program"):
+        file = folder / f"{place} of {cache}" / "at" / "program.py"
         if not file.exists():
-            file.parent.mkdir()
+            file.parent.mkdir(parents=True)
             file.write_text(text)
         done = subprocess.run(
             [sys.executable, str(file)],
@@ -99,6 +99,10 @@ def test_callees_give_the_bits_that_numba_gives_as_usual_also_from_the_cache(run
     usual, _ = run(AS_USUAL, "usual")
     assert (usual, False) == first
     assert (usual, True) == run(PROGRAM, "cache")
+
+
+def test_equal_sources_of_another_installation_are_not_compiled_again(run, first):
+    assert run(PROGRAM, "cache", "another installation") == (first[0], True)
 
 
 def test_only_what_python_calls_has_machine_code(first, folder):

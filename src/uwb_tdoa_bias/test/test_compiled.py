@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from uwb_tdoa_bias.common import compiled
+from uwb_tdoa_bias.common import compiled, executable
 from uwb_tdoa_bias.common.files import TEMPORARY
 
 SOURCES = Path(__file__).resolve().parents[2]
@@ -123,11 +123,26 @@ def test_a_link_is_followed_once_and_the_default_is_the_cache_of_the_user(named,
     assert place() == named.parents[1] / "uwb_tdoa" / NAME
 
 
+def test_each_state_of_the_sources_and_of_what_compiles_them_has_a_folder(tmp_path, monkeypatch):
+    for name, text in (("one", "x = 1"), ("same", "x = 1"), ("other", "x = 2")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "code.py").write_text(text)
+
+    def name(folder):
+        compiled._digest.cache_clear()
+        return compiled._digest(tmp_path / folder)
+
+    assert name("one") == name("same") != name("other")
+    before = name("one")
+    monkeypatch.setattr(compiled, "VERSIONS", "0.99 3.0")
+    assert name("one") != before
+
+
 def test_garbage_is_collected_as_before_after_a_compilation():
     before, listener = gc.get_threshold(), compiled._Listener()
     listener.on_start(None)
     listener.on_start(None)  # a function that the first one calls
     listener.on_end(None)
-    assert gc.get_threshold() == compiled.COLLECT
+    assert gc.get_threshold() == executable.COLLECT
     listener.on_end(None)
     assert gc.get_threshold() == before

@@ -57,7 +57,8 @@ class RadioCorrections:
             kind: Corrector(anchor_table.anchors, mine) for kind, mine in acting if len(mine)
         }
         self._anchor_table, self._slice, self._start = anchor_table, -math.inf, math.nan
-        # (1,) of ODOMETRY; its position is NaN until there is odometry
+        # (1,) of ODOMETRY: the last one before the present slice, and the last one of all; their
+        # positions are NaN until there is odometry
         self._pose = self._latest = _NOWHERE
 
     def add_odometry(self, rows: np.ndarray) -> None:
@@ -68,11 +69,15 @@ class RadioCorrections:
         rows : (n,) array of ODOMETRY
             Odometry of the last part, in the order of its stamps.
         """
-        if len(rows):
-            self._latest = rows[-1:]
+        if not self._correctors or not len(rows):
+            return
+        earlier = int(np.searchsorted(_slice_numbers(rows), self._slice))
+        if earlier:
+            self._pose = rows[earlier - 1 : earlier]
+        self._latest = rows[-1:]
 
     def slices(self, measured: Measurements) -> Iterator[Measurements]:
-        """Yield Measurements in corrected parts, or all at once if no effect needs correction.
+        """Yield Measurements in corrected parts, or all at once if none needs correction.
 
         The caller must pass the odometry of each part to `add_odometry` before it asks for the
         next.
@@ -80,24 +85,35 @@ class RadioCorrections:
         if not self._correctors:
             yield measured
             return
-        of_rows = [np.floor(part["t"] / SLICE) for part in measured]
+        self._begin(measured)
+        kinds = measured.sensors["kind"]
+        if not len(kinds) or not np.isin(kinds, list(self._correctors)).any():
+            newest = np.concatenate([_slice_numbers(part[-1:]) for part in measured])
+            self._enter(float(newest.max()))
+            yield measured
+            return
+        of_rows = [_slice_numbers(part) for part in measured]
         for number in np.unique(np.concatenate(of_rows)).tolist():
-            if number != self._slice:
-                self._slice, self._pose = number, self._latest
-            inside = (
-                slice(*np.searchsorted(numbers, [number, number + 1.0])) for numbers in of_rows
-            )
+            self._enter(number)
+            inside = (slice(*np.searchsorted(each, [number, number + 1.0])) for each in of_rows)
             now = Measurements(*(part[rows] for part, rows in zip(measured, inside)))
             yield now._replace(sensors=self._corrected(now))
+
+    def _begin(self, measured: Measurements) -> None:
+        """Store the stamp at which the recording starts: of its first TDOA or distance."""
+        if math.isnan(self._start):
+            ranged = np.isin(measured.sensors["kind"], list(KINDS))
+            stamps = [*measured.tdoa["t"][:1], *measured.sensors["t"][ranged][:1]]
+            self._start = float(min(stamps, default=math.nan))
+
+    def _enter(self, number: float) -> None:
+        """Store the last pose before a new slice."""
+        if number != self._slice:
+            self._slice, self._pose = number, self._latest
 
     def _corrected(self, measured: Measurements) -> np.ndarray:
         """Return the (m,) of SENSOR_ROW of one slice, with the distances corrected."""
         sensors = measured.sensors
-        if math.isnan(self._start):
-            # the recording starts with its first TDOA or distance
-            ranged = np.isin(sensors["kind"], list(KINDS))
-            stamps = [*measured.tdoa["t"][:1], *sensors["t"][ranged][:1]]
-            self._start = float(min(stamps, default=math.nan))
         _, p, q, _, yaw_std = poses_of(Odometry.from_rows(self._pose))
         for kind, corrector in self._correctors.items():
             anchors = self._anchor_table.anchors
@@ -116,6 +132,12 @@ class RadioCorrections:
             sensors["value"][rows, 0] -= bias
             sensors["std"][rows, 0] = np.hypot(sensors["std"][rows, 0], std)
         return sensors
+
+
+def _slice_numbers(rows: np.ndarray) -> np.ndarray:
+    """Return the number of the slice of each row, (n,)."""
+    numbers: np.ndarray = np.floor(rows["t"] / SLICE)
+    return numbers
 
 
 class PipelineOutput(NamedTuple):

@@ -64,7 +64,7 @@ class Innovations:
     run : Run
         Result of the filter.
     records : list of arrays
-        History of the run.
+        History of the run; empty if no derivatives are wanted.
     of : list of (m,) int arrays
         For each record the place in `rows`, or -1 for other records.
     """
@@ -198,6 +198,7 @@ def record_innovations(
     config: FilterConfig | None = None,
     corrector: Corrector | None = None,
     streams: Sequence[str] = (TDOAS,),
+    derivatives: bool = True,
 ) -> Innovations:
     """Run bias correction and filter on a Flight without its pressure and return Innovations.
 
@@ -215,6 +216,8 @@ def record_innovations(
     streams : sequence of str
         TDOAS, and names of SENSORS. Streams that the flight lacks or the filter does not use are
         ignored.
+    derivatives : bool
+        Whether to record the history, from which the Innovations compute derivatives.
     """
     corrector = corrector or Corrector(flight.anchors)
     config = replace(config or FilterConfig(), **auxiliary.NO_PRESSURE)
@@ -222,7 +225,7 @@ def record_innovations(
         flight = without_unknown_offset(flight, config, corrector)
     config = replace(config, **auxiliary.NONE)
     records = _Needed()
-    run = run_offline(flight, config, corrector, records)
+    run = run_offline(flight, config, corrector, records if derivatives else None)
     streams = [name for name in streams if name == TDOAS or name in run.sensors]
     corrected = corrector.effects.correct_streams(flight)
     of_tdoas = structured(RESIDUAL, *(getattr(run.residuals, name) for name in OF_ROW))
@@ -232,17 +235,6 @@ def record_innovations(
     used = np.flatnonzero(outcomes["verdict"] == USED)
     used = used[np.argsort(stamps[used], kind="stable")]
     t, value = stamps[used], outcomes["innovation"][used]
-    waiting: dict[tuple[float, float], list[int]] = {}
-    for place, key in enumerate(zip(t.tolist(), value.tolist())):
-        waiting.setdefault(key, []).append(place)
-    of = []
-    for some in records:
-        keys = zip(some["t"].tolist(), some["innovation"].tolist())
-        of.append(
-            np.array(
-                [waiting[key].pop(0) if waiting.get(key) else -1 for key in keys], dtype=np.int64
-            )
-        )
     first = np.cumsum([0, *map(len, sources[:-1])])
     stream = np.searchsorted(first, used, side="right") - 1
     return Innovations(
@@ -254,8 +246,24 @@ def record_innovations(
         outcomes["variance"][used],
         run,
         records,
-        of,
+        _places_of(records, t, value),
     )
+
+
+def _places_of(records: Sequence[np.ndarray], t: np.ndarray, value: np.ndarray) -> list[np.ndarray]:
+    """Return Innovations.of for records and the stamps and values, (n,), of innovations."""
+    waiting: dict[tuple[float, float], list[int]] = {}
+    for place, key in enumerate(zip(t.tolist(), value.tolist()) if records else ()):
+        waiting.setdefault(key, []).append(place)
+    of = []
+    for some in records:
+        keys = zip(some["t"].tolist(), some["innovation"].tolist())
+        of.append(
+            np.array(
+                [waiting[key].pop(0) if waiting.get(key) else -1 for key in keys], dtype=np.int64
+            )
+        )
+    return of
 
 
 @compiled

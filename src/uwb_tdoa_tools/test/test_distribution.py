@@ -1,12 +1,13 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The distribution `uwb-tdoa`: a wheel in an empty environment, without ROS.
+"""The distribution `uwb-tdoa`: a wheel in an environment with what it needs alone, without ROS.
 
-The environments lie in build/distribution, always at the same paths: what numba compiled there for a
-wheel serves the next run, too.
+The environments lie in build/distribution. One stays until the wheel needs something else, or the
+pins or Python change; of the wheel itself, each run installs the present one.
 """
 
 from functools import cache
+import hashlib
 import json
 import os
 from pathlib import Path
@@ -78,17 +79,33 @@ def wheel(tmp_path_factory):
 
 @cache
 def installed(wheel, number):
-    """The folder of the programs of a new environment with the wheel, and what it needs by our pins."""
-    place = ROOT / "build" / "distribution" / number
-    shutil.rmtree(place, ignore_errors=True)
-    run(python_of(number), "-m", "venv", "--without-pip", place)
+    """The folder of the programs of an environment with the wheel, and what it needs by our pins."""
+    place, python = ROOT / "build" / "distribution" / number, python_of(number)
     pins = wheel.with_name("pins.txt")
     lines = (ROOT / "requirements.txt").read_text().splitlines()
     pins.write_text("\n".join(line for line in lines if re.match(r"[\w.-]+==", line)))
     pip = (sys.executable, "-m", "pip", "--python", place / "bin" / "python", "install")
     # modules that no command imports need no bytecode
-    run(*pip, "--no-compile", "--only-binary", ":all:", "-c", pins, wheel)
+    pip += ("--no-compile", "--only-binary", ":all:", "-c", pins)
+    needed, made_for = needs(wheel, pins, python), place / "needs.txt"
+    if not made_for.exists() or made_for.read_text() != needed:
+        shutil.rmtree(place, ignore_errors=True)
+        run(python, "-m", "venv", "--without-pip", place)
+        run(*pip, wheel)
+        made_for.write_text(needed)
+    else:
+        run(*pip, "--no-deps", "--force-reinstall", wheel)
     return place / "bin"
+
+
+def needs(wheel, pins, python):
+    """A digest of all that decides what is in an environment besides the wheel."""
+    with zipfile.ZipFile(wheel) as held:
+        (name,) = (each for each in held.namelist() if each.endswith(".dist-info/METADATA"))
+        lines = held.read(name).splitlines()
+    required = b"\n".join(line for line in lines if line.startswith(b"Requires-"))
+    of_python = run(python, "-I", "-c", "import sys; print(sys.version, sys.base_prefix)")
+    return hashlib.sha256(b"\0".join([required, pins.read_bytes(), of_python.encode()])).hexdigest()
 
 
 @pytest.fixture(scope="module")

@@ -37,7 +37,7 @@ def ended(name, words):
 def test_from_tape_to_calibrated_without_ground_truth(
     tmp_path, monkeypatch, capsys, shared_data, source
 ):
-    """docs/calibration.md, in one command and step by step, and docs/localizing.md."""
+    """docs/calibration.md, in one command, and then docs/localizing.md or step by step."""
     at_desk(tmp_path, monkeypatch)
     survey = read_survey(written("anchors.yaml", *blocks(WALK, "yaml")))
     hall = simulated(survey, (0, 6)) if source == "simulated" else measured(shared_data)
@@ -61,6 +61,15 @@ def test_from_tape_to_calibrated_without_ground_truth(
     else:
         assert after < before
         _lines_run(printed.out)
+    if source == "simulated":
+        (located, *_) = commands(blocks(section("localizing.md", "Where the tag was"))[0])
+        assert main(*located) in (0, 1) and Path("localized/flight.tum").exists()
+    else:
+        _step_by_step(hall, before, capsys)
+
+
+def _step_by_step(hall, before, capsys):
+    """check and survey, which calibrate has done in one command."""
     (checked,), (surveyed,) = (
         commands(blocks(section("calibration.md", heading))[0])
         for heading in ("2. Fly, and check", "3. Survey")
@@ -70,10 +79,8 @@ def test_from_tape_to_calibrated_without_ground_truth(
     code = ended(*surveyed)
     printed = capsys.readouterr()
     after = hall.error("surveyed")
-    said_on_the_way(capsys, f"{source}, survey", before, after)
+    said_on_the_way(capsys, "measured, survey", before, after)
     assert "nothing is applied" in printed.out if code else after < before
-    (located, *_) = commands(blocks(section("localizing.md", "Where the tag was"))[0])
-    assert main(*located) in (0, 1) and Path("localized/flight.tum").exists()
 
 
 def _lines_run(text):

@@ -132,6 +132,16 @@ def test_no_module_imports_a_command():
         assert not commands, module
 
 
+def test_what_takes_a_second_to_import_is_imported_where_it_is_used():
+    """In the start of each command that needs it, and of no other."""
+    slow = {"scipy.stats", "scipy.signal"}
+    for module in modules():
+        found = imports(module, top_only=True)
+        assert not found & slow, module
+        if module.startswith(("uwb_tdoa_tools.evaluating", "uwb_tdoa_tools.localizing")):
+            assert not [name for name in found if ".diagnosis" in name], module
+
+
 def test_no_package_imports_one_above():
     for module in modules():
         for name in imports(module):

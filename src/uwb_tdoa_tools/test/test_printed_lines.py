@@ -201,6 +201,7 @@ def test_every_line_that_a_calibration_prints_runs_as_it_stands(desk, capsys, na
             duration=40.0,
             trajectory="sines",
             imu_rate=100.0,
+            bias=False,
             multipath=False,
             outlier_probability=0.0,
         )

@@ -69,15 +69,17 @@ def annotated():
 
 
 @pytest.mark.slow
-def test_annotations(tmp_path, monkeypatch):
+def test_annotations(monkeypatch):
+    """The wrong module lies at the same path each time: mypy's cache keeps it."""
     run = pytest.importorskip("mypy.api").run
     pytest.importorskip("rclpy")
     monkeypatch.chdir(ROOT)
     subprocess.run([sys.executable, ".ci/stubs.py", "build/typings"], check=True)
     assert {"uwb_tdoa_bias", "uwb_tdoa_ekf", "uwb_tdoa_tools"} <= set(annotated())
-    wrong = tmp_path / "wrong_annotations.py"
+    wrong = ROOT / "build/wrong/wrong_annotations.py"
+    wrong.parent.mkdir(exist_ok=True)
     wrong.write_text(WRONG)
-    monkeypatch.setenv("MYPYPATH", str(tmp_path))
+    monkeypatch.setenv("MYPYPATH", str(wrong.parent))
     packages = [word for name in (*annotated(), wrong.stem) for word in ("-p", name)]
     report, failure, _ = run(["--config-file", ".ci/mypy.ini", "--show-absolute-path", *packages])
     comments = (line.partition("  # ")[2] for line in WRONG.splitlines())

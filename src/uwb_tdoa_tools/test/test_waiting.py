@@ -104,7 +104,8 @@ def end(process):
 
 def silences(name, words, folder):
     """[s] of computing until each thing that a command says, and until its end, or LONG_ENOUGH; and
-    the share of time that it had to wait for a core.
+    the share of time that it had to wait for a core. What is said within EVERY of LONG_ENOUGH ends
+    it: no silence after that could be too long.
     """
     out, process = [], None
     line = [sys.executable, "-m", f"uwb_tdoa_tools.commands.{name}", *words]
@@ -123,7 +124,7 @@ def silences(name, words, folder):
             if heard:
                 out.append(clock - spoken)
                 spoken = clock
-                if not os.read(process.stdout.fileno(), 1 << 16):
+                if not os.read(process.stdout.fileno(), 1 << 16) or clock > LONG_ENOUGH - EVERY:
                     break
             if clock > LONG_ENOUGH or clock - spoken > 2.0 * EVERY:
                 out.append(clock - spoken)

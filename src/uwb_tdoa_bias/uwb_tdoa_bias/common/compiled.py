@@ -4,6 +4,7 @@
 
 numba's own cache notices a change in the file of a compiled function. It does not notice changes
 in the files of the functions that it calls. Here every state of the sources has its own folder.
+Equal sources share it wherever they are installed: a second installation compiles nothing.
 """
 
 from __future__ import annotations
@@ -18,7 +19,9 @@ import sys
 import time
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from . import executable  # noqa: F401  # imports numba in another folder
+import numpy as np
+
+from . import executable  # it also imports numba in another folder
 from .files import folder_of_process
 
 if TYPE_CHECKING:
@@ -43,17 +46,17 @@ def _hidden(*names: str) -> Iterator[None]:
 # scipy for matrix products in compiled code, and coverage to measure compiled code. The project
 # does neither.
 with _hidden("scipy", "coverage"):
+    import numba
     from numba import config, njit
-    from numba.core import event
+    from numba.core import caching, event
     import numba.np.arraymath  # noqa: F401
 
     from . import callees
 
 _FUNCTIONS: list[Any] = []  # all compiled functions; numba compiles at the first call
 SAY_EVERY = 4.0  # s
-# Thresholds of Python's garbage collection during a compilation, which makes many objects that stay:
-# a tenth of the time less, 60 MB more than with the usual ones.
-COLLECT = 20_000, 5, 100
+# Machine code also depends on these. numba names the version of Python in its files.
+VERSIONS = f"{numba.__version__} {np.__version__}"
 # One row of a structured array. Compiled code reads and writes its fields as attributes. Python
 # has no type for it.
 Record = Any
@@ -62,6 +65,25 @@ Function = TypeVar("Function", bound="Callable[..., Any]")
 # numba would otherwise look for settings in the present folder before each compilation.
 config._config_fname = "/dev/null/.numba_config.yaml"
 callees.install()
+
+
+class _Locator(caching.CacheImpl._locator_classes[0]):  # type: ignore[misc,valid-type]  # its name changes
+    """Name the files of a function in config.CACHE_DIR without the path and time of its source."""
+
+    @classmethod
+    def get_suitable_cache_subpath(cls, py_file: str) -> str:
+        return Path(py_file).parent.name
+
+    def get_source_stamp(self) -> str:
+        return ""  # the folder is that of one state of the sources
+
+
+class _Files(caching.CompileResultCacheImpl):
+    _locator_classes = [_Locator]
+
+
+class _Cache(caching.FunctionCache):
+    _impl_class = _Files
 
 
 def compiled(function: Function) -> Function:
@@ -74,7 +96,8 @@ def compiled(function: Function) -> Function:
     place = _place(_digest(Path(function.__code__.co_filename).parent))
     config.CACHE_DIR = str(place)  # type: ignore[attr-defined]  # as above
     try:
-        made: Any = njit(error_model="numpy", cache=True)(function)
+        made: Any = njit(error_model="numpy")(function)
+        made._cache = _Cache(function)
         setattr(made, callees.OURS, True)
         _FUNCTIONS.append(made)
         return made
@@ -96,7 +119,7 @@ class _Listener(event.Listener):
     def on_start(self, event: Event) -> None:
         if not self._depth:
             self._collect = gc.get_threshold()
-            gc.set_threshold(*COLLECT)
+            gc.set_threshold(*executable.COLLECT)
         self._began = self._began if self._depth else time.monotonic()
         self._depth += 1
         self._tell()
@@ -160,8 +183,11 @@ def _is_ours_alone(folder: Path) -> bool:
 
 @cache
 def _digest(folder: Path) -> str:
-    """Return a name for the present state of the sources below `folder` and beside this file."""
-    digest = hashlib.sha256()
+    """Return a name for the present state of the sources below `folder` and beside this file.
+
+    It also depends on VERSIONS.
+    """
+    digest = hashlib.sha256(VERSIONS.encode())
     for source in sorted({*folder.rglob("*.py"), *Path(__file__).parent.glob("*.py")}):
         digest.update(source.name.encode() + b"\0" + source.read_bytes())
     return digest.hexdigest()[:16]

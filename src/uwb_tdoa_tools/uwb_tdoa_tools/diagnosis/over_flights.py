@@ -9,7 +9,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.stats import t as student_t
+from scipy.special import stdtr
 
 from .regression.scan import Scan
 from .regression.select import select
@@ -124,7 +124,7 @@ def harm(several: Sequence[Share]) -> float:
         return 0.0
     freedom = SPREAD_FLIGHTS + n - 1
     spread = np.sqrt((SPREAD_FLIGHTS * SPREAD**2 + n * np.var(share)) / freedom)
-    return float(student_t.cdf((HALF - share.mean()) / (spread * np.sqrt(1.0 + 1.0 / n)), freedom))
+    return float(stdtr(freedom, (HALF - share.mean()) / (spread * np.sqrt(1.0 + 1.0 / n))))
 
 
 def course(several: Sequence[Share]) -> str | None:

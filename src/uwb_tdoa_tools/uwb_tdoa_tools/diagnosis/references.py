@@ -181,14 +181,16 @@ class Nothing(Reference):
         config: FilterConfig | None = None,
         constraints: Sequence[Constraint] = (),
         streams: Sequence[str] = (),
+        derivatives: bool = True,
     ) -> None:
         """Run the filter with a FilterConfig.
 
         streams : with innovations that are residuals, as of `record_innovations`; the offset of
             ranges is kept then. By default as described above.
+        derivatives : whether the innovations give derivatives, too
         """
         super().__init__(config, constraints)
-        self._streams = tuple(streams)
+        self._streams, self._derivatives = tuple(streams), derivatives
 
     def prepare(self, flight: Flight) -> Flight:
         return without_truth(flight)
@@ -214,7 +216,7 @@ class Nothing(Reference):
             flight = without_unknown_offset(flight, config, by)
             config = replace(config, **auxiliary.NONE)  # the offset is corrected
             streams = (TDOAS,) if len(flight.tdoa) else (RANGES,)
-        innovations = record_innovations(flight, config, by, streams)
+        innovations = record_innovations(flight, config, by, streams, self._derivatives)
         estimate = innovations.run.odometry
         return ReferenceView(Truth(estimate.t, estimate.p, estimate.q), innovations)
 

@@ -17,7 +17,6 @@ from uwb_tdoa_bias.common.files import write_filled
 from uwb_tdoa_bias.common.flight import Flight, Truth
 from uwb_tdoa_ekf.results import Odometry, Residuals
 
-from ..diagnosis.output import as_text
 from ..estimate import FlightEstimator
 from ..scoring.metrics import position_at, within
 from .residuals import by_pair
@@ -246,6 +245,8 @@ def write_diagnosis(
     path: Path, result: Diagnosis, base: EffectSet, config: FilterConfig | None
 ) -> None:
     """Write the single flight of a Diagnosis: estimates with `base` and with the found effects."""
+    from ..diagnosis.output import as_text  # takes a second to import
+
     (flight,) = result.flights
     before, after = (FlightEstimator(config, effects)(flight) for effects in (base, result.effects))
     truth = flight.truth if result.reference.tells_errors else None

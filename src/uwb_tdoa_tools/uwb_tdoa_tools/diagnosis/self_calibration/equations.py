@@ -165,6 +165,7 @@ class Runs:
         self._base = base
         self._config = config or FilterConfig()
         self._reference = Nothing(config, streams=streams)
+        self._of_innovations = Nothing(config, streams=streams, derivatives=False)
         self.spans: dict[str, tuple[float, float]] = {}
         self.flights = [self._reference.prepare(flight) for flight in flights]
         self._of_anchors = [one for one in constraints if isinstance(one, Distance)]
@@ -181,7 +182,7 @@ class Runs:
         slow = []
         for one in self.flights:
             flight = without_unknown_offset(replace(one, anchors=anchors), self._config, by)
-            about = self._base, self._reference, anchors, delays
+            about = self._base, self._of_innovations, anchors, delays
             slow.append(_slow(_residuals(*about, flight, self.spans.get(one.name))[1]))
         return student_scale(_joined(slow))
 
