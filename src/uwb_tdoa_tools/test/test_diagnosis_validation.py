@@ -31,6 +31,7 @@ from uwb_tdoa_tools.diagnosis.validation import (
     Displacements,
     _dropped,
     _Trials,
+    _worse_in_one,
     cross_fitted,
     select_by_error,
     validation_cases,
@@ -339,6 +340,19 @@ def test_what_makes_the_error_larger_or_is_worth_nothing_is_dropped(moved, alone
     assert all(
         after - before == pytest.approx(moved[one]) for one, (before, after) in dropped.items()
     )
+
+
+@pytest.mark.parametrize(
+    "changes, worst", [((0.5, -0.04), "a"), ((0.5, -0.02), None), ((-0.1, 0.5), "a")]
+)
+def test_what_makes_one_flight_worse_is_not_applied(changes, worst):
+    """changes : of the errors of 1 m of two flights without "a", m."""
+    along = [np.tile([by, 0.0, 0.0], (4, 1)) for by in (1.0, *changes)]
+    of_both = Displacements([along[0], along[0]], {"a": along[1:], "b": [along[0], along[0]]})
+    found = _worse_in_one(of_both, ["a", "b"])
+    assert (found and found[0]) == worst
+    if worst:
+        assert f"{1.0 + min(changes):.3f} m without, 1.000 m with" in found[1]
 
 
 class Some(str):

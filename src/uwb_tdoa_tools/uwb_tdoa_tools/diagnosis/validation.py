@@ -159,7 +159,7 @@ def select_by_error(
     then predict the error without several of them, and candidates are dropped one by one by this
     prediction. The filter runs again with the rest, until no candidate is dropped. Detections stay
     only if the error falls with them. At most TRIAL_FLIGHTS flights are judged. Trials correct
-    measurements at the poses of a run with all effects. Of several flights none may get worse by an
+    measurements at the poses of a run with all effects. Of two flights none may get worse by an
     effect. Events at a time of a single flight are tried for their worth, but not kept.
 
     map_function : as of `attribute`
@@ -178,7 +178,7 @@ def select_by_error(
             for one in applicable:
                 worth[one] = displacements.error([one]) - whole
             harmful = _harmful(attribution, candidates, applicable)
-            if harmful is None and not alone:
+            if harmful is None and len(flights) == 2:
                 harmful = _worse_in_one(displacements, applicable)
             if harmful is None:
                 break
@@ -247,17 +247,20 @@ def _harmful(
 def _worse_in_one(
     displacements: Displacements, applicable: Sequence[Candidate]
 ) -> tuple[Candidate, str] | None:
-    """Return the Candidate with the largest loss in a trial flight, and why; None without one.
+    """Return the Candidate with the largest loss in one of two flights, and why; None without one.
 
-    A loss counts above LOSS. What helps one flight and does harm to another may do either to a
-    third one.
+    A loss counts above LOSS. What helps one flight and does harm to the other may do either to a
+    third one. Of more flights, the mean decides.
     """
     losses = {one: displacements.largest_loss(one) for one in applicable}
     worst = max(losses, key=lambda one: losses[one][0])
     loss, before, after = losses[worst]
     if loss <= LOSS:
         return None
-    return worst, f"one of the flights gets worse by it: {before:.3f} m without, {after:.3f} m with"
+    return (
+        worst,
+        f"one of both flights gets worse by it: {before:.3f} m without, {after:.3f} m with",
+    )
 
 
 def _dropped(
