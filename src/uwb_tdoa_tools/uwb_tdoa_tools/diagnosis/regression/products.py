@@ -131,8 +131,9 @@ class Products:
         found.sort(key=lambda item: -item[0])
         out = []
         for _, subset, pair, _ in found[:REFINED]:
-            finer = [_Bins.of(name, subset.values[name], FINE) for name in pair]
-            if all(finer):
+            both = [_Bins.of(name, subset.values[name], FINE) for name in pair]
+            finer = [bins for bins in both if bins is not None]
+            if len(finer) == len(both):
                 sums = subset.weighted(information, residual)
                 _, place = _best_product(sums, subset.prior, *finer)
                 tried = len(finer[0].of_shapes) * len(finer[1].of_shapes) * FINER
