@@ -81,6 +81,20 @@ if domain_id is not None:
     _take_domain()
 
 
+@pytest.fixture
+def must_end():
+    """Fail after two minutes of processor time: for input that once took much longer, or for ever. It times nothing."""
+
+    def hangs(number, frame):
+        pytest.fail("it does not end: two minutes of processor time are gone")
+
+    before = signal.signal(signal.SIGVTALRM, hangs)
+    signal.setitimer(signal.ITIMER_VIRTUAL, 120.0)
+    yield
+    signal.setitimer(signal.ITIMER_VIRTUAL, 0.0)
+    signal.signal(signal.SIGVTALRM, before)
+
+
 @pytest.fixture(scope="session")
 def shared_data():
     """The folder of measured flights, ../shared/data beside the repository; skips the test where there is none."""

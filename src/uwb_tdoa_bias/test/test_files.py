@@ -11,7 +11,6 @@ import struct
 import subprocess
 import sys
 import threading
-import time
 import tracemalloc
 import zipfile
 
@@ -438,13 +437,13 @@ def assert_plain(content):
 
 
 @pytest.mark.parametrize(
-    "number", ["9" * 1_000_000, "-" + "9" * 1_000_000 + ".0", "1e" + "9" * 1_000_000]
+    "number", ["9" * 5_000_000, "-" + "9" * 5_000_000 + ".0", "1e" + "9" * 5_000_000]
 )
-def test_a_long_number_is_refused_at_once_and_not_repeated(number):
-    began = time.process_time()
+@pytest.mark.usefixtures("must_end")
+def test_a_long_number_is_refused_and_not_repeated(number):
     with pytest.raises(InputError) as refused:
         parse_yaml(f"a: {number}", "f")
-    assert len(str(refused.value)) < 200 and time.process_time() - began < 2.0
+    assert len(str(refused.value)) < 200
 
 
 # --- foreign text ---

@@ -10,7 +10,6 @@ rclpy = pytest.importorskip("rclpy")
 
 from dataclasses import replace  # noqa: E402
 from fractions import Fraction  # noqa: E402
-import time  # noqa: E402
 
 from builtin_interfaces.msg import Time  # noqa: E402
 from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
@@ -272,16 +271,15 @@ def test_the_log_says_each_kind_of_thing_once_in_a_while():
 @pytest.mark.parametrize(
     "text",
     [
-        "9" * 20_000,
-        "9" * 20_000 + " m",
-        "1.5 " * 5_000,
-        "- " * 10_000,
-        "9" + " " * 20_000,
-        "9 " + "9" * 20_000 + "x",
+        "9" * 200_000,
+        "9" * 200_000 + " m",
+        "1.5 " * 50_000,
+        "- " * 100_000,
+        "9" + " " * 200_000,
+        "9 " + "9" * 200_000 + "x",
     ],
 )
-def test_long_numbers_take_no_time(text):
-    """A pattern that tried again at each of 20 000 digits took 8 s."""
-    began = time.process_time()
+@pytest.mark.usefixtures("must_end")
+def test_the_time_for_a_long_number_does_not_grow_with_its_square(text):
+    """A pattern that tried again at each digit took 8 s for a tenth of these."""
     Saying().anew(text, 0.0)
-    assert time.process_time() - began < 0.2

@@ -5,7 +5,6 @@
 from dataclasses import replace
 from pathlib import Path
 import re
-import time
 
 from covariances import assert_covariance
 from driving import assert_equal, assert_sound, cut, drive, errors, state_for
@@ -208,6 +207,7 @@ def test_stays_sound_over_an_hour_of_updates():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("must_end")
 def test_a_clock_that_leaps_forward_does_not_stall_the_filter():
     """From a start at zero to the wall clock would be 1.7e9 s; this is a thousandth of it."""
     flight = fly(14, 2.0)
@@ -215,9 +215,7 @@ def test_a_clock_that_leaps_forward_does_not_stall_the_filter():
     drive(flight, state=state)
     imu, d = flight.imu, flight.tdoa
     leap = replace(flight, imu=replace(imu, t=imu.t + 1.7e6), tdoa=replace(d, t=d.t + 1.7e6))
-    begin = time.process_time()
     odometry, _ = drive(leap, state=state)
-    assert time.process_time() - begin < 5.0
     assert_sound(state, odometry)
 
 

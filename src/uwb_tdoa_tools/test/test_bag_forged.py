@@ -10,7 +10,6 @@ import sqlite3
 import struct
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -32,7 +31,6 @@ from uwb_tdoa_tools.estimate import with_antenna
 from uwb_tdoa_tools.readers.inputs import Reading
 
 BOTH = pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-AT_ONCE = 2.0  # s of processor time
 ENDLESS = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT"
 
 
@@ -80,15 +78,14 @@ def tables(tmp_path):
         ),
     ],
 )
+@pytest.mark.usefixtures("must_end")
 def test_nothing_in_a_database_is_computed(tables, statements, salvage):
     bag, run = tables
     run(*statements)
-    began = time.process_time()
     with pytest.raises(
         InputError, match="is no table and no index of columns|no message that can be read"
     ):
         read_bag(bag, salvage=salvage)
-    assert time.process_time() - began < AT_ONCE
 
 
 def test_a_row_that_fills_the_memory(tables, monkeypatch):
@@ -164,6 +161,7 @@ def test_files_that_are_no_list(tmp_path, files):
         read_bag(tmp_path / "bag")
 
 
+@pytest.mark.usefixtures("must_end")
 def test_a_definition_that_takes_a_minute_to_read(tables):
     bag, run = tables
     fields = "".join(f"float64 x{k}\n" for k in range(20_000))
@@ -171,13 +169,11 @@ def test_a_definition_that_takes_a_minute_to_read(tables):
         f"UPDATE message_definitions SET encoded_message_definition = '{fields}'",
         "UPDATE topics SET type_description_hash = ''",
     )
-    began = time.process_time()
     with pytest.raises(
         InputError,
         match="the definition of uwb_tdoa_msgs/msg/Tdoa in the bag has more than 65536 bytes",
     ):
         read_bag(data_file(bag))
-    assert time.process_time() - began < AT_ONCE
 
 
 @pytest.mark.parametrize("salvage", [False, True])
@@ -426,6 +422,7 @@ def shared_children(file, table, levels=10):
 
 @pytest.mark.parametrize("salvage", [False, True])
 @pytest.mark.parametrize("table", ["sqlite_master", "topics", "messages"])
+@pytest.mark.usefixtures("must_end")
 def test_pages_that_share_their_children_are_not_walked_for_ever(
     tables, table, salvage, monkeypatch
 ):
@@ -433,12 +430,10 @@ def test_pages_that_share_their_children_are_not_walked_for_ever(
     bag, _ = tables
     assert shared_children(data_file(bag), table) < 200_000
     monkeypatch.setattr(limits, "SECONDS", 0.5)
-    began = time.process_time()
     with (
         nullcontext() if salvage and table == "messages" else pytest.raises(InputError)
     ):  # there the first rows are read
         read_bag(bag, salvage=salvage)
-    assert time.process_time() - began < 5.0
 
 
 def test_an_interrupt_ends_a_walk_through_a_database(tables):

@@ -3,7 +3,6 @@
 """Layouts of anchors that are searched for, and the maps and pictures of a plan."""
 
 from dataclasses import replace
-import time
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -238,23 +237,16 @@ def test_a_whole_round_leaves_more_flyable_than_every_pairing_alone():
     ).all() and whole.flyable.sum() > 1.2 * alone.flyable.sum()
 
 
-def cpu_seconds(anchors, shape, pairing):
+@pytest.mark.usefixtures("must_end")
+@pytest.mark.parametrize("pairing", PAIRINGS)
+def test_a_fine_slice_has_an_error_nearly_everywhere(pairing):
+    anchors, shape = corners(), (100, 100, 1)
     extent = np.ptp(anchors.positions, axis=0)
     step = max(extent[:2] / shape[:2])
     grid = Grid(anchors.positions.min(axis=0) + [0, 0, 0.3 * step], step, shape)
-    installation = Installation(anchors, pairing=pairing)
-    began = time.process_time()
-    found = chart(
-        installation, grid, Demand(Room(grid.lower, grid.lower + grid.step * np.array(shape)))
-    )
+    room = Room(grid.lower, grid.lower + grid.step * np.array(shape))
+    found = chart(Installation(anchors, pairing=pairing), grid, Demand(room))
     assert np.isfinite(found.error).mean() > 0.9
-    return time.process_time() - began
-
-
-@pytest.mark.parametrize("pairing", PAIRINGS)
-def test_a_slice_is_quick(pairing):
-    """100 x 100 cells, 8 anchors, all maps, in CPU time: 0.2 - 0.25 s on a 2020s laptop core."""
-    assert min(cpu_seconds(corners(), (100, 100, 1), pairing) for _ in range(3)) < 0.5
 
 
 INSTALLATION = Installation(corners())

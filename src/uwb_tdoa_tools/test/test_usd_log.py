@@ -6,7 +6,6 @@ import re
 import struct
 import subprocess
 import sys
-import time
 import tracemalloc
 import zlib
 
@@ -268,12 +267,11 @@ def test_names_of_our_streams_are_no_events(read):
     assert len(flight.tdoa) == 2 and set(flight.extra) == {"estTemperature", "tdoa", "pose"}
 
 
-def test_a_header_of_many_types_takes_no_time(read):
+@pytest.mark.usefixtures("must_end")
+def test_the_time_for_a_header_does_not_grow_with_the_square_of_its_types(read):
     events = {f"e{k}": (1000 + k, []) for k in range(900)} | EVENTS
     events["wide"] = (999, [(f"v{k}", "b") for k in range(9_000)])
-    began = time.process_time()
     assert len(read(log_bytes(events=events)).tdoa) == 2
-    assert time.process_time() - began < 5.0
 
 
 @pytest.mark.parametrize(
