@@ -4,7 +4,6 @@
 not named.
 """
 
-
 from flights import corners
 import numpy as np
 import pytest

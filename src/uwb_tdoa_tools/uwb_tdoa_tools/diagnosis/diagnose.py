@@ -18,6 +18,7 @@ from uwb_tdoa_ekf.evidence import OF_ANCHORS
 from uwb_tdoa_ekf.offline import may_have_offset
 
 from ..checking.flight_rules import judge_flight
+from ..scoring.gains import LOSS, gain
 from ..scoring.metrics import Score, radio_residuals
 from . import comparison, repairing, validation
 from .attribution import Attribution, attribute, residuals_of
@@ -34,7 +35,7 @@ from .self_calibration.prior import with_calibration
 from .self_calibration.solve import same_anchors
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Collection, Sequence
 
     from uwb_tdoa_bias.common.flight import Flight
 
@@ -108,16 +109,11 @@ def diagnose(
         else {}
     )
     sound, rest = repairing.sound(fitted, base, repairs)
-    found = attribute(
-        sound,
-        reference,
-        rest,
-        progress=work.saying("tracing residuals to effects"),
-        map_function=map_function,
-    )
     if reference.tells_errors:
-        outcome = _by_error(work, found, (fitted, sound), held_out, rest, repairs)
+        found, selected = _searched(work, sound, rest)
+        outcome = _by_error(work, found, selected, fitted, held_out, repairs)
     else:
+        found = _attributed(work, sound, rest)
         outcome = _by_self_calibration(work, found, (fitted, sound), held_out, rest)
     judging = work.saying("judging")
     remaining = residuals_of(fitted, reference, outcome.effects, judging, map_function)
@@ -228,26 +224,58 @@ class _Outcome:
     changes: tuple[str, ...] = ()
 
 
+def _attributed(
+    work: _Work, flights: Flights, base: EffectSet, kinds: Collection[str] | None = None
+) -> Attribution:
+    """Return the Attribution of Flights with the EffectSet `base`; kinds : as of `attribute`."""
+    tracing = work.saying("tracing residuals to effects")
+    return attribute(
+        flights, work.reference, base, kinds, progress=tracing, map_function=work.map_function
+    )
+
+
+def _searched(
+    work: _Work, flights: Flights, base: EffectSet
+) -> tuple[Attribution, validation.ValidatedSelection]:
+    """Return the Attribution of Flights with known errors, and what of it helps the filter.
+
+    A declared effect can explain residuals in place of another one, and mislead the filter. The
+    search is repeated without such effects, as long as the error falls by more than LOSS.
+    """
+    trying = work.saying("running the filter without each")
+    baseline = comparison.Baseline(base, work.config)
+    kinds = frozenset(EFFECTS)
+    best: tuple[Attribution, validation.ValidatedSelection] | None = None
+    refused: tuple[Refused, ...] = ()
+    while True:
+        found = _attributed(work, flights, base, kinds)
+        # The report keeps a finding that does not help the filter, but it is not added.
+        model = replace(found, selection=written(found.selection, found.candidates))
+        selected = validation.select_by_error(model, flights, baseline, trying, work.map_function)
+        if best and gain(best[1].error, selected.error) <= LOSS:
+            return best
+        selected = replace(selected, refused=(*refused, *selected.refused))
+        best = found, selected
+        if not selected.misleading:
+            return best
+        kinds -= selected.misleading
+        refused = selected.refused
+
+
 def _by_error(
     work: _Work,
     found: Attribution,
-    flights: tuple[Flights, Flights],
+    selected: validation.ValidatedSelection,
+    fitted: Flights,
     held_out: Flights,
-    rest: EffectSet,
     repairs: dict[Detection, float],
 ) -> _Outcome:
     """Return the _Outcome if the position errors are known: effects are added if errors fall.
 
-    flights : as recorded, and with correct ids and signs
-    rest : EffectSet of the base without effects on ids and signs; repairs : {Detection: worth, m}
+    fitted : Flights as recorded
+    repairs : {Detection: worth, m}
     """
-    (fitted, sound), base, config, map_function = flights, work.base, work.config, work.map_function
-    trying = work.saying("running the filter without each")
-    # The report keeps a finding that does not help the filter, but it is not added.
-    model = replace(found, selection=written(found.selection, found.candidates))
-    selected = validation.select_by_error(
-        model, sound, comparison.Baseline(rest, config), trying, map_function
-    )
+    base, config, map_function = work.base, work.config, work.map_function
     attribution, selected = repairing.before_others(found, selected, repairs)
     model = selected.applied(attribution)
     effects, baseline = (
@@ -272,7 +300,7 @@ def _by_error(
     ):  # errors in the air do not judge effects near the floor
         refused.append(Refused("all", why_not))
         selected = validation.ValidatedSelection(
-            attribution.selection.only(()), (), (), selected.worth
+            attribution.selection.only(()), (), (), selected.worth, selected.error
         )
         model, after = selected.applied(attribution), before
         effects = with_calibration(base, attribution.of_floor, None)

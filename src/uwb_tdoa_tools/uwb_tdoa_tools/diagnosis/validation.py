@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from uwb_tdoa_bias.correction.corrector import Corrector, FixedPoseCorrector
-from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.results import poses_of
 
@@ -26,7 +26,7 @@ from .refinement import effects_of, recurs
 from .regression.fit import refit
 from .regression.select import Selection
 from .regression.table import BLOCK
-from .regression.terms import columns_of
+from .regression.terms import Candidate, columns_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from .attribution import Attribution
     from .comparison import KnownRuns
     from .detectors import Detection
-    from .regression.terms import Candidate
 
     Poses = tuple[np.ndarray, ...]  # return value of `poses_of`
 
@@ -71,6 +70,7 @@ class ValidatedSelection:
     refused : (Refused, ...) of the others
     worth : {candidate or detection: increase of the mean 3D RMSE without it, m}; for dropped ones,
         at the time they were dropped
+    error : mean 3D RMSE of the trials, m
     runs : runs of the filter as in the nodes, made on the way, by their cases
     """
 
@@ -78,7 +78,20 @@ class ValidatedSelection:
     detections: tuple[Detection, ...]
     refused: tuple[Refused, ...]
     worth: dict[Candidate | Detection, float]
+    error: float
     runs: KnownRuns = ()
+
+    @property
+    def misleading(self) -> set[str]:
+        """Return the names of declared effects that explain residuals and mislead the filter.
+
+        Without one of them the error falls by more than LOSS.
+        """
+        return {
+            one.name
+            for one, gained in self.worth.items()
+            if isinstance(one, Candidate) and one.name in EFFECTS and -gained > LOSS * self.error
+        }
 
     def applied(self, attribution: Attribution) -> Attribution:
         """Return the Attribution with the selected effects only."""
@@ -222,7 +235,9 @@ def select_by_error(
         )
         candidates = [one for one in candidates if one is not momentary]
     selection = attribution.selection.kept(candidates)  # with the weights of the trials
-    return ValidatedSelection(selection, tuple(detections), tuple(refused), worth, trials.runs)
+    return ValidatedSelection(
+        selection, tuple(detections), tuple(refused), worth, error, trials.runs
+    )
 
 
 def _harmful(
