@@ -11,6 +11,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.effects import EffectSet, true_samples
+from uwb_tdoa_bias.effects.anchor import AnchorDelay
 from uwb_tdoa_bias.effects.stamps import shifted
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.readers import inputs
@@ -221,6 +223,30 @@ def test_wrong_ids_and_signs_are_no_other_frame(name, request):
     for wrong in (opposite, mislabelled(one, first, second), mislabelled(one, second, last)):
         same, said = align_truth(wrong)
         assert said == () and np.array_equal(same.truth.p, one.truth.p)
+
+
+def test_delays_of_anchors_that_shift_the_estimate_are_no_other_frame(flight):
+    """Each anchor is late by its distance from a tag that is beside the true place.
+
+    Then the TDOAs agree with a shifted frame in the middle of the room only, and they are later
+    corrected where the ground truth is right.
+    """
+    shift, middle = np.array([0.4, 0.0, 0.0]), flight.truth.p.mean(axis=0)
+    away = flight.anchors.positions - middle
+    late = -(away / np.linalg.norm(away, axis=1)[:, None]) @ shift
+    anchors = zip(flight.anchors.ids.tolist(), late.tolist())
+    wrong = EffectSet([AnchorDelay({str(number): value for number, value in anchors})])
+    samples, rows = true_samples(flight)
+    d = flight.tdoa.d.copy()
+    d[rows] += wrong.bias(samples)
+    delayed = replace(flight, tdoa=replace(flight.tdoa, d=d))
+    found = estimate_alignment(delayed, run_offline(delayed).odometry)
+    assert found.frame_differs, found.offset
+    same, said = align_truth(delayed)
+    assert said == () and np.array_equal(same.truth.p, flight.truth.p)
+    moved, said = align_truth(in_frame(flight, shift=shift))
+    assert "another frame" in said[0]
+    assert np.abs(moved.truth.p - flight.truth.p).max() < 0.1
 
 
 @pytest.mark.slow

@@ -1,10 +1,11 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
 import json
+from types import SimpleNamespace
 
 from known_effects import clean_flight, effect_of
 import pytest
@@ -19,6 +20,9 @@ from uwb_tdoa_tools import parallel
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands.diagnose import main
 from uwb_tdoa_tools.diagnosis import diagnose, output, with_noise
+from uwb_tdoa_tools.diagnosis.findings import Refused
+from uwb_tdoa_tools.diagnosis.regression.terms import Candidate, Term
+from uwb_tdoa_tools.diagnosis.validation import ValidatedSelection
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +59,51 @@ def test_streams_that_the_filter_does_not_use_are_left_out_of_everything(flight,
     unused = module.unused_streams(config)
     assert unused == ("imu", "height") and module.unused_streams(FilterConfig()) == ()
     assert module._only_of(unused, "gyro_bias") and not module._only_of(unused, "anchor_delay")
+
+
+@dataclass(frozen=True)
+class Found:
+    """What `attribute` finds without the effects that are left out."""
+
+    left_out: frozenset
+    selection: SimpleNamespace
+    candidates: tuple = ()
+
+
+@pytest.mark.parametrize(
+    ("errors", "without"),
+    [
+        ([0.30, 0.20, 0.15, 0.10], {"truth_frame", "anchor_delay", "nlos"}),
+        ([0.30, 0.20, 0.195], {"truth_frame"}),
+        ([0.30, 0.295, 0.20, 0.195, 0.15], {"anchor_delay", "nlos"}),
+        ([0.30, 0.295, 0.295], set()),
+    ],
+)
+def test_the_search_is_repeated_without_what_misleads_the_filter(errors, without, monkeypatch):
+    """The frame of the ground truth is left out first. What was refused beside is judged anew."""
+    module = import_module("uwb_tdoa_tools.diagnosis.diagnose")
+    several = iter(errors)
+
+    def attributed(flights, reference, base, kinds, **_):
+        left_out = frozenset(EFFECTS) - kinds
+        frame = Candidate((Term(EFFECTS["truth_frame"](), ()),))
+        return Found(left_out, SimpleNamespace(chosen=(frame,) * ("truth_frame" in kinds)))
+
+    def validated(found, *_):
+        error = next(several)
+        worst = next(one for one in ("anchor_delay", "nlos", "") if one not in found.left_out)
+        worth = {Candidate((Term(EFFECTS[worst](), ()),)): -0.1} if worst else {}
+        refused = (Refused(worst, "misleads"), Refused("other", str(error)))
+        return ValidatedSelection(None, (), refused, worth, error)
+
+    monkeypatch.setattr(module, "attribute", attributed)
+    monkeypatch.setattr(module, "written", lambda selection, _: selection)
+    monkeypatch.setattr(module.validation, "select_by_error", validated)
+    work = module._Work(None, EffectSet(), None, print, map)
+    found, selected = module._searched(work, (), EffectSet())
+    assert found.left_out == without
+    names = [one.what for one in selected.refused]
+    assert without - {"truth_frame"} <= set(names) and names.count("other") == 1
 
 
 @pytest.mark.slow

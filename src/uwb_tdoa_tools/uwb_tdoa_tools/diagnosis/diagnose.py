@@ -13,6 +13,7 @@ import numpy as np
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import SENSOR_NAMES
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
+from uwb_tdoa_bias.effects.truth import TruthFrame
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.evidence import OF_ANCHORS
 from uwb_tdoa_ekf.offline import may_have_offset
@@ -244,22 +245,37 @@ def _searched(
     """
     trying = work.saying("running the filter without each")
     baseline = comparison.Baseline(base, work.config)
-    kinds = frozenset(EFFECTS)
-    best: tuple[Attribution, validation.ValidatedSelection] | None = None
-    refused: tuple[Refused, ...] = ()
-    while True:
+
+    def searched(kinds: Collection[str]) -> tuple[Attribution, validation.ValidatedSelection]:
         found = _attributed(work, flights, base, kinds)
         # The report keeps a finding that does not help the filter, but it is not added.
         model = replace(found, selection=written(found.selection, found.candidates))
-        selected = validation.select_by_error(model, flights, baseline, trying, work.map_function)
-        if best and gain(best[1].error, selected.error) <= LOSS:
-            return best
-        selected = replace(selected, refused=(*refused, *selected.refused))
-        best = found, selected
-        if not selected.misleading:
-            return best
-        kinds -= selected.misleading
-        refused = selected.refused
+        return found, validation.select_by_error(
+            model, flights, baseline, trying, work.map_function
+        )
+
+    kinds = frozenset(EFFECTS)
+    best = searched(kinds)
+    refused: tuple[Refused, ...] = ()
+    while True:
+        for names in _suspects(*best):
+            trial = searched(kinds - names)
+            if gain(best[1].error, trial[1].error) > LOSS:
+                break
+        else:
+            return best[0], replace(best[1], refused=(*refused, *best[1].refused))
+        refused = (*refused, *(one for one in best[1].refused if one.what in names))
+        kinds, best = kinds - names, trial
+
+
+def _suspects(found: Attribution, selected: validation.ValidatedSelection) -> list[frozenset[str]]:
+    """Return the names of effects to search without: a frame beside misleading ones, and these.
+
+    Nodes do not get the frame of the ground truth, and the values of other effects depend on it.
+    """
+    misleading = selected.misleading
+    frame = {TruthFrame.name}.intersection(one.name for one in found.selection.chosen)
+    return [frozenset(names) for names in (frame, misleading) if misleading and names]
 
 
 def _by_error(
