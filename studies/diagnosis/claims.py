@@ -115,12 +115,16 @@ def _only_pair(effect, flight):
 
 
 def claims(findings):
-    """[Claim] of Findings, those that are worth most first."""
-    ranked = sorted(
-        findings, key=lambda finding: (bool(finding.together_with), -finding.prominence)
-    )
+    """[Claim] of Findings in the order of the report: those applied by their worth, then the others
+    by their prominence. Parts of a map come last.
+    """
+
+    def place(finding):
+        worth = finding.worth or 0.0 if finding.added else 0.0
+        return bool(finding.together_with), not finding.added, -worth, -finding.prominence
+
     out = []
-    for finding in ranked:
+    for finding in sorted(findings, key=place):
         out += _undeclared(finding) if finding.effect.settings else _declared(finding.effect)
     return out
 
