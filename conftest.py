@@ -65,7 +65,7 @@ def pytest_collection_modifyitems(items):
 
 
 def pytest_collection_finish():
-    """What is imported until now is never garbage: searching it again and again takes time."""
+    """Leave what is imported until now out of garbage collections: it stays, and looking at it takes time."""
     gc.collect()
     gc.freeze()
 

@@ -8,7 +8,7 @@ GENERAL = "qos_overrides.", "use_sim_time", "start_type_description_service"  # 
 
 
 def written_and_declared(node, config):
-    """({name: value} in the parameter file `config`, {name: value} of what the node declares)."""
+    """({name: value} in the parameter file `config`, {name: value} of the node)."""
     (written,) = (entry["ros__parameters"] for entry in yaml.safe_load(config.read_text()).values())
     declared = {
         name: p.value

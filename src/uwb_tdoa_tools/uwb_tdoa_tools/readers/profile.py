@@ -68,7 +68,7 @@ TIMES = {  # of each stream: the first that is given, else "time"
     "flow": ("flow_time",),
     "anchors": (),
 }
-RADIO = "tdoa", "range"  # one of them is required
+RADIO = "tdoa", "range"  # streams; a profile has one of them or both
 ANCHORS = "anchor_a", "anchor_b", "anchor", "anchor_id"  # columns that name anchors
 # cells of tools without a value
 EMPTY = {"", "-", "--", "n/a", "na", "nan", "none", "null"}
