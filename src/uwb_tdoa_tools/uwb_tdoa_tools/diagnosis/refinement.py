@@ -133,17 +133,18 @@ def with_measured_noise(
     table, model, chosen = selection.table, selection.fit, list(selection.chosen)
     known = list(dict.fromkeys([*declared, *chosen]))
     for _ in range(DISGUISED):
-        found = scan(table, model, chosen)[:1]
-        progress()
-        if not found:
+        uninflated = replace(model, inflation=np.ones_like(model.inflation))
+        for found in scan.best_of_each_channel(table, uninflated, chosen):
+            progress()
+            wider = table.with_terms(found.terms)
+            less = fit(wider, columns_of([*known, found]), covariance=False).inflation
+            less = np.minimum(less, model.inflation)
+            trial = fit(table, columns_of(chosen), less, covariance=False, near=model)
+            if criterion_of(wider, chosen, trial, found, len(declared), scan.even) > 0.0:
+                break
+        else:
             break
-        wider = table.with_terms(found[0].terms)
-        less = fit(wider, columns_of([*known, *found]), covariance=False).inflation
-        less = np.minimum(less, model.inflation)
-        trial = fit(table, columns_of(chosen), less, covariance=False, near=model)
-        if criterion_of(wider, chosen, trial, found[0], len(declared), scan.even) <= 0.0:
-            break
-        table, chosen, known = wider, [*chosen, *found], [*known, *found]
+        table, chosen, known = wider, [*chosen, found], [*known, found]
         model = fit(table, columns_of(chosen), less, covariance=False, near=trial)
     if model is selection.fit:
         return selection
