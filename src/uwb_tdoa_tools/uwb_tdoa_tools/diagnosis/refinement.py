@@ -126,15 +126,14 @@ def with_measured_noise(
 
     A function that no declared effect describes counts as correlated noise, and hides itself.
     Functions are added to the fit that measures the inflation, as long as they pay their price
-    with the inflation that they leave.
+    with the inflation that they leave. The best function is tried, then the best one of each axis.
 
     declared : Candidates of the fit that measured the inflation; scan : Scan of the table
     """
     table, model, chosen = selection.table, selection.fit, list(selection.chosen)
     known = list(dict.fromkeys([*declared, *chosen]))
     for _ in range(DISGUISED):
-        uninflated = replace(model, inflation=np.ones_like(model.inflation))
-        for found in scan.best_of_each_channel(table, uninflated, chosen):
+        for found in [*scan(table, model, chosen)[:1], *scan.best_of_axes(table, model, chosen)]:
             progress()
             wider = table.with_terms(found.terms)
             less = fit(wider, columns_of([*known, found]), covariance=False).inflation

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.sparse import csr_array
 
-from uwb_tdoa_bias.effects import SmoothTerm
+from uwb_tdoa_bias.effects import RADIO, SmoothTerm
 from uwb_tdoa_bias.effects.covariates import CATEGORIES
 from uwb_tdoa_bias.effects.smooth_term import SHAPES
 
@@ -142,14 +142,20 @@ class Scan:
         more = self._worth_more(table, found, self._products(*held[1:]))
         return single[:FIRST_SINGLE] + more + single[FIRST_SINGLE:]
 
-    def best_of_each_channel(
+    def best_of_axes(
         self, table: RegressionTable, model: Fit, chosen: Sequence[Candidate]
     ) -> list[Candidate]:
-        """Return the best function of each channel; the arguments are those of a call."""
+        """Return the best function of each axis of a sensor, as if its rows were independent.
+
+        The arguments are those of a call.
+        """
+        model = replace(model, inflation=np.ones_like(model.inflation))
         held = self._held(table, model, chosen)
         best: dict[str, _Item] = {}
         for item in self.gains(table, held):
-            best.setdefault(item[1].view.channel, item)
+            channel = item[1].view.channel
+            if channel not in RADIO:
+                best.setdefault(channel, item)
         return [self._candidate(*self._refined(held, item)[1:]) for item in best.values()]
 
     def _held(self, table: RegressionTable, model: Fit, chosen: Sequence[Candidate]) -> _Held:
