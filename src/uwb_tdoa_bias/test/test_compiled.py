@@ -75,7 +75,7 @@ def test_what_belongs_to_somebody_else_is_not_used(named, monkeypatch):
 
 @pytest.mark.parametrize("variables", [{"NUMBA_CACHE_DIR": "cache"}, {"XDG_CACHE_HOME": "cache"}])
 def test_no_folder_of_the_present_folder_is_used(named, monkeypatch, capsys, variables):
-    """Unpacked archives keep their modes and belong to the user, so they may contain planted code."""
+    """Unpacked archives keep their modes and belong to the user, so they may hold planted code."""
     for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name)
     for name, value in variables.items():

@@ -281,7 +281,7 @@ def test_the_jacobian_of_a_range_is_the_difference_of_directions(seed):
 def test_what_is_left_of_a_step_is_a_standard_deviation():
     """The step lies between the ends of the reach.
 
-    The linear part leaves half of it uncorrected on either side.
+    Half of the step remains, with either sign.
     """
     samples = moving(3)
     samples = replace(samples, p=np.zeros_like(samples.p))

@@ -161,7 +161,7 @@ def test_a_stream_that_begins_after_a_silence_is_taken(surroundings):
 
 def test_turns_rest_as_long_as_they_took_and_only_if_there_was_something():
     def rest(*streams):
-        """Return the rest after a turn with streams of (duration in s, whether anything arrived)."""
+        """Return the rest after a turn with streams (duration in s, whether anything arrived)."""
         taking = [Mock(take=lambda one=one: time.sleep(one[0]) or one[1]) for one in streams]
         return StreamPoller(taking).take()
 
