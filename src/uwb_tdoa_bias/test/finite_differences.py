@@ -1,13 +1,25 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""One judge for every analytic derivative: central differences."""
+"""Central differences, the reference for every analytic derivative."""
 
 import numpy as np
 
 
 def numerical_jacobian(function, at, step=1e-6):
-    """Derivative of function: (n,) -> (m,) or scalar at the point `at`, by central differences: (m,
-    n).
+    """Return the derivative of a function by central differences.
+
+    Parameters
+    ----------
+    function : callable
+        Maps (n,) to (m,) or to a scalar.
+    at : (n,) array
+        Point of the derivative.
+    step : float
+        Half of the difference.
+
+    Returns
+    -------
+    (m, n) array
     """
     at = np.asarray(at, dtype=float)
     columns = []

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A bias network for tests whose output can be computed by hand. Needs the onnx package.
+"""A bias network for tests: its output can be computed by hand. Needs the onnx package.
 
 bias = 0.05 m + 0.02 dx_a + 0.01 m elevation_T_b,  limited to +-1 m
 """
@@ -10,8 +10,7 @@ import json
 import numpy as np
 from onnx import TensorProto, helper, numpy_helper
 
-# Neither the order of the features nor offset and scale are what a reader that ignores them would
-# assume.
+# A reader that ignores the order of the features, the offset or the scale gets a wrong bias.
 FEATURES = ("elevation_T_b", "dx_a")
 OFFSET = (0.25, -1.5)  # rad, m
 SCALE = (0.5, 4.0)  # rad, m
@@ -21,14 +20,20 @@ CONSTANT = 0.05  # m
 
 
 def known_answer(elevation, dx):
-    """Return the bias, m, for the elevation of anchor b seen from the tag, rad, and dx: anchor a
-    minus tag along x, m.
+    """Return the bias, in m.
+
+    Parameters
+    ----------
+    elevation : float or array
+        Elevation of anchor b seen from the tag, in rad.
+    dx : float or array
+        Anchor a minus tag along x, in m.
     """
     return np.clip(CONSTANT + SLOPES[0] * elevation + SLOPES[1] * dx, -CLIP, CLIP)
 
 
 def make():
-    """Return the onnx.ModelProto."""
+    """Return the network as an onnx.ModelProto."""
     weight = np.multiply(SLOPES, SCALE).astype(np.float32).reshape(2, 1)
     constant = np.array([CONSTANT + np.dot(SLOPES, OFFSET)], dtype=np.float32)
     graph = helper.make_graph(
@@ -51,7 +56,7 @@ def make():
 
 
 def write(folder):
-    """Write the model into a folder. Returns the path of the file."""
+    """Write the model into a folder and return the path of the file."""
     path = folder / "known_answer.onnx"
     path.write_bytes(make().SerializeToString())
     return path

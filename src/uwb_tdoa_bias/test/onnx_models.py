@@ -25,8 +25,16 @@ CONSTANTS = {
 
 
 def model(path, nodes, width=5, opset=13, batch="n", **constants):
-    """Write a graph of (kind, inputs, outputs, attributes), with those of CONSTANTS, and of its
-    own, that it names; its input is "x", its output the last node's.
+    """Write a model with metadata and return its path.
+
+    The input is "x". The output is the output of the last node.
+
+    Parameters
+    ----------
+    nodes : list of (kind, inputs, outputs, attributes)
+        Nodes of the graph.
+    constants : array
+        Constants by name, in addition to CONSTANTS. The graph keeps the ones that a node uses.
     """
     made = [
         helper.make_node(kind, inputs, outputs, **more) for kind, inputs, outputs, more in nodes

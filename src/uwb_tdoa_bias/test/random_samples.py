@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Random attitudes, and random TDOAs with the poses they were taken at."""
+"""Random attitudes, and random TDOAs with the poses of the tag."""
 
 from dataclasses import fields
 
@@ -12,12 +12,12 @@ from uwb_tdoa_bias.effects import RangeSamples, Samples
 
 
 def random_rotation(rng):
-    """Any attitude, each as likely."""
+    """Return a random attitude; all attitudes are equally likely."""
     return Rotation.from_quat(rng.standard_normal(4))
 
 
 def random_samples(seed, n=20, n_anchors=5):
-    """Samples of n TDOAs between anchors in a cube of 10 m, all attitudes known."""
+    """Return Samples of n TDOAs between anchors in a cube of 10 m, with known attitudes."""
     rng = np.random.default_rng(seed)
     anchors = Anchors(
         rng.permutation(100)[:n_anchors],
@@ -32,6 +32,6 @@ def random_samples(seed, n=20, n_anchors=5):
 
 
 def ranges_of(samples, rows):
-    """RangeSamples of Samples: the distances to anchors in rows (n,)."""
+    """Return RangeSamples: distances to the anchors in `rows` (n,)."""
     own = {one.name: getattr(samples, one.name) for one in fields(samples)}
     return RangeSamples(**{**own, "a": rows, "b": rows})

@@ -277,7 +277,7 @@ def test_what_is_not_certain_is_refused_with_place_and_remedy(tmp_path, form):
 
 
 def test_cases_of_others(shared_data):
-    """Small files that failed once."""
+    """Read small files on which the reader failed once."""
     folder = shared_data.parent / "cases" / "anchors"
     for name in (
         "cfclient.yaml",
@@ -318,7 +318,7 @@ def sentence(positions):
 
 
 def changed(rows, function):
-    """Positions of ROOM, those in some rows changed by a function."""
+    """Return the positions of ROOM, with a function applied to some rows."""
     positions = ROOM.copy()
     positions[rows] = function(positions[rows])
     return positions
@@ -360,7 +360,7 @@ def test_it_is_refused_with_its_source():
     st.sampled_from([0.0, 1e3, 5e6]),
 )
 def test_rooms_and_halls_are_usable(seed, count, length, width, height, origin):
-    """From a table to a hall of 300 x 200 m, in any frame."""
+    """Test layouts from a table to a hall of 300 x 200 m, in any frame."""
     positions = (
         np.random.default_rng(seed).uniform(0.0, 1.0, (count, 3)) * [length, width, height] + origin
     )
@@ -368,7 +368,7 @@ def test_rooms_and_halls_are_usable(seed, count, length, width, height, origin):
 
 
 def test_a_large_network_takes_little_work():
-    """Ten thousand anchors over three kilometres, a grid of 30 m."""
+    """Test ten thousand anchors on a grid of 30 m, over three kilometres."""
     x, y = np.meshgrid(np.arange(100) * 30.0, np.arange(100) * 30.0)
     positions = np.column_stack([x.ravel(), y.ravel(), np.full(10_000, 5.0)])
     assert not sentence(positions)

@@ -56,7 +56,7 @@ def test_whoever_comes_later_gets_anchors_frames_and_markers():
     assert (second.child_frame_id, second.transform.rotation.w) == (
         "anchor_3",
         1.0,
-    )  # not known: level
+    )  # unknown attitude: level
     assert (second.transform.translation.x, second.transform.translation.z) == (4.0, 6.0)
     cubes = [marker for marker in got[MarkerArray].markers if marker.ns == "anchors"]
     assert [(marker.id, marker.pose.position.y) for marker in cubes] == [(7, 2.0), (3, 5.0)]

@@ -45,7 +45,7 @@ def test_an_antenna_that_would_be_too_far_from_the_body_is_said_and_taken_as_the
 
 
 def test_tdoas_of_two_antennas_are_corrected_each_by_its_own_place_and_none_is_dropped(node):
-    """They take turns, message by message. One arm is 0.3 m, the other 0.3 m to the other side."""
+    """The antennas alternate. Their lever arms are 0.3 m and -0.3 m along x."""
     for frame, x in (("left", 0.3), ("right", -0.3)):
         node._frames.frames.set("base_link", frame, (0.0, 0.0, 0.0, 1.0), (x, 0.0, 0.0))
     node._anchors.anchors = Anchors.from_positions([[-9.0, 0.0, 0.0], [9.0, 0.0, 0.0]])

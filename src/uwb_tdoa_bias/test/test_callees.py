@@ -58,7 +58,8 @@ print(sum(root.stats.cache_hits.values()) > 0)
 """
 
 
-AS_USUAL = "import numba\nnumba.version_info = (9, 9)\n" + PROGRAM  # a version that was not tried
+# numba compiles as usual if its version is untested
+AS_USUAL = "import numba\nnumba.version_info = (9, 9)\n" + PROGRAM
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +69,10 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def run(folder):
-    """Run a program with a cache of its own: (what it printed, whether it was cached)."""
+    """Return a function that runs a program with a given cache.
+
+    That function returns the printed lines, and whether numba loaded code from the cache.
+    """
 
     def one(text, cache, place="program"):
         file = folder / f"{place} of {cache}" / "at" / "program.py"
@@ -91,7 +95,7 @@ def run(folder):
 
 @pytest.fixture(scope="module")
 def first(run):
-    """What PROGRAM gave with an empty cache."""
+    """Return the result of PROGRAM with an empty cache."""
     return run(PROGRAM, "cache")
 
 

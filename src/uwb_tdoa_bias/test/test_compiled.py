@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Compiled code is read from no folder in which anybody else may have put it: what is there is run."""
+"""Compiled code is executed, so it is never read from a folder that another user may write to."""
 
 import ast
 import gc
@@ -13,12 +13,12 @@ from uwb_tdoa_bias.common import compiled, executable
 from uwb_tdoa_bias.common.files import TEMPORARY
 
 SOURCES = Path(__file__).resolve().parents[2]
-NAME = "0123"  # of a state of the sources
+NAME = "0123"  # of one state of the sources
 
 
 @pytest.fixture
 def named(tmp_path, monkeypatch):
-    """A folder that NUMBA_CACHE_DIR names; the user's own is another."""
+    """Return the folder in NUMBA_CACHE_DIR. The default folder of the user is another."""
     (tmp_path / "between").mkdir()
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "between" / "named"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
@@ -35,7 +35,7 @@ def is_temporary(folder):
 
 
 def foreign(monkeypatch, *paths):
-    """Files that seem to belong to somebody else."""
+    """Make files appear to belong to another user."""
     plain = os.stat
 
     def changed(path, *a, **k):
@@ -58,7 +58,7 @@ def test_the_named_folder_is_used_and_made_for_the_user_alone(named):
 
 @pytest.mark.parametrize("mode", [0o777, 0o1777, 0o757, 0o775, 0o755])
 def test_a_folder_into_which_others_get_is_not_used(named, capsys, mode):
-    """Whatever is in it: somebody else may have put it there."""
+    """Another user may have put files into it."""
     (named / NAME).mkdir(parents=True)
     (named / NAME).chmod(mode)
     assert is_temporary(place())
@@ -75,9 +75,7 @@ def test_what_belongs_to_somebody_else_is_not_used(named, monkeypatch):
 
 @pytest.mark.parametrize("variables", [{"NUMBA_CACHE_DIR": "cache"}, {"XDG_CACHE_HOME": "cache"}])
 def test_no_folder_of_the_present_folder_is_used(named, monkeypatch, capsys, variables):
-    """An archive that is unpacked keeps its modes, and belongs to the user: compiled code may be
-    planted in it.
-    """
+    """Unpacked archives keep their modes and belong to the user, so they may hold planted code."""
     for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name)
     for name, value in variables.items():
@@ -93,8 +91,9 @@ def test_where_nothing_can_be_kept_there_is_a_temporary_folder(named, capsys):
 
 
 def test_no_compiled_function_unpacks_an_argument_by_a_bare_name():
-    """numba 0.68 may lose what is changed in place of arrays in a tuple: `x, cost = places` and
-    `x[0] -= step`. `places.x` is right.
+    """Check every compiled function for assignments such as `x, cost = places`.
+
+    After them, numba 0.68 may lose in-place changes of arrays (`x[0] -= step`). `places.x` works.
     """
     unpacked, looked = [], 0
     for path in SOURCES.glob("uwb_tdoa_*/uwb_tdoa_*/**/*.py"):

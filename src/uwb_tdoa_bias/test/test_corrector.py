@@ -34,13 +34,14 @@ ARM = EffectSet((TagLeverArm({"z": 0.3}),))
 
 
 def Corrector(*model, history=100, **options):
-    """A Corrector that uses the first pose at once."""
+    """Return a Corrector that uses the first pose at once."""
     return LateCorrector(*model, **options, poses=Poses(history, start=0.0))
 
 
 class Height(Network):
-    """Stands in for a network: the bias is the height of the tag, unknown where there is no pose or
-    z is above 2 m.
+    """Stand in for a network. The bias is the height of the tag, in m.
+
+    It is unknown without a pose and above z = 2 m.
     """
 
     name = "height"
@@ -58,7 +59,7 @@ class Height(Network):
 
 
 def correct(corrector, t, dense=False):
-    """Correct measurements of 1 m at stamps t; `dense`: each is preceded by one with its own stamp."""
+    """Correct TDOAs of 1 m at stamps t. `dense` puts one with the same stamp before each."""
     t = np.atleast_1d(np.asarray(t, dtype=float))
     each = 2 if dense else 1
     rows = np.repeat(np.arange(len(t)), each)
@@ -69,7 +70,7 @@ def correct(corrector, t, dense=False):
 
 
 def climbing(corrector, stamps):
-    """Tell the corrector poses whose height is their stamp."""
+    """Add poses to the corrector. The height of each pose equals its stamp."""
     for t in stamps:
         corrector.add_pose(t, np.array([1.0, 1.0, t]), np.array([0.0, 0.0, 0.0, 1.0]))
     return corrector
@@ -108,11 +109,10 @@ def test_what_the_filter_weighs_is_left_in():
     st.integers(0, 20),
 )
 def test_uses_the_newest_pose_a_lag_before_the_preceding_measurement(poses, asked, lag):
-    # eighths of a second are exact: "no later than" is tested at equality too
+    # Eighths of a second are exact, so the test of "no later than" includes equality.
     corrector = climbing(Corrector(ANCHORS, None, Height(), lag=lag / 8), np.array(poses) / 8)
-    told = [
-        t for k, t in enumerate(poses) if t > max(poses[:k], default=-1)
-    ]  # stamps must rise, others are ignored
+    # A pose that is not newer than all earlier ones is ignored.
+    told = [t for k, t in enumerate(poses) if t > max(poses[:k], default=-1)]
     found = correct(corrector, np.array(asked) / 8)
     for k, (t, bias, status) in enumerate(zip(asked, found.bias, found.status)):
         preceding = min(t, max(asked[:k], default=t))
@@ -138,7 +138,7 @@ def test_once_ready_no_later_pose_changes_a_correction(before, asked, after):
 
 def test_where_the_network_cannot_tell_effects_remain():
     corrector = climbing(Corrector(ANCHORS, DELAYS, Height(), lag=0.0), [1.0, 2.5])
-    # no pose yet; a pose it knows; one it does not
+    # no pose yet; within the domain of the network; outside of it
     found = correct(corrector, [0.0, 1.0, 2.5], dense=True)
     np.testing.assert_allclose(found.bias, [-0.1, -0.2 + 1.0, 0.2])
     assert found.status.tolist() == [EFFECTS, NETWORK, EFFECTS]
@@ -150,7 +150,8 @@ def test_where_the_network_cannot_tell_effects_remain():
 )
 def test_says_when_the_network_has_faded(known, status):
     corrector = climbing(Corrector(ANCHORS, None, Height(known=known), lag=0.0), [1.0])
-    found = correct(corrector, [0.0, 1.0], dense=True)  # no pose yet: the network says nothing
+    # Before the first pose the network gives no bias.
+    found = correct(corrector, [0.0, 1.0], dense=True)
     assert found.status.tolist() == [PASSED, status] and found.std.tolist() == [0.0, 0.05]
 
 
@@ -185,7 +186,7 @@ def test_effects_are_those_of_the_mean_heading_while_the_yaw_is_unknown():
         told[yaw_std] = correct(corrector, [0.0])
     upright = Corrector(ANCHORS, EffectSet((TagLeverArm({"z": 0.2}),)), lag=0.0)
     upright.add_pose(0.0, np.array([1.0, 2.0, 1.0]), np.array([0.0, 0.0, 0.0, 1.0]))
-    # what is across averages out
+    # The horizontal part of the lever arm averages out.
     np.testing.assert_allclose(told[2.0].bias, correct(upright, [0.0]).bias, atol=0.01)
     assert abs(told[0.1].bias[0] - told[2.0].bias[0]) > 0.03
     assert told[0.1].std[0] == 0.0 and told[2.0].std[0] > 0.03
@@ -208,10 +209,10 @@ def test_parts_of_odometry_hold_the_velocity_in_the_world(seed):
     rng = np.random.default_rng(seed)
     poses, twists = rng.normal(size=(3, 43)), rng.normal(size=(3, 42))
     poses[:, 3:7] /= np.linalg.norm(poses[:, 3:7], axis=1)[:, None]
-    poses[2, 3:7] = 0.0  # not known
+    poses[2, 3:7] = 0.0  # unknown
     poses[:, [28, 35, 42]] = [[0.01, 0.01, 4.0], [1.44, 1.44, 6.25], [0.01, 0.01, 0.09]]
     p, q, v, yaw_std = parts_of(poses, twists)
-    # without an estimated attitude the yaw is what everybody assumes
+    # Without an estimated attitude, the assumed yaw counts as exact.
     np.testing.assert_allclose(yaw_std, [2.0, 0.0, 0.3])
     np.testing.assert_array_equal(p, poses[:, :3])
     np.testing.assert_allclose(v[:2], Rotation.from_quat(q[:2]).apply(twists[:2, :3]), atol=1e-12)
@@ -220,9 +221,9 @@ def test_parts_of_odometry_hold_the_velocity_in_the_world(seed):
 
 @given(st.floats(0.0, 0.999 * START))
 def test_the_first_pose_may_be_late_and_changes_nothing(late):
-    """TDOAs at 100 Hz; the pose of 0 s arrives later than its stamp, those after it do not.
+    """TDOAs arrive at 100 Hz. The poses up to `late` s arrive together, all later ones on time.
 
-    Where a pose is needed, it is waited for.
+    A TDOA waits for the pose that it needs.
     """
     stamps, told = np.arange(0.0, 1.5, 0.01), []
     for arrival in (0.0, late):
@@ -233,9 +234,8 @@ def test_the_first_pose_may_be_late_and_changes_nothing(late):
                     corrector,
                     [p for p in np.arange(0.0, t + 0.005, 0.01) if p > corrector._poses.newest],
                 )
-            assert t < arrival or corrector.ready(
-                before
-            )  # before the first pose nothing is waited for
+            # Before the first pose, TDOAs are corrected without waiting.
+            assert t < arrival or corrector.ready(before)
             told_now.append(correct(corrector, t).bias[0])
             before = t
         told.append(told_now)

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What single effects and their correctors do: delays, geometry, floor, labels, sensors, advice."""
+"""Single effects and their correctors: delays, geometry, floor, labels, sensors, advice."""
 
 from dataclasses import replace
 
@@ -72,8 +72,9 @@ def test_lever_arm_without_attitude_cannot_tell_and_adds_nothing_to_the_set():
 
 
 def standing(heights, x=0.0):
-    """Samples at heights (n,), m, above (x, 0), of TDOAs from an anchor 0 that is on time to anchor
-    1.
+    """Return samples at heights (n,), in m, above (x, 0).
+
+    The TDOAs are between anchor 0, which has no delay, and anchor 1.
     """
     anchors, n = Anchors.from_positions([[4, 4, 3], [5, 0, 0.2]], ids=[0, 1]), len(heights)
     p = np.column_stack([np.full(n, x), np.zeros(n), heights])
@@ -87,7 +88,7 @@ def test_on_the_floor_an_anchor_is_late_below_its_height_and_may_be_about_it():
     samples = standing(np.array([0.0, 0.03, 0.08, 0.12, 0.18, 1.0]))
     bias, noise = floor.bias(samples), floor.noise_std(samples)
     np.testing.assert_allclose(bias, [3.0, 3.0, 3.0, 1.5, 0.0, 0.0], atol=1e-6)
-    # late or not: 3 m times sqrt(p (1 - p))
+    # Each TDOA is late with probability p, so the deviation is 3 m times sqrt(p (1 - p)).
     np.testing.assert_allclose(noise, [0.0, 0.0, 0.0, 1.5, 0.0, 0.0], atol=2e-3)
     hopping = EFFECTS["floor_multipath"]({"1.delay": 3.0, "1.height": 0.12, "1.noise": 0.4})
     np.testing.assert_allclose(
@@ -182,7 +183,7 @@ def test_sensors_are_corrected_the_same_at_once_and_one_by_one_whatever_was_not_
     unstated = corrector.correct(
         "velocity", Velocity(t, v, np.where(np.isinf(std), std, 0.0))
     ).columns[2]
-    # the driver still states none
+    # A deviation that the driver does not state stays unstated.
     np.testing.assert_array_equal(unstated, np.where(np.isinf(std), std, 0.0))
     single = [
         corrector.correct(
@@ -219,7 +220,8 @@ def test_ids_are_exchanged_at_once_and_signs_after_them():
         and b.tolist() == [2, 1, 7, 4]
         and d.tolist() == [-0.5, -1.0, 2.0, -0.25]
     )
-    assert A.tolist() == [1, 2, 4, 7] and D[0] == 0.5  # what was given stays as it was
+    # The inputs are unchanged.
+    assert A.tolist() == [1, 2, 4, 7] and D[0] == 0.5
     assert LabelCorrector([EFFECTS["anchor_delay"]({"1": 0.3})]).idle
 
 
@@ -256,7 +258,7 @@ def test_values_are_rounded_to_their_standard_deviation(value, std, text):
     "values, std, order",
     [
         ({0: 0.1, 1: -0.3, 3: 0.02}, {0: 0.05, 1: 0.02, 3: 0.011}, ["1", "0"]),
-        ({0: 0.3, 1: 0.2, 3: 0.4}, {0: 0.0, 1: 0.01}, ["1", "0", "3"]),  # unknown ones last
+        ({0: 0.3, 1: 0.2, 3: 0.4}, {0: 0.0, 1: 0.01}, ["1", "0", "3"]),  # unknown deviations last
     ],
 )
 def test_significant_values_come_in_the_order_of_their_significance(values, std, order):
@@ -322,7 +324,8 @@ def test_advice_names_place_size_and_sign(name, values, std, said):
     (sentence,) = EFFECTS[name](values, std).advice()
     for part in said:
         assert part in sentence
-    for key in values:  # of what is not significant nothing is said
+    # Advice leaves insignificant values out.
+    for key in values:
         if key in std and abs(values[key]) < 2 * std[key]:
             assert f"anchor {key}" not in sentence and f"along {key}" not in sentence
 
@@ -342,7 +345,7 @@ def test_regions_and_shifts_on_the_map_are_those_of_the_values():
 
 def test_an_effect_without_a_sentence_of_its_own_is_advised_on_by_its_physics():
     class Rust(EFFECTS["anchor_delay"]):
-        """An effect that somebody adds."""
+        """An effect that a user adds."""
 
         name, physics, remedy = "rust", "rusty connectors", ""
 

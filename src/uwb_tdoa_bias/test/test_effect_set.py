@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""effects.yaml, domains, covariances and the bias Jacobian: what an EffectSet does."""
+"""EffectSet: effects.yaml, domains, covariances and the bias Jacobian."""
 
 from dataclasses import replace
 
@@ -147,8 +147,16 @@ def test_the_covariance_of_a_hall_takes_little_room(tmp_path):
 
 
 def corrected(effect, t, p=(3.0, 3.0, 1.5), first=0.0):
-    """(Correction, Corrector) of TDOAs of anchors 0 and 1 at t (n,) s, the first one at `first`,
-    with the tag at p.
+    """Return (Correction, Corrector) of TDOAs of anchors 0 and 1.
+
+    Parameters
+    ----------
+    t : float or (n,) array
+        Stamps, in s.
+    p : (3,)
+        Position of the tag, in m.
+    first : float
+        Stamp of a TDOA before them, in s. It is the zero of the time of the effects.
     """
     corrector, t = (
         Corrector(ANCHORS, EffectSet((effect,))),
@@ -165,9 +173,8 @@ def test_a_drift_is_corrected_within_its_domain_only():
     out, corrector = corrected(drift, [30.0, 60.0, 90.0, 600.0, 3600.0])
     assert out.bias[:2] == pytest.approx([0.3, 0.6]) and 0.2 < out.bias[2] < 0.5
     assert abs(out.bias[3:]).max() < 1e-6
-    assert (out.std[:2] == 0.0).all() and out.std[3:] == pytest.approx(
-        [0.6, 0.6], abs=1e-6
-    )  # what it may still be
+    # The deviation covers the drift at the end of the domain.
+    assert (out.std[:2] == 0.0).all() and out.std[3:] == pytest.approx([0.6, 0.6], abs=1e-6)
     assert corrector.outside == ["anchor_clock_drift (time 0 to 60 s)"]
     assert corrected(drift, 30.0)[1].outside == []
 
@@ -197,7 +204,7 @@ def test_an_arrival_fades_with_the_longer_of_both_ranges():
 
 
 def turning(covariate, knots):
-    """0.1 rad/s on gyro.z within the domain of a covariate."""
+    """Return a constant error of 0.1 rad/s on gyro.z within the domain of a covariate."""
     values = dict.fromkeys(("c0", "c1", "c2"), 0.1)
     return SmoothTerm(
         values, {}, "", "gyro.z", covariate, "common", knots, domain={covariate: knots}
@@ -220,7 +227,7 @@ def test_functions_of_the_filter_state_fade_too():
 
 
 def line(covariate, form="common", steep=STEEP):
-    """A straight function of a covariate, far beyond what samples have."""
+    """Return a straight function of a covariate. Its knots lie far beyond the samples."""
     return SmoothTerm(
         covariate=covariate,
         form=form,
@@ -254,7 +261,7 @@ def test_the_jacobian_of_a_line_is_its_slope(seed):
 @given(seed=st.integers(0, 10**6))
 def test_the_jacobian_of_a_range_is_the_difference_of_directions(seed):
     samples = moving(seed)
-    far = replace(samples, p=samples.p + 500.0)  # so that a range is straight within the reach
+    far = replace(samples, p=samples.p + 500.0)  # A range is straight within the reach.
     wide = SmoothTerm(
         covariate="range",
         form="arrival",
@@ -272,7 +279,10 @@ def test_the_jacobian_of_a_range_is_the_difference_of_directions(seed):
 
 
 def test_what_is_left_of_a_step_is_a_standard_deviation():
-    """A step of s right between the ends of the reach: half of it is no line, to either side."""
+    """The step lies between the ends of the reach.
+
+    Half of the step remains, with either sign.
+    """
     samples = moving(3)
     samples = replace(samples, p=np.zeros_like(samples.p))
     step = SmoothTerm(
@@ -321,7 +331,7 @@ def test_the_jacobian_without_a_yaw_is_zero():
         corrector.add_pose(
             0.01 * k, np.ones(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), yaw_std
         )
-    times = 0.5, 1.1, 1.15  # the pose is as old as the TDOA before
+    times = 0.5, 1.1, 1.15  # pose no newer than the TDOA before
     sure, _, unsure = (
         corrector.correct(np.array([t]), np.array([0]), np.array([1]), np.array([2.0]))
         for t in times

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What every effect does, whatever its family."""
+"""Properties that every effect has, whatever its family."""
 
 from dataclasses import replace
 from functools import cache
@@ -62,7 +62,7 @@ ON_BOTH = [effect for effect, _ in FITTED_ON_RADIO if set(RADIO) <= set(effect.c
 
 @cache
 def flight_with_all(seed, n=400):
-    """A Flight on a smooth path with every stream, without noise and errors."""
+    """Return a Flight on a smooth path with every stream, without noise and errors."""
     rng, t = np.random.default_rng(seed), np.arange(n) / 25.0
     phase = rng.uniform(0.0, 6.0, 6)
     p = np.stack([np.sin(0.7 * t + phase[0]), np.cos(0.5 * t + phase[1]), np.zeros(n)], axis=1)
@@ -95,7 +95,10 @@ def flight_with_all(seed, n=400):
 
 
 def made(effect, size=0.1, rng=None):
-    """The effect with values of about a size, up to 1, for all that it can have."""
+    """Return the effect with a random value for every possible parameter.
+
+    The magnitude is about `size`, or smaller if the bound of a parameter is below 1.
+    """
     if effect.name in ("anchor_ids", "pair_sign"):
         return effect(
             {"anchor_ids": {"1": 2, "2": 4, "4": 1}, "pair_sign": {"0-1": -1}}[effect.name]
@@ -108,14 +111,14 @@ def made(effect, size=0.1, rng=None):
 
 
 def part_of(flight, channel):
-    """The stream of a channel of a Flight, "truth" included."""
+    """Return the stream of a channel of a Flight, "truth" included."""
     if channel in ("gyro", "accel"):
         return flight.imu
     return measured_on(flight, channel) if channel in STREAM_OF else getattr(flight, channel)
 
 
 def values_of(flight, channel):
-    """Values of a channel of a Flight, "truth" included."""
+    """Return the values of a channel of a Flight, "truth" included."""
     part = part_of(flight, channel)
     if channel in ("gyro", "accel"):
         return getattr(part, channel)
@@ -123,14 +126,14 @@ def values_of(flight, channel):
 
 
 def labels_of(flight, channel):
-    """Stamps and ids of a channel of a Flight."""
+    """Return the stamps and ids of a channel of a Flight."""
     part = part_of(flight, channel)
     ids = {"tdoa": ("a", "b"), "range": ("anchor",)}.get(channel, ())
     return np.stack([part.t, *(getattr(part, name) for name in ids)])
 
 
 def samples_of(flight, channel):
-    """Samples of a sensor of a Flight for effects on it."""
+    """Return samples of a sensor of a Flight, for effects on it."""
     track = Track(flight.truth)
     if channel in BY_POSE:
         return sensor_samples(channel, measured_on(flight, channel).t, track, flight.tdoa.t[0])
@@ -147,7 +150,8 @@ def test_is_declared_in_full(effect):
     assert effect.unit and effect.reference and effect.physics
     assert set(effect.distinguished_by) <= set(effect.confounded_with) <= set(EFFECTS)
     assert set(effect.channels) <= {"tdoa", "gyro", "accel", *STREAM_OF}
-    np.testing.assert_array_equal(effect().bias(random_samples(1)), 0.0)  # no parameter, no effect
+    # An effect without parameters changes nothing.
+    np.testing.assert_array_equal(effect().bias(random_samples(1)), 0.0)
     np.testing.assert_array_equal(effect().noise_std(random_samples(1)), 0.0)
     bound = effect.bound_of(effect.example)
     for wrong in (np.nan, np.inf, 1.01 * bound, -1.01 * bound, "much", None, [0.1]):
@@ -193,7 +197,7 @@ def test_regressors_are_derivatives_of_the_bias(effect, channel, seed):
 @pytest.mark.parametrize("effect", ON_SENSORS)
 @given(st.integers(0, 20))
 def test_regressors_on_sensors_are_what_inject_adds(effect, seed):
-    """To first order; at the ends of intervals and of the recording neither is defined."""
+    """Compare to first order. Both are undefined at the ends of intervals and of the recording."""
     flight = flight_with_all(seed)
     one = made(effect, 1e-3, np.random.default_rng(seed))
     keys = [key for key in one.values if not key.endswith(("start", "end"))]
@@ -202,11 +206,12 @@ def test_regressors_on_sensors_are_what_inject_adds(effect, seed):
     for channel in effect.channels:
         before, after = values_of(flight, channel), values_of(changed, channel)
         t, moved = flight.truth.t, labels_of(changed, channel)[0]
-        if not np.array_equal(moved, t):  # late stamps: readings at the old ones
+        # Stamps are late: interpolate the readings to the old stamps.
+        if not np.array_equal(moved, t):
             after = np.stack([np.interp(t, moved, column) for column in after.T], axis=1)
         sizes = [one.values[key] for key in keys]
         predicted = fixed.regressors(samples_of(flight, channel), keys) @ sizes
-        rough = 5e-5 if effect.name == "velocity_delay" else 2e-5  # of accelerations from poses
+        rough = 5e-5 if effect.name == "velocity_delay" else 2e-5  # accelerations come from poses
         np.testing.assert_allclose((after - before)[5:-5], predicted[5:-5], atol=rough)
 
 
@@ -277,7 +282,7 @@ def test_says_whether_it_uses_the_attitude(effect):
 
 
 def filled(effect, value, std):
-    """The effect with one value for all parameters that a fit may give it."""
+    """Return the effect with the same value for all parameters that a fit may set."""
     keys = effect.groups(ANCHORS, PAIRS)[0] or (effect.example,)
     limits = {"0.x": 1.0, "0.y": -2.0, "0.z": 1.5, "0.radius": 0.6} if effect.name == "nlos" else {}
     return effect({**dict.fromkeys(keys, value), **limits}, dict.fromkeys(keys, std))

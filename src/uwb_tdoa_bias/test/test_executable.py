@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""How executables start, and how they end when they are interrupted before they have begun."""
+"""Start of executables, and their end when they are interrupted before they have begun."""
 
 import os
 from signal import SIGINT
@@ -40,7 +40,7 @@ START = (
 
 @pytest.fixture
 def write(tmp_path, monkeypatch):
-    """write(name, text): a module that can be imported here and by other processes."""
+    """Return write(name, text), which writes a module that this and other processes can import."""
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setenv("PYTHONPATH", ":".join([str(tmp_path), *sys.path]))
     return lambda name, text: (tmp_path / f"{name}.py").write_text(text)
@@ -108,16 +108,19 @@ def test_linear_algebra_takes_one_thread_unless_the_user_says_more(
     monkeypatch.setenv("OMP_NUM_THREADS", given) if given else monkeypatch.delenv(
         "OMP_NUM_THREADS", raising=False
     )
-    assert start(name)() == kept  # before anything is imported
+    # The variable is set before the module is imported.
+    assert start(name)() == kept
 
 
 @pytest.mark.parametrize("late", [False, True])
 def test_a_folder_of_recordings_does_not_say_how_libraries_behave(
     write, tmp_path, monkeypatch, late
 ):
-    """matplotlib takes the settings of the folder in which it is imported: of its memory, and of
-    LaTeX. numba takes its cache, and modules, from there. Most commands import matplotlib when they
-    draw, which is in the folder of the user.
+    """The present folder must not configure the libraries.
+
+    matplotlib reads its settings from the folder in which it is imported. They can exhaust the
+    memory or start LaTeX. numba reads its cache and modules from there. Most commands import
+    matplotlib late, in the folder of the user.
     """
     pytest.importorskip("matplotlib")
     (tmp_path / "matplotlibrc").write_text("savefig.dpi: 100000\ntext.usetex: True\n")

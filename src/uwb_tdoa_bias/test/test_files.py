@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Files: how they are written, and what is refused when they are read."""
+"""Files: how they are written, and which contents are refused when they are read."""
 
 import io
 import math
@@ -38,7 +38,7 @@ from uwb_tdoa_bias.common.text import printable, sanitize
     [
         ("Höhe ± 0.1 m, σ\n", "Höhe ± 0.1 m, σ\n".encode()),
         (os.fsdecode("flüge".encode()), "flüge".encode()),
-        ("fl\udcc3\udcbcge", "flüge".encode()),  # as Python gets an argument in an ASCII locale
+        ("fl\udcc3\udcbcge", "flüge".encode()),  # an argument of Python in an ASCII locale
         ("a\udcffb", "a\ufffdb".encode()),
         ("a\ud800b", b"a?b"),
     ],
@@ -188,7 +188,7 @@ def test_what_numpy_wrote_comes_back(read, function):
 
 
 def forged(shape="(10000000000,)", kind="<f8", body=bytes(8), compress=zipfile.ZIP_DEFLATED):
-    """An .npz file whose array `a` claims a shape."""
+    """Return an .npz file. The header of its array `a` states any given shape."""
     header = f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
     data = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header.encode() + body
     stream = io.BytesIO()
@@ -332,7 +332,7 @@ SCALARS = st.one_of(
     st.booleans(),
     st.integers(1 - 2**63, 2**63 - 1),
     st.floats(allow_nan=False, allow_infinity=False),
-    # no 1e3: YAML 1.1
+    # no digits: YAML 1.1 reads 1e3 as a text
     st.text(st.characters(codec="utf-8", exclude_categories=["Cc", "Cs", "Nd"]), max_size=8),
 )
 KEYS = st.text("abcxyz01-", max_size=4)

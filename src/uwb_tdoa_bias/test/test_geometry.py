@@ -82,7 +82,7 @@ def test_a_single_tdoa_in_compiled_code_is_that_of_the_arrays_to_the_bit(seed, o
 def test_one_vector_turned_by_many_attitudes(seed):
     rng = np.random.default_rng(seed)
     turns, v = [random_rotation(rng) for _ in range(4)], rng.normal(size=3)
-    # of any length
+    # quaternions of any length
     q = np.array([turn.as_quat() for turn in turns]) * rng.uniform(0.5, 2.0, (4, 1))
     out = np.empty((6, 3))
     rotate_each(np.concatenate([q, [[0.0, 0.0, 0.0, 0.0], [np.nan, 0.0, 0.0, 1.0]]]), v, out)
@@ -95,12 +95,15 @@ def test_one_vector_turned_by_many_attitudes(seed):
 # --- transforms ---
 
 
-QUARTER = Rotation.from_euler("z", 90.0, degrees=True)  # to the left
+QUARTER = Rotation.from_euler("z", 90.0, degrees=True)  # 90 degrees to the left
 IDENTITY = (0.0, 0.0, 0.0, 1.0)
 
 
 def robot():
-    """A mast on the base, an IMU on the mast turned to the left, and a radio on the base."""
+    """Return frames of a robot: a mast on the base, an IMU on the mast, and a radio on the base.
+
+    The IMU is turned by 90 degrees to the left.
+    """
     frames = Frames()
     frames.set("base_link", "mast", IDENTITY, (0.1, 0.0, 0.5))
     frames.set("mast", "imu_link", QUARTER.as_quat(), (0.0, 0.2, 0.0))
@@ -134,7 +137,7 @@ def test_a_frame_that_moves_is_interpolated_and_held_for_a_while():
     frames = robot()
     frames.move("odom", "base_link", IDENTITY, (0.0, 0.0, 0.0), 1.0)
     frames.move("odom", "base_link", QUARTER.as_quat(), (2.0, 0.0, 0.0), 2.0)
-    frames.move("odom", "base_link", IDENTITY, (9.0, 0.0, 0.0), 1.9)  # not later
+    frames.move("odom", "base_link", IDENTITY, (9.0, 0.0, 0.0), 1.9)  # not newer: ignored
     turn, p = frames.between("odom", "base_link", 1.5)
     assert turn.magnitude() == pytest.approx(np.pi / 4) and p.tolist() == [1.0, 0.0, 0.0]
     turn, p = frames.between("odom", "radio", 2.0 + HELD)
@@ -167,13 +170,13 @@ def test_frames_are_bounded(monkeypatch):
     frames = robot()
     with pytest.raises(InputError, match="3 frames already"):
         frames.set("base_link", "camera", IDENTITY, (0.0, 0.0, 0.0))
-    assert frames.set("base_link", "radio", IDENTITY, (1.0, 0.0, 0.0))  # it is known: it may move
+    assert frames.set("base_link", "radio", IDENTITY, (1.0, 0.0, 0.0))  # a known frame may move
 
 
 def test_a_transform_that_is_sent_again_with_jitter_is_no_other():
     frames = Frames()
     assert frames.set("base_link", "imu", (0.0, 0.0, 0.0, 1.0), (0.1, 0.0, 0.0))
-    for k in range(1, 50):  # it does not creep
+    for k in range(1, 50):  # small steps do not add up to a motion
         assert not frames.set(
             "base_link", "imu", (0.0, 0.0, 1e-6, 1.0), (0.1 + 1e-4 * min(k, 9), 0.0, 0.0)
         )
@@ -204,7 +207,7 @@ def test_azimuth_cut_is_met_exactly():
     ("cut", "theta"), [(DWM1000_ELEVATION_1, 0.0), (DWM1000_ELEVATION_2, 90.0)]
 )
 def test_elevation_cuts_are_met_away_from_the_plane(cut, theta):
-    """On an elevation cut, equation 14 leaves (1 - cos^40) of it: all but 0.4 % from 30 degrees on."""
+    """On an elevation cut, equation 14 keeps 1 - cos^40: all but 0.4 % from 30 degrees on."""
     around = np.deg2rad(30.0 * np.arange(12))
     azimuth = np.deg2rad(theta)
     direction = np.cos(around)[:, None] * towards(azimuth, 0.0) + np.sin(around)[

@@ -41,7 +41,7 @@ def batch(n=50):
 
 
 def expected(s):
-    """By hand: the vector to anchor b in the body frame."""
+    """Compute the bias by hand, with the vector to anchor b in the body frame."""
     to_b = ANCHORS.positions[s.b] - s.p
     x, y, z = Rotation.from_quat(s.q).inv().apply(to_b).T
     dx = ANCHORS.positions[s.a][:, 0] - s.p[:, 0]
@@ -52,7 +52,7 @@ def test_predicts_what_is_computed_by_hand(network_file):
     s = batch()
     bias, std, known = Network(network_file).predict(s)
     np.testing.assert_allclose(bias, expected(s), atol=1e-6)  # the model computes in float32
-    assert np.ptp(bias) > 0.1  # an answer that says something
+    assert np.ptp(bias) > 0.1  # The bias varies, so the comparison is meaningful.
     np.testing.assert_array_equal(std, 0.0)
     np.testing.assert_array_equal(known, 1.0)
 
@@ -64,7 +64,7 @@ def test_output_is_clipped_and_nan_without_the_attitude_it_needs(network_file):
 
 
 def changed(tmp_path, **meta):
-    """The model with other metadata; None removes an entry."""
+    """Write the model with other metadata and return its path. None removes an entry."""
     model = known_answer.make()
     for entry in list(model.metadata_props):
         if entry.key in meta:
@@ -162,7 +162,7 @@ def test_a_model_is_named_by_its_file(network_file, tmp_path):
 
 
 def otherwise(tmp_path, nodes, constants, inputs):
-    """A model with the metadata of the known answer and other insides."""
+    """Write a model with the metadata of the known answer and another graph."""
     onnx = pytest.importorskip("onnx")
     made, helper = known_answer.make(), onnx.helper
     graph = helper.make_graph(

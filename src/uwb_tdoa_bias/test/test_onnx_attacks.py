@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Models that were made to run, hang or fill: each is refused at once, with the reason."""
+"""Models that execute code, hang or exhaust memory: each is refused at once, with the reason."""
 
 import json
 import os
@@ -19,7 +19,7 @@ from uwb_tdoa_bias.correction.network import Network
 onnx = pytest.importorskip("onnx")
 from onnx import TensorProto, helper, numpy_helper  # noqa: E402
 
-START = 2.0  # s of processor time that the process of a trial takes before it loads the model
+START = 2.0  # s of processor time that a trial needs before it loads the model
 META = {
     "features": ["dx_a", "dy_a"],
     "offset": [0, 0],
@@ -33,7 +33,7 @@ COLUMN = numpy_helper.from_array(np.ones((2, 1), np.float32), "column")
 
 
 def model(*nodes, constants=(), width=2, meta=META, **more):
-    """ModelProto whose output is that of the last node."""
+    """Return a ModelProto. Its output is the output of the last node."""
     graph = helper.make_graph(
         nodes,
         "attack",
@@ -49,7 +49,7 @@ def model(*nodes, constants=(), width=2, meta=META, **more):
 
 
 def doubling():
-    """A kilobyte that becomes 2^30 columns."""
+    """Return a model of one kilobyte that computes 2^30 columns."""
     nodes = (NODE("Concat", [f"v{k}" if k else "x"] * 2, [f"v{k + 1}"], axis=1) for k in range(30))
     return model(*nodes)
 
@@ -70,7 +70,7 @@ def looping():
 
 
 def read_elsewhere(file="../../etc/passwd"):
-    """The weights are bytes of a file of the user."""
+    """Return a model that reads its weights from a file of the user."""
     weights = onnx.TensorProto(
         name="column", data_type=TensorProto.FLOAT, dims=[2, 1], data_location=TensorProto.EXTERNAL
     )
@@ -100,7 +100,7 @@ def claiming(*dims):
 
 
 def busy():
-    """The same weights a thousand times."""
+    """Return a model that applies the same weights a thousand times."""
     weights = numpy_helper.from_array(np.zeros((500, 500), np.float32), "weights")
     nodes = [NODE("Concat", ["x"] * 250, ["v0"], axis=1)]
     return model(
@@ -115,7 +115,7 @@ def long():
 
 
 def branching_seldom():
-    """It branches, and loops, only for other numbers than those of the trial."""
+    """Return a model with another branch for inputs above 1e6, which the trial does not try."""
     far, text = (
         numpy_helper.from_array(np.float32(1e6), "far"),
         helper.make_tensor_value_info("z", TensorProto.FLOAT, None),
@@ -131,7 +131,7 @@ def branching_seldom():
 
 
 def spent():
-    """s of processor time of the processes that have ended."""
+    """Return the processor time of all processes that have ended, in s."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 
@@ -166,18 +166,17 @@ def test_refused_at_once(tmp_path, made, said):
 
 
 def test_a_model_opens_no_file_in_its_trial(tmp_path, monkeypatch):
-    """Weights in another file are bytes of a file of the user; a pipe in its place would hang.
+    """The weights of the model are in another file, which exists and has the right size.
 
-    Here the file is there, and fits.
+    Such a model could read a file of the user. A pipe in place of the file would hang.
     """
     (tmp_path / "weights").write_bytes(np.ones(2, np.float32).tobytes())
     made = read_elsewhere("weights").SerializeToString()
     monkeypatch.chdir(tmp_path)
     options = trial.onnxruntime.SessionOptions()
     options.graph_optimization_level = trial.onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
-    assert (
-        trial.Session(made, options=options).run(np.ones((1, 2))) == 2.0
-    )  # the attack: bytes of the present folder are weights
+    # The attack works without the trial: bytes of the present folder become weights.
+    assert trial.Session(made, options=options).run(np.ones((1, 2))) == 2.0
     for place in (tmp_path, "/"):
         monkeypatch.chdir(place)
         with pytest.raises(trial.Unplayable, match="onnxruntime: "):
@@ -219,7 +218,7 @@ def test_a_trial_takes_no_module_of_the_present_folder(tmp_path, monkeypatch):
 
 
 def test_a_trial_without_an_end(monkeypatch):
-    """On a machine that is busy, or a process that is stopped."""
+    """A trial can hang on a busy machine, or if its process is stopped."""
     monkeypatch.setattr(trial, "MODEL_WAIT", 0.3)
     monkeypatch.setattr(trial, "START", "import time; time.sleep(60)")
     trial.tried_out.cache_clear()

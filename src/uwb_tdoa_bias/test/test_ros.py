@@ -67,7 +67,7 @@ def test_seconds_do_not_depend_on_the_epoch(first, stamps):
 
 @given(st.integers(0, 2**31 - 1 - MONTH), st.integers(0, MONTH), NANOSECONDS)
 def test_seconds_are_the_nearest_float(first, second, nanosecond):
-    """As tools read them from a bag: else a period ends a sample earlier or later in a node."""
+    """Nodes and tools must read the same seconds. Otherwise, a period may end one sample apart."""
     epoch = Epoch()
     epoch.seconds(Time(sec=first))
     nearest = float(Fraction(second * 10**9 + nanosecond, 10**9))
@@ -155,16 +155,15 @@ def test_bad_anchors_are_refused():
 def test_anchors_need_a_publisher_that_keeps_them():
     assert qos_check_compatible(ANCHORS_QOS, ANCHORS_QOS)[0] != QoSCompatibility.ERROR
     assert qos_check_compatible(QoSProfile(depth=1), ANCHORS_QOS)[0] == QoSCompatibility.ERROR
-    assert (
-        qos_check_compatible(QoSProfile(depth=1), ANY_QOS)[0] != QoSCompatibility.ERROR
-    )  # but takes them when repeated
+    # They are compatible with repeated volatile anchors.
+    assert qos_check_compatible(QoSProfile(depth=1), ANY_QOS)[0] != QoSCompatibility.ERROR
 
 
 # --- ros log ---
 
 
 class Written:
-    """Stands for a logger of rclpy."""
+    """Stand in for a logger of rclpy."""
 
     def __init__(self):
         self.lines = []
@@ -173,7 +172,7 @@ class Written:
 
 @pytest.fixture
 def clock(monkeypatch):
-    """The time, s, that a Log sees: a list of one."""
+    """Return the time that a Log reads, in s, as a list of one element."""
     now = [1000.0]
     monkeypatch.setattr(parameters.time, "monotonic", lambda: now[0])
     return now
@@ -227,11 +226,12 @@ def test_simulated_time_that_stands_still_or_is_missing_is_said():
             (9.0, 6, paused),
             (9.2, 7, None),
             (9.4, 7, None),
+            # A clock with one step a second is running, too.
             (10.2, 8, None),
             (11.2, 9, None),
             (12.2, 9, None),
             (13.0, 9, None),
-            (13.3, 9, paused),  # once a second: runs, too
+            (13.3, 9, paused),
         ):
             for _ in range(200):
                 source.publish(Clock(clock=Time(sec=second)))
@@ -246,7 +246,7 @@ def test_simulated_time_that_stands_still_or_is_missing_is_said():
 
 
 def test_the_log_says_each_kind_of_thing_once_in_a_while():
-    """38 warnings in 38 s, because a percentage changed."""
+    """A changing percentage once caused 38 warnings in 38 s."""
     saying = Saying()
     lines = [
         saying.anew(
@@ -256,15 +256,14 @@ def test_the_log_says_each_kind_of_thing_once_in_a_while():
         for second in range(38)
     ]
     assert lines == [True] + 37 * [False]
-    assert saying.anew(
-        "40 % of the TDOAs of anchor 4 are late by 0.10 s", 38.0
-    )  # another anchor is another thing
+    # A message about another anchor is new.
+    assert saying.anew("40 % of the TDOAs of anchor 4 are late by 0.10 s", 38.0)
     flips = [
         saying.anew(("running", "anchors 1 and 2 are exchanged")[second % 2], 40.0 + second)
         for second in range(20)
     ]
     assert flips == [True, True] + 18 * [False]
-    assert saying.anew("running", 75.0)  # what stays is said in the end
+    assert saying.anew("running", 75.0)  # a state that lasts is logged
     assert not saying.anew("running", 200.0)
 
 
@@ -281,5 +280,5 @@ def test_the_log_says_each_kind_of_thing_once_in_a_while():
 )
 @pytest.mark.usefixtures("must_end")
 def test_the_time_for_a_long_number_does_not_grow_with_its_square(text):
-    """A pattern that tried again at each digit took 8 s for a tenth of these."""
+    """A pattern that started again at each digit took 8 s for a text of a tenth of this length."""
     Saying().anew(text, 0.0)

@@ -29,8 +29,10 @@ POSE = "pose.pose.position", "pose.pose.orientation", "pose.covariance"
 
 @pytest.fixture(params=["bytes", "objects"])
 def way(request, monkeypatch):
-    """Both ways of reading and writing: by the definition, and by message objects where that does
-    not fit.
+    """Run a test with both ways to read and write.
+
+    "bytes" uses the message definition, "objects" the message objects: the fallback if the
+    definition does not fit.
     """
     if request.param == "objects":
         monkeypatch.setattr(CdrCodec, "_agrees", lambda self: False)
@@ -85,7 +87,7 @@ def test_vectors_and_arrays_are_columns(way):
 
 
 def test_what_is_written_is_what_an_object_would_be(way):
-    # not in the order of the definition
+    # The order differs from the definition.
     codec = CdrCodec(TdoaCorrected, "corrected", "anchor_b", "anchor_a", "raw")
     template = codec.template(corrected(7, model="effects"))
     wanted = [corrected(k, model="effects") for k in (7, 8, 300)]
@@ -114,7 +116,7 @@ def test_a_middleware_that_serializes_otherwise_is_noticed(monkeypatch):
 
 
 def tdoa_bytes(order="<", options=0, frame=b"tag", variance=True, more=b""):
-    """A serialized Tdoa, by hand: 1 s, 2 ns, anchors 3 and 4, 0.5 m, 0.25 m^2."""
+    """Serialize a Tdoa by hand: 1 s, 2 ns, anchors 3 and 4, 0.5 m, 0.25 m^2."""
     kind = b"\0\1" if order == "<" else b"\0\0"
     body = struct.pack(f"{order}iII", 1, 2, len(frame) + 1) + frame + b"\0"
     body += b"\0" * (-len(body) % 2) + struct.pack(f"{order}HH", 3, 4)

@@ -22,7 +22,7 @@ NUMBERS = st.floats(allow_nan=False)
 
 
 def message(transforms):
-    """TFMessage of (sec, nanosec, parent, child, q, p)."""
+    """Return a TFMessage of tuples (sec, nanosec, parent, child, q, p)."""
     out = TFMessage()
     for sec, nanosec, parent, child, q, p in transforms:
         one = TransformStamped(child_frame_id=child)
@@ -55,9 +55,8 @@ def test_transforms_are_read_as_the_middleware_wrote_them(transforms):
     ]
     data = serialize_message(message(transforms))
     assert read_transforms(data) == expected
-    assert (
-        read_transforms(data[:3] + b"\1" + data[4:]) == expected
-    )  # with options, by the middleware itself
+    # With options set, the middleware reads the message.
+    assert read_transforms(data[:3] + b"\1" + data[4:]) == expected
 
 
 def test_what_is_no_list_of_transforms_is_refused():

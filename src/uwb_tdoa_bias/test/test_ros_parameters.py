@@ -30,7 +30,7 @@ PARAMETERS = {
 
 @pytest.fixture
 def node_with():
-    """node_with(*arguments) gives a node that was started so."""
+    """Return node_with(*arguments), which starts a node with these ROS arguments."""
     nodes = []
 
     def make(*arguments):
@@ -127,8 +127,9 @@ def test_a_file_that_counts_is_not_said(node_with, said, tmp_path):
     assert not said
 
 
-ODD = [  # texts of a parameter file, and whether rcl takes it
-    # as launch_ros writes every list
+# Contents of a parameter file. rcl accepts some and refuses the others.
+ODD = [
+    # launch_ros writes every list in this way
     "/**: {ros__parameters: {speeds: !!python/tuple [1.0, 2.0]}}",
     "/**: {ros__parameters: {mode: !!str none}}",
     "/**: {ros__parameters: {mode: !ours none}}",
@@ -156,7 +157,8 @@ def test_a_parameter_file_is_judged_by_rcl_alone(node_with, said, tmp_path, text
     try:
         node = node_with("--params-file", str(file))
     except rclpy_implementation.RCLError:
-        rclpy.init()  # what it refuses, it refuses before any node is there
+        # rcl refuses a file before the node exists.
+        rclpy.init()
         return
     say_unused([node], [str(file)])
     given = any(name in node._parameter_overrides for name in PARAMETERS)

@@ -30,7 +30,7 @@ DEEP = QoSProfile(depth=1000)
 
 @pytest.fixture(params=["events", "single"])
 def surroundings(request, monkeypatch):
-    """(node of ours, another node); once with each of the executors."""
+    """Return (our node, another node), once with each of the executors."""
     if request.param == "single":
         monkeypatch.setattr(process, "EventsExecutor", None)
     elif process.EventsExecutor is None:
@@ -44,7 +44,7 @@ def surroundings(request, monkeypatch):
 
 
 def until(condition):
-    """Wait for what needs nobody to be spun."""
+    """Wait for a condition without spinning a node."""
     end = time.monotonic() + 120.0
     while not condition():
         assert time.monotonic() < end
@@ -79,9 +79,8 @@ def test_nothing_waits_behind_what_comes_often(surroundings):
         return asked
 
     spin_until(spinner, answered)
-    assert (
-        sum(map(bool, busy)) < 50
-    )  # rounds in which something was served; one callback in each would be six times as many
+    # Rounds that served something. With one callback in each round there are six times as many.
+    assert sum(map(bool, busy)) < 50
     spin_until(spinner, lambda: len(flood) == MANY)
     spinner.close()
 
@@ -96,7 +95,7 @@ def test_what_waits_is_measured(surroundings):
         waited, spinner.longest_wait = spinner.longest_wait, 0.0
         return waited < 0.2
 
-    # a loaded machine may have kept this process waiting in between
+    # A loaded machine may have delayed this process in between.
     spin_until(spinner, nothing_waited)
     publisher.publish(DiagnosticStatus())
     spin_until(spinner, lambda: spinner.longest_wait > 0.25)
@@ -104,7 +103,7 @@ def test_what_waits_is_measured(surroundings):
 
 
 def pressures(node, take):
-    """The Streams of a node with one stream."""
+    """Return the Streams of a node with one stream."""
     streams = Streams(node, Epoch(), lambda: None)
     streams.add(CdrCodec(FluidPressure, "fluid_pressure"), "pressure", take)
     return streams
@@ -152,7 +151,7 @@ def test_a_stream_that_begins_after_a_silence_is_taken(surroundings):
     streams = pressures(node, take)
     publisher = other.create_publisher(FluidPressure, "pressure", DEEP)
     until(publisher.get_subscription_count)
-    # the process sleeps in its executor until then
+    # The process sleeps in its executor until then.
     node.create_timer(0.1, lambda: publisher.publish(FluidPressure()))
     spinner = Spinner([node], StreamPoller([streams]))
     spinner.spin(stop)
@@ -162,12 +161,12 @@ def test_a_stream_that_begins_after_a_silence_is_taken(surroundings):
 
 def test_turns_rest_as_long_as_they_took_and_only_if_there_was_something():
     def rest(*streams):
-        """The rest after a turn with streams: (s that it takes, whether anything arrived)."""
+        """Return the rest after a turn with streams (duration in s, whether anything arrived)."""
         taking = [Mock(take=lambda one=one: time.sleep(one[0]) or one[1]) for one in streams]
         return StreamPoller(taking).take()
 
     assert rest((0.0, False)) is None
-    assert PERIOD <= rest((0.0, True), (0.0, False)) <= 0.01  # a busy computer takes its time
+    assert PERIOD <= rest((0.0, True), (0.0, False)) <= 0.01  # upper limit for a busy computer
     assert 0.004 <= rest((0.005, True)) <= 0.01
     assert rest((0.05, True)) == 0.01
 

@@ -31,7 +31,7 @@ RATE = np.array([0.3, -0.5, 0.8])  # rad/s, body
 
 
 def path(n=400, step=0.01):
-    """A parabola that is flown while turning evenly: namespace of t, p, q, v."""
+    """Return t, p, q, v of a tag on a parabola that turns at a constant rate."""
     t = 5.0 + step * np.arange(n)
     s = (t - t[0])[:, None]
     p = np.array([1.0, 2.0, 1.0]) + s * [0.5, -0.2, 0.1] + 0.5 * s**2 * [0.2, 0.4, -0.1]
@@ -73,8 +73,9 @@ def test_the_preceding_stamp_is_that_of_the_newest_before(t, newest):
     ["speed", "climb_rate", "acceleration", "turning_rate", "interval", "previous_anchor"],
 )
 def test_what_is_learned_is_what_is_applied(covariate):
-    """The regressors at true poses, and those of a Corrector that is told the same poses, are the
-    same function.
+    """Training and correction use the same regressors.
+
+    A fit computes them at true poses. Here, a Corrector gets the same poses.
     """
     poses = path()
     t = np.sort(np.random.default_rng(1).uniform(5.8, 8.9, 60))
@@ -119,7 +120,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 def expected(samples):
-    """Every feature by its name, each straight from its definition."""
+    """Compute every feature from its definition."""
     anchors, out = samples.anchors, {}
     for side, rows in (("a", samples.a), ("b", samples.b)):
         to_anchor = anchors.positions[rows] - samples.p
@@ -150,7 +151,7 @@ def test_places(seed):
 @given(seeds)
 def test_definitions(seed):
     samples = random_samples(seed)
-    # arcsin is steep near the pole
+    # The slope of arcsin is large near the pole.
     np.testing.assert_allclose(columns(samples, FEATURES), expected(samples), atol=1e-6)
 
 
@@ -181,9 +182,8 @@ def test_low_pass_follows_a_step_with_its_time_constant():
     for _ in range(round(VIBRATION_CORNER / dt)):
         value = low_pass(value, 1.0, dt, VIBRATION_CORNER)
     assert value == pytest.approx(1.0 - np.exp(-1.0), abs=1e-3)
-    assert (
-        low_pass(0.0, 5.0, 1.0, VIBRATION_CORNER) == 5.0
-    )  # a step longer than that: the sample itself
+    # A step longer than the time constant returns the sample itself.
+    assert low_pass(0.0, 5.0, 1.0, VIBRATION_CORNER) == 5.0
 
 
 def test_power_is_the_variance_of_what_is_fast_and_nothing_of_what_is_slow():

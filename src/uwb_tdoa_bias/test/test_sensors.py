@@ -1,8 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Every sensor of the registry keeps what its record promises; what each says in particular is in
-tests of its own.
-"""
+"""Properties that every sensor of the registry has. Other tests check each sensor in detail."""
 
 from types import SimpleNamespace
 
@@ -27,7 +25,7 @@ ANCHORS = Anchors([2, 7], [[0.0, 0.0, 0.0], [6.0, 8.0, 0.0]], [[np.nan] * 4] * 2
 
 
 def simulated(sensor):
-    """The Stream that a sensor makes of a motion, without noise."""
+    """Simulate a sensor on a motion, without noise, and return its Stream."""
     motion = SimpleNamespace(p=np.linspace([1.0, 2.0, 0.5], [2.0, 1.0, 2.0], N), v=np.ones((N, 3)))
     config = SimpleNamespace(anchors=ANCHORS, tag_lever_arm=np.zeros(3))
     for name in SENSORS:
@@ -49,9 +47,7 @@ STREAMS = {name: simulated(sensor) for name, sensor in SENSORS.items()} | {
 
 
 def of_message(sensor, stream):
-    """{field: values} that are read of the messages that are written for a stream: what is not
-    written is 0.
-    """
+    """Return {field: values} of the messages of a stream. Fields without a value are 0."""
     content = sensor.content(stream)
     return {
         name: np.broadcast_to(content.get(name, 0.0), (N, k) if k > 1 else (N,))
@@ -79,7 +75,7 @@ def test_what_is_written_is_read(name):
     fields = of_message(sensor, stream)
     for one, other in zip(sensor.read(T, fields).columns, stream.columns):
         np.testing.assert_array_equal(one, other)
-    table = np.column_stack(list(fields.values()))  # as a table of a bag holds them
+    table = np.column_stack(list(fields.values()))  # format of a table of a bag
     for one, other in zip(sensor.read(T, sensor.split(table)).columns, stream.columns):
         np.testing.assert_array_equal(one, other)
     assert all(values.all() for values in sensor.sound(fields).values())
@@ -102,7 +98,8 @@ def test_what_the_filter_gets(name):
         and rows.keys() <= {"value", "std", "anchor"}
         and np.isfinite(rows["value"]).all()
     )
-    if name != "velocity":  # NaN is no measurement, wherever it stands
+    # NaN is not a measurement, in any column.
+    if name != "velocity":
         *_, broken = SENSORS[name].measured(STREAMS[name].with_values(np.full((N, 1), np.nan)))
         assert not broken.any()
 
@@ -115,10 +112,10 @@ def test_the_yaw_rate_is_a_part_of_the_velocity_stream():
 
 
 def of_twist(linear, rate, variances):
-    """The Velocity of one message: its linear velocity (3,), yaw rate and variances (4,)."""
+    """Return the Velocity of one message: linear velocity (3,), yaw rate and variances (4,)."""
     covariance = np.zeros((1, 36))
     covariance[0, [0, 7, 14, 35]] = variances
-    angular = np.array([[np.nan, 5.0, rate]])  # rates about x and y may be anything
+    angular = np.array([[np.nan, 5.0, rate]])  # rates about x and y are ignored
     return SENSORS["velocity"].read(
         T[:1],
         {
@@ -136,7 +133,7 @@ def of_twist(linear, rate, variances):
         (0.5, (0.0, 0.0, 0.0, 0.0), 0.5, 0.0),  # most drivers of wheels
         (0.0, (0.0, 0.0, 0.0, 0.0), 0.0, 0.0),
         (0.5, (0.01, 0.01, 0.01, 0.0), 0.5, 0.0),
-        (0.0, (0.01, 0.01, 1e6, 0.0), np.nan, np.inf),  # optical flow: nothing is said of the rate
+        (0.0, (0.01, 0.01, 1e6, 0.0), np.nan, np.inf),  # optical flow: no yaw rate
         (0.5, (0.01, 0.01, 0.01, 1e6), np.nan, np.inf),
         (0.5, (0.01, 0.01, 0.01, -1.0), np.nan, np.inf),
     ],

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What a model says is what the reference of ONNX says, with the same bits whatever comes with it."""
+"""A Session gives the outputs of the ONNX reference, with the same bits in every batch."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ ROW_OF_ITS_OWN = [("ReduceSum", ["x", "a"], ["y"], {"keepdims": 1})]  # of five 
 
 
 def played(path):
-    """The Session of a file after its trial, which is in this process."""
+    """Return the Session of a file after its trial, which runs in this process."""
     session = Session(path.read_bytes())
     session.alone |= not trial._is_the_same_in_any_batch(session)
     return session
@@ -40,9 +40,10 @@ def assert_plays(path, positive=False, atol=1e-6, seed=0):
     np.testing.assert_allclose(together, expected, rtol=2e-6, atol=atol)
     for n in (0, 1, 2, 3, 4, 5, 7, 16, BATCH - 1):
         for first in (0, 1, 6):
+            # The same bits are required.
             np.testing.assert_array_equal(
                 session.run(x[first : first + n]), together[first : first + n]
-            )  # to the bit
+            )
     other = np.concatenate([x[:3], 100.0 * x[3:]])
     np.testing.assert_array_equal(session.run(other)[:3], together[:3])
     np.testing.assert_array_equal(session.run(x[::-1])[::-1], together)
@@ -58,7 +59,7 @@ def test_operators_of_one_value(tmp_path, kind, width):
 @pytest.mark.parametrize("other", ["one", "column"])
 @pytest.mark.parametrize("kind", ELEMENTWISE)
 def test_operators_of_two(tmp_path, kind, other):
-    # not about 0: a quotient is then as exact
+    # Stay away from 0, so that a quotient is exact enough.
     nodes = [("Abs", ["column of x"], ["size"], {}), ("Add", ["size", "one"], ["column"], {})]
     nodes = [("MatMul", ["x", "C"], ["column of x"], {}), *nodes, (kind, ["x", other], ["y"], {})]
     assert_plays(model(tmp_path / "model.onnx", nodes), atol=1e-5)
@@ -66,7 +67,7 @@ def test_operators_of_two(tmp_path, kind, other):
 
 @pytest.mark.parametrize("kind", CONDITIONS)
 def test_conditions(tmp_path, kind):
-    """A condition decides between two numbers, by Where."""
+    """A condition selects between two numbers by Where."""
     sides = [("Less", ["x", "low"], ["p"], {}), ("Less", ["high", "x"], ["q"], {})]
     inputs = {"Not": ["p"], "And": ["p", "q"], "Or": ["p", "q"], "Equal": ["x", "size"]}
     made = [("Abs", ["x"], ["size"], {}), *sides]
@@ -114,7 +115,7 @@ def test_conditions(tmp_path, kind):
             ("Constant", [], ["k"], {"value": numpy_helper.from_array(np.float32([0.5]), "k")}),
             ("Mul", ["x", "k"], ["y"], {}),
         ],
-        [  # what the processor adds up differs with the place of a row in memory
+        [  # The bits of this sum depend on the place of a row in memory.
             ("Reshape", ["x", "s"], ["h"], {}),
             ("MatMul", ["h", "d"], ["g"], {}),
             ("Sin", ["g"], ["f"], {}),
@@ -142,8 +143,9 @@ def test_a_model_for_one_row_at_a_time(tmp_path):
 
 @pytest.mark.parametrize("width", [1, 3, 4, 5, 7, 8, 14, 33])
 def test_which_rows_are_played_by_themselves(tmp_path, width):
-    """The bits of a sum depend on where the row begins, unless it has less than 4 numbers or fills
-    packets of 4.
+    """The bits of a sum depend on the start of the row in memory.
+
+    Rows of up to 4 numbers, or of a multiple of 4, are exceptions.
     """
     assert played(model(tmp_path / "model.onnx", ROW_OF_ITS_OWN, width)).alone == (
         width > 4 and width % 4 != 0

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Functions without a name: splines and shapes, their bias, their refusals and their words."""
+"""Smooth terms: splines and shapes, their bias, refused values, and descriptions."""
 
 from dataclasses import replace
 
@@ -118,7 +118,7 @@ def test_a_factor_multiplies_the_function_but_not_its_level(shape, factor_shape,
     full = SmoothTerm(values, **settings)
     bias = full.bias(samples)
     np.testing.assert_allclose(bias, full.regressors(samples, keys) @ list(values.values()))
-    # by hand: with levels alone the factor counts for nothing, without levels it is a factor
+    # By hand: the factor has no effect on the levels and multiplies all other values.
     alone = {key: value for key, value in settings.items() if not key.startswith("factor")}
     levels = {key: value for key, value in values.items() if key.endswith("c0")}
     rest = {key: value for key, value in values.items() if not key.endswith("c0")}

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Which stamps are accepted, and which pose belongs to a stamp."""
+"""Accepted stamps, and the pose that belongs to a stamp."""
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -21,9 +21,7 @@ from uwb_tdoa_bias.common.stamps import (
 
 
 def through(stamps, reached=()):
-    """(accepted, outliers, places at which the stream jumped back) of stamps fed one after the
-    other.
-    """
+    """Feed stamps one by one. Return (accepted, outliers, places of jumps back)."""
     gate, accepted, outliers, back = StampGate(), [], [], []
     for place, t in enumerate(stamps):
         good, bad, jumped_back = gate.take(t, place, reached)
@@ -44,10 +42,10 @@ def test_a_stream_that_goes_on_is_accepted_at_once():
     [
         ([50.0, 1.0, 1.1], [], [], [2]),
         ([0.0, 60.0, 60.0, 60.1], [], [], []),
-        # it must persist for longer where another stream goes on
+        # A jump must last longer if another stream continues without it.
         ([50.0, 1.0, 1.1, 1.2, 1.3], [50.1], [], [4]),
         ([50.0, 1.0, 1.1, 1.2, 50.1], [50.1], [1, 2, 3], []),
-        # at once where another stream has made it
+        # It counts at once if another stream has made it.
         ([0.0, 60.0], [60.1], [], []),
         ([50.0, 1.0, 1.1], [1.0], [], [2]),
     ],
@@ -60,7 +58,7 @@ def test_a_jump_that_persists_is_another_time(stamps, reached, outliers, back):
 
 @given(st.floats(0.6, 1e6) | st.floats(-1e6, -1.3), st.integers(1, 25))
 def test_a_burst_of_wrong_stamps_shorter_than_a_jump_costs_its_messages_alone(off, count):
-    """At 100 Hz. Thirty in a row would be a jump."""
+    """Stamps come at 100 Hz. Thirty wrong ones in a row would be a jump."""
     stamps = [0.01 * k for k in range(200)]
     wrong = [t + off for t in stamps[100 : 100 + count]]
     accepted, outliers, back = through([*stamps[:100], *wrong, *stamps[100 + count :]], [1.0])

@@ -7,7 +7,7 @@ import sys
 
 from hypothesis import settings
 
-# the judge of derivatives lies beside the tests of the package below
+# `finite_differences` lies with the tests of uwb_tdoa_bias.
 sys.path.append(str(Path(__file__).resolve().parents[2] / "uwb_tdoa_bias" / "test"))
 
 # The first call of a compiled function takes seconds; every run tries the same examples.

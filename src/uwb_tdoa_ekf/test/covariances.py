@@ -1,13 +1,15 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Random covariances, and what makes a matrix one."""
+"""Random covariances, and a check that a matrix is a covariance."""
 
 import numpy as np
 
 
 def random_covariance(rng, n=15, spread=1.0):
-    """(n, n), symmetric positive definite; standard deviations over 10**-spread to 10**spread, any
-    correlation.
+    """Return a random covariance (n, n).
+
+    It is symmetric and positive definite. The standard deviations lie between 10**-spread and
+    10**spread; correlations are arbitrary.
     """
     factor = rng.standard_normal((n, n)) + 0.5 * np.eye(n)
     covariance = factor @ factor.T
@@ -18,8 +20,9 @@ def random_covariance(rng, n=15, spread=1.0):
 
 
 def assert_covariance(covariance, tolerance=1e-9):
-    """Finite, symmetric, and positive definite: no eigenvalue of the correlation matrix below
-    -tolerance.
+    """Check that a matrix is finite, symmetric, and positive definite.
+
+    No eigenvalue of its correlation matrix may be below -tolerance.
     """
     assert np.isfinite(covariance).all()
     std = np.sqrt(np.einsum("...ii->...i", covariance))

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Feed a flight to the core, and judge what comes out."""
+"""Feed a flight to the core and check the results."""
 
 from covariances import assert_covariance
 from flights import kept, measurements, position_at
@@ -12,8 +12,9 @@ from uwb_tdoa_ekf.core.memory import Measurements, new_state
 
 
 def drive(flight, config=None, state=None, cuts=()):
-    """Odometry and residuals of the engine, fed in the pieces between the stamps `cuts`: fields by
-    attribute.
+    """Return odometry and residuals of the engine, with fields as attributes.
+
+    The flight is fed in pieces between the stamps `cuts`.
     """
     state = state_for(flight) if state is None else state
     parameters, whole, parts = (config or FilterConfig()).parameters(), measurements(flight), []
@@ -25,24 +26,24 @@ def drive(flight, config=None, state=None, cuts=()):
 
 
 def state_for(flight):
-    """FilterState of a filter that has seen nothing of a Flight."""
+    """Return the FilterState of a filter before its first measurement of a Flight."""
     return new_state(flight.anchors.positions)
 
 
 def errors(flight, odometry):
-    """Distances to the true positions, (n,) m."""
+    """Return the distances to the true positions, (n,), in m."""
     return np.linalg.norm(odometry.x[:, :3] - position_at(flight, odometry.t), axis=1)
 
 
 def assert_equal(left, right):
-    """Two pairs of odometry and residuals, to the bit."""
+    """Check that two pairs of odometry and residuals agree to the bit."""
     for one, other in zip(left, right):
         for name in one.dtype.names:
             np.testing.assert_array_equal(one[name], other[name], err_msg=name)
 
 
 def assert_sound(state, odometry):
-    """Finite states, unit quaternions, covariances."""
+    """Check for finite states, unit quaternions and valid covariances."""
     assert np.isfinite(odometry.x).all()
     np.testing.assert_allclose(np.linalg.norm(odometry.x[:, 6:10], axis=1), 1.0, atol=1e-9)
     assert (np.diff(odometry.t) >= 0.0).all()
@@ -56,5 +57,5 @@ def assert_sound(state, odometry):
 
 
 def cut(stream, low, high):
-    """The part of an Imu or Tdoas between two stamps."""
+    """Return the part of an Imu or Tdoas between two stamps."""
     return kept(stream, (stream.t >= low) & (stream.t < high))

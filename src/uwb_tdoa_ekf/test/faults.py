@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Faults of drivers put into a simulated flight, as columns of what is sent and when.
+"""Driver faults in a simulated flight, as columns of the sent messages and their arrival.
 
 Without ROS.
 """
@@ -20,7 +20,7 @@ LATENCY = 0.002  # s
 
 
 def put(columns, place, value):
-    """The columns with one replaced."""
+    """Return the columns with one replaced."""
     return (*columns[:place], value, *columns[place + 1 :])
 
 
@@ -33,13 +33,13 @@ def of_tdoa(change):
 
 
 def second_tag(columns, rng):
-    """Every TDOA is followed by one of a tag 2 m away."""
+    """Add the TDOA of another tag after every TDOA. It differs by 2 m."""
     other = put(columns, D, columns[D] + 2.0 * np.sign(rng.normal(size=len(columns[D]))))
     return merged(columns, put(other, T, other[T] + 0.003))
 
 
 def repeated(columns, rng):
-    """Every inertial sample ten times, a millisecond apart."""
+    """Repeat every inertial sample ten times, a millisecond apart."""
     parts = (
         put(put(columns, T, columns[T] + 0.001 * k), ARRIVAL, columns[ARRIVAL] + 0.001 * k)
         for k in range(10)
@@ -53,7 +53,8 @@ def merged(*parts):
     return tuple(column[order] for column in columns)
 
 
-FAULTS = {  # name: (what it does to the columns of a flight, what is said)
+# name: (function of the columns of a flight, text of the finding)
+FAULTS = {
     "IMU in g": (of_imu(lambda c, rng: put(c, ACCEL, c[ACCEL] / 9.81)), "accelerometer is in g"),
     "gyroscope in degrees/s": (
         of_imu(lambda c, rng: put(c, GYRO, np.rad2deg(c[GYRO]))),
@@ -89,11 +90,12 @@ FAULTS = {  # name: (what it does to the columns of a flight, what is said)
         "-z points up",
     ),
 }
-OF_THE_CLOCK = {"all 10 s ahead"}  # which no stream shows by itself
+# A common clock error does not show in the streams.
+OF_THE_CLOCK = {"all 10 s ahead"}
 
 
 def _flight():
-    """A flight that hears its anchors one after the other, as TDOA2 has them."""
+    """Return a flight that hears its anchors one after the other, as with TDOA2."""
     flight = fly(
         seed=5,
         duration=30.0,
@@ -116,8 +118,14 @@ FLIGHT = _flight()
 
 
 def columns_of(begin, parts):
-    """imu and tdoa columns of the flight that begins at `begin` s of the clock, with [(from s, to
-    s, names of faults)].
+    """Return the imu and tdoa columns of a flight.
+
+    Parameters
+    ----------
+    begin : float
+        Begin of the flight, in s of the clock.
+    parts : list of (from, to, names of faults)
+        Times in s after `begin`.
     """
     rng = np.random.default_rng(3)
     end = parts[-1][1]

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Small simulated flights whose every error is known, for the tests of the filter."""
+"""Small simulated flights with known errors, for the tests of the filter."""
 
 from dataclasses import replace
 
@@ -18,15 +18,16 @@ GRAVITY = 9.81
 
 
 def corners(size=(7.0, 8.0, 3.0), first_id=10):
-    """Anchors at the corners of a box with one corner at the origin; their ids are not their rows."""
+    """Return Anchors at the corners of a box with one corner at the origin.
+
+    Their ids differ from their rows.
+    """
     box = np.stack(np.meshgrid(*([0.0, 1.0],) * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     return Anchors.from_positions(box * size, ids=first_id + np.arange(8)[::-1])
 
 
 class Wave:
-    """A smooth path: every coordinate and every Euler angle is a sine of time, so that all
-    derivatives are exact.
-    """
+    """A smooth path with exact derivatives: each coordinate and Euler angle is a sine of time."""
 
     def __init__(self, rng, middle, reach=1.5, tilt=0.15, yaw=0.5):
         self.middle = np.asarray(middle, dtype=float)
@@ -38,7 +39,11 @@ class Wave:
         self.angle_phase = rng.uniform(0.0, 2.0 * np.pi, 3)
 
     def motion(self, t):
-        """p, v (n, 3) m, m/s, world; Rotation body to world; specific force and body rates (n, 3)."""
+        """Return the motion at stamps t.
+
+        These are p and v (n, 3) in the world in m and m/s, and the Rotation from body to world.
+        Then follow specific force and body rates (n, 3) in m/s^2 and rad/s.
+        """
         t = np.asarray(t)[:, None]
         p = self.middle + self.size * np.sin(self.pace * t + self.phase)
         v = self.size * self.pace * np.cos(self.pace * t + self.phase)
@@ -76,10 +81,22 @@ def fly(
     hover=False,
     begin=0.0,
 ):
-    """A Flight with random pairs of anchors, and the exact pose every 5 ms. The errors are those of
-    the filter's model: tdoa_std, m, white; accel_noise, m/s^2/sqrt(Hz), and gyro_noise,
-    rad/s/sqrt(Hz), white; accel_bias, m/s^2, and gyro_bias, rad/s, standard deviations of the first
-    bias; their random walks per sqrt(s); outliers: share of TDOAs that are metres off.
+    """Simulate a flight with TDOAs of random pairs of anchors and the exact pose every 5 ms.
+
+    The errors follow the model of the filter.
+
+    Parameters
+    ----------
+    tdoa_std : float
+        White noise of TDOAs, in m.
+    accel_noise, gyro_noise : float
+        White noise densities, in m/s^2/sqrt(Hz) and rad/s/sqrt(Hz).
+    accel_bias, gyro_bias : float
+        Standard deviations of the first bias, in m/s^2 and rad/s.
+    accel_bias_walk, gyro_bias_walk : float
+        Random walks of the biases, per sqrt(s).
+    outliers : float
+        Share of TDOAs that are metres off.
     """
     rng = np.random.default_rng(seed)
     anchors = corners() if anchors is None else anchors
@@ -93,7 +110,7 @@ def fly(
     rates = rates + _inertial_error(
         rng, len(imu_t), imu_rate, gyro_noise, gyro_bias, gyro_bias_walk
     )
-    # off the grid of the IMU, so that no two stamps of different streams agree
+    # TDOAs are off the grid of the IMU: streams share no stamp.
     tdoa_t = (
         np.arange(int(duration * tdoa_rate)) + rng.uniform(0.1, 0.9, int(duration * tdoa_rate))
     ) / tdoa_rate
@@ -120,8 +137,16 @@ def fly(
 def with_sensors(
     flight, seed=0, rate=25.0, height_std=0.01, pressure_std=0.05, drift=0.0, velocity_std=0.05
 ):
-    """The flight of `fly` with a range finder over ground at z = 0, a barometer that drifts by
-    `drift` m/s, and a velocity; standard deviations in m, m and m/s, white.
+    """Add height, pressure and velocity to a flight of `fly`.
+
+    The ground of the range finder is at z = 0. The noise is white.
+
+    Parameters
+    ----------
+    height_std, pressure_std, velocity_std : float
+        Standard deviations, in m, m and m/s.
+    drift : float
+        Drift of the barometer, in m/s.
     """
     rng, begin = np.random.default_rng(seed), flight.truth.t[0]
     since = (np.arange(int((flight.truth.t[-1] - begin) * rate)) + 0.37) / rate
@@ -143,9 +168,7 @@ def with_sensors(
 
 
 def with_ranges(flight, seed=0, rate=200.0, std=0.02):
-    """The flight of `fly` with distances to its anchors, each in its turn; standard deviation in m,
-    white.
-    """
+    """Add distances to the anchors in turn to a flight of `fly`, with white noise of `std` m."""
     t = np.arange(flight.truth.t[0], flight.truth.t[-1], 1.0 / rate)
     row, p = np.arange(len(t)) % len(flight.anchors), position_at(flight, t)
     d = np.linalg.norm(p - flight.anchors.positions[row], axis=1) + std * np.random.default_rng(
@@ -155,23 +178,23 @@ def with_ranges(flight, seed=0, rate=200.0, std=0.02):
 
 
 def only_ranges(std=0.1, rate=100.0):
-    """A Flight of `fly` with distances to its anchors instead of TDOAs."""
+    """Return a flight of `fly` with distances to its anchors instead of TDOAs."""
     return without_tdoas(with_ranges(fly(seed=1), 3, rate, std))
 
 
 def kept(stream, rows):
-    """Some rows of an Imu, Tdoas or another stream of columns."""
+    """Return some rows of an Imu, Tdoas or another stream of columns."""
     columns = {name: column[rows] for name, column in vars(stream).items() if column is not None}
     return replace(stream, **columns)
 
 
 def without_tdoas(flight, low=-np.inf, high=np.inf):
-    """The Flight without its TDOAs between two stamps, s."""
+    """Return the Flight without its TDOAs between two stamps, in s."""
     return replace(flight, tdoa=kept(flight.tdoa, (flight.tdoa.t < low) | (flight.tdoa.t > high)))
 
 
 def errors_of(flight, odometry, after=-np.inf):
-    """Position errors (n, 3) m from the stamp `after` on, and their NEES (n,)."""
+    """Return position errors (n, 3), in m, after the stamp `after`, and their NEES (n,)."""
     late = odometry.t > after
     error = odometry.p[late] - position_at(flight, odometry.t[late])
     information = np.linalg.inv(odometry.covariance[late, :3, :3])
@@ -179,7 +202,7 @@ def errors_of(flight, odometry, after=-np.inf):
 
 
 def rms_error(flight, odometry, after=2.0):
-    """RMS error of positions, m, from `after` s after the first on."""
+    """Return the RMS position error, in m, from `after` s after the first odometry on."""
     error, _ = errors_of(flight, odometry, odometry.t[0] + after)
     return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
 
@@ -191,7 +214,7 @@ def _inertial_error(rng, n, rate, noise, bias, walk):
 
 
 def measurements(flight):
-    """A Flight as the core is fed with it."""
+    """Return a Flight as Measurements for the core."""
     imu, d, rows = flight.imu, flight.tdoa, flight.anchors.index
     return Measurements(
         structured(IMU_SAMPLE, imu.t, imu.gyro, imu.accel),
@@ -200,17 +223,18 @@ def measurements(flight):
 
 
 def position_at(flight, t):
-    """True positions (n, 3) m at stamps t."""
+    """Return the true positions (n, 3), in m, at stamps t."""
     return np.stack([np.interp(t, flight.truth.t, flight.truth.p[:, k]) for k in range(3)], axis=1)
 
 
-# m, its bounds with the anchors of corners()
+# Bounds of the workspace with the anchors of corners(), in m.
 WORKSPACE = np.array([[-1.0, -1.0, -1.5], [8.0, 9.0, 4.5]])
 
 
 def leaving(flight):
-    """A hovering Flight with the TDOAs of a tag that leaves its workspace along all axes, level, at
-    constant velocity, until 3 s.
+    """Replace the TDOAs of a hovering Flight: until 3 s, the tag leaves its workspace.
+
+    It moves level, at constant velocity, along all axes.
     """
     t, anchors = flight.tdoa.t, flight.anchors
     p = np.array([6.0, 7.0, 3.0]) + np.minimum(t, 3.0)[:, None] * [1.2, 1.2, 1.0]

@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Simulated halls in which a tag hears the anchors within the radio's reach, and a room in which it
-hears few TDOAs, for tests and tables.
+"""Simulated halls and a room, for tests and tables.
+
+In a hall, a tag hears the anchors within the reach of the radio. In the room, it hears few TDOAs.
 """
 
 from dataclasses import dataclass
@@ -14,12 +15,13 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
 from uwb_tdoa_bias.common.geometry import tdoa
 
-RATE = 100.0  # Hz, of inertial samples and of the truth
-HEIGHT = 1.2  # m, of the tag above its floor
-OUTLIERS, OUTLIER_SIZE = 0.05, 2.0  # share, and mean size, m, exponential, of either sign
-NOISE, DELAY = 0.1, 0.1  # m, of a TDOA, and of each anchor
+RATE = 100.0  # Hz, rate of inertial samples and ground truth
+HEIGHT = 1.2  # m, height of the tag above its floor
+OUTLIERS, OUTLIER_SIZE = 0.05, 2.0  # share, and mean of the exponential size in m, of either sign
+NOISE, DELAY = 0.1, 0.1  # m, standard deviation of a TDOA, and delay of an anchor
 FLOOR = 8.0  # m between two floors
-HALLS = {  # m by m, anchors along each, m of reach
+# size in m, number of anchors along each side, reach in m
+HALLS = {
     "100 x 60 m, 77 anchors": ((100.0, 60.0), (11, 7), 18.0),
     "200 x 100 m, 231 anchors": ((200.0, 100.0), (21, 11), 18.0),
     "300 x 200 m, 294 anchors": ((300.0, 200.0), (21, 14), 27.0),
@@ -27,7 +29,8 @@ HALLS = {  # m by m, anchors along each, m of reach
     "1000 x 640 m, 10000 anchors": ((1000.0, 640.0), (125, 80), 18.0),
 }
 ROOM = (8.0, 6.0)
-ROOMS = {  # of 8 x 6 m: where the anchors are
+# positions of the anchors in a room of 8 x 6 m
+ROOMS = {
     "corners": [(x, y, z) for x in (0.0, 8.0) for y in (0.0, 6.0) for z in (0.2, 2.5)],
     "ceiling, 4": [(x, y, 2.5) for x in (0.0, 8.0) for y in (0.0, 6.0)],
     "ceiling, 8": [(x, y, 2.5) for x in (0.0, 4.0, 8.0) for y in (0.0, 3.0, 6.0)][:8],
@@ -38,8 +41,12 @@ ROOMS = {  # of 8 x 6 m: where the anchors are
 
 @dataclass(frozen=True)
 class Hall:
-    """anchors : Anchors; size : (x, y) m; reach : m; floor : (N,) number of the floor of each
-    anchor, heard on that alone.
+    """Anchors of a hall with one or more floors.
+
+    anchors : Anchors.
+    size : (x, y), in m.
+    reach : reach of the radio, in m.
+    floor : (N,) floor of each anchor. A tag hears only the anchors of its floor.
     """
 
     anchors: Anchors
@@ -49,8 +56,9 @@ class Hall:
 
 
 def hall(name, floors=1, seed=7):
-    """Hall of HALLS: a grid of anchors, 2.5 to 6 m high, a third of them 0.4 to 1.2 m; so many
-    floors above each other.
+    """Return a Hall of HALLS with the given number of floors above each other.
+
+    The anchors form a grid. Two thirds hang at 2.5 to 6 m, one third at 0.4 to 1.2 m.
     """
     size, counts, reach = HALLS[name]
     rng, n, parts = np.random.default_rng(seed), counts[0] * counts[1], []
@@ -72,15 +80,16 @@ def hall(name, floors=1, seed=7):
 
 
 def room(name):
-    """Hall of ROOMS, in which every anchor is heard."""
+    """Return the Hall of a room of ROOMS. A tag hears every anchor."""
     return Hall(
         Anchors.from_positions(np.array(ROOMS[name])), ROOM, 100.0, np.zeros(len(ROOMS[name]))
     )
 
 
 def walk(size, duration, rng, speed):
-    """Level path of somebody who turns smoothly towards one place after another: (n, 2) m and
-    heading (n,) rad, every 1 / RATE s.
+    """Return a level path that turns smoothly from one random goal to the next.
+
+    Returns positions (n, 2), in m, and headings (n,), in rad, every 1 / RATE s.
     """
     n, dt = int(duration * RATE) + 1, 1.0 / RATE
     margin = np.minimum(3.0, 0.2 * np.array(size))
@@ -104,10 +113,18 @@ def walk(size, duration, rng, speed):
 
 
 def fly(where, seed, duration=20.0, rate=200.0, blinks=0.0, speed=1.5, dead=(), lift=None):
-    """Flight of a tag that walks in a Hall. rate : TDOAs per second between pairs of those heard;
-    blinks : per second instead, each of all TDOAs with the first of those heard; dead : (begin,
-    end) s in which nothing is heard; lift : s at which it is carried one floor up, in 10 s, in
-    which nothing is heard.
+    """Simulate a flight of a tag that walks in a Hall.
+
+    Parameters
+    ----------
+    rate : float
+        TDOAs per second, between random pairs of the anchors in reach.
+    blinks : float
+        Blinks per second instead. Each gives the TDOAs of all anchors in reach with the first one.
+    dead : list of (begin, end)
+        Times without TDOAs, in s.
+    lift : float, optional
+        Time at which the tag is carried one floor up, in s. This takes 10 s without TDOAs.
     """
     rng = np.random.default_rng([seed, 5])
     places, heading = walk(where.size, duration, rng, speed)

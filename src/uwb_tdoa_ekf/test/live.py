@@ -15,7 +15,7 @@ IMU, TDOA, FIRST_SENSOR = range(3)
 
 
 def messages(flight):
-    """All (stamp, stream, place in the stream) of a flight in stamp order, inertial samples first."""
+    """Return all (stamp, stream, place in the stream) in stamp order, inertial samples first."""
     parts = [flight.imu, flight.tdoa, *(getattr(flight, name) for name in STREAMS)]
     streams = enumerate(part.t if part is not None else () for part in parts)
     return sorted((t, stream, i) for stream, stamps in streams for i, t in enumerate(stamps))
@@ -35,8 +35,9 @@ def send(estimator, flight, stream, i):
 
 
 def arriving(flight, rng, imu_delay=0.0, tdoa_delay=0.0, imu_jitter=0.0, tdoa_jitter=0.0):
-    """The messages in the order in which they come in after such delays: constant, and uniform from
-    0 to jitter, s.
+    """Return the messages in their order of arrival.
+
+    Each delay is the sum of a constant and a uniform value between 0 and the jitter, in s.
     """
     delay, jitter = {IMU: imu_delay, TDOA: tdoa_delay}, {IMU: imu_jitter, TDOA: tdoa_jitter}
     return sorted(
@@ -46,8 +47,14 @@ def arriving(flight, rng, imu_delay=0.0, tdoa_delay=0.0, imu_jitter=0.0, tdoa_ji
 
 
 def feed(estimator, flight, order=None, advance=None):
-    """Everything (Odometry, Residuals) that the estimator gives for the messages in this order
-    (default: by stamp). advance(): whether to advance after a message (default: always).
+    """Return (Odometry, Residuals) of the estimator for all messages.
+
+    Parameters
+    ----------
+    order : list of messages, optional
+        Order of the messages; default: by stamp.
+    advance : callable, optional
+        Whether to advance after a message; default: always.
     """
     parts = []
     for _t, stream, i in messages(flight) if order is None else order:
@@ -59,7 +66,7 @@ def feed(estimator, flight, order=None, advance=None):
 
 
 def joined(parts):
-    """One Odometry or Residuals out of many."""
+    """Concatenate many Odometry or Residuals."""
     kind = type(parts[0])
     return kind(
         *(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(kind))
@@ -67,7 +74,7 @@ def joined(parts):
 
 
 def assert_same(left, right, tolerance=0.0):
-    """Two Odometry, or two Residuals, agree in everything."""
+    """Check that two Odometry, or two Residuals, agree in every field."""
     for field in fields(left):
         a, b = getattr(left, field.name), getattr(right, field.name)
         assert len(a) == len(b), field.name
@@ -79,7 +86,7 @@ def assert_same_as_offline(flight, config=None, **feeding):
     odometry, residuals = feed(estimator, flight, **feeding)
     expected = run_offline(flight, config)
     assert_same(odometry, expected.odometry)
-    # what is refused is told at once
+    # Residuals of refused TDOAs come at once, so compare by stamp.
     assert_same(by_stamp(residuals), by_stamp(expected.residuals))
     assert {name: estimator.counts[name] for name in VERDICTS.values()} == expected.counts
 

@@ -1,8 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What watching the anchors in flight takes, by their number: memory, and time for each slice of
-half a second.
-"""
+"""Memory, and time per slice of half a second, of the Monitor by number of anchors."""
 
 import time
 import tracemalloc
@@ -15,13 +13,13 @@ from uwb_tdoa_ekf.monitoring.monitor import Monitor
 from uwb_tdoa_ekf.monitoring.slices import LENGTH
 from uwb_tdoa_ekf.results import Odometry, Residuals
 
-RATE = 400  # Hz, of TDOAs
-# anchors, and how many of them are heard at a time
+RATE = 400  # Hz, rate of TDOAs
+# (installed anchors, anchors heard at a time)
 CASES = ((8, 8), (100, 30), (100, 100), (1000, 30), (1000, 200))
 
 
 def odometry_of(t, p, v=(1.0, 0.0, 0.0), gyro_bias=0.0):
-    """Odometry at places p (n, 3); gyro_bias about z, (n,) or one for all."""
+    """Return Odometry at positions p (n, 3). `gyro_bias` is about z, (n,) or a scalar."""
     n = len(t)
     zeros = np.zeros((n, 3))
     bias = np.column_stack([np.zeros((n, 2)), np.broadcast_to(gyro_bias, n)])
@@ -38,14 +36,15 @@ def odometry_of(t, p, v=(1.0, 0.0, 0.0), gyro_bias=0.0):
 
 
 def residuals_of(t, a, b, innovation, verdict=USED):
-    """Residuals of TDOAs between anchors with ids a and b."""
+    """Return Residuals of TDOAs between anchors with ids a and b."""
     one = np.ones(len(t))
     return Residuals(t, a, b, innovation, one, one, np.broadcast_to(verdict, len(t)))
 
 
 def fly(monitor, anchors, heard, slices, first=0, seed=0):
-    """Give a Monitor so many slices of a flight along a row of Anchors, of which it hears the
-    nearest `heard`.
+    """Feed `slices` slices of a flight along a row of Anchors to a Monitor.
+
+    The tag hears the nearest `heard` anchors.
     """
     rng, n = np.random.default_rng(seed), round(RATE * LENGTH)
     for k in range(first, first + slices):
@@ -60,7 +59,7 @@ def fly(monitor, anchors, heard, slices, first=0, seed=0):
 
 
 def row_of(n):
-    """n Anchors of a hall that is as long as it needs to be."""
+    """Return n Anchors in a row. The length of the hall is proportional to n."""
     rng = np.random.default_rng(n)
     return Anchors.from_positions(
         np.column_stack([np.arange(n) * 0.5 - 4.0, rng.uniform(-6.0, 6.0, (n, 2))])
@@ -68,8 +67,14 @@ def row_of(n):
 
 
 def cost(n, heard, slices):
-    """(largest memory, bytes; processor time of a slice, s) of a Monitor of n anchors, after so
-    many slices.
+    """Return (largest memory in bytes, processor time of a slice in s) of a Monitor.
+
+    Parameters
+    ----------
+    n, heard : int
+        Number of anchors, and of anchors heard at a time.
+    slices : int
+        Number of slices before the time is measured.
     """
     anchors = row_of(n)
     tracemalloc.start()

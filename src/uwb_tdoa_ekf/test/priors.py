@@ -11,13 +11,16 @@ from uwb_tdoa_ekf.core.update import project
 
 
 class Prior:
-    """A HYPOTHESIS and an INNOVATION, filled in and projected; the same as a dense Jacobian row h
-    (15,).
+    """A random HYPOTHESIS and a projected INNOVATION.
+
+    `h` (15,) is the same measurement as a dense row of the Jacobian.
     """
 
     def __init__(self, seed, states=(0, 1, 2), surprise=1.0):
-        """states : the error states measured; surprise : size of the innovation in its standard
-        deviations.
+        """Draw a prior.
+
+        states : measured error states.
+        surprise : size of the innovation, in its standard deviations.
         """
         self.rng = rng = np.random.default_rng(seed)
         self._ekf = new_state(np.zeros((1, 3))).record
@@ -40,11 +43,11 @@ class Prior:
         project(self.hypothesis.P, self.innovation)
 
     def textbook(self, noise):
-        """State and covariance after a Kalman update with this noise variance."""
+        """Return state and covariance of a Kalman update with this noise variance."""
         return self.after(*kalman(self.hypothesis.P, self.h, self.innovation.value, noise))
 
     def after(self, error, covariance):
-        """State and covariance after an error (15,) was estimated with this covariance."""
+        """Return the state after an error estimate (15,), and the given covariance."""
         x = self.hypothesis.x.copy()
         inject(x, error, 1.0)
         return x, covariance
@@ -58,13 +61,13 @@ class Prior:
 
 
 def kalman(P, h, innovation, noise):
-    """Error (n,) and covariance of the textbook update, by matrices."""
+    """Return error (n,) and covariance of the textbook update, by matrices."""
     gain = P @ h / (h @ P @ h + noise)
     return gain * innovation, (np.eye(len(h)) - np.outer(gain, h)) @ P
 
 
 def with_offset(prior):
-    """Random offset states for a prior; the joint covariance (18, 18)."""
+    """Set random offset states of a prior and return the joint covariance (18, 18)."""
     joint = np.zeros((18, 18))
     joint[:15, :15] = prior.hypothesis.P
     link = 0.1 * prior.rng.standard_normal((3, 15)) @ np.linalg.cholesky(prior.hypothesis.P).T

@@ -1,8 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The real ros2 command: that of the ROS installation, or the one in ../shared/ros2cli beside the
-checkout, made ready once.
-"""
+"""The real ros2 command: from the ROS installation, or built once from ../shared/ros2cli."""
 
 import fcntl
 from importlib.util import find_spec
@@ -18,16 +16,17 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[3]
 FOLDER, MADE = ROOT.parent / "shared" / "ros2cli", ROOT / "build" / "ros2cli"
-WITH = "psutil", "argcomplete", "packaging"  # that it imports
-PATIENCE = 180.0  # s for anything that must happen
-# What asyncio says when SIGINT comes between two statements of the loop of launch, which then ends
-# with 1, however well its nodes end.
+WITH = "psutil", "argcomplete", "packaging"  # required by ros2cli
+PATIENCE = 180.0  # s, limit for every wait
+# asyncio prints this if SIGINT comes between two statements of the loop of launch. Then launch ends
+# with exit code 1, even if all nodes end well.
 FAULT_OF_LAUNCH = "Task was destroyed but it is pending!"
+# Its code is executed, so only the user or root may write to it.
 OURS = (
     FOLDER.is_dir()
     and FOLDER.stat().st_uid in (os.getuid(), 0)
     and not FOLDER.stat().st_mode & 0o022
-)  # what is in it is run
+)
 WHY_NOT = (
     None
     if shutil.which("ros2") or OURS and all(map(find_spec, WITH))
@@ -38,7 +37,7 @@ WHY_NOT = (
 
 
 def ros2():
-    """The words before those of a ros2 command."""
+    """Return the first words of a ros2 command."""
     if WHY_NOT:
         pytest.skip(WHY_NOT)
     if shutil.which("ros2"):
@@ -85,13 +84,23 @@ def ros2():
 
 
 class Launch:
-    """A running `ros2 launch`, in a process group of its own as under a terminal. lines : what it
-    and its nodes wrote so far; over : whether all of it has ended.
+    """A running `ros2 launch` in its own process group, as in a terminal.
+
+    lines : output of launch and its nodes.
+    over : whether all processes have ended.
     """
 
     def __init__(self, folder, *words, path=()):
-        """folder : empty, for its temporary files and logs; words : after `ros2 launch`; path :
-        folders that come first in PATH.
+        """Start `ros2 launch`.
+
+        Parameters
+        ----------
+        folder : Path
+            Empty folder for temporary files and logs.
+        words : str
+            Arguments of `ros2 launch`.
+        path : sequence of Path
+            Folders in front of PATH.
         """
         self.temporary = folder / "temporary"
         self.temporary.mkdir()
@@ -101,7 +110,7 @@ class Launch:
             "PYTHONUNBUFFERED": "1",
         }
         variables["PATH"] = os.pathsep.join([*map(str, path), os.environ["PATH"]])
-        # without one launch passes Ctrl-C on, and nodes that have it already get it twice
+        # Without a terminal, launch forwards Ctrl-C. Nodes then receive it twice.
         self._terminal, stdin = os.openpty()
         self.process = subprocess.Popen(
             [*ros2(), "launch", *words],
@@ -131,26 +140,25 @@ class Launch:
         return "".join(self.lines)
 
     def wait(self, text, count=1):
-        """Wait until a text was written so often."""
+        """Wait until a text was printed `count` times."""
         with self._news:
             self._news.wait_for(lambda: self.over or self.said.count(text) >= count, PATIENCE)
         assert self.said.count(text) >= count, f"waited for {text}: {self.said}"
 
     def ended(self):
-        """The exit code, when it has ended by itself."""
+        """Wait for the end and return the exit code."""
         code = self.process.wait(timeout=PATIENCE)
         self.reader.join(timeout=PATIENCE)
         return code
 
     def interrupt(self):
-        """Ctrl-C, which ends all nodes in good order."""
+        """Send Ctrl-C and check that all nodes end cleanly."""
         started = self.said.count("process started with pid")
         os.killpg(self.process.pid, signal.SIGINT)
         code = self.ended()
         if FAULT_OF_LAUNCH in self.said:
-            lines = [
-                line for line in self.lines if line.startswith("[")
-            ]  # of nodes; launch has no such mark
+            # Lines of nodes begin with "["; the traceback of launch does not.
+            lines = [line for line in self.lines if line.startswith("[")]
         else:
             lines = self.lines
             assert code == 0, self.said
@@ -161,7 +169,7 @@ class Launch:
         ), self.said
 
     def pid_of(self, node):
-        """Process id of the node that was started last by this name."""
+        """Return the process id of the last started node with this name."""
         line = [
             line
             for line in self.lines
@@ -170,7 +178,7 @@ class Launch:
         return int(line.rpartition("[")[2].partition("]")[0])
 
     def close(self):
-        """End what is left."""
+        """Kill all remaining processes."""
         try:
             os.killpg(self.process.pid, signal.SIGKILL)
         except ProcessLookupError:

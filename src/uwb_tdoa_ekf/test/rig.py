@@ -1,8 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The real nodes as processes of their own, and a node of the test that plays their surroundings
-and listens.
-"""
+"""The real nodes as separate processes, and a test node that publishes and receives."""
 
 from copy import copy
 from dataclasses import dataclass, replace
@@ -34,17 +32,17 @@ from uwb_tdoa_bias.ros.topics import STREAM_QOS
 from uwb_tdoa_ekf.results import VERDICTS, rows_of
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa, TdoaCorrected, TdoaResidual
 
-EPOCH = 1_700_000_000  # s; stamps of today's size
-# s for anything that must happen; the very first start of ekf_node compiles the filter
+EPOCH = 1_700_000_000  # s, so that stamps have a current date
+# s, limit for every wait. The very first start of ekf_node compiles the filter.
 PATIENCE = 180.0
-AGAIN = 10.0  # s after which a node that has not answered is asked once more
+AGAIN = 10.0  # s without an answer before a request is repeated
 MODULES = {
     "bias_node": "uwb_tdoa_bias.bias_node",
     "ekf_node": "uwb_tdoa_ekf.ekf_node",
     "debias_node": "uwb_tdoa_ekf.debias_node",
     "localization_node": "uwb_tdoa_ekf.localization_node",
 }
-# nodes of one process, which hand over to each other
+# nodes of one process that exchange messages directly
 MEMBERS = {"localization_node": ("bias_node", "ekf_node")}
 OUTPUTS = {
     "bias_node": ("uwb/tdoa_corrected",),
@@ -73,7 +71,10 @@ STREAMS = {
 
 
 def _rigs():
-    """make_rig() gives a Rig in a namespace of its own; what it started ends with the test."""
+    """Give make_rig(), which returns a Rig in its own namespace.
+
+    The processes of the Rig end with the test.
+    """
     rclpy.init()
     rigs, domain = [], os.environ.get("ROS_DOMAIN_ID", "0")
 
@@ -93,7 +94,7 @@ make_shared_rig = pytest.fixture(scope="module", name="make_shared_rig")(_rigs)
 
 
 def recording(seconds=4.0, imu_rate=200.0, tdoa_rate=100.0):
-    """A Flight whose stamps are what a node reads from the messages that hold them."""
+    """Return a Flight with the stamps that a node reads from its messages."""
     flight = fly(
         seed=5,
         duration=seconds,
@@ -110,39 +111,41 @@ def recording(seconds=4.0, imu_rate=200.0, tdoa_rate=100.0):
 
 
 def vector(v):
-    """Its coordinates."""
+    """Return the coordinates of a vector message."""
     return v.x, v.y, v.z
 
 
 def positions(messages):
-    """Positions (n, 3) m of messages of odometry."""
+    """Return the positions (n, 3), in m, of odometry messages."""
     return np.array([vector(message.pose.pose.position) for message in messages])
 
 
 def stamp(t, epoch=EPOCH):
-    """Stamp of t s after the epoch."""
+    """Return the stamp t s after the epoch."""
     second, nanosecond = divmod(round(t * 1e9), 10**9)
     return Time(sec=epoch + second, nanosec=nanosecond)
 
 
 def seconds_of(stamp, epoch=EPOCH):
-    """Seconds after the epoch, as a node reads them if its first stamp is in the epoch's first
-    second.
+    """Return the seconds after the epoch.
+
+    A node reads the same if its first stamp is in the first second of the epoch.
     """
     return ((stamp.sec - epoch) * 10**9 + stamp.nanosec) / 1e9
 
 
 @dataclass
 class Process:
-    """A node in a process group of its own; lines: what it wrote so far."""
+    """A node in its own process group. `lines` holds its output."""
 
     process: subprocess.Popen
     lines: list
     reader: threading.Thread
 
     def stop(self, number=signal.SIGINT):
-        """Signal the group; returns the exit code, and for how many seconds it neither ran nor
-        waited for a core before it ended.
+        """Send a signal to the process group and wait for its end.
+
+        Returns the exit code, and the time in s that the process neither ran nor waited for a core.
         """
         threads = {}
         started, before, slept = time.monotonic(), worked(self.process.pid, threads), 0.0
@@ -156,15 +159,23 @@ class Process:
 
 
 class Rig:
-    """Starts nodes in `namespace`, publishes what they take, keeps what they publish.
+    """Start nodes in `namespace`, publish their inputs, and keep their outputs.
 
     received : {topic: messages in order of arrival}, for the streams and "/tf".
     """
 
     def __init__(self, namespace, listen=(*STREAMS, "/tf"), reliable=True, latched=True):
-        """listen : topics to keep; reliable : make the streams so, for a test that cannot bear the
-        loss of a message;
-        latched : have a latched publisher of anchors."""
+        """Create the test node.
+
+        Parameters
+        ----------
+        listen : sequence of str
+            Topics to keep.
+        reliable : bool
+            Use reliable streams, for tests in which no message may be lost.
+        latched : bool
+            Create a latched publisher of anchors.
+        """
         self.namespace, self.domain = namespace, os.environ.get("ROS_DOMAIN_ID", "0")
         self.node = rclpy.create_node("rig", namespace=namespace)
         self._reliable, self._qos = reliable, copy(STREAM_QOS)
@@ -208,10 +219,10 @@ class Rig:
             self._status.update((status.name, status) for status in message.status)
 
     def start(self, *names, **arguments):
-        """Start nodes, with arguments by name of the node; returns when they hear what they need,
-        and we hear them.
+        """Start nodes, with arguments by name of the node. Return when all endpoints are connected.
 
-        Topics that no started node publishes are played by us. From then on nothing is lost.
+        The rig publishes the topics that no started node publishes. After the return, no message is
+        lost.
         """
         for name in names:
             command = [
@@ -248,7 +259,10 @@ class Rig:
         return [self._processes[name] for name in names]
 
     def meet(self, *names):
-        """Returns when nodes, whoever starts them, hear what they need, and we hear them."""
+        """Wait until the given nodes and the rig receive each other.
+
+        Any process may have started the nodes.
+        """
         made = {topic for name in names for topic in OUTPUTS[name]}
         taken = {topic for name in names for topic in INPUTS[name]}
         for topic in taken - made:
@@ -282,18 +296,20 @@ class Rig:
         self.wait(all_matched, "all to have found each other")
 
     def add_publisher(self, topic):
-        """Play a topic that a node can do without."""
+        """Publish an optional input of a node."""
         publisher = self._publishers[topic] = self.node.create_publisher(
             STREAMS[topic], topic, self._qos
         )
         self.wait(publisher.get_subscription_count, f"{topic} to be heard")
 
     def pose_publisher(self, process):
-        """Publisher of initialpose that the started node of this Process, which has anchors, hears,
-        and nothing of which is under way.
+        """Return a publisher of initialpose from which the node of `process` receives.
 
-        A node may hear a topic later than it is heard: poses of no frame are published until it has
-        refused the last.
+        The node has been started and has anchors.
+
+        A node may receive from a publisher later than the publisher sees it. Therefore, poses in
+        unknown frames are published until the node has refused the last. None is under way on
+        return.
         """
         publisher, sent = (
             self.node.create_publisher(PoseWithCovarianceStamped, "initialpose", 100),
@@ -318,11 +334,11 @@ class Rig:
         return publisher
 
     def watch(self, process):
-        """Wait for nothing any more when this Process has ended, which starts nodes itself."""
+        """Stop every wait if this Process ends. It starts nodes itself."""
         self._processes["launch"] = process
 
     def close(self):
-        """End what was started."""
+        """End all processes and the test node."""
         for process in self._processes.values():
             if process.process.poll() is None:
                 os.killpg(process.process.pid, signal.SIGKILL)
@@ -333,7 +349,7 @@ class Rig:
         self.node.destroy_node()
 
     def wait(self, condition, what):
-        """Listen until condition() holds."""
+        """Receive messages until condition() holds."""
         deadline = time.monotonic() + PATIENCE
         while not condition():
             self._executor.spin_once(timeout_sec=0.1)
@@ -347,9 +363,10 @@ class Rig:
                 raise AssertionError(f"waited {PATIENCE} s for {what}; {accounts}; {said}")
 
     def answer(self, ask, what):
-        """The result of the Future of ask(). It asks again after AGAIN: the middleware drops an
-        answer to a client that it has not met yet, and a node that was killed seems to be there for
-        some time.
+        """Return the result of the Future of ask().
+
+        It asks again after AGAIN seconds. The middleware drops an answer to a client that it has
+        not discovered yet. A killed node also seems to exist for some time.
         """
         asked = []
 
@@ -362,20 +379,21 @@ class Rig:
         return next(future.result() for _, future in asked if future.done())
 
     def values(self, name):
-        """{key: text} of the last diagnostics of a node; empty before."""
+        """Return {key: text} of the last diagnostics of a node, empty before the first."""
         status = self._status.get(f"/{self.namespace}/{name}")
         return {entry.key: entry.value for entry in status.values} if status else {}
 
     def fresh_status(self, name):
-        """Diagnostics of a node that were written after now."""
+        """Wait for diagnostics of a node that are newer than this call."""
         self._since = time.time()
         self._status.clear()
         self.wait(lambda: self.values(name), f"diagnostics of {name}")
         return self._status[f"/{self.namespace}/{name}"]
 
     def counts(self, name, **expected):
-        """{key: int} of all counts of a node, when those named have the expected values and we have
-        what it sent.
+        """Return {key: int} of all counts of a node.
+
+        Wait until the named counts have the expected values and all sent messages have arrived.
         """
         own = {
             "bias_node": {"uwb/tdoa_corrected": ["published"]},
@@ -402,8 +420,14 @@ class Rig:
         return {key: int(value) for key, value in self.values(name).items() if value.isdigit()}
 
     def send_anchors(self, anchors, publisher=None):
-        """anchors : Anchors, or an AnchorArray to be sent as it is; publisher : another than the
-        latched one.
+        """Publish anchors.
+
+        Parameters
+        ----------
+        anchors : Anchors or AnchorArray
+            An AnchorArray is sent unchanged.
+        publisher : Publisher, optional
+            Default: the latched one.
         """
         publisher = publisher or self._anchors
         publisher.publish(
@@ -450,7 +474,7 @@ class Rig:
         self.send("odometry", message, t, "map", epoch)
 
     def send_sensor(self, topic, flight, i, epoch=EPOCH):
-        """Measurement i of a Flight's height, pressure or velocity, on one of their topics."""
+        """Publish measurement i of a Flight's height, pressure or velocity on the given topic."""
         part = getattr(flight, topic.partition("/")[0])
         message = STREAMS[topic]()
         if topic == "height":
@@ -466,13 +490,13 @@ class Rig:
         self.send(topic, message, part.t[i], epoch=epoch)
 
     def play(self, flight, epoch=EPOCH, ahead=0.025, send_tdoa=None, sensors=()):
-        """Send a Flight in stamp order, never more than `ahead` s of stamps beyond what the nodes
-        have made of it.
+        """Send a Flight in stamp order.
 
-        Returns when every TDOA but those of the last `ahead` s has its residual. (Much further
-        ahead than that, the result would depend on timing while the filter starts: bias_node cannot
-        know yet that there will be poses.)
-        sensors : topics of height, pressure or velocity to play too.
+        Return when all TDOAs before the last `ahead` s have residuals. The stamps are never more
+        than `ahead` s ahead of the nodes. Further ahead, the result would depend on timing during
+        the start of the filter: bias_node cannot know yet that poses will come.
+
+        sensors : topics of height, pressure or velocity to send, too.
         """
         imu, tdoa = flight.imu, flight.tdoa
         of_sensors = sorted(
@@ -502,14 +526,14 @@ def _collect(stream, lines):
 
 
 def worked(pid, threads=None):
-    """Seconds that the threads of a process have run, or waited for a core to run on.
+    """Return the time in s that the threads of a process ran or waited for a core.
 
-    threads : {path: nanoseconds}, which is filled; it keeps what threads did that have ended since
+    threads : {path: nanoseconds}, updated by each call. It keeps the times of ended threads.
     """
     threads = {} if threads is None else threads
     for file in Path(f"/proc/{pid}/task").glob("*/schedstat"):
         try:
             threads[file] = sum(map(int, file.read_text().split()[:2]))
-        except (OSError, ValueError):  # that thread has ended
+        except (OSError, ValueError):  # the thread has ended
             continue
     return 1e-9 * sum(threads.values())

@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Small simulated drives of a rover on a floor whose every error is known: wheels, an inertial
-sensor and TDOAs.
+"""Small simulated drives of a rover on a floor: wheels, an inertial sensor and TDOAs.
+
+Every error is known.
 """
 
 from dataclasses import replace
@@ -15,23 +16,25 @@ from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_bias.common.sensors import Velocity
 
 GRAVITY = 9.81
-# m, m, rad: of the body over a floor that is not quite even
+# m, m, rad: height and tilt of the body over a floor that is not quite even
 HEIGHT, HEIGHT_STD, TILT_STD = (0.2, 0.02, 0.01)
-FINE = 500.0  # Hz of the motion
+FINE = 500.0  # Hz, rate of the motion
 ANCHORS = [[0, 0, 2.4], [12, 0, 1.8], [12, 8, 2.4], [0, 8, 1.8], [6, 0, 0.9], [6, 8, 2.7]]
-STOPS = (25.0, 60.0)  # s, of the beginning of each; it lasts
-STOP = 4.0  # s
+STOPS = (25.0, 60.0)  # s, begin of each stop
+STOP = 4.0  # s, duration of a stop
 TURN = 0.8  # rad/s
 
 
 def hall():
-    """Six Anchors in 12 x 8 m."""
+    """Return six Anchors in 12 x 8 m."""
     return Anchors.from_positions(np.array(ANCHORS, dtype=float), ids=3 + np.arange(6))
 
 
 def motion(rng, duration, speed):
-    """Stamps (n,) s, positions (n, 2) m, yaws, speeds and yaw rates (n,) of a unicycle that follows
-    a point, with stops. It turns by TURN rad/s at most.
+    """Return the motion of a unicycle that follows a point, with stops.
+
+    Returns stamps (n,) in s, positions (n, 2) in m, yaws, speeds and yaw rates (n,). The yaw rate
+    is at most TURN rad/s.
     """
     t = np.arange(int(duration * FINE) + 1) / FINE
     pace = speed * (1.0 + 0.4 * np.sin(0.31 * t + rng.uniform(0.0, 6.0))) * np.minimum(1.0, t / 2.0)
@@ -61,9 +64,10 @@ def drive(
     scale=0.02,
     stated=False,
 ):
-    """A Flight of a rover: IMU 100 Hz, wheels 50 Hz that slip at times and state a covariance only
-    if `stated`, TDOAs 100 Hz of random pairs with constant errors of the anchors, and the true
-    pose.
+    """Simulate the flight of a rover with its true pose.
+
+    The IMU has 100 Hz, the wheels 50 Hz, and the TDOAs of random pairs 100 Hz. The wheels slip at
+    times. They state a covariance only if `stated`. Each anchor has a constant error.
     """
     rng, anchors = np.random.default_rng(seed), hall()
     t, p, yaw, pace, rate = motion(rng, duration, speed)
@@ -101,9 +105,8 @@ def drive(
     wheel_t = (np.arange(int(duration * 50.0)) + 0.37) / 50.0
     v, w = (np.interp(wheel_t, t, column) for column in (pace, rate))
     moving = np.abs(v) > 1e-3
-    for start in (
-        rng.uniform(0.05, 0.95, round(duration / 22.0)) * duration
-    ):  # the wheels turn faster than the rover moves, and unequally
+    # During slip, the wheels turn faster than the rover moves, and unequally.
+    for start in rng.uniform(0.05, 0.95, round(duration / 22.0)) * duration:
         slips = (wheel_t > start) & (wheel_t < start + 0.7)
         v, w = np.where(slips, 1.3 * v, v), np.where(slips, w + 0.15 * moving, w)
     n = len(v)
@@ -139,7 +142,17 @@ def drive(
 
 
 def late(flight, rows=(0, 2), since=40.0, lasts=5.0, by=1.5):
-    """The Flight with the anchors in some rows late by `by`, m, from `since` s after its begin on."""
+    """Return the Flight with delayed anchors.
+
+    Parameters
+    ----------
+    rows : sequence of int
+        Rows of the delayed anchors.
+    since, lasts : float
+        Begin after the first stamp, and duration, in s.
+    by : float
+        Delay, in m.
+    """
     tdoas, ids = flight.tdoa, flight.anchors.ids[list(rows)]
     during = (tdoas.t - flight.truth.t[0] > since) & (tdoas.t - flight.truth.t[0] < since + lasts)
     d = tdoas.d + by * during * (np.isin(tdoas.b, ids).astype(float) - np.isin(tdoas.a, ids))
@@ -147,15 +160,18 @@ def late(flight, rows=(0, 2), since=40.0, lasts=5.0, by=1.5):
 
 
 def yaw_of(q):
-    """(n,) rad of quaternions (n, 4)."""
+    """Return the yaws (n,), in rad, of quaternions (n, 4)."""
     x, y, z, w = q.T
     return np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y**2 + z**2))
 
 
 class Errors:
-    """Of an Odometry against a Flight: position (n, 3) m, yaw and tilt (n,) rad, normalized squares
-    of xy, height and yaw, and steps (n - 1,) m of xy beyond those of the truth; after `since`, s
-    from the begin.
+    """Errors of an Odometry against a Flight, from `since` s after its begin on.
+
+    position : (n, 3), in m.
+    yaw, tilt : (n,), in rad.
+    nees_xy, nees_z, nees_yaw : normalized squares.
+    steps : (n - 1,), in m, changes of the horizontal error from one pose to the next.
     """
 
     def __init__(self, flight, odometry, since=0.0):
@@ -183,5 +199,5 @@ class Errors:
 
     @property
     def xy(self):
-        """(n,) m."""
+        """Return the horizontal error (n,), in m."""
         return np.linalg.norm(self.position[:, :2], axis=1)

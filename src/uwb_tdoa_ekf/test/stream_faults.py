@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Simulated flights with faults of drivers, played live to real nodes, in lanes side by side."""
+"""Play simulated flights with driver faults live to real nodes, in several lanes side by side."""
 
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -26,8 +26,9 @@ PUBLISHERS = {
 
 @dataclass
 class Lane:
-    """A Rig with an ekf_node, and what was played to it: [(begin, [(from, to, names of faults)])],
-    s of the clock.
+    """A Rig with an ekf_node, and the flights that were played to it.
+
+    plan : [(begin, [(from, to, names of faults)])], in s of the clock.
     """
 
     rig: Rig
@@ -37,7 +38,7 @@ class Lane:
 
 
 def lanes_of(make_rig, count):
-    """`count` Lanes whose nodes are ready."""
+    """Return `count` Lanes with nodes that are ready."""
     lanes = []
     for _ in range(count):
         rig = make_rig(listen=(), reliable=False)
@@ -59,10 +60,10 @@ def lanes_of(make_rig, count):
 
 
 def play(lanes, plans):
-    """Play to each lane its plan, a list of flights, each [(from s, to s, names of faults)];
-    returns when it is over.
+    """Play its plan to each lane; return when all flights are over.
 
-    Before each flight the filter is reset. Fills in heard, poses and plan of the lanes.
+    A plan is a list of flights: [(from s, to s, names of faults)]. The filter is reset before each
+    flight. Fills in heard, poses and plan of the lanes.
     """
     epoch, events = int(time.time()), []
     start = time.time() + 1.0
@@ -85,7 +86,7 @@ def play(lanes, plans):
 
 
 def process_of(lane):
-    """The Popen of the node of a Lane."""
+    """Return the Popen of the node of a Lane."""
     (node,) = lane.rig._processes.values()
     return node.process
 
@@ -105,7 +106,7 @@ def _send(events, clients, epoch):
 
 @contextmanager
 def listening(lanes):
-    """Hear at once what the nodes say while the block lasts."""
+    """Receive messages of the nodes immediately while the block lasts."""
     over = threading.Event()
 
     def listen(executor):
@@ -124,11 +125,11 @@ def listening(lanes):
 
 
 def _relative(t, epoch):
-    """s after the epoch; a stamp of 0 stays one."""
+    """Return t relative to the epoch, in s; a stamp of 0 stays 0."""
     return t - epoch if t else -float(epoch)
 
 
 def publish_twice(lane, name):
-    """Another publisher on a topic; returns it."""
+    """Create and return another publisher on a topic."""
     topic = PUBLISHERS[name]
     return lane.rig.node.create_publisher(STREAMS[topic], topic, OUTPUT_QOS)

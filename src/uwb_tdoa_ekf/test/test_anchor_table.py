@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Anchors that come, go and move while a filter runs."""
+"""Anchors that are added, removed and moved while a filter runs."""
 
 from dataclasses import replace
 
@@ -21,15 +21,16 @@ PLACE, NEW = BOX.positions[1] + [1.5, 0.0, -0.5], [3.5, 4.0, 3.0]
 
 
 def after(before=BOX):
-    """Anchors after the change: one is gone, one stands elsewhere, one is new."""
+    """Return the Anchors after the change: one removed, one moved, one added."""
     positions = before.positions.copy()
     positions[1] = PLACE
     return Anchors.from_positions(np.vstack([positions[1:], NEW]), np.append(before.ids[1:], ADDED))
 
 
 def flight_through(seed=3, seconds=8.0, everything=False):
-    """Flight among the anchors that there are at each time; everything : the one that is gone sends
-    on.
+    """Return a Flight with the anchors of each time.
+
+    With `everything`, the removed anchor continues to send.
     """
     flight, rng = fly(seed, seconds), np.random.default_rng(seed)
     t = flight.tdoa.t
@@ -64,7 +65,7 @@ def fed(estimator, flight):
 
 
 def flown(told=True, everything=False):
-    """(Estimator, odometry and residuals before, and after the change)."""
+    """Return (Estimator, Flight, results before the change, results after it)."""
     flight, estimator = flight_through(everything=everything), Estimator(BOX)
     before = fed(estimator, cut(flight, -np.inf, CHANGE))
     if told:
@@ -132,7 +133,7 @@ def test_who_moves_anchors_again_and_again_fills_no_memory(monkeypatch):
 
 
 def test_nothing_is_said_of_an_anchor_that_was_taken_away():
-    """It is not heard any more; as long as it should be there, the monitor says so."""
+    """The monitor reports a silent anchor, unless the anchor was removed."""
     flight = fly(5, 16.0, tdoa_rate=400.0)
     quiet = (flight.tdoa.t > 6.0) & ((flight.tdoa.a == GONE) | (flight.tdoa.b == GONE))
     flight = replace(flight, tdoa=kept(flight.tdoa, ~quiet))

@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Height, pressure and velocity in the core: each update against the textbook, and what goes wrong
-with them in flights.
+"""Height, pressure and velocity in the core.
+
+The tests compare each update with the textbook, and fly with sensor faults.
 """
 
 from dataclasses import replace
@@ -41,7 +42,7 @@ import uwb_tdoa_ekf.core.engine
 
 
 def tilted(seed):
-    """A prior with a random attitude and velocity."""
+    """Return a prior with a random attitude and velocity."""
     prior = Prior(seed)
     prior.hypothesis.x[3:6] = prior.rng.uniform(-3.0, 3.0, 3)
     prior.hypothesis.x[6:10] = Rotation.random(random_state=prior.rng.integers(2**31)).as_quat()
@@ -49,8 +50,10 @@ def tilted(seed):
 
 
 def assert_row_is_the_derivative(prior, compare):
-    """compare() fills in the innovation; its row is by how much the innovation falls when the state
-    errs.
+    """Check the row of an innovation by differences.
+
+    compare() computes the innovation. Each entry of its row is the decrease of the innovation per
+    unit of error of that state.
     """
     compare()
     n = prior.innovation.entries
@@ -164,7 +167,7 @@ def only(flight, *names):
 
 
 def rms(flight, config=None, after=2.0):
-    """RMS errors (3,) m per axis, from `after` s on."""
+    """Return the RMS errors (3,) per axis, in m, from `after` s on."""
     odometry = run_offline(flight, config).odometry
     chosen = odometry.t > after
     return np.sqrt(
@@ -194,7 +197,7 @@ def test_each_sensor_helps(flight, without):
 
 
 def changed(flight, change):
-    """The flight with change(t, range) (n,) instead of its ranges."""
+    """Return the flight with change(t, range) (n,) in place of its ranges."""
     return replace(
         flight, height=replace(flight.height, range=change(flight.height.t, flight.height.range))
     )
@@ -212,7 +215,8 @@ HEIGHT_FAULTS = {
 
 @pytest.mark.parametrize("fault", HEIGHT_FAULTS)
 def test_a_range_finder_that_is_wrong_does_no_harm(flight, fault):
-    after = 11.0 if fault == "stuck" else 2.0  # 3 s are for finding out
+    # The filter needs 3 s to detect a stuck sensor.
+    after = 11.0 if fault == "stuck" else 2.0
     without = rms(only(flight), after=after)
     wrong = rms(changed(only(flight, "height"), HEIGHT_FAULTS[fault]), after=after)
     assert np.linalg.norm(wrong) < 1.1 * np.linalg.norm(without)
@@ -236,7 +240,7 @@ def test_wheels_that_spin_are_not_used(flight, without):
 @settings(max_examples=10, deadline=None)
 @given(seeds)
 def test_the_filter_is_never_locked_out_by_a_wrong_start(seed):
-    """Ranges come only after 2 s; whatever z was by then, it is right soon after."""
+    """Ranges begin after 2 s. The error of z falls below 0.15 m by 4 s, whatever it was before."""
     flight = only(with_sensors(fly(seed % 1000, 6.0, tdoa_std=0.5)), "height")
     kept = flight.height.t > 2.0
     late = replace(
@@ -263,8 +267,10 @@ SENSOR_NAMES = "height", "pressure", "velocity", "range"
     st.booleans(),
 )
 def test_any_sensors_in_any_mode_leave_covariances(seed, robust, loss, names, slopes, wrong):
-    """slopes : the TDOAs have biases that change with position and velocity; wrong : each sensor
-    has outliers.
+    """Test states and covariances with random sensors, options and faults.
+
+    slopes : the biases of TDOAs change with position and velocity.
+    wrong : each sensor has outliers.
     """
     rng = np.random.default_rng(seed)
     flight = with_ranges(with_sensors(fly(seed % 1000, 3.0, accel_noise=0.05, outliers=0.05)))
@@ -317,8 +323,9 @@ def test_a_kind_without_a_branch_raises():
 
 @pytest.mark.parametrize("followed", [0, 1])
 def test_a_range_finder_decides_between_mirrored_places(followed):
-    """Two hypotheses are 1.4 m below and above anchors in a plane, and equally probable; the tag is
-    at the lower one.
+    """Two equally probable hypotheses lie 1.4 m below and above anchors in a plane.
+
+    The tag is at the lower one.
     """
     state, parameters = new_state(np.array(corners().positions)), FilterConfig().parameters()[0]
     ekf, sensor, residual, places = (
@@ -348,13 +355,12 @@ def test_a_range_finder_decides_between_mirrored_places(followed):
                 > -IMPROBABLE
             )
     right, mirrored = ekf.hypotheses["log_weight"][list(places)]
-    assert (
-        right - mirrored > 5.0
-    )  # the mirrored one is 150 times less probable; if it was followed, it gives way then
+    # The mirrored hypothesis is 150 times less probable. A filter that followed it switches.
+    assert right - mirrored > 5.0
 
 
 def test_a_velocity_that_does_not_change_any_more_is_not_used(flight):
-    """It freezes while the tag moves, and later TDOAs end."""
+    """The velocity freezes while the tag moves. Later the TDOAs end."""
     t, v = flight.velocity.t, flight.velocity.v.copy()
     v[t > 8.0] = v[t > 8.0][0]
     heard = flight.tdoa.t < 10.0

@@ -52,11 +52,12 @@ def test_a_path_is_cut_into_cells_and_thin_ones_are_left_out():
     true = np.column_stack([np.linspace(0.0, 1.9, 191), np.zeros(191)])
     found = collect(true + [0.1, -0.2], true, 0.5, least=30)
     np.testing.assert_allclose(found.bias, np.tile([0.1, -0.2], (len(found), 1)))
+    # the cells at the ends hold 25 and 15
     assert [tuple(cell) for cell in found.cell] == [
         (1, 0),
         (2, 0),
         (3, 0),
-    ]  # the ends hold 25 and 15
+    ]
     assert found.count.tolist() == [50, 50, 50]
 
 
@@ -64,7 +65,7 @@ def test_a_path_is_cut_into_cells_and_thin_ones_are_left_out():
 def test_corrected_bias_is_the_mean_of_the_integrals_along_the_axes(d):
     one = markers(d=d, std=np.linspace(0.05, 0.15, d))
     found = corrected_bias(one)
-    # in the middle: 3 standard deviations stay on the line
+    # In the middle, 3 standard deviations stay on the line.
     row = int(np.flatnonzero((one.cell == 2).all(axis=1))[0])
     expected = np.zeros(d)
     for axis in range(d):
@@ -93,19 +94,19 @@ STEP = 0.5
 
 
 def nodes(n, d, values, wobble=0.0):
-    """Cells, places and one column of values; values(at) -> (n,)."""
+    """Return cells, positions and one column of values; values(at) -> (n,)."""
     cell, at = grid(n, d)
     at = at + wobble * np.random.default_rng(2).standard_normal(cell.shape)
     return cell, at, values(at)[:, None]
 
 
 def gentle(at):
-    """Positive, and nowhere 8 times a neighbour's: eq. A5 has a positive width everywhere."""
+    """Return positive values. No value is 8 times a neighbour, so eq. A5 has positive widths."""
     return 1.0 + 0.3 * np.sin(at[:, 0]) + 0.2 * np.cos(2.0 * at[:, 1])
 
 
 def slow(cell, at, values, x):
-    """Eqs. A1 - A8 one by one, in the plane, for one place."""
+    """Evaluate eqs. A1 - A8 one by one, in the plane, for one position."""
     b_min = min(values) if min(values) < 0 else 0.0
     b = values - b_min
     total, c1 = b_min, 0.5
@@ -147,7 +148,8 @@ def test_an_inner_node_keeps_its_value(d):
     network = AngularNetwork(cell, at, values, STEP)
     inner = ((cell > 0) & (cell < 4)).all(axis=1)
     shift = np.abs(network(at[inner]) - values[inner])
-    assert shift.max() < 0.02  # tails of nodes two steps away
+    # Nodes two steps away still contribute a little.
+    assert shift.max() < 0.02
 
 
 @pytest.mark.parametrize("d", [2, 3])
@@ -179,7 +181,7 @@ def make_map(d=3, n=4, step=0.5, bias=None, **fields):
 
 
 def outside(x, d=3):
-    """A place `x` m beyond the middle of the face x = 1.5 m of the hull."""
+    """Return a position `x` m beyond the middle of the face x = 1.5 m of the hull."""
     return np.array([[1.5 + x, 0.75, 0.75 if d == 3 else 9.0]])
 
 
@@ -208,7 +210,7 @@ def test_outside_of_the_hull_the_correction_fades_and_the_covariance_grows(inter
     corrections = np.linalg.norm(found - p, axis=1)
     assert (np.diff(corrections) <= 1e-12).all() and corrections[-2] == corrections[-1] == 0.0
     traces = np.trace(covariance, axis1=1, axis2=2)
-    # the bias that was not taken out
+    # The covariance includes the bias that remains uncorrected.
     assert traces[-1] == pytest.approx(0.12 + 0.1**2 + 0.2**2 + 0.3**2) and traces[-1] > traces[0]
 
 
@@ -301,15 +303,16 @@ def test_fields_that_make_no_map_are_refused(change, named):
 
 
 def field(true):
-    """A bias of up to 0.2 m, (n, 3)."""
+    """Return a bias of up to 0.2 m, (n, 3)."""
     return 0.15 * np.stack(
         [np.sin(true[:, 0]), np.cos(true[:, 1]), np.sin(0.7 * true[:, 0] + true[:, 2])], axis=1
     )
 
 
 def fly(seed, n=4000, noise=0.03, claimed=None, bias=field):
-    """A Part all over 3 x 3 x 2 m. claimed : standard deviation that its covariance says, m; None
-    for no covariance.
+    """Return a Part with positions all over 3 x 3 x 2 m.
+
+    claimed : standard deviation of its covariance, in m; None for no covariance.
     """
     rng = np.random.default_rng(seed)
     true = rng.uniform([0.0, 0.0, 0.0], [3.0, 3.0, 2.0], (n, 3))
@@ -336,7 +339,7 @@ def test_a_known_bias_is_found_and_taken_out_elsewhere(planar):
 
 
 def test_the_network_needs_a_full_grid_and_is_worse_than_the_thin_plate():
-    """In the plane, markers everywhere: both help."""
+    """In the plane, with markers everywhere, both reduce the error."""
     parts, fresh = [fly(1, 8000), fly(2, 8000)], fly(3, noise=0.0)
     left = {
         kind: left_over(fit(parts, 0.5, 10, True, kind), fresh)[:, :2] for kind in INTERPOLATORS
@@ -349,7 +352,8 @@ def test_the_network_needs_a_full_grid_and_is_worse_than_the_thin_plate():
 
 @pytest.mark.parametrize(("claimed", "honest"), [(0.03, True), (0.2, False)])
 def test_covariances_become_honest_but_never_smaller(claimed, honest):
-    def drifting(seed):  # a bias of the flight's own, which no map can know
+    # The bias differs from flight to flight, so no map can correct it.
+    def drifting(seed):
         own = 0.08 * np.random.default_rng(seed).standard_normal(3)
         return fly(seed, 1500, claimed=claimed, bias=lambda true: field(true) + own)
 
@@ -369,7 +373,8 @@ def test_covariances_become_honest_but_never_smaller(claimed, honest):
             )
         )
     if honest:
-        assert 2.0 < np.mean(nees) < 5.0  # 20 flights: a third of 3 either way, and more above
+        # 20 flights: the mean NEES of 3 is uncertain by a third, and by more above it.
+        assert 2.0 < np.mean(nees) < 5.0
         assert np.trace(found.added) > 0.01
     else:
         assert np.mean(nees) < 3.0 and not found.added.any()

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Both nodes, started once, from no anchors to their end: what they say, and what they survive."""
+"""Both nodes in one run, from the wait for anchors to the end: messages and robustness."""
 
 import itertools
 import re
@@ -26,7 +26,7 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 @pytest.fixture(scope="module")
 def rig(make_shared_rig):  # noqa: F811
-    """A Rig with both nodes: rig.processes, and rig.statuses that they have published."""
+    """Return a Rig with both nodes: rig.processes, and their published rig.statuses."""
     rig = make_shared_rig()
     rig.processes, rig.statuses = rig.start("bias_node", "ekf_node"), []
     rig.node.create_subscription(EstimatorStatus, "status", rig.statuses.append, LATCHED)
@@ -92,7 +92,8 @@ def test_status_says_what_may_be_flown_by_and_why_not(rig):
         return [each for each in rig.statuses if each.status == wanted]
 
     rig.wait(running, "it to run")
-    assert not any(each.yaw_known or each.lost for each in running())  # it has not moved enough
+    # It has not moved enough.
+    assert not any(each.yaw_known or each.lost for each in running())
     assert all(each.yaw_std > 0.4 and each.header.frame_id == "map" for each in running())
 
     def silent():
@@ -151,7 +152,7 @@ def test_frames_that_alternate_are_warned_of_once(rig):
     rig.wait(both_are_said, "two frames to be said")
     rig.wait(lambda: warned("left") and warned("right"), "both frames to be warned of")
     assert rig.counts("ekf_node")["unreadable on imu/data"] == 0
-    # how often the log says what it has said before; with /diagnostics when its text is another
+    # Number of times that the log repeats a warning. /diagnostics adds one when its text changes.
     again = 1 + int((time.monotonic() - began) / AGAIN)
     assert max(len(warned("left")), len(warned("right"))) <= 1 + 2 * again
 

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What compile_nodes leaves to be compiled when the nodes start: nothing."""
+"""After compile_nodes, the nodes have nothing to compile when they start."""
 
 import os
 import subprocess

@@ -9,13 +9,14 @@ import pytest
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_ekf.core.config import CHOICES, PARAMETERS, FilterConfig
 
+# 0 switches the term off
 WITHOUT = [
     "vibration_gain",
     "yaw_rate_std",
     "range_offset_std",
     "fixed_height_std",
     "non_holonomic_std",
-]  # 0: there is no such thing
+]
 SWITCHES = (
     "use_imu",
     "adapt_noise",

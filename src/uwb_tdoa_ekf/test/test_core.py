@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Parts of the filter core, each against what it is documented to compute."""
+"""Parts of the filter core, compared with their documented computations."""
 
 from dataclasses import replace
 
@@ -52,7 +52,7 @@ CASES = [
     (0, 1, 5.0, 0.0, True),  # right behind anchor 0
     (0, 1, 5.0 + LARGEST_ERROR, 0.0, True),
     (0, 1, -5.0 - LARGEST_ERROR, 0.0, True),
-    (0, 1, 5.001 + LARGEST_ERROR, 0.0, False),  # no place hears that
+    (0, 1, 5.001 + LARGEST_ERROR, 0.0, False),  # impossible at any position
     (1, 0, -5.001 - LARGEST_ERROR, 0.0, False),
     (0, 2, 5.0, 0.0, False),
     (0, 0, 0.0, 0.0, False),
@@ -120,8 +120,9 @@ def test_it_is_not_asked_for_where_the_place_is_known_and_finite_at_an_anchor():
 
 
 def taught(std, noise, seconds=20.0, seed=0):
-    """Excess variances after TDOAs at 400 Hz whose anchors have the standard deviations `noise`,
-    (N,) m.
+    """Return the excess variances after TDOAs at 400 Hz.
+
+    `noise` (N,) holds the standard deviations of the anchors, in m.
     """
     rng, n = np.random.default_rng(seed), len(noise)
     state, parameters = new_state(np.zeros((n, 3))), FilterConfig(tdoa_std=std).parameters()[0]
@@ -164,7 +165,7 @@ def test_variances_stay_finite_and_not_negative(values, prior_variance):
 
 
 def test_an_anchor_that_is_late_for_a_while_disturbs_less():
-    """Anchor 3 is a metre late in every pair for a second at a time, as behind an obstacle."""
+    """Anchor 3 is a metre late in every pair, for one second in three, as behind an obstacle."""
     errors = {}
     for adapt in (False, True):
         found = []
@@ -191,7 +192,7 @@ STD = 0.25
 
 
 def informed(p, seconds=5.0, rate=400.0, heard=range(8), state=None, begin=0.0):
-    """A FilterState that has taken TDOAs round the ring of the anchors `heard` at a place p (3,)."""
+    """Return a FilterState after TDOAs round the ring of anchors `heard`, at p (3,)."""
     state, heard = state or new_state(ANCHORS), list(heard)
     anchors, information = state.anchors, state.record.information
     way = np.array(p) - ANCHORS
@@ -217,13 +218,13 @@ def stated(state, P, correlation_length=np.inf, height_std=0.0):
 
 @pytest.mark.parametrize("p", [[3.0, 4.0, 1.5], [1.0, 6.0, 0.5]])
 def test_it_is_the_covariance_of_a_position_by_one_arrival_from_each_anchor(p):
-    """Least squares with an error of its own for each anchor, and a common one of the clock."""
+    """The reference is least squares with an error per anchor and a common clock error."""
     way = np.array(p) - ANCHORS
     unit = way / np.linalg.norm(way, axis=1)[:, None]
     centred = unit - unit.mean(axis=0)
     of_anchor = noise.SHARE * STD**2 / 2.0
     expected = np.linalg.inv(centred.T @ centred) * of_anchor
-    # a ring of neighbours weighs directions a little differently from all pairs
+    # A ring of neighbours weighs directions a little differently from all pairs.
     found = stated(informed(p), 1e3 * np.eye(3))
     assert 0.4 < np.trace(found) / np.trace(expected) < 2.5
 
@@ -259,7 +260,7 @@ def test_it_is_bounded_by_what_the_filter_knows():
 
 @pytest.mark.parametrize("p", [[3.0, 4.0, 0.2], [1.0, 6.0, 0.5]])
 def test_a_height_that_is_held_does_not_follow_errors_that_persist(p):
-    """Held exactly, only x and y follow: the covariance of a problem in two dimensions."""
+    """With an exact height, only x and y are free: the covariance of a two-dimensional problem."""
     state, P = informed(p), 1e6 * np.eye(3)
     plain, held, loose = (stated(state, P, height_std=std) for std in (0.0, 1e-4, 1e4))
     information = np.linalg.inv(plain)
@@ -345,7 +346,7 @@ def fresh():
 
 
 def after(gyro, accel, rate=1000.0, seconds=3.0, imu=None, pause=0.0, seed=0):
-    """IMU_STATE after a stream of samples: gyro, accel are (mean (3,), standard deviation)."""
+    """Return IMU_STATE after a stream of samples; gyro, accel: (mean (3,), standard deviation)."""
     imu, rng = fresh() if imu is None else imu, np.random.default_rng(seed)
     start = max(imu.t, 0.0) + pause
     for k in range(int(rate * seconds)):
@@ -368,7 +369,7 @@ STILL = dict(gyro=(np.zeros(3), 0.002), accel=(UP, 0.02))
         ({"gyro": (np.zeros(3), 0.05)}, False),
         ({"gyro": (np.array([0.0, 0.0, 0.1]), 0.002)}, False),
         ({"accel": (UP, 0.3)}, False),
-        # a metre per second squared sideways is a tilt of 6 degrees
+        # 1 m/s^2 sideways is a tilt of 6 degrees.
         ({"accel": (UP + [1.0, 0.0, 0.0], 0.02)}, True),
         ({"accel": (1.1 * UP, 0.02)}, False),
     ],
@@ -414,9 +415,8 @@ def test_an_axis_whose_mean_is_that_of_hovering_does_not_rectify_however_it_vibr
         weigh(imu, False, parameters)
         weights[offset] = imu.accel_weight
     error = 4.0 * 3.0**2
-    assert weights[3.0][0] == pytest.approx(
-        1.5**2 / (1.5**2 + error), rel=0.2
-    )  # as if nothing were known of its mean
+    # The weight is the same as with an unknown mean.
+    assert weights[3.0][0] == pytest.approx(1.5**2 / (1.5**2 + error), rel=0.2)
     for weight in (weights[0.0][0], weights[3.0][1], weights[3.0][2]):
         assert weight == pytest.approx(1.5**2 / (1.5**2 + LEAST_RECTIFIED * error), rel=0.1)
 
@@ -452,8 +452,9 @@ def test_samples_are_averaged_with_the_last_one_unless_it_is_old():
 
 
 def test_what_is_far_from_hovering_is_taken_for_what_it_is_however_it_vibrates():
-    """A turn with 3 g; a vibrating sensor that is off by as much as vibration makes it stays
-    between.
+    """A vibrating accelerometer keeps 95 % of its weight at 3 g, as in a turn.
+
+    An error of 0.2 g, as vibration causes it, reduces the weight below 0.6.
     """
     parameters = FilterConfig(accel_prior_std=1.5, vibration_gain=4.0).parameters()[0]
     weights = {}
@@ -468,15 +469,16 @@ def test_what_is_far_from_hovering_is_taken_for_what_it_is_however_it_vibrates()
 
 
 def state(seed=0):
-    """q (4,), v (3,), covariance (9, 9) of a filter that is sure to 1e-4."""
+    """Return q (4,), v (3,) and covariance (9, 9), with standard deviations of about 1e-4."""
     random = np.random.default_rng(seed)
     root = random.normal(size=(9, 9)) * 1e-4
     return Rotation.random(random_state=seed).as_quat(), random.normal(size=3) * 2, root @ root.T
 
 
 def disturbed(q, v, covariance, n=50_000):
-    """Samples of true attitude and velocity, as the filter believes them: true attitude = q
-    Exp(dtheta).
+    """Draw true positions, velocities and attitudes from the belief of the filter.
+
+    True attitude = q Exp(dtheta).
     """
     error = np.random.default_rng(1).multivariate_normal(np.zeros(9), covariance, n)
     return (
@@ -489,9 +491,8 @@ def disturbed(q, v, covariance, n=50_000):
 def test_covariance_is_that_of_what_an_odometry_holds():
     q, v, covariance = state()
     dp, velocity, truth = disturbed(q, v, covariance)
-    turned = (
-        truth * Rotation.from_quat(q).inv()
-    ).as_rotvec()  # truth = Exp(turned) q: about the axes of the world
+    # truth = Exp(turned) q, about the axes of the world
+    turned = (truth * Rotation.from_quat(q).inv()).as_rotvec()
     sampled = np.cov(np.hstack([dp, turned, truth.inv().apply(velocity)]).T)
     u, converted = to_odometry(q[None], v[None], covariance[None])
     np.testing.assert_allclose(u[0], Rotation.from_quat(q).inv().apply(v), atol=1e-12)

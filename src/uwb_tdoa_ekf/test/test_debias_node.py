@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""debias_node: its parameters, and alone as a process over topics."""
+"""debias_node: its parameters, and the node as a separate process over topics."""
 
 from pathlib import Path
 
@@ -21,13 +21,13 @@ from uwb_tdoa_ekf.debias_node import DebiasNode  # noqa: E402
 
 CONFIG = Path(__file__).resolve().parents[1] / "config" / "debias_node.yaml"
 ANCHORS = Anchors.from_positions([[0, 0, 0], [4, 0, 2], [4, 4, 0], [0, 4, 2], [2, 2, 3]])
-# known, half a metre outside, far away
+# inside the map, half a metre outside, far away
 PLACES = [[0.7, 0.7, 0.7], [2.0, 0.7, 0.7], [9.0, 0.7, 0.7]]
 
 
 @pytest.fixture
 def file(tmp_path):
-    """A map of 0.1, -0.2 and 0.3 m in 1.5 x 1.5 x 1.5 m."""
+    """Write a map of 1.5 x 1.5 x 1.5 m with a bias of 0.1, -0.2 and 0.3 m."""
     cell = np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     bias = np.tile([0.1, -0.2, 0.3], (64, 1))
     BiasMap(
@@ -53,7 +53,8 @@ def odometry(p, speed=0.0):
     message = Odometry(child_frame_id="base_link")
     place, orientation = message.pose.pose.position, message.pose.pose.orientation
     place.x, place.y, place.z = map(float, p)
-    orientation.z = orientation.w = np.sqrt(0.5)  # 90 degrees to the left: forward is +y
+    # 90 degrees to the left, so forward is +y
+    orientation.z = orientation.w = np.sqrt(0.5)
     message.twist.twist.linear.x = speed
     message.pose.covariance = np.arange(36.0) + 100.0 * np.eye(6).ravel()
     return message
@@ -107,7 +108,8 @@ def test_positions_are_debiased_and_accounted_for(make_rig, file):
     )
     np.testing.assert_allclose(xyz(rig.debiased[2]), PLACES[2])
     np.testing.assert_array_equal(xyz(rig.debiased[3]), [0.7, np.nan, 0.7])
-    np.testing.assert_array_equal(xyz(rig.debiased[4]), PLACES[0])  # of another frame: as it was
+    # Another frame: the pose is unchanged.
+    np.testing.assert_array_equal(xyz(rig.debiased[4]), PLACES[0])
     assert rig.debiased[4].header.frame_id == "elsewhere"
     counts = rig.counts("debias_node", received=5)
     assert (counts["corrected"], counts["faded"], counts["outside"], counts["invalid"]) == (

@@ -30,11 +30,11 @@ ANCHORS = corners()  # ids 10 ... 17
 
 EFFECTS = """effects: {anchor_delay: {values: {10: 0.1, 14: -0.05}}, anchor_ids: {values: {98: 11}},
   pair_sign: {values: {11-15: -1}}, tdoa_time_offset: {values: {offset: 0.03}}}"""
-LATE = 0.03  # s, of every TDOA, as EFFECTS have it
+LATE = 0.03  # s, delay of every TDOA, corrected by EFFECTS
 
 
 def test_bias_node_corrects_each_tdoa_at_its_pose_and_accounts_for_it(make_rig, tmp_path):
-    """Stamps are those of TDOAs that are not late."""
+    """Stamps in this test are those without the delay LATE; `send` adds it."""
     (tmp_path / "effects.yaml").write_text(EFFECTS)
     rig = make_rig()
     rig.start("bias_node", bias_node=["-p", f"effects_file:={tmp_path / 'effects.yaml'}"])
@@ -46,7 +46,7 @@ def test_bias_node_corrects_each_tdoa_at_its_pose_and_accounts_for_it(make_rig, 
         rig.wait(lambda: len(rig.corrected) == count, what)
         return rig.corrected[count - 1]
 
-    # it waits for anchors, and for poses once there are some
+    # It waits for anchors, and for poses if there are some.
     send(0.1, 10, 14, 1.0)
     assert rig.counts("bias_node", received=1)["waiting"] == 1
     rig.send_anchors(ANCHORS)
@@ -54,14 +54,14 @@ def test_bias_node_corrects_each_tdoa_at_its_pose_and_accounts_for_it(make_rig, 
     assert first.status == TdoaCorrected.STATUS_EFFECTS and "anchor_delay" in first.model
     assert (first.raw, first.header.stamp) == (1.0, stamp(0.1))
     assert (first.bias, first.corrected) == pytest.approx((-0.15, 1.15))
-    rig.send_pose(0.2)  # the first: nothing is corrected in the next 0.2 s
+    rig.send_pose(0.2)  # the first pose: no corrections in the next 0.2 s
     rig.send_pose(0.5)
     rig.counts("bias_node", poses=2)
     for t in (0.56, 0.6, 0.64, 0.68):
         send(t, 14, 10, 1.0)
     counts = rig.counts("bias_node", received=5)
-    # The filter can have no later pose than that of 0.1 before it gets 0.56. What precedes 0.6 is
-    # 60 ms after the pose.
+    # Before 0.56 the filter cannot have a pose later than 0.1. The TDOA before 0.6 is 60 ms after
+    # the pose of 0.5.
     assert (counts["published"], counts["waiting"]) == (2, 3)
     rig.send_pose(0.57)
     corrected(4, "0.6 and 0.64, which follow 0.56 and 0.6")
@@ -71,7 +71,7 @@ def test_bias_node_corrects_each_tdoa_at_its_pose_and_accounts_for_it(make_rig, 
     assert stamps == [0.1, 0.56, 0.6, 0.64, 0.68]
     assert rig.counts("bias_node", published=5)["released before their pose"] == 0
 
-    # it does not wait for ever
+    # The wait is limited.
     for t in (1.0, 1.1, 1.2):
         send(t, 14, 10, 1.0)
     assert rig.counts("bias_node", received=8)["waiting"] == 3
@@ -80,15 +80,15 @@ def test_bias_node_corrects_each_tdoa_at_its_pose_and_accounts_for_it(make_rig, 
     counts = rig.counts("bias_node", received=9, published=6)
     assert (counts["waiting"], counts["released before their pose"]) == (3, 1)
 
-    # a recording that starts again: what waits belongs to the old one, whose poses are forgotten
+    # The recording starts again. Waiting TDOAs belong to the old run, and its poses are forgotten.
     send(0.1, 14, 10, 2.0)
-    send(0.16, 14, 10, 3.0)  # one stamp could have been wrong
+    send(0.16, 14, 10, 3.0)  # A single stamp could be wrong.
     corrected(8, "no waiting for poses of the past")
     assert [message.raw for message in rig.corrected[6:]] == [2.0, 3.0]
     counts = rig.counts("bias_node", received=11)
     assert (counts["published"], counts["waiting"], counts["dropped"]) == (8, 0, 3)
 
-    # what cannot be corrected is passed on, and counted; wrong ids and signs are put right
+    # TDOAs without a correction are passed on and counted. Wrong ids and signs are corrected.
     nan, inf = float("nan"), float("inf")
     pairs = [(10, 99, 1.0), (99, 10, 1.0), (10, 10, 1.0), (10, 14, nan), (10, 14, inf)]
     for i, row in enumerate([*pairs, (98, 15, 1.5), (15, 98, 1.5)]):
@@ -135,7 +135,7 @@ def test_ekf_node_accounts_for_every_measurement_from_bad_anchors_to_others(make
         rig.send_corrected(t, a, b, 0.0)
     assert rig.counts("ekf_node", TDOAs_received=2)["waiting"] == 2
     assert rig.fresh_status("ekf_node").level == DiagnosticStatus.ERROR
-    rig.send_anchors(flight.anchors)  # late: what came before is used now
+    rig.send_anchors(flight.anchors)  # late anchors: the filter now uses the buffered TDOAs
     rig.play(flight, send_tdoa=rig.send_corrected)
 
     now = max(flight.tdoa.t[-1], flight.imu.t[-1])
@@ -146,12 +146,13 @@ def test_ekf_node_accounts_for_every_measurement_from_bad_anchors_to_others(make
         rig.send_corrected(now + 0.001, *row)
     late = now - 0.5
     rig.send_corrected(late, a, b, 0.0)
-    # Out of order, but within `reorder`: used in the order of their stamps.
+    # Out of order by less than `reorder`, so they are used in the order of their stamps.
     rig.send_corrected(now + 0.013, a, b, 0.0)
     rig.send_corrected(now + 0.011, b, a, 0.0)
     rig.send_imu(now + 0.1)
     rig.send_corrected(now + 0.1, a, b, 0.0)
-    # All but the very last, and the last one of the flight that had been waiting.
+    # Residuals of all TDOAs except the very last. This includes the last of the flight, which
+    # waited.
     told = len(flight.tdoa) + 2 + len(invalid) + 1 + 2
     rig.wait(lambda: len(rig.residuals) == told, "all residuals")
     said = {}
@@ -178,7 +179,7 @@ def test_ekf_node_accounts_for_every_measurement_from_bad_anchors_to_others(make
     assert (values["state"], values["flyable"]) == ("running", "no")
     assert float(values["efficiency"]) > 0.0
 
-    # an IMU without accelerometer, or without gyroscope, is not believed
+    # An IMU without accelerometer, or without gyroscope, is refused.
     for k, covariance in enumerate(["linear_acceleration"] * 3 + ["angular_velocity"]):
         message = Imu()
         getattr(message, f"{covariance}_covariance")[0] = -1.0
@@ -192,13 +193,14 @@ def test_ekf_node_accounts_for_every_measurement_from_bad_anchors_to_others(make
     rig.wait(warnings, "a warning")
     assert len(warnings()) == 1
 
-    # the same anchors change nothing, others start the filter anew
+    # Equal anchors change nothing. Other anchors restart the filter.
     rig.send_anchors(flight.anchors)
     assert rig.counts("ekf_node")["restarts"] == 0
     moved = flight.anchors.at(flight.anchors.positions + 0.5)
     rig.send_anchors(moved)
     counts = rig.counts("ekf_node", restarts=1, state="starting")
-    assert counts["waiting"] == 0 and len(rig.residuals) == told + 1  # all, with the old anchors
+    # All residuals are there, with the old anchors.
+    assert counts["waiting"] == 0 and len(rig.residuals) == told + 1
 
 
 MOUNTED = """effects: {height_offset: {values: {offset: 0.1}}, height_scale: {values: {scale: 0.02}}, velocity_scale:
@@ -212,7 +214,7 @@ def test_height_pressure_and_velocity_are_used_where_they_are_there(make_rig, tm
     effects, flight = EffectSet.from_yaml(file), with_sensors(recording(3.0), rate=50.0)
     for effect in effects.effects:
         flight = effect.inject(flight)
-    # a sensor_msgs/Range is not more precise
+    # sensor_msgs/Range has single precision
     flight.height.range[:] = np.float32(flight.height.range)
     flight.height.range[20] = np.inf
     topics = ["height", "pressure", "velocity"]
@@ -236,7 +238,8 @@ def test_height_pressure_and_velocity_are_used_where_they_are_there(make_rig, tm
     np.testing.assert_allclose(positions(rig.odometry), expected.p[place], atol=1e-3)
 
 
-BAD = [  # node, arguments, what is named
+# node, arguments, pattern of the error message
+BAD = [
     ("bias_node", ["-p", "model_file:=nowhere.onnx"], "nowhere.onnx does not exist"),
     ("bias_node", ["-p", "hold:=1"], "hold: .* 1.0"),
     ("ekf_node", ["-p", "robust:=maybe"], "robust: 'maybe' is not one of"),
@@ -261,6 +264,7 @@ def test_bad_parameters_are_refused_in_one_sentence():
     ]
     for process, (node, _, named) in zip(started, BAD):
         _, said = process.communicate(timeout=PATIENCE)
-        *_, last = said.splitlines()  # the first node of several may have said that it is ready
+        # In a process with several nodes, the first may have printed that it is ready.
+        *_, last = said.splitlines()
         assert process.returncode == 2 and "Traceback" not in said
         assert last.startswith(f"{node}: error: ") and re.search(named, said)

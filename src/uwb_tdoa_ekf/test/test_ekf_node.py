@@ -52,7 +52,7 @@ def test_every_parameter_is_in_the_parameter_file_with_its_default(node):
 
 
 def message(variances=(0.25, 0.25, 0.0, 0.0, 0.0, 0.07), frame="map", second=5):
-    """As RViz sends it: x, y and yaw, 90 degrees to the left."""
+    """Return a pose as RViz sends it: x, y and yaw, here 90 degrees to the left."""
     out = PoseWithCovarianceStamped()
     out.header.frame_id, out.header.stamp.sec = frame, second
     out.pose.pose.position.x, out.pose.pose.position.y, out.pose.pose.position.z = 1.0, 2.0, 0.0
@@ -103,7 +103,7 @@ def test_nonsense_is_refused(content, named):
 
 
 class Publisher:
-    """Keeps (translation, quaternion, stamp) of what is published."""
+    """Keep (translation, quaternion, stamp) of each published transform."""
 
     def __init__(self):
         self.sent = []
@@ -124,7 +124,7 @@ class Publisher:
 
 
 class Stub:
-    """A node, and a frame odom that the body drives in: at t, s, it is at (t, 0, lift), tilted."""
+    """A node with a frame odom. At time t, the body is at (t, 0, lift) in odom, tilted."""
 
     def __init__(self, lift=0.0, tilt=0.0):
         self.tf, self.lift, self.tilt = Publisher(), lift, tilt
@@ -195,7 +195,7 @@ def test_the_first_transform_is_not_held(monkeypatch):
 
 @pytest.mark.parametrize("planar", [False, True])
 def test_world_to_odom_of_a_planar_vehicle_turns_about_the_vertical_alone(monkeypatch, planar):
-    """odom -> base_link of an odometry in three dimensions tilts."""
+    """The transform odom -> base_link of a three-dimensional odometry is tilted."""
     node = Stub(lift=0.05, tilt=0.03)
     publish(
         made(monkeypatch, node, planar),

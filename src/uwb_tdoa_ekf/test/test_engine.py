@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The filter core: flights, and the history that it records of them."""
+"""The filter core: flights, and the recorded history."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -37,7 +37,7 @@ def test_verdicts_are_those_of_the_message():
 
 
 def without_imu(flight, low=-np.inf, high=np.inf):
-    """The flight with no inertial samples between two stamps."""
+    """Return the flight without the inertial samples between two stamps."""
     return replace(flight, imu=kept(flight.imu, (flight.imu.t < low) | (flight.imu.t >= high)))
 
 
@@ -63,7 +63,8 @@ def test_tracks_a_flight_with_outliers():
                 residuals.weight[~far & np.isfinite(residuals.innovation)],
             )
             assert len(wild) > 50 and np.median(wild) < 0.5 * np.median(tame), (robust, adapt)
-            assert adapt or wild.max() < 0.6  # an anchor known to be noisy may be believed
+            # The filter may trust an anchor with a known noise.
+            assert adapt or wild.max() < 0.6
 
 
 def test_odometry_comes_at_the_first_event_of_each_period():
@@ -77,8 +78,9 @@ def test_odometry_comes_at_the_first_event_of_each_period():
 
 
 def test_residuals_are_innovation_and_its_variance():
-    """Against the odometry: at 1 MHz every event gives one, so that the one before a TDOA holds the
-    state it met.
+    """Compare with the odometry.
+
+    At 1 MHz every event gives odometry, so the one before a TDOA holds the prior state.
     """
     flight = fly(7, 2.0, imu_rate=1000.0)
     odometry, residuals = drive(
@@ -96,8 +98,9 @@ def test_residuals_are_innovation_and_its_variance():
         assert residuals.innovation[k] == pytest.approx(flight.tdoa.d[k] - tdoa(p, a, b), abs=1e-4)
         g = (p - b) / np.linalg.norm(p - b) - (p - a) / np.linalg.norm(p - a)
         prior = g @ odometry.covariance[before, :3, :3] @ g
+        # An anchor near the ground may be late, and the filter adds noise for it.
         if max(a[2], b[2]) > 2.0 > 0.5 > min(a[2], b[2]) or max(a[2], b[2]) < 0.5:
-            continue  # an anchor near the ground may be late, which counts as noise
+            continue
         assert residuals.variance[k] == pytest.approx(0.2**2 + prior, rel=0.05)
         tested += 1
     assert tested > 15
@@ -121,14 +124,17 @@ def test_bridges_seconds_without_imu_or_tdoas():
     odometry, _ = drive(without_tdoas(flight, 8.0, 10.0))
     blind = odometry[(odometry.t > 8.0) & (odometry.t < 10.0)]
     std = np.sqrt(np.einsum("nii->ni", blind.covariance[:, :3, :3]))
-    assert (np.diff(std.sum(axis=1)) > 0.0).all()  # it says that it knows less and less
+    # The stated deviation grows.
+    assert (np.diff(std.sum(axis=1)) > 0.0).all()
     assert (np.abs(blind.x[:, :3] - position_at(flight, blind.t)) < 4.0 * std).all()
     assert errors(flight, odometry[odometry.t > 11.0]).max() < 0.4
 
 
 def nasty(seed, imu_size):
-    """Streams that no sensor would send: huge and jumping IMU values, stamps that repeat, gaps of
-    seconds, TDOAs of any value that is not refused, a tag on an antenna.
+    """Return streams that no sensor would send.
+
+    They have huge and jumping IMU values, repeated stamps, gaps of seconds, TDOAs of any accepted
+    value, and a tag at an anchor.
     """
     rng = np.random.default_rng(seed)
     flight = fly(seed, 2.0, imu_rate=float(rng.choice([20.0, 100.0, 1000.0])))
@@ -147,7 +153,8 @@ def nasty(seed, imu_size):
     d = flight.tdoa.d.copy()
     wild = rng.random(len(d)) < rng.choice([0.0, 0.1, 1.0])
     d[wild] = (rng.uniform(-1.0, 1.0, len(d)) * (baseline + 1.0))[wild]
-    if rng.random() < 0.2:  # on the first anchor
+    # the tag is at the first anchor
+    if rng.random() < 0.2:
         d = tdoa(
             flight.anchors.positions[0], flight.anchors.positions[a], flight.anchors.positions[b]
         )
@@ -168,7 +175,7 @@ def test_nothing_but_finite_states_and_covariances_comes_out(seed, robust, use_i
 
 
 def test_the_zero_of_time_changes_nothing():
-    """Nor does how long before the first message it lies."""
+    """The interval between the zero of time and the first message does not matter either."""
     flight = fly(16, 4.0, tdoa_std=0.5)
     imu, d = flight.imu, flight.tdoa
     later = replace(flight, imu=replace(imu, t=imu.t + 1024.0), tdoa=replace(d, t=d.t + 1024.0))
@@ -184,8 +191,8 @@ def test_stamps_that_repeat_are_used_and_move_nothing():
     twice = replace(flight, imu=kept(flight.imu, doubled))
     odometry, _ = drive(flight)
     again, _ = drive(twice)
-    # the sample repeated is averaged with itself, not with the one before: a difference of half a
-    # sample's change
+    # The repeated sample is averaged with itself instead of the one before. The input differs by
+    # half the change between samples.
     np.testing.assert_allclose(again.x[:, :3], odometry.x[:, :3], atol=0.02)
 
 
@@ -209,7 +216,7 @@ def test_stays_sound_over_an_hour_of_updates():
 @pytest.mark.slow
 @pytest.mark.usefixtures("must_end")
 def test_a_clock_that_leaps_forward_does_not_stall_the_filter():
-    """From a start at zero to the wall clock would be 1.7e9 s; this is a thousandth of it."""
+    """The leap is 1.7e6 s: a thousandth of the leap from zero to the wall clock, 1.7e9 s."""
     flight = fly(14, 2.0)
     state = state_for(flight)
     drive(flight, state=state)
@@ -223,7 +230,7 @@ def test_a_clock_that_leaps_forward_does_not_stall_the_filter():
 
 
 def recorded(flight, config=None):
-    """(records, residuals) of a flight that is fed at once."""
+    """Return (records, residuals) of a flight that is fed at once."""
     records, fed = [], measurements(flight)
     _, residuals, _ = feed(
         new_state(flight.anchors.positions), (config or FilterConfig()).parameters(), fed, records
@@ -248,8 +255,9 @@ def test_every_tdoa_that_is_used_has_its_record_and_none_is_without_room(seed, o
 
 
 def test_a_record_leads_to_the_next():
-    """P after an update is (I - K h) (Phi P Phi' + Q), with no Q for what no noise drives: of a tag
-    without an IMU all but the yaw.
+    """P after an update is (I - K h) (Phi P Phi' + Q).
+
+    States without process noise have Q = 0. Here, the tag has no IMU, and only the yaw has noise.
     """
     flight = fly(3, 2.0)
     records, _ = recorded(
@@ -268,7 +276,7 @@ def test_a_record_leads_to_the_next():
 
 
 def test_what_a_record_does_not_lead_to_is_noise():
-    """A tag is lifted from its rest: of what was known of its velocity nothing carries over.
+    """A tag is lifted from rest, and its old velocity gives no information.
 
     Q = P before the update - Phi P Phi' >= 0.
     """
@@ -290,7 +298,7 @@ def test_what_a_record_does_not_lead_to_is_noise():
 
 
 def lifted(rng):
-    """A Flight that lies still for 4 s, and is lifted then: with 0.5 m/s^2 for a second."""
+    """Return a Flight that lies still for 4 s, then accelerates upwards at 0.5 m/s^2 for 1 s."""
     flight = fly(2, 6.0, hover=True, tdoa_std=0.05)
     accel = flight.imu.accel + np.where((flight.imu.t > 4.0) & (flight.imu.t < 5.0), 0.5, 0.0)[
         :, None

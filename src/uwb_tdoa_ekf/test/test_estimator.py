@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The live filter: arrival in any order gives what the recording gives."""
+"""The live filter: any order of arrival gives the result of the recording."""
 
 from dataclasses import replace
 import math
@@ -44,7 +44,7 @@ FIRST, SECOND = corners().ids[:2].tolist()
 
 
 def received(estimator):
-    """(IMU, TDOA) messages that the accounts and the buffers tell of."""
+    """Return (IMU, TDOA) messages in the counts plus the buffers."""
     counts, (imu, tdoa, *_) = estimator.counts, estimator.waiting
     return sum(counts[name] for name in ("imu_used", "imu_late", "imu_invalid")) + imu, sum(
         counts[name] for name in VERDICTS.values()
@@ -70,7 +70,7 @@ def assert_sensors_as_offline(flight, config=None, **feeding):
 
 
 def spoiled(flight):
-    """Some of every sensor cannot be measurements."""
+    """Replace some values of every sensor by impossible ones."""
     height, pressure, velocity = flight.height, flight.pressure, flight.velocity
     height.range[10:13], pressure.pressure[10:12], velocity.v[10] = (
         [np.nan, np.inf, -1.0],
@@ -197,7 +197,10 @@ def test_an_inertial_sample_that_is_not_finite_is_as_if_it_had_never_come():
 @settings(max_examples=40)
 @given(seeds, st.booleans())
 def test_every_message_is_accounted_for_once(seed, use_imu):
-    """Any disorder, any nonsense, at any moment: accounts plus buffers are what was received."""
+    """Counts plus buffers equal the number of sent messages.
+
+    Messages come in any order, with invalid values, at any moment.
+    """
     rng = np.random.default_rng(seed)
     estimator = Estimator(corners(), FilterConfig(use_imu=use_imu))
     sent, clock, parts = [0, 0], 0.0, []
@@ -229,7 +232,7 @@ def test_a_clock_that_falls_back_starts_anew_and_keeps_the_accounts():
     estimator = Estimator(first.anchors)
     for _t, stream, i in messages(first):
         send(estimator, first, stream, i)
-    estimator.advance()  # not finished: some are still waiting when the clock falls back
+    estimator.advance()  # some messages still wait when the clock falls back
     waiting = estimator.waiting
     assert estimator.running and waiting[TDOA] > 0
     odometry, residuals = feed(estimator, again)
@@ -259,7 +262,7 @@ def test_falling_back_by_less_is_late_not_a_restart():
 def test_rates_are_those_measured_last(engine):
     flight = fly(8, 2.0)
     odometry = engine(flight).odometry
-    if engine is smooth:  # the smoother estimates none
+    if engine is smooth:  # the smoother estimates no rates
         assert np.isnan(odometry.rate).all() and np.isnan(odometry.rate_variance).all()
         return
     last = np.searchsorted(flight.imu.t, odometry.t, side="right") - 1
@@ -315,7 +318,7 @@ def test_a_restart_is_named_for_a_while():
 
 
 # --- estimator faults ---
-BEGIN, END = 5.0, 9.0  # s, of a fault
+BEGIN, END = 5.0, 9.0  # s, begin and end of a fault
 IMU_FAULTS = {
     "in g": lambda w, f: (w, f / 9.81),
     "degrees/s": lambda w, f: (np.rad2deg(w), f),
@@ -348,7 +351,7 @@ def test_without_an_imu_that_cannot_be_right_the_filter_knows_how_well_it_does_w
 
 
 def twice(flight):
-    """The Flight with every TDOA twice, the second one right after the first."""
+    """Return the Flight with every TDOA twice, the second one right after the first."""
     return replace(flight, tdoa=kept(flight.tdoa, np.repeat(np.arange(len(flight.tdoa)), 2)))
 
 
@@ -378,7 +381,7 @@ def test_a_stream_whose_stamps_do_not_go_on_is_used_and_does_not_grow(step=1e-9)
     imu, tdoa, n = flight.imu, flight.tdoa, MOST_WAITING + 500
     estimator = Estimator(flight.anchors)
     estimator.add_imu(imu.t, imu.gyro, imu.accel)
-    # out of order: what is stamped alike is waited for
+    # After stamps out of order, TDOAs with equal stamps wait.
     estimator.add_tdoa(tdoa.t[[1, 0]], tdoa.a[:2], tdoa.b[:2], tdoa.d[:2])
     ids = flight.anchors.ids[np.arange(n) % len(flight.anchors)]
     for k in range(3):
@@ -399,9 +402,8 @@ def test_a_tag_without_tdoas_is_lost_once_it_may_be_anywhere_and_found_when_they
         return True
 
     odometry, _ = feed(estimator, flight, advance=note)
-    assert not (
-        (odometry.t > 34.0) & (odometry.t < 40.0)
-    ).any()  # metres by the dozen are no odometry
+    # With an error of dozens of metres, there must be no odometry.
+    assert not ((odometry.t > 34.0) & (odometry.t < 40.0)).any()
     assert (odometry.t < 33.0).any() and odometry.t[-1] > 44.9
     error = np.linalg.norm(odometry.p - position_at(flight, odometry.t), axis=1)
     assert error[odometry.t > 42.0].max() < 0.5
@@ -427,7 +429,7 @@ def test_a_tag_whose_velocity_is_measured_is_not_lost_without_tdoas():
 
 
 def pose_at(flight, t, offset=(0.0, 0.0, 0.0), std=0.1, yaw=math.nan, yaw_std=math.nan):
-    """Arguments of set_pose: the true position of a flight at t, off by some metres."""
+    """Return arguments of set_pose: the true position at t plus `offset`, in m."""
     return t, position_at(flight, np.array([t]))[0] + offset, std**2 * np.eye(3), yaw, yaw_std
 
 
@@ -437,7 +439,7 @@ def test_a_pose_that_is_set_starts_the_filter_there_with_its_yaw():
     estimator = Estimator(flight.anchors)
     estimator.set_pose(*pose_at(flight, 0.05, yaw=yaw, yaw_std=0.1))
     odometry, residuals = feed(estimator, flight)
-    assert odometry.t[0] < 0.06  # half a second of TDOAs would be needed
+    assert odometry.t[0] < 0.06  # without the pose, it needs half a second of TDOAs
     error = np.linalg.norm(odometry.p - position_at(flight, odometry.t), axis=1)
     assert error.max() < 0.35
     found = Rotation.from_quat(odometry.q[0]).as_euler("ZYX")[0]
@@ -462,7 +464,7 @@ def test_a_pose_takes_effect_at_its_stamp_whenever_it_comes_before(ahead):
             expected = odometry
     assert_same(odometry, expected)
     before, after = odometry.p[odometry.t <= t], odometry.p[odometry.t > t]
-    assert after[0, 0] - before[-1, 0] > 2.5  # it goes where it is told
+    assert after[0, 0] - before[-1, 0] > 2.5  # it moves to the given pose
 
 
 def test_a_pose_that_comes_late_counts_from_the_next_measurement_and_another_time_is_refused():
@@ -535,7 +537,7 @@ def test_another_tuning_counts_from_the_next_measurement_on():
 
 
 def with_a_late_anchor(size=0.8, since=20.0):
-    """A flight of 32 s in which one of eight anchors becomes late."""
+    """Return a flight of 32 s, and the same flight with a late anchor from `since` s on."""
     flight = fly(4, 32.0, imu_rate=50.0, tdoa_rate=100.0, tdoa_std=0.05)
     tdoa = flight.tdoa
     sign = (tdoa.b == FIRST).astype(float) - (tdoa.a == FIRST)
@@ -559,7 +561,8 @@ def test_a_delay_that_comes_in_flight_is_taken_out_if_asked_for_whatever_the_arr
         of_anchor = (run.residuals.a == FIRST) | (run.residuals.b == FIRST)
         compensated = run.residuals.verdict == COMPENSATED
         assert compensated.any() == (name == "on") and not compensated[~of_anchor].any()
-        if name == "on":  # the innovation still has the delay
+        # The innovation still contains the delay.
+        if name == "on":
             assert np.mean(np.abs(run.residuals.innovation[compensated])) == pytest.approx(
                 0.8, abs=0.15
             )
@@ -581,8 +584,9 @@ TURNS = {
 
 
 def flown(turn):
-    """A flight with an inertial sensor that begins late, in axes that are turned by a rotation
-    vector.
+    """Return a flight with an inertial sensor that begins late.
+
+    A rotation vector turns the axes of the sensor.
     """
     flight, turn = fly(seed=8, duration=16.0), Rotation.from_rotvec(turn)
     later = flight.imu.t > flight.imu.t[0] + IMU_BEGINS

@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What a filter leaves unexplained: fed block by block as at once, and left out from where on it is
-certain to be too much.
+"""Innovations that a filter leaves unexplained.
+
+Feeding in blocks gives the same result. It is left out once it certainly exceeds the limit.
 """
 
 from flights import fly, without_tdoas

@@ -47,8 +47,9 @@ PARAMETERS = FilterConfig().parameters()
 
 
 def heard(p, v=(0.0, 0.0, 0.0), late=0.0, std=0.08, seed=0, seconds=0.5, n=180):
-    """(k,) of PAIR in a window of random pairs, of a tag that is at p (3,) in its middle; late (8,)
-    m.
+    """Return the PAIRs (k,) of a window of TDOAs of random pairs.
+
+    The tag is at p (3,) in the middle of the window. `late` (8,) holds the delays in m.
     """
     rng = np.random.default_rng(seed)
     t = np.sort(rng.uniform(0.0, seconds, n))
@@ -74,10 +75,9 @@ def test_anchors_may_be_late_where_both_antennas_are_low_and_far_apart():
     assert not may_be_late(high, np.array([5.0, 0.0, 0.03]), 0.0, 0.0)
     assert not may_be_late(low, np.array([5.0, 0.0, 1.2]), 0.0, 0.0)
     assert not may_be_late(low, np.array([0.3, 0.0, 0.03]), 0.0, 0.0)  # steep
-    assert may_be_late(low, np.array([5.0, 0.0, 1.2]), 1.0, 0.0)  # it may be lower
-    assert may_be_late(
-        low + [0.0, 0.0, 2.0], np.array([5.0, 0.0, 2.03]), 0.0, 2.0
-    )  # over another ground
+    assert may_be_late(low, np.array([5.0, 0.0, 1.2]), 1.0, 0.0)  # the tag may be lower
+    # The ground is higher here.
+    assert may_be_late(low + [0.0, 0.0, 2.0], np.array([5.0, 0.0, 2.03]), 0.0, 2.0)
 
 
 def test_tdoas_are_noisier_near_the_ground_and_nowhere_else():
@@ -123,9 +123,8 @@ def test_a_tdoa_of_a_late_anchor_says_nothing_and_no_other_is_doubted(off, used)
         return in_time(anchors[high], anchors[low], innovation[0])
 
     share = judged(0.0)
-    assert (
-        share >= NOT_USED
-    ) == used  # -3.3: the high one would have to be late; that is no matter of the ground
+    # At -3.3 m the high anchor would have to be late, and that is no effect of the ground.
+    assert (share >= NOT_USED) == used
     assert (anchors["late"][low] > 0.9) == (off == 3.3) and anchors["late"][high] == 0.0
     hypothesis["x"][0, 2] = 2.0
     assert judged(0.1) == 1.0 and anchors["late"][low] == 0.0
@@ -148,8 +147,9 @@ def test_a_tag_whose_anchors_are_late_is_still_and_one_that_moves_is_not():
 
 
 def placed(p, elsewhere, late=0.0, seed=0, state=None):
-    """(position (3,), standard deviations (3,), on the ground?) of a tag at rest at p, if a start
-    has found it `elsewhere`.
+    """Return (position (3,), standard deviations (3,), on the ground?) of a tag at rest at p.
+
+    The start has found it `elsewhere`.
     """
     state = state or new_state(POSITIONS)
     set_bounds(state.record.extent, 1.0, state.record.workspace)
@@ -161,7 +161,7 @@ def placed(p, elsewhere, late=0.0, seed=0, state=None):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_late_low_anchors_put_it_on_the_ground_and_not_above_the_hall(seed):
-    """Free in z such TDOAs agree on a place high above the hall."""
+    """With a free z, these TDOAs agree on a position high above the hall."""
     p = [2.5, 5.0, 0.03]
     x, std, on_ground = placed(p, [2.5, 5.0, 7.5], np.where(LOW, 3.3, 0.0), seed)
     assert on_ground and np.linalg.norm(x - p) < 0.3
@@ -170,8 +170,9 @@ def test_late_low_anchors_put_it_on_the_ground_and_not_above_the_hall(seed):
 
 @pytest.mark.parametrize("height", [0.75, 1.5])
 def test_what_stands_on_a_table_or_hovers_is_where_it_is_said_to_be_or_may_be(height):
-    """With a quarter of a metre of error for each anchor the height is hardly known: both places
-    are possible.
+    """With an error of 0.25 m per anchor the height is hardly known.
+
+    Both positions are possible, and the stated deviations cover the true one.
     """
     p = [2.5, 5.0, height]
     x, std, _ = placed(p, p)
@@ -179,8 +180,9 @@ def test_what_stands_on_a_table_or_hovers_is_where_it_is_said_to_be_or_may_be(he
 
 
 def test_a_blocked_low_anchor_does_not_lift_it():
-    """As on constellation 4: one anchor is 1.9 m late, at any height; without the ground in mind
-    the tag is put 1.6 m up.
+    """One anchor is 1.9 m late at any height, as on constellation 4.
+
+    Without a ground hypothesis, the estimate is 1.6 m too high.
     """
     late = np.zeros(8)
     late[np.flatnonzero(LOW)[0]] = 1.9
@@ -199,7 +201,7 @@ def test_where_two_explanations_are_alike_its_deviation_is_as_large_as_they_are_
     "seen, true", [([2.5, 5.0], True), ([np.nan, np.nan], True), ([6.5, 1.0], False)]
 )
 def test_delays_that_are_known_count_where_they_were_seen(seen, true):
-    """Elsewhere the echoes are others: there they differ by what nobody knows."""
+    """Elsewhere the echoes differ from the known delays by an unknown amount."""
     floor, p = np.where(LOW, 3.4, 0.3) + 0.1 * np.arange(8), [2.5, 5.0, 0.03]
     state = new_state(POSITIONS, floor=(floor, 0.05, seen))
     late = floor if true else np.where(LOW, 2.2, 0.0)
@@ -215,9 +217,18 @@ PLACE = np.array([2.5, 5.0, 0.03])
 
 
 def on_floor(seed, duration, late=3.3, shaking=0.0, lift=np.inf, back=np.inf, known=None):
-    """A flight that stands at PLACE and, from `lift` s on, rises by 0.5 m/s^2 for 2 s, stays up,
-    and comes down likewise from `back` s on; while it is below 0.12 m the anchors at 0.15 m are
-    about `late` m later, or all by `known` (8,) m. shaking : m/s^2, white, of the accelerometer.
+    """Return a flight that stands at PLACE, rises, and comes down again.
+
+    Parameters
+    ----------
+    lift, back : float
+        Times at which it rises and comes down, in s. Either takes 2 s, with 0.5 m/s^2.
+    late : float
+        Delay of the anchors at 0.15 m while the tag is below 0.12 m, in m, approximately.
+    known : (8,) array, optional
+        Delays of all anchors instead, in m.
+    shaking : float
+        White noise of the accelerometer, in m/s^2.
     """
     low = replace(corners(), positions=np.array(corners().positions) + [0.0, 0.0, 0.15])
     flight, rng = (
@@ -266,7 +277,7 @@ def on_floor(seed, duration, late=3.3, shaking=0.0, lift=np.inf, back=np.inf, kn
 
 
 def run(flight, corrector=None, **config):
-    """(t, error (n, 3) m, NEES (n,)) of the odometry."""
+    """Return (t, error (n, 3) in m, NEES (n,)) of the odometry."""
     odometry = run_offline(flight, FilterConfig(**config), corrector).odometry
     return odometry.t, *errors_of(flight, odometry)
 
@@ -281,7 +292,10 @@ def test_on_a_floor_where_low_anchors_are_late_it_is_right_and_honest(shaking):
 
 @pytest.mark.parametrize("margin", [5.0, 1000.0])
 def test_in_a_wide_workspace_it_starts_on_the_floor_too(margin):
-    """Free in z late low anchors put it metres above the hall, which is within such a workspace."""
+    """With a free z, late low anchors give a position metres above the hall.
+
+    It is inside such a workspace.
+    """
     for seed in range(4):
         t, error, nees = run(on_floor(seed, 3.0, shaking=0.6), workspace_margin=margin)
         assert t[0] < 0.7 and np.linalg.norm(error, axis=1).max() < 0.5 and nees.mean() < 9.0
@@ -324,7 +338,7 @@ def test_delays_that_are_known_of_the_floor_make_it_sharp():
 
 
 def test_a_tag_that_lies_still_stays_where_it_is_without_tdoas():
-    """One second of TDOAs, then nothing for ten: the firmware's own test asks for 5 m."""
+    """One second of TDOAs is followed by ten without. The test of the firmware requires 5 m."""
     for seed in range(4):
         t, error, nees = run(without_tdoas(on_floor(seed, 11.0, late=0.0), 1.0))
         assert t[-1] > 10.9 and np.linalg.norm(error, axis=1).max() < 0.5 and nees.max() < 20.0
@@ -338,7 +352,7 @@ def test_without_an_imu_it_stands_too():
 
 
 def share_at_rest(flight):
-    """Share of the time, from 1 s on, in which a filter takes the tag for one at rest."""
+    """Return the share of time from 1 s on in which the filter considers the tag at rest."""
     estimator, resting = Estimator(flight.anchors, FilterConfig()), []
     for now in np.arange(0.1, flight.imu.t[-1], 0.1):
         for stream, add in ((flight.imu, estimator.add_imu), (flight.tdoa, estimator.add_tdoa)):
@@ -351,15 +365,14 @@ def share_at_rest(flight):
 
 
 def test_too_few_tdoas_are_no_evidence_of_motion():
-    """Pairs at random, as TDoA3 has them: in many looks no pair is heard often enough.
+    """With random pairs, as in TDoA3, many windows contain no pair often enough.
 
-    Counted as motion, such looks left 0.15 of the time.
+    If they counted as motion, the share at rest was 0.15.
     """
     at_rest = [
         fly(seed, 20.0, hover=True, tdoa_rate=240.0, accel_noise=0.003, gyro_noise=0.0005)
         for seed in range(3)
     ]
     assert np.mean([share_at_rest(flight) for flight in at_rest]) > 0.6
-    assert (
-        share_at_rest(fly(0, 20.0, tdoa_rate=240.0, accel_noise=0.003, gyro_noise=0.0005)) == 0.0
-    )  # it flies
+    # This tag flies.
+    assert share_at_rest(fly(0, 20.0, tdoa_rate=240.0, accel_noise=0.003, gyro_noise=0.0005)) == 0.0

@@ -21,7 +21,7 @@ from uwb_tdoa_ekf.monitoring.health import ERROR, OK, WARN  # noqa: E402
 from uwb_tdoa_ekf.monitoring.status import flyability  # noqa: E402
 
 # --- health ---
-# The node looks five times a second; here a report is a look, once a second.
+# The node looks at its counts five times a second. Here, each report is a look, once a second.
 STARTING, RUNNING = (
     SimpleNamespace(running=False, lost=None),
     SimpleNamespace(running=True, side_unknown=None),
@@ -29,7 +29,7 @@ STARTING, RUNNING = (
 
 
 class Judge(health.Health):
-    """Health with time.monotonic by hand."""
+    """Health with time.monotonic under the control of the test."""
 
     def __init__(self, monkeypatch, config=FilterConfig(), volume=None):
         self.now = 1000.0
@@ -37,9 +37,9 @@ class Judge(health.Health):
         super().__init__(config, 0.25, volume)
 
     def second(self, estimator, imu=1000, tdoa=400, wrong=(None, (), ()), **counts):
-        """Let one second pass with so many messages; returns (level, text, values).
+        """Let one second pass with the given numbers of messages; return (level, text, values).
 
-        wrong : what is refused, wiring, findings.
+        wrong : (refused input, wiring, findings).
         """
         self.now += 1.0
         self.received.update(imu=imu, tdoa=tdoa)
@@ -81,7 +81,7 @@ def test_without_use_of_an_imu_none_is_missing(monkeypatch):
 def test_a_start_that_takes_long_is_a_warning(judge):
     levels = [judge.second(STARTING)[0] for _ in range(8)]
     assert levels == [OK] * 6 + [WARN] * 2
-    judge.second(STARTING, tdoa=0)  # without data nothing can start
+    judge.second(STARTING, tdoa=0)  # without data no start is possible
     assert judge.second(STARTING)[0] == OK
 
 
@@ -94,7 +94,7 @@ def test_most_tdoas_lost_for_one_reason_is_a_warning(judge, name):
     assert level == WARN and name in text and "load" not in text
     for _ in range(2):
         last = judge.second(RUNNING, used=9500, **{name: 1500})
-    assert last[0] == OK  # that was then
+    assert last[0] == OK  # the old counts have no effect any longer
 
 
 def test_most_tdoas_rejected_for_seconds_is_a_warning(judge):
@@ -150,7 +150,7 @@ def test_odometry_that_is_behind_or_ahead_of_the_clock_is_a_warning(
     assert values["odometry behind the clock"].startswith(value)
     for k in range(3):
         text = judge.second(RUNNING, used=400, invalid=400 * (k + 1))[1]
-    assert "invalid" in text  # what matters more is said
+    assert "invalid" in text  # the more important trouble comes first
 
 
 def test_a_tag_outside_of_the_flyable_volume_is_a_warning(monkeypatch):
@@ -164,7 +164,7 @@ def test_a_tag_outside_of_the_flyable_volume_is_a_warning(monkeypatch):
     level, text, values = judge.second(running)
     assert level == WARN and "outside of the flyable volume" in text and values["flyable"] == "no"
     for k in range(3):
-        # what matters more is said
+        # The more important trouble comes first.
         level, text, values = judge.second(running, used=1, invalid=99 * (k + 1))
     assert level == WARN and "invalid" in text and values["flyable"] == "no"
 
@@ -177,7 +177,8 @@ def test_a_sensor_that_stops_is_told_and_so_is_one_that_contradicts(judge):
         assert judge.second(RUNNING, **counts)[:2] == (OK, "running")
     said = [judge.second(RUNNING, **counts) for _ in range(3)]
     assert said[-1][0] == WARN and "no messages on height any more" in said[-1][1]
-    for expected in (OK, WARN):  # for a second even a sound one may contradict
+    # For one second, a good sensor may contradict, too.
+    for expected in (OK, WARN):
         judge.received["height"] += 25
         counts.update(used=400, height_rejected=25)
         level, text, _ = judge.second(RUNNING, **counts)

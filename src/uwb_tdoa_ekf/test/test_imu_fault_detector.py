@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Inertial samples that cannot be right are left out at once, and used again; healthy ones never
-are (those of measured flights: test_stream_watch.py).
+"""Implausible inertial samples are left out at once. Later good samples are used again.
+
+Healthy samples are always used; test_stream_watch.py checks this for measured flights.
 """
 
 import re
@@ -18,18 +19,21 @@ from uwb_tdoa_ekf.core.state import GRAVITY
 from uwb_tdoa_ekf.monitoring.filter_findings import implausible
 
 T = np.arange(3000) / 200.0
-BEGIN, END = 5.0, 9.0  # s, of a fault
+BEGIN, END = 5.0, 9.0  # s, begin and end of a fault
 BAD = ((T >= BEGIN) & (T < END))[:, None]
 
 
 def swaying(yaw_rate=0.05):
-    """Rates and specific force of a tag that sways by some 10 degrees and turns."""
+    """Return rates and specific force of a tag that sways by some 10 degrees and turns."""
     angles = np.stack([yaw_rate * T, 0.2 * np.sin(1.3 * T), 0.15 * np.sin(1.7 * T)], axis=1)
     return sensed(Rotation.from_euler("ZYX", angles))
 
 
 def sensed(attitude, acceleration=0.0):
-    """Rates and specific force of attitudes at T, and of accelerations (n, 3) m/s^2 in the world."""
+    """Return rates and specific force for attitudes at T.
+
+    acceleration : (n, 3), in m/s^2 in the world.
+    """
     turns = (attitude[:-1].inv() * attitude[1:]).as_rotvec() / np.diff(T)[:, None]
     return np.vstack([turns, turns[-1:]]), attitude.inv().apply(
         np.broadcast_to(acceleration + np.array([0, 0, GRAVITY]), (len(T), 3))
@@ -37,7 +41,7 @@ def sensed(attitude, acceleration=0.0):
 
 
 def left_out(gyro, accel):
-    """[(s, reason)] of the samples that are left out."""
+    """Return [(s, reason)] of the samples that are left out."""
     state, parameters, out = new_state(np.zeros((4, 3))), FilterConfig().parameters(), []
     for row in structured(IMU_SAMPLE, T, gyro, accel)[:, None]:
         feed(state, parameters, Measurements(row, np.empty(0, TDOA)))
@@ -77,8 +81,9 @@ def test_a_spin_about_the_vertical_in_degrees_is_faster_than_anything_turns():
 
 
 def test_what_a_tag_may_do_is_no_fault():
-    """It falls, is hit, spins, banks with its thrust (all that a multirotor feels), and is turned
-    on its back for a while.
+    """The tag falls, is hit, spins and is turned on its back for a while.
+
+    It also banks with its thrust, the only force that a multirotor feels.
     """
     fall = np.where((T > 5.0) & (T < 5.2), -GRAVITY, 0.0) + np.where(
         (T > 5.2) & (T < 5.25), 4.0 * GRAVITY, 0.0
@@ -110,8 +115,9 @@ def test_a_tag_that_lies_on_its_back_goes_without_after_some_seconds():
     ("turn", "says"), [([1.0, -1.0, -1.0], r"-9\.\d m/s\^2"), ([0.0, 0.0, 0.0], r"of 0 m/s\^2")]
 )
 def test_what_is_said_has_the_number_of_the_sensor(turn, says):
-    """It once was 1.0, whatever the sensor read: the field `size` of a numpy record is hidden by
-    how many it is.
+    """The number was once 1.0 whatever the sensor read.
+
+    The attribute `size` of a numpy record is its number of elements and hides a field of that name.
     """
     gyro, accel = (values * turn for values in swaying())
     state, parameters = new_state(np.zeros((4, 3))), FilterConfig().parameters()

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The launch files under the real launch and launch_ros, with the nodes they start."""
+"""The launch files with the real launch and launch_ros, and the nodes that they start."""
 
 from contextlib import contextmanager
 import os
@@ -61,8 +61,9 @@ PROFILES = """<?xml version="1.0" encoding="UTF-8" ?>
 
 @pytest.fixture
 def launch(tmp_path):
-    """launch(*words, rig=None, path=()) gives a Launch, which ends with the test; rig : a Rig that
-    waits for nodes of it.
+    """Return launch(*words, rig=None, path=()), which starts a Launch. It ends with the test.
+
+    rig : a Rig that waits for nodes of this launch.
     """
     started = []
 
@@ -80,9 +81,7 @@ def launch(tmp_path):
 
 
 def left_behind(launched):
-    """Names of what is in its folder for temporary files, but for what numba and the middleware
-    keep there.
-    """
+    """Return the names of all files in its folder for temporary files."""
     return sorted(path.name for path in launched.temporary.iterdir())
 
 
@@ -107,14 +106,14 @@ def ticking(publisher, epoch):
 
 
 def ends_well(launched):
-    """Ctrl-C ends all nodes in good order, and nothing stays behind."""
+    """Check that Ctrl-C ends all nodes cleanly and no temporary files remain."""
     launched.interrupt()
     assert "has died" not in launched.said, launched.said
     assert left_behind(launched) == []
 
 
 def values_of(rig, node, *names):
-    """The values of parameters of a node, by its absolute name."""
+    """Return the values of parameters of a node, given its absolute name."""
     client = AsyncParameterClient(rig.node, node)
     rig.wait(client.services_are_ready, f"the services of {node}")
     values = rig.answer(lambda: client.get_parameters(names), node).values
@@ -122,7 +121,7 @@ def values_of(rig, node, *names):
 
 
 def reliable(file, namespace):
-    """Write a parameter file, of both nodes, with which no message is lost."""
+    """Write a parameter file with reliable streams for both nodes."""
     ends = (
         "uwb/tdoa.subscription",
         "imu/data.subscription",
@@ -148,7 +147,7 @@ def tags_file(folder, text):
 
 
 def test_one_tag_on_simulated_time_from_start_to_ctrl_c(make_rig, launch, tmp_path):
-    # diagnostics are newer than any before
+    # The epoch makes these diagnostics newer than all earlier ones.
     flight, rig, epoch = (recording(2.0), make_rig(latched=False), int(time.time()) + 10**6)
     file = reliable(tmp_path / "reliable.yaml", rig.namespace)
     clock = rig.node.create_publisher(Clock, "/clock", 10)
@@ -226,9 +225,8 @@ def test_list_parameters_of_a_launch_file_of_others_and_ours_in_their_namespace(
     assert "none of its parameters" not in launched.said
     launched.interrupt()
     assert "has died" not in launched.said
-    assert all(
-        name.startswith("launch_params_") for name in left_behind(launched)
-    )  # of the node of the others
+    # These files belong to the node of the other launch file.
+    assert all(name.startswith("launch_params_") for name in left_behind(launched))
 
 
 PLAYER = """#!/bin/sh
@@ -267,7 +265,8 @@ def test_a_node_that_crashes_is_started_again(make_rig, launch):
     os.kill(launched.pid_of("ekf_node"), signal.SIGKILL)
     launched.wait("ekf_node has ended with exit code -9: it is started again in 1 s")
     launched.wait(READY, 2)
-    assert values_of(rig, "/ekf_node", "use_sim_time") == [False]  # it lives
+    # The node answers.
+    assert values_of(rig, "/ekf_node", "use_sim_time") == [False]
     launched.interrupt()
     assert launched.said.count("has died") == 1, launched.said
     assert left_behind(launched) == []
@@ -275,7 +274,7 @@ def test_a_node_that_crashes_is_started_again(make_rig, launch):
 
 def test_a_node_that_refuses_what_it_is_given_is_not_started_again(launch):
     launched = launch("uwb_tdoa_ekf", "tdoa.launch.py", "effects_file:=/nowhere.yaml")
-    # of either: with shutdown the first ends the other
+    # Either node may print it: with shutdown, the first to end stops the other.
     launched.wait("_node: error: /nowhere.yaml")
     launched.wait(
         "_node refuses what it is given (see its message above), and is not started again"
@@ -301,7 +300,7 @@ def test_arguments_are_listed_and_what_is_wrong_with_one_is_said(launch):
 
 
 def param(rig, *words):
-    """What `ros2 param ...` does, once it has found the node: the CompletedProcess."""
+    """Run `ros2 param ...` until it finds the node; return its CompletedProcess."""
     made = []
 
     def found():
@@ -327,7 +326,7 @@ def test_a_dump_of_parameters_goes_back_into_the_node_and_into_its_launch_file(
                 *words, *(f"{node}_params:={tmp_path / node}.yaml" for node in nodes), rig=rig
             )
         for node, name in nodes.items():
-            values_of(rig, name, "use_sim_time")  # it is there
+            values_of(rig, name, "use_sim_time")  # the node is there
             dump = param(rig, "dump", name)
             dumps.append(yaml.safe_load(dump.stdout))
             assert len(dumps[-1][name]["ros__parameters"]) > 5, dump.stderr
@@ -343,7 +342,7 @@ def test_a_dump_of_parameters_goes_back_into_the_node_and_into_its_launch_file(
 
 
 def values_below(part):
-    """All values in nested mappings."""
+    """Return all values in nested mappings."""
     return [
         value
         for each in part.values()
@@ -352,7 +351,10 @@ def values_below(part):
 
 
 def test_what_is_launched_obeys_no_profiles_of_the_present_folder(launch, tmp_path, monkeypatch):
-    """Programs of others, too, as rviz2. Fast DDS would empty the file that is named as its log."""
+    """This includes programs of other packages, such as rviz2.
+
+    With the profile in this folder, Fast DDS would use the file as its log and empty it.
+    """
     (tmp_path / "bashrc").write_text("precious\n")
     (tmp_path / "DEFAULT_FASTRTPS_PROFILES.xml").write_text(PROFILES.format(tmp_path / "bashrc"))
     (tmp_path / "stock.launch.py").write_text(STOCK)

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What the launch files start; test_launch_files.py runs them."""
+"""Processes that the launch files start; test_launch_files.py runs them."""
 
 import json
 import os
@@ -93,8 +93,9 @@ def test_what_a_node_is_told_are_arguments_which_later_ones_override():
 def test_a_node_that_crashes_is_started_again_each_time_later():
     lives = Lives("tag1/ekf_node", True, "shutdown")
     assert [lives.ended(-9, 1.0).again for _ in range(7)] == [1.0, 2.0, 4.0, 8.0, 16.0, 30.0, 30.0]
-    assert lives.ended(1, 61.0).again == 1.0  # it had lived well
-    again = lives.ended(2, 1.0)  # not at its start: whoever wrote the file may not have been ready
+    assert lives.ended(1, 61.0).again == 1.0  # after a long life
+    # Not its first start: a file may have been incomplete, so the node is started again.
+    again = lives.ended(2, 1.0)
     assert (again.again, again.everything) == (2.0, False)
     assert again.text == "tag1/ekf_node has ended with exit code 2: it is started again in 2 s"
 

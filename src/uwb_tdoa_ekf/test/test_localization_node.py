@@ -63,8 +63,9 @@ def test_tags_that_hear_the_same_say_the_same_each_in_its_namespace(make_rig):
 
 @pytest.fixture
 def started():
-    """started(*arguments) gives a LocalizationNode with these ROS arguments, which its Spinner
-    serves.
+    """Return started(*arguments), which starts a LocalizationNode with these ROS arguments.
+
+    Its Spinner serves the node.
     """
     nodes, spinners = [], []
 
@@ -85,7 +86,7 @@ def started():
 
 
 def served(node):
-    """Full names of the nodes of its tags that are there."""
+    """Return the full names of all running nodes of its tags."""
     return {each.get_fully_qualified_name() for tag in node._tags for each in tag.members}
 
 
@@ -115,7 +116,7 @@ def test_a_tag_that_fails_in_flight_does_not_take_the_others_along(started, monk
     else:
         monkeypatch.setattr(first._anchors._latched, "_callback", defect)
         first._anchors._latched.subscription.callback(serialize_message(AnchorArray()))
-    node.turns.take()  # notes it
+    node.turns.take()  # notes the failure
     node.turns.take()
     assert served(node) == {"/b/bias_node", "/b/ekf_node"} and node._tags[1].members == others
     assert "tag 'a' has failed and is started again in 1 s: some defect" in node._report()[1]
@@ -131,7 +132,7 @@ def test_a_tag_that_fails_in_flight_does_not_take_the_others_along(started, monk
 def test_whatever_is_raised_at_the_start_of_one_tag_concerns_that_tag_alone(
     started, monkeypatch, error
 ):
-    """As an OSError of a file, or an RCLError of the middleware."""
+    """Possible errors are an OSError of a file and an RCLError of the middleware."""
     real, failing = localization_node.EkfNode, [True]
 
     def node_of(*arguments, namespace, **options):

@@ -27,7 +27,7 @@ ANCHORS = Anchors.from_positions(
     np.random.default_rng(0).uniform(-4, 4, (6, 3)), ids=[3, 5, 7, 9, 11, 13]
 )
 IDS, RATE = ANCHORS.ids, 100  # Hz
-# coordinates within 3 cm, delays within 2
+# Standard deviations of a calibration: 3 cm for coordinates, 2 cm for delays.
 CALIBRATED = Covariance(keys_of(IDS), np.diag(np.repeat([0.03**2, 0.02**2], [18, 6])))
 
 
@@ -42,9 +42,10 @@ def watch(
     rejected=lambda t: 0.0,
     calibrated=None,
 ):
-    """[(s, alarms)] of a flight in which the anchors have delays_at(t, p) (6,) m; 100 TDOAs a
-    second in a ring. The tag flies rounds of 10 s; the filter knows where it is, and rejects that
-    share of the TDOAs.
+    """Return [(s, alarms)] of a flight with anchor delays delays_at(t, p) (6,), in m.
+
+    There are 100 TDOAs a second in a ring. The tag flies rounds of 10 s. The filter has the true
+    position. `rejected` gives the share of TDOAs that it rejects.
     """
     return played(
         Monitor(ANCHORS, calibrated), delays_at, gyro, noise, seconds, seed, moving, heard, rejected
@@ -62,7 +63,7 @@ def played(
     heard=lambda t, a, b: t == t,
     rejected=lambda t: 0.0,
 ):
-    """What `watch` gives, of a Monitor."""
+    """Return the same as `watch`, for a given Monitor."""
     rng, said = np.random.default_rng(seed), []
     for second in range(seconds):
         t = second + np.arange(RATE) / RATE
@@ -93,12 +94,12 @@ def only(row, size):
 
 
 def negated(t, place):
-    """Delays that make each TDOA the negative of itself."""
+    """Return delays that make each TDOA its own negative."""
     return -2.0 * np.linalg.norm(place - ANCHORS.positions, axis=1)
 
 
 def test_signs_turn_from_a_moment_in_which_the_filter_was_right():
-    """What contradicts the filter all the time, as late anchors do on a floor, is no event."""
+    """A contradiction that lasts from the start, as with late anchors on a floor, is no event."""
     monitor = Monitor(ANCHORS)
     played(monitor, negated, rejected=lambda t: 0.9, moving=False, seconds=20)
     assert monitor.turns == 0
@@ -170,7 +171,8 @@ def test_names_the_anchor_that_is_not_heard_any_more():
 
 
 def test_names_two_anchors_that_were_exchanged():
-    def delays(t, p):  # the range to the one, where that to the other is expected
+    # Each anchor has the range of the other.
+    def delays(t, p):
         out, ranges = np.zeros(6), np.linalg.norm(p - ANCHORS.positions, axis=1)
         if t > 30.0:
             out[1], out[4] = ranges[4] - ranges[1], ranges[1] - ranges[4]
@@ -198,7 +200,7 @@ def test_what_happens_on_the_floor_is_not_judged():
 
 @pytest.mark.parametrize("seed", range(2))
 def test_what_makes_several_late_at_once_names_none(seed):
-    """As on a floor: half of the anchors by metres, each pair by its own."""
+    """Half of the anchors are late by metres, each by another delay, as on a floor."""
     late = np.random.default_rng(seed).uniform(2.5, 4.0, 6) * (np.arange(6) % 2)
     said = watch(lambda t, p: late * (t > 40.0), seed=seed, seconds=50)
     assert [alarms for _, alarms in said if alarms] == []
@@ -247,7 +249,7 @@ def test_does_not_depend_on_when_it_is_asked():
 
 
 def test_a_swap_is_named_until_something_else_has_been_true_for_a_while(monkeypatch):
-    """Text flipped between two pairs and "running" from one half second to the next."""
+    """The text once flipped between two pairs and "running" every half second."""
     odd = [(), (3, 4), (1, 2), (), (1, 2)]
     answers = iter([*odd, *8 * [(1, 2)], *odd, *6 * [(1, 2)], *16 * [()], *16 * [(3, 4)]])
 
@@ -265,7 +267,7 @@ def test_a_swap_is_named_until_something_else_has_been_true_for_a_while(monkeypa
 
 
 def test_names_an_anchor_that_was_moved_before_the_start_and_where_it_stands(row=4):
-    """Nothing was said of it for as long as the flight lasted: nothing changed in flight."""
+    """Nothing changes in flight. The monitor once reported nothing for the whole flight."""
     shift = np.array([0.4, -0.5, 0.3])
 
     def delays(t, p):
@@ -305,9 +307,10 @@ ROOM = Anchors.from_positions(
 
 
 def displaced(seed, std, shift=(0.0, 0.0, 0.0), row=3):
-    """[(row, others)] of a flight through ROOM, an anchor of which stands elsewhere. The signals of
-    each anchor are late by a smooth function of the place, of that standard deviation in m, as
-    antennas make them.
+    """Return [(row, others)] of a flight through ROOM with a displaced anchor.
+
+    The signals of each anchor are late by a smooth function of the position, as antennas cause it.
+    `std` is the standard deviation of the delay, in m.
     """
     rng, comparison = np.random.default_rng(seed), SurveyComparison(ROOM)
     waves, phases = rng.standard_normal((30, 3)) / 1.2, rng.uniform(0.0, 2.0 * np.pi, 30)
@@ -326,14 +329,18 @@ def displaced(seed, std, shift=(0.0, 0.0, 0.0), row=3):
 
 
 def test_errors_of_antennas_are_no_shift():
-    """A slope of them was thought to be no larger than what differs from cell to cell: an anchor
-    was named in 6 of 30 flights, with up to 25 powers of e.
+    """The slope of antenna errors was once assumed to be at most their variation between cells.
+
+    An anchor was then named in 6 of 30 flights, with up to 25 powers of e.
     """
     assert [displaced(seed, 0.1) for seed in range(30)] == [[]] * 30
 
 
 def test_the_moved_anchor_is_named_in_spite_of_errors_of_antennas():
-    """It was among those that were named in 12 of 20 flights, and alone in one."""
+    """At least 12 of 20 flights name an anchor, always including the moved one.
+
+    At least 8 name it alone. An earlier version named it alone in one flight.
+    """
     found = [displaced(seed, 0.1, (0.5, -0.4, 0.3)) for seed in range(20)]
     named = [one for one in found if one]
     assert len(named) >= 12 and all(
@@ -351,9 +358,10 @@ def test_a_function_of_the_place_has_no_mean_and_no_more_than_its_size(places):
 
 
 def test_anchors_that_the_data_do_not_separate_are_named_together():
-    """One of them was named, and at times the wrong one."""
+    """An earlier version named a single one, and at times the wrong one."""
     n, towards = 3, np.zeros((3, 12))
-    for k, row in enumerate((0, 1)):  # shifts of 0 and 1 along x look alike; of 2, nothing is heard
+    # Shifts of 0 and 1 along x have the same effect. Anchor 2 is not heard.
+    for k, row in enumerate((0, 1)):
         towards[:, 3 * row] = 1.0 + 1e-3 * k
     part = Part(1e4 * towards.T @ towards, 1e4 * towards.T @ np.full(3, 0.5), 0.0, 0.1)
     covariance = np.diag(np.full(4 * n, 0.02**2))
@@ -391,7 +399,7 @@ def test_the_sentence_on_a_moved_anchor_names_those_that_are_as_probable():
 
 
 def test_a_coordinate_that_is_hardly_known_displaces_no_anchor():
-    """Evidence for a shift of x is none for the height that the same fit has."""
+    """Evidence for a shift along x is no evidence for the height in the same fit."""
     sure = Displaced(1, np.array([0.06, 0.0, 0.3]), np.array([0.01, 0.01, 0.1]), 0.0, 12.0, False)
     unknown = replace(sure, std=np.array([0.01, 0.01, 0.5]))
     late = replace(unknown, shift=np.zeros(3), later=0.3)
@@ -412,7 +420,7 @@ def test_who_is_moved_in_flight_is_not_said_to_have_been_elsewhere_before():
 
 
 def test_a_gap_of_any_length_is_passed_at_once():
-    """A clock that is set: no slice is tested for each half second of 54 years."""
+    """If the clock is set, no test runs for each half second of 54 years."""
     monitor, rng = Monitor(ANCHORS), np.random.default_rng(0)
     parts = []
     for begin in (0.0, 1.7e9):
@@ -431,14 +439,17 @@ def test_a_gap_of_any_length_is_passed_at_once():
 
 
 def test_memory_grows_with_the_number_of_anchors_not_with_its_square():
-    cost(8, 8, 30)  # what is compiled, is
+    # The first run compiles all functions.
+    cost(8, 8, 30)
     (few, _), (many, _) = cost(100, 30, 30), cost(1000, 30, 30)
-    assert many < 12.0 * few and many < 20e6  # bytes; 240 matrices of them would be 1.9 GB
+    # In bytes. 240 matrices over all anchors are 1.9 GB.
+    assert many < 12.0 * few and many < 20e6
 
 
 def late(n, heard, row, since, slices, size=0.8, seed=1):
-    """The Change that is found last in slices of a tag that hears the nearest anchors; one is late
-    from slice `since` on.
+    """Return the last Change found in slices of a tag that hears the nearest anchors.
+
+    The anchor in `row` is late by `size` m from slice `since` on.
     """
     rng, anchors, detector = np.random.default_rng(seed), row_of(n).positions, ChangeDetector()
     found = None

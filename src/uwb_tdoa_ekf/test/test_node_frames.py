@@ -1,8 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""ekf_node and bias_node among the frames, parameters and services that a robot has.
+"""ekf_node and bias_node with the frames, parameters and services of a robot.
 
-One start of the nodes serves many questions.
+Each test starts the nodes once and checks many properties.
 """
 
 import numpy as np
@@ -32,9 +32,9 @@ from uwb_tdoa_bias.ros.frames import TF_QOS, TF_STATIC_QOS  # noqa: E402
 from uwb_tdoa_ekf.offline import run_offline  # noqa: E402
 from uwb_tdoa_msgs.msg import AnchorArray  # noqa: E402
 
-# of the IMU on the body: upside down
+# attitude of the IMU on the body: upside down
 TURN = Rotation.from_euler("ZYX", [90.0, 0.0, 180.0], degrees=True)
-ARM = [0.05, 0.0, 0.1]  # m, of the antenna on the body
+ARM = [0.05, 0.0, 0.1]  # m, position of the antenna on the body
 
 
 def transform(parent, child, p=(0.0, 0.0, 0.0), q=(0.0, 0.0, 0.0, 1.0), t=None):
@@ -54,8 +54,10 @@ def call(rig, kind, service, request):
 
 
 def test_sensors_in_frames_of_their_own_among_frames_that_move(make_rig, tmp_path):
-    """IMU turned, antenna on an arm, odom -> base_link from somebody else, anchors and effects of
-    files: as the offline engine.
+    """The results agree with the offline engine.
+
+    The IMU is turned, the antenna is on an arm, and another node publishes odom -> base_link.
+    Anchors and effects come from files.
     """
     flight = recording(3.0)
     flight.anchors.to_yaml(tmp_path / "anchors.yaml")
@@ -100,7 +102,8 @@ def test_sensors_in_frames_of_their_own_among_frames_that_move(make_rig, tmp_pat
     send, course = rig.send, []
 
     def in_frames(topic, message, t, frame="base_link", **epoch):
-        if topic == "imu/data" and round(t * 200.0) % 10 == 0:  # odom drifts away from the map
+        # odom drifts away from the map.
+        if topic == "imu/data" and round(t * 200.0) % 10 == 0:
             course.append(t)
             q = Rotation.from_euler("z", 0.1 * t).as_quat()
             moving.publish(
@@ -122,7 +125,7 @@ def test_sensors_in_frames_of_their_own_among_frames_that_move(make_rig, tmp_pat
     apart = np.linalg.norm(positions(rig.odometry) - expected.p[place], axis=1)
     assert len(apart) > 300 and apart.max() < 0.01
 
-    # map -> odom leads, over odom -> base_link, to the odometry of the same stamp
+    # map -> odom and odom -> base_link together give the odometry of the same stamp.
     poses = {
         (m.header.stamp.sec, m.header.stamp.nanosec): m.pose.pose.position for m in rig.odometry
     }
@@ -135,13 +138,14 @@ def test_sensors_in_frames_of_their_own_among_frames_that_move(make_rig, tmp_pat
         v, q = message.transform.translation, message.transform.rotation
         led = Rotation.from_quat([q.x, q.y, q.z, q.w]).apply([t, 0.5 * t, 0.0]) + [v.x, v.y, v.z]
         p = poses[message.header.stamp.sec, message.header.stamp.nanosec]
-        # of when the course was not there yet: 50 ms later
+        # odom -> base_link comes only every 50 ms, so it may be missing at this stamp.
         np.testing.assert_allclose(led, [p.x, p.y, p.z], atol=0.02)
 
 
 def test_what_a_robot_does_to_a_running_filter(make_rig):
-    """Volatile anchors, both kinds of subscribers, an unknown frame, parameters in flight,
-    initialpose, reset.
+    """The test covers volatile anchors, both kinds of subscribers and an unknown frame.
+
+    Parameters, initialpose and reset follow in flight.
     """
     flight = recording(2.0)
     rig = make_rig(reliable=False, latched=False)
@@ -217,7 +221,7 @@ def test_what_a_robot_does_to_a_running_filter(make_rig):
     )
     np.testing.assert_allclose(positions(rig.odometry[-1:])[0, :2], [1.0, 2.0], atol=0.2)
 
-    # an IMU whose frame nobody knows
+    # an IMU in an unknown frame
     rig.send("imu/data", rig.imu_message(), t + 0.31, "imu_link")
     unknown = "imu/data is in frame 'imu_link', which /tf_static does not connect with 'base_link'"
     rig.wait(lambda: any(unknown in line for line in process.lines), "it to be named")

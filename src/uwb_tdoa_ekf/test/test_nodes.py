@@ -41,8 +41,8 @@ def quaternion(q):
 )
 def test_odometry_is_that_of_the_offline_engine(make_rig, tmp_path, what, processes):
     flight = recording()
-    heard = np.abs(flight.tdoa.t - 2.0) > 0.06  # nothing, for longer than a pose lag
-    doubt = np.where(np.arange(len(flight.tdoa)) % 5, 0.0, 0.5)  # m^2, that the tag tells
+    heard = np.abs(flight.tdoa.t - 2.0) > 0.06  # no TDOAs, for longer than a pose lag
+    doubt = np.where(np.arange(len(flight.tdoa)) % 5, 0.0, 0.5)  # m^2, variance that the tag states
     flight = replace(flight, tdoa=kept(replace(flight.tdoa, variance=doubt), heard))
     model = known_answer.write(tmp_path)
     effects = tmp_path / "effects.yaml"
@@ -99,7 +99,7 @@ def test_odometry_is_that_of_the_offline_engine(make_rig, tmp_path, what, proces
     assert {m.model for m in rig.corrected} == models[what]
     assert np.ptp(expected.bias) > 0.05
 
-    # The odometry is the same, but for what still waits.
+    # The odometry is the same, except for the part that still waits.
     odometry = expected.odometry
     n = len(rig.odometry)
     assert len(odometry) - 3 <= n <= len(odometry) and n > 500
@@ -126,7 +126,7 @@ def test_odometry_is_that_of_the_offline_engine(make_rig, tmp_path, what, proces
     np.testing.assert_allclose(twist[:, :3, :3], covariance[:n, 6:, 6:], atol=1e-6)
     assert {(m.header.frame_id, m.child_frame_id) for m in rig.odometry} == {("map", "base_link")}
 
-    # And so is what is said beside it.
+    # Transforms and residuals agree as well.
     rig.wait(lambda: len(rig.received["/tf"]) == n, "all transforms")
     transforms = {seconds_of(t.header.stamp): t for m in rig.received["/tf"] for t in m.transforms}
     for message in rig.odometry:
@@ -147,19 +147,20 @@ def test_odometry_is_that_of_the_offline_engine(make_rig, tmp_path, what, proces
 
     if what == "effects":
         return
-    # A recording that starts again gives the same again.
+    # A recording that starts again gives the same results again.
     rig.play(flight)
     again = rig.counts(
         "ekf_node", IMU_samples_received=2 * len(flight.imu), TDOAs_received=2 * len(flight.tdoa)
     )
-    assert (again["restarts"], again["late"]) == (1, ekf["waiting"])  # what had been left waiting
+    # The TDOAs that still waited are late.
+    assert (again["restarts"], again["late"]) == (1, ekf["waiting"])
     first, second = rig.odometry[:n], rig.odometry[n:]
     assert [m.header.stamp for m in first] == [m.header.stamp for m in second]
     assert [m.pose.pose for m in first] == [m.pose.pose for m in second]
 
 
 def test_a_rover_over_topics_is_that_of_the_offline_engine_to_the_bit(make_rig):
-    """Wheels that come as nav_msgs/Odometry, TDOAs and an IMU; a planar vehicle."""
+    """The rover is a planar vehicle with wheels as nav_msgs/Odometry, TDOAs and an IMU."""
     flight = drive(1, 8.0, begin=0.0)
     for name in ("imu", "tdoa", "velocity"):
         part = getattr(flight, name)
@@ -195,7 +196,8 @@ def test_a_rover_over_topics_is_that_of_the_offline_engine_to_the_bit(make_rig):
     np.testing.assert_array_equal([vector(t.linear) for t in twists], velocity)
     stated = np.array([m.pose.covariance for m in rig.odometry]).reshape(n, 6, 6)
     np.testing.assert_array_equal(stated, covariance[:, :6, :6])
-    assert np.ptp([t.angular.z for t in twists]) > 0.1  # of the gyroscope, or of the wheels
+    # The yaw rate comes from the gyroscope or the wheels.
+    assert np.ptp([t.angular.z for t in twists]) > 0.1
 
 
 def test_quality_of_service(make_rig):
@@ -208,7 +210,7 @@ def test_quality_of_service(make_rig):
     publishers = {
         "uwb/tdoa_corrected": {"bias_node": always},
         "uwb/residual": {"ekf_node": always},
-        "odometry": {"ekf_node": best_effort},  # by the parameter above
+        "odometry": {"ekf_node": best_effort},  # set by the parameter above
         "/tf": {"ekf_node": always},
         "/diagnostics": {"bias_node": always, "ekf_node": always},
     }
@@ -239,7 +241,7 @@ def test_quality_of_service(make_rig):
             assert found(endpoints, topic) == nodes, topic
 
     def arrived():
-        rig.send_tdoa(0.1, 10, 11, 0.5)  # best effort: until one is not lost
+        rig.send_tdoa(0.1, 10, 11, 0.5)  # best effort: repeat until one arrives
         return rig.corrected
 
     rig.wait(arrived, "a measurement to pass")

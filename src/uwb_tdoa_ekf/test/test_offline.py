@@ -34,8 +34,9 @@ EFFECTS = EffectSet(
 
 
 def live(flight, corrector, config=None):
-    """Estimator and corrector as the two nodes use them, message by message in the order of the
-    stamps: what a measurement is corrected with is what the filter has told by then.
+    """Run Estimator and corrector as the two nodes do, message by message in stamp order.
+
+    The corrector uses only the poses that the filter has published until then.
     """
     estimator, parts, corrected = Estimator(flight.anchors, config, reorder=0.0), [], []
 
@@ -72,9 +73,7 @@ def live(flight, corrector, config=None):
 
 
 class Doubt(Network):
-    """Stands in for a network that knows a bias and how sure it is of it, both depending on the
-    pose.
-    """
+    """Stand in for a network with a bias and a deviation that depend on the pose."""
 
     name = "doubt"
 
@@ -91,7 +90,7 @@ class Doubt(Network):
     [(0.01, None, False), (0.05, Doubt(), False), (0.2, Doubt(), False), (0.05, Doubt(), True)],
 )
 def test_corrections_are_those_of_live_feeding(lag, network, grid):
-    """Grid: poses exactly `lag` old, and the boundaries of batches, on the stamps of measurements."""
+    """With `grid`, poses exactly `lag` old and ends of batches coincide with stamps of TDOAs."""
     flight = fly(1, 4.0, imu_rate=100.0 if grid else 200.0, tdoa_rate=200.0, outliers=0.02)
     if grid:
         stamps = np.arange(len(flight.tdoa)) / 200.0
@@ -120,7 +119,7 @@ def test_what_is_corrected_is_what_was_wrong():
 
 
 def climbing(flight, steep):
-    """The Flight, its TDOAs with an error that is proportional to the climb rate, and that effect."""
+    """Return a Flight with TDOA errors proportional to the climb rate, and that effect."""
     effect = SmoothTerm(
         covariate="climb_rate",
         knots=(-5.0, 5.0),
@@ -133,8 +132,9 @@ def climbing(flight, steep):
 
 
 def test_a_bias_that_changes_with_the_state_is_taken_out_at_the_state(monkeypatch):
-    """At the pose of a moment ago alone it is not: the error of the velocity comes back as one of
-    the position.
+    """A correction at an earlier pose alone is insufficient.
+
+    The velocity error then causes a position error.
     """
     wrong, effect = climbing(fly(3, 12.0), 1.5)
 
@@ -149,8 +149,9 @@ def test_a_bias_that_changes_with_the_state_is_taken_out_at_the_state(monkeypatc
 
 
 def test_a_slope_tells_nothing_of_a_place_far_away():
-    """As after the tag was lost and found elsewhere, when the bias is still that of where it was
-    not.
+    """A slope has no effect if its linearization point is 5 m away.
+
+    This happens after a lost tag is found elsewhere: the bias still belongs to the wrong position.
     """
     flight = fly(7, 2.0)
     slope, state = np.ones((2, len(flight.tdoa), 6))
@@ -249,11 +250,18 @@ def test_leaves_the_flight_as_it_was_and_gives_the_same_twice():
 def consistency(
     robust, loss="geman_mcclure", seeds=range(40), duration=20.0, tdoa_std=0.1, **config
 ):
-    """NEES and NIS of flights whose every error is of the filter's own model, with the filter told
-    their true sizes.
+    """Return NEES and NIS of flights with errors of the filter's own model.
 
-    Returns (nees (flights, times) at 20 Hz after 3 s, nis (flights,) mean over that time, TDOAs in
-    it).
+    The filter has the true sizes of all errors.
+
+    Returns
+    -------
+    nees : (flights, times) array
+        At 20 Hz, after 3 s.
+    nis : (flights,) array
+        Mean over that time.
+    count : int
+        Number of TDOAs in that time.
     """
     sizes = dict(accel_noise=0.05, gyro_noise=0.003, accel_bias_walk=0.01, gyro_bias_walk=1e-4)
     settings = FilterConfig(
@@ -280,9 +288,10 @@ def consistency(
 
 
 def shares_inside(nees, nis, count, what):
-    """Shares of times and of flights inside the two-sided 95 % chi-square bounds of their averages:
-    Bar-Shalom et al., Estimation with Applications to Tracking and Navigation, sec. 5.4.2: the NEES
-    over flights, the NIS over time.
+    """Return the shares of times and of flights inside the two-sided 95 % chi-square bounds.
+
+    NEES is averaged over flights, NIS over time: Bar-Shalom et al., Estimation with Applications to
+    Tracking and Navigation, sec. 5.4.2.
     """
     flights = len(nees)
     low, high = chi2.ppf([0.025, 0.975], 3 * flights) / flights
@@ -300,9 +309,11 @@ def shares_inside(nees, nis, count, what):
 
 @pytest.mark.slow
 def test_a_plain_update_is_consistent():
-    """White noise only, and a filter that knows it. Average position NEES of 40 flights inside its
-    95 % bounds at 90 % of the times; NIS inside for 85 % of the flights: 38 of 40 are expected,
-    fewer than 34 happen once in 300 times to an honest filter.
+    """The noise is white, and the filter has its true size.
+
+    The average position NEES of 40 flights must be inside its 95 % bounds at 90 % of the times. NIS
+    must be inside for 85 % of the flights. 38 of 40 are expected. A consistent filter has fewer
+    than 34 once in 300 times.
     """
     times, flights = shares_inside(
         *consistency("gate", vibration_gain=0.0, adapt_noise=False), "no gate"
@@ -316,8 +327,9 @@ def test_a_plain_update_is_consistent():
     [("innovation", "geman_mcclure"), ("m_estimation", "huber")],
 )
 def test_robust_updates_are_cautious_but_not_overconfident(robust, loss):
-    """Weights throw information away that Gaussian noise does not ask them to: the covariance may
-    only be too large.
+    """The weights discard information although the noise is Gaussian.
+
+    Therefore, the covariance may only be too large.
     """
     nees, nis, count = consistency(robust, loss)
     shares_inside(nees, nis, count, f"{robust}, {loss}")
@@ -329,7 +341,8 @@ def test_a_tag_that_knows_its_noise_is_located_better():
     told, untold = [], []
     for seed in range(4):
         flight, rng = fly(seed, 8.0), np.random.default_rng(seed)
-        std = rng.choice([0.0, 1.5], len(flight.tdoa))  # m, beside the 0.1 m of every one
+        # In m, in addition to the 0.1 m of every TDOA.
+        std = rng.choice([0.0, 1.5], len(flight.tdoa))
         noisy = replace(flight.tdoa, d=flight.tdoa.d + std * rng.standard_normal(len(std)))
         for runs, tdoa in ((untold, noisy), (told, replace(noisy, variance=std**2))):
             runs.append(rms_error(flight, run_offline(replace(flight, tdoa=tdoa)).odometry))

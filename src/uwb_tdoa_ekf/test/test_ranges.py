@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Distances to anchors: update, start, corrections; live and offline give the same."""
+"""Distances to anchors: update, start and corrections. Live and offline results agree."""
 
 from dataclasses import replace
 
@@ -35,7 +35,7 @@ from uwb_tdoa_ekf.pipeline import SLICE, RadioCorrections
 from uwb_tdoa_ekf.smoother import smooth
 
 # --- ranges ---
-CALIBRATED = FilterConfig(range_offset_std=0.0)  # no offset is looked for
+CALIBRATED = FilterConfig(range_offset_std=0.0)  # no estimation of the range offset
 STD = 0.1  # m
 
 
@@ -119,7 +119,7 @@ def test_an_offset_of_all_ranges_is_found(ranged, offset):
     known = run_offline(ranged, CALIBRATED).odometry
     found = run_offline(longer).odometry
     assert error(ranged, found) < 1.2 * error(ranged, known)
-    assert errors_of(ranged, found)[1].mean() < 3.0  # as many as there are axes
+    assert errors_of(ranged, found)[1].mean() < 3.0  # 3 axes
 
 
 def test_the_smoother_takes_the_offset_out_that_the_filter_finds(ranged):
@@ -163,7 +163,7 @@ def test_what_is_known_of_ranges_is_taken_out_live_as_off_line():
 
 
 def measured(t, anchor, value):
-    """Measurements of ranges alone."""
+    """Return Measurements with ranges only."""
     rows = np.zeros(len(t), SENSOR_ROW)
     rows["t"], rows["kind"], rows["anchor"], rows["value"][:, 0] = (
         t,
@@ -175,7 +175,7 @@ def measured(t, anchor, value):
 
 
 def odometry_at(t, p):
-    """(n,) of ODOMETRY of a tag at p (n, 3) m, whose attitude nobody knows."""
+    """Return ODOMETRY (n,) of a tag at p (n, 3), in m, with an unknown attitude."""
     rows = np.zeros(len(t), ODOMETRY)
     rows["t"], rows["x"] = t, np.nan
     rows["x"][:, :3] = p
@@ -196,7 +196,8 @@ def test_a_slice_is_corrected_at_the_last_pose_before_it():
         t[2:4].tolist(),
         t[4:].tolist(),
     ]
-    np.testing.assert_array_equal(found[0]["value"][:, 0], 4.0)  # nobody knows where it is
+    # Before the first pose, nothing is corrected.
+    np.testing.assert_array_equal(found[0]["value"][:, 0], 4.0)
     for part, place in zip(found[1:], places):
         bias = np.linalg.norm(place - moved) - np.linalg.norm(place - BOX.positions[1])
         np.testing.assert_allclose(part["value"][:, 0], 4.0 - bias, atol=1e-12)
@@ -228,7 +229,7 @@ def test_what_is_fed_is_not_changed():
 
 
 def test_what_comes_at_once_and_one_by_one_is_corrected_alike():
-    """Also where the border between two slices is rounded."""
+    """This includes rounding at the border between two slices."""
     t = 1.7e9 + np.arange(400) / 100.0
     whole, single = (RadioCorrections(EffectSet((MOVED,)), AnchorTable(BOX)) for _ in range(2))
 

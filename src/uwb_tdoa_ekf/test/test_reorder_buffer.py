@@ -33,7 +33,7 @@ from uwb_tdoa_ekf.reorder_buffer import (
 
 
 def late(stamps):
-    """Whether each of them is late, and the LatenessPolicy after them."""
+    """Return whether each message is late, and whether the policy then trusts the stream."""
     policy, newest, out = LatenessPolicy(), -math.inf, []
     for t in stamps:
         out.append(policy.is_late(t, newest))
@@ -45,15 +45,17 @@ def test_the_first_that_breaks_a_trusted_order_is_late_and_what_is_older_than_wh
     end = 2.0 * TRIAL
     stamps = [0.0, end, end - 0.001, end + 0.002, end + 0.001, end - 0.002, end]
     assert late(stamps) == ([False, False, True, False, False, True, True], False)
+    # some stamps occur twice
     assert late([0.0, *stamps]) == (
         [False, False, False, True, False, False, True, False],
         False,
-    )  # some come twice
+    )
 
 
 def on_grid(flight, until):
-    """The flight with stamps that are multiples of 0.01 s, without TDOAs that would share one with
-    another before `until`, s.
+    """Return the flight with stamps in multiples of 0.01 s.
+
+    Before `until`, in s, TDOAs with equal stamps are removed.
     """
     imu, tdoa = (
         replace(part, t=np.round(100.0 * part.t) / 100.0) for part in (flight.imu, flight.tdoa)
@@ -95,14 +97,14 @@ def test_the_first_stamp_that_comes_twice_late_in_a_flight_is_late_however_the_s
 
 
 def rows(kind, *stamps):
-    """(n,) of a structured type that are told apart by their stamps, and that all are usable."""
+    """Return rows (n,) with these stamps, and that all are usable."""
     out = np.zeros(len(stamps), kind)
     out["t"] = stamps
     return out, np.ones(len(stamps), bool)
 
 
 def buffer_of(reorder=0.1, lag=1.0, use_imu=True):
-    """(ReorderBuffer, what it refuses: [(stream, stamp, verdict)], stamps of its restarts)."""
+    """Return (ReorderBuffer, refused rows [(stream, stamp, verdict)], causes of restarts)."""
     refused, restarts = [], []
     buffer = ReorderBuffer(
         reorder,
@@ -119,7 +121,7 @@ def buffer_of(reorder=0.1, lag=1.0, use_imu=True):
 def test_rows_leave_in_the_order_of_their_stamps_when_no_stream_can_precede_them():
     buffer, refused, _ = buffer_of()
     buffer.add(TDOA_STREAM, *rows(TDOA_ROW, 0.0, 0.3, 0.2))
-    assert buffer.watermark < 0.0  # there may be inertial samples
+    assert buffer.watermark < 0.0  # inertial samples may still come
     buffer.add(IMU_STREAM, *rows(IMU_SAMPLE, 0.0, 0.5))
     assert 0.19 < buffer.watermark < 0.2 and buffer.waiting[:2] == (2, 3) and buffer.first == 0.0
     imu, tdoa, _ = buffer.take(buffer.watermark)
@@ -147,9 +149,8 @@ def test_a_stamp_that_is_no_number_begins_nothing():
     buffer.add(IMU_STREAM, rows(IMU_SAMPLE, math.nan)[0], np.array([False]))
     assert buffer.began == math.inf and buffer.newest == -math.inf
     buffer.add(TDOA_STREAM, *rows(TDOA_ROW, 0.0, 0.5, 1.0, 1.5, 2.0))
-    assert (
-        buffer.began == 0.0 and buffer.watermark == 2.0
-    )  # nothing waits for an IMU of which no sample has come
+    # Without any inertial sample, nothing waits for the IMU.
+    assert buffer.began == 0.0 and buffer.watermark == 2.0
 
 
 def test_a_stamp_that_is_no_measurement_counts_and_a_lone_one_far_away_is_refused():
@@ -189,13 +190,14 @@ RATE = {
     HEIGHT_STREAM: 10.0,
 }  # Hz
 LAG, LATENCY, LENGTH, BEGIN, END = 0.25, 0.02, 14.0, 5.0, 9.0  # s; a fault lasts from BEGIN to END
-SCATTER = 0.1  # s, standard deviation of stamps that are given on arrival by a busy machine
-DECIDED = 1.1  # s, the longest time without a used TDOA, when any other stream fails, or all jump
+SCATTER = 0.1  # s, standard deviation of arrival stamps on a busy computer
+# s, longest time without a used TDOA if another stream fails, or if all jump
+DECIDED = 1.1
 
 
 @dataclass
 class Fault:
-    """What happens to the stamps and to the messages of a stream from `begin` to `end`, s."""
+    """A fault of the stamps and messages of a stream from `begin` to `end`, in s."""
 
     kind: str
     size: float = 0.0
@@ -203,7 +205,7 @@ class Fault:
     end: float = END
 
     def apply(self, t, rng):
-        """(stamps, which messages come, delays of arrival) of messages measured at t (n,) s."""
+        """Return (stamps, which messages come, delays) of messages measured at t (n,), in s."""
         at, stamps, kept, delays = (
             (t >= self.begin) & (t < self.end),
             t.copy(),
@@ -217,12 +219,13 @@ class Fault:
         elif self.kind == "lone":
             stamps[np.flatnonzero(at)[:1]] += self.size
         elif self.kind == "each":
-            # one in a second
+            # one per second
             stamps[np.flatnonzero(at)[:: int(np.sum(at) / (self.end - self.begin))]] += self.size
         elif self.kind == "few":
+            # messages of 0.1 s
             stamps[np.flatnonzero(at)[: 1 + int(0.1 * np.sum(at) / (self.end - self.begin))]] += (
                 self.size
-            )  # 0.1 s of them
+            )
         elif self.kind == "standing":
             stamps[at] = self.begin + self.size
         elif self.kind == "scattered":
@@ -252,12 +255,19 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 class Played:
-    """Streams with faults, played to a ReorderBuffer. used : {stream: [(measured at, given out
-    at)], s}, by arrival; refused : how many of each; restarts : their causes.
+    """Streams with faults, played to a ReorderBuffer.
+
+    used : {stream: [(time of measurement, time of release)]}, in s, by arrival.
+    refused : number of refused rows of each stream.
+    restarts : (s, cause) of each restart.
     """
 
     def __init__(self, streams, seed, everything=None):
-        """streams : {place: Fault}; everything : Fault of all of them."""
+        """Play the streams.
+
+        streams : {place: Fault}.
+        everything : Fault of all streams together, optional.
+        """
         rng, self.refused, self.restarts, self.used = (
             np.random.default_rng(seed),
             dict.fromkeys(streams, 0),
@@ -270,7 +280,7 @@ class Played:
         arrivals, self.sent = [], dict.fromkeys(streams, 0)
         for place, fault in streams.items():
             measured = np.arange(0.0, LENGTH, 1.0 / RATE[place])
-            # no stamp comes twice, whatever the fault
+            # Stamps are unique, whatever the fault.
             measured += 0.3 / RATE[place] * rng.random() + 1e-4 * rng.random(len(measured))
             stamps, kept, delays = fault.apply(measured, rng)
             if everything is not None:
@@ -313,7 +323,7 @@ class Played:
                 ]
 
     def gap(self, place):
-        """Longest time between two moments at which rows of a stream were given out, s."""
+        """Return the longest time between two releases of rows of a stream, in s."""
         return float(np.diff([0.0, *(given for _, given in self.used[place]), LENGTH]).max())
 
     def check_accounts(self):
@@ -325,7 +335,7 @@ class Played:
 @settings(max_examples=30, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
 @given(st.sampled_from([VELOCITY_STREAM, HEIGHT_STREAM, RANGE_STREAM]), faults, seeds)
 def test_no_clock_of_a_sensor_costs_a_tdoa_or_an_inertial_sample(place, fault, seed):
-    """Ranges are waited for like TDOAs."""
+    """The buffer waits for ranges as for TDOAs."""
     played = Played({IMU_STREAM: HEALTHY, TDOA_STREAM: HEALTHY, place: fault}, seed)
     played.check_accounts()
     assert not played.restarts and played.refused[TDOA_STREAM] == 0
@@ -369,7 +379,7 @@ def test_a_clock_of_the_tdoas_costs_them_no_more_than_the_fault_and_a_second(kin
             and played.refused[IMU_STREAM] == 0
         )
     elif kind == "offset":
-        assert len(played.restarts) <= 2 and played.gap(TDOA_STREAM) < DECIDED  # there and back
+        assert len(played.restarts) <= 2 and played.gap(TDOA_STREAM) < DECIDED  # one jump each way
 
 
 @settings(max_examples=20, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))

@@ -1,8 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A rover on a floor: wheels as a sensor of motion, the plane, and TDOAs that contradict the
-wheels.
-"""
+"""A rover on a floor: wheels as a motion sensor, the plane, and TDOAs that contradict wheels."""
 
 from dataclasses import replace
 import math
@@ -30,11 +28,11 @@ from uwb_tdoa_ekf.smoother import smooth
 SHORT, LAG = 45.0, 0.25  # s; s, default of the estimator
 PLANAR = FilterConfig(planar=True, fixed_height=HEIGHT)
 WHEELS = replace(PLANAR, use_imu=False)
-SETTLED = 15.0  # s after which the yaw is known
+SETTLED = 15.0  # s until the yaw is known
 
 
 def errors(flight, config, since=SETTLED):
-    """Errors of a filter that starts anywhere."""
+    """Return the errors of a filter without a given start."""
     return Errors(flight, run_offline(flight, config).odometry, since)
 
 
@@ -59,7 +57,8 @@ def test_wheels_tell_position_and_yaw_with_an_imu_and_without(rover, config, xy,
         and np.mean(found.nees_yaw) < 5.0
         and np.mean(found.nees_xy) < 5.0
     )
-    early = errors(rover, config, 0.0)  # the yaw is not said to be known before it is
+    # The filter must not claim a known yaw too early.
+    early = errors(rover, config, 0.0)
     assert not np.any((early.yaw_std < YAW_KNOWN) & (np.abs(early.yaw) > 3.0 * YAW_KNOWN))
 
 
@@ -88,8 +87,9 @@ def test_a_yaw_that_nothing_measures_grows_uncertain_as_the_parameter_says(rover
 
 
 def test_a_yaw_without_a_yaw_rate_is_known_by_motion_alone(rover):
-    """Velocities without a yaw rate: the yaw follows from the direction of the motion, and is lost
-    while the rover stands.
+    """Without a yaw rate, the yaw follows from the direction of the motion.
+
+    It becomes unknown while the rover stands.
     """
     no_rate = rover.replaced(velocity=replace(rover.velocity, yaw_rate=None, yaw_rate_std=None))
     found = errors(no_rate, WHEELS)
@@ -102,7 +102,8 @@ def test_a_yaw_without_a_yaw_rate_is_known_by_motion_alone(rover):
 def test_wheels_carry_the_tag_while_no_tdoas_come(rover):
     begin = rover.truth.t[0]
     silent = without_tdoas(rover, begin + 25.0, begin + 40.0)
-    for config, share in ((PLANAR, 0.1), (WHEELS, 0.2)):  # of the way
+    # share of the distance
+    for config, share in ((PLANAR, 0.1), (WHEELS, 0.2)):
         found = errors(silent, config)
         assert found.xy.max() < share * 15.0 * 0.5 and np.mean(found.nees_xy) < 5.0
 
@@ -114,7 +115,8 @@ def test_a_planar_vehicle_is_flat_and_says_how_well_that_is_known(rover, config)
     np.testing.assert_array_equal(odometry.q[:, :2], 0.0)
     np.testing.assert_array_equal(odometry.v[:, 2], 0.0)
     variances = np.diagonal(odometry.covariance, axis1=1, axis2=2)
-    np.testing.assert_allclose(variances[:, 2], PLANAR_HEIGHT_STD**2)  # 15 s without TDOAs included
+    # This includes 15 s without TDOAs.
+    np.testing.assert_allclose(variances[:, 2], PLANAR_HEIGHT_STD**2)
     np.testing.assert_allclose(variances[:, 6:8], config.tilt_std**2)
     assert np.linalg.eigvalsh(odometry.covariance).min() > 0.0
 
@@ -127,7 +129,7 @@ def test_a_fixed_height_alone_is_held_and_stated(rover):
 
 
 def test_a_yaw_rate_alone_shows_no_yaw(rover):
-    """A gyroscope in a twist, and no IMU: where the rover is stays as good as with TDOAs alone."""
+    """With a gyroscope in a twist and no IMU, the position is as good as with TDOAs alone."""
     n = len(rover.velocity)
     alone = rover.replaced(
         velocity=replace(rover.velocity, v=np.full((n, 3), np.nan), std=np.full((n, 3), np.inf))
@@ -139,7 +141,7 @@ def test_a_yaw_rate_alone_shows_no_yaw(rover):
 
 
 def test_two_sources_of_velocity_do_not_disturb_each_other(rover):
-    """Between two messages of wheels, one of optical flow, without a yaw rate."""
+    """Optical flow without a yaw rate alternates with messages of wheels."""
     wheels = rover.velocity
     n = len(wheels)
     parts = [
@@ -156,7 +158,7 @@ def test_two_sources_of_velocity_do_not_disturb_each_other(rover):
 
 
 def test_what_cannot_move_sideways(rover):
-    """Wheels that say nothing of the velocity across."""
+    """The wheels state no sideways velocity."""
     std = rover.velocity.std.copy()
     std[:, 0], std[:, 1:] = 0.03, np.inf
     along = rover.replaced(velocity=replace(rover.velocity, std=std))
@@ -184,7 +186,10 @@ def test_live_is_off_line(config):
 
 
 def test_the_yaw_rate_of_wheels_is_that_of_the_odometry_where_they_predict():
-    """Without an IMU, and with one that falls silent, whose bias is not that of the wheels."""
+    """The filter has no IMU, or an IMU that stops.
+
+    The wheels do not have the bias of the gyroscope.
+    """
     short = drive(1, 8.0)
     wheels, silent = short.velocity, short.truth.t[0] + 6.0
     imu = rows_of(short.imu, short.imu.t < silent)
@@ -197,7 +202,8 @@ def test_the_yaw_rate_of_wheels_is_that_of_the_odometry_where_they_predict():
         last = np.searchsorted(wheels.t, odometry.t, side="right") - 1
         assert len(odometry) > 100 and np.isnan(odometry.rate[:, :2]).all()
         same = odometry.rate[:, 2] == wheels.yaw_rate[last]
-        assert same.mean() > 0.95  # of the others the last wheels were refused
+        # In the remaining cases the last message of the wheels was refused.
+        assert same.mean() > 0.95
         np.testing.assert_allclose(odometry.rate_variance[same, 2], config.yaw_rate_std**2)
 
 
@@ -244,8 +250,9 @@ def test_two_late_anchors_do_not_overrule_wheels(seed, rows, config):
 
 
 def test_a_tag_that_two_places_are_possible_for_says_so():
-    """`unsure` while TDOAs agree on another place, with a deviation that covers it; not before, nor
-    some time after.
+    """`unsure` is set while TDOAs agree on another position. The deviation then covers it.
+
+    It is not set before, nor some time after.
     """
     flight = late(drive(3, SHORT), (0, 4), since=33.0)
     estimator, said = Estimator(flight.anchors, PLANAR), []
@@ -267,8 +274,9 @@ def test_a_tag_that_two_places_are_possible_for_says_so():
 
 
 def test_a_rover_that_is_lost_is_found(config=WHEELS):
-    """The filter is told a wrong place, and wheels are good: TDOAs of all anchors win, after a time
-    in which it is unsure.
+    """The filter gets a wrong pose, and the wheels are good.
+
+    The filter is unsure for a while. Then TDOAs of all anchors prevail.
     """
     flight = drive(1, 40.0)
     estimator, begin = Estimator(flight.anchors, config), flight.truth.t[0]
@@ -306,7 +314,7 @@ def test_a_turn_about_the_vertical(seed, angle):
 
 
 def test_wheels_that_turn_evenly_are_not_stuck():
-    """A simulated rover drives straight at one speed: its wheels repeat a value."""
+    """A simulated rover drives straight at constant speed, so its wheels repeat the same value."""
     flight = with_sensors(fly(2, 6.0, anchors=corners()))
     t = flight.velocity.t
     even = Velocity(

@@ -14,7 +14,7 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import without_offset
 from uwb_tdoa_ekf.sensitivity import FORGOTTEN, record_innovations
 
-# Nothing that decides or learns, so that the filter is as linear as it can be.
+# Without decisions and adaptation the filter is nearly linear.
 PLAIN = FilterConfig(
     robust="gate",
     gate=1e3,
@@ -23,7 +23,7 @@ PLAIN = FilterConfig(
     workspace_margin=1e3,
     initial_yaw_std=0.1,
 )
-# s; the start itself follows biases too, which `Innovations` do not know: it must be forgotten
+# s. The start follows biases, too, and `Innovations` do not model it. It must be forgotten.
 SETTLED = 4.0
 
 
@@ -55,7 +55,8 @@ def test_what_the_position_can_follow_leaves_little_trace():
     found = record_innovations(flight, PLAIN)
     a, b = (flight.anchors.index(ids[found.rows]) for ids in (flight.tdoa.a, flight.tdoa.b))
     samples = samples_at(flight.tdoa.t[found.rows], a, b, flight.truth, flight.anchors)
-    shift = EFFECTS["truth_frame"]().regressors(samples, ["x", "y", "z"])  # all anchors by the same
+    # The same shift of all anchors.
+    shift = EFFECTS["truth_frame"]().regressors(samples, ["x", "y", "z"])
     delay = AnchorDelay().regressors(samples, [str(flight.anchors.ids[0])])
     late = samples.t > SETTLED
 
@@ -94,9 +95,8 @@ def test_an_unknown_offset_of_ranges_bends_no_innovations_of_tdoas():
         record_innovations(longer, calibrated, streams=("tdoa", "range")),
         record_innovations(longer, streams=("tdoa", "range")),
     )
-    np.testing.assert_array_equal(
-        *(one.value for one in of_ranges)
-    )  # there the offset is what somebody looks for
+    # There the filter estimates the offset.
+    np.testing.assert_array_equal(*(one.value for one in of_ranges))
 
 
 def test_blocks_of_sparse_regressors_give_the_same():
@@ -105,7 +105,8 @@ def test_blocks_of_sparse_regressors_give_the_same():
     t = flight.tdoa.t[found.rows]
     rng = np.random.default_rng(0)
     regressors = rng.standard_normal((len(t), 5)) * (rng.random((len(t), 5)) < 0.4)
-    regressors[t < 4.0, 3] = 0.0  # one that is not heard before, and one that is not heard later
+    # One bias acts only from 4 s on, the other only until 2 s.
+    regressors[t < 4.0, 3] = 0.0
     regressors[t > 2.0, 4] = 0.0
     stamps = np.array([1.0, 5.0, 7.5])
 
@@ -136,14 +137,14 @@ def test_what_is_not_heard_any_more_is_forgotten():
     share = np.sqrt(np.mean(whole[t > 2.0 + FORGOTTEN] ** 2) / np.mean(whole[t < 2.0] ** 2))
     assert (
         share < 0.05
-        # of an error of all TDOAs at the start, which the bias of the accelerometer takes up: 0.04; a
-        # fit weighs squares
+        # 0.04 for a common error of all TDOAs at the start: the accelerometer bias absorbs it. A
+        # fit uses squares.
     )
 
 
 @pytest.mark.parametrize("streams", [("range",), ("tdoa", "range")])
 def test_derivatives_of_distances_beside_tdoas_are_those_of_two_runs(streams):
-    """An anchor that is late is late for both."""
+    """A late anchor delays its TDOAs and its distances."""
     flight, step, keys = with_ranges(fly(seed=3, duration=8.0, tdoa_std=0.02)), 1e-4, ["11", "14"]
     if "tdoa" not in streams:
         flight = replace(flight, tdoa=kept(flight.tdoa, slice(0)))
@@ -175,7 +176,8 @@ def test_derivatives_of_distances_beside_tdoas_are_those_of_two_runs(streams):
 
 def test_what_is_recorded_of_tdoas_does_not_depend_on_what_else_is():
     flight = with_ranges(fly(seed=6, duration=6.0))
-    calibrated = FilterConfig(range_offset_std=0.0)  # else the offset is looked for among them
+    # Otherwise, the filter estimates the offset from them.
+    calibrated = FilterConfig(range_offset_std=0.0)
     alone, both = (
         record_innovations(flight, calibrated, streams=streams)
         for streams in (("tdoa",), ("tdoa", "range"))

@@ -41,7 +41,7 @@ def function(channel="accel.z", covariate="height", shape="line", size=1.0):
 
 
 def taken(effect, x):
-    """What is taken out of a sample at a nominal state."""
+    """Return the correction that is subtracted from a sample at a nominal state."""
     samples = np.zeros(1, IMU_SAMPLE)
     subtract(rows_of(EffectSet((effect,)).sensor_functions), x, samples[0])
     return -samples["gyro"][0], -samples["accel"][0]
@@ -81,7 +81,7 @@ def test_several_add_up_on_their_axes():
 
 
 def with_error(flight, effect):
-    """The Flight, its inertial samples with an effect of where the tag truly is."""
+    """Return the Flight with an effect at the true positions on its inertial samples."""
     at = np.interp(flight.imu.t, flight.truth.t, flight.truth.p[:, 2])
     accel = flight.imu.accel.copy()
     accel[:, 2] += effect.curve(at)

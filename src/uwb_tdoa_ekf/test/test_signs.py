@@ -1,6 +1,9 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The sign of all TDOAs in flight: certain, either way, on simulated flights and on measured ones."""
+"""Detection of a wrong sign of all TDOAs in flight. The result must be certain either way.
+
+The flights are simulated or measured.
+"""
 
 from dataclasses import replace
 
@@ -14,8 +17,10 @@ from uwb_tdoa_ekf.monitoring.stream_rules import StreamWatch
 
 
 def watched(flight, sign, doubted=np.inf):
-    """[(s, finding or None, certain)] of a Flight, second by second, with such a sign: callable of
-    the stamps. From `doubted` s on the filter doubts it.
+    """Return [(s, finding or None, certain)] of a Flight, for each second.
+
+    sign : callable of the stamps; factor of the TDOAs.
+    doubted : time from which the filter doubts the sign, in s.
     """
     watch, tdoa, said = SignWatch(flight.anchors), flight.tdoa, []
     second = np.floor(tdoa.t - tdoa.t[0])
@@ -68,8 +73,9 @@ def test_doubts_make_it_compare_again():
 
 
 def flown(flight, sign, seconds):
-    """[(s, rules)] of what an Estimator and a StreamWatch find, each second of a Flight with such a
-    sign: callable of the stamps.
+    """Return [(s, rules)] of the findings of an Estimator and a StreamWatch, for each second.
+
+    sign : callable of the stamps; factor of the TDOAs.
     """
     flight = replace(flight, tdoa=replace(flight.tdoa, d=flight.tdoa.d * sign(flight.tdoa.t)))
     estimator, watch, said = Estimator(flight.anchors), StreamWatch(flight.anchors, 0.25), []

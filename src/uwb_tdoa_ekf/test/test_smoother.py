@@ -27,9 +27,12 @@ def rmse(flight, odometry):
 
 
 def batch(t, a, b, d, positions, p0, prior_std, q, tdoa_std):
-    """Least squares over a whole recording of a tag that moves along a straight line with white
-    acceleration noise, linearised about p0: positions (n, 3) and their covariances, by one large
-    system of equations.
+    """Solve the least-squares problem of a whole recording as one system of equations.
+
+    The tag moves along a straight line with white acceleration noise. TDOAs are linearized about
+    p0.
+
+    Returns positions (n, 3) and their covariances.
     """
     n = len(t)
     rows, values = [], []
@@ -103,13 +106,14 @@ def test_its_covariance_is_honest_and_never_larger_than_the_filters(use_imu):
         assert (variance[1][common[1]] <= variance[0][common[0]] * (1 + 1e-6)).all()
         middle = rows_of(smoothed, (smoothed.t > 2.0) & (smoothed.t < 11.0))
         nees.append(errors_of(flight, middle)[1].mean())
-    assert 2.0 < np.mean(nees) < (4.0 if use_imu else 6.0)  # the wave is no white acceleration
+    # The path is a wave, unlike white acceleration.
+    assert 2.0 < np.mean(nees) < (4.0 if use_imu else 6.0)
 
 
 def test_its_covariance_holds_errors_that_do_not_average_out():
-    """As much of them as the filter's: it averages no more of them out."""
+    """The consider covariance equals that of the filter: smoothing does not average it out."""
     flight = fly(2, 14.0, **NOISE)
-    # known: an unknown one the smoother finds first, and runs the filter with it
+    # With an unknown yaw, the smoother first finds it and runs the filter again.
     config = FilterConfig(initial_yaw_std=0.1)
     filtered, smoothed = (engine(flight, config).odometry for engine in (run_offline, smooth))
     rows = np.searchsorted(filtered.t, smoothed.t, side="right") - 1
@@ -124,8 +128,9 @@ def test_its_covariance_holds_errors_that_do_not_average_out():
 
 
 def test_its_covariance_holds_what_an_offset_of_all_ranges_may_be_off_by():
-    """Of white noise, so that nothing else persists; anchors at about one height, where an error of
-    the offset is a much larger one of the height.
+    """The noise is white, so that no other error persists.
+
+    The anchors have nearly equal heights, so an offset error causes a much larger height error.
     """
     told = dict(
         range_std=0.1,
@@ -154,7 +159,10 @@ def test_its_covariance_holds_what_an_offset_of_all_ranges_may_be_off_by():
 
 
 def test_without_imu_it_is_the_least_squares_solution():
-    """After the start, with white noise and a tag at rest, where nothing is non-linear."""
+    """The comparison begins after the start.
+
+    Noise is white and the tag is at rest, so the problem is linear.
+    """
     flight = fly(3, 2.0, hover=True, tdoa_rate=50.0, tdoa_std=0.05)
     config = FilterConfig(
         use_imu=False,
@@ -169,7 +177,7 @@ def test_without_imu_it_is_the_least_squares_solution():
     first = run_offline(flight, config)
     smoothed = smooth(flight, config).odometry
     used = np.isin(flight.tdoa.t, smoothed.t)
-    used[np.flatnonzero(used)[0]] = False  # the one that completed the start
+    used[np.flatnonzero(used)[0]] = False  # this TDOA completed the start
     t = flight.tdoa.t[used]
     a, b = flight.anchors.index(flight.tdoa.a[used]), flight.anchors.index(flight.tdoa.b[used])
     p0 = flight.truth.p[0]
@@ -184,7 +192,7 @@ def test_without_imu_it_is_the_least_squares_solution():
         config.motion_noise,
         0.05,
     )
-    late = t > t[0] + 0.6  # by when the start's covariance is forgotten
+    late = t > t[0] + 0.6  # the covariance of the start is forgotten by then
     at = np.searchsorted(smoothed.t, t[late])
     np.testing.assert_allclose(smoothed.p[at] - p0, p[late], atol=0.01)
     std, expected = (
@@ -222,8 +230,9 @@ def test_the_unknown_yaw_is_known_from_the_beginning():
 
 @pytest.mark.parametrize("yaw", [-6.9, 4.5, 7.0])
 def test_any_yaw_that_can_be_given_is_smoothed(yaw):
-    """The direction that the filter followed is a multiple of 90 degrees from the given one: their
-    sum may be more than a yaw may be.
+    """The yaw of the filter differs from the given one by a multiple of 90 degrees.
+
+    Their sum may exceed the range of a yaw.
     """
     flight = fly(4, 6.0, **NOISE)
     given, same = (
@@ -235,7 +244,7 @@ def test_any_yaw_that_can_be_given_is_smoothed(yaw):
 
 
 def test_a_tag_outside_of_its_workspace_is_smoothed_to_the_end():
-    """Its inertial sensor feels nothing of that: it must not have one."""
+    """The inertial sensor does not feel this motion, so it is not used."""
     flight = leaving(fly(6, 4.0, hover=True, tdoa_rate=400.0))
     odometry = smooth(flight, FilterConfig(use_imu=False)).odometry
     assert odometry.t[-1] > flight.tdoa.t[-1] - 0.01
@@ -246,15 +255,19 @@ def test_a_tag_outside_of_its_workspace_is_smoothed_to_the_end():
 
 @pytest.mark.parametrize("seed, late", [(4, 1.5), (2, 3.0), (4, 3.0)])
 def test_an_inertial_sensor_that_comes_later_leaves_a_covariance(seed, late):
-    """It opens the yaw in flight, and the filter changes between yaws with paths of their own."""
+    """The sensor makes the yaw unknown in flight.
+
+    The filter then changes between yaw hypotheses, each with its own path.
+    """
     flight = fly(seed, 10.0, accel_noise=0.05, gyro_noise=0.003, tdoa_std=0.3, tdoa_rate=60.0)
     flight = replace(flight, imu=kept(flight.imu, flight.imu.t > late))
     assert_covariance(smooth(flight).odometry.covariance, tolerance=1e-6)
 
 
 def ranged(seed, time, size=0.1):
-    """A flight of ranges alone: with white noise, and an error of each anchor that persists for
-    `time` s.
+    """Return a flight with ranges only.
+
+    They have white noise. The error of each anchor has a correlation time of `time` s.
     """
     flight = with_ranges(fly(seed, 24.0, **NOISE), seed)
     d, rng = flight.range.d.copy(), np.random.default_rng(seed)
@@ -269,7 +282,7 @@ def ranged(seed, time, size=0.1):
 
 
 def test_the_correlation_of_ranges_is_measured():
-    """200 ranges a second to eight anchors: 25 of an anchor."""
+    """Eight anchors share 200 ranges a second: 25 for each."""
     lengths = []
     for time in (0.0, 0.5, 1.0):
         flight = ranged(0, time)

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""How the filter starts: the position that it finds, and the hypotheses that it follows."""
+"""Start of the filter: its first position, and the hypotheses that it follows."""
 
 from dataclasses import replace
 
@@ -36,12 +36,13 @@ from uwb_tdoa_ekf.offline import run_offline
 
 
 SIZE = np.array([7.0, 8.0, 3.0])
-STD = 0.25  # m, what locate is told of one TDOA
+STD = 0.25  # m, standard deviation of a TDOA that locate assumes
 
 
 def constellation(n, rng):
-    """(n, 3) positions in the room: four corners that form a tetrahedron, the eight corners, then
-    anywhere.
+    """Return (n, 3) positions in the room.
+
+    First come four corners that form a tetrahedron, then the other corners, then random positions.
     """
     corner = np.array(corners().positions)
     chosen = [0, 3, 5, 6] + [1, 2, 4, 7]
@@ -49,7 +50,10 @@ def constellation(n, rng):
 
 
 def window(rng, positions, p, v, n=100, std=0.0, outliers=0.0, anchor_std=0.0, length=0.5):
-    """n TDOAs of random pairs over `length` s, at whose end the tag is at p with velocity v."""
+    """Return n TDOAs of random pairs over `length` s.
+
+    At the end, the tag is at p with velocity v.
+    """
     t = np.sort(rng.uniform(0.0, length, n))
     a = rng.integers(0, len(positions), n)
     b = (a + rng.integers(1, len(positions), n)) % len(positions)
@@ -65,7 +69,7 @@ def window_of(t, a, b, d):
 
 
 def places(tdoas, positions, count=2, std=STD):
-    """(x (count, 6), covariance (count, 6, 6), cost (count,), share) as of `locate`."""
+    """Return x (count, 6), covariance (count, 6, 6), cost (count,) and share of `locate`."""
     found, workspace = (
         Places(np.empty((count, 6)), np.empty((count, 6, 6)), np.empty(count)),
         np.empty((2, 3)),
@@ -84,7 +88,7 @@ def located(tdoas, positions):
 
 
 def errors(n, count, speed=0.0, seed=0, **kind):
-    """Position errors (count,) m, and shares of agreeing TDOAs, for tags anywhere inside."""
+    """Return position errors (count,), in m, and shares of agreeing TDOAs, for random positions."""
     rng = np.random.default_rng([seed, n])
     off, shares = [], []
     for _ in range(count):
@@ -104,7 +108,7 @@ def errors(n, count, speed=0.0, seed=0, **kind):
     ("kind", "median", "largest", "share"),
     [
         ({}, 0.1, 0.1, 1.0),
-        # the prior of 1 m/s per axis holds the velocity back, by half of the path at most
+        # The prior of 1 m/s per axis reduces the velocity. The error is at most half of the path.
         ({"speed": 1.0}, 0.3, 0.3, 1.0),
         ({"speed": 0.5, "std": 0.1}, 0.12, 0.3, 1.0),
         ({"std": 0.1, "outliers": 0.3}, 0.1, 0.3, 0.7),
@@ -125,7 +129,8 @@ def test_anchors_on_a_wall_leave_two_places_and_no_others():
         x, _, cost, _ = places(window(rng, positions, p, np.zeros(3)), positions, 3)
         np.testing.assert_allclose(sorted(x[:2, 0]), [-p[0], p[0]], atol=0.1)
         assert cost[0] == 0.0 and cost[1] < 0.1
-        if np.isfinite(cost[2]):  # on the wall between them
+        # on the wall between them
+        if np.isfinite(cost[2]):
             assert abs(x[2, 0]) < 0.1 and cost[2] > cost[1]
 
 
@@ -138,7 +143,7 @@ def test_anchors_all_around_leave_one_place():
 
 @given(st.integers(0, 2**32 - 1), st.booleans())
 def test_a_place_is_split_along_its_principal_axis_whichever_that_is(seed, normal):
-    """normal : the axis is normal to (1, 1, 1), where a power iteration may have begun."""
+    """With `normal`, the axis is normal to (1, 1, 1), a likely start of a power iteration."""
     rng = np.random.default_rng(seed)
     axis = rng.standard_normal(3)
     axis -= normal * axis.mean()
@@ -183,8 +188,9 @@ def test_few_anchors_in_one_plane_say_how_little_they_tell():
 
 @pytest.mark.parametrize("n", [8, 16])
 def test_covariance_is_honest_when_errors_persist_over_the_window(n):
-    """Errors of the anchors, of the size that locate is told, last for the whole window, as
-    measured ones do.
+    """Errors of the anchors last for the whole window, as measured ones do.
+
+    Their size agrees with the assumption of locate.
     """
     rng, seen = np.random.default_rng(n), []
     for _ in range(400):
@@ -212,7 +218,7 @@ def test_two_anchors_do_not_break_it():
     )
     assert np.isfinite(x).all()
     assert_covariance(covariance)
-    assert covariance[1, 1] > 1.0  # it knows that it does not know
+    assert covariance[1, 1] > 1.0  # it states its uncertainty
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -239,7 +245,7 @@ def test_level_makes_the_specific_force_point_up_and_keeps_the_yaw(seed):
 
 
 def test_halves_of_a_place_whose_velocity_is_correlated_have_covariances():
-    """Before, the velocity stayed what it was, and the filter became no number."""
+    """Once, the velocity kept its value, and the state became NaN."""
     x, covariance, cost = np.zeros((2, 6)), np.zeros((2, 6, 6)), np.array([0.0, np.inf])
     row = np.concatenate([np.eye(3), 0.9 * np.eye(3)], axis=1)
     covariance[0] = 9.0 * row.T @ row + 0.1 * np.eye(6) + np.diag([5.0, 0, 0, 0, 0, 0])
@@ -290,12 +296,16 @@ def test_one_tdoa_long_before_the_others_does_not_use_up_the_timeout():
         for column in (flight.tdoa.a, flight.tdoa.b, flight.tdoa.d)
     ]
     odometry, _ = drive(replace(flight, tdoa=Tdoas(early, *first)))
-    assert odometry.t[0] > 30.4  # a window of start_window, not a dozen TDOAs
+    # It needs a window of start_window; a dozen TDOAs are too few.
+    assert odometry.t[0] > 30.4
 
 
 @pytest.mark.parametrize("robust", ROBUST)
 def test_finds_a_tag_again_that_was_carried_away(robust):
-    """3.6 m, which its inertial sensor has not felt: not before it could have come so far."""
+    """At 5 s the tag is 3.6 m away, and its inertial sensor has not felt the motion.
+
+    The filter finds it by 8 s: not before it can have come so far.
+    """
     near, far = fly(10, 12.0, hover=True), fly(10, 12.0, hover=True)
     there = np.array([1.0, 6.5, 0.8])
     p = np.where(far.tdoa.t[:, None] < 5.0, near.truth.p[0], there)
@@ -320,7 +330,7 @@ def test_a_good_flight_needs_no_recovery():
 
 
 def beside(flight, positions):
-    """The flight, heard by anchors at other positions (N, 3) m."""
+    """Return the flight with anchors at other positions (N, 3), in m."""
     a, b = flight.anchors.index(flight.tdoa.a), flight.anchors.index(flight.tdoa.b)
     p = flight.meta["wave"].motion(flight.tdoa.t)[0]
     d = tdoa(p, positions[a], positions[b]) + 0.1 * np.random.default_rng(0).standard_normal(len(p))
@@ -330,7 +340,7 @@ def beside(flight, positions):
 
 
 def test_of_anchors_on_a_wall_both_sides_are_followed_until_motion_tells():
-    """The deviation is as large as the sides are apart; the accelerometer then decides."""
+    """The deviation covers both sides. Then the accelerometer decides."""
     y, z = np.meshgrid([0.0, 2.7, 5.3, 8.0], [0.3, 3.0])
     wall = np.column_stack([np.full(8, 0.5), y.ravel(), z.ravel()])
     wrong = 0
@@ -341,7 +351,8 @@ def test_of_anchors_on_a_wall_both_sides_are_followed_until_motion_tells():
         std = np.sqrt(np.trace(odometry.covariance[:, :3, :3], axis1=1, axis2=2))
         wrong += (off > 1.5).any()
         assert (off < 4.0 * std).all() and off[-1] < 1.0
-    assert wrong  # of some the other side is believed in for a while
+    # In some flights the filter follows the wrong side for a while.
+    assert wrong
 
 
 # --- hypotheses ---
@@ -351,7 +362,7 @@ NOISE = dict(accel_noise=0.01, gyro_noise=0.001)  # a common sensor that does no
 
 
 def yaw_errors(flight, odometry):
-    """rad, at the stamps of the odometry."""
+    """Return yaw errors, in rad, at the stamps of the odometry."""
     attitude = flight.meta["wave"].motion(odometry.t)[2]
     return (attitude.inv() * Rotation.from_quat(odometry.q)).as_rotvec()[:, 2]
 
@@ -382,8 +393,9 @@ def test_what_is_elsewhere_is_not_the_same_whichever_way_it_faces():
 
 @pytest.mark.parametrize("wrong", [0.5 * np.pi, -0.5 * np.pi, np.pi, 0.8])
 def test_a_yaw_that_nobody_told_is_found_while_moving_and_doubted_until_then(wrong):
-    """Within 15 degrees 10 s after the start; before, the error is inside three of its own standard
-    deviations.
+    """The error falls below 15 degrees within 10 s after the start.
+
+    It is inside three of its standard deviations at 99 % of the times.
     """
     for seed in range(3):
         flight = fly(seed, 15.0, **NOISE)
@@ -410,7 +422,7 @@ def test_a_yaw_that_no_motion_tells_stays_unknown():
 
 
 def test_turning_the_world_turns_the_estimate():
-    """Nothing in the filter prefers a direction but initial_yaw, and that only among equals."""
+    """Only initial_yaw prefers a direction, and only among equally good hypotheses."""
     flight = fly(3, 12.0, **NOISE)
     turn = Rotation.from_euler("z", 2.0)
     anchors = replace(flight.anchors, positions=turn.apply(flight.anchors.positions.copy()))

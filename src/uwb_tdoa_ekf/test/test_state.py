@@ -39,7 +39,7 @@ def plus(x, error, gain=1.0):
 
 
 def minus(x, y):
-    """The error state, (15,), that takes y to x."""
+    """Return the error state (15,) that takes y to x."""
     attitude = Rotation.from_quat(y[6:10]).inv() * Rotation.from_quat(x[6:10])
     return np.concatenate([x[:6] - y[:6], attitude.as_rotvec(), x[10:] - y[10:]])
 
@@ -54,8 +54,10 @@ def ekf_with(x, P):
 
 
 def predicted(x, P, dt, gyro, accel, weight, psd=(0.0, 0.0, 0.0), rest=(0.0, 0.0, 0.0)):
-    """State and covariance after one prediction; psd of the accelerometer, rest: gyroscope and both
-    bias walks.
+    """Return state and covariance after one prediction.
+
+    psd : of the accelerometer.
+    rest : of the gyroscope and both bias walks.
     """
     ekf, parameters = ekf_with(x, P), np.zeros(1, PARAMETERS)[0]
     for name, value in zip(
@@ -105,7 +107,7 @@ def test_inject_and_minus_undo_each_other(seed):
 
 @given(seeds)
 def test_many_small_steps_solve_the_equations_of_motion(seed):
-    """Eq. 14 of Zhao et al. with constant rates and specific force, solved by scipy."""
+    """Compare with Eq. 14 of Zhao et al. at constant rates and specific force, solved by scipy."""
     _, x, gyro, accel, _ = random_case(seed)
     rates, f = gyro - x[13:], accel - x[10:13]
 
@@ -117,7 +119,7 @@ def test_many_small_steps_solve_the_equations_of_motion(seed):
     P, after = np.eye(15), x
     for _ in range(400):
         after, _ = predicted(after, P, 0.0005, gyro, accel, np.ones(3))
-    # input held over each step: first order
+    # The input is held over each step: first order.
     np.testing.assert_allclose(after[:6], exact, atol=0.005)
     attitude = Rotation.from_quat(x[6:10]) * Rotation.from_rotvec(0.2 * rates)
     assert (attitude.inv() * Rotation.from_quat(after[6:10])).magnitude() < 1e-10
@@ -133,7 +135,7 @@ def test_no_weight_means_hovering_thrust():
 
 def documented_phi(x, dt, gyro, accel, weight):
     R = Rotation.from_quat(x[6:10]).as_matrix()
-    # share `weight` of what was measured, the rest is hovering
+    # `weight` is the share of the measured force, the rest is hovering.
     f = -DOWN + weight * (accel - x[10:13] + DOWN)
     phi = np.eye(15)
     phi[0:3, 3:6] = dt * np.eye(3)
@@ -166,8 +168,9 @@ def test_covariance_is_phi_p_phi_of_the_documented_phi(seed):
 
 @given(seeds)
 def test_covariance_follows_the_nominal_state_to_first_order_in_dt(seed):
-    """Phi from finite differences of the nominal prediction: what is left falls with the square of
-    dt.
+    """Compare with Phi from finite differences of the nominal prediction.
+
+    The difference falls with the square of dt.
     """
     rng, x, gyro, accel, weight = random_case(seed)
     P, left = random_covariance(rng, spread=0.3), []

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""`status`: what may be flown by, and what became of the measurements."""
+"""`status`: whether the estimate is safe for flight, and the fate of the measurements."""
 
 from collections import Counter
 import math
@@ -55,8 +55,9 @@ def found(rule, severity=ERROR, value=1.0):
 def used(
     seconds=8.0, running=True, tdoa="used", imu=True, received=True, silent=0.0, velocity=False
 ):
-    """Use, looked at five times a second for so many seconds, of which in the last `silent` nothing
-    came.
+    """Return a Use that looked five times a second for some seconds.
+
+    silent : time without messages at the end, in s.
     """
     use, counts, arrived = Use(0.25), Counter(), Counter()
     for k in range(int(5 * seconds)):
@@ -150,7 +151,10 @@ def test_what_may_be_flown_by(estimator, yaw_std, use, status, yaw_known, why):
 
 
 def test_a_yaw_that_is_known_is_known_to_who_hears_status():
-    """The deviation is a number of numpy; in the bytes of a message, its boolean would be false."""
+    """The deviation is a numpy number.
+
+    A comparison gives a numpy boolean, and the bytes of a message would hold false.
+    """
     serialization = pytest.importorskip("rclpy.serialization")
     messages = pytest.importorskip("uwb_tdoa_msgs.msg")
     from uwb_tdoa_ekf.outputs import StatusOutput, Time
@@ -196,7 +200,8 @@ def test_a_fault_of_the_imu_counts_while_the_filter_uses_it(rule):
     assert status_of(RUNS, KNOWN, 0.01, used(), [found(rule)]).status == FAULT
     for estimator, use in ((GOES_WITHOUT, used()), (RUNS, used(imu=False))):
         said = status_of(estimator, KNOWN, 0.01, use, [found(rule)])
-        assert said == Status(RUNNING, True, found(rule).sentence)  # and /diagnostics says the same
+        # /diagnostics reports the same.
+        assert said == Status(RUNNING, True, found(rule).sentence)
 
 
 def test_what_does_not_make_the_position_wrong_does_not_end_running():
@@ -216,9 +221,8 @@ def test_the_odometry_of_a_fault_states_that_it_may_be_anywhere():
     assert np.allclose(added[:, :3, :3], np.diag([64.0, 81.0, 16.0])) and np.allclose(
         added[:, 3:6, 3:6], 4.0 * np.eye(3)
     )
-    assert np.allclose(
-        np.trace(added[:, 6:, 6:], axis1=1, axis2=2), math.pi**2
-    )  # about the vertical alone
+    # The yaw alone is unknown.
+    assert np.allclose(np.trace(added[:, 6:, 6:], axis1=1, axis2=2), math.pi**2)
     assert (wide.p == odometry.p).all() and (np.linalg.eigvalsh(wide.covariance) > -1e-9).all()
 
 
@@ -246,13 +250,13 @@ LOOK = 0.2  # s
 
 
 class Looked:
-    """A Use that is looked at five times a second."""
+    """A Use that looks five times a second."""
 
     def __init__(self):
         self.use, self.now, self.received, self.counts = Use(0.25), 50.0, Counter(), Counter()
 
     def go(self, seconds, running=True, rate=400, imu=1000, **shares):
-        """Go on for seconds in which so many TDOAs came, with these shares of what became of them.
+        """Let time pass with this rate of TDOAs and these shares of their verdicts.
 
         Returns [(s, trouble)].
         """
@@ -268,7 +272,7 @@ class Looked:
         return said
 
     def first(self, seconds, **shares):
-        """Seconds until something is said, and what."""
+        """Return (seconds until the first trouble, trouble)."""
         return next(
             ((at, words) for at, words in self.go(seconds, **shares) if words), (float("inf"), "")
         )
@@ -288,8 +292,9 @@ def test_tdoas_of_which_none_is_used_are_named_within_two_seconds(reason, words)
 
 
 def test_a_start_and_a_landing_do_not_contradict():
-    """Of measured flights on the floor: 85 % rejected for 3 s after the start and for 2 s after
-    landing.
+    """The rates come from measured flights on the floor.
+
+    The filter rejects 85 % for 3 s after the start and for 2 s after landing.
     """
     looked = Looked()
     assert not any(said for _, said in looked.go(3.0, rejected=0.85, used=0.15))

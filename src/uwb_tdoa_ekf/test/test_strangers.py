@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What anybody on the network can do to the nodes: each test is an attack."""
+"""Attacks that any program on the network can make on the nodes."""
 
 import math
 
@@ -29,13 +29,13 @@ NAN, INF = math.nan, math.inf
 
 
 class Stranger:
-    """Publishes on the topics of a Rig, and calls services of its nodes."""
+    """Publish on the topics of a Rig and call services of its nodes."""
 
     def __init__(self, rig):
         self._rig, self._publishers = rig, {}
 
     def publish(self, topic, *messages):
-        """Publish, once somebody listens."""
+        """Publish messages as soon as a subscriber is there."""
         if topic not in self._publishers:
             publisher = self._publishers[topic] = self._rig.node.create_publisher(
                 type(messages[0]), topic, LATCHED.get(topic, 100)
@@ -45,18 +45,21 @@ class Stranger:
             self._publishers[topic].publish(message)
 
     def call(self, kind, service, **request):
-        """The response of a service of a node, which it must give."""
+        """Return the response of a service of a node."""
         client = self._rig.node.create_client(kind, f"/{self._rig.namespace}/{service}")
         self._rig.wait(client.service_is_ready, f"{service} to be offered")
         return self._rig.answer(lambda: client.call_async(kind.Request(**request)), service)
 
     def set(self, node, name, **value):
-        """SetParametersResult of a parameter, whose value has these fields."""
+        """Set a parameter and return its SetParametersResult.
+
+        value : fields of the ParameterValue.
+        """
         parameter = Parameter(name=name, value=ParameterValue(**value))
         return self.call(SetParameters, f"{node}/set_parameters", parameters=[parameter]).results[0]
 
     def alive(self, *nodes):
-        """Whether nodes still answer."""
+        """Return whether the nodes still answer."""
         return all(
             self.call(GetParameters, f"{node}/get_parameters", names=["use_sim_time"]).values
             for node in nodes
@@ -85,7 +88,7 @@ def pose(covariance, second=0):
 
 @pytest.fixture(scope="module")
 def attacked(make_shared_rig, tmp_path_factory):  # noqa: F811
-    """(Rig, Stranger, Process of bias_node, Process of ekf_node), which have anchors."""
+    """Return (Rig, Stranger, Process of bias_node, Process of ekf_node); the nodes have anchors."""
     file = tmp_path_factory.mktemp("attacked") / "effects.yaml"
     file.write_text("effects: {anchor_delay: {values: {10: 0.1}}}")
     rig = make_shared_rig()
@@ -97,7 +100,10 @@ def attacked(make_shared_rig, tmp_path_factory):  # noqa: F811
 
 @pytest.fixture(scope="module")
 def frozen(make_shared_rig):  # noqa: F811
-    """(Rig, Stranger, Process of ekf_node), frozen, which have anchors and a transform."""
+    """Return (Rig, Stranger, Process of ekf_node).
+
+    The nodes are frozen, with anchors and a transform.
+    """
     rig = make_shared_rig()
     arguments = ["-p", "frozen:=true"]
     _, ekf = rig.start("bias_node", "ekf_node", bias_node=arguments, ekf_node=arguments)
@@ -116,12 +122,14 @@ def said(process, text):
 
 
 def test_no_pose_and_no_parameter_ends_a_node_and_no_flood_of_poses_fills_it(attacked):
-    rig, stranger, _, ekf = attacked  # before its first measurement: any stamp may be to come
+    # Before its first measurement, the node accepts poses of any stamp.
+    rig, stranger, _, ekf = attacked
     poses = rig.pose_publisher(ekf)
 
     def refused(text, *told):
-        """Whether the node has said so; else these poses are published: few at a time, because its
-        queue holds no more.
+        """Publish poses and return whether the node has printed the text.
+
+        The queue of the node holds few messages, so the caller passes few poses.
         """
         for message in told:
             poses.publish(message)
@@ -203,7 +211,7 @@ def test_more_anchors_than_a_message_may_hold_are_refused(attacked):
 
 def test_a_frozen_node_takes_no_other_parameter_anchors_transform_or_pose(frozen):
     (rig, stranger, process), flight = frozen, recording(2.0)
-    # before the start a pose may be told: these are refused for their frame only
+    # The node accepts poses before its start. It refuses these for their frame only.
     poses = rig.pose_publisher(process)
     rig.play(flight)
     rig.wait(lambda: rig.odometry, "odometry")
@@ -220,11 +228,11 @@ def test_a_frozen_node_takes_no_other_parameter_anchors_transform_or_pose(frozen
         assert not result.successful
         assert f"parameter '{name}': refused, because this node is frozen" in result.reason
     same = stranger.set("ekf_node", "tdoa_std", **double, double_value=0.25)
-    assert same.successful  # what it is
+    assert same.successful  # the value is unchanged
     reset = stranger.call(Trigger, "ekf_node/reset")
     assert not reset.success and "a reset: refused, because this node is frozen" in reset.message
     assert rig.counts("ekf_node", refused_because_frozen=5)["restarts"] == 0
-    rig.send_anchors(flight.anchors)  # the same
+    rig.send_anchors(flight.anchors)  # the same anchors
     rig.send_anchors(flight.anchors.at(flight.anchors.positions + 0.5))
     rig.counts("ekf_node", refused_because_frozen=6)
     stranger.publish("/tf_static", FIRST, OTHER)
@@ -250,7 +258,7 @@ def test_what_a_frozen_node_refuses_is_a_warning_once(frozen):
 
 @pytest.mark.parametrize("nodes", ["attacked", "frozen"])
 def test_no_peer_fills_the_log(request, nodes):
-    """IMU messages, each in a frame with another name of 4 kB, made 298 MB of log in 10 s."""
+    """IMU messages in ever new frames with names of 4 kB once made 298 MB of log in 10 s."""
     rig, stranger, *_, process = request.getfixturevalue(nodes)
     before, heard = len(process.lines), rig.counts("ekf_node")["IMU samples received"]
     for k in range(3000):

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Faults of streams, live, through a real ekf_node."""
+"""Stream faults, live, with a real ekf_node."""
 
 import pytest
 
@@ -30,7 +30,8 @@ def values_of(status):
 
 def test_publishers_and_lost_messages_are_named(make_rig):  # noqa: F811
     (lane,) = lanes_of(make_rig, 1)
-    play([lane], [[[(0.0, 2.0, ())]]])  # a loss shows between messages that arrive
+    # A loss shows only between messages that arrive.
+    play([lane], [[[(0.0, 2.0, ())]]])
     for name, topic in PUBLISHERS.items():
         publisher = publish_twice(lane, name)
         both = f"2 publish on {topic} \\(.*rig"
@@ -42,13 +43,14 @@ def test_publishers_and_lost_messages_are_named(make_rig):  # noqa: F811
         )  # noqa: B023
         lane.rig.node.destroy_publisher(publisher)
 
-    # what is sent while a node is stopped is lost, and counted to the last message
+    # A stopped node loses messages. It then counts every lost one.
     before, sent, epoch = values_of(lane.rig.fresh_status("ekf_node")), 5000, int(time.time())
     os.killpg(process_of(lane).pid, signal.SIGSTOP)
     for k in range(sent):
         if k == sent - 10:
             os.killpg(process_of(lane).pid, signal.SIGCONT)
-        if k >= sent - 10:  # that some are missing shows when others follow
+        # A gap shows when other messages follow.
+        if k >= sent - 10:
             time.sleep(0.05)
         lane.rig.send_imu(time.time() - epoch, (0.0, 0.0, 1e-4 * k), epoch=epoch)
 
@@ -67,23 +69,24 @@ RUNNING, FAULT, WAITING = (
     EstimatorStatus.STATUS_FAULT,
     EstimatorStatus.STATUS_WAITING,
 )
-BEFORE, LONG, AFTER = 8.0, 5.0, 8.0  # s of flight before a fault, of it, and after it
-SOON = 4.5  # s within which it is said
+BEFORE, LONG, AFTER = 8.0, 5.0, 8.0  # s of flight before, during and after a fault
+SOON = 4.5  # s within which the fault must be reported
 
 
 def unknown(columns, rng):
-    """TDOAs with ids that the survey does not have."""
+    """Change the ids of TDOAs so that the survey does not have them."""
     t, arrival, a, b, d = columns
     return t, arrival, a + 500, b + 500, d
 
 
 def silent(imu, tdoa, rng):
-    """Neither stream comes."""
+    """Remove both streams."""
     return tuple(c[:0] for c in imu), tuple(c[:0] for c in tdoa)
 
 
-SIGNS = "all signs change"  # whose end takes a comparison of 12 s
-CASES = {  # name: (what it does to the columns of a flight, status, what `why` says)
+SIGNS = "all signs change"  # the end of this fault takes a comparison of 12 s
+# name: (function of the columns of a flight, status, pattern of `why`)
+CASES = {
     SIGNS: (of_tdoa(lambda c, rng: put(c, D, -c[D])), FAULT, "the sign of all TDOAs has changed"),
     "ids are not in the survey": (of_tdoa(unknown), FAULT, "anchors that the survey does not have"),
     "TDOAs come 0.6 s late": (
@@ -106,7 +109,7 @@ CASES = {  # name: (what it does to the columns of a flight, status, what `why` 
 
 
 class Heard:
-    """What a node says, with the s of the clock."""
+    """Received EstimatorStatus messages, with the time in s of the clock."""
 
     def __init__(self, rig):
         self.statuses, self.rig = [], rig
@@ -115,14 +118,25 @@ class Heard:
         )
 
     def at(self, when):
-        """The EstimatorStatus that held at s of the clock."""
+        """Return the last EstimatorStatus up to a time, in s of the clock."""
         return [status for at, status in self.statuses if at <= when][-1]
 
 
 def tried(lanes, heards, names):
-    """Fly with a fault in each lane: [(name, s until it is said or nan, largest error and its
-    deviation since then, m, status in the end, s after the end of the fault until nothing keeps it
-    from being flown by)].
+    """Fly with one fault in each lane and return a list with one tuple per lane.
+
+    Returns
+    -------
+    name : str
+        Name of the fault.
+    first : float
+        Time until the fault is reported, in s, or nan.
+    wrong : (float, float)
+        Largest error since then and its deviation, in m.
+    during : list of int
+        Status values since then, until the end of the fault.
+    well : float
+        Time after the end of the fault until the status is RUNNING again, in s, or nan.
     """
     out, ends = [], np.cumsum([BEFORE, LONG, AFTER])
     for lane in lanes:

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Rules over the streams: silent on healthy streams; each fault gives its finding."""
+"""Rules over the streams: healthy streams give no finding, each fault gives its own."""
 
 from dataclasses import replace
 import math
@@ -17,13 +17,14 @@ from uwb_tdoa_ekf.monitoring.stream_rules import StreamRules
 
 # --- stream rules ---
 GRAVITY = 9.81
-ANCHORS = corners()  # no id is its row
+ANCHORS = corners()  # ids differ from rows
 RADIO = 0.05  # m, noise of a TDOA
 
 
 def streams(seconds=20.0, imu_rate=500.0, tdoa_rate=300.0, seed=0):
-    """Healthy columns: imu (t, arrival, gyro, force) of a tag that sways, tdoa (t, arrival, a, b,
-    d) of the same.
+    """Return the healthy columns of a tag that sways.
+
+    These are imu (t, arrival, gyro, force) and tdoa (t, arrival, a, b, d).
     """
     rng = np.random.default_rng(seed)
     t = 100.0 + np.arange(int(seconds * imu_rate)) / imu_rate
@@ -51,7 +52,7 @@ def _arrival(t, rng):
 
 
 def judged(imu, tdoa, arrivals=True):
-    """{rule: Finding}; without arrivals, as of a log."""
+    """Return {rule: Finding}. Without arrivals, the columns are as in a log."""
     rules = StreamRules(ANCHORS)
     for feed, (t, arrival, *values) in ((rules.feed_imu, imu), (rules.feed_tdoa, tdoa)):
         if len(t):
@@ -61,7 +62,7 @@ def judged(imu, tdoa, arrivals=True):
 
 
 def put(columns, place, value):
-    """The columns with one of them replaced."""
+    """Return the columns with one replaced."""
     return (*columns[:place], value, *columns[place + 1 :])
 
 
@@ -131,7 +132,7 @@ def _bumps(t):
 
 
 def _repeated(columns):
-    """Each TDOA once more, 2 ms later."""
+    """Repeat each TDOA 2 ms later."""
     both = [np.concatenate([column, column]) for column in columns]
     n = len(columns[0])
     both[T][n:] += 0.002
@@ -141,7 +142,7 @@ def _repeated(columns):
 
 
 def _both_orders(columns, sign):
-    """Every second TDOA with its anchors the other way round, and `sign` times the value."""
+    """Exchange the anchors of every second round of TDOAs, and multiply their values by `sign`."""
     t, arrival, a, b, d = columns
     odd = (np.arange(len(t)) // 8) % 2 == 1
     return t, arrival, np.where(odd, b, a), np.where(odd, a, b), np.where(odd, sign * d, d)
@@ -163,7 +164,7 @@ def test_a_fault_of_a_stream_is_named(stream, rule):
     assert one.cause and one.evidence and one.remedy
 
 
-# m, after which 32 bits of the clock of a DW1000 begin anew
+# m, range after which the 32-bit clock of a DW1000 starts again at 0
 TICKS = 2.0**32 * 299792458.0 / (128 * 499.2e6)
 
 
@@ -182,8 +183,9 @@ def test_a_fixed_step_is_named_with_its_size_and_nothing_else(step, share, signs
 
 
 def at_rest(imu, bias):
-    """The samples of a tag that stands still, with a bias of the gyroscope, in the unit of its
-    message.
+    """Return the samples of a tag that stands still.
+
+    bias : of the gyroscope, in the unit of its message.
     """
     rng = np.random.default_rng(5)
     n = len(imu[T])
@@ -211,7 +213,8 @@ def test_a_log_shows_an_offset_by_where_its_streams_begin_and_end():
     assert judged(put(imu, T, imu[T] + 0.4), tdoa, arrivals=False)[
         "stamps_apart"
     ].value == pytest.approx(0.4, abs=0.02)
-    late = tuple(column[imu[T] > 104.0] for column in imu)  # switched on later, and no offset
+    # The IMU is switched on later; this is no offset.
+    late = tuple(column[imu[T] > 104.0] for column in imu)
     assert judged(late, tdoa, arrivals=False) == {}
 
 
@@ -303,13 +306,13 @@ def finding(rule, severity=ERROR, value=1.0):
         ),
         (finding("tdoa_sign", WARNING), False, False),
         (finding("survey_misfit", NOTE), False, False),
-        # the filter goes without the IMU
+        # The filter runs without the IMU.
         (finding("imu_turned"), True, False),
         (finding("imu_left_out"), False, False),
-        # unknown ids, where they are most
+        # Unknown ids count if they are the majority.
         *((finding("ids_unknown", value=share), False, False) for share in (0.05, 0.49)),
         *((finding("ids_unknown", value=share), True, True) for share in (0.51, 1.0)),
-        # what is dropped or slow
+        # dropped or slow messages
         *(
             (finding(rule), False, False)
             for rule in ("tdoa_twice", "gap", "rate", "blocks", "few_anchors", "tdoa_of_one")

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The rules over streams as they act in flight, on measured and simulated flights."""
+"""The rules over streams in flight, on measured and simulated flights."""
 
 from collections import Counter
 import re
@@ -18,7 +18,7 @@ LOOK = 0.2  # s
 
 
 def watched(imu, tdoa, seconds=8.0, **options):
-    """[{rule: Finding}], second by second, of columns as `streams` makes them."""
+    """Return [{rule: Finding}], for each second, of columns as from `streams`."""
     watch = StreamWatch(ANCHORS, 0.25, **options)
     begin, said = min(imu[1][0], tdoa[1][0]), []
     for second in range(int(seconds)):
@@ -42,9 +42,8 @@ def test_a_healthy_flight_has_no_findings():
 def test_a_fault_is_named_within_five_seconds_and_forgotten_when_it_ends(fault, phase=0.55):
     begin, rng = 1e9 + 3.7 * phase, np.random.default_rng(0)
     columns = columns_of(begin, [(0.0, 4.0, ()), (4.0, 10.0, (fault,)), (10.0, 16.0, ())])
-    for (
-        stream
-    ) in columns:  # who sends is not on time either: messages come in lumps, up to 30 ms late
+    # Senders are not on time either: messages come in lumps, up to 30 ms late.
+    for stream in columns:
         late = stream[ARRIVAL] + 0.03 * rng.random(len(stream[ARRIVAL])) ** 4
         stream[ARRIVAL][:] = np.maximum.accumulate(late)
     watch, said, before = StreamWatch(FLIGHT.anchors, 0.25), [], -np.inf
@@ -114,7 +113,7 @@ def test_another_time_is_judged_anew():
 
 
 def flights(folder):
-    """(name, Flight) of the measured micro-SD logs."""
+    """Yield (name, Flight) of the measured micro-SD logs."""
     readers = pytest.importorskip("uwb_tdoa_tools.readers")
     for log in sorted(
         path for path in (folder / "flights").rglob("*") if path.is_file() and not path.suffix
@@ -125,7 +124,7 @@ def flights(folder):
 
 @pytest.mark.slow
 def test_nothing_is_said_of_measured_flights(shared_data):
-    """Rules over the streams, use, sign, yaw and IMU, live, from the floor to the landing."""
+    """Run stream rules, use, sign, yaw and IMU checks live, from the floor to the landing."""
     count, rng = 0, np.random.default_rng(0)
     for name, flight in flights(shared_data):
         watch, use, received = StreamWatch(flight.anchors, 0.25), Use(0.25), Counter()
@@ -145,7 +144,7 @@ def test_nothing_is_said_of_measured_flights(shared_data):
             if k % 5 == 4:
                 assert watch.findings() == [], (name, now - begin)
         assert estimator.sign_turns == estimator.yaw_doubts == 0, name
-        # the filter never goes without its IMU
+        # The filter never runs without its IMU.
         assert estimator._ekf.imu_fault_detector.contradicted == -np.inf, name
         count += 1
     assert count == 22

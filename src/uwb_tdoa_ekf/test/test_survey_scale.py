@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The scale of a survey is found in TDOAs, before TDOAs are blamed; what they do not determine is
-not named.
+"""TDOAs show a wrong scale of the survey, before TDOAs are blamed.
+
+A scale that they do not determine is not named.
 """
 
 from flights import corners
@@ -22,8 +23,9 @@ RADIO, SYSTEMATIC = 0.07, 0.1  # m, noise of a TDOA, and error of each pair
 
 
 def flown(positions, seconds=25.0, rate=300.0, moving=1.0, sign=1.0, unit=1.0, seed=0):
-    """{rule: Finding} of what StreamRules say with the anchors at `positions`, of TDOAs in the room
-    of ANCHORS.
+    """Return {rule: Finding} of StreamRules with anchors at `positions`.
+
+    The TDOAs come from a tag in the room of ANCHORS.
     """
     rng = np.random.default_rng(seed)
     t = 100.0 + np.arange(int(seconds * rate)) / rate
@@ -47,7 +49,7 @@ def scaled(factor):
 
 
 ROOM = ANCHORS.positions
-# what is no scale of the survey: (positions of the survey, options of `flown`)
+# Cases without a wrong scale: (positions of the survey, options of `flown`).
 NO_SCALE = {
     "a right survey": (ROOM, {}),
     "a right survey again": (ROOM, {"seed": 1}),
@@ -116,7 +118,7 @@ def test_a_tag_that_stands_shows_a_clear_scale_only():
 
 @pytest.mark.usefixtures("must_end")
 def test_the_work_of_a_start_does_not_grow_with_the_survey():
-    """A coarse grid over the workspace: of a bound, however wide and high that is."""
+    """The number of points of the coarse grid has a bound, however large the workspace is."""
     rows = np.arange(160)
     a, b = rows % 8, (rows + 1) % 8
     window = structured(TDOA, rows * 0.003, a, b, np.ones(160), np.zeros(160))

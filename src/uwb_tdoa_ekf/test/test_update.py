@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""One update of a hypothesis, plain and robust, against the textbook and the paper."""
+"""One update of a hypothesis, plain and robust, compared with the textbook and the paper."""
 
 from covariances import assert_covariance
 from hypothesis import given
@@ -120,8 +120,10 @@ def test_m_estimation_is_that_of_the_paper(seed, loss, length, iterations, state
 
 
 def m_estimation(prior, P, h, noise, parameters):
-    """Eqs. 8 - 13 of Zhao et al. (RA-L 2021) as they stand there, the Jacobian at the prior mean,
-    no weight of the measurement below SMALLEST_WEIGHT: error, covariance, weight.
+    """Return error, covariance and weight by Eqs. 8 - 13 of Zhao et al. (RA-L 2021).
+
+    The Jacobian is taken at the prior mean. The weight of the measurement is at least
+    SMALLEST_WEIGHT.
     """
     S, error, value = np.linalg.cholesky(P), np.zeros(len(h)), prior.innovation.value
     loss, state_scale, scale = (
@@ -135,7 +137,8 @@ def m_estimation(prior, P, h, noise, parameters):
     return error, posterior, w
 
 
-MEASURED = {  # error states that a measurement depends on, and the auxiliary one
+# error states of a measurement, and its auxiliary state
+MEASURED = {
     "tdoa": ((0, 1, 2), None),
     "tdoa, slope on velocity": ((0, 1, 2, 3, 4, 5), None),
     "height": ((2, 6, 7), None),

@@ -26,16 +26,16 @@ from uwb_tdoa_msgs.msg import Tdoa  # noqa: E402
 DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "architecture.md"
 FILE = re.compile(r"`([\w/]+\.py)`")
 OURS = re.compile(r".*/(?:uwb_tdoa_bias|uwb_tdoa_ekf)/(?!test/)(.*\.py)")
-MOST_FILES = 15  # of the walk
-MOST_PASSED = 23  # with those beside it
-SETTLED = 100  # odometry messages; then both nodes know the pose and correct TDOAs
+MOST_FILES = 15  # files of the walk
+MOST_PASSED = 23  # including the files beside the walk
+SETTLED = 100  # odometry messages until both nodes have the pose and correct TDOAs
 TRACED = 10  # TDOAs
 PATIENCE = 30.0  # s
 
 
 @pytest.fixture
 def nodes(tmp_path):
-    """Flight, BiasNode and EkfNode of its anchors, with an effect, and a node of the test."""
+    """Give a Flight, BiasNode and EkfNode with its anchors and an effect, and a test node."""
     flight = recording(seconds=3.0)
     flight.anchors.to_yaml(tmp_path / "anchors.yaml")
     EffectSet((AnchorDelay({int(flight.anchors.ids[0]): 0.1}),)).to_yaml(tmp_path / "effects.yaml")
@@ -49,7 +49,7 @@ def nodes(tmp_path):
 
 
 def walking(flight):
-    """The messages of a Flight in the order of their stamps: (is a TDOA, message)."""
+    """Yield the messages of a Flight in stamp order: (is a TDOA, message)."""
     imu, tdoa = flight.imu, flight.tdoa
     for t, stream, i in messages(flight):
         if stream == IMU:
@@ -98,7 +98,8 @@ def test_a_tdoa_passes_the_files_that_are_documented(nodes):
     compiled = {file for file in walk - passed if file.startswith("core/")}
     steps = Path(engine.__file__).read_text()  # names the modules of compiled code
     assert all(re.search(rf"\b{Path(file).stem}\.", steps) for file in compiled)
-    watching = {file for file in passed if file.startswith("monitoring/")}  # some once a second
+    # Some monitors run once a second.
+    watching = {file for file in passed if file.startswith("monitoring/")}
     assert watching and "`monitoring/`" in beside
     looking_up = set(FILE.findall(beside))
     assert passed - watching == (walk - compiled) | looking_up

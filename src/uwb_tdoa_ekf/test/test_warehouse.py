@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tags in halls with many anchors, tags that hear few TDOAs, and anchors in a plane.
 
-The figures of many seeds: `./dev study warehouse`.
+`./dev study warehouse` gives the figures of many seeds.
 """
 
 from halls import HALLS, fly, hall, room
@@ -17,11 +17,11 @@ from uwb_tdoa_ekf.estimator import Estimator
 
 WITHOUT_IMU = FilterConfig(use_imu=False)
 SLOW = {"duration": 12.0, "speed": 1.0}
-PAIRS = 6  # of runs, at most, whose processor times are compared
+PAIRS = 6  # largest number of pairs of runs to compare by processor time
 
 
 def surroundings(positions, a, b, reach=30.0, tag_side="unknown"):
-    """(2, 3) m: bounds after the anchors in rows a and b were heard, and the memory."""
+    """Return the bounds (2, 3), in m, after TDOAs of the anchors in rows a and b, and the state."""
     state, bounds = new_state(positions), np.empty((2, 3))
     window = structured(TDOA, 0.01 * np.arange(len(a)), a, b, np.zeros(len(a)))
     workspace.listen(state.record, window, state.anchors, reach, SIDES.index(tag_side))
@@ -39,7 +39,7 @@ def test_in_a_hall_it_is_searched_within_reach_of_all_that_are_heard():
     positions = np.array([[0.0, 0.0, 3.0], [10.0, 0.0, 1.0], [300.0, 0.0, 3.0], [0.0, 200.0, 5.0]])
     bounds, _ = surroundings(positions, [0], [1])
     np.testing.assert_allclose(bounds[:, :2], [[-1.0, -1.0], [30.0, 30.0]])
-    # they are farther apart than that: the radio reaches farther
+    # The anchors are farther apart than `reach`, so the reach is larger.
     bounds, _ = surroundings(positions, [0], [1], reach=5.0)
     np.testing.assert_allclose(bounds[:, 0], [10.0 - np.hypot(10.0, 2.0), np.hypot(10.0, 2.0)])
 
@@ -116,7 +116,8 @@ def test_after_a_silence_in_which_it_walked_a_tag_is_found_within_two_seconds():
 
 def test_after_a_silence_no_tdoa_makes_a_wrong_place_certain():
     where = hall("100 x 60 m, 77 anchors")
-    for seed in (3, 4, 15):  # each was wrong by more than 5 deviations within 0.1 s
+    # The error once exceeded 5 deviations within 0.1 s for each seed.
+    for seed in (3, 4, 15):
         flight = fly(where, seed, 17.0, dead=[(3.0, 16.3)])
         found = judge(flight, WITHOUT_IMU)
         assert (found["off"] / found["std"]).max() < 5.0, seed
@@ -129,7 +130,8 @@ def test_a_tag_that_walks_beyond_the_margin_is_found_after_a_silence():
         np.abs(flight.truth.p[-70:, :2] - 0.5 * np.array(where.size))
         - np.ptp(where.anchors.positions[:, :2], axis=0) / 2.0
     )
-    assert over.max() > 1.0  # m beyond the anchors, by which the search is bounded
+    # The path leaves the anchors, which bound the search, by more than 1 m.
+    assert over.max() > 1.0
     found = judge(flight, WITHOUT_IMU)
     assert (found["off"][found["odometry"].t > 16.4] < 1.0).all()
 
@@ -162,17 +164,19 @@ def test_ten_minutes_with_dead_zones_and_a_change_of_floor(config=WITHOUT_IMU):
 
 @pytest.mark.slow
 def test_a_tag_costs_what_it_hears_and_not_what_is_installed():
-    """Runs in turn, until a pair that nothing disturbs shows it.
+    """The runs alternate until one pair is undisturbed.
 
-    What grows with what is installed, up to 500 times here, shows it in none.
+    A cost that grows with the number of anchors, here up to 500 times larger, would show in every
+    pair.
     """
-    cost(20, 5.0, 1)  # what is compiled, is
+    # The first run compiles all functions.
+    cost(20, 5.0, 1)
     ratios = []
     while min(ratios, default=np.inf) >= 1.5 and len(ratios) < PAIRS:
         (few, low, _, one), (many, high, _, other) = (cost(n, 10.0, 1) for n in (20, 10_000))
         ratios.append(many / few)
     assert min(ratios) < 1.5, ratios
-    # bytes: what is known of an anchor, and no matrix of all with all
+    # In bytes. An anchor takes at most 1000; there is no matrix over all pairs of anchors.
     assert high < low + 10_000 * 1000
     np.testing.assert_allclose(one.p, other.p, atol=0.05)
 

@@ -1,6 +1,9 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A yaw that is wrong is doubted: opened again within seconds of motion, and not one that is right."""
+"""The filter doubts a wrong yaw and opens it again within seconds of motion.
+
+It keeps a right one.
+"""
 
 from dataclasses import replace
 import itertools
@@ -24,7 +27,10 @@ from uwb_tdoa_ekf.smoother import smooth
 
 
 class Brisk(Wave):
-    """Twice as fast: a horizontal acceleration of about 1 m/s^2, as measured flights have."""
+    """A path at twice the speed.
+
+    The horizontal acceleration is about 1 m/s^2, as in measured flights.
+    """
 
     def __init__(self, *arguments):
         super().__init__(*arguments)
@@ -41,12 +47,15 @@ SOON = 5.0  # s of motion; the tag of `fly` moves from the first stamp on
 
 
 def yaw_at(flight, t):
-    """True yaw, rad."""
+    """Return the true yaw, in rad."""
     return flight.meta["wave"].motion(np.atleast_1d(t))[2].as_euler("ZYX")[:, 0]
 
 
 def told(flight, wrong, degrees=5.0):
-    """FilterConfig that is told a yaw that is so many rad off, and its deviation."""
+    """Return a FilterConfig with an initial yaw that is `wrong` rad off.
+
+    degrees : stated standard deviation, in degrees.
+    """
     yaw = float(yaw_at(flight, 0.0)[0]) + wrong
     return FilterConfig(
         initial_yaw=math.remainder(yaw, 2.0 * math.pi), initial_yaw_std=math.radians(degrees)
@@ -54,7 +63,7 @@ def told(flight, wrong, degrees=5.0):
 
 
 def dishonest(flight, odometry):
-    """(n,) bool: the yaw is farther off than three of its deviations, and than 20 degrees."""
+    """Return whether the yaw error exceeds both three deviations and 20 degrees, (n,) bool."""
     error = Rotation.from_quat(odometry.q).as_euler("ZYX")[:, 0] - yaw_at(flight, odometry.t)
     off = np.abs((error + np.pi) % (2.0 * np.pi) - np.pi)
     return off > np.maximum(
@@ -63,7 +72,7 @@ def dishonest(flight, odometry):
 
 
 def opened(estimator, flight):
-    """Feed a Flight: (Odometry, stamps, s, at which the yaw was opened again)."""
+    """Feed a Flight and return (Odometry, stamps in s at which the yaw was opened again)."""
     count, stamps, messages = 0, [], itertools.count()
 
     def advance():
@@ -145,6 +154,6 @@ def test_evidence_is_the_likelihood_ratio_of_the_best_angle():
     doubt = new_state(np.zeros((4, 3))).record.yaw_test
     assert evidence(doubt) == 0.0 and doubt.response.shape == (2, ERROR_STATES)
     doubt.information[:] = 10.0 * np.eye(2)
-    # innovations of 270 degrees
+    # innovations of a yaw error of 270 degrees
     doubt.vector[:] = 10.0 * np.array([math.cos(1.5 * math.pi) - 1.0, math.sin(1.5 * math.pi)])
     assert evidence(doubt) == pytest.approx(0.5 * 10.0 * 2.0)

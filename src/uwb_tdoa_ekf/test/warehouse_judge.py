@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""How runs of tags in halls are judged: their errors, and what they cost by how many anchors are
-installed, of which a tag hears the same 20.
+"""Measure the errors of tags in halls, and the cost of a tag by number of installed anchors.
+
+In the measurement of cost, the tag always hears the same 20 anchors.
 """
 
 from pathlib import Path
@@ -22,13 +23,17 @@ from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.monitoring.stream_rules import StreamWatch
 
 SPACING = 8.0  # m
-TURN = 0.005  # s of stamps that a node takes at once
+TURN = 0.005  # s of stamps that a node processes at once
 
 
 def judge(flight, config):
-    """Figures of one run. at_2 : m, error 2 s after the first TDOA, inf where there is no estimate;
-    rmse : m, from 10 s on; nees : mean of the position, 3 where it is honest; start : s after the
-    first TDOA; spent, stamps : TDOAs, and stamps of them, until then.
+    """Return the figures of one run.
+
+    at_2 : error 2 s after the first TDOA, in m; inf without an estimate.
+    rmse : in m, from 10 s on.
+    nees : mean of the position; 3 for a consistent filter.
+    start : time from the first TDOA to the first odometry, in s.
+    spent, stamps : number of TDOAs, and of their stamps, until then.
     """
     state = state_for(flight)
     odometry, residuals = drive(flight, config, state)
@@ -65,14 +70,15 @@ def judge(flight, config):
 
 
 def heard_at_start(flight, seconds=0.5):
-    """Anchors in the TDOAs of the first seconds."""
+    """Return the number of anchors in the TDOAs of the first seconds."""
     first = flight.tdoa.t < flight.tdoa.t[0] + seconds
     return len(np.unique(np.concatenate([flight.tdoa.a[first], flight.tdoa.b[first]])))
 
 
 def after_gaps(flight, found, within=1.0, gap=1.0):
-    """For each silence of more than `gap` s, how long after it the error was above `within` m last,
-    s, of the 10 s that follow.
+    """Return the recovery time after each silence of more than `gap` s, in s.
+
+    This is the last time that the error exceeds `within` m in the 10 s after the silence.
     """
     t, out = flight.tdoa.t, []
     for k in np.flatnonzero(np.diff(t) > gap):
@@ -83,8 +89,9 @@ def after_gaps(flight, found, within=1.0, gap=1.0):
 
 
 def installation(n):
-    """n Anchors, the first 20 of which are the same for every n; the others are out of reach of a
-    tag among these.
+    """Return n Anchors. The first 20 are the same for every n.
+
+    A tag among them hears none of the others.
     """
     rng = np.random.default_rng(1)
     x, y = np.meshgrid(np.arange(5) * SPACING, np.arange(4) * SPACING)
@@ -97,9 +104,7 @@ def installation(n):
 
 
 class Tag:
-    """Both nodes of a tag, without ROS: correction, filter with its monitor, and watch over the
-    streams.
-    """
+    """Both nodes of a tag, without ROS: correction, filter with its monitor, and stream watch."""
 
     def __init__(self, anchors):
         self.corrector, self.estimator, self.watch = (
@@ -109,7 +114,7 @@ class Tag:
         )
 
     def take(self, flight):
-        """Take a Flight, turn by turn. Returns the Odometry of each."""
+        """Process a Flight, turn by turn. Return the Odometry of each turn."""
         imu, d, out, next_look = flight.imu, flight.tdoa, [], 1.0
         edges = np.arange(0.0, d.t[-1] + TURN, TURN)
         of_imu, of_tdoa = np.searchsorted(imu.t, edges), np.searchsorted(d.t, edges)
@@ -132,16 +137,18 @@ class Tag:
 
 
 def flight_among(anchors, duration):
-    """Flight of a tag that walks among the first 20 of Anchors and hears these alone, the same
-    whatever the others are.
+    """Return a Flight of a tag that walks among the first 20 Anchors and hears no others.
+
+    It does not depend on the other anchors.
     """
     few = Hall(anchors.only(np.arange(20)), (4.0 * SPACING, 3.0 * SPACING), 100.0, np.zeros(20))
     return fly(few, 0, duration)
 
 
 def cost(n, duration=30.0, repeat=3):
-    """(share of a core, memory of a tag, bytes, start from a file, s of processor time, the last
-    Odometry) among n installed anchors.
+    """Return (share of a core, memory, start, Odometry of the last turn) among n installed anchors.
+
+    The memory of a tag is in bytes. The start from a file is in s of processor time.
     """
     anchors, shares = installation(n), []
     with tempfile.TemporaryDirectory() as folder:
