@@ -26,13 +26,13 @@ GCC, ARM_GCC = shutil.which("gcc"), shutil.which("arm-none-eabi-gcc")
 QEMU = shutil.which("qemu-system-arm")
 STRICT = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off")
 PROCESSOR = ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16")
-# Those of the Crazyflie firmware (its Makefile), which may fuse multiplication and addition
+# Flags of the Crazyflie firmware (its Makefile). They allow fused multiply-add.
 FIRMWARE = (
     *("-Os", "-std=gnu11", "-fno-math-errno", "-mfp16-format=ieee", "-fno-strict-aliasing"),
     *("-ffunction-sections", "-fdata-sections"),
     *("-Wall", "-Wextra", "-Wmissing-braces", "-Wdouble-promotion", "-Werror"),
 )
-CLOCK = 168e6  # Hz, of the emulated processor, which executes one instruction in 1 ns
+CLOCK = 168e6  # Hz, of the emulated processor. It executes one instruction in 1 ns.
 CASE = np.dtype([("a", np.int32), ("b", np.int32), ("state", STATE)])
 RESULT = np.dtype(
     [
@@ -121,7 +121,7 @@ def network(folder, orientations=True):
 
 
 def cases(n, seed=0):
-    """n random states and pairs: array of CASE."""
+    """Return n random states and pairs: array of CASE."""
     rng, out = np.random.default_rng(seed), np.zeros(n, CASE)
     a = rng.integers(0, 8, n)
     out["a"], out["b"] = ANCHORS.ids[a], ANCHORS.ids[(a + rng.integers(1, 8, n)) % 8]
@@ -136,7 +136,7 @@ def cases(n, seed=0):
 
 
 def samples_of(some):
-    """The Samples of cases."""
+    """Return the Samples of cases."""
     state = {name: some["state"][name].astype(float) for name in STATE.names}
     return Samples(
         state["time"],
