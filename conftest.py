@@ -34,8 +34,8 @@ LONGEST = """checking_check calibrating launch_files distribution surveying_know
     diagnosis_ranging study_plans first_map live_replay autopilot_flight train diagnosis_deviations alignment
     warehouse rerun each_node profiles evaluate study_odd_messages stream_watch nodes both_nodes executables
     checking_trials callees""".split()
-# Number of later tests that may not reuse the domain of a test. A killed node stays visible for 20
-# s.
+# Number of later tests that may not reuse the domain of a test.
+# A killed node stays visible for 20 s.
 KEPT = 3
 
 

@@ -63,7 +63,7 @@ def random_recording():
 
 
 def measured_recording(folder):
-    """Return a Recording of a measured log. Heights and pressures that the log lacks are 0."""
+    """Return a Recording of 10 s of a measured log. Values before the first sample are 0."""
     flight = read_flight(
         folder / "flights/0425/TDOA2/0425-traj1", folder / "surveys/anchor_0425.txt"
     )

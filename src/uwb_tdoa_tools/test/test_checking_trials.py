@@ -329,7 +329,6 @@ def flown(seconds=20.0, rate=300.0, seed=0, place=None, errors=(0.0, 0.0), ancho
 
     place : position of a tag at rest (3,), m
     errors : standard deviations of the errors of the pairs, m, in the first and in the second half
-    of the time
     """
     rng = np.random.default_rng(seed)
     t = np.arange(int(seconds * rate)) / rate
