@@ -23,8 +23,8 @@ from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS as STATUS_QOS
 from uwb_tdoa_bias.ros.topics import OUTPUT_QOS
 from uwb_tdoa_msgs.msg import EstimatorStatus
 
-PATIENCE = 120.0  # s for anything that must happen
-PERIOD = 0.005  # s, of odometry
+PATIENCE = 120.0  # s, limit of each wait
+PERIOD = 0.005  # s, period of odometry
 
 
 class Px4:
@@ -110,7 +110,7 @@ class Bench:
             self.lines.append(line)
 
     def wait(self, condition, what):
-        """Listen until condition()."""
+        """Process messages until condition() is true."""
         until = time.monotonic() + PATIENCE
         while not condition():
             self._executor.spin_once(timeout_sec=0.005)
@@ -227,7 +227,7 @@ def message_of(t, pose, twist):
 
 
 def usec(message):
-    """Stamp of an Odometry, us since 1970."""
+    """Return the stamp of an Odometry, us since 1970."""
     return message.header.stamp.sec * 10**6 + message.header.stamp.nanosec // 1000
 
 

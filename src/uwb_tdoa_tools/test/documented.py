@@ -22,7 +22,7 @@ PLACEHOLDERS = ("PACKAGE NAME", "PKG EXE", "NAME ARGS")
 def commands(page, names, folder):
     """Return [(page, [word, ...])] of the commands on a page.
 
-    The first word is ./dev, ros2, uwb-tdoa or one of `names`.
+    The first word is ./dev, ros2, uwb-tdoa or in `names`.
 
     folder : an empty working directory; it gets stubs, ./dev and a DATA like the measured flights
     """

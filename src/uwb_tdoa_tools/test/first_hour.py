@@ -80,7 +80,7 @@ class Hall:
 
 
 def off(positions, seed, exact=()):
-    """Return positions with tape errors, (N, 3) m. exact : rows with a tenth of these errors."""
+    """Return positions with tape errors, (N, 3) m. exact : rows with ten times smaller errors."""
     noise = TAPE * np.random.default_rng(seed).standard_normal(positions.shape)
     noise[list(exact)] *= 0.1
     return positions + noise

@@ -171,7 +171,8 @@ def normalised(flight, std, seed):
     Anchors are displaced by random errors of std, m. The true shifts undo them. The true delays are
     0.
 
-    Returns {effect: (errors over the stated deviations (n,), errors over those of the fit (n,))}.
+    Returns {effect: (errors over the stated deviations (n,), errors over the deviations of the fit
+    (n,))}.
     """
     off = std * np.random.default_rng(seed).standard_normal((len(flight.anchors), 3))
     shaken = replace(flight, anchors=flight.anchors.at(flight.anchors.positions + off))

@@ -38,7 +38,7 @@ class Hall:
         self.odometry = message
 
     def wait(self, condition, what, limit=PATIENCE):
-        """Listen until condition()."""
+        """Process messages until condition() is true."""
         wait(limit, what, self._processes, self.node, condition)
 
     def ask(self, kind, name, **request):

@@ -106,10 +106,9 @@ def test_mcap_has_checksums_of_its_own(bags, share, mask):
 
 
 def test_sums_are_where_others_look_for_them(bags):
-    """MCAP specification: one CRC-32 of each unpacked chunk, one of the data, and one of the
-    summary.
+    """MCAP specification: a CRC-32 of each unpacked chunk, of the data, and of the summary.
 
-    The last one includes the footer up to the checksum.
+    The last CRC-32 includes the footer up to the checksum.
     """
     content = data_file(bags["mcap"]).read_bytes()
     with open(data_file(bags["mcap"]), "rb") as file:

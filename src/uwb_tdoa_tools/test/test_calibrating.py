@@ -286,7 +286,7 @@ def stub(monkeypatch, made, seen):
 @pytest.mark.parametrize(
     ("more", "seen"),
     [
-        # the last one is the hold-out flight
+        # the last flight is the hold-out flight
         ((), (["flight1", "flight2"], ["flight3"], [True, True])),
         (("--no-truth",), (["flight1", "flight2"], ["flight3"], [False, False])),
         (("--holdout", "flight1.bag"), (["flight2", "flight3"], ["flight1"], [True, True])),

@@ -251,7 +251,7 @@ def test_gross_errors_do_not_count():
 
 
 def test_series_with_few_samples_are_not_judged():
-    """In a hall, most pairs have few samples. Then some delay explains nearly all of them."""
+    """In a hall, most pairs have few samples. Then some delay explains nearly all samples."""
     few, together = np.arange(3, 60), np.array([0, 1, 2, 3, 4, 5])
     t = np.concatenate([TIMES, 7.0 * few, TIMES[:300:50][together]])
     series = np.concatenate([SERIES, np.full(len(few), 3), np.full(len(together), 4)])

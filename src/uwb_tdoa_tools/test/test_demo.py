@@ -179,7 +179,7 @@ def test_nothing_is_written_where_nothing_helps(diagnosis, tmp_path):
 
 @pytest.mark.parametrize("kind", inject.KINDS)
 def test_every_kind_of_hidden_effect_costs_something(kind):
-    """After correction, the error of the filter equals the error in a hall without the effect."""
+    """Each effect causes an error of 0.08 to 0.7 m. Its correction at least halves the error."""
     effect = inject.KINDS[kind](np.random.default_rng(1), corners())
     flight = simulate(replace(loop.HALL, seed=9, yaw="rotating"))
     effect_in = effect.inject(flight)

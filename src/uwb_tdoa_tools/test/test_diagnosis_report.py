@@ -151,7 +151,7 @@ def test_a_phase_that_becomes_worse_is_in_the_verdict_with_the_flights_by_name(r
 
 
 def test_the_verdict_says_why_in_words_of_the_field(result):
-    """The verdict first gives the share, then the reason.
+    """The verdict first gives the improvement, then the causes.
 
     For a function without a name, it gives the largest part and the causes.
     """
@@ -456,7 +456,7 @@ def test_without_truth_ground_truth_would_tell(without_truth):
     )  # the flight has an accelerometer
 
 
-# ------------------------------------------------------------------------------------------- the
+# ------------------------------------------------------------------------------------------
 # the same in all outputs
 
 

@@ -35,7 +35,7 @@ NO_INDEX = r"NewConnectionError|NameResolution|Timeout|ProxyError|from versions:
 def kept(*beginnings):
     """Return the environment variables whose names have such prefixes.
 
-    Some of these variables select the kernels of BLAS.
+    Some variables select the kernels of BLAS.
     """
     return {name: value for name, value in os.environ.items() if name.startswith(beginnings)}
 
@@ -164,7 +164,7 @@ for name in main.NAMES:
 def test_every_command_starts_in_an_empty_environment(wheel, recording, tmp_path, number):
     programs = installed(wheel, number)
     ours = {path.name for path in programs.iterdir()}
-    assert COMMAND in ours and not ours & set(main.NAMES)  # `convert` is ImageMagick's
+    assert COMMAND in ours and not ours & set(main.NAMES)  # `convert` is a program of ImageMagick
     tool = programs / COMMAND
     assert run(tool, "--version") == f"uwb-tdoa of uwb_tdoa {version()}\n"
     assert run(tool, "check", "--help").startswith("usage: uwb-tdoa check ")

@@ -94,7 +94,7 @@ def test_one_that_nobody_told_where_it_is_has_no_place(tmp_path):
     )
     assert (
         verdict_of(flown)["why"] == "refused to arm"
-    )  # the start is NaN, and so is this estimate
+    )  # the start is NaN, and the estimate stays at its start
 
 
 def test_one_whose_estimate_becomes_no_number_in_flight_is_lost_and_ends_nothing(tmp_path):

@@ -305,7 +305,8 @@ def test_it_is_up_flies_its_circles_and_sinks(said):
     said.until(7.0)
     np.testing.assert_allclose(said.until(7.02)[0], [1.0, 2.0, 1.23], atol=1e-3)
     halfway = said.until(15.01)[0]
-    np.testing.assert_allclose(halfway, [1.0, 2.0, 1.23], atol=0.02)  # after one of two circles
+    # after the first of two circles
+    np.testing.assert_allclose(halfway, [1.0, 2.0, 1.23], atol=0.02)
     np.testing.assert_allclose(said.until(11.0 + 16.0 + 0.01)[0, 2], 0.43, atol=5e-3)
     sinking = said.until(30.0)
     assert sinking[1, 2] < 0.0 and said.mission.state == FLYING  # until it reaches the ground

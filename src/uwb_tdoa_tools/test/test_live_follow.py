@@ -180,7 +180,7 @@ STAMPS = [10.0 + 0.01 * k for k in range(200)]
 
 def test_the_replay_waits_for_tdoas_in_the_filter(filtered):
     follower, residuals = filtered
-    assert play(follower, STAMPS) == 9  # the last one is a step newer than the first
+    assert play(follower, STAMPS) == 9  # the last stamp is a step newer than the first
     residuals.say(*STAMPS[:6])
     assert play(follower, STAMPS[9:]) == 6
     residuals.say(*STAMPS[6:100])

@@ -82,7 +82,7 @@ class Process:
 
 @contextmanager
 def processes():
-    """Give a function that starts processes. All of them are ended with the block."""
+    """Give a function that starts processes. All processes end with the block."""
     started = []
 
     def start(*arguments):

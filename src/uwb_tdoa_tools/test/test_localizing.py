@@ -37,7 +37,7 @@ def flight():
 def bags(flight, tmp_path_factory):
     """Write the same flight with its ground truth, without one, and with a wrong one.
 
-    The wrong one is shifted by 3 m in each coordinate, and one position is NaN.
+    The wrong ground truth is shifted by 3 m in each coordinate, and one position is NaN.
     """
     folder = tmp_path_factory.mktemp("localize")
     wrong = replace(flight.truth, p=flight.truth.p + 3.0)

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""From a tape measure and flights to anchors."""
+"""Anchor positions from a tape measure and flights."""
 
 from dataclasses import replace
 import json
