@@ -68,8 +68,9 @@ def pytest_collection_modifyitems(items):
 
 
 def pytest_collection_finish():
-    """Exclude the modules imported so far from garbage collection. They stay, and scanning takes
-    time.
+    """Exclude the modules imported so far from garbage collection.
+
+    They stay, and scanning takes time.
     """
     gc.collect()
     gc.freeze()

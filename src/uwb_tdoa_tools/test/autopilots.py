@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""An autopilot_node as a process, an autopilot that listens on loopback, and a test node that
-publishes odometry.
+"""An autopilot_node as a process, with an autopilot on loopback.
+
+A node of the test publishes odometry.
 """
 
 from contextlib import contextmanager
@@ -185,8 +186,9 @@ class Path:
         self.twist = np.hstack([turn.inv().apply(v), rates, np.tile(twist.ravel(), (n, 1))])
 
     def messages(self, begin):
-        """Return the Odometry messages of the path. The first has the stamp `begin`, s
-        since 1970.
+        """Return the Odometry messages of the path.
+
+        The first has the stamp `begin`, s since 1970.
         """
         return [message_of(begin + t, *row) for t, *row in zip(self.t, self.pose, self.twist)]
 

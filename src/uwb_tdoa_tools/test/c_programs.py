@@ -233,8 +233,9 @@ def _value(one, inputs, columns, rows):
 
 
 def _network_outputs(network, x):
-    """Return the outputs (n, k) of a Dense for inputs (n, i). Each sum adds its terms one
-    by one.
+    """Return the outputs (n, k) of a Dense for inputs (n, i).
+
+    Each sum adds its terms one by one.
     """
     for weights, biases, activation in network.layers:
         total = np.tile(biases, (len(x), 1))
@@ -264,7 +265,7 @@ def _piecewise(pieces, x):
 
 
 def write(folder, code):
-    """Write uwb_bias.h and uwb_bias.c to a new folder."""
+    """Make the folder, and write uwb_bias.h and uwb_bias.c to it."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in code.files.items():
         (folder / name).write_text(text)

@@ -127,8 +127,7 @@ WALK = section("csv.md", "From a CSV file and a tape measure to a diagnosed flig
 
 
 def recorded(hall, truth, name="in time"):
-    """Write the recordings of a Hall as another tool would, and return the commands to convert
-    them.
+    """Write the recordings of a Hall as another tool, and return the commands to convert them.
 
     The commands come from the page. As it explains, missing sensors are left out.
     """

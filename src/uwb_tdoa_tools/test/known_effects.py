@@ -114,8 +114,9 @@ def clean_flight(seed, duration=50.0, aided=False, ranged=False):
 
 
 def with_yaw_rate(flight, noise, seed=0):
-    """Return the Flight with yaw rates in its velocity stream: ground truth plus white noise,
-    rad/s.
+    """Return the Flight with yaw rates in its velocity stream.
+
+    They are the true rates plus white noise. noise : rad/s
     """
     velocity = flight.velocity
     true = COMPARED["yaw_rate"].reading(Track(flight.truth), velocity.t)[:, 0]
@@ -151,8 +152,9 @@ def marks_of(flight, count, rng):
 
 
 def names_found(attribution):
-    """Return the names of effects, the most certain first. Functions are named
-    channel/covariate.
+    """Return the names of effects, the most certain first.
+
+    Functions are named channel/covariate.
     """
     findings = attribution.findings()
     declared = sorted(

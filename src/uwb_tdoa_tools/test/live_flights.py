@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A vehicle_node and the nodes that it flies by, as processes, and a test node that sends requests
-and subscribes.
+"""A vehicle_node and the nodes that it flies by, as processes.
+
+A node of the test sends requests and subscribes.
 """
 
 from contextlib import contextmanager

@@ -38,8 +38,9 @@ class Mistake:
 
 
 def mistake(text, *named, needs="", alone=False):
-    """Return a decorator that enters function(Recording, Generator, other Recording) into
-    MISTAKES.
+    """Return a decorator that adds a function to MISTAKES.
+
+    The function takes (Recording, Generator, other Recording).
     """
 
     def enter(make):

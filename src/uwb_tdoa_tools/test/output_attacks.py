@@ -55,8 +55,9 @@ def unknown(parser):
 
 @pytest.fixture
 def place(tmp_path):
-    """Return a folder with recordings, a bag, a file, and links to files that must stay
-    unchanged.
+    """Return a folder with recordings, a bag, a file, and links to other files.
+
+    Everything in it must stay unchanged.
     """
     bag, flights, home = tmp_path / "bag", tmp_path / "flights", tmp_path / "home"
     for folder in (bag, flights, home, tmp_path / "holds", tmp_path / "linked"):

@@ -48,8 +48,9 @@ ROWS = [  # (name, ticks, values); estBarometer and estTemperature are not in or
 
 
 def log_bytes(rows=ROWS, version=2, events=EVENTS):
-    """Return a micro-SD event log. Ticks are microseconds in version 2, milliseconds in
-    version 1.
+    """Return a micro-SD event log.
+
+    Ticks are microseconds in version 2, milliseconds in version 1.
     """
     out = bytearray(struct.pack("<BHH", 0xBC, version, len(events)))
     for name, (number, variables) in events.items():

@@ -265,8 +265,7 @@ def test_a_crazyflie_logs_to_topics_and_gets_poses(recording):
 
 
 def _expected(vehicle):
-    """Return {stream: sorted [(value, s since 1970)]} of the values that the vehicle sent, in SI
-    units.
+    """Return {stream: sorted [(value, s since 1970)]}, as sent by the vehicle, in SI units.
 
     The value of a TDOA is (a, b, difference). The value of an inertial sample is its force along z.
     """

@@ -1,8 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Forged bags that would hang the reader, exhaust memory or mislead, and invalid single
-messages.
-"""
+"""Forged bags that would hang the reader, exhaust memory or mislead; invalid messages."""
 
 from contextlib import nullcontext
 from dataclasses import replace

@@ -22,8 +22,9 @@ BATCHES = 12  # transactions in the -wal file
 
 @pytest.fixture(params=["file", "directory"])
 def unclosed(request, tmp_path):
-    """Return a bag of a killed recorder. The last two thirds of its messages are in the
-    -wal file.
+    """Return a bag of a killed recorder.
+
+    The last two thirds of its messages are in the -wal file.
     """
     write_bag(FLIGHT, tmp_path / "written", "sqlite3")
     (written,) = (tmp_path / "written").glob("*.db3")

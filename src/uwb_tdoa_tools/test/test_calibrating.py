@@ -193,8 +193,9 @@ def test_one_sentence_alone_judges_the_motion(better, path, sentence):
 
 
 def test_with_ground_truth_quick_forecasts_what_a_diagnosis_gains(flights):
-    """Forecast from one flight and from two, within seconds. The gain is measured on hold-out
-    flights.
+    """Forecast from one flight and from two, within seconds.
+
+    The gain is measured on hold-out flights.
     """
     *fitted, other = flights
     alone, several = library.forecast(fitted[:1]), library.forecast(fitted)

@@ -21,9 +21,7 @@ LATE = 0.3  # m, anchor 3
 
 @pytest.fixture
 def desk(tmp_path, monkeypatch):
-    """Return a folder with the anchors.yaml of the page and recordings in the format of another
-    tool.
-    """
+    """Return a folder with the anchors.yaml of the page, and recordings of another tool."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "anchors.yaml").write_text(*blocks(WALK, "yaml"))
     taped = read_survey("anchors.yaml")

@@ -82,10 +82,10 @@ def test_fits_and_selections_of_a_sparse_table_are_those_of_a_dense_one(both):
 
 
 def equations(n_anchors, functions=6, seed=0):
-    """Return normal equations (gram, vector) of n_anchors anchors, 4 unknowns each, and of
-    functions.
+    """Return normal equations (gram, vector).
 
-    The last two functions occur in no row.
+    The unknowns are 4 for each of n_anchors anchors, and one for each function. The last two
+    functions occur in no row.
     """
     rng = np.random.default_rng(seed)
     x = rng.standard_normal((300, 4 * n_anchors + functions))

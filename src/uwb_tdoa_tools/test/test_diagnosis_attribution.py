@@ -120,8 +120,9 @@ def test_an_undeclared_effect_is_found_by_its_covariate(flight):
     ],
 )
 def test_what_was_missed_once_is_named_first(flight, effect, named):
-    """No function has two covariates. If an anchor is late when fast and high, the anchor
-    is named.
+    """No function has two covariates.
+
+    If an anchor is late when fast and high, the anchor is named.
     """
     first, *_ = attribute([getattr(undeclared, effect)(flight)], TRUTH).findings()
     assert first.effect.label.startswith(named)
@@ -143,9 +144,7 @@ def test_a_function_does_not_hide_itself_as_noise(flight, monkeypatch):
 
 
 def inflation_alone(flight):
-    """Return the variance inflation of the TDOAs of a Flight after a fit of all declared
-    effects.
-    """
+    """Return the variance inflation of the TDOAs of a Flight, fitted with all declared effects."""
     under_base = residuals_of([flight], TRUTH, EffectSet())
     declared = attribution._declared(under_base, TRUTH, None, attribution._installation([flight]))
     table = refinement.linearised(under_base, declared, ())
@@ -191,9 +190,7 @@ def test_nothing_is_found_in_sound_heights_pressures_and_velocities(aided):
 
 
 def test_of_two_models_that_tell_the_same_the_one_of_fewer_parameters_counts(flight):
-    """Models: a frame that is shifted along z, the same with useless delays of all anchors, and
-    none.
-    """
+    """Models: a frame shifted along z, the same with useless delays of all anchors, and none."""
     shifted = EFFECTS["truth_frame"]({"z": 0.3}).inject(flight)
     frame, delays = (
         candidates_of(EFFECTS[name](), flight.anchors, None)

@@ -125,9 +125,7 @@ def test_anchors_that_are_late_on_the_floor_are_found_with_their_heights(landed)
 
 
 def test_the_floor_is_described_without_a_name_for_it(landed):
-    """Functions of the height describe that low anchors are metres late near the floor, but not
-    above.
-    """
+    """Functions of the height describe low anchors: metres late near the floor, but not above."""
     found = on_the_floor(landed, named=False)
     assert found and all(effect.covariate in ("height", "elevation") for effect in found)
     (part,) = near(landed)

@@ -68,8 +68,9 @@ def test_a_delay_beside_others_that_are_zero_is_stated_as_well_as_it_is_known():
 
 
 def test_delays_are_stated_apart_from_what_all_have_in_common():
-    """TDOAs do not determine the mean delay. The fit sets it to 0, and no standard deviation
-    includes it.
+    """TDOAs do not determine the mean delay.
+
+    The fit sets it to 0, and no standard deviation includes it.
     """
     delays = 0.05 * np.random.default_rng(5).standard_normal(8)
     flight = EFFECTS["anchor_delay"](dict(zip("01234567", delays.tolist()))).inject(

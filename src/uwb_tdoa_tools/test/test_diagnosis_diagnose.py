@@ -161,8 +161,9 @@ def test_two_processes_give_the_same_to_the_bit():
 @pytest.mark.slow
 @pytest.mark.parametrize("inertial", [False, True])
 def test_a_late_ground_truth_is_no_fault_of_the_robot(inertial):
-    """`diagnose` reported "87 % gone". Its tdoa_time_offset of -0.41 s made another
-    flight worse.
+    """`diagnose` reported "87 % gone".
+
+    Its tdoa_time_offset of -0.41 s made another flight worse.
     """
     fitted, other = (clean_flight(seed, 40.0) for seed in (100, 101))
     if not inertial:

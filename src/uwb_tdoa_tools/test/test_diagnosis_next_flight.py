@@ -144,9 +144,7 @@ def planned():
 
 
 def names_left(found):
-    """Return the names of the chosen candidates, and the names of rivals with a similar
-    criterion.
-    """
+    """Return the names of the chosen candidates and of rivals with a similar criterion."""
     near = {
         one.candidate.name for rivals in found.selection.rivals for one in rivals if one.gap < 10.0
     }

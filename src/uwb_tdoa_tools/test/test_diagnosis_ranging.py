@@ -161,8 +161,9 @@ def test_a_function_of_ranges_that_nobody_declared_is_found(both):
 
 
 def test_delays_of_all_anchors_do_not_turn_the_ground_truth(both):
-    """The delays bend an estimate from ranges so much that the frame of the truth seems
-    different.
+    """The delays bend an estimate from ranges.
+
+    The frame of the ground truth then seems different.
     """
     delays = EFFECTS["anchor_delay"]({str(i): 0.1 + 0.05 * i for i in range(8)})
     wrong = delays.inject(alone(both))

@@ -687,8 +687,9 @@ def test_shifts_of_anchors_add_up_over_effects(result):
 
 
 def score(error):
-    """Return the Score of a flight from one cell into the next, ten samples each. errors : (n, 3)
-    m.
+    """Return the Score of a flight from one cell into the next, ten samples each.
+
+    errors : (n, 3) m.
     """
     places = np.where(np.arange(20)[:, None] < 10, [0.5, 0.5, 1.5], [1.5, 0.5, 1.5])
     return SimpleNamespace(t=5.0 + np.arange(20) * 0.1, first=5.0, p=places, error=np.array(error))

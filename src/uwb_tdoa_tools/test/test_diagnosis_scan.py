@@ -117,8 +117,9 @@ def test_of_thousands_the_right_function_is_proposed_first(flight, term):
 
 
 def test_the_gain_is_that_of_normal_equations_with_the_same_weights(flight):
-    """The closed form for thousands of functions agrees with one fit, in a model with another
-    effect.
+    """The closed form for thousands of functions agrees with one fit.
+
+    The model already holds another effect.
     """
     effect = effect_of("anchor_delay", True, 1)
     table, _, scan = scanned(TERMS[2].inject(effect.inject(flight)))

@@ -58,8 +58,9 @@ def run(*words, folder=None, code=0, **variables):
 
 
 def python_of(number):
-    """Return a Python of this version that can make an environment. Skip the test if
-    there is none.
+    """Return a Python of this version that can make an environment.
+
+    Skip the test if there is none.
     """
     pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
     found = [sys.base_prefix + f"/bin/python{number}", shutil.which(f"python{number}")]

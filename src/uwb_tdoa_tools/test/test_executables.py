@@ -1,8 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Every executable: its help, its examples, the documented commands, and Ctrl-C during
-the start.
-"""
+"""Every executable: help, examples, documented commands, and Ctrl-C during the start."""
 
 import argparse
 from importlib import import_module
@@ -108,8 +106,9 @@ def test_every_example_is_a_command_line(name):
 
 
 def parameters(name):
-    """Return the parameter names of a node, from its parameter file (see the tests of the
-    nodes).
+    """Return the parameter names of a node, from its parameter file.
+
+    The tests of the nodes check this file.
     """
     package = NODES[name].partition(".")[0]
     (content,) = yaml.safe_load(

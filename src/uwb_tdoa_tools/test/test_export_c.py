@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The C code of a correction equals numpy and Python, accepts any input, and is small on a
-Cortex-M4F.
+"""The C code of a correction equals numpy and Python.
+
+It accepts any input, and is small on a Cortex-M4F.
 """
 
 import subprocess

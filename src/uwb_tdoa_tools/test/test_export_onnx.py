@@ -192,8 +192,9 @@ def test_a_file_that_no_node_would_load_is_not_written(tmp_path):
 
 
 def test_a_measured_flight_has_the_same_figures_by_the_file_and_by_effects(shared_data, tmp_path):
-    """The filter is in the loop. The file cannot hold gyro_bias, so the filter gets it as an
-    effect.
+    """The filter is in the loop.
+
+    The file cannot hold gyro_bias, so the filter gets it as an effect.
     """
     log, survey = shared_data / "flights/0426/0426-traj3", shared_data / "surveys/anchor_0426.txt"
     flight, path = read_flight(log, survey), tmp_path / "bias.onnx"

@@ -69,8 +69,9 @@ def measured(positions, *coordinates, std=0.02, noise=0.0, drop=()):
 
 
 def side_of(positions):
-    """Return the heights of all anchors, and a rough position off the line of the trusted
-    anchors.
+    """Return the heights of all anchors, and a rough position of one anchor.
+
+    This anchor is off the line of the trusted anchors.
     """
     one, other = apart(positions)
     line = positions[other] - positions[one]

@@ -51,8 +51,9 @@ def test_it_arrives_and_the_verdict_is_that_of_its_truth(drives):
 
 
 def test_wheels_say_more_or_less_than_is_true_and_the_imu_what_is():
-    """Between slips, the wheels are wrong by their scale. An IMU without errors measures the
-    motion.
+    """Between slips, the wheels are wrong by their scale.
+
+    An IMU without errors measures the motion.
     """
     still = replace(WORLD, imu=NO_IMU_ERRORS, vibration=(0.0, 0.0, 0.0))
     one = rover.drive(replace(TASK, world=still, seed=6))

@@ -131,9 +131,7 @@ def test_no_module_imports_a_command():
 
 
 def test_what_takes_a_second_to_import_is_imported_where_it_is_used():
-    """Modules that take a second to import are imported in functions, not at the start of a
-    command.
-    """
+    """Modules that take a second to import are imported in functions."""
     slow = {"scipy.stats", "scipy.signal"}
     for module in modules():
         found = imports(module, top_only=True)

@@ -189,8 +189,9 @@ def test_late_subscriptions_receive_the_anchors(tmp_path, start, node):
 
 @pytest.mark.slow
 def test_slow_reliable_subscription_loses_nothing(tmp_path, start, node):
-    """The subscription sleeps for 1 s. The replay could publish all messages ten times in this
-    time.
+    """The subscription sleeps for 1 s.
+
+    The replay could publish all messages ten times in this time.
     """
     count = 12_000  # more than DDS stores for a writer
     write_bag(small_flight(seconds=count / 1000), tmp_path / "flight.bag")

@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Bad starts on measured flights: shifted by 2 m, started in flight, or with a yaw error of 90
-degrees.
+"""Bad starts on measured flights.
+
+The filter is shifted by 2 m, starts in flight, or has a yaw error of 90 degrees.
 """
 
 from dataclasses import replace

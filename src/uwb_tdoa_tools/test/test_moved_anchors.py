@@ -38,8 +38,9 @@ CONFIG = SimulationConfig(
 
 
 def flown(positions=None):
-    """Return a flight among the surveyed anchors, or other positions. The path is always
-    the same.
+    """Return a flight among the surveyed anchors, or other positions.
+
+    The path is always the same.
     """
     filled, room = CONFIG.complete()
     moved = None if positions is None else filled.anchors.at(positions)
@@ -74,8 +75,9 @@ def exchanged(sound):
 
 @pytest.fixture(scope="module")
 def calibrated(sound):
-    """Return a calibration without errors: standard deviations of 2 cm (coordinates) and 1 cm
-    (delays).
+    """Return a calibration without errors.
+
+    Standard deviations: 2 cm for coordinates, 1 cm for delays.
     """
     keys = keys_of(sound.anchors.ids)
     n = len(sound.anchors)

@@ -211,8 +211,9 @@ def ranges(points, anchors):
 
 
 def covariance_of(pairing, variance, link_std=0.0):
-    """Return the covariance of the measurements of a Pairing, (n, M, M) m^2. variance :
-    (n, N) m^2.
+    """Return the covariance of the measurements of a Pairing, (n, M, M) m^2.
+
+    variance : (n, N) m^2.
     """
     d = pairing.incidence()
     own = link_std**2 * np.eye(len(d))

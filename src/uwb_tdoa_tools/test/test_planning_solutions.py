@@ -275,9 +275,7 @@ def test_imprecision_is_no_second_solution():
 
 
 def test_a_second_minimum_predicts_how_often_an_estimator_flips():
-    """For a share of Phi(-misfit / 2) of noisy rounds, the other minimum fits better than the
-    truth.
-    """
+    """The other minimum fits better than the truth in a share Phi(-misfit / 2) of noisy rounds."""
     anchors, rng = constellation("random-3-5"), np.random.default_rng(4)
     room = Room(anchors.positions.min(axis=0) - 1.0, anchors.positions.max(axis=0) + 1.0)
     noise = 0.1

@@ -1,8 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Requirements of a release to the ROS index: changelogs, and Debian packages as bloom
-makes them.
-"""
+"""Requirements of a release to the ROS index: changelogs, and Debian packages by bloom."""
 
 import gzip
 import os
@@ -24,9 +22,7 @@ PACKAGES = sorted(path.parent for path in (ROOT / "src").glob("*/package.xml"))
 
 @pytest.mark.parametrize("folder", PACKAGES, ids=lambda folder: folder.name)
 def test_each_package_has_a_changelog_that_catkin_reads(folder):
-    """The file is tested as if catkin_prepare_release had put the version in place of
-    "Forthcoming".
-    """
+    """The version replaces "Forthcoming", as after catkin_prepare_release."""
     changelog = pytest.importorskip("catkin_pkg.changelog")
     text = (folder / "CHANGELOG.rst").read_text()
     assert f"Changelog for package {folder.name}\n" in text

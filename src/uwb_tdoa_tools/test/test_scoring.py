@@ -46,8 +46,9 @@ def straight(duration=10.0, rate=50.0, floor=1.0):
 
 
 def estimate(truth, error, low=0.0, high=10.0, std=0.1, rate=100.0):
-    """Return odometry with errors error(t) (n, 3), m, and a stated standard deviation `std` per
-    axis.
+    """Return odometry with errors error(t) (n, 3), m.
+
+    std : stated standard deviation per axis, m
     """
     t = np.arange(low, high, 1.0 / rate)
     true = np.stack([np.interp(t, truth.t, truth.p[:, k]) for k in range(3)], axis=1)

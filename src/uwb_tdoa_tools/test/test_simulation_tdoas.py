@@ -227,8 +227,9 @@ def test_power_bias_is_the_table_of_aps011():
 
 
 def test_friis_by_hand():
-    """Two isotropic antennas: the free-space loss of the handbooks, 32.45 + 20 log10(km) + 20
-    log10(MHz) dB.
+    """Two isotropic antennas have the free-space loss of the handbooks.
+
+    It is 32.45 + 20 log10(km) + 20 log10(MHz) dB.
     """
     link = RadioLink(ISOTROPIC, ISOTROPIC, tx_power_dbm=0.0, frequency=4.0e9)
     p = received_power_dbm(np.zeros(3), LEVEL, np.array([4.0, 0, 0]), LEVEL, link)

@@ -52,8 +52,9 @@ def test_orientation_is_exact_and_says_what_remains():
 
 
 def test_arms_up_left_forward_are_what_the_surveyor_saw():
-    """In front of an upright stand that faces the viewer, arm 2 is on the left. REP 103: this is
-    -y.
+    """In front of an upright stand that faces the viewer, arm 2 is on the left.
+
+    REP 103: this is -y.
     """
     up, left_of_viewer, forward = ARM_TIPS
     assert up[2] == 0.110 and forward[0] == 0.080

@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""vehicle_node: its parameters, and a flight with the real nodes by services, on a busy
-computer.
+"""vehicle_node: its parameters, and a flight with the real nodes on a busy computer.
+
+The test commands the flight by services.
 """
 
 from dataclasses import replace
