@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What the tests of all packages share."""
+"""Fixtures and hooks that the tests of all packages share."""
 
 from collections import deque
 from functools import cache
@@ -12,20 +12,21 @@ import signal
 
 import pytest
 
-# A shell that starts us in the background has interrupts ignored, and so would have every process that a test interrupts.
+# If a shell starts pytest in the background, interrupts are ignored.
+# Child processes of the tests would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 gc.set_threshold(20_000, 5, 100)  # as in commands: modules and tests are many objects that stay
-# Before anything imports rclpy: this session talks to itself only, beside others on the same machine.
+# Before anything imports rclpy: only processes on this machine are discovered.
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-# before anything imports numpy, as executables do: threads of BLAS only wait for each other
+# Before anything imports numpy, as in the executables: BLAS threads only wait for each other.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 try:
     from domain_coordinator import domain_id
-except ImportError:  # no ROS: the tests of the cores need none
+except ImportError:  # without ROS: the tests of the cores need none
     domain_id = None
-# reservations of domains, oldest first; taken until this process ends, or KEPT others came
+# Reserved domains, oldest first. Each stays reserved until this process ends or KEPT newer follow.
 _taken = deque()
-# files of tests: each takes half a minute or more, the longest first
+# Test files that take half a minute or more, the longest first.
 LONGEST = """checking_check calibrating launch_files distribution surveying_known first_hour_without_truth
     moved_anchors first_hour diagnosis_self_calibration diagnosis_attribution waiting surveying diagnosis_diagnose
     lockstep plan demo hall stream_faults printed_lines diagnosis_references clock_recordings vehicle_node
@@ -33,19 +34,21 @@ LONGEST = """checking_check calibrating launch_files distribution surveying_know
     diagnosis_ranging study_plans first_map live_replay autopilot_flight train diagnosis_deviations alignment
     warehouse rerun each_node profiles evaluate study_odd_messages stream_watch nodes both_nodes executables
     checking_trials callees""".split()
-KEPT = 3  # tests for which nobody gets the domain of a test that is over: others see a node that was killed for 20 s more
+# Number of later tests that may not reuse the domain of a test.
+# A killed node stays visible for 20 s.
+KEPT = 3
 
 
 def _take_domain():
-    """Live in a ROS domain that nobody else has, and nobody had lately."""
+    """Reserve a ROS domain that no other session uses and no recent test has used."""
     while len(_taken) > KEPT:
         _taken.popleft().__exit__(None, None, None)
     while True:
-        # by chance none of the last seconds
+        # random, so unlikely to equal a recent domain
         reservation = domain_id(lambda: random.randint(1, 100))
         try:
             os.environ["ROS_DOMAIN_ID"] = str(reservation.__enter__())
-        except RuntimeError:  # other sessions have those that are left
+        except RuntimeError:  # other sessions use the remaining domains
             if _taken:
                 _taken.popleft().__exit__(None, None, None)
             continue
@@ -59,20 +62,23 @@ def _uses_ros(path):
 
 
 def pytest_collection_modifyitems(items):
-    """The files that take longest come first: no process has one to itself when the others have nothing left to do."""
+    """Run the longest files first, so that all workers finish at about the same time."""
     place = {f"test_{name}": k for k, name in enumerate(LONGEST)}
     items.sort(key=lambda item: place.get(item.path.stem, len(place)))
 
 
 def pytest_collection_finish():
-    """Leave what is imported until now out of garbage collections: it stays, and looking at it takes time."""
+    """Exclude the modules imported so far from garbage collection.
+
+    They stay, and scanning takes time.
+    """
     gc.collect()
     gc.freeze()
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
-    """A test that starts nodes, or processes that do, has a domain of its own."""
+    """Give each test that starts nodes its own ROS domain."""
     if domain_id is not None and _uses_ros(item.path):
         _take_domain()
 
@@ -83,7 +89,10 @@ if domain_id is not None:
 
 @pytest.fixture
 def must_end():
-    """Fail after two minutes of processor time: for input that once took much longer, or for ever. It times nothing."""
+    """Fail after two minutes of processor time.
+
+    For inputs that once took much longer or never ended. This is no performance test.
+    """
 
     def hangs(number, frame):
         pytest.fail("it does not end: two minutes of processor time are gone")
@@ -97,7 +106,7 @@ def must_end():
 
 @pytest.fixture(scope="session")
 def shared_data():
-    """The folder of measured flights, ../shared/data beside the repository; skips the test where there is none."""
+    """Return the folder of measured flights, ../shared/data. Skip the test if it does not exist."""
     folder = Path(__file__).resolve().parent.parent / "shared" / "data"
     if not folder.is_dir():
         pytest.skip("no measured flights in ../shared/data")

@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""An autopilot_node as a process, an autopilot that listens on loopback, and a node of the test that
-publishes odometry.
+"""An autopilot_node as a process, with an autopilot on loopback.
+
+A node of the test publishes odometry.
 """
 
 from contextlib import contextmanager
@@ -23,12 +24,16 @@ from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS as STATUS_QOS
 from uwb_tdoa_bias.ros.topics import OUTPUT_QOS
 from uwb_tdoa_msgs.msg import EstimatorStatus
 
-PATIENCE = 120.0  # s for anything that must happen
-PERIOD = 0.005  # s, of odometry
+PATIENCE = 120.0  # s, limit of each wait
+PERIOD = 0.005  # s, period of odometry
 
 
 class Px4:
-    """A receiver of MAVLink. odometry : ODOMETRY as they came; beats : HEARTBEAT of the node."""
+    """A receiver of MAVLink.
+
+    odometry : received ODOMETRY messages
+    beats : HEARTBEAT messages of the node
+    """
 
     def __init__(self):
         os.environ["MAVLINK20"] = "1"
@@ -56,7 +61,11 @@ class Px4:
 
 
 class Bench:
-    """What the test sees and does. lines : output of the node; values : of its /diagnostics."""
+    """The node under test, and everything that the test sends and receives.
+
+    lines : output of the node
+    values : values of its /diagnostics
+    """
 
     def __init__(self, turn):
         self.node, self.values, self.text, self.gated = rclpy.create_node("bench"), {}, "", []
@@ -75,7 +84,7 @@ class Bench:
                 self.text = status.message
 
     def start(self, *parameters):
-        """Start the node, and wait until it hears us and we hear it."""
+        """Start the node. Wait until both sides have discovered each other."""
         words = ["--ros-args", *(word for value in parameters for word in ("-p", value))]
         words += ["-p", "qos_overrides./odometry.subscription.reliability:=reliable"]
         self.process = subprocess.Popen(
@@ -102,7 +111,7 @@ class Bench:
             self.lines.append(line)
 
     def wait(self, condition, what):
-        """Listen until condition()."""
+        """Process messages until condition() is true."""
         until = time.monotonic() + PATIENCE
         while not condition():
             self._executor.spin_once(timeout_sec=0.005)
@@ -115,17 +124,17 @@ class Bench:
         self._status.publish(EstimatorStatus(status=status, yaw_known=yaw_known, why=why))
 
     def publish(self, messages):
-        """Publish messages of odometry."""
+        """Publish odometry messages."""
         for message in messages:
             self._odometry.publish(message)
             self.sent += 1
 
     def settle(self):
-        """Wait until the node has read all, and has said so in a report made later."""
+        """Wait until the diagnostics of the node count all messages sent so far."""
         self.wait(lambda: self.values.get("received") == str(self.sent), "count of all messages")
 
     def end(self):
-        """Exit code after Ctrl-C."""
+        """Send Ctrl-C and return the exit code."""
         self.process.send_signal(signal.SIGINT)
         return self.process.wait(timeout=PATIENCE)
 
@@ -142,7 +151,7 @@ class Bench:
 
 @contextmanager
 def bench(turn):
-    """A Bench that calls turn() while it waits."""
+    """Return a Bench that calls turn() while it waits."""
     rclpy.init()
     made = Bench(turn)
     try:
@@ -153,13 +162,13 @@ def bench(turn):
 
 
 class Path:
-    """A helix that a vehicle flies nose first, banked and pitched, and noisy estimates of it.
+    """A helix that a vehicle flies nose first, banked and pitched, with noisy estimates.
 
-    The estimates are as far off as their covariance says. truth : (n, 3) m.
+    The errors of the estimates match their covariance. truth : positions (n, 3), m.
     """
 
     def __init__(self, seconds, seed=1):
-        """seconds : its length."""
+        """seconds : length of the path, s."""
         rng = np.random.default_rng(seed)
         self.t = np.arange(0.0, seconds, PERIOD)
         angle = 0.8 * self.t
@@ -169,19 +178,26 @@ class Path:
             "ZYX", np.stack([angle + 0.5 * np.pi, -0.2 + 0.0 * angle, 0.1 + 0.0 * angle], axis=1)
         )
         pose, twist = _covariance(rng, 0.03), _covariance(rng, 0.05)
-        slow = rng.multivariate_normal(np.zeros(3), pose[:3, :3])  # as a filter errs
+        # slowly varying, as errors of a filter
+        slow = rng.multivariate_normal(np.zeros(3), pose[:3, :3])
         n = len(self.t)
         self.pose = np.hstack([self.truth + slow, turn.as_quat(), np.tile(pose.ravel(), (n, 1))])
         rates = np.tile([0.1, -0.2, 0.8], (n, 1))
         self.twist = np.hstack([turn.inv().apply(v), rates, np.tile(twist.ravel(), (n, 1))])
 
     def messages(self, begin):
-        """Its messages, the first at `begin` s since 1970."""
+        """Return the Odometry messages of the path.
+
+        The first has the stamp `begin`, s since 1970.
+        """
         return [message_of(begin + t, *row) for t, *row in zip(self.t, self.pose, self.twist)]
 
 
 def at_rest(count, step=PERIOD, jump=0.0):
-    """Messages of a vehicle that stands, `step` s apart, up to now; the second half `jump` m off."""
+    """Return messages of a vehicle at rest, `step` s apart, up to now.
+
+    jump : shift of the second half, m
+    """
     path = Path(PERIOD)
     pose, twist = path.pose[0], path.twist[0]
     twist[:6] = 0.0
@@ -193,13 +209,13 @@ def at_rest(count, step=PERIOD, jump=0.0):
 
 
 def _covariance(rng, std):
-    """A (6, 6) covariance with correlations, of about std^2."""
+    """Return a covariance (6, 6) with correlations and variances of about std^2."""
     root = std * (np.eye(6) + 0.3 * rng.standard_normal((6, 6)))
     return root @ root.T
 
 
 def message_of(t, pose, twist):
-    """The Odometry at t s since 1970 with the numbers of its pose, (43,), and twist, (42,)."""
+    """Return an Odometry at t s since 1970. pose : (43,), twist : (42,) numbers."""
     message = Odometry(child_frame_id="base_link")
     message.header.frame_id = "map"
     nanoseconds = round(1e9 * t)
@@ -213,12 +229,12 @@ def message_of(t, pose, twist):
 
 
 def usec(message):
-    """Stamp of an Odometry, us since 1970."""
+    """Return the stamp of an Odometry, us since 1970."""
     return message.header.stamp.sec * 10**6 + message.header.stamp.nanosec // 1000
 
 
 def numbers(message):
-    """(position, Rotation, velocity, angular velocity, both covariances) of an Odometry."""
+    """Return (position, Rotation, velocity, angular velocity, both covariances) of an Odometry."""
     at, turn = message.pose.pose.position, message.pose.pose.orientation
     linear, angular = message.twist.twist.linear, message.twist.twist.angular
     return (
@@ -232,7 +248,7 @@ def numbers(message):
 
 
 def numbers_of_mavlink(message):
-    """The same of an ODOMETRY."""
+    """Return the same as `numbers`, from an ODOMETRY of MAVLink."""
     w, x, y, z = message.q
     return (
         np.array([message.x, message.y, message.z]),
@@ -245,7 +261,7 @@ def numbers_of_mavlink(message):
 
 
 def _whole(upper):
-    """The (6, 6) matrix of its upper triangle by rows, (21,)."""
+    """Return the matrix (6, 6) from its upper triangle by rows, (21,)."""
     whole, k = np.empty((6, 6)), 0
     for i in range(6):
         for j in range(i, 6):

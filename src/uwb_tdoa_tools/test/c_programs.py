@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Compile the C of a correction, run it on this computer or an emulated Cortex-M4F, and measure it."""
+"""Compile the C code of a correction, run it here or on an emulated Cortex-M4F, and measure it."""
 
 import ctypes
 from dataclasses import replace
@@ -26,13 +26,13 @@ GCC, ARM_GCC = shutil.which("gcc"), shutil.which("arm-none-eabi-gcc")
 QEMU = shutil.which("qemu-system-arm")
 STRICT = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off")
 PROCESSOR = ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16")
-# Those of the Crazyflie firmware (its Makefile), which may fuse multiplication and addition
+# Flags of the Crazyflie firmware (its Makefile). They allow fused multiply-add.
 FIRMWARE = (
     *("-Os", "-std=gnu11", "-fno-math-errno", "-mfp16-format=ieee", "-fno-strict-aliasing"),
     *("-ffunction-sections", "-fdata-sections"),
     *("-Wall", "-Wextra", "-Wmissing-braces", "-Wdouble-promotion", "-Werror"),
 )
-CLOCK = 168e6  # Hz, of the emulated processor, which executes one instruction in 1 ns
+CLOCK = 168e6  # Hz, of the emulated processor. It executes one instruction in 1 ns.
 CASE = np.dtype([("a", np.int32), ("b", np.int32), ("state", STATE)])
 RESULT = np.dtype(
     [
@@ -92,7 +92,7 @@ PREFIXES = {"anchor": "3.", "pair": "0-1."}
 
 
 def effects():
-    """{name: effect} of all kinds that C holds."""
+    """Return {name: effect} of all kinds that the C code supports."""
     out = {name: EFFECTS[name](values) for name, values in ONE_EACH.items()}
     for name, settings in TERMS.items():
         prefix = PREFIXES.get(settings.get("form"), "")
@@ -102,26 +102,26 @@ def effects():
     return out
 
 
-COMMON = (  # without the patterns of antennas
+COMMON = (  # without antenna patterns
     *("anchor_delay", "anchor_position", "tag_lever_arm", "range_scale", "range_bias"),
     *("anchor_clock_drift", "nlos", "pair_offset", "noise_level", "spline over elevation"),
 )
 
 
 def chosen(*names):
-    """The EffectSet of some effects."""
+    """Return the EffectSet of some effects."""
     known = effects()
     return EffectSet(tuple(known[name] for name in names))
 
 
 def network(folder, orientations=True):
-    """A network of the first paper with random weights, of 14 inputs or 8: Network."""
+    """Return a Network of the first paper with random weights and 14 or 8 inputs."""
     names = FEATURES if orientations else WITHOUT
     return network_of(Path(folder), names, 3, clip=1.0, name="drawn")
 
 
 def cases(n, seed=0):
-    """n random states and pairs: array of CASE."""
+    """Return n random states and pairs: array of CASE."""
     rng, out = np.random.default_rng(seed), np.zeros(n, CASE)
     a = rng.integers(0, 8, n)
     out["a"], out["b"] = ANCHORS.ids[a], ANCHORS.ids[(a + rng.integers(1, 8, n)) % 8]
@@ -136,7 +136,7 @@ def cases(n, seed=0):
 
 
 def samples_of(some):
-    """The Samples of cases."""
+    """Return the Samples of cases."""
     state = {name: some["state"][name].astype(float) for name in STATE.names}
     return Samples(
         state["time"],
@@ -151,7 +151,7 @@ def samples_of(some):
 
 
 def missing():
-    """Executables that `cost_of` needs and that are not installed."""
+    """Return the executables that `cost_of` needs but that are not installed."""
     needed = {"gcc": GCC, "arm-none-eabi-gcc": ARM_GCC, "qemu-system-arm": QEMU}
     return [name for name, path in needed.items() if path is None]
 
@@ -179,7 +179,10 @@ FUNCTIONS = {
 
 
 def by_numpy(code, some):
-    """(bias (n,), std (n,)) of cases by numpy in single precision, in the order of the C."""
+    """Return (bias (n,), std (n,)) of cases by numpy in single precision.
+
+    The operations have the order of the C code.
+    """
     columns = {}
     for name, member in MEMBERS.items():
         field, _, place = member.partition("[")
@@ -194,9 +197,10 @@ def by_numpy(code, some):
 
 
 def _outputs(program, columns, rows):
-    """The outputs of a Program, each (n,) float32.
+    """Return the outputs of a Program, each (n,) float32.
 
-    columns : {name of an input: (n,)}; rows : {"a" and "b": rows (n,) of the anchors}
+    columns : {name of an input: (n,)}
+    rows : {"a" and "b": rows (n,) of the anchors}
     """
     made = []
     with np.errstate(all="ignore"):
@@ -209,7 +213,7 @@ def _outputs(program, columns, rows):
 
 
 def _value(one, inputs, columns, rows):
-    """The value (n,) of a Scalar."""
+    """Return the value (n,) of a Scalar."""
     if one.kind == "input":
         return columns[one.value]
     if one.kind == "constant":
@@ -229,7 +233,10 @@ def _value(one, inputs, columns, rows):
 
 
 def _network_outputs(network, x):
-    """The outputs (n, k) of a Dense for inputs (n, i); each sum adds its terms one by one."""
+    """Return the outputs (n, k) of a Dense for inputs (n, i).
+
+    Each sum adds its terms one by one.
+    """
     for weights, biases, activation in network.layers:
         total = np.tile(biases, (len(x), 1))
         for column, row in zip(x.T, weights):
@@ -240,7 +247,7 @@ def _network_outputs(network, x):
 
 
 def _piecewise(pieces, x):
-    """The values (n,) of Pieces at x (n,)."""
+    """Return the values (n,) of Pieces at x (n,)."""
     breaks, table = np.float32(pieces.breaks), np.float32(pieces.table)
     if pieces.scale:
         at = np.nan_to_num((x - breaks[0]) * pieces.scale)
@@ -258,14 +265,14 @@ def _piecewise(pieces, x):
 
 
 def write(folder, code):
-    """Write uwb_bias.h and uwb_bias.c to a folder, which is made."""
+    """Make the folder, and write uwb_bias.h and uwb_bias.c to it."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in code.files.items():
         (folder / name).write_text(text)
 
 
 def on_host(folder, some, flags=STRICT):
-    """Results (n,) of RESULT of cases on this computer."""
+    """Run cases on this computer and return their RESULT (n,)."""
     sources = [HERE / "main.c", HERE / "host.c", "uwb_bias.c"]
     command = [GCC, *flags, f"-I{HERE}", "-I.", *sources, "-lm", "-o", "host"]
     subprocess.run(command, cwd=folder, check=True)
@@ -273,7 +280,7 @@ def on_host(folder, some, flags=STRICT):
 
 
 def linked(folder, flags=FIRMWARE, name="board.elf"):
-    """Compile the test program for the board; returns the size of its flash, bytes."""
+    """Compile the test program for the board and return its size in flash, bytes."""
     sources = [HERE / "main.c", HERE / "board.c", "uwb_bias.c"]
     options = ["-nostartfiles", "-T", HERE / "netduinoplus2.ld", "-Wl,--gc-sections"]
     options += ["--specs=nano.specs", "--specs=nosys.specs", "-lm", "-o", name]
@@ -283,7 +290,7 @@ def linked(folder, flags=FIRMWARE, name="board.elf"):
 
 
 def on_board(folder, some, flags=FIRMWARE):
-    """(results (n,) of RESULT, cost (1,) of COST) of cases on the emulated board."""
+    """Run cases on the emulated board and return (RESULT (n,), COST (1,))."""
     linked(folder, flags)
     quiet = ["-nographic", "-monitor", "none", "-serial", "none"]
     hosted = ["-semihosting-config", "enable=on,target=native", "-icount", "shift=0"]
@@ -299,16 +306,20 @@ def _results(folder, command, some):
 
 
 def _size(folder, name):
-    """(text, data, bss) of a file, bytes."""
+    """Return (text, data, bss) of a file, bytes."""
     command = ["arm-none-eabi-size", name]
     out = subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
     return tuple(map(int, out.splitlines()[1].split()[:3]))
 
 
 def cost_of(folder, code, n=320):
-    """What a correction costs on the board, dict: instructions per TDOA, their mean and the most, and
-    per Jacobian; bytes of flash of the correction alone (own) and with what it needs of libm (flash),
-    and of RAM.
+    """Return the cost of a correction on the board.
+
+    instructions, most : instructions per TDOA, mean and maximum
+    jacobian : instructions per Jacobian
+    own : bytes of flash of the correction alone
+    flash : bytes of flash, including functions of libm
+    ram : bytes of RAM
     """
     write(folder, code)
     whole = linked(folder, (*FIRMWARE, "-DWITHOUT_JACOBIAN"), "without.elf")
@@ -340,7 +351,7 @@ int uwb_bias(int a, int b, const uwb_bias_state *state, float *bias, float *std)
 
 
 def _own_flash(folder):
-    """Bytes of the sections of uwb_bias.c that a program without the Jacobian keeps."""
+    """Return the bytes of uwb_bias.c that remain in a program without the Jacobian."""
     command = ["arm-none-eabi-nm", "-S", "--defined-only", "without.elf"]
     out = subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
     kept = {

@@ -13,7 +13,7 @@ PARAMETERS = {POSITION_STD: 0.01, ATTITUDE_STD: 0.0045}  # defaults of the firmw
 
 
 class Caller(list):
-    """As cflib.utils.callbacks.Caller."""
+    """Stand-in for cflib.utils.callbacks.Caller."""
 
     add_callback = list.append
 
@@ -35,7 +35,10 @@ class LogConfig:
 
 
 class Crazyflie:
-    """cf.log, cf.param, cf.extpos and the callbacks. made : the last one."""
+    """Stand-in for a Crazyflie: cf.log, cf.param, cf.extpos and the callbacks.
+
+    made : the last instance
+    """
 
     def __init__(self):
         Crazyflie.made = self

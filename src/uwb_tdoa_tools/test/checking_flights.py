@@ -9,8 +9,8 @@ from mistakes import arriving
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
-# Errors of TDOAs that a calibrated installation has. Turning, so that every axis of the gyroscope
-# tells something.
+# TDOA errors of a calibrated installation. The vehicle turns: each gyroscope axis measures
+# something.
 QUICK = dict(
     duration=18.0,
     imu_rate=400.0,
@@ -24,6 +24,6 @@ QUICK = dict(
 
 @cache
 def recording(seed=0, live=False, **config):
-    """Recording of a simulated flight."""
+    """Return the Recording of a simulated flight."""
     made = of_flight(simulate(SimulationConfig(seed=seed, **{**QUICK, **config})))
     return arriving(made, seed) if live else made

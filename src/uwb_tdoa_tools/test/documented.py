@@ -1,10 +1,9 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The commands that the documentation shows, found by letting a shell run its blocks among stubs
-that only take notes.
+"""Find the commands that the documentation shows.
 
-What braces, variables and loops stand for is the shell's to say, not a guess of ours. Nothing else
-is on its PATH.
+A shell runs the code blocks of a page. Its PATH holds only stubs that log their arguments. The
+shell expands braces, variables and loops.
 """
 
 from pathlib import Path
@@ -14,17 +13,18 @@ import subprocess
 
 ROOT = Path(__file__).resolve().parents[3]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
-LISTED = ("ls", "grep")  # what the blocks use besides
+LISTED = ("ls", "grep")  # real programs that the blocks need
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"`((?:\./dev|ros2|uwb-tdoa) [^`]+)`")
 PLACEHOLDERS = ("PACKAGE NAME", "PKG EXE", "NAME ARGS")
 
 
 def commands(page, names, folder):
-    """[(page, [word, ...])] of every command on a page whose first word is ./dev, ros2, uwb-tdoa or
-    one of names.
+    """Return [(page, [word, ...])] of the commands on a page.
 
-    folder : an empty one to run in; gets ./dev and a DATA that is as measured flights are.
+    The first word is ./dev, ros2, uwb-tdoa or in `names`.
+
+    folder : an empty working directory; it gets stubs, ./dev and a DATA like the measured flights
     """
     text = page.read_text()
     scripts = [
@@ -67,7 +67,7 @@ def _is_shell(block, names):
 
 
 def _without_brackets(script):
-    """What may be left out, [--option value], is taken."""
+    """Keep optional arguments: [--option value] becomes --option value."""
     return re.sub(r"\[(--[^\]]+)\]", r"\1", script)
 
 

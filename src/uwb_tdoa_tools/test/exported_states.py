@@ -19,7 +19,7 @@ from uwb_tdoa_bias.effects.smooth_term import FACTORS, OF_LINKS, SHAPES
 from uwb_tdoa_tools.exporting.correction import is_traceable
 from uwb_tdoa_tools.training import network as training
 
-# Ends of what a tag in `anchors_of` sees
+# Ranges of the covariates of a tag in `anchors_of`: (lowest, highest)
 RANGES = {
     "time": (0.0, 300.0),
     "x": (-1.0, 9.0),
@@ -34,19 +34,20 @@ RANGES = {
     "previous_anchor": (0.0, 7.0),
     "range": (0.0, 12.0),
 }
-ANGLE = (-3.0, 3.0)  # rad, of the other covariates
+ANGLE = (-3.0, 3.0)  # rad, range of the other covariates
 
 
 def anchors_of(count=8, seed=3):
-    """Anchors of a hall, of any orientations; ids 0, 1, ..."""
+    """Return the Anchors of a hall with any orientations and ids 0, 1, ..."""
     rng = np.random.default_rng(seed)
     positions = rng.uniform([0, 0, 0], [8, 7, 3.5], (count, 3))
     return Anchors(np.arange(count), positions, rng.standard_normal((count, 4)))
 
 
 def states(anchors, n=10_000, seed=0):
-    """Samples of any pairs in any state; each twentieth lacks its pose, attitude or motion, and of
-    each tenth the yaw is unknown.
+    """Return Samples of any pairs in any state.
+
+    One in twenty lacks its pose, attitude or motion. One in ten has an unknown yaw.
     """
     rng, count = np.random.default_rng(seed), len(anchors)
     a = rng.integers(0, count, n)
@@ -75,7 +76,7 @@ def states(anchors, n=10_000, seed=0):
 
 
 def rows_of(samples, some):
-    """Samples of some rows, with their Motion."""
+    """Return the Samples of some rows, with their Motion."""
     known = {one.name: getattr(samples, one.name) for one in fields(samples)}
     values = {
         name: value[some] if isinstance(value, np.ndarray) else value
@@ -86,7 +87,7 @@ def rows_of(samples, some):
 
 
 def smooth_terms(anchors):
-    """{label: SmoothTerm}: all covariates in all forms, and all shapes."""
+    """Return {label: SmoothTerm}: all covariates in all forms, and all shapes."""
     out = {}
     for covariate in (*OF_TDOA, *OF_ARRIVAL):
         for form in ("common", "arrival", "anchor", "pair", "direction"):
@@ -104,14 +105,14 @@ def smooth_terms(anchors):
 
 
 def product(anchors, form, factor, shape):
-    """A SmoothTerm of random coefficients with a factor."""
+    """Return a SmoothTerm of random coefficients with a factor."""
     one = term(anchors, "range" if form == "anchor" else "speed", form, "step")
     knots = tuple(np.linspace(*RANGES[factor], SHAPES[shape][0]).tolist())
     return replace(one, factor=factor, factor_shape=shape, factor_knots=knots)
 
 
 def term(anchors, covariate, form, shape="spline"):
-    """A SmoothTerm of random coefficients."""
+    """Return a SmoothTerm of random coefficients."""
     low, high = RANGES.get(covariate, ANGLE)
     count = SHAPES[shape][0] if shape in SHAPES else 5
     names = covariate in CATEGORIES
@@ -126,14 +127,14 @@ def term(anchors, covariate, form, shape="spline"):
 
 
 def exportable(anchors):
-    """{label: effect} of all effects that a file can hold."""
+    """Return {label: effect} of all effects that a file can hold."""
     declared = {name: effect_of(name, True, 1) for name in SIZES if name in EFFECTS}
     kept = {name: effect for name, effect in declared.items() if is_traceable(effect)}
     return kept | smooth_terms(anchors)
 
 
 def network_of(folder, names=FEATURES, seed=0, **more):
-    """A Network of the paper's layers with random weights; more : its metadata."""
+    """Return a Network of the paper's layers with random weights. more : its metadata."""
     rng, k = np.random.default_rng(seed), len(names)
     sizes = (k, *training.LAYERS, 1)
     layers = [

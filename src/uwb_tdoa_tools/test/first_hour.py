@@ -1,11 +1,13 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What a new user has in the first hour.
+"""The data that a new user has in the first hour.
 
-A recording in CSV files of another tool, a survey by tape that is good to 10 cm, ground truth in a
-file of its own: late, on another epoch, in another frame. After each step that claims to help, a
-flight that took no part is judged by what the user has in hand then, with the true ground truth:
-the error is smaller, or the step has said that nothing is to be used.
+The user has a recording in CSV files of another tool. Anchor positions are measured by tape with a
+standard deviation of 10 cm. The ground truth is in a separate file. It is late, of another epoch,
+or in another frame.
+
+The tests evaluate each step on a hold-out flight, with the true ground truth. The error must fall,
+or the step must have reported that its result is not to be used.
 """
 
 from dataclasses import dataclass, replace
@@ -28,13 +30,13 @@ from uwb_tdoa_tools.scoring.alignment import transform_truth
 from uwb_tdoa_tools.scoring.evaluation import score_of
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
-TAPE = 0.1  # m, standard deviation of each coordinate
+TAPE = 0.1  # m, standard deviation of each coordinate measured by tape
 CLEAN = dict(trajectory="sines", imu_rate=100.0, truth_rate=50.0, bias=False)
-# s of each flight: 30 s of them in the air are needed
+# s, length of each flight. The steps need 30 s in the air.
 SIMULATED, MEASURED = 40.0, 45.0
 LATE, EPOCH = 0.4, 1.7e9  # s
 TURNED = Rotation.from_euler("z", 8.0, degrees=True).as_matrix()
-TRUTHS = {  # what may be wrong with a ground truth: function of a Truth
+TRUTHS = {  # errors of a ground truth: functions of a Truth
     "in time": lambda truth: truth,
     "late": lambda truth: replace(truth, t=truth.t + LATE),
     "in another frame": lambda truth: transform_truth(truth, TURNED, np.array([0.5, -0.3, 0.0])),
@@ -47,8 +49,9 @@ CALIBRATION = {"anchors": "anchors.yaml", "effects": "effects.yaml", "config": "
 
 @dataclass
 class Hall:
-    """Two Flights of an installation whose anchors are as they are, and another one that judges;
-    tape : Anchors as somebody measured them.
+    """Two Flights of an installation with true anchor positions, and a hold-out flight.
+
+    tape : Anchors as measured by the user
     """
 
     flights: list
@@ -56,8 +59,11 @@ class Hall:
     tape: object
 
     def error(self, folder=None, anchors=None, **files):
-        """m, 3D RMSE of the flight that judges, with the files of a calibration that are there in a
-        folder. files : {"effects": name, ...}, in place of CALIBRATION.
+        """Return the 3D RMSE of the hold-out flight, m.
+
+        It uses the files of a calibration that exist in the folder.
+
+        files : {"effects": name, ...}, instead of CALIBRATION
         """
         there = (
             {name: Path(folder) / file for name, file in (files or CALIBRATION).items()}
@@ -74,14 +80,14 @@ class Hall:
 
 
 def off(positions, seed, exact=()):
-    """(N, 3) m, positions as a tape says them. exact : rows that are measured well."""
+    """Return positions with tape errors, (N, 3) m. exact : rows with ten times smaller errors."""
     noise = TAPE * np.random.default_rng(seed).standard_normal(positions.shape)
     noise[list(exact)] *= 0.1
     return positions + noise
 
 
 def simulated(tape, exact=()):
-    """The Hall of a tape: anchors that stand elsewhere, and are late."""
+    """Return a Hall with displaced and late anchors. tape : Anchors as measured by the user."""
     true = tape.at(off(tape.positions, 1, exact))
     rng = np.random.default_rng(2)
     late = AnchorDelay(
@@ -97,8 +103,9 @@ def simulated(tape, exact=()):
 
 
 def measured(folder):
-    """The Hall of const1 in a folder of measured flights; of the flights that are not judged the
-    first seconds.
+    """Return the Hall of const1 in a folder of measured flights.
+
+    The flights except the hold-out flight are cut to their first seconds.
     """
     flown = [
         Reading(folder / "surveys").one(folder / "util" / f"const1-trial{k}.csv.gz")
@@ -110,7 +117,7 @@ def measured(folder):
 
 
 def at_desk(folder, monkeypatch):
-    """Work in a folder, as somebody who starts things with ./dev run."""
+    """Work in a folder, with the settings of ./dev run."""
     monkeypatch.chdir(folder)
     monkeypatch.setenv(command_lines.RUN, "./dev run")
     return folder
@@ -120,8 +127,9 @@ WALK = section("csv.md", "From a CSV file and a tape measure to a diagnosed flig
 
 
 def recorded(hall, truth, name="in time"):
-    """The commands of the page that convert a Hall's recordings, once these are there as another
-    tool writes them; without what is not there, as the page says.
+    """Write the recordings of a Hall as another tool, and return the commands to convert them.
+
+    The commands come from the page. As it explains, missing sensors are left out.
     """
     for day, flight in zip(("monday", "tuesday"), hall.flights):
         write_tables(replace(flight, truth=TRUTHS[name](flight.truth) if truth else None), day)
@@ -137,12 +145,12 @@ def recorded(hall, truth, name="in time"):
 
 
 def said_on_the_way(capsys, step, before, after):
-    """Tell what a step has brought, for the documentation."""
+    """Print the errors before and after a step, for the documentation."""
     with capsys.disabled():
         print(f"{step}: {before:.3f} -> {after:.3f} m on a flight that took no part")
 
 
 def written(path, text):
-    """The path of a file with a text."""
+    """Write a text to a file and return its path."""
     Path(path).write_text(text)
     return path

@@ -1,8 +1,9 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings of others, written from a Flight: bags of ROS 1 and ROS 2 with messages of their types, CSV files, ULog.
+"""Recordings of other tools, written from a Flight.
 
-The definitions of the messages are written here by what their fields are.
+Bags of ROS 1 and ROS 2 with their message types, CSV files, ULog. The message definitions here
+follow the meaning of the fields.
 """
 
 import csv
@@ -15,7 +16,7 @@ from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-BEGIN = 1_700_000_000 * 10**9  # ns, when the recordings begin
+BEGIN = 1_700_000_000 * 10**9  # ns, start of the recordings
 TAG = 7
 NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # of our world axes
 
@@ -57,11 +58,11 @@ DEFINITIONS = {
 
 
 def store_of(which):
-    """A typestore of ROS with the DEFINITIONS."""
+    """Return a typestore of ROS with the DEFINITIONS."""
     store = get_typestore(which)
     for name, text in DEFINITIONS.items():
         package = name.split("/")[0]
-        for other in DEFINITIONS:  # types of the same package are named without it
+        for other in DEFINITIONS:  # types of the same package are written without its name
             if other.startswith(f"{package}/"):
                 short = other.rpartition("/")[2]
                 text = text.replace(f"\n{short}[", f"\n{package}/{short}[")
@@ -71,7 +72,7 @@ def store_of(which):
 
 
 def message(store, kind, **values):
-    """A message with some fields; the others are zero."""
+    """Return a message with some fields set. All other fields are zero."""
     filled = {}
     for name, (node, what) in store.fielddefs[kind][1]:
         if name in values:
@@ -88,18 +89,18 @@ def message(store, kind, **values):
 
 
 def header(store, stamp, frame=""):
-    """A std_msgs/Header of a stamp in ns."""
+    """Return a std_msgs/Header with a stamp in ns."""
     time = message(store, "builtin_interfaces/msg/Time", sec=stamp // 10**9, nanosec=stamp % 10**9)
     return message(store, "std_msgs/msg/Header", stamp=time, frame_id=frame)
 
 
 def vector(store, kind, values):
-    """A Point, Vector3 or Quaternion."""
+    """Return a Point, Vector3 or Quaternion."""
     return message(store, f"geometry_msgs/msg/{kind}", **dict(zip("xyzw", map(float, values))))
 
 
 def ns(t):
-    """Stamps in ns of times in s."""
+    """Return the stamps in ns of times in s."""
     return [BEGIN + round(1e9 * each) for each in t]
 
 
@@ -132,7 +133,7 @@ def write_ros_2(path, topics, storage, compression=None, size=None):
 
 
 def ranges_by_time(flight):
-    """[(ns, [(anchor, m), ...])]: all ranges of an instant, about."""
+    """Return [(ns, [(anchor, m), ...])]: ranges grouped by approximately equal stamps."""
     parts = np.array_split(np.arange(len(flight.range)), len(flight.range) // 4)
     stamps = ns(flight.range.t)
     return [
@@ -142,7 +143,7 @@ def ranges_by_time(flight):
 
 
 def cf_msgs(flight):
-    """As the scripts of the UTIL dataset write a log."""
+    """Return topics(store): messages as the scripts of the UTIL dataset convert a log."""
 
     def topics(store):
         def inertial(kind, values):
@@ -202,7 +203,7 @@ def cf_msgs(flight):
 
 
 def linktrack(flight, frame):
-    """As nlink_parser publishes the frames of a tag: without stamps."""
+    """Return topics(store): frames of a tag without stamps, as nlink_parser publishes them."""
     kind = f"nlink_parser/msg/Linktrack{frame.capitalize()}"
 
     def topics(store):
@@ -226,7 +227,7 @@ def linktrack(flight, frame):
 
 
 def dwm1001_topics(flight, tags=("7",)):
-    """As a driver that has a topic for each pair of a tag and an anchor."""
+    """Return topics(store) of a driver with one topic for each pair of a tag and an anchor."""
 
     def topics(store):
         found, kind = {}, "std_msgs/msg/Float64"
@@ -249,7 +250,10 @@ def dwm1001_topics(flight, tags=("7",)):
 
 
 def dwm1001_arrays(flight):
-    """As a driver that publishes all distances of a line of the shell; ids have four hexadecimal digits."""
+    """Return topics(store) of a driver that publishes all distances of one shell line.
+
+    Ids have four hexadecimal digits.
+    """
     kind, inner = "dwm1001_ros_interfaces/msg/UWBMeas", "dwm1001_ros_interfaces/msg/Anchor"
 
     def topics(store):
@@ -272,7 +276,7 @@ def dwm1001_arrays(flight):
 
 
 def two_way_ranges(flight):
-    """uwb_msgs/TwoWayRangeStamped of a tag."""
+    """Return topics(store): uwb_msgs/TwoWayRangeStamped of a tag."""
     kind = "uwb_msgs/msg/TwoWayRangeStamped"
 
     def topics(store):
@@ -296,7 +300,10 @@ def two_way_ranges(flight):
 
 
 def tdoa_arrays(flight):
-    """uwb_msgs/TDOARangesStamped: TDOAs against the first anchor of the pair, one message each."""
+    """Return topics(store): uwb_msgs/TDOARangesStamped.
+
+    Each holds one TDOA against the first anchor of the pair.
+    """
     kind = "uwb_msgs/msg/TDOARangesStamped"
 
     def topics(store):
@@ -321,17 +328,17 @@ def tdoa_arrays(flight):
 
 
 def ned(p):
-    """Positions (n, 3) as north, east, down."""
+    """Return positions (n, 3) as north, east, down."""
     return np.stack([p[:, 1], p[:, 0], -p[:, 2]], axis=1)
 
 
 def frd(vectors):
-    """Vectors (n, 3) in a body whose y points to the right and whose z points down."""
+    """Return vectors (n, 3) in a body frame forward, right, down."""
     return vectors * [1.0, -1.0, -1.0]
 
 
 def ned_of_frd(q):
-    """Attitudes (n, 4) w x y z of a body with axes FRD in a world NED, from x y z w, FLU in ENU."""
+    """Convert attitudes of FLU in ENU, x y z w, to FRD in NED, w x y z; (n, 4)."""
     x, y, z, w = q.T
     half = np.sqrt(
         0.5
@@ -341,7 +348,7 @@ def ned_of_frd(q):
 
 
 def px4_bag(flight):
-    """Topics of px4_msgs, stamped in us since the start of the autopilot."""
+    """Return topics(store) of px4_msgs, stamped in us since the start of the autopilot."""
 
     def topics(store):
         def rows(kind, t, **columns):
@@ -429,7 +436,7 @@ def write_ulog(path, flight):
 
 
 def isas(flight):
-    """As the bags of ISAS-Walk."""
+    """Return topics(store): messages as in the bags of ISAS-Walk."""
     kind, inner = "fraunhofer_rtls_flare/msg/RTLSStick", "fraunhofer_rtls_flare/msg/RTLSRange"
     listed, place = (
         "fraunhofer_rtls_flare/msg/Anchorlist",
@@ -440,7 +447,7 @@ def isas(flight):
         ranges = []
         for stamp, heard in ranges_by_time(flight):
             entries = [message(store, inner, id=anchor, range=d, ra=1) for anchor, d in heard]
-            entries.append(message(store, inner, id=0, range=99.0, ra=0))  # an old one
+            entries.append(message(store, inner, id=0, range=99.0, ra=0))  # an outdated entry
             ranges.append(
                 (stamp, message(store, kind, header=header(store, stamp), ranges=entries))
             )
@@ -484,7 +491,10 @@ def isas(flight):
 
 
 def write_starloc(folder, flight):
-    """Files as of STAR-loc: ranges of two tags, the second of which is 1 m off, and an inertial sensor."""
+    """Write files like STAR-loc: ranges of two tags and an inertial sensor.
+
+    Ranges of the second tag are 1 m longer.
+    """
     folder.mkdir()
     p = np.array(
         [np.interp(flight.range.t, flight.truth.t, column) for column in flight.truth.p.T]

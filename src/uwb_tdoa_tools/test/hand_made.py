@@ -8,7 +8,7 @@ from uwb_tdoa_bias.common.flight import Truth
 
 
 def truth_of(*legs, rate=100.0):
-    """A Truth through (stamp, x, y, z), straight in between."""
+    """Return a Truth through points (stamp, x, y, z), linear in between."""
     stamps, *places = np.transpose(legs)
     t = np.arange(stamps[0], stamps[-1] + 0.5 / rate, 1.0 / rate)
     return Truth(
@@ -19,7 +19,10 @@ def truth_of(*legs, rate=100.0):
 
 
 def flown(floor=0.03, rest=5.0, after=4.0):
-    """On the floor, a second up to 1 m above it, there, and a second down; departs at `rest`."""
+    """Return the Truth of a flight that departs at `rest`, s.
+
+    It climbs to 1 m within a second, stays there, and descends within a second.
+    """
     up, down = rest + 1.0, rest + 11.0
     return truth_of(
         (0, 0, 0, floor),

@@ -1,7 +1,9 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Simulated flights without any effect, every effect at a small and at a large size to put into
-them, places known on their paths, and what is found by name.
+"""Simulated flights without effects, and effects of known size to inject into them.
+
+Each effect has a small and a large size. Helpers return marks on the flown path and the effects
+that a diagnosis finds.
 """
 
 from dataclasses import replace
@@ -18,10 +20,10 @@ from uwb_tdoa_tools.simulation import ImuErrors, SimulationConfig, simulate
 
 ANCHORS_FOUND = "anchor_position", "anchor_delay"
 PATHS = ("sines", "rising_circle", "square", "sines", "rising_circle")
-# Without effects: white noise, outliers within the nominal 2 %, an inertial sensor without bias.
+# Without effects: white noise, outliers within the nominal 2 %, an IMU without bias.
 CLEAN = {"bias": False, "multipath": False, "imu_errors": ImuErrors(gyro_bias=0.0, accel_bias=0.0)}
 
-# {effect: (small, large)}: parameters; N is the number of some anchor, P of some pair.
+# {effect: (small, large)}: parameters; N is the number of an anchor, P a pair.
 SIZES = {
     "anchor_delay": ({"N": 0.05}, {"N": 0.3}),
     "pair_offset": ({"P": 0.05}, {"P": 0.3}),
@@ -82,7 +84,7 @@ SIZES = {
 AIDED = tuple(
     name for name in SIZES if set(EFFECTS[name].channels) <= set(BY_POSE)
 )  # effects on height, pressure, velocity, yaw rate
-# effects on ranges alone, of which `study diagnose-ranges` tells
+# effects on ranges only; `study diagnose-ranges` covers them
 RANGED = ("range_offset", "range_delay")
 MARK_TIME, MARK_STD = 2.0, 0.05  # s, m
 NOISES = {f"{name}_noise": 0.1 for name, sensor in SENSORS.items() if not sensor.locates}
@@ -91,8 +93,10 @@ YAW_RATE_NOISE = 0.02  # rad/s
 
 
 def clean_flight(seed, duration=50.0, aided=False, ranged=False):
-    """A simulated flight without any effect. aided : with height, pressure, velocity and yaw rate;
-    ranged : with distances to anchors.
+    """Return a simulated flight without any effect.
+
+    aided : with height, pressure, velocity and yaw rate
+    ranged : with distances to anchors
     """
     flight = simulate(
         SimulationConfig(
@@ -110,8 +114,9 @@ def clean_flight(seed, duration=50.0, aided=False, ranged=False):
 
 
 def with_yaw_rate(flight, noise, seed=0):
-    """The Flight with yaw rates beside its velocities, those of its ground truth and white noise,
-    rad/s.
+    """Return the Flight with yaw rates in its velocity stream.
+
+    They are the true rates plus white noise. noise : rad/s
     """
     velocity = flight.velocity
     true = COMPARED["yaw_rate"].reading(Track(flight.truth), velocity.t)[:, 0]
@@ -121,10 +126,10 @@ def with_yaw_rate(flight, noise, seed=0):
 
 
 def effect_of(name, large, seed):
-    """The effect at a size, on an anchor or pair that the seed chooses."""
+    """Return the effect at a size. The seed chooses the anchor or pair."""
     rng = np.random.default_rng([seed, len(name)])
     anchor = int(rng.integers(8))
-    pair = f"{anchor}-{(anchor + 1) % 8}"  # is heard in both protocols
+    pair = f"{anchor}-{(anchor + 1) % 8}"  # measured in both protocols
     values = SIZES[name][int(large)]
     return EFFECTS[name](
         {key.replace("N", str(anchor)).replace("P", pair): value for key, value in values.items()}
@@ -132,8 +137,9 @@ def effect_of(name, large, seed):
 
 
 def marks_of(flight, count, rng):
-    """[Mark] at places of the ground truth, MARK_TIME long, evenly over the airborne part, MARK_STD
-    off.
+    """Return [Mark] at ground-truth positions, evenly over the airborne part.
+
+    Each lasts MARK_TIME, s, with errors of MARK_STD, m.
     """
     truth, (begin, end) = flight.truth, scored_phase(flight.truth)[1:]
     out = []
@@ -146,7 +152,10 @@ def marks_of(flight, count, rng):
 
 
 def names_found(attribution):
-    """Names of effects, the most certain first, functions without a name as channel/covariate."""
+    """Return the names of effects, the most certain first.
+
+    Functions are named channel/covariate.
+    """
     findings = attribution.findings()
     declared = sorted(
         (finding for finding in findings if finding.declared),
@@ -159,9 +168,13 @@ def names_found(attribution):
 
 
 def normalised(flight, std, seed):
-    """{effect: (errors over stated deviations (n,), over those of the fit alone (n,))} of what is
-    found in a Flight whose anchors are put off by std, m. What the survey and the delays should be
-    is what came with the flight, and zero.
+    """Return the normalized errors of the effects found in a Flight with displaced anchors.
+
+    Anchors are displaced by random errors of std, m. The true shifts undo them. The true delays are
+    0.
+
+    Returns {effect: (errors over the stated deviations (n,), errors over the deviations of the fit
+    (n,))}.
     """
     off = std * np.random.default_rng(seed).standard_normal((len(flight.anchors), 3))
     shaken = replace(flight, anchors=flight.anchors.at(flight.anchors.positions + off))
@@ -171,7 +184,7 @@ def normalised(flight, std, seed):
         for row, i in enumerate(flight.anchors.ids)
         for k, axis in enumerate("xyz")
     }
-    # the second is fitted anew: without the deviations that hold
+    # the second fit leaves out the validated deviations
     stated, alone = (found.fit, found.only(found.chosen).fit)
     out = {}
     for kind in ANCHORS_FOUND:
@@ -182,6 +195,6 @@ def normalised(flight, std, seed):
 
 
 def root(several):
-    """Root mean square of arrays together; NaN of none."""
+    """Return the root mean square of all arrays together; NaN if there are none."""
     together = np.concatenate(several)
     return float(np.sqrt(np.mean(together**2))) if len(together) else np.nan

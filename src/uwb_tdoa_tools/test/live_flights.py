@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A vehicle_node and the nodes that it flies by, as processes, and a node of the test that asks and
-listens.
+"""A vehicle_node and the nodes that it flies by, as processes.
+
+A node of the test sends requests and subscribes.
 """
 
 from contextlib import contextmanager
@@ -14,12 +15,12 @@ from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS
 from uwb_tdoa_tools.live.processes import Processes, own_domain, wait
 from uwb_tdoa_tools.live.session import session
 
-# s for anything that must happen; the very first start compiles the filter and the vehicle
+# s, limit of each wait; the first start compiles the filter and the vehicle
 PATIENCE = 400.0
 
 
 class Hall:
-    """verdicts : [dict], as they came; odometry : the newest, or None."""
+    """verdicts : [dict] in the order received; odometry : the newest, or None."""
 
     def __init__(self, node, processes):
         self.verdicts, self.odometry, self.node = [], None, node
@@ -38,11 +39,11 @@ class Hall:
         self.odometry = message
 
     def wait(self, condition, what, limit=PATIENCE):
-        """Listen until condition()."""
+        """Process messages until condition() is true."""
         wait(limit, what, self._processes, self.node, condition)
 
     def ask(self, kind, name, **request):
-        """What a service answers."""
+        """Return the response of a service."""
         client = self.node.create_client(kind, name)
         self.wait(client.service_is_ready, name)
         answer = client.call_async(kind.Request(**request))
@@ -52,8 +53,9 @@ class Hall:
 
 @contextmanager
 def hall(folder, *parameters, ekf=()):
-    """A Hall with all nodes, on simulated time, while the block lasts. parameters, ekf :
-    NAME:=VALUE, of vehicle_node and ekf_node.
+    """Run all nodes on simulated time while the block lasts, and give a Hall.
+
+    parameters, ekf : NAME:=VALUE, of vehicle_node and ekf_node
     """
     with own_domain(), session("test", []) as (node, stop), Processes(folder, stop) as processes:
         told = {

@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Mistakes of drivers, surveys and clocks, put into recordings: what each does to the streams, and
-by what name it is found.
+"""Mistakes of drivers, surveys and clocks, to put into recordings.
+
+Each states its effect on the streams and the rules of `check` that must name it.
 """
 
 from dataclasses import dataclass, replace
@@ -14,15 +15,19 @@ from uwb_tdoa_bias.common.flight import Imu, Tdoas
 from uwb_tdoa_tools.checking.recording import IMU, TDOA
 
 MISTAKES = {}
-# s, of a message on its way, the least and the mean of what comes on top
+# Delay of a message, s: minimum, and mean of the additional random delay
 LATENCY, JITTER = (2e-3, 1e-3)
 
 
 @dataclass(frozen=True)
 class Mistake:
-    """text : for the table; named : rules of `check` that name it; needs : "imu", "tdoa3", "rooms"
-    (other surveys) or ""; make : callable of (Recording, Generator, other Recording of the same
-    room or None) -> Recording; alone : no other survey may be tried.
+    """A mistake to put into a recording.
+
+    text : for the table
+    named : rules of `check` that name it
+    make : callable(Recording, Generator, other Recording of the same room or None) -> Recording
+    needs : "imu", "tdoa3", "rooms" (other surveys) or ""
+    alone : no other survey may be tried
     """
 
     text: str
@@ -33,7 +38,10 @@ class Mistake:
 
 
 def mistake(text, *named, needs="", alone=False):
-    """Decorator: enter a function of (Recording, Generator, other Recording) into MISTAKES."""
+    """Return a decorator that adds a function to MISTAKES.
+
+    The function takes (Recording, Generator, other Recording).
+    """
 
     def enter(make):
         MISTAKES[make.__name__] = Mistake(text, named, make, needs, alone)
@@ -43,8 +51,9 @@ def mistake(text, *named, needs="", alone=False):
 
 
 def arriving(recording, seed):
-    """The Recording with arrival times: every message a few milliseconds after its stamp, none
-    before the one before it.
+    """Return the Recording with arrival times.
+
+    Each message arrives a few milliseconds after its stamp. The order of the messages stays.
     """
     rng = np.random.default_rng([seed, 1])
     out = {"tdoa_arrival": _arrival(recording.tdoa.t, rng)}
@@ -58,14 +67,14 @@ def _arrival(t, rng):
 
 
 def _tdoa(recording, rows=slice(None), **columns):
-    """Other columns of the TDOAs, then some of their rows."""
+    """Replace columns of the TDOAs, then keep some rows."""
     tdoa = replace(recording.tdoa, **columns)
     tdoa = Tdoas(*(column[rows] for column in vars(tdoa).values()))
     return replace(recording, tdoa=tdoa, tdoa_arrival=recording.tdoa_arrival[rows])
 
 
 def _imu(recording, rows=slice(None), **columns):
-    """The same of the inertial samples."""
+    """Do the same to the inertial samples."""
     imu = replace(recording.imu, **columns)
     return replace(
         recording,

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Attacks on what command lines write: links, inputs and parts of bags in the place of an output."""
+"""Attacks on the outputs of commands: links, inputs and parts of bags in place of an output."""
 
 import argparse
 from pathlib import Path
@@ -10,16 +10,16 @@ import pytest
 
 from uwb_tdoa_tools.outputs import Output, OutputBag, OutputFile, OutputFolder
 
-READ = set(  # options and arguments that name what is read, or no path at all
+READ = set(  # options and arguments that name inputs, or no path
     """flights flight input bag map anchors survey effects config model peer correction marks distances holdout odometry beside antenna
     walls places poses coordinates static data diagnosed trained train test cases columns seed names""".split()
 )
-NUMBERS = "int", "float", "whole_number"  # names of types of options
+NUMBERS = "int", "float", "whole_number"  # names of option types
 PATHS = re.compile("FILE|DIR|BAG|LOG|CSV|MAP|FLIGHT|IN$|S$|ANCHORS|LIBRARY|DATA|DIRECTORY|FOLDER")
 
 
 def parsers(words, parser):
-    """{words: parser} of each command of an ArgumentParser that has options of its own."""
+    """Return {words: parser} of each command of an ArgumentParser, without groups of commands."""
     inner = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
     if not inner:
         return {words: parser}
@@ -31,7 +31,7 @@ def parsers(words, parser):
 
 
 def outputs(parser):
-    """The options of a parser that name outputs."""
+    """Return the options of a parser that name outputs."""
     return [
         action
         for action in parser._actions
@@ -40,7 +40,7 @@ def outputs(parser):
 
 
 def unknown(parser):
-    """Names of its options that take a path, and are neither outputs nor READ, or both."""
+    """Return the names of path options that are neither outputs nor in READ, or are both."""
     found = []
     for action in parser._actions:
         metavar = action.metavar if isinstance(action.metavar, str) else ""
@@ -55,7 +55,10 @@ def unknown(parser):
 
 @pytest.fixture
 def place(tmp_path):
-    """A folder with recordings, a bag, a file, and links to what is precious."""
+    """Return a folder with recordings, a bag, a file, and links to other files.
+
+    Everything in it must stay unchanged.
+    """
     bag, flights, home = tmp_path / "bag", tmp_path / "flights", tmp_path / "home"
     for folder in (bag, flights, home, tmp_path / "holds", tmp_path / "linked"):
         folder.mkdir()
@@ -78,7 +81,7 @@ LINKS = [
     ("to nothing", "is a link to {0}/home/new"),
     ("to a folder", "is a link to {0}/home"),
 ]
-ATTACKS = {  # [(output, what is read, what is said)]
+ATTACKS = {  # [(output, input or None, error message)]
     OutputFile: [
         *((name, None, said) for name, said in LINKS),
         ("file", "file", "{0}/file: is {0}/file, which is read"),
@@ -110,8 +113,9 @@ ATTACKS = {  # [(output, what is read, what is said)]
 
 
 def line(words, parser, attacked, out, read):
-    """A command line with an output and, where there is an option for it, what is read; None where
-    there is none.
+    """Return a command line with an output and, if given, an input.
+
+    Returns None if the command has no option for the input.
     """
     line, reads = [], read is None
     for action in parser._actions:
@@ -152,8 +156,9 @@ def content(folder):
 
 
 def attack(main, words, parser, action, place, capsys):
-    """Attack an output of a command, whose main(arguments) is given, in the folder `place`: all is
-    refused, and stays as it is.
+    """Attack an output of a command in the folder `place`.
+
+    The command must refuse each attack and change nothing. main : callable(arguments)
     """
     before = content(place)
     for out, read, said in ATTACKS[action.type]:

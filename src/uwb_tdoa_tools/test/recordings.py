@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Small recordings made from nothing, for the tests of everything that reads and writes them."""
+"""Small synthetic recordings for the tests of all readers and writers."""
 
 import struct
 import zlib
@@ -27,7 +27,7 @@ EVENTS = {  # name: (id, [(variable, struct code)])
     "estTOF": (12, [("range.zrange", "H")]),
     "estFlow": (10, [("motion.deltaX", "h"), ("motion.deltaY", "h")]),
 }
-ROWS = [  # name, ticks, values: not in order of time within estBarometer and estTemperature
+ROWS = [  # (name, ticks, values); estBarometer and estTemperature are not in order of time
     ("estGyroscope", 1_000_000, (180.0, 0.0, -90.0)),
     ("estAcceleration", 1_000_020, (0.0, 0.5, 1.0)),
     ("estTDOA", 1_000_500, (0, 1, 1.25)),
@@ -48,7 +48,10 @@ ROWS = [  # name, ticks, values: not in order of time within estBarometer and es
 
 
 def log_bytes(rows=ROWS, version=2, events=EVENTS):
-    """A micro-SD event log. Ticks are microseconds in version 2 and milliseconds in version 1."""
+    """Return a micro-SD event log.
+
+    Ticks are microseconds in version 2, milliseconds in version 1.
+    """
     out = bytearray(struct.pack("<BHH", 0xBC, version, len(events)))
     for name, (number, variables) in events.items():
         out += struct.pack("<H", number) + name.encode() + b"\0" + struct.pack("<H", len(variables))
@@ -65,8 +68,8 @@ FULL_HEADER = (
     "t_tdoa,idA,idB,tdoa_meas,t_acc,acc_x,acc_y,acc_z,t_gyro,gyro_x,gyro_y,gyro_z,t_tof,tof,t_flow,deltaX,deltaY,"
     "t_baro,baro,t_pose,pose_x,pose_y,pose_z,pose_qx,pose_qy,pose_qz,pose_qw"
 )
-# three TDOAs, four IMU samples, one tof, two flow, one baro, two poses: side by side, not at one
-# instant
+# three TDOAs, four IMU samples, one tof, two flow, one baro, two poses: in the same rows, but at
+# different times
 FULL_ROWS = [
     "0.010,0,1,0.25,0.001,0,0,1,0.001,180,0,0,0.02,31,0.03,1,-2,0.04,99.5,0.005,1,2,3,0,0,0,1",
     "0.012,1.0,5.0,-0.50,0.002,0,0,1,0.002,0,90,0,,,0.05,3,4,,,0.009,1,2,3.5,0,0,0.6,0.8",
@@ -80,11 +83,12 @@ def csv_text(header=FULL_HEADER, rows=FULL_ROWS):
 
 
 def small_flight(seconds=2.0, rate=1000, name="small"):
-    """A Flight whose streams have different stamps, with an unknown orientation among anchors and
-    truth.
+    """Return a Flight with different stamps in each stream.
+
+    Some orientations of anchors and ground truth are unknown.
     """
     rng = np.random.default_rng(7)
-    # us, as a log has them
+    # us, as in a log
     ticks = 10_000_000 + np.arange(round(seconds * rate)) * 1_000_000 // rate
     n, k, m = len(ticks), len(ticks) // 2, len(ticks) // 4
     quaternions = rng.normal(size=(m, 4))
@@ -103,7 +107,7 @@ def small_flight(seconds=2.0, rate=1000, name="small"):
 
 
 def differences(one, other):
-    """Names of the arrays that are not exactly equal in two flights."""
+    """Return the names of the arrays that are not exactly equal in two flights."""
     found = []
     for part in ("anchors", "tdoa", "imu", "truth", "height", "pressure", "velocity"):
         first, second = getattr(one, part), getattr(other, part)

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What tests of reports share: findings and diagnoses made up, and pages read."""
+"""Helpers for the tests of reports: artificial findings and diagnoses, and parsed pages."""
 
 from dataclasses import replace
 from html import unescape
@@ -13,12 +13,12 @@ from uwb_tdoa_bias.effects import EFFECTS
 from uwb_tdoa_tools.diagnosis.findings import EffectFinding
 from uwb_tdoa_tools.diagnosis.regression.terms import Candidate, Term
 
-# Keys of diagnosis.json that are names of something: of parameters, anchors, lags.
+# Keys of diagnosis.json whose content has names as keys: parameters, anchors, lags.
 NAMES_BELOW = {"parameters", "std", "direction", "values", "autocorrelation"}
 
 
 def said(page):
-    """The words of a page, without markup."""
+    """Return the text of a page, without markup."""
     text = unescape(re.sub(r"<style>.*?</style>|<[^>]*>", " ", page, flags=re.S))
     return " ".join(text.replace("m/s²", "m/s^2").split())
 
@@ -42,7 +42,11 @@ def run(name, error, diverged=False):
 
 
 def judged(result, before, after, gain, **changes):
-    """The Diagnosis with other errors: {flight: m}, and the interval of the gain."""
+    """Return the Diagnosis with other errors.
+
+    before, after : {flight: error, m}
+    gain : confidence interval of the gain, m
+    """
     sides = []
     for errors in (before, after):
         runs = [
@@ -67,7 +71,11 @@ def keys_of(content):
 
 
 class Tags(HTMLParser):
-    """Every tag with those that it is in; what was not closed."""
+    """Collect all tags of a page.
+
+    seen : [(tag, attributes, enclosing tags)]
+    open : tags that are not closed
+    """
 
     def __init__(self, page):
         super().__init__()

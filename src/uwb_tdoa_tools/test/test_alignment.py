@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Ground truth is a sensor too: late, of another epoch, turned, shifted, z down."""
+"""Ground truth can be wrong as well: late, of another epoch, rotated, shifted, z down."""
 
 from dataclasses import replace
 import re
@@ -50,14 +50,14 @@ def path_of_bare(bare):
 
 
 def in_frame(flight, axes=np.eye(3), shift=(0.0, 0.0, 0.0)):
-    """The Flight whose ground truth is in another frame."""
+    """Return the Flight with its ground truth in another frame."""
     return replace(
         flight, truth=transform_truth(flight.truth, np.asarray(axes, dtype=float), np.array(shift))
     )
 
 
 def mislabelled(flight, one, two):
-    """The Flight with the ids of two anchors exchanged in its TDOAs."""
+    """Return the Flight with the ids of two anchors exchanged in its TDOAs."""
 
     def other(ids):
         return np.where(ids == one, two, np.where(ids == two, one, ids))
@@ -226,10 +226,11 @@ def test_wrong_ids_and_signs_are_no_other_frame(name, request):
 
 
 def test_delays_of_anchors_that_shift_the_estimate_are_no_other_frame(flight):
-    """Each anchor is late by its distance from a tag that is beside the true place.
+    """The delays of all anchors imitate a tag that is shifted by 0.4 m along x.
 
-    Then the TDOAs agree with a shifted frame in the middle of the room only, and they are later
-    corrected where the ground truth is right.
+    The TDOAs agree with a shifted frame in the middle of the room only. A correct ground truth
+    stays where it is; the delays are corrected later. Without delays, a shifted ground truth is
+    moved back.
     """
     shift, middle = np.array([0.4, 0.0, 0.0]), flight.truth.p.mean(axis=0)
     away = flight.anchors.positions - middle
@@ -251,8 +252,10 @@ def test_delays_of_anchors_that_shift_the_estimate_are_no_other_frame(flight):
 
 @pytest.mark.slow
 def test_no_healthy_recording_is_moved_and_every_late_one_is(shared_data):
-    """Every sixth of 37 recordings; those with an inertial sensor are told by it, to 20 ms, the
-    others by the TDOAs, to 30 ms.
+    """Test every sixth of 37 recordings.
+
+    The IMU determines the delay of the ground truth to 20 ms. Without an IMU, the TDOAs determine
+    it to 30 ms.
     """
     reading = inputs.Reading(str(shared_data / "surveys"))
     found = inputs.find_flights(
@@ -274,7 +277,7 @@ def test_no_healthy_recording_is_moved_and_every_late_one_is(shared_data):
 
 
 def test_a_frame_of_its_own_is_turned_and_not_mirrored(flight, odometry):
-    """A mirror image may be nearer by chance, where the truth is metres away."""
+    """A mirror image may fit better by chance if the ground truth is metres away."""
     rng = np.random.default_rng(0)
     for turn in Rotation.random(100, random_state=1).as_matrix():
         other = in_frame(flight, turn, rng.uniform(-5.0, 5.0, 3))

@@ -1,9 +1,9 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A Crazyflie by cflib: its log blocks to topics, and positions to it.
+"""A Crazyflie over cflib: log blocks become topics, and positions are sent to it.
 
-The vehicle is a process of the test that speaks CRTP over UDP on loopback, as the firmware does, and
-logs what a recording holds.
+The vehicle is a process of the test. It speaks CRTP over UDP on loopback, like the firmware, and
+logs the content of a recording.
 """
 
 import socket
@@ -33,15 +33,15 @@ from uwb_tdoa_tools.readers.streams import GRAVITY  # noqa: E402
 
 RUNNING = EstimatorStatus.STATUS_RUNNING
 KINDS = {"FP16": (8, "e"), "float": (7, "f"), "uint16_t": (2, "H")}  # codes of log variables
-STORED = {"FP16": "float"}  # what the firmware keeps of a variable that is sent as half floats
+STORED = {"FP16": "float"}  # how the firmware stores variables that it sends as half floats
 SECONDS = 3.0
 
 
 class Recording:
-    """Values of log variables at a time of a recording. seconds : its length."""
+    """Values of log variables over the time of a recording. seconds : its length."""
 
     def __init__(self, t, columns):
-        """columns : {variable: (n,)}, which hold from t (n,) s on."""
+        """columns : {variable: values (n,)}; each value holds from its stamp t (n,), s, on."""
         self._t, self._columns, self.seconds = t, columns, t[-1] - t[0]
 
     def __call__(self, variable, t):
@@ -63,7 +63,7 @@ def random_recording():
 
 
 def measured_recording(folder):
-    """Of a log of a Crazyflie; without heights and pressures that it has not."""
+    """Return a Recording of 10 s of a measured log. Values before the first sample are 0."""
     flight = read_flight(
         folder / "flights/0425/TDOA2/0425-traj1", folder / "surveys/anchor_0425.txt"
     )
@@ -87,14 +87,15 @@ def measured_recording(folder):
 
 
 class Vehicle:
-    """The firmware, as far as cflib asks it.
+    """The part of the firmware that cflib uses.
 
-    go : set it to let the time of the log begin; came : (port, channel, data) that were no questions;
-    logged : {variable: [(s since 1970, value)]} as sent.
+    go : Event that starts the time of the log
+    came : (port, channel, data) of packets that need no answer
+    logged : {variable: [(s since 1970, value)]} as sent
     """
 
     def __init__(self, recording, booted):
-        """booted : s of its clock when it starts."""
+        """booted : clock of the vehicle at the start, s."""
         self.recording, self.came, self.parameters = recording, [], dict(PARAMETERS)
         self.go, self.logged, self.over = threading.Event(), {}, False
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -135,7 +136,7 @@ class Vehicle:
         elif (port, channel) == (15, 0):  # the ping
             self._answer(port, channel, data)
         elif (port, channel) == (13, 1):
-            self._answer(port, channel, bytes([0, 7]))  # version of the protocol
+            self._answer(port, channel, bytes([0, 7]))  # protocol version
         elif (port, channel) == (4, 0):
             self._answer(port, channel, bytes([1, 0]))  # no memories
         elif channel == 0 and port in (2, 5):
@@ -153,7 +154,7 @@ class Vehicle:
             self.came.append((port, channel, data))
 
     def _contents(self, port, data):
-        """Answer on a table of contents."""
+        """Answer a request for a table of contents."""
         names = list(self.parameters) if port == 2 else self._names
         if data[0] == 3:
             return struct.pack("<BHI", 3, len(names), port)
@@ -193,13 +194,13 @@ class Vehicle:
                 )
                 values += packed
                 self.logged.setdefault(name, []).append((now, struct.unpack("<" + code, packed)[0]))
-            assert len(values) <= 26  # bytes of a packet
+            assert len(values) <= 26  # bytes, the largest size of a packet
             stamp = struct.pack("<I", round(1e3 * (self._booted + t)) % 2**24)[:3]
             self._answer(5, 2, bytes([number]) + stamp + values)
             self._started[number] = (period, max(due + period, t))
 
     def changes(self, name):
-        """What was logged and was not the value before; 0 is none."""
+        """Return [(t, value)] where a logged value changes. 0 means no value."""
         found, before = [], 0.0
         for t, value in self.logged[name]:
             if value != before:
@@ -216,7 +217,7 @@ def recording(request):
 
 
 def test_a_crazyflie_logs_to_topics_and_gets_poses(recording):
-    """Its clock wraps on the way."""
+    """The clock of the vehicle wraps during the test."""
     pytest.importorskip("cflib")
     vehicle = Vehicle(recording, WRAP - 0.5 * SECONDS)
     got = {name: [] for name in BLOCKS}
@@ -264,9 +265,9 @@ def test_a_crazyflie_logs_to_topics_and_gets_poses(recording):
 
 
 def _expected(vehicle):
-    """{stream: sorted [(value, s since 1970)]} of what the vehicle sent, in our units.
+    """Return {stream: sorted [(value, s since 1970)]}, as sent by the vehicle, in SI units.
 
-    The value of a TDOA is (a, b, difference); that of an inertial sample its force along z.
+    The value of a TDOA is (a, b, difference). The value of an inertial sample is its force along z.
     """
     out = {"tdoa": [], "imu": [(GRAVITY * z, t) for t, z in vehicle.logged["acc.z"]]}
     for name in BLOCKS["tdoa"][0]:
@@ -281,7 +282,10 @@ def _expected(vehicle):
 
 
 def _check_samples(got, expected):
-    """Each once, with its value, at its time but for the least delay of the link."""
+    """Check that each sample arrives once, with its value and stamp.
+
+    The smallest delay of the link remains in the stamps.
+    """
     values = {
         "tdoa": lambda m: (m.anchor_a, m.anchor_b, m.distance_difference),
         "imu": lambda m: m.linear_acceleration.z,
@@ -298,7 +302,7 @@ def _check_samples(got, expected):
         wanted = sorted((t, value) for value, t in expected[name])
         assert len(rows) == len(wanted) > 20, name
         delays = np.array([t - at for (t, _), (at, _) in zip(rows, wanted)])
-        # the wrap neither loses a second nor makes one
+        # the wrap neither loses nor adds a second
         assert delays.min() > -0.01 and delays.max() < 0.5, name
         got_values = sorted(value for _, value in rows)
         for value, other in zip(got_values, sorted(value for _, value in wanted)):
@@ -306,9 +310,10 @@ def _check_samples(got, expected):
 
 
 def _check_poses(vehicle):
-    """No pose came before the vehicle knew how far off it may be, and no thrust of 0 ever."""
+    """Check that the vehicle got the standard deviations before the first pose, and no commands."""
     ports = [(port, channel) for port, channel, _ in vehicle.came]
-    assert 3 not in {port for port, _ in ports}  # the commander, whom close_link() calls
+    # port of the commander; close_link() sends a thrust of 0 on it
+    assert 3 not in {port for port, _ in ports}
     first = ports.index((6, 1))
     assert ports[:first].count((2, 2)) >= 2
     (message,) = at_rest(1)
@@ -361,10 +366,10 @@ def test_log_blocks_fit_their_packets(cflib):  # noqa: F811
 def test_it_sends_nothing_that_the_crazyflie_would_believe_too_much(cflib):  # noqa: F811
     made, vehicle = link()
     made.send(an_estimate(0.2), 0)
-    assert vehicle.poses == []  # there is no link yet
+    assert vehicle.poses == []  # no link yet
     vehicle.fully_connected.call("")
     made.turn()
-    vehicle.param.set_value = lambda name, value: None  # it does not do as asked
+    vehicle.param.set_value = lambda name, value: None  # the vehicle ignores the parameter
     made.send(an_estimate(0.2), 0)
     assert vehicle.poses == []
     vehicle.values |= {POSITION_STD: 0.2, ATTITUDE_STD: 0.2}
@@ -372,7 +377,7 @@ def test_it_sends_nothing_that_the_crazyflie_would_believe_too_much(cflib):  # n
     assert vehicle.poses == [(0.0, 1.0, 2.0, 0.0, 0.0, 0.0, 1.0)]
     made.send(an_estimate(0.4), 0)
     assert len(vehicle.poses) == 1
-    made.send(an_estimate(0.02), 0)  # it believes it less than it might
+    made.send(an_estimate(0.02), 0)  # smaller errors than announced are safe
     assert len(vehicle.poses) == 2
 
 

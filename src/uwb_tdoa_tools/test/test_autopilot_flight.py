@@ -1,10 +1,11 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A measured flight through the real nodes to an autopilot: a pose that is wrong, the recovery from
-it, a reset, and a loss of all TDOAs.
+"""A measured flight through the real nodes to an autopilot.
 
-The clock goes on when the nodes have kept up, so a busy machine changes nothing. It is no faster than
-the clock of the wall, by which `status` is published.
+It includes a wrong pose, the recovery from it, a reset, and a loss of all TDOAs.
+
+The clock advances when the nodes have kept up, so a busy machine changes nothing. It is not faster
+than real time, because `status` is published in real time.
 """
 
 from contextlib import contextmanager
@@ -36,7 +37,7 @@ STEP = 0.05  # s of the flight
 PATIENCE, IMPATIENCE = (
     5.0,
     0.05,
-)  # s of the wall clock for odometry, and for the next where none came
+)  # s of real time: limit for odometry, and limit for the next if none came
 POSE, RESET, SILENCE, END = 12.0, 18.0, (23.0, 32.0), 37.0  # s of the flight
 RATE = 50.0
 NODES = {
@@ -50,12 +51,12 @@ NODES = {
 
 
 class Player:
-    """Plays a flight, and listens to what the nodes make of it."""
+    """Play a flight and record the output of the nodes."""
 
     def __init__(self, node, processes, flight, px4):
         self.node, self.px4, self.gated, self._processes = node, px4, [], processes
         self._begin, self._newest, self._silent = flight.imu.t[0], 0.0, False
-        self._due = 0.0  # time.monotonic() before which no step ends, s
+        self._due = 0.0  # time.monotonic() at which a step may end, s
         make = node.create_publisher
         self._tdoas, self._samples = (
             make(Tdoa, "uwb/tdoa", OUTPUT_QOS),
@@ -118,7 +119,7 @@ class Player:
             self._tdoas.publish(message)
 
     def _keep_up(self, end):
-        """Set the clock, and wait for odometry of this time and for what the autopilot gets of it."""
+        """Set the clock. Wait for odometry of this time and for the messages to the autopilot."""
         due, self._due = self._due, time.monotonic() + STEP
         while time.monotonic() < due:
             rclpy.spin_once(self.node, timeout_sec=0.01)
@@ -157,7 +158,7 @@ class Player:
 
 @contextmanager
 def playing(folder, flight, px4):
-    """A Player of a flight to nodes that have found each other."""
+    """Give a Player of a flight. The nodes have discovered each other."""
     with own_domain(), session("test", []) as (node, stop), Processes(folder, stop) as processes:
         autopilot = [
             "protocol:=mavlink",
@@ -210,11 +211,12 @@ def _check_start(stream, truth):
     errors = [np.linalg.norm([m.x, -m.y, -m.z] - truth(t)) for t, m in steady if t > 6.0]
     assert np.median(errors) < 0.4 and np.max(errors) < 1.0
     climb = [m.vz for t, m in steady if 2.0 < t < 4.0 or t < 6.0]
-    assert min(climb, default=-1.0) < -0.1 or truth(first)[2] > 1.0  # it took off, or had already
+    # it takes off, or is in the air already
+    assert min(climb, default=-1.0) < -0.1 or truth(first)[2] > 1.0
 
 
 def _resets(stream, begin, end):
-    """[(t s, change m)] of each step of the reset counter from begin to end s."""
+    """Return [(t s, change m)] of each step of the reset counter between begin and end, s."""
     steps = zip(stream, stream[1:])
     return [
         (t, np.linalg.norm([m.x - b.x, m.y - b.y, m.z - b.z]))
@@ -224,7 +226,7 @@ def _resets(stream, begin, end):
 
 
 def _check_jumps(stream, truth):
-    """The pose counts, and the way back from it."""
+    """Check that the wrong pose and the recovery from it each cause a reset."""
     resets = _resets(stream, POSE, RESET)
     (first, out), (second, back) = resets[0], resets[-1]
     assert first < POSE + 0.5 and out > 1.5 and second > first and back > 0.5
@@ -234,7 +236,7 @@ def _check_jumps(stream, truth):
 
 
 def _check_silences(stream):
-    """Of the reset, and of the loss of all TDOAs, before which the quality falls."""
+    """Check the reset and the gap after the loss of all TDOAs. The quality falls before the gap."""
     times = np.array([t for t, _ in stream])
     lost = [k for k in np.flatnonzero(np.diff(times) > 1.0) if times[k] > RESET]
     (k,) = lost
@@ -247,7 +249,10 @@ def _check_silences(stream):
 
 
 def _check_for_mavros(messages):
-    """Frames that mavros turns by its own transforms; a velocity in the body; covariances."""
+    """Check the frames, the velocity in the body frame, and the covariances.
+
+    mavros converts these frames itself.
+    """
     for message in messages:
         assert (message.header.frame_id, message.child_frame_id) == ("map", "base_link")
         *_, pose, twist = numbers(message)

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What an autopilot gets: frames and covariances of MAVLink, the gate, and jumps."""
+"""The messages to an autopilot: frames and covariances of MAVLink, the gate, and jumps."""
 
 from dataclasses import replace
 import math
@@ -21,7 +21,10 @@ PERIOD = 5_000_000  # ns, of odometry at 200 Hz
 
 
 def estimate(t=0.0, p=(0.0, 0.0, 0.0), v=(0.0, 0.0, 0.0), yaw=0.0, std=0.1):
-    """At t s, moving at v m/s of the world; std of position m, velocity m/s, attitude rad."""
+    """Return an Estimate at t s that moves at v m/s in the world.
+
+    std : standard deviations of position m, velocity m/s, attitude rad
+    """
     turn = Rotation.from_euler("z", yaw)
     covariance = std**2 * np.eye(6)
     p, v = np.array(p, dtype=float), turn.inv().apply(v)
@@ -50,13 +53,13 @@ def estimates(draw):
 
 
 def to_ned(vector):
-    """East, north, up to north, east, down."""
+    """Convert east, north, up to north, east, down."""
     east, north, up = vector
     return np.array([north, east, -up])
 
 
 def flipped(vector):
-    """Forward, left, up to forward, right, down."""
+    """Convert forward, left, up to forward, right, down."""
     x, y, z = vector
     return np.array([x, -y, -z])
 
@@ -67,7 +70,10 @@ WORLD = {FRD: flipped, NED: to_ned}
 @given(estimates(), vectors)
 @pytest.mark.parametrize("world", WORLDS)
 def test_each_arrow_is_the_same_arrow_in_the_frames_of_mavlink(world, ours, arrow):
-    """An arrow on the vehicle, in the world: first turned and then converted, or the other way round."""
+    """Rotation and conversion of frames commute.
+
+    An arrow on the vehicle is first rotated and then converted, or the other way round.
+    """
     theirs, convert = ours.in_mavlink(world), WORLD[world]
     np.testing.assert_allclose(theirs.p, convert(ours.p))
     np.testing.assert_allclose(theirs.v, flipped(ours.v))
@@ -91,14 +97,14 @@ def test_an_error_is_as_unlikely_in_both_frames(world, ours, first, second):
             for one, error in ((ours, here), (theirs, there))
         ]
         assert nees[1] == pytest.approx(nees[0], rel=1e-6)
-        upper = np.zeros((6, 6))  # as the receiver puts it together
+        upper = np.zeros((6, 6))  # as the receiver unpacks it
         upper[UPPER] = getattr(theirs, name)[UPPER]
         whole = upper + upper.T - np.diag(upper.diagonal())
         np.testing.assert_allclose(whole, getattr(theirs, name), atol=1e-12)
 
 
 def test_a_vehicle_that_is_turned_to_the_left_and_climbs():
-    """In words: yaw grows clockwise, climbing is a negative vz, the nose is the x axis."""
+    """Yaw grows clockwise, a climb is a negative vz, and the nose is the x axis."""
     ours = estimate(p=(1.0, 2.0, 3.0), v=(0.0, 0.5, 0.3), yaw=math.radians(90.0))
     theirs = ours.in_mavlink(FRD)
     np.testing.assert_allclose(theirs.p, [1.0, -2.0, -3.0])
@@ -135,7 +141,7 @@ def opened(rate=200.0, deviation=1.5, yaw=True):
 
 
 def passed(gate, some):
-    """Stamps, in s, of the estimates that pass, each on time."""
+    """Return the stamps, s, of the estimates that pass the gate. Each arrives on time."""
     return [1e-9 * (one.stamp - NOW) for one in some if gate.admit(one, one.stamp)]
 
 
@@ -159,7 +165,7 @@ def test_nothing_passes_before_a_status_and_without_a_yaw():
     assert passed(gate, steady(3, 0.1)) == [] and gate.why == "the yaw is not known yet"
     gate.set_status(RUNNING, True, "")
     assert len(passed(gate, steady(3, 0.2))) == 3 and gate.why == ""
-    assert gate.resets == 0  # the first ones are no jump to anybody
+    assert gate.resets == 0  # for the receiver, the first messages are no jump
     position = Gate(200.0, 1.5, needs_yaw=False)
     position.set_status(RUNNING, False, "the yaw is not known yet")
     assert len(passed(position, steady(3))) == 3
@@ -171,7 +177,7 @@ def test_it_is_silent_while_the_filter_does_not_run_and_says_that_it_was(status)
     assert len(passed(gate, steady(10))) == 10
     gate.set_status(status, True, "the tag is lost")
     assert passed(gate, steady(10, 0.05)) == [] and gate.why == "the tag is lost"
-    assert gate.resets == 0  # of what is sent
+    assert gate.resets == 0  # only jumps of sent messages count
     gate.set_status(RUNNING, True, "")
     assert len(passed(gate, steady(10, 0.1))) == 10 and gate.resets == 1
 
@@ -193,7 +199,7 @@ def test_what_is_late_or_vague_is_not_sent():
     [dict(p=(1.0, 0.0, 0.0)), dict(v=(0.0, 0.0, 1.5)), dict(yaw=1.0), dict(t=0.6), dict(t=-0.6)],
 )
 def test_a_jump_counts_once(change):
-    """Of the position, the velocity, the yaw; a gap; a stamp of the past."""
+    """A jump of position, velocity or yaw, a gap, and a stamp of the past count once."""
     gate, start = opened(), steady(10)
     after = [
         estimate(**{"t": 0.05, **change}),
@@ -210,7 +216,7 @@ def test_a_jump_counts_once(change):
 
 @given(st.floats(-3.0, 3.0), st.floats(-3.0, 3.0), st.floats(-15.0, 15.0), st.integers(1, 4))
 def test_motion_and_measurements_are_no_jump(speed, turn, acceleration, step):
-    """As fast as a quadrotor moves; an update moves the estimate by decimetres at most."""
+    """The motion is as fast as of a quadrotor. Updates move the estimate by decimetres at most."""
     dt, update = 1e-9 * PERIOD * step, 0.2
     before = estimate(0.0, v=(speed, 0.0, 0.0), yaw=0.3, std=0.05)
     faster = speed + acceleration * dt

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""autopilot_node as a process: what PX4 gets over loopback, parsed by pymavlink."""
+"""autopilot_node as a process: the messages to PX4 over loopback, parsed by pymavlink."""
 
 import pathlib
 import re
@@ -45,7 +45,7 @@ def test_every_parameter_is_in_the_parameter_file_with_its_default():
         (["log:=[imu]"], "log: only a Crazyflie has log blocks; set protocol to crazyflie."),
         (["log:=[sonar]"], "log: 'sonar' is not one of tdoa, imu, height, pressure."),
         (["protocol:=mavlink"], "connection: '' is none of udpout:HOST:PORT"),
-        # pymavlink would run a program, or read a file
+        # pymavlink would run this program, or read this file
         (["protocol:=mavlink", "connection:=/home/me/a.elf"], "'/home/me/a.elf' is none of"),
         (["protocol:=mavlink", "connection:=flight.log"], "'flight.log' is none of"),
         (["protocol:=crazyflie", "connection:=cf1"], "'cf1' is no address of a Crazyflie"),
@@ -119,7 +119,7 @@ def test_px4_gets_a_flight_and_silence_when_it_is_lost():
 
 
 def _open(rig, px4):
-    """Nothing comes before a status, then something."""
+    """Check that messages start only after a status."""
     rig.publish(at_rest(20))
     rig.settle()
     assert px4.odometry == [] and rig.values["passed"] == "0"
@@ -143,7 +143,7 @@ def _open(rig, px4):
 
 
 def _play(rig, px4, path):
-    """Publish a Path in its own time, as a stream of its own; returns its messages."""
+    """Publish a Path in real time as a new stream, and return its messages."""
     px4.receive()
     px4.odometry.clear()
     rig.gated.clear()
@@ -188,11 +188,11 @@ def _check_stream(px4, path, played):
         assert whole == pytest.approx(nees(np.r_[v, w], twist), rel=1e-3)
         deviation = 100.0 * np.sqrt(pose.diagonal()[:3].max())
         assert message.quality == 100 - round(deviation)
-        # as PX4 sees it: it climbs, nose up, and goes where its nose points
+        # as PX4 sees it: it climbs, nose up, and flies in the direction of its nose
         assert message.vz < 0.0 < other.as_euler("ZYX")[1] and message.vx > 0.7
         yaws.append(other.as_euler("ZYX")[0])
     assert np.ptp(np.unwrap(yaws)) == pytest.approx(0.8 * seconds, rel=0.01)
-    assert yaws[1] < yaws[0]  # to the left, which is negative in their frame
+    assert yaws[1] < yaws[0]  # a left turn, negative in the frame of PX4
     assert px4.odometry[-1].z == pytest.approx(px4.odometry[0].z - 0.2 * seconds, rel=1e-4)
 
 
@@ -202,18 +202,18 @@ def _check_time(rig, px4):
     rig.wait(lambda: px4.answers, "an answer to TIMESYNC")
     (answer,) = px4.answers
     assert answer.ts1 == 12345 and before < answer.tc1 < time.time_ns()
-    px4.port.mav.timesync_send(answer.tc1, answer.ts1)  # an answer is not answered
+    px4.port.mav.timesync_send(answer.tc1, answer.ts1)  # an answer gets no answer
     rig.wait(lambda: rig.values.get("TIMESYNC answered") == "1", "the count")
 
 
 def _check_jump(rig, px4):
-    """By 2 m from one message to the next, as of a filter that recovers or was reset."""
+    """Check a jump by 2 m between two messages, as from a recovery or reset of the filter."""
     count = len(px4.odometry)
     rig.publish(at_rest(40, jump=2.0))
     rig.settle()
     px4.receive()
     new = px4.odometry[count:]
-    assert len(new) in (10, 11)  # 0.2 s, and one because a jump goes out at once
+    assert len(new) in (10, 11)  # 0.2 s; plus one because a jump is sent at once
     for message in new:
         after = message.x > new[0].x + 1.0
         assert message.reset_counter == (new[0].reset_counter + after) % 256
@@ -221,7 +221,7 @@ def _check_jump(rig, px4):
 
 
 def _check_silence(rig, px4):
-    """Odometry goes on, but may not be flown by."""
+    """Check that nothing is sent to the autopilot while odometry continues but the tag is lost."""
     rig.tell(LOST, why="the tag is lost")
 
     def is_silent():

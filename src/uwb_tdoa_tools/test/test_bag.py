@@ -35,7 +35,7 @@ BOTH = pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 
 
 def content(path):
-    """All messages of a bag, by topic."""
+    """Return all messages of a bag, by topic."""
     with AnyReader([path]) as reader:
         found = {}
         for connection, stamp, data in reader.messages():
@@ -74,13 +74,13 @@ def test_round_trip(tmp_path, storage):
     assert (
         back.name == "small" and back.meta["protocol"] == "tdoa3" and "reordered" not in back.meta
     )
-    (file,) = (tmp_path / "flight").glob("flight.*")  # the data file alone will do
+    (file,) = (tmp_path / "flight").glob("flight.*")  # the data file alone is enough
     assert differences(flight, read_bag(file)) == []
 
 
 @BOTH
 def test_a_file_that_was_read_is_closed(tmp_path, storage):
-    """A process may have no more than 1024 files open, and bags may be more."""
+    """A process can open at most 1024 files, and there may be more bags."""
     write_bag(small_flight(0.1), tmp_path / "flight", storage)
     (file,) = (tmp_path / "flight").glob("flight.*")
 
@@ -242,7 +242,7 @@ def test_existing_output(tmp_path):
 def test_failure_half_way_leaves_nothing(tmp_path):
     flight = small_flight(0.1)
     t = flight.truth.t.copy()
-    t[-1] = np.nan  # found when the last stream is serialized
+    t[-1] = np.nan  # detected when the last stream is serialized
     with pytest.raises(InputError, match="truth: stamp 24 is nan"):
         write_bag(
             dataclasses.replace(flight, truth=Truth(t, flight.truth.p, flight.truth.q)),
@@ -268,7 +268,7 @@ def test_unknown_storage_and_empty_flight(tmp_path):
 
 
 def write_topics(path, *topics):
-    """A bag of (topic, msgtype, [(stamp ns, message)])."""
+    """Write a bag of (topic, msgtype, [(stamp ns, message)])."""
     store = typestore()
     with Writer(path, version=9) as writer:
         for topic, msgtype, written in topics:
@@ -281,7 +281,7 @@ def test_namespace_other_topics_and_order_of_stamps(tmp_path):
     store = typestore()
     tdoa = small_flight(0.05).tdoa
     late = list(tdoa_messages(tdoa, store))
-    # two arrive the wrong way round
+    # two messages arrive in the wrong order
     late[3], late[4] = ((late[3][0], late[4][1]), (late[4][0], late[3][1]))
     text = store.types["std_msgs/msg/String"]("hello")
     write_topics(
@@ -379,7 +379,7 @@ def test_odometry(tmp_path):
     assert len(odometry) == 2
     np.testing.assert_array_equal(odometry.t, [1.0, 2.000000001])
     np.testing.assert_array_equal(odometry.p, [[1, 2, 3], [4, 5, 6]])
-    # turned from body to world
+    # rotated from body to world
     np.testing.assert_allclose(odometry.v, [[0, 1, 0], [1, 0, 0]], atol=1e-12)
     np.testing.assert_allclose(odometry.q[0], [0, 0, half, half])
     np.testing.assert_array_equal(odometry.covariance[0], 2 * covariance.reshape(6, 6))

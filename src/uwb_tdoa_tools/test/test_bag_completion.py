@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Sound bags whose metadata.yaml is lost, or does not fit to the files: what the files hold decides."""
+"""Intact bags whose metadata.yaml is lost or does not match the files. The files count."""
 
 import re
 import shutil
@@ -118,7 +118,7 @@ def test_a_sound_bag_is_read_and_left_as_it_is(bag, form):
 
 @pytest.mark.parametrize("form", FORMS)
 def test_what_is_missing_in_such_a_bag_is_not_passed_over(bag, form):
-    """The same, with a data file whose end is cut off."""
+    """The same, with a truncated data file."""
     given = form(bag)
     files = [file for file in bag.iterdir() if file.name != "metadata.yaml"]
     files[0].write_bytes(files[0].read_bytes()[:-300])
@@ -134,7 +134,7 @@ def test_a_file_that_is_not_there_is_named(bag):
 
 
 def test_a_renamed_file_of_another_recording_is_refused(bag, tmp_path):
-    """The checksum and the counts in metadata.yaml are of the file that was there."""
+    """The checksum and the counts in metadata.yaml belong to the replaced file."""
     storage = "sqlite3" if data_file(bag).suffix == ".db3" else "mcap"
     write_bag(small_flight(0.1), tmp_path / "other", storage)
     data_file(bag).unlink()
@@ -144,7 +144,7 @@ def test_a_renamed_file_of_another_recording_is_refused(bag, tmp_path):
 
 
 def test_parts_without_metadata_are_one_recording(bag, tmp_path):
-    """As `ros2 bag record` splits: NAME_0, NAME_1, ..., NAME_10, which is the last."""
+    """`ros2 bag record` splits a recording: NAME_0, NAME_1, ..., NAME_10. The last is NAME_10."""
     parts = tmp_path / "split"
     parts.mkdir()
     file = data_file(bag)

@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Bags that are cut, damaged or forged: refused with what is wrong, or read as far as they are
-sound.
+"""Bags that are truncated, damaged or forged.
+
+Each is refused with a reason, or read up to the damage.
 """
 
 from dataclasses import replace
@@ -54,7 +55,7 @@ def copy(bags, tmp_path):
 
 
 def forget_sum(bag):
-    """As if the bag were of somebody who leaves no checksum in metadata.yaml."""
+    """Remove the checksum from metadata.yaml, as in bags of other tools."""
     file = bag / "metadata.yaml"
     file.write_text(
         file.read_text().replace(metadata(bag)["custom_data"][CHECKSUM_KEY], NO_CHECKSUM)
@@ -89,9 +90,10 @@ def test_any_changed_byte_is_refused(bags, storage, share, mask):
 @given(share=st.floats(0.0, 1.0, exclude_max=True), mask=st.integers(1, 255))
 @example(share=0.0, mask=1)
 def test_mcap_has_checksums_of_its_own(bags, share, mask):
-    """The data file alone, without metadata.yaml.
+    """Read the data file alone, without metadata.yaml.
 
-    Two bytes in the footer's place of its own checksums may be zeroed.
+    A changed byte is always detected. Two bytes at the place of the footer's checksums may be
+    zeroed.
     """
     file = data_file(bags["mcap"])
     at = int(share * file.stat().st_size)
@@ -104,8 +106,9 @@ def test_mcap_has_checksums_of_its_own(bags, share, mask):
 
 
 def test_sums_are_where_others_look_for_them(bags):
-    """MCAP specification: CRC-32 of each chunk unpacked, of the data, of the summary with the
-    footer up to the sum.
+    """MCAP specification: a CRC-32 of each unpacked chunk, of the data, and of the summary.
+
+    The last CRC-32 includes the footer up to the checksum.
     """
     content = data_file(bags["mcap"]).read_bytes()
     with open(data_file(bags["mcap"]), "rb") as file:
@@ -146,7 +149,7 @@ def test_a_cut_bag_is_read_up_to_the_cut(copy, storage, kept):
         read_bag(bag)
     try:
         flight = read_bag(bag, salvage=True)
-    except InputError as error:  # rosbags writes one chunk of a MB: nothing of it is whole
+    except InputError as error:  # rosbags writes one chunk of a MB, and it is incomplete
         assert storage == "mcap" and "no message that can be read" in str(error)
         return
     n = len(flight.tdoa)
@@ -185,7 +188,7 @@ def test_a_whole_bag_loses_nothing_by_salvage(bags, storage):
 def test_numbers_that_are_not_finite(tmp_path, storage):
     flight = small_flight(0.1)
     flight.tdoa.d[3] = np.nan
-    flight.truth.p[5, 1] = 1e308  # what is computed of it is not finite
+    flight.truth.p[5, 1] = 1e308  # a computation with it overflows
     flight.imu.accel[7, 2] = -np.inf
     write_bag(flight, tmp_path / "bag", storage)
     with pytest.raises(
@@ -296,7 +299,7 @@ def test_sqlite_with_other_things_in_it(copy, statement):
 
 
 def chunked(compression, packed, size, crc=0):
-    """An MCAP file of one chunk."""
+    """Return an MCAP file with one chunk."""
 
     def record(kind, content):
         return struct.pack("<BQ", kind, len(content)) + content

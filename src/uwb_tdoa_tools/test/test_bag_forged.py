@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Bags that somebody made to hang, to fill or to mislead, and single messages that are none."""
+"""Forged bags that would hang the reader, exhaust memory or mislead; invalid messages."""
 
 from contextlib import nullcontext
 from dataclasses import replace
@@ -36,7 +36,7 @@ ENDLESS = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELEC
 
 @pytest.fixture
 def tables(tmp_path):
-    """A bag of SQLite, and what runs statements on its data file."""
+    """Return an SQLite bag and a function that runs statements on its data file."""
     write_bag(small_flight(0.1), tmp_path / "bag", "sqlite3")
     forget_sum(tmp_path / "bag")
 
@@ -99,8 +99,9 @@ def test_a_row_that_fills_the_memory(tables, monkeypatch):
 
 @pytest.fixture
 def packed(tmp_path):
-    """A bag whose files are compressed as a whole, with files of our own: {name: bytes that are
-    packed}.
+    """Return a function that writes a bag with given files, compressed as a whole.
+
+    It takes {name: uncompressed size or content}.
     """
     write_bag(small_flight(0.1), tmp_path / "plain")
     forget_sum(tmp_path / "plain")
@@ -130,7 +131,10 @@ def packed(tmp_path):
 
 
 def test_several_files_may_not_unfold_to_more_than_all_of_them_may(packed, monkeypatch):
-    """Three files of 33 kB that became 3 GiB; here 32 MiB each, of which the limit is 16 MiB."""
+    """Three files of 33 kB unpacked to 3 GiB.
+
+    Here each file unpacks to 32 MiB, and the limit is 16 MiB.
+    """
     bag = packed({f"{k}.mcap.zstd": 32 << 20 for k in range(3)})
     assert sum(file.stat().st_size for file in bag.iterdir()) < 30_000
     with pytest.raises(
@@ -151,7 +155,7 @@ def test_a_file_is_unpacked_once(tmp_path):
 
 @pytest.mark.parametrize("files", ["x", "5", "null", "{}"])
 def test_files_that_are_no_list(tmp_path, files):
-    """rosbags clears them when it closes the bag."""
+    """rosbags clears the list when it closes the bag."""
     write_bag(small_flight(0.1), tmp_path / "bag")
     file = tmp_path / "bag" / "metadata.yaml"
     content = yaml.safe_load(file.read_text())
@@ -194,7 +198,7 @@ def test_chunks_may_not_unfold_to_more_than_all_of_them_may(tmp_path, monkeypatc
 
 
 def test_an_index_may_not_show_a_message_again_and_again(tmp_path, monkeypatch):
-    """What is read cannot be more than what is there."""
+    """The messages read must not be larger than the file."""
     write_bag(small_flight(0.1), tmp_path / "bag")
     with open_bag(tmp_path / "bag") as reader:
         found = [message for message in reader.messages() for _ in range(1 << 14)]
@@ -204,7 +208,10 @@ def test_an_index_may_not_show_a_message_again_and_again(tmp_path, monkeypatch):
 
 
 def with_bad_messages(path, storage, of, count=100, many=1, cut=5):
-    """A bag of `count` TDOAs, and as many of others; `many` messages of each topic of `of` are cut."""
+    """Write a bag of `count` TDOAs and as many messages of other topics.
+
+    `many` messages of each topic in `of` are truncated to `cut` bytes.
+    """
     plain = path.with_name("whole")
     write_bag(small_flight(count / 500.0), plain)
     seen, writer = (
@@ -317,7 +324,7 @@ def test_rows_that_are_none_are_left_out(tables, statement):
 
 
 def claiming(path, meta, name="flight"):
-    """A bag whose metadata claim something."""
+    """Write a bag with forged metadata."""
     write_bag(small_flight(0.1), path)
     about, file = json.dumps({"name": name, "meta": meta}), path / "metadata.yaml"
     lines = file.read_text().splitlines()
@@ -385,8 +392,10 @@ def test_the_antenna_of_ranges_alone_is_written_and_read(tmp_path):
 
 
 def shared_children(file, table, levels=10):
-    """Make the tree of a table of a SQLite file one whose pages share their children: each of
-    `levels` pages has the next one hundreds of times. Returns the bytes of the file.
+    """Forge a tree of an SQLite table whose pages share their children.
+
+    Each of `levels` pages refers to the next page hundreds of times. Returns the size of the file,
+    bytes.
     """
     connection = sqlite3.connect(file)
     roots = dict(connection.execute("SELECT name, rootpage FROM sqlite_master")) | {
@@ -396,7 +405,7 @@ def shared_children(file, table, levels=10):
     connection.close()
     data, root = bytearray(file.read_bytes()), roots[table]
     pages, leaf = len(data) // size, bytearray(data[(root - 1) * size : root * size])
-    # bytes of the file's own header, before that of its first page
+    # bytes of the file header, which precedes the header of the first page
     of_file = 100 if root == 1 else 0
     leaf[: 300 - of_file] = leaf[of_file:300]
     for level in range(levels):
@@ -426,13 +435,13 @@ def shared_children(file, table, levels=10):
 def test_pages_that_share_their_children_are_not_walked_for_ever(
     tables, table, salvage, monkeypatch
 ):
-    """A file of 53 kB hung for ever. In five levels are 10^13 rows."""
+    """A file of 53 kB hung the reader forever. Five levels hold 10^13 rows."""
     bag, _ = tables
     assert shared_children(data_file(bag), table) < 200_000
     monkeypatch.setattr(limits, "SECONDS", 0.5)
     with (
         nullcontext() if salvage and table == "messages" else pytest.raises(InputError)
-    ):  # there the first rows are read
+    ):  # with --salvage, the first rows are read
         read_bag(bag, salvage=salvage)
 
 

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Frames in bags: sensors outside of the body frame, and the sources of anchors."""
+"""Frames in bags: sensors mounted away from the body frame, and the sources of anchors."""
 
 from dataclasses import replace
 
@@ -58,8 +58,9 @@ def transforms(store, *rows):
 
 
 def mounted(flight, path, *static, robot=""):
-    """The bag of a flight whose IMU and antenna are in frames of their own. static : messages of
-    /tf_static, rows each.
+    """Write the bag of a flight with an IMU and an antenna in separate frames.
+
+    static : messages of /tf_static, each a list of rows
     """
     turned = Imu(
         flight.imu.t, TURN.inv().apply(flight.imu.gyro), TURN.inv().apply(flight.imu.accel)
@@ -109,7 +110,7 @@ def test_sensors_are_taken_to_the_body(flight, tmp_path, robot):
     effects = EffectSet((TagLeverArm(values=dict(zip("xyz", ANTENNA))),))
     expected = run_offline(read, None, Corrector(read.anchors, effects)).odometry
     np.testing.assert_allclose(evaluate(read)[1].odometry.p, expected.p, atol=1e-9)
-    given = EffectSet((TagLeverArm(values={"z": 0.01}),))  # counts more than the bag
+    given = EffectSet((TagLeverArm(values={"z": 0.01}),))  # overrides the bag
     expected = run_offline(read, None, Corrector(read.anchors, given)).odometry
     np.testing.assert_allclose(evaluate(read, effects=given)[1].odometry.p, expected.p, atol=1e-9)
 
@@ -214,7 +215,7 @@ def test_frames_of_tf_static_are_anchors(tmp_path):
 
 
 def test_markers_of_anchors_are_anchors(tmp_path):
-    """Beside their labels, others that have been deleted, and markers of something else."""
+    """The topic also has labels, deleted markers, and markers of other objects."""
     places = list(zip(ANCHORS.ids.tolist(), ANCHORS.positions.tolist()))
     cubes = [marker(number, place) for number, place in places]
     others = [marker(number, (9.0, 9.0, 9.0), TEXT) for number, _ in places]

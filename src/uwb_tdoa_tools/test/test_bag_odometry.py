@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Wheel odometry in bags, as nav_msgs/Odometry and as a twist, under our name and another: read as
-the node reads it.
+"""Wheel odometry in bags: nav_msgs/Odometry and twists, under default and other topic names.
+
+Tools read it like the node.
 """
 
 from dataclasses import replace
@@ -35,7 +36,7 @@ def halves(stream):
 
 
 def bag_of(flight, folder, *topics):
-    """A bag of the flight with velocities on other topics, (topic, type, Velocity)."""
+    """Write a bag of the flight with velocities on other topics, (topic, type, Velocity)."""
     store = typestore()
     write_bag(flight.without("velocity"), folder / "rest")
     with AnyReader([folder / "rest"]) as reader, new_bag(folder / "bag", "mcap", False) as writer:
@@ -70,7 +71,7 @@ def test_velocities_are_the_same_on_each_topic_that_the_node_hears(
     for column, expected in zip(
         read_bag(path, topics=renamed).velocity.columns, flight.velocity.columns
     ):
-        # variances, of which messages hold the square
+        # messages hold variances, flights hold standard deviations
         np.testing.assert_allclose(column, expected, rtol=1e-15)
     recording = read_recording(Reading(topics=renamed), path)
     np.testing.assert_array_equal(recording.sensors["velocity"].v, flight.velocity.v)

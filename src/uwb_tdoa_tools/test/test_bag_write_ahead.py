@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""SQLite bags of a recorder that was killed: what is in the -wal file counts, or the bag is
-refused.
+"""SQLite bags of a recorder that was killed.
+
+The reader uses the -wal file, or refuses the bag.
 """
 
 import shutil
@@ -16,13 +17,14 @@ from uwb_tdoa_tools.bags.files import messages, open_bag
 from uwb_tdoa_tools.readers import inputs
 
 FLIGHT = small_flight(0.3)
-BATCHES = 12  # transactions in the log
+BATCHES = 12  # transactions in the -wal file
 
 
 @pytest.fixture(params=["file", "directory"])
 def unclosed(request, tmp_path):
-    """A bag whose last two thirds are in the log of its file, as a recorder leaves it that is
-    killed.
+    """Return a bag of a killed recorder.
+
+    The last two thirds of its messages are in the -wal file.
     """
     write_bag(FLIGHT, tmp_path / "written", "sqlite3")
     (written,) = (tmp_path / "written").glob("*.db3")
@@ -96,7 +98,7 @@ def test_a_damaged_log_is_refused_and_salvaged_up_to_there(unclosed, byte):
 
 def test_a_transaction_that_was_not_finished_costs_that_transaction(unclosed):
     if unclosed.is_dir():
-        return  # metadata.yaml tells how many messages there are
+        return  # metadata.yaml holds the number of messages
     log = log_of(unclosed)
     log.write_bytes(log.read_bytes()[:-100])
     assert 0.8 * len(FLIGHT.tdoa) < len(read_bag(unclosed).tdoa) < len(FLIGHT.tdoa)
@@ -107,7 +109,8 @@ def test_an_unfinished_transaction_is_undone(tmp_path):
     (file,) = (tmp_path / "bag").glob("*.db3")
     connection = sqlite3.connect(file, isolation_level=None)
     connection.execute("PRAGMA journal_mode=DELETE")
-    connection.execute("PRAGMA cache_size=2")  # pages: what is changed goes to the file
+    # pages; a small cache writes changes to the file at once
+    connection.execute("PRAGMA cache_size=2")
     connection.execute("BEGIN")
     connection.execute("UPDATE messages SET timestamp = 0, data = zeroblob(length(data))")
     (tmp_path / "killed").mkdir()

@@ -49,7 +49,7 @@ CLEAN = dict(
 
 
 def shaken_flight(seed):
-    """A flight whose anchors stand elsewhere than the survey says, the same in each."""
+    """Return a flight with survey errors. The errors are the same in each flight."""
     flight = simulate(SimulationConfig(seed=seed, trajectory="sines", **CLEAN))
     off = 0.1 * np.random.default_rng(5).standard_normal(flight.anchors.positions.shape)
     return replace(
@@ -88,8 +88,9 @@ def test_without_ground_truth_other_flights_get_better_and_none_is_read(flights)
 
 @pytest.mark.slow
 def test_ranges_of_another_tag_judge():
-    """Another tag has a delay of its own, which the filter finds: anchors are not to blame for
-    that, and nothing need be calibrated.
+    """The hold-out flight has another tag with another delay.
+
+    The filter estimates this delay. The anchors are correct, so no calibration is needed.
     """
     flown = dict(CLEAN, range_noise=0.1)
     ranged = [
@@ -121,12 +122,12 @@ def test_a_single_flight_is_judged_on_its_end(flights):
                 "something else is wrong too"
             ),
         ),
-        # Noise is described alike in both directions.
+        # The report describes a difference within the noise in the same way in both directions.
         (0.05, 0.04, f"it makes {NO_DIFFERENCE}: 3D RMSE 5.0 -> 4.0 cm"),
         (0.04, 0.05, f"it makes {NO_DIFFERENCE}: 3D RMSE 4.0 -> 5.0 cm"),
         (0.02, 0.05, "it makes things worse: 3D RMSE 2.0 -> 5.0 cm"),
         (0.055, 0.02, None),
-        (0.08, 0.05, None),  # a tape that is good to 5 cm
+        (0.08, 0.05, None),  # anchors measured by tape to 5 cm
     ],
 )
 def test_innovations_alone_must_speak_clearly(before, after, why):
@@ -192,7 +193,10 @@ def test_one_sentence_alone_judges_the_motion(better, path, sentence):
 
 
 def test_with_ground_truth_quick_forecasts_what_a_diagnosis_gains(flights):
-    """Of one flight and of two, within seconds; the gain is that of flights that took no part."""
+    """Forecast from one flight and from two, within seconds.
+
+    The gain is measured on hold-out flights.
+    """
     *fitted, other = flights
     alone, several = library.forecast(fitted[:1]), library.forecast(fitted)
     assert (alone.flights, several.flights) == (1, 2)
@@ -234,7 +238,7 @@ def test_quick_says_what_is_to_be_expected(flights):
 
 @pytest.fixture(scope="module")
 def bags(flights, tmp_path_factory):
-    """A folder with flights as bags."""
+    """Write flights as bags and return their folder."""
     folder = tmp_path_factory.mktemp("bags")
     for flight in flights:
         write_bag(flight, folder / f"{flight.name}.bag")
@@ -244,7 +248,7 @@ def bags(flights, tmp_path_factory):
 
 @pytest.fixture
 def room(bags, tmp_path, monkeypatch):
-    """A folder to work in, with flights as bags."""
+    """Return a working directory with flights as bags."""
     monkeypatch.chdir(tmp_path)
     for bag in bags.iterdir():
         (tmp_path / bag.name).symlink_to(bag)
@@ -283,7 +287,8 @@ def stub(monkeypatch, made, seen):
 @pytest.mark.parametrize(
     ("more", "seen"),
     [
-        ((), (["flight1", "flight2"], ["flight3"], [True, True])),  # the last one judges
+        # the last flight is the hold-out flight
+        ((), (["flight1", "flight2"], ["flight3"], [True, True])),
         (("--no-truth",), (["flight1", "flight2"], ["flight3"], [False, False])),
         (("--holdout", "flight1.bag"), (["flight2", "flight3"], ["flight1"], [True, True])),
     ],
@@ -328,7 +333,7 @@ def test_it_stops_where_check_finds_an_error(room, flights, monkeypatch, capsys)
 
 
 def faulty(monkeypatch, *names):
-    """Let check find an error in the flights of these names."""
+    """Make `check` report an error for the flights with these names."""
     error = Finding("tdoa_sign", ERROR, "the sign of all TDOAs is wrong", "seen", "turn it", 0.0)
     monkeypatch.setattr(
         library,
@@ -453,7 +458,7 @@ def test_a_rover_with_odometry_of_its_wheels_is_calibrated(tmp_path):
     found = {one.name: one for one in EffectSet.from_yaml(out / "effects.yaml").effects}
     for name in ("velocity_scale", "yaw_rate_scale"):
         assert abs(found[name].values["scale"] - 0.03) < 3.0 * found[name].std["scale"]
-    # what the printed lines start the nodes by
+    # the nodes start with this configuration in the printed lines
     config = FilterConfig.from_yaml(out / "ekf_node.yaml")
     assert config.planar and config.fixed_height == 0.0
     told = json.loads((out / "calibration.json").read_text())

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Findings of `check` about whole recordings: none if healthy, else the mistake."""
+"""Findings of `check` on whole recordings: none if healthy, otherwise the mistake."""
 
 from dataclasses import replace
 
@@ -22,10 +22,10 @@ from uwb_tdoa_tools.simulation.rooms import constellation
 
 OTHER_ROOM = constellation("random-5")
 NO_TDOAS = Tdoas(*(np.empty(0, kind) for kind in (float, int, int, float)))
-# with these, nothing but the streams themselves is judged
+# with these errors, `check` examines the streams only
 NOTHING_TRIED = ["stamp_zero", "clipped", "jump"]
-LONGER = {"mirrored_survey": {"duration": 30.0}}  # shows once the yaw is known
-HARMLESS = "clipped_accel"  # nothing is cut off in a smooth simulated flight
+LONGER = {"mirrored_survey": {"duration": 30.0}}  # visible once the yaw is known
+HARMLESS = "clipped_accel"  # a smooth simulated flight does not reach the limits
 
 
 def rules(report):
@@ -128,7 +128,9 @@ def test_an_axis_is_turned_upwards_by_a_rotation(axis, sign):
 
 @pytest.mark.slow
 def test_a_measured_flight_and_its_mistakes(shared_data):
-    """It took no part in choosing the limits; the table of all is in docs/notebook/checking.md."""
+    """This flight was not used to choose the limits. docs/notebook/checking.md has the
+    full table.
+    """
     ((path, survey),) = inputs.find_flights(
         [shared_data / "flights/0426/0426-traj5"], shared_data / "surveys"
     )
@@ -144,13 +146,14 @@ def test_a_measured_flight_and_its_mistakes(shared_data):
         assert rules(check(made, surveys)) & set(MISTAKES[mistake].named)
 
 
-# what it was taken for
+# wrong causes that `check` named before
 OF_ANOTHER_ROOM = {"ids_swapped", "pair_sign", "imu_rate_unit", "imu_axes", "tdoa_sign"}
 
 
 def test_a_survey_of_another_room_is_named():
-    """Eight anchors elsewhere under the same ids: many of them exchanged explain most of it, and a
-    slower gyroscope the rest.
+    """Eight anchors have other positions but the same ids.
+
+    Many exchanged ids explain most of the error. A slower gyroscope explains the rest.
     """
     flight = clean_flight(702, 40.0)
     elsewhere = flight.anchors.positions[[3, 7, 2, 5, 0, 4, 1, 6]] * [0.8, 1.0, 1.0] + [
@@ -171,7 +174,7 @@ def test_a_survey_of_another_room_is_named():
     ],
 )
 def test_a_survey_of_another_room_is_named_with_a_measured_log(log, survey, shared_data):
-    """The first was said to have the sign of all TDOAs wrong."""
+    """For the first recording, `check` reported a wrong sign of all TDOAs."""
     (flight,) = inputs.Reading(str(shared_data / "surveys" / f"anchor_{survey}")).flights(
         [str(shared_data / log)]
     )
@@ -181,7 +184,7 @@ def test_a_survey_of_another_room_is_named_with_a_measured_log(log, survey, shar
 
 @pytest.fixture(scope="module")
 def ranged():
-    """A Flight of ranges alone."""
+    """Return a Flight with ranges only."""
     config = SimulationConfig(
         duration=20.0, imu_rate=200.0, truth_rate=20.0, start_in_air=True, range_noise=0.1
     )

@@ -18,8 +18,9 @@ from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 @pytest.fixture(scope="module")
 def checked(tmp_path_factory):
-    """A folder with a healthy bag and one with flipped signs, the exit code of checking it, and the
-    JSON.
+    """Check a folder with a healthy bag and a bag with flipped signs.
+
+    Returns the folder, the exit code and the JSON.
     """
     folder = tmp_path_factory.mktemp("bags")
     flight = simulate(SimulationConfig(seed=0, **{**QUICK, "imu_rate": 200.0}))

@@ -1,7 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What is found of a flight against its ground truth: in the TDOAs of a pair, in stamps, and in
-inertial samples."""
+"""Findings of `check` against ground truth: TDOAs of a pair, stamps and inertial samples."""
 
 from dataclasses import replace
 
@@ -93,7 +92,7 @@ D = TRUE + 0.1 * np.random.default_rng(0).standard_normal(len(T))
 
 
 def fault_of(d, true=TRUE):
-    """Name of the first rule that says something of a pair, with its value."""
+    """Return the name and the value of the first rule that reports a fault of a pair."""
     for rule in pair_rules.OF_PAIR:
         found = rule(d, true, T)
         if found is not None:
@@ -205,8 +204,9 @@ def course(t):
 
 
 def delays_of(late, noise=0.1):
-    """Delays of three series with noise and constant errors of their own, each sample `late` (n,)
-    s.
+    """Return the Delays of three series with noise and separate constant errors.
+
+    late : delay of each sample (n,), s
     """
     measured = (
         course(TIMES - late) + SERIES + noise * np.random.default_rng(0).standard_normal(len(TIMES))
@@ -251,7 +251,7 @@ def test_gross_errors_do_not_count():
 
 
 def test_series_with_few_samples_are_not_judged():
-    """As of most pairs of a hall: of a few samples some delay explains nearly all."""
+    """In a hall, most pairs have few samples. Then some delay explains nearly all samples."""
     few, together = np.arange(3, 60), np.array([0, 1, 2, 3, 4, 5])
     t = np.concatenate([TIMES, 7.0 * few, TIMES[:300:50][together]])
     series = np.concatenate([SERIES, np.full(len(few), 3), np.full(len(together), 4)])

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Topics of real processes, checked live."""
+"""Live checks of topics that real processes publish."""
 
 import json
 import signal
@@ -56,7 +56,7 @@ executor.spin()
 
 @pytest.fixture
 def process():
-    """process(command): starts it; interrupted at the end."""
+    """Return process(command), which starts a process. It is interrupted at the end of the test."""
     started = []
 
     def start(*command):
@@ -100,13 +100,14 @@ def test_mistakes_of_a_live_driver_are_found(tmp_path, process, capsys, monkeypa
     assert "/tag1/imu/data from /tag1/driver: best effort, volatile" in said.out
     assert (
         1.0 < float(content["facts"]["duration"].split()[0]) < 9.0
-    )  # 3 s, by the clock, of a driver that may be late
+    )  # 3 s of clock time; the driver may start late
 
 
 @pytest.mark.slow
 def test_live_streams_equal_the_recording(tmp_path, process, monkeypatch):
-    """Played on simulated time, listened to for a part of it: the very samples, so that the rules
-    say the same.
+    """Live samples equal the recorded samples exactly, so the rules find the same.
+
+    The recording is played on simulated time. The check receives the first part.
     """
     pytest.importorskip("uwb_tdoa_msgs.msg")
     listen = pytest.importorskip("uwb_tdoa_tools.live.record")
@@ -128,10 +129,11 @@ def test_live_streams_equal_the_recording(tmp_path, process, monkeypatch):
     for stream, there in ((live.tdoa, whole.tdoa), (live.imu, whole.imu)):
         assert (
             10 < len(stream) < len(there) and stream.t[0] == there.t[0]
-        )  # nothing is lost, from the first on
+        )  # no sample is lost after the first one
         for name, column in vars(stream).items():
             np.testing.assert_array_equal(column, getattr(there, name)[: len(stream)])
-    assert np.isnan(live.tdoa_arrival).all() and np.isnan(live.imu_arrival).all()  # of another time
+    # stamps are in simulated time
+    assert np.isnan(live.tdoa_arrival).all() and np.isnan(live.imu_arrival).all()
     assert (
         np.array_equal(live.anchors.positions, whole.anchors.positions)
         and live.frames.keys() == whole.frames.keys()

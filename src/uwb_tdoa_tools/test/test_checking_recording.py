@@ -1,7 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Bags as they were received, and what is found of their frames, topics, anchors, publishers, ranges and
-motion."""
+"""Bags as received, and findings about frames, topics, anchors, publishers, ranges and motion."""
 
 from dataclasses import replace
 
@@ -89,7 +88,7 @@ def test_a_cut_bag_is_salvaged(bag):
     with pytest.raises(InputError, match="--salvage"):
         read_recording(Reading(), bag)
     made = read_recording(Reading(salvage=True), bag)
-    assert len(made.tdoa) == len(small_flight().tdoa)  # what is cut is its index
+    assert len(made.tdoa) == len(small_flight().tdoa)  # the truncated part is its index
 
 
 def test_a_flight_without_imu_is_read(tmp_path):
@@ -148,7 +147,7 @@ OTHER_TOPICS = {**TOPICS, "/odom": ODOMETRY}
             "without a message",
         ),
         ({"imu": None}, None, ""),  # a CSV file has no topics
-        ({"topics": TOPICS}, None, ""),  # of filters of ours
+        ({"topics": TOPICS}, None, ""),  # topics of our filters
         ({"topics": OTHER_TOPICS}, "odometry_unread", "--topic velocity/odometry=/odom"),
         ({"topics": OTHER_TOPICS, "read": frozenset({"/odom"})}, None, ""),
         ({"recorded": moved(1.0)}, "survey_differs", "up to 1.00 m apart"),
@@ -175,7 +174,8 @@ ANCHORS_END = End(
     [
         ([DRIVER, NODE], set()),
         ([DRIVER, STRICT], {"qos_unmatched"}),
-        ([DRIVER, STRICT, NODE], set()),  # one node that asks in both ways, as ours do for anchors
+        # one node that subscribes twice, as our nodes do for anchors
+        ([DRIVER, STRICT, NODE], set()),
         ([replace(DRIVER, reliable=True), STRICT], set()),
         ([replace(DRIVER, reliable=True), replace(NODE, latched=True)], {"qos_unmatched"}),
         ([DRIVER, replace(DRIVER, node="/other"), NODE], {"publishers_several"}),
@@ -205,7 +205,7 @@ def test_publishers_and_subscriptions_are_judged(ends, expected):
 
 @pytest.fixture(scope="module", params=["sines", "circle"])
 def ranged(request):
-    """A Flight of ranges alone, without systematic errors."""
+    """Return a Flight with ranges only, without systematic errors."""
     config = SimulationConfig(
         seed=7,
         trajectory=request.param,
@@ -266,7 +266,9 @@ PLACES = np.random.default_rng(0).uniform([1.0, 1.0, 0.5], [5.0, 6.0, 2.5], (40,
 
 
 def windows(anchors, heard, seconds=20):
-    """TdoaWindows of 100 TDOAs a second; heard(t, a, b) (n,) bool says which come through."""
+    """Return TdoaWindows of 100 TDOAs per second. heard(t, a, b) selects the received ones, (n,)
+    bool.
+    """
     t = np.arange(0.0, seconds, 0.01)
     a = np.arange(len(t)) % len(anchors)
     b = (a + 1) % len(anchors)

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A survey that cannot be right is said by whoever estimates, not by `check` alone."""
+"""Each tool that estimates reports an impossible survey, like `check`."""
 
 from dataclasses import replace
 import json
@@ -33,7 +33,7 @@ def flight():
 
 
 def renamed(flight, ids):
-    """The flight with a survey in which the anchors have other ids."""
+    """Return the flight with other anchor ids in its survey."""
     anchors = flight.anchors
     return replace(
         flight,
@@ -55,7 +55,7 @@ def test_missing_anchors_are_named(flight):
     [(0, "does not fit"), pytest.param(2, "is of another room", marks=pytest.mark.slow)],
 )
 def test_the_survey_of_another_room_is_blamed_and_no_sign(seed, said):
-    """With other anchors, some pairs seem to have the other sign, and ids to be mixed up."""
+    """With wrong anchors, some pairs seem to have a wrong sign, and some ids seem exchanged."""
     (remark,) = survey_remarks(replace(flown(seed), anchors=constellation("staircase")))
     assert said in remark
 

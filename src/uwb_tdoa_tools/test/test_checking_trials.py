@@ -1,7 +1,9 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What `check` tries on a recording without ground truth: causes compete, the one that explains the most
-is named, and where a recording determines none, none is an error."""
+"""Hypotheses that `check` tries on a recording without ground truth.
+
+The cause that explains most is named. If a recording determines no cause, none is an error.
+"""
 
 from dataclasses import replace
 import importlib
@@ -124,7 +126,7 @@ def test_no_piece_of_a_measured_flight_has_the_survey_of_another_room(
     start = whole.tdoa.t[0] + begin
     rows = slice(*np.searchsorted(whole.tdoa.t, [start, start + seconds]))
     piece = replace(whole, tdoa=rows_of(whole.tdoa, rows), imu=None)
-    assert tdoa_rules.apparent_gain(piece.survey_fit) > 0.065  # the limit before
+    assert tdoa_rules.apparent_gain(piece.survey_fit) > 0.065  # the previous limit
     assert tdoa_rules.gained(piece.survey_fit) is None
 
 
@@ -227,7 +229,7 @@ def test_rotation_and_translation_are_no_displacement(seed):
     moved = Rotation.random(random_state=seed).apply(positions) + rng.normal(size=3)
     assert displacement(positions, moved).max() < 1e-9
     mirrored = moved * [1.0, 1.0, -1.0]
-    assert displacement(positions, mirrored).max() > 1e-3  # a mirror image is another survey
+    assert displacement(positions, mirrored).max() > 1e-3  # a mirror image is a different survey
 
 
 def test_few_tdoas_make_no_window():
@@ -296,7 +298,7 @@ def shared(shared_data):
     ],
 )
 def test_every_command_refuses_the_cases(command, shared, tmp_path, monkeypatch, capsys):
-    """Before it starts workers or writes."""
+    """The commands fail before they start workers or write files."""
     name, *rest = command.split()
     main = importlib.import_module(f"uwb_tdoa_tools.commands.{name}").main
     monkeypatch.chdir(tmp_path)
@@ -323,8 +325,10 @@ def test_the_case_of_another_room_has_no_error(shared):
 
 
 def flown(seconds=20.0, rate=300.0, seed=0, place=None, errors=(0.0, 0.0), anchors=ROOM):
-    """OrderedRecording of TDOAs of a tag that moves, or that stands at place (3,) m; errors : m, of
-    each pair, in the first half of the time and in the second.
+    """Return an OrderedRecording of TDOAs of a moving tag, or of a tag at rest.
+
+    place : position of a tag at rest (3,), m
+    errors : standard deviations of the errors of the pairs, m, in the first and in the second half
     """
     rng = np.random.default_rng(seed)
     t = np.arange(int(seconds * rate)) / rate
@@ -342,7 +346,7 @@ def flown(seconds=20.0, rate=300.0, seed=0, place=None, errors=(0.0, 0.0), ancho
 
 
 def test_errors_that_change_are_no_errors_of_the_survey():
-    """Anchors elsewhere explain much of each half, and nothing of the other."""
+    """Other anchor positions explain much of one half, but nothing of the other half."""
     fits = [flown(seed=seed, errors=(0.45, -0.3)).survey_fit for seed in range(6)]
     assert sum(apparent_gain(fit) > GAIN for fit in fits) >= 2
     assert [gained(fit) for fit in fits] == [None] * 6
@@ -361,7 +365,7 @@ def test_a_survey_of_another_room_fits_both_halves_with_its_anchors_moved(seed):
 
 
 def standing(seed, bias, errors):
-    """OrderedRecording of 12 s of a tag that stands, with a gyroscope of some bias, rad/s."""
+    """Return an OrderedRecording of 12 s of a tag at rest. bias : of the gyroscope, rad/s."""
     rng = np.random.default_rng(seed)
     t = np.arange(2400) / 200.0
     imu = Imu(
@@ -390,11 +394,13 @@ def test_a_time_stamp_that_wraps_is_the_only_finding(share):
     assert "2^32 ticks" in report.findings[0].cause
 
 
-# What is lost is told
+# Unused data is reported
 
 
 def log(gyro_rate=None, accel_rate=None):
-    """Flight of a Crazyflie's log with sensors of some rates, Hz, or without one."""
+    """Return the Flight of a Crazyflie log. gyro_rate, accel_rate : Hz, or None without
+    the sensor.
+    """
     t = np.arange(4000) / 200.0
     streams = {
         "tdoa": {

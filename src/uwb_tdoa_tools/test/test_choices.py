@@ -1,8 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What options offer: the names are those that the code knows, and no parser imports more than it
-shows.
-"""
+"""Choices of options: the names equal those in the code, and parsers import no heavy modules."""
 
 import subprocess
 import sys
@@ -22,7 +20,7 @@ from uwb_tdoa_tools.simulation import SimulationConfig
 from uwb_tdoa_tools.simulation.config import VEHICLE_DEFAULTS
 from uwb_tdoa_tools.simulation.paths import TRAJECTORIES
 
-# what a command imports only to work: half a second and more together
+# modules that a command imports only for its work; together they take half a second or more
 HEAVY = """PIL apsw jinja2 joblib llvmlite matplotlib numba onnx onnxruntime pandas rclpy rosbags scipy sklearn
     tqdm""".split()
 
@@ -52,7 +50,7 @@ def test_the_defaults_that_simulate_names_are_those_of_a_simulation():
 
 
 def test_help_and_usage_errors_import_nothing_heavy():
-    """One process for all: what one parser imported, the next would not show otherwise."""
+    """One process tests all parsers: a module imported by one would be hidden for the next."""
     code = (
         "import contextlib, importlib, io, sys\n"
         f"for name in {TOOLS}:\n"

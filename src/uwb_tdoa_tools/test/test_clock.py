@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""One continuous time from clocks that restart, wrap or are set, by the order of the file."""
+"""Continuous time from clocks that restart, wrap or are set, by the order of the messages."""
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -23,12 +23,12 @@ def stamps_of(duration=20.0, rates=RATES, start=3.0, seed=0):
 
 
 def moved(stamps, at, by):
-    """Stamps of a clock that jumps by so much, s, when it would show `at`."""
+    """Return stamps of a clock that jumps by `by`, s, when it would show `at`, s."""
     return {name: np.where(t < at, t, t + by) for name, t in stamps.items()}
 
 
 def whole(stamps, found):
-    """{stream: stamps on the continuous time, without outliers}."""
+    """Return {stream: stamps on the continuous time, without outliers}."""
     return {
         name: (t + found.shifts.get(name, 0.0))[found.kept.get(name, slice(None))]
         for name, t in stamps.items()
@@ -36,8 +36,9 @@ def whole(stamps, found):
 
 
 def assert_continuous(stamps, found, true):
-    """All streams run on as they truly did, but for the instant of a jump, whose length only the
-    usual step tells.
+    """Assert that all streams continue as in reality, except for the length of each jump.
+
+    Only the usual interval between messages determines this length.
     """
     for name, t in whole(stamps, found).items():
         kept = true[name][found.kept.get(name, slice(None))]
@@ -49,7 +50,7 @@ def assert_continuous(stamps, found, true):
         )
         for name in ("imu", "tdoa")
     ]
-    assert abs(shifts[0] - shifts[1]) < 1e-6  # streams of one clock stay together
+    assert abs(shifts[0] - shifts[1]) < 1e-6  # streams of one clock stay synchronous
 
 
 @pytest.mark.parametrize(
@@ -85,7 +86,7 @@ def test_a_wrap_is_undone_by_its_exact_size():
 
 @pytest.mark.parametrize("name", ["2^40 ticks of 15.65 ps", "2^24 microseconds"])
 def test_slow_streams_take_the_nearest_of_two_wraps(name):
-    """They are 0.43 s apart, within the tolerance of streams of 5 Hz."""
+    """Their periods differ by 0.43 s, less than the tolerance of streams of 5 Hz."""
     true = stamps_of(rates={"imu": 5.0, "tdoa": 4.0})
     (jump,) = straightened(moved(true, 18.0, -WRAPS[name])).jumps
     assert (jump.kind, jump.period) == (WRAP, name)
@@ -95,7 +96,7 @@ def test_slow_streams_take_the_nearest_of_two_wraps(name):
 def test_arrivals_determine_the_size_of_a_jump(by):
     true = {
         name: np.where(t < 12.0, t, t + 3.0) for name, t in stamps_of().items()
-    }  # the recorder hears nothing for 3 s
+    }  # the recorder receives nothing for 3 s
     stamps = moved(true, 13.0, by)
     rng = np.random.default_rng(1)
     arrived = {name: 1e3 + t + 0.02 + 0.001 * rng.random(len(t)) for name, t in true.items()}
@@ -115,7 +116,7 @@ def test_a_pause_is_named_and_moves_nothing():
     )
     arrived = {
         name: t + 0.01 for name, t in stamps.items()
-    }  # then it is known that nothing happened
+    }  # arrival times show that there is no jump
     assert not straightened(stamps, arrived).jumps
 
 
@@ -207,16 +208,17 @@ def test_every_message_is_counted_and_time_is_continuous(jumps, wild, far, drop,
     stamps = {name: true[name] + shift[name] for name in true}
     apart = sorted(place for place in wild if place < len(stamps["tdoa"]))
     apart = [place for k, place in enumerate(apart) if not k or place - apart[k - 1] > 3]
-    # Of the first messages nothing shows yet which of two times is right: if two of the first five
-    # are from one wrong time, the three between them are left out, too.
+    # The first messages do not determine which of two times is right. If two of the first five are
+    # from one wrong time, the three between them are left out, too.
     apart = [place for place in apart if place > 4]
     stamps["tdoa"] = stamps["tdoa"].copy()
     stamps["tdoa"][apart] += far
     found = straightened(stamps)
-    for name, count in found.outliers.items():  # of a time of few messages nobody knows
+    for name, count in found.outliers.items():  # a short piece of time cannot be assigned
         assert count <= len(apart) * (name == "tdoa") + FEW * len(jumps)
     for name, t in whole(stamps, found).items():
-        assert len(t) + found.outliers.get(name, 0) == len(stamps[name])  # each has an account
+        # every message is accounted for
+        assert len(t) + found.outliers.get(name, 0) == len(stamps[name])
         steps = np.diff(t)
         assert steps.min() > -1.0 and steps.max() < 2.0  # continuous
     assert sum(jump.kind == RESTART for jump in found.jumps) >= len(found.restarts)

@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings whose clock is set, starts again or wraps: read on one continuous time, named by
-check, and of no more memory.
+"""Recordings whose clock is set, restarts or wraps.
+
+They are read on one continuous time, `check` names the jump, and memory does not grow.
 """
 
 from dataclasses import replace
@@ -29,7 +30,7 @@ FLIGHT = replace(WHOLE, imu=SLOW)
 MIDDLE = 12.0  # s
 YEARS = 55 * 365.25 * 86400.0
 WRAP = 2**32 * 1e-6
-BASE = 1e8  # s, so that no stamp falls below 0
+BASE = 1e8  # s; no stamp falls below 0
 KINDS = {
     "restart": ("clock_restart", lambda t: np.where(t < MIDDLE, t, t - MIDDLE)),
     "years": ("clock_set", lambda t: np.where(t < MIDDLE, t, t + YEARS)),
@@ -39,8 +40,9 @@ KINDS = {
 
 
 def bag(path, clock, storage="mcap", arrivals=True, imu=lambda t: t):
-    """Write FLIGHT as it is recorded by a clock(t): each message in its turn. arrivals : log times
-    are of a sound clock, else the stamps.
+    """Write FLIGHT as recorded with a clock(t), the messages in their order.
+
+    arrivals : log times come from a correct clock; otherwise they equal the stamps
     """
     store, rows = typestore(), []
     tdoa, samples = FLIGHT.tdoa, FLIGHT.imu
@@ -87,7 +89,7 @@ def test_a_bag_is_read_on_one_time_and_check_names_the_jump(tmp_path, name, arri
     for stream, true in ((flight.tdoa, FLIGHT.tdoa), (flight.imu, FLIGHT.imu)):
         assert len(stream) == len(true)
         assert np.ptp(stream.t - true.t) < 0.02
-    np.testing.assert_array_equal(flight.tdoa.d, FLIGHT.tdoa.d)  # in the order in which they were
+    np.testing.assert_array_equal(flight.tdoa.d, FLIGHT.tdoa.d)  # in the original order
     assert len(flight.restarts) == (name == "restart")
     (survey,) = [tmp_path / "anchors.yaml"]
     FLIGHT.anchors.to_yaml(survey)
@@ -104,7 +106,7 @@ def test_the_filter_restarts_with_the_clock():
     before = whole.odometry.t < restart
     np.testing.assert_array_equal(run.odometry.p[: before.sum()], whole.odometry.p[before])
     after = run.odometry.t[run.odometry.t >= restart]
-    assert after[0] > restart + 0.05  # it is found again
+    assert after[0] > restart + 0.05  # the filter initializes again
     assert len(run.residuals) == len(FLIGHT.tdoa) and (run.residuals.t == FLIGHT.tdoa.t).all()
     late = run.odometry.t > restart + 6.0
     there = np.searchsorted(whole.odometry.t, run.odometry.t[late])
@@ -163,7 +165,7 @@ assert report.findings
 
 @pytest.mark.parametrize("by", [10 * 86400.0, YEARS])
 def test_a_gap_of_any_length_takes_no_more_memory(by):
-    """What no reader has put on one time, as a pause of days is not."""
+    """The streams are not put on a continuous time first, as with a pause of days."""
     from pathlib import Path
 
     def bound():

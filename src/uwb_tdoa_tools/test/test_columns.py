@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""CSV files of other tools: any column names, any of the usual units, one file or several."""
+"""CSV files of other tools: any column names, common units, one file or several."""
 
 import numpy as np
 import pytest
@@ -232,7 +232,7 @@ def test_semicolons_commas_names_and_holes_of_a_spreadsheet(files, capsys):
 def test_names_of_a_survey(files, survey, ids):
     (files / "named.yaml").write_text(survey)
     named = read_named_anchors("named.yaml")
-    assert read_survey("named.yaml").ids.tolist() == named.anchors.ids.tolist()  # of every tool
+    assert read_survey("named.yaml").ids.tolist() == named.anchors.ids.tolist()  # as in every tool
     assert named.ids == ids and (not ids or set(named.anchors.ids) == set(ids.values()))
 
 
@@ -259,8 +259,9 @@ def test_gaps_are_skipped_and_counted_and_too_many_are_refused(files, capsys):
 
 
 def test_sensors_with_clocks_of_their_own_in_one_file(files, capsys):
-    """A time column for each sensor; the stamps of the inertial sensor count from elsewhere, those
-    of motion capture are late.
+    """Each sensor has a time column.
+
+    Stamps of the IMU have another origin. Stamps of motion capture are late.
     """
     rows = ["t_uwb,from,to,diff,t_gyro,gx,gy,gz,t_acc,ax,ay,az,t_cap,x,y,z"]
     rows += [f"{k},0,1,100,{k + 1.7e9},1,2,3,{k + 1.7e9},0,0,1,{k + 0.2},1,2,3" for k in range(5)]
@@ -360,7 +361,7 @@ def test_a_survey_of_pandas_has_no_name_for_its_ids(files):
 
 
 def test_hexadecimal_ids_of_a_survey_are_the_ids_that_messages_have(tmp_path):
-    """Not the digits at their ends."""
+    """An id is the whole hexadecimal number, not the digits at its end."""
     survey = tmp_path / "survey.csv"
     survey.write_text("id,x,y,z\n0x1A20,0,0,0\n0x1A21,4,0,3\n0x00F2,4,5,0\n")
     named = read_named_anchors(survey)
@@ -374,4 +375,5 @@ def test_an_id_counts_where_the_names_of_anchors_end_with_it(tmp_path):
     named = read_named_anchors(survey)
     assert [named.id_of(text) for text in ("A12", "12", "2", "3")] == [12, 12, 2, None]
     survey.write_text("name,x,y,z\nNE,0,0,0\nNW,4,0,3\nSW,4,5,0\n")
-    assert read_named_anchors(survey).id_of("1") is None  # the second line, or an id of the radio
+    # neither the second line nor an id of the radio
+    assert read_named_anchors(survey).id_of("1") is None

@@ -1,8 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""docs/csv.md as a new user follows it: the files it speaks of, and its commands in their
-order.
-"""
+"""docs/csv.md as a new user follows it: its files, and its commands in their order."""
 
 from importlib import import_module
 import re
@@ -23,7 +21,7 @@ LATE = 0.3  # m, anchor 3
 
 @pytest.fixture
 def desk(tmp_path, monkeypatch):
-    """A folder with the anchors.yaml of the page, and recordings as another tool writes them."""
+    """Return a folder with the anchors.yaml of the page, and recordings of another tool."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "anchors.yaml").write_text(*blocks(WALK, "yaml"))
     taped = read_survey("anchors.yaml")
@@ -66,7 +64,7 @@ def test_the_way_to_a_diagnosed_flight(desk, tmp_path, capsys):
 
 
 def errors(out):
-    """3D errors, m, in the lines of `evaluate`, in their order."""
+    """Return the 3D errors, m, in the lines of `evaluate`, in their order."""
     return [
         float(line.split()[4])
         for line in out.splitlines()

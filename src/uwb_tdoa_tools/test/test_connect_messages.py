@@ -1,7 +1,9 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The publishers of docs/drivers.md: the Python one as a process, over topics; the C++ one as far
-as its messages go.
+"""The publishers of docs/drivers.md.
+
+The Python publisher runs as a process, over topics. The C++ publisher is compiled against the
+messages.
 """
 
 import os
@@ -47,11 +49,11 @@ struct Node {
 """
 
 
-ENOUGH = 1200  # samples of the IMU, of which the rules say something
+ENOUGH = 1200  # IMU samples that the rules need
 
 
 def findings_of(anchors, imu, tdoas):
-    """[Finding] of the rules over streams, as check and ekf_node have them, of messages."""
+    """Return [Finding] of the rules on streams of messages, as in `check` and ekf_node."""
 
     def seconds(messages):
         return np.array(
@@ -83,7 +85,7 @@ def listener():
 
 
 def test_the_publisher_in_python(tmp_path, listener):
-    """With reliable subscriptions, as most have, that come after the anchors were sent."""
+    """Subscribe reliably, as most subscribers do, after the anchors were sent."""
     (tmp_path / "driver.py").write_text(*blocks(section("drivers.md", "In Python"), "python"))
     process = subprocess.Popen(
         [sys.executable, tmp_path / "driver.py"], stderr=subprocess.PIPE, text=True
@@ -164,4 +166,4 @@ def test_the_publisher_in_cpp(tmp_path):
     assert subprocess.run(
         ["g++", "-std=c++17", "-fsyntax-only", "-I", tmp_path, *paths, tmp_path / "driver.cpp"],
         capture_output=True,
-    ).returncode  # the headers are those of the messages
+    ).returncode  # the headers match the messages

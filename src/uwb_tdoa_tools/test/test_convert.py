@@ -97,7 +97,7 @@ def test_missing_survey(files, capsys):
 
 
 def test_what_a_moved_clock_puts_before_zero_is_left_out_and_said(tmp_path, monkeypatch, capsys):
-    """As of a tool whose clock begins with the recording."""
+    """The clock of some tools starts with the recording."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "survey.csv").write_text(SURVEY)
     rows = [f"{0.1 * k:.1f},0,1,0.25,,,," for k in range(20)] + [

@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Log variables of a Crazyflie to streams; studies/test/test_study_radio_link.py runs the example
-node around that.
+"""Log variables of a Crazyflie become streams.
+
+studies/test/test_study_radio_link.py runs the example node.
 """
 
 import subprocess
@@ -28,7 +29,7 @@ from uwb_tdoa_tools.crazyflie import (
 
 def test_a_value_is_a_measurement_once():
     block = LogBlock(["stateEstimate.z", "tdoa2.d7-0", "tdoa2.d0-1"])
-    first = [(pytest.approx(1.0 - PERIOD / 2), 0, 1, 0.5)]  # the other is 0: never received
+    first = [(pytest.approx(1.0 - PERIOD / 2), 0, 1, 0.5)]  # tdoa2.d7-0 is 0: never received
     assert block.take(1000, [1.0, 0.0, 0.5]) == (first, None)
     assert block.take(1010, [1.0, -2.0, 0.5]) == (
         [(pytest.approx(1.01 - PERIOD / 2), 7, 0, -2.0)],
@@ -44,7 +45,7 @@ def test_inertial_samples_are_in_si_units_whatever_their_order():
     assert tdoas == [] and t == 2.5
     np.testing.assert_allclose(gyro, [np.pi, 0.0, -np.pi / 2])
     np.testing.assert_allclose(accel, [0.0, 0.5 * GRAVITY, GRAVITY])
-    assert LogBlock(RATES).take(0, [1.0, 2.0, 3.0]) == ([], None)  # half an IMU is none
+    assert LogBlock(RATES).take(0, [1.0, 2.0, 3.0]) == ([], None)  # half an IMU sample is not used
 
 
 @settings(max_examples=50, deadline=None)
@@ -60,7 +61,7 @@ def test_the_clock_is_off_by_the_least_delay_and_never_runs_back_far(delays, off
 
 @given(st.floats(0.0, 0.05), st.floats(-1e3, 1e9), st.integers(1, 3))
 def test_the_clock_goes_on_when_the_time_of_the_vehicle_wraps(delay, offset, wraps):
-    """24 bits of ms: after 4.7 hours."""
+    """The time has 24 bits, in ms: it wraps after 4.7 hours."""
     clock = VehicleClock()
     for t in np.linspace(0.0, wraps * WRAP, 200):
         assert clock.stamp(t % WRAP, t + offset + delay) == pytest.approx(
@@ -70,8 +71,9 @@ def test_the_clock_goes_on_when_the_time_of_the_vehicle_wraps(delay, offset, wra
 
 @given(st.floats(10.0, WRAP - 1.0), st.floats(5.0, 60.0))
 def test_the_clock_begins_anew_with_a_vehicle_that_was_switched_on_again(before, off):
-    """After the first message at the latest its stamps are those of its arrival."""
-    # nothing tells it from a wrap while it was off: a link that is opened again begins anew
+    """After the first message at the latest, stamps equal arrival times."""
+    # A longer pause is indistinguishable from a wrap while switched off. A new link starts a new
+    # clock.
     assume(before + off + 1.0 < WRAP)
     clock, now = VehicleClock(), 1e9
     for t in (before - 0.02, before - 0.01, before):
@@ -85,7 +87,7 @@ def test_a_stalled_link_does_not_move_the_clock():
     clock = VehicleClock()
     for t in np.arange(0.0, 2.0, PERIOD):
         clock.stamp(t, 100.0 + t)
-    stalled = [clock.stamp(t, 105.0) for t in np.arange(2.0, 5.0, PERIOD)]  # all come at once
+    stalled = [clock.stamp(t, 105.0) for t in np.arange(2.0, 5.0, PERIOD)]  # all arrive at once
     np.testing.assert_allclose(stalled, 100.0 + np.arange(2.0, 5.0, PERIOD), atol=0.01)
 
 

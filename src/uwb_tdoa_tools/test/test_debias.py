@@ -33,7 +33,7 @@ def survey(tmp_path):
 
 @pytest.fixture
 def points(tmp_path):
-    """A CSV file of 4 x 4 x 3 places, five positions at each, all BIAS off."""
+    """Write a CSV file of 4 x 4 x 3 places with five positions each, all with the error BIAS."""
     places = (
         np.stack(np.meshgrid(range(4), range(4), range(3), indexing="ij"), axis=-1).reshape(-1, 3)
         * 0.5
@@ -101,7 +101,7 @@ def test_a_planar_network_needs_no_heights(tmp_path, points, survey):
 
 @pytest.fixture(scope="module")
 def flights(tmp_path_factory):
-    """Two bags of flights through the same biases."""
+    """Write two bags of flights through the same biases."""
     folder = tmp_path_factory.mktemp("flights")
     for name, speed in (("one", 1.0), ("two", 0.8)):
         config = SimulationConfig(
@@ -150,7 +150,7 @@ def test_flights_make_a_map_and_are_judged_by_it(tmp_path, flights, capsys):
 
 
 def wrong_map(path, bias, anchors):
-    """A map of one bias all over the room."""
+    """Write a map with one bias in the whole room."""
     cell = np.stack(
         np.meshgrid(*[np.arange(-5, 6)] * 2, np.arange(4), indexing="ij"), axis=-1
     ).reshape(-1, 3)
@@ -220,13 +220,13 @@ def test_as_much_of_a_map_is_taken_as_flights_left_out_bear_out(tmp_path, flight
     told = json.loads((tmp_path / "fit.json").read_text())["borne_out"]
     assert (
         len(told["left_out"]) == 2 and told["gain"] > 0.0 and told["share"] > 0.0
-    )  # both bags hold flights of one name
+    )  # both bags hold flights with the same name
     assert "expected of flights like these" in capsys.readouterr().out
     whole = BiasMap.load(out)
     half = whole.scaled(0.5)
     np.testing.assert_allclose(half.bias, 0.5 * whole.bias)
     added = np.linalg.eigvalsh(half.added - 0.25 * whole.added)
-    assert added.min() > -1e-9 and added.max() > 0.0  # what stays is uncertain
+    assert added.min() > -1e-9 and added.max() > 0.0  # the remaining bias is uncertain
 
 
 @pytest.mark.parametrize(

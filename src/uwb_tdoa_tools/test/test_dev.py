@@ -1,8 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What ./dev says without doing anything, and what it says is missing.
+"""Output of ./dev without side effects, and its messages about missing programs.
 
-Nothing here installs or builds.
+No test here installs or builds.
 """
 
 import fcntl
@@ -26,7 +26,7 @@ BASE_PYTHON = os.path.realpath(sys.executable)
 
 @pytest.fixture
 def workspace(tmp_path):
-    """A fresh copy of the scripts, as after `git clone`."""
+    """Return a fresh copy of the scripts, as after `git clone`."""
     shutil.copy(ROOT / "dev", tmp_path)
     shutil.copy(ROOT / "requirements.txt", tmp_path)
     shutil.copytree(ROOT / ".dev", tmp_path / ".dev")
@@ -35,7 +35,7 @@ def workspace(tmp_path):
 
 @pytest.fixture
 def machine(tmp_path):
-    """A PATH with the barest of machines on it. Call it with name=target to put programs there."""
+    """Return a function that makes a minimal PATH. It takes name=target of more programs."""
     path = tmp_path / "bin"
     path.mkdir()
 
@@ -141,7 +141,8 @@ def test_a_jazzy_without_rclpy(workspace):
 
 def test_what_is_not_what_was_locked_is_not_installed(workspace, machine):
     environment = machine(python3=BASE_PYTHON, **{"c++": script(workspace / "c++", "exit 1")})
-    other = workspace / "other-1.0-py3-none-any.whl"  # in the place of one of this name and version
+    # replaces the locked wheel of the same name and version
+    other = workspace / "other-1.0-py3-none-any.whl"
     with zipfile.ZipFile(other, "w") as wheel:
         wheel.writestr(
             "other-1.0.dist-info/METADATA", "Metadata-Version: 2.1\nName: other\nVersion: 1.0\n"
@@ -182,7 +183,7 @@ def test_all_that_is_installed_is_locked(asked, lock):
 
 
 def canonical(name):
-    """Of a distribution, as PyPA specifies."""
+    """Normalize the name of a distribution as PyPA specifies."""
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
@@ -202,7 +203,7 @@ def test_a_step_that_fails_shows_the_end_of_its_log(workspace, machine):
 
 @pytest.fixture
 def prepare(workspace):
-    """The module .dev/prepare.py of a fresh copy, with a folder for its logs."""
+    """Return the module .dev/prepare.py of a fresh copy, with a folder for its logs."""
     for name in ("colcon.meta", "src", "log"):
         (workspace / name).mkdir() if name != "colcon.meta" else shutil.copy(ROOT / name, workspace)
     spec = spec_from_file_location("prepare", workspace / ".dev" / "prepare.py")
@@ -222,7 +223,7 @@ def test_where_nothing_is_to_be_done_nobody_waits_for_another(prepare, monkeypat
         prepare.main("run")
     with pytest.raises(
         BaseException, match="nothing to do"
-    ):  # the demo wants the nodes compiled, too
+    ):  # the demo also needs the nodes to be compiled
         prepare.main("demo")
 
 
@@ -260,7 +261,7 @@ def test_a_step_that_fails_ends_those_beside_it(prepare):
 
 
 def test_another_user_than_the_one_who_built_is_told_what_to_do(workspace):
-    """Who may write anything is root: then the command runs as nobody."""
+    """Root can write to any file, so root runs the command as the user `nobody`."""
     folder = Path(tempfile.mkdtemp(prefix="checkout of häns "))
     try:
         for name in ("dev", "requirements.txt", ".dev"):

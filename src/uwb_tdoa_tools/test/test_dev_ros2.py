@@ -1,8 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""`./dev ros2` of those without ROS, as processes against a live node; and the commands of the
-documentation.
-"""
+"""`./dev ros2` without ROS, as processes against a live node; commands of the documentation."""
 
 import argparse
 from pathlib import Path
@@ -32,7 +30,7 @@ from uwb_tdoa_msgs.msg import Tdoa, TdoaResidual  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[3]
 SCRIPT = ROOT / ".dev" / "ros2.py"
-COMMANDS = {  # words: what they say, as an expression, and the exit code
+COMMANDS = {  # words: (expected output as a regular expression, exit code)
     "topic list -t": (r"/tag1/uwb/tdoa \[uwb_tdoa_msgs/msg/Tdoa\]\n", 0),
     "topic info -v /tag1/uwb/tdoa": (
         (
@@ -69,7 +67,7 @@ def spin_until(node, condition, what=lambda: "it did not happen"):
 
 @pytest.fixture
 def driver():
-    """A node that publishes TDOAs at 50 Hz, best effort, and has two parameters."""
+    """A node with two parameters that publishes TDOAs at 50 Hz, best effort."""
     rclpy.init()
     node = rclpy.create_node("driver", namespace="tag1")
     parameters = {
@@ -100,8 +98,9 @@ def start(words, stdout=subprocess.PIPE):
 
 @pytest.mark.slow
 def test_commands(driver):
-    """Asked again as long as the answer is another one: on a loaded machine a command may have
-    looked before it could see the node.
+    """Repeat each command until its answer is correct.
+
+    On a loaded machine, a command may end before it has discovered the node.
     """
     asked, said = {words: start(words) for words in COMMANDS}, {}
 
@@ -131,7 +130,7 @@ def test_the_rate_of_a_topic(driver, tmp_path):
     said = tmp_path / "hz.txt"
     with said.open("w") as file:
         hz = start("topic hz /tag1/uwb/tdoa", file)
-        try:  # a loaded machine publishes at 50 Hz later, not never
+        try:  # a loaded machine reaches 50 Hz later
             spin_until(
                 driver, lambda: any(abs(rate - 50.0) < 15.0 for rate in rates_in(said.read_text()))
             )
@@ -217,7 +216,7 @@ def test_a_terminal_obeys_nothing_that_others_have_written(monkeypatch, capsys, 
 
 
 class Any_:
-    """Has every method, which does nothing."""
+    """Has every method. All methods do nothing."""
 
     def __getattr__(self, name):
         return lambda *_, **__: None

@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Sparse tables say what dense ones do; what is eliminated, and what a change would bring, is what
-the whole system says.
+"""Sparse tables give the same results as dense tables.
+
+Elimination of unknowns, and the effect of changes, agree with the full system.
 """
 
 from dataclasses import replace
@@ -25,7 +26,7 @@ from uwb_tdoa_tools.diagnosis.self_calibration.prior import Prior, posterior, so
 
 @pytest.fixture(scope="module")
 def both():
-    """(dense Table, the same as a sparse one, [Candidate])."""
+    """Return (dense Table, the same as a sparse Table, [Candidate])."""
     table, candidates = table_with(
         effect_of("anchor_delay", True, 1).inject(clean_flight(100, 30.0))
     )
@@ -81,8 +82,10 @@ def test_fits_and_selections_of_a_sparse_table_are_those_of_a_dense_one(both):
 
 
 def equations(n_anchors, functions=6, seed=0):
-    """(gram, vector) of as many unknowns as n_anchors have, and functions more, of which some are
-    in no row.
+    """Return normal equations (gram, vector).
+
+    The unknowns are 4 for each of n_anchors anchors, and one for each function. The last two
+    functions occur in no row.
     """
     rng = np.random.default_rng(seed)
     x = rng.standard_normal((300, 4 * n_anchors + functions))

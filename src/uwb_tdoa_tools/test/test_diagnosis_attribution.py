@@ -27,7 +27,7 @@ def flight():
 
 
 def quick(flight):
-    """The declared effects alone, without functions without a name: Attribution."""
+    """Return the Attribution of declared effects only, without unnamed functions."""
     return attribute([flight], TRUTH, undeclared=False)
 
 
@@ -56,8 +56,9 @@ def test_a_declared_effect_is_found_with_its_size(flight, name):
 
 
 def test_an_anchor_that_is_far_off_is_fitted_where_it_is(flight):
-    """A fit about the surveyed place takes the change of direction for something else: it must be
-    made about its own values.
+    """A fit about the surveyed position misses the change of direction.
+
+    The fit must be repeated about the fitted position.
     """
     far = EFFECTS["anchor_position"]({"3.z": -1.3})
 
@@ -120,13 +121,16 @@ def test_an_undeclared_effect_is_found_by_its_covariate(flight):
     ],
 )
 def test_what_was_missed_once_is_named_first(flight, effect, named):
-    """No function has two covariates: of an anchor late if fast and high the anchor is named."""
+    """No function has two covariates.
+
+    If an anchor is late when fast and high, the anchor is named.
+    """
     first, *_ = attribute([getattr(undeclared, effect)(flight)], TRUTH).findings()
     assert first.effect.label.startswith(named)
 
 
 def test_a_function_does_not_hide_itself_as_noise(flight, monkeypatch):
-    """What no declared effect describes is correlated in time, as noise is."""
+    """An undeclared effect is correlated in time, like noise."""
     inflation, original = [], attribution.with_measured_noise
 
     def noted(selection, *rest):
@@ -141,7 +145,7 @@ def test_a_function_does_not_hide_itself_as_noise(flight, monkeypatch):
 
 
 def inflation_alone(flight):
-    """The variance inflation of TDOAs of a Flight beside all declared effects."""
+    """Return the variance inflation of the TDOAs of a Flight, fitted with all declared effects."""
     under_base = residuals_of([flight], TRUTH, EffectSet())
     declared = attribution._declared(under_base, TRUTH, None, attribution._installation([flight]))
     table = refinement.linearised(under_base, declared, ())
@@ -160,7 +164,7 @@ def test_measured_flight(shared_data):
     effects = EffectSet(attribute([one], TRUTH).effects)
     before, after = (
         residuals(two, TRUTH, model)["tdoa"] for model in (EffectSet(), effects)
-    )  # of a flight that was not fitted
+    )  # of a hold-out flight
     assert np.median(np.abs(after.residual[after.airborne])) < 0.7 * np.median(
         np.abs(before.residual[before.airborne])
     )
@@ -187,9 +191,7 @@ def test_nothing_is_found_in_sound_heights_pressures_and_velocities(aided):
 
 
 def test_of_two_models_that_tell_the_same_the_one_of_fewer_parameters_counts(flight):
-    """A frame that is shifted along z; the same with delays of all anchors, which are of no use
-    beside it; and nothing.
-    """
+    """Models: a frame shifted along z, the same with useless delays of all anchors, and none."""
     shifted = EFFECTS["truth_frame"]({"z": 0.3}).inject(flight)
     frame, delays = (
         candidates_of(EFFECTS[name](), flight.anchors, None)
@@ -205,8 +207,9 @@ def test_of_two_models_that_tell_the_same_the_one_of_fewer_parameters_counts(fli
 
 
 def test_of_two_models_of_the_same_things_the_one_that_is_worth_more_counts(flight, monkeypatch):
-    """A frame that is shifted along z and a little along x: both are shifts of the frame, and one
-    tells three quarters of it.
+    """Models: a frame shifted along z and slightly along x, and a frame shifted along z only.
+
+    Both shift the frame. The smaller model explains three quarters of the shift.
     """
     shifted = EFFECTS["truth_frame"]({"z": 0.3, "x": 0.02}).inject(flight)
     frame = candidates_of(EFFECTS["truth_frame"](), flight.anchors, None)

@@ -106,7 +106,7 @@ def test_at_rest_the_gyroscope_is_no_function_of_what_it_measures_itself():
 
 
 def test_without_attitude_the_gyroscope_is_judged_at_rest_and_the_accelerometer_not_at_all():
-    # turns slowly, soon after it has left the floor
+    # slow rotation, soon after take-off
     reference, flight = (Nothing(), clean_flight(110, 30.0))
     parts = residuals(reference.prepare(flight), reference, EffectSet())
     assert (
@@ -147,7 +147,7 @@ def test_a_drift_that_is_found_knows_for_how_long_it_was_seen():
 
 
 def residual(flight, low, high):
-    """A residual, looked at between two times after the first TDOA."""
+    """Return a residual. The fit uses the time from `low` to `high`, s after the first TDOA."""
     t = flight.tdoa.t
     a, b = (flight.anchors.index(side) for side in (flight.tdoa.a, flight.tdoa.b))
     samples = samples_at(t, a, b, flight.truth, flight.anchors, t[0], lag=None)
@@ -170,7 +170,7 @@ def test_a_domain_is_of_the_flights_that_were_fitted_and_of_the_air():
 
 
 def test_functions_of_the_place_know_the_heights_that_were_seen():
-    """A flight at one height tells nothing of another one, but of a few centimetres more."""
+    """A flight at one height determines a function only within a few centimetres of this height."""
     flight = clean_flight(100, 40.0)
     seen = Seen([residual(flight, 5.0, 30.0)])
     height = SmoothTerm({"c0": 0.1}, covariate="height", knots=(0.0, 2.0))

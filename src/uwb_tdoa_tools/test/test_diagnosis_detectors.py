@@ -104,7 +104,7 @@ def near(*flights):
 
 
 def on_the_floor(*flights, named=True):
-    """Effects found near the floor of some flights."""
+    """Return the effects found near the floor of some flights."""
     return effects_of(
         on_floor(near(*flights), [DETECTORS["floor_multipath"]] if named else [], True, [])
     )
@@ -125,9 +125,7 @@ def test_anchors_that_are_late_on_the_floor_are_found_with_their_heights(landed)
 
 
 def test_the_floor_is_described_without_a_name_for_it(landed):
-    """By functions of the height: together they say that low anchors are metres late below, and on
-    time above.
-    """
+    """Functions of the height describe low anchors: metres late near the floor, but not above."""
     found = on_the_floor(landed, named=False)
     assert found and all(effect.covariate in ("height", "elevation") for effect in found)
     (part,) = near(landed)

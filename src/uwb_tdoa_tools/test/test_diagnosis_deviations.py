@@ -1,8 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Deviations of positions of anchors that are found beside ground truth: whether errors are as
-large as they say.
-"""
+"""Standard deviations of anchor positions, fitted with ground truth, match the actual errors."""
 
 from known_effects import clean_flight, normalised, root
 import numpy as np
@@ -15,7 +13,7 @@ from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.refinement import effects_of
 from uwb_tdoa_tools.readers import inputs
 
-MEASURED = {  # recordings on which nothing was chosen, and how far off their surveys are put, m
+MEASURED = {  # hold-out recordings, and the errors put into their surveys, m
     "util/const1-trial3-tdoa2.csv.gz": 0.1,
     "util/const3-trial2-tdoa2.csv.gz": 0.05,
     "util/const4-trial1-tdoa2-traj2.csv.gz": 0.1,
@@ -36,8 +34,9 @@ def test_deviations_hold_on_simulated_flights():
 
 @pytest.mark.slow
 def test_deviations_hold_on_measured_flights(shared_data):
-    """Those of the fit alone are two to four times too small: what is wrong beside the anchors is
-    wrong all of the flight.
+    """The standard deviations of the fit alone are two to four times too small.
+
+    Other systematic errors last for the whole flight.
     """
     reading, told, fitted = inputs.Reading(str(shared_data / "surveys")), [], []
     for path, std in MEASURED.items():
@@ -55,7 +54,7 @@ def test_what_is_no_anchor_keeps_its_deviation():
 
 
 def test_a_delay_beside_others_that_are_zero_is_stated_as_well_as_it_is_known():
-    """What all delays have in common is not shown, and counts for no deviation of a single one."""
+    """TDOAs do not determine the mean delay. It adds nothing to the deviation of a single delay."""
     errors, stated = [], []
     for seed in (305, 306, 307):
         flight = EFFECTS["anchor_delay"]({"5": 0.1}).inject(clean_flight(seed, 30.0))
@@ -69,8 +68,9 @@ def test_a_delay_beside_others_that_are_zero_is_stated_as_well_as_it_is_known():
 
 
 def test_delays_are_stated_apart_from_what_all_have_in_common():
-    """No TDOA shows what is common to all delays: a fit leaves it at 0, and no deviation of a value
-    holds it.
+    """TDOAs do not determine the mean delay.
+
+    The fit sets it to 0, and no standard deviation includes it.
     """
     delays = 0.05 * np.random.default_rng(5).standard_normal(8)
     flight = EFFECTS["anchor_delay"](dict(zip("01234567", delays.tolist()))).inject(

@@ -63,7 +63,7 @@ def test_streams_that_the_filter_does_not_use_are_left_out_of_everything(flight,
 
 @dataclass(frozen=True)
 class Found:
-    """What `attribute` finds without the effects that are left out."""
+    """The result of `attribute` without the effects that are left out."""
 
     left_out: frozenset
     selection: SimpleNamespace
@@ -80,7 +80,7 @@ class Found:
     ],
 )
 def test_the_search_is_repeated_without_what_misleads_the_filter(errors, without, monkeypatch):
-    """The frame of the ground truth is left out first. What was refused beside is judged anew."""
+    """The frame of the ground truth is left out first. Other refused effects are tried again."""
     module = import_module("uwb_tdoa_tools.diagnosis.diagnose")
     several = iter(errors)
 
@@ -143,7 +143,7 @@ def test_two_processes_give_the_same_to_the_bit():
         effect_of("anchor_delay", True, 4).inject(clean_flight(seed, 18.0))
         for seed in (100, 101, 102)
     ]
-    flights[1] = EFFECTS["pair_offset"]({"0-1": 0.3}).inject(flights[1])  # of one flight alone
+    flights[1] = EFFECTS["pair_offset"]({"0-1": 0.3}).inject(flights[1])  # in one flight only
     told = []
     for jobs in (1, 2):
         over = partial(parallel.over, jobs=jobs, unit=None)
@@ -161,7 +161,10 @@ def test_two_processes_give_the_same_to_the_bit():
 @pytest.mark.slow
 @pytest.mark.parametrize("inertial", [False, True])
 def test_a_late_ground_truth_is_no_fault_of_the_robot(inertial):
-    """It was "87 % gone", and tdoa_time_offset -0.41 s made another flight worse."""
+    """`diagnose` reported "87 % gone".
+
+    Its tdoa_time_offset of -0.41 s made another flight worse.
+    """
     fitted, other = (clean_flight(seed, 40.0) for seed in (100, 101))
     if not inertial:
         fitted, other = fitted.without("imu"), other.without("imu")
@@ -177,7 +180,7 @@ def test_a_late_ground_truth_is_no_fault_of_the_robot(inertial):
 
 @pytest.mark.slow
 def test_without_inertial_sensor_the_clock_of_the_tdoas_is_left_alone():
-    # too little to be seen before anything else
+    # too small for the checks that come first
     late = shifted(clean_flight(100, 40.0).without("imu"), "tdoa", 0.06)
     result = diagnose([late])
     assert "tdoa_time_offset" not in {effect.name for effect in result.effects}

@@ -15,13 +15,13 @@ from uwb_tdoa_tools.diagnosis.references import GroundTruth
 
 
 def temperature(t):
-    """Rises and falls by 4 degrees, unlike anything that the vehicle does."""
+    """Rises and falls by 4 degrees, independent of the motion of the vehicle."""
     return 30.0 + np.interp(t, [0.0, 9.0, 13.0, 28.0, 31.0, 50.0], [0.0, 4.0, 0.5, 3.5, 1.0, 2.0])
 
 
 @pytest.fixture(scope="module")
 def flight():
-    """With a temperature in its log, beside what is no covariate."""
+    """Return a flight with a temperature in its log, and with series that cannot be covariates."""
     flight = clean_flight(103, 40.0)
     t = np.linspace(flight.imu.t[0], flight.imu.t[-1], 200)
     log = {
@@ -62,7 +62,7 @@ def test_a_gyroscope_that_drifts_with_the_temperature_is_told_in_words(flight):
 
 @pytest.mark.slow
 def test_one_anchor_that_changes_with_the_log_is_found(flight):
-    """Whatever its shape is called: at most a tenth of it is left."""
+    """The fitted function may have any shape. At most a tenth of the error may remain."""
     warm = extra_at(flight, flight.tdoa.t)["baro.temperature"]
     late = 0.1 * (warm - 30.0)
     of_anchor = (flight.tdoa.b == 2) | (flight.tdoa.a == 2)
@@ -78,7 +78,7 @@ def test_one_anchor_that_changes_with_the_log_is_found(flight):
 
 
 def test_what_nodes_cannot_take_out_leaves_no_residual_under_a_model_that_has_it(flight):
-    """Else a fit about its own values would count it twice."""
+    """Otherwise a fit about its own values would count the effect twice."""
     gyro = flight.imu.gyro.copy()
     gyro[:, 1] += 0.02 * (extra_at(flight, flight.imu.t)["baro.temperature"] - 30.0)
     warm, reference = replace(flight, imu=replace(flight.imu, gyro=gyro)), GroundTruth()

@@ -13,7 +13,7 @@ from uwb_tdoa_tools.diagnosis.channels import CHANNELS
 from uwb_tdoa_tools.diagnosis.detectors import DETECTORS
 
 FOLDER = Path(diagnosis.__file__).parent
-# where files may know their own subject; the last two are about anchors and TDOAs, and nothing else
+# files that may know their own subject; the last two are about anchors and TDOAs only
 ROOMS = ("channels", "detectors", "deviations.py", "self_calibration")
 DRIVER = [path for path in FOLDER.rglob("*.py") if path.relative_to(FOLDER).parts[0] not in ROOMS]
 CLASSES = {effect.__name__ for effect in EFFECTS.values()}

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The flight that settles what a diagnosis leaves open."""
+"""The flight that resolves the open questions of a diagnosis."""
 
 from argparse import ArgumentParser
 from types import SimpleNamespace
@@ -36,7 +36,7 @@ def of_anchors(anchors):
 
 
 def sides(path):
-    """Speeds, accelerations and turning rates along a TimedPath."""
+    """Return speeds, accelerations and turning rates along a TimedPath."""
     v = np.diff(path.p, axis=0) * RATE
     a = np.diff(v, axis=0) * RATE
     rate = np.diff(path.yaw) * RATE
@@ -69,7 +69,8 @@ def test_motions_stay_clear_of_walls_and_anchors_and_within_limits(lower, size, 
         for path in found.paths:
             assert (path.p >= low - 1e-9).all() and (path.p <= high + 1e-9).all(), path.what
             away = np.linalg.norm(path.p[:, None] - anchors.positions, axis=2)
-            assert away.min() > ANCHOR_CLEARANCE - 2.5 * speed / RATE  # every fifth pose is judged
+            # the planner checks every fifth pose
+            assert away.min() > ANCHOR_CLEARANCE - 2.5 * speed / RATE
             keeps(path, limits)
 
 
@@ -102,7 +103,7 @@ def test_a_path_goes_on_where_the_one_before_ended():
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_the_misfit_is_that_of_least_squares(seed):
-    """Of old and new rows together, beyond the misfit of the old ones."""
+    """The misfit is the increase by the new rows, beyond the misfit of the old rows alone."""
     rng = np.random.default_rng(seed)
     old, new = rng.standard_normal((9, 4)), rng.standard_normal((7, 6))
     places = np.array([0, 2, 3, 5])
@@ -132,7 +133,10 @@ def test_a_probability_rises_with_what_distinguishes_and_not_with_what_does_not(
 
 @pytest.fixture(scope="module")
 def planned():
-    """A flight with a lever arm at one yaw, which looks like a shifted frame; its diagnosis and plan."""
+    """Return a flight with a lever arm at one yaw, its diagnosis and the planned flight.
+
+    At one yaw, a lever arm looks like a shifted frame.
+    """
     first = flown(EFFECTS["tag_lever_arm"]({"x": 0.1}), 5, trajectory="circle", duration=25.0)
     found = attribute([first], GroundTruth(), undeclared=False)
     library = motions(room_of(first.anchors), [first], Limits(time=30.0))
@@ -140,7 +144,7 @@ def planned():
 
 
 def names_left(found):
-    """Names of what was chosen, and of what has nearly the same criterion."""
+    """Return the names of the chosen candidates and of rivals with a similar criterion."""
     near = {
         one.candidate.name for rivals in found.selection.rivals for one in rivals if one.gap < 10.0
     }

@@ -93,7 +93,7 @@ def test_a_function_that_one_flight_alone_can_show_is_not_applied():
 
 @pytest.mark.slow
 def test_what_came_in_one_flight_is_said_of_that_flight_and_not_applied():
-    """A reflector that makes anchor 3 late beyond x = 0.5 m."""
+    """A reflector makes anchor 3 late for x > 0.5 m."""
     step = SmoothTerm(
         {"3.c0": 0.0, "3.c1": 0.5}, {}, "", "tdoa", "x", "anchor", (-2.0, 0.5, 2.0), "step"
     )
@@ -112,7 +112,7 @@ def test_what_flights_show_alike_does_no_harm_and_what_one_of_three_lacks_may():
     assert harm(several(1.0, 1.1, 0.9)) < 0.03
     assert harm(several(1.0, 0.2, 1.0)) > 0.25
     assert harm(several(1.5, 0.0)) > 0.2
-    # of an equal spread, more flights are more certain
+    # with equal spread, more flights reduce the risk
     assert harm(several(*[1.2, 0.8] * 3)) < harm(several(1.2, 0.8))
 
 

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Distances to anchors in the diagnosis: alone, and beside TDOAs."""
+"""Distances to anchors in the diagnosis: alone, and with TDOAs."""
 
 from dataclasses import replace
 
@@ -46,19 +46,19 @@ FLOWN = dict(
 
 @pytest.fixture(scope="module")
 def both():
-    """A flight with TDOAs and ranges, with white noise alone."""
+    """Return a flight with TDOAs and ranges and white noise only."""
     return simulate(SimulationConfig(seed=11, trajectory="sines", **FLOWN))
 
 
 def alone(flight):
-    """The Flight without TDOAs."""
+    """Return the Flight without TDOAs."""
     return replace(
         flight, tdoa=type(flight.tdoa)(*(column[:0] for column in vars(flight.tdoa).values()))
     )
 
 
 def found(flight, kinds=KINDS):
-    """{name: values} of what attribution finds in a Flight."""
+    """Return {name: values} of the effects found in a Flight."""
     effects = attribute([flight], GroundTruth(), kinds=kinds, undeclared=False).effects
     return {effect.name: effect.values for effect in effects}
 
@@ -74,7 +74,7 @@ def found(flight, kinds=KINDS):
     ids=lambda each: getattr(each, "name", None),
 )
 def test_what_is_wrong_with_ranges_is_found(both, effect, taken):
-    """What TDOAs and ranges say of an anchor together is one finding."""
+    """TDOAs and ranges together give one finding for an anchor."""
     values = found(taken(effect.inject(both)))
     assert set(values) == {effect.name}
     for key in {*effect.values, *values[effect.name]}:
@@ -161,7 +161,10 @@ def test_a_function_of_ranges_that_nobody_declared_is_found(both):
 
 
 def test_delays_of_all_anchors_do_not_turn_the_ground_truth(both):
-    """They bend an estimate from ranges by so much that the frame of the truth seems another one."""
+    """The delays bend an estimate from ranges.
+
+    The frame of the ground truth then seems different.
+    """
     delays = EFFECTS["anchor_delay"]({str(i): 0.1 + 0.05 * i for i in range(8)})
     wrong = delays.inject(alone(both))
     flight, said = align_truth(wrong)

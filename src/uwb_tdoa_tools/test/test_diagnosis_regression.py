@@ -34,7 +34,7 @@ PAIRS = np.array([[k, (k + 1) % 8] for k in range(8)])
 def table_with(
     *flights, names=("anchor_delay", "pair_offset", "anchor_position", "gyro_bias", "accel_bias")
 ):
-    """(Table, [Candidate]) of flights with the columns of some effects."""
+    """Return (Table, [Candidate]) of flights with the columns of some effects."""
     parts = [residuals(flight, GroundTruth(), EffectSet()) for flight in flights]
     candidates = [
         c for name in names for c in candidates_of(EFFECTS[name](), flights[0].anchors, PAIRS)
@@ -202,7 +202,7 @@ def test_an_alternative_is_named_where_the_flight_cannot_tell(late):
         alternative.effect
         for alternative in alternatives(selection, selection.chosen[0], candidates)
     }
-    assert "pair_offset" in names  # TDoA2: a delay of an anchor is two offsets of pairs
+    assert "pair_offset" in names  # TDoA2: a delay of an anchor equals two pair offsets
     assert "gyro_bias" not in names
 
 
@@ -212,7 +212,7 @@ def test_what_no_tdoa_can_tell_is_named(late):
     hidden = unobservable(selection, candidates)
     assert any(
         item.effect == "anchor_delay" and len(item.direction) == 8 for item in hidden
-    )  # the sum of all
+    )  # the common delay of all anchors
     assert any(
         item.effect == "range_scale" and item.direction is None for item in hidden
     )  # has no column here
@@ -224,7 +224,7 @@ def test_a_flight_that_tells_is_the_same_both_ways():
 
 
 def test_alternatives_that_explain_as_much_have_the_order_of_their_names(monkeypatch):
-    """And not that of a set, which differs from process to process."""
+    """The order of a set would differ from process to process."""
     names = ["pair_offset", "anchor_delay", "range_bias", "nlos", "range_scale"]
     monkeypatch.setattr(confounding, "_shares", lambda *_: dict.fromkeys(names, 0.95))
     chosen = Candidate((Term(EFFECTS["anchor_position"](), ()),))

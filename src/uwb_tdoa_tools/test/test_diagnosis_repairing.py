@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Ids and signs before physics."""
+"""Errors in ids and signs are searched before physical effects."""
 
 from known_effects import clean_flight, effect_of
 import pytest
@@ -78,7 +78,8 @@ def test_diagnose_offers_it_beside_physics_and_judges_both():
     }
     worth = next(finding.worth for finding in result.findings if finding.effect.name == IDS.name)
     before, after = (figures["pooled"]["rmse_3d"] for figures in (result.before, result.after))
-    assert worth > 2.0 * after and after < 0.3 * before  # without it three times the error is left
+    # without the repair, the error is three times as large
+    assert worth > 2.0 * after and after < 0.3 * before
     assert "anchor_ids" in output.as_text(result) and "ids_exchanged" in str(
         output.as_json(result)["numbers"]
     )

@@ -36,8 +36,9 @@ AS_WELL = Alternative("anchor_position", 1.0, 2.0, "a flight on several sides")
 
 @pytest.fixture(scope="module")
 def result():
-    """Diagnosis of a short flight with a late anchor and an anchor that stands elsewhere, judged on
-    another one.
+    """Return the Diagnosis of a short flight with a late and a displaced anchor.
+
+    It is validated on a hold-out flight.
     """
     effects = (
         EFFECTS["anchor_delay"]({"3": 0.3}),
@@ -150,7 +151,10 @@ def test_a_phase_that_becomes_worse_is_in_the_verdict_with_the_flights_by_name(r
 
 
 def test_the_verdict_says_why_in_words_of_the_field(result):
-    """How much, then why, for a function without a name with its largest part and its causes."""
+    """The verdict first gives the improvement, then the causes.
+
+    For a function without a name, it gives the largest part and the causes.
+    """
     functions = [
         SmoothTerm(
             {
@@ -406,7 +410,7 @@ def test_values_are_shown_as_far_as_they_are_significant(result, name, values, s
 
 
 # ----------------------------------------------------------------------------------------------------
-# what is unclear
+# unclear causes
 
 
 def test_what_could_not_be_told_comes_with_what_would_tell(result):
@@ -434,7 +438,7 @@ def test_what_could_not_be_told_comes_with_what_would_tell(result):
 
 
 def test_what_the_flights_have_is_not_asked_for(result):
-    """Of flights with attitudes, but with neither IMU nor wheels."""
+    """The flights have attitudes, but neither an IMU nor wheels."""
     assert all(np.isfinite(flight.truth.q).all() for flight in result.flights)
     items = [Unobservable("gyro_bias", None), Unobservable("velocity_scale", None)]
     flights = tuple(flight.without("imu") for flight in result.flights)
@@ -449,11 +453,11 @@ def test_without_truth_ground_truth_would_tell(without_truth):
     assert "ground truth" in remedies["truth_frame"]
     assert (
         remedies["accel_bias"] == "ground truth of position and attitude"
-    )  # there is an accelerometer
+    )  # the flight has an accelerometer
 
 
-# ------------------------------------------------------------------------------------------- the
-# same in all outputs
+# ------------------------------------------------------------------------------------------
+# the same in all outputs
 
 
 def test_the_numbers_of_findings_are_those_of_effects_yaml(result, page, tmp_path):
@@ -683,7 +687,10 @@ def test_shifts_of_anchors_add_up_over_effects(result):
 
 
 def score(error):
-    """Judged by `errors`, (n, 3) m, while it flies from one cell into the next, ten samples each."""
+    """Return the Score of a flight from one cell into the next, ten samples each.
+
+    errors : (n, 3) m.
+    """
     places = np.where(np.arange(20)[:, None] < 10, [0.5, 0.5, 1.5], [1.5, 0.5, 1.5])
     return SimpleNamespace(t=5.0 + np.arange(20) * 0.1, first=5.0, p=places, error=np.array(error))
 

@@ -1,8 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What `diagnose` finds on a vehicle that never leaves the floor, whose truth is known; and values
-that are those of the written model.
-"""
+"""Findings of `diagnose` on a vehicle that stays on the floor. They equal the simulated values."""
 
 import numpy as np
 import pytest
@@ -20,7 +18,7 @@ from uwb_tdoa_tools.simulation import ImuErrors, SimulationConfig, simulate
 SCALE = 0.02
 NO_TDOAS = Tdoas(*(np.empty(0, kind) for kind in (float, int, int, float)))
 ERRORS = ImuErrors(gyro_bias=0.01)
-WALK = 2e-3  # m/s^2, of the bias of the accelerometer in 90 s
+WALK = 2e-3  # m/s^2, random walk of the accelerometer bias in 90 s
 
 
 def rover(seed, **changes):
@@ -29,7 +27,7 @@ def rover(seed, **changes):
 
 
 def traced(flight, *streams):
-    """Attribution of some streams of a flight alone."""
+    """Return the Attribution of a flight that keeps only some streams."""
     others = {"tdoa": NO_TDOAS, "imu": None, "velocity": None}
     kept = flight.replaced(
         **{name: nothing for name, nothing in others.items() if name not in streams}
@@ -62,7 +60,7 @@ def test_biases_of_a_gyroscope_that_turns_about_one_axis_have_their_signs(seed):
         true = np.mean(state[f"gyro_bias_{axis}"])
         assert abs(found.values[axis] - true) < 3.0 * np.hypot(found.std[axis], 2e-5), (
             axis
-        )  # and it walks
+        )  # plus the random walk
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -70,7 +68,10 @@ def test_biases_of_a_gyroscope_that_turns_about_one_axis_have_their_signs(seed):
     "bias", [{"z": 0.1}, {"x": -0.1, "z": -0.1}, {"x": 0.025, "y": -0.02, "z": -0.062}]
 )
 def test_an_accelerometer_on_a_level_floor_has_a_bias_and_what_it_could_be_is_listed(bias, seed):
-    """There its z reads the same all the time: a bias, a scale and gravity cannot be told apart."""
+    """On a level floor, z of the accelerometer is constant.
+
+    Bias, scale and gravity are then indistinguishable.
+    """
     still = rover(seed, imu_errors=ImuErrors(accel_bias=0.0))
     made = traced(EFFECTS["accel_bias"](bias).inject(still), "imu")
     findings = [one for one in made.findings() if one.channel == "accel"]
@@ -87,7 +88,7 @@ def test_a_rate_that_is_noise_explains_nothing():
     turning = np.column_stack([np.zeros(300), 0.3 * np.sin(np.linspace(0.0, 20.0, 300))])
     measured = turning + 0.01 + 1e-3 * rng.standard_normal(turning.shape)
     assert _turns(measured, turning).tolist() == [False, True]
-    # the ground truth is worse than the sensor
+    # the ground truth is noisier than the sensor
     noisy = turning + 0.02 * rng.standard_normal(turning.shape)
     assert _turns(measured, noisy).tolist() == [False, True]
 

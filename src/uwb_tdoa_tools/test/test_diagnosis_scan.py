@@ -25,7 +25,7 @@ def flight():
 
 
 def scanned(flight):
-    """(Table, Fit of nothing, Scan) of a flight."""
+    """Return (Table, Fit of the empty model, Scan) of a flight."""
     found = [residuals(flight, TRUTH, EffectSet())]
     table = table_of(found)
     views = {
@@ -43,7 +43,7 @@ def put_in(form, key, covariate, knots, shape, size):
 
 
 def product(key, first, second, size):
-    """A product of two intervals or steps, each (covariate, knots)."""
+    """Return a product of two intervals or steps, each (covariate, knots)."""
     (covariate, knots), (factor, factor_knots) = first, second
     shapes = {3: "step", 4: "interval"}
     return SmoothTerm(
@@ -81,14 +81,14 @@ def test_a_product_of_two_covariates_or_what_recurs_is_proposed_first(flight, te
     if term.periodic:
         period, found = (knots[-1] - knots[0] for knots in (term.knots, first.term.knots))
         assert found == pytest.approx(period, rel=0.01)
-    else:  # two explanations of the same rows differ in their knots
+    else:  # two explanations of the same rows may have different knots
         inner = zip(term.knots[1:-1], first.term.knots[1:-1])
         alike = first.term.arguments == term.arguments and len(first.term.knots) == len(term.knots)
         assert all(abs(one - other) < 0.15 for one, other in inner if alike)
 
 
 def test_what_changes_fast_is_no_noise_of_its_series(flight):
-    """A wave of 4 s moves the TDOAs by more than their noise between two rows."""
+    """A wave with a period of 4 s moves the TDOAs between two rows by more than their noise."""
     wave = put_in("anchor", "3", "time", (0.0, 4.0), "wave", 0.4)
     (table, _, scan), (_, _, plain) = scanned(wave.inject(flight)), scanned(flight)
     rows = table.rows_of("tdoa")
@@ -117,7 +117,10 @@ def test_of_thousands_the_right_function_is_proposed_first(flight, term):
 
 
 def test_the_gain_is_that_of_normal_equations_with_the_same_weights(flight):
-    """The closed form of thousands against one, on top of another effect."""
+    """The closed form for thousands of functions agrees with one fit.
+
+    The model already holds another effect.
+    """
     effect = effect_of("anchor_delay", True, 1)
     table, _, scan = scanned(TERMS[2].inject(effect.inject(flight)))
     chosen = (Candidate((Term(effect, tuple(effect.values)),)),)
@@ -137,7 +140,7 @@ def test_the_gain_is_that_of_normal_equations_with_the_same_weights(flight):
         vector = x[:, :k].T @ (information * table.y)
         return vector @ np.linalg.solve(gram, vector)
 
-    # that of the mean of a cell is not quite the mean of the cell
+    # the function of a mean differs slightly from the mean of the function in a cell
     assert gain == pytest.approx(explained(len(columns)) - explained(1), rel=0.05)
 
 

@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""One calibration of anchors from flights alone, whoever asks for it: when it may be used, and what
-`diagnose` makes of it.
+"""The calibration of anchors from flights alone, which all tools share.
+
+The tests cover the conditions of its use, and `diagnose`.
 """
 
 from dataclasses import replace
@@ -35,13 +36,13 @@ def flight_with(*effects, seed=100, seconds=40.0):
 
 @pytest.fixture(scope="module")
 def flights():
-    """Two that are late."""
+    """Return two flights with late anchors."""
     return [flight_with(LATE, seed=seed) for seed in (100, 101)]
 
 
 @pytest.fixture(scope="module")
 def late(flights):
-    """Of two flights."""
+    """Return the self-calibration of the two flights."""
     return self_calibrate(flights)
 
 
@@ -59,7 +60,7 @@ def test_delays_of_several_anchors_are_told_well_enough_from_the_innovations_alo
     moved = evaluate(replace(other, anchors=late.anchors), effects=late.effects)[0].row()["rmse_3d"]
     assert errors[1] < 0.4 * errors[0] and moved == pytest.approx(
         errors[1], rel=0.02
-    )  # shifts in effects.yaml, or in the anchors
+    )  # shifts in effects.yaml give the same result as shifts in the anchors
 
 
 @pytest.mark.slow
@@ -107,7 +108,7 @@ def test_a_delay_of_one_flight_is_no_delay_of_the_other():
 
 
 def why_not_of(flight):
-    """What `diagnose` says of a self-calibration of a flight, where it does not apply it."""
+    """Return the reason why `diagnose` does not apply the self-calibration of a flight."""
     reference = Nothing()
     return _calibrated(
         _Work(reference, EffectSet(), None, lambda what: None, map),
@@ -134,7 +135,10 @@ def test_nothing_is_applied_if_something_else_is_wrong_too():
 
 @pytest.mark.parametrize("ratio, applied", [(0.95, False), (1.05, True)])
 def test_slow_errors_of_ranges_ask_for_a_smaller_fall(late, ratio, applied):
-    """Whatever remains: more than of TDOAs may, or so little that TDOAs would be taken."""
+    """The rule for ranges does not depend on the size of the remaining errors.
+
+    For TDOAs, this size decides.
+    """
     for left in (0.5 * LEFT, 2.0 * LEFT):
         before = ratio * CLEARLY_OF_RANGES * left
         found = replace(late, before=before, left=left, marks=None)
@@ -147,9 +151,9 @@ def test_slow_errors_of_ranges_ask_for_a_smaller_fall(late, ratio, applied):
     [
         (0.1, 0.9 * LEFT, None, True),
         (0.1, 1.1 * LEFT, None, False),
-        # the tape was worse than what else is wrong
+        # the tape error was larger than the remaining errors
         (1.2 * CLEARLY * LEFT, 1.1 * LEFT, None, True),
-        (0.1, 1.1 * LEFT, (0.2, 0.1, 0.8), True),  # marks know better
+        (0.1, 1.1 * LEFT, (0.2, 0.1, 0.8), True),  # the marks decide
         (0.1, 0.9 * LEFT, (0.2, 0.1, 0.7), False),
         (0.1, 0.9 * LEFT, (0.1, 0.2, 0.8), False),
     ],

@@ -65,7 +65,7 @@ def test_every_flight_is_judged_with_effects_that_it_took_no_part_in(flights, at
 
 
 def test_a_model_that_no_trial_changes_is_not_run_again(flights, attribution, monkeypatch):
-    """The runs of the trials, as in the nodes, are those that judge the written model."""
+    """The runs of the trials also validate the written model."""
     kept = select_by_error(attribution, flights, Baseline(NONE))
     model = kept.applied(attribution)
     assert model.selection.chosen == attribution.selection.chosen
@@ -78,7 +78,7 @@ def test_a_model_that_no_trial_changes_is_not_run_again(flights, attribution, mo
 
 
 def test_a_displacement_is_used_again_where_corrections_have_not_changed(monkeypatch):
-    """Dropping an accelerometer bias leaves the correction by an anchor's delay as it was."""
+    """Without an accelerometer bias, the correction by the delay of an anchor stays the same."""
     flights = [
         effect_of("accel_bias", True, 1).inject(AnchorDelay({"2": 0.3}).inject(flight))
         for flight in (clean_flight(100, 30.0), clean_flight(101, 30.0))
@@ -183,7 +183,7 @@ def test_what_is_worth_little_is_kept_of_several_flights_and_not_of_one(flights)
     assert sorted(candidate.name for candidate in alone.worth) == ["anchor_delay", "gyro_bias"]
     assert np.array_equal(
         alone.selection.fit.weight, found[1].selection.fit.weight
-    )  # it is applied as it was tried
+    )  # it is applied as tried
 
 
 def test_what_no_node_can_take_out_is_not_tried():
@@ -209,7 +209,7 @@ def test_noise_that_the_filter_should_know_of_is_kept_and_noise_that_it_should_n
     rng = np.random.default_rng(0)
     noisy = [
         EFFECTS["noise_level"]({"0-1": 0.3, "1-2": 0.3}).inject(flight, rng) for flight in flights
-    ]  # no gate rejects that
+    ]  # the gate does not reject these errors
     kept, noise = judged(0.3)
     assert kept.detections == (noise,) and kept.worth[noise] > 0.0
     noisy = flights
@@ -292,7 +292,7 @@ def test_a_gain_that_a_shift_of_the_reference_can_feign_is_none():
     assert sure[0] > 0.5 and unsure[0] < 0.0 < unsure[1]
     sides = [{"pooled": {"rmse_3d": 0.15}}, {"pooled": {"rmse_3d": 0.04, "rmse_3d_gain_ci": sure}}]
     assert why_not(*sides, 0.0) is None and why_not(*sides, 0.1) is None
-    # above zero by 2.3 standard deviations alone
+    # above zero by 2.3 standard deviations only
     sides[1]["pooled"]["rmse_3d_gain_ci"] = [0.02, 0.28]
     assert "may be 10 cm from where" in why_not(*sides, 0.1)
     sides[1]["pooled"]["rmse_3d_gain_ci"] = unsure
@@ -315,7 +315,10 @@ def test_noise_is_described_alike_in_both_directions(after, interval, sentence):
 
 
 def displacements(**moved):
-    """Of one case with an error of 1 m along x: metres by which the error along x grows."""
+    """Return the Displacements of one case with an error of 1 m along x.
+
+    moved : growth of the error along x without each effect, m
+    """
     error = np.tile([1.0, 0.0, 0.0], (4, 1))
     changes = {name: [np.tile([by, 0.0, 0.0], (4, 1))] for name, by in moved.items()}
     return Displacements([error], changes)
@@ -329,7 +332,7 @@ def displacements(**moved):
         ({"a": 0.0}, False, "a"),
         ({"a": -0.3, "b": 0.2}, False, "a"),
         ({"a": 0.04, "b": 0.06}, True, "a"),
-        # either may go, but not both: each does the work of the other
+        # one may be dropped, but not both: each replaces the other
         ({"a": 0.0003, "b": 0.0003}, False, "a"),
         ({"a": -0.1, "b": -0.1}, False, "ab"),
     ],
@@ -346,7 +349,7 @@ def test_what_makes_the_error_larger_or_is_worth_nothing_is_dropped(moved, alone
     "changes, worst", [((0.5, -0.04), "a"), ((0.5, -0.02), None), ((-0.1, 0.5), "a")]
 )
 def test_what_makes_one_flight_worse_is_not_applied(changes, worst):
-    """changes : of the errors of 1 m of two flights without "a", m."""
+    """changes : change of the error of 1 m without "a", in each of two flights, m."""
     along = [np.tile([by, 0.0, 0.0], (4, 1)) for by in (1.0, *changes)]
     of_both = Displacements([along[0], along[0]], {"a": along[1:], "b": [along[0], along[0]]})
     found = _worse_in_one(of_both, ["a", "b"])
@@ -356,14 +359,14 @@ def test_what_makes_one_flight_worse_is_not_applied(changes, worst):
 
 
 class Some(str):
-    """The label of a candidate that nodes can take out."""
+    """The label of a candidate that the nodes can correct."""
 
     label = property(str)
     terms = (SimpleNamespace(effect=SimpleNamespace(usable=True), function=None),)
 
 
 class Worth:
-    """Trials of effects with a known worth; without both "a" and "b" the error is 0.5 m larger."""
+    """Trials of effects with known worth. Without both "a" and "b", the error is 0.5 m larger."""
 
     runs = ()
 
@@ -382,7 +385,7 @@ class Worth:
 
 
 def selected(monkeypatch, worth, shares=((1.0, 1.0),)):
-    """The ValidatedSelection of effects by their worth; shares : of each in two flights."""
+    """Return the ValidatedSelection of effects by their worth. shares : of each in two flights."""
     trials = Worth(worth)
     of_each = dict(zip(worth, [*shares, *[(1.0, 1.0)] * len(worth)]))
     monkeypatch.setattr(validation, "_Trials", lambda *_: trials)
@@ -397,7 +400,7 @@ def selected(monkeypatch, worth, shares=((1.0, 1.0),)):
 
 
 def test_fewer_are_dropped_where_displacements_do_not_add_up(monkeypatch):
-    """Without both, the error is larger than displacements predict; without either it is not."""
+    """Without both, the error is larger than the displacements predict. Without one, it is not."""
     found = selected(monkeypatch, {"a": -0.1, "b": -0.05, "c": 0.2})
     assert found.selection == ("b", "c")
     assert found.worth == {

@@ -1,9 +1,9 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The distribution `uwb-tdoa`: a wheel in an environment with what it needs alone, without ROS.
+"""The distribution `uwb-tdoa`: a wheel in an environment with its requirements only, without ROS.
 
-The environments lie in build/distribution. One stays until the wheel needs something else, or the
-pins or Python change; of the wheel itself, each run installs the present one.
+The environments lie in build/distribution. Each is reused until the requirements of the wheel, the
+pins or Python change. Each run installs the current wheel.
 """
 
 from functools import cache
@@ -33,12 +33,15 @@ NO_INDEX = r"NewConnectionError|NameResolution|Timeout|ProxyError|from versions:
 
 
 def kept(*beginnings):
-    """The variables of this process with such names. BLAS chooses its kernels by some of them."""
+    """Return the environment variables whose names have such prefixes.
+
+    Some variables select the kernels of BLAS.
+    """
     return {name: value for name, value in os.environ.items() if name.startswith(beginnings)}
 
 
 def run(*words, folder=None, code=0, **variables):
-    """Run a program as a user without ROS does, and return what it printed."""
+    """Run a program like a user without ROS, and return its output."""
     plain = {name: os.environ[name] for name in ("HOME", "TMPDIR") if name in os.environ}
     plain |= kept("PIP_", "OPENBLAS_")
     done = subprocess.run(
@@ -55,7 +58,10 @@ def run(*words, folder=None, code=0, **variables):
 
 
 def python_of(number):
-    """A Python of that version that can make an environment; skips the test where there is none."""
+    """Return a Python of this version that can make an environment.
+
+    Skip the test if there is none.
+    """
     pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
     found = [sys.base_prefix + f"/bin/python{number}", shutil.which(f"python{number}")]
     found += sorted(pyenv.glob(f"{number}*/bin/python"))
@@ -79,13 +85,16 @@ def wheel(tmp_path_factory):
 
 @cache
 def installed(wheel, number):
-    """The folder of the programs of an environment with the wheel, and what it needs by our pins."""
+    """Return the folder with the programs of an environment.
+
+    It has the wheel and its requirements, with our pins.
+    """
     place, python = ROOT / "build" / "distribution" / number, python_of(number)
     pins = wheel.with_name("pins.txt")
     lines = (ROOT / "requirements.txt").read_text().splitlines()
     pins.write_text("\n".join(line for line in lines if re.match(r"[\w.-]+==", line)))
     pip = (sys.executable, "-m", "pip", "--python", place / "bin" / "python", "install")
-    # modules that no command imports need no bytecode
+    # bytecode of unused modules is not needed
     pip += ("--no-compile", "--only-binary", ":all:", "-c", pins)
     needed, made_for = needs(wheel, pins, python), place / "needs.txt"
     if not made_for.exists() or made_for.read_text() != needed:
@@ -99,7 +108,7 @@ def installed(wheel, number):
 
 
 def needs(wheel, pins, python):
-    """A digest of all that decides what is in an environment besides the wheel."""
+    """Return a digest of everything that determines an environment, except the wheel."""
     with zipfile.ZipFile(wheel) as held:
         (name,) = (each for each in held.namelist() if each.endswith(".dist-info/METADATA"))
         lines = held.read(name).splitlines()
@@ -110,7 +119,7 @@ def needs(wheel, pins, python):
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
-    """A bag with our message types, and its anchors."""
+    """Return a folder with a bag that has our message types, and its anchors."""
     folder = tmp_path_factory.mktemp("recording")
     settings = {"duration": 16.0, "imu_rate": 100.0, "start_in_air": True, "seed": 4}
     flight = simulate(SimulationConfig(truth_rate=50.0, **settings))
@@ -135,7 +144,7 @@ def test_the_wheel_holds_the_packages_and_our_messages(wheel):
         assert {f"{package}/{name}" for name in files} <= set(names)
 
 
-# A line for each command that ends well with its help.
+# Prints a line for each command that ends successfully with its help.
 HELP_OF_ALL = """
 from contextlib import redirect_stdout
 import io
@@ -156,7 +165,7 @@ for name in main.NAMES:
 def test_every_command_starts_in_an_empty_environment(wheel, recording, tmp_path, number):
     programs = installed(wheel, number)
     ours = {path.name for path in programs.iterdir()}
-    assert COMMAND in ours and not ours & set(main.NAMES)  # `convert` is ImageMagick's
+    assert COMMAND in ours and not ours & set(main.NAMES)  # `convert` is a program of ImageMagick
     tool = programs / COMMAND
     assert run(tool, "--version") == f"uwb-tdoa of uwb_tdoa {version()}\n"
     assert run(tool, "check", "--help").startswith("usage: uwb-tdoa check ")
@@ -168,20 +177,23 @@ def test_every_command_starts_in_an_empty_environment(wheel, recording, tmp_path
     assert told.split() == ["True", version()]
 
 
-# what each command gets, and the files that it writes
+# arguments of each command, with the files that it writes; exit code
 WORK = {
     "check": (["flight.bag", "--json", "OUT/check.json"], 0),
     "evaluate": (["flight.bag", "--json", "OUT/evaluate.json", "--tum", "OUT/tum"], 0),
     "localize": (["flight.bag", "--smooth", "--out", "OUT/localized"], None),
     "diagnose": (["flight.bag", "--most", "4000", "--out", "OUT/diagnosis"], 0),
-    "survey": (["flight.bag", "--out", "OUT/surveyed"], 2),  # it refuses a flight as short as this
+    "survey": (["flight.bag", "--out", "OUT/surveyed"], 2),  # it refuses such a short flight
     "plan": (["anchors.yaml", "--step", "1", "--out", "OUT/plan"], 0),
 }
 FIGURES = ".json", ".csv", ".tum", ".yaml", ".html"
 
 
 def figures(folder):
-    """{path of a file of figures: content} below a folder. The folder has no part in them."""
+    """Return {path: content} of all files with figures below a folder.
+
+    The path of the folder is replaced.
+    """
     return {
         path.relative_to(folder): path.read_bytes().replace(str(folder).encode(), b"OUT")
         for path in sorted(folder.rglob("*"))
@@ -212,7 +224,7 @@ def test_figures_are_those_with_ros_bit_by_bit(wheel, recording, tmp_path):
                     [*start, *line], cwd=recording, env=variables, capture_output=True, text=True
                 )
             assert done.returncode in ((0, 1) if code is None else (code,)), done.stderr
-            # lines are broken by the length of the folder
+            # line breaks depend on the length of the folder
             printed = " ".join(done.stdout.replace(str(out), "OUT").split())
             results.append((done.returncode, printed))
             errors.append(done.stderr)

@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What holds for every page of the documentation: links lead somewhere, a page stays short, and the
-reference has every topic.
+"""Rules for every page of the documentation.
+
+Links lead somewhere, pages stay short, and the reference lists every topic.
 """
 
 import ast
@@ -15,8 +16,8 @@ from uwb_tdoa_bias.common.sensors import SENSORS
 ROOT = Path(__file__).resolve().parents[3]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
 LINK = re.compile(r"\]\(([^)\s]+)\)|(?:src|href)=\"([^\"]+)\"")
-LONGEST = 150  # lines of a page that people read from top to bottom
-# Lines of pages that are longer. They may only become shorter.
+LONGEST = 150  # lines of a page for continuous reading
+# Lines of longer pages. They may only become shorter.
 LONGER = {
     "architecture.md": 386,
     "effects.md": 488,
@@ -29,23 +30,23 @@ TOPIC = re.compile(r"/?(uwb|imu|odometry|plan|ground_truth|velocity)/[a-z_]+(/[a
 
 
 def slug(heading):
-    """The anchor of a heading, as GitHub makes it."""
+    """Return the anchor of a heading, as GitHub makes it."""
     text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading.replace("`", "")).strip().lower()
     return re.sub(r"[^\w\- ]", "", text).replace(" ", "-")
 
 
 def prose(page):
-    """The text of a page without its blocks of code."""
+    """Return the text of a page without its code blocks."""
     return re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
 
 
 def anchors(page):
-    """The anchors of a page."""
+    """Return the anchors of a page."""
     return {slug(heading) for heading in re.findall(r"^#+ (.*)$", prose(page), re.MULTILINE)}
 
 
 def broken(page):
-    """The links of a page that lead nowhere."""
+    """Return the links of a page that lead nowhere."""
     for link in (one or other for one, other in LINK.findall(prose(page))):
         if re.match(r"[a-z]+:", link):
             continue
@@ -71,7 +72,7 @@ def test_a_page_to_read_is_short_and_a_long_one_becomes_no_longer():
     "folder, index", [("docs", "README.md"), ("docs/notebook", "docs/notebook/README.md")]
 )
 def test_the_list_of_pages_has_every_page(folder, index):
-    """It is also the navigation of the site."""
+    """The list is also the navigation of the site."""
     start = (ROOT / index).parent
     linked = {
         (start / link.partition("#")[0]).resolve() for link, _ in LINK.findall(prose(ROOT / index))
@@ -86,7 +87,10 @@ def test_a_link_that_leads_nowhere_is_found(tmp_path):
 
 
 def topics():
-    """The topics and services of the packages: those that a node makes, and texts that look like one."""
+    """Return the topics and services of the packages.
+
+    They come from calls in nodes, and from texts that look like a topic.
+    """
     found = {topic for sensor in SENSORS.values() for topic, _ in sensor.topics}
     for path in ROOT.glob("src/uwb_tdoa_*/uwb_tdoa_*/**/*.py"):
         for node in ast.walk(ast.parse(path.read_text())):

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Where a machine has less than ours: no POSIX-only modules, and a home that nobody can write to.
+"""Less capable machines: no POSIX-only modules, and a home directory that is read-only.
 
 An ASCII locale, and names with spaces and umlauts: test_writers.py. Another user: test_dev.py.
 """
@@ -15,7 +15,7 @@ from test_layout import ROS, modules
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
-# What Windows lacks of what we use, or macOS: hidden before anything is imported.
+# Modules that are missing on Windows or macOS. They are hidden before any import.
 HIDE = """
 import os, signal, sys
 for name in "fcntl grp pwd pty resource syslog termios tty".split():
@@ -25,7 +25,7 @@ for name in "O_DIRECTORY O_NOFOLLOW O_PATH fchdir getuid killpg sched_getaffinit
 for name in "ITIMER_REAL SIGALRM SIGKILL setitimer".split():
     vars(signal).pop(name, None)
 """
-NOWHERE = "/proc/nowhere"  # which root cannot write to either
+NOWHERE = "/proc/nowhere"  # even root cannot write there
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +86,10 @@ def test_a_network_is_refused_where_its_trial_has_no_limits(tmp_path):
 
 @pytest.mark.slow
 def test_a_command_needs_no_home_to_write_to(bag, tmp_path):
-    """What numba compiles is kept elsewhere here: without that it takes minutes, and is said."""
+    """The cache of numba lies elsewhere here.
+
+    Without it, compilation takes minutes and prints a message.
+    """
     kept = os.environ.get("NUMBA_CACHE_DIR") or os.path.expanduser("~/.cache/uwb_tdoa")
     homeless = {"HOME": NOWHERE, "XDG_CACHE_HOME": NOWHERE, "NUMBA_CACHE_DIR": kept}
     done = run(

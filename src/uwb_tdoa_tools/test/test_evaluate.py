@@ -59,8 +59,10 @@ def odometry(flight):
 
 
 def write_odometry(path, odometry, space="", verdicts=()):
-    """A bag with a nav_msgs/Odometry for each estimate on /odometry; space: before the topics;
-    verdicts: one uwb/residual for each.
+    """Write a bag with a nav_msgs/Odometry for each estimate on /odometry.
+
+    space : namespace of the topics
+    verdicts : one uwb/residual for each
     """
     store, residual = typestore(), "uwb_tdoa_msgs/msg/TdoaResidual"
     with new_bag(path) as writer:
@@ -77,7 +79,7 @@ def write_odometry(path, odometry, space="", verdicts=()):
 
 
 def report(arguments, tmp_path):
-    """What `evaluate --json` writes."""
+    """Return the content that `evaluate --json` writes."""
     file = tmp_path / "report.json"
     assert main([*map(str, arguments), "--json", str(file)]) == 0
     return json.loads(file.read_text())
@@ -219,7 +221,7 @@ def test_an_interrupted_run_over_many_goes_on_where_it_was(tmp_path, capsys):
     whole = report([*bags, "--no-bias", *alone], tmp_path)
     assert main([*map(str, bags[:2]), "--no-bias", "--resume", str(kept), *alone]) == 0
     first = kept.read_bytes()
-    kept.write_bytes(first[:-20])  # the second was being written
+    kept.write_bytes(first[:-20])  # the second entry was being written
     capsys.readouterr()
     assert report([*bags, "--no-bias", "--resume", kept, *alone], tmp_path) == whole
     assert "holds 1 of 3 flights; going on with the others" in capsys.readouterr().err
@@ -284,7 +286,7 @@ def test_picture_and_trajectories(flight, bag, tmp_path):
 
 
 def test_a_run_that_never_starts_has_a_picture_and_a_report_in_strict_json(flight, tmp_path):
-    """RFC 8259 has no NaN and no Infinity, which such a run could bring in."""
+    """RFC 8259 has no NaN and no Infinity. Such a run could contain them."""
     few = {name: getattr(flight.tdoa, name)[:5] for name in "tabd"}
     write_bag(replace(flight, tdoa=replace(flight.tdoa, **few)), tmp_path / "few")
     picture, file = tmp_path / "error.png", tmp_path / "report.json"

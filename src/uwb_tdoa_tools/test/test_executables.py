@@ -1,8 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Every executable: its help, its examples, the commands that the documentation shows, and Ctrl-C
-while it starts.
-"""
+"""Every executable: help, examples, documented commands, and Ctrl-C during the start."""
 
 import argparse
 from importlib import import_module
@@ -38,7 +36,7 @@ NODES = {
     "localization_node": "uwb_tdoa_ekf.localization_node",
     "vehicle_node": "uwb_tdoa_tools.vehicle_node",
 }
-MEMBERS = {"localization_node": ("bias_node", "ekf_node")}  # whose parameters it takes, too
+MEMBERS = {"localization_node": ("bias_node", "ekf_node")}  # it also takes their parameters
 COMMANDS = {"compile_nodes": "uwb_tdoa_ekf.compile_nodes"} | {
     path.stem: f"uwb_tdoa_tools.commands.{path.stem}"
     for path in sorted((ROOT / "src/uwb_tdoa_tools/uwb_tdoa_tools/commands").glob("[a-z]*.py"))
@@ -48,21 +46,19 @@ TOOLS = [name for name, module in COMMANDS.items() if module.startswith("uwb_tdo
 
 
 def parser_of(name):
-    if name == "ros2":  # of ./dev, which shows what ROS 2 shows
+    if name == "ros2":  # of ./dev, with the same output as ROS 2
         return runpy.run_path(str(ROOT / ".dev" / "ros2.py"))["parser"]()
     return import_module(COMMANDS[name]).parser()
 
 
 def subcommands(parser):
-    """{name: parser} of a parser's own commands."""
+    """Return {name: parser} of the subcommands of a parser."""
     found = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
     return found[0].choices if found else {}
 
 
 def parses(name, words):
-    """Whether the words are a command line of an executable, to its own parser; prints what is
-    wrong.
-    """
+    """Return whether the parser of an executable accepts the words. Print the error if not."""
     try:
         parser_of(name).parse_args(cli.without_ros_arguments(words))
     except SystemExit as stop:
@@ -110,7 +106,10 @@ def test_every_example_is_a_command_line(name):
 
 
 def parameters(name):
-    """Names of a node's parameters, which its parameter file lists (see the tests of the nodes)."""
+    """Return the parameter names of a node, from its parameter file.
+
+    The tests of the nodes check this file.
+    """
     package = NODES[name].partition(".")[0]
     (content,) = yaml.safe_load(
         (ROOT / "src" / package / "config" / f"{name}.yaml").read_text()
@@ -120,7 +119,7 @@ def parameters(name):
 
 @pytest.fixture(scope="module")
 def documented(tmp_path_factory):
-    """[(page, executable, its words)] of all commands in the documentation, ours alone."""
+    """Return [(page, executable, arguments)] of our commands in the documentation."""
     found = []
     for page in PAGES:
         for where, (first, *words) in commands(page, EVERY, tmp_path_factory.mktemp(page.stem)):
@@ -169,7 +168,7 @@ def test_every_documented_command_is_a_command_line(documented):
                 and given
                 and set(given) <= parameters(name) | {"use_sim_time"}
             ), (where, name, words)
-        elif words:  # without any, it is the name of the executable in a sentence
+        elif words:  # without arguments, it is the name of the executable in a sentence
             assert parses(name, words), (where, name, words)
 
 
@@ -179,13 +178,13 @@ CHEAP = ("check", "convert", "debias", "evaluate", "inject", "plan", "simulate")
 
 @pytest.fixture
 def hall(tmp_path, monkeypatch):
-    """A working directory with the recordings that the documentation speaks of, simulated."""
+    """Return a working directory with simulated versions of the documented recordings."""
     monkeypatch.chdir(tmp_path)
     corners().to_yaml("anchors.yaml")
     for speed, name in (
         (1.0, "flight"),
         (0.8, "other"),
-    ):  # of one radio: a map of another one would do harm, and not be written
+    ):  # the same radio: a map of another one would increase the error and not be written
         config = SimulationConfig(
             seed=4,
             duration=18.0,
@@ -249,8 +248,9 @@ sys.meta_path.insert(0, Halt())
 
 @pytest.mark.parametrize("name", ["bias_node", "ekf_node", "evaluate"])
 def test_an_interrupt_while_it_imports_is_quiet(name, tmp_path):
-    """In the middle of it: the first of some modules of libraries is not there before the interrupt
-    comes. One of each package: all start in the same way (test_layout.py).
+    """The interrupt comes during an import of a library, which the test blocks.
+
+    One executable of each package is enough: all start in the same way (test_layout.py).
     """
     (tmp_path / "sitecustomize.py").write_text(HALT)
     environment = {

@@ -1,6 +1,9 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The C of a correction: equal to numpy and Python, sound with any input, small on a Cortex-M4F."""
+"""The C code of a correction equals numpy and Python.
+
+It accepts any input, and is small on a Cortex-M4F.
+"""
 
 import subprocess
 
@@ -23,7 +26,7 @@ KINDS = tuple(c.effects())
 
 
 def same_bits(results, code, some):
-    """Check bias and standard deviation against numpy in single precision, bit by bit."""
+    """Check bias and standard deviation bit by bit against numpy in single precision."""
     np.testing.assert_array_equal(results["wrong"], 0)
     for name, expected in zip(("bias", "std"), by_numpy(code, some)):
         np.testing.assert_array_equal(results[name], expected)
@@ -31,7 +34,7 @@ def same_bits(results, code, some):
 
 
 def agree(folder, effect_set, network=None):
-    """Check the C of a correction against numpy and Python, on this computer."""
+    """Check the C code of a correction against numpy and Python, on this computer."""
     code, some = vehicle_code(ANCHORS, effect_set, network), cases(10_000)
     write(folder, code)
     results = on_host(folder, some)
@@ -60,18 +63,18 @@ def test_both_networks_are_equal_to_numpy_and_python(tmp_path, orientations):
 
 @pytest.mark.parametrize("name", ["antenna_pattern", "received_power_bias"])
 def test_an_angle_of_a_pattern_is_wrapped_by_a_comparison(name):
-    """floorf of the C library costs a hundred instructions for each anchor."""
+    """floorf of the C library takes a hundred instructions for each anchor."""
     source = vehicle_code(ANCHORS, chosen(name)).files["uwb_bias.c"]
     assert "atan2f(" in source and "floorf(" not in source
 
 
 def numbers_of(some):
-    """The numbers of the states of cases, (n, 19), a view."""
+    """Return the numbers of the states of cases, (n, 19), as a view."""
     return some.view(np.float32).reshape(len(some), -1)[:, 2:]
 
 
 def odd_cases(n):
-    """Cases of which most have numbers that no state and no id has."""
+    """Return cases. Most contain numbers or ids that do not occur in practice."""
     some, rng = cases(n, seed=5), np.random.default_rng(5)
     odd = np.float32(
         [np.nan, np.inf, -np.inf, 3e38, -3e38, 1e-45, 0.0, -0.0, 1e20, -1e20, 2.0**31, 1e-20]
@@ -106,7 +109,7 @@ def test_no_input_is_a_fault(tmp_path, with_network):
 
 
 def calls_libm(name):
-    """Whether the C of an effect calls a function that differs between C libraries."""
+    """Return whether the C code of an effect calls a function that differs between C libraries."""
     code = vehicle_code(ANCHORS, chosen(name))
     programs = [code.level, *code.steep.values()]
     return any(one.kind in c.LIBM for program in programs for one in program.scalars)
@@ -114,7 +117,7 @@ def calls_libm(name):
 
 @needs_board
 def test_the_board_computes_the_same_bits(tmp_path):
-    """+, -, *, / and the square root are those of IEEE 754; so the effects without libm agree."""
+    """+, -, *, / and the square root follow IEEE 754, so effects without libm agree."""
     names = [name for name in KINDS if not calls_libm(name)]
     assert {"tag_lever_arm", "nlos", "spline over speed"} <= set(names)
     code, some = vehicle_code(ANCHORS, chosen(*names)), cases(1000)

@@ -16,7 +16,7 @@ from uwb_tdoa_tools.exporting import crazyflie
 from uwb_tdoa_tools.exporting.vehicle import vehicle_code
 
 pytestmark = pytest.mark.skipif(GCC is None, reason="no C compiler (gcc)")
-# What the build needs of the firmware. Its own files are not part of this repository.
+# Stand-ins for the firmware files that the build needs. This repository does not contain them.
 FIRMWARE = {
     "kalman_core.h": """
 #pragma once
@@ -122,13 +122,13 @@ int main(void) {
 
 
 def extra_flags(makefile, folder):
-    """The flags that the Makefile of a build adds to those of the firmware."""
+    """Return the flags that the Makefile of a build adds to the firmware flags."""
     (line,) = (line for line in makefile.splitlines() if line.startswith("EXTRA_CFLAGS"))
     return line.partition("+=")[2].replace("$(PWD)", str(folder)).split()
 
 
 def build(folder, names):
-    """A folder with the build and the stand-ins; returns the program."""
+    """Compile the build with the stand-ins in a folder, and return the program."""
     made = crazyflie.files(vehicle_code(ANCHORS, chosen(*names)).files, ANCHORS)
     made |= {f"firmware/{name}": text for name, text in FIRMWARE.items()}
     made |= {"firmware/src/updates.c": UPDATES, "firmware/src/estimator_kalman.c": ESTIMATOR}
@@ -137,7 +137,7 @@ def build(folder, names):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
     flags = [flag for flag in c.FIRMWARE if flag != "-mfp16-format=ieee"]
-    # as Kbuild orders them: those of the firmware first, then EXTRA_CFLAGS
+    # same order as Kbuild: flags of the firmware, then EXTRA_CFLAGS
     include = ["-Ifirmware", *extra_flags(made["Makefile"], folder / "app")]
     sources = ["src/uwb_bias.c", "src/uwb_bias_firmware.c"]
     sources += ["firmware/src/updates.c", "firmware/src/estimator_kalman.c"]

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The folders that export writes in C, and what it leaves out of them."""
+"""The folders that export writes in C, and the effects that it leaves out."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ SMALL_IDS = Anchors(np.arange(8), ANCHORS.positions, ANCHORS.orientations)
 
 
 def texts(folder):
-    """{path: text} of a folder."""
+    """Return {path: text} of a folder."""
     found = (path for path in folder.rglob("*") if path.is_file())
     return {str(path.relative_to(folder)): path.read_text() for path in found}
 
@@ -81,7 +81,7 @@ def test_one_command_writes_all_targets(tmp_path, monkeypatch, capsys):
 
 
 def _with_ids(some):
-    """The cases with the ids of ANCHORS for rows."""
+    """Return the cases with ids of ANCHORS instead of rows."""
     out = some.copy()
     for end in "ab":
         out[end] = ANCHORS.ids[some[end]]

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""bias_node with the exported file alone, over topics, beside effects and network off line."""
+"""bias_node with the exported file alone, over topics, against effects and network offline."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ EQUAL = 1e-4  # m
 
 
 def test_bias_node_corrects_as_with_effects_and_network(make_rig, tmp_path):  # noqa: F811
-    """The filter is in the loop: what it gets decides where the next TDOA is corrected."""
+    """The filter is in the loop: the corrections influence where the next TDOA is corrected."""
     flight = recording()
     values = {
         "anchor_delay": {"10": 0.1, "14": -0.05},

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A correction in one ONNX file is that of effects and network: each effect, all together."""
+"""A correction in one ONNX file equals effects and network: each effect, and all together."""
 
 from dataclasses import replace
 import json
@@ -38,13 +38,13 @@ EFFECTS = exportable(ANCHORS)
 
 
 def exported(path, effects, network=None):
-    """The ExportedCorrection of a file that is written for ANCHORS."""
+    """Return the ExportedCorrection of a file written for ANCHORS."""
     path.write_bytes(printed(trace(ANCHORS, effects, network)).SerializeToString())
     return ExportedCorrection(path, Session(path.read_bytes()))
 
 
 def assert_equal(effects, network, model, samples):
-    """The file says the same as effects and network, within EQUAL."""
+    """Assert that the file equals effects and network within EQUAL."""
     expected = Corrector(ANCHORS, effects, network).prediction(samples)
     found = Corrector(ANCHORS, None, model).prediction(samples)
     scale = {"bias": EQUAL, "std": EQUAL, "slope": EQUAL / REACH, "status": 0.0, "state": 0.0}
@@ -60,12 +60,13 @@ def test_each_effect(tmp_path, name):
     samples = states(ANCHORS)
     assert_equal(effects, None, model, samples)
     prediction = Corrector(ANCHORS, effects).prediction(samples)
-    assert max(np.abs(prediction.bias).max(), prediction.std.max()) > 0.01  # it is tested
+    # the correction is not zero
+    assert max(np.abs(prediction.bias).max(), prediction.std.max()) > 0.01
 
 
 @pytest.mark.parametrize("names", [FEATURES, WITHOUT], ids=["14", "8"])
 def test_networks(tmp_path, names):
-    """Alone, which limits each prediction in every way, and with all effects that are declared."""
+    """Test a network alone, a network with all limits, and a network with all declared effects."""
     limits = {name: [-4.0, 4.0, 3.0] for name in names[:6]}
     more = {"validity": limits, "fade_std": 0.2, "largest_yaw_std": 1.0, "share": 0.75}
     plain, limited = (network_of(tmp_path, names, k, **extra) for k, extra in enumerate(({}, more)))
@@ -78,7 +79,7 @@ def test_networks(tmp_path, names):
 
 
 def test_a_file_goes_through_the_trial_of_all_models_and_through_the_checker_of_onnx(tmp_path):
-    """Its rows give the same bits in every batch."""
+    """Each row gives the same bits in every batch."""
     declared = EffectSet((EFFECTS["anchor_delay"], EFFECTS["range_bias"], EFFECTS["nlos"]))
     path = tmp_path / "bias.onnx"
     traced = write_onnx(path, ANCHORS, declared, network_of(tmp_path))
@@ -117,7 +118,7 @@ def test_unknown_anchors_are_not_corrected_whatever_else_comes(tmp_path):
 
 
 def test_an_anchor_that_was_moved_since_is_not_corrected_and_is_named(tmp_path):
-    """All that a file holds was found for anchors where they were."""
+    """The corrections in a file hold only for the anchor positions at export."""
     model = exported(tmp_path / "bias.onnx", EffectSet((EFFECTS["anchor_delay"],)))
     assert model.trouble(ANCHORS) is None
     elsewhere = ANCHORS.positions.copy()
@@ -148,7 +149,7 @@ def test_nothing_is_corrected_twice(tmp_path):
     assert len(with_antenna(None, flight, model)) == 1
 
 
-# Worth of each effect that a file does not hold, m, from its size in known_effects.SIZES
+# Expected worth of each effect that a file cannot hold, m, from its size in known_effects.SIZES
 LEFT_OUT = {
     "tdoa_time_offset": (0.05, "at 1 m/s", "it changes the stamps of TDOAs"),
     "gyro_bias": (0.05 * 9.81 / 6.0, "after 1 s without TDOAs", "it acts on gyro"),
@@ -191,7 +192,10 @@ def test_a_file_that_no_node_would_load_is_not_written(tmp_path):
 
 
 def test_a_measured_flight_has_the_same_figures_by_the_file_and_by_effects(shared_data, tmp_path):
-    """The filter is in the loop; gyro_bias, which the file lacks, comes with it."""
+    """The filter is in the loop.
+
+    The file cannot hold gyro_bias, so the filter gets it as an effect.
+    """
     log, survey = shared_data / "flights/0426/0426-traj3", shared_data / "surveys/anchor_0426.txt"
     flight, path = read_flight(log, survey), tmp_path / "bias.onnx"
     kinds = "anchor_delay", "antenna_pattern", "gyro_bias"
@@ -212,7 +216,10 @@ def test_a_measured_flight_has_the_same_figures_by_the_file_and_by_effects(share
 
 @pytest.fixture
 def desk(tmp_path, monkeypatch):
-    """A folder with anchors, effects of which two are left out, and a network."""
+    """A working directory with anchors, effects and a network.
+
+    The export leaves out two of the three effects.
+    """
     monkeypatch.chdir(tmp_path)
     ANCHORS.to_yaml("anchors.yaml")
     kinds = "anchor_delay", "tdoa_time_offset", "gyro_bias"

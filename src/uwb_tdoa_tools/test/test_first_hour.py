@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The first hour of a new user with ground truth, by the commands of the documentation word for
-word, and what came of it.
+"""The first hour of a new user with ground truth: the documented commands and their results.
+
+The commands are taken word for word from the documentation.
 """
 
 import re
@@ -21,7 +22,7 @@ from walking import blocks, commands, main, run
 from uwb_tdoa_bias.common.survey import read_survey
 from uwb_tdoa_bias.effects import EffectSet
 
-# check reads no ground truth, and says the same of the others
+# `check` reads no ground truth, so its result is the same for the other cases
 CHECKED = (("simulated", "in another frame"), ("measured", "late"))
 
 
@@ -37,14 +38,17 @@ CHECKED = (("simulated", "in another frame"), ("measured", "late"))
 def test_from_csv_and_tape_to_a_diagnosed_flight(
     tmp_path, monkeypatch, capsys, shared_data, source, name
 ):
-    """convert, check, evaluate, diagnose, evaluate: docs/csv.md. test_connect.py: a truth in time."""
+    """docs/csv.md: convert, check, evaluate, diagnose, evaluate.
+
+    test_connect.py covers a ground truth that is in time.
+    """
     at_desk(tmp_path, monkeypatch)
     if source == "simulated":
         hall = simulated(read_survey(written("anchors.yaml", *blocks(WALK, "yaml"))))
     else:
         hall = measured(shared_data)
     script = recorded(hall, True, name)
-    if "epoch" in name:  # convert refuses it, and says what to add
+    if "epoch" in name:  # convert refuses the recording and prints the option to add
         assert [main(*command) for command in commands(script)] == [2, 2]
         assert capsys.readouterr().err.count("on another clock than the TDOAs") == 2
         script = script.replace("--out", "--align time --out")
@@ -54,7 +58,8 @@ def test_from_csv_and_tape_to_a_diagnosed_flight(
     if (source, name) not in CHECKED:
         judging = re.sub(r"^.* check .*\n", "", judging, flags=re.MULTILINE)
     before = hall.error()
-    diverged = (0, 1) if "z down" in name else (0,)  # by that ground truth, until it is turned
+    # against this ground truth, until its frame is corrected
+    diverged = (0, 1) if "z down" in name else (0,)
     for command, words in commands(judging):
         assert main(command, words) in (diverged if command == "evaluate" else (0,)), (
             command,

@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The first hour of a new user without ground truth, and the steps of guide.md, by the commands of
-the documentation word for word, and what came of it.
+"""The first hour of a new user without ground truth, and the steps of guide.md.
+
+The commands are taken word for word from the documentation.
 """
 
 from pathlib import Path
@@ -26,7 +27,7 @@ from uwb_tdoa_bias.common.survey import read_survey
 
 
 def ended(name, words):
-    """Exit code of a step that may say that nothing is to be used: 0 or 1."""
+    """Return the exit code of a step: 0, or 1 if its result is not to be used."""
     code = main(name, words)
     assert code in (0, 1), (name, words)
     return code
@@ -37,7 +38,7 @@ def ended(name, words):
 def test_from_tape_to_calibrated_without_ground_truth(
     tmp_path, monkeypatch, capsys, shared_data, source
 ):
-    """docs/calibration.md, in one command, and then docs/localizing.md or step by step."""
+    """docs/calibration.md in one command, then docs/localizing.md or step by step."""
     at_desk(tmp_path, monkeypatch)
     survey = read_survey(written("anchors.yaml", *blocks(WALK, "yaml")))
     hall = simulated(survey, (0, 6)) if source == "simulated" else measured(shared_data)
@@ -69,7 +70,7 @@ def test_from_tape_to_calibrated_without_ground_truth(
 
 
 def _step_by_step(hall, before, capsys):
-    """check and survey, which calibrate has done in one command."""
+    """Run check and survey, the steps of calibrate."""
     (checked,), (surveyed,) = (
         commands(blocks(section("calibration.md", heading))[0])
         for heading in ("2. Fly, and check", "3. Survey")
@@ -84,9 +85,7 @@ def _step_by_step(hall, before, capsys):
 
 
 def _lines_run(text):
-    """Lines that a tool has printed to be copied run as they stand; those of nodes have files that
-    can be read.
-    """
+    """Check that printed commands run unchanged. For nodes, check that their files exist."""
     lines = re.findall(r"\./dev run uwb_tdoa_\w+ .*$", text, re.MULTILINE)
     assert len(lines) == 3
     for line in lines:

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""First maps of unknown anchors: what is accepted is right, and what is open is named."""
+"""First maps of unknown anchors: accepted maps are correct, and open questions are named."""
 
 from dataclasses import replace
 import json
@@ -25,7 +25,7 @@ from uwb_tdoa_tools.first_map.search import rigid_distance
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.surveying.known import read_coordinates
 
-CERTAIN = 4.0  # standard deviations, largest error of a coordinate of an accepted map
+CERTAIN = 4.0  # standard deviations, limit of the coordinate errors of an accepted map
 
 
 def flown(seed=7, **config):
@@ -39,7 +39,7 @@ def flight():
 
 
 def apart(positions):
-    """Rows of the two anchors that are farthest apart, seen from above."""
+    """Return the rows of the two anchors that are farthest apart, seen from above."""
     distance = np.linalg.norm((positions[:, None] - positions)[:, :, :2], axis=2)
     return np.unravel_index(np.argmax(distance), distance.shape)
 
@@ -55,7 +55,7 @@ def seen_of(flights, *coordinates):
 
 
 def measured(positions, *coordinates, std=0.02, noise=0.0, drop=()):
-    """Observations of all distances between anchors but those in `drop`."""
+    """Return observations of all distances between anchors except `drop`."""
     rng = np.random.default_rng(3)
     rows = [
         (a, b, np.linalg.norm(positions[a] - positions[b]) + noise * rng.standard_normal(), std)
@@ -69,7 +69,10 @@ def measured(positions, *coordinates, std=0.02, noise=0.0, drop=()):
 
 
 def side_of(positions):
-    """Heights of all anchors, and a rough place of one off the line of the trusted ones."""
+    """Return the heights of all anchors, and a rough position of one anchor.
+
+    This anchor is off the line of the trusted anchors.
+    """
     one, other = apart(positions)
     line = positions[other] - positions[one]
     row = int(np.argmax(np.abs((positions - positions[one]) @ [-line[1], line[0], 0.0])))
@@ -106,7 +109,7 @@ def test_levelled_accelerations_are_second_differences_of_positions(roll, pitch,
     rng = np.random.default_rng(seed)
     t = np.arange(0.0, 8.0, 0.01)
     size, frequency = rng.uniform(0.1, 0.5, 3), rng.uniform(1.5, 3.0, 3)
-    moving = t > 3.0  # at rest before, by which the attitude is known
+    moving = t > 3.0  # the attitude is known from the time at rest before
     since = np.maximum(t - 3.0, 0.0)[:, None]
     swing = -size * frequency**2 * np.sin(frequency * since)
     world = np.where(moving[:, None], swing, 0.0)
@@ -144,7 +147,7 @@ def test_gradient_is_that_of_the_cost(flight, inertial):
         there[row, 1] = step
         ends = [Fit(problem, path + sign * there, columns).cost for sign in (1, -1)]
         slope = (ends[0] - ends[1]) / (2.0 * step)
-        # WEAK is no part of the cost
+        # the cost does not include WEAK
         assert equations.path_gradient[3 * row + 1] == pytest.approx(slope, rel=1e-3, abs=1e-2)
 
 
@@ -202,7 +205,7 @@ def test_a_faulty_inertial_sensor_is_refused(flight):
 
 @pytest.mark.parametrize("signs", [(-1.0, 1.0, 1.0), (-1.0, -1.0, -1.0)])
 def test_a_gyroscope_with_wrong_signs_mirrors_no_map(flight, signs):
-    """The mirror image fits all TDOAs, so only the inertial sensor itself can show it."""
+    """The mirror image fits all TDOAs, so only the IMU itself can reveal it."""
     imu = replace(flight.imu, gyro=flight.imu.gyro * np.array(signs))
     assert "accelerations" in map_anchors(seen_of([replace(flight, imu=imu)])).why_not
 

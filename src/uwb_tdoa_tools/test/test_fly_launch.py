@@ -20,7 +20,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(WHY_NOT is not None, reason=s
 
 @pytest.fixture
 def launch(tmp_path):
-    """launch(*arguments) gives a Launch of fly.launch.py, which ends with the test."""
+    """Return launch(*arguments), which gives a Launch of fly.launch.py. It ends with the test."""
     started = []
 
     def make(*arguments):

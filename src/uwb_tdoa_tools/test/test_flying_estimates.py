@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A peer as estimate: a tiny library that is compiled here and returns its start."""
+"""A peer estimator: a tiny library compiled here. It returns its start as the estimate."""
 
 import ctypes
 import shutil
@@ -54,7 +54,7 @@ void tdoa_peer_state(double *at, double *v, double *q) {
 
 
 def built(folder, source=SOURCE, version=estimates.VERSION):
-    """Path of a library."""
+    """Compile a library and return its path."""
     (folder / "peer.c").write_text(source.replace("VERSION", str(version)))
     subprocess.run(
         [CC, "-O2", "-shared", "-fPIC", "-o", folder / "libpeer.so", folder / "peer.c", "-lm"],
@@ -64,7 +64,7 @@ def built(folder, source=SOURCE, version=estimates.VERSION):
 
 
 def test_it_is_flown_by_and_judged_like_ours(tmp_path):
-    """It says that it stands on the floor while it climbs: the vehicle goes up and up."""
+    """The estimate stays on the floor while the vehicle climbs, so the vehicle climbs further."""
     library = built(tmp_path, SOURCE + STATE)
     flown = fly(
         Task(HALL, seed=2, given="place", peer=str(library), path=Circles(turns=1, turn_time=4.0))
@@ -94,7 +94,7 @@ def test_one_that_nobody_told_where_it_is_has_no_place(tmp_path):
     )
     assert (
         verdict_of(flown)["why"] == "refused to arm"
-    )  # the start was NaN, and this one stays there
+    )  # the start is NaN, and the estimate stays at its start
 
 
 def test_one_whose_estimate_becomes_no_number_in_flight_is_lost_and_ends_nothing(tmp_path):
@@ -184,7 +184,7 @@ void tdoa_peer_position(double *out) { out[0] = last; out[1] = samples; out[2] =
 
 
 def exported(folder, *effects):
-    """A folder as export --c writes it."""
+    """Return a folder as `export --c` writes it."""
     folder.mkdir()
     code = vehicle_code(HALL.anchors, EffectSet(effects))
     for name, text in code.files.items():
@@ -201,11 +201,11 @@ def test_an_exported_correction_reaches_each_tdoa_of_a_peer(tmp_path):
     imu = Imu(t - 0.5, zeros, zeros)
     tdoa = Tdoas(t, np.full(3, ids[0]), np.array([ids[1], 999, ids[1]]), np.full(3, 1.0))
     both = np.concatenate(estimates.events(imu, tdoa, HALL.anchors))
-    for _ in range(2):  # a start forgets the time of the first TDOA
+    for _ in range(2):  # a new start forgets the time of the first TDOA
         other.start(HALL.anchors, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
         other.run(both[np.argsort(both["t"], kind="stable")])
         last, samples, tdoas = other.position()
-        assert (samples, tdoas) == (3, 2)  # of an unknown anchor nothing arrives
+        assert (samples, tdoas) == (3, 2)  # TDOAs of an unknown anchor are not passed on
         assert last == pytest.approx(1.0 - 0.2 - 0.01 * 5.0, abs=1e-6)
 
 
@@ -248,4 +248,4 @@ def test_a_vehicle_flies_by_a_corrected_peer(tmp_path):
     folder = exported(tmp_path / "c", AnchorDelay({str(HALL.anchors.ids[0]): 0.1}))
     library = str(built(tmp_path, SOURCE + STATE))
     task = Task(HALL, seed=2, given="place", peer=library, correction=str(folder))
-    assert verdict_of(fly(task))["landed"] is False  # it returns its start
+    assert verdict_of(fly(task))["landed"] is False  # the estimate stays at its start

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Flights over topics: messages of any content, and the time of each turn."""
+"""Flights over topics: messages with any content, and the time of each turn."""
 
 from types import SimpleNamespace
 
@@ -28,7 +28,7 @@ from uwb_tdoa_tools.flying.world import HALL  # noqa: E402
 
 
 class Pace:
-    """Takes notes."""
+    """Records the stamps of the received odometry."""
 
     def __init__(self):
         self.stamps = []
@@ -42,7 +42,7 @@ class Pace:
 
 @pytest.fixture
 def topics():
-    """OverTopics at 5 s of simulated time, which knows of a filter that runs, with its pace."""
+    """Return OverTopics at 5 s of simulated time, with its pace. The filter is running."""
     rclpy.init()
     node, pace = StreamNode("vehicle"), Pace()
     made = OverTopics(node, HALL, pace, clock=True)
@@ -76,7 +76,7 @@ def odometry(
 
 
 def hear(topics, *messages):
-    """Have serialized messages come on odometry."""
+    """Pass serialized messages to the subscription of odometry."""
 
     def fetch(codec):
         return [
@@ -92,12 +92,12 @@ def test_it_is_where_the_odometry_says_with_its_velocity_in_the_world(topics):
     t, p, v, q = topics.pose
     assert t == pytest.approx(4.905) and topics.deviation == pytest.approx(0.2)
     np.testing.assert_allclose(p, [1.1, 2.0, 0.5])
-    np.testing.assert_allclose(v, [0.0, 1.0, 0.0], atol=1e-12)  # the body points along y
+    np.testing.assert_allclose(v, [0.0, 1.0, 0.0], atol=1e-12)  # the body x axis points along y
     np.testing.assert_allclose(topics.odometry.t, [4.9, 4.905])
 
 
 def test_odometry_of_the_present_is_used(topics):
-    """At every step of a grid, some of which 1e-9 times nanoseconds misses by a rounding."""
+    """The stamps form a grid. 1e-9 times nanoseconds rounds differently at some steps."""
     steps = [number / 200.0 for number in range(1001, 1201)]
     for now in steps:
         topics.publish_truth(now, np.zeros(STATE))
@@ -151,8 +151,9 @@ def test_by_a_status_that_is_not_running_it_neither_starts_nor_goes_on(topics, s
 
 
 def test_odometry_from_before_anything_was_measured_is_not_taken(topics):
-    """Whoever publishes it would have ended the node: in real time stamps count from the start, and
-    there was none.
+    """In real time, stamps count from the start.
+
+    Odometry before the start would have ended the node.
     """
     topics._begin = None
     hear(topics, odometry(4.9))
@@ -185,7 +186,7 @@ def measured(now, tdoa=True):
 
 @pytest.fixture
 def running(clock):
-    """A Lockstep in step with a filter of 200 Hz, at 5 s."""
+    """Return a Lockstep at 5 s, synchronous with a filter of 200 Hz."""
     made = Lockstep(clock.now)
     for k in range(1, 501):
         made.sent(TURN * k, measured(TURN * k))
@@ -219,7 +220,7 @@ def test_one_that_does_not_come_is_not_waited_for_any_longer(running, clock):
     assert running.may_go_on()
     running.sent(5.04, measured(5.04))
     clock.t += 2.0 * IMPATIENCE
-    assert not running.may_go_on()  # it is waited for again
+    assert not running.may_go_on()  # it waits again
 
 
 def test_in_a_silence_nothing_is_due_until_the_filter_goes_on_without(running):

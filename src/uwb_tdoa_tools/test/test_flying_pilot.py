@@ -23,7 +23,7 @@ SIZE = (6.0, 6.0, 3.0)
 
 @pytest.fixture
 def up():
-    """One that takes off at (1, -1, 0.03) with a yaw of 3 rad, to 1.2 m within 2.5 s."""
+    """Return a path that takes off at (1, -1, 0.03) with a yaw of 3 rad, to 1.2 m within 2.5 s."""
     made = CommandedPath(np.array([1.0, -1.0, 0.03]), 3.0, SIZE)
     made.take_off(1.2, 2.5)
     return made
@@ -45,11 +45,11 @@ def test_each_command_goes_on_from_where_the_last_one_has_it(up):
     up.go_to(1.3, False, (0.0, 0.0, 1.5), -3.0, 3.0)
     np.testing.assert_allclose(up.at(np.array([1.3])), before, atol=1e-9)
     np.testing.assert_allclose(up.at(np.array([4.3]))[0, 0], [0.0, 0.0, 1.5], atol=1e-9)
-    assert up.yaw_offset(4.3) == pytest.approx(2.0 * math.pi - 6.0)  # the shorter way around
+    assert up.yaw_offset(4.3) == pytest.approx(2.0 * math.pi - 6.0)  # the shorter direction
     up.go_to(5.0, True, (0.5, 0.0, 0.0), 0.1, 2.0)
     np.testing.assert_allclose(up.at(np.array([7.0]))[0, 0], [0.5, 0.0, 1.5], atol=1e-9)
     assert up.yaw_offset(7.0) == pytest.approx(2.0 * math.pi - 5.9)
-    # the past stays what it was
+    # the past does not change
     np.testing.assert_allclose(up.at(np.array([1.25]))[0, 0, 2], 0.615)
 
 
@@ -104,7 +104,7 @@ PERFECT = replace(
 
 
 class Said(OwnFilter):
-    """Says why, and whether it is sure, as the test wants."""
+    """An estimate whose reason and deviation the test sets."""
 
     why, unsure = "", False
 
@@ -115,7 +115,7 @@ class Said(OwnFilter):
 
 @pytest.fixture
 def flight():
-    """(Trial, Pilot) of a vehicle that stands."""
+    """Return (Trial, Pilot) of a vehicle at rest."""
     trial = Trial(Task(PERFECT, 3, "place"), Said(PERFECT.anchors, FilterConfig()), duration=40.0)
     return trial, Pilot(trial)
 

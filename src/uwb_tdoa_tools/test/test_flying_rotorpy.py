@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The vehicle beside an oracle: rotorpy's Crazyflie 2, where it is installed (pip install rotorpy)."""
+"""The vehicle against rotorpy's Crazyflie 2 as a reference (pip install rotorpy)."""
 
 import numpy as np
 import pytest
@@ -19,13 +19,14 @@ from uwb_tdoa_tools.flying.vehicle import (
 multirotor = pytest.importorskip("rotorpy.vehicles.multirotor")
 from rotorpy.vehicles.crazyflie_params import quad_params  # noqa: E402
 
-HELD, SECONDS = 0.02, 2.0  # s for which a command is held; of a flight
+HELD, SECONDS = 0.02, 2.0  # s, duration of a command; s, duration of a flight
 PRECISE = {"method": "RK45", "rtol": 1e-9, "atol": 1e-10}
 
 
 def flights(seed):
-    """States (n, 17) of ours and of rotorpy's vehicle, from the same state, with the same random
-    commands and wind.
+    """Return the states (n, 17) of our vehicle and of rotorpy's vehicle.
+
+    Both start in the same state, with the same random commands and wind.
     """
     rng = np.random.default_rng(seed)
     ours = Vehicle(radius=0.0)  # rotorpy has no ground effect
@@ -65,8 +66,9 @@ def flights(seed):
 
 
 def apart(seed):
-    """Largest differences, of positions m, velocities m/s, attitudes rad, rates rad/s, over a
-    flight; and the largest rate, rad/s.
+    """Return the largest differences over a flight, and the largest rate, rad/s.
+
+    Differences of positions m, velocities m/s, attitudes rad and rates rad/s.
     """
     ours, theirs = flights(seed)
     p, v, w = (

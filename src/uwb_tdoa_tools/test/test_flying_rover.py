@@ -51,7 +51,10 @@ def test_it_arrives_and_the_verdict_is_that_of_its_truth(drives):
 
 
 def test_wheels_say_more_or_less_than_is_true_and_the_imu_what_is():
-    """Between slips the wheels are off by their scale; the IMU without errors feels the motion."""
+    """Between slips, the wheels are wrong by their scale.
+
+    An IMU without errors measures the motion.
+    """
     still = replace(WORLD, imu=NO_IMU_ERRORS, vibration=(0.0, 0.0, 0.0))
     one = rover.drive(replace(TASK, world=still, seed=6))
     truth, wheels, imu = one.flight.truth, one.flight.velocity, one.flight.imu
@@ -120,11 +123,11 @@ def test_it_drives_where_the_radio_is_silent_for_a_while():
     stamps = one.odometry.t[one.odometry.t > 5.0]
     assert (
         np.linalg.norm(rover_error(one, stamps)[:, :2], axis=1).max() < 0.5
-    )  # wheels and gyroscope carry it
+    )  # wheels and gyroscope bridge the gap
 
 
 def rover_error(one, stamps):
-    """(n, 3) m, of the estimate of a TrialResult."""
+    """Return the position error of a TrialResult, (n, 3) m."""
     rows = np.searchsorted(one.odometry.t, stamps)
     return one.odometry.p[rows] - position_at(stamps, one.flight.truth)
 

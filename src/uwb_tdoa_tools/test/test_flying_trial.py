@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A flight of `fly`: what its sensors say, and how it goes."""
+"""A flight of `fly`: its sensor data and its course."""
 
 from dataclasses import replace
 
@@ -32,7 +32,7 @@ HIGH, LEVEL = np.array([0.5, 0.3, 1.2]), np.array([0.0, 0.0, 0.0, 1.0])
 
 
 def residual(world, p=HIGH, seed=0, duration=20.0, schedule_faults=(np.inf, np.inf)):
-    """(Radio, what each TDOA has beside geometry (n,) m) at one place."""
+    """Return (Radio, TDOAs minus geometry (n,) m) at one position."""
     radio = Radio(world, seed, duration)
     radio.schedule_faults(*schedule_faults)
     d = radio.measured(
@@ -76,7 +76,7 @@ def test_low_anchors_are_late_or_not_up_to_their_own_height():
     assert ((limit[low] >= 0.06) & (limit[low] <= 0.2)).all()
     for height, share in ((0.03, 1.0), (0.31, 0.0), (float(limit[2]), 0.5)):
         radio, rest = residual(world, np.array([0.5, 0.3, height]), duration=60.0)
-        first = 2  # low, after a high one
+        first = 2  # a low anchor that follows a high one
         mine = (radio.b == first) & ~low[radio.a]
         hit = rest[mine] > 1.0
         assert hit.mean() == pytest.approx(share, abs=0.05)
@@ -124,7 +124,7 @@ def test_a_person_blocks_what_passes_through_him_for_a_while():
     hit = np.abs(rest) > 1e-9
     assert 0.01 < hit.mean() < 0.4 and np.abs(rest).max() < 2.0
     bursts = np.flatnonzero(np.diff(hit.astype(int)) == 1)
-    assert hit.sum() > 10 * len(bursts) / 8  # they come in bursts, not one by one
+    assert hit.sum() > 10 * len(bursts) / 8  # they come in bursts
 
 
 def test_vibration_is_as_strong_as_asked_for_and_in_its_band():
@@ -173,7 +173,7 @@ def test_other_sensors_say_what_is_true_but_for_their_noise():
 
 @pytest.mark.parametrize("name", SENSORS)
 def test_a_sensor_without_a_class_of_its_own_measures_by_its_record(name):
-    n, up = 100, 0.2  # rows, and m of the ground below
+    n, up = 100, 0.2  # rows, and height of the ground below, m
     p, v = np.tile(HIGH, (n, 1)), np.tile([0.5, 0.0, 0.1], (n, 1))
     q = np.tile([0.0, 0.0, np.sin(0.1), np.cos(0.1)], (n, 1))
     at = slice(0, n), p, q, v, p[:, 2] - up
@@ -265,9 +265,9 @@ def test_through_a_silence_and_by_late_samples_it_flies_on():
 
 
 def test_an_effect_is_in_the_loop_what_inject_makes_of_it(plain):
-    """At the same true path it adds to each TDOA what it adds to a recording."""
+    """On the same true path, it changes each TDOA as `inject` changes a recording."""
     effect = parse_effect("nlos", ["2.delay=0.4", "2.start=1", "2.end=3"])
-    rules = Rules(rest=3.5, patience=0.0, arm=1e-6)  # stays where it is
+    rules = Rules(rest=3.5, patience=0.0, arm=1e-6)  # the vehicle does not move
     task = Task(PERFECT, seed=3, given="place", path=SHORT, rules=rules)
     without, with_it = (
         fly(task).flight,
@@ -290,7 +290,7 @@ def test_after_a_minute_it_flies_once_more_from_where_it_was_carried():
     carried = truth.p[(truth.t > second.begin - 6.0) & (truth.t < second.begin)]
     assert carried[:, 2].max() == pytest.approx(0.53, abs=0.02)
     lifted = (imu.t > second.begin - 6.0) & (imu.t < second.begin - 4.0)
-    assert np.abs(imu.accel[lifted, 2] - 9.81).max() > 0.3  # its sensors feel that
+    assert np.abs(imu.accel[lifted, 2] - 9.81).max() > 0.3  # its sensors measure the lift
     verdict = verdict_of(flown)
     assert verdict["started"] == second.started
     assert position_at(np.array([truth.t[-1]]), truth)[0, 2] < 0.05
@@ -300,7 +300,7 @@ def test_it_is_flown_by_what_a_network_corrects(tmp_path):
     path = Circles(turns=1, turn_time=4.0)
     task = Task(PERFECT, seed=1, given="place", path=path, model=str(known_answer.write(tmp_path)))
     plain, corrected = fly(replace(task, model=None)), fly(task)
-    # the same samples until the vehicle moves, but other estimates
+    # the same samples until the vehicle moves, but different estimates
     np.testing.assert_array_equal(plain.flight.tdoa.d[:100], corrected.flight.tdoa.d[:100])
     n = min(len(plain.odometry.t), len(corrected.odometry.t))
     assert np.abs(plain.odometry.p[:n] - corrected.odometry.p[:n]).max() > 0.01

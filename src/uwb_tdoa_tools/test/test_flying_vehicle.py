@@ -39,8 +39,9 @@ STILL = np.zeros(3)
 
 
 def flown(vehicle, state, speeds, seconds, wind=STILL):
-    """The state after so many seconds with constant commands, and the largest number of feet that
-    touched the ground.
+    """Fly with constant commands.
+
+    Returns the final state, and the largest number of feet that touched the ground.
     """
     state, scratch, record = np.array(state), np.empty((2, 17)), vehicle.record()
     feet = max(
@@ -83,7 +84,7 @@ def test_a_fall_is_a_fall():
 def test_at_the_right_speed_it_hovers():
     vehicle = Vehicle()
     state, feet = flown(vehicle, aloft(vehicle), np.full(4, hovering(vehicle)), 2.0)
-    # the ground effect is not quite nothing
+    # the ground effect is not exactly zero
     np.testing.assert_allclose(state, aloft(vehicle), atol=1e-3)
     assert feet == 0
 
@@ -111,8 +112,9 @@ def test_a_motor_takes_its_time():
     ("faster", "axis", "sign"), [((0, 3), 0, 1), ((2, 3), 1, 1), ((0, 2), 2, 1), ((1, 2), 0, -1)]
 )
 def test_faster_rotors_turn_it_where_they_are(faster, axis, sign):
-    """Those on the left roll it to the right, those behind pitch it down, those of one sense of
-    turning yaw it.
+    """Faster rotors on the left roll it to the right, faster rear rotors pitch it down.
+
+    Faster rotors with the same sense of rotation yaw it.
     """
     vehicle = Vehicle()
     speeds = np.full(4, hovering(vehicle))
@@ -159,8 +161,9 @@ TICK = 4
 
 
 def flown_of_controller(wanted, yaw, seconds, turn=0.0, nominal=None):
-    """States (n, 17) of a vehicle whose controller knows the truth, from (0, 0, 2) m and a yaw
-    `turn`, rad, on.
+    """Return the states (n, 17) of a vehicle whose controller knows the truth.
+
+    It starts at (0, 0, 2) m with the yaw `turn`, rad.
     """
     vehicle, n = Vehicle(), int(seconds * IMU_RATE)
     state = vehicle.at_rest(0.0, 0.0, turn)
@@ -236,7 +239,7 @@ GROUND = 0.03
 
 
 def followed(path, place=(0.3, -0.2)):
-    """(Reference, t (n,) s, wanted (n, 3, 3)) up to where it sinks."""
+    """Return (Reference, t (n,) s, commands (n, 3, 3)) up to the descent."""
     reference = path.starting_at(np.array(place), GROUND)
     t = np.arange(0.0, path.duration, 0.01)
     return reference, t, reference.at(t)
@@ -260,13 +263,13 @@ STEP_OF_MISSION = 0.01
 
 
 class Said:
-    """An estimate that says what it is told to."""
+    """Feeds a mission with estimates that the test sets."""
 
     def __init__(self, mission):
         self.mission, self.t, self.sinks = mission, 0.0, 0.0
 
     def until(self, end, deviation=0.1, support=0.0, stale=False):
-        """What was wanted at `end`, s. Its height falls at `sinks`, m/s."""
+        """Return the command at `end`, s. The estimated height falls at `sinks`, m/s."""
         wanted = None
         while self.t < end - 1e-9:
             t = round(self.t, 9)
@@ -302,17 +305,18 @@ def test_it_is_up_flies_its_circles_and_sinks(said):
     said.until(7.0)
     np.testing.assert_allclose(said.until(7.02)[0], [1.0, 2.0, 1.23], atol=1e-3)
     halfway = said.until(15.01)[0]
-    np.testing.assert_allclose(halfway, [1.0, 2.0, 1.23], atol=0.02)  # one of two circles
+    # after the first of two circles
+    np.testing.assert_allclose(halfway, [1.0, 2.0, 1.23], atol=0.02)
     np.testing.assert_allclose(said.until(11.0 + 16.0 + 0.01)[0, 2], 0.43, atol=5e-3)
     sinking = said.until(30.0)
-    assert sinking[1, 2] < 0.0 and said.mission.state == FLYING  # to wherever the ground is
+    assert sinking[1, 2] < 0.0 and said.mission.state == FLYING  # until it reaches the ground
 
 
 def test_an_estimate_that_does_not_come_down_is_pulled_down_and_another_is_not(said):
     high = said.until(30.0)[0, 2]
     assert (
         high == pytest.approx(-DESCENT_LEAD) and said.until(31.0)[0, 2] == high
-    )  # of an estimate of 0: no lower than that
+    )  # the estimate is 0, so the command is not lower than this
     falling = Said(Mission(Circles(), (1.0, 2.0), 0.03))
     falling.sinks = 0.15
     assert falling.until(30.0)[0, 2] == pytest.approx(-0.15 * 29.99, abs=1e-6)
@@ -331,7 +335,7 @@ def test_lost_it_stops_and_sinks_and_goes_on_where_it_was(said):
     wanted = said.until(13.0, deviation=1.6)
     assert said.mission.state == LOST and said.mission.lost == pytest.approx(12.0)
     assert np.isnan(wanted[0]).all() and wanted[1, 2] == -Rules().descent_speed
-    assert np.isnan(said.until(14.0, deviation=1.2)[0]).all()  # not yet good enough to go on
+    assert np.isnan(said.until(14.0, deviation=1.2)[0]).all()  # not yet good enough to continue
     after = said.until(14.01)
     assert said.mission.state == FLYING and said.mission.lost == pytest.approx(12.0)
     np.testing.assert_allclose(after[0], before[0], atol=0.02)

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Verdicts of flights that are made up."""
+"""Verdicts of artificial flights."""
 
 from types import SimpleNamespace
 
@@ -13,7 +13,7 @@ from uwb_tdoa_tools.flying.mission import DONE, REFUSED
 from uwb_tdoa_tools.flying.verdict import summary, text, verdict_of
 
 T = np.arange(0.0, 20.0, 0.0025)
-UP, DOWN = 4.0, 14.0  # s, between which it is in the air
+UP, DOWN = 4.0, 14.0  # s, start and end of the time in the air
 
 
 def made_up(
@@ -28,7 +28,7 @@ def made_up(
     ended=DOWN + 0.5,
     state=DONE,
 ):
-    """A flight that goes straight up at UP and down at DOWN with so many m/s."""
+    """Return a flight that climbs at UP and descends at DOWN, with constant speed, m/s."""
     states = np.zeros((len(T), 17))
     height = np.clip(np.minimum(T - UP, (DOWN - T) * sink), 0.0, 1.2) if z is None else z
     states[:, :2], states[:, 2] = np.where(T[:, None] > DOWN - 4.0, xy, 0.0), height

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""diagnose and survey in a hall, of whose anchors a tag hears a part."""
+"""diagnose and survey in a hall. The tag receives only some of the anchors at a time."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ LATE, MOVED, SHIFT = 38, 50, {"x": 0.2, "y": -0.2, "z": 0.1}
 
 
 def hall(nx=11, ny=7, spacing=9.0):
-    """A grid of Anchors, a third of them low."""
+    """Return a grid of Anchors. One third is low."""
     rng, n = np.random.default_rng(7), nx * ny
     x, y = np.meshgrid((np.arange(nx) + 0.5) * spacing, (np.arange(ny) + 0.5) * spacing)
     z = np.where(rng.random(n) < 1.0 / 3.0, rng.uniform(0.4, 1.2, n), rng.uniform(2.5, 6.0, n))
@@ -70,7 +70,7 @@ def test_an_anchor_that_is_late_and_one_that_was_moved_are_named_and_nothing_els
         finding.effect
         for finding in diagnose([faulty]).findings
         if "tdoa" in finding.effect.channels
-    ]  # the inertial sensor has errors of its own
+    ]  # the IMU also has errors
     found = {
         (effect.name, key): value for effect in of_tdoas for key, value in effect.values.items()
     }
@@ -132,7 +132,7 @@ def test_an_anchor_that_stands_apart_from_the_others_is_named_even_if_the_tape_a
     shifts = 0.005 * rng.standard_normal((len(given), 3))
     shifts[MOVED, :2] = 0.2, -0.2
     covariance = np.diag(np.full(4 * len(given), 0.01**2))
-    covariance[:3, :3] = 0.1**2 * np.eye(3)  # one that was never heard
+    covariance[:3, :3] = 0.1**2 * np.eye(3)  # an anchor that was never received
     found = SelfCalibration(
         given,
         Prior.of(given, np.full((len(given), 3), 0.1)),
@@ -187,7 +187,7 @@ def test_a_fast_tag_does_not_speak_against_the_survey():
     assert len(fit) > tdoa_rules.FEWEST and tdoa_rules.gained(fit) is None
     assert (
         fit._loss(fit._start, fit.positions) - fit.solve()[0] > tdoa_rules.GAIN
-    )  # it would, from where a start puts the tag
+    )  # with the initial positions of the tag, it would contradict the survey
 
 
 def test_a_hall_is_no_plane_unless_those_that_are_heard_together_lie_in_one(sound):
@@ -199,7 +199,7 @@ def test_a_hall_is_no_plane_unless_those_that_are_heard_together_lie_in_one(soun
 
 @pytest.mark.parametrize("late", [0.0, 0.3])
 def test_tdoas_that_are_late_in_a_hall_are_found_and_others_are_not(sound, late, monkeypatch):
-    monkeypatch.setattr(time_rules, "MOST", len(sound.tdoa) // 20)  # as of a recording of an hour
+    monkeypatch.setattr(time_rules, "MOST", len(sound.tdoa) // 20)  # as in a recording of an hour
     of = time_rules.delays_of_tdoas(
         KnownPath(replace(sound, tdoa=replace(sound.tdoa, t=sound.tdoa.t + late)))
     )

@@ -51,10 +51,10 @@ def surveys(tmp_path):
     [
         ("flights/0422/0422-log00", "anchor_0422.txt"),
         ("flights/0425/TDOA2/0425-traj1", "anchor_0425.txt"),
-        ("0422/log00", "anchor_0422.txt"),  # the folder names it
-        ("backup-0422/flights/0425/traj1", "anchor_0425.txt"),  # what is said last is meant
+        ("0422/log00", "anchor_0422.txt"),  # the folder determines the survey
+        ("backup-0422/flights/0425/traj1", "anchor_0425.txt"),  # the last match counts
         ("util/const1-trial1-tdoa2.csv.gz", "anchor_const1.csv"),
-        # the longer key is the better fit
+        # the longer key is the better match
         ("util/const10-trial1-tdoa2.csv.gz", "anchor_const10.csv"),
         ("util/const3-trial2-tdoa3-traj1.csv", "anchor_const3.csv"),
     ],
@@ -66,7 +66,7 @@ def test_a_folder_of_surveys_serves_the_recordings_whose_path_has_the_key(
 
 
 def test_the_longest_key_wins_where_keys_overlap(tmp_path, surveys):
-    """As help and docstring say."""
+    """This is documented in the help and in the docstring."""
     make(surveys, "anchor_25.txt")
     assert survey_for(tmp_path / "0425" / "traj1", surveys) == surveys / "anchor_0425.txt"
 
@@ -104,12 +104,12 @@ def test_folders_are_searched_in_order_and_hidden_files_left_out(tmp_path):
 def test_a_bag_that_no_survey_of_a_folder_fits_keeps_its_own_anchors_and_says_so(
     tmp_path, surveys, capsys, monkeypatch
 ):
-    monkeypatch.setattr(inputs, "_REPORTED", set())  # of what ran before in this process
+    monkeypatch.setattr(inputs, "_REPORTED", set())  # reported earlier in this process
     make(tmp_path / "flights", "bag1/metadata.yaml", "bag1/bag1_0.mcap", "0422-log")
     for name, magic in (
         ("loose.mcap", b"\x89MCAP0\r\n"),
         ("old", b"SQLite format 3\0"),
-    ):  # a bag by what is in it, not by its name
+    ):  # the content identifies a bag, not its name
         (tmp_path / "flights" / name).write_bytes(magic)
     found = find_flights([str(tmp_path / "flights")], surveys)
     assert [(path.name, survey and survey.name) for path, survey in found] == [
@@ -138,7 +138,7 @@ def test_nothing_there_is_bad_input(tmp_path):
 def test_of_more_flights_than_are_to_be_held_some_are_drawn(tmp_path, capsys, monkeypatch):
     paths = [tmp_path / f"flight-{k}" for k in range(9)]
     for path in paths:
-        path.write_bytes(log_bytes())  # of two TDOAs
+        path.write_bytes(log_bytes())  # holds two TDOAs
     (tmp_path / "survey.csv").write_text(SURVEY)
     reading, names = Reading(tmp_path / "survey.csv"), [path.name for path in paths]
     assert [flight.name for flight in reading.flights(paths, 18)] == names
@@ -196,7 +196,7 @@ def test_a_survey_that_is_given_counts_whatever_anchors_a_bag_holds_and_that_is_
     assert [flight.anchors.positions[0, 0] for flight in Reading().flights(bags)] == [0.1, 0.1]
     said = [
         line for line in capsys.readouterr().err.splitlines() if " flights done, " not in line
-    ]  # as a slow computer says
+    ]  # printed on a slow computer
     assert len(said) == 1 and f"the anchors of {survey} count here" in said[0]
 
 
@@ -220,7 +220,7 @@ def test_a_bag_that_was_not_closed_is_one(tmp_path):
 
 @pytest.mark.parametrize("kind", ["log", "bag"])
 def test_ground_truth_that_is_not_wanted_is_not_read(tmp_path, kind):
-    """Not even to say that it is damaged."""
+    """Not even damage in it is reported."""
     (tmp_path / "survey.csv").write_text(SURVEY)
     if kind == "bag":
         flight = small_flight()

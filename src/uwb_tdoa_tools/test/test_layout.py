@@ -1,8 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The layout of the packages, read from their sources: who imports whom, and what is declared as a
-dependency.
-"""
+"""The layout of the packages, read from their sources: imports and declared dependencies."""
 
 import ast
 from functools import cache
@@ -15,12 +13,12 @@ from xml.etree import ElementTree
 import pytest
 
 SRC = Path(__file__).resolve().parents[2]
-# imports go to the left
+# packages may import packages to their left
 ORDER = ("uwb_tdoa_msgs", "uwb_tdoa_bias", "uwb_tdoa_ekf", "uwb_tdoa_tools")
 PACKAGES = ORDER[1:]
-# the public module, which a package installs besides itself
+# the public module, which a package installs in addition to its own
 API = {"uwb_tdoa_tools": ("uwb_tdoa",)}
-# Who talks ROS. Everything else can be imported and tested without it.
+# Modules that use ROS. All others can be imported and tested without it.
 ROS = """
     uwb_tdoa_bias.anchors_node uwb_tdoa_bias.bias_node
     uwb_tdoa_bias.ros.process uwb_tdoa_bias.ros.anchors uwb_tdoa_bias.ros.cdr
@@ -38,11 +36,11 @@ ROS = """
     uwb_tdoa_tools.flying.over_topics uwb_tdoa_tools.live.run uwb_tdoa_tools.live.session uwb_tdoa_tools.vehicle_node
 """.split()
 IS_ROS = re.compile(r"rclpy|\w+_msgs|\w+_interfaces|domain_coordinator|ament_index_python")
-# import name: (rosdep key, name on the Python package index); ROS packages are imported under their
-# own name
+# import name: (rosdep key, name on the Python package index)
+# ROS packages are imported under their own name
 KEYS = {
     "PIL": ("python3-pil", "Pillow"),
-    "backports": (None, "backports.zstd"),  # comes with rosbags, as lz4 does
+    "backports": (None, "backports.zstd"),  # installed with rosbags, like lz4
     "cflib": (None, "cflib"),  # for protocol crazyflie
     "dask": (None, "distributed"),
     "distributed": (None, "distributed"),
@@ -60,22 +58,22 @@ KEYS = {
     "pyulog": (None, "pyulog"),  # for logs of PX4
     "rerun": (None, "rerun-sdk"),  # for --rerun
     "rosbags": ("python3-rosbags-pip", "rosbags"),
-    "pandas": (None, "pandas"),  # for tables, where it is installed
-    "rotorpy": (None, "rotorpy"),  # an oracle of tests, for who wants it
+    "pandas": (None, "pandas"),  # optional, for tables
+    "rotorpy": (None, "rotorpy"),  # optional, a reference for tests
     "scipy": ("python3-scipy", "scipy"),
     "sklearn": ("python3-sklearn", "scikit-learn"),
     "tqdm": ("python3-tqdm", "tqdm"),
     "yaml": ("python3-yaml", "PyYAML"),
 }
-# by launch files, and what starts these
+# programs that launch files start, and the launch system
 STARTED = {"uwb_tdoa_ekf": {"ros2bag", "ros2launch", "rviz2"}}
-# of the tests, which import them not, or where they are
+# needed to run the tests, but not imported
 RUNNERS = {"python3-pytest-xdist"}
 
 
 @cache
 def modules():
-    """{module: path} of all our packages."""
+    """Return {module: path} of all our packages."""
     found = {}
     for package in PACKAGES:
         folders = [SRC / package / name for name in (package, *API.get(package, ()))]
@@ -87,13 +85,13 @@ def modules():
 
 @cache
 def imports(module, top_only=False):
-    """Full names of what a module imports: modules of ours, and top-level names of others."""
+    """Return the imports of a module: full names of our modules, and top-level names of others."""
     path = modules()[module]
     tree = ast.parse(path.read_text())
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
     found = set()
     for node in tree.body if top_only else ast.walk(tree):
-        if isinstance(node, ast.Try) and top_only:  # optional parts are imported under try
+        if isinstance(node, ast.Try) and top_only:  # optional parts are imported in a try block
             continue
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
@@ -115,7 +113,7 @@ def ours(module, top_only=False):
 
 
 def test_relative_imports_lead_to_modules():
-    """Those in functions too, which fail only when they run."""
+    """Imports in functions count, too. They fail only when the function runs."""
     for module, path in modules().items():
         package = module if path.name == "__init__.py" else module.rpartition(".")[0]
         for node in ast.walk(ast.parse(path.read_text())):
@@ -133,7 +131,7 @@ def test_no_module_imports_a_command():
 
 
 def test_what_takes_a_second_to_import_is_imported_where_it_is_used():
-    """In the start of each command that needs it, and of no other."""
+    """Modules that take a second to import are imported in functions."""
     slow = {"scipy.stats", "scipy.signal"}
     for module in modules():
         found = imports(module, top_only=True)
@@ -152,14 +150,14 @@ def test_no_package_imports_one_above():
 
 
 def test_files_are_on_floors():
-    """No file needs itself by others, neither for what it runs nor for its types."""
+    """Imports between files form no cycle, neither at run time nor for types."""
     TopologicalSorter(
         {module: ours(module) - {module} for module in modules()}
-    ).prepare()  # raises CycleError, which names the circle
+    ).prepare()  # raises CycleError, which names the cycle
 
 
 def test_folders_are_on_floors():
-    """Nor does a folder."""
+    """Imports between folders form no cycle."""
     needs = {}
     for module in modules():
         folder = folder_of(module)
@@ -169,7 +167,7 @@ def test_folders_are_on_floors():
 
 
 def folder_of(module):
-    """package.folder of a module or package in it, whatever lies below; "" for what is in none."""
+    """Return package.folder of a module or package, at any depth below; "" without a folder."""
     parts = module.split(".")
     return ".".join(parts[:2]) if (SRC / parts[0] / Path(*parts[:2])).is_dir() else ""
 
@@ -195,7 +193,7 @@ def test_nothing_imports_studies_and_they_import_no_command():
 
 
 def way_to_ros(module):
-    """The modules through which importing a module imports ROS: text; "" if it does not."""
+    """Return the chain of imports from a module to ROS as text; "" if it does not import ROS."""
     seen, waiting = set(), [(module,)]
     while waiting:
         way = waiting.pop()
@@ -204,7 +202,7 @@ def way_to_ros(module):
                 return " imports ".join((*way, name))
             parents = {
                 name.rsplit(".", k)[0] for k in range(name.count(".") + 1)
-            }  # importing it runs their __init__
+            }  # an import runs their __init__
             for other in (parents & modules().keys()) - seen:
                 seen.add(other)
                 waiting.append((*way, other))
@@ -217,16 +215,17 @@ def test_ros_is_imported_by_those_who_talk_it_and_nobody_else(module):
 
 
 def names_of_messages(package):
-    """Packages of the message types that are named as text, and become classes when a program runs."""
+    """Return the packages of message types that are named in strings and imported at run time."""
     texts = "".join(
         path.read_text() for path in modules().values() if path.is_relative_to(SRC / package)
     )
-    return set(re.findall(r'"(\w+)/msg/\w+"', texts)) - {"pkg", package}  # in a docstring
+    return set(re.findall(r'"(\w+)/msg/\w+"', texts)) - {"pkg", package}  # from a docstring
 
 
 def needed(package, *folders):
-    """Top-level names, not of ours and not of Python, that the files in some folders of a package
-    import.
+    """Return the external packages that the files in some folders of a package import.
+
+    Our packages and the standard library do not count.
     """
     names = set()
     for folder in (*folders, *(API.get(package, ()) if package in folders else ())):
@@ -244,7 +243,7 @@ def needed(package, *folders):
         names -= local
     beside = {
         path.stem for other in PACKAGES for path in (SRC / other / "test").iterdir()
-    }  # helpers of tests
+    }  # test helpers
     return (
         names
         - set(sys.stdlib_module_names)
@@ -277,7 +276,7 @@ def test_pyproject_declares_what_is_imported_and_nothing_else():
     names = [re.match(r"[\w.-]+", one)[0] for some in lists for one in ast.literal_eval(some)]
     assert len(names) == len(set(names))
     imported = set().union(*(needed(package, package) for package in PACKAGES))
-    tested = {"rotorpy"} & needed("uwb_tdoa_tools", "test")  # of tests that are skipped without it
+    tested = {"rotorpy"} & needed("uwb_tdoa_tools", "test")  # tests without it are skipped
     assert set(names) == {KEYS[name][1] for name in (imported | tested) if name in KEYS}
 
 
@@ -332,4 +331,4 @@ def test_commands_are_thin(module):
     assert len(statements) - len(options) <= 65
     assert not re.search(
         r"(?<!\w)print\(|tqdm\.write", text
-    )  # cli.show and cli.say make text of others printable
+    )  # cli.show and cli.say escape unprintable text from others

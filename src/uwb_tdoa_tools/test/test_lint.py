@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Format and rules of the sources, as ruff.toml says, and the number of arguments of a function."""
+"""Format and rules of the sources in ruff.toml, and the number of arguments of a function."""
 
 import ast
 import subprocess
@@ -15,7 +15,7 @@ SOURCES = [
     ROOT / "src/uwb_tdoa_tools/uwb_tdoa_tools",
     ROOT / "studies",
 ]
-MOST_ARGUMENTS = 7  # of a function, as CONTRIBUTING.md says; self and cls are none
+MOST_ARGUMENTS = 7  # arguments of a function (CONTRIBUTING.md), without self and cls
 
 
 def arguments(function):

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What is played keeps in step with what comes of it."""
+"""A replay stays synchronous with the output of the nodes."""
 
 import time
 
@@ -36,7 +36,7 @@ def node():
 
 
 class Speaker:
-    """Publishes stamps on a topic and waits until somebody has subscribed."""
+    """Publishes stamps on a topic. `matched` waits for a subscription."""
 
     def __init__(self, node, topic, kind=Imu):
         self._publisher, self._kind = node.create_publisher(kind, topic, 1000), kind
@@ -68,7 +68,7 @@ def follower(node, speaker):
 
 
 def waits(follower, stamp):
-    """Whether a message at stamp, ns, is waited for."""
+    """Return whether the replay waits before a message with this stamp, ns."""
     stop = Soon()
     follower.wait(stamp, stop)
     return stop.came
@@ -78,7 +78,7 @@ def test_the_replay_waits_for_a_topic_that_is_behind(follower, speaker, monkeypa
     monkeypatch.setattr(follow, "SILENCE", 1000.0)
     assert follower.wait(100 * SECOND, False) == 0.0
     assert not waits(follower, 100 * SECOND + LEAD)
-    assert waits(follower, 101 * SECOND + LEAD)  # 100.0 was the beginning
+    assert waits(follower, 101 * SECOND + LEAD)  # 100.0 was the start
     speaker.say(101)
     until = time.monotonic() + 60.0
     while waits(follower, 101 * SECOND + LEAD):
@@ -94,7 +94,7 @@ def test_a_topic_that_has_gone_silent_is_not_waited_for(follower, speaker, monke
     assert not waits(follower, 10 * SECOND)
     speaker.say(9)
     until = time.monotonic() + 60.0
-    while not waits(follower, 12 * SECOND):  # it is waited for again, once that has come
+    while not waits(follower, 12 * SECOND):  # it waits again after a new message
         assert time.monotonic() < until
 
 
@@ -129,7 +129,7 @@ def test_stamps_are_read_from_the_bytes():
 
 @pytest.fixture
 def starting(node, speaker):
-    """(Follower of TDOAs too, Speaker of what comes out of the filter)."""
+    """Return (Follower that also follows TDOAs, Speaker of the output of the filter)."""
     residuals = Speaker(node, "uwb/residual", TdoaResidual)
     follower = Follower(node, "imu/late")
     speaker.matched()
@@ -139,7 +139,7 @@ def starting(node, speaker):
 
 @pytest.fixture
 def filtered(starting, speaker, monkeypatch):
-    """The same, when the first pose is long ago."""
+    """Return the same, with the first pose long ago."""
     monkeypatch.setattr(follow, "START", 0)
     speaker.say(10)
     until = time.monotonic() + 60.0
@@ -150,7 +150,7 @@ def filtered(starting, speaker, monkeypatch):
 
 
 def play(follower, stamps):
-    """Play TDOAs at stamps, s, as far as they need not be waited for: how many were."""
+    """Play TDOAs at stamps, s, until the follower has to wait. Return their number."""
     for number, stamp in enumerate(stamps):
         if waits(follower, round(stamp * SECOND)):
             return number
@@ -159,9 +159,12 @@ def play(follower, stamps):
 
 
 class Soon:
-    """True after 0.2 s in which it was asked often: on a loaded machine time may pass in which
-    nobody does anything.
-    came : whether somebody was told so."""
+    """Becomes true after 0.2 s and more than 20 queries.
+
+    On a loaded machine, 0.2 s may pass without any query.
+
+    came : whether a query has returned true
+    """
 
     def __init__(self):
         self.came, self._until, self._asked = False, time.monotonic() + 0.2, 0
@@ -177,7 +180,7 @@ STAMPS = [10.0 + 0.01 * k for k in range(200)]
 
 def test_the_replay_waits_for_tdoas_in_the_filter(filtered):
     follower, residuals = filtered
-    assert play(follower, STAMPS) == 9  # the last of them is a step newer than the first
+    assert play(follower, STAMPS) == 9  # the last stamp is a step newer than the first
     residuals.say(*STAMPS[:6])
     assert play(follower, STAMPS[9:]) == 6
     residuals.say(*STAMPS[6:100])
@@ -191,7 +194,7 @@ def test_steps_are_shorter_until_bias_node_has_poses(starting, speaker, monkeypa
     speaker.say(10.01)
     assert play(follower, STAMPS[5:]) == 2
     monkeypatch.setattr(follow, "SILENCE", 0.1)
-    assert play(follower, STAMPS[7:18]) == 11  # the IMU of the recording is too far behind for that
+    assert play(follower, STAMPS[7:18]) == 11  # the IMU of the recording is too far behind to wait
 
 
 def test_tdoas_that_are_lost_are_not_waited_for(filtered):
@@ -202,7 +205,7 @@ def test_tdoas_that_are_lost_are_not_waited_for(filtered):
 
 
 def test_stamps_that_an_effect_shifts_are_followed(filtered):
-    """bias_node takes tdoa_time_offset out of the stamps."""
+    """bias_node corrects the stamps by tdoa_time_offset."""
     follower, residuals = filtered
     play(follower, STAMPS)
     residuals.say(*(stamp - 0.4 for stamp in STAMPS[:10]))
@@ -236,7 +239,7 @@ def test_the_replay_does_not_wait_for_tdoas_that_wait_for_a_height(filtered):
     residuals.say(*STAMPS[:6])
     assert play(follower, STAMPS[22:]) == 5
     residuals.say(*STAMPS[6:95])
-    assert play(follower, STAMPS[27:]) == 77  # after a second without one it does not
+    assert play(follower, STAMPS[27:]) == 77  # without heights for a second, it no longer waits
 
 
 def test_help_and_pages_give_the_age_until_which_tdoas_are_awaited():

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The life of the processes of a live run, and what they say."""
+"""Start, output and end of the processes of a live run."""
 
 from contextlib import nullcontext
 import os
@@ -18,9 +18,9 @@ from uwb_tdoa_tools.live import processes  # noqa: E402
 
 @pytest.fixture
 def start(tmp_path, monkeypatch):
-    """start(name, script lines): run a shell script as an executable of a package.
+    """Return start(name, script lines), which runs a shell script as an executable of a package.
 
-    Ends everything afterwards.
+    All processes end after the test.
     """
     folder = tmp_path / "lib" / "some_package"
     folder.mkdir(parents=True)
@@ -84,7 +84,7 @@ def test_a_process_that_ignores_the_interrupt_is_killed(start, tmp_path, monkeyp
 
 
 def test_domains_are_drawn_at_random():
-    """Others would hear nodes of the run before."""
+    """With a fixed domain, a run could receive messages of the previous run."""
 
     def number():
         with processes.own_domain():
@@ -104,7 +104,7 @@ def test_a_signal_to_us_ends_the_run(start):
 
 
 class NobodySpeaks:
-    """In the place of rclpy, whose node has nothing to serve."""
+    """A stand-in for rclpy. Its node has nothing to process."""
 
     @staticmethod
     def spin_once(node, timeout_sec):
@@ -165,7 +165,7 @@ def test_changing_counters_extend_the_wait(start, quick):
 
 
 class Queue(nullcontext):
-    """The handle of a subscription, with messages that wait to be read."""
+    """The handle of a subscription with messages in its queue."""
 
     def __init__(self):
         super().__init__()
@@ -194,10 +194,10 @@ def test_settled_when_every_node_repeats_its_counts():
     diagnostics._take(status("ekf_node", received=4, rate="3.0 Hz"))
     node.queue.messages += ["said before", "said before, too"]
     diagnostics.forget()
-    assert not node.queue.messages  # nothing that was said before can settle it
+    assert not node.queue.messages  # old messages cannot settle it
     assert not diagnostics.is_settled()
     diagnostics._take(status("bias_node", received=5, rate="0.0 Hz"))
-    assert not diagnostics.is_settled()  # the other has not spoken
+    assert not diagnostics.is_settled()  # ekf_node has not published yet
     diagnostics._take(status("ekf_node", received=5, rate="0.0 Hz"))
     assert not diagnostics.is_settled()  # it has received one more
     diagnostics._take(status("ekf_node", received=5, rate="0.0 Hz"))

@@ -1,8 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Replays as real processes that talk over DDS, and what is recorded of topics.
+"""Replays as real processes that communicate over DDS, and recorded topics.
 
-No step waits for time to pass, only for what must happen.
+Each step waits for an event, never for a fixed time.
 """
 
 from contextlib import contextmanager
@@ -35,7 +35,7 @@ from uwb_tdoa_msgs.msg import AnchorArray, Tdoa  # noqa: E402
 from uwb_tdoa_tools.commands import replay  # noqa: E402
 from uwb_tdoa_tools.live.record import recorded_odometry  # noqa: E402
 
-LIMIT = 180.0  # s: a step that takes longer has failed
+LIMIT = 180.0  # s, limit of each step
 STREAMS = ["imu/data", "uwb/tdoa", "ground_truth/pose"]
 DEEP = QoSProfile(depth=100_000, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(
@@ -44,7 +44,7 @@ LATCHED = QoSProfile(
 
 
 class Process:
-    """A tool of ours that runs, and what it says on stderr, line by line."""
+    """A running tool of ours, with its lines on stderr."""
 
     def __init__(self, name, *arguments):
         command = [sys.executable, "-m", f"uwb_tdoa_tools.commands.{name}", *map(str, arguments)]
@@ -61,7 +61,7 @@ class Process:
         self._lines.put(None)
 
     def until(self, text):
-        """Wait for a line on stderr that holds the text."""
+        """Wait for a line on stderr that contains the text."""
         deadline = time.monotonic() + LIMIT
         while True:
             line = self._lines.get(timeout=max(deadline - time.monotonic(), 0.01))
@@ -71,7 +71,7 @@ class Process:
                 return
 
     def end(self, number=None):
-        """Exit code and stdout, after sending a signal if one is given."""
+        """Send a signal, if given, and return exit code and stdout."""
         if number is not None:
             self.process.send_signal(number)
         code = self.process.wait(timeout=2.0 * LIMIT)
@@ -82,7 +82,7 @@ class Process:
 
 @contextmanager
 def processes():
-    """A maker of processes, all of which have ended when the block ends."""
+    """Give a function that starts processes. All processes end with the block."""
     started = []
 
     def start(*arguments):
@@ -115,7 +115,7 @@ def node():
 
 
 def take(subscription, enough):
-    """Messages from a subscription until enough(messages)."""
+    """Return messages of a subscription as soon as enough(messages) is true."""
     messages = []
     deadline = time.monotonic() + LIMIT
     while not enough(messages):
@@ -179,7 +179,7 @@ def test_late_subscriptions_receive_the_anchors(tmp_path, start, node):
         "--wait-topics",
         "imu/data",
     )
-    take(imu, lambda messages: len(messages) > 10)  # the anchors have long been published
+    take(imu, lambda messages: len(messages) > 10)  # the anchors were published long before
     (array,) = take(subscribe(node, AnchorArray, "uwb/anchors", LATCHED), lambda messages: messages)
     assert [anchor.id for anchor in array.anchors] == [0, 1, 5]
     code, out = replaying.end(signal.SIGINT)
@@ -189,8 +189,11 @@ def test_late_subscriptions_receive_the_anchors(tmp_path, start, node):
 
 @pytest.mark.slow
 def test_slow_reliable_subscription_loses_nothing(tmp_path, start, node):
-    """The subscription sleeps for a second, in which the replay could publish all of it ten times."""
-    count = 12_000  # more than what DDS keeps for a writer
+    """The subscription sleeps for 1 s.
+
+    The replay could publish all messages ten times in this time.
+    """
+    count = 12_000  # more than DDS stores for a writer
     write_bag(small_flight(seconds=count / 1000), tmp_path / "flight.bag")
     keep_all = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
     imu = subscribe(node, Imu, "imu/data", keep_all)
@@ -233,8 +236,9 @@ def test_loop_starts_again_until_stopped(tmp_path, start, node):
 
 
 def test_all_topics_of_a_tag_move_to_a_namespace(tmp_path, start, node):
-    """As in the example of --help: all of the tag's topics, the anchors too, and the frames stay
-    where they are.
+    """The command is the example in --help.
+
+    All topics of the tag get the namespace, also the anchors. The frames do not change.
     """
     write_bag(small_flight(seconds=0.2), tmp_path / "flight.bag")
     kinds = {"uwb/tdoa": Tdoa, "imu/data": Imu, "ground_truth/pose": PoseStamped}
@@ -272,7 +276,7 @@ def test_without_subscriptions_it_ends_with_an_error(tmp_path, start):
 
 
 def test_a_topic_without_a_publisher_cannot_be_followed(tmp_path, start, node):
-    """Some listen, but not to the TDOAs, or nobody says what comes of them."""
+    """There are subscriptions, but none to the TDOAs; or the followed topic has no publisher."""
     write_bag(small_flight(seconds=0.1), tmp_path / "flight.bag")
     subscribe(node, Imu, "imu/data")
     unheard = start("replay", tmp_path / "flight.bag", "--wait-matched", 1, "--follow", "odometry")
@@ -282,7 +286,7 @@ def test_a_topic_without_a_publisher_cannot_be_followed(tmp_path, start, node):
         2,
         20,
         LIMIT,
-    ):  # it waits for the publisher so long; on a loaded machine it may not have found us by then
+    ):  # time to discover the publisher; a loaded machine needs more
         silent = start(
             "replay", tmp_path / "flight.bag", "--wait-matched", wait, "--follow", "odometry"
         )
@@ -296,8 +300,9 @@ def test_a_topic_without_a_publisher_cannot_be_followed(tmp_path, start, node):
 
 
 def test_no_message_is_lost_for_want_of_discovery(tmp_path, start, node):
-    """Best effort, and without naming topics to wait for: not one message may be lost for want of
-    discovery.
+    """The replay is best effort and names no topics to wait for.
+
+    Not one message may be lost before discovery.
     """
     write_bag(small_flight(seconds=0.3), tmp_path / "flight.bag")
     subscribe(node, AnchorArray, "uwb/anchors", LATCHED)

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""How the nodes are started for a live run. (test_demo.py runs the real ones.)"""
+"""Start of the nodes for a live run. test_demo.py runs the real nodes."""
 
 from types import SimpleNamespace
 

@@ -97,7 +97,7 @@ def test_types_of_installed_packages_are_found():
 
 
 def test_unknown_packages_are_not_imported(tmp_path, monkeypatch):
-    """Whoever publishes tells a name, and an import runs what it finds."""
+    """A publisher chooses the name of its type, and an import runs code."""
     (tmp_path / "evil_msgs").mkdir()
     (tmp_path / "evil_msgs" / "__init__.py").write_text("")
     (tmp_path / "evil_msgs" / "msg.py").write_text("class Nice: pass")

@@ -35,8 +35,9 @@ def flight():
 
 @pytest.fixture(scope="module")
 def bags(flight, tmp_path_factory):
-    """The same flight with its truth, without any, and with one that is somewhere else and no
-    number once.
+    """Write the same flight with its ground truth, without one, and with a wrong one.
+
+    The wrong ground truth is shifted by 3 m in each coordinate, and one position is NaN.
     """
     folder = tmp_path_factory.mktemp("localize")
     wrong = replace(flight.truth, p=flight.truth.p + 3.0)
@@ -79,7 +80,7 @@ def test_ground_truth_is_not_read_and_the_trajectory_is_that_of_evaluate_to_the_
 
 @pytest.mark.parametrize("ranges", [False, True])
 def test_evaluate_and_localize_state_the_same_nis(bags, ranges, tmp_path, capsys):
-    """They said 5.26 and 0.93 of one flight; then `evaluate` left out ranges."""
+    """They reported 5.26 and 0.93 for one flight. Later, `evaluate` left out ranges."""
     recording = bags / "true" / "flight.bag"
     if ranges:
         recording = tmp_path / "ranged.bag"
@@ -148,7 +149,8 @@ def test_a_tum_file_has_one_line_per_pose(tmp_path):
     read = np.loadtxt(path)
     np.testing.assert_allclose(read[:, 0], t, rtol=0, atol=1e-6)
     np.testing.assert_allclose(read[:, 1:4], p, atol=1e-6)
-    np.testing.assert_array_equal(read[1, 4:], [0, 0, 0, 1])  # unknown becomes the identity
+    # unknown attitudes become the identity
+    np.testing.assert_array_equal(read[1, 4:], [0, 0, 0, 1])
     write_tum(tmp_path / "none.tum", np.empty(0), np.empty((0, 3)), np.empty((0, 4)))
     assert (tmp_path / "none.tum").read_text() == ""
 
@@ -172,7 +174,7 @@ def test_a_clean_flight_is_good_and_within_what_is_stated(flight):
 
 @pytest.fixture(scope="module")
 def ranged():
-    """A flight of ranges alone, without ground truth."""
+    """Return a flight with ranges only, without ground truth."""
     made = simulate(SimulationConfig(seed=1, range_noise=0.1, **CLEAN))
     return replace(made, tdoa=rows_of(made.tdoa, slice(0)), truth=None)
 
@@ -293,8 +295,9 @@ def test_a_recording_without_an_estimate_has_files_and_a_picture_too(flight, tmp
 
 
 def walked(n=600):
-    """(Odometry, Residuals) of a tag that goes from x = 0 to 40 m; anchor k is heard from 10 k to
-    10 k + 20 m, the last TDOAs are rejected.
+    """Return (Odometry, Residuals) of a tag that moves from x = 0 to 40 m.
+
+    Anchor k is received from 10 k to 10 k + 20 m. The last TDOAs are rejected.
     """
     t = 0.1 * np.arange(n)
     p = np.column_stack([40.0 * t / t[-1], np.full(n, 2.0), np.ones(n)])

@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Replays that follow the nodes, with the nodes' own parameters and best-effort links, beside a
-computer at work.
+"""Replays that follow the nodes, on a busy computer.
+
+The nodes have their default parameters and best-effort connections.
 """
 
 from dataclasses import replace
@@ -35,7 +36,7 @@ READY_LIMIT, SETTLE_LIMIT = 180.0, 60.0  # s
 
 @pytest.fixture
 def load():
-    """load(n): n processes that never rest, until the test ends."""
+    """Return load(n), which starts n busy processes until the test ends."""
     running = []
 
     def start(count):
@@ -50,9 +51,13 @@ def load():
 
 
 def replayed(bag, folder, *options, nodes=(), begin=lambda: None):
-    """(exit code of a replay that follows the odometry, its output, diagnostics {node: {key:
-    text}}, recorded bag).
-    nodes : {node: arguments}; begin() : called when the nodes are there, before the replay."""
+    """Replay a bag in step with the odometry of the nodes.
+
+    nodes : {node: arguments}
+    begin : callable, called when the nodes are ready, before the replay
+
+    Returns (exit code, output, diagnostics {node: {key: text}}, recorded bag).
+    """
     model, recorded = known_answer.write(folder), folder / "recorded.bag"
     nodes = {"bias_node": ("--ros-args", "-p", f"model_file:={model}"), **dict(nodes)}
     with (
@@ -98,7 +103,7 @@ def assert_equal_to_offline(flight, told, recorded):
 
 @pytest.mark.slow
 def test_ranges_are_used_as_off_line_and_heights_with_holes_do_not_delay_the_replay(tmp_path):
-    """In a hole ekf_node waits for a height, and with it all TDOAs."""
+    """In a gap of the heights, ekf_node waits for a height and holds back all TDOAs."""
     flight = simulate(
         SimulationConfig(seed=3, duration=16.0, imu_rate=200.0, height_noise=0.01, range_noise=0.1)
     )
@@ -108,7 +113,7 @@ def test_ranges_are_used_as_off_line_and_heights_with_holes_do_not_delay_the_rep
     flight = read_bag(tmp_path / "flight.bag")
     _, said, told, recorded = replayed(tmp_path / "flight.bag", tmp_path, "--rate", 2)
     told_by = told["ekf_node"]
-    # the first of all, as nobody waits for what has not come yet
+    # the very first height may be late: before it, no height is expected
     assert int(told_by["height_late"]) <= 1, said
     assert_equal_to_offline(flight, told, recorded)
     _, run = evaluate(flight, network=load_network(recorded.with_name("known_answer.onnx")))
@@ -117,7 +122,7 @@ def test_ranges_are_used_as_off_line_and_heights_with_holes_do_not_delay_the_rep
     assert abs(int(told_by["range_used"]) - used) <= 2
     assert (tmp_path / "ekf_node.log").read_text().partition("running")[2].count(
         "no TDOAs"
-    ) <= 1  # when all has been played
+    ) <= 1  # after the end of the replay
 
 
 @pytest.mark.slow
@@ -150,9 +155,7 @@ def test_nodes_that_do_not_wait_long_enough_are_not_followed(tmp_path):
 
 
 def delayed(bag, out, count=10, delay=1_000_000_000):
-    """A copy of a bag in which some TDOAs from the middle were recorded a second after their
-    stamps.
-    """
+    """Copy a bag. Some TDOAs from the middle are recorded one second after their stamps."""
     with open_bag(bag) as reader, new_bag(out) as writer:
         made = {
             c.topic: writer.add_connection(

@@ -13,7 +13,7 @@ from uwb_tdoa_tools import cli, command_lines, main
 
 @pytest.fixture(autouse=True)
 def restored(monkeypatch):
-    monkeypatch.setenv(command_lines.RUN, "./dev run")  # which the command changes
+    monkeypatch.setenv(command_lines.RUN, "./dev run")  # the command changes it
 
 
 def test_help_lists_every_command(capsys):
@@ -57,7 +57,7 @@ def test_a_command_gets_its_words_and_its_errors_name_it(capsys):
 )
 def test_next_steps_have_the_form_of_the_call(called, tool, node, monkeypatch):
     if called is None:
-        monkeypatch.delenv(command_lines.RUN)  # of the fixture
+        monkeypatch.delenv(command_lines.RUN)  # set by the fixture
     else:
         monkeypatch.setenv(command_lines.RUN, called)
     assert command_lines.tool("check", "a.bag") == tool
@@ -72,7 +72,7 @@ def test_next_steps_have_the_form_of_the_call(called, tool, node, monkeypatch):
 
 @pytest.fixture(scope="module")
 def completed():
-    """completed(word, ...): what bash offers for the last of some words."""
+    """Return the completions that bash offers for the last word of completed(word, ...)."""
     completion = main.completion()
 
     def offered(*words):
@@ -95,5 +95,5 @@ def test_a_shell_completes_commands_options_and_values(completed):
     assert completed("uwb-tdoa", "evaluate", "--sm") == ["--smooth"]
     assert completed("uwb-tdoa", "evaluate", "--align", "") == ["none", "time", "frame"]
     assert completed("uwb-tdoa", "evaluate", "--align", "fr") == ["frame"]
-    assert "--holdout" in completed("uwb-tdoa", "debias", "--")  # of its own commands, too
-    assert completed("uwb-tdoa", "check", "fli") == []  # files, by the shell
+    assert "--holdout" in completed("uwb-tdoa", "debias", "--")  # options of its subcommands, too
+    assert completed("uwb-tdoa", "check", "fli") == []  # the shell completes files

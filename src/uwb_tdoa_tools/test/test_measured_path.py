@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The main job on a measured flight: nodes over topics, eight times as fast, against the offline engine
-and ground truth.
+"""The main use case on a measured flight, at eight times real time.
+
+The nodes over topics are compared with the offline engine and with ground truth.
 """
 
 import numpy as np

@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Measured ranges, as docs/notebook/ranges.md takes them: the filter finds the
-antenna delay of a tag that nobody has calibrated.
+"""Measured ranges, as in docs/notebook/ranges.md.
+
+The filter estimates the unknown antenna delay of the tag.
 """
 
 import shutil
@@ -21,7 +22,7 @@ from uwb_tdoa_tools.scoring.metrics import Score, radio_residuals
 
 @pytest.fixture(params=["1", "2"])
 def tag(request, tmp_path, shared_data):
-    """The flight of one tag of STAR-loc, without the inertial sensor."""
+    """Return the flight of one tag of STAR-loc, without the IMU."""
     folder = shared_data / "ranging" / "starloc"
     shutil.copy(folder / "loop-2d-fast_s1" / "uwb.csv.gz", tmp_path)
     survey = read_named_anchors(folder / "uwb_markers_v2.csv")
@@ -29,7 +30,7 @@ def tag(request, tmp_path, shared_data):
 
 
 def test_a_tag_of_which_nobody_knows_the_delay_is_located_and_honest(tag):
-    """A filter that takes the tag for calibrated is a metre off, and certain."""
+    """Without an unknown delay, the filter is wrong by a metre, and its covariance is too small."""
     row, wrong = (
         evaluate(tag, config)[0].row() for config in (None, FilterConfig(range_offset_std=0.0))
     )
@@ -38,7 +39,7 @@ def test_a_tag_of_which_nobody_knows_the_delay_is_located_and_honest(tag):
 
 
 def test_a_survey_of_ranges_is_applied_and_the_position_gets_better(tag):
-    """Anchors that the flight itself shows, without its ground truth."""
+    """The flight determines the anchors without its ground truth."""
     found = self_calibrate([tag])
     assert found.why_not is None and found.before > 1.25 * found.left
     before, after = (
@@ -53,7 +54,7 @@ def test_a_survey_of_ranges_is_applied_and_the_position_gets_better(tag):
 
 @pytest.mark.parametrize(("smoothed", "peer"), [(False, 0.454), (True, 0.111)])
 def test_a_walk_is_nearer_to_the_truth_than_its_peer(shared_data, smoothed, peer):
-    """On line and in hindsight, after rigid alignment, without a calibration."""
+    """Online and smoothed, after rigid alignment, without a calibration."""
     bag = shared_data / "ranging" / "isas" / "ISAS-Walk1.bag"
     walk = read_by_profile([bag], load_profile("isas"))
     run = FlightEstimator(smoothed=smoothed)(walk)

@@ -1,6 +1,9 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Every measured file is read whole: against counts from a second, plain way through the file."""
+"""Every measured file is read completely.
+
+A second, simple parser counts the events.
+"""
 
 from collections import Counter
 import gzip
@@ -22,7 +25,7 @@ def relative(path):
 
 
 def count_events(content):
-    """{event name: number of events} of a version 2 log."""
+    """Return {event name: number of events} of a version 2 log."""
     at = 5
 
     def string():
@@ -60,14 +63,15 @@ def test_log(path):
     assert len(flight.imu) == counts.pop("estGyroscope") == counts.pop("estAcceleration") > 30_000
     assert len(flight.truth) == counts.pop("estPose") > 8000
     assert len(flight.height or ()) == counts.pop("estTOF", 0)
-    # the log repeats each of them, up to a thousand times a second
+    # the log repeats each reading up to a thousand times per second
     readings = len(flight.pressure or ())
     assert (readings > 500) == (counts.pop("estBarometer", 0) > 0)
     pixel_counts, velocities = (
         counts.pop("estFlow", 0),
         0 if flight.velocity is None else len(flight.velocity.t),
     )
-    assert 0.2 * pixel_counts <= velocities <= 0.4 * pixel_counts  # some three readings for each
+    # about three readings for each velocity
+    assert 0.2 * pixel_counts <= velocities <= 0.4 * pixel_counts
     assert {name: len(columns["t"]) for name, columns in flight.extra.items()} == dict(counts)
     assert "reordered" not in flight.meta and "imu_accel_interpolated" not in flight.meta
     assert set(flight.tdoa.a) == set(flight.tdoa.b) == set(range(8)) == set(flight.anchors.ids)

@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Bad starts on measured flights: put 2 m aside, switched on in flight, with a yaw that is 90
-degrees wrong.
+"""Bad starts on measured flights.
+
+The filter is shifted by 2 m, starts in flight, or has a yaw error of 90 degrees.
 """
 
 from dataclasses import replace
@@ -27,9 +28,9 @@ FLIGHTS = (
     "0426-traj9",
     "tdoa2-obs-log1",
 )
-TIMES = (5.0, 15.0)  # s after take-off at which something goes wrong
-AFTER, WINDOW = 3.0, 2.0  # s until it must be over, and over which that is judged
-YAW_TIME = 10.0  # s in the air by which the yaw must be known
+TIMES = (5.0, 15.0)  # s after take-off, time of the disturbance
+AFTER, WINDOW = 3.0, 2.0  # s, limit of the recovery; s, evaluated time after it
+YAW_TIME = 10.0  # s in the air, limit until the yaw is known
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +38,7 @@ def flights(shared_data):
     paths = [path for name in FLIGHTS for path in (shared_data / "flights").rglob(name)]
     assert len(paths) == len(FLIGHTS)
     flights = Reading(shared_data / "surveys").flights(paths)
-    return [flight.without(*SENSOR_NAMES) for flight in flights]  # starts from TDOAs alone
+    return [flight.without(*SENSOR_NAMES) for flight in flights]  # starts from TDOAs only
 
 
 def between(stream, low, high):
@@ -69,8 +70,9 @@ def rms(flight, t, p, low, high):
 
 @pytest.mark.slow
 def test_a_filter_put_aside_or_started_in_flight_is_back_within_three_seconds(flights):
-    """Within twice the error of the undisturbed filter: its RMSE, or what it is just then, as
-    beside an obstacle.
+    """The limit is twice the error of the undisturbed filter.
+
+    This is its RMSE or, for example near an obstacle, its error at that time.
     """
     kinds = ("usual", "2 m off", "in flight")
     print(

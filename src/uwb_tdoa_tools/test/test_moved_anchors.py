@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Anchors that were moved or exchanged, before a recording or on the way: who names them, and who
-is not blamed.
+"""Anchors moved or exchanged before or during a recording.
+
+The tools must name these anchors and blame no others.
 """
 
 from dataclasses import replace
@@ -37,8 +38,9 @@ CONFIG = SimulationConfig(
 
 
 def flown(positions=None):
-    """The flight among the anchors of the survey, or at other positions, always along the same
-    path.
+    """Return a flight among the surveyed anchors, or other positions.
+
+    The path is always the same.
     """
     filled, room = CONFIG.complete()
     moved = None if positions is None else filled.anchors.at(positions)
@@ -73,7 +75,10 @@ def exchanged(sound):
 
 @pytest.fixture(scope="module")
 def calibrated(sound):
-    """What is known of the anchors of the survey: 2 cm of each coordinate, 1 cm of each delay."""
+    """Return a calibration without errors.
+
+    Standard deviations: 2 cm for coordinates, 1 cm for delays.
+    """
     keys = keys_of(sound.anchors.ids)
     n = len(sound.anchors)
     known = Covariance(keys, np.diag(np.repeat([0.02**2, 0.01**2], [3 * n, n])))
@@ -87,7 +92,10 @@ def calibrated(sound):
 
 
 def far_moved():
-    """(Flight, row of the anchor that was moved by half a metre, shift (3,) m), in a random room."""
+    """Return a flight in a random room with one anchor moved by half a metre.
+
+    Returns (Flight, row of the anchor, shift (3,) m).
+    """
     config = SimulationConfig(seed=2, constellation="random-2-8", bias=False)
     filled, room = config.complete()
     anchors, row = filled.anchors, 6
@@ -100,7 +108,7 @@ def far_moved():
 
 
 def from_the_middle_on(flight, other):
-    """The one until its middle, then the other."""
+    """Return the first half of one flight and the second half of the other."""
     middle = flight.tdoa.t[0] + 0.5 * np.ptp(flight.tdoa.t)
     return replace(
         flight,
@@ -137,7 +145,7 @@ def test_an_anchor_that_was_moved_before_the_start_is_named_with_the_command_tha
 
 
 def test_what_check_says_of_an_anchor_holds_the_doubt_of_the_monitor():
-    """The monitor could not separate two anchors, and `check` named one of them alone."""
+    """The monitor could not separate two anchors, but `check` named only the first."""
     one = Finding(
         "anchor_moved", ERROR, "anchor 5 is not where the survey has it", "explains", "", 0.0
     )
@@ -181,7 +189,7 @@ def test_what_happens_in_the_middle_of_a_recording_is_named_with_its_time(
 def test_with_exchanged_ids_evaluate_blames_neither_the_truth_nor_itself(
     exchanged, tmp_path, capsys
 ):
-    """It said "tilted by 89.6 degrees", and ended with 0."""
+    """`evaluate` reported "tilted by 89.6 degrees" and returned 0."""
     write_bag(exchanged, tmp_path / "flight")
     code = evaluate.main([str(tmp_path / "flight")])
     out, err = capsys.readouterr()
@@ -205,12 +213,12 @@ def test_ids_are_asked_for_before_anchors(exchanged, tmp_path, capsys, command, 
 
 @pytest.fixture(scope="module")
 def calibration(moved):
-    """What self-calibration finds in the flight whose anchor 3 was moved, without ground truth."""
+    """Return the self-calibration of the flight with the moved anchor 3, without ground truth."""
     return self_calibrate([replace(moved, truth=None)], Tape(std=0.05))
 
 
 def test_one_moved_anchor_is_found_as_such_without_ground_truth(calibration):
-    """It was spread over others: a tape is off a little everywhere."""
+    """The shift was spread over other anchors, because a tape has errors everywhere."""
     (change,) = calibration.changes
     assert change.effect == "anchor_position" and change.anchor == "3"
     assert np.linalg.norm(calibration.shifts[ROW] - SHIFT) < 0.08
@@ -221,7 +229,7 @@ def test_one_moved_anchor_is_found_as_such_without_ground_truth(calibration):
 
 
 def test_one_that_the_filter_rejects_is_placed_by_all_of_its_tdoas():
-    """Rejected TDOAs were not in the equations: nothing was named, and 0.4 m were left."""
+    """Rejected TDOAs were not in the equations. No anchor was named, and 0.4 m remained."""
     flight, row, shift = far_moved()
     found = self_calibrate([flight], Tape(std=0.05))
     (change,) = found.changes
@@ -240,7 +248,10 @@ def test_a_sound_flight_has_no_moved_anchor(sound):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["0422-log02", "0426-traj13"])
 def test_errors_of_antennas_are_no_moved_anchor(shared_data, name):
-    """Measured flights, anchors as surveyed: one of them absorbed part of the errors of others."""
+    """Measured flights with the surveyed anchors.
+
+    One anchor absorbed part of the antenna errors of the others.
+    """
     where = shared_data / "surveys" / f"anchor_{name[:4]}.txt"
     flight = read_flight(shared_data / "flights" / name[:4] / name, where)
     assert not self_calibrate([replace(flight, truth=None)], Tape(std=0.05)).changes
@@ -265,7 +276,7 @@ def test_nothing_is_said_to_be_untold_of_an_anchor_that_has_moved(calibration):
 
 @pytest.mark.slow
 def test_anchors_of_a_hall_that_are_left_behind_are_no_fault():
-    """There were 44 warnings: look at its power."""
+    """There were 44 warnings such as "look at its power"."""
     grid = np.array(
         [[10.0 * i, 10.0 * k, 3.0 + 2.0 * ((i + k) % 2)] for i in range(9) for k in range(5)]
     )

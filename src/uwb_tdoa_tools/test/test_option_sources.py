@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What an option says and a file says too: the option counts, or is refused with a sentence;
-nothing is passed over.
+"""An option and a file give the same setting.
+
+The option overrides the file, or is refused with a message. Nothing is ignored silently.
 """
 
 from dataclasses import replace
@@ -41,7 +42,7 @@ CLEAN = dict(
 
 @pytest.fixture
 def desk(tmp_path, monkeypatch):
-    """A bag whose anchors stand elsewhere than they do, and a survey that says where."""
+    """A working directory with a bag whose anchors are wrong, and a correct survey."""
     monkeypatch.chdir(tmp_path)
     flight = simulate(SimulationConfig(seed=1, **CLEAN))
     flight.anchors.to_yaml("right.yaml")
@@ -53,7 +54,7 @@ def desk(tmp_path, monkeypatch):
 
 
 def rmse(words, monkeypatch):
-    """3D RMSE that evaluate reaches."""
+    """Return the 3D RMSE of `evaluate`, m."""
     results, judge = [], Evaluator.__call__
     with monkeypatch.context() as patch:
         patch.setattr(
@@ -109,7 +110,7 @@ def test_convert_and_inject_put_the_survey_into_the_bag(desk):
     ],
 )
 def test_every_tool_reads_the_recording_with_the_survey(desk, monkeypatch, command, words):
-    """It says so, and whatever it then does it does with those anchors."""
+    """The tool reads the recording with the anchors of the survey."""
     seen = []
     module = {
         check: "uwb_tdoa_tools.checking.recording",

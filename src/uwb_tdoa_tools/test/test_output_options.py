@@ -1,8 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""No command writes through a link, or over what it reads.
+"""No command writes through a link or overwrites its input.
 
-The commands are those of setup.py, so that a new one is among them.
+The list of commands comes from setup.py, so it includes new commands.
 """
 
 from importlib import import_module
@@ -73,7 +73,7 @@ def test_standard_output_is_a_file():
 @pytest.mark.parametrize(
     ("kind", "out", "said"),
     [
-        (OutputFile, "/proc/out", "cannot be written .*: /proc"),  # for root, too
+        (OutputFile, "/proc/out", "cannot be written .*: /proc"),  # fails for root, too
         (OutputFolder, "/proc/out", "cannot be written .*: /proc"),
         (OutputFolder, "file/out", "cannot be made, as .*file is a file"),
         (OutputFile, "home", "is a directory; give a file"),

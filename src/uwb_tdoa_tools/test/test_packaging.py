@@ -1,8 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""One version everywhere, in what is written too; keys that rosdep knows; and what colcon test
-would run.
-"""
+"""Package files: one version everywhere, known rosdep keys, and tests that colcon finds."""
 
 import json
 from pathlib import Path
@@ -54,7 +52,7 @@ def test_the_version_is_an_option(capsys):
 
 
 def test_package_files_are_valid():
-    """By the rules of REP 149, as ament and rosdep read them."""
+    """The rules of REP 149 apply, as in ament and rosdep."""
     package = pytest.importorskip("catkin_pkg.package")
     for folder in PACKAGES:
         remarks = []
@@ -63,7 +61,7 @@ def test_package_files_are_valid():
 
 
 def declared():
-    """Names of all dependencies in all package.xml, our packages aside."""
+    """Return the names of all dependencies in all package.xml, without our packages."""
     tags = ("depend", "exec_depend", "test_depend", "build_depend", "buildtool_depend")
     roots = [ElementTree.parse(folder / "package.xml").getroot() for folder in PACKAGES]
     return {element.text for root in roots for tag in tags for element in root.iter(tag)} - {
@@ -78,7 +76,7 @@ def test_rosdep_knows_what_is_declared():
 
 
 def container():
-    """[(instruction, rest)] of the Containerfile, continued lines joined."""
+    """Return [(instruction, rest)] of the Containerfile, with continued lines joined."""
     text = re.sub(r"\\\n\s*", " ", (ROOT / "Containerfile").read_text())
     return [
         line.split(maxsplit=1) for line in text.splitlines() if line and not line.startswith("#")
@@ -101,7 +99,7 @@ def test_the_container_has_what_it_copies_and_calls():
     for word, rest in steps:
         if word == "COPY":
             assert all((ROOT / name).exists() for name in rest.split()[:-1])
-        elif word == "RUN":  # as far as a shell can tell without running it
+        elif word == "RUN":  # only the syntax: the command does not run
             assert subprocess.run(["bash", "-n", "-c", rest], capture_output=True).stderr == b""
     ros2, launch, package, file = json.loads(dict(steps)["CMD"])
     assert (ros2, launch) == ("ros2", "launch") and (
@@ -155,7 +153,7 @@ def test_the_container_runs_as_an_ordinary_user_beside_the_host_and_with_pins():
     after = steps[order.index("USER") + 1 :]
     assert [word for word, _ in after] == ["RUN", "CMD"] and "compile_nodes" in after[0][
         1
-    ]  # what is compiled belongs to the user
+    ]  # the user owns the compiled code
     assert "podman run" in first and "--net" not in first
     chosen = next(
         re.search(r'grep -E "(.*?)" requirements.txt', rest)[1]
@@ -174,7 +172,7 @@ def test_the_container_runs_as_an_ordinary_user_beside_the_host_and_with_pins():
 
 
 def setup_of(folder, *names):
-    """What setup.py of a package says of some names: {name: value}."""
+    """Return {name: value} of some names in setup.py of a package."""
     code = (
         f"import json, runpy, setuptools; kept = {{}}; setuptools.setup = kept.update; "
         f"runpy.run_path('setup.py'); names = {names}; "
@@ -189,7 +187,7 @@ def setup_of(folder, *names):
 
 @pytest.mark.parametrize("folder", PYTHON, ids=lambda folder: folder.name)
 def test_colcon_finds_tests(folder):
-    """By the rule of colcon itself, on what setup.py says."""
+    """colcon searches for tests by its own rule, on the content of setup.py."""
     rule = pytest.importorskip("colcon_core.task.python.test")
     assert rule.has_test_dependency(setup_of(folder, "extras_require"), "pytest")
 

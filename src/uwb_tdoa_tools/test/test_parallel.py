@@ -1,8 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Runs over many flights at once.
+"""Runs over many flights in parallel.
 
-(The functions are of this module, which the other processes import.)
+The other processes import this module for its functions.
 """
 
 import io
@@ -23,7 +23,7 @@ from uwb_tdoa_tools.parallel import Progress
 
 
 def times_ten(number):
-    time.sleep(0.02 * (number % 3))  # so that they do not end in the order in which they began
+    time.sleep(0.02 * (number % 3))  # the items do not end in the order of their start
     return 10 * number
 
 
@@ -38,7 +38,7 @@ def refuse_three(number):
 
 
 def resolution(_):
-    """Of pictures, as matplotlib is set where it is imported."""
+    """Return the resolution of pictures, which is set when matplotlib is imported."""
     import matplotlib
 
     return matplotlib.rcParams["savefig.dpi"]
@@ -46,7 +46,7 @@ def resolution(_):
 
 @pytest.fixture
 def importable(monkeypatch):
-    """This module can be imported in processes that are started now."""
+    """Make this module importable in new processes."""
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), *sys.path]))
 
 
@@ -108,17 +108,18 @@ def test_an_interrupt_ends_all_processes_silently(importable):
     for _ in range(3):
         assert (
             work.stdout.readline() == b"done\n"
-        )  # the first by itself, the others by its children
+        )  # the first runs in this process, the others in its children
     os.killpg(work.pid, signal.SIGINT)  # as a terminal does
-    _, err = work.communicate(timeout=120)  # returns when the children have closed their ends, too
+    _, err = work.communicate(timeout=120)  # returns when the children have closed their pipes, too
     assert work.returncode == 130 and all(
         b" of 201 flights done, " in line for line in err.splitlines()
     )
 
 
 def test_modules_in_the_present_folder_do_not_run(tmp_path, importable):
-    """Python looks for modules where it starts, if it is told to by -m, as joblib does: whatever
-    lies there would run.
+    """With -m, as joblib uses it, Python imports modules from the working directory.
+
+    Any file there could run.
     """
     for name in ("joblib", "struct", "selectors", "runpy", "pickle"):
         (tmp_path / f"{name}.py").write_text(
@@ -229,7 +230,7 @@ def test_a_dask_cluster_gives_the_same_results_and_errors(importable, capsys):
 
 
 class Lines(io.StringIO):
-    """A stream without a terminal that tells when it holds so many lines."""
+    """A stream that is no terminal. Sets `full` when it holds `wanted` lines."""
 
     def __init__(self, wanted):
         super().__init__()
@@ -263,7 +264,7 @@ def test_progress_shows_the_work_and_its_share(often):
 
 
 def test_short_work_prints_no_progress(monkeypatch):
-    # beside which it is short on a loaded machine, too
+    # short also on a loaded machine
     monkeypatch.setattr(parallel, "FIRST", 600.0)
     lines = Lines(1)
     with Progress("weigh", stream=lines):

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The pages are in plain words: short sentences, and none of the habits that readers stumbled over."""
+"""The pages use plain words: short sentences, and none of the habits that confused readers."""
 
 import re
 
@@ -9,23 +9,23 @@ import pytest
 
 GUIDE = [page for page in PAGES if page.parent.name != "notebook"]
 GUIDE += [ROOT / "CONTRIBUTING.md", ROOT / "SECURITY.md"]
-HIGHEST_GRADE = 7.0  # Flesch-Kincaid, of a page
+HIGHEST_GRADE = 7.0  # largest Flesch-Kincaid grade of a page
 LONGEST = 25  # words of a sentence
 MOST = 0.05  # share of the sentences of a page that may be longer, or have a habit
-FEW = 30  # sentences, below which two may
+FEW = 30  # with fewer sentences, two may
 HABITS = re.compile(
     r"\b(told|tells?|telling|[Nn]obody|[Ss]omebody|anew|alike|beforehand|thereby|bears? out"
     r"|borne out|for want of|of its own|goes on|go on|(are|is) said|[Ww]hat (is|was|are|were|has)"
     r"|that of|those of|of what|of which|[Oo]ne (that|who|of))\b"
 )
-# What is no prose: code, tables, headings, pictures, equations.
+# Parts that are not prose: code, tables, headings, pictures, equations.
 NO_PROSE = [
     re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL),
     re.compile(r"^\s*\|.*$|^#.*$", re.MULTILINE),
     re.compile(r"!\[[^\]]*\]\([^)]*\)"),
     re.compile(r"\$\$.*?\$\$", re.DOTALL),
 ]
-# What counts as one word or none: code, equations, numbers, names of files, titles of papers.
+# Parts that count as one word or none: code, equations, numbers, file names, titles of papers.
 WORDS = {
     r"\[([^\]]*)\]\([^)]*\)": r"\1",
     r"`[^`]*`|\$[^$\n]+\$": "code",
@@ -39,7 +39,7 @@ WORDS = {
 
 
 def prose(text):
-    """The paragraphs and items of a page, each ending as a sentence does."""
+    """Return the paragraphs and items of a page, each with an end of sentence."""
     for pattern in NO_PROSE:
         text = pattern.sub("", text)
     for pattern, instead in WORDS.items():
@@ -53,7 +53,7 @@ def sentences(text):
 
 
 def hard(text):
-    """The sentences of a page that are long, or have a habit."""
+    """Return the sentences of a page that are too long or have a habit."""
     return [one for one in sentences(text) if len(one.split()) > LONGEST or HABITS.search(one)]
 
 

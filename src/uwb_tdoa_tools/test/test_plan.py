@@ -85,7 +85,7 @@ def test_a_volume(anchors, tmp_path, capsys):
 
 
 def test_a_round_of_ranges_and_of_both(anchors, tmp_path, capsys):
-    """Ranges have one solution, and tell what TDOAs do not."""
+    """Ranges have one solution. They determine more than TDOAs."""
     bounds = {}
     for protocol in ("tdoa2", "ranges", "tdoa2+ranges"):
         out = tmp_path / protocol
@@ -151,7 +151,7 @@ def test_options_change_the_bound(anchors, tmp_path, monkeypatch):
 
     base = median()
     assert median("--protocol", "tdoa3") == pytest.approx(median("--covariance", "all_pairs"))
-    # nor is the bound looked for in what follows from it
+    # no search for the bound in the later steps
     monkeypatch.setattr(run, "draw_map", lambda *_: None)
     monkeypatch.setattr(run, "advice", lambda *_: None)
     (tmp_path / "weak.yaml").write_text(
@@ -167,8 +167,9 @@ def test_options_change_the_bound(anchors, tmp_path, monkeypatch):
 
 
 def test_one_figure_of_the_room_and_an_anchor_that_makes_it_larger(tmp_path, capsys):
-    """Six anchors in one half of a room: the other half is imprecise, and the plan with the anchor
-    that is proposed says what was promised.
+    """Six anchors stand in one half of a room, so the other half is imprecise.
+
+    The plan with the proposed anchor confirms the predicted figures.
     """
     half = Anchors.from_positions(
         [[0, 0, 0.2], [4, 0, 2.8], [4, 5, 0.2], [0, 5, 2.8], [0, 0, 2.8], [4, 5, 2.8]],
@@ -346,7 +347,7 @@ def test_maps_are_published_to_late_subscribers(anchors, tmp_path):
 
 
 def test_with_a_height_sensor_four_anchors_at_one_height_serve_a_volume(square, tmp_path, capsys):
-    """They do not without: their plane mirrors every position."""
+    """Without a height sensor they do not: the plane of the anchors mirrors every position."""
     options, out = (
         ["--volume", "--room", "0", "4", "0", "4", "0", "2", "--step", "0.5"],
         tmp_path / "o",

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""plan of a hall in which a tag hears the anchors within the radio's reach."""
+"""plan of a hall, in which a tag receives the anchors within the radio reach."""
 
 from dataclasses import replace
 import json
@@ -24,7 +24,7 @@ REACH = 15.0  # m
 
 
 def anchors_of(nx, ny, hole=None, spacing=8.0):
-    """A grid of Anchors at three heights; those within 12 m of `hole` (2,) m are missing."""
+    """Return a grid of Anchors at three heights, without anchors within 12 m of `hole` (2,), m."""
     x, y = np.meshgrid(np.arange(nx) * spacing, np.arange(ny) * spacing)
     n = x.size
     positions = np.column_stack(
@@ -165,8 +165,9 @@ def test_the_reach_is_asked_for_where_a_room_is_larger_than_30_m(tmp_path, capsy
 
 
 def test_anchors_of_a_hall_are_designed_and_give_what_was_wanted(tmp_path, capsys):
-    """The fewest that serve, behind a wall too; a table of what fewer and more give; and the plan
-    of them says the same again.
+    """The design is the smallest sufficient number of anchors, behind a wall too.
+
+    A table compares other numbers of anchors. A plan of the design gives the same figures.
     """
     (tmp_path / "walls.yaml").write_text("walls: [[14, 0, 14, 10]]\n")
     asked = [

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Layouts of anchors that are searched for, and the maps and pictures of a plan."""
+"""Search for anchor layouts, and the maps and pictures of a plan."""
 
 from dataclasses import replace
 
@@ -116,7 +116,7 @@ def test_slopes_are_those_of_numerical_differentiation(options):
 
 def test_anchors_that_locate_nothing_have_no_slopes():
     goal, layout, x = case()
-    # all in one plane, with the points beside it
+    # all anchors in one plane, with the points outside it
     low = Layout(AnchorPlaces([[0, 0, 1, 6, 5, 1]]), 6, None, np.zeros(3))
     x, points = low.start(np.random.default_rng(0).random((6, 2))), POINTS * [1, 1, 0] + [0, 0, 1]
     errors, slopes = errors_and_slopes(goal, low, x, points)
@@ -129,7 +129,7 @@ def goal(installation, criterion="pairings", objective="worst"):
 
 
 def bad_anchors():
-    """All crowded into one corner of the room."""
+    """Return anchors that are all in one corner of the room."""
     return facing(
         [[0, 0, 0.2], [1.5, 0, 2.5], [0, 1.5, 1.5], [0.5, 0, 1.0], [0, 0.7, 2.9]], (3, 2.5, 1.5)
     )
@@ -162,7 +162,7 @@ def test_one_more_anchor():
     assert better.ids.tolist() == [4, 0, 9, 2, 1, 3] and better.frame == "hall"
     assert aim.score(better) <= 1.05 * scores.min() and scores.min() < aim.score(
         fixed
-    )  # the start is moved to a place of a grid
+    )  # the search starts from a grid position and moves it
 
 
 def test_no_layout_at_all():
@@ -171,14 +171,16 @@ def test_no_layout_at_all():
         optimise(aim, AnchorPlaces([[0, 0, 1, 6, 5, 1]]), 5, starts=2)
 
 
-# what holds all that was flown higher than 0.3 m on 0422, 0425 and 0426
+# box around all flights above 0.3 m on 0422, 0425 and 0426
 FLIGHTS = ((-1.6, -1.6, 0.3), (1.6, 1.6, 2.1))
 
 
 @pytest.mark.slow
 def test_the_surveyed_layout_is_beaten_by_a_fifth(shared_data):
-    """8 anchors on the walls of 7 x 8 x 3 m: the worst bound over the volume of the shared flights,
-    on a grid the search has not seen.
+    """The search places 8 anchors on the walls of 7 x 8 x 3 m.
+
+    The worst bound in the volume of the shared flights falls by a fifth. The grid is not the grid
+    of the search.
     """
     survey = read_survey(shared_data / "surveys" / "anchor_0425.txt")
     lower, upper = np.array([-3.05, -4.2, 0.0]), np.array([3.95, 3.8, 3.0])
@@ -307,7 +309,7 @@ def test_nothing_flyable_is_no_error():
 
 def test_a_bag_of_them(tmp_path):
     found = map_messages(CHART, INSTALLATION.anchors)
-    for _ in range(2):  # the second replaces the first
+    for _ in range(2):  # the second file replaces the first
         write_messages(found, tmp_path / "plan.bag")
     with open_bag(tmp_path / "plan.bag") as reader:
         assert {c.topic: c.msgtype for c in reader.connections} == {
@@ -330,7 +332,7 @@ FLOWN = lattice((-1, -1, 0.5), (1, 1, 2), 1.0)
 
 @pytest.fixture
 def figures(monkeypatch):
-    """[(figure, title)] of all pictures that would be written."""
+    """Return [(figure, title)] of all pictures to be written."""
     made = []
     monkeypatch.setattr(plots, "_save", lambda figure, title, path: made.append((figure, title)))
     return made

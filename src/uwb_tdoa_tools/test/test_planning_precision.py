@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What an installation and its radio noise let anybody know, and what flights achieve of it."""
+"""The precision that an installation and its radio noise allow, and the errors of flights."""
 
 from dataclasses import replace
 
@@ -116,9 +116,7 @@ ONE = Anchors.from_positions([[0.0, 0.0, 0.0]])  # no orientation: omnidirection
 
 
 def test_link_budget_by_hand():
-    """Eqs. 9 - 12 with pencil and paper: 10 m at 3.9936 GHz and 499.2 MHz, 25 degrees C, -10 dBm,
-    mean gain.
-    """
+    """Eqs. 9 - 12 by hand: 10 m at 3.9936 GHz and 499.2 MHz, 25 degrees C, -10 dBm, mean gain."""
     got = RadioNoise(tx_power_dbm=-10.0).variance(np.array([[10.0, 0.0, 0.0]]), ONE)[0, 0]
     path_loss = 20 * np.log10(4 * np.pi * 10.0 * 3.9936e9 / 299792458.0)  # 64.48 dB
     thermal = 10 * np.log10(1.380649e-23 * 298.15 * 499.2e6 / 1e-3)  # -86.88 dBm
@@ -203,7 +201,7 @@ def test_antenna_file(tmp_path):
 
 
 SQUARE = facing([[0, 0, 0.2], [4, 0, 0.2], [4, 4, 0.2], [0, 4, 0.2]], (2, 2, 0.2))
-# metres of noise: the second term of eq. 1 counts
+# metres of noise: the second term of eq. 1 matters
 NOISY = RadioNoise(tx_power_dbm=-38.0, full_strength=0.1)
 PLACES = np.array([[0.4, -0.7, 1.3], [2.9, 3.1, 0.8], [-3.0, 1.0, 2.2], [3.2, 3.6, 0.5]])
 
@@ -213,7 +211,10 @@ def ranges(points, anchors):
 
 
 def covariance_of(pairing, variance, link_std=0.0):
-    """The covariance of the measurements of a Pairing, (n, M, M) m^2. variance : (n, N) m^2."""
+    """Return the covariance of the measurements of a Pairing, (n, M, M) m^2.
+
+    variance : (n, N) m^2.
+    """
     d = pairing.incidence()
     own = link_std**2 * np.eye(len(d))
     if pairing.shared or pairing.ranges:
@@ -227,8 +228,9 @@ def without(pairing, k):
 
 
 def numerical_information(point, installation, pairing, step=1e-3):
-    """Minus the second derivatives, by finite differences, of the expected log-likelihood of the
-    TDOAs.
+    """Return the information of the TDOAs by finite differences.
+
+    It is minus the second derivative of the expected log-likelihood.
     """
     k, anchors, d = installation.dimensions, installation.anchors, pairing.incidence()
 
@@ -263,7 +265,7 @@ def test_information_is_the_curvature_of_the_likelihood(name, link_std, dimensio
     installation = Installation(corners(), NOISY, name, link_std, dimensions)
     (pairing,) = installation.round(8)
     if pairing.shared and not link_std and name == "ring":
-        pairing = without(pairing, 3)  # the closed ring has no density
+        pairing = without(pairing, 3)  # the measurements of the closed ring have no density
     for point, matrix in zip(PLACES, information(PLACES, installation)):
         wanted = numerical_information(point, installation, pairing)
         np.testing.assert_allclose(matrix, wanted, rtol=2e-3, atol=2e-3 * np.abs(wanted).max())
@@ -271,7 +273,7 @@ def test_information_is_the_curvature_of_the_likelihood(name, link_std, dimensio
 
 @pytest.mark.parametrize("noise", [NOISY, FixedNoise(0.1)])
 def test_what_tdoas_and_ranges_tell_adds_up(noise):
-    """They are measured one without the other."""
+    """TDOAs and ranges are independent measurements, so their information adds up."""
     alone = [
         information(PLACES, Installation(corners(), noise, name, 0.05))
         for name in ("ring", "every_range")
@@ -303,7 +305,7 @@ def test_it_does_not_matter_which_pair_of_the_ring_is_dropped():
 
 
 def test_dilution_in_the_middle_of_a_square():
-    """Four alike ranges with an unknown offset from the corners: variance 1/2 along each axis."""
+    """Four equal ranges from the corners with an unknown offset: variance 1/2 along each axis."""
     installation = Installation(SQUARE, dimensions=2)
     np.testing.assert_allclose(
         dilution(np.array([[2.0, 2.0, 0.2]]), installation), [[np.sqrt(0.5)] * 2]
@@ -321,9 +323,10 @@ def test_no_bound_where_there_is_no_information():
 
 
 def test_the_4_x_4_m_square_of_the_paper():
-    """Grasso et al., sec. 2.2.3: best inside the hull, about +-5 cm at 99 % there. Power is not
-    printed: the most that the data sheet gives, -39 dBm/MHz over 499.2 MHz, and 9 dB for frames
-    shorter than 0.125 ms.
+    """Grasso et al., sec. 2.2.3: best inside the hull, about +-5 cm at 99 % there.
+
+    The paper does not state the power. The test uses the maximum in the data sheet, -39 dBm/MHz
+    over 499.2 MHz, plus 9 dB for frames shorter than 0.125 ms.
     """
     installation = Installation(
         SQUARE, RadioNoise(tx_power_dbm=-39.0 + 10 * np.log10(499.2) + 9.0), dimensions=2
@@ -390,8 +393,9 @@ BIAS = np.array([0.1, -0.2, 0.3])
 
 
 def samples(n=4000, scale=1.0, seed=0):
-    """As good as the bound of one round times `scale`, beside a bias; the filter claims twice the
-    standard deviation.
+    """Return ErrorSamples at the bound of one round times `scale`, plus a bias.
+
+    The filter states twice the standard deviation.
     """
     rng = np.random.default_rng(seed)
     place = rng.uniform([-2, -2, 0.5], [2, 2, 1.5], (n, 3))
@@ -438,7 +442,10 @@ def test_flights_pool_without_mixing_their_seconds():
 
 @pytest.mark.parametrize("trajectory", ["hover", "circle"])
 def test_a_simulated_flight(trajectory):
-    """Without bias, what the filter reaches is better than one round, and far from a thousand."""
+    """Without bias, the filter is better than the bound of one round.
+
+    It is far from the bound of a thousand rounds.
+    """
     flight = simulate(
         SimulationConfig(
             trajectory=trajectory,

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Where a position has a second solution: of pairings, of all that is heard, and what follows."""
+"""Second solutions of a position: of pairings and of all measurements, and their consequences."""
 
 from dataclasses import replace
 
@@ -49,7 +49,7 @@ def tdoas(points, anchors):
 @given(st.integers(0, 10**6), st.sampled_from([2, 3]))
 def test_a_mirrored_position_has_the_same_tdoas(seed, dimensions):
     rng = np.random.default_rng(seed)
-    # of any heights
+    # at any heights
     anchors = Anchors.from_positions(rng.uniform([-4, -4, 0], [4, 4, 3], (dimensions + 1, 3)))
     try:
         subsets = Subsets(anchors, dimensions)
@@ -76,7 +76,7 @@ def agreement(anchors, dimensions, points, chosen=None):
         found = solutions(points, corner, dimensions)
         assert (
             (same_place(points[:, None], found, corner)).any(axis=1).all()
-        )  # it finds at least the point
+        )  # it finds at least the true point
         unique = (np.isnan(found[..., 0]) | same_place(points[:, None], found, corner)).all(axis=1)
         agree.append(unique == predicted[:, q])
     assert 0.02 < np.mean(predicted) < 0.98
@@ -89,7 +89,7 @@ IN_SPACE = np.random.default_rng(2).uniform([-4, -4.5, -0.5], [4, 4.5, 3.5], (60
 
 @pytest.mark.parametrize(
     ("anchors", "dimensions", "points", "chosen"),
-    [  # clear of the diagonals
+    [  # away from the diagonals
         (SQUARE, 2, Grid.slice((-0.95, 4.9), (-1.1, 5.2), 0.2, 0.45).points, None),
         (SKEW, 2, Grid.slice((-0.95, 4.9), (-1.1, 5.2), 0.2, 0.45).points, None),
         (AT_HEIGHTS, 2, Grid.slice((-1.93, 5.97), (-2.07, 6.03), 1.2, 0.7).points, None),
@@ -102,8 +102,10 @@ def test_brute_force_agrees(anchors, dimensions, points, chosen):
 
 
 def test_the_flyable_area_of_the_paper():
-    """Fig. 6c and sec. 5.1: an envelope about each anchor that holds at least all within 0.5 m of
-    it; the middle and the middles of the sides are free; the same at all four corners.
+    """Fig. 6c and sec. 5.1 of the paper.
+
+    An envelope around each anchor contains at least all points within 0.5 m of the anchor. The
+    middle and the middles of the sides are free. All four corners look the same.
     """
     subsets, installation = Subsets(SQUARE, 2), Installation(SQUARE, dimensions=2)
     assert len(subsets.rows) == 4 and subsets.left_out == 0
@@ -128,7 +130,8 @@ def test_the_flyable_area_of_the_paper():
 
 def test_flat_choices_are_left_out():
     subsets = Subsets(corners(), 3)
-    assert (len(subsets.rows), subsets.left_out) == (58, 12)  # of 70: 6 faces and 6 diagonal planes
+    # of 70; 6 faces and 6 diagonal planes are left out
+    assert (len(subsets.rows), subsets.left_out) == (58, 12)
     with pytest.raises(InputError, match="nearly in one line"):
         Subsets(Anchors.from_positions([[0, 0, 0], [4, 0.02, 0], [8, 0, 0]]), 2)
 
@@ -151,7 +154,7 @@ def box(rng, low, high):
 
 
 def whitened(p, anchors, variance, planar):
-    """f(x) -> TDOAs of consecutive anchors at x less those at p, over their correlated errors."""
+    """Return f(x): TDOAs of consecutive anchors at x minus TDOAs at p, whitened."""
     d = np.diff(np.eye(len(anchors)), axis=0)
     root = np.linalg.inv(np.linalg.cholesky(d * variance @ d.T))
     true = np.linalg.norm(p - anchors, axis=1)
@@ -167,8 +170,10 @@ def whitened(p, anchors, variance, planar):
 
 
 def has_no_minimum_there(point, anchors, noise, place, room):
-    """Whether a descent from a place, with the TDOAs of fewer anchors, ends at the point or outside
-    of the room: a valley that an anchor splits, or a minimum that an anchor moves into the room.
+    """Return whether a descent from `place` ends at the point or outside the room.
+
+    The descent uses the TDOAs of fewer anchors. If it ends at the point, the additional anchor has
+    split a valley. If it ends outside, the additional anchor has moved a minimum into the room.
     """
     variance = noise.variance(point[None], Anchors.from_positions(anchors))[0]
     residual = whitened(point, anchors, variance, False)
@@ -188,8 +193,9 @@ def random_room(seed):
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 10**6))
 def test_one_more_anchor_loses_a_place_only_if_it_makes_the_second_minimum(seed):
-    """One more anchor raises the misfit everywhere, and lowers the bound. So it can only lose a place
-    to a minimum that was none before.
+    """One more anchor raises the misfit everywhere, and lowers the bound.
+
+    It can exclude a position only by a minimum that did not exist before.
     """
     _, room, positions, noise, points = random_room(seed)
     few, more = (
@@ -255,8 +261,9 @@ def test_in_a_hall_a_wall_or_a_missing_anchor_gains_a_place_only_by_a_lost_minim
 
 
 def test_imprecision_is_no_second_solution():
-    """Anchors at nearly one height hardly tell z; all of them together have one minimum in the room
-    all the same.
+    """Anchors at nearly one height hardly determine z.
+
+    Together, they still have only one minimum in the room.
     """
     rng = np.random.default_rng(0)
     x, y = (axis.ravel() for axis in np.meshgrid(np.arange(5) * 12.0, np.arange(4) * 12.0))
@@ -268,9 +275,7 @@ def test_imprecision_is_no_second_solution():
 
 
 def test_a_second_minimum_predicts_how_often_an_estimator_flips():
-    """Phi(-misfit / 2) of noisy rounds are explained better by the other minimum than by the true
-    place.
-    """
+    """The other minimum fits better than the truth in a share Phi(-misfit / 2) of noisy rounds."""
     anchors, rng = constellation("random-3-5"), np.random.default_rng(4)
     room = Room(anchors.positions.min(axis=0) - 1.0, anchors.positions.max(axis=0) + 1.0)
     noise = 0.1

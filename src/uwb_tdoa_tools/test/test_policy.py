@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What SROS2 lets each node do is what it does: sros2/policy.xml and the graph."""
+"""SROS2 allows each node exactly what it does: sros2/policy.xml against the ROS graph."""
 
 from pathlib import Path
 from xml.etree import ElementTree
@@ -38,11 +38,11 @@ KINDS = {
         VehicleNode,
     )
 }
-OTHERS = {"robot", "operator"}  # who are not ours
+OTHERS = {"robot", "operator"}  # enclaves of other nodes
 
 
 def allowed():
-    """{enclave: {node: {role: full names}}} of the policy."""
+    """Return {enclave: {node: {role: full names}}} of the policy."""
     out = {}
     for enclave in ElementTree.parse(FILE).iter("enclave"):
         of_nodes = out[Path(enclave.get("path")).name] = {}
@@ -58,7 +58,7 @@ def allowed():
 
 @pytest.fixture
 def arguments(tmp_path):
-    """What nodes are started with, so that they use all that they can."""
+    """Return arguments with which each node uses all its topics and services."""
     Anchors.from_positions(np.eye(3)).to_yaml(tmp_path / "anchors.yaml")
     cell = np.stack(np.meshgrid(*[np.arange(3)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     bias = np.zeros((27, 3))
@@ -89,7 +89,7 @@ def arguments(tmp_path):
 
 
 def of_graph(observer, node):
-    """{role: full names} of a node, as another one sees it."""
+    """Return {role: full names} of a node, as another node sees it."""
     asked = [node.get_name(), node.get_namespace()]
     found = {
         "publish": observer.get_publisher_names_and_types_by_node(*asked),
@@ -101,7 +101,7 @@ def of_graph(observer, node):
 
 
 def differences(permitted, used):
-    """What is to be added to the profiles of an enclave, and what is to be removed."""
+    """Return the entries to add to the profiles of an enclave, and the entries to remove."""
     return [
         f"{verb} {role} {name} of the profile {node}"
         for node in sorted(permitted.keys() | used.keys())

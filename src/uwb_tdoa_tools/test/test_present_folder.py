@@ -1,8 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A folder of recordings may hold anything.
+"""A folder of recordings may contain any files.
 
-Nothing in it is a library, a module, a program or a setting of what is started there.
+Programs started there must not load a library, module, program or setting from it.
 """
 
 import os
@@ -29,7 +29,7 @@ PROFILES = """<?xml version="1.0" encoding="UTF-8" ?>
   </consumer></log>
   <profiles>{profile}{profile}</profiles>
 </dds>"""
-# twice: its name is written to the log
+# twice: the duplicate name is written to the log
 PROFILE = '<participant profile_name="touch x"><rtps></rtps></participant>'
 STARTS_ROS = (
     "import rclpy\ndef main():\n    rclpy.init()\n    rclpy.create_node('victim')\n    "
@@ -43,8 +43,9 @@ built = pytest.mark.skipif(
 
 @pytest.fixture
 def libraries(tmp_path):
-    """A folder with files that are called as the libraries of Python and of ls, and are none: who
-    loads one of them ends at once.
+    """Return a folder with invalid files, named like the libraries of Python and of ls.
+
+    A program that loads such a file ends at once.
     """
     for program in (os.path.realpath(sys.executable), shutil.which("ls")):
         for line in subprocess.run(
@@ -63,7 +64,7 @@ def run(command, folder, **variables):
 
 
 def variables_of(text):
-    """{variable: value} of the output of `env`."""
+    """Return {variable: value} of the output of `env`."""
     return dict(line.split("=", 1) for line in text.splitlines() if "=" in line)
 
 
@@ -108,7 +109,7 @@ def test_no_entry_is_empty_after_dev(libraries, words):
         name: f":{'' if name != 'PATH' else CLEAN['PATH']}:"
         for name in PATHS
         if name != "LD_LIBRARY_PATH"
-    }  # bash itself would load
+    }  # bash would load libraries from this path
     done = run([ROOT / "dev", *words], libraries, **given)
     assert (
         done.returncode == 0
@@ -152,7 +153,7 @@ def test_the_middleware_obeys_no_profiles_there(tmp_path, protected):
     (tmp_path / "start.py").write_text(code)
     kept = {name: value for name, value in os.environ.items() if name != "SKIP_DEFAULT_XML_FILE"}
     kept["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
-    kept.pop("PYTHONSAFEPATH", None)  # a user's own shell does not set it
+    kept.pop("PYTHONSAFEPATH", None)  # a user's shell does not set it
     done = subprocess.run(
         [sys.executable, "start.py"],
         cwd=tmp_path,
@@ -162,7 +163,8 @@ def test_the_middleware_obeys_no_profiles_there(tmp_path, protected):
         timeout=300,
     )
     assert done.returncode == 0, done.stderr
-    assert (victim.read_text() == "precious\n") == protected  # or the attack would be none
+    # without protection, the attack succeeds
+    assert (victim.read_text() == "precious\n") == protected
 
 
 @built
@@ -176,7 +178,7 @@ def test_the_start_file_of_the_user_brings_no_empty_entry(tmp_path):
 
 
 def test_the_entry_point_of_the_container_leaves_no_empty_entry(tmp_path):
-    """The setup of ROS leaves one, as colcon does. The image itself is not built here."""
+    """The setup of ROS leaves one, like colcon. The image is not built here."""
     changed = next(
         line
         for line in (ROOT / "Containerfile").read_text().splitlines()

@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Command lines that are printed to be copied: each runs as it stands, and does good where it says
-so.
+"""Command lines that are printed to be copied.
+
+Each runs unchanged, and reduces the error where it promises that.
 """
 
 import ast
@@ -40,19 +41,19 @@ LINE = re.compile(r"\./dev run uwb_tdoa_\w+ .*$", re.MULTILINE)
 
 @pytest.fixture
 def desk(tmp_path, monkeypatch):
-    """A folder to work in, for somebody who starts things with ./dev run."""
+    """Return a working directory, with the settings of ./dev run."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv(command_lines.RUN, "./dev run")
     return tmp_path
 
 
 def lines_of(text):
-    """Command lines in what was printed, whose lines may be wrapped."""
+    """Return the command lines in printed text, with wrapped lines joined."""
     return [line.strip() for line in LINE.findall(re.sub(r"\n {10}(?! )", " ", text))]
 
 
 def run(line):
-    """Run a line as it stands; of a node, read what it would."""
+    """Run a line unchanged. For a node, read its files instead."""
     (dev, verb, package, name, *words) = shlex.split(line)
     assert (dev, verb) == ("./dev", "run")
     if name.endswith("_node"):
@@ -105,7 +106,8 @@ PACKAGES = [
 TOOLS = tuple(
     path.stem for path in (PACKAGES[2] / "commands").glob("*.py") if path.stem != "__init__"
 )
-# Whose lines tests below, test_first_hour_without_truth.py, test_demo.py and test_first_map.py run
+# Modules whose printed lines are run: below, and in test_first_hour_without_truth.py, test_demo.py
+# and test_first_map.py
 PRINT = {
     *(f"commands/{name}.py" for name in ("calibrate", "diagnose", "map_anchors", "survey")),
     "flying/demo.py",
@@ -114,7 +116,7 @@ PRINT = {
 
 @cache
 def sources():
-    """[(name, syntax tree)] of all modules that are installed."""
+    """Return [(name, syntax tree)] of all installed modules."""
     paths = [
         (path.relative_to(package).as_posix(), path)
         for package in PACKAGES
@@ -124,8 +126,10 @@ def sources():
 
 
 def texts(tree):
-    """Texts in a module that may be printed, with "value" where a value is put in: no docstrings,
-    and no examples of --help, which begin as the user began.
+    """Yield the strings of a module that may be printed, with "value" for each inserted value.
+
+    Docstrings and the examples of --help are left out. These examples start with the command prefix
+    of the user.
     """
     passed = {
         id(part)
@@ -167,8 +171,9 @@ def test_whoever_prints_lines_to_copy_is_tested_here():
 
 
 def test_no_text_is_a_command_that_does_not_run_as_it_stands():
-    """One that begins with a command of ROS is understood by ./dev ros2 too, and has no gap that
-    the user must fill.
+    """A command that begins like ROS must run with ./dev ros2, too.
+
+    It must have no gap for the user to fill.
     """
     pytest.importorskip("rclpy")
     spec = spec_from_file_location("dev_ros2", ROOT / ".dev" / "ros2.py")
@@ -194,7 +199,7 @@ def test_no_text_is_a_command_that_does_not_run_as_it_stands():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["survey", "diagnose"])
 def test_every_line_that_a_calibration_prints_runs_as_it_stands(desk, capsys, name):
-    """From another folder than --out, with a survey in a file."""
+    """The working directory is not --out, and the survey is in a file."""
     flight = simulate(
         SimulationConfig(
             seed=1,
@@ -225,7 +230,7 @@ def test_every_line_that_a_calibration_prints_runs_as_it_stands(desk, capsys, na
 def test_the_line_that_survey_prints_makes_the_error_of_a_measured_flight_smaller(
     desk, shared_data, capsys, monkeypatch
 ):
-    """Though its bag holds the anchors of the tape."""
+    """The bag holds anchors with tape errors."""
     for trial in (1, 2):
         flight = Reading(shared_data / "surveys").one(
             shared_data / "util" / f"const1-trial{trial}-tdoa2.csv.gz"

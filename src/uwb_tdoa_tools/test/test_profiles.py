@@ -1,6 +1,9 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings of others, read by the shipped profiles and by others: to a trajectory with one command each."""
+"""Recordings of others, read by shipped and by other profiles.
+
+Each becomes a trajectory with one command.
+"""
 
 import bz2
 import dataclasses
@@ -49,7 +52,7 @@ FLOAT32 = 1e-6  # relative
 
 @pytest.fixture(scope="session")
 def flight():
-    """A simulated flight with ranges and TDOAs, whose stamps a us holds."""
+    """Return a simulated flight with ranges and TDOAs. Stamps are multiples of 1 us."""
     config = SimulationConfig(
         duration=18.0,
         imu_rate=100.0,
@@ -74,7 +77,7 @@ def ulog(path, flight):
     return write_ulog(path, flight)
 
 
-# {kind: (profile, options, write(path, flight), streams that come back)}
+# {kind: (profile, options, write(path, flight), streams that it contains)}
 KINDS = {
     "util": ("util", [], lambda p, f: write_ros_1(p, cf_msgs(f)), "tdoa imu truth"),
     "util, bz2": (
@@ -124,7 +127,7 @@ KINDS = {
 
 @pytest.fixture(scope="session", params=KINDS)
 def recording(request, flight, tmp_path_factory):
-    """(path, words of a command line that read it, streams that it has)."""
+    """Return (path, words of a command line that reads it, streams that it contains)."""
     profile, more, write, streams = KINDS[request.param]
     folder = tmp_path_factory.mktemp("foreign")
     path = write(folder / "recording", flight)
@@ -140,7 +143,7 @@ def recording(request, flight, tmp_path_factory):
 
 
 def same(one, other, streams, start):
-    """Compare streams, whose stamps are `start` later in `other`."""
+    """Compare streams. Stamps of `other` are later by `start`, s."""
     for name in streams:
         if name == "anchors":
             np.testing.assert_allclose(
@@ -217,7 +220,7 @@ def test_every_shipped_profile_is_tested_and_loads():
         assert load_profile(name).about
 
 
-# One topic, by profiles of our own.
+# One topic, with our own profiles.
 
 
 @pytest.fixture
@@ -226,7 +229,7 @@ def survey(flight):
 
 
 def profile_of(folder, *sources, **more):
-    """The Profile of a YAML file with these sources."""
+    """Return the Profile of a YAML file with these sources."""
     path = folder / "own.yaml"
     path.write_text(yaml.safe_dump({"sources": list(sources), **more}))
     return load_profile(path)
@@ -386,7 +389,7 @@ def test_several_recordings_in_a_folder_are_never_merged(flight, survey, tmp_pat
 def test_definitions_come_from_the_profile_where_the_bag_has_none(
     flight, survey, tmp_path, monkeypatch
 ):
-    """As bags of ROS 2 Humble in SQLite."""
+    """Bags of ROS 2 Humble in SQLite have no definitions."""
     bag = write_ros_2(tmp_path / "bag", two_way_ranges(flight), SQLITE)
     (file,) = bag.glob("*.db3")
     with sqlite3.connect(file) as connection:
@@ -522,7 +525,7 @@ def test_a_cut_bag_of_foreign_types_is_salvaged(flight, survey, tmp_path, storag
 
 
 def test_an_index_that_lacks_messages_is_damage(twr, survey):
-    """Those that the chunks state, in the last record of the file."""
+    """The last record of the file holds the counts of the chunks."""
     content = twr.read_bytes()
     count = int.from_bytes(content[-4:], "little")
     twr.write_bytes(content[:-4] + (count + 1).to_bytes(4, "little"))
@@ -531,7 +534,7 @@ def test_an_index_that_lacks_messages_is_damage(twr, survey):
 
 
 def test_a_chunk_that_unpacks_to_too_much_is_refused(flight, survey, tmp_path):
-    """A megabyte of zeros for each byte."""
+    """Each byte unpacks to a megabyte of zeros."""
     bomb = bz2.compress(bytes(200_000_000), 9)
 
     def topics(store):
@@ -576,7 +579,7 @@ def test_the_profile_of_the_page_is_one(tmp_path):
 
 
 def test_a_first_profile_of_an_unknown_kind_is_used_as_it_is(flight, tmp_path, capsys):
-    """Names and units by what the fields are called and hold."""
+    """The names and content of the fields determine streams and units."""
     csv = tmp_path / "rover.csv"
     rows = [
         f"{t:.6f},{anchor},{1e3 * d:.0f}"
@@ -608,7 +611,7 @@ def test_a_first_profile_of_an_unknown_kind_is_used_as_it_is(flight, tmp_path, c
 
 
 def test_a_foreign_bag_without_our_topics_is_suggested_as_it_is(flight, tmp_path, capsys):
-    """Also by the command that check names, and where no profile fits."""
+    """`check` names the same command. It also works if no profile fits."""
     bag = write_ros_1(
         tmp_path / "walk.bag",
         lambda store: {
@@ -642,7 +645,8 @@ def test_the_measured_ranges_of_starloc(shared_data, tag, error):
     expected = np.linalg.norm(
         true - read.anchors.positions[read.anchors.index(read.range.anchor)], axis=1
     )
-    assert 0.1 < np.median(read.range.d - expected) < 0.3  # README: 0.1 to 0.5 m too long
+    # README: ranges are 0.1 to 0.5 m too long
+    assert 0.1 < np.median(read.range.d - expected) < 0.3
 
 
 def test_the_measured_walk_of_isas(shared_data):
@@ -654,7 +658,7 @@ def test_the_measured_walk_of_isas(shared_data):
         4839,
         3168,
     )
-    # measured by the accelerometer: the anchors with z = 1.86 are below those with z = 0
+    # The accelerometer shows the axis: anchors with z = 1.86 are below anchors with z = 0.
     assert sorted(read.anchors.positions[:, 2].round(2).tolist()) == [-1.86, -1.85, 0.0, 0.0, 0.0]
     upside_down = dataclasses.replace(
         read, anchors=read.anchors.at(read.anchors.positions * [1.0, -1.0, -1.0])

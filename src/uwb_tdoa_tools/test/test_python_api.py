@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The public module: its names, what they take, and what examples and the page make of it."""
+"""The public module: its names, its arguments, and the code in the examples and on the page."""
 
 import ast
 import inspect
@@ -19,7 +19,7 @@ import uwb_tdoa as uwb
 from uwb_tdoa_bias.common.text import version
 from uwb_tdoa_bias.effects import EFFECTS
 
-# What a new version may add to, and may not take from.
+# A new version may add names and arguments, but not remove them.
 SIGNATURES = {
     "calibrate": "flights holdout=() *effects=None *config=None *truth=None *tape=None",
     "check": "flight",
@@ -43,7 +43,7 @@ PAGE = ROOT / "docs" / "python.md"
 
 
 def words_of(function):
-    """The arguments of a function: name, default, * before those that need their name."""
+    """Return the arguments of a function: name and default; * marks keyword-only arguments."""
     parts = []
     for each in inspect.signature(function).parameters.values():
         before = {each.KEYWORD_ONLY: "*", each.VAR_KEYWORD: "**"}.get(each.kind, "")
@@ -82,7 +82,7 @@ def is_of_uwb(node):
 
 
 def test_the_module_is_imported_in_no_time():
-    """It imports a library when a function needs one."""
+    """A library is imported only when a function needs it."""
     code = "import sys, uwb_tdoa; print(*{'numpy', 'numba', 'scipy', 'matplotlib'} & sys.modules.keys())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (0, "\n", "")
@@ -90,7 +90,7 @@ def test_the_module_is_imported_in_no_time():
 
 @pytest.fixture
 def own():
-    """A decorated effect, which is forgotten afterwards."""
+    """Return a function that declares effects. They are removed after the test."""
     known = dict(EFFECTS)
 
     def make(name, module=__name__):
@@ -105,7 +105,8 @@ def own():
 def test_an_effect_of_your_own_is_known_everywhere(own, tmp_path):
     kind = uwb.effect(own("warmth"))
     assert uwb.EFFECTS["warmth"] is kind
-    assert uwb.effect(own("warmth")) is uwb.EFFECTS["warmth"] is not kind  # a cell that runs again
+    # as in a notebook cell that runs again
+    assert uwb.effect(own("warmth")) is uwb.EFFECTS["warmth"] is not kind
     with pytest.raises(ValueError, match="an effect of that name exists"):
         uwb.effect(own("anchor_delay"))
     with pytest.raises(ValueError, match="has no `row`"):
@@ -137,7 +138,7 @@ def test_tables_are_of_pandas_or_of_numpy(flight, monkeypatch, with_pandas):
 
 
 def run_in(folder, program):
-    """Run a program of the examples, in a folder; returns what it printed."""
+    """Run an example program in a folder and return its output."""
     done = subprocess.run(
         [sys.executable, program],
         cwd=folder,
@@ -179,7 +180,10 @@ def test_an_example_does_what_it_says(program, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.ipynb")), ids=lambda p: p.stem)
 def test_a_notebook_runs_cell_by_cell(path, tmp_path):
-    """Without its magic lines, which set where pictures appear. The value of a last line is shown."""
+    """Magic lines, which choose the display of pictures, are removed.
+
+    The last value of each cell is shown.
+    """
     cells = json.loads(path.read_text())["cells"]
     codes = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
     assert len(codes) > 3 and all(cell.get("outputs", []) == [] for cell in cells)

@@ -30,7 +30,7 @@ def survey(tmp_path):
     ],
 )
 def test_kind_is_found_by_content(tmp_path, survey, content, kind):
-    file = tmp_path / "flight.txt"  # a name that says nothing
+    file = tmp_path / "flight.txt"  # a meaningless name
     file.write_bytes(content)
     for given in (survey, str(survey), ANCHORS):
         flight = read_flight(file, given)

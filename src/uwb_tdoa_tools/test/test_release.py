@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What a release to the ROS index needs: changelogs, and Debian packages as bloom makes them."""
+"""Requirements of a release to the ROS index: changelogs, and Debian packages by bloom."""
 
 import gzip
 import os
@@ -22,7 +22,7 @@ PACKAGES = sorted(path.parent for path in (ROOT / "src").glob("*/package.xml"))
 
 @pytest.mark.parametrize("folder", PACKAGES, ids=lambda folder: folder.name)
 def test_each_package_has_a_changelog_that_catkin_reads(folder):
-    """As it is when catkin_prepare_release has put the version for what is forthcoming."""
+    """The version replaces "Forthcoming", as after catkin_prepare_release."""
     changelog = pytest.importorskip("catkin_pkg.changelog")
     text = (folder / "CHANGELOG.rst").read_text()
     assert f"Changelog for package {folder.name}\n" in text
@@ -34,7 +34,7 @@ def test_each_package_has_a_changelog_that_catkin_reads(folder):
 
 
 def test_each_source_names_its_licence():
-    """An empty file needs none."""
+    """Empty files need no licence."""
     files = [path for path in (ROOT / "src").rglob("*.py") if path.stat().st_size]
     without = [str(path) for path in files if LICENCE not in path.read_text()[:200]]
     assert len(files) > 300 and not without
@@ -42,7 +42,7 @@ def test_each_source_names_its_licence():
 
 @pytest.fixture(scope="module")
 def bloom(tmp_path_factory):
-    """Environment variables under which bloom finds an index of our dependencies, without a network."""
+    """Return environment variables for bloom with a local index of our dependencies."""
     folder = tmp_path_factory.mktemp("bloom")
     run(sys.executable, "-m", "venv", folder / "venv")
     run(folder / "venv" / "bin" / "python", "-m", "pip", "install", "bloom")
@@ -102,7 +102,7 @@ def bloom(tmp_path_factory):
 
 @pytest.mark.slow
 def test_bloom_makes_a_debian_package_of_each(bloom, tmp_path):
-    """A pip key becomes the name of a Debian package that there is none of: docs/release.md."""
+    """A pip key becomes the name of a Debian package that does not exist: docs/release.md."""
     shutil.copytree(ROOT / "src", tmp_path / "src", ignore=shutil.ignore_patterns("__pycache__"))
     depends = {}
     for package in PACKAGES:

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""--rerun: what each tool writes for the viewer."""
+"""--rerun: the content that each tool writes for the viewer."""
 
 from dataclasses import replace
 import sys
@@ -33,7 +33,7 @@ ALWAYS = {
 
 @pytest.fixture(scope="module")
 def flight():
-    """One whose anchor 3 is late."""
+    """Return a flight with a late anchor 3."""
     return AnchorDelay({"3": 0.3}).inject(
         simulate(SimulationConfig(seed=1, duration=40.0, **CLEAN))
     )
@@ -48,7 +48,7 @@ def desk(flight, tmp_path, monkeypatch):
 
 @pytest.fixture
 def viewer(monkeypatch):
-    """A stand-in for the library, which takes notes."""
+    """A stand-in for the library that records its calls."""
     library = MagicMock()
     monkeypatch.setitem(sys.modules, "rerun", library)
     monkeypatch.setattr(pictures, "find_spec", lambda name: object())
@@ -56,7 +56,7 @@ def viewer(monkeypatch):
 
 
 def names(viewer):
-    """Of all that was written."""
+    """Return the names of everything written."""
     stream = viewer.RecordingStream.return_value
     return {
         call.args[0] for call in (*stream.log.call_args_list, *stream.send_columns.call_args_list)

@@ -13,7 +13,7 @@ from uwb_tdoa_tools.results_file import ResultsFile, fingerprint_of, settings_of
 
 
 def fill(path, keys, asked=None):
-    """What had to be made of keys, whose results are their lengths."""
+    """Return the keys that were computed. The result of a key is its length."""
     asked = asked or {"seed": 1}
     made = []
     with ResultsFile(path, asked) as done:

@@ -36,8 +36,9 @@ UPRIGHT = [0.0, 0.0, 0.0, 1.0]
 
 
 def straight(duration=10.0, rate=50.0, floor=1.0):
-    """A truth that flies along x with 1 m/s at 1 m, on the floor for the first and last `floor`
-    seconds.
+    """Return a Truth that moves along x at 1 m/s and 1 m height.
+
+    It is on the floor for the first and last `floor` seconds.
     """
     t = np.arange(0.0, duration + 0.5 / rate, 1.0 / rate)
     z = np.where((t >= floor) & (t <= duration - floor), 1.0, 0.0)
@@ -45,7 +46,10 @@ def straight(duration=10.0, rate=50.0, floor=1.0):
 
 
 def estimate(truth, error, low=0.0, high=10.0, std=0.1, rate=100.0):
-    """Odometry that is off by error(t) (n, 3) m, and says that it is off by `std` per axis."""
+    """Return odometry with errors error(t) (n, 3), m.
+
+    std : stated standard deviation per axis, m
+    """
     t = np.arange(low, high, 1.0 / rate)
     true = np.stack([np.interp(t, truth.t, truth.p[:, k]) for k in range(3)], axis=1)
     covariance = np.tile(np.diag([std**2] * 3 + [1.0] * 6), (len(t), 1, 1))
@@ -67,14 +71,14 @@ def residuals(innovation, variance, verdict):
 def test_what_is_judged_is_from_the_first_to_the_last_instant_above_the_limit():
     truth = straight()
     assert scored_phase(truth) == ("in_the_air", 1.0, 9.0)
-    truth.p[200:220, 2] = 0.1  # a touch of the floor in between counts
+    truth.p[200:220, 2] = 0.1  # the floor is touched for a moment
     assert scored_phase(truth)[1:] == (1.0, 9.0)
-    truth.p[:, 2] = np.where(truth.p[:, 2] > 0.5, 0.3, 0.0)  # at the limit is not above it
-    assert scored_phase(truth)[0] == "moving"  # which never leaves the floor
+    truth.p[:, 2] = np.where(truth.p[:, 2] > 0.5, 0.3, 0.0)  # 0.3 m is the limit, not above it
+    assert scored_phase(truth)[0] == "moving"  # it never leaves the floor
 
 
 def test_errors_are_against_the_truth_interpolated_to_the_estimate():
-    truth = straight(rate=2.0)  # much coarser than the estimate, which is off its grid
+    truth = straight(rate=2.0)  # much coarser than the estimate, at other stamps
     odometry = estimate(truth, constant(0.1, -0.2, 0.3))
     t, error, covariance = position_errors(odometry, truth, *scored_phase(truth)[1:])
     assert t[0] >= 1.0 and t[-1] <= 9.0 and len(t) == 801
@@ -86,7 +90,8 @@ def test_what_lies_in_a_hole_of_the_truth_has_no_error():
     truth = straight()
     odometry = estimate(truth, constant(0.1, -0.2, 0.3))
     known = (truth.t < 4.0) | (truth.t > 6.0)
-    truth = Truth(truth.t[known], truth.p[known] ** 2, truth.q[known])  # nothing to be interpolated
+    # interpolation over the hole would be wrong
+    truth = Truth(truth.t[known], truth.p[known] ** 2, truth.q[known])
     t, _, _ = position_errors(odometry, truth, *scored_phase(truth)[1:])
     assert np.sum(t <= 4.0) > 100 and np.sum(t >= 6.0) > 100 and not np.any((t > 4.02) & (t < 5.98))
 
@@ -120,7 +125,7 @@ def test_root_mean_square_is_the_root_of_the_summed_squares():
 def test_diverged_is_more_than_a_quarter_beyond_a_metre(lost, diverged):
     errors = np.zeros((100, 3))
     errors[: int(100 * lost), 0] = 1.001
-    errors[int(100 * lost) :, 0] = 1.0  # exactly a metre is not beyond it
+    errors[int(100 * lost) :, 0] = 1.0  # exactly one metre does not count as beyond
     found = summary(errors, np.ones(100), np.ones(0))
     assert found["frac_gt_1m"] == pytest.approx(lost) and found["diverged"] is diverged
 
@@ -132,7 +137,7 @@ def test_an_estimate_that_is_not_finite_has_diverged(bad):
     odometry.p[500] = bad
     assert Score("flight", odometry, truth).row()["diverged"]
     odometry = estimate(truth, constant(0.0, 0.0, 0.0))
-    odometry.p[20] = bad  # before the take-off nobody looks
+    odometry.p[20] = bad  # times before take-off do not count
     assert not Score("flight", odometry, truth).row()["diverged"]
 
 
@@ -142,8 +147,8 @@ def test_an_estimate_that_is_not_finite_has_diverged(bad):
         (0.5, 10.0, False, False),
         (1.9, 10.0, False, False),
         (2.1, 10.0, True, True),
-        (0.0, 3.0, True, False),  # it ends in mid flight
-        (9.5, 10.0, True, False),  # there is none in the air
+        (0.0, 3.0, True, False),  # ends in flight
+        (9.5, 10.0, True, False),  # no estimate in the air
     ],
 )
 def test_an_estimate_of_a_part_of_the_flight_has_diverged(low, high, diverged, late_start):
@@ -169,7 +174,7 @@ def test_nees_of_hand_made_errors():
 
 
 def test_an_odometry_that_claims_no_covariance_still_has_errors():
-    """Many a publisher of nav_msgs/Odometry leaves the covariance zero."""
+    """Many publishers of nav_msgs/Odometry leave the covariance zero."""
     truth = straight()
     row = Score("flight", estimate(truth, constant(0.1, 0.0, 0.0), std=0.0), truth).row()
     assert row["rmse_3d"] == pytest.approx(0.1) and not np.isfinite(row["nees_mean"])
@@ -244,7 +249,7 @@ def test_what_a_run_leaves_survives_json_and_does_not_grow_with_it():
     for truth, end in ((short, 10.0), (long, 200.0)):
         made = estimate(truth, lambda t: 0.1 * noise.standard_normal((len(t), 3)), high=end)
         sizes.append(len(json.dumps(Score("flight", made, truth).result().as_dict())))
-    assert sizes[1] < 2.0 * sizes[0]  # 20 times as long
+    assert sizes[1] < 2.0 * sizes[0]  # for a flight 20 times as long
     never = Score("never", estimate(short, constant(0.0, 0.0, 0.0), low=9.5), short)
     nan = Score("nan", estimate(short, constant(np.nan, 0.0, 0.0)), short)
     for score in (Score("flight", made, truth), never, nan):
@@ -280,7 +285,7 @@ def test_phases_of_a_flight_are_those_of_the_data_and_leave_nothing_out():
 
 @pytest.mark.parametrize("floor", [-1.5, 0.0, 0.085])
 def test_a_floor_that_is_not_at_zero_gives_the_same_departure(floor):
-    """A vehicle at 0.085 m is not at lift-off because it is 1.5 cm above its floor."""
+    """A vehicle at 0.085 m has not taken off at 1.5 cm above its floor."""
     truth = flown(floor)
     if floor < -1.0:
         truth.p[:, 2] += np.where(truth.p[:, 2] > -0.6, 1.0, 0.0)  # or it would never exceed 0.3 m
@@ -329,7 +334,7 @@ SLOW_TAKE_OFF = (
             ["at_rest_earlier", "at_rest_before", "at_rest_after", "moving"],
         ),
         (
-            truth_of(*OFF_A_TABLE),  # it rests 0.07 m above the floor at the end
+            truth_of(*OFF_A_TABLE),  # at the end it rests 0.07 m above the floor
             {"at_rest_before": (4.1, 6.1), "at_rest_after": (17.96, 20.0)},
             [],
         ),
@@ -351,7 +356,7 @@ def test_phases_are_those_of_the_motion(truth, expected, missing):
 
 
 def covers(found):
-    """Whether the phases but the whole leave nothing of it out."""
+    """Return whether the phases, except "whole", cover the whole time."""
     begin, end = found["whole"]
     for first, last in sorted(span for name, span in found.items() if name != "whole"):
         if first > begin + 1e-9:
@@ -361,8 +366,9 @@ def covers(found):
 
 
 def test_random_paths_have_phases_that_leave_nothing_out():
-    """Down to single poses; whatever the truth does, there is no traceback and no part of it that
-    no phase holds.
+    """Random paths, down to single poses.
+
+    There is no traceback, and each moment belongs to a phase.
     """
     rng = np.random.default_rng(0)
     for _ in range(300):
@@ -388,7 +394,7 @@ STD = 0.5
 
 
 def odometry_of(truth, error, low=-np.inf, high=np.inf, rate=100.0, std=STD):
-    """Odometry of a Truth that is off by error(t) (n, 3) m, from `low` to `high`, s."""
+    """Return odometry of a Truth with errors error(t) (n, 3), m, from `low` to `high`, s."""
     t = np.arange(truth.t[0] + 0.5 / rate, truth.t[-1], 1.0 / rate)
     t = t[(t >= low) & (t <= high)]
     true = np.stack([np.interp(t, truth.t, truth.p[:, k]) for k in range(3)], axis=1)
@@ -398,7 +404,10 @@ def odometry_of(truth, error, low=-np.inf, high=np.inf, rate=100.0, std=STD):
 
 
 def high_on_the_floor(truth, off=4.0):
-    """Right in the air, `off` m too high until z > 0.3 m, as estimates of measured flights are."""
+    """Return errors that are `off` m along z until z > 0.3 m, and 0 in the air.
+
+    Estimates of measured flights behave like this.
+    """
     begin = phases(truth)["in_the_air"][0]
     return lambda t: np.where(t < begin, 1.0, 0.0)[:, None] * [0.0, 0.0, off]
 
@@ -434,12 +443,12 @@ def test_the_step_is_the_largest_jump_between_estimates_and_where_it_is():
     assert found["first_3_s"]["step"] == found["whole"]["step"] == pytest.approx(1.5)
     assert found["at_rest_before"]["step"] == pytest.approx(
         0.0, abs=1e-9
-    )  # and the motion itself is none
+    )  # the motion itself is not a step
     assert found["last_3_s"]["step"] == pytest.approx(0.0, abs=1e-9)
 
 
 def test_time_without_an_estimate_is_told_where_it_is():
-    truth = flown()  # departs at 5.07 s
+    truth = flown()  # take-off at 5.07 s
     made = odometry_of(truth, lambda t: np.zeros((len(t), 3)), low=4.0)
     keep = (made.t < 10.0) | (made.t > 12.0)
     made = SimpleNamespace(t=made.t[keep], p=made.p[keep], covariance=made.covariance[keep])
@@ -451,7 +460,7 @@ def test_time_without_an_estimate_is_told_where_it_is():
     assert found["at_rest_before"]["without_estimate"] == pytest.approx(4.0 - 3.07, abs=0.03)
     assert found["in_the_air"]["without_estimate"] == pytest.approx(
         1.9, abs=0.03
-    )  # one stands for 0.1 s
+    )  # the last estimate holds for 0.1 s
     assert found["at_rest_after"]["without_estimate"] == pytest.approx(0.0, abs=0.03)
     assert found["whole"]["without_estimate"] == pytest.approx(4.0 + 1.9, abs=0.05)
 
@@ -463,7 +472,7 @@ def test_a_slow_odometry_has_no_gaps_and_an_end_is_one():
     assert found["in_the_air"]["without_estimate"] == 0.0
     assert found["at_rest_after"]["without_estimate"] == pytest.approx(
         21.0 - 17.75 - 2.0, abs=0.01
-    )  # for 4 intervals the last one stands
+    )  # the last estimate holds for 4 intervals
 
 
 def test_time_without_truth_is_told():
@@ -552,7 +561,7 @@ def test_a_pool_counts_the_runs_that_have_a_phase():
     }
     assert found["at_rest_before"]["without_estimate"] == pytest.approx(
         2.0, abs=0.03
-    )  # of the one that never began
+    )  # from the run that never started
 
 
 def test_tables_tell_each_phase():
@@ -579,7 +588,7 @@ def test_tables_tell_each_phase():
     row = text.splitlines()[-1]
     assert row.startswith("| flight | 4.000") and row.endswith(
         "| 0.000 | 0.200 |"
-    )  # the step comes at z > 0.3 m
+    )  # the step is at z > 0.3 m
     assert "runs: median" not in markdown_of([score.result()], pool, {})
 
 
@@ -597,7 +606,7 @@ def test_estimates_that_are_not_finite_spoil_their_phase_and_no_other(bad):
 
 @given(st.floats(-0.5, 0.5), st.floats(0.005, 0.2))
 def test_a_gain_counts_if_a_loss_is_unlikely(expected, std):
-    """Against the normal distribution that has the interval."""
+    """The reference is the normal distribution with this confidence interval."""
     interval = expected - 1.96 * std, expected + 1.96 * std
     loss = 0.5 * math.erfc((expected + LOSS) / std / math.sqrt(2.0))
     sure = expected / std > 1.96

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Simulated flights: the command, their configuration, rooms and inertial sensors."""
+"""Simulated flights: the command, configurations, rooms and inertial sensors."""
 
 from dataclasses import replace
 import json
@@ -150,7 +150,7 @@ configs = st.builds(
 def test_any_config_gives_a_sound_flight(config):
     try:
         flight = simulate(config)
-    except InputError as error:  # the only two honest reasons among these configurations
+    except InputError as error:  # the only two valid reasons among these configurations
         assert str(error).startswith(("speed: ", "duration: "))
         return
     for stream in (flight.tdoa, flight.imu, flight.truth):
@@ -293,7 +293,7 @@ def test_height_pressure_and_velocity_are_true_without_noise_and_noisy_as_told()
     assert np.std(noisy.velocity.v - exact.velocity.v) == pytest.approx(0.05, rel=0.1)
     assert (noisy.velocity.std == 0.05).all() and (exact.velocity.std > 0.0).all()
     assert plain.height is None and plain.pressure is None and plain.velocity is None
-    # every part draws from its own stream
+    # every part has its own random stream
     np.testing.assert_array_equal(noisy.tdoa.d, plain.tdoa.d)
 
 
@@ -333,8 +333,9 @@ SHELF = Walls(((4.0, -10.0, 4.0, 20.0, 3.0),))
 
 
 def hall_of_cells():
-    """32 Anchors in 28 x 14 m, whose ids are 256 times the number of their cell of 16, and 0 ...
-    15.
+    """Return 32 Anchors in 28 x 14 m. Ids are 256 times the number of a cell, plus 0 ... 15.
+
+    Each cell holds 16 anchors.
     """
     x, y = np.meshgrid(np.arange(8) * 4.0, np.arange(4) * 14.0 / 3.0)
     positions = np.column_stack([x.ravel(), y.ravel(), np.tile([0.5, 3.0, 5.5, 4.0], 8)])
@@ -448,7 +449,7 @@ CONFIG = SimulationConfig(trajectory="hover", duration=30.0)
 
 
 def errors_of(imu_errors, **change):
-    """The errors of both sensors, (gyro (n, 3), accel (n, 3)), and the flight."""
+    """Return the errors of both sensors, (gyro (n, 3), accel (n, 3)), and the flight."""
     config = replace(CONFIG, imu_errors=imu_errors, **change)
     flight, exact = (
         simulate(config),
@@ -523,6 +524,6 @@ assert topics_of("sonar") == (("sonar", "sensor_msgs/msg/FluidPressure"),)
 
 
 def test_the_registry_alone_adds_a_sensor_to_recordings_parameters_simulation_and_bags():
-    """In another process: whoever imports the registry makes its fields by it."""
+    """It runs in another process, because importers of the registry derive their fields from it."""
     run = subprocess.run([sys.executable, "-c", REGISTERED], capture_output=True, text=True)
     assert run.returncode == 0, run.stderr

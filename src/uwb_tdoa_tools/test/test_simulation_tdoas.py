@@ -63,8 +63,9 @@ def test_tdoa3_takes_any_pair_some_240_times_per_second():
 
 
 def across_a_hall(protocol, reach, seed, cells=None):
-    """(Schedule, place (n, 3) of each measurement, positions (40, 3)) of a tag that crosses 60 m of
-    a hall.
+    """Return the schedule of a tag that crosses 60 m of a hall.
+
+    Returns (Schedule, position (n, 3) at each measurement, anchor positions (40, 3)), m.
     """
     rng = np.random.default_rng(seed)
     positions = np.column_stack([rng.uniform(0.0, 60.0, (40, 2)), rng.uniform(0.0, 5.0, 40)])
@@ -92,7 +93,7 @@ LEVER = np.array([-0.012, 0.001, 0.091])
 
 
 def geometry(flight, lever=(0.0, 0.0, 0.0)):
-    """TDOAs from the true pose that is next in time."""
+    """Return TDOAs from the next true pose."""
     at = np.minimum(np.searchsorted(flight.truth.t, flight.tdoa.t), len(flight.truth) - 1)
     p = flight.truth.p[at] + Rotation.from_quat(flight.truth.q[at]).apply(lever)
     a, b = (
@@ -105,7 +106,7 @@ def geometry(flight, lever=(0.0, 0.0, 0.0)):
 @pytest.mark.parametrize("protocol", ["tdoa2", "tdoa3"])
 @pytest.mark.parametrize("lever", [(0.0, 0.0, 0.0), tuple(LEVER)])
 def test_without_errors_a_tdoa_is_geometry(protocol, lever):
-    """A hovering tag: the poses at any stamp are those of the truth."""
+    """The tag hovers, so its pose at any stamp equals the ground truth."""
     config = SimulationConfig(
         trajectory="hover",
         place=(0.7, -1.1),
@@ -226,8 +227,9 @@ def test_power_bias_is_the_table_of_aps011():
 
 
 def test_friis_by_hand():
-    """Two isotropic antennas: the free-space loss of the handbooks, 32.45 + 20 log10(km) + 20
-    log10(MHz) dB.
+    """Two isotropic antennas have the free-space loss of the handbooks.
+
+    It is 32.45 + 20 log10(km) + 20 log10(MHz) dB.
     """
     link = RadioLink(ISOTROPIC, ISOTROPIC, tx_power_dbm=0.0, frequency=4.0e9)
     p = received_power_dbm(np.zeros(3), LEVEL, np.array([4.0, 0, 0]), LEVEL, link)
@@ -237,8 +239,9 @@ def test_friis_by_hand():
 
 
 def test_gains_of_both_antennas_count():
-    """Tag above the anchor, which it has at its back (-x of a flat antenna), in the upper null of
-    the anchor.
+    """The tag is above the anchor: in the upper null of the anchor's antenna.
+
+    The anchor is behind the tag's flat antenna (-x).
     """
     link = RadioLink(tx_power_dbm=0.0)
     isotropic = RadioLink(ISOTROPIC, ISOTROPIC, tx_power_dbm=0.0)
@@ -266,7 +269,10 @@ def test_only_relative_poses_matter():
 
 
 def spin(anchors, link=RadioLink()):
-    """TDOA bias of the pair (0, 1) over a full turn of the tag half-way between the anchors."""
+    """Return the TDOA bias of the pair (0, 1) over a full turn of the tag.
+
+    The tag is half-way between the anchors.
+    """
     yaw = np.linspace(-np.pi, np.pi, 181)
     q_tag = Rotation.from_rotvec(np.outer(yaw, [0.0, 0.0, 1.0])).as_quat()
     late = arrival_bias(

@@ -54,7 +54,7 @@ def test_gyro_integrates_to_the_attitude(flown):
 
 
 def test_specific_force_integrates_to_the_position(flown):
-    """Dead reckoning from exact samples, trapezoidal, over 10 s: millimetres."""
+    """Exact samples, integrated for 10 s with the trapezoidal rule, match within millimetres."""
     t = np.arange(8.0, 18.0, 1e-3)
     motion = flown.motion(t)
     a = Rotation.from_quat(motion.q).apply(motion.specific_force) - [0.0, 0.0, GRAVITY]
@@ -175,7 +175,7 @@ def test_rates_and_forces_are_those_of_the_motion(vehicle, trajectory, seed, spe
     t, h = np.linspace(0.1, 39.9, 2003), 1e-3
     before, here, after = (motion(t + k * h) for k in (-1, 0, 1))
     np.testing.assert_allclose((after.p - before.p) / (2 * h), here.v, atol=1e-4)
-    # of a cubic, whose second derivative has corners
+    # of a cubic; its second derivative has corners
     np.testing.assert_allclose((after.v - before.v) / (2 * h), here.a, atol=2e-2)
     turned = (Rotation.from_quat(before.q).inv() * Rotation.from_quat(after.q)).as_rotvec() / (
         2 * h
@@ -225,7 +225,7 @@ def test_a_person_walks_at_the_height_of_a_hand():
     assert 1.0 < flight.truth.p[:, 2].min() < flight.truth.p[:, 2].max() < 1.2
     assert (
         np.abs(np.linalg.norm(flight.imu.accel, axis=1) - GRAVITY).max() > 1.0
-    )  # its steps are felt
+    )  # its steps are measured
     assert flight.velocity is None
 
 

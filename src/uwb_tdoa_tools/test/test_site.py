@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The site: it builds strictly, its links lead somewhere, and it loads nothing from elsewhere."""
+"""The site builds strictly, its links lead somewhere, and it loads nothing from other servers."""
 
 from html.parser import HTMLParser
 import os
@@ -43,13 +43,13 @@ class Page(HTMLParser):
 
 
 def addresses(css):
-    """What a style sheet loads."""
+    """Return the addresses that a style sheet loads."""
     return re.findall(r"""url\(["']?([^"')]+)|@import\s+["']([^"']+)""", css)
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    """{path: Page} of the site, built without a network."""
+    """Return {path: Page} of the site, built without a network."""
     folder = tmp_path_factory.mktemp("site")
     offline = {"http_proxy": "http://127.0.0.1:9", "https_proxy": "http://127.0.0.1:9"}
     done = subprocess.run(
@@ -68,7 +68,7 @@ def folder_of(site):
 
 
 def broken(path, page, site):
-    """The links of a page that lead to no file or to no anchor of the site."""
+    """Return the links of a page that lead to no file or no anchor of the site."""
     for link in page.links:
         parts = urlsplit(link)
         if parts.scheme or not link:

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Streams of readers: the protocol of TDOAs, and velocities from pixel counts."""
+"""Streams of readers: the TDOA protocol, and velocities from pixel counts."""
 
 from dataclasses import replace
 
@@ -32,7 +32,7 @@ def test_any_pair_is_tdoa3():
     assert protocol(tdoas(a, (a + rng.integers(1, 8, 500)) % 8)) == "tdoa3"
 
 
-RING = [4, 1, 7, 0, 3, 6]  # the order in which anchors send need not be that of their ids
+RING = [4, 1, 7, 0, 3, 6]  # anchors need not send in the order of their ids
 
 
 def test_a_ring_in_any_order_whichever_id_a_tool_writes_first():
@@ -74,8 +74,10 @@ def flight():
 
 
 def pixel_counts(flight):
-    """Stamps and counts, x and y, of a sensor that looks down, by the geometry of a pinhole: a
-    point of the ground at X in the body frame is seen at X / depth, and moves by -(v + omega x X).
+    """Return stamps and pixel counts, x and y, of a sensor that looks down.
+
+    Pinhole geometry: a ground point at X in the body frame appears at X / depth. It moves by -(v +
+    omega x X).
     """
     t = np.arange(100, 3900) / 100.0 + flight.imu.t[0]
     track = Track(flight.truth)
@@ -97,7 +99,7 @@ def test_pixel_counts_become_the_velocity_that_made_them(flight):
     air = (made.t > first + 0.5) & (made.t < last - 0.5)
     true = sensor_samples("velocity", made.t[air], Track(flight.truth)).reading
     assert np.isinf(made.std[:, 2]).all() and np.isfinite(made.std[:, :2]).all()
-    # of ranges with 1 cm of noise
+    # with ranges with 1 cm of noise
     error = np.sqrt(np.mean((made.v[air, :2] - true[:, :2]) ** 2, axis=0))
     assert (np.std(true[:, :2], axis=0) > 0.2).all() and (error < 0.015).all()
 

@@ -52,13 +52,14 @@ def test_orientation_is_exact_and_says_what_remains():
 
 
 def test_arms_up_left_forward_are_what_the_surveyor_saw():
-    """Standing before an upright stand that faces us, arm 2 is on the left; REP 103 calls this side
-    -y.
+    """In front of an upright stand that faces the viewer, arm 2 is on the left.
+
+    REP 103: this is -y.
     """
     up, left_of_viewer, forward = ARM_TIPS
     assert up[2] == 0.110 and forward[0] == 0.080
     np.testing.assert_allclose(np.linalg.norm(left_of_viewer), 0.121)
-    viewer = -forward / np.linalg.norm(forward)  # where the viewer looks
+    viewer = -forward / np.linalg.norm(forward)  # direction of view
     assert np.cross(up, viewer) @ left_of_viewer > 0
 
 
@@ -108,8 +109,9 @@ def test_missing_and_binary(tmp_path):
 
 
 def test_measured_stands_are_one_shape(shared_data):
-    """The antenna sits at one place of all stands, and those on the floor stand upright: the frame
-    is the right one.
+    """The antenna is at the same place of all stands, and stands on the floor are upright.
+
+    So the frame is correct.
     """
     for file in sorted((shared_data / "surveys").glob("*.txt")):
         anchors = read_survey(file)

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""From a tape measure and flights to anchors."""
+"""Anchor positions from a tape measure and flights."""
 
 from dataclasses import replace
 import json
@@ -37,7 +37,7 @@ def at(flight, positions):
 
 
 def shaken(anchors, std, seed):
-    """Positions as a tape of this std tells them, TRUSTED coordinates as they are."""
+    """Return positions with tape errors of this std, m. TRUSTED coordinates are exact."""
     off = std * np.random.default_rng(seed).standard_normal(anchors.positions.shape)
     return anchors.positions + np.where(
         Tape(1.0, trusted=TRUSTED).position_std(anchors) < 0.5, 0.0, off
@@ -84,7 +84,7 @@ def test_a_flight_that_took_no_part_gains(flights, result):
     )
     after = evaluate(at(other, found.surveyed.positions), config, effects=effects)[0].row()
     assert after["rmse_3d"] < 0.5 * before and after["rmse_3d"] < 1.2 * error(other)
-    assert found.tdoa_std < 0.25 and 0.5 < after["nees_mean"] < 6.0  # of white noise of 0.05 m
+    assert found.tdoa_std < 0.25 and 0.5 < after["nees_mean"] < 6.0  # white noise of 0.05 m
 
 
 def test_the_noise_beside_a_calibration_is_that_of_the_flights_without_their_ground_truth(flights):
@@ -105,7 +105,7 @@ def test_an_anchor_of_which_nothing_is_known_is_placed(flights):
 
 
 def marks_file(path, flight, places=3, changes=()):
-    """Marks of the ground truth of a Flight, 2 s each, within a millimetre."""
+    """Write marks from the ground truth of a Flight, 2 s each, within a millimetre."""
     begin, truth, marks = flight.tdoa.t[0], flight.truth, []
     for first in np.linspace(5.0, 30.0, places):
         inside = (truth.t >= begin + first) & (truth.t <= begin + first + 2.0)
@@ -126,7 +126,10 @@ def marks_file(path, flight, places=3, changes=()):
 
 @pytest.fixture
 def solved(result, monkeypatch):
-    """Tapes of the command, which gets a SelfCalibration that is made already: solved.result."""
+    """Replace the self-calibration of the command by a ready one, solved.result.
+
+    solved.tapes holds the tapes that the command passes.
+    """
     seen = SimpleNamespace(result=result, tapes=[])
 
     def instead(flights, tape, *_):
@@ -161,7 +164,7 @@ def test_flights_that_are_too_short_are_refused():
 
 def test_marks_hold_the_frame_where_no_anchor_is_trusted(flights, tmp_path):
     flight = flights[0]
-    away = flight.anchors.positions + [0.2, -0.15, 0.1]  # all alike: nothing in the TDOAs tells
+    away = flight.anchors.positions + [0.2, -0.15, 0.1]  # a common shift, which TDOAs do not show
     moved = [at(flight, away)]
     marks = read_marks(marks_file(tmp_path / "marks.yaml", flight, 6), moved)
     with_marks, without = (
@@ -244,12 +247,12 @@ def test_the_command_writes_surveys_that_are_read(flights, solved, tmp_path, cap
     )
 
 
-TAG = 0.25  # m, that all ranges are too long by
+TAG = 0.25  # m, offset of all ranges
 
 
 @pytest.fixture(scope="module")
 def ranged():
-    """Two flights of ranges alone, with delays of anchors and of the tag."""
+    """Return two flights with ranges only, with delays of anchors and of the tag."""
     flown = dict(
         duration=40.0,
         floor_time=1.0,
@@ -272,7 +275,7 @@ def ranged():
 
 @pytest.fixture(scope="module")
 def by_ranges(ranged):
-    """What the first of the flights of ranges tells."""
+    """Return the self-calibration of the first flight with ranges."""
     return self_calibrate(ranged[0][:1], Tape(0.1, trusted=TRUSTED))
 
 
@@ -292,7 +295,7 @@ def test_ranges_tell_of_anchors_and_of_the_delay_of_the_tag(ranged, by_ranges):
 
 
 def test_another_tag_needs_no_parameter_by_hand(ranged, by_ranges):
-    """The filter finds by how much another tag differs from the one that was surveyed."""
+    """The filter estimates the difference between another tag and the tag of the survey."""
     (_, same), _ = ranged
     found = by_ranges
     none, other = FilterConfig(range_offset_std=0.0), without_offset(same, 0.15)

@@ -1,8 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What is known beside the flights: the last calibration, distances between anchors, the path of
-another odometry.
-"""
+"""Known data besides flights: the last calibration, distances, and the path of other odometry."""
 
 from dataclasses import replace
 import re
@@ -130,7 +128,7 @@ def test_distances_that_cannot_be_are_refused(flights, tmp_path, text, words):
 
 
 def odometry_of(flight, drift=0.02, yaw=1.0, seed=0):
-    """OdometryPath of the ground truth of a Flight in a frame of its own, that drifts."""
+    """Return the OdometryPath of a Flight: its ground truth with drift, in another frame."""
     truth, rng = flight.truth, np.random.default_rng(seed)
     t = np.arange(truth.t[0], truth.t[-1], 0.05)
     p = np.stack([np.interp(t, truth.t, column) for column in truth.p.T], axis=1)
@@ -144,7 +142,7 @@ def odometry_of(flight, drift=0.02, yaw=1.0, seed=0):
 
 
 def ends(flight, std=0.05):
-    """[Mark] of where a Flight was before it took off and after it landed."""
+    """Return [Mark] of a Flight: its positions before take-off and after landing."""
     truth, last = flight.truth, flight.tdoa.t[-1] - flight.tdoa.t[0]
     return [
         Mark(flight.name, since, since + 2.0, tuple(truth.p[row]), std)
@@ -163,7 +161,7 @@ def test_a_path_laid_beside_the_filters_is_where_the_tag_was_and_takes_its_shift
     for marks in ([], ends(flight)):
         reference = OdometryReference(None, [odometry_of(flight, drift=0.005), *marks])
         paths = [reference.prepare(each).truth for each in (replace(flight, truth=None), wrong)]
-        np.testing.assert_array_equal(paths[0].p, paths[1].p)  # no truth is read
+        np.testing.assert_array_equal(paths[0].p, paths[1].p)  # no ground truth is read
         path = paths[0]
         aloft = (path.t > flight.truth.t[0] + 5.0) & (path.t < flight.truth.t[-1] - 5.0)
         off = path.p[aloft] - np.stack(
@@ -199,7 +197,7 @@ def test_marks_on_the_floor_tell_nothing_and_those_in_the_air_judge_each_other(f
 
 
 def marks_in_the_air(flight):
-    """[Mark] of four places of a Flight, 1 s each."""
+    """Return [Mark] of four positions of a Flight, 1 s each."""
     truth, begin = flight.truth, flight.tdoa.t[0]
     rows = [np.searchsorted(truth.t, begin + since + 0.5) for since in (8.0, 14.0, 20.0, 26.0)]
     return [

@@ -13,8 +13,9 @@ PAGE = (ROOT / "docs" / "symptoms.md").read_text()
 
 
 def findings():
-    """{rule: its severities} of all Findings, of the streams and of `check`; an empty set if the source
-    does not show them.
+    """Return {rule: its severities} of all Findings, of the streams and of `check`.
+
+    The set is empty if the source does not show the severity.
     """
     found = {}
     monitoring = SRC / "uwb_tdoa_ekf/uwb_tdoa_ekf/monitoring"
@@ -33,7 +34,7 @@ def findings():
 
 
 def _made_in(function):
-    """(rule, its severities) of each Finding that a function makes."""
+    """Yield (rule, its severities) of each Finding that a function makes."""
     given = {"ERROR": {"error"}, "WARNING": {"warning"}, "NOTE": {"note"}}
     for node in ast.walk(function):
         if isinstance(node, ast.Assign) and _name(node.targets[0]) == "severity":
@@ -51,7 +52,7 @@ def _severities(node, given):
 
 
 def _of_mistake(arguments, _):
-    """Its last argument says whether it is severe."""
+    """Return the severities of a Mistake. Its last argument chooses between error and warning."""
     if len(arguments) < 6:
         return {"error"}
     severe = arguments[5]
@@ -60,7 +61,7 @@ def _of_mistake(arguments, _):
     return {"error", "warning"}
 
 
-MAKERS = {  # {what makes a finding: severities by its arguments}
+MAKERS = {  # {function that makes a finding: severities by its arguments}
     "Finding": lambda arguments, given: _severities(arguments[1], given),
     "MistakeTrial": lambda arguments, given: {"error"},
     "Mistake": _of_mistake,
@@ -72,7 +73,7 @@ def _name(node):
 
 
 def rows():
-    """[(rules of a row, their severities)] of the table."""
+    """Yield (rules of a row, their severities) of the table."""
     table = PAGE.partition("## What `check` finds\n")[2]
     cells = [line.split("|")[1:3] for line in table.splitlines() if line.startswith("| `")]
     for names, severities in cells:
@@ -85,7 +86,7 @@ def test_every_finding_of_check_is_on_the_page_and_no_other():
     named = [name for names, _ in rows() for name in names]
     of_numbers = {
         rule for fault in FAULTS.values() for rule in fault.rules
-    }  # some rules are named after what they are of
+    }  # some rules are named after their subject
     assert len(named) == len(set(named)) and set(named) == findings().keys() | of_numbers
 
 

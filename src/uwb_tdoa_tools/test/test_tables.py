@@ -66,5 +66,5 @@ def test_numbers_take_less_memory_than_their_text_would(write):
     numbers = read_numbers(file, ("b", "a"))
     most = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert most < 22e6  # 17e6 to read a block; 65e6 as rows of text
+    assert most < 22e6  # 17e6 for reading in blocks; 65e6 for rows of text
     np.testing.assert_array_equal(numbers, np.tile([2.0, 1.0], (150_000, 1)))

@@ -18,7 +18,7 @@ from uwb_tdoa_tools.training.labels import labels
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Two flights with attitude, two without; one anchor is late."""
+    """Write two flights with attitude and two without. One anchor is late."""
     out = tmp_path_factory.mktemp("flights")
     late = [EFFECTS["anchor_delay"]({"3": 0.4}).inject(flight(seed)) for seed in range(4)]
     for one in (*late[:2], *map(without_attitude, late[2:])):
@@ -65,7 +65,7 @@ def test_trains_on_flights_with_and_without_attitude_in_one_command(folder, tmp_
     assert set(meta["validity"]) >= {"forward_x", "up_x"} and meta["fade_std"] > 0.0
     assert (
         meta["features"][:3] == ["x", "y", "z"] and "largest_yaw_std" not in meta
-    )  # maps of places alone
+    )  # maps of positions only
     assert len(meta["offset"]) == len(meta["scale"]) == len(meta["features"])
 
     told = json.loads((out / "training.json").read_text())
@@ -132,7 +132,7 @@ def test_a_resumed_training_writes_the_same_files(folder, tmp_path, monkeypatch,
         and len(done) == 2
         and not any(fold in before for fold in done)
     )
-    assert "holds 4 of 4 parts" in capsys.readouterr().err  # the errors without correction
+    assert "holds 4 of 4 parts" in capsys.readouterr().err  # errors without correction
     assert trained("again", *resume) == whole and len(done) == 2
     assert trained("other", "--seed", "5", *resume)[0] == 2
     assert (

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What a bias model is trained on, the kinds of models, and how much of one is taken."""
+"""Training data of a bias model, kinds of models, and the share of a model that is applied."""
 
 from dataclasses import replace
 
@@ -128,9 +128,9 @@ SITES, FEATURES, DENSE = 4, 6, 3
 
 
 def design(noise, outliers, seed=0, n=4000):
-    """(Design, weights of the sites, dense weights).
+    """Return (Design, weights of the sites, dense weights).
 
-    The sites' weights sum to zero: differences tell no common one.
+    The weights of the sites sum to zero, because differences do not determine a common weight.
     """
     random = np.random.default_rng(seed)
     weights, dense = random.normal(size=(SITES, FEATURES)), random.normal(size=DENSE)
@@ -290,7 +290,7 @@ CIRCLE = {"trajectory": "circle", "yaw_angle": 0.3}
 
 @pytest.fixture(autouse=True, scope="module")
 def small():
-    """Few centres, so that the fits are quick."""
+    """Use few centres to make the fits fast."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(structured, "CENTRES", 40)
         patch.setattr(structured, "LINK_CENTRES", 60)
@@ -403,7 +403,7 @@ RECIPE = models.Recipe("structured", 0)
 
 
 def errors(*ratios):
-    """As of Shrinkage: of flights with an error of 0.5 m, ratios at all SHARES."""
+    """Return errors as in Shrinkage: 0.5 m per flight, times the ratios at all SHARES."""
     return {
         str(k): {None: 0.5} | dict(zip(SHARES, (0.5 * ratio for ratio in some)))
         for k, some in enumerate(ratios)
@@ -415,7 +415,7 @@ def errors(*ratios):
     [
         ([(1.0, 0.8, 0.7, 0.6), (1.0, 0.8, 0.7, 0.6)], 1.0),  # all gain
         ([(1.0, 1.0, 1.1, 1.2), (1.0, 1.1, 1.1, 1.1)], 0.0),  # none gains
-        # the mean alone would take all but the last bit
+        # the mean alone would choose a larger share
         ([(1.0, 0.8, 0.7, 0.6), (1.0, 0.96, 1.0, 1.15)], 0.5),
     ],
 )

@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""mypy, where it is installed, as .ci/mypy.ini says: the annotations of the packages and folders
-that it names, and messages by the stubs that .ci/stubs.py writes.
+"""mypy with .ci/mypy.ini: the annotations of our packages and folders.
+
+Message types come from the stubs that .ci/stubs.py writes. Skipped without mypy.
 """
 
 import configparser
@@ -59,7 +60,7 @@ ERROR = re.compile(r"^(.*):(\d+): error: .*\[([\w-]+)\]$", re.MULTILINE)
 
 
 def annotated():
-    """Names of the packages and folders whose functions must have annotations."""
+    """Return the packages and folders whose functions must have annotations."""
     found = configparser.ConfigParser()
     found.read(ROOT / ".ci/mypy.ini")
     sections = (
@@ -70,7 +71,7 @@ def annotated():
 
 @pytest.mark.slow
 def test_annotations(monkeypatch):
-    """The wrong module lies at the same path each time: mypy's cache keeps it."""
+    """The wrong module always has the same path, because mypy caches it."""
     run = pytest.importorskip("mypy.api").run
     pytest.importorskip("rclpy")
     monkeypatch.chdir(ROOT)

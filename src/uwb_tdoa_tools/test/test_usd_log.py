@@ -36,7 +36,7 @@ def test_streams_units_and_stamps(read):
     np.testing.assert_array_equal(flight.tdoa.a, [0, 1])
     np.testing.assert_array_equal(flight.tdoa.b, [1, 5])
     np.testing.assert_array_equal(flight.tdoa.d, [1.25, -0.5])
-    # the accelerometer's 20 us later belong to these
+    # accelerometer samples 20 us later get these stamps
     np.testing.assert_array_equal(flight.imu.t, [1.0, 1.001, 1.002])
     np.testing.assert_allclose(
         flight.imu.gyro, np.pi * np.array([[1, 0, -0.5], [0, 0.5, 0], [0, 0, 0.25]])
@@ -59,8 +59,9 @@ CANDIDATES = [
 
 
 def with_candidates(*but):
-    """A log that has the same TDOAs as candidates, of the other sign, and one more candidate of each packet, which
-    is written 20 us later.
+    """Return a log with the same TDOAs as candidates, with the other sign.
+
+    Each packet has one more candidate, written 20 us later.
     """
     rows = [row for row in ROWS if row[0] not in but]
     packets = [row for row in ROWS if row[0] == "estTDOA"]
@@ -103,8 +104,9 @@ def test_other_events_are_kept_sorted_and_empty_ones_are_not(read):
 def test_range_finder_and_barometer_in_si_units_one_row_for_each_reading(read):
     flight = read(log_bytes())
     np.testing.assert_array_equal(flight.height.t, [1.0012, 1.0013])
-    np.testing.assert_array_equal(flight.height.range, [1.25, np.inf])  # 32767 mm: nothing in sight
-    # that of 1.00152 repeats the one before
+    # 32767 mm: no target in sight
+    np.testing.assert_array_equal(flight.height.range, [1.25, np.inf])
+    # the reading at 1.00152 repeats the previous one
     np.testing.assert_array_equal(flight.pressure.t, [1.0014, 1.0015])
     np.testing.assert_allclose(
         flight.pressure.pressure, [101325.0, 101325.0 - 12.013 * 101.5], atol=6.0
@@ -123,7 +125,7 @@ def test_lost_accelerometer_event_is_interpolated(read):
     rows = [row for row in ROWS if row[:2] != ("estAcceleration", 1_001_020)]
     flight = read(log_bytes(rows))
     assert flight.meta["imu_accel_interpolated"]
-    # before the first accelerometer sample there is none
+    # the samples before the first accelerometer sample are left out
     np.testing.assert_array_equal(flight.imu.t, [1.001, 1.002])
     np.testing.assert_allclose(
         flight.imu.accel[0], 9.81 * np.array([0.49, 0.5 - 0.245, 1.0]), rtol=1e-6
@@ -177,7 +179,7 @@ def test_refused_with_the_reason(read, content, sentence):
 
 
 def with_number(name, column, value):
-    """Rows of which one number is another."""
+    """Return ROWS with one number replaced."""
     rows, changed = [], False
     for event, ticks, values in ROWS:
         if event == name and not changed:
@@ -279,7 +281,7 @@ def test_the_time_for_a_header_does_not_grow_with_the_square_of_its_types(read):
     [(40, 60_000, "more than 10000 variables"), (20_000, 0, "more than 1000 event types")],
 )
 def test_a_header_of_millions_of_variables_takes_no_memory(read, types, variables, said):
-    """2.6 million of them, in 21 MB, took 1.3 GB."""
+    """2.6 million variables, in 21 MB, took 1.3 GB."""
     content = log_bytes(
         [],
         events={
@@ -304,8 +306,9 @@ def test_a_header_of_millions_of_variables_takes_no_memory(read, types, variable
     ],
 )
 def test_a_folder_of_flights_does_not_say_where_compiled_code_is(tmp_path, setting):
-    """numba looks for a configuration of its own where it is started; what it finds in such a
-    cache, or module, is run.
+    """numba looks for a configuration in its working directory.
+
+    It would run code from such a cache or module.
     """
     (tmp_path / ".numba_config.yaml").write_text(f"{setting}\n")
     (tmp_path / "evil.py").write_text("open('planted', 'w').close()")

@@ -41,7 +41,7 @@ def test_full_schema(read, packed):
     np.testing.assert_array_equal(flight.truth.t, [0.005, 0.009])
     np.testing.assert_array_equal(flight.truth.q[1], [0, 0, 0.6, 0.8])
     assert (len(flight.height), len(flight.pressure)) == (1, 1)
-    assert flight.velocity is None  # one range is too few to make one of the pixel counts
+    assert flight.velocity is None  # one range is too few for a velocity from pixel counts
 
 
 def test_subset_without_imu_and_attitude(read):
@@ -110,7 +110,8 @@ def test_plain_file_cut_within_a_line_is_refused(read):
     whole = csv_text()
     for cut in range(1, len(whole)):
         text = whole[:cut]
-        if text.endswith("\n") and text.count("\n") > 1:  # cannot be told from a shorter recording
+        # indistinguishable from a shorter recording
+        if text.endswith("\n") and text.count("\n") > 1:
             assert len(read(text).tdoa) == min(text.count("\n") - 1, 3)
         else:
             with pytest.raises(InputError):
@@ -225,8 +226,9 @@ def test_cells_of_all_blocks_count(read, monkeypatch):
 
 
 def test_a_million_empty_members_of_gzip_take_no_time(read):
-    """20 MB of them were not finished in 60 s: the time must grow as the file does, or end with the
-    limit of seconds.
+    """20 MB of empty members were not finished in 60 s.
+
+    The time must grow linearly with the file, or reading must end at the time limit.
     """
     empty, packed = gzip.compress(b""), gzip.compress(csv_text(TDOA, ["1,0,1,1"]).encode())
     took = []
@@ -234,7 +236,7 @@ def test_a_million_empty_members_of_gzip_take_no_time(read):
         began = time.process_time()
         assert len(read(packed + count * empty).tdoa) == 1
         took.append(time.process_time() - began)
-    assert took[1] < 8.0 * took[0]  # 16 times as long, where each member copies the rest
+    assert took[1] < 8.0 * took[0]  # 16 times as long if each member copies the rest
 
 
 def test_the_limit_of_seconds_holds_within_gzip(read, monkeypatch):

@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""vehicle_node: its parameters, and a flight with the real nodes by services, beside a computer at
-work.
+"""vehicle_node: its parameters, and a flight with the real nodes on a busy computer.
+
+The test commands the flight by services.
 """
 
 from dataclasses import replace
@@ -32,7 +33,7 @@ from uwb_tdoa_tools.vehicle_node import PARAMETERS, VehicleNode  # noqa: E402
 
 CONFIG = Path(__file__).resolve().parents[1] / "config" / "vehicle_node.yaml"
 SERVICES = Path(__file__).resolve().parents[2] / "uwb_tdoa_msgs" / "srv"
-OF_CRAZYSWARM2 = {  # the requests of crazyflie_interfaces 1.0
+OF_CRAZYSWARM2 = {  # requests of crazyflie_interfaces 1.0
     "Takeoff": "uint8 group_mask, float32 height, builtin_interfaces/Duration duration",
     "GoTo": (
         "uint8 group_mask, bool relative, geometry_msgs/Point goal, float32 yaw, "
@@ -112,6 +113,6 @@ def test_a_rover_drives_by_the_nodes_as_it_does_in_lockstep(tmp_path):
     world = replace(WORLDS["hall"], sensors=rover.SENSOR_NAMES)
     task = Task(world, 3, "place", config=FilterConfig(**rover.FILTER), path=Waypoints())
     lockstep = verdict_of(rover.drive(task))
-    one_turn = task.path.speed * DT  # m, by an odometry that came one turn later
+    one_turn = task.path.speed * DT  # m, error of odometry that comes one turn later
     for name in ("tracking", "farthest", "place"):
         assert verdict[name] == pytest.approx(lockstep[name], abs=one_turn)

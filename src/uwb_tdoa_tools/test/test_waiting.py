@@ -1,10 +1,9 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Nobody waits in silence: each command says something within 2 s, and goes on to say something
-every 5 s.
+"""No command is silent: it prints a message within 2 s, and then at least every 5 s.
 
-Time counts as long as the command itself computes. Where it has to wait for a core, others compute
-on the same ones, and it takes up to twice as long to compute, too.
+Only the computing time of the command counts. If it has to wait for a core, other processes use the
+same cores. Then it may take twice as long to compute.
 """
 
 import os
@@ -24,13 +23,13 @@ from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.rooms import corners
 
-# s; the last: of computing, after which enough is known of what does not end before
+# s, limits of the first message and of each silence; then the computing time that is measured
 FIRST, EVERY = 2.0, 5.0
 LONG_ENOUGH = FIRST + EVERY
-PATIENCE = 120.0  # s for a command that is interrupted to end
-# of the time that a command has waited for a core, from which on others compute on the same ones
+PATIENCE = 120.0  # s, limit for a command to end after an interrupt
+# share of time waiting for a core above which the machine counts as busy
 CROWD = 0.05
-WORDS = {  # command: words after it
+WORDS = {  # command: its arguments
     "calibrate": "flight.bag --out calibrated",
     "check": "wrong.bag",
     "convert": "flight.bag --out other.bag",
@@ -48,7 +47,7 @@ WORDS = {  # command: words after it
     "survey": "flight.bag --out surveyed",
     "train": "flight.bag --model structured --out model",
 }
-ELSEWHERE = {"replay"}  # what these wait for is the time of a recording
+ELSEWHERE = {"replay"}  # these wait for the time of a recording
 
 
 def test_every_command_is_here():
@@ -60,7 +59,7 @@ def test_every_command_is_here():
 
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory):
-    """A folder with a flight, another one whose TDOAs have the wrong sign, and anchors."""
+    """Return a folder with a flight, a flight with wrong TDOA signs, and anchors."""
     folder = tmp_path_factory.mktemp("desk")
     flight = simulate(SimulationConfig(seed=1, duration=120.0))
     write_bag(flight, folder / "flight.bag")
@@ -73,7 +72,7 @@ def desk(tmp_path_factory):
 
 
 def computed(pid):
-    """s of processor time of a process and of the processes that it has started."""
+    """Return the processor time of a process and its children, s."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
         children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
@@ -83,7 +82,7 @@ def computed(pid):
 
 
 def waited(pid):
-    """s that the main thread of a process has waited for a core."""
+    """Return the time that the main thread of a process has waited for a core, s."""
     try:
         return 1e-9 * int(Path(f"/proc/{pid}/schedstat").read_text().split()[1])
     except (FileNotFoundError, ProcessLookupError):
@@ -91,8 +90,10 @@ def waited(pid):
 
 
 def end(process):
-    """Interrupt a command, so that it ends what it has started, nodes in process groups of their
-    own among it, which a kill would leave behind; and kill what is left of its group.
+    """Interrupt a command, then kill the rest of its process group.
+
+    On an interrupt, the command ends its own child processes. A kill would leave nodes in other
+    process groups.
     """
     for number, patience in ((signal.SIGINT, PATIENCE), (signal.SIGKILL, None)):
         try:
@@ -103,9 +104,11 @@ def end(process):
 
 
 def silences(name, words, folder):
-    """[s] of computing until each thing that a command says, and until its end, or LONG_ENOUGH; and
-    the share of time that it had to wait for a core. What is said within EVERY of LONG_ENOUGH ends
-    it: no silence after that could be too long.
+    """Run a command, and measure its silences in computing time.
+
+    Returns the share of time waiting for a core, and [s] before each message and the end. Measuring
+    stops after LONG_ENOUGH. It also stops at a message less than EVERY before: no later silence
+    could be too long.
     """
     out, process = [], None
     line = [sys.executable, "-m", f"uwb_tdoa_tools.commands.{name}", *words]

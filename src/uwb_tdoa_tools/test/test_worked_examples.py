@@ -1,8 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What docs/add_effect.md and docs/add_channel.md tell people to write is written here as they
-would, and works.
-"""
+"""The examples in docs/add_effect.md and docs/add_channel.md work as printed."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +21,7 @@ DOCS = Path(__file__).resolve().parents[3] / "docs"
 
 
 def written(page, heading=""):
-    """The names that the code of a page defines, of one heading of it if one is given."""
+    """Return the names that the code on a page defines, optionally only below one heading."""
     text = (DOCS / page).read_text()
     if heading:
         text = text.partition(f"## {heading}\n")[2].partition("\n## ")[0]

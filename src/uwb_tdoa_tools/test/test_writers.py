@@ -1,8 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Whatever the suite writes goes through `common/files.py`: whole or not at all, and in UTF-8
-in any locale.
-"""
+"""The suite writes files through `common/files.py`: completely or not at all, always in UTF-8."""
 
 import ast
 from dataclasses import replace
@@ -22,24 +20,24 @@ from uwb_tdoa_tools.bags.bag import write_bag
 SOURCES = [
     ROOT / "src" / name / name for name in ("uwb_tdoa_bias", "uwb_tdoa_ekf", "uwb_tdoa_tools")
 ] + [ROOT / "studies"]
-ELSEWHERE = {  # what is no file that a user gets at once
+ELSEWHERE = {  # these files are not handed to a user directly
     "uwb_tdoa_bias/common/files.py",
     "uwb_tdoa_tools/bags/completion.py",  # files unpacked in a temporary folder
     "uwb_tdoa_tools/bags/integrity.py",  # a bag unpacked in a temporary folder
     "uwb_tdoa_tools/bags/mcap.py",  # checksums into a bag that is not yet in its place
     "uwb_tdoa_tools/results_file.py",  # grows line by line
-    "uwb_tdoa_tools/live/processes.py",  # what a process prints
+    "uwb_tdoa_tools/live/processes.py",  # output of a process
     "studies/scale.py",  # the same
-    "studies/fuzzing/figures.py",  # a word to the kernel
+    "studies/fuzzing/figures.py",  # a setting of the kernel
     "studies/fuzzing/make_corpus.py",  # files of the repository
-    "studies/fuzzing/targets.py",  # what a reader gets, in a temporary folder
+    "studies/fuzzing/targets.py",  # input of a reader, in a temporary folder
 }
 WRITING = re.compile("(?=.*[wax+])[rwaxbt+]{1,3}")  # a mode of `open`
-FILLED = ("savefig", "savetxt", "savez", "savez_compressed")  # they take an open file
+FILLED = ("savefig", "savetxt", "savez", "savez_compressed")  # they accept an open file
 
 
 def direct(path):
-    """Lines of a source that write a file by themselves: [(line, code)]."""
+    """Return the lines of a source that write a file directly: [(line, code)]."""
     found = []
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if not isinstance(node, ast.Call):
@@ -59,7 +57,7 @@ def direct(path):
         wrong |= name in FILLED and not (
             node.args and isinstance(node.args[0], ast.Name) and node.args[0].id == "file"
         )
-        wrong |= name == "dump" and len(node.args) > 1  # of json or yaml
+        wrong |= name == "dump" and len(node.args) > 1  # json or yaml
         if wrong:
             found.append((node.lineno, ast.unparse(node)))
     return found
@@ -102,9 +100,9 @@ ASCII = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
 
 
 def in_ascii(folder, command, *arguments, encoding="ascii"):
-    """Run a command in an ASCII locale; returns what it printed.
+    """Run a command in an ASCII locale and return its output.
 
-    encoding : of what it prints, by the wish of the user.
+    encoding : of its output, as a user may choose it
     """
     line = [
         sys.executable,
@@ -122,7 +120,7 @@ def in_ascii(folder, command, *arguments, encoding="ascii"):
 
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory):
-    """A bag of a short flight. Its name and its folder are not ASCII, and have spaces."""
+    """Write a bag of a short flight. Its name and folder have spaces and non-ASCII characters."""
     path = tmp_path_factory.mktemp("zwei flüge — 二") / "bag"
     write_bag(replace(clean_flight(100, 24.0), name="flüge"), path)
     return path

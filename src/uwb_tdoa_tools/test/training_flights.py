@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Small simulated flights to train on."""
+"""Small simulated flights for training."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 
 def flight(seed=0, constellation="corners", **changes):
-    """A Flight of 12 s in the air; the anchors are calibrated."""
+    """Return a Flight of 12 s in the air with calibrated anchors."""
     config = SimulationConfig(
         **{
             "seed": seed,
@@ -28,6 +28,6 @@ def flight(seed=0, constellation="corners", **changes):
 
 
 def without_attitude(one):
-    """The Flight as a CSV file holds it: no IMU, no attitude."""
+    """Return the Flight as a CSV file holds it: no IMU, no attitude."""
     q = np.full_like(one.truth.q, np.nan)
     return replace(one, imu=None, truth=replace(one.truth, q=q), name=f"{one.name}-csv")

@@ -1,9 +1,10 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Effects that nobody declared: they exist here only, for tests and benchmarks of diagnose to find.
+"""Effects that are not declared: `diagnose` must find them in tests and benchmarks.
 
-Each takes a Flight and returns the Flight with the effect. CASES: {name: (function, channel,
-covariates that name it)}.
+Each takes a Flight and returns the Flight with the effect.
+
+CASES : {name: (function, channel, covariates that name it)}
 """
 
 from dataclasses import replace
@@ -43,17 +44,17 @@ def drag_on_cable(flight):
 
 
 def warming_tag(flight):
-    """All TDOAs start too large and settle within a quarter of a minute."""
+    """All TDOAs are too large at first. The error decays with a time constant of 15 s."""
     return _tdoa(flight, lambda s: 0.3 * np.exp(-(s.t - s.start) / 15.0))
 
 
 def layered_air(flight):
-    """TDOAs wave with the height of the tag."""
+    """TDOAs have a wave over the height of the tag."""
     return _tdoa(flight, lambda s: 0.15 * np.sin(3.0 * s.p[:, 2]))
 
 
 def standing_wave(flight):
-    """Arrivals wave with the range."""
+    """Arrivals have a wave over the range."""
     return _tdoa(flight, _arrivals(lambda to: 0.15 * np.sin(2.0 * np.linalg.norm(to, axis=1))))
 
 
@@ -70,27 +71,27 @@ def mirror_wall(flight):
 
 
 def cooling_gyro(flight):
-    """The gyroscope's x drifts after it is switched on."""
+    """The x axis of the gyroscope drifts after it is switched on."""
     return _imu(flight, gyro=np.array([0.05, 0.0, 0.0]) * np.exp(-_since(flight) / 20.0))
 
 
 def loaded_gyro(flight):
-    """The gyroscope's z feels the load on the vehicle."""
+    """The z axis of the gyroscope changes with the load on the vehicle."""
     force = np.linalg.norm(flight.imu.accel, axis=1, keepdims=True)
     return _imu(flight, gyro=np.array([0.0, 0.0, 0.05]) * (force - 9.81) ** 2)
 
 
 def spun_accelerometer(flight):
-    """The accelerometer sits off the centre: its y feels the square of the turning rate."""
+    """The accelerometer is off-centre: its y axis changes with the square of the turning rate."""
     rate = np.linalg.norm(flight.imu.gyro, axis=1, keepdims=True)
     return _imu(flight, accel=np.array([0.0, 0.8, 0.0]) * rate**2)
 
 
-# Effects that were not named once
+# Effects that `diagnose` once failed to name
 
 
 def slow_wave(flight):
-    """One anchor is late and early in turn, every 17 s."""
+    """One anchor is alternately late and early, with a period of 17 s."""
     return _of_anchor(flight, 3, lambda s: 0.3 * np.sin(2.0 * np.pi * (s.t - s.start) / 17.0))
 
 

@@ -1,8 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The commands of a page of the documentation, run as somebody who follows it would, and files as
-other tools write them.
-"""
+"""Run the commands of a documentation page like a user, on files in the format of other tools."""
 
 from importlib import import_module
 import re
@@ -12,11 +10,11 @@ from documented import ROOT
 import numpy as np
 
 MILLI = 1e3
-FIGURES = "%.12g"  # stamps of another epoch, in ms, need them all
+FIGURES = "%.12g"  # stamps of another epoch in ms need all digits
 
 
 def section(page, heading):
-    """The text below a heading of a page of docs/."""
+    """Return the text below a heading of a page of docs/."""
     text = (ROOT / "docs" / page).read_text()
     level = re.search(rf"^(#+) {re.escape(heading)}$", text, re.MULTILINE).group(1)
     return re.split(
@@ -27,14 +25,15 @@ def section(page, heading):
 
 
 def blocks(text, language=""):
-    """Contents of the fenced blocks of a language."""
+    """Return the contents of the fenced blocks of a language."""
     found = re.findall(r"^```(\w*)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
     return [content for name, content in found if name == language]
 
 
 def commands(script):
-    """[(name of a tool, [word, ...])] of the lines of a script that run one of our tools, split as
-    the shell splits them.
+    """Return [(name of a tool, [word, ...])] of the lines of a script that run our tools.
+
+    The shell splits the lines.
     """
     stub = "dev() { test $1 = run || return 0; shift 2; printf '%s\\0' \"$@\"; echo; }; "
     told = subprocess.run(
@@ -50,7 +49,7 @@ def commands(script):
 
 
 def main(name, words):
-    """Exit code of a tool that is run in this process."""
+    """Run a tool in this process and return its exit code."""
     return import_module(f"uwb_tdoa_tools.commands.{name}").main(words)
 
 
@@ -61,8 +60,9 @@ def run(script):
 
 
 def write_tables(flight, stem):
-    """Write a Flight as CSV files of another tool, STEM_ranging.csv and so on: milliseconds,
-    millimetres, degrees/s and g, with the ids the other way round.
+    """Write a Flight as CSV files of another tool, STEM_ranging.csv and so on.
+
+    Units: milliseconds, millimetres, degrees/s and g. The ids are in the opposite order.
     """
     tdoa, imu, truth = flight.tdoa, flight.imu, flight.truth
     tables = {"ranging": ("t_ms,to,from,diff_mm", [MILLI * tdoa.t, tdoa.b, tdoa.a, MILLI * tdoa.d])}

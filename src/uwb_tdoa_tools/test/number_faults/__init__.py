@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Faults of numbers, drawn and put into flights: is each named by its rule of `check`?"""
+"""Random faults of numbers to put into flights. A rule of `check` must name each."""
 
 from dataclasses import dataclass
 
@@ -9,8 +9,12 @@ from . import inertial, labels, stamps, truth, values
 
 @dataclass(frozen=True)
 class Fault:
-    """put_in(flight, rng) -> Flight; rules : that name it; inertial : needs a flight with inertial
-    samples; judge_truth : spoils the ground truth, not the estimate.
+    """A fault of numbers.
+
+    put_in : callable(flight, rng) -> Flight
+    rules : rules that name it
+    inertial : it needs a flight with inertial samples
+    judge_truth : it corrupts the ground truth instead of the estimate
     """
 
     put_in: object

@@ -11,7 +11,7 @@ GRAVITY = 9.81  # m/s^2
 
 
 def of_sensor(sensor, change):
-    """A fault of "gyro" or "accel": change(values (n, 3), rng, t) -> values."""
+    """Return a fault of "gyro" or "accel": change(values (n, 3), rng, t) -> values."""
 
     def fault(flight, rng):
         return replace(
@@ -25,7 +25,7 @@ def of_sensor(sensor, change):
 
 
 def repeated(flight, rng):
-    """Each sample several times."""
+    """Repeat each sample several times."""
     times = int(rng.integers(2, 16))
     rows = np.arange(len(flight.imu)) // times * times
     return replace(
@@ -34,7 +34,7 @@ def repeated(flight, rng):
 
 
 def turned(values, rng, t):
-    """Axes exchanged or mirrored."""
+    """Exchange or mirror axes."""
     order, signs = np.arange(3), np.ones(3)
     while (order == np.arange(3)).all() and (signs == 1.0).all():
         order, signs = rng.permutation(3), rng.choice([-1.0, 1.0], 3)
@@ -42,24 +42,24 @@ def turned(values, rng, t):
 
 
 def in_degrees(values, rng, t):
-    """Degrees/s, or rad/s that were divided once too often."""
+    """Convert to degrees/s, or convert from degrees once too often."""
     return values * rng.choice([180.0 / np.pi, np.pi / 180.0])
 
 
 def in_g(values, rng, t):
-    """g, or thousandths of it."""
+    """Convert to g, or to thousandths of g."""
     return values / GRAVITY * rng.choice([1.0, 1000.0])
 
 
 def saturated(values, rng, t):
-    """All axes, at one limit about the mean of what is measured."""
+    """Clip all axes at one distance from their median."""
     middle = np.median(values, axis=0)
     limit = np.quantile(np.abs(values - middle), rng.uniform(0.3, 0.95))
     return np.clip(values, middle - limit, middle + limit)
 
 
 def filtered(values, rng, t):
-    """A low pass of first order, 50 ms to a second."""
+    """Apply a first-order low pass with a time constant of 50 ms to 1 s."""
     step, constant = np.median(np.diff(t)), np.exp(rng.uniform(np.log(0.05), np.log(1.0)))
     share = step / (step + constant)
     return lfilter([share], [1.0, share - 1.0], values - values[0], axis=0) + values[0]

@@ -16,7 +16,7 @@ def _taken(flight, rows):
 
 
 def ids(flight, rng):
-    """Two anchors are each called by the name of the other."""
+    """Exchange the ids of two anchors."""
     one, two = rng.choice(np.unique(flight.tdoa.a), 2, replace=False)
     table = {one: two, two: one}
     a, b = (
@@ -26,7 +26,7 @@ def ids(flight, rng):
 
 
 def sign(every):
-    """The other sign."""
+    """Flip the sign of one pair, or of every pair."""
 
     def fault(flight, rng):
         d = flight.tdoa.d.copy()
@@ -38,21 +38,21 @@ def sign(every):
 
 
 def twice(flight, rng):
-    """A share of the packets comes several times."""
+    """Repeat a share of the packets several times."""
     share, times = rng.uniform(0.3, 1.0), int(rng.integers(2, 6))
     count = np.where(rng.random(len(flight.tdoa)) < share, times, 1)
     return _taken(flight, np.repeat(np.arange(len(flight.tdoa)), count))
 
 
 def reordered(flight, rng):
-    """Packets are shuffled within blocks, and stamped in the order in which they come out."""
+    """Shuffle packets within blocks. The stamps stay in order."""
     of, block = flight.tdoa, rng.uniform(0.1, 2.0)
     order = np.lexsort((rng.random(len(of)), np.floor((of.t - of.t[0]) / block)))
     return replace(flight, tdoa=replace(_taken(flight, order).tdoa, t=of.t))
 
 
 def missing(flight, rng):
-    """One anchor is not received, for a while or all the time."""
+    """Drop all TDOAs of one anchor, for a while or all the time."""
     of, number = flight.tdoa, rng.choice(np.unique(flight.tdoa.a))
     first, length = rng.uniform(0.0, 0.5), rng.uniform(0.2, 1.0)
     share = (of.t - of.t[0]) / (of.t[-1] - of.t[0])
@@ -61,6 +61,6 @@ def missing(flight, rng):
 
 
 def lost(flight, rng):
-    """Nothing at all is received, now and then for some seconds."""
+    """Drop all TDOAs for some seconds, again and again."""
     of, period = flight.tdoa, rng.uniform(8.0, 15.0)
     return _taken(flight, np.flatnonzero((of.t - of.t[0]) % period > rng.uniform(0.6, 3.0)))

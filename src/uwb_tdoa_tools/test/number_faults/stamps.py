@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Faults in the stamps of a stream. A reader puts what falls in order, so does this."""
+"""Faults in the stamps of a stream. The result is sorted by stamp, as a reader sorts it."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ import numpy as np
 
 
 def of_stream(stream, change):
-    """A fault of the stamps of "tdoa" or "imu": change(t, rng) -> t."""
+    """Return a fault of the stamps of "tdoa" or "imu": change(t, rng) -> t."""
 
     def fault(flight, rng):
         part = getattr(flight, stream)
@@ -25,16 +25,16 @@ def _signed(rng, low, high):
 
 
 def quantised(t, rng):
-    """To steps of 20 ms to half a second."""
+    """Round down to steps of 20 ms to 0.5 s."""
     step = _signed(rng, 0.02, 0.5)
     return t[0] + np.floor((t - t[0]) / abs(step)) * abs(step)
 
 
 def drifting(t, rng):
-    """By 0.1 to 1 s over the flight."""
+    """Drift by 0.1 to 1 s over the flight."""
     return t + _signed(rng, 0.1, 1.0) * (t - t[0]) / (t[-1] - t[0])
 
 
 def jumping(t, rng):
-    """By 0.1 to 1 s, somewhere in the middle of the flight."""
+    """Jump by 0.1 to 1 s near the middle of the flight."""
     return t + _signed(rng, 0.1, 1.0) * (t - t[0] > rng.uniform(0.3, 0.7) * (t[-1] - t[0]))

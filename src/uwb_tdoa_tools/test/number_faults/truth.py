@@ -15,14 +15,14 @@ def _middle(flight, rng):
 
 
 def hole(flight, rng):
-    """Two to four seconds without a pose."""
+    """Drop the poses of two to four seconds."""
     of, first = flight.truth, _middle(flight, rng)
     seen = (of.t < first) | (of.t > first + rng.uniform(2.0, 4.0))
     return replace(flight, truth=Truth(of.t[seen], of.p[seen], of.q[seen]))
 
 
 def leap(flight, rng):
-    """For one to five seconds elsewhere, by 0.3 to 2 m."""
+    """Shift the positions by 0.3 to 2 m for one to five seconds."""
     of, first = flight.truth, _middle(flight, rng)
     moved = (of.t >= first) & (of.t < first + rng.uniform(1.0, 5.0))
     shift = rng.standard_normal(3)
@@ -31,7 +31,7 @@ def leap(flight, rng):
 
 
 def attitude(flight, rng):
-    """Of a mirrored frame, about one axis; the other way round; or with w first."""
+    """Mirror the attitude about one axis, invert it, or put w first."""
     x, y, z, w = flight.truth.q.T
     columns = [(x, -y, -z, w), (-x, y, -z, w), (-x, -y, z, w), (-x, -y, -z, w), (w, x, y, z)][
         rng.integers(5)

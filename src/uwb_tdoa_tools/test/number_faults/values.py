@@ -1,19 +1,21 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Faults in the values of TDOAs: of one pair, or of every pair.
+"""Faults in the values of TDOAs, of one pair or of every pair.
 
-Each takes a Flight and a generator and gives the Flight with it.
+Each is a callable(Flight, Generator) -> Flight.
 """
 
 from dataclasses import replace
 
 import numpy as np
 
-STEPS = 2, 11  # packets over which values are held or interpolated, from and below
+# smallest and largest number of packets over which values are held or interpolated; excludes the
+# end
+STEPS = 2, 11
 
 
 def rows_of_pairs(flight, rng, every):
-    """[rows (n,)] of each pair that is heard, or of one that is heard often."""
+    """Return [rows (n,)] of each measured pair, or of one frequently measured pair."""
     of = flight.tdoa
     heard, key, count = np.unique(
         np.column_stack([of.a, of.b]), axis=0, return_inverse=True, return_counts=True
@@ -24,8 +26,9 @@ def rows_of_pairs(flight, rng, every):
 
 
 def of_pairs(change, every):
-    """A fault of the values of one pair, or of every pair in the same way: change(values, t, size)
-    -> values, size = draw(rng).
+    """Return a fault of the values of one pair, or of every pair in the same way.
+
+    change : (draw, apply); size = draw(rng, values), values = apply(values, t, size)
     """
     draw, apply = change
 
@@ -60,7 +63,7 @@ def _interval(rng, d):
 
 
 def _stands(d, t, interval):
-    """Between two shares of the flight."""
+    """Hold the last value over an interval, given as two shares of the flight."""
     first, last = (np.searchsorted(t, t[0] + share * (t[-1] - t[0])) for share in interval)
     return np.concatenate([d[:first], np.full(last - first, d[max(first - 1, 0)]), d[last:]])
 
@@ -70,7 +73,7 @@ def _late(d, t, packets):
 
 
 def _interpolated(d, t, packets):
-    """Only every so manieth was measured; what is between lies on a line, over the packets."""
+    """Keep every n-th value, n = packets. Interpolate linearly in between."""
     known = np.arange(0, len(d), packets)
     return np.interp(np.arange(len(d)), known, d[known])
 
