@@ -28,12 +28,14 @@ APART = 1e-4  # s, over which attitudes are differentiated
 
 
 class Path:
-    """What simulate() takes as a trajectory.
+    """A trajectory for simulate().
 
-    duration : s; position : function of stamps (n,) s, 0 to duration, that gives (n, 3) m, with
-        four derivatives; attitude :
-    function of stamps that gives a Rotation, body to world, or None for that of a multirotor, whose
-    thrust carries it; running : (begin, end) s, of its motors, or None.
+    duration : s
+    position : function of stamps (n,) s, 0 to duration, that returns (n, 3) m. It has four
+        derivatives.
+    attitude : function of stamps that returns a Rotation, body to world. None: the attitude of a
+        multirotor, which follows from its thrust.
+    running : (begin, end) s, of its motors, or None
     """
 
     def __init__(

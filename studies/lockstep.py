@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""lockstep: replays that follow the nodes, at several rates and loads, beside the run off line."""
+"""lockstep: compare replays that wait for the nodes with the off-line run, by rate and load."""
 
 from contextlib import ExitStack
 from dataclasses import replace
@@ -76,8 +76,9 @@ def run(args):
 
 
 def replayed_once(bag, flight, rate, load, rmse, offline):
-    """(exit code, TDOAs late, mm of RMSE from the offline one, poses of the offline Odometry that
-    were not recorded, mm of the others from it at most, s that the replay took) of one replay.
+    """Results of one replay: (exit code, late TDOAs, difference of the RMSE from the off-line run in
+    mm, off-line poses that were not recorded, largest distance of the recorded poses from the
+    off-line poses in mm, duration of the replay in s).
     """
     with ExitStack() as stack, tempfile.TemporaryDirectory() as folder:
         for _ in range(load):

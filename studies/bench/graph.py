@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_tools.live.processes import Processes
 
-CASES = (  # Hz of /clock, Hz of /tf, whether streams flow, busy loops beside
+CASES = (  # Hz of /clock, Hz of /tf, whether streams flow, number of busy processes
     (0.0, 0.0, False, 0),
     (0.0, 0.0, True, 0),
     (40.0, 0.0, True, 0),
@@ -167,7 +167,7 @@ class _Asking:
         ]
 
     def ask(self, seconds: float, clock: subprocess.Popen[bytes] | None) -> Answers:
-        """clock : Popen of what publishes it, or None."""
+        """clock : Popen of the process that publishes it, or None."""
         out, began = Answers(), time.monotonic()
         _wait(
             self._node,

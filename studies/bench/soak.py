@@ -41,7 +41,7 @@ def soak(minutes, starts, folder):
                 f"{title} {1e-6 * memory(processes.pid(title)):.1f} MB" for title in starts
             )
             print(f"{(time.monotonic() - began) / 60.0:6.1f} min  {used}", flush=True)
-            source.received[0].clear()  # the odometry; nobody looks at it
+            source.received[0].clear()  # the odometry, which is not used
 
         source.play(flight, EVERY, say, rounds)
         diagnostics.forget()

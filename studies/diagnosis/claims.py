@@ -37,7 +37,7 @@ CATALOGUE = {
     "gyro_bias": ("axis", (), ()),
     "accel_bias": ("axis", (), ()),
 }
-# {shape of a function without a name: that of the grammar}
+# {shape of a function without a name: shape in the grammar}
 SHAPES = {
     "line": "trend",
     "beyond": "ramp",
@@ -53,8 +53,13 @@ STREAM = {"imu_gravity": "accel", "imu_misalignment": "gyro"}
 
 @dataclass(frozen=True)
 class Claim:
-    """stream; subset : kind of it; who : frozenset of the anchors, or of the axis; covariates :
-    those that it names, the first and what is the same in that flight; shape; text.
+    """A statement about an error.
+
+    stream : as in the grammar
+    subset : kind of the subset
+    who : frozenset of the anchors, or of the axis
+    covariates : the named covariate, then those that are equivalent to it in that flight
+    shape, text
     """
 
     stream: str
@@ -65,17 +70,19 @@ class Claim:
     text: str
 
     def names(self, true):
-        """Whether stream and subset are those of another Claim."""
+        """Whether another Claim has the same stream and subset."""
         return (self.stream, self.subset, self.who) == (true.stream, true.subset, true.who)
 
     def depends_as(self, true):
-        """Whether a covariate is that of another Claim."""
+        """Whether another Claim shares a covariate."""
         return bool(set(self.covariates) & set(true.covariates))
 
 
 def truth_of(effect, flight):
-    """Claim of an Undeclared in a Flight. A direction is a pair where nobody hears the other one,
-    and so is what follows an anchor where only one pair does.
+    """Claim of an Undeclared in a Flight.
+
+    A direction counts as a pair if there are hardly any TDOAs in the other direction. The effect of
+    a previous anchor counts as a pair if only one pair follows that anchor.
     """
     subset = effect.subset
     if effect.covariate == NAMES and (pair := _only_pair(effect, flight)):
@@ -130,7 +137,7 @@ def claims(findings):
 
 
 def _undeclared(finding):
-    """A Claim for every anchor or pair, or one for all anchors alike."""
+    """A Claim for every anchor or pair, or one for all anchors together."""
     effect = finding.effect
     stream, _, axis = effect.channel.partition(".")
     shape, covariates = SHAPES.get(effect.shape, ""), _covariates(finding)

@@ -42,7 +42,7 @@ Change = Callable[[Any], Any]
 
 @dataclass(frozen=True)
 class FlownFault:
-    """stream : name; change : of what it measures; once : of the first message only; lasts : s."""
+    """stream : name; change : of its measurements; once : only the first message; lasts : s."""
 
     stream: str
     change: Change
@@ -51,7 +51,7 @@ class FlownFault:
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """Sensors that it needs beside TDOAs and the IMU."""
+        """Sensors that it needs in addition to TDOAs and the IMU."""
         return (self.stream,) if self.stream in SENSOR_NAMES else ()
 
 
@@ -266,8 +266,8 @@ def run(args: Namespace) -> None:
 
 
 def table(rows: list[dict[str, Any]]) -> list[str]:
-    """Lines of Markdown: of each fault how many landed at their place, came down safely, and the
-    largest part of what was said.
+    """Lines of Markdown, a row for each fault: flights that landed at their place, flights that came
+    down safely, and the first status message.
     """
     lines = [
         "| fault | flights | landed | safe | what `status` said first |",
