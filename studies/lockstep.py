@@ -76,9 +76,10 @@ def run(args):
 
 
 def replayed_once(bag, flight, rate, load, rmse, offline):
-    """Results of one replay: (exit code, late TDOAs, difference of the RMSE from the off-line run in
-    mm, off-line poses that were not recorded, largest distance of the recorded poses from the
-    off-line poses in mm, duration of the replay in s).
+    """Replay a bag once, and compare it with the off-line run.
+
+    Returns (exit code, late TDOAs, difference of the RMSE mm, off-line poses that were not recorded,
+    largest distance of recorded from off-line poses mm, duration of the replay s).
     """
     with ExitStack() as stack, tempfile.TemporaryDirectory() as folder:
         for _ in range(load):

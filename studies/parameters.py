@@ -30,7 +30,7 @@ def add_options(add):
 
 
 def run(args):
-    """Print a table, a row for each parameter, the one that matters most first."""
+    """Print a table, a row for each parameter, the most important first."""
     flights = measured_flights(args.data, args.flights, args.sensors)
     usual = FilterConfig()
     before = outcome(flights, usual)

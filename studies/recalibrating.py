@@ -26,7 +26,7 @@ SETS = {
     "const4": [_CONST4.format(k) for k in (1, 2, 3)],
 }
 TRUSTED = "0", "6"
-CHANGES = {  # in words: effect of what changed
+CHANGES = {  # {description: effect of the change}
     "nothing": EFFECTS["anchor_delay"]({}),
     "anchor 3 moved by 15 cm in x": EFFECTS["anchor_position"]({"3.x": 0.15}),
     "anchor 1 moved by 14 cm in y and z": EFFECTS["anchor_position"]({"1.y": -0.1, "1.z": 0.1}),

@@ -39,8 +39,9 @@ def rectified(flight: Flight) -> tuple[np.ndarray, np.ndarray]:
 
 
 def lateness(flight: Flight) -> dict[int, np.ndarray]:
-    """{number of an interval of HEIGHTS: lateness (n,) m of the anchors of a Flight, by the mean of
-    those above 1.5 m}.
+    """{number of an interval of HEIGHTS: lateness (n,) m of the anchors of a Flight}.
+
+    It is relative to the mean of the anchors above 1.5 m.
     """
     tdoa, positions = flight.tdoa, flight.anchors.positions
     inside = (tdoa.t > flight.truth.t[0]) & (tdoa.t < flight.truth.t[-1])

@@ -3,9 +3,9 @@
 """closed-loop: repeat the flights of Zhao et al. (RA-L 2021, section V) in the loop of `fly`.
 
 The trajectories are A (a level circle) and B (a circle that rises and falls). They are flown in one
-constellation of anchors that is part of the training, and in three new ones. The estimators are the
-M-estimation EKF alone, with the paper's network without and with the orientations of the anchors,
-and our filter alone and with diagnosed effects.
+constellation of anchors that is part of the training, and in three new ones. One estimator is the
+M-estimation EKF: alone, and with the paper's network without and with the orientations of the
+anchors. The other is our filter: alone, and with diagnosed effects.
 
 The networks are trained on flights in three constellations. The effects are diagnosed from three
 training flights, one per constellation. Writes to --out: trained/, flights.json, table.md, and the counterparts
@@ -230,8 +230,8 @@ def _flight(task: Task) -> Flight:
 
 
 def _train(parts: list[list[Flight]], some: list[Flight], folder: Path, name: str) -> str:
-    """Write a correction to a folder: one of NETWORKS, trained and validated on `parts`, or EFFECTS,
-    found in the flights `some`. Returns the name.
+    """Write a correction to a folder and return its name. NETWORKS are trained and validated on
+    `parts`; EFFECTS are found in the flights `some`.
     """
     (folder / name if name in NETWORKS else folder).mkdir(parents=True, exist_ok=True)
     if name in NETWORKS:
@@ -294,8 +294,9 @@ def _row(title: str, values: Iterable[float], digits: int = 3) -> str:
 
 
 def gain_of_landed(verdicts: dict, by: str, than: str) -> tuple[float, int]:
-    """(Share by which the mean error of one estimator is smaller than that of another, number of
-    flights), over the flights in UNSEEN that landed with both.
+    """(Gain, number of flights), over the flights in UNSEEN that landed with both estimators.
+
+    The gain is the share by which the mean error with `by` is smaller than the one with `than`.
     """
     both = [
         (one["estimation"], other["estimation"])

@@ -40,7 +40,7 @@ WORSE = 1.03  # ratio of errors beyond which a case counts as made worse
 
 
 def diagnose_case(effects, seed, aided=False):
-    """dict of one case: the effects put in, the effects found, and the errors of their parameters.
+    """dict of one case: the effects put in, those found, and whether their parameters are right.
 
     It also has the errors of the filter on a second flight with the same effects: without
     correction, with the effects found, and with the true effects.

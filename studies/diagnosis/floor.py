@@ -25,7 +25,7 @@ WILD = 6.0  # m that an outlier counts as
 
 def figures(data):
     """dict of figures of all raw flights of DAYS below the folder `data`, and of the other
-    flights, which do not show the effect.
+    flights, where the effect is not visible.
     """
     recordings = inputs.Reading(data / "surveys")
     days = {day: _seen(recordings.flights(_files(data / "flights" / day))) for day in DAYS}
@@ -95,8 +95,8 @@ def _fitted(seen):
 def _explained(effect, seen):
     """dict of how much of the residuals an Effect explains in other flights at rest on the floor.
 
-    It has the explained share of their power, over all flights and in the worst flight, and the
-    medians of the residuals, m, before and after.
+    It has the explained share of their power, over all flights and in the worst flight. It also has
+    the medians of the residuals, m, before and after.
     """
     sides = []
     for part in (residual["tdoa"] for residual in seen.values()):

@@ -65,7 +65,7 @@ class Undeclared:
 
     @property
     def covariates(self):
-        """Covariates that count as right: naming a single one is enough."""
+        """Covariates that count as right: a claim must name a single one."""
         return (self.covariate,)
 
     @property

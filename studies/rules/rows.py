@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What the filter is run on, and what is judged of it."""
+"""The inputs of the filter, and how its output is judged."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ class Inputs:
     def __init__(self, data: Path, cache: Path) -> None:
         """data : folder of measured flights; cache : folder."""
         self._data, self._cache = data, cache / "inputs"
-        self.anew = False  # count streams anew, as constants of their counters have changed
+        self.anew = False  # count streams again, because constants of their counters have changed
         self._cache.mkdir(parents=True, exist_ok=True)
         self._kept: dict[str, Any] = {}
 
@@ -141,7 +141,7 @@ class Inputs:
         return made
 
     def rows(self) -> list[Row]:
-        """All of them, those of the screen first."""
+        """All rows. The rows of the screen come first."""
         made = [
             *self._measured(),
             *self._flown(),

@@ -1,8 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What any model of the pose could reach at most, and how much of the errors comes again at the
-same place.
-"""
+"""A bound for any model of the pose, and the share of the errors that repeats at the same place."""
 
 from types import SimpleNamespace
 
@@ -73,9 +71,10 @@ def oracle(flight, window):
 
 
 def repeatability(one, other):
-    """How much of the errors of two flights is alike at the same place: (correlation, cells
-    compared), over the medians per pair of anchors and cell of 0.3 m that both flew through. one,
-    other : Labels.
+    """Correlation of the errors of two flights at the same place: (correlation, cells compared).
+
+    It compares the medians per pair of anchors and cell of 0.3 m that both flew through.
+    one, other : Labels
     """
     maps = []
     for labels in (one, other):
