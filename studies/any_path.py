@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Motion along any path, for what the families of trajectories do not do: tags that are carried,
-driven, thrown, or far away.
+"""Motion along any path: tags that are carried, driven, thrown, or far away.
+
+The families of trajectories in `simulate` do not cover these.
 """
 
 from __future__ import annotations

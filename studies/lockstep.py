@@ -78,8 +78,8 @@ def run(args):
 def replayed_once(bag, flight, rate, load, rmse, offline):
     """Replay a bag once, and compare it with the off-line run.
 
-    Returns (exit code, late TDOAs, difference of the RMSE mm, off-line poses that were not recorded,
-    largest distance of recorded from off-line poses mm, duration of the replay s).
+    Returns (exit code, late TDOAs, difference of the RMSE mm, missing poses, largest distance of
+    recorded from off-line poses mm, duration of the replay s).
     """
     with ExitStack() as stack, tempfile.TemporaryDirectory() as folder:
         for _ in range(load):

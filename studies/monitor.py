@@ -1,7 +1,9 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""monitor: what the monitor of ekf_node names on measured flights, what it names on flights that
-nothing was put into, and what it costs. The same filter and monitor as in the node, off line.
+"""monitor: judge the monitor of ekf_node on measured flights with faults, and on unchanged flights.
+Measure its processor time.
+
+The study runs the filter and monitor of the node off line.
 """
 
 from dataclasses import replace
@@ -101,8 +103,9 @@ EVENT_LIMIT = 5.0  # s
 
 
 def watched(flight, config):
-    """[(s, sentences)], every STEP, and (t (n,) s, p (n, 3) m) of a Flight: off line, which is what
-    live gives.
+    """[(s, sentences)], every STEP, and (t (n,) s, p (n, 3) m) of a Flight.
+
+    The filter runs off line, with the same result as live.
     """
     result, monitor, said = run_offline(flight, config), Monitor(flight.anchors), []
     odometry, residuals = (_by_stamp(part) for part in (result.odometry, result.residuals))
@@ -123,7 +126,7 @@ def _by_stamp(part):
 
 
 def _between(part, low, high):
-    """What of an Odometry, or of Residuals, is stamped from `low` on, and before `high`, s."""
+    """The part of an Odometry, or of Residuals, with stamps from `low` on and before `high`, s."""
     inside = slice(*np.searchsorted(part.t, [low, high]))
     return type(part)(*(column[inside] for column in vars(part).values()))
 
@@ -138,8 +141,9 @@ def error_of(flight, track, low, high):
 
 
 def delays_at_truth(flight):
-    """(t (n,) s, delays (n, N) m): as the monitor reduces them, by half seconds in the air, but at
-    the ground truth.
+    """(t (n,) s, delays (n, N) m) at the ground truth, for each half second in the air.
+
+    They are reduced as in the monitor.
     """
     tdoa, (begin, end), positions = flight.tdoa, airborne(flight), flight.anchors.positions
     a, b = flight.anchors.index(tdoa.a), flight.anchors.index(tdoa.b)

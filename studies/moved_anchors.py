@@ -3,10 +3,10 @@
 """moved_anchors: recordings in which an anchor was moved by 0.3 to 1 m, or two were exchanged,
 before the start or in the middle.
 
-A tag is calibrated by a flight of last week, without ground truth; the anchors change; another
-flight is recorded. Each recording is judged with the calibration of last week, and as if there were
-none. A change costs what it adds to the 3D RMSE from 5 s after it on. Measured flights have no
-change: whatever is named there is false.
+A flight of last week calibrates the tag, without ground truth. Then the anchors change, and another
+flight is recorded. Each recording is judged with the calibration of last week, and without it. The
+cost of a change is the increase of the 3D RMSE from 5 s after it on. Measured flights have no
+change, so every named anchor is a false alarm.
 """
 
 from dataclasses import replace
@@ -331,7 +331,7 @@ def _about(sentence):
 
 
 def _groups(sentences):
-    """Return the groups of anchors that sentences name, in order. In each group, one has changed."""
+    """Return the groups of anchors that sentences name, in order. In a group, one has changed."""
     groups = set()
     for sentence in sentences:
         said = sentence.partition(" (")[0]

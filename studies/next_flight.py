@@ -85,11 +85,11 @@ def run(args):
 
 
 def judged(seed, longest, functions):
-    """dict of the case of a seed: the true effect, the effect that remains ambiguous with it, and the
-    probability of success that the plan states.
+    """dict of the case of a seed, or None if the first flight leaves no ambiguity.
 
-    It also has whether the planned flight and the random flights resolve the ambiguity. None if the
-    first flight leaves no ambiguity.
+    It has the true effect, the effect that remains ambiguous with it, and the probability of
+    success that the plan states. It also has whether the planned flight and the random flights
+    resolve the ambiguity.
     """
     rng = np.random.default_rng([seed, 52])
     name = KINDS[rng.integers(len(KINDS))]

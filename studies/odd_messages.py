@@ -137,9 +137,14 @@ ANCHORS = Anchors.from_positions(
 
 @dataclass
 class Account:
-    """sent, received, unreadable, expected : messages by topic (received: streams; expected :
-    unreadable ones of the others);
-    memory : bytes after each tenth; log : bytes.
+    """Numbers of messages by topic, and the memory of a node.
+
+    sent : all topics
+    received : messages of streams
+    unreadable : counted by the node
+    expected : unreadable messages on topics that are no streams
+    memory : bytes after each tenth
+    log : bytes
     """
 
     sent: dict
@@ -216,7 +221,7 @@ def odd(message, rng):
 
 
 def whole(kind, k, change=lambda message: message):
-    """The k-th valid message, as bytes. change(message) returns the message to serialize instead."""
+    """The k-th valid message, as bytes. change(message) returns the message that is serialized."""
     return serialize_message(change(_message(kind, k)))
 
 

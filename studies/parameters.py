@@ -1,6 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""parameters: what each parameter of the filter is worth, halved and doubled, on measured flights."""
+"""parameters: halve and double each parameter of the filter, and measure the effect on measured
+flights.
+"""
 
 from dataclasses import fields, replace
 from pathlib import Path

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A recorded flight as it would have come over the radio link: sampled, rounded, repeated, lost and
+"""Simulate a radio link for a recorded flight: messages are sampled, rounded, repeated, lost and
 late.
 """
 

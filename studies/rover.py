@@ -3,13 +3,13 @@
 """rover: judge the filter, and the effects that diagnose writes, on simulated drives over a floor.
 
 A rover drives for 90 s among six anchors in 12 x 8 m. It has wheels (50 Hz, 2 % too fast, slip), an
-IMU (100 Hz) and 100 TDOAs a second. The TDOAs have a noise of 0.1 m and antenna delays of 5 cm; both
-make up `tdoa_std`. The antenna is on a mast 0.4 m above base_link, which is on the floor.
+IMU (100 Hz) and 100 TDOAs a second. The TDOAs have a noise of 0.1 m and antenna delays of 5 cm;
+both make up `tdoa_std`. The antenna is on a mast 0.4 m above base_link, which is on the floor.
 
-The filter assumes persistent errors, as in measured data. `tdoa_correlation_length: 1.0` states that
-they are white, as here. Rows of a hall have the errors of real halls, and the default `tdoa_std`.
-There, anchors are surveyed to 3 cm, have delays of 10 cm, and errors by received power and by both
-antennas. 3 % of the TDOAs are outliers, and each of four places blocks one anchor.
+The filter assumes persistent errors, as in measured data. `tdoa_correlation_length: 1.0` states
+that they are white, as here. Rows of a hall have the errors of real halls, and the default
+`tdoa_std`. There, anchors are surveyed to 3 cm, have delays of 10 cm, and errors by received power
+and by both antennas. 3 % of the TDOAs are outliers, and each of four places blocks one anchor.
 """
 
 from dataclasses import replace

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """scale: measure how processor time and memory of the tools grow with flights, anchors and effects.
 
-Each case runs in a separate process. Flights are simulated, 10 s in the air, 240 TDOAs a second. The
-tool runs as a user would run it, with one job. Each case goes to --out as soon as it is done; a
+Each case runs in a separate process. Flights are simulated, 10 s in the air, 240 TDOAs a second.
+The tool runs as a user would run it, with one job. Each case goes to --out as soon as it is done; a
 second run skips the cases in --out.
 """
 

@@ -1,7 +1,7 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Height, pressure and velocity on measured flights: what each is worth, and what faults put into
-them do.
+"""Measure the worth of height, pressure and velocity on measured flights, and the effect of their
+faults.
 """
 
 from dataclasses import replace
@@ -65,8 +65,8 @@ def run(args):
 
 
 def with_velocity(flight, rate=VELOCITY_RATE):
-    """The flight with a velocity in the body frame, made of its ground truth and noise, at a rate,
-    Hz, where none was recorded.
+    """The flight with a velocity in the body frame. If none was recorded, it is simulated from the
+    ground truth with noise, at `rate`, Hz.
     """
     if flight.velocity is not None:
         return flight
@@ -123,8 +123,9 @@ def of_four(flight):
 
 
 def bounds(flights, height_std):
-    """(4,) m, along x, y, z and in space: the bound of `plan` for one round of TDOAs, and a height
-    if height_std, m, is finite, at the places that were flown; roots of means over each flight,
+    """Bound of `plan` for one round of TDOAs, (4,) m, along x, y, z and in space.
+
+    A finite height_std, m, adds a height. The bound is the root mean square along each flown path,
     averaged over the flights.
     """
     rows = []
@@ -205,9 +206,7 @@ def faults(flights, config):
 
 
 def is_named(flight, sensor, run):
-    """Whether, for two seconds of a Run, most messages of a sensor contradict everything else or are
-    invalid.
-    """
+    """Whether most messages of a sensor are rejected or invalid for two seconds of a Run."""
     second = (getattr(flight, sensor).t - flight.tdoa.t[0]).astype(int)
     unused = np.isin(run.sensors[sensor]["verdict"], NAMED)
     first = second.min()

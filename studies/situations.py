@@ -5,8 +5,8 @@ consistency of the filter.
 
 The filter has default parameters and no correction, and starts where the recording begins. Unless a
 situation changes it, there are 8 anchors in 7 x 8 x 3 m. Noise, outliers, antenna delays, received
-power and late arrivals near the floor are as in `simulate`. Half of the seeds use TDOA2, half TDOA3.
-Each row judges one stretch of its recordings, all seeds together.
+power and late arrivals near the floor are as in `simulate`. Half of the seeds use TDOA2, half
+TDOA3. Each row judges one stretch of its recordings, all seeds together.
 """
 
 from dataclasses import dataclass, field, replace
@@ -45,9 +45,13 @@ MARGIN = FilterConfig().workspace_margin
 
 @dataclass(frozen=True)
 class Situation:
-    """One row. make : function of a Generator and a dict for SimulationConfig that gives a Flight;
-    judged : (begin, end) s; over : s at which what happens is over, from which the time to be right
-    again counts, None: from the 100th TDOA on; config : of the filter.
+    """One row.
+
+    make : function of a Generator and a dict for SimulationConfig that returns a Flight
+    judged : (begin, end) s
+    over : s at which the disturbance ends. The time to be right again counts from here; None: from
+        the 100th TDOA.
+    config : of the filter
     """
 
     name: str
@@ -116,7 +120,7 @@ def run(args):
 
 
 def _results(items, path, jobs):
-    """Generator of `measure` of each item; those that the file `path` holds are not made again."""
+    """Generator of `measure` of each item. Items that the file `path` holds are not repeated."""
     if path is None:
         yield from parallel.over(measure, items, jobs, unit="simulation")
         return
@@ -140,8 +144,10 @@ def _results(items, path, jobs):
 
 
 def measure(item):
-    """{"figures": of the judged stretch, as of `scoring.by_phase.ErrorSeries`, null where there are
-    none; "again": s, null for never} of (name, seed).
+    """{"figures", "again"} of (name, seed).
+
+    figures : of the judged stretch, as in `scoring.by_phase.ErrorSeries`, null where there are none
+    again : s until the filter is right again, null for never
     """
     name, seed = item
     (situation,) = [one for one in SITUATIONS if one.name == name]
@@ -181,8 +187,10 @@ def again(judged, since):
 
 
 def figures(results):
-    """Of the `measure` of several seeds: a dict as of `PooledErrors.figures`, besides again_median,
-    again_max, s, and never, how many.
+    """Pool the `measure` of several seeds.
+
+    Returns a dict as of `PooledErrors.figures`, with again_median, again_max, s, and never, the
+    number of seeds in which the filter is never right again.
     """
     pool = PooledErrors()
     for result in results:
@@ -290,9 +298,7 @@ def _hop(rng, common):
 
 
 def _low_late(make, rng, common):
-    """What `make` gives, with the low anchors late for a tag on the floor, as on the measured
-    flights.
-    """
+    """The Flight of `make`, with low anchors late near the floor, as in measured flights."""
     flight = make(rng, common)
     low = np.flatnonzero(flight.anchors.positions[:, 2] < LOW)
     height = np.interp(flight.tdoa.t, flight.truth.t, flight.truth.p[:, 2])
@@ -313,7 +319,7 @@ def _later(flight, size, each):
 
 
 def _without(streams, begin, end, make, rng, common):
-    """What `make` gives, without the samples of some streams from `begin` to `end`, s."""
+    """The Flight of `make`, without the samples of some streams from `begin` to `end`, s."""
     flight = make(rng, common)
     for name in streams:
         stream = getattr(flight, name)
@@ -330,7 +336,7 @@ def _without(streams, begin, end, make, rng, common):
 
 
 def _few(count, make, rng, common):
-    """What `make` gives, with `count` anchors heard from 10 s on."""
+    """The Flight of `make`, with only `count` anchors heard from 10 s on."""
     flight = make(rng, common)
     heard = rng.permutation(flight.anchors.ids)[:count]
     kept = (flight.tdoa.t < 10.0) | (np.isin(flight.tdoa.a, heard) & np.isin(flight.tdoa.b, heard))

@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Surveys of measured flights, shaken and made better from the flights alone; the tag is judged on
-other flights.
+"""Add errors to surveys of measured flights, and correct them from the flights alone.
+
+The tag is judged on other flights.
 """
 
 from dataclasses import replace
@@ -137,8 +138,8 @@ def run(args):
 def with_known(data, kind, splits, seed):
     """Print a table of the error with surveys good to 0.1 m, before and after a calibration.
 
-    The calibration uses the given kind of knowledge in KNOWN. With "odometry", it is a diagnosis that
-    uses an odometry with known places of take-off and landing.
+    The calibration uses the given kind of knowledge in KNOWN. With "odometry", it is a diagnosis
+    that uses an odometry with known places of take-off and landing.
     """
     print(
         "| fitted to | judged on | mean 3D RMSE before | after | worst ratio | known "
@@ -172,8 +173,8 @@ def with_known(data, kind, splits, seed):
 
 
 def ends_of(flight, several, rng):
-    """[Mark]: where the tag stood before it took off and after it landed, END_TIME each, END_STD
-    off.
+    """[Mark]: positions of the tag before take-off and after landing, for END_TIME each, with an
+    error of END_STD.
     """
     truth, out = flight.truth, []
     last = flight.tdoa.t[-1] - flight.tdoa.t[0]

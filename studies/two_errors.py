@@ -1,7 +1,7 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""two-errors: how far accelerometers rectify vibration, and how late each anchor is over the height of
-the tag.
+"""two-errors: measure how much accelerometers rectify vibration, and the lateness of each anchor
+over the height of the tag.
 """
 
 from collections import defaultdict

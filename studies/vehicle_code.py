@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""vehicle-code: what exported C costs on an emulated STM32F405, of effects and of networks.
+"""vehicle-code: cost of exported C code of effects and networks on an emulated STM32F405.
 
 The emulator counts the instructions per TDOA: mean and maximum over random states. Flash has two
 columns: the exported functions and tables alone, and with the functions that they need of the C

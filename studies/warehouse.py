@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""warehouse: starts in halls, slow tags, anchors in a plane, a walk of ten minutes, and what a tag
-costs by how many anchors are installed.
+"""warehouse: judge starts in halls, slow tags, anchors in a plane, and a walk of ten minutes.
+
+Measure the cost of a tag by the number of installed anchors.
 """
 
 from flights import position_at
@@ -19,8 +20,8 @@ WRONG, CERTAIN, AGAIN = (1.0, 5.0, 2.0)
 
 
 def bound(where, seed, duration=20.0):
-    """Lower bound (3,) m of the error along each axis that antenna delays cause, because they do not
-    average out. It is the root mean square along the path from 10 s on.
+    """Lower bound (3,) m of the error along each axis due to antenna delays, which do not average
+    out. It is the root mean square along the path from 10 s on.
     """
     rng = np.random.default_rng([seed, 5])  # as `fly` walks
     places = walk(where.size, duration, rng, 1.5)[0][int(10.0 * RATE) :: int(0.5 * RATE)]

@@ -137,8 +137,8 @@ class Core:
         self.samples, self.tdoas, self.sensors = len(self._imu), len(self._tdoa), len(self._sensors)
 
     def timed(self, tdoa: bool, sensors: bool = False) -> float:
-        """s that the rest takes, with or without its TDOAs, and its heights, pressures and
-        velocities.
+        """Time to process the remaining events, s, with or without TDOAs, and with or without
+        heights, pressures and velocities.
         """
         self.last = self.state.copy()
         return self._feed(

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The flights that are measured with: simulated, 1 kHz IMU and 400 Hz TDOA."""
+"""The simulated flights of the measurements: 1 kHz IMU and 400 Hz TDOA."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The nodes live, in real time: CPU, memory, latency, losses, time to ready; for one tag and for
-several.
+"""Measure the live nodes in real time, for one tag and for several: CPU, memory, latency, losses,
+time to ready.
 """
 
 from __future__ import annotations
@@ -260,7 +260,7 @@ def fly(flight: Flight, folder: Path, namespaces: Sequence[str], starts: Starts)
 
 @contextmanager
 def surroundings(folder: str | Path) -> Iterator[tuple[Node, Processes]]:
-    """(node of ours, Processes) in a domain of their own, whose logs ready_at understands."""
+    """(our node, Processes) in a separate domain. `ready_at` can read the logs of the processes."""
     form = "[{severity}] [{time}] [{name}]: {message}"
     logs = {"RCUTILS_CONSOLE_OUTPUT_FORMAT": form, "RCUTILS_COLORIZED_OUTPUT": "0"}
     with (

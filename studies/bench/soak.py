@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""soak: both nodes for hours at 1 kHz IMU and 400 Hz TDOAs: their memory, and whether their counters
-hold all that was published.
+"""soak: run both nodes for hours at 1 kHz IMU and 400 Hz TDOAs.
+
+The study prints their memory, and checks that their counters contain all published messages.
 """
 
 import math

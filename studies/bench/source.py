@@ -1,8 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The surroundings of the nodes: publishes a flight in real time and takes the odometry that comes
-back.
-"""
+"""The surroundings of the nodes: publish a flight in real time and receive the odometry."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What ekf_node says in flight of the mistakes that `check` finds in recordings: a part of a
-flight, with each, played to both nodes as it would have arrived.
+"""Test whether ekf_node reports in flight the mistakes that `check` finds in recordings.
+
+A part of a flight, with each mistake, is played to both nodes as it would have arrived.
 """
 
 from collections import Counter
@@ -82,8 +83,9 @@ def run(args):
 
 
 def line(row):
-    """A row of the table: the mistake, its rule in `check`, and the rules that the node reported, or
-    its most frequent message.
+    """A row of the table: the mistake, its rule in `check`, and the rules that the node reported.
+
+    If it reported none, its most frequent message.
     """
     mistake = MISTAKES.get(row["mistake"])
     text = max(row["texts"], key=row["texts"].get) if row["texts"] else "nothing at all"
@@ -109,7 +111,7 @@ def middle(recording, seconds):
 
 
 class _Nodes:
-    """bias_node and ekf_node as processes in a separate domain, and the publishers of their input."""
+    """bias_node and ekf_node as processes in a separate domain, with publishers of their input."""
 
     def __enter__(self):
         from contextlib import ExitStack

@@ -5,11 +5,11 @@
 The trajectories are A (a level circle) and B (a circle that rises and falls). They are flown in one
 constellation of anchors that is part of the training, and in three new ones. One estimator is the
 M-estimation EKF: alone, and with the paper's network without and with the orientations of the
-anchors. The other is our filter: alone, and with diagnosed effects.
+anchors. The second is our filter: alone, and with diagnosed effects.
 
 The networks are trained on flights in three constellations. The effects are diagnosed from three
-training flights, one per constellation. Writes to --out: trained/, flights.json, table.md, and the counterparts
-of figures 7 to 9: rmse.png, paths.png, errors.png.
+training flights, one per constellation. Writes to --out: trained/, flights.json, table.md, and the
+counterparts of figures 7 to 9: rmse.png, paths.png, errors.png.
 """
 
 from argparse import Namespace

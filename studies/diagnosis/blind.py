@@ -49,7 +49,7 @@ LOOKED_AT = ("0425 a", "0426 a", "const1", "const4 trial 1")  # while this was d
 
 
 class Measured:
-    """Measured flights, with the effects diagnosed from other flights of their day and installation."""
+    """Measured flights, with effects diagnosed from other flights of their day and installation."""
 
     def __init__(self, data, out, splits=tuple(GROUPS)):
         """data, out : Paths. The known effects are read from the output of `measured` in `out`. If
@@ -101,8 +101,10 @@ def rmse(flight, effects):
 
 
 def case(source, seed, number=2, draw=grammar.draw):
-    """(Undeclared, `number` flights with it, the same without, base, where) of a seed; None if the
-    effect costs too little however it is enlarged. draw : draw(seed, flight) returns the effect
+    """(Undeclared, `number` flights with it, the same without, base, where) of a seed.
+
+    None if the effect costs too little even when it is enlarged.
+    draw : draw(seed, flight) returns the effect
     """
     flights, base, where = source.flights(np.random.default_rng([seed, 7]), number)
     effect = draw(seed, flights[0])
@@ -116,7 +118,7 @@ def case(source, seed, number=2, draw=grammar.draw):
 
 
 class Told(Effect):
-    """An Undeclared, known exactly, that is taken out at the poses that a node has."""
+    """An Undeclared that is known exactly. The correction uses the poses that a node has."""
 
     name = "told"
     needs_motion = True
@@ -167,7 +169,7 @@ _told_as_they_are = {}
 
 
 def _as_they_are(flights, judge, base, where):
-    """Claims about the unchanged flights, and the 3D RMSE of the judging flight with their effects."""
+    """Claims about the unchanged flights, and 3D RMSE, m, of `judge` with their effects."""
     key = where, *(flight.name for flight in (*flights, judge))
     if key not in _told_as_they_are:
         result = diagnose(flights, base=base)

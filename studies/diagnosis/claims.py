@@ -1,10 +1,9 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What findings say, and what an effect of the grammar is, in the same terms: stream, subset,
-covariate, shape.
+"""Describe findings and effects of the grammar in the same terms: stream, subset, covariate, shape.
 
-Some effects of the grammar have a name in the catalogue: an anchor that is late from one time to
-another is nlos.
+Some effects of the grammar have a name in the catalogue. For example, an anchor that is late from
+one time to another is nlos.
 """
 
 from dataclasses import dataclass
@@ -107,7 +106,7 @@ def truth_of(effect, flight):
 
 
 def _only_pair(effect, flight):
-    """Ids of the pair whose TDOAs are those that it changes; None if there is no such pair."""
+    """Ids of the only pair whose TDOAs the effect changes; None if there is no such pair."""
     samples, _ = true_samples(flight)
     pairs, changed = (
         np.sort(samples.anchors.ids[np.column_stack([samples.a, samples.b])], axis=1),
@@ -122,8 +121,10 @@ def _only_pair(effect, flight):
 
 
 def claims(findings):
-    """[Claim] of Findings in the order of the report: those applied by their worth, then the others
-    by their prominence. Parts of a map come last.
+    """[Claim] of Findings in the order of the report.
+
+    Applied findings come first, by their worth. The others follow by their prominence. Parts of a
+    map come last.
     """
 
     def place(finding):
@@ -162,9 +163,7 @@ def _undeclared(finding):
 
 
 def _covariates(finding):
-    """That of the function, and those that are named as the same thing in that flight, of the same
-    part.
-    """
+    """Covariates of the function, then of its equivalent alternatives for the same part."""
     own, _, name = finding.effect.label.rpartition(" over ")
     others = (other.effect.rpartition(" over ") for other in finding.alternatives)
     names = (name, *(other for part, _, other in others if part == own))

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Faults of numbers, drawn and put into measured flights: are they named?"""
+"""Put random numerical faults into measured flights, and count how many are named."""
 
 from number_faults import FAULTS
 import numpy as np
@@ -55,8 +55,10 @@ def _paths():
 
 
 def draw(name, fault, flight, before, rng):
-    """dict of a fault put into a flight. before : m, 3D RMSE of the filter without it; cost : m by
-    which it grows, None where that says nothing.
+    """dict of a fault put into a flight.
+
+    before : m, 3D RMSE of the filter without it. "cost" is the increase in m, None for a fault of
+    the ground truth.
     """
     faulty = fault.put_in(flight, rng)
     found = [finding.rule for finding in judge_flight(faulty)]

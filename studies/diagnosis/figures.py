@@ -321,8 +321,9 @@ def _speed(args):
 
 
 def _confusions(results, path):
-    """Draw confusion matrices of the effect put in and the first claim, by stream, subset, covariate
-    and shape.
+    """Draw confusion matrices of the effect put in and the first claim.
+
+    There is one each for stream, subset, covariate and shape.
     """
     figure, axes = plt.subplots(2, 2, figsize=(14, 13), layout="constrained")
     for k, (ax, key) in enumerate(zip(axes.ravel(), ("stream", "subset", "covariate", "shape"))):

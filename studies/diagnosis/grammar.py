@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Draw effects that are not in the catalogue from a grammar: stream, subset, covariate, shape, size.
+"""Draw effects that are not in the catalogue from a grammar.
 
+An effect has a stream, a subset, a covariate, a shape and a size.
 Each seed gives a different effect. This module shares no code with the search, except the
 definitions of the covariates.
 """
@@ -65,7 +66,7 @@ class Undeclared:
 
     @property
     def covariates(self):
-        """Covariates that count as right: a claim must name a single one."""
+        """Covariates that count as right. A claim must name at least one."""
         return (self.covariate,)
 
     @property

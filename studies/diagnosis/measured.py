@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The measured flights: as they are, and with effects put in on top."""
+"""Diagnose the measured flights: unchanged, and with additional effects."""
 
 import json
 import time
@@ -70,7 +70,7 @@ PRESENT = ("outlier_rate", "noise_correlation", "floor_multipath")
 
 
 def load(data, paths, sensors=()):
-    """Flights of paths below the folder `data`. They keep only the given sensors of SENSOR_NAMES."""
+    """Flights of paths below the folder `data`, with only the given sensors of SENSOR_NAMES."""
     flights = inputs.Reading(data / "surveys").flights([data / path for path in paths])
     return [
         flight.without(*(name for name in SENSOR_NAMES if name not in sensors))

@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Changes of the events of a flight, by which faults are made: each takes (events, Scene) and
-returns events.
+"""Changes of the events of a flight, from which faults are made.
+
+Each takes (events, Scene) and returns events.
 """
 
 from __future__ import annotations

@@ -86,8 +86,8 @@ class Looks:
 def looks_at(heard: Heard, scene: Scene, seconds: float) -> Looks:
     """Return the Looks of received messages.
 
-    An odometry is compared with the truth at its stamp, or at its arrival if the stamp is of another
-    clock. The last one before a gap is compared with the truth of each look.
+    An odometry is compared with the truth at its stamp. If the stamp is of another clock, it is
+    compared at its arrival. The last one before a gap is compared with the truth of each look.
     """
     t = np.arange(0.0, seconds, STEP)
     arrival = np.array([at for at, _ in heard.odometry])

@@ -82,11 +82,13 @@ HEARD: dict[str, tuple[type, QoSProfile]] = {
 class Heard:
     """What nodes published, on the clock of the events.
 
-    odometry : (arrival s, Odometry); status : (arrival s, EstimatorStatus); diagnostics : (arrival
-        s, node, level, text); begin : s since
-    1970 of 0; late : s, by which an event was sent late at most; stop : {node: s that it took to
-    end, inf if it did not end well};
-    failed : why the nodes did not start, or "".
+    odometry : (arrival s, Odometry)
+    status : (arrival s, EstimatorStatus)
+    diagnostics : (arrival s, node, level, text)
+    begin : origin of the clock, s since 1970
+    late : s, largest delay of a sent event
+    stop : {node: s that it took to end, inf if it did not end well}
+    failed : why the nodes did not start, or ""
     """
 
     odometry: list[tuple[float, Any]] = field(default_factory=list)

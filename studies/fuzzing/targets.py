@@ -1,10 +1,9 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What is fuzzed: every function that reads a file from outside, each with bytes. It may return or
-raise InputError.
+"""Targets of the fuzzer: every function that reads a file from outside, called with bytes.
 
-A target that is protected by a checksum is also entered behind it (`*_sealed`): what a fuzzer
-changes would not get past it otherwise.
+A target may return or raise InputError. If a checksum protects a format, there is a second target
+behind the checksum (`*_sealed`). Otherwise changed bytes would never get past it.
 """
 
 from functools import cache

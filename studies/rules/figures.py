@@ -1,7 +1,7 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""rules: measure the worth of each rule and each constant of the filter's core. With --watch: of the
-rules over streams and residuals.
+"""rules: measure the worth of each rule and each constant of the filter's core. With --watch: of
+the rules over streams and residuals.
 
 Each rule is switched off, and each constant is halved and doubled, one at a time. The study then
 compares the errors on recordings, flights of `fly`, starts and faults. The filter is compiled once:

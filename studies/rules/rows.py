@@ -54,8 +54,12 @@ FIRST_SEED = 9301  # of flights of `fly`
 
 @dataclass(frozen=True)
 class Case:
-    """One run. spans : {name: (begin, end) s} that are judged; over : s from which the time to be
-    right again counts, or None; arm : m, of the tag, that is corrected; effects : that are known.
+    """One run.
+
+    spans : {name: (begin, end) s} to judge
+    over : s from which the time to be right again counts, or None
+    arm : m, lever arm of the tag, which is corrected
+    effects : known effects
     """
 
     flight: Flight
@@ -68,8 +72,11 @@ class Case:
 
 @dataclass(frozen=True)
 class Row:
-    """One row of the study. group : "measured", "flown", "starts", "halls", "faults" or "sensors"; needs : sensors
-    without whose rules it changes nothing; screen : it is of the screen.
+    """One row of the study.
+
+    group : "measured", "flown", "starts", "halls", "faults" or "sensors"
+    needs : sensors of the row. The rules of a sensor run only on rows that have this sensor.
+    screen : whether it is in the screen
     """
 
     name: str
@@ -122,7 +129,7 @@ class Inputs:
         self._kept: dict[str, Any] = {}
 
     def case(self, row: Row) -> Case:
-        """That of a Row."""
+        """The Case of a Row."""
         return self.kept(row.name, row.make)
 
     def kept(self, name: str, make: Callable[[], Any]) -> Any:

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What the rules over streams and residuals are run on, and what they find in it."""
+"""The inputs of the rules over streams and residuals, and the findings in them."""
 
 from __future__ import annotations
 

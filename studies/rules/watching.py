@@ -270,7 +270,10 @@ def _imports(tree: ast.Module, module: str, name: str) -> bool:
 
 
 def differs(before: Said, after: Said) -> dict[str, str]:
-    """Changes of the findings: {rule: "lost", "new", "late", "early", "longer", "shorter" or "size"}."""
+    """Changes of the findings of a row: {rule: kind}.
+
+    The kind is "lost", "new", "late", "early", "longer", "shorter" or "size".
+    """
     out = {rule: "lost" for rule in before if rule not in after}
     out |= {rule: "new" for rule in after if rule not in before}
     for rule in before.keys() & after.keys():

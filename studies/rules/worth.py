@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What a variant changes, row by row."""
+"""Changes that a variant causes, row by row."""
 
 from __future__ import annotations
 

@@ -25,11 +25,10 @@ def rmse(flight, corrector=None):
 
 
 def oracle(flight, window):
-    """A stand-in for a Corrector that knows the error of each TDOA from the ground truth, smoothed
-    over `window` s.
+    """A substitute for a Corrector that gets the error of each TDOA from the ground truth.
 
-    The running median of a pair's own errors: a bound for every model that follows the error no
-    faster than this.
+    The error is the running median of the errors of a pair over `window` s. This is a bound for
+    every model that does not follow the error faster.
     """
     data, anchors, truth = flight.tdoa, flight.anchors, flight.truth
     a, b = anchors.index(data.a), anchors.index(data.b)

@@ -4,9 +4,9 @@
 without any on other flights.
 
 Prints the 3D RMSE, in metres. With --bound, it adds the filter with the true errors, smoothed: a
-bound for any model of the pose. With --simulated N, both sets of flights are simulated: N flights in
-each of three constellations to train, and three other constellations to test. Writes to --out:
-table.md, comparison.json, histograms.png, rmse.png, and each model in a separate folder.
+bound for any model of the pose. With --simulated N, both sets of flights are simulated: N flights
+in each of three constellations to train, and of three other constellations to test. Writes to
+--out: table.md, comparison.json, histograms.png, rmse.png, and each model in a separate folder.
 """
 
 from functools import partial

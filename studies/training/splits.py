@@ -1,7 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""random-splits: every kind of bias model trained on some flights drawn at random, and judged on
-all others; by whole flights.
+"""random-splits: train every kind of bias model on random flights, and judge it on all others.
 
 Each split goes to --out as one line of JSON as soon as it is done. A second run skips the splits in
 --out.
