@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What re-makes the figures of the documentation.
+"""Studies that reproduce the figures of the documentation.
 
 Not installed: `./dev study NAME` runs it from the repository.
 """

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""`./dev study NAME ...`: make the figures of the documentation anew."""
+"""`./dev study NAME ...`: reproduce the figures of the documentation."""
 
 import argparse
 import sys

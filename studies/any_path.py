@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Motion along any path, for what the families of trajectories do not do: tags that are carried,
-driven, thrown, or far away.
+"""Motion along any path: tags that are carried, driven, thrown, or far away.
+
+The families of trajectories in `simulate` do not cover these.
 """
 
 from __future__ import annotations
@@ -28,12 +29,14 @@ APART = 1e-4  # s, over which attitudes are differentiated
 
 
 class Path:
-    """What simulate() takes as a trajectory.
+    """A trajectory for simulate().
 
-    duration : s; position : function of stamps (n,) s, 0 to duration, that gives (n, 3) m, with
-        four derivatives; attitude :
-    function of stamps that gives a Rotation, body to world, or None for that of a multirotor, whose
-    thrust carries it; running : (begin, end) s, of its motors, or None.
+    duration : s
+    position : function of stamps (n,) s, 0 to duration, that returns (n, 3) m. It has four
+        derivatives.
+    attitude : function of stamps that returns a Rotation, body to world. None: the attitude of a
+        multirotor, which follows from its thrust.
+    running : (begin, end) s, of its motors, or None
     """
 
     def __init__(

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""arm64: the off-line filter on an emulated 64-bit Arm beside this machine, value by value.
+"""arm64: compare the off-line filter on an emulated 64-bit Arm with this machine, value by value.
 
 The folder gets Debian's arm64 Python (apt-get and the package sources of this machine), the
 aarch64 wheels that .dev/requirements.lock pins, and the compiled code: 1 GB, which a second run
@@ -60,7 +60,7 @@ def add_options(add):
 
 
 def run(args):
-    """Install what is missing, run both, and print the table. Returns 1 if a value differs."""
+    """Install missing packages, run both, and print the table. Returns 1 if a value differs."""
     lacking = [package for name, package in PROGRAMS.items() if shutil.which(name) is None]
     if lacking:
         raise InputError(f"arm64: needs Debian's packages {', '.join(lacking)}; install them.")
@@ -79,7 +79,7 @@ def run(args):
 
 
 def cases(folder, args):
-    """{case: what the estimates of it need}: a simulated flight in three ways, and given flights."""
+    """{case: inputs of its estimates}: a simulated flight in three ways, and the given flights."""
     flight = simulate(FLIGHT)
     known = exportable(flight.anchors)
     effects = EffectSet(tuple(known[name] for name in TEN))
@@ -128,7 +128,7 @@ def emulated(folder):
 
 
 def environment_of(folder):
-    """The environment of the emulated Python, with a folder of its own for compiled code."""
+    """The environment of the emulated Python, with a separate folder for compiled code."""
     compiled = folder / "numba"
     compiled.mkdir(mode=0o700, exist_ok=True)
     return {**environment([folder / "site", *SOURCES]), "NUMBA_CACHE_DIR": str(compiled)}
@@ -195,7 +195,7 @@ def install_wheels(folder, python):
 
 
 def do(words, trouble):
-    """Run a command; raise InputError with what a failure of it means."""
+    """Run a command. Raises InputError with `trouble`, the meaning of a failure, if it fails."""
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     if done.returncode:
         last = (done.stderr.strip() or done.stdout.strip()).rpartition("\n")[2]
@@ -255,7 +255,7 @@ def same_bits(one, other):
 
 
 def table(rows):
-    """Lines of Markdown: each case, and each array of it that differs."""
+    """Lines of Markdown: each case, and each of its arrays that differs."""
     yield "| case | arrays | values | differing values | largest difference |"
     yield "|---|---:|---:|---:|---:|"
     for name in dict.fromkeys(row["name"].partition(": ")[0] for row in rows):

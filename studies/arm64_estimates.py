@@ -26,7 +26,7 @@ PATIENCE = 3600  # s, limit of the trial of a model and of each of its rows, whi
 
 
 def estimates(recording, survey, effects, model):
-    """Return {name: array} of everything that the filter makes of a recording."""
+    """Return {name: array} of all outputs of the filter for a recording."""
     flight = Reading(survey).one(recording)
     held = EffectSet.from_yaml(effects) if effects else None
     run = FlightEstimator(effects=held, network=load_network(model))(flight)

@@ -1,9 +1,9 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""calibrating: surveys shaken as by a tape, calibrated without ground truth, judged on flights that
-took no part in anything.
+"""calibrating: add tape-measure errors to surveys, calibrate without ground truth, and judge the
+result on hold-out flights.
 
-Ratios of the 3D RMSE of the tag after and before; 1 where nothing is offered.
+The figures are ratios of the 3D RMSE of the tag after and before; 1 where nothing is offered.
 """
 
 from dataclasses import replace

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Measured TDoA2 logs put through the radio link of a Crazyflie: what the estimate loses by that."""
+"""Send measured TDoA2 logs through the radio link of a Crazyflie, and compare the estimates."""
 
 from dataclasses import replace
 

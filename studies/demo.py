@@ -21,7 +21,7 @@ HARM = -0.05  # smallest gain that is no harm
 
 
 def looped(seed):
-    """Row of a seed: what was in the hall, what was found, errors of the third flight, m, and s."""
+    """Row of a seed: true effect, effects found, errors of the third flight, m, and time, s."""
     began = time.monotonic()
     with TemporaryDirectory() as folder:
         bags = loop.record(seed, Path(folder))

@@ -1,7 +1,9 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""domains: what an effect does to flights beyond where it was seen: a clock's drift, fitted to the first
-seconds of one flight, taken out of the others, without its domain and with it.
+"""domains: test an effect beyond the data that it was fitted to.
+
+The effect is a clock's drift, fitted to the first seconds of one flight. It corrects the other
+flights, without the limits of its domain and with them.
 """
 
 from dataclasses import replace

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""drives: each way to use the sensors of a simulated rover on wheels, by the filter."""
+"""drives: compare filter configurations with different sensors of a simulated rover on wheels."""
 
 import numpy as np
 from rovers import HEIGHT, Errors, drive, late

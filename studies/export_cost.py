@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""export-cost: what a TDOA costs by an exported file and by compiled effects, in one thread."""
+"""export-cost: time per TDOA of an exported file and of compiled effects, in one thread."""
 
 import time
 

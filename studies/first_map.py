@@ -1,10 +1,11 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""First maps of unknown anchors in simulated halls: which are accepted, and how far they are off.
+"""First maps of unknown anchors in simulated halls: which are accepted, and how large their errors
+are.
 
-Each hall draws its size, anchors, path, protocol, noise, outliers and delays. Two anchors are trusted. The
-inputs take turns, see INPUTS. A map is wrong and certain if it is accepted and a coordinate is off by more
-than CERTAIN of its standard deviations.
+Size, anchors, path, protocol, noise, outliers and delays of each hall are random. Two anchors are
+trusted. The inputs take turns, see INPUTS. A map is wrong and certain if it is accepted and a
+coordinate is off by more than CERTAIN of its standard deviations.
 """
 
 from dataclasses import replace

@@ -1,10 +1,10 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""localizing: what localize says of recordings, as they are and with mistakes put into them,
-against their ground truth.
+"""localizing: compare the verdicts of localize with ground truth, on unchanged recordings and on
+recordings with mistakes.
 
-A flight is within what is stated if its position is within twice the stated standard deviation for
-95 % of the time, where the tag was not lost.
+A flight is within the stated error if its position error is below twice the stated standard
+deviation for 95 % of the time. Time in which the tag was lost does not count.
 """
 
 from dataclasses import replace
@@ -102,7 +102,7 @@ def _with(flight, name):
 
 
 def _judged(flight):
-    """What is said of a Flight, without its truth, and what is true."""
+    """dict of the verdict on a Flight without its ground truth, and of its true errors."""
     run = FlightEstimator()(flight)
     told = assess(replace(flight, truth=None), run)
     t, error, _ = position_errors(run.odometry, flight.truth, flight.truth.t[0], flight.truth.t[-1])

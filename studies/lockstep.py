@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""lockstep: replays that follow the nodes, at several rates and loads, beside the run off line."""
+"""lockstep: compare replays that wait for the nodes with the off-line run, by rate and load."""
 
 from contextlib import ExitStack
 from dataclasses import replace
@@ -76,8 +76,10 @@ def run(args):
 
 
 def replayed_once(bag, flight, rate, load, rmse, offline):
-    """(exit code, TDOAs late, mm of RMSE from the offline one, poses of the offline Odometry that
-    were not recorded, mm of the others from it at most, s that the replay took) of one replay.
+    """Replay a bag once, and compare it with the off-line run.
+
+    Returns (exit code, late TDOAs, difference of the RMSE mm, missing poses, largest distance of
+    recorded from off-line poses mm, duration of the replay s).
     """
     with ExitStack() as stack, tempfile.TemporaryDirectory() as folder:
         for _ in range(load):

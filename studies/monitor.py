@@ -1,7 +1,9 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""monitor: what the monitor of ekf_node names on measured flights, what it names on flights that
-nothing was put into, and what it costs. The same filter and monitor as in the node, off line.
+"""monitor: judge the monitor of ekf_node on measured flights with faults, and on unchanged flights.
+Measure its processor time.
+
+The study runs the filter and monitor of the node off line.
 """
 
 from dataclasses import replace
@@ -53,7 +55,7 @@ def airborne(flight):
 
 
 def flights_of(folder, days):
-    """Flights of these days: micro-SD logs by their folder, CSV files by their constellation."""
+    """Flights of the given days: micro-SD logs by folder, CSV files by constellation."""
     flights = [f for f in measured(folder) if any(f"/{day}/" in f.meta["source"] for day in days)]
     for path in sorted((folder / "util").glob("*.csv.gz")):
         constellation = path.name.split("-")[0]
@@ -70,7 +72,7 @@ def late(flight, row, size, since):
 
 
 def silenced(flight, ids, since):
-    """The Flight in which the first of these anchors is not heard from a stamp on."""
+    """The Flight in which anchor ids[0] falls silent at stamp `since`, s."""
     tdoa = flight.tdoa
     heard = (tdoa.t < since) | ((tdoa.a != ids[0]) & (tdoa.b != ids[0]))
     return replace(flight, tdoa=type(tdoa)(*(column[heard] for column in vars(tdoa).values())))
@@ -91,8 +93,8 @@ def exchanged(flight, ids, since):
     )
 
 
-# what is put into flights, and what is to be said of anchors, first {} and second {}, within
-# EVENT_LIMIT
+# {fault: (function that puts it into a flight, alarm that is expected within EVENT_LIMIT)}. {0} and
+# {1} are the ids of the anchors.
 EVENTS = {
     "silent": (silenced, "anchor {0} is not heard any more"),
     "exchanged": (exchanged, "two anchors are exchanged, {0} and {1}"),
@@ -101,8 +103,9 @@ EVENT_LIMIT = 5.0  # s
 
 
 def watched(flight, config):
-    """[(s, sentences)], every STEP, and (t (n,) s, p (n, 3) m) of a Flight: off line, which is what
-    live gives.
+    """[(s, sentences)], every STEP, and (t (n,) s, p (n, 3) m) of a Flight.
+
+    The filter runs off line, with the same result as live.
     """
     result, monitor, said = run_offline(flight, config), Monitor(flight.anchors), []
     odometry, residuals = (_by_stamp(part) for part in (result.odometry, result.residuals))
@@ -123,7 +126,7 @@ def _by_stamp(part):
 
 
 def _between(part, low, high):
-    """What of an Odometry, or of Residuals, is stamped from `low` on, and before `high`, s."""
+    """The part of an Odometry, or of Residuals, with stamps from `low` on and before `high`, s."""
     inside = slice(*np.searchsorted(part.t, [low, high]))
     return type(part)(*(column[inside] for column in vars(part).values()))
 
@@ -138,8 +141,9 @@ def error_of(flight, track, low, high):
 
 
 def delays_at_truth(flight):
-    """(t (n,) s, delays (n, N) m): as the monitor reduces them, by half seconds in the air, but at
-    the ground truth.
+    """(t (n,) s, delays (n, N) m) at the ground truth, for each half second in the air.
+
+    They are reduced as in the monitor.
     """
     tdoa, (begin, end), positions = flight.tdoa, airborne(flight), flight.anchors.positions
     a, b = flight.anchors.index(tdoa.a), flight.anchors.index(tdoa.b)
@@ -160,9 +164,11 @@ def delays_at_truth(flight):
 
 
 def borne_out(flight, t, sentence):
-    """By how much the anchor that a sentence names, first said at t, s, is later at the ground
-    truth in the SPAN seconds around t than from 2 SPAN to SPAN before t: m, as the monitor would
-    have it, which shrinks delays; NaN for other sentences.
+    """Change of the delay of the anchor that an alarm names, from the ground truth, m.
+
+    It is the mean delay in the SPAN seconds around t, minus the mean from 2 SPAN to SPAN before t.
+    The delays are shrunk as in the monitor. NaN for other sentences.
+    t : stamp of the first alarm, s
     """
     if not sentence.startswith("anchor "):
         return np.nan
@@ -176,9 +182,7 @@ def borne_out(flight, t, sentence):
 
 
 def clean(flights, config):
-    """Prints what is said of flights that nothing was put into, and what the ground truth says to
-    it.
-    """
+    """Prints the alarms on unchanged flights, and the change of the delay from the ground truth."""
     seconds = alarmed = grounded = 0
     for flight in flights:
         said, _ = watched(flight, config)

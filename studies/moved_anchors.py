@@ -3,10 +3,10 @@
 """moved_anchors: recordings in which an anchor was moved by 0.3 to 1 m, or two were exchanged,
 before the start or in the middle.
 
-A tag is calibrated by a flight of last week, without ground truth; the anchors change; another
-flight is recorded. Each recording is judged with the calibration of last week, and as if there were
-none. A change costs what it adds to the 3D RMSE from 5 s after it on. Measured flights have no
-change: whatever is named there is false.
+A flight of last week calibrates the tag, without ground truth. Then the anchors change, and another
+flight is recorded. Each recording is judged with the calibration of last week, and without it. The
+cost of a change is the increase of the 3D RMSE from 5 s after it on. Measured flights have no
+change, so every named anchor is a false alarm.
 """
 
 from dataclasses import replace
@@ -39,7 +39,7 @@ MATTERS = 0.05  # m, by which a change must make the position worse
 SETTLED, LANDING = 8.0, 5.0  # s after the start, and before the end, that are not judged
 TAPE = 0.05  # m
 NEAR = 0.08  # m, 3D, within which a moved anchor shall be found
-STEP = 0.5  # s between two looks at what is said live
+STEP = 0.5  # s between two checks of the live alarms
 _NAMED = re.compile(
     r"two anchors are exchanged, \d+ and \d+|anchor \d+(?:(?:, \d+)* or \d+)?(?=: | is not where| "
     r"is not at| does not stand| is later)|the ids of two"
@@ -67,7 +67,7 @@ def add_options(add):
 
 
 def run(args):
-    """Print two tables, of what is named, and of where moved anchors are found."""
+    """Print two tables: the named anchors, and the estimated positions of moved anchors."""
     seeds = range(args.first, args.first + args.draws)
     twice = range(args.first, args.first + 2 * args.draws)
     cases = [
@@ -175,7 +175,10 @@ def without_calibration(case):
 
 
 def _judged(flight, sound, estimator, since):
-    """{"cost": m, and what is `said`} of a Flight, beside the one without a change."""
+    """Return {"cost": m} and the named anchors of a Flight, see `said`.
+
+    cost : increase of the RMSE over the flight without a change
+    """
     cost = 0.0
     if flight is not sound:
         cost = _rmse(flight, estimator, since) - _rmse(sound, estimator, since)
@@ -328,7 +331,7 @@ def _about(sentence):
 
 
 def _groups(sentences):
-    """Return the anchors that sentences name, in order: [ids, one of which has changed]."""
+    """Return the groups of anchors that sentences name, in order. In a group, one has changed."""
     groups = set()
     for sentence in sentences:
         said = sentence.partition(" (")[0]
@@ -345,7 +348,7 @@ def _ids(sentences):
 
 
 def _right(groups, ids, size=None):
-    """Whether groups of at most two anchors name what has changed, and nothing else.
+    """Whether groups of at most two anchors name the changed anchors, and no group is superfluous.
 
     size : of the largest group; None for any.
     """

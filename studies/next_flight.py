@@ -85,8 +85,11 @@ def run(args):
 
 
 def judged(seed, longest, functions):
-    """dict of the case of a seed: what was true, what was left open, the probability that the plan
-    states, and whether the planned and the random flight settle it. None if nothing is left open.
+    """dict of the case of a seed, or None if the first flight leaves no ambiguity.
+
+    It has the true effect, the effect that remains ambiguous with it, and the probability of
+    success that the plan states. It also has whether the planned flight and the random flights
+    resolve the ambiguity.
     """
     rng = np.random.default_rng([seed, 52])
     name = KINDS[rng.integers(len(KINDS))]
@@ -166,7 +169,7 @@ def title_of(effect):
 
 
 def open_question(found, effect):
-    """Title of the effect that the true one cannot be told from; None if there is none."""
+    """Title of the effect that is ambiguous with the true one; None if there is none."""
     true = title_of(effect)
     for candidate, rivals in zip(found.selection.chosen, found.selection.rivals):
         near = {one.candidate.title for one in rivals if abs(one.gap) < AMBIGUOUS}
@@ -178,7 +181,9 @@ def open_question(found, effect):
 
 
 def settles(found, effect, left):
-    """Whether an Attribution has the true effect, and `left` neither beside it nor near it."""
+    """Whether an Attribution contains the true effect, and `left` is neither chosen nor a close
+    alternative.
+    """
     true = title_of(effect)
     chosen = {
         one.title: rivals for one, rivals in zip(found.selection.chosen, found.selection.rivals)

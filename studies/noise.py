@@ -1,9 +1,11 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""noise: whether the covariance of the position is honest after a calibration (NEES, 3 is right),
-on flights that took no part in it, with IMU and without, with the parameters of the filter as they
-are and as `survey` and `diagnose` write them; and with others at half or a multiple of what they
-are, beside those.
+"""noise: test whether the covariance of the position is honest after a calibration (NEES, 3 is
+right).
+
+The flights are hold-out flights, with IMU and without. The filter runs with its default parameters
+and with the parameters that `survey` and `diagnose` write. With --vary, one more parameter at a
+time is a fraction or a multiple of its default.
 """
 
 from dataclasses import replace
@@ -21,7 +23,7 @@ from .diagnosis.measured import SPLITS
 from .surveying import KNOWN, at, measured_flights
 
 HONEST = 1.5, 4.5  # mean NEES of a flight
-# parameter: factors; a longer correlation goes with a smaller tdoa_std, so that TDOAs tell as much
+# parameter: factors; a longer correlation needs a smaller tdoa_std, to give TDOAs the same weight
 VARIED = {
     "tdoa_correlation_length": (0.25, 4.0),
     "motion_noise": (0.5, 2.0),

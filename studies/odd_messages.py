@@ -1,14 +1,17 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""odd-messages: what nodes do with messages that no driver should send.
+"""odd-messages: send messages to nodes that no driver should send.
 
-Messages of every type that a node takes, so many on each topic, changed at random: numbers that are
-none, huge, tiny or negative, ids and stamps of anything, long names; then, as bytes, cut off,
-longer, of a type without its last 8 bytes, bits turned over, of another encoding, noise. In between
-come whole ones. No node may end; every message of a stream is received or counted as unreadable,
-every other one that cannot be read is counted; memory stays what it was. Then as many requests of
-every service of each node, those for parameters too, with values that are odd: each is answered.
-With them come odd messages to those nodes that count none.
+The study sends --count messages on each topic that a node takes, changed at random. Numbers are
+NaN, huge, tiny or negative, ids and stamps are random, and names are long. As bytes, messages are
+cut off, longer, without their last 8 bytes, with flipped bits, in another encoding, or noise. Valid
+messages come in between.
+
+No node may end, and its memory must not grow. Every message of a stream must be received or counted
+as unreadable. On other topics, every unreadable message must be counted.
+
+Then the study sends as many requests with odd values to every service of each node, including
+parameter services. Each must be answered. Nodes that count no messages get odd messages meanwhile.
 """
 
 from collections import Counter
@@ -134,9 +137,14 @@ ANCHORS = Anchors.from_positions(
 
 @dataclass
 class Account:
-    """sent, received, unreadable, expected : messages by topic (received: streams; expected :
-    unreadable ones of the others);
-    memory : bytes after each tenth; log : bytes.
+    """Numbers of messages by topic, and the memory of a node.
+
+    sent : all topics
+    received : messages of streams
+    unreadable : counted by the node
+    expected : unreadable messages on topics that are no streams
+    memory : bytes after each tenth
+    log : bytes
     """
 
     sent: dict
@@ -148,8 +156,8 @@ class Account:
 
 
 def changed(data, rng, step=1):
-    """A message as bytes, changed at random, or as it is. step : bytes, of which its length is made
-    a multiple.
+    """A message as bytes, changed at random, or unchanged. step : its length becomes a multiple of
+    so many bytes.
     """
     data += bytes(-len(data) % step)
     out, kind = bytearray(data), rng.random()
@@ -213,7 +221,7 @@ def odd(message, rng):
 
 
 def whole(kind, k, change=lambda message: message):
-    """A whole message, the k-th, as bytes; change(message) : what is serialized instead."""
+    """The k-th valid message, as bytes. change(message) returns the message that is serialized."""
     return serialize_message(change(_message(kind, k)))
 
 
@@ -299,8 +307,9 @@ def _publishers(node, processes, diagnostics, name):
 
 
 def _send(node, processes, publishers, name, count, rng):
-    """Account of what was sent: one message on each topic until the node has answered; of anchors
-    only the last is kept.
+    """Account of the sent messages: one on each topic, then a wait for an answer of the node.
+
+    Of the anchors, the middleware keeps only the last message.
     """
     out = Account(dict.fromkeys(publishers, count), {}, {}, dict.fromkeys(SINGLE[name], 0), [], 0)
     client = node.create_client(GetParameters, f"/{name}/get_parameters")
@@ -380,8 +389,9 @@ def _told(name, folder):
 
 
 def request_ordeal(name, count, folder, seed=1):
-    """{service: how many of `count` odd requests were answered}, and bytes of memory after each
-    tenth, of a node that is asked by every service, and gets the messages of UNCOUNTED. A vehicle
+    """Send `count` odd requests to every service of a node, and the messages of UNCOUNTED.
+
+    Returns {service: number of answered requests}, and bytes of memory after each tenth. A vehicle
     that falls ends its node, as it should: it is started again.
     """
     answered, used, rng = Counter(), [], np.random.default_rng(seed)
@@ -497,7 +507,7 @@ def add_options(add):
 
 
 def run(args):
-    """Send them, and print what became of them. Raises Failure if a node ends or counts wrong."""
+    """Send the messages, and print the counts. Raises Failure if a node ends or counts wrong."""
     bad = False
     with tempfile.TemporaryDirectory() as folder:
         for name in (name for name in STREAMS if name in args.only):

@@ -1,6 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""parameters: what each parameter of the filter is worth, halved and doubled, on measured flights."""
+"""parameters: halve and double each parameter of the filter, and measure the effect on measured
+flights.
+"""
 
 from dataclasses import fields, replace
 from pathlib import Path
@@ -30,7 +32,7 @@ def add_options(add):
 
 
 def run(args):
-    """Print a table, a row for each parameter, the one that matters most first."""
+    """Print a table, a row for each parameter, the most important first."""
     flights = measured_flights(args.data, args.flights, args.sensors)
     usual = FilterConfig()
     before = outcome(flights, usual)

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A recorded flight as it would have come over the radio link: sampled, rounded, repeated, lost and
+"""Simulate a radio link for a recorded flight: messages are sampled, rounded, repeated, lost and
 late.
 """
 
@@ -24,8 +24,8 @@ BOOTED = 12.3  # s on our clock at which the vehicle was switched on
 
 @dataclass(frozen=True)
 class Link:
-    """half : TDOAs as half floats; lost : share of messages; latency, jitter : s, of a message, the
-    least, and the mean of what comes on top.
+    """half : TDOAs as half floats; lost : share of messages; latency : s, least of a message;
+    jitter : s, mean additional latency.
     """
 
     half: bool = False
@@ -66,7 +66,7 @@ def messages(
 
 
 def streamed(flight: Flight, link: Link, seed: int = 0) -> Flight:
-    """The Flight that `LogBlock` and `VehicleClock` make of these messages."""
+    """The Flight that `LogBlock` and `VehicleClock` reconstruct from the messages of a flight."""
     blocks, clock, tdoas, samples = (
         [LogBlock(variables) for variables in BLOCKS],
         VehicleClock(),

@@ -1,7 +1,9 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""ranges: simulated flights with distances to anchors, alone and beside TDOAs, against the bound of
-`plan` for one round; and what faulty ranges do beside TDOAs.
+"""ranges: compare the error of simulated flights with distances to anchors, alone and with TDOAs,
+with the bound of `plan` for one round.
+
+A second table shows the effect of faulty ranges in addition to TDOAs.
 """
 
 from collections.abc import Sequence
@@ -45,7 +47,7 @@ SETS = {
 }
 
 
-FAULTS = {  # what becomes of Ranges, beside TDOAs with errors that persist
+FAULTS = {  # functions that spoil Ranges; the TDOAs have persistent errors
     "sound": lambda ranges, rng: ranges,
     "3 m too long": lambda ranges, rng: replace(ranges, d=ranges.d + 3.0),
     "twice as long": lambda ranges, rng: replace(ranges, d=2.0 * ranges.d),
@@ -143,7 +145,7 @@ def rmse(flight: Flight, effects: EffectSet | None = None) -> float:
 
 
 def spoiled(flight: Flight, fault, seed: int) -> Flight:
-    """The Flight with one of FAULTS in its ranges."""
+    """The Flight with a fault of FAULTS in its ranges."""
     return replace(flight, range=fault(flight.range, np.random.default_rng(seed)))
 
 

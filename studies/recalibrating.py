@@ -1,11 +1,11 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""recalibrating: a survey with one flight, something changed, and a survey with another that starts
-from the first.
+"""recalibrating: survey with one flight, change the installation, and survey again with another
+flight, starting from the first result.
 
-What changes is an anchor that is moved, or late; the survey that came with the flights takes the
-change, so that nothing is simulated but that. Judged on a third flight, with last week's
-calibration and with the new one.
+The change is an anchor that is moved, or late. It is put into the survey that came with the
+flights, so only the change is simulated. A third flight judges last week's calibration and the new
+one.
 """
 
 from dataclasses import replace
@@ -26,7 +26,7 @@ SETS = {
     "const4": [_CONST4.format(k) for k in (1, 2, 3)],
 }
 TRUSTED = "0", "6"
-CHANGES = {  # in words: effect of what changed
+CHANGES = {  # {description: effect of the change}
     "nothing": EFFECTS["anchor_delay"]({}),
     "anchor 3 moved by 15 cm in x": EFFECTS["anchor_position"]({"3.x": 0.15}),
     "anchor 1 moved by 14 cm in y and z": EFFECTS["anchor_position"]({"1.y": -0.1, "1.z": 0.1}),

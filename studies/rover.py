@@ -1,16 +1,15 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""rover: simulated drives over a floor, each judged by its truth: how well the filter does, and
-whether what diagnose writes is true.
+"""rover: judge the filter, and the effects that diagnose writes, on simulated drives over a floor.
 
-A rover drives for 90 s among six anchors in 12 x 8 m, with wheels (50 Hz, 2 % too fast, slip), an
-IMU (100 Hz) and 100 TDOAs a second with a noise of 0.1 m and delays of the anchors of 5 cm, which
-make up `tdoa_std`. Its antenna is on a mast 0.4 m above base_link, which is on the floor.
+A rover drives for 90 s among six anchors in 12 x 8 m. It has wheels (50 Hz, 2 % too fast, slip), an
+IMU (100 Hz) and 100 TDOAs a second. The TDOAs have a noise of 0.1 m and antenna delays of 5 cm;
+both make up `tdoa_std`. The antenna is on a mast 0.4 m above base_link, which is on the floor.
 
-The filter takes errors to persist, as measured ones do; `tdoa_correlation_length: 1.0` states that
-they are white, as here. In rows of a hall errors are those of real halls, and `tdoa_std` the
-default: anchors are surveyed to 3 cm, have delays of 10 cm, and errors by received power and by
-both antennas; 3 % of the TDOAs are outliers; and each of four places blocks one anchor.
+The filter assumes persistent errors, as in measured data. `tdoa_correlation_length: 1.0` states
+that they are white, as here. Rows of a hall have the errors of real halls, and the default
+`tdoa_std`. There, anchors are surveyed to 3 cm, have delays of 10 cm, and errors by received power
+and by both antennas. 3 % of the TDOAs are outliers, and each of four places blocks one anchor.
 """
 
 from dataclasses import replace
@@ -153,7 +152,7 @@ def drive_of_hall(seed):
 
 
 def flown(seed):
-    """The same of a quadrotor, with an antenna beside its middle."""
+    """As `drive`, of a quadrotor whose antenna is off its centre."""
     config = SimulationConfig(
         seed=seed,
         duration=DURATION,
@@ -252,8 +251,9 @@ def yaw_of(q):
 
 
 def deviations(kind, seed):
-    """{value: (error, stated deviation), or None where diagnose finds none} of one drive or flight,
-    which is diagnosed by its ground truth for effects of the catalogue.
+    """{value: (error, stated deviation), or None where diagnose finds none} of one drive or flight.
+
+    The diagnosis uses its ground truth and the effects of the catalogue.
     """
     flight, delays = (drive if kind == "planar" else flown)(seed)
     reference = GroundTruth()
@@ -276,7 +276,7 @@ def deviations(kind, seed):
     ids = np.array([str(i) for i in flight.anchors.ids.tolist()])
     late = found["anchor_delay"].values if "anchor_delay" in found else {}
     zero = ~np.isin(ids, list(late)) if len(late) < len(ids) else np.ones(len(ids), bool)
-    true |= {  # apart from the mean of those that are not written
+    true |= {  # relative to the mean delay of the anchors that diagnose does not write
         ("anchor_delay", i): d
         for i, d in zip(ids.tolist(), (delays - delays[zero].mean()).tolist())
     }

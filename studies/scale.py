@@ -1,11 +1,10 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""scale: how processor time and memory of the tools grow with flights, anchors and effects, each
-case in a process of its own.
+"""scale: measure how processor time and memory of the tools grow with flights, anchors and effects.
 
-Flights are simulated, 10 s in the air, 240 TDOAs a second. The tool runs as a user would run it,
-with one job. Each case goes to --out as soon as it is done; what is there already is not done
-again.
+Each case runs in a separate process. Flights are simulated, 10 s in the air, 240 TDOAs a second.
+The tool runs as a user would run it, with one job. Each case goes to --out as soon as it is done; a
+second run skips the cases in --out.
 """
 
 from dataclasses import dataclass
@@ -107,9 +106,10 @@ def all_cases():
 
 
 def measure(case, folder):
-    """{"cpu": s of processor time, user and system, of the tool's process and those that it
-    started, "memory": MB, the most that one of them held} of a Case. Raises Failure where the tool
-    fails.
+    """{"cpu": s, "memory": MB} of a Case. Raises Failure where the tool fails.
+
+    cpu is the processor time, user and system, of the tool's process and its child processes.
+    memory is the largest peak memory of a process.
     """
     flights = make_flights(case.flights, case.anchors, folder)
     command = [
@@ -150,8 +150,9 @@ def make_flights(count, anchors, folder):
 
 
 def table(results):
-    """Markdown of {Case: figures}: a row for each case, with what each flight more costs beside the
-    case with fewer.
+    """Markdown of {Case: figures}: a row for each case, with its cost per additional flight.
+
+    That cost is relative to the case with the next smaller number of flights.
     """
     lines = [
         (

@@ -1,7 +1,7 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Height, pressure and velocity on measured flights: what each is worth, and what faults put into
-them do.
+"""Measure the worth of height, pressure and velocity on measured flights, and the effect of their
+faults.
 """
 
 from dataclasses import replace
@@ -29,7 +29,7 @@ from uwb_tdoa_tools.scoring.phases import NEAR_THE_FLOOR, TITLES
 SETS = (), ("height",), ("pressure",), ("height", "pressure"), ("velocity",), ("height", "velocity")
 # Hz, m/s: of a velocity made of the ground truth, where none was recorded
 VELOCITY_RATE, VELOCITY_STD = (25.0, 0.1)
-TAKE_OFF = 0.2  # s into the airborne part, whose largest error is told
+TAKE_OFF = 0.2  # s into the airborne part, for which the largest error is printed
 GRACE = 3.0  # s after the beginning of a fault that do not count
 ONSET = 8.0  # s into the airborne part at which a fault begins that is not there from the start
 STEPS = 0.3, -0.5, 0.8  # m, of the ground below, one after the other,
@@ -65,8 +65,8 @@ def run(args):
 
 
 def with_velocity(flight, rate=VELOCITY_RATE):
-    """The flight with a velocity in the body frame, made of its ground truth and noise, at a rate,
-    Hz, where none was recorded.
+    """The flight with a velocity in the body frame. If none was recorded, it is simulated from the
+    ground truth with noise, at `rate`, Hz.
     """
     if flight.velocity is not None:
         return flight
@@ -83,12 +83,12 @@ def with_velocity(flight, rate=VELOCITY_RATE):
 
 
 def only(flight, names):
-    """The flight with no other sensors than those of these names."""
+    """The flight with only the named sensors."""
     return flight.without(*(name for name in SENSOR_NAMES if name not in names))
 
 
 def velocity(flights, config):
-    """Table of the noise of the velocity, and of what diagnose finds in it."""
+    """Table of the noise of the velocity, and of the effects that diagnose finds in it."""
     print("| flight | noise x, y [m/s] | found |\n|---|---|---|")
     for flight in flights:
         error = residuals(flight, GroundTruth(), EffectSet())["velocity"].residual
@@ -102,9 +102,10 @@ def velocity(flights, config):
 
 
 def worth(flights, config):
-    """Tables of the errors with each set of sensors: with all anchors and the IMU, without IMU, and
-    with TDOAs of four anchors only; and the bound of `plan` beside them, of one round of TDOAs and
-    a height.
+    """Print tables of the errors with each set of sensors, and of the bound of `plan`.
+
+    There is one table with all anchors and the IMU, one without IMU, and one with TDOAs of four
+    anchors only. The bound is for one round of TDOAs and a height.
     """
     for words, change, setting in (
         ("all anchors", lambda flight: flight, config),
@@ -122,8 +123,9 @@ def of_four(flight):
 
 
 def bounds(flights, height_std):
-    """(4,) m, along x, y, z and in space: the bound of `plan` for one round of TDOAs, and a height
-    if height_std, m, is finite, at the places that were flown; roots of means over each flight,
+    """Bound of `plan` for one round of TDOAs, (4,) m, along x, y, z and in space.
+
+    A finite height_std, m, adds a height. The bound is the root mean square along each flown path,
     averaged over the flights.
     """
     rows = []
@@ -169,8 +171,10 @@ def _worth(flights, config, sets):
 
 
 def faults(flights, config):
-    """Table of the 3D RMSE with a faulty sensor over that without the sensor, and of the flights in which
-    the status of ekf_node would name the sensor: one row per fault.
+    """Print a table with one row per fault.
+
+    A row has the ratio of the 3D RMSE with the faulty sensor to the 3D RMSE without the sensor. It
+    also has the number of flights in which the status of ekf_node would name the sensor.
     """
     print(
         "| fault | mean 3D without | sound | faulty | largest faulty / without | named | "
@@ -202,9 +206,7 @@ def faults(flights, config):
 
 
 def is_named(flight, sensor, run):
-    """Whether, for two seconds of a Run, most messages of a sensor contradict everything else or are
-    invalid.
-    """
+    """Whether most messages of a sensor are rejected or invalid for two seconds of a Run."""
     second = (getattr(flight, sensor).t - flight.tdoa.t[0]).astype(int)
     unused = np.isin(run.sensors[sensor]["verdict"], NAMED)
     first = second.min()

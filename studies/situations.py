@@ -1,12 +1,12 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""situations: where a tag can be and what can happen to it, simulated over many seeds, and how
-right and how honest the filter is there.
+"""situations: simulate situations of a tag over many seeds, and judge the accuracy and the
+consistency of the filter.
 
-The filter is that of a user who configures nothing, switched on where the recording begins, without
-corrections. Anchors, if nothing else is said, are 8 in 7 x 8 x 3 m; noise, outliers, delays of
-anchors, received power and late arrivals near the floor are those of `simulate`. Half of the seeds
-use TDOA2, half TDOA3. Each row judges one stretch of its recordings, all seeds together.
+The filter has default parameters and no correction, and starts where the recording begins. Unless a
+situation changes it, there are 8 anchors in 7 x 8 x 3 m. Noise, outliers, antenna delays, received
+power and late arrivals near the floor are as in `simulate`. Half of the seeds use TDOA2, half
+TDOA3. Each row judges one stretch of its recordings, all seeds together.
 """
 
 from dataclasses import dataclass, field, replace
@@ -36,7 +36,7 @@ from .any_path import Path, between
 RIGHT, FOR = (0.5, 2.0)
 FLYING = ImuErrors(vibration=1.0)
 REST = 0.03  # m, of a tag on its vehicle on the floor
-# m later are anchors below LOW for a tag on the floor, all of it below, none above these heights
+# m: anchors below LOW are late by LATE for a tag below FADES[0], and not late above FADES[1]
 LATE, LOW, FADES = (3.2, 0.5, (0.06, 0.2))
 SHADOW, BEHIND = 0.4, 0.5  # m later is an anchor behind a person; cosine beyond which it is
 WALL = 3.5  # m, x of the wall of the room
@@ -45,9 +45,13 @@ MARGIN = FilterConfig().workspace_margin
 
 @dataclass(frozen=True)
 class Situation:
-    """One row. make : function of a Generator and a dict for SimulationConfig that gives a Flight;
-    judged : (begin, end) s; over : s at which what happens is over, from which the time to be right
-    again counts, None: from the 100th TDOA on; config : of the filter.
+    """One row.
+
+    make : function of a Generator and a dict for SimulationConfig that returns a Flight
+    judged : (begin, end) s
+    over : s at which the disturbance ends. The time to be right again counts from here; None: from
+        the 100th TDOA.
+    config : of the filter
     """
 
     name: str
@@ -94,7 +98,7 @@ def add_options(add):
 
 
 def run(args):
-    """Simulate what is missing, and print the table."""
+    """Simulate the missing cases, and print the table."""
     chosen = [one for one in SITUATIONS if any(word in one.name for word in args.only)]
     if not chosen:
         raise InputError(
@@ -116,7 +120,7 @@ def run(args):
 
 
 def _results(items, path, jobs):
-    """Generator of `measure` of each item; those that the file `path` holds are not made again."""
+    """Generator of `measure` of each item. Items that the file `path` holds are not repeated."""
     if path is None:
         yield from parallel.over(measure, items, jobs, unit="simulation")
         return
@@ -140,8 +144,10 @@ def _results(items, path, jobs):
 
 
 def measure(item):
-    """{"figures": of the judged stretch, as of `scoring.by_phase.ErrorSeries`, null where there are
-    none; "again": s, null for never} of (name, seed).
+    """{"figures", "again"} of (name, seed).
+
+    figures : of the judged stretch, as in `scoring.by_phase.ErrorSeries`, null where there are none
+    again : s until the filter is right again, null for never
     """
     name, seed = item
     (situation,) = [one for one in SITUATIONS if one.name == name]
@@ -181,8 +187,10 @@ def again(judged, since):
 
 
 def figures(results):
-    """Of the `measure` of several seeds: a dict as of `PooledErrors.figures`, besides again_median,
-    again_max, s, and never, how many.
+    """Pool the `measure` of several seeds.
+
+    Returns a dict as of `PooledErrors.figures`, with again_median, again_max, s, and never, the
+    number of seeds in which the filter is never right again.
     """
     pool = PooledErrors()
     for result in results:
@@ -227,7 +235,7 @@ def table(together):
 
 
 def _plain(of):
-    """As JSON takes it: null for what is no number."""
+    """Return a dict for JSON: None replaces floats that are not finite."""
     return {
         name: None if isinstance(value, float) and not math.isfinite(value) else value
         for name, value in of.items()
@@ -290,9 +298,7 @@ def _hop(rng, common):
 
 
 def _low_late(make, rng, common):
-    """What `make` gives, with the low anchors late for a tag on the floor, as on the measured
-    flights.
-    """
+    """The Flight of `make`, with low anchors late near the floor, as in measured flights."""
     flight = make(rng, common)
     low = np.flatnonzero(flight.anchors.positions[:, 2] < LOW)
     height = np.interp(flight.tdoa.t, flight.truth.t, flight.truth.p[:, 2])
@@ -313,7 +319,7 @@ def _later(flight, size, each):
 
 
 def _without(streams, begin, end, make, rng, common):
-    """What `make` gives, without the samples of some streams from `begin` to `end`, s."""
+    """The Flight of `make`, without the samples of some streams from `begin` to `end`, s."""
     flight = make(rng, common)
     for name in streams:
         stream = getattr(flight, name)
@@ -330,7 +336,7 @@ def _without(streams, begin, end, make, rng, common):
 
 
 def _few(count, make, rng, common):
-    """What `make` gives, with `count` anchors heard from 10 s on."""
+    """The Flight of `make`, with only `count` anchors heard from 10 s on."""
     flight = make(rng, common)
     heard = rng.permutation(flight.anchors.ids)[:count]
     kept = (flight.tdoa.t < 10.0) | (np.isin(flight.tdoa.a, heard) & np.isin(flight.tdoa.b, heard))
@@ -379,7 +385,7 @@ def _outside(far, rng, common):
 
 
 def _one_side(rng, common):
-    """All eight anchors on one wall, the tag 2 to 5 m in front of it."""
+    """All eight anchors on one wall, and the tag 2 to 5 m in front of the wall."""
     y, z = np.meshgrid([-3.0, -1.0, 1.0, 3.0], [0.3, 2.8])
     wall = np.column_stack([np.full(8, -WALL), y.ravel(), z.ravel()])[rng.permutation(8)]
     return _flown(
@@ -399,8 +405,9 @@ def _in_a_plane(rng, common):
 
 
 def _in_a_line(rng, common):
-    """Six anchors along a line 1.5 m high, the tag 2 m beside it: where about that line no TDOA
-    tells.
+    """Six anchors along a line 1.5 m high, and the tag at a distance of 2 m.
+
+    The angle of the tag about that line is unobservable from TDOAs.
     """
     line = np.column_stack(
         [np.zeros(6), np.linspace(-4.0, 4.0, 6)[[0, 3, 5, 1, 4, 2]], np.full(6, 1.5)]

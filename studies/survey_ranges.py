@@ -1,7 +1,7 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""survey-ranges: errors of ranges that no position of an anchor explains, in simulated flights, and
-whether `survey` makes another flight better. The rule of `survey` was set on these.
+"""survey-ranges: simulate range errors that anchor positions cannot explain, and test whether
+`survey` improves another flight. The rule of `survey` was tuned on these flights.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Surveys of measured flights, shaken and made better from the flights alone; the tag is judged on
-other flights.
+"""Add errors to surveys of measured flights, and correct them from the flights alone.
+
+The tag is judged on other flights.
 """
 
 from dataclasses import replace
@@ -28,7 +29,7 @@ from uwb_tdoa_tools.surveying.known import DRIFT
 
 from .diagnosis.measured import SPLITS
 
-SHAKES = 0.1, 0.3  # m, unless others are asked for
+SHAKES = 0.1, 0.3  # m, default of --tape
 _UTIL, _CONST4, _0425 = (
     "util/const{}-trial{}.csv.gz",
     "util/const4-trial1-tdoa2-traj{}.csv.gz",
@@ -135,8 +136,10 @@ def run(args):
 
 
 def with_known(data, kind, splits, seed):
-    """Print a table: surveys as they came, within 0.1 m, made better with what KNOWN of a kind
-    says; or diagnosed beside an odometry that took off and landed at known places.
+    """Print a table of the error with surveys good to 0.1 m, before and after a calibration.
+
+    The calibration uses the given kind of knowledge in KNOWN. With "odometry", it is a diagnosis
+    that uses an odometry with known places of take-off and landing.
     """
     print(
         "| fitted to | judged on | mean 3D RMSE before | after | worst ratio | known "
@@ -170,8 +173,8 @@ def with_known(data, kind, splits, seed):
 
 
 def ends_of(flight, several, rng):
-    """[Mark]: where the tag stood before it took off and after it landed, END_TIME each, END_STD
-    off.
+    """[Mark]: positions of the tag before take-off and after landing, for END_TIME each, with an
+    error of END_STD.
     """
     truth, out = flight.truth, []
     last = flight.tdoa.t[-1] - flight.tdoa.t[0]
@@ -185,7 +188,7 @@ def ends_of(flight, several, rng):
 
 
 def odometry_of(flight, several, rng):
-    """[OdometryPath]: the ground truth in a frame of its own, that drifts by DRIFT."""
+    """[OdometryPath]: the ground truth in another frame, with a drift of DRIFT."""
     truth = flight.truth
     t = np.arange(truth.t[0], truth.t[-1], ODOMETRY_STEP)
     p = np.stack([np.interp(t, truth.t, column) for column in truth.p.T], axis=1)
@@ -201,10 +204,12 @@ KNOWN = {  # kind: function of (Flight, how many there are, Generator) that give
 
 
 def draw(flights, judged, std, seed, plain=False):
-    """dict of figures of one draw: mean 3D RMSE, m, of the judged Flights with the true, shaken and
-    surveyed anchors; root mean square errors, m, of the coordinates that are not trusted, shaken
-    and surveyed, and of what was found, applied or not, over its std. plain : trust none more than
-    others.
+    """dict of figures of one draw.
+
+    It has the mean 3D RMSE, m, of the judged Flights with the true, shaken and surveyed anchors. It
+    also has the RMS error, m, of the coordinates that are not trusted, shaken and surveyed. The
+    normalised error is the error of the result, applied or not, over its std.
+    plain : trust no coordinate more than others
     """
     true = flights[0].anchors
     tape = Tape(std, trusted=() if plain else third(true))
@@ -249,7 +254,7 @@ def _measured(data, fit, judge, sensors):
 
 
 def measured_flights(data, paths, sensors=()):
-    """Flights below a folder, with these of SENSOR_NAMES alone."""
+    """Flights below a folder, with only the given sensors of SENSOR_NAMES."""
     unused = [sensor for sensor in SENSOR_NAMES if sensor not in sensors]
     reading = inputs.Reading(str(data / "surveys"))
     return [

@@ -1,7 +1,7 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""two-errors: how far accelerometers rectify vibration, and how late each anchor is over the height of
-the tag.
+"""two-errors: measure how much accelerometers rectify vibration, and the lateness of each anchor
+over the height of the tag.
 """
 
 from collections import defaultdict
@@ -39,8 +39,9 @@ def rectified(flight: Flight) -> tuple[np.ndarray, np.ndarray]:
 
 
 def lateness(flight: Flight) -> dict[int, np.ndarray]:
-    """{number of an interval of HEIGHTS: lateness (n,) m of the anchors of a Flight, by the mean of
-    those above 1.5 m}.
+    """{number of an interval of HEIGHTS: lateness (n,) m of the anchors of a Flight}.
+
+    It is relative to the mean of the anchors above 1.5 m.
     """
     tdoa, positions = flight.tdoa, flight.anchors.positions
     inside = (tdoa.t > flight.truth.t[0]) & (tdoa.t < flight.truth.t[-1])

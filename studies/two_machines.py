@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""two-machines: who hears whom on two machines, by what each is told. The machines are two network
-namespaces of this one, joined by a virtual cable, for which it takes root.
+"""two-machines: test which of two machines hears the other, by their discovery settings.
+
+The machines are two network namespaces of this machine, joined by a virtual cable. This needs root.
 """
 
 from contextlib import contextmanager
@@ -17,7 +18,7 @@ LOCALHOST, SUBNET, PEER = (
     f"{RANGE}=SUBNET",
     f"ROS_STATIC_PEERS={ADDRESS[ROBOT]}",
 )
-CASES = [  # what the robot is told, and what we are
+CASES = [  # settings of the robot, settings of our machine
     ((), ()),
     ((LOCALHOST,), (LOCALHOST,)),
     ((SUBNET,), (LOCALHOST,)),

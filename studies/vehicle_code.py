@@ -1,10 +1,10 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""vehicle-code: what exported C costs on an emulated STM32F405, of effects and of networks.
+"""vehicle-code: cost of exported C code of effects and networks on an emulated STM32F405.
 
-Instructions are those of one TDOA, the mean and the most over random states, counted by the
-emulator. Flash has two columns: of the exported
-functions and tables, and with what they need of the C library. RAM is stack and state.
+The emulator counts the instructions per TDOA: mean and maximum over random states. Flash has two
+columns: the exported functions and tables alone, and with the functions that they need of the C
+library. RAM is stack and state.
 """
 
 from c_programs import ANCHORS, COMMON, chosen, cost_of, effects, missing, network

@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""warehouse: starts in halls, slow tags, anchors in a plane, a walk of ten minutes, and what a tag
-costs by how many anchors are installed.
+"""warehouse: judge starts in halls, slow tags, anchors in a plane, and a walk of ten minutes.
+
+Measure the cost of a tag by the number of installed anchors.
 """
 
 from flights import position_at
@@ -19,8 +20,8 @@ WRONG, CERTAIN, AGAIN = (1.0, 5.0, 2.0)
 
 
 def bound(where, seed, duration=20.0):
-    """(3,) m, root mean square along the path from 10 s on of what delays of the anchors leave open
-    at least, along each axis: they do not average out.
+    """Lower bound (3,) m of the error along each axis due to antenna delays, which do not average
+    out. It is the root mean square along the path from 10 s on.
     """
     rng = np.random.default_rng([seed, 5])  # as `fly` walks
     places = walk(where.size, duration, rng, 1.5)[0][int(10.0 * RATE) :: int(0.5 * RATE)]
@@ -78,8 +79,9 @@ def say(name, runs):
 
 
 def say_walks(name, where, seeds, config):
-    """What is the worst in walks of ten minutes with three dead zones and a change of floor, and a
-    line of each that is worse than asked.
+    """Print the worst figures of walks of ten minutes with three dead zones and a change of floor.
+
+    Also prints a line for each walk that misses the requirement.
     """
     worst, sure, wrong, nees = [], [], [], []
     for seed in seeds:

@@ -34,11 +34,11 @@ SECTION = "compiled core, one core"
 
 
 def measure(progress: Callable[[str], object], quick: bool = False) -> Iterator[Figure]:
-    """Generator of Figures. progress(text) : called with what comes next.
+    """Generator of Figures. progress(text) : called with the name of the next measurement.
 
-    Each pair of figures comes from the same stretch of a flight, run from the same state: with its
-    inertial samples alone, and with TDOAs at the stamps of inertial samples, so that the difference
-    is their updates and nothing else.
+    Each pair of figures comes from the same stretch of a flight, run from the same state: once with
+    its inertial samples alone, once with TDOAs at the stamps of inertial samples. The difference is
+    the cost of the TDOA updates.
     """
     repeats = 9 if quick else 41
     for anchors in ANCHORS[1:2] if quick else ANCHORS:
@@ -70,7 +70,7 @@ def per_event(
     anchors: int, robust: str, hypotheses: int, repeats: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """us per prediction and per update, two (repeats,) arrays, while 1 or YAWS yaws are followed."""
-    # A tag that hovers tells nothing about its yaw.
+    # While a tag hovers, its yaw is unobservable.
     trajectory = "hover" if hypotheses > 1 else "sines"
     path: dict[str, Any] = {"trajectory": trajectory, "start_in_air": True, "multipath": False}
     flight = make_flight(BEFORE + MEASURED, anchors, **path)
@@ -90,7 +90,7 @@ def per_event(
 
 
 def per_sensor(sensor: str, repeats: int) -> np.ndarray:
-    """us per height, pressure or velocity beside 1 kHz IMU and 400 Hz TDOA: (repeats,)."""
+    """us per height, pressure or velocity, with 1 kHz IMU and 400 Hz TDOA: (repeats,)."""
     noise: dict[str, Any] = {f"{sensor}_noise": NOISES[sensor]}
     flight = make_flight(BEFORE + MEASURED, start_in_air=True, multipath=False, **noise)
     core = Core(flight, FilterConfig(initial_yaw_std=0.5, odometry_rate=RARELY))
@@ -124,7 +124,7 @@ class Core:
         self._begin = imu.t[0]
 
     def start(self) -> None:
-        """Feed what comes BEFORE; what is measured is the rest.
+        """Feed the events of the first BEFORE seconds. Only later events are measured.
 
         Raises RuntimeError if the filter does not run by then.
         """
@@ -137,8 +137,8 @@ class Core:
         self.samples, self.tdoas, self.sensors = len(self._imu), len(self._tdoa), len(self._sensors)
 
     def timed(self, tdoa: bool, sensors: bool = False) -> float:
-        """s that the rest takes, with or without its TDOAs, and its heights, pressures and
-        velocities.
+        """Time to process the remaining events, s, with or without TDOAs, and with or without
+        heights, pressures and velocities.
         """
         self.last = self.state.copy()
         return self._feed(

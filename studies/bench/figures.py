@@ -40,7 +40,7 @@ class Figure:
     def of(
         cls, section: str, name: str, unit: str, values: ArrayLike, target: float | None = None
     ) -> Figure:
-        """From repeated measurements, a number or (n,) of them; NaN where there is none."""
+        """Return the Figure of repeated measurements: a number or (n,), NaN where it is missing."""
         numbers = np.atleast_1d(np.asarray(values, dtype=float))
         numbers = numbers[np.isfinite(numbers)]
         low, median, high = np.percentile(numbers, [25, 50, 75]) if len(numbers) else (np.nan,) * 3

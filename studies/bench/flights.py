@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The flights that are measured with: simulated, 1 kHz IMU and 400 Hz TDOA."""
+"""The simulated flights of the measurements: 1 kHz IMU and 400 Hz TDOA."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 SHORTEST = 16.0  # s that the simulation needs to take off and land
 TDOA_RATE = 400.0  # Hz
-FAR, SPACING, ROW = 1000.0, 8.0, 125  # m, m, anchors: where those stand that nobody hears
+FAR, SPACING, ROW = 1000.0, 8.0, 125  # m, m, anchors: positions of anchors out of radio range
 
 
 def make_flight(
@@ -36,8 +36,8 @@ def make_flight(
 
 
 def among(flight: Flight, installed: int) -> Flight:
-    """The flight where so many anchors are installed: its own, and others out of the radio's reach,
-    in rows of a hall beside it.
+    """Return the flight with `installed` anchors. The added ones stand in rows of another hall, out
+    of radio range.
     """
     beyond = np.arange(installed - len(flight.anchors))
     far = np.column_stack(

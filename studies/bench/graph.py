@@ -1,7 +1,7 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""How fast nodes answer the rest of the graph, parameters, poses that are given, a clock that
-stops, while messages flow.
+"""Measure how fast nodes answer parameter requests, apply an initial pose, and report a stopped
+clock, while messages flow.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_tools.live.processes import Processes
 
-CASES = (  # Hz of /clock, Hz of /tf, whether streams flow, busy loops beside
+CASES = (  # Hz of /clock, Hz of /tf, whether streams flow, number of busy processes
     (0.0, 0.0, False, 0),
     (0.0, 0.0, True, 0),
     (40.0, 0.0, True, 0),
@@ -57,9 +57,12 @@ TARGET_IDLE = 1.0  # % of a core
 
 @dataclass
 class Answers:
-    """answers, poses : s that each get_parameters, each initialpose took, SILENCE without an
-    answer; periods : s between reports;
-    pause : s until a clock that stopped was reported, None without one; cpu : share of one core.
+    """Response times of a node.
+
+    answers, poses : s that each get_parameters, each initialpose took, SILENCE without an answer
+    periods : s between reports
+    pause : s until a stopped clock was reported, None without a report
+    cpu : share of one core
     """
 
     answers: list[float] = field(default_factory=list)
@@ -115,9 +118,12 @@ def ask(
     busy: int = 0,
     arguments: Sequence[str] = (),
 ) -> Answers:
-    """Answers of an ekf_node, for so long. clock, tf : Hz, 0.0 for none; streams : whether a tag
-    flies, through a bias_node; busy : loops that take all of a core; arguments : more of the
-    ekf_node.
+    """Measure the Answers of an ekf_node for `seconds`.
+
+    clock, tf : Hz, 0.0 for none
+    streams : whether the streams of a flying tag arrive, through a bias_node
+    busy : number of processes that each use a whole core
+    arguments : additional arguments of the ekf_node
     """
     with ExitStack() as stack:
         node, processes = stack.enter_context(surroundings(folder))
@@ -167,7 +173,7 @@ class _Asking:
         ]
 
     def ask(self, seconds: float, clock: subprocess.Popen[bytes] | None) -> Answers:
-        """clock : Popen of what publishes it, or None."""
+        """clock : Popen of the process that publishes it, or None."""
         out, began = Answers(), time.monotonic()
         _wait(
             self._node,

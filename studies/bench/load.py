@@ -1,7 +1,7 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What else there is in a graph, as a process: a simulator's clock, a robot's transforms, a tag's
-streams.
+"""Publish other messages of a graph, in a separate process: a simulator's clock, a robot's
+transforms, a tag's streams.
 
 python -m studies.bench.load clock 200
 python -m studies.bench.load tf 500

@@ -1,7 +1,7 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The nodes live, in real time: CPU, memory, latency, losses, time to ready; for one tag and for
-several.
+"""Measure the live nodes in real time, for one tag and for several: CPU, memory, latency, losses,
+time to ready.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ FLEETS = (
     (30, 100.0, 100.0),
     (60, 100.0, 40.0),
 )
-INSTALLED = 8, 1000, 10_000  # anchors, 8 of which are heard
+INSTALLED = 8, 1000, 10_000  # anchors; the tag hears 8
 TARGET_CPU, TARGET_LATENCY, TARGET_READY = 25.0, 10.0, 0.5  # % of one core, ms, s
 TARGET_LATENCY_OF_FLEET = 30.0  # ms
 TARGET_START = 3.0  # s, of a node among many anchors
@@ -71,12 +71,17 @@ SECTION = "both nodes live at 1 kHz IMU + 400 Hz TDOA, default parameters and Qo
 
 @dataclass
 class NodeFigures:
-    """ready : {title: s from its start}; first : s from the anchors to the first odometry, half a
-    second of which passes before the first measurement; memory : {title: bytes}; cpu : {title:
-    share of one core in each block};
-    latency : one (n,) array of ms per block; lost, late : messages; source_late : (k,) ms, each
-        message of the source;
-    source_cpu : share of one core in each block.
+    """Measurements of running nodes.
+
+    ready : {title: s from its start}
+    first : s from the anchors to the first odometry. This includes half a second before the first
+        measurement.
+    memory : {title: bytes}
+    cpu : {title: share of one core in each block}
+    latency : one (n,) array of ms per block
+    lost, late : numbers of messages
+    source_late : (k,) ms, delay of each message of the source
+    source_cpu : share of one core in each block
     """
 
     ready: dict[str, float] = field(default_factory=dict)
@@ -151,8 +156,9 @@ def measure_tags(
 def measure_hall(
     progress: Callable[[str], object], folder: Path, quick: bool = False
 ) -> Iterator[Figure]:
-    """Generator of Figures for a tag in a localization_node by how many anchors are installed, of
-    which it hears the same 8.
+    """Generator of Figures for a tag in a localization_node, by the number of installed anchors.
+
+    The tag always hears the same 8.
     """
     progress("hall, first start")
     start(folder)
@@ -254,7 +260,7 @@ def fly(flight: Flight, folder: Path, namespaces: Sequence[str], starts: Starts)
 
 @contextmanager
 def surroundings(folder: str | Path) -> Iterator[tuple[Node, Processes]]:
-    """(node of ours, Processes) in a domain of their own, whose logs ready_at understands."""
+    """(our node, Processes) in a separate domain. `ready_at` can read the logs of the processes."""
     form = "[{severity}] [{time}] [{name}]: {message}"
     logs = {"RCUTILS_CONSOLE_OUTPUT_FORMAT": form, "RCUTILS_COLORIZED_OUTPUT": "0"}
     with (
@@ -325,7 +331,7 @@ def _count(
     diagnostics: DiagnosticsListener,
     source: Source,
 ) -> None:
-    """Fill in what was lost between the processes, and what came too late to be used."""
+    """Fill in how many messages were lost between the processes, and how many were too late."""
     out.lost = dict.fromkeys(("TDOAs", "IMU samples", "odometry"), 0)
     for space, received in zip(namespaces, source.received):
         bias, ekf = (diagnostics.newest(_title(space, name)) for name in ("bias_node", "ekf_node"))

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The compiled core beside another filter, in one run."""
+"""Measure the compiled core and another filter in one run."""
 
 from __future__ import annotations
 
@@ -27,12 +27,14 @@ if TYPE_CHECKING:
 
 REPEATS = 41
 SAMPLED = 0.01  # s, from one position of a peer to the next
-START = 4.0  # s in the air, in which the error is that of the floor
+START = 4.0  # s in the air: until then, errors from the floor persist
 
 
 def events_of(flight: Flight, begin: float, end: float) -> tuple[np.ndarray, np.ndarray]:
-    """(inertial samples, the same and TDOAs) of a Flight from begin to end, s: two arrays of EVENT
-    in order of their stamps, each TDOA at that of the sample before, as `Core` measures ours.
+    """(inertial samples, the same and TDOAs) of a Flight from begin to end, s: two arrays of EVENT.
+
+    Events are in order of their stamps. Each TDOA gets the stamp of the inertial sample before it,
+    as in the measurement of our filter in `Core`.
     """
     assert flight.imu is not None
     samples, ranges = events(flight.imu, flight.tdoa, flight.anchors)
@@ -43,7 +45,7 @@ def events_of(flight: Flight, begin: float, end: float) -> tuple[np.ndarray, np.
 
 
 def measure(progress: Callable[[str], object], peer: Peer, quick: bool = False) -> Iterator[Figure]:
-    """Generator of Figures: ours and those of a Peer, run in turn. progress(text)."""
+    """Generator of Figures of our core and of a Peer, run in turn. progress(text)."""
     repeats = 9 if quick else REPEATS
     progress("peer")
     flight = make_flight(BEFORE + MEASURED, start_in_air=True, multipath=False)
@@ -84,8 +86,8 @@ def errors(
 ) -> Iterator[Figure]:
     """Generator of Figures: the 3D RMSE of a peer on Flights with ground truth, m.
 
-    The means are given of whole flights, and of what follows after START.
-    correction : beside the errors with it, those without it and the change are given
+    The means are over whole flights, and over the part after START.
+    correction : if given, the figures are the errors without it, with it, and their ratio
     """
     ways = {"as it is": None} | ({"corrected": correction} if correction is not None else {})
     section = f"3D RMSE of {Path(library).name} on measured flights"

@@ -54,7 +54,7 @@ def measure(
 
 
 def speed(recorded: str | Path) -> float:
-    """s of flight per s of which a bag with odometry was recorded."""
+    """Seconds of flight per second of recording, of a bag with odometry."""
     with open_bag(recorded) as reader:
         arrived = [stamp for _, stamp, _ in messages(recorded, reader, list(reader.connections))]
     return float(np.ptp(read_odometry(recorded).t) / (1e-9 * np.ptp(arrived)))

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""s that a whole recording takes without ROS: filter, correction, smoother."""
+"""Measure the time of a whole recording without ROS, s: filter, correction, smoother."""
 
 from __future__ import annotations
 

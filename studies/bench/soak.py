@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""soak: both nodes for hours at 1 kHz IMU and 400 Hz TDOAs: their memory, and whether their counters
-hold all that was published.
+"""soak: run both nodes for hours at 1 kHz IMU and 400 Hz TDOAs.
+
+The study prints their memory, and checks that their counters contain all published messages.
 """
 
 import math
@@ -41,7 +42,7 @@ def soak(minutes, starts, folder):
                 f"{title} {1e-6 * memory(processes.pid(title)):.1f} MB" for title in starts
             )
             print(f"{(time.monotonic() - began) / 60.0:6.1f} min  {used}", flush=True)
-            source.received[0].clear()  # the odometry; nobody looks at it
+            source.received[0].clear()  # the odometry, which is not used
 
         source.play(flight, EVERY, say, rounds)
         diagnostics.forget()

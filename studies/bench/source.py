@@ -1,8 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The surroundings of the nodes: publishes a flight in real time and takes the odometry that comes
-back.
-"""
+"""The surroundings of the nodes: publish a flight in real time and receive the odometry."""
 
 from __future__ import annotations
 
@@ -39,8 +37,8 @@ class Source:
     """Publishes imu/data, uwb/tdoa and uwb/anchors with the default QoS; subscribes to `odometry`
     in each namespace.
 
-    Takes messages from the middleware without callbacks: what is published is not delayed by what
-    is received, and the arrival of an odometry is when the middleware of this process had it.
+    Takes messages from the middleware without callbacks. So received messages do not delay
+    published ones, and an odometry arrives when the middleware of this process receives it.
     """
 
     def __init__(self, node: Node, namespaces: Sequence[str]) -> None:
@@ -53,7 +51,7 @@ class Source:
         self.received: list[list[tuple[int, int]]] = [
             [] for _ in namespaces
         ]  # (arrival, stamp), ns
-        # whose callbacks only run while somebody waits, before and after `play`
+        # Their callbacks run only in a wait, before and after `play`.
         self.subscriptions = [
             node.create_subscription(
                 Odometry, f"{space}/odometry", partial(_keep, received), OUTPUT_QOS, raw=True
@@ -161,7 +159,7 @@ def latencies(
 
 
 def _stamp(seconds: float) -> tuple[Time, int]:
-    """(Time, ns) of seconds since 1970, to the microsecond: a float holds no more."""
+    """(Time, ns) of seconds since 1970, to the microsecond: a float has no finer resolution."""
     ns = round(seconds * 1e6) * 1000
     second, nanosecond = divmod(ns, 10**9)
     return Time(sec=second, nanosec=nanosecond), ns

@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""bench: measure what the suite costs on this machine. Figures are medians with their quartiles,
-beside their targets.
+"""bench: measure processor time, memory and latency of the suite on this machine.
+
+Figures are medians with their quartiles and targets.
 
 core : us per IMU prediction and per robust TDOA update, by anchors and kind of robustness.
 offline : s for a recording of 45 s, with correction, network and smoother.
@@ -9,16 +10,16 @@ nodes : time to ready, CPU, memory, latency and losses of both nodes at 1 kHz IM
 tags : the same for 1 to 8 tags, and for 30 and 60 at 100 Hz, in localization_nodes; all tags hear
 the same streams.
 hall : the same for a tag that hears 8 of 8, 1000 and 10 000 installed anchors.
-peer : another filter beside ours, with --peer alone.
+peer : another filter compared with ours; needs --peer.
 replay : how fast a bag goes through both nodes without loss.
-graph : how long parameters, a told pose and a clock that stops wait while streams, /clock and /tf
-flow; idle CPU.
+graph : time to answer a parameter request, to apply an initial pose and to report a stopped clock,
+while streams, /clock and /tf flow; idle CPU.
 
 With --peer, another filter runs over the same events in turn with ours, and the ratio is printed.
-With --peer and --flights, it also runs over measured flights, and its errors are printed: as they
-are, and with --correction, a folder of export --c, too. It starts at the true pose.
-Real nodes run in a ROS domain of their own. Other work on the machine changes the figures, above all
-the latencies; the study prints how much processor time others used. To keep others away:
+With --peer and --flights, it also runs over measured flights, and its errors are printed. With
+--correction, a folder of export --c, the errors with correction follow. It starts at the true pose.
+Real nodes run in a separate ROS domain. Other work on the machine changes the figures, above all
+the latencies; the study prints the processor time of other processes. To get priority over them:
 sudo -E env PATH=$PATH chrt --fifo 10 ./dev study bench --only nodes tags
 """
 
@@ -110,9 +111,12 @@ def measure(
 ) -> tuple[dict[str, Any], list[Figure]]:
     """Measure some of PARTS. Returns (machine, list of Figure).
 
-    folder : for bags and the output of the nodes; quick : fewer repetitions and cases; model : ONNX
-        file for "offline"; other : Peer, to measure beside the core. machine : what the figures
-    depend on, dict. Raises InputError, LiveError.
+    folder : for bags and the output of the nodes
+    quick : fewer repetitions and cases
+    model : ONNX file for "offline"
+    other : Peer, to compare with the core
+
+    machine is a dict of properties that the figures depend on. Raises InputError, LiveError.
     """
     folder.mkdir(parents=True, exist_ok=True)
     before, figures = used_by_all(), []

@@ -1,7 +1,7 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What processes of this machine have used, by Linux's /proc (see man proc_stat, proc_pid_stat,
-proc_pid_status).
+"""CPU time and memory of processes on this machine, from Linux's /proc (see man proc_stat,
+proc_pid_stat, proc_pid_status).
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Mistakes of drivers, surveys and clocks put into flights, and what `check` says of them; and of
-the flights as they are.
+"""Put mistakes of drivers, surveys and clocks into flights, and count what `check` reports.
+
+The unchanged flights are judged, too.
 """
 
 from functools import partial
@@ -74,8 +75,8 @@ def judge_flight(task, reading, surveys, only=None):
     """[{"flight", "live", "mistake", "said": {rule: severity}, "named": bool}] of one flight:
     (number, recording, partner).
 
-    Every other flight is judged as a bag recorded live, with the times at which its messages
-    arrived, the others as a log that knows nothing but stamps.
+    Flights with an even number are judged as bags recorded live, with arrival times. The remaining
+    flights are judged as logs, which have only stamps.
     """
     number, recording, partner = task
     flight = of_flight(reading.read(recording))
@@ -117,8 +118,9 @@ def possible(mistake, flight, other, rooms):
 
 
 def table(rows):
-    """Markdown: a line for each mistake, with how often it was named, and what was said besides
-    that is not said without it.
+    """Markdown: a line for each mistake, with how often `check` named it.
+
+    A column lists other rules that it reported, unless it reports them without the mistake, too.
     """
     lines = ["| mistake | named | flights | what else was said |", "| --- | ---: | ---: | --- |"]
     for name in dict.fromkeys(row["mistake"] for row in rows):

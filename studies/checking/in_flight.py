@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What ekf_node says in flight of the mistakes that `check` finds in recordings: a part of a
-flight, with each, played to both nodes as it would have arrived.
+"""Test whether ekf_node reports in flight the mistakes that `check` finds in recordings.
+
+A part of a flight, with each mistake, is played to both nodes as it would have arrived.
 """
 
 from collections import Counter
@@ -25,8 +26,8 @@ from .figures import ANOTHER, possible
 
 # s on the clock of the robot at which a part begins: no mistake makes a stamp negative
 BOOT = 100.0
-EVERY = 4  # of the inertial samples one is played, so that a busy computer is none of the mistakes
-SETTLED = 3.0  # s of flight before what is said counts
+EVERY = 4  # play each fourth inertial sample: a busy computer must not look like a mistake
+SETTLED = 3.0  # s of flight before reports count
 NOT_PLAYED = {"turned_frame"}  # speaks of /tf_static
 READY, PAUSE = 180.0, 1.5  # s: the very first start compiles the filter; between two mistakes
 
@@ -82,8 +83,9 @@ def run(args):
 
 
 def line(row):
-    """A row of the table: the mistake, what `check` calls it, and what the node found, or said most
-    of the time.
+    """A row of the table: the mistake, its rule in `check`, and the rules that the node reported.
+
+    If it reported none, its most frequent message.
     """
     mistake = MISTAKES.get(row["mistake"])
     text = max(row["texts"], key=row["texts"].get) if row["texts"] else "nothing at all"
@@ -109,7 +111,7 @@ def middle(recording, seconds):
 
 
 class _Nodes:
-    """bias_node and ekf_node as processes in a domain of their own, and who plays to them."""
+    """bias_node and ekf_node as processes in a separate domain, with publishers of their input."""
 
     def __enter__(self):
         from contextlib import ExitStack

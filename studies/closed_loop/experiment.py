@@ -1,14 +1,15 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""closed-loop: the flights of Zhao et al. (RA-L 2021, section V) made anew in the loop of `fly`:
-trajectories A (a level circle) and B (a circle that rises and falls), in a constellation of anchors
-that took part in training and in three that did not, by the M-estimation EKF alone, with the
-paper's network without and with the orientations of the anchors, and by ours alone and with
-diagnosed effects.
+"""closed-loop: repeat the flights of Zhao et al. (RA-L 2021, section V) in the loop of `fly`.
 
-The networks are trained on flights in three constellations, the effects are diagnosed from three of
-these flights, one of each. Writes to --out: trained/, flights.json, table.md, and the counterparts
-of figures 7 to 9: rmse.png, paths.png, errors.png.
+The trajectories are A (a level circle) and B (a circle that rises and falls). They are flown in one
+constellation of anchors that is part of the training, and in three new ones. One estimator is the
+M-estimation EKF: alone, and with the paper's network without and with the orientations of the
+anchors. The second is our filter: alone, and with diagnosed effects.
+
+The networks are trained on flights in three constellations. The effects are diagnosed from three
+training flights, one per constellation. Writes to --out: trained/, flights.json, table.md, and the
+counterparts of figures 7 to 9: rmse.png, paths.png, errors.png.
 """
 
 from argparse import Namespace
@@ -41,7 +42,7 @@ from .sines import Sines
 TRAINING = "corners", "wall_middles", "staircase"
 KNOWN, UNSEEN = TRAINING[0], ("low_ceiling", "random-7", "random-8")
 TRAJECTORIES = {"A": Circles(), "B": Circles(swing=0.4)}
-TILT = np.deg2rad(12.0)  # of an anchor as somebody put it up, as random constellations have it
+TILT = np.deg2rad(12.0)  # of an anchor mounted by hand, as in random constellations
 DELAY, INSTALLATION = 0.05, 1  # m, of the modules, as in `simulate`; always the same eight modules
 FIRST_TRAINING, FLOWN = 101, 60.0  # seed of the first flight to train on; s in the air of each
 NETWORKS = "paper_no_orientation", "paper"
@@ -153,8 +154,10 @@ def run(args: Namespace) -> None:
 
 
 def world_of(name: str) -> World:
-    """World with the anchors of a named constellation, each turned about the vertical by any angle
-    and tilted a little: where an anchor stands then does not tell how it is turned.
+    """World with the anchors of a named constellation.
+
+    Each anchor is turned about the vertical by a random angle and tilted a little. So its position
+    does not determine its orientation.
     """
     anchors, rng = constellation(name), np.random.default_rng(list(name.encode()))
     turn = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi, len(anchors)))
@@ -191,8 +194,10 @@ def task(kind: tuple[str, str, str], seed: int, trained: Path) -> Task:
 
 
 def train(count: int, folder: Path, jobs: int | None = None) -> Path:
-    """Fly to train, `count` times in each of TRAINING, told their place; train the networks, and
-    find the effects. Returns the folder, Path, to which they are written. Raises InputError.
+    """Fly `count` times in each constellation of TRAINING, train the networks, find the effects.
+
+    Each filter is given its initial position. Returns the folder, Path, with the networks and the
+    effects. Raises InputError.
     """
     if count < 2:
         raise InputError(
@@ -225,8 +230,8 @@ def _flight(task: Task) -> Flight:
 
 
 def _train(parts: list[list[Flight]], some: list[Flight], folder: Path, name: str) -> str:
-    """Write one of NETWORKS, trained and validated on parts, or EFFECTS, found in some flights, to
-    a folder. Returns the name.
+    """Write a correction to a folder and return its name. NETWORKS are trained and validated on
+    `parts`; EFFECTS are found in the flights `some`.
     """
     (folder / name if name in NETWORKS else folder).mkdir(parents=True, exist_ok=True)
     if name in NETWORKS:
@@ -289,8 +294,9 @@ def _row(title: str, values: Iterable[float], digits: int = 3) -> str:
 
 
 def gain_of_landed(verdicts: dict, by: str, than: str) -> tuple[float, int]:
-    """(Share by which the mean error is smaller by an estimator than by another one, number of
-    flights): of those in UNSEEN that landed by both.
+    """(Gain, number of flights), over the flights in UNSEEN that landed with both estimators.
+
+    The gain is the share by which the mean error with `by` is smaller than the one with `than`.
     """
     both = [
         (one["estimation"], other["estimation"])

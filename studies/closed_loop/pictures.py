@@ -46,8 +46,9 @@ def draw_errors_by_kind(verdicts: dict[tuple[str, str, str], list[dict]], path: 
 
 
 def draw_paths(shown: dict[str, list], path: Path) -> None:
-    """Figure 8: where flights went from their start, from above and from the side, beside where
-    they were to go. shown : {estimator: [Drawn]}.
+    """Draw figure 8: flown and desired paths relative to their start, from above and from the side.
+
+    shown : {estimator: [Drawn]}
     """
     figure, axes = plt.subplots(
         2,

@@ -18,11 +18,15 @@ AWAY = 6.0  # s, from the middle to the sines and back
 
 @dataclass(frozen=True)
 class Sines:
-    """Up, through a whole room in products of sines (`simulate`'s, those of the training flights of
-    Zhao et al. 2021), back, and down.
-    room : Room; seed : of the sines; height, rise, fall : as of Circles; seconds : in the air;
-        speed : m/s, root mean square; turning :
-    rad/s, all the while.
+    """A path up, through a whole room in products of sines, back, and down.
+
+    The sines are the same as in `simulate` and in the training flights of Zhao et al. 2021.
+    room : Room
+    seed : of the sines
+    height, rise, fall : as in Circles
+    seconds : in the air
+    speed : m/s, root mean square
+    turning : rad/s, constant
     """
 
     room: Room

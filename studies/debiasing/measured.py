@@ -1,7 +1,7 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""debias-measured: a map fitted to some measured flights, judged on others, beside what `diagnose`
-reaches on them.
+"""debias-measured: fit a map to some measured flights, judge it on others, and compare it with
+`diagnose`.
 """
 
 from functools import partial

@@ -11,8 +11,9 @@ from uwb_tdoa_bias.common.files import write_filled
 
 
 def set_up_tables(figures):
-    """Markdown of what set_up.copied found, in centimetres, coordinates as in the paper: from the
-    corner.
+    """Markdown of the figures of set_up.copied, in centimetres.
+
+    Coordinates count from the corner, as in the paper.
     """
     names = [name for name in figures["static"]["validation"] if name != "places"]
     lines = ["Mean of |bias| over the places: x / y / both, and the largest, cm.", ""]
@@ -35,7 +36,7 @@ def set_up_tables(figures):
 
 
 def measured_tables(figures):
-    """Markdown of what measured.judged found: means of the runs, m, and beneath them every run."""
+    """Markdown of the figures of measured.judged: means of the runs, m, then every run."""
     names = list(
         dict.fromkeys(
             name for case in figures for row in case["runs"] for name in row if name != "flight"

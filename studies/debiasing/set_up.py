@@ -1,8 +1,10 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
 """debias-set-up: a simulated copy of the set-up of Grasso et al. (Sensors 2022, 22, 9136), sections
-4 and 5. 4 x 4 m, four anchors at the height of the tag, 0.2 m, a calibration grid of 50 cm, a
-validation grid of 25 cm beside it, rails, and a square path.
+4 and 5.
+
+The area has 4 x 4 m, and four anchors at the height of the tag, 0.2 m. There is a calibration grid
+of 50 cm, a validation grid of 25 cm, rails, and a square path.
 """
 
 from dataclasses import dataclass, replace
@@ -61,7 +63,7 @@ class Measured:
         return Part(self.p, self.true, self.covariance)
 
 
-# a stay is measured: its noise is averaged, as that of a tag that may move
+# Without zero-velocity updates, the filter averages the noise of a stay as for a moving tag.
 AVERAGING = FilterConfig(zero_velocity=False)
 
 
@@ -96,8 +98,9 @@ def grid(first, last, step):
 
 
 def measure(task, seed):
-    """Measured of one run. task : (number, fields of SimulationConfig); the anchors' delays are
-    those of the seed, all else random is the run's own.
+    """Measured of one run. task : (number, fields of SimulationConfig)
+
+    The seed determines the antenna delays; everything else that is random differs between runs.
     """
     number, fields = task
     config = SimulationConfig(
@@ -131,9 +134,10 @@ def measure(task, seed):
 
 
 def _held_level(flight):
-    """The flight with TDOAs of 0 between two more anchors, far above and below the middle: the
-    filter then knows the height, as it must, because four anchors in one plane with the tag do not
-    tell it.
+    """Return the flight with TDOAs of 0 between two added anchors, far above and below the middle.
+
+    They give the filter the height, which is unobservable from four anchors in one plane with the
+    tag.
     """
     anchors, tdoa, n = flight.anchors, flight.tdoa, len(flight.anchors)
     poles = [[0.0, 0.0, HEIGHT + FAR], [0.0, 0.0, HEIGHT - FAR]]

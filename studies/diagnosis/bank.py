@@ -40,8 +40,10 @@ WORSE = 1.03  # ratio of errors beyond which a case counts as made worse
 
 
 def diagnose_case(effects, seed, aided=False):
-    """dict of one case: what was put in, found, how near the parameters, and the errors of the
-    filter on a second flight with the same effects: before, corrected as found, corrected as it is.
+    """dict of one case: the effects put in, those found, and whether their parameters are right.
+
+    It also has the errors of the filter on a second flight with the same effects: without
+    correction, with the effects found, and with the true effects.
     """
     flight, other = _flown(effects, seed, aided)
     reference = GroundTruth()
@@ -57,9 +59,11 @@ def diagnose_case(effects, seed, aided=False):
 
 
 def case_without_truth(effects, seed):
-    """dict of one case diagnosed without ground truth: what was put in, found, said to be
-    unobservable, and applied; and the errors of the filter on a second flight with the same
-    effects, before and after that.
+    """dict of one case diagnosed without ground truth: the effects put in, found, reported as
+    unobservable, and applied.
+
+    It also has the errors of the filter on a second flight with the same effects, before and after
+    the correction.
     """
     flight, other = _flown(effects, seed)
     result = diagnose([flight], reference=Nothing())
@@ -113,7 +117,7 @@ def _right(effects, attribution):
             return False
         for key, value in effect.values.items():
             if effect.name == "outlier_rate":
-                # on top of what is nominal
+                # in addition to the nominal outliers
                 value = value + (1.0 - value) * SimulationConfig.outlier_probability
             limits = (
                 (".start", ".end", ".height")

@@ -1,11 +1,11 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The blind bank: effects of the grammar put into flights, measured ones on top of what others of
-the day have told.
+"""The blind bank: put effects of the grammar into flights, diagnose them, and judge the result.
 
-An effect is put into two flights. One is diagnosed, the other judges what was found: named rightly,
-and removed. Or into more, of which the last one judges what was found in one of the others, in two
-of them, and so on.
+An effect is put into two flights. One is diagnosed. The other shows whether the effect is named
+rightly, and removed. With more flights, the last one judges the diagnosis of the first flight, of
+the first two, and so on. Measured flights are corrected first, by a diagnosis of other flights of
+the same day.
 """
 
 from dataclasses import replace
@@ -31,7 +31,7 @@ from .claims import claims, truth_of
 
 LEAST_COST = 0.02  # m of 3D RMSE that an effect costs in both flights
 GROW, GROWTHS = 1.7, 3  # an effect that costs less is made larger, so often
-# first seeds: of cases that were looked at, and of those that are reported
+# first seeds: of the cases used in development, and of the reported cases
 DEVELOPED_ON, DRAWN_ONCE = (0, 1_000_000)
 # {split of `measured`: places of its judged flights, in groups of one protocol}: each flight is
 # judged on the next.
@@ -49,11 +49,11 @@ LOOKED_AT = ("0425 a", "0426 a", "const1", "const4 trial 1")  # while this was d
 
 
 class Measured:
-    """Measured flights, with what the other flights of their day and installation have told."""
+    """Measured flights, with effects diagnosed from other flights of their day and installation."""
 
     def __init__(self, data, out, splits=tuple(GROUPS)):
-        """data, out : Paths; what `measured` has written to `out` is what is known, and it is made
-        where it is missing.
+        """data, out : Paths. The known effects are read from the output of `measured` in `out`. If
+        it is missing, `measured` is run first.
         """
         self._data, self._out, self._splits = data, out, splits
         for split in splits:
@@ -101,8 +101,10 @@ def rmse(flight, effects):
 
 
 def case(source, seed, number=2, draw=grammar.draw):
-    """(Undeclared, `number` flights with it, the same without, base, where) of a seed; None if the
-    effect costs too little however it is enlarged. draw : draw(seed, flight) returns the effect
+    """(Undeclared, `number` flights with it, the same without, base, where) of a seed.
+
+    None if the effect costs too little even when it is enlarged.
+    draw : draw(seed, flight) returns the effect
     """
     flights, base, where = source.flights(np.random.default_rng([seed, 7]), number)
     effect = draw(seed, flights[0])
@@ -116,7 +118,7 @@ def case(source, seed, number=2, draw=grammar.draw):
 
 
 class Told(Effect):
-    """An Undeclared, known exactly, that is taken out at the poses that a node has."""
+    """An Undeclared that is known exactly. The correction uses the poses that a node has."""
 
     name = "told"
     needs_motion = True
@@ -167,7 +169,7 @@ _told_as_they_are = {}
 
 
 def _as_they_are(flights, judge, base, where):
-    """What is said of flights as they are, and the error of the flight that judges with that."""
+    """Claims about the unchanged flights, and 3D RMSE, m, of `judge` with their effects."""
     key = where, *(flight.name for flight in (*flights, judge))
     if key not in _told_as_they_are:
         result = diagnose(flights, base=base)
@@ -185,8 +187,9 @@ def run(source, seed, draw=grammar.draw, count=1):
 
 
 def several(source, number, seed):
-    """[dict] of the case of a seed among so many flights, with one of them diagnosed, with two, and
-    so on; None if it costs too little.
+    """[dict] of the case of a seed with `number` flights: one flight diagnosed, two, and so on.
+
+    None if the effect costs too little.
     """
     drawn = case(source, seed, number)
     return (
@@ -197,7 +200,7 @@ def several(source, number, seed):
 
 
 def _judge(count, effect, flown, flights, base, where):
-    """dict of a case of which the first `count` flights are diagnosed. The last one judges."""
+    """dict of a case. The first `count` flights are diagnosed, and the last one judges."""
     result = diagnose(flown[:count], base=base)
     plain, before, after = (
         rmse(flights[-1], base),
@@ -251,7 +254,7 @@ def _first(said):
 
 
 def false_alarms(number, first=DEVELOPED_ON):
-    """Yields dict of what is found in simulated flights without any effect."""
+    """Yields a dict of the claims about each simulated flight without any effect."""
     for seed in range(first, first + number):
         findings = attribute([clean_flight(1000 + seed)], GroundTruth()).findings()
         yield {"seed": seed, "said": [claim.text for claim in claims(findings)]}

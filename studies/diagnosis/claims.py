@@ -1,10 +1,9 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What findings say, and what an effect of the grammar is, in the same terms: stream, subset,
-covariate, shape.
+"""Describe findings and effects of the grammar in the same terms: stream, subset, covariate, shape.
 
-Some effects of the grammar have a name in the catalogue: an anchor that is late from one time to
-another is nlos.
+Some effects of the grammar have a name in the catalogue. For example, an anchor that is late from
+one time to another is nlos.
 """
 
 from dataclasses import dataclass
@@ -37,7 +36,7 @@ CATALOGUE = {
     "gyro_bias": ("axis", (), ()),
     "accel_bias": ("axis", (), ()),
 }
-# {shape of a function without a name: that of the grammar}
+# {shape of a function without a name: shape in the grammar}
 SHAPES = {
     "line": "trend",
     "beyond": "ramp",
@@ -53,8 +52,13 @@ STREAM = {"imu_gravity": "accel", "imu_misalignment": "gyro"}
 
 @dataclass(frozen=True)
 class Claim:
-    """stream; subset : kind of it; who : frozenset of the anchors, or of the axis; covariates :
-    those that it names, the first and what is the same in that flight; shape; text.
+    """A statement about an error.
+
+    stream : as in the grammar
+    subset : kind of the subset
+    who : frozenset of the anchors, or of the axis
+    covariates : the named covariate, then those that are equivalent to it in that flight
+    shape, text
     """
 
     stream: str
@@ -65,17 +69,19 @@ class Claim:
     text: str
 
     def names(self, true):
-        """Whether stream and subset are those of another Claim."""
+        """Whether another Claim has the same stream and subset."""
         return (self.stream, self.subset, self.who) == (true.stream, true.subset, true.who)
 
     def depends_as(self, true):
-        """Whether a covariate is that of another Claim."""
+        """Whether another Claim shares a covariate."""
         return bool(set(self.covariates) & set(true.covariates))
 
 
 def truth_of(effect, flight):
-    """Claim of an Undeclared in a Flight. A direction is a pair where nobody hears the other one,
-    and so is what follows an anchor where only one pair does.
+    """Claim of an Undeclared in a Flight.
+
+    A direction counts as a pair if there are hardly any TDOAs in the other direction. The effect of
+    a previous anchor counts as a pair if only one pair follows that anchor.
     """
     subset = effect.subset
     if effect.covariate == NAMES and (pair := _only_pair(effect, flight)):
@@ -100,7 +106,7 @@ def truth_of(effect, flight):
 
 
 def _only_pair(effect, flight):
-    """Ids of the pair whose TDOAs are those that it changes; None if there is no such pair."""
+    """Ids of the only pair whose TDOAs the effect changes; None if there is no such pair."""
     samples, _ = true_samples(flight)
     pairs, changed = (
         np.sort(samples.anchors.ids[np.column_stack([samples.a, samples.b])], axis=1),
@@ -115,8 +121,10 @@ def _only_pair(effect, flight):
 
 
 def claims(findings):
-    """[Claim] of Findings in the order of the report: those applied by their worth, then the others
-    by their prominence. Parts of a map come last.
+    """[Claim] of Findings in the order of the report.
+
+    Applied findings come first, by their worth. The others follow by their prominence. Parts of a
+    map come last.
     """
 
     def place(finding):
@@ -130,7 +138,7 @@ def claims(findings):
 
 
 def _undeclared(finding):
-    """A Claim for every anchor or pair, or one for all anchors alike."""
+    """A Claim for every anchor or pair, or one for all anchors together."""
     effect = finding.effect
     stream, _, axis = effect.channel.partition(".")
     shape, covariates = SHAPES.get(effect.shape, ""), _covariates(finding)
@@ -155,9 +163,7 @@ def _undeclared(finding):
 
 
 def _covariates(finding):
-    """That of the function, and those that are named as the same thing in that flight, of the same
-    part.
-    """
+    """Covariates of the function, then of its equivalent alternatives for the same part."""
     own, _, name = finding.effect.label.rpartition(" over ")
     others = (other.effect.rpartition(" over ") for other in finding.alternatives)
     names = (name, *(other for part, _, other in others if part == own))

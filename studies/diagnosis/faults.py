@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Faults of numbers, drawn and put into measured flights: are they named?"""
+"""Put random numerical faults into measured flights, and count how many are named."""
 
 from number_faults import FAULTS
 import numpy as np
@@ -16,8 +16,10 @@ TRIES = 8  # draws of a fault, for each that is to be costly, after which it cou
 
 
 def cases(data, number, first):
-    """Yields dict of each draw, of every fault until `number` of it cost the filter LEAST_COST, or
-    spoil the truth. data : Path of the measured flights; first : seed of the first draw.
+    """Yields a dict of each draw. Each fault is drawn until `number` draws count.
+
+    A draw counts if it costs the filter LEAST_COST, or if it is a fault of the ground truth.
+    data : Path of the measured flights; first : seed of the first draw
     """
     paths, known = _paths(), {}
     for place, (name, fault) in enumerate(FAULTS.items()):
@@ -37,9 +39,7 @@ def cases(data, number, first):
 
 
 def as_they_are(data):
-    """{rule: [names of the flights]} of what is named in the measured flights without any fault put
-    in.
-    """
+    """{rule: [names of the flights]}: rules reported for the unchanged measured flights."""
     said = {}
     for path in _paths():
         flight = measured.load(data, [path])[0]
@@ -55,8 +55,10 @@ def _paths():
 
 
 def draw(name, fault, flight, before, rng):
-    """dict of a fault put into a flight. before : m, 3D RMSE of the filter without it; cost : m by
-    which it grows, None where that says nothing.
+    """dict of a fault put into a flight.
+
+    before : m, 3D RMSE of the filter without it. "cost" is the increase in m, None for a fault of
+    the ground truth.
     """
     faulty = fault.put_in(flight, rng)
     found = [finding.rule for finding in judge_flight(faulty)]
@@ -76,7 +78,7 @@ def counts(result):
 
 
 def figures(results):
-    """Figures of the draws: of all, and of those that count."""
+    """Figures of all draws, and of the draws that count."""
     costly = [r for r in results if counts(r)]
     return {
         "draws": len(results),

@@ -1,8 +1,10 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""diagnosis: the figures of docs/notebook/diagnosis.md. Every part prints its figures and writes them,
-with all cases, to PART.json in the output folder; bank, blind and injected draw what was found
-first for what was put in, too.
+"""diagnosis: the figures of docs/notebook/diagnosis.md.
+
+Every part prints its figures and writes them, with all cases, to PART.json in the output folder.
+The parts bank, blind and injected also draw a confusion matrix: the effect put in against the first
+effect found.
 """
 
 from functools import partial
@@ -319,7 +321,10 @@ def _speed(args):
 
 
 def _confusions(results, path):
-    """What was put in, and the first thing said, by channel, subset, covariate and shape."""
+    """Draw confusion matrices of the effect put in and the first claim.
+
+    There is one each for stream, subset, covariate and shape.
+    """
     figure, axes = plt.subplots(2, 2, figsize=(14, 13), layout="constrained")
     for k, (ax, key) in enumerate(zip(axes.ravel(), ("stream", "subset", "covariate", "shape"))):
         pairs = [
@@ -350,7 +355,10 @@ def _matrix(ax, count, rows, columns):
 
 
 def _confusion(results, path):
-    """Rows: what was put in; columns: the first thing found; small and large together."""
+    """Draw a confusion matrix of small and large effects.
+
+    Rows: effect put in; columns: first effect found.
+    """
     names = [name for name in bank.SIZES if name not in (*bank.AIDED, *bank.RANGED)]
     columns = [*names, "something without a name", "nothing"]
     count = np.zeros((len(names) + 1, len(columns)))

@@ -1,7 +1,9 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What happens on the floor of the measured flights: found by the search alone and with the effect,
-and what one set of flights tells of another.
+"""Diagnose errors near the floor in the measured flights.
+
+The search runs alone and with the effect floor_multipath. Then the effect fitted to one set of
+flights is applied to another set.
 """
 
 import numpy as np
@@ -22,8 +24,8 @@ WILD = 6.0  # m that an outlier counts as
 
 
 def figures(data):
-    """Figures of all raw flights of DAYS below the folder `data`, and of those where nothing of it
-    is to be seen: dict.
+    """dict of figures of all raw flights of DAYS below the folder `data`, and of the other
+    flights, where the effect is not visible.
     """
     recordings = inputs.Reading(data / "surveys")
     days = {day: _seen(recordings.flights(_files(data / "flights" / day))) for day in DAYS}
@@ -74,7 +76,7 @@ def _seen(flights):
 
 
 def _found(seen, named):
-    """Selection of what is near the floor. named : the effect is looked for, too."""
+    """Selection of effects near the floor. named : whether floor_multipath is a candidate."""
     return on_floor(list(seen.values()), [DETECTORS["floor_multipath"]] if named else [], True, [])
 
 
@@ -91,9 +93,10 @@ def _fitted(seen):
 
 
 def _explained(effect, seen):
-    """Of other flights at rest on the floor: share of the power of their residuals that an Effect
-    explains, of all and of the one of which it explains least; medians of the residuals, m, before
-    and after.
+    """dict of how much of the residuals an Effect explains in other flights at rest on the floor.
+
+    It has the explained share of their power, over all flights and in the worst flight. It also has
+    the medians of the residuals, m, before and after.
     """
     sides = []
     for part in (residual["tdoa"] for residual in seen.values()):

@@ -1,10 +1,10 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Effects that no catalogue holds, drawn from a grammar: which stream, which part of it, over what,
-of which shape, how large.
+"""Draw effects that are not in the catalogue from a grammar.
 
-A seed is a different effect. None of this imports what searches for it, but the covariates that
-both must mean alike.
+An effect has a stream, a subset, a covariate, a shape and a size.
+Each seed gives a different effect. This module shares no code with the search, except the
+definitions of the covariates.
 """
 
 from dataclasses import dataclass, replace
@@ -20,7 +20,7 @@ SHAPES = ("trend", "step", "ramp", "periodic", "transient", "bend")
 SIZES = {"tdoa": (0.15, 0.8), "gyro": (0.03, 0.3), "accel": (0.3, 2.0)}
 STREAMS = ("tdoa", "tdoa", "tdoa", "tdoa", "gyro", "accel")
 SUBSETS = ("anchor", "anchor", "pair", "direction", "arrivals", "all")  # of TDOAs
-# of TDOAs and inertial samples alike
+# of TDOAs and of inertial samples
 OF_POSE = ("time", "x", "y", "height", "speed", "climb_rate", "acceleration")
 OF_ATTITUDE = ("turning_rate", "tilt", "bearing_in_tag", "elevation_in_tag")
 ANGLES = ("bearing", "bearing_in_tag")
@@ -43,11 +43,16 @@ LOW, HIGH = 0.05, 0.95  # quantiles of the covariate between which a shape unfol
 
 @dataclass(frozen=True)
 class Undeclared:
-    """stream : "tdoa", "gyro", "accel"; subset : one of SUBSETS, or "axis"; who : anchor ids or the
-    number of the axis;
-    covariate : name; shape : one of SHAPES; size : of the stream's unit; limits : (low, high) of
-        the covariate; form :
-    three numbers from 0 to 1 that the shape takes as it likes.
+    """An effect that is not in the catalogue.
+
+    stream : "tdoa", "gyro", "accel"
+    subset : "axis" or an entry of SUBSETS
+    who : anchor ids or the number of the axis
+    covariate : name
+    shape : one of SHAPES
+    size : in the unit of the stream
+    limits : (low, high) of the covariate
+    form : three numbers from 0 to 1, the free parameters of the shape
     """
 
     stream: str
@@ -61,7 +66,7 @@ class Undeclared:
 
     @property
     def covariates(self):
-        """Those of which one counts as right."""
+        """Covariates that count as right. A claim must name at least one."""
         return (self.covariate,)
 
     @property
@@ -112,7 +117,7 @@ class Undeclared:
         return replace(flight, tdoa=replace(flight.tdoa, d=d))
 
     def bias(self, samples):
-        """What it adds to the TDOAs of Samples, (n,) m; NaN where the pose does not tell."""
+        """The bias of the TDOAs of Samples, (n,) m; NaN where the pose does not determine it."""
         ids = samples.anchors.ids
         a, b = ids[samples.a], ids[samples.b]
         if self.covariate in ON_ARRIVAL:

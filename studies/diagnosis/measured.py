@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The measured flights: as they are, and with effects put in on top."""
+"""Diagnose the measured flights: unchanged, and with additional effects."""
 
 import json
 import time
@@ -70,7 +70,7 @@ PRESENT = ("outlier_rate", "noise_correlation", "floor_multipath")
 
 
 def load(data, paths, sensors=()):
-    """Flights of paths below the folder `data`, with those of their SENSOR_NAMES that are named."""
+    """Flights of paths below the folder `data`, with only the given sensors of SENSOR_NAMES."""
     flights = inputs.Reading(data / "surveys").flights([data / path for path in paths])
     return [
         flight.without(*(name for name in SENSOR_NAMES if name not in sensors))
@@ -84,7 +84,7 @@ def folder_of(name):
 
 
 def _phases(content):
-    """{phase: [3D RMSE m before, after]} of what is not in the air, of all judged flights."""
+    """{phase near the floor: [3D RMSE m before, after]} over all judged flights."""
     before, after = (content[side]["pooled"]["phases"] for side in ("before", "after"))
     return {
         name: [_rounded(side[name]["rmse_3d"]) for side in (before, after)]

@@ -3,8 +3,8 @@
 """A second generator of effects that no catalogue holds: random processes, random trees of one or
 two covariates, many periods and duty cycles in time.
 
-It draws functions, not shapes: what the search tries is not among what is drawn. It shares the
-covariates with the search, and nothing else.
+It draws functions, not shapes, so the search cannot try the same functions. It shares only the
+covariates with the search.
 """
 
 from dataclasses import dataclass, replace
@@ -24,7 +24,7 @@ ON_TDOA = ("time", "x", "y", "height", "speed", "climb_rate", "acceleration", "t
 ON_ANCHOR = (*ON_TDOA, "range", "bearing", "elevation")
 ON_IMU = ("time", "x", "y", "height", "speed", "climb_rate", "vibration", "turning_rate")
 LENGTHS = (0.08, 0.6)  # shares of the range of a covariate, length scale of a process
-FEATURES = 60  # cosines of which a process is the sum
+FEATURES = 60  # a process is a sum of so many cosines
 DEPTH = 3  # largest, of a tree
 PERIODS = (2.0, 9.0)  # of a wave or a duty cycle in a flight
 LOW, HIGH = 0.02, 0.98  # quantiles of the covariate between which a function unfolds
@@ -34,8 +34,10 @@ LOW, HIGH = 0.02, 0.98  # quantiles of the covariate between which a function un
 class Hidden:
     """An effect: function(u (n, k)), of k covariates scaled to 0 ... 1, times `size`.
 
-    stream, subset, who : as of grammar.Undeclared; covariates : names; ranges : ((low, high), ...)
-    of them; shape : one of KINDS
+    stream, subset, who : as in grammar.Undeclared
+    covariates : names
+    ranges : ((low, high), ...) of the covariates
+    shape : one of KINDS
     """
 
     stream: str

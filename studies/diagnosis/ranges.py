@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""diagnose-ranges: errors put into simulated distances to anchors, alone and beside TDOAs, and what
-diagnose makes of them on another flight.
+"""diagnose-ranges: put errors into simulated distances to anchors, and diagnose them.
+
+The distances are used alone and together with TDOAs. Another flight judges the diagnosis.
 """
 
 from __future__ import annotations
@@ -102,7 +103,7 @@ def one(item: tuple[str, str, int, bool]) -> tuple[float, float, float, float, f
     before, after = (rmse(flights[1], effects) for effects in (None, result.effects))
     if name is None:
         return float(len(result.effects) > 0), np.nan, before, after, before
-    # delays that only ranges have are those of anchors, where there are ranges alone
+    # With ranges alone, a delay of the ranges is the same as a delay of the anchor.
     name = "anchor_delay" if name == "range_offset" and what == "ranges" else name
     added = {effect.name: effect.values for effect in result.effects}.get(name, {})
     off = max(abs(added.get(key, 0.0) - values.get(key, 0.0)) for key in {**values, **added})

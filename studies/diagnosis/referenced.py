@@ -1,6 +1,9 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Measured flights diagnosed with less than ground truth, and judged with it on others."""
+"""Diagnose measured flights with weaker references than ground truth.
+
+Ground truth judges the result on other flights.
+"""
 
 import numpy as np
 

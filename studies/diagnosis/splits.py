@@ -1,7 +1,7 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Random splits by whole flights: what a diagnosis of some flights of a day promises, and what other
-flights of the day get.
+"""Random splits by whole flights: compare the error that a diagnosis of some flights of a day
+promises with the error on other flights of the day.
 """
 
 import numpy as np
@@ -42,7 +42,7 @@ def drawn(seed):
 
 
 def run(data, seed):
-    """dict of a split: the promised errors, and those of each judged flight, m."""
+    """dict of a split: the promised errors, and the errors of each judged flight, m."""
     day, fit, judge = drawn(seed)
     result = diagnose(measured.load(data, fit))
     promised = [

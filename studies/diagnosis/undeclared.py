@@ -1,7 +1,7 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Effects that no catalogue holds: does the scan name channel and covariate, and does its term help
-other flights?
+"""Effects that are not in the catalogue: test whether the scan names channel and covariate, and
+whether its term improves other flights.
 """
 
 from known_effects import clean_flight, names_found

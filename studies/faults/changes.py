@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Changes of the events of a flight, by which faults are made: each takes (events, Scene) and
-returns events.
+"""Changes of the events of a flight, from which faults are made.
+
+Each takes (events, Scene) and returns events.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from .events import NUMBERS, Event, Scene, in_order
 
 APART = 0.02  # m
 Change = Callable[[list[Event], Scene], list[Event]]
-OfOne = Callable[[Event, Scene], Iterable[Event]]  # what is sent instead of one event
+OfOne = Callable[[Event, Scene], Iterable[Event]]  # replaces one event by others
 
 
 def nothing(events: list[Event], _: Scene) -> list[Event]:
@@ -116,7 +117,7 @@ def valued(function: Callable[[Any], Any], *fields: str) -> OfOne:
 
 
 def frozen(streams: str) -> Change:
-    """Values stay those of the first message of the fault; stamps go on."""
+    """Values freeze at the first message of the fault; stamps continue."""
 
     def change(events: list[Event], scene: Scene) -> list[Event]:
         kept: dict[str, dict[str, Any]] = {}
@@ -212,8 +213,10 @@ def republished(period: float, change: Callable[[Anchors, np.random.Generator], 
 
 
 def framed(stream: str, *frames: str) -> Change:
-    """Messages of a stream come in these frames, in turn. By /tf_static the first is that of the
-    body, each other is APART above the one before.
+    """Messages of a stream come in these frames, in turn.
+
+    In /tf_static, the first frame is at the body. Each following frame is APART above the previous
+    one.
     """
 
     def changed(events: list[Event], scene: Scene) -> list[Event]:

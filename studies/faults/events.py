@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What is sent to the nodes during a flight: one Event for each message."""
+"""The messages that the nodes get during a flight: one Event for each."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.common.flight import Flight
 
 BEFORE = 1.5  # s on the floor before take-off
-IMU_EVERY = 4  # of the inertial samples one is sent, so that the computer is not busy
+IMU_EVERY = 4  # send each fourth inertial sample, to keep the computer idle enough
 RATES = {"height": 50.0, "velocity": 100.0, "pressure": 25.0, "range": 100.0}  # Hz
 HEIGHT_STD, PRESSURE_STD, RANGE_STD = 0.02, 0.1, 0.1  # m
 # {stream: the fields of its values that are numbers}
@@ -108,7 +108,7 @@ def with_sensors(flight: Flight) -> Flight:
 
 
 def events_of(flight: Flight, streams: tuple[str, ...]) -> list[Event]:
-    """The anchors and the messages of these streams, each sent at its stamp."""
+    """The anchors and the messages of the given streams, each sent at its stamp."""
     out = [Event(-1.0, "anchors", 0.0, {"anchors": flight.anchors})]
     for name in streams:
         stream = getattr(flight, name)

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Faults put into a flight that real nodes hear over topics: how wrong they get, what they say, and
+"""Play a flight with faults to real nodes over topics. Measure their errors, their reports, and
 whether they recover.
 """
 

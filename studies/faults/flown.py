@@ -1,10 +1,10 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""fly-faults: the vehicle of `fly` takes off, flies and lands by the estimate while a fault is put
-into its streams.
+"""fly-faults: the vehicle of `fly` takes off, flies and lands by the estimate, with a fault in its
+streams.
 
-It obeys what `status` would say: it sinks where that is not "running". Lockstep, without ROS; a
-fault lasts from 12 to 15 s after switching on, in the first circle.
+It obeys `status`: it sinks while `status` is not "running". The study runs in lockstep, without
+ROS. A fault lasts from 12 to 15 s after switching on, in the first circle.
 """
 
 from argparse import Namespace
@@ -42,7 +42,7 @@ Change = Callable[[Any], Any]
 
 @dataclass(frozen=True)
 class FlownFault:
-    """stream : name; change : of what it measures; once : of the first message only; lasts : s."""
+    """stream : name; change : of its measurements; once : only the first message; lasts : s."""
 
     stream: str
     change: Change
@@ -51,7 +51,7 @@ class FlownFault:
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """Sensors that it needs beside TDOAs and the IMU."""
+        """Sensors that it needs in addition to TDOAs and the IMU."""
         return (self.stream,) if self.stream in SENSOR_NAMES else ()
 
 
@@ -216,7 +216,7 @@ class FaultyFilter:
 
 
 def flown(task: tuple[str, int]) -> dict[str, Any]:
-    """What becomes of one flight: (name of a fault, seed)."""
+    """The result of one flight: (name of a fault, seed)."""
     name, seed = task
     fault = FAULTS[name]
     trial = Trial(Task(world_of("hall", sensors=fault.sensors), seed))
@@ -266,8 +266,10 @@ def run(args: Namespace) -> None:
 
 
 def table(rows: list[dict[str, Any]]) -> list[str]:
-    """Lines of Markdown: of each fault how many landed at their place, came down safely, and the
-    largest part of what was said.
+    """Lines of Markdown, a row for each fault.
+
+    It has the flights that landed at their place, the flights that came down safely, and the first
+    status message.
     """
     lines = [
         "| fault | flights | landed | safe | what `status` said first |",

@@ -24,9 +24,9 @@ STEP = 0.02  # s between two looks
 # s for which an odometry, and a status, count as new; the latter comes each second
 FRESH, FRESH_STATUS = (0.5, 2.5)
 OTHER_CLOCK = 1.0  # s between stamp and arrival, from which on the stamp is of another clock
-# m; stated deviations; s for which both may be exceeded while nothing is said
+# m; stated deviations; s for which both may be exceeded while the status reports no problem
 WRONG, SIGMAS, WRONG_LIMIT = (1.0, 3.0, 2.0)
-# rad, s: the same for a yaw that is said to be known
+# rad, s: the same for a yaw that the filter reports as known
 WRONG_YAW, YAW_LIMIT = (math.radians(20.0), 5.0)
 RECOVERED_LIMIT, STOP_LIMIT = 3.0, 5.0  # s
 # s by which events may be sent late before the row says that the machine was too busy for it
@@ -53,12 +53,14 @@ HEAD = (
 
 @dataclass(frozen=True)
 class Looks:
-    """What a vehicle sees that flies by odometry and status, each STEP.
+    """The odometry and status that a vehicle flies by, sampled each STEP.
 
-    t : (n,) s; error, std : (n,) m, of the position, true and stated, NaN before the first
-        odometry; yaw_error, yaw_std : (n,) rad;
-    fresh : (n,) bool, an odometry came lately; running, clean : (n,) bool, a status came lately
-        that says so, clean with an empty `why`.
+    t : (n,) s
+    error, std : (n,) m, true error of the position and stated deviation, NaN before the first
+        odometry
+    yaw_error, yaw_std : (n,) rad
+    fresh : (n,) bool, an odometry came lately
+    running, clean : (n,) bool, a recent status reports a running filter; clean: with an empty `why`
     """
 
     t: np.ndarray
@@ -72,7 +74,7 @@ class Looks:
 
     @property
     def wrong(self) -> np.ndarray:
-        """(n,) bool: far off, beyond what is stated, and nothing said."""
+        """(n,) bool: a large error beyond the stated deviation, while the status is clean."""
         return self.clean & (self.error > np.maximum(WRONG, SIGMAS * self.std))
 
     @property
@@ -82,9 +84,10 @@ class Looks:
 
 
 def looks_at(heard: Heard, scene: Scene, seconds: float) -> Looks:
-    """Looks of what was heard. An odometry is compared with the truth at its stamp, or at its
-    arrival if the stamp is of another clock. The last one before a gap is compared with the truth
-    of each look.
+    """Return the Looks of received messages.
+
+    An odometry is compared with the truth at its stamp. If the stamp is of another clock, it is
+    compared at its arrival. The last one before a gap is compared with the truth of each look.
     """
     t = np.arange(0.0, seconds, STEP)
     arrival = np.array([at for at, _ in heard.odometry])
@@ -145,7 +148,7 @@ def is_clean(status: Any) -> bool:
 def judged(name: str, fault: Fault, heard: Heard, scene: Scene) -> dict[str, Any]:
     """The figures of a fault, by name, and its verdict.
 
-    Times count from the begin of the fault, that of the recovery from its end.
+    Times count from the begin of the fault; the time to recover counts from its end.
     """
     if heard.failed:
         return {
@@ -189,7 +192,7 @@ def judged(name: str, fault: Fault, heard: Heard, scene: Scene) -> dict[str, Any
 
 
 def verdict(row: dict[str, Any]) -> str:
-    """Return "ok", or MISS and what was missed."""
+    """Return "ok", or MISS and the failed criteria."""
     missed = [
         text
         for text, is_missed in {
@@ -233,7 +236,7 @@ def _warnings(heard: Heard, name: str) -> list[tuple[float, str]]:
 
 
 def _words(said: list[tuple[float, str]]) -> str:
-    """The first of what was said, with its time."""
+    """The first status message, with its time."""
     if not said:
         return "nothing"
     at, text = said[0]
@@ -255,10 +258,10 @@ def _said(sentences: list[tuple[float, str]], begin: float) -> list[tuple[float,
 
 
 def _recovered(looks: Looks, fault: Fault) -> float:
-    """s from the end of the fault until odometry flows, is right, and status says so, and all this
-    lasts; inf if it never does.
+    """s from the end of the fault until the filter has recovered for good; inf if it never does.
 
-    A filter that is started anew by request may say that the yaw is not known.
+    It has recovered if odometry flows and is right, and the status is clean. After a requested
+    reset, the status may report an unknown yaw.
     """
     well = looks.fresh & (looks.running if fault.anew else looks.clean) & (looks.error < WRONG)
     after = np.flatnonzero((looks.t >= fault.end) & ~well)

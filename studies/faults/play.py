@@ -57,7 +57,7 @@ if TYPE_CHECKING:
 PACKAGES = {"bias_node": "uwb_tdoa_bias", "ekf_node": "uwb_tdoa_ekf"}
 # s: the very first start compiles the filter; from ready nodes to the first message
 READY, LEAD = (180.0, 0.5)
-FETCH = 0.02  # s between two looks at what has arrived
+FETCH = 0.02  # s between two checks for received messages
 # of a message that begins with a header, behind the bytes that say how it is encoded
 STAMP, HEADER = (struct.Struct("<iI"), 4)
 RELIABLE = QoSProfile(depth=1000)
@@ -82,11 +82,13 @@ HEARD: dict[str, tuple[type, QoSProfile]] = {
 class Heard:
     """What nodes published, on the clock of the events.
 
-    odometry : (arrival s, Odometry); status : (arrival s, EstimatorStatus); diagnostics : (arrival
-        s, node, level, text); begin : s since
-    1970 of 0; late : s, by which an event was sent late at most; stop : {node: s that it took to
-    end, inf if it did not end well};
-    failed : why the nodes did not start, or "".
+    odometry : (arrival s, Odometry)
+    status : (arrival s, EstimatorStatus)
+    diagnostics : (arrival s, node, level, text)
+    begin : origin of the clock, s since 1970
+    late : s, largest delay of a sent event
+    stop : {node: s that it took to end, inf if it did not end well}
+    failed : why the nodes did not start, or ""
     """
 
     odometry: list[tuple[float, Any]] = field(default_factory=list)
@@ -98,7 +100,7 @@ class Heard:
     failed: str = ""
 
     def add(self, topic: str, arrival: float, message: Any) -> None:
-        """Take a message of one of `HEARD`."""
+        """Store a message of a topic in `HEARD`."""
         if topic == "/diagnostics":
             self.diagnostics += [
                 (arrival, of.name.strip("/"), ord(of.level), of.message) for of in message.status
@@ -153,7 +155,7 @@ class _Stage:
         parameters: dict[str, dict[str, Any]],
         streams: set[str],
     ) -> None:
-        """Start the nodes. streams : names of what is sent to them."""
+        """Start the nodes. streams : names of the streams that they get."""
         self._node, self._processes, self._parameters = node, processes, parameters
         self._titles: dict[str, str] = {}
         self._busy: list[subprocess.Popen[bytes]] = []
@@ -210,7 +212,7 @@ class _Stage:
         return send
 
     def play(self, calls: list[tuple[float, Callable[[float], object]]]) -> Heard:
-        """Make each call at its time, s; returns what was heard until the last."""
+        """Make each call at its time, s. Returns the messages received until the last call."""
         for end in self._heard.values():
             list(waiting(end))  # older than the flight
         raw: list[tuple[int, str, bytes]] = []
@@ -233,8 +235,9 @@ class _Stage:
         return heard
 
     def close(self) -> None:
-        """End what keeps the cores busy, and what publishes: whoever gets the domain next would
-        hear of it until it is collected.
+        """End the busy processes and destroy the node.
+
+        Until it is garbage-collected, the next user of the domain would receive from it.
         """
         for process in self._busy:
             process.kill()

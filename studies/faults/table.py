@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The faults: one row each. A new one is a line of `FAULTS`."""
+"""The faults: one row each. To add a fault, add a line to `FAULTS`."""
 
 from __future__ import annotations
 
@@ -51,12 +51,16 @@ ALL = " ".join(STREAMS)
 
 @dataclass(frozen=True)
 class Fault:
-    """text : what is wrong; change : of the events; plays : sensors beside TDOAs and the IMU;
-    begin, lasts, after : s, see `BEGIN`;
-    parameters : {node: {name: value}}; anew : the filter is started anew by request; turned :
-        degrees by which the world is
-    turned about z, which nothing that is measured shows: the estimate is right if it is turned,
-    too.
+    """A fault of the messages, and the time in which it acts.
+
+    text : description
+    change : of the events
+    plays : sensors in addition to TDOAs and the IMU
+    begin, lasts, after : s, see `BEGIN`
+    parameters : {node: {name: value}}
+    anew : the filter restarts by request
+    turned : degrees by which the world is turned about z. No measurement shows this, so the
+        estimate is right if it is turned, too.
     """
 
     text: str
@@ -81,7 +85,7 @@ class Fault:
 
     @property
     def ends(self) -> bool:
-        """Whether the flight goes on after it."""
+        """Whether the flight continues after the fault."""
         return self.after > 0.0
 
 

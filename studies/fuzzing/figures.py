@@ -5,9 +5,9 @@ within 5 s and 500 MB.
 
 The small files of the fuzz corpus are changed by their structure. Seed and number determine each
 file, so that --seed and --first repeat it. One process reads the files of a kind, one after the
-other. A file that takes too long ends the process, and the next process goes on behind it. Memory
-is what a file adds to the process at its peak. Findings are kept in --out: the file, named by kind,
-seed and number.
+other. A file that takes too long ends the process, and a new process continues with the next file.
+Memory is the peak that a file adds to the process. Findings are kept in --out: the file, named by
+kind, seed and number.
 """
 
 from collections import Counter
@@ -80,8 +80,9 @@ def changed(kind, seed, number):
 
 
 def fuzz(kind, seed, first, end):
-    """(Counter of outcomes, slowest in s, largest in MB, {number: what was found}) of some files.
-    Of findings at one place of the code, the first is kept.
+    """(Counter of outcomes, slowest in s, largest in MB, {number: finding}) of some files.
+
+    If several findings are at the same place of the code, the first is kept.
     """
     outcomes, slowest, largest, findings, number = Counter(), 0.0, 0.0, {}, first
     with tqdm(total=end - first, desc=kind, leave=False) as bar:
@@ -123,7 +124,7 @@ def _read(pipe, kind, seed, first, end):
     """
     tempfile.tempdir = str(targets.FOLDER)  # of the readers, too
     for path in targets.seeds(kind):
-        targets.TARGETS[kind](path.read_bytes())  # what is imported and compiled does not count
+        targets.TARGETS[kind](path.read_bytes())  # time to import and compile does not count
     signal.signal(signal.SIGPROF, signal.SIG_DFL)
     resource.setrlimit(
         resource.RLIMIT_DATA,

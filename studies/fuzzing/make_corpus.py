@@ -94,7 +94,7 @@ TEXTS = {
     "csv": [
         csv_text(),
         csv_text("t_tdoa,idA,idB,tdoa_meas", ["0.1,0,1,0.5", "0.2,1,5,-1e-1"]),
-        csv_text(  # one inertial sample beside optical flow: found by fuzzing
+        csv_text(  # one inertial sample, with optical flow: found by fuzzing
             "t_tdoa,idA,idB,tdoa_meas,t_acc,acc_x,acc_y,acc_z,t_gyro,gyro_x,gyro_y,gyro_z,t_tof,tof,t_flow,deltaX,deltaY",
             [
                 "0.1,0,1,0.5,0.1,0,0,1,0.1,0,0,1,0.1,300,0.1,1,2",

@@ -175,8 +175,9 @@ def of_yaml(data, chance):
 
 
 def of_protobuf(data, chance, depth=0):
-    """One field of a message changed, left out or repeated; the lengths of what it is in stay
-    right.
+    """One field of a message changed, left out or repeated.
+
+    The lengths of the enclosing messages stay right.
     """
     fields, at = [], 0
     while at < len(data):
@@ -246,9 +247,9 @@ def _field(key, value):
 
 
 def of_mcap(data, chance):
-    """One record changed, left out, moved or repeated; those around it stay right.
+    """One record changed, left out, moved or repeated; the neighbouring records stay right.
 
-    Of a chunk what is in it, if it is not packed.
+    In a chunk that is not compressed, its content is changed.
     """
     found, at = [], len(mcap.MAGIC)
     while at + 9 <= len(data) - len(mcap.MAGIC):

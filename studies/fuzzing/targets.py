@@ -1,10 +1,9 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What is fuzzed: every function that reads a file from outside, each with bytes. It may return or
-raise InputError.
+"""Targets of the fuzzer: every function that reads a file from outside, called with bytes.
 
-A target that is protected by a checksum is also entered behind it (`*_sealed`): what a fuzzer
-changes would not get past it otherwise.
+A target may return or raise InputError. If a checksum protects a format, there is a second target
+behind the checksum (`*_sealed`). Otherwise changed bytes would never get past it.
 """
 
 from functools import cache
@@ -142,7 +141,7 @@ def csv_salvaged(data):
 
 
 def csv_gzip(data):
-    """What is in it is changed, and packed anew."""
+    """Compress the changed content again."""
     packed = data if data.startswith(b"\x1f\x8b") else gzip.compress(data, 1, mtime=0)
     _finite(read_util_csv(_file(packed), ANCHORS))
 
@@ -182,7 +181,7 @@ def bag_metadata(data):
 
 
 def bag_message(data):
-    """The first byte says of which topic, the rest is its message."""
+    """The first byte selects the topic; the remaining bytes are its message."""
     topic, msgtype = list(MESSAGES.items())[data[0] % len(MESSAGES) if data else 0]
     path = _file(bag_of(topic, msgtype, data[1:]), "message.mcap")
     if topic == "/odometry":
@@ -192,8 +191,9 @@ def bag_message(data):
 
 
 def bag_packed(data):
-    """A bag whose file is compressed as a whole: what is in it, or if that is no MCAP, the
-    compressed file itself.
+    """A bag whose file is compressed as a whole.
+
+    data : content of the file. If it is no MCAP, it is the compressed file itself.
     """
     folder = FOLDER / "packed"
     folder.mkdir(exist_ok=True)
@@ -277,9 +277,7 @@ def model(data):
 
 
 def _judged_by_a_copy(content):
-    """As `trial.tried_out`, by a copy of this process: to start Python anew would take 0.3 s each
-    time.
-    """
+    """As `trial.tried_out`, in a fork of this process: a new Python takes 0.3 s to start."""
     ours, theirs = os.pipe()
     if not (child := os.fork()):
         try:
@@ -298,9 +296,9 @@ def _judged_by_a_copy(content):
 
 
 def _finite(flight):
-    """What is read is finite: AssertionError otherwise.
+    """Raise AssertionError if a value of a Flight is not finite.
 
-    (A height of inf or NaN says that nothing was in range.)
+    (A height of inf or NaN means that nothing was in range.)
     """
     finite = {
         "tdoa": "tabd",

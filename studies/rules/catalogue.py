@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The rules of the compiled core, and which of its constants are no tuning."""
+"""The rules of the compiled core, and its constants that are not tuning parameters."""
 
 from __future__ import annotations
 

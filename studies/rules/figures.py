@@ -1,11 +1,11 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""rules: what each rule and each constant of the filter's core is worth, and with --watch those of
+"""rules: measure the worth of each rule and each constant of the filter's core. With --watch: of
 the rules over streams and residuals.
 
-Each rule is switched off, and each constant is halved and doubled, one at a time. Recordings,
-flights of `fly`, starts and faults show what that changes. The filter is compiled once: see
-`studies/rules/tuned.py`. Interrupted work goes on where it was.
+Each rule is switched off, and each constant is halved and doubled, one at a time. The study then
+compares the errors on recordings, flights of `fly`, starts and faults. The filter is compiled once:
+see `studies/rules/tuned.py`. An interrupted study continues where it stopped.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def add_options(add: Callable) -> None:
 
 
 def run(args: Namespace) -> None:
-    """Run what is missing, and print the table."""
+    """Run the missing variants, and print the table."""
     cache = Path(args.cache).absolute()
     cache.mkdir(parents=True, exist_ok=True)
     made = tuned.copy_to(cache)
@@ -89,7 +89,7 @@ def _work(args: Namespace, cache: Path, made: tuned.Tuned) -> None:
         path.unlink()
 
 
-Figures = dict[str, dict[str, dict[str, list]]]  # of each variant and row: spans, or what is said
+Figures = dict[str, dict[str, dict[str, list]]]  # of each variant and row: spans, or findings
 
 
 def read(path: Path) -> Figures:
@@ -166,7 +166,7 @@ def _largest(of: tuple[float, str]) -> str:
 
 
 def table_of_watch(found: Figures) -> str:
-    """Markdown: what is found less, more, later or earlier without each rule; then each constant."""
+    """Markdown: changes of the findings without each rule; then with each constant changed."""
     base = found.get(work.BASE, {})
     lines = ["| rule | rows | changed | which |", "|---|---:|---:|---|"]
     texts, made = {}, []

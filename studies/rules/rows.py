@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What the filter is run on, and what is judged of it."""
+"""The inputs of the filter, and how its output is judged."""
 
 from __future__ import annotations
 
@@ -54,8 +54,12 @@ FIRST_SEED = 9301  # of flights of `fly`
 
 @dataclass(frozen=True)
 class Case:
-    """One run. spans : {name: (begin, end) s} that are judged; over : s from which the time to be
-    right again counts, or None; arm : m, of the tag, that is corrected; effects : that are known.
+    """One run.
+
+    spans : {name: (begin, end) s} to judge
+    over : s from which the time to be right again counts, or None
+    arm : m, lever arm of the tag, which is corrected
+    effects : known effects
     """
 
     flight: Flight
@@ -68,8 +72,11 @@ class Case:
 
 @dataclass(frozen=True)
 class Row:
-    """One row of the study. group : "measured", "flown", "starts", "halls", "faults" or "sensors"; needs : sensors
-    without whose rules it changes nothing; screen : it is of the screen.
+    """One row of the study.
+
+    group : "measured", "flown", "starts", "halls", "faults" or "sensors"
+    needs : sensors of the row. The rules of a sensor run only on rows that have this sensor.
+    screen : whether it is in the screen
     """
 
     name: str
@@ -117,12 +124,12 @@ class Inputs:
     def __init__(self, data: Path, cache: Path) -> None:
         """data : folder of measured flights; cache : folder."""
         self._data, self._cache = data, cache / "inputs"
-        self.anew = False  # count streams anew, as constants of their counters have changed
+        self.anew = False  # count streams again, because constants of their counters have changed
         self._cache.mkdir(parents=True, exist_ok=True)
         self._kept: dict[str, Any] = {}
 
     def case(self, row: Row) -> Case:
-        """That of a Row."""
+        """The Case of a Row."""
         return self.kept(row.name, row.make)
 
     def kept(self, name: str, make: Callable[[], Any]) -> Any:
@@ -141,7 +148,7 @@ class Inputs:
         return made
 
     def rows(self) -> list[Row]:
-        """All of them, those of the screen first."""
+        """All rows. The rows of the screen come first."""
         made = [
             *self._measured(),
             *self._flown(),

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A copy of the filter whose constants and rules are read from one table while it runs.
 
-Compiled code freezes its constants, and compiling it takes minutes. So the sources are copied once:
-each constant in a compiled function becomes a load from a table at a fixed address, and each rule
-asks that table whether it is on. A variant is then a number in the table.
+Compiled code freezes its constants, and compiling it takes minutes. So the sources are copied once.
+Each constant in a compiled function becomes a load from a table at a fixed address. Each rule reads
+from that table whether it is on. A variant is then a number in the table.
 """
 
 from __future__ import annotations
@@ -329,7 +329,7 @@ def _source(module: str) -> str:
 
 
 def _tree(module: str) -> ast.Module:
-    """A tree of a module of the package, to be changed; an empty one of another module."""
+    """A tree of a module of the package, to be changed. For other modules, it is empty."""
     return ast.parse(_source(module))
 
 

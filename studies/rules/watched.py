@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What the rules over streams and residuals are run on, and what they find in it."""
+"""The inputs of the rules over streams and residuals, and the findings in them."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class Seen:
 
 
 def rows(inputs: Inputs) -> list[Watched]:
-    """All of them, the cheapest first."""
+    """All rows, the cheapest first."""
     return [*_of_streams(inputs), *_of_scale(inputs), *_of_sign(inputs), *_of_anchors(inputs)]
 
 
@@ -242,7 +242,7 @@ def _for_a_while(inputs: Inputs, fault: str) -> Said:
 def _counted(anchors: Anchors, imu: Columns, tdoa: Columns) -> Seen:
     """Count streams in windows, look by look."""
     rules, looks = StreamRules(anchors), []
-    rules._scale.add = lambda snapshot: None  # which has rows of its own
+    rules._scale.add = lambda snapshot: None  # the scale has separate rows
     known = [np.where(np.isfinite(c[ARRIVAL]), c[ARRIVAL], c[T]) for c in (imu, tdoa)]
     begin = min(float(np.min(one)) for one in known)
     until = min(max(float(np.max(one)) for one in known), begin + 2.0 * UNTIL)
@@ -260,7 +260,7 @@ def _counted(anchors: Anchors, imu: Columns, tdoa: Columns) -> Seen:
 
 
 def _replayed(seen: Seen, scale: bool = False) -> Said:
-    """What is found in flight, look by look, and in the whole as `check` does."""
+    """Findings in flight, look by look, and over the whole recording as in `check`."""
     watch, said = StreamWatch(seen.anchors, LAG), {}
     whole = StreamRules(seen.anchors)
     for now, imu, tdoa, unknown in seen.looks:

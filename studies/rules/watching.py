@@ -129,8 +129,12 @@ SWITCHES: dict[str, tuple[str, Any]] = {
 
 @dataclass(frozen=True)
 class Patch:
-    """A variant: name : as in the table; of : of a Watched; changed : {(module, attribute): value};
-    entry, factor : what is scaled in compiled functions.
+    """A variant.
+
+    name : as in the table
+    of : kinds of Watched rows that it concerns
+    changed : {(module, attribute): value}
+    entry, factor : constant to scale in compiled functions, and its factor
     """
 
     name: str
@@ -202,7 +206,7 @@ def _holders(trees: dict[str, ast.Module], module: str, name: str) -> list[str]:
 
 
 def _method(function: Callable) -> Callable:
-    """A function, so that it is bound to its object where it is one of a class."""
+    """Wrap a callable in a function, which binds to its object if it is a method of a class."""
     return lambda *args, **named: function(*args, **named)
 
 
@@ -266,7 +270,10 @@ def _imports(tree: ast.Module, module: str, name: str) -> bool:
 
 
 def differs(before: Said, after: Said) -> dict[str, str]:
-    """{rule: "lost", "new", "late", "early", "longer", "shorter" or "size"} of what is said of a row."""
+    """Changes of the findings of a row: {rule: kind}.
+
+    The kind is "lost", "new", "late", "early", "longer", "shorter" or "size".
+    """
     out = {rule: "lost" for rule in before if rule not in after}
     out |= {rule: "new" for rule in after if rule not in before}
     for rule in before.keys() & after.keys():

@@ -167,7 +167,7 @@ def _watch(job: dict[str, Any], inputs: Inputs, live: Live) -> None:
 
 
 def _said(patch: watching.Patch, row: watched.Watched, live: Live) -> watched.Said:
-    """What is said of a row, or the error that a variant makes."""
+    """Findings of a row, or the exception that a variant raises."""
     with patch.applied(live):
         try:
             return row.said()

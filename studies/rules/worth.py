@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What a variant changes, row by row."""
+"""Changes that a variant causes, row by row."""
 
 from __future__ import annotations
 
@@ -21,10 +21,14 @@ CLEAR, CLEAR_ROWS, CLEAR_MEAN = (0.05, 3, 0.01)
 
 @dataclass
 class Worth:
-    """What a variant changes. rows : how many were run; changes : {row: largest change} of those that
-    change by more than NOTICED; lost : how many are worse by more than CLEAR; worse, better :
-    (share, row), the largest; mean : share, of the 3D RMSE over all spans; nees : of the mean
-    excess over HONEST.
+    """The changes that a variant causes.
+
+    rows : number of rows that were run
+    changes : {row: largest change} of rows that change by more than NOTICED
+    lost : number of rows that are worse by more than CLEAR
+    worse, better : (share, row), the largest loss and the largest gain
+    mean : share, of the 3D RMSE over all spans
+    nees : of the mean excess over HONEST
     """
 
     rows: int = 0

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The figure of what a map of the bias is made of."""
+"""The study of maps of the bias in a simulated set-up."""
 
 import numpy as np
 

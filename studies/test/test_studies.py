@@ -11,7 +11,7 @@ from studies.__main__ import STUDIES, main, parser
 
 
 def parses(words):
-    """Whether the words are a command line; prints what is wrong."""
+    """Whether the words are a valid command line. Prints the error if not."""
     try:
         parser().parse_args(words)
     except SystemExit as stop:

@@ -28,7 +28,7 @@ from uwb_tdoa_tools.flying.estimates import (
 )
 from uwb_tdoa_tools.flying.world import HALL  # noqa: E402
 
-OTHERS = 0.2  # of the CPU time, from which on nothing can be asked of what is played in real time
+OTHERS = 0.2  # share of the CPU time used by others, above which real-time playback is not judged
 
 
 def test_a_figure_is_the_median_and_the_quartiles_of_what_is_known():
@@ -110,7 +110,7 @@ def test_latency_is_that_of_the_first_odometry_that_contains_a_tdoa():
     ms = 1_000_000
     stamps = np.array([0, 10, 12, 20, 30, 90]) * ms
     sent = 1000 * ms + stamps
-    # stamps in order of arrival; the third is one that came late
+    # stamps in order of arrival; the third came late
     of = np.array([5, 15, 10, 30]) * ms
     arrivals = 1000 * ms + np.array([8, 18, 19, 37]) * ms
     found = source.latencies(sent, stamps, arrivals, of)
@@ -192,7 +192,7 @@ def test_a_library_gets_the_events_of_a_flight_in_their_order(tmp_path):
     other.start(flight.anchors, p, q)
     assert other.run(both) > 0.0
     np.testing.assert_array_equal(other.position(), p)
-    other.run(both[::-1].copy())  # it tells that this is nonsense
+    other.run(both[::-1].copy())  # events in reverse order are an error
     assert np.isnan(other.position()).all()
 
 

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The study of first maps, on two halls: one that gives a map, one that leaves a mirror image."""
+"""The study of first maps, on two halls: the first gives a map, the second a mirror ambiguity."""
 
 from studies.first_map import CERTAIN, judged
 

@@ -1,7 +1,9 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Every reader on changed files returns or raises InputError; and who fuzzes for long notices what
-is no InputError, takes too long or takes too much, and goes on behind it.
+"""On changed files, every reader returns or raises InputError.
+
+The fuzzing study reports other exceptions, and files that take too long or too much memory. It then
+continues with the next file.
 """
 
 from mmap import mmap

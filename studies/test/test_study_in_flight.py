@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The study of what the nodes say in flight: its table, and the part of a flight that is played."""
+"""The study of the nodes' reports in flight: its table, and the part of a flight that is played."""
 
 from checking_flights import recording
 import numpy as np

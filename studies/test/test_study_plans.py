@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The study of plans: its solver against places with a known answer, and two cases of it."""
+"""The study of plans: its solver at places with a known answer, and two cases."""
 
 import numpy as np
 import pytest

@@ -1,7 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What comes over the radio of a Crazyflie, sampled and late, to streams; and the example node on
-that.
+"""Reconstruct streams from the sampled and late messages of a Crazyflie's radio.
+
+The example node runs on the same messages.
 """
 
 from dataclasses import replace
@@ -143,8 +144,8 @@ def test_the_example_over_topics_gives_what_the_converter_gives(flight, tmp_path
     (tmp_path / "sent.json").write_text(json.dumps(sent))
     (tmp_path / "player.py").write_text(PLAYER)
     # Not by `node & kill -INT $!` of a shell, which has SIGINT ignored in the background: rclpy
-    # then wakes the node before it ends its
-    # context, and a node that waits anew between the two waits for ever.
+    # then wakes the node before it ends its context. A node that waits again in between waits
+    # forever.
     with (
         _python(tmp_path, ROOT / "docs/connect/crazyflie_node.py") as node,
         _python(tmp_path, "player.py", "sent.json") as player,

@@ -16,7 +16,7 @@ def flight():
 
 
 def test_the_bound_of_ranges_is_that_of_their_geometry(flight):
-    """Of a place: the inverse of what the directions to all anchors say."""
+    """At a place, it is the inverse of the information in the directions to all anchors."""
     place = flight.truth.p[len(flight.truth) // 2]
     away = place - flight.anchors.positions
     unit = away / np.linalg.norm(away, axis=1, keepdims=True)

@@ -65,7 +65,7 @@ def test_the_constants_of_compiled_functions_are_in_the_table(made):
     assert known["noise.LARGEST_OUTLIER"].values == (noise.LARGEST_OUTLIER,)
     assert known["stationary_position.LANDING_STD"].values == (0.2, 0.2, 0.5)
     assert known["stationarity.LONG"].is_count and "state.GRAVITY" not in known
-    # what follows from another constant is no constant of its own
+    # a constant that is computed from another one has no separate entry
     assert "update.GATE" in known and "hypotheses.LARGEST_NIS" not in known
     copied = (made.folder / "uwb_tdoa_ekf/core/hypotheses.py").read_text()
     assert f"tuned_number({known['update.GATE'].place}) ** 2" in copied

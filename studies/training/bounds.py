@@ -1,8 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What any model of the pose could reach at most, and how much of the errors comes again at the
-same place.
-"""
+"""A bound for any model of the pose, and the share of the errors that repeats at the same place."""
 
 from types import SimpleNamespace
 
@@ -27,11 +25,10 @@ def rmse(flight, corrector=None):
 
 
 def oracle(flight, window):
-    """A stand-in for a Corrector that knows the error of each TDOA from the ground truth, smoothed
-    over `window` s.
+    """A substitute for a Corrector that gets the error of each TDOA from the ground truth.
 
-    The running median of a pair's own errors: a bound for every model that follows the error no
-    faster than this.
+    The error is the running median of the errors of a pair over `window` s. This is a bound for
+    every model that does not follow the error faster.
     """
     data, anchors, truth = flight.tdoa, flight.anchors, flight.truth
     a, b = anchors.index(data.a), anchors.index(data.b)
@@ -73,9 +70,10 @@ def oracle(flight, window):
 
 
 def repeatability(one, other):
-    """How much of the errors of two flights is alike at the same place: (correlation, cells
-    compared), over the medians per pair of anchors and cell of 0.3 m that both flew through. one,
-    other : Labels.
+    """Correlation of the errors of two flights at the same place: (correlation, cells compared).
+
+    It compares the medians per pair of anchors and cell of 0.3 m that both flew through.
+    one, other : Labels
     """
     maps = []
     for labels in (one, other):

@@ -1,10 +1,12 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""compare-models: train bias models on some flights, run the filter with each of them, and with
-none, on others, and print the 3D RMSE, in metres. With --bound beside them: the filter with the
-true errors, smoothed, a bound for any model of the pose. With --simulated N both are simulated: N
-flights in each of three constellations, and of three others. Writes to --out: table.md,
-comparison.json, histograms.png, rmse.png, and each model in a folder of its own.
+"""compare-models: train bias models on some flights, and compare the filter with each model and
+without any on other flights.
+
+Prints the 3D RMSE, in metres. With --bound, it adds the filter with the true errors, smoothed: a
+bound for any model of the pose. With --simulated N, both sets of flights are simulated: N flights
+in each of three constellations to train, and of three other constellations to test. Writes to
+--out: table.md, comparison.json, histograms.png, rmse.png, and each model in a separate folder.
 """
 
 from functools import partial

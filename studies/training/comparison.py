@@ -1,7 +1,7 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Every kind of bias model trained on the same flights, and what the filter reaches with each on
-others.
+"""Train every kind of bias model on the same flights, and compare the resulting estimates on other
+flights.
 """
 
 import numpy as np
@@ -24,9 +24,14 @@ BOUNDS = {"oracle 0.5 s": 0.5, "oracle 1 s": 1.0, "oracle 2 s": 2.0}
 def compare(train, tests, kinds, out, seed=0, validation=None, bound=False):
     """Train, run, and draw. Returns a dict of plain values.
 
-    train : list of Flight; tests : {group: list of Flight}; kinds : of choices.MODELS; out : folder,
-        Path; validation :
-    names or None; bound : with oracles and repeatability. Raises InputError.
+    train : list of Flight
+    tests : {group: list of Flight}
+    kinds : of choices.MODELS
+    out : folder, Path
+    validation : names or None
+    bound : with oracles and repeatability
+
+    Raises InputError.
     """
     out.mkdir(parents=True, exist_ok=True)
     names, correctors, skipped = _trained(train, kinds, out, seed, validation)

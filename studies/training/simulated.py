@@ -31,7 +31,7 @@ def flights(
 
     The anchors' own delays are calibrated (zero): they are constants of single modules, which no
     model of poses can know.
-    progress : wraps the list of what is to be flown, e.g. tqdm.
+    progress : wraps the list of flights to simulate, e.g. tqdm
     """
     out: dict[str, list[Flight]] = {name: [] for name in constellations}
     for name, k in progress([(name, k) for name in constellations for k in range(count)]):

@@ -1,8 +1,9 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""spin: simulate a tag that spins between two anchors, and draw the error of their TDOA over its
-yaw, for several orientations of anchor 0 and for five specimens of the tag. Counterpart of figure 4
-of Zhao et al. (2021).
+"""spin: simulate a tag that spins between two anchors, and draw the error of their TDOA over yaw.
+
+There are several orientations of anchor 0, and five specimens of the tag. The counterpart is figure
+4 of Zhao et al. (2021).
 """
 
 from functools import partial

@@ -1,10 +1,9 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""random-splits: every kind of bias model trained on some flights drawn at random, and judged on
-all others; by whole flights.
+"""random-splits: train every kind of bias model on random flights, and judge it on all others.
 
-Each split goes to --out as one line of JSON as soon as it is done; what is there already is not
-done again.
+Each split goes to --out as one line of JSON as soon as it is done. A second run skips the splits in
+--out.
 """
 
 from collections import defaultdict
@@ -71,9 +70,12 @@ def run(args):
 
 
 def split(flights, uncorrected_errors, seed, fit, kinds):
-    """Yield, for each kind, a dict of one split: 3D RMSE of every left-out flight by share, and of
-    every judged flight with the share that is borne out, and with all. plain : of
-    `shrinking.uncorrected`.
+    """Yield, for each kind, a dict of one split.
+
+    It has the 3D RMSE of every left-out flight by share of the correction. For every judged flight,
+    it has the 3D RMSE with the share that the left-out flights support, and with the full
+    correction.
+    uncorrected_errors : of `shrinking.uncorrected`
     """
     order = np.random.default_rng([seed, fit]).permutation(len(flights))
     chosen, others = ([flights[k] for k in part] for part in (order[:fit], order[fit:]))
@@ -107,8 +109,8 @@ def split(flights, uncorrected_errors, seed, fit, kinds):
 
 
 def table(rows, shrunk):
-    """Markdown: a row for each kind. shrunk : with the shares that flights left out bear out, not
-    all.
+    """Markdown: a row for each kind. shrunk : scale the correction by the share that the left-out
+    flights support, instead of the full correction.
     """
     title = "as much as is borne out" if shrunk else "all of it"
     lines = [

@@ -4,8 +4,8 @@
 
 
 def markdown(report):
-    """The table of what `compare` gave, runs and means of groups, with the reduction of the error
-    against none.
+    """The table of the result of `compare`: runs, and means of groups with the change of the error
+    from the filter without a model.
     """
     kinds = [key for key in report["runs"][0] if key not in ("group", "flight")]
     lines = [["group", "flight", *kinds], ["---", "---"] + ["---:"] * len(kinds)]
