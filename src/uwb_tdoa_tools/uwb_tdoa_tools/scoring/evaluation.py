@@ -203,7 +203,8 @@ def _left_by_delays(residual: np.ndarray, a: np.ndarray, b: np.ndarray) -> float
     known = np.isfinite(residual)
     y, count = residual[known], int(max(a.max(), b.max())) + 1
     a, b = a[known], b[known]
-    left, weight = y, np.ones(len(y))
+    left: np.ndarray = y
+    weight: np.ndarray = np.ones(len(y))
     for _ in range(FITS_OF_DELAYS):
         pairs = np.bincount(a * count + b, weight, count**2).reshape(count, count)
         pairs = pairs + pairs.T
