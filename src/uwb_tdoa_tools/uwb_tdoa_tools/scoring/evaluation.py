@@ -191,27 +191,28 @@ def _delays_fit(flight: Flight, effects: EffectSet, found: Alignment) -> bool:
         moved = replace(flight, truth=found.significant().applied_to(flight.truth, how))
         samples, rows = true_samples(moved)
         residual = flight.tdoa.d[rows] - samples.predicted() - effects.bias(samples)
-        left.append(_left_by_delays(residual, samples.a, samples.b) if len(residual) else np.nan)
+        known = np.isfinite(residual)
+        ends = np.stack([samples.a, samples.b])[:, known]
+        left.append(_left_by_delays(residual[known], ends) if known.any() else np.nan)
     return not found.axes_differ and bool(left[1] > LARGEST_FRAME_RATIO * left[0])
 
 
-def _left_by_delays(residual: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
+def _left_by_delays(residual: np.ndarray, ends: np.ndarray) -> float:
     """Return the median absolute residual (n,) m after a robust fit of one delay per anchor, m.
 
-    a, b : (n,) rows of the anchors of each TDOA; their delays add delay_b - delay_a
+    ends : (2, n) rows of the anchors a and b of each TDOA; their delays add delay_b - delay_a
     """
-    known = np.isfinite(residual)
-    y, count = residual[known], int(max(a.max(), b.max())) + 1
-    a, b = a[known], b[known]
-    left: np.ndarray = y
-    weight: np.ndarray = np.ones(len(y))
+    heard, place = np.unique(ends, return_inverse=True)
+    (a, b), count = place.reshape(ends.shape), len(heard)
+    left: np.ndarray = residual
+    weight: np.ndarray = np.ones(len(residual))
     for _ in range(FITS_OF_DELAYS):
-        pairs = np.bincount(a * count + b, weight, count**2).reshape(count, count)
-        pairs = pairs + pairs.T
+        forth = np.bincount(a * count + b, weight, count**2).reshape(count, count)
+        pairs = forth + forth.T
         normal = np.diag(pairs.sum(axis=1)) - pairs  # of a graph of anchors: its Laplacian
-        vector = np.bincount(b, weight * y, count) - np.bincount(a, weight * y, count)
+        vector = np.bincount(b, weight * residual, count) - np.bincount(a, weight * residual, count)
         delay = np.linalg.lstsq(normal, vector, rcond=None)[0]
-        left = y - delay[b] + delay[a]
+        left = residual - delay[b] + delay[a]
         weight = 1.0 / (1.0 + (left / (2.0 * 1.4826 * np.median(np.abs(left)) + 1e-9)) ** 2)
     return float(np.median(np.abs(left)))
 
