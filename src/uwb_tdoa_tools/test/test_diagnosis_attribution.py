@@ -117,7 +117,6 @@ def test_an_undeclared_effect_is_found_by_its_covariate(flight):
         ("fast_and_high", "tdoa of anchor 3 over "),
         ("late_by_speed", "tdoa of anchor 5 over speed"),
         ("leaning_accel", "accel.z over height"),
-        ("accel_of_place_beside_drift", "accel.z over y"),
     ],
 )
 def test_what_was_missed_once_is_named_first(flight, effect, named):

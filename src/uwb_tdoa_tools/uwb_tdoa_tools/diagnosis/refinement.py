@@ -126,24 +126,24 @@ def with_measured_noise(
 
     A function that no declared effect describes counts as correlated noise, and hides itself.
     Functions are added to the fit that measures the inflation, as long as they pay their price
-    with the inflation that they leave. The best function is tried, then the best one of each axis.
+    with the inflation that they leave.
 
     declared : Candidates of the fit that measured the inflation; scan : Scan of the table
     """
     table, model, chosen = selection.table, selection.fit, list(selection.chosen)
     known = list(dict.fromkeys([*declared, *chosen]))
     for _ in range(DISGUISED):
-        for found in [*scan(table, model, chosen)[:1], *scan.best_of_axes(table, model, chosen)]:
-            progress()
-            wider = table.with_terms(found.terms)
-            less = fit(wider, columns_of([*known, found]), covariance=False).inflation
-            less = np.minimum(less, model.inflation)
-            trial = fit(table, columns_of(chosen), less, covariance=False, near=model)
-            if criterion_of(wider, chosen, trial, found, len(declared), scan.even) > 0.0:
-                break
-        else:
+        found = scan(table, model, chosen)[:1]
+        progress()
+        if not found:
             break
-        table, chosen, known = wider, [*chosen, found], [*known, found]
+        wider = table.with_terms(found[0].terms)
+        less = fit(wider, columns_of([*known, *found]), covariance=False).inflation
+        less = np.minimum(less, model.inflation)
+        trial = fit(table, columns_of(chosen), less, covariance=False, near=model)
+        if criterion_of(wider, chosen, trial, found[0], len(declared), scan.even) <= 0.0:
+            break
+        table, chosen, known = wider, [*chosen, *found], [*known, *found]
         model = fit(table, columns_of(chosen), less, covariance=False, near=trial)
     if model is selection.fit:
         return selection

@@ -254,8 +254,8 @@ def measure_inflation(
 
     It is the larger of two measures. The first is 1 + 2 sum(rho) over the autocorrelation of each
     series up to 3 s. The second is the ratio of the variance of block sums of scores to independent
-    rows, averaged over the columns. It includes correlation between series. No axis of a channel
-    gets more than their median: an excess on one axis only is an effect.
+    rows, averaged over the columns. It includes correlation between series. All axes of a channel
+    get their median: an excess on one axis only is an effect.
 
     residual : (n,) of a fit with all columns, because effects that are left count as noise
     weight : (n,) robust weights; scale : (groups,)
@@ -272,7 +272,7 @@ def measure_inflation(
         out[k] = max(1.0, min(raw, len(r) / len(np.unique(table.block[rows]))))
     for name in table.present:
         axes = np.unique(table.group[table.rows_of(name)])
-        out[axes] = np.minimum(out[axes], np.median(out[axes]))
+        out[axes] = np.median(out[axes])
     return out
 
 

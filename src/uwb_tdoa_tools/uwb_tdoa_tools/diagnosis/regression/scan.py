@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.sparse import csr_array
 
-from uwb_tdoa_bias.effects import RADIO, SmoothTerm
+from uwb_tdoa_bias.effects import SmoothTerm
 from uwb_tdoa_bias.effects.covariates import CATEGORIES
 from uwb_tdoa_bias.effects.smooth_term import SHAPES
 
@@ -135,36 +135,16 @@ class Scan:
         Rows that the fit treats as outliers get a larger weight (Huber): an effect can act on few
         rows only. Noisy series get a smaller weight.
         """
-        held = self._held(table, model, chosen)
-        found = self.gains(table, held)[:PROPOSED]
-        found = _best_first(table, [self._refined(held, item) for item in found])
-        single = [self._candidate(*item[1:]) for item in _various(found)]
-        more = self._worth_more(table, found, self._products(*held[1:]))
-        return single[:FIRST_SINGLE] + more + single[FIRST_SINGLE:]
-
-    def best_of_axes(
-        self, table: RegressionTable, model: Fit, chosen: Sequence[Candidate]
-    ) -> list[Candidate]:
-        """Return the best function of each axis of a sensor, as if its rows were independent.
-
-        The arguments are those of a call.
-        """
-        model = replace(model, inflation=np.ones_like(model.inflation))
-        held = self._held(table, model, chosen)
-        best: dict[str, _Item] = {}
-        for item in self.gains(table, held):
-            channel = item[1].view.channel
-            if channel not in RADIO:
-                best.setdefault(channel, item)
-        return [self._candidate(*self._refined(held, item)[1:]) for item in best.values()]
-
-    def _held(self, table: RegressionTable, model: Fit, chosen: Sequence[Candidate]) -> _Held:
-        """Return `_held` of a Fit with the weights of the search."""
         scale = HUBER * model.scale[table.group] / np.sqrt(self.even)
         weight = np.minimum(1.0, scale / np.maximum(np.abs(model.residual), 1e-12)) * self.even
         everywhere = np.ones(len(table.y), dtype=bool)
         model = refit(table, columns_of(chosen), replace(model, weight=weight), everywhere)
-        return _held(table, model, chosen)
+        held = _held(table, model, chosen)
+        found = self.gains(table, held)[:PROPOSED]
+        found = _best_first(table, [self._refined(held, item) for item in found])
+        single = [self._candidate(*item[1:]) for item in _various(found)]
+        more = self._worth_more(table, found, self._products(held[1], model.residual))
+        return single[:FIRST_SINGLE] + more + single[FIRST_SINGLE:]
 
     def _worth_more(
         self, table: RegressionTable, found: Sequence[_Item], proposals: Sequence[Proposal]
