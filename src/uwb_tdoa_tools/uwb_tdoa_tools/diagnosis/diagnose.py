@@ -13,7 +13,6 @@ import numpy as np
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import SENSOR_NAMES
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
-from uwb_tdoa_bias.effects.truth import TruthFrame
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.evidence import OF_ANCHORS
 from uwb_tdoa_ekf.offline import may_have_offset
@@ -269,13 +268,18 @@ def _searched(
 
 
 def _suspects(found: Attribution, selected: validation.ValidatedSelection) -> list[frozenset[str]]:
-    """Return the names of effects to search without: a frame beside misleading ones, and these.
+    """Return the names of effects to search without: errors of the reference, and misleading ones.
 
-    Nodes do not get the frame of the ground truth, and the values of other effects depend on it.
+    The first are tried beside misleading ones only. Nodes do not get them, and the values of other
+    effects depend on them.
     """
     misleading = selected.misleading
-    frame = {TruthFrame.name}.intersection(one.name for one in found.selection.chosen)
-    return [frozenset(names) for names in (frame, misleading) if misleading and names]
+    of_reference = {
+        one.name
+        for one in found.selection.chosen
+        if one.terms[0].effect.needs_reference and not one.terms[0].effect.usable
+    }
+    return [frozenset(names) for names in (of_reference, misleading) if misleading and names]
 
 
 def _by_error(
