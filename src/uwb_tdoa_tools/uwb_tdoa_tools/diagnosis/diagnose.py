@@ -263,7 +263,11 @@ def _searched(
                 break
         else:
             return best[0], replace(best[1], refused=(*refused, *best[1].refused))
-        refused = (*refused, *(one for one in best[1].refused if one.what in names))
+        # The repeated search does not report these effects.
+        known = [one for one in best[1].refused if one.what in names]
+        better = validation.why_without(best[1].error, trial[1].error)
+        others = sorted(names.difference(one.what for one in known))
+        refused = (*refused, *known, *(Refused(name, better) for name in others))
         kinds, best = kinds - names, trial
 
 

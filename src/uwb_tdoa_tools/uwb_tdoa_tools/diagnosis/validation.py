@@ -208,7 +208,7 @@ def select_by_error(
             kept = [one for one in candidates if one not in gone]
             error = trials.start(kept, detections)
         for one, (before, after) in gone.items():
-            refused.append(Refused(one.label, _why_without(before, after)))
+            refused.append(Refused(one.label, why_without(before, after)))
             worth[one] = after - before
         candidates = kept
     for detection in attribution.detections:
@@ -221,7 +221,7 @@ def select_by_error(
             error = trial
         else:
             useless = f"does not make the filter better: {error:.3f} m without, {trial:.3f} m with"
-            why = useless if trial >= error * (1.0 - WORSE) else _why_without(trial, error)
+            why = useless if trial >= error * (1.0 - WORSE) else why_without(trial, error)
             refused.append(Refused(detection.effect.label, why))
     for momentary in (one for one in candidates if alone and _momentary(one)):
         refused.append(
@@ -337,7 +337,7 @@ def _applicable(candidates: Sequence[Candidate]) -> list[Candidate]:
     return [one for one in candidates if any(term.effect.usable for term in one.terms)]
 
 
-def _why_without(error: float, without: float) -> str:
+def why_without(error: float, without: float) -> str:
     """Return why an effect is not applied, given the errors with and without it, m."""
     figures = f"{error:.3f} m with, {without:.3f} m without"
     if without <= error * (1.0 - WORSE):

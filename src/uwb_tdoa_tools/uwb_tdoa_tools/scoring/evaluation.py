@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.effects import RADIO, EffectSet, true_samples
+from uwb_tdoa_bias.effects import RADIO, EffectSet, Samples, true_samples
 
 from ..checking.pair_rules import repairs
 from ..choices import FRAME, NONE, TIME
@@ -26,6 +26,8 @@ from .alignment import (
 from .metrics import Score, radio_residuals
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from uwb_tdoa_bias.common.flight import Flight, Truth
     from uwb_tdoa_bias.correction.model import Model
     from uwb_tdoa_ekf.core.config import FilterConfig
@@ -35,8 +37,8 @@ if TYPE_CHECKING:
 # largest ratio of the distances with repaired ids and signs, and with another frame
 LARGEST_LABEL_RATIO = 1.5
 # Largest ratio of the residuals of TDOAs with the frame moved and with it as it is, delays of
-# anchors fitted to both. Ten recordings with a ground truth put 0.35 m or 5 degrees off: 0.60 to
-# 0.92, and 0.94 to 1.03 where the path is too small to tell. Errors of anchors: 0.93 and more.
+# anchors fitted to both. Ten recordings with a ground truth put 0.35 m or 5 degrees off: 0.51 to
+# 0.92, and 0.94 to 1.03 where the path is too small to tell. Errors of anchors: 0.94 and more.
 LARGEST_FRAME_RATIO = 0.93
 FITS_OF_DELAYS = 8  # number of reweighted fits of delays
 
@@ -185,16 +187,29 @@ def _delays_fit(flight: Flight, effects: EffectSet, found: Alignment) -> bool:
     Errors that depend on the bearing of an anchor shift the estimate, too. False without TDOAs, and
     if the axes differ.
     """
-    assert flight.truth is not None
+    if found.axes_differ or not len(flight.tdoa):
+        return False
     left = []
-    for how in (TIME, FRAME):
-        moved = replace(flight, truth=found.significant().applied_to(flight.truth, how))
-        samples, rows = true_samples(moved)
-        residual = flight.tdoa.d[rows] - samples.predicted() - effects.bias(samples)
+    for samples, residual in _residuals(flight, effects, found, "tdoa"):
         known = np.isfinite(residual)
         ends = np.stack([samples.a, samples.b])[:, known]
         left.append(_left_by_delays(residual[known], ends) if known.any() else np.nan)
-    return not found.axes_differ and bool(left[1] > LARGEST_FRAME_RATIO * left[0])
+    return bool(left[1] > LARGEST_FRAME_RATIO * left[0])
+
+
+def _residuals(
+    flight: Flight, effects: EffectSet, found: Alignment, stream: str
+) -> Iterator[tuple[Samples, np.ndarray]]:
+    """Yield (Samples, residual (n,) m) of a stream of RADIO, first in the frame of the truth.
+
+    Then with the frame moved.
+    """
+    assert flight.truth is not None
+    for how in (TIME, FRAME):
+        moved = replace(flight, truth=found.significant().applied_to(flight.truth, how))
+        samples, rows = true_samples(moved, RADIO[stream])
+        measured = getattr(flight, stream).d[rows]
+        yield samples, measured - samples.predicted() - effects.bias(samples)
 
 
 def _left_by_delays(residual: np.ndarray, ends: np.ndarray) -> float:
@@ -222,18 +237,13 @@ def _ranges_fit(flight: Flight, effects: EffectSet, found: Alignment) -> bool:
 
     Delays of anchors distort the estimate, but are only constants in ranges. False without ranges.
     """
-    assert flight.truth is not None
     channels = [
         name for name, kind in RADIO.items() if kind.ends == 1 and getattr(flight, name) is not None
     ]
     if not channels:
         return False
     away = []
-    for how in (TIME, FRAME):
-        moved = replace(flight, truth=found.significant().applied_to(flight.truth, how))
-        samples, rows = true_samples(moved, RADIO[channels[0]])
-        measured = getattr(flight, channels[0]).d[rows]
-        left = measured - samples.predicted() - effects.bias(samples)
+    for samples, left in _residuals(flight, effects, found, channels[0]):
         of_anchors = [left[samples.b == anchor] for anchor in np.unique(samples.b)]
         apart = [np.abs(some - np.median(some)) for some in of_anchors]
         away.append(np.median(np.concatenate(apart)) if apart else np.nan)
