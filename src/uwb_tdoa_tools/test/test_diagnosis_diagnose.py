@@ -21,6 +21,7 @@ from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands.diagnose import main
 from uwb_tdoa_tools.diagnosis import diagnose, output, with_noise
 from uwb_tdoa_tools.diagnosis.findings import Refused
+from uwb_tdoa_tools.diagnosis.regression.confounding import Unobservable
 from uwb_tdoa_tools.diagnosis.regression.terms import Candidate, Term
 from uwb_tdoa_tools.diagnosis.validation import ValidatedSelection
 
@@ -104,6 +105,16 @@ def test_the_search_is_repeated_without_what_misleads_the_filter(errors, without
     assert found.left_out == without
     names = [one.what for one in selected.refused]
     assert without <= set(names) and names.count("other") == 1
+
+
+def test_an_effect_that_a_repeated_search_leaves_out_is_not_called_unobservable(monkeypatch):
+    module = import_module("uwb_tdoa_tools.diagnosis.diagnose")
+    partly = Unobservable("anchor_position", {"0.x": 1.0})
+    lacking = [Unobservable(name, None) for name in ("truth_frame", "range_offset", "gyro_bias")]
+    monkeypatch.setattr(module, "unobservable", lambda *_: [partly, *lacking])
+    found = SimpleNamespace(selection=None, candidates=())
+    refused = [Refused("truth_frame", ""), Refused("anchor_position", "")]
+    assert module._unobservable(found, ("imu",), refused) == [partly, lacking[1]]
 
 
 @pytest.mark.slow

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 
     from ..parallel import MapFunction
     from .detectors import Detection
+    from .regression.confounding import Unobservable
     from .regression.terms import Candidate
     from .self_calibration import SelfCalibration
 
@@ -130,11 +131,7 @@ def diagnose(
         outcome.findings,
         outcome.effects,
         [*outcome.attribution.refused, *outcome.refused],
-        [
-            item
-            for item in unobservable(found.selection, found.candidates)
-            if not _only_of(unused, item.effect)
-        ],
+        _unobservable(found, unused, outcome.refused),
         *outcome.sides,
         outcome.judged_on,
         health(found.residuals, scores),
@@ -180,6 +177,22 @@ def with_noise(
 def unused_streams(config: FilterConfig) -> tuple[str, ...]:
     """Return the names of the streams of a Flight that the filter does not use."""
     return tuple(name for name in ("imu", *SENSOR_NAMES) if not getattr(config, f"use_{name}"))
+
+
+def _unobservable(
+    found: Attribution, unused: Sequence[str], refused: Sequence[Refused]
+) -> list[Unobservable]:
+    """Return what the flights do not determine, without effects that show in unused streams alone.
+
+    An effect that a repeated search leaves out is refused; the flights do not lack its channel.
+    """
+    left_out = {one.what for one in refused}
+    return [
+        item
+        for item in unobservable(found.selection, found.candidates)
+        if not _only_of(unused, item.effect)
+        and (item.direction is not None or item.effect not in left_out)
+    ]
 
 
 def _only_of(unused: Sequence[str], effect: str) -> bool:
