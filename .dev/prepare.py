@@ -272,14 +272,19 @@ def colcon(selected):
 
 
 def digest(paths, *words):
-    """Hash of the words and of every file under the paths: names and contents."""
+    """Hash of the words and of every file under the paths: names and contents.
+
+    Tests are not built. Compiled modules and hidden folders (.hypothesis, .pytest_cache) are
+    written where programs run.
+    """
     total = hashlib.sha256("\0".join(words).encode())
     for path in paths:
         files = (
             [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
         )
         for file in files:
-            if not {"test", "__pycache__"} & set(file.relative_to(path).parts):
+            parts = file.relative_to(path).parts
+            if not any(part in ("test", "__pycache__") or part[0] == "." for part in parts):
                 total.update(f"\0{file.relative_to(ROOT)}\0".encode())
                 total.update(file.read_bytes())
     return total.hexdigest()

@@ -228,6 +228,26 @@ def test_where_nothing_is_to_be_done_nobody_waits_for_another(prepare, monkeypat
 
 
 @pytest.mark.parametrize(
+    ("written", "builds"),
+    [
+        ("setup.py", True),
+        ("uwb_tdoa_bias/new.py", True),
+        ("uwb_tdoa_bias/__pycache__/new.pyc", False),
+        ("test/test_new.py", False),
+        (".hypothesis/constants/0b0ec", False),  # written by tests that run in this folder
+        (".pytest_cache/v/cache/nodeids", False),
+        ("uwb_tdoa_bias/.new.py.swp", False),
+    ],
+)
+def test_only_sources_that_are_installed_start_a_build(prepare, written, builds):
+    before = prepare.digests()
+    path = prepare.ROOT / "src" / "uwb_tdoa_bias" / written
+    path.parent.mkdir(parents=True)
+    path.write_text("new")
+    assert (prepare.digests() != before) == builds
+
+
+@pytest.mark.parametrize(
     ("name", "output", "share"),
     [
         (
