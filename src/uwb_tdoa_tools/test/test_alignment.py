@@ -15,6 +15,8 @@ from uwb_tdoa_bias.effects import EffectSet, true_samples
 from uwb_tdoa_bias.effects.anchor import AnchorDelay
 from uwb_tdoa_bias.effects.stamps import shifted
 from uwb_tdoa_ekf.offline import run_offline
+from uwb_tdoa_tools.bags.bag import write_bag
+from uwb_tdoa_tools.commands import evaluate as evaluate_command
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.scoring.alignment import (
     _other_axes,
@@ -225,7 +227,7 @@ def test_wrong_ids_and_signs_are_no_other_frame(name, request):
         assert said == () and np.array_equal(same.truth.p, one.truth.p)
 
 
-def test_delays_of_anchors_that_shift_the_estimate_are_no_other_frame(flight):
+def test_delays_of_anchors_that_shift_the_estimate_are_no_other_frame(flight, tmp_path, capsys):
     """The delays of all anchors imitate a tag that is shifted by 0.4 m along x.
 
     The TDOAs agree with a shifted frame in the middle of the room only. A correct ground truth
@@ -245,6 +247,10 @@ def test_delays_of_anchors_that_shift_the_estimate_are_no_other_frame(flight):
     assert found.frame_differs, found.offset
     same, said = align_truth(delayed)
     assert said == () and np.array_equal(same.truth.p, flight.truth.p)
+    write_bag(delayed, tmp_path / "delayed")
+    assert evaluate_command.main([str(tmp_path / "delayed")]) == 0
+    told = capsys.readouterr().err
+    assert "do not judge with --align frame before `diagnose`" in told
     moved, said = align_truth(in_frame(flight, shift=shift))
     assert "another frame" in said[0]
     assert np.abs(moved.truth.p - flight.truth.p).max() < 0.1

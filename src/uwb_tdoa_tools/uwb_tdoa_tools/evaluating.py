@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from uwb_tdoa_bias.common.text import sanitize
+from uwb_tdoa_bias.effects import EffectSet
 
 from . import parallel
 from .bags.bag import late_tdoas, read_odometry
@@ -20,7 +21,7 @@ from .checking.flight_rules import judge_truth
 from .checking.recording import of_flight
 from .checking.report import survey_remarks
 from .checking.watch import BEFORE_TRUTH
-from .choices import ALIGN, NONE
+from .choices import ALIGN, FRAME, NONE, TIME
 from .estimate import FlightEstimator
 from .localizing.localize import write_tum
 from .localizing.pictures import write_rerun
@@ -29,7 +30,7 @@ from .readers.inputs import Reading, report_remarks
 from .readers.tables import number, read_table
 from .results_file import ResultsFile, fingerprint_of
 from .scoring.alignment import estimate_alignment, require_truth
-from .scoring.evaluation import corrected_truth
+from .scoring.evaluation import corrected_truth, delays_fit
 from .scoring.metrics import Score, radio_residuals
 from .scoring.phases import NEAR_THE_FLOOR, TITLES
 from .scoring.pooling import Pool, Result
@@ -176,13 +177,17 @@ class Evaluator:
 
     def _truth_findings(self, flight: Flight, found: Alignment) -> Iterator[str]:
         """Yield sentences on errors of the ground truth."""
-        for how, words in (("time", found.clock_sentence()), ("frame", found.frame_sentence())):
+        align = "judge with --align {}, and put it right where it comes from"
+        remedies = {TIME: align, FRAME: align}
+        effects = self.estimator.effects or EffectSet()
+        if found.frame_differs and delays_fit(effects.correct_streams(flight), effects, found):
+            remedies[FRAME] = (
+                "delays of anchors explain the TDOAs as well, so do not judge with --align {} before "
+                "`diagnose` has told which of both it is"
+            )
+        for how, words in ((TIME, found.clock_sentence()), (FRAME, found.frame_sentence())):
             if words:
-                yield words + (
-                    f"; judge with --align {how}, and put it right where it comes from."
-                    if self.align == NONE
-                    else "."
-                )
+                yield words + (f"; {remedies[how].format(how)}." if self.align == NONE else ".")
         for finding in judge_truth(flight):
             yield f"{finding.cause}: {finding.evidence}; {finding.remedy}."
 

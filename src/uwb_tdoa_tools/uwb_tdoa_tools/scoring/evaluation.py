@@ -161,7 +161,7 @@ def _alignment(flight: Flight, effects: EffectSet, config: FilterConfig | None) 
     assert straight.truth is not None
     found = estimate_alignment(straight, odometry)
     if found.frame_differs and (
-        _ranges_fit(straight, effects, found) or _delays_fit(straight, effects, found)
+        _ranges_fit(straight, effects, found) or delays_fit(straight, effects, found)
     ):
         found = replace(found, axes=np.eye(3), turn=np.eye(3), shift=np.zeros(3))
     repair = (
@@ -181,11 +181,17 @@ def _alignment(flight: Flight, effects: EffectSet, config: FilterConfig | None) 
     )
 
 
-def _delays_fit(flight: Flight, effects: EffectSet, found: Alignment) -> bool:
+def delays_fit(flight: Flight, effects: EffectSet, found: Alignment) -> bool:
     """Return whether delays of anchors explain the TDOAs as well as another frame does.
 
     Errors that depend on the bearing of an anchor shift the estimate, too. False without TDOAs, and
     if the axes differ.
+
+    Parameters
+    ----------
+    flight : Flight with ground truth and corrected streams.
+    effects : known effects.
+    found : Alignment of the ground truth with the estimate.
     """
     if found.axes_differ or not len(flight.tdoa):
         return False
