@@ -12,6 +12,7 @@ import pytest
 from studies.rules import figures, tuned, watching, work
 from studies.rules.catalogue import RULES, Rule
 from studies.rules.worth import noise_of, worth
+from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_ekf.core import noise, update
 
 # In another process, as the copy takes the place of the filter: a variance, and the noise that is
@@ -53,6 +54,12 @@ def made(tmp_path_factory):
 def test_every_rule_of_the_catalogue_stands_in_the_core_once_by_name(made):
     assert [entry.name for entry in made.rules] and len({rule.name for rule in RULES}) == len(RULES)
     assert {entry.name for entry in made.rules} == {rule.name for rule in RULES}
+
+
+def test_the_modules_of_all_sensors_are_known():
+    known = {module: name for module, name in work.MODULES.items() if module != "plane"}
+    assert tuple(known.values()) == tuple(SENSORS)
+    assert known["ranges"] == "range" and known["velocity"] == "velocity"
 
 
 def test_a_rule_that_is_not_there_is_named(tmp_path):

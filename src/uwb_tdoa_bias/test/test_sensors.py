@@ -79,6 +79,7 @@ def test_what_is_written_is_read(name):
     for one, other in zip(sensor.read(T, sensor.split(table)).columns, stream.columns):
         np.testing.assert_array_equal(one, other)
     assert all(values.all() for values in sensor.sound(fields).values())
+    assert next(iter(sensor.parameters)) == f"use_{name}", "use_<name> is the first parameter"
 
 
 @pytest.mark.parametrize("name", SENSORS)
@@ -98,9 +99,13 @@ def test_what_the_filter_gets(name):
         and rows.keys() <= {"value", "std", "anchor"}
         and np.isfinite(rows["value"]).all()
     )
+    for field in rows.keys() - {"anchor"}:
+        shape = rows[field].shape
+        assert len(shape) == 2 and shape[1] <= 4, f"{field}: {shape}, not (n, k) with k <= 4"
     # NaN is not a measurement, in any column.
     if name != "velocity":
-        *_, broken = SENSORS[name].measured(STREAMS[name].with_values(np.full((N, 1), np.nan)))
+        missing = np.full_like(STREAMS[name].values, np.nan)
+        *_, broken = SENSORS[name].measured(STREAMS[name].with_values(missing))
         assert not broken.any()
 
 

@@ -8,6 +8,7 @@ rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from dataclasses import fields  # noqa: E402
+import json  # noqa: E402
 import math  # noqa: E402
 from pathlib import Path  # noqa: E402
 import re  # noqa: E402
@@ -41,6 +42,12 @@ def node():
 
 def test_every_parameter_is_in_the_parameter_file_with_its_default(node):
     parameters, declared = written_and_declared(node, CONFIG)
+    missing = [
+        f"    {name}: {json.dumps(declared[name])}  # {node.describe_parameter(name).description}"
+        for name in declared
+        if name not in parameters
+    ]
+    assert not missing, "\n".join(["add to ekf_node.yaml, in the order of the registry:", *missing])
     assert parameters == declared
     assert {field.name for field in fields(FilterConfig)} < declared.keys()
     assert FilterConfig.from_yaml(CONFIG) == FilterConfig()

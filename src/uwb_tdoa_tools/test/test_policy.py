@@ -137,9 +137,9 @@ def test_nobody_else_may_take_over():
         & {"/uwb/anchors", "/initialpose", "/odometry", "/uwb/tdoa_corrected", "/clock"}
         and not robot["request"]
     )
-    assert {f"/{topic}" for each in SENSORS.values() for topic, _ in each.topics} <= robot[
-        "publish"
-    ]
+    missing = {f"/{topic}" for each in SENSORS.values() for topic, _ in each.topics}
+    missing -= robot["publish"]
+    assert not missing, f"add publish {', '.join(sorted(missing))} of the profile /robot"
     offered = {
         name for nodes in policy.values() for roles in nodes.values() for name in roles["reply"]
     }

@@ -21,6 +21,7 @@ from live_flights import hall  # noqa: E402
 from test_lockstep import load  # noqa: E402, F401
 
 from uwb_tdoa_bias.common.errors import InputError  # noqa: E402
+from uwb_tdoa_bias.common.sensors import SENSORS  # noqa: E402
 from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_msgs.srv import GoTo, Land, Takeoff  # noqa: E402
 from uwb_tdoa_tools.flying import rover  # noqa: E402
@@ -57,7 +58,7 @@ def test_requests_are_those_that_users_of_crazyswarm2_know(name):
 @pytest.mark.parametrize(
     "given, why",
     [
-        ("sensors:=[sonar]", "sensors: 'sonar' is not one of height, pressure, velocity, range."),
+        ("sensors:=[sonar]", f"sensors: 'sonar' is not one of {', '.join(SENSORS)}."),
         (
             "vehicle:=rover",
             "vehicle: a rover takes no commands and no sensors; set mission to true.",

@@ -201,7 +201,8 @@ def add_options(made: argparse.ArgumentParser) -> None:
     ).add_argument
     for name, sensor in SENSORS.items():
         unit, words, _ = sensor.noise
-        add(f"--{name}-noise", metavar=unit, type=float, **unless, help=words)
+        option = f"--{name.replace('_', '-')}-noise"
+        add(option, metavar=unit, type=float, **unless, help=words)
 
 
 def config_of(args: argparse.Namespace) -> SimulationConfig:
