@@ -8,6 +8,7 @@ pins or Python change. Each run installs the current wheel.
 
 from functools import cache
 import hashlib
+from importlib import import_module
 import json
 import os
 from pathlib import Path
@@ -21,6 +22,7 @@ from documented import ROOT
 import pytest
 
 from uwb_tdoa_bias.common.text import version
+from uwb_tdoa_bias.effects import EFFECTS
 from uwb_tdoa_tools import main
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.command_lines import COMMAND, RUN
@@ -119,11 +121,14 @@ def needs(wheel, pins, python):
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
-    """Return a folder with a bag that has our message types, and its anchors."""
+    """Return a folder with a bag that has our message types, and its anchors.
+
+    One anchor is late. With more errors, the search of diagnose takes longer.
+    """
     folder = tmp_path_factory.mktemp("recording")
-    settings = {"duration": 16.0, "imu_rate": 100.0, "start_in_air": True, "seed": 4}
-    flight = simulate(SimulationConfig(truth_rate=50.0, **settings))
-    write_bag(flight, folder / "flight.bag")
+    settings = {"duration": 12.0, "imu_rate": 100.0, "start_in_air": True, "seed": 4}
+    flight = simulate(SimulationConfig(truth_rate=50.0, bias=False, multipath=False, **settings))
+    write_bag(EFFECTS["anchor_delay"]({"3": 0.3}).inject(flight), folder / "flight.bag")
     flight.anchors.to_yaml(folder / "anchors.yaml")
     return folder
 
@@ -201,38 +206,37 @@ def figures(folder):
     }
 
 
-def test_figures_are_those_with_ros_bit_by_bit(wheel, recording, tmp_path):
-    tool, made = installed(wheel, HERE) / COMMAND, {}
+def test_figures_are_those_with_ros_bit_by_bit(wheel, recording, tmp_path, monkeypatch, capsys):
+    """The commands of the sources run in this process. Those of the wheel run as programs."""
+    tool = installed(wheel, HERE) / COMMAND
+    monkeypatch.chdir(recording)
+    monkeypatch.setenv(RUN, COMMAND)
+    outs = [tmp_path / side for side in ("with", "without")]
+    for out in outs:
+        out.mkdir()
     for name, (words, code) in WORK.items():
-        results, errors = [], []
-        for side in ("with", "without"):
-            out = tmp_path / side
-            out.mkdir(exist_ok=True)
-            line = [word.replace("OUT", str(out)) for word in words]
-            if side == "without":
-                done = subprocess.run(
-                    [tool, name, *line],
-                    cwd=recording,
-                    env={**kept("HOME", "OPENBLAS_"), "PATH": "/usr/bin:/bin"},
-                    capture_output=True,
-                    text=True,
-                )
-            else:
-                start = [sys.executable, "-m", f"uwb_tdoa_tools.commands.{name}"]
-                variables = {**os.environ, "OMP_NUM_THREADS": "1", RUN: COMMAND}
-                done = subprocess.run(
-                    [*start, *line], cwd=recording, env=variables, capture_output=True, text=True
-                )
-            assert done.returncode in ((0, 1) if code is None else (code,)), done.stderr
-            # line breaks depend on the length of the folder
-            printed = " ".join(done.stdout.replace(str(out), "OUT").split())
-            results.append((done.returncode, printed))
-            errors.append(done.stderr)
-        assert results[0] == results[1], (name, errors)
-        made[name] = results
-    with_ros, without = (figures(tmp_path / side) for side in ("with", "without"))
+        ours, theirs = ([word.replace("OUT", str(out)) for word in words] for out in outs)
+        capsys.readouterr()
+        ended = import_module(f"uwb_tdoa_tools.commands.{name}").main(ours)
+        said = capsys.readouterr()
+        done = subprocess.run(
+            [tool, name, *theirs],
+            env={**kept("HOME", "OPENBLAS_"), "PATH": "/usr/bin:/bin"},
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode in ((0, 1) if code is None else (code,)), done.stderr
+        # line breaks depend on the length of the folder
+        printed = [
+            " ".join(text.replace(str(out), "OUT").split())
+            for text, out in zip((said.out, done.stdout), outs)
+        ]
+        assert ended == done.returncode, (name, said.err, done.stderr)
+        assert printed[0] == printed[1], (name, said.err, done.stderr)
+    with_ros, without = map(figures, outs)
     assert with_ros.keys() == without.keys()
     for path, content in with_ros.items():
         assert content == without[path], path
     assert json.loads((tmp_path / "without" / "evaluate.json").read_text())["runs"]
+    assert "anchor_delay" in (tmp_path / "without" / "diagnosis" / "effects.yaml").read_text()
     assert len(with_ros) >= 9

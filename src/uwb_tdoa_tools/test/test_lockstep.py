@@ -36,7 +36,7 @@ READY_LIMIT, SETTLE_LIMIT = 180.0, 60.0  # s
 
 @pytest.fixture
 def load():
-    """Return load(n), which starts n busy processes until the test ends."""
+    """Return load(n), which starts n busy processes. They end with the test or load.end()."""
     running = []
 
     def start(count):
@@ -44,17 +44,23 @@ def load():
             subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)
         )
 
+    def end():
+        while running:
+            process = running.pop()
+            process.kill()
+            process.wait()
+
+    start.end = end
     yield start
-    for process in running:
-        process.kill()
-        process.wait()
+    end()
 
 
-def replayed(bag, folder, *options, nodes=(), begin=lambda: None):
+def replayed(bag, folder, *options, nodes=(), begin=lambda: None, end=lambda: None):
     """Replay a bag in step with the odometry of the nodes.
 
     nodes : {node: arguments}
     begin : callable, called when the nodes are ready, before the replay
+    end : callable, called after the replay and before the nodes are asked what they received
 
     Returns (exit code, output, diagnostics {node: {key: text}}, recorded bag).
     """
@@ -87,6 +93,7 @@ def replayed(bag, folder, *options, nodes=(), begin=lambda: None):
         command = ("uwb_tdoa_tools", "replay", bag, "--follow", "odometry", *options)
         replay = processes.start(*command, may_end_with=(0, 1, 2))
         wait(None, None, processes, node, lambda: replay.poll() is not None)
+        end()
         diagnostics.forget()
         wait(SETTLE_LIMIT, "the nodes to finish", processes, node, diagnostics.is_settled)
         told = {name: diagnostics.newest(name) for name in ("bias_node", "ekf_node")}
@@ -131,7 +138,7 @@ def test_a_measured_flight_beside_three_busy_processes(shared_data, tmp_path, lo
     flight = read_flight(log, survey)
     write_bag(between(flight, -np.inf, flight.imu.t[0] + 16.0), tmp_path / "flight.bag")
     code, said, told, recorded = replayed(
-        tmp_path / "flight.bag", tmp_path, "--rate", 4, begin=lambda: load(3)
+        tmp_path / "flight.bag", tmp_path, "--rate", 4, begin=lambda: load(3), end=load.end
     )
     assert code == 0, said
     assert_equal_to_offline(read_bag(tmp_path / "flight.bag"), told, recorded)
@@ -140,7 +147,8 @@ def test_a_measured_flight_beside_three_busy_processes(shared_data, tmp_path, lo
 @pytest.mark.slow
 def test_nodes_that_do_not_wait_long_enough_are_not_followed(tmp_path):
     write_bag(
-        simulate(SimulationConfig(seed=3, duration=16.0, imu_rate=200.0)), tmp_path / "flight.bag"
+        simulate(SimulationConfig(seed=3, duration=8.0, imu_rate=200.0, start_in_air=True)),
+        tmp_path / "flight.bag",
     )
     nodes = {"bias_node": ("--ros-args", "-p", "hold:=0.08")}
     code, said, _, _ = replayed(tmp_path / "flight.bag", tmp_path, nodes=nodes)
@@ -180,7 +188,8 @@ def delayed(bag, out, count=10, delay=1_000_000_000):
 @pytest.mark.slow
 def test_late_messages_give_code_1(tmp_path):
     write_bag(
-        simulate(SimulationConfig(seed=3, duration=16.0, imu_rate=200.0)), tmp_path / "flight.bag"
+        simulate(SimulationConfig(seed=3, duration=8.0, imu_rate=200.0, start_in_air=True)),
+        tmp_path / "flight.bag",
     )
     delayed(tmp_path / "flight.bag", tmp_path / "delayed.bag")
     code, said, told, _ = replayed(tmp_path / "delayed.bag", tmp_path, "--rate", 2)
