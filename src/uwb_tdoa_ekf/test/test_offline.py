@@ -14,6 +14,7 @@ from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas
 from uwb_tdoa_bias.correction.corrector import Corrector, known_yaw_std
 from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, SmoothTerm, TagLeverArm
+from uwb_tdoa_bias.effects.pair import PairOffset
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.memory import INVALID, STARTUP, USED
 from uwb_tdoa_ekf.estimator import Estimator
@@ -103,6 +104,25 @@ def test_corrections_are_those_of_live_feeding(lag, network, grid):
         corrected[valid], np.stack([baseline.bias, baseline.bias_std], axis=1)[valid], atol=1e-9
     )
     assert np.abs(baseline.bias).max() > 0.3 and (baseline.residuals.verdict == USED).sum() > 500
+
+
+class Waiting(Corrector):
+    """Wait for poses that no correction depends on."""
+
+    uses_pose = True
+
+
+def test_constant_corrections_wait_for_no_poses():
+    flight = fly(3, 4.0)
+    constant = EffectSet((AnchorDelay({IDS[0]: 0.5}), PairOffset({f"{IDS[0]}-{IDS[1]}": 0.1})))
+    at_once = Corrector(flight.anchors, constant)
+    assert not at_once.uses_pose and Corrector(flight.anchors, EFFECTS).uses_pose
+    one, other = (
+        run_offline(flight, None, each) for each in (at_once, Waiting(flight.anchors, constant))
+    )
+    assert_same(one.odometry, other.odometry, 0.0)
+    np.testing.assert_array_equal(one.bias, other.bias)
+    np.testing.assert_array_equal(one.residuals.innovation, other.residuals.innovation)
 
 
 def test_what_is_corrected_is_what_was_wrong():

@@ -141,7 +141,7 @@ def run_offline(
         of_tdoas.append(batch[usable])
         fed = pipeline.run(buffer, until)
         parts += fed
-        if not corrector.idle and fed:
+        if corrector.uses_pose and fed:
             corrector.add_pose(*poses_of(odometry_of(fed)))
     outcome = _verdicts(len(tdoa), np.concatenate(of_tdoas), [part.tdoas for part in parts])
     residuals = Residuals.from_rows(tdoa.t, tdoa.a, tdoa.b, outcome)
@@ -281,7 +281,7 @@ def _batches(
         # TDOAs of one stamp are in the same order as in the nodes
         known = known[np.lexsort((d[known], b[known], a[known], t[known]))]
     stamps, first = t[known], 0
-    lag = math.inf if corrector.idle else corrector.lag
+    lag = corrector.lag if corrector.uses_pose else math.inf
     for number, bound in enumerate([*sorted(restarts), math.inf]):
         last, anew = int(np.searchsorted(stamps, bound)), number > 0
         while True:

@@ -298,6 +298,7 @@ def _through(
     stamps, positions = path[0], path[1]
     before, after = states[0], states[1]
     n = regressors.shape[1]
+    change = np.empty(n)  # row by row below: loops over the parameters are vectorized
     for i in range(len(records)):
         record = records[i]
         while passed < len(stamps) and stamps[passed] < record.t:
@@ -317,12 +318,16 @@ def _through(
                         after[r, j] += step * before[c, j]
         place = of[i]
         for j in range(n):
-            change = regressors[place, j] if place >= 0 else 0.0
-            for c in range(ERROR_STATES):
-                change -= record.row[c] * after[c, j]
-            if place >= 0:
-                out[place, j] = change
-            for r in range(ERROR_STATES):
-                after[r, j] += record.gain[r] * change
+            change[j] = regressors[place, j] if place >= 0 else 0.0
+        for c in range(ERROR_STATES):
+            entry = record.row[c]
+            for j in range(n):
+                change[j] -= entry * after[c, j]
+        if place >= 0:
+            out[place] = change
+        for r in range(ERROR_STATES):
+            gain = record.gain[r]
+            for j in range(n):
+                after[r, j] += gain * change[j]
         before[:, :] = after
     return passed

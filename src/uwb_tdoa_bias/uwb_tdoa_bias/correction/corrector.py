@@ -143,6 +143,11 @@ class Corrector:
         return not self._has_model
 
     @property
+    def uses_pose(self) -> bool:
+        """Return whether a correction depends on the pose of the tag, so it waits for poses."""
+        return not self.idle and (self.network is not None or self.effects.uses_pose)
+
+    @property
     def outside(self) -> list[str]:
         """Phrases on effects that faded by more than half for some of the latest TDOAs.
 

@@ -100,6 +100,7 @@ class AnchorDelay(AnchorEffect):
         phrase="anchor {key} {size} {way}",
         ways=("late", "early"),
     )
+    uses_pose = False
 
     def found(self) -> str:
         found = super().found()

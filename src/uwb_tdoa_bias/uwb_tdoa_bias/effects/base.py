@@ -256,6 +256,7 @@ class Effect:
     is_hypothesis: ClassVar[bool] = False  # True: the filter tests it, and no Corrector removes it
     needs_reference: ClassVar[bool] = False  # True: innovations alone do not show it
     needs_motion: ClassVar[bool] = False  # True: depends on more than the pose of the tag
+    uses_pose: ClassVar[bool] = True  # False: its bias is a constant of each pair of anchors
     uses_attitude: ClassVar[bool] = False  # True: its bias depends on the attitude of the tag
     periodic: ClassVar[bool] = False  # True: it recurs in time, and goes on beyond its domain
 

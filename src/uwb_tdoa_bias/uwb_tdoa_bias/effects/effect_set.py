@@ -349,6 +349,12 @@ class EffectSet:
         )
 
     @cached_property
+    def uses_pose(self) -> bool:
+        """Return whether the correction of a TDOA depends on the pose of the tag."""
+        of_tdoas = (effect for effect in self.effects if "tdoa" in effect.channels)
+        return any(effect.uses_pose or effect.domain for effect in of_tdoas)
+
+    @cached_property
     def needs_motion(self) -> bool:
         """Return whether an effect depends on more than poses."""
         return any(effect.needs_motion for effect in self.effects)

@@ -61,6 +61,7 @@ class PairOffset(PairEffect):
         phrase="the TDOA of {key} is {size} too {way}",
         ways=("large", "small"),
     )
+    uses_pose = False
 
     def bias(self, samples: Samples) -> np.ndarray:
         rows = {i: row for row, i in enumerate(samples.anchors.ids.tolist())}

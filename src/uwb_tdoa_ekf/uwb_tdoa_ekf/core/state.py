@@ -118,16 +118,19 @@ def predict(
     for i in range(MOVING_STATES):
         for j in range(MOVING_STATES, ERROR_STATES):
             P[i, j] = P[j, i] = T[i, j]
-        for r in range(3):
-            if i <= r:
-                P[i, r] = P[r, i] = T[i, r] + dt * T[i, 3 + r]
-            if i <= 3 + r:
-                by_attitude = A[r, 0] * T[i, 6] + A[r, 1] * T[i, 7] + A[r, 2] * T[i, 8]
-                by_bias = B[r, 0] * T[i, 9] + B[r, 1] * T[i, 10] + B[r, 2] * T[i, 11]
-                P[i, 3 + r] = P[3 + r, i] = T[i, 3 + r] + by_attitude + by_bias
-            if i <= 6 + r:
-                by_rotation = E[r, 0] * T[i, 6] + E[r, 1] * T[i, 7] + E[r, 2] * T[i, 8]
-                P[i, 6 + r] = P[6 + r, i] = by_rotation - dt * T[i, 12 + r]
+    for r in range(3):
+        a0, a1, a2 = A[r, 0], A[r, 1], A[r, 2]
+        b0, b1, b2 = B[r, 0], B[r, 1], B[r, 2]
+        e0, e1, e2 = E[r, 0], E[r, 1], E[r, 2]
+        for i in range(r + 1):
+            P[i, r] = P[r, i] = T[i, r] + dt * T[i, 3 + r]
+        for i in range(3 + r + 1):
+            by_attitude = a0 * T[i, 6] + a1 * T[i, 7] + a2 * T[i, 8]
+            by_bias = b0 * T[i, 9] + b1 * T[i, 10] + b2 * T[i, 11]
+            P[i, 3 + r] = P[3 + r, i] = T[i, 3 + r] + by_attitude + by_bias
+        for i in range(6 + r + 1):
+            by_rotation = e0 * T[i, 6] + e1 * T[i, 7] + e2 * T[i, 8]
+            P[i, 6 + r] = P[6 + r, i] = by_rotation - dt * T[i, 12 + r]
     _add_noise(P, transition.rotation, imu.accel_psd, parameters, dt)
 
 
@@ -173,14 +176,16 @@ def propagate(M: np.ndarray, transition: Record) -> None:
         transition.attitude_attitude,
     )
     for r in range(3):
+        # read before the loop, which is then vectorized
+        a0, a1, a2 = A[r, 0], A[r, 1], A[r, 2]
+        b0, b1, b2 = B[r, 0], B[r, 1], B[r, 2]
+        e0, e1, e2 = E[r, 0], E[r, 1], E[r, 2]
         for j in range(ERROR_STATES):
             out[r, j] = M[r, j] + dt * M[3 + r, j]
-            by_attitude = A[r, 0] * M[6, j] + A[r, 1] * M[7, j] + A[r, 2] * M[8, j]
-            by_bias = B[r, 0] * M[9, j] + B[r, 1] * M[10, j] + B[r, 2] * M[11, j]
+            by_attitude = a0 * M[6, j] + a1 * M[7, j] + a2 * M[8, j]
+            by_bias = b0 * M[9, j] + b1 * M[10, j] + b2 * M[11, j]
             out[3 + r, j] = M[3 + r, j] + by_attitude + by_bias
-            out[6 + r, j] = (
-                E[r, 0] * M[6, j] + E[r, 1] * M[7, j] + E[r, 2] * M[8, j] - dt * M[12 + r, j]
-            )
+            out[6 + r, j] = e0 * M[6, j] + e1 * M[7, j] + e2 * M[8, j] - dt * M[12 + r, j]
 
 
 @compiled

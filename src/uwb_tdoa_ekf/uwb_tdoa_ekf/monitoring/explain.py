@@ -20,6 +20,8 @@ from ..core.engine import feed
 from ..core.memory import IMU_SAMPLE, Measurements, new_state, usable_tdoas
 
 if TYPE_CHECKING:
+    from collections.abc import Generator
+
     from ..core.memory import FilterState
 
 SCALE = 0.5  # m, scale of the Geman-McClure loss: an innovation of this size has a loss of one half
@@ -128,6 +130,31 @@ def unexplained(
     limit : float
         If the mean loss is certain to exceed this limit, return an Unexplained without blocks.
     """
+    blocks = each_block(tdoa, positions, imu, config)
+    while True:
+        try:
+            least = next(blocks)
+        except StopIteration as end:
+            return end.value
+        if least > limit * (1.0 + 1e-9):
+            return Unexplained({})
+
+
+def each_block(
+    tdoa: np.ndarray,
+    positions: np.ndarray,
+    imu: np.ndarray = NO_IMU,
+    config: FilterConfig = CONFIG,
+) -> Generator[float, None, Unexplained]:
+    """Run the filter of `unexplained` block by block, and return the Unexplained.
+
+    The parameters are as for `unexplained`.
+
+    Yields
+    ------
+    least : float
+        Least mean loss that is possible after the blocks so far.
+    """
     t, state, parameters = tdoa["t"], new_state(positions), config.parameters()
     number = _numbers(t)
     # first row of each block, and of the rows before the first block
@@ -135,14 +162,13 @@ def unexplained(
     counted = (np.diff(edges) > FEW) & (number[edges[:-1]] >= 0)
     # number of inertial samples before the first TDOA of each block
     of_imu = (0, *imu["t"].searchsorted(t[edges[1:-1]]), len(imu))
-    most, loss, out = limit * (1.0 + 1e-9) * np.count_nonzero(counted), 0.0, np.empty(len(t))
+    count, loss, out = max(np.count_nonzero(counted), 1), 0.0, np.empty(len(t))
     for k, (first, end) in enumerate(zip(edges, edges[1:])):
         out[first:end] = innovations(
             state, tdoa[first:end], positions, imu[of_imu[k] : of_imu[k + 1]], parameters
         )
         loss += float(np.mean(_loss(out[first:end]))) if counted[k] else 0.0
-        if loss > most:
-            return Unexplained({})
+        yield loss / count
     return Unexplained.of(t, out)
 
 

@@ -10,6 +10,7 @@ seen, because the yaw is unknown. Nor can a sign about an axis about which the t
 from __future__ import annotations
 
 from dataclasses import replace
+from heapq import heappop, heappush
 from itertools import permutations, product
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -18,7 +19,13 @@ import numpy as np
 from uwb_tdoa_bias.common.flight import Imu
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.memory import TDOA, imu_rows, structured
-from uwb_tdoa_ekf.monitoring.explain import Unexplained, compare, in_words, unexplained
+from uwb_tdoa_ekf.monitoring.explain import (
+    Unexplained,
+    compare,
+    each_block,
+    in_words,
+    unexplained,
+)
 from uwb_tdoa_ekf.monitoring.finding import ERROR, WARNING, Finding
 from uwb_tdoa_ekf.monitoring.inertial_rules import AXES
 
@@ -237,29 +244,29 @@ def _all(recording: OrderedRecording, base: Unexplained) -> list[Arrangement]:
     The accelerometer is fixed, because the yaw is unknown anyway.
     """
     short = recording.part(BRIEF)
-    of_short = _unexplained(short)
-    tried: list[Arrangement] = []
-    for accel, gyro in product((UPRIGHT, MIRROR), ARRANGEMENTS):
-        best = sorted(map(_ratio, tried))[:CHOSEN]  # of those so far
-        limit = best[-1] if len(best) == CHOSEN else np.inf
-        tried.append(_tried(of_short, short, accel, gyro, limit))
-    chosen = sorted(tried, key=_ratio)[:CHOSEN]
-    return [_tried(base, recording, one.accel, one.gyro) for one in chosen]
+    arrangements = list(product((UPRIGHT, MIRROR), ARRANGEMENTS))
+    trials = [_each_block(_arranged(short, accel, gyro)) for accel, gyro in arrangements]
+    # The trial with the least loss so far goes on. The first that end have the least loss of all.
+    waiting = [(0.0, k) for k in range(len(trials))]
+    chosen: list[tuple[np.ndarray, np.ndarray]] = []
+    while waiting and len(chosen) < CHOSEN:
+        _, k = heappop(waiting)
+        try:
+            heappush(waiting, (next(trials[k]), k))
+        except StopIteration:
+            chosen.append(arrangements[k])
+    return [_tried(base, recording, accel, gyro) for accel, gyro in chosen]
 
 
 def _tried(
-    base: Unexplained,
-    recording: OrderedRecording,
-    accel: np.ndarray,
-    gyro: np.ndarray,
-    limit: float = RATIO + TIE,
+    base: Unexplained, recording: OrderedRecording, accel: np.ndarray, gyro: np.ndarray
 ) -> Arrangement:
     """Return the loss of an arrangement in comparison with `base`.
 
-    The ratio is infinite if it exceeds the limit: by default, if the loss is too large for the
-    arrangement to be taken, or to tie.
+    The ratio is infinite if the loss is too large for the arrangement to be taken, or to tie.
     """
-    ratio, z = compare(base, _unexplained(_arranged(recording, accel, gyro), limit * base.mean))
+    arranged = _arranged(recording, accel, gyro)
+    ratio, z = compare(base, _unexplained(arranged, (RATIO + TIE) * base.mean))
     return Arrangement(ratio if np.isfinite(ratio) else np.inf, z, accel, gyro)
 
 
@@ -279,11 +286,21 @@ def _unexplained(recording: OrderedRecording, limit: float = np.inf) -> Unexplai
 
     limit : see `monitoring.explain.unexplained`.
     """
+    return unexplained(*_measured(recording), LEANING, limit)
+
+
+def _each_block(recording: OrderedRecording) -> Iterator[float]:
+    """Yield the least mean loss after each block, see `monitoring.explain.each_block`."""
+    return each_block(*_measured(recording), LEANING)
+
+
+def _measured(recording: OrderedRecording) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return TDOAs, positions of the anchors, and inertial samples, as `unexplained` takes them."""
     tdoa, imu, (a, b) = recording.tdoa, recording.imu, recording.rows()
     assert imu is not None
     rows = structured(TDOA, tdoa.t, a, b, tdoa.d, tdoa.variance)[np.lexsort((tdoa.d, b, a, tdoa.t))]
     samples, usable = imu_rows(imu.t, imu.gyro, imu.accel)
-    return unexplained(rows, recording.anchors.positions, samples[usable], LEANING, limit)
+    return rows, recording.anchors.positions, samples[usable]
 
 
 def _complexity(accel: np.ndarray, gyro: np.ndarray) -> float:

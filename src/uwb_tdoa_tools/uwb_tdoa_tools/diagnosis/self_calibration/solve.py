@@ -371,7 +371,8 @@ def _calibrated(
 
 def _in_model(found: SelfCalibration) -> EffectSet:
     """Return the EffectSet for the surveyed anchors, whether they may be used or not."""
-    return with_calibration(found.base, found.found(np.zeros_like(found.shifts)), None)
+    _, delays = found.found(found.shifts)
+    return with_calibration(found.base, (delays,), None)
 
 
 def _alone(spread: SelfCalibration, found: SelfCalibration) -> SelfCalibration:
