@@ -41,6 +41,9 @@ KEPT = 3
 
 def _take_domain():
     """Reserve a ROS domain that no other session uses and no recent test has used."""
+    if len(_taken) > KEPT:
+        # A node whose constructor failed stays visible in its domain until it is collected.
+        gc.collect()
     while len(_taken) > KEPT:
         _taken.popleft().__exit__(None, None, None)
     while True:

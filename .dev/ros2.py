@@ -209,14 +209,24 @@ def node_list(node, stop, args):
 
 
 def param_list(node, stop, args):
+    silent = []
     for name in [args.node] if args.node else _nodes(node, stop):
         client = _client(node, stop, name, missing_ok=not args.node)
         if client is None:  # a node without parameters
             continue
+        try:
+            names = _answer(node, stop, client.list_parameters()).result.names
+        except Failure:
+            if args.node:
+                raise
+            silent.append(name)  # the others may answer
+            continue
         if not args.node:
             show(f"{name}:")
-        for parameter in sorted(_answer(node, stop, client.list_parameters()).result.names):
+        for parameter in sorted(names):
             show(parameter if args.node else f"  {parameter}")
+    if silent:
+        raise Failure(f"{', '.join(silent)}: does not answer")
 
 
 def param_get(node, stop, args):

@@ -126,6 +126,22 @@ def test_commands(driver):
 
 
 @pytest.mark.slow
+def test_a_node_that_does_not_answer_does_not_hide_the_others(driver):
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    silent = rclpy.create_node("a_silent_one", context=context)  # it is not spun
+    try:
+        asked = start("param list")
+        spin_until(driver, lambda: asked.poll() is not None)
+    finally:
+        silent.destroy_node()
+        rclpy.shutdown(context=context)
+    said = asked.communicate()[0]
+    assert re.search(COMMANDS["param list"][0], said) and "a_silent_one:\n" not in said
+    assert "/a_silent_one: does not answer" in said and asked.returncode == 1
+
+
+@pytest.mark.slow
 def test_the_rate_of_a_topic(driver, tmp_path):
     said = tmp_path / "hz.txt"
     with said.open("w") as file:
