@@ -60,6 +60,7 @@ def oracle(flight, window):
 
     return SimpleNamespace(
         idle=False,
+        uses_pose=False,
         lag=np.inf,
         effects=EffectSet(),
         weighed=EffectSet(),

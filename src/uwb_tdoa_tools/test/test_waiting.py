@@ -3,8 +3,7 @@
 """No command is silent: it prints a message within 2 s, and then at least every 5 s.
 
 Only the computing time of the command counts. If it has to wait for a core, other processes use the
-same cores. Then it may take twice as long to compute. The commands print their progress SPEED times
-as often here, and may be silent half as long. So each is measured for a shorter time.
+same cores. Then it may take twice as long to compute.
 """
 
 import os
@@ -18,18 +17,15 @@ import time
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.common import compiled
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
-from uwb_tdoa_tools import command_lines, parallel
+from uwb_tdoa_tools import command_lines
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.rooms import corners
 
-PROMISED = 5.0  # s, limit of each silence
-SPEED = 4.0
 # s, limits of the first message and of each silence; then the computing time that is measured if
 # the command is silent, also on a busy machine
-FIRST, EVERY = 2.0, 0.5 * PROMISED
+FIRST, EVERY = 2.0, 5.0
 LONG_ENOUGH = 2.0 * (FIRST + EVERY)
 PATIENCE = 120.0  # s, limit for a command to end after an interrupt
 # share of time waiting for a core above which the machine counts as busy
@@ -53,18 +49,6 @@ WORDS = {  # command: its arguments
     "train": "flight.bag --model structured --out model",
 }
 ELSEWHERE = {"replay"}  # these wait for the time of a recording
-# Run a command that prints its progress SPEED times as often.
-SOONER = f"""
-import importlib
-import sys
-from uwb_tdoa_bias.common import compiled
-from uwb_tdoa_tools import parallel
-compiled.SAY_EVERY /= {SPEED}
-parallel.EVERY /= {SPEED}
-_, name, *words = sys.argv
-sys.argv = [name, *words]
-sys.exit(importlib.import_module("uwb_tdoa_tools.commands." + name).main(words))
-"""
 
 
 def test_every_command_is_here():
@@ -72,10 +56,6 @@ def test_every_command_is_here():
         path.stem for path in (Path(command_lines.__file__).parent / "commands").glob("[a-z]*.py")
     }
     assert commands == WORDS.keys() | ELSEWHERE
-
-
-def test_progress_is_printed_as_often_as_promised():
-    assert parallel.FIRST < FIRST and max(parallel.EVERY, compiled.SAY_EVERY) < PROMISED
 
 
 @pytest.fixture(scope="module")
@@ -131,7 +111,7 @@ def silences(name, words, folder):
     stops at the first message after FIRST, or after LONG_ENOUGH.
     """
     out, process = [], None
-    line = [sys.executable, "-c", SOONER, name, *words]
+    line = [sys.executable, "-m", f"uwb_tdoa_tools.commands.{name}", *words]
     pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
     with subprocess.Popen(line, cwd=folder, start_new_session=True, **pipes) as process:
         selector = selectors.DefaultSelector()
