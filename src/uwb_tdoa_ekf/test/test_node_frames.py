@@ -17,6 +17,7 @@ from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped  # noqa: E402
 from rcl_interfaces.msg import Parameter, ParameterValue  # noqa: E402
 from rcl_interfaces.srv import SetParameters  # noqa: E402
+from rclpy.duration import Duration  # noqa: E402
 from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
 from rig import STREAMS, make_rig, positions, recording, seconds_of, stamp  # noqa: E402, F401
 from scipy.spatial.transform import Rotation  # noqa: E402
@@ -92,6 +93,8 @@ def test_sensors_in_frames_of_their_own_among_frames_that_move(make_rig, tmp_pat
         lambda: static.get_subscription_count() == 2 and moving.get_subscription_count() >= 1,
         "TF to be heard",
     )
+    # A matched subscription gets latched messages a little later.
+    assert static.wait_for_all_acked(Duration(seconds=60.0))
     effects = EffectSet((*known, TagLeverArm(values=dict(zip("xyz", ARM)))))
     flight = effects.effects[-1].inject(flight)
     turned = TURN.inv()
