@@ -250,7 +250,7 @@ def test_delays_of_anchors_that_shift_the_estimate_are_no_other_frame(flight, tm
     write_bag(delayed, tmp_path / "delayed")
     assert evaluate_command.main([str(tmp_path / "delayed")]) == 0
     told = capsys.readouterr().err
-    assert "do not judge with --align frame before `diagnose`" in told
+    assert "run `diagnose` before you judge with --align frame" in told
     moved, said = align_truth(in_frame(flight, shift=shift))
     assert "another frame" in said[0]
     assert np.abs(moved.truth.p - flight.truth.p).max() < 0.1

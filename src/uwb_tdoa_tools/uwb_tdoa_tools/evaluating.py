@@ -180,10 +180,12 @@ class Evaluator:
         align = "judge with --align {}, and put it right where it comes from"
         remedies = {TIME: align, FRAME: align}
         effects = self.estimator.effects or EffectSet()
-        if found.frame_differs and delays_fit(effects.correct_streams(flight), effects, found):
+        # The truth is corrected already.
+        straight = replace(effects.correct_streams(flight), truth=flight.truth)
+        if found.frame_differs and delays_fit(straight, effects, found):
             remedies[FRAME] = (
-                "delays of anchors explain the TDOAs as well, so do not judge with --align {} before "
-                "`diagnose` has told which of both it is"
+                "delays of anchors explain the TDOAs as well: run `diagnose` before you judge with "
+                "--align {}"
             )
         for how, words in ((TIME, found.clock_sentence()), (FRAME, found.frame_sentence())):
             if words:

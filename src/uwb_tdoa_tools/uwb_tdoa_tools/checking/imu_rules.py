@@ -246,7 +246,7 @@ def _all(recording: OrderedRecording, base: Unexplained) -> list[Arrangement]:
     short = recording.part(BRIEF)
     arrangements = list(product((UPRIGHT, MIRROR), ARRANGEMENTS))
     trials = [_each_block(_arranged(short, accel, gyro)) for accel, gyro in arrangements]
-    # The trial with the least loss so far goes on. The first that end have the least loss of all.
+    # The trial with the least loss so far continues. The first ones to end have the least loss.
     waiting = [(0.0, k) for k in range(len(trials))]
     chosen: list[tuple[np.ndarray, np.ndarray]] = []
     while waiting and len(chosen) < CHOSEN:
