@@ -12,7 +12,15 @@ import numpy as np
 
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
 from uwb_tdoa_ekf.core.engine import feed
-from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, N_YAWS, TDOA, Measurements, new_state, structured
+from uwb_tdoa_ekf.core.memory import (
+    IMU_SAMPLE,
+    N_YAWS,
+    TDOA,
+    Measurements,
+    new_state,
+    structured,
+    usable_tdoas,
+)
 from uwb_tdoa_ekf.offline import loaded
 
 from .figures import Figure
@@ -118,7 +126,8 @@ class Core:
         # no prediction of their own: at the stamp of the inertial sample before
         stamps = sample_before(imu.t, tdoa.t)
         rows = flight.anchors.index(tdoa.a), flight.anchors.index(tdoa.b)
-        self._tdoa = structured(TDOA, stamps, *rows, tdoa.d, np.zeros(len(tdoa)))
+        received = structured(TDOA, stamps, *rows, tdoa.d)
+        self._tdoa = received[usable_tdoas(received, flight.anchors.positions)]
         self._sensors = loaded(flight, config)[0].take(math.inf).sensors
         self._sensors["t"] = sample_before(imu.t, self._sensors["t"])
         self._begin = imu.t[0]

@@ -15,7 +15,8 @@ from uwb_tdoa_bias.effects import true_samples
 
 from . import grammar
 
-KINDS = ("process", "tree", "periods", "duty")
+RECURRING = ("periods", "duty")
+KINDS = ("process", "tree", *RECURRING)
 STREAMS = ("tdoa", "tdoa", "tdoa", "tdoa", "gyro", "accel")
 # m, rad/s, m/s^2: root mean square of an effect in the flight, drawn evenly in the logarithm
 SIZES = {"tdoa": (0.1, 0.4), "gyro": (0.02, 0.15), "accel": (0.2, 1.0)}
@@ -67,9 +68,10 @@ class Hidden:
         return f"{self.stream} {self.subset} {part}: {self.size:.2g} {self.shape} over {over}"
 
     def course(self, *several):
-        """What it adds at values (n,) of each covariate: (n,)."""
-        u = [(v - low) / (high - low) for v, (low, high) in zip(several, self.ranges)]
-        return self.size * self.function(np.clip(np.stack(u, axis=1), 0.0, 1.0))
+        """What it adds at values (n,) of each covariate: (n,). What recurs does not end."""
+        scaled = [(v - low) / (high - low) for v, (low, high) in zip(several, self.ranges)]
+        u = np.stack(scaled, axis=1)
+        return self.size * self.function(u if self.shape in RECURRING else np.clip(u, 0.0, 1.0))
 
     def inject(self, flight, rng=None):
         """The Flight with it."""
@@ -127,7 +129,7 @@ def draw(seed, flight):
     # nodes correct inertial samples over one covariate
     number = 1 + int(kind == "tree" and stream == "tdoa" and rng.uniform() < 0.5)
     covariates = tuple(rng.choice(choices, number, replace=False).tolist())
-    if kind in ("periods", "duty"):
+    if kind in RECURRING:
         covariates = ("time",)
     function = {"process": _process, "tree": _tree, "periods": _wave, "duty": _duty}[kind](
         rng, number

@@ -98,9 +98,10 @@ def test_an_sensor_is_measured_beside_the_rest(sensor):
     )  # a difference: on a loaded machine below 0 at times
 
 
-def test_the_core_is_measured_per_event():
-    prediction, update = core.per_event(8, "innovation", 1, 5)
-    assert prediction.shape == update.shape == (5,)
+@pytest.mark.parametrize("anchors", core.ANCHORS)
+def test_the_core_is_measured_per_event(anchors):
+    prediction, update = core.per_event(anchors, "innovation", 1, 2)
+    assert prediction.shape == update.shape == (2,)
     assert (prediction > 0.0).all() and np.isfinite(
         update
     ).all()  # a difference: on a loaded machine below 0 at times

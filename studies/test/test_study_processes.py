@@ -64,3 +64,12 @@ def test_it_shares_no_code_with_the_search():
         if isinstance(node, ast.ImportFrom)
     ]
     assert not any("uwb_tdoa_tools" in module or "smooth_term" in module for module in imported)
+
+
+def test_what_recurs_does_not_end_and_other_functions_are_held(drawn):
+    later = np.linspace(1.0, 2.0, 500)
+    for one in drawn:
+        if len(one.covariates) == 1:
+            low, high = one.limits
+            course = one.course(low + (high - low) * later)
+            assert (np.ptp(course) > one.size) == (one.shape in processes.RECURRING)
