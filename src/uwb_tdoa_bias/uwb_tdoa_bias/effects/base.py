@@ -411,26 +411,8 @@ class Effect:
 
     # Domain
 
-    def corrected_bias(self, samples: Samples) -> np.ndarray:
-        """Return the bias that is corrected, (n,) m: it fades beyond the domain.
-
-        It is NaN where unknown. A time is held at the end of its domain, because no growth beyond
-        it was observed. What recurs goes on.
-        """
-        return self.faded_bias(samples)[0]
-
-    def faded_bias(
-        self, samples: Samples
-    ) -> tuple[np.ndarray, np.ndarray | float, np.ndarray | float]:
-        """Return the bias that is corrected within and beyond the domain.
-
-        Beyond its domain an effect fades, and the uncorrected rest counts as noise.
-
-        Returns (bias (n,) m, as of `corrected_bias`; standard deviation of the uncorrected rest
-        (n,) m; weight (n,)). The last two are 0.0 and 1.0 without a domain.
-        """
-        if not self.domain:
-            return self.bias(samples), 0.0, 1.0
+    def domain_weight(self, samples: Samples) -> np.ndarray:
+        """Return the weight of the effect, (n,): 1 within its domain, less beyond."""
         n = len(samples)
         weight = np.ones(n)
         for covariate, limits in self.domain.items():
@@ -439,11 +421,30 @@ class Effect:
                 weight *= of_arrivals.reshape(-1, n).min(axis=0)
             elif (values := covariate_of(samples, covariate)) is not None:
                 weight *= fade_weight(values, limits)
+        return weight
+
+    def corrected_bias(self, samples: Samples) -> np.ndarray:
+        """Return the bias that is corrected, (n,) m: it fades beyond the domain.
+
+        It is NaN where unknown.
+        """
+        bias = self._held_bias(samples)
+        return self.domain_weight(samples) * bias if self.domain else bias
+
+    def uncorrected_std(self, samples: Samples) -> np.ndarray | float:
+        """Return the standard deviation of what is not corrected beyond the domain, (n,) m."""
+        rest = 1.0 - self.domain_weight(samples)
+        return rest * np.abs(np.nan_to_num(self._held_bias(samples))) if rest.any() else 0.0
+
+    def _held_bias(self, samples: Samples) -> np.ndarray:
+        """Return the bias, (n,) m. A time is held at the end of its domain.
+
+        No growth beyond it was observed. What recurs goes on.
+        """
         if "time" in self.domain and not self.periodic:
             last = samples.start + self.domain["time"][1]
             samples = replace(samples, t=np.minimum(samples.t, last))
-        bias = self.bias(samples)
-        return weight * bias, (1.0 - weight) * np.abs(np.nan_to_num(bias)), weight
+        return self.bias(samples)
 
     @property
     def domain_words(self) -> str:

@@ -197,6 +197,8 @@ def fade_weight(values: np.ndarray, limits: tuple[float, float]) -> np.ndarray:
     """
     low, high = limits
     beyond = np.maximum(np.maximum(low - values, values - high), 0.0)
+    if isinstance(beyond, np.ndarray) and not beyond.any():
+        return np.ones(beyond.shape)  # the usual case
     return np.exp(-0.5 * (np.nan_to_num(beyond) / (FADE * max(high - low, 1e-6))) ** 2)
 
 

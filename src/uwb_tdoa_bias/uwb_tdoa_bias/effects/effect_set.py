@@ -317,7 +317,7 @@ class EffectSet:
                 total += effect.noise_std(samples) ** 2
         for effect in self._limited:
             if samples.channel in effect.channels:
-                total += effect.faded_bias(samples)[1] ** 2
+                total += effect.uncorrected_std(samples) ** 2
         return np.sqrt(total)
 
     def outside(self, samples: Samples) -> list[str]:
@@ -326,7 +326,7 @@ class EffectSet:
             effect.domain_words
             for effect in self._limited
             if samples.channel in effect.channels
-            and np.min(effect.faded_bias(samples)[2], initial=1.0) < FADED_BELOW
+            and np.min(effect.domain_weight(samples), initial=1.0) < FADED_BELOW
         ]
 
     @cached_property
