@@ -19,10 +19,11 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools import parallel
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands.diagnose import main
-from uwb_tdoa_tools.diagnosis import diagnose, output, with_noise
+from uwb_tdoa_tools.diagnosis import comparison, diagnose, output, with_noise
 from uwb_tdoa_tools.diagnosis.findings import Refused
 from uwb_tdoa_tools.diagnosis.regression.confounding import Unobservable
 from uwb_tdoa_tools.diagnosis.regression.terms import Candidate, Term
+from uwb_tdoa_tools.diagnosis.report.verdict import verdict
 from uwb_tdoa_tools.diagnosis.validation import ValidatedSelection
 
 
@@ -146,6 +147,34 @@ def test_what_is_late_on_the_floor_goes_to_the_file_whatever_the_air_says(flight
     result = diagnose([effect_of("floor_multipath", True, 0).inject(flight)])
     assert result.effects.name == "floor_multipath" and not result.refused
     assert result.after["pooled"]["rmse_3d"] == result.before["pooled"]["rmse_3d"]
+
+
+def test_the_floor_is_judged_without_the_effects_that_were_refused(flight, monkeypatch):
+    """The report once showed the errors before for both sides, and hid a gain from 40 to 23 cm."""
+    on_floor = effect_of("floor_multipath", True, 0).inject(flight)
+    late = effect_of("anchor_delay", True, 0).inject(on_floor)
+    module = import_module("uwb_tdoa_tools.diagnosis.diagnose")
+    monkeypatch.setattr(module.comparison, "why_not", lambda *sides: "no gain")
+    result = diagnose([late])
+    assert result.effects.name == "floor_multipath" and result.refused[-1].what == "all"
+    baseline = comparison.Baseline(EffectSet())
+    before, after = comparison.compare(result.cases, baseline)
+    for made, expected in ((result.before, before), (result.after, after)):
+        assert made["pooled"]["phases"] == expected["pooled"]["phases"]
+    assert after["pooled"]["phases"] != before["pooled"]["phases"]
+
+
+@pytest.mark.parametrize("times, written", [(1.0, True), (200.0, False)])
+def test_noise_that_raises_the_error_is_not_written(flight, monkeypatch, times, written):
+    module = import_module("uwb_tdoa_tools.diagnosis.diagnose")
+    measured = module.measured_noise
+    monkeypatch.setattr(module, "measured_noise", lambda *some: times * measured(*some))
+    result = with_noise(diagnose([effect_of("anchor_delay", True, 0).inject(flight)]))
+    assert (result.tdoa_std is not None) == written == (result.written is not None)
+    said = " ".join(verdict(result).sentences)
+    assert ("is not written to ekf_node.yaml: the filter does better without it" in said) != written
+    if not written:
+        assert result.refused[-1].what.startswith("tdoa_std")
 
 
 @pytest.mark.slow

@@ -49,6 +49,8 @@ if TYPE_CHECKING:
 
 # smallest share of the power of slow innovations that a self-calibration must explain
 EXPLAINED = 0.1
+# m, increase of the error that counts as a loss by the measured noise for the filter
+LEAST_LOSS = 0.005
 CANNOT_JUDGE = "without ground truth nobody can tell whether taking it out helps the position"
 
 
@@ -156,6 +158,8 @@ def with_noise(
 ) -> Diagnosis:
     """Return the Diagnosis with the noise for the filter, judged as the files will hold it.
 
+    If the noise raises the error by more than LOSS, it is left out.
+
     config : FilterConfig of the diagnosis; map_function : as of `attribute`
     say : say(sentence) is called if the flights are too short to measure the noise
     """
@@ -171,7 +175,24 @@ def with_noise(
         diagnosis.reference.shift_std,
         map_function,
     )
+    if why := _why_not_noise(diagnosis.after["pooled"], written["pooled"]):
+        refused = Refused(f"tdoa_std {std:.{DECIMALS}f} m", why)
+        return replace(diagnosis, refused=[*diagnosis.refused, refused])
     return replace(diagnosis, tdoa_std=std, written=written)
+
+
+def _why_not_noise(without: dict[str, Any], written: dict[str, Any]) -> str | None:
+    """Return why the measured noise is not written, given pooled figures; None if it is.
+
+    A loss up to LOSS is accepted, because the noise makes the stated deviations right.
+    """
+    errors, nees = ([side[key] for side in (without, written)] for key in ("rmse_3d", "nees_mean"))
+    if gain(*errors) >= -LOSS or errors[1] - errors[0] < LEAST_LOSS:
+        return None
+    why = validation.why_without(errors[1], errors[0])
+    if None in nees or abs(nees[1] - 1.0) >= abs(nees[0] - 1.0):
+        return why
+    return f"{why}. With it the stated deviations fit better (NEES {nees[0]:.1f} to {nees[1]:.1f})"
 
 
 def unused_streams(config: FilterConfig) -> tuple[str, ...]:
@@ -339,9 +360,18 @@ def _by_error(
         selected = validation.ValidatedSelection(
             attribution.selection.only(()), (), (), selected.worth, selected.error
         )
-        model, after = selected.applied(attribution), before
+        model = selected.applied(attribution)
         effects = with_calibration(base, attribution.of_floor, None)
         cases = [replace(case, effects=effects) for case in cases]
+        after = before
+        if attribution.of_floor:
+            before, after = comparison.compare(
+                cases,
+                baseline,
+                work.saying("judging"),
+                work.reference.shift_std,
+                map_function,
+            )
     findings = _findings(
         model.findings(), attribution.findings(), attribution.detections, selected.worth
     )

@@ -220,7 +220,8 @@ def select_by_error(
             worth[detection] = error - trial
             error = trial
         else:
-            useless = f"does not make the filter better: {error:.3f} m without, {trial:.3f} m with"
+            useless = f"it gains less than {WORSE:.1%} of the error: "
+            useless += _with_and_without(trial, error)
             why = useless if trial >= error * (1.0 - WORSE) else why_without(trial, error)
             refused.append(Refused(detection.effect.label, why))
     for momentary in (one for one in candidates if alone and _momentary(one)):
@@ -274,7 +275,8 @@ def _worse_in_one(
         return None
     return (
         worst,
-        f"one of both flights gets worse by it: {before:.3f} m without, {after:.3f} m with",
+        f"one of both flights gets worse by it: {_with_and_without(after, before)}; a third flight "
+        "decides it",
     )
 
 
@@ -339,7 +341,7 @@ def _applicable(candidates: Sequence[Candidate]) -> list[Candidate]:
 
 def why_without(error: float, without: float) -> str:
     """Return why an effect is not applied, given the errors with and without it, m."""
-    figures = f"{error:.3f} m with, {without:.3f} m without"
+    figures = _with_and_without(error, without)
     if without <= error * (1.0 - WORSE):
         return f"the filter does better without it: {figures}"
     if without < error + min(LEAST_WORTH, LEAST_SHARE * error):
@@ -348,6 +350,11 @@ def why_without(error: float, without: float) -> str:
         f"of one flight, worth less than {WORTH_OF_ONE:.0%} of the error, it may as well do harm to "
         f"another; {SECOND}: {figures}"
     )
+
+
+def _with_and_without(error: float, without: float) -> str:
+    """Return errors with and without an effect, m, as text."""
+    return f"{error:.3f} m with, {without:.3f} m without"
 
 
 def _momentary(candidate: Candidate) -> bool:

@@ -245,7 +245,8 @@ def _worse_phases(diagnosis: Diagnosis) -> list[str]:
 def _with_noise(diagnosis: Diagnosis) -> list[str]:
     """Return a sentence on the error with all files as they are written."""
     if diagnosis.written is None or diagnosis.tdoa_std is None:
-        return []
+        refused = (item for item in diagnosis.refused if item.what.startswith("tdoa_std"))
+        return [f"{item.what} is not written to ekf_node.yaml: {item.why}." for item in refused]
     after = diagnosis.written["pooled"]
     worse = "; ".join(worse_phases(diagnosis.before["pooled"], after))
     also = f"; worse: {worse}" if worse else ""
