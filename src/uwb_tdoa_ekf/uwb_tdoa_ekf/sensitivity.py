@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 # names of streams: TDOAs, which are not in SENSORS, and ranges
 TDOAS, RANGES = ("tdoa", "range")
-NEEDED = "t", "kind", "transition", "row", "gain", "innovation"  # fields of a history record
+NEEDED = "t", "kind", "transition", "jacobian", "gain", "innovation"  # fields of a history record
 # s after which a parameter without further measurements no longer affects the estimate
 FORGOTTEN = 10.0
 
@@ -320,7 +320,7 @@ def _through(
         for j in range(n):
             change[j] = regressors[place, j] if place >= 0 else 0.0
         for c in range(ERROR_STATES):
-            entry = record.row[c]
+            entry = record.jacobian[c]
             for j in range(n):
                 change[j] -= entry * after[c, j]
         if place >= 0:
