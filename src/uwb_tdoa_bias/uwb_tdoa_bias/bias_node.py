@@ -107,6 +107,7 @@ CORRECTED = (  # fields written of a TdoaCorrected
 MOST_FRAMES = 100  # limit, since a topic may carry any number of names
 EARLY = 2000  # TDOAs kept until anchors arrive
 Item = tuple[Any, ...]  # one TDOA: frame, sec, nanosec, and MEASURED
+FRAME, ANCHOR_A, ANCHOR_B, DIFFERENCE = 0, 3, 4, 5  # places in an Item
 STATUS = {PASSED: "passed", EFFECTS: "effects", NETWORK: "network", FADED: "faded"}
 
 
@@ -376,7 +377,7 @@ class BiasNode(StreamNode):
     def _pass(self, item: Item | None) -> None:
         """Publish a TDOA uncorrected, unless it is already published."""
         if item is not None:
-            self._publish([item], Correction.none(np.array(item[5:6])))
+            self._publish([item], Correction.none(np.array([item[DIFFERENCE]])))
 
     def _release(self) -> None:
         """Publish all TDOAs that need not wait longer."""
@@ -386,24 +387,25 @@ class BiasNode(StreamNode):
             return
         has_poses = self._poses.newest > -math.inf
         released = self._hold.take(lambda preceding: not has_poses or corrector.ready(preceding))
-        for _, same in groupby(released, lambda one: one[1][0]):  # by frame
-            self._release_alike(*zip(*same))
+        for _, of_frame in groupby(released, lambda one: one[1][FRAME]):
+            self._correct_and_publish(*zip(*of_frame))
 
-    def _release_alike(
+    def _correct_and_publish(
         self, stamps: Sequence[float], items: Sequence[Item], ready: Sequence[bool]
     ) -> None:
         """Correct and publish TDOAs of one frame.
 
         stamps : s; items : as in `_take`; ready : whether the pose of each is known
         """
-        corrector: Any = self._antenna(items[0][0]).corrector  # exists once anchors arrived
-        t, d = np.array(stamps), np.array([item[5] for item in items])
-        a, b = (corrector.anchors.index([item[side] for item in items]) for side in (3, 4))
+        corrector: Any = self._antenna(items[0][FRAME]).corrector  # exists once anchors arrived
+        t, d = np.array(stamps), np.array([item[DIFFERENCE] for item in items])
+        a = corrector.anchors.index([item[ANCHOR_A] for item in items])
+        b = corrector.anchors.index([item[ANCHOR_B] for item in items])
         valid = (a >= 0) & (b >= 0) & (a != b) & np.isfinite(d)
         correction = corrector.correct(t[valid], a[valid], b[valid], d[valid])
-        if not valid.all():
-            found, correction = correction, Correction.none(d)
-            for name, values in vars(found).items():
+        if not valid.all():  # the others pass uncorrected
+            of_valid, correction = correction, Correction.none(d)
+            for name, values in vars(of_valid).items():
                 getattr(correction, name)[valid] = values
         self._counts["invalid"] += len(t) - int(valid.sum())
         self._counts["unready"] += len(t) - sum(ready)
