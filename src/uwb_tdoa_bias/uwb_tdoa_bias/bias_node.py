@@ -289,7 +289,7 @@ class BiasNode(StreamNode):
         self._give_corrector(antenna)
         if elsewhere:
             self.get_logger().info(
-                f"'{frame}' is placed by /tf_static; correcting with: {antenna.name_of_status[NETWORK]}"
+                f"'{frame}' is placed by /tf_static; correcting with: {names[NETWORK]}"
             )
 
     def _on_odometry(

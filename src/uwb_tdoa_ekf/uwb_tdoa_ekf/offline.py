@@ -266,7 +266,7 @@ def _batches(
     longest : int
         Largest number of TDOAs per batch.
     restarts : sequence of float
-        Stamps, in s, from which a restart of the clock has shifted the others.
+        Shifted stamps, in s, of the first message after each restart of the clock.
 
     Yields
     ------

@@ -327,7 +327,7 @@ def status_of(
 def _reason_against_flying(
     estimator: Estimator, use: Use, yaw_known: bool, findings: Sequence[Finding]
 ) -> str:
-    """Return why nobody should fly by a filter that runs without a fault; "" without a reason."""
+    """Return why a vehicle must not fly by this filter, which has no fault; "" if it may."""
     imu_fault = estimator.without_imu  # Finding for which the IMU is left out, or None
     if estimator.unsure:
         return estimator.unsure
