@@ -68,7 +68,7 @@ RULES = (
         "curvature adds variance",
         "engine",
         "_compare",
-        "update.variance(hypothesis.x, hypothesis.P, a.position, b.position)",
+        "update.second_order_variance(hypothesis.x, hypothesis.P, a.position, b.position)",
         "0.0",
     ),
     Rule("a TDOA heard at rest repeats", "stationarity", "repetition", "ekf.resting"),
@@ -291,25 +291,29 @@ RULES = (
         "QUIET_NOISE**2 if quiet else noise",
         "noise",
     ),
-    Rule("IMU fault detector", "imu_fault_detector", "update", "t - check.contradicted < CLEARED"),
+    Rule(
+        "IMU fault detector", "imu_fault_detector", "update", "t - detector.contradicted < CLEARED"
+    ),
     Rule(
         "IMU fault: weight",
         "imu_fault_detector",
         "update",
-        "t - check.weighed > TOO_LONG and (not LIGHTEST < weight < HEAVIEST)",
+        "unsupported and (not LIGHTEST < force_norm < HEAVIEST)",
     ),
     Rule(
         "IMU fault: direction of gravity",
         "imu_fault_detector",
         "update",
-        "t - check.weighed > TOO_LONG or upwards < DOWNWARDS",
+        "unsupported or upward_force < DOWNWARDS",
     ),
-    Rule("IMU fault: turning rate", "imu_fault_detector", "update", "check.spun == TOO_FAR"),
+    Rule(
+        "IMU fault: turning rate", "imu_fault_detector", "update", "detector.excess_turn == TOO_FAR"
+    ),
     Rule(
         "IMU fault: lying on a side",
         "imu_fault_detector",
         "update",
-        "lies and (imu_faulty or t - check.upright > LYING)",
+        "lies and (imu_faulty or t - detector.upright > LYING)",
     ),
     Rule("widen at an IMU fault", "engine", "_switch", "initialization.widen(ekf, records)", ""),
     Rule(

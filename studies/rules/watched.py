@@ -561,7 +561,7 @@ def _events(anchors: Anchors, run: Any, calibrated: Covariance | None = None) ->
         ]
         monitor.add(*some)
         monitor.update(low + 1.0)
-        for finding in monitor._found().values():
+        for finding in monitor._anchor_findings().values():
             named = re.search(r"[Aa]nchors? ?(are exchanged, )?([\d ,or]*\d)", finding.cause)
             _note(said, finding, float(low + 1.0 - begin), named[2] if named else "")
         for sentence in monitor._axis_alarms():

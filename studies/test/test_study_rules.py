@@ -34,7 +34,7 @@ a, b = np.array([1.0, 0.2, 0.0]), np.array([0.0, 2.0, 1.0])
 
 
 def now():
-    return update.variance(x, P, a, b)
+    return update.second_order_variance(x, P, a, b)
 
 
 values = [now()]
@@ -93,7 +93,7 @@ def test_the_copy_changes_while_it_runs_and_is_the_filter_otherwise(made, tmp_pa
     file, before, doubled, after = json.loads(out)
     place = np.array([1.0, 0.2, 0.0]), np.array([0.0, 2.0, 1.0])
     assert file.startswith(str(made.folder))
-    assert before == after == update.variance(np.zeros(3), np.eye(15), *place) > 0.0
+    assert before == after == update.second_order_variance(np.zeros(3), np.eye(15), *place) > 0.0
     assert doubled == 0.0
 
 

@@ -63,7 +63,7 @@ def oracle(flight, window):
         uses_pose=False,
         lag=np.inf,
         effects=EffectSet(),
-        weighed=EffectSet(),
+        left_to_filter=EffectSet(),
         correct=correct,
         add_pose=nothing,
         reset=nothing,

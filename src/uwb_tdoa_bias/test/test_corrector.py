@@ -78,7 +78,7 @@ def climbing(corrector, stamps):
 
 def test_with_nothing_to_correct_with_measurements_pass():
     corrector = climbing(Corrector(ANCHORS), [0.0, 1.0])
-    assert corrector.idle and corrector.model == "none" and corrector.ready(1e9)
+    assert corrector.idle and corrector.model_name == "none" and corrector.ready(1e9)
     found = correct(corrector, [0.5, 2.0])
     assert (
         found.bias.tolist() == [0, 0]
@@ -88,17 +88,17 @@ def test_with_nothing_to_correct_with_measurements_pass():
     assert found.status.tolist() == [PASSED, PASSED]
 
 
-def test_what_the_filter_weighs_is_left_in():
+def test_effects_that_the_filter_judges_are_not_corrected():
     floor = CATALOGUE["floor_multipath"]({"4.delay": 3.3, "4.height": 5.0})
     corrector = Corrector(ANCHORS, EffectSet((*DELAYS, floor)))
     assert (
         floor.is_hypothesis
-        and corrector.weighed.effects == (floor,)
+        and corrector.left_to_filter.effects == (floor,)
         and corrector.effects == DELAYS
     )
     both = climbing(Corrector(ANCHORS, EffectSet((floor, *DELAYS))), [0.0, 1.0])
     alone = climbing(Corrector(ANCHORS, DELAYS), [0.0, 1.0])
-    assert both.model == "anchor_delay"
+    assert both.model_name == "anchor_delay"
     found, expected = correct(both, [1.5, 1.6]), correct(alone, [1.5, 1.6])
     assert np.array_equal(found.bias, expected.bias) and np.array_equal(found.std, expected.std)
 

@@ -35,7 +35,7 @@ from uwb_tdoa_bias.ros.anchors import (  # noqa: E402
     in_words,
     same_anchors,
 )
-from uwb_tdoa_bias.ros.diagnostics import Saying, SimulatedClock  # noqa: E402
+from uwb_tdoa_bias.ros.diagnostics import LogFilter, SimulatedClock  # noqa: E402
 from uwb_tdoa_bias.ros.parameters import BURST, REFILL, Log
 from uwb_tdoa_bias.ros.topics import OUTPUT_QOS, STREAM_QOS, Epoch  # noqa: E402
 
@@ -247,9 +247,9 @@ def test_simulated_time_that_stands_still_or_is_missing_is_said():
 
 def test_the_log_says_each_kind_of_thing_once_in_a_while():
     """A changing percentage once caused 38 warnings in 38 s."""
-    saying = Saying()
+    log_filter = LogFilter()
     lines = [
-        saying.anew(
+        log_filter.should_log(
             f"{40 + second} % of the TDOAs of anchor 3 are late by {0.1 * second:.2f} s",
             1.0 * second,
         )
@@ -257,14 +257,16 @@ def test_the_log_says_each_kind_of_thing_once_in_a_while():
     ]
     assert lines == [True] + 37 * [False]
     # A message about another anchor is new.
-    assert saying.anew("40 % of the TDOAs of anchor 4 are late by 0.10 s", 38.0)
+    assert log_filter.should_log("40 % of the TDOAs of anchor 4 are late by 0.10 s", 38.0)
     flips = [
-        saying.anew(("running", "anchors 1 and 2 are exchanged")[second % 2], 40.0 + second)
+        log_filter.should_log(
+            ("running", "anchors 1 and 2 are exchanged")[second % 2], 40.0 + second
+        )
         for second in range(20)
     ]
     assert flips == [True, True] + 18 * [False]
-    assert saying.anew("running", 75.0)  # a state that lasts is logged
-    assert not saying.anew("running", 200.0)
+    assert log_filter.should_log("running", 75.0)  # a state that lasts is logged
+    assert not log_filter.should_log("running", 200.0)
 
 
 @pytest.mark.parametrize(
@@ -281,4 +283,4 @@ def test_the_log_says_each_kind_of_thing_once_in_a_while():
 @pytest.mark.usefixtures("must_end")
 def test_the_time_for_a_long_number_does_not_grow_with_its_square(text):
     """A pattern that started again at each digit took 8 s for a text of a tenth of this length."""
-    Saying().anew(text, 0.0)
+    LogFilter().should_log(text, 0.0)

@@ -105,9 +105,9 @@ def test_after_a_gap_what_counts_is_the_item_before_it():
     hold = PoseQueue(limit=10.0)
     hold.add(1.0, "a")
     hold.add(5.0, "b")
-    assert hold.take(lambda before: before < 2.0) == [(1.0, "a", True), (5.0, "b", True)]
+    assert hold.take(lambda preceding: preceding < 2.0) == [(1.0, "a", True), (5.0, "b", True)]
     hold.add(5.1, "c")  # b has left, and still counts
-    assert hold.take(lambda before: before < 5.0) == []
+    assert hold.take(lambda preceding: preceding < 5.0) == []
 
 
 @given(st.lists(st.tuples(st.floats(0, 2), st.floats(0, 2)), max_size=40))
@@ -117,7 +117,7 @@ def test_every_item_leaves_once_in_order_and_not_before_its_time(steps):
         hold.add(t, number)
         newest = max([t, *before])
         before.append(t)
-        for stamp, item, ready in hold.take(lambda before: before <= progress):
+        for stamp, item, ready in hold.take(lambda preceding: preceding <= progress):
             assert ready == (min(stamp, max(before[:item], default=stamp)) <= progress)
             assert ready or newest - stamp > 0.2
             out.append(item)

@@ -107,6 +107,7 @@ CORRECTED = (  # fields written of a TdoaCorrected
 MOST_FRAMES = 100  # limit, since a topic may carry any number of names
 EARLY = 2000  # TDOAs kept until anchors arrive
 Item = tuple[Any, ...]  # one TDOA: frame, sec, nanosec, and MEASURED
+FRAME, ANCHOR_A, ANCHOR_B, DIFFERENCE = 0, 3, 4, 5  # places in an Item
 STATUS = {PASSED: "passed", EFFECTS: "effects", NETWORK: "network", FADED: "faded"}
 
 
@@ -117,14 +118,14 @@ class Antenna:
     Attributes
     ----------
     effects : EffectSet, including the antenna's place on the body
-    models : {status: name of the bias model in messages}
+    name_of_status : {status of a correction: name of the bias model in messages}
     trouble : why the place of the antenna is unknown, or None
     corrector : Corrector, once there are anchors
     heard : number of TDOAs since the last report
     """
 
     effects: EffectSet
-    models: dict[int, str]
+    name_of_status: dict[int, str]
     trouble: str | None = None
     corrector: Corrector | None = None
     heard: int = 0
@@ -158,10 +159,10 @@ class BiasNode(StreamNode):
         self._effects = EffectSet.from_yaml(effects_file) if effects_file else EffectSet()
         self._late = self._effects.stamp_offset("tdoa")  # s
         self._labels = LabelCorrector(self._effects.effects)
-        self._network = load_network(model_file)
+        self._model = load_network(model_file)
         self._known_poses = Poses()  # of all correctors
         self._antennas: dict[str, Antenna] = {}  # by frame of the TDOAs
-        self._body_antenna = Antenna(self._effects, self._models(self._effects))
+        self._body_antenna = Antenna(self._effects, self._compiled_names(self._effects))
         self._epoch, self._rate = Epoch(), Rate()
         self._counts: Counter[str] = Counter()
         self._reported: Counter[str] = Counter()  # at the last report
@@ -182,7 +183,7 @@ class BiasNode(StreamNode):
         if member is None:
             say_unused([self], files_of(arguments))
             self.turns = process.StreamPoller([self.streams])
-        self.ready = f"ready; correcting with: {self._model}"
+        self.ready = f"ready; correcting with: {self._model_name}"
 
     @property
     def holds(self) -> int:
@@ -195,18 +196,18 @@ class BiasNode(StreamNode):
         return [self._body_antenna, *self._antennas.values()]
 
     @property
-    def _model(self) -> str:
+    def _model_name(self) -> str:
         """Name of the bias model that corrects the TDOAs."""
         placed = [*self._antennas.values(), self._body_antenna]
-        return placed[0].models[NETWORK]
+        return placed[0].name_of_status[NETWORK]
 
     @property
     def _idle(self) -> bool:
-        return all(antenna.models[NETWORK] == "none" for antenna in self._all_antennas)
+        return all(antenna.name_of_status[NETWORK] == "none" for antenna in self._all_antennas)
 
-    def _models(self, effects: EffectSet) -> dict[int, str]:
-        """Compile the functions of an EffectSet, and return {status: name of the bias model}."""
-        return warm_up(effects, self._network, self._lag).models
+    def _compiled_names(self, effects: EffectSet) -> dict[int, str]:
+        """Compile the functions of an EffectSet, and return `name_of_status` for an Antenna."""
+        return warm_up(effects, self._model, self._lag).name_of_status
 
     def _start_over(self) -> None:
         """Delete the poses and all TDOAs that wait for one."""
@@ -222,7 +223,7 @@ class BiasNode(StreamNode):
         anchors = self._anchors.anchors
         if anchors is not None:
             antenna.corrector = Corrector(
-                anchors, antenna.effects, self._network, self._lag, self._known_poses
+                anchors, antenna.effects, self._model, self._lag, self._known_poses
             )
 
     def _on_anchors(self, anchors: Anchors) -> None:
@@ -257,7 +258,7 @@ class BiasNode(StreamNode):
         """
         trouble, effects, known = None, self._effects, self._antennas.get(frame)
         between = self._frames.frames.between(self._body, frame)
-        held = self._network.holds if self._network else ()
+        held = self._model.holds if self._model else ()
         if TagLeverArm.name in (*held, *(effect.name for effect in effects.effects)):
             source = "model_file" if TagLeverArm.name in held else "effects_file"
             self.get_logger().info(
@@ -281,12 +282,14 @@ class BiasNode(StreamNode):
             known.trouble = trouble
             return
         elsewhere = effects.effects != self._effects.effects
-        models = self._models(effects) if elsewhere else self._body_antenna.models
-        antenna = self._antennas[frame] = Antenna(effects, models, trouble)
+        names = self._body_antenna.name_of_status
+        if elsewhere:
+            names = self._compiled_names(effects)
+        antenna = self._antennas[frame] = Antenna(effects, names, trouble)
         self._give_corrector(antenna)
         if elsewhere:
             self.get_logger().info(
-                f"'{frame}' is placed by /tf_static; correcting with: {antenna.models[NETWORK]}"
+                f"'{frame}' is placed by /tf_static; correcting with: {names[NETWORK]}"
             )
 
     def _on_odometry(
@@ -374,7 +377,7 @@ class BiasNode(StreamNode):
     def _pass(self, item: Item | None) -> None:
         """Publish a TDOA uncorrected, unless it is already published."""
         if item is not None:
-            self._publish([item], Correction.none(np.array(item[5:6])))
+            self._publish([item], Correction.none(np.array([item[DIFFERENCE]])))
 
     def _release(self) -> None:
         """Publish all TDOAs that need not wait longer."""
@@ -383,25 +386,26 @@ class BiasNode(StreamNode):
             self._counts["dropped"] += self._hold.shorten(EARLY)
             return
         has_poses = self._poses.newest > -math.inf
-        released = self._hold.take(lambda before: not has_poses or corrector.ready(before))
-        for _, same in groupby(released, lambda one: one[1][0]):  # by frame
-            self._release_alike(*zip(*same))
+        released = self._hold.take(lambda preceding: not has_poses or corrector.ready(preceding))
+        for _, of_frame in groupby(released, lambda one: one[1][FRAME]):
+            self._correct_and_publish(*zip(*of_frame))
 
-    def _release_alike(
+    def _correct_and_publish(
         self, stamps: Sequence[float], items: Sequence[Item], ready: Sequence[bool]
     ) -> None:
         """Correct and publish TDOAs of one frame.
 
         stamps : s; items : as in `_take`; ready : whether the pose of each is known
         """
-        corrector: Any = self._antenna(items[0][0]).corrector  # exists once anchors arrived
-        t, d = np.array(stamps), np.array([item[5] for item in items])
-        a, b = (corrector.anchors.index([item[side] for item in items]) for side in (3, 4))
+        corrector: Any = self._antenna(items[0][FRAME]).corrector  # exists once anchors arrived
+        t, d = np.array(stamps), np.array([item[DIFFERENCE] for item in items])
+        a = corrector.anchors.index([item[ANCHOR_A] for item in items])
+        b = corrector.anchors.index([item[ANCHOR_B] for item in items])
         valid = (a >= 0) & (b >= 0) & (a != b) & np.isfinite(d)
         correction = corrector.correct(t[valid], a[valid], b[valid], d[valid])
-        if not valid.all():
-            found, correction = correction, Correction.none(d)
-            for name, values in vars(found).items():
+        if not valid.all():  # the others pass uncorrected
+            of_valid, correction = correction, Correction.none(d)
+            for name, values in vars(of_valid).items():
                 getattr(correction, name)[valid] = values
         self._counts["invalid"] += len(t) - int(valid.sum())
         self._counts["unready"] += len(t) - sum(ready)
@@ -422,9 +426,9 @@ class BiasNode(StreamNode):
         measured = columns if stamps is None else (*stamps, *columns[2:])  # up to the variance
         values = [np.array(column) for column in (*measured, *vars(correction).values())]
         status = correction.status.tolist()
-        models = [self._antenna(frame).models[one] for frame, one in zip(frames, status)]
+        names = [self._antenna(frame).name_of_status[one] for frame, one in zip(frames, status)]
         first = 0
-        for (frame, model), same in groupby(zip(frames, models)):
+        for (frame, model), same in groupby(zip(frames, names)):
             end = first + len(list(same))
             template = self._template(frame, model)
             rows = template.rows(end - first)
@@ -456,7 +460,7 @@ class BiasNode(StreamNode):
         correctors = [antenna.corrector for antenna in self._all_antennas]
         outside = [phrase for one in correctors if one is not None for phrase in one.outside]
         values = {
-            "model": self._model,
+            "model": self._model_name,
             "received": counts["received"],
             "published": counts["published"],
             "waiting": len(self._hold) + len(self._tdoas),
@@ -501,7 +505,7 @@ class BiasNode(StreamNode):
                 DiagnosticStatus.WARN,
                 "no TDOAs on uwb/tdoa: check that the tag's driver runs in this namespace",
             )
-        trouble = self._network and self._network.trouble(self._anchors.anchors)
+        trouble = self._model and self._model.trouble(self._anchors.anchors)
         if trouble:
             return DiagnosticStatus.WARN, f"model_file {trouble}"
         if self._poses.newest == -math.inf:
@@ -514,7 +518,7 @@ class BiasNode(StreamNode):
                 DiagnosticStatus.WARN,
                 "odometry is late: TDOAs leave before their pose; check the load of ekf_node",
             )
-        return DiagnosticStatus.OK, f"correcting with {self._model}"
+        return DiagnosticStatus.OK, f"correcting with {self._model_name}"
 
 
 def main(argv: Sequence[str] | None = None) -> int:

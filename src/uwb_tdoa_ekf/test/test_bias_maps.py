@@ -389,6 +389,29 @@ def test_points_without_covariance_add_the_map_s_whole_error():
     assert 0.0 < np.sqrt(found.added[0, 0]) < 0.05
 
 
+LOST_FLIGHT = Part(np.full((50, 3), 9.0), np.zeros((50, 3)))
+SHORT_FLIGHT = fly(4, n=20)
+
+
+@pytest.mark.parametrize("unusable", [LOST_FLIGHT, SHORT_FLIGHT], ids=["lost", "short"])
+@pytest.mark.parametrize("first", [False, True])
+def test_a_held_out_flight_without_a_marker_is_left_out_of_the_figures(unusable, first):
+    """No position of a flight is within 1 m of the truth, or no cell holds enough of them."""
+    others = [fly(1, claimed=0.03), fly(2, claimed=0.03)]
+    parts = [unusable, *others] if first else [*others, unusable]
+    found, expected = fit(parts, 0.5, least=10), fit(others, 0.5, least=10)
+    assert len(found.at) == len(expected.at)
+    np.testing.assert_allclose(found.bias, expected.bias, atol=0.01)
+    np.testing.assert_allclose(found.added, expected.added, atol=2e-5)
+    if unusable is LOST_FLIGHT:
+        np.testing.assert_array_equal(found.added, expected.added)
+
+
+def test_without_any_held_out_marker_the_whole_bias_counts_as_uncertain():
+    found = fit([fly(1), LOST_FLIGHT], 0.5, least=10)
+    np.testing.assert_allclose(found.added, found.bias.T @ found.bias / len(found.bias))
+
+
 @pytest.mark.parametrize(
     ("parts", "named"),
     [

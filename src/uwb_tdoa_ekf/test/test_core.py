@@ -36,7 +36,7 @@ from uwb_tdoa_ekf.core.memory import (
 )
 from uwb_tdoa_ekf.core.noise import learn
 from uwb_tdoa_ekf.core.state import GRAVITY
-from uwb_tdoa_ekf.core.update import SMALLEST, variance
+from uwb_tdoa_ekf.core.update import SMALLEST, second_order_variance
 from uwb_tdoa_ekf.core.workspace import SMALLEST as WORKSPACE_SMALLEST
 from uwb_tdoa_ekf.core.workspace import STD as WORKSPACE_STD
 from uwb_tdoa_ekf.core.workspace import constrain, contains, set_bounds
@@ -107,13 +107,13 @@ def test_it_is_the_mean_square_of_what_the_slope_leaves_out(x):
     P[:3, :3] = np.diag([0.5, 0.1, 0.4]) ** 2
     e = rng.standard_normal((200_000, 3)) * np.sqrt(np.diag(P)[:3])
     left = tdoa(x + e, A, B) - tdoa(x, A, B) - e @ np.ravel(tdoa_jacobian(x, A, B))
-    assert variance(x, P, A, B) == pytest.approx(np.mean(left**2), rel=0.25)
+    assert second_order_variance(x, P, A, B) == pytest.approx(np.mean(left**2), rel=0.25)
 
 
 def test_it_is_not_asked_for_where_the_place_is_known_and_finite_at_an_anchor():
     P = np.eye(15) * (0.9 * SMALLEST) ** 2 / 3.0
-    assert variance(np.array([2.0, 0.0, 1.5]), P, A, B) == 0.0
-    assert np.isfinite(variance(A.copy(), np.eye(15), A, B))
+    assert second_order_variance(np.array([2.0, 0.0, 1.5]), P, A, B) == 0.0
+    assert np.isfinite(second_order_variance(A.copy(), np.eye(15), A, B))
 
 
 # --- noise ---
@@ -203,8 +203,8 @@ def informed(p, seconds=5.0, rate=400.0, heard=range(8), state=None, begin=0.0):
         innovation.row[:3] = unit[b] - unit[a]
         innovation.noise_variance, innovation.weight, innovation.curvature = STD**2, 1.0, 0.0
         t = begin + k / rate
-        last = t - 1.0 / rate if k else -np.inf
-        noise.observe(information, anchors[a], anchors[b], innovation, t, last)
+        previous = t - 1.0 / rate if k else -np.inf
+        noise.observe(information, anchors[a], anchors[b], innovation, t, previous)
     return state
 
 

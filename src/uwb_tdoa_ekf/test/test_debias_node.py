@@ -155,7 +155,7 @@ def test_a_map_of_other_anchors_is_refused_and_of_these_is_used(node):
         node._on_odometry(message)
         return node._report()[:2]
 
-    got, node._belongs = [], None
+    got, node._map_fits_anchors = [], None
     level, text = sent(None)
     assert level == DiagnosticStatus.WARN and "no anchors" in text and "anchors_file" in text
     level, text = sent(ANCHORS.at(ANCHORS.positions + [0.5, 0.0, 0.0]))

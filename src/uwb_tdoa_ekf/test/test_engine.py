@@ -248,7 +248,7 @@ def test_every_tdoa_that_is_used_has_its_record_and_none_is_without_room(seed, o
     )
     assert records["kind"][0] == RESET and (np.diff(records["t"]) >= 0.0).all()
     of_position = records[
-        (records["kind"] == UPDATE) & (records["row"][:, :3] != 0.0).sum(axis=1).astype(bool)
+        (records["kind"] == UPDATE) & (records["jacobian"][:, :3] != 0.0).sum(axis=1).astype(bool)
     ]
     used = residuals["innovation"][residuals["verdict"] == USED]
     assert np.isin(used, of_position["innovation"]).all()
@@ -268,7 +268,7 @@ def test_a_record_leads_to_the_next():
         phi[:9] = record["transition"]
         prior = phi @ before["P"] @ phi.T
         prior[8, 8] += FilterConfig().turn_noise ** 2 * (record["t"] - before["t"])
-        gain, row = record["gain"], record["row"]
+        gain, row = record["gain"], record["jacobian"]
         np.testing.assert_allclose(
             record["P"], (np.eye(15) - np.outer(gain, row)) @ prior, atol=1e-9
         )

@@ -59,7 +59,7 @@ def test_odometry_is_that_of_the_offline_engine(make_rig, tmp_path, what, proces
                 "-p",
                 f"model_file:={model}",
             ],
-            Corrector(flight.anchors, network=Network(model)),
+            Corrector(flight.anchors, model=Network(model)),
         ),
     }[what]
     config, told = FilterConfig(), ["--params-file", f"{SOURCES}/uwb_tdoa_ekf/config/ekf_node.yaml"]

@@ -18,7 +18,7 @@ from uwb_tdoa_ekf.core.update import (
     NEGLIGIBLE,
     SMALLEST_WEIGHT,
     kalman,
-    update_state,
+    kalman_direct,
     weigh,
 )
 
@@ -49,12 +49,12 @@ def test_kalman_is_the_textbook_update(seed, states):
 
 
 @given(seeds, st.integers(0, 5), st.floats(0.01, 10.0))
-def test_update_state_is_the_textbook_update_with_a_unit_row(seed, state, std):
+def test_update_directly_is_the_textbook_update_with_a_unit_row(seed, state, std):
     prior = Prior(seed)
     prior.h[:] = np.arange(15) == state
     prior.innovation.value = 1.5 - prior.hypothesis.x[state]
     expected = prior.textbook(std**2)
-    update_state(prior.hypothesis, prior.innovation, state, 1.5, std)
+    kalman_direct(prior.hypothesis, prior.innovation, state, 1.5, std)
     prior.assert_is(*expected)
 
 

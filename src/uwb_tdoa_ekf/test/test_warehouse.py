@@ -144,7 +144,7 @@ def test_how_far_a_place_is_outside_and_one_that_is_no_number_is_nowhere():
         ([2.0, -0.7, 5.0], 1.0),
         ([2.0, np.nan, 2.0], np.inf),
     ):
-        assert workspace.outside(bounds, np.array(x)) == pytest.approx(beyond)
+        assert workspace.distance_outside(bounds, np.array(x)) == pytest.approx(beyond)
         assert workspace.contains(bounds, np.array(x)) == (beyond <= 0.0)
 
 

@@ -86,7 +86,8 @@ class DebiasNode(StreamNode):
             copy(STREAM_QOS),
             qos_overriding_options=OVERRIDES,
         )
-        self._belongs: bool | None = None  # None until anchors arrive
+        # whether the map was made for the anchors; None until anchors arrive
+        self._map_fits_anchors: bool | None = None
         self._anchors = AnchorsInput(self, self._on_anchors, own["anchors_file"])
         self._anchors.start()
         say_unused([self], files_of(arguments))
@@ -94,23 +95,29 @@ class DebiasNode(StreamNode):
         self.ready = f"ready; {len(self._map.at)} markers, {self._map.interpolator}"
 
     def _on_anchors(self, anchors: Anchors) -> None:
-        self._belongs = self._map.belongs_to(anchors)
+        self._map_fits_anchors = self._map.belongs_to(anchors)
 
     def _on_odometry(self, message: Odometry) -> None:
+        """Publish the odometry with position and position covariance corrected; count the result.
+
+        Other messages pass unchanged: invalid ones, and all while the map does not fit the anchors.
+        """
         self._counts["received"] += 1
         point = message.pose.pose.position
         p = np.array([point.x, point.y, point.z])
         if message.header.frame_id != self._map.frame or not np.isfinite(p).all():
             kind = "invalid"
-        elif not self._belongs:
+        elif not self._map_fits_anchors:
             kind = "refused"
         else:
             covariance = np.array(message.pose.covariance).reshape(6, 6)
-            (p,), (covariance[:3, :3],), (validity,) = self._map.correct(
+            positions, covariances, validities = self._map.correct(
                 p[None], covariance[None, :3, :3]
             )
+            point.x, point.y, point.z = positions[0].tolist()
+            covariance[:3, :3] = covariances[0]
+            validity = validities[0]
             kind = "corrected" if validity == 1.0 else "faded" if validity > 0.0 else "outside"
-            point.x, point.y, point.z = p.tolist()
             message.pose.covariance = covariance.ravel()
         self._counts[kind] += 1
         self._publisher.publish(message)
@@ -147,7 +154,7 @@ class DebiasNode(StreamNode):
                 DiagnosticStatus.ERROR,
                 f"{what}: correct world_frame of ekf_node, or make a map in its frame",
             )
-        if recent["refused"] and self._belongs is None:
+        if recent["refused"] and self._map_fits_anchors is None:
             return (
                 DiagnosticStatus.WARN,
                 (

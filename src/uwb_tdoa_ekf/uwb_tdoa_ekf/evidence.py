@@ -164,7 +164,7 @@ def eliminated(
     return gram[:n, :n] - less[:, :-1], vector[:n] - less[:, -1], 0.5 * evidence
 
 
-def log_evidence(part: Part, prior: np.ndarray, size: float, offset: np.ndarray) -> float:
+def log_evidence(part: Part, prior: np.ndarray, log_det: float, offset: np.ndarray) -> float:
     """Return the logarithm of the evidence of a Part.
 
     Parameters
@@ -173,7 +173,7 @@ def log_evidence(part: Part, prior: np.ndarray, size: float, offset: np.ndarray)
         Normal equations.
     prior : (n, n) array
         Inverse covariance of the prior, in 1/m^2.
-    size : float
+    log_det : float
         Logarithm of the determinant of the prior covariance.
     offset : (n,) array
         Linearization point minus mean of the prior, in m.
@@ -181,7 +181,10 @@ def log_evidence(part: Part, prior: np.ndarray, size: float, offset: np.ndarray)
     right, root = part.vector - prior @ offset, np.linalg.cholesky(part.gram + prior)
     solved = solve_triangular(root, right, lower=True, check_finite=False)
     return part.rest + 0.5 * float(
-        solved @ solved - 2.0 * np.sum(np.log(np.diagonal(root))) - size - offset @ prior @ offset
+        solved @ solved
+        - 2.0 * np.sum(np.log(np.diagonal(root)))
+        - log_det
+        - offset @ prior @ offset
     )
 
 
@@ -232,8 +235,8 @@ def with_each_change(
 ) -> dict[ChangeKey, float]:
     """Return {key: largest log evidence over the Parts} with each change added to the prior.
 
-    The result is closed form: a change acts as a shift of the prior mean, and the data determine
-    that shift.
+    A change shifts the prior mean of some unknowns, and the data determine the shift. The log
+    evidence is quadratic in the shift, so its marginal has a closed form.
 
     Parameters
     ----------
@@ -246,25 +249,21 @@ def with_each_change(
     changes : mapping
         {key: Change} to try.
     """
-    prior, size, out = (
-        np.linalg.inv(covariance),
-        float(np.linalg.slogdet(covariance)[1]),
-        dict.fromkeys(changes, -np.inf),
-    )
+    prior, log_det = np.linalg.inv(covariance), float(np.linalg.slogdet(covariance)[1])
+    out = dict.fromkeys(changes, -np.inf)
     for part in parts:
-        evidence, inverse = (
-            log_evidence(part, prior, size, offset),
-            np.linalg.inv(part.gram + prior),
-        )
-        slope = prior @ (offset + inverse @ (part.vector - prior @ offset))
-        information = prior - prior @ inverse @ prior
+        evidence = log_evidence(part, prior, log_det, offset)
+        posterior = np.linalg.inv(part.gram + prior)
+        # gradient and negative Hessian of the log evidence by a shift of the prior mean
+        gradient = prior @ (offset + posterior @ (part.vector - prior @ offset))
+        information = prior - prior @ posterior @ prior
         for key, (places, std) in changes.items():
-            some = information[np.ix_(places, places)]
-            more = slope[places] @ np.linalg.solve(
-                some + np.eye(len(places)) / std**2, slope[places]
+            of_change = information[np.ix_(places, places)]
+            twice_gain = gradient[places] @ np.linalg.solve(
+                of_change + np.eye(len(places)) / std**2, gradient[places]
             )
-            more -= np.linalg.slogdet(np.eye(len(places)) + std**2 * some)[1]
-            out[key] = max(out[key], evidence + 0.5 * float(more))
+            twice_gain -= np.linalg.slogdet(np.eye(len(places)) + std**2 * of_change)[1]
+            out[key] = max(out[key], evidence + 0.5 * float(twice_gain))
     return out
 
 

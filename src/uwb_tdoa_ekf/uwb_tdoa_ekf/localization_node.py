@@ -155,8 +155,9 @@ class Tag:
         self._pair: Pair | None = None
         self._failure: Exception | None = None
         self._node, self._name, self._start = node, name, start
-        # two times of time.monotonic(), and a duration, in s
-        self._began, self._due, self._wait = 0.0, math.inf, 0.0
+        # s, by time.monotonic(): the last start, and the next one
+        self._began, self._due = 0.0, math.inf
+        self._wait = 0.0  # s between failure and start; 0 before a failure, and after SOUND without
 
     @property
     def members(self) -> list[StreamNode]:
@@ -171,9 +172,10 @@ class Tag:
         try:
             self._pair = self._start()
         except Exception as error:
-            if isinstance(error, InputError) and not self._wait:
+            first_start = not self._wait  # no start has failed yet
+            if first_start and isinstance(error, InputError):
                 self.refused = error
-            self._again(error)
+            self._plan_restart(error)
             return
         self.trouble, self._began = None, time.monotonic()
         for node in self.members:
@@ -207,7 +209,7 @@ class Tag:
             self._node.get_logger().error(line)
         if time.monotonic() > self._began + SOUND:
             self._wait = 0.0
-        self._again(error)
+        self._plan_restart(error)
         self._replace(gone)
         for node in gone:
             node.destroy_node()
@@ -217,8 +219,8 @@ class Tag:
         assert self._node.spinner is not None  # a node that takes turns has a spinner
         self._node.spinner.replace(gone, self.members)
 
-    def _again(self, error: Exception) -> None:
-        """Log why the nodes do not run and when they are started again."""
+    def _plan_restart(self, error: Exception) -> None:
+        """Set when the nodes are started again, unless they were refused; log it with the error."""
         then = "is not started again"
         if self.refused is None:
             self._wait = min(LONGEST, 2.0 * self._wait) or FIRST

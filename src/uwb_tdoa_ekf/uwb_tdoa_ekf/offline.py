@@ -112,7 +112,7 @@ def run_offline(
     flight = corrector.effects.correct_streams(flight)
     tdoa, anchors = flight.tdoa, flight.anchors
     raw = tdoa.t, anchors.index(tdoa.a), anchors.index(tdoa.b), tdoa.d
-    effects = EffectSet((*corrector.effects, *corrector.weighed))
+    effects = EffectSet((*corrector.effects, *corrector.left_to_filter))
     anchor_table = AnchorTable(anchors)
     pipeline = Pipeline(anchor_table, config, effects, watched=False, records=records)
     buffer, places = loaded(flight, config)
@@ -122,10 +122,10 @@ def run_offline(
         np.ndarray
     ] = []  # places in the flight of usable TDOAs, in the order of their stamps
     recoveries = 0
-    for batch, until, anew in _batches(
+    for batch, until, restart in _batches(
         *raw, corrector, len(tdoa) if records is None else RECORDED_AT_ONCE, flight.restarts
     ):
-        if anew:  # as in the nodes when stamps jump back
+        if restart:  # the nodes start over here, because the stamps that they get fall back
             recoveries += int(pipeline.state.record.recoveries)
             pipeline = Pipeline(anchor_table, config, effects, watched=False, records=records)
             corrector.reset()
@@ -254,7 +254,8 @@ def _batches(
     """Yield batches of TDOAs that can be corrected and used together.
 
     A correction needs a pose that is `lag` old. TDOAs less than that apart can be corrected in one
-    batch. Each time of the clock has at least one batch.
+    batch. The stamps are continuous: the reader has shifted them after each restart of the clock. No
+    batch crosses a restart. Each part between restarts yields at least one batch, which may be empty.
 
     Parameters
     ----------
@@ -265,7 +266,7 @@ def _batches(
     longest : int
         Largest number of TDOAs per batch.
     restarts : sequence of float
-        Stamps at which the clock restarts, in s.
+        Shifted stamps, in s, of the first message after each restart of the clock.
 
     Yields
     ------
@@ -273,8 +274,8 @@ def _batches(
         Places of the TDOAs, in the order of their stamps.
     until : float
         Stamp up to which everything may be used afterwards, in s.
-    anew : bool
-        True if the clock restarts before this batch.
+    restart : bool
+        True for the first batch after a restart.
     """
     known = np.flatnonzero((a >= 0) & (b >= 0) & np.isfinite(d) & np.isfinite(t))
     if not (np.diff(t[known]) > 0.0).all():
@@ -283,14 +284,14 @@ def _batches(
     stamps, first = t[known], 0
     lag = corrector.lag if corrector.uses_pose else math.inf
     for number, bound in enumerate([*sorted(restarts), math.inf]):
-        last, anew = int(np.searchsorted(stamps, bound)), number > 0
+        last, restart = int(np.searchsorted(stamps, bound)), number > 0
         while True:
             end = last
             if first < last:
-                old = int(np.searchsorted(stamps, stamps[first] + lag))
-                end = min(old, first + longest, last)
+                pose_limit = int(np.searchsorted(stamps, stamps[first] + lag))
+                end = min(pose_limit, first + longest, last)
             before = stamps[end] if end < last else bound
-            yield known[first:end], math.nextafter(before, -math.inf), anew
-            first, anew = end, False
+            yield known[first:end], math.nextafter(before, -math.inf), restart
+            first, restart = end, False
             if first >= last:
                 break

@@ -213,14 +213,16 @@ class ReorderBuffer:
         if place in self._leading and self.began == math.inf and usable.any():
             self.began = float(rows["t"][usable][0])
         self._streams[place].seen = float(rows["t"][-1])
-        if usable.all() and self._streams[place].append(rows, self.used_until, self._limit(place)):
+        if usable.all() and self._streams[place].append(
+            rows, self.used_until, self._largest_stamp(place)
+        ):
             if place == self._reference:
                 self._overtaken = None
         else:
             for k, (t, good) in enumerate(zip(rows["t"].tolist(), usable.tolist())):
                 if good:
                     self._take_in(place, t, rows[k : k + 1])
-                elif t <= self._limit(place):
+                elif t <= self._largest_stamp(place):
                     # pass the time on: bias_node may wait for the pose of this stamp
                     self._streams[place].gate.pass_time(t, self._reached(place))
         stream = self._streams[place]
@@ -263,11 +265,12 @@ class ReorderBuffer:
         for place, stream in enumerate(self._streams):
             self._refuse_outliers(place, stream.gate.finish())
 
-    def _limit(self, place: int) -> float:
-        """Return the largest stamp, in s, that a stream may have.
+    def _largest_stamp(self, place: int) -> float:
+        """Return the largest stamp, in s, of a row that a stream may add.
 
-        The limit is infinite for a stream that agrees with the others, because it may continue
-        while they are silent.
+        Only a stream that is ahead, or has no stamp yet, has a limit: LARGEST_LEADS after the stamp
+        with which it is compared. A stream that agrees with the others may continue while they are
+        silent.
         """
         stream = self._streams[place]
         if place in (TDOA_STREAM, self._reference) or not (
@@ -326,7 +329,7 @@ class ReorderBuffer:
         row : (1,) array
             Row of the type in KINDS.
         """
-        stream, limit = self._streams[place], self._limit(place)
+        stream, limit = self._streams[place], self._largest_stamp(place)
         if t > limit:
             self._refuse_ahead(place, t, row)
             return

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 # names of streams: TDOAs, which are not in SENSORS, and ranges
 TDOAS, RANGES = ("tdoa", "range")
-NEEDED = "t", "kind", "transition", "row", "gain", "innovation"  # fields of a history record
+NEEDED = "t", "kind", "transition", "jacobian", "gain", "innovation"  # fields of a history record
 # s after which a parameter without further measurements no longer affects the estimate
 FORGOTTEN = 10.0
 
@@ -84,9 +84,10 @@ class Innovations:
         return np.flatnonzero(self.stream == self.streams.index(stream))
 
     def by_bias(self, regressors: np.ndarray) -> np.ndarray:
-        """Return the derivative of the negative innovations by parameters, (n, k).
+        """Return the derivative of the negative innovations by parameters of a bias, (n, k).
 
-        A bias that the position can follow does not change the innovations.
+        It is what remains of the regressors after the filter has followed the bias. A bias that the
+        position can follow does not change the innovations.
 
         Parameters
         ----------
@@ -95,9 +96,9 @@ class Innovations:
         """
         regressors = np.ascontiguousarray(regressors, dtype=float)
         out, states = np.zeros_like(regressors), np.zeros((2, ERROR_STATES, regressors.shape[1]))
-        nowhere = np.empty(0), np.empty((0, 3, regressors.shape[1]))
+        no_path = np.empty(0), np.empty((0, 3, regressors.shape[1]))
         for records, of in zip(self.records, self.of):
-            _through(records, of, regressors, states, out, nowhere, 0)
+            _propagate(records, of, regressors, states, out, no_path, 0)
         return out
 
     def in_blocks(
@@ -148,7 +149,7 @@ class Innovations:
             out, before = np.zeros_like(known), passed
             for records, of in piece:
                 own = np.where(of >= 0, of - first, -1)
-                passed = _through(records, own, known, states, out, path, passed)
+                passed = _propagate(records, own, known, states, out, path, passed)
             state[:, columns] = states[0]
             if positions is not None and passed > before:
                 positions[before:passed, :, columns] = path[1][before:passed]
@@ -184,7 +185,7 @@ def _pieces(
 
 
 class _Needed(list):
-    """Collect arrays of a history, reduced to the fields that `_through` reads.
+    """Collect arrays of a history, reduced to the fields that `_propagate` reads.
 
     This saves more than half of the memory.
     """
@@ -267,7 +268,7 @@ def _places_of(records: Sequence[np.ndarray], t: np.ndarray, value: np.ndarray) 
 
 
 @compiled
-def _through(
+def _propagate(
     records: np.ndarray,
     of: np.ndarray,
     regressors: np.ndarray,
@@ -320,7 +321,7 @@ def _through(
         for j in range(n):
             change[j] = regressors[place, j] if place >= 0 else 0.0
         for c in range(ERROR_STATES):
-            entry = record.row[c]
+            entry = record.jacobian[c]
             for j in range(n):
                 change[j] -= entry * after[c, j]
         if place >= 0:

@@ -206,7 +206,7 @@ def _backward(
     adjoint : (15,) array
         Bierman's lambda after the records; replaced by the value before them.
     information : (15, 15) array
-        Bierman's Lambda; replaced likewise.
+        Bierman's Lambda after the records; replaced by the value before them.
     rows : (n,) array of ODOMETRY
         Filled from its end.
     """
@@ -228,7 +228,7 @@ def _backward(
 
 @compiled
 def _smoothed(record: Record, adjoint: np.ndarray, information: np.ndarray, row: Record) -> None:
-    """Write x - P lambda and P - P Lambda P to a row of ODOMETRY."""
+    """Write the smoothed state x - P lambda and covariance P - P Lambda P to a row of ODOMETRY."""
     P = record.P
     correction = np.zeros(ERROR_STATES)  # -P lambda
     product = np.zeros((9, ERROR_STATES))  # upper rows of P Lambda
@@ -253,26 +253,33 @@ def _smoothed(record: Record, adjoint: np.ndarray, information: np.ndarray, row:
 
 @compiled
 def _through_update(record: Record, adjoint: np.ndarray, information: np.ndarray) -> None:
-    """Step lambda and Lambda backwards through one scalar update.
+    """Step `adjoint` and `information` backwards through one scalar update.
 
-    The equations are lambda <- C' lambda - h' y / S and Lambda <- C' Lambda C + h' h / S. Here C =
-    I - K h, and the innovation y has the variance S.
+    The equations are lambda <- C' lambda - h' y / S and Lambda <- C' Lambda C + h' h / S with C = I -
+    K h. In the code:
+
+    - lambda, Lambda: adjoint, information
+    - h, K: record.jacobian, record.gain
+    - y, S: record.innovation and its record.variance
     """
-    h, gain = record.row, record.gain
+    h, gain = record.jacobian, record.gain
     information_gain = np.zeros(ERROR_STATES)  # Lambda K
     for j in range(ERROR_STATES):
         for k in range(ERROR_STATES):
             information_gain[j] += information[j, k] * gain[k]
-    # K' lambda + y / S, K' Lambda K + 1 / S
-    along, across = (record.innovation / record.variance, 1.0 / record.variance)
+    # factors of h' and of h' h: K' lambda + y / S, and K' Lambda K + 1 / S
+    adjoint_factor = record.innovation / record.variance
+    information_factor = 1.0 / record.variance
     for k in range(ERROR_STATES):
-        along += gain[k] * adjoint[k]
-        across += gain[k] * information_gain[k]
+        adjoint_factor += gain[k] * adjoint[k]
+        information_factor += gain[k] * information_gain[k]
     for j in range(ERROR_STATES):
-        adjoint[j] -= h[j] * along
+        adjoint[j] -= h[j] * adjoint_factor
         for k in range(ERROR_STATES):
             information[j, k] += (
-                h[j] * h[k] * across - h[j] * information_gain[k] - information_gain[j] * h[k]
+                h[j] * h[k] * information_factor
+                - h[j] * information_gain[k]
+                - information_gain[j] * h[k]
             )
 
 
@@ -280,10 +287,10 @@ def _through_update(record: Record, adjoint: np.ndarray, information: np.ndarray
 def _through_prediction(
     transition: np.ndarray, adjoint: np.ndarray, information: np.ndarray
 ) -> None:
-    """Step lambda and Lambda backwards through one prediction.
+    """Step `adjoint` and `information` backwards through one prediction.
 
-    The equations are lambda <- Phi' lambda and Lambda <- Phi' Lambda Phi. The lower rows of Phi
-    equal the identity.
+    The equations are lambda <- Phi' lambda and Lambda <- Phi' Lambda Phi. `transition` holds the upper
+    rows of Phi; the lower rows equal the identity.
     """
     before = adjoint.copy()
     product = np.zeros((ERROR_STATES, ERROR_STATES))  # Lambda Phi

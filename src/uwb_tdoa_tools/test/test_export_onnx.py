@@ -89,8 +89,8 @@ def test_a_file_goes_through_the_trial_of_all_models_and_through_the_checker_of_
     assert model.meta.keys() == traced.meta().keys()
     assert model.name == f"{declared.name}+random" and model.of_effects == declared.name
     corrector = Corrector(ANCHORS, None, model)
-    assert corrector.models[EFFECTS_ONLY] == declared.name
-    assert corrector.models[NETWORK] == corrector.model == model.name
+    assert corrector.name_of_status[EFFECTS_ONLY] == declared.name
+    assert corrector.name_of_status[NETWORK] == corrector.model_name == model.name
     samples = states(ANCHORS, 300)
     together = corrector.prediction(samples)
     one = corrector.prediction(rows_of(samples, slice(7, 8)))

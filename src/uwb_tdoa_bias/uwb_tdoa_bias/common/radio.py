@@ -65,7 +65,8 @@ class Antenna:
     delay_span: float = 0.15
 
     def __post_init__(self) -> None:
-        cuts = []  # gains of each cut on the axes
+        """Check the numbers, and that cuts agree on the axes where they cross; raise InputError."""
+        on_axes = []  # (4,) dBi for each cut: its gains on the four axes that it crosses
         for name, most in (("gain_offset", LARGEST_GAIN), ("delay_span", 10.0)):
             value = getattr(self, name)
             if (
@@ -89,8 +90,8 @@ class Antenna:
                     f"and {LARGEST_GAIN:g} dBi "
                     "around the full circle."
                 )
-            cuts.append(gains[:: len(gains) // 4])
-        azimuth, first, second = cuts
+            on_axes.append(gains[:: len(gains) // 4])
+        azimuth, first, second = on_axes
         crossings = {
             "+x": (azimuth[0], first[0]),
             "-x": (azimuth[2], first[2]),

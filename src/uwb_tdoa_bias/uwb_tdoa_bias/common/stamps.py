@@ -170,14 +170,14 @@ class PoseQueue:
         return removed
 
     def take(self, ready: Callable[[float], bool]) -> list[tuple[float, Any, bool]]:
-        """Remove and return the items that may leave: a list of (t, item, ready(before)).
+        """Remove and return the items that may leave: a list of (t, item, ready(preceding)).
 
-        before : s, the latest stamp added before the item, at most t; t for the first item
+        preceding : s, the latest stamp added before the item, at most t; t for the first item
         """
         out = []
         while self._items:
-            t, before, item = self._items[0]
-            is_ready = ready(before)
+            t, preceding, item = self._items[0]
+            is_ready = ready(preceding)
             if not is_ready and self._newest - t <= self.limit and len(self._items) <= MOST_WAITING:
                 break
             out.append((t, item, is_ready))

@@ -136,19 +136,22 @@ def _role(cell: str) -> tuple[str, float]:
     return ("name", 1.0) if text in ("", *IDS) else ("", 1.0)
 
 
+_YAML_KEY = re.compile(r"^\s*(?:- *)?[{\s]*[\"']?[\w /*.-]+[\"']?\s*:(?:\s|$)")
+
+
 def is_table(text: str) -> bool:
-    """Return whether a text is a table, not YAML or JSON."""
+    """Return whether a text is a table, not YAML or JSON; an empty one is a table.
+
+    YAML and JSON begin with one of {, [, %, - or have a line with a key.
+    """
     lines = [
         line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")
     ]
     if not lines:
         return True
     # A table may begin with a negative number, e.g. -3.1.
-    begins_tree = lines[0].lstrip()[0] in "{[%-" and not _is_number(cells_of(lines[0])[0])
-    return not begins_tree and not any(map(_KEY.match, lines))
-
-
-_KEY = re.compile(r"^\s*(?:- *)?[{\s]*[\"']?[\w /*.-]+[\"']?\s*:(?:\s|$)")
+    begins_as_yaml = lines[0].lstrip()[0] in "{[%-" and not _is_number(cells_of(lines[0])[0])
+    return not begins_as_yaml and not any(map(_YAML_KEY.match, lines))
 
 
 def cells_of(line: str, delimiter: str | None = None) -> list[str]:
@@ -162,21 +165,25 @@ def cells_of(line: str, delimiter: str | None = None) -> list[str]:
 
 
 def lines_of(text: str) -> Lines:
-    """Return the lines of a table without comments and empty lines; a comment may be the header."""
-    texts = [
+    """Return the lines of a table without comments and empty lines.
+
+    The last comment before the first row is kept if it is a header. A text of comments alone is
+    returned whole.
+    """
+    filled_lines = [
         (number, line) for number, line in enumerate(text.splitlines(), start=1) if line.strip()
     ]
-    rows = [(number, line) for number, line in texts if not line.lstrip().startswith("#")] or texts
-    delimiter = delimiter_of(rows[0][1])
-    headers = [
+    rows = [(number, line) for number, line in filled_lines if not line.lstrip().startswith("#")]
+    rows = rows or filled_lines
+    first_row, first_line = rows[0]
+    delimiter = delimiter_of(first_line)
+    comments_above = [
         (number, cells_of(line.lstrip("# \t"), delimiter))
-        for number, line in texts
-        if number < rows[0][0]
+        for number, line in filled_lines
+        if number < first_row
     ]
-    return [
-        *[line for line in headers[-1:] if columns_of(line[1])],
-        *((number, cells_of(line, delimiter)) for number, line in rows),
-    ]
+    header = [(number, cells) for number, cells in comments_above[-1:] if columns_of(cells)]
+    return [*header, *((number, cells_of(line, delimiter)) for number, line in rows)]
 
 
 def delimiter_of(line: str) -> str:

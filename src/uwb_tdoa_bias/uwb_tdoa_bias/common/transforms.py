@@ -61,10 +61,10 @@ class Frames:
         return child in self._static
 
     def differs(self, parent: str, child: str, q: Sequence[float], p: Sequence[float]) -> bool:
-        """Return whether a constant transform is new, or differs from the known one.
+        """Return whether `set` would change something; a frozen node asks before it refuses.
 
-        It differs by more than SAME_PLACE or SAME_TURN. Parameters as for `set`. Raises InputError as
-        `set`.
+        It would if the child is unknown, has another parent, or differs by more than SAME_PLACE or
+        SAME_TURN. Parameters as for `set`. Raises InputError as `set`.
         """
         self._check(self._static, MOST, parent, child, q, p)
         known = self._static.get(child)
@@ -146,19 +146,22 @@ class Frames:
         return found
 
     def _at(self, frame: str, t: float | None) -> tuple[str, Rotation, np.ndarray] | None:
-        """Return (parent, Rotation, p (3,) m) of a moving frame, interpolated; None if unknown."""
+        """Return (parent, Rotation, p (3,) m) of a moving frame at stamp t, s, by interpolation.
+
+        After the last transform, that one holds for HELD. Return None before the first, after this
+        time, and for an unknown frame.
+        """
         if t is None or frame not in self._moving:
             return None
         parent, course = self._moving[frame]
         stamps = [entry[0] for entry in course]
-        k = bisect_right(stamps, t)
-        if k == 0 or t > stamps[-1] + HELD:
+        following = bisect_right(stamps, t)
+        if following == 0 or t > stamps[-1] + HELD:
             return None
-        before, after = course[k - 1], course[min(k, len(course) - 1)]
+        before, after = course[following - 1], course[min(following, len(course) - 1)]
         if after is before:
             return parent, rotations.Rotation.from_quat(before[1]), np.array(before[2])
         share = (t - before[0]) / (after[0] - before[0])
-        turn = rotations.Slerp([0.0, 1.0], rotations.Rotation.from_quat([before[1], after[1]]))(
-            share
-        )
+        ends = rotations.Rotation.from_quat([before[1], after[1]])
+        turn = rotations.Slerp([0.0, 1.0], ends)(share)
         return parent, turn, (1.0 - share) * np.array(before[2]) + share * np.array(after[2])

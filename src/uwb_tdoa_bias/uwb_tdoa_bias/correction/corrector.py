@@ -84,26 +84,30 @@ class Corrector:
         self,
         anchors: Anchors,
         effects: EffectSet | None = None,
-        network: Model | None = None,
+        model: Model | None = None,
         lag: float = POSE_LAG,
         poses: Poses | None = None,
     ) -> None:
-        """Set the bias model.
+        """Set effects and model.
+
+        Effects with `is_hypothesis` (floor reflections) are not corrected here: the filter decides
+        whether they act. They are in `left_to_filter`, all others in `effects`.
 
         Parameters
         ----------
         anchors : Anchors
-        effects : EffectSet or None; hypotheses, which the filter weighs, are not corrected: see `weighed`
-        network : Model or None
+        effects : EffectSet or None
+        model : Model or None; an ONNX file with a learned network, with exported effects, or with
+            both. Its effects must not be in `effects`, too.
         lag : s
         poses : Poses that other Correctors use, too; by default its own
         """
         self.anchors = anchors
         effects = EffectSet() if effects is None else effects
         self.effects = effects.where(lambda effect: not effect.is_hypothesis)
-        self.weighed = effects.where(lambda effect: effect.is_hypothesis)
-        self.network = network
-        held = network.holds if network else ()
+        self.left_to_filter = effects.where(lambda effect: effect.is_hypothesis)
+        self.model = model
+        held = model.holds if model else ()
         twice = set(held) & {effect.label for effect in self.effects}
         if twice:
             raise InputError(
@@ -112,9 +116,14 @@ class Corrector:
             )
         self.lag = lag
         own = self.effects.name if len(self.effects) else ""
-        self.model = _joined(own, network.name if network else "")
-        of_effects = _joined(own, network.of_effects if network else "")
-        self.models = {PASSED: "none", EFFECTS: of_effects, NETWORK: self.model, FADED: self.model}
+        self.model_name = _joined(own, model.name if model else "")
+        of_effects = _joined(own, model.of_effects if model else "")
+        self.name_of_status = {
+            PASSED: "none",
+            EFFECTS: of_effects,
+            NETWORK: self.model_name,
+            FADED: self.model_name,
+        }
         self._poses = Poses() if poses is None else poses
         self._begin()
 
@@ -124,28 +133,26 @@ class Corrector:
         self._begin()
 
     def _begin(self) -> None:
-        self._latest: Samples | None = None  # of the latest TDOAs
-        self._newest: float = None  # type: ignore[assignment]  # latest stamp of a TDOA, once there is one
-        self._first = math.nan  # stamp of the first TDOA, once there is one
-        self._last: tuple[float, int] | None = None  # stamp and later anchor of the last one
+        self._latest_samples: Samples | None = None  # of the latest batch
+        # s, stamps of TDOAs, once there is one: the latest, and that of the first
+        self._newest_stamp: float = None  # type: ignore[assignment]
+        self._first_stamp = math.nan
+        # stamp, s, and id of the second anchor of the last TDOA
+        self._last_tdoa: tuple[float, int] | None = None
 
     def change_anchors(self, anchors: Anchors) -> None:
         """Continue with other Anchors and the known poses."""
-        self.anchors, self._latest, self._last = anchors, None, None
-
-    @property
-    def _has_model(self) -> bool:
-        return len(self.effects) > 0 or self.network is not None
+        self.anchors, self._latest_samples, self._last_tdoa = anchors, None, None
 
     @property
     def idle(self) -> bool:
-        """True without effects and network."""
-        return not self._has_model
+        """True without effects and model."""
+        return len(self.effects) == 0 and self.model is None
 
     @property
     def uses_pose(self) -> bool:
         """Return whether a correction depends on the pose of the tag, so it waits for poses."""
-        return not self.idle and (self.network is not None or self.effects.uses_pose)
+        return not self.idle and (self.model is not None or self.effects.uses_pose)
 
     @property
     def outside(self) -> list[str]:
@@ -153,7 +160,8 @@ class Corrector:
 
         Such TDOAs were measured outside of the domain of the effect.
         """
-        return [] if self._latest is None else self.effects.outside(self._latest)
+        samples = self._latest_samples
+        return [] if samples is None else self.effects.outside(samples)
 
     def add_pose(
         self,
@@ -177,15 +185,15 @@ class Corrector:
             t, p, q, np.broadcast_to(v, np.shape(p)), np.broadcast_to(yaw_std, np.shape(t))
         )
 
-    def ready(self, before: float) -> bool:
+    def ready(self, preceding: float) -> bool:
         """Return whether no future pose can change the correction of a TDOA.
 
-        before : stamp of the TDOA that precedes it, s
+        preceding : s, stamp of the TDOA before it, as in `Poses.for_tdoas`
         """
         return (
             self.idle
-            or self._poses.newest > before - self.lag
-            or before < self._poses.begin < math.inf
+            or self._poses.newest > preceding - self.lag
+            or preceding < self._poses.begin < math.inf
         )
 
     def correct(self, t: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray) -> Correction:
@@ -199,18 +207,18 @@ class Corrector:
         a, b : (n,) rows of `anchors`
         d : (n,) m, raw d_ab
         """
-        if not self._has_model or len(t) == 0:
+        if self.idle or len(t) == 0:
             return Correction.none(d)
-        self._latest = samples = self.samples(t, a, b)
+        self._latest_samples = samples = self.samples(t, a, b)
         bias, std, status, slope, state = self.prediction(samples)
         return Correction(bias, std, d - bias, status.astype(np.uint8), slope, state)
 
     def prediction(self, samples: Samples) -> Prediction:
-        """Return the Prediction of Samples by effects and network."""
+        """Return the Prediction of Samples by effects and model."""
         bias, std, slope, state = self.contribution(samples)
         status = np.full(len(samples), float(EFFECTS if len(self.effects) else PASSED))
         known = Prediction(bias, std, status, slope, state)
-        return known if self.network is None else self.network.added(samples, known)
+        return known if self.model is None else self.model.added(samples, known)
 
     def contribution(
         self, samples: Samples
@@ -227,42 +235,44 @@ class Corrector:
         steep = self.effects.state_dependent
         bias, noise = self.effects.state_independent.bias(samples), self.effects.noise_std(samples)
         if len(steep):
-            of_steep, slope, curved = steep.bias_jacobian(samples)
+            of_steep, slope, curvature_std = steep.bias_jacobian(samples)
             bias = bias + of_steep
-            noise = np.hypot(noise, curved)
+            noise = np.hypot(noise, curvature_std)
             state = samples.linearization_point
-        unknown: np.ndarray = np.zeros(len(samples), bool)
+        yaw_unknown: np.ndarray = np.zeros(len(samples), bool)
         if samples.yaw_std is not None:
-            unknown = samples.yaw_std > LARGEST_YAW_STD
-        turning = self.effects.of_attitude
-        if len(turning) and unknown.any():
-            headings = np.concatenate(
+            yaw_unknown = samples.yaw_std > LARGEST_YAW_STD
+        of_attitude = self.effects.of_attitude
+        if len(of_attitude) and yaw_unknown.any():
+            # the estimated attitude, then four headings
+            attitudes = np.concatenate(
                 [samples.q, *(rotated_in_yaw(samples.q, k) for k in range(4))]
             )
-            headed = turning.bias(replace(samples.repeated(5), q=headings)).reshape(5, -1)
-            known, each = headed[0], headed[1:]
-            bias = np.where(unknown, bias - known + each.mean(axis=0), bias)
-            noise = np.where(unknown, np.hypot(noise, each.std(axis=0)), noise)
-        if len(steep) and unknown.any():
-            level = steep.where(lambda effect: not effect.uses_attitude).bias_jacobian(samples)[1]
-            slope = np.where(unknown[:, None], level, slope)
+            biases = of_attitude.bias(replace(samples.repeated(5), q=attitudes)).reshape(5, -1)
+            estimated, headings = biases[0], biases[1:]
+            bias = np.where(yaw_unknown, bias - estimated + headings.mean(axis=0), bias)
+            noise = np.where(yaw_unknown, np.hypot(noise, headings.std(axis=0)), noise)
+        if len(steep) and yaw_unknown.any():
+            without_attitude = steep.where(lambda effect: not effect.uses_attitude)
+            other_slope = without_attitude.bias_jacobian(samples)[1]
+            slope = np.where(yaw_unknown[:, None], other_slope, slope)
         return bias, noise, slope, state
 
     def samples(self, t: np.ndarray, a: np.ndarray, b: np.ndarray) -> Samples:
         """Return the Samples of a batch at the poses known so far; parameters as for `correct`."""
-        if self._newest is None:
-            self._first = self._newest = t[0]
-        places, p, q, yaw_std = self._poses.before(t, self._newest, self.lag)
-        self._newest = max(self._newest, t.max())
-        samples = Samples(t, a, b, p, q, self.anchors, self._first, yaw_std=yaw_std)
-        if not (self.effects.needs_motion or (self.network and self.network.needs_motion)):
+        if self._newest_stamp is None:
+            self._first_stamp = self._newest_stamp = t[0]
+        rows, p, q, yaw_std = self._poses.for_tdoas(t, self._newest_stamp, self.lag)
+        self._newest_stamp = max(self._newest_stamp, t.max())
+        samples = Samples(t, a, b, p, q, self.anchors, self._first_stamp, yaw_std=yaw_std)
+        if not (self.effects.needs_motion or (self.model and self.model.needs_motion)):
             return samples
         kept = self._poses.kept
-        last_t, last_b = self._last or (t[0], -1)
-        self._last = (t[-1], self.anchors.ids[b[-1]])
+        last_t, last_b = self._last_tdoa or (t[0], -1)
+        self._last_tdoa = (t[-1], self.anchors.ids[b[-1]])
         return replace(
             samples,
-            motion=motion_at(kept.t, kept.v, kept.q, places),
+            motion=motion_at(kept.t, kept.v, kept.q, rows),
             interval=t - np.concatenate([[last_t], t[:-1]]),
             previous=np.concatenate([[last_b], self.anchors.ids[b[:-1]]]),
         )
@@ -271,7 +281,7 @@ class Corrector:
 class FixedPoseCorrector(Corrector):
     """Corrects a recording at the poses of an earlier run with another model."""
 
-    idle = True  # no waiting for poses
+    uses_pose = False  # it has all poses, so it waits for none
 
     def __init__(
         self, anchors: Anchors, effects: EffectSet | None, poses: Sequence[np.ndarray]
@@ -294,12 +304,12 @@ def _joined(*names: str) -> str:
     return "+".join(filter(None, names)) or "none"
 
 
-def warm_up(effects: EffectSet, network: Model | None, lag: float = POSE_LAG) -> Corrector:
+def warm_up(effects: EffectSet, model: Model | None, lag: float = POSE_LAG) -> Corrector:
     """Return a Corrector after one correction.
 
     The first correction compiles the functions, or loads them from numba's cache.
     """
-    corrector = Corrector(Anchors.from_positions(np.eye(3)), effects, network, lag)
+    corrector = Corrector(Anchors.from_positions(np.eye(3)), effects, model, lag)
     corrector.add_pose(
         np.zeros(1), *parts_of(np.eye(1, POSE_NUMBERS, 6), np.zeros((1, TWIST_NUMBERS)))
     )
@@ -375,21 +385,24 @@ class Poses:
         if self._count and self.begin == math.inf:
             self.begin = float(self._columns.t[0]) + self._start
 
-    def before(
+    def for_tdoas(
         self, t: np.ndarray, newest: float, lag: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return the newest pose at least `lag` s before the TDOA that precedes each TDOA.
+        """Return the pose at which each TDOA is corrected: the newest that is old enough.
+
+        It must be at least `lag` older than the newest earlier TDOA. If that TDOA is later than t, or
+        there is none, t itself counts. While that stamp is before `begin`, there is no pose.
 
         Parameters
         ----------
-        t : (n,) s, of the TDOAs; `preceding` gives the TDOA before each
-        newest : latest stamp of earlier TDOAs, s
+        t : (n,) s, stamps of the TDOAs in order of arrival
+        newest : s, latest stamp of all TDOAs before this batch; t[0] if there is none
         lag : s
 
         Returns
         -------
-        places, p, q, yaw_std : (n,) int, (n, 3) m, (n, 4), (n,) rad; -1 and NaN where there is no pose,
-            and before `begin`
+        rows : (n,) int, rows of `kept`; -1 if there is no pose
+        p, q, yaw_std : (n, 3) m, (n, 4), (n,) rad; NaN if there is no pose
         """
         n = len(t)
         out = np.empty(n, dtype=np.int64), np.empty((n, 3)), np.empty((n, 4)), np.empty(n)
@@ -429,18 +442,21 @@ def _look_up(
     kept: PoseArrays,
     out: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
 ) -> None:
-    places, p, q, yaw_std = out[0], out[1], out[2], out[3]
+    """Fill `out` with row, position, attitude and yaw deviation of the pose for each TDOA; compiled.
+
+    t, newest, limits = (lag, begin), out : as in `Poses.for_tdoas`; count : number of poses in `kept`
+    """
+    rows, p, q, yaw_std = out[0], out[1], out[2], out[3]
     lag, begin = limits[0], limits[1]
-    precede(t, newest, yaw_std)
+    stamps = np.empty(len(t))  # s, of the TDOA before each
+    precede(t, newest, stamps)
     for i in range(len(t)):
-        place = (
-            np.searchsorted(kept.t[:count], yaw_std[i] - lag, side="right") - 1
-            if yaw_std[i] >= begin
-            else -1
-        )
-        places[i] = place
-        if place >= 0:
-            p[i], q[i], yaw_std[i] = kept.p[place], kept.q[place], kept.yaw_std[place]
+        row = -1
+        if stamps[i] >= begin:
+            row = np.searchsorted(kept.t[:count], stamps[i] - lag, side="right") - 1
+        rows[i] = row
+        if row >= 0:
+            p[i], q[i], yaw_std[i] = kept.p[row], kept.q[row], kept.yaw_std[row]
         else:
             p[i], q[i], yaw_std[i] = np.nan, np.nan, np.nan
 

@@ -253,7 +253,8 @@ class Effect:
     sizable_share: ClassVar[float] = 0.5
     # Channels, at least one of which must show: else the reference may have the error.
     corroborating_channels: ClassVar[tuple[str, ...]] = ()
-    is_hypothesis: ClassVar[bool] = False  # True: the filter tests it, and no Corrector removes it
+    # True: no Corrector removes it; the filter decides whether it acts, as floor reflections
+    is_hypothesis: ClassVar[bool] = False
     needs_reference: ClassVar[bool] = False  # True: innovations alone do not show it
     needs_motion: ClassVar[bool] = False  # True: depends on more than the pose of the tag
     uses_pose: ClassVar[bool] = True  # False: its bias is a constant of each pair of anchors

@@ -425,6 +425,7 @@ class EffectSet:
         entries: dict[str, dict[str, Any]] = {}
         for effect in self.effects:
             entry = {name: _plain(getattr(effect, name)) for name in (*effect.settings, *ENTRY)}
+            # several effects of one kind are numbered; smooth terms always are
             number = 1 + sum(other.name == effect.name for other in self.effects[: len(entries)])
             name = effect.name if number == 1 and not effect.settings else f"{effect.name}_{number}"
             entries[name] = {key: value for key, value in entry.items() if value}

@@ -39,16 +39,16 @@ class Motion:
     rate: np.ndarray
 
 
-def motion_at(t: np.ndarray, v: np.ndarray, q: np.ndarray, places: np.ndarray) -> Motion:
+def motion_at(t: np.ndarray, v: np.ndarray, q: np.ndarray, rows: np.ndarray) -> Motion:
     """Return the Motion at some states of a history, from earlier states alone.
 
     Acceleration and rate are backward differences over SPAN: a node can compute the same.
 
     t : (m,) s, rising; v : (m, 3) m/s, world; q : (m, 4) x y z w
-    places : (n,) rows of the history, -1 for none
+    rows : (n,) rows of the history, -1 for none
     """
-    out = np.full((3, len(places), 3), np.nan)
-    _differences(t, v, q, places, out)
+    out = np.full((3, len(rows), 3), np.nan)
+    _differences(t, v, q, rows, out)
     return Motion(*out)
 
 
@@ -74,10 +74,10 @@ def precede(t: np.ndarray, newest: float, out: np.ndarray) -> None:
 
 @compiled
 def _differences(
-    t: np.ndarray, v: np.ndarray, q: np.ndarray, places: np.ndarray, out: np.ndarray
+    t: np.ndarray, v: np.ndarray, q: np.ndarray, rows: np.ndarray, out: np.ndarray
 ) -> None:
-    for i in range(len(places)):
-        k = places[i]
+    for i in range(len(rows)):
+        k = rows[i]
         if k < 0:
             continue
         out[0, i] = v[k]

@@ -463,6 +463,7 @@ class SmoothTerm(Effect):
         return [keys, *alone] if self.form == "anchor" else [keys]
 
     def advice(self) -> tuple[str, ...]:
+        # the anchors, pairs or axes with a function of their own; "" for one of all
         parts = list(dict.fromkeys(key.rpartition(".")[0] for key in self.values))
         if len(parts) > MOST_PARTS or not parts:
             return ()
@@ -699,7 +700,7 @@ def described(term: SmoothTerm, part: str = "") -> str:
     prefix = f"{part}." if part else ""
     name, unit = _named(term.covariate), UNITS.get(term.covariate, "")
     knots = [f"{rounded(knot)} {unit}".strip() for knot in term.knots]
-    seen = f"{_where_factor(term)} (seen from {knots[0]} to {knots[-1]})"
+    seen = f"{_factor_clause(term)} (seen from {knots[0]} to {knots[-1]})"
     size = term.values.get(f"{prefix}c1", 0.0)
     std = term.std.get(f"{prefix}c1")
     if term.shape in ("step", "interval"):
@@ -716,7 +717,7 @@ def described(term: SmoothTerm, part: str = "") -> str:
         on, period = (
             f"{rounded(value - term.knots[0])} {unit}".strip() for value in term.knots[1:]
         )
-        where = f" for {on} in each {period} of {name}, first at {knots[0]}{_where_factor(term)}"
+        where = f" for {on} in each {period} of {name}, first at {knots[0]}{_factor_clause(term)}"
         return _off(term, part, size, std, where)
     if term.shape in ("line", "beyond", "below"):
         first, last = {"line": (0, 1), "beyond": (1, 2), "below": (1, 0)}[term.shape]
@@ -731,7 +732,7 @@ def described(term: SmoothTerm, part: str = "") -> str:
     swing = course[top] - course[bottom]
     if term.shape == "wave":
         length = f"{rounded(term.knots[1] - term.knots[0])} {unit}".strip()
-        how = f" and less in turn, every {length} of {name}{_where_factor(term)}"
+        how = f" and less in turn, every {length} of {name}{_factor_clause(term)}"
         return _off(term, part, swing, None, how)
     where = (
         f"where {name} is {rounded(at[top])} {unit} than where it is {rounded(at[bottom])} {unit}"
@@ -739,8 +740,8 @@ def described(term: SmoothTerm, part: str = "") -> str:
     return _off(term, part, swing, None, f" {where}{seen}")
 
 
-def _where_factor(term: SmoothTerm) -> str:
-    """Return how the factor changes the function, as a part of a clause; "" without one."""
+def _factor_clause(term: SmoothTerm) -> str:
+    """Return a clause on where the factor lets the function act; "" without a factor."""
     if not term.factor:
         return ""
     name, unit = _named(term.factor), UNITS.get(term.factor, "")

@@ -40,7 +40,8 @@ Report = tuple[bytes, str, dict[str, Any]]  # level of a DiagnosticStatus, text,
 class Diagnostics:
     """Publishes one status on /diagnostics each second of the wall clock.
 
-    It publishes at once if simulated time stops or continues. It logs a status that is new by Saying.
+    It publishes at once if simulated time stops or continues. A LogFilter decides
+    which statuses it logs.
 
     Parameters
     ----------
@@ -54,7 +55,8 @@ class Diagnostics:
         report: Callable[[], Report],
         look: Callable[[], None] = lambda: None,
     ) -> None:
-        self._node, self._report, self._look, self._saying = node, report, look, Saying()
+        self._node, self._report, self._look = node, report, look
+        self._log_filter = LogFilter()
         self._clock, self._looks = SimulatedClock(node), 0
         self._clock_status: tuple[bytes, str] | None = None
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", DIAGNOSTICS_QOS)
@@ -95,7 +97,7 @@ class Diagnostics:
         if refused and level == DiagnosticStatus.OK:
             level, text = DiagnosticStatus.WARN, refused
         level, text = self._clock_status or (level, text)
-        if self._saying.anew(text, time.monotonic()):
+        if self._log_filter.should_log(text, time.monotonic()):
             logger = self._node.get_logger()
             if level == DiagnosticStatus.OK:
                 logger.info(text)
@@ -111,27 +113,26 @@ class Diagnostics:
         self._publisher.publish(message)
 
 
-class Saying:
+class LogFilter:
     """Decides which sentences are worth a line in the log.
 
     Sentences that differ only in measured numbers are of one kind; ids of anchors are no measured
-    numbers. A sentence is logged if its kind differs from the last one and was not logged within
-    AGAIN seconds.
+    numbers. A sentence is logged if its kind differs from that of the last logged one, and was not
+    logged within AGAIN seconds. Sentences that are not logged do not count.
     """
 
     def __init__(self) -> None:
-        self._last: str | None = None
-        self._when: dict[str, float] = {}
+        self._last_logged: str | None = None
+        self._logged_at: dict[str, float] = {}  # {kind: s}, within AGAIN
 
-    def anew(self, text: str, now: float) -> bool:
+    def should_log(self, text: str, now: float) -> bool:
         """Return whether to log a text now, and count it as logged; now : s."""
         kind = NUMBER.sub(_unless_id, text)
-        if kind == self._last or now - self._when.get(kind, -math.inf) < AGAIN:
+        if kind == self._last_logged or now - self._logged_at.get(kind, -math.inf) < AGAIN:
             return False
-        self._when = {one: when for one, when in self._when.items() if now - when < AGAIN} | {
-            kind: now
-        }
-        self._last = kind
+        recent = {other: at for other, at in self._logged_at.items() if now - at < AGAIN}
+        self._logged_at = recent | {kind: now}
+        self._last_logged = kind
         return True
 
 

@@ -65,7 +65,7 @@ class StreamNode(ParameterNode):
     ) -> Subscription:
         """Subscribe as rclpy does."""
         callback = callback if callback is unserved else self._contained(callback)
-        options["event_callbacks"] = self._quiet(
+        options["event_callbacks"] = self._with_few_warnings(
             topic, options.get("event_callbacks") or SubscriptionEventCallbacks()
         )
         return super().create_subscription(msg_type, topic, callback, qos_profile, **options)
@@ -74,12 +74,12 @@ class StreamNode(ParameterNode):
         self, msg_type: type, topic: str, qos_profile: QoSProfile | int, **options: Any
     ) -> Publisher:
         """Make a publisher as rclpy does."""
-        options["event_callbacks"] = self._quiet(
+        options["event_callbacks"] = self._with_few_warnings(
             topic, options.get("event_callbacks") or PublisherEventCallbacks()
         )
         return super().create_publisher(msg_type, topic, qos_profile, **options)
 
-    def _quiet(self, topic: str, events: Events) -> Events:
+    def _with_few_warnings(self, topic: str, events: Events) -> Events:
         """Return event callbacks that limit the warnings on peers with another QoS or type.
 
         rclpy would write one line per peer.

@@ -611,7 +611,9 @@ def _compare(
             innovation.row[k] += tdoa.slope[k]
             innovation.entries = max(innovation.entries, k + 1)
     project(hypothesis.P, innovation)
-    innovation.curvature = update.variance(hypothesis.x, hypothesis.P, a.position, b.position)
+    innovation.curvature = update.second_order_variance(
+        hypothesis.x, hypothesis.P, a.position, b.position
+    )
     innovation.prior_variance += innovation.curvature
 
 

@@ -19,7 +19,7 @@ RECORD = np.dtype(
         ("kind", np.int64),
         # upper rows, since the previous record
         ("transition", float, (MOVING_STATES, ERROR_STATES)),
-        ("row", float, ERROR_STATES),  # Jacobian h
+        ("jacobian", float, ERROR_STATES),  # Jacobian row h, zeros included
         ("gain", float, ERROR_STATES),  # Kalman gain K
         ("innovation", float),  # in the unit of the measurement
         ("variance", float),  # of the innovation, as the update used it
@@ -68,7 +68,7 @@ def add_update(ekf: Record, h: int, t: float, history: np.ndarray) -> None:
         innovation = ekf.innovation
         record.innovation, record.variance = innovation.value, innovation.total_variance
         for n in range(innovation.entries):
-            record.row[innovation.states[n]] = innovation.row[n]
+            record.jacobian[innovation.states[n]] = innovation.row[n]
         for j in range(ERROR_STATES):
             record.gain[j] = innovation.cross_covariance[j] / innovation.total_variance
 
@@ -96,7 +96,7 @@ def _next(ekf: Record, t: float, kind: int, history: np.ndarray) -> Record:
     best, record = ekf.hypotheses[ekf.best], history[ekf.recorded]
     record.t, record.kind = t, kind
     record.transition[:] = ekf.since_record[:MOVING_STATES]
-    record.row[:] = 0.0
+    record.jacobian[:] = 0.0
     record.gain[:] = 0.0
     record.x[:] = best.x
     record.P[:] = best.P

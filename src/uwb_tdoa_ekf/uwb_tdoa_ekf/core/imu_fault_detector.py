@@ -34,12 +34,14 @@ WEIGHT, TURN, RATE, TILT = range(1, 5)  # reason of a fault
 
 
 @compiled
-def update(check: Record, imu: Record, sample: Record, continuous: bool, imu_faulty: bool) -> bool:
+def update(
+    detector: Record, imu: Record, sample: Record, continuous: bool, imu_faulty: bool
+) -> bool:
     """Update the fault detector with an IMU_SAMPLE and return whether the IMU is faulty.
 
     Parameters
     ----------
-    check : IMU_FAULT_DETECTOR
+    detector : IMU_FAULT_DETECTOR
         State of the detector, updated in place.
     imu : IMU_STATE
         Statistics after `inertial.observe` of the sample, before `inertial.store`.
@@ -55,60 +57,58 @@ def update(check: Record, imu: Record, sample: Record, continuous: bool, imu_fau
     bool
         Whether the filter must leave out inertial samples from this one on.
     """
-    t, force, up = sample.t, imu.slow_accel, check.up
+    t, force, up = sample.t, imu.slow_accel, detector.up
     if not continuous:
-        check.weighed = check.upright = t
+        detector.supported = detector.upright = t
         up[:] = force
     dt = t - imu.t if continuous else 0.0
     _turn(up, imu.gyro, dt)
-    upwards = weight = length = rate = 0.0
-    tallest = 0
+    along_up = squared_force = squared_up = squared_rate = 0.0
+    longest_axis = 0  # body axis with the largest force
     for k in range(3):
         up[k] = low_pass(up[k], force[k], dt, MEMORY)
-        upwards += up[k] * force[k]
-        weight += force[k] ** 2
-        length += up[k] ** 2
-        rate += imu.gyro[k] ** 2
-        if abs(force[k]) > abs(force[tallest]):
-            tallest = k
-    weight, upwards, rate = (
-        math.sqrt(weight),
-        upwards / max(math.sqrt(length), 1e-9),
-        math.sqrt(rate),
-    )
-    if upwards > LIGHTEST and weight < HEAVIEST:
-        check.weighed = t
-    check.spun = min(max(check.spun + (rate - FASTEST) * dt, 0.0), TOO_FAR)
-    lies = force[2] < UPRIGHT * weight and abs(force[tallest]) > AXIS * weight
+        along_up += up[k] * force[k]
+        squared_force += force[k] ** 2
+        squared_up += up[k] ** 2
+        squared_rate += imu.gyro[k] ** 2
+        if abs(force[k]) > abs(force[longest_axis]):
+            longest_axis = k
+    force_norm, rate = math.sqrt(squared_force), math.sqrt(squared_rate)
+    upward_force = along_up / max(math.sqrt(squared_up), 1e-9)
+    if upward_force > LIGHTEST and force_norm < HEAVIEST:
+        detector.supported = t
+    detector.excess_turn = min(max(detector.excess_turn + (rate - FASTEST) * dt, 0.0), TOO_FAR)
+    lies = force[2] < UPRIGHT * force_norm and abs(force[longest_axis]) > AXIS * force_norm
     if not lies:
-        check.upright = t
-    if t - check.weighed > TOO_LONG and not LIGHTEST < weight < HEAVIEST:
-        _contradict(check, force, t, WEIGHT, weight)
-    elif t - check.weighed > TOO_LONG or upwards < DOWNWARDS:
-        _contradict(check, force, t, TURN, upwards)
-    elif check.spun == TOO_FAR:
-        _contradict(check, force, t, RATE, rate)
-    elif lies and (imu_faulty or t - check.upright > LYING):
-        _contradict(check, force, t, TILT, force[2])
-    return t - check.contradicted < CLEARED
+        detector.upright = t
+    unsupported = t - detector.supported > TOO_LONG
+    if unsupported and not LIGHTEST < force_norm < HEAVIEST:
+        _contradict(detector, force, t, WEIGHT, force_norm)
+    elif unsupported or upward_force < DOWNWARDS:
+        _contradict(detector, force, t, TURN, upward_force)
+    elif detector.excess_turn == TOO_FAR:
+        _contradict(detector, force, t, RATE, rate)
+    elif lies and (imu_faulty or t - detector.upright > LYING):
+        _contradict(detector, force, t, TILT, force[2])
+    return t - detector.contradicted < CLEARED
 
 
 @compiled
-def _contradict(check: Record, force: np.ndarray, t: float, reason: int, size: float) -> None:
+def _contradict(detector: Record, force: np.ndarray, t: float, reason: int, size: float) -> None:
     """Note an impossible sample, and reset the vertical to the measured force.
 
     force is the specific force (3,), m/s^2, body frame. size is the impossible value in its own
     unit.
     """
-    check.contradicted, check.reason, check.size = t, reason, size
-    check.up[:] = force
+    detector.contradicted, detector.reason, detector.size = t, reason, size
+    detector.up[:] = force
 
 
 @compiled
 def _turn(vector: np.ndarray, rate: np.ndarray, dt: float) -> None:
-    """Turn a constant vector of the world, given in the body frame, by -rate * dt (Rodrigues).
+    """Update a vector in the body frame so that it stays constant in the world.
 
-    vector (3,) is updated in place. rate (3,) is the angular rate of the body in rad/s, dt is in s.
+    It turns by -rate * dt (Rodrigues). vector (3,) is updated in place. rate (3,) is the angular rate of the body in rad/s, dt is in s.
     """
     angle = dt * math.sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2)
     if angle < 1e-12:

@@ -506,7 +506,7 @@ def recover(
     x, covariance, cost = places.x, places.covariance, places.cost
     explained = np.mean(inliers(window, anchors, ekf.hypotheses[ekf.best].x[:6]))
     if (
-        workspace.outside(ekf.workspace, x[0]) > (workspace.STD if anywhere else 0.0)
+        workspace.distance_outside(ekf.workspace, x[0]) > (workspace.STD if anywhere else 0.0)
         or share < AGREE_ANYHOW
     ):
         return

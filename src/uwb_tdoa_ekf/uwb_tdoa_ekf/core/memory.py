@@ -102,8 +102,8 @@ IMU_STATE = _record(
 # State of the IMU fault detector, see imu_fault_detector.py.
 IMU_FAULT_DETECTOR = _record(
     ("up", float, 3),  # m/s^2, specific force, rotated by the gyroscope
-    ("spun", float),  # rad, recent turn beyond the limit
-    ("weighed", float),  # s, stamp of the last sample in which the force bore the tag
+    ("excess_turn", float),  # rad, recent turn beyond the limit
+    ("supported", float),  # s, stamp of the last sample whose force can carry the tag
     ("upright", float),  # s, stamp of the last sample in which the tag did not lie on its side
     ("contradicted", float),  # s, stamp of the last impossible sample
     ("reason", int),  # of the fault
@@ -446,9 +446,9 @@ def imu_rows(t: np.ndarray, gyro: np.ndarray, accel: np.ndarray) -> tuple[np.nda
 def usable_tdoas(rows: np.ndarray, positions: np.ndarray) -> np.ndarray:
     """Return (n,) bool: which TDOAs can be measurements.
 
-    Refused are an unknown anchor (row -1), a pair of equal anchors, a value that is not finite, an
-    invalid variance, a value longer than the baseline plus LARGEST_ERROR, and an implausible slope
-    of the bias.
+    These are refused: an unknown anchor (row -1), a pair of equal anchors, a value or stamp that is
+    not finite, a value longer than the baseline plus LARGEST_ERROR, an invalid variance, and an
+    implausible slope of the bias or state at which it holds.
 
     Parameters
     ----------
@@ -463,10 +463,10 @@ def usable_tdoas(rows: np.ndarray, positions: np.ndarray) -> np.ndarray:
         a, b, d = tdoa.a, tdoa.b, tdoa.d
         usable = a >= 0 and b >= 0 and a != b and math.isfinite(tdoa.t) and math.isfinite(d)
         if usable:
-            square = 0.0
+            squared_baseline = 0.0
             for k in range(3):
-                square += (positions[a, k] - positions[b, k]) ** 2
-            longest = math.sqrt(square) + LARGEST_ERROR
+                squared_baseline += (positions[a, k] - positions[b, k]) ** 2
+            longest = math.sqrt(squared_baseline) + LARGEST_ERROR
             usable = abs(d) <= longest and 0.0 <= tdoa.variance < math.inf
         for k in range(N_STATES):  # NaN compares false
             usable = usable and abs(tdoa.slope[k]) < STEEPEST and abs(tdoa.state[k]) < FARTHEST

@@ -87,11 +87,12 @@ def begin(information: np.ndarray, P: np.ndarray) -> None:
 
 @compiled
 def observe(
-    information: np.ndarray, a: Record, b: Record, innovation: Record, t: float, last: float
+    information: np.ndarray, a: Record, b: Record, innovation: Record, t: float, previous: float
 ) -> None:
-    """Update the information that a single TDOA from each heard anchor gives about the position.
+    """Update the information that one arrival from each heard anchor gives about the position.
 
-    Each TDOA counts with its own measurement noise.
+    The information is forgotten over MEMORY. However often an anchor is heard in this time, it counts
+    once. A TDOA has two arrivals, and counts with its own measurement noise.
 
     Parameters
     ----------
@@ -103,18 +104,18 @@ def observe(
         Innovation after the update.
     t : float
         Stamp of the TDOA, s.
-    last : float
-        Stamp of the last TDOA, s.
+    previous : float
+        Stamp of the TDOA before, s.
     """
-    fades = min(t - last, LONGEST_STEP) / MEMORY
-    # the sum over all TDOAs in MEMORY is the number of anchors
-    apart = 0.5 * (min(t - a.heard, MEMORY) + min(t - b.heard, MEMORY)) / MEMORY
+    forgotten = min(t - previous, LONGEST_STEP) / MEMORY
+    # The silence of an anchor before each arrival, as a share of MEMORY, sums to 1 over MEMORY.
+    share = 0.5 * (min(t - a.heard, MEMORY) + min(t - b.heard, MEMORY)) / MEMORY
     a.heard = b.heard = t
-    gain = apart * innovation.weight / (innovation.noise_variance + innovation.curvature / SHARE)
+    gain = share * innovation.weight / (innovation.noise_variance + innovation.curvature / SHARE)
     for i in range(3):
         for j in range(3):
             information[i, j] += (
-                gain * innovation.row[i] * innovation.row[j] - fades * information[i, j]
+                gain * innovation.row[i] * innovation.row[j] - forgotten * information[i, j]
             )
 
 

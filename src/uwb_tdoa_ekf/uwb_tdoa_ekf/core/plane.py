@@ -20,7 +20,7 @@ from . import hypotheses, velocity
 from .history import add_update
 from .memory import HYPOTHESES
 from .state import CONSTRAINT_PERIOD, rotation, yaw_of
-from .update import GATE, kalman, kalman_robust, project, update_state
+from .update import GATE, kalman, kalman_direct, kalman_robust, project
 
 RISE_STD = 0.02  # m/s, of the vertical velocity of a planar vehicle
 # records in a history per application: height, rise, tilt about two axes, velocity along two
@@ -57,10 +57,10 @@ def hold(ekf: Record, parameters: Record, t: float, records: np.ndarray) -> None
         if not hypotheses.alive(hypothesis):
             continue
         if std > 0.0 and hypothesis.P[2, 2] > std**2:
-            update_state(hypothesis, innovation, 2, parameters.fixed_height, std)
+            kalman_direct(hypothesis, innovation, 2, parameters.fixed_height, std)
             add_update(ekf, h, t, records)
         if parameters.planar and hypothesis.P[5, 5] > RISE_STD**2:
-            update_state(hypothesis, innovation, 5, 0.0, RISE_STD)
+            kalman_direct(hypothesis, innovation, 5, 0.0, RISE_STD)
             add_update(ekf, h, t, records)
         for axis in range(2):
             if parameters.planar and _is_tilted(

@@ -63,9 +63,9 @@ def exponential(r0: float, r1: float, r2: float) -> tuple[float, float, float, f
 
 @compiled
 def turn(x: np.ndarray, bx: float, by: float, bz: float, bw: float) -> None:
-    """Multiply the attitude: q <- q * b.
+    """Turn the attitude of a nominal state x (16,) in the body frame: q <- q * b, normalised.
 
-    b is a unit quaternion (x, y, z, w) of a rotation in the body frame.
+    b is the unit quaternion (bx, by, bz, bw) of the rotation.
     """
     ax, ay, az, aw = x[6], x[7], x[8], x[9]
     qx = aw * bx + ax * bw + ay * bz - az * by
@@ -283,8 +283,11 @@ def turn_about_vertical(x: np.ndarray, angle: float) -> None:
 def difference(
     a: np.ndarray, b: np.ndarray
 ) -> tuple[float, float, float, float, float, float, float, float, float]:
-    """Return the error from nominal state a to b, without biases: [dp, dv, dtheta], 9 elements."""
-    ax, ay, az, aw = -a[6], -a[7], -a[8], a[9]
+    """Return the error from nominal state a to b, without biases: [dp, dv, dtheta], 9 elements.
+
+    dtheta is the rotation vector in the body frame of a, as `inject` adds it.
+    """
+    ax, ay, az, aw = -a[6], -a[7], -a[8], a[9]  # inverse attitude of a
     bx, by, bz, bw = b[6], b[7], b[8], b[9]
     x = aw * bx + ax * bw + ay * bz - az * by
     y = aw * by - ax * bz + ay * bw + az * bx

@@ -19,7 +19,7 @@ from .inertial import SHAKING_MEMORY
 from .memory import HYPOTHESES
 from .state import CHECK_PERIOD, CONSTRAINT_PERIOD, GRAVITY, rotation
 from .stationary_position import SPEED_STD
-from .update import GATE, update_state
+from .update import GATE, kalman_direct
 
 # m/s, standard deviation of a zero-velocity update: with a quiet IMU, and with a vibrating one
 QUIET_STD, SHAKING_STD = (0.02, 0.15)
@@ -194,7 +194,7 @@ def update_zero_velocity(ekf: Record, t: float, records: np.ndarray) -> None:
         if not (slow or ekf.resting):
             continue
         for state in range(3, 6):
-            update_state(hypothesis, ekf.innovation, state, 0.0, std)
+            kalman_direct(hypothesis, ekf.innovation, state, 0.0, std)
             add_update(ekf, h, t, records)
 
 

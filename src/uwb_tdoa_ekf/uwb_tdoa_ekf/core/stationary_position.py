@@ -20,7 +20,7 @@ from .history import add_reset, add_update
 from .hypotheses import alive, set_state
 from .memory import HYPOTHESES
 from .startup import Places
-from .update import GATE, update_state
+from .update import GATE, kalman_direct
 from .workspace import surround
 
 NEAR = 1.0  # m beyond the anchors that a tag is expected in
@@ -308,7 +308,7 @@ def set_hovering_position(
                 P[state, state] = max(P[state, state], HOVER_STD**2)
             else:
                 std = math.sqrt(ekf.still_covariance[state - 3, state - 3] + SPEED_STD**2)
-            update_state(ekf.hypotheses[h], ekf.innovation, state, value, std)
+            kalman_direct(ekf.hypotheses[h], ekf.innovation, state, value, std)
             add_update(ekf, h, t, records)
 
 

@@ -43,7 +43,7 @@ INNOVATION = np.dtype(
         ("value", float),  # measured minus predicted
         ("noise_variance", float),  # of a single measurement
         ("prior_variance", float),  # h P h', plus curvature
-        # variance of the second-order term of a TDOA within P, see `variance`
+        # variance of the second-order term of a TDOA within P, see `second_order_variance`
         ("curvature", float),
         # P h', covariance of error state and prediction; the gain is this over total_variance
         ("cross_covariance", float, ERROR_STATES),
@@ -124,10 +124,12 @@ def kalman_robust(
 
 
 @compiled
-def update_state(
+def kalman_direct(
     hypothesis: Record, innovation: Record, state: int, value: float, std: float
 ) -> None:
-    """Update a HYPOTHESIS with a direct measurement of a position or velocity state.
+    """Update a HYPOTHESIS with a direct measurement of one position or velocity state.
+
+    The measurement has neither a robust weight nor a correlation length: it counts fully.
 
     Parameters
     ----------
@@ -148,8 +150,10 @@ def update_state(
 
 
 @compiled
-def variance(x: np.ndarray, P: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
-    """Return the mean square of the second-order term of a TDOA, in m^2.
+def second_order_variance(x: np.ndarray, P: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
+    """Return the second-order variance of a TDOA: the mean square of its second-order term, in m^2.
+
+    It is 0 where the position is certain to SMALLEST.
 
     Parameters
     ----------

@@ -15,7 +15,7 @@ import numpy as np
 from uwb_tdoa_bias.common.compiled import Record, compiled
 
 from .config import SIDES
-from .update import update_state
+from .update import kalman_direct
 
 # m, least distance from the middle of the anchors to each bound, however flat they lie
 SMALLEST = 3.0
@@ -223,20 +223,19 @@ def rows_heard(window: np.ndarray) -> np.ndarray:
 @compiled
 def contains(bounds: np.ndarray, x: np.ndarray) -> bool:
     """Return True if position x (3,), m, is within `bounds` (2, 3), m."""
-    return outside(bounds, x) <= 0.0
+    return distance_outside(bounds, x) <= 0.0
 
 
 @compiled
-def outside(bounds: np.ndarray, x: np.ndarray) -> float:
-    """Return the distance by which position x (3,), m, is beyond `bounds` (2, 3), in m.
+def distance_outside(bounds: np.ndarray, x: np.ndarray) -> float:
+    """Return how far position x (3,), m, is outside of `bounds` (2, 3), m, along the worst axis, in m.
 
-    The axis with the largest distance counts. The result is not positive inside, and inf if x is
-    not a number.
+    The result is not positive inside, and inf if x is not a number.
     """
     farthest = -np.inf
     for k in range(3):
         beyond = max(bounds[0, k] - x[k], x[k] - bounds[1, k])
-        farthest = max(farthest, beyond) if beyond == beyond else np.inf
+        farthest = np.inf if math.isnan(beyond) else max(farthest, beyond)
     return farthest
 
 
@@ -276,5 +275,5 @@ def constrain(hypothesis: Record, innovation: Record, bounds: np.ndarray, axis: 
     x = hypothesis.x[axis]
     if bounds[0, axis] <= x <= bounds[1, axis] or hypothesis.P[axis, axis] <= STD**2:
         return False
-    update_state(hypothesis, innovation, axis, min(max(x, bounds[0, axis]), bounds[1, axis]), STD)
+    kalman_direct(hypothesis, innovation, axis, min(max(x, bounds[0, axis]), bounds[1, axis]), STD)
     return True

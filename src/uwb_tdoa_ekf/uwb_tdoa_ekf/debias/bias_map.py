@@ -423,18 +423,21 @@ class BiasMap:
 
     @classmethod
     def load(cls, path: str | Path) -> BiasMap:
-        """Read a file that `save` wrote; raise InputError if it is wrong."""
+        """Read a file that `save` wrote.
+
+        Raises InputError if the file is damaged, of another version, or no valid map.
+        """
         what, remedy = f"position bias map of version {VERSION}", "make one with `debias`"
         kinds = {name: "i" if kind is int else "f" for name, kind in _ARRAYS.items()}
-        texts = ("format", "units", "frame", "source", "interpolator")
-        content = read_arrays(
-            path, {**kinds, **dict.fromkeys(texts, "U"), "version": "i", "step": "f"}, what, remedy
-        )
+        fields_of_text = ("frame", "source", "interpolator")
+        kinds |= dict.fromkeys(("format", "units", *fields_of_text), "U")
+        kinds |= {"version": "i", "step": "f"}
+        content = read_arrays(path, kinds, what, remedy)
         try:
             if str(content["format"]) != FORMAT or int(content["version"]) != VERSION:
                 raise ValueError(f"format {content['format']}, version {content['version']}")
             fields: dict[str, Any] = {name: content[name] for name in _ARRAYS} | {
-                name: str(content[name]) for name in texts[2:]
+                name: str(content[name]) for name in fields_of_text
             }
             return cls(**fields, step=float(content["step"]))
         except (TypeError, ValueError, OverflowError) as error:  # InputError is a ValueError

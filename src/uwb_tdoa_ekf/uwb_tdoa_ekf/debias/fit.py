@@ -170,9 +170,9 @@ def fit(
 
     The covariance `added` comes from cross-validation. Maps are fitted without some of the parts,
     or without stretches of a single part. `added` is their mean squared error at the held-out
-    markers. If the covariances of the positions are known, `added` is scaled. The scale makes the
-    normalised squared error of the held-out positions d on average. It is 0 if the covariances
-    alone are large enough.
+    markers. Held-out parts without a marker are left out of these figures. If the covariances of
+    the positions are known, `added` is scaled. The scale makes the normalised squared error of the
+    held-out positions d on average. It is 0 if the covariances alone are large enough.
 
     Parameters
     ----------
@@ -199,9 +199,10 @@ def fit(
         others = [part for i, fold in enumerate(folds) if i != k for part in fold]
         try:
             bias_map = _fit(others, options, whole.added)
-        except InputError:  # the remaining parts are too few for a map
+            markers = _markers(held_out, options)
+        except InputError:  # too few others for a map, or no marker in the held-out parts
             continue
-        bias_errors.append(_bias_errors(bias_map, held_out, options))
+        bias_errors.append(_bias_errors(bias_map, markers))
         for part in held_out:
             error, covariance = _position_errors(bias_map, part)
             errors.append(error)
@@ -209,17 +210,20 @@ def fit(
     deviations = np.concatenate(bias_errors)
     # no held-out marker is in a known region: assume the error without a map
     if len(deviations) == 0:
-        return _fit(parts, options, whole.bias.T @ whole.bias / len(whole.bias))
+        mean_square = whole.bias.T @ whole.bias / len(whole.bias)
+        return _fit(parts, options, mean_square)
     added = deviations.T @ deviations / len(deviations)
     known = [covariance for covariance in covariances if covariance is not None]
     if sum(map(len, errors)) and len(known) == len(covariances):
-        added = added * _needed(np.concatenate(errors), np.concatenate(known), added)
+        added = added * _needed_factor(np.concatenate(errors), np.concatenate(known), added)
     return _fit(parts, options, added)
 
 
-def _bias_errors(bias_map: BiasMap, parts: list[Part], options: _Options) -> np.ndarray:
-    """Return marker biases of held-out parts minus the map, where it is valid, (n, d) m."""
-    markers = _markers(parts, options)
+def _bias_errors(bias_map: BiasMap, markers: Markers) -> np.ndarray:
+    """Return the raw mean bias of held-out markers minus the map, where it is valid, (n, d) m.
+
+    It uses the raw means, not the smoothed biases of `corrected_bias`.
+    """
     at = _in_space(measured_places(markers, markers.bias))
     error = markers.bias - bias_map.bias_at(at)[:, : markers.bias.shape[1]]
     return error[bias_map.validity(at) == 1.0]
@@ -241,7 +245,7 @@ def _position_errors(bias_map: BiasMap, part: Part) -> tuple[np.ndarray, np.ndar
     return error, None if part.covariance is None else part.covariance[valid, :d, :d]
 
 
-def _needed(error: np.ndarray, covariance: np.ndarray, added: np.ndarray) -> float:
+def _needed_factor(error: np.ndarray, covariance: np.ndarray, added: np.ndarray) -> float:
     """Return the factor, at least 0, that makes the normalised squared error d on average.
 
     The normalised squared error is e' (P + factor added)^-1 e, and d is the number of dimensions.

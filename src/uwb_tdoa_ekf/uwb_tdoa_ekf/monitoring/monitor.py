@@ -232,7 +232,7 @@ class Monitor:
     def add(self, odometry: Odometry, residuals: Residuals) -> None:
         """Add Odometry and the Residuals that belong to it."""
         if self._end is not None and len(residuals.t) and residuals.t[0] > self._last + LOST_TIME:
-            # finish the flight before, so that no empty slices of the gap are tested
+            # No TDOA came for LOST_TIME: end the flight before. These data start the next one.
             self.update(math.inf)
         self._odometry.append(odometry)
         began = self._end is not None
@@ -256,7 +256,11 @@ class Monitor:
         self._odometry = [rows_of(odometry, odometry.t >= begin)]
 
     def update(self, until: float) -> None:
-        """Test all slices that end by `until`, in s; all data up to then must be added."""
+        """Test all slices that end by `until`, in s; all data up to then must be added.
+
+        The flight ends if no TDOA came for LOST_TIME, or if `until` is inf. Then everything but the
+        history is forgotten.
+        """
         if self._end is None or until < self._end:
             return
         residuals, odometry = concatenated(self._residuals), concatenated(self._odometry)
@@ -267,7 +271,8 @@ class Monitor:
             self._keep_history(self._end)
             self._end += LENGTH
         self._residuals, self._odometry = [residuals], [odometry]
-        if self._end <= until:  # no TDOA came for too long
+        # the loop has stopped before `until`, at LOST_TIME after the last TDOA: the flight is over
+        if self._end <= until:
             self._forget()
             self._odometry = [odometry]
             self._keep_one_slice()
@@ -466,14 +471,17 @@ class Monitor:
     @property
     def alarms(self) -> list[str]:
         """Return sentences on changes and on deviations from the survey."""
-        return [*(finding.brief for finding in self._found().values()), *self._axis_alarms()]
+        return [
+            *(finding.brief for finding in self._anchor_findings().values()),
+            *self._axis_alarms(),
+        ]
 
     @property
     def exchanged(self) -> Finding | None:
         """Return the Finding on two exchanged anchors, or None."""
         return self._swap() if self._swapped else None
 
-    def _found(self) -> dict[str, Finding]:
+    def _anchor_findings(self) -> dict[str, Finding]:
         """Return {key: Finding} of all findings on anchors that hold now."""
         found = {f"exchanged {self._swapped}": self._swap()} if self._swapped else {}
         found |= {
@@ -491,7 +499,7 @@ class Monitor:
 
     def _keep_history(self, end: float) -> None:
         """Update the history with the findings that hold at the stamp `end`, in s."""
-        before, found = self._standing, self._found()
+        before, found = self._standing, self._anchor_findings()
         self._past += [event for key, event in before.items() if key not in found]
         self._standing = {
             key: Event(finding, before[key].since if key in before else end, end)

@@ -184,42 +184,43 @@ class SurveyComparison:
         rows, cells = self._latest()
         if len(cells) < FEWEST_CELLS or sum(cell.slices for cell in cells) < FEWEST_SLICES:
             return []
-        n, ids, nothing = len(rows), self._anchors.ids[rows], np.zeros(4 * len(rows))
+        # The unknowns are 3 n coordinates, then n delays. The survey is the mean of their prior.
+        n, ids, no_offset = len(rows), self._anchors.ids[rows], np.zeros(4 * len(rows))
         parts = self._parts(rows, cells)
 
-        def before(delay_std: float) -> tuple[np.ndarray, np.ndarray]:
+        def prior_of(delay_std: float) -> tuple[np.ndarray, np.ndarray]:
             variance = np.repeat([SURVEY_STD**2, delay_std**2], [3 * n, n])
             return known_before(ids, variance, self._calibrated)
 
-        delay_std = smallest_delays(parts, lambda std: before(std)[0], nothing)
-        covariance, known = before(delay_std)
+        delay_std = smallest_delays(parts, lambda std: prior_of(std)[0], no_offset)
+        covariance, calibrated = prior_of(delay_std)
+        # a delay can only have changed if the calibration states it
         possible = {
-            key: one
-            for key, one in changes_of(n).items()
-            if key[0] == POSITION or known[one[0]].all()
+            key: change
+            for key, change in changes_of(n).items()
+            if key[0] == POSITION or calibrated[change[0]].all()
         }
-        changes = most_likely_changes(parts, covariance, nothing, possible, ODDS)
+        changes = most_likely_changes(parts, covariance, no_offset, possible, ODDS)
         if not changes.found:
             return []
-        named: dict[ChangeKey, tuple[float, bool, tuple[int, ...]]] = {}
+        reported: dict[ChangeKey, tuple[float, bool, tuple[int, ...]]] = {}
         for (what, k), (odds, rivals) in changes.found.items():
             either = any(row == k for _, row in rivals)
             others = tuple(dict.fromkeys(int(rows[row]) for _, row in rivals if row != k))
-            named[POSITION if (POSITION, k) in rivals else what, k] = odds, either, others
-        for some, size in (
-            possible[key] for key in named
-        ):  # a shift is assumed if the data do not distinguish it from a delay
-            covariance[some, some] += size**2
+            # a shift is reported if the data do not distinguish it from a delay
+            what = POSITION if (POSITION, k) in rivals else what
+            reported[what, k] = odds, either, others
+        for places, std in (possible[key] for key in reported):
+            covariance[places, places] += std**2
         part, prior = parts[changes.number], np.linalg.inv(covariance)
-        inverse = np.linalg.inv(part.gram + prior)
-        step, std = inverse @ part.vector, np.sqrt(np.diag(inverse))
+        posterior = np.linalg.inv(part.gram + prior)
+        estimate, stds = posterior @ part.vector, np.sqrt(np.diag(posterior))
         out: dict[int, Displaced] = {}
-        for (what, k), (odds, either, rival_rows) in named.items():
-            places = slice(3 * k, 3 * k + 3)
-            later = float(step[3 * n + k]) if what == DELAY else 0.0
+        for (what, k), (odds, either, others) in reported.items():
+            own = slice(3 * k, 3 * k + 3)
+            later = float(estimate[3 * n + k]) if what == DELAY else 0.0
             out.setdefault(
-                k,
-                Displaced(int(rows[k]), step[places], std[places], later, odds, either, rival_rows),
+                k, Displaced(int(rows[k]), estimate[own], stds[own], later, odds, either, others)
             )
         return list(out.values())
 

@@ -315,47 +315,51 @@ def status_of(
             use.trouble
             or (restarted.sentence if restarted else "the start position is looked for"),
         )
-    known = bool(yaw_std <= YAW_KNOWN)  # a message takes no other type for true
+    yaw_known = bool(yaw_std <= YAW_KNOWN)  # a message takes no other type for true
     if fault is not None:
         return Status(FAULT, False, fault.sentence)
     if odometry_age > SILENT:
         why = "neither TDOAs nor inertial samples are used: there is no odometry; see /diagnostics"
         return Status(WAITING, False, why)
-    return Status(RUNNING, known, _why(estimator, use, known, findings))
+    return Status(RUNNING, yaw_known, _reason_against_flying(estimator, use, yaw_known, findings))
 
 
-def _why(estimator: Estimator, use: Use, known: bool, findings: Sequence[Finding]) -> str:
-    """Return the reason against flying by a filter that runs without a fault; "" without one."""
-    left_out = estimator.without_imu
+def _reason_against_flying(
+    estimator: Estimator, use: Use, yaw_known: bool, findings: Sequence[Finding]
+) -> str:
+    """Return why a vehicle must not fly by this filter, which has no fault; "" if it may."""
+    imu_fault = estimator.without_imu  # Finding for which the IMU is left out, or None
     if estimator.unsure:
         return estimator.unsure
     if use.tdoa_age > SILENT:
-        said = use.trouble or f"no TDOA was used for more than {SILENT:g} s"
+        trouble = use.trouble or f"no TDOA was used for more than {SILENT:g} s"
         sources = [
-            *(["the IMU"] if use.imu_used and left_out is None else []),
+            *(["the IMU"] if use.imu_used and imu_fault is None else []),
             *(["the velocities"] if use.velocity_used else []),
         ]
-        way = (
+        motion = (
             f"by {' and '.join(sources)} alone"
             if sources
             else "on as the tag moved last, without the IMU and without velocities,"
         )
-        return f"{said}: the position goes {way} and drifts"
+        return f"{trouble}: the position goes {motion} and drifts"
     if use.trouble:
         return use.trouble
-    if not known and left_out is not None:
-        return f"the yaw is not known, because the filter goes without the IMU: {left_out.sentence}"
-    if not known and estimator.yaw_doubts:
+    if not yaw_known and imu_fault is not None:
+        return (
+            f"the yaw is not known, because the filter goes without the IMU: {imu_fault.sentence}"
+        )
+    if not yaw_known and estimator.yaw_doubts:
         return (
             "the yaw was wrong, and is looked for again: do not steer by it; it is known once the "
             "tag has moved"
         )
-    if not known and not (use.imu_used or use.velocity_used):
+    if not yaw_known and not (use.imu_used or use.velocity_used):
         return (
             "the yaw is not known, because neither an IMU nor velocities are used: do not steer "
             "by it; give imu/data, or odometry of wheels"
         )
-    if not known:
+    if not yaw_known:
         return (
             "the yaw is not known yet: do not steer by it; it is once the tag has moved, or if it "
             "is told (initialpose)"

@@ -123,7 +123,7 @@ class StreamRules:
         self._scale.add(window.latest)
 
     def finish(self) -> None:
-        """Close the windows at the end of a recording, unless they are almost empty."""
+        """Add the last, shorter windows of a recording if they have at least FULL messages."""
         if len(self._imu) >= FULL:
             self._keep(self.imu, imu_window(*self._imu.rest()))
         if len(self._tdoa) >= FULL:

@@ -242,6 +242,7 @@ def locate(
         Filled with the best position, in m.
     """
     n = len(d)
+    # ends: positions of both anchors of each TDOA; low, high: corners of the room around them
     ends, low, high = np.empty((n, 2, 3)), np.full(3, np.inf), np.full(3, -np.inf)
     for i in range(n):
         for side in range(2):
@@ -249,59 +250,60 @@ def locate(
                 ends[i, side, j] = positions[rows[i, side], j]
                 low[j], high[j] = min(low[j], ends[i, side, j]), max(high[j], ends[i, side, j])
     size = math.sqrt(np.sum((high - low) ** 2))
-    least, p, g, system = np.inf, np.empty(3), np.empty(3), np.empty((3, 4))
+    least, p, gradient = np.inf, np.empty(3), np.empty(3)
+    normal = np.empty((3, 4))  # normal equations, the right side in the last column
     for start in range(len(starts)):
         for j in range(3):
             p[j] = 0.5 * (low[j] + high[j]) + 0.5 * starts[start, j] * (high[j] - low[j])
-        for step in range(STEPS + 1):
+        for step in range(STEPS + 1):  # the last one evaluates the loss only
             scale, loss = max(0.3 * size * 0.5**step, SCALE) if step < STEPS else SCALE, 0.0
-            system[:, :] = 0.0
+            normal[:, :] = 0.0
             for i in range(n):
-                r = d[i]
+                residual = d[i]  # measured minus predicted
                 for side in range(2):
                     length = 1e-18
                     for j in range(3):
                         length += (p[j] - ends[i, side, j]) ** 2
                     length = math.sqrt(length)
-                    r += length if side == 0 else -length
+                    residual += length if side == 0 else -length
                     for j in range(3):
                         unit = (p[j] - ends[i, side, j]) / length
-                        g[j] = -unit if side == 0 else g[j] + unit
-                square = (r / scale) ** 2
+                        gradient[j] = -unit if side == 0 else gradient[j] + unit
+                square = (residual / scale) ** 2
                 loss += square / (1.0 + square)
                 weight = 1.0 / (1.0 + square) ** 2
                 for j in range(3):
                     for k in range(3):
-                        system[j, k] += weight * g[j] * g[k]
-                    system[j, 3] += weight * g[j] * r
+                        normal[j, k] += weight * gradient[j] * gradient[k]
+                    normal[j, 3] += weight * gradient[j] * residual
             if step == STEPS:
                 if loss / n < least:
                     least = loss / n
                     place[:] = p
                 break
-            _go(p, system, NEAR * size)
+            _step(p, normal, NEAR * size)
     return least
 
 
 @compiled
-def _go(p: np.ndarray, system: np.ndarray, longest: float) -> None:
+def _step(p: np.ndarray, normal: np.ndarray, longest: float) -> None:
     """Step p (3,) by the solution of normal equations, at most `longest` m far.
 
-    The normal equations (3, 4) are overwritten.
+    The normal equations (3, 4) have the right side in the last column. They are overwritten.
     """
     for j in range(3):
-        system[j, j] += 1e-6
+        normal[j, j] += 1e-6
     for j in range(3):
         for k in range(j + 1, 3):
-            share = system[k, j] / system[j, j]
+            share = normal[k, j] / normal[j, j]
             for m in range(j, 4):
-                system[k, m] -= share * system[j, m]
+                normal[k, m] -= share * normal[j, m]
     length = 0.0
     for j in range(2, -1, -1):
         for m in range(j + 1, 3):
-            system[j, 3] -= system[j, m] * system[m, 3]
-        system[j, 3] /= system[j, j]
-        length += system[j, 3] ** 2
+            normal[j, 3] -= normal[j, m] * normal[m, 3]
+        normal[j, 3] /= normal[j, j]
+        length += normal[j, 3] ** 2
     share = min(1.0, longest / max(math.sqrt(length), 1e-12))
     for j in range(3):
-        p[j] += share * system[j, 3]
+        p[j] += share * normal[j, 3]

@@ -61,7 +61,7 @@ def correction_in_words(corrector: Corrector | None, *files: str | Path | None) 
             "nothing: neither --effects nor --model is given, and corrections of other flights "
             "may harm this one"
         )
-    return f"{corrector.model} ({', '.join(str(file) for file in files if file)})"
+    return f"{corrector.model_name} ({', '.join(str(file) for file in files if file)})"
 
 
 @dataclass(frozen=True)
