@@ -28,6 +28,7 @@ from uwb_tdoa_tools.commands import export  # noqa: E402
 from uwb_tdoa_tools.estimate import with_antenna  # noqa: E402
 from uwb_tdoa_tools.exporting.correction import is_traceable, left_out, trace  # noqa: E402
 from uwb_tdoa_tools.exporting.onnx_file import printed, write_onnx  # noqa: E402
+from uwb_tdoa_tools.exporting.tracing import samples_of  # noqa: E402
 from uwb_tdoa_tools.readers import read_flight  # noqa: E402
 from uwb_tdoa_tools.scoring.evaluation import evaluate  # noqa: E402
 from uwb_tdoa_tools.training.network import FEATURES, WITHOUT  # noqa: E402
@@ -261,3 +262,17 @@ def test_anchors_that_single_precision_or_one_file_cannot_hold_are_refused(tmp_p
     for anchors, said in ((far, "give positions in a frame that begins nearby"), (many, "129")):
         with pytest.raises(InputError, match=said):
             write_onnx(tmp_path / "bias.onnx", anchors, EffectSet((EFFECTS["anchor_delay"],)))
+
+
+@pytest.mark.parametrize("rows", [0, slice(0, 3), slice(None, None, 2), np.zeros(3, dtype=bool)])
+@pytest.mark.parametrize("others", [(), (0,)])
+def test_an_effect_that_selects_single_rows_is_refused(rows, others):
+    place = samples_of(ANCHORS, motion=False).p
+    with pytest.raises(TypeError, match="an effect may not select single rows .*; write the"):
+        place[(rows, *others)]
+
+
+def test_an_effect_may_index_all_rows_as_numpy_does():
+    place = samples_of(ANCHORS, motion=False).p
+    for key in (slice(None), np.s_[:, 0], np.s_[..., 0], np.s_[..., None], np.s_[..., None, 1:]):
+        assert place[key].shape == np.zeros(place.shape)[key].shape

@@ -334,7 +334,9 @@ FLOWN = lattice((-1, -1, 0.5), (1, 1, 2), 1.0)
 def figures(monkeypatch):
     """Return [(figure, title)] of all pictures to be written."""
     made = []
-    monkeypatch.setattr(plots, "_save", lambda figure, title, path: made.append((figure, title)))
+    monkeypatch.setattr(
+        plots, "_save", lambda figure, path: made.append((figure, figure.get_suptitle()))
+    )
     return made
 
 

@@ -15,7 +15,7 @@ import pytest
 from uwb_tdoa_bias.common.flight import Truth
 from uwb_tdoa_ekf.core.memory import INVALID, LATE, REJECTED, STARTUP, USED
 from uwb_tdoa_tools.evaluating import line_of_run, lines_of_phases, markdown_of
-from uwb_tdoa_tools.scoring.gains import LOSS, difference
+from uwb_tdoa_tools.scoring.gains import LOSS, clear_change
 from uwb_tdoa_tools.scoring.metrics import (
     Score,
     coverage,
@@ -612,5 +612,5 @@ def test_a_gain_counts_if_a_loss_is_unlikely(expected, std):
     sure = expected / std > 1.96
     if abs(loss - 0.025) > 1e-3 and abs(expected / std - 1.96) > 1e-3:
         counts = sure or expected > LOSS and loss < 0.025
-        assert (difference(1.0, 1.0 - expected, interval) > 0) == counts
-        assert (difference(1.0, 1.0 - expected, interval) < 0) == (expected / std < -1.96)
+        assert (clear_change(1.0, 1.0 - expected, interval) > 0) == counts
+        assert (clear_change(1.0, 1.0 - expected, interval) < 0) == (expected / std < -1.96)

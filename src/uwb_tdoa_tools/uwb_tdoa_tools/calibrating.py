@@ -34,7 +34,7 @@ from .diagnosis.self_calibration.solve import CLEARLY_OF_RANGES, IMPROVED, LEFT
 from .diagnosis.validation import cross_fitted
 from .estimate import FlightEstimator
 from .parallel import Progress
-from .scoring.gains import NO_DIFFERENCE, change_in_words, difference
+from .scoring.gains import NO_DIFFERENCE, change_in_words, clear_change
 from .surveying.report import as_text
 
 if TYPE_CHECKING:
@@ -273,26 +273,28 @@ def _reason_against_unverified(before: float, after: float, of_ranges: bool, on:
     )
 
 
-def _validated(calibration: Calibration, any_effect: bool) -> Calibration:
+def _validated(calibration: Calibration, changes_anything: bool) -> Calibration:
     """Return the Calibration with the reason against its use, if there is one.
 
-    `any_effect` is whether the calibration changes anything.
+    `changes_anything` is whether anchors or effects differ from those given.
     """
     if calibration.why_not is not None:
         return calibration
-    if not any_effect:
+    if not changes_anything:
         return replace(
             calibration,
-            why_not="nothing was found that makes the error smaller where it took no part",
+            why_not="no effect was found that reduces the error on data that was not used to fit it",
         )
+    before, after = calibration.before, calibration.after
     if calibration.interval is not None or calibration.measure == RMSE:
-        changed = difference(calibration.before, calibration.after, calibration.interval)
-    else:  # of innovations alone only a large change counts
-        sides = calibration.before, calibration.after
-        changed = int(np.sign(sides[0] - sides[1])) * int(max(sides) >= SMALLEST_RATIO * min(sides))
-    if changed > 0:
+        change = clear_change(before, after, calibration.interval)
+    elif max(before, after) < SMALLEST_RATIO * min(before, after):
+        change = 0  # without ground truth only a large change of the innovations counts
+    else:
+        change = int(np.sign(before - after))
+    if change > 0:  # the error falls
         return calibration
-    why = f"it makes {NO_DIFFERENCE}" if changed == 0 else "it makes things worse"
+    why = f"it makes {NO_DIFFERENCE}" if change == 0 else "it makes things worse"
     return replace(calibration, why_not=f"{why}: {calibration.as_text()}")
 
 
@@ -386,7 +388,7 @@ class Forecast:
     ----------
     seconds : s in the air, analysed.
     flights : number of analysed flights.
-    before, after : m, 3D RMSE where a first fit took no part, without and with it.
+    before, after : m, 3D RMSE without and with a first fit, on data that it was not fitted to.
     interval : (low, high), 95 % interval of the gain, a share of `before`; None if unknown.
     """
 
@@ -403,20 +405,20 @@ class Forecast:
 
     def sentences(self) -> list[str]:
         """Return the forecast as sentences."""
-        of = "1 flight" if self.flights == 1 else f"{self.flights} flights"
-        much = change_in_words(self.before, self.after)
+        flights = "1 flight" if self.flights == 1 else f"{self.flights} flights"
+        gain = change_in_words(self.before, self.after)
         if self.interval is not None:
-            much += f", 95 % interval of the gain {percent(self.interval)}"
+            gain += f", 95 % interval of the gain {percent(self.interval)}"
         lines = [
-            f"from {self.seconds:.0f} s of {of}, by ground truth: the position error (3D RMSE) is "
+            f"from {self.seconds:.0f} s of {flights}, by ground truth: the position error (3D RMSE) is "
             f"{100 * self.before:.1f} cm",
             f"a first fit of {self.fitted} of all anchors leaves "
-            f"{100 * self.after:.1f} cm where it took no part ({much})",
+            f"{100 * self.after:.1f} cm on data that it was not fitted to ({gain})",
         ]
-        changed = difference(self.before, self.after, self.interval)
-        if changed > 0:
+        change = clear_change(self.before, self.after, self.interval)
+        if change > 0:  # the error falls
             lines.append("a calibration with --out is likely to gain about as much")
-        elif changed == 0:
+        elif change == 0:
             lines.append(f"that is {NO_DIFFERENCE}; a calibration may find other effects")
         else:
             lines.append(
@@ -435,8 +437,8 @@ def forecast(
     """Predict the gain of a calibration with ground truth from parts of a few flights.
 
     Positions, delays and maps of anchors make most of the gain. They are fitted at once, without
-    the search of a diagnosis, and judged where they took no part (`first_fit`). Raises InputError
-    if the flights are too short.
+    the search of a diagnosis, and judged on data that they were not fitted to (`cross_fitted`).
+    Raises InputError if the flights are too short.
     """
     count = min(len(flights), FORECAST_FLIGHTS)
     chosen = [flights[k * len(flights) // count] for k in range(count)]

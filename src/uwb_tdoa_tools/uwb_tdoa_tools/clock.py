@@ -23,12 +23,12 @@ LEADING = "tdoa", "imu", "gyro", "acc", *LOCATING  # streams whose clock restart
 AHEAD = 10.0  # s; a longer step forward of a quick stream is a pause, or a clock that was set
 SLOW = 20.0  # usual steps; the same of a slow one
 PAUSE = 3600.0  # s for which a recorder may pause if arrival times are unknown
-# messages that agree with each other and not with those before: another time; fewer are outliers
+# Fewest messages that begin another time: they agree with each other, and not with those before. Fewer
+# are outliers.
 FEW = 10
 NEAR = 20  # messages on both sides of a jump by whose arrivals its size is known
 TOGETHER = 5.0  # s by which a jump may differ between streams of one clock
-# jumps per message, or ten; where there are more, no clock is at work, but several tags or a faulty
-# driver
+# Largest number of jumps per message, or ten jumps. Several tags or a faulty driver cause more.
 MOST = 0.01
 WRAPS = {  # what counters of drivers hold: s
     "2^40 ticks of 15.65 ps": 2**40 / (128 * 499.2e6),
@@ -217,18 +217,22 @@ class _Stream:
     def cut(self, ends: Sequence[float]) -> None:
         """Find the breaks and the outliers.
 
+        A piece between two large steps is accepted if it continues the time of the last accepted one.
+        Otherwise it begins another time if many messages agree with it. All other pieces are outliers.
+
         ends : s, last stamps of other streams that are steady
         """
         few = min(FEW, max(2, len(self.finite) // 20))
-        pieces = list(zip(self._edges[:-1].tolist(), self._edges[1:].tolist()))
+        pieces = list(zip(self._edges[:-1].tolist(), self._edges[1:].tolist()))  # of `finite`
         if len(pieces) == 1:
             return
-        last, breaks, kept = -1, list[_Break](), self.kept.copy()
+        last = -1  # place of the last accepted message; -1 before the first
+        breaks, kept = list[_Break](), self.kept.copy()
         for number, (begin, end) in enumerate(pieces):
             first = int(self.finite[begin])
             following = pieces[number + 1][0] if number + 1 < len(pieces) else None
             many = self._lasts(pieces[number:], few, last)
-            if last < 0:
+            if last < 0:  # the first messages may be outliers, too
                 accepted = many or any(
                     self._follows(end - 1, piece[0]) for piece in pieces[number + 1 : number + 4]
                 )
@@ -249,9 +253,9 @@ class _Stream:
                 last = int(self.finite[end - 1])
             else:
                 kept[self.finite[begin:end]] = False
-        wild = np.count_nonzero(~kept)
-        if last < 0 or len(breaks) > max(10, MOST * len(self.t)) or wild > 0.1 * len(self.t):
-            return  # no clock: as it is
+        outliers = np.count_nonzero(~kept)
+        if last < 0 or len(breaks) > max(10, MOST * len(self.t)) or outliers > 0.1 * len(self.t):
+            return  # no clock explains that: the stamps stay as they are
         self.breaks, self.kept = breaks, kept
 
     def _follows(self, before: int, after: int) -> bool:

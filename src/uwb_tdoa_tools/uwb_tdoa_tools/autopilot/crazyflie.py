@@ -78,25 +78,29 @@ class CrazyflieLink(Link):
         self._log_config, self._uri, self._content = LogConfig, uri, content
         self._streams, self._topics, self._clock = streams, topics, clock
         self._events: SimpleQueue[Callable[[], None]] = SimpleQueue()
-        self._is_open, self._since = False, 0.0  # time.monotonic() of the last attempt, s
-        self._due: float | None = 0.0  # time.monotonic() of the next attempt, s; None during one
-        self._asked: dict[str, float] = {}  # {parameter: time.monotonic() of the last request, s}
+        self._is_open = False
+        # time.monotonic() of the last attempt to connect and of the next one, s; None during one
+        self._attempted_at = 0.0
+        self._next_attempt: float | None = 0.0
+        # {parameter: time.monotonic() of the last request to set it, s}
+        self._set_requested_at: dict[str, float] = {}
         self._trouble, self._missing = NOT_YET, ""
-        self._sent = self._logged = 0
+        self._poses_sent = self._messages_logged = 0
         self._vehicle: Any = Crazyflie()
         self._vehicle.fully_connected.add_callback(lambda _: self._events.put(self._start))
         for lost in (self._vehicle.connection_failed, self._vehicle.connection_lost):
             lost.add_callback(lambda _, why: self._events.put(lambda: self._lose(why)))
 
     def turn(self) -> None:
-        """Take what came, and connect where there is no link."""
+        """Run what the threads of cflib have queued, and connect if there is no link."""
         while not self._events.empty():
             self._events.get()()
         now = time.monotonic()
-        if self._due is None and not self._is_open and now > self._since + CONNECTING:
+        is_connecting = self._next_attempt is None and not self._is_open
+        if is_connecting and now > self._attempted_at + CONNECTING:
             self._lose("it does not answer")
-        if self._due is not None and now >= self._due:
-            self._since, self._due = now, None
+        if self._next_attempt is not None and now >= self._next_attempt:
+            self._attempted_at, self._next_attempt = now, None
             self._vehicle.open_link(self._uri)
 
     def _lose(self, why: str) -> None:
@@ -105,12 +109,12 @@ class CrazyflieLink(Link):
             f"no link to the Crazyflie ({why}): check its power, its address and the radio"
         )
         self.close()
-        self._due = time.monotonic() + AGAIN
+        self._next_attempt = time.monotonic() + AGAIN
 
     def _start(self) -> None:
         """Start the log blocks of the vehicle, which is connected now."""
         self._is_open, self._trouble, self._missing = True, "", ""
-        self._asked.clear()
+        self._set_requested_at.clear()
         self._topics.restart()
         for stream in self._streams:
             variables, period = BLOCKS[stream]
@@ -140,7 +144,7 @@ class CrazyflieLink(Link):
     def _deliver(
         self, block: LogBlock, timestamp: float, values: dict[str, float], arrival: float
     ) -> None:
-        self._logged += 1
+        self._messages_logged += 1
         self._topics.take(block, timestamp, list(values.values()), arrival)
 
     def send(self, estimate: Estimate, resets: int) -> None:
@@ -156,24 +160,24 @@ class CrazyflieLink(Link):
             self._vehicle.extpos.send_extpose(*estimate.p.tolist(), *estimate.q.tolist())
         else:
             self._vehicle.extpos.send_extpos(*estimate.p.tolist())
-        self._sent += 1
+        self._poses_sent += 1
 
     def _tell(self, name: str, stated: float) -> bool:
         """Set a parameter to a deviation if it differs; return whether it is large enough."""
         stated = max(stated, FINEST[name])
         told, now = float(self._vehicle.param.get_value(name)), time.monotonic()
         same = stated / TOLD < told < stated * TOLD
-        if not same and now >= self._asked.get(name, 0.0) + TELL:
-            self._asked[name] = now
+        if not same and now >= self._set_requested_at.get(name, 0.0) + TELL:
+            self._set_requested_at[name] = now
             self._vehicle.param.set_value(name, stated)
         return stated < TRUSTED * told
 
     def report(self) -> tuple[str, dict[str, Any]]:
-        """Return the trouble, and the counts."""
+        """Return the trouble, "" if there is none, and the counts for /diagnostics."""
         return self._trouble or self._missing, {
             "autopilot": "Crazyflie" if self._is_open else "none",
-            "poses sent": self._sent,
-            "messages of log blocks": self._logged,
+            "poses sent": self._poses_sent,
+            "messages of log blocks": self._messages_logged,
         }
 
     def close(self) -> None:

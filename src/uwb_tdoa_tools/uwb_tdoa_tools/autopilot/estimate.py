@@ -103,16 +103,16 @@ class Estimate:
         """Return 100 less the deviation in cm, and at least 1: as MAVLink counts, in percent."""
         return max(LOWEST_QUALITY, BEST_QUALITY - round(100.0 * self.deviation))
 
-    def in_mavlink(self, world: str) -> Estimate:
+    def in_mavlink(self, world_frame: str) -> Estimate:
         """Return the Estimate in the frames of MAVLink.
 
         Parameters
         ----------
-        world : str
+        world_frame : str
             FRD: x stays the x axis of the anchors' frame. NED: that frame has x east and y north.
         """
-        turn = _WORLD[world]
-        q = _product(_product(_TURN[world], self.q), _BODY_TURN)
+        turn = _WORLD[world_frame]
+        q = _product(_product(_TURN[world_frame], self.q), _BODY_TURN)
         return replace(
             self,
             p=turn @ self.p,

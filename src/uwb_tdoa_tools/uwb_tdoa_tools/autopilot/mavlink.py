@@ -24,17 +24,17 @@ if TYPE_CHECKING:
 CONNECTION = re.compile(r"(udpin|udpout|tcp|tcpin):[^:\s]+:\d{1,5}|/dev/[\w./-]+")
 FORMS = "udpout:HOST:PORT, udpin:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT or /dev/NAME"
 COMPONENT = 197  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
-HEARTBEAT, SILENT = 1.0, 3.0  # s between heartbeats; s without one of the autopilot
+HEARTBEAT, SILENT = 1.0, 3.0  # s between our heartbeats; s without one of the autopilot
 MOST_READ = 100  # messages of one turn; a flood must not hold up the odometry
 NAMES = {3: "ArduPilot", 12: "PX4"}  # MAV_AUTOPILOT
-INVALID = 8  # MAV_AUTOPILOT of what is none, e.g. a ground station
+INVALID = 8  # MAV_AUTOPILOT of a sender that is no autopilot, e.g. a ground station
 
 
 class MavlinkLink(Link):
     """A link to PX4 or ArduPilot."""
 
     def __init__(
-        self, connection: str, baud: int, system: int, world: str, clock: Callable[[], int]
+        self, connection: str, baud: int, system: int, world_frame: str, clock: Callable[[], int]
     ) -> None:
         """Open the connection.
 
@@ -46,8 +46,8 @@ class MavlinkLink(Link):
             Of a serial port.
         system : int
             MAVLink system id to send with: that of the vehicle.
-        world : str
-            FRD or NED (Estimate.in_mavlink).
+        world_frame : str
+            Frame of ODOMETRY: FRD or NED (Estimate.in_mavlink).
         clock : callable
             Returns the time that stamps refer to, in ns since 1970.
         """
@@ -59,7 +59,7 @@ class MavlinkLink(Link):
             from pymavlink import mavutil
         except ImportError as error:
             raise missing("mavlink", error, "pymavlink") from error
-        self._world, self._clock = world, clock
+        self._world_frame, self._clock = world_frame, clock
         try:
             self._port = mavutil.mavlink_connection(
                 connection,
@@ -77,18 +77,19 @@ class MavlinkLink(Link):
                 "correct the connection."
             ) from error
         self._dialect = mavutil.mavlink
-        self._sent = self._asked = 0  # ODOMETRY sent; requests of TIMESYNC answered
-        self._beat = self._heard = -SILENT  # time.monotonic(), s
+        self._odometry_sent = self._timesync_answered = 0  # numbers of messages
+        self._heartbeat_sent_at = self._heartbeat_heard_at = -SILENT  # time.monotonic(), s
         self._autopilot = "none"
 
     def send(self, estimate: Estimate, resets: int) -> None:
-        """Send ODOMETRY."""
-        ours, dialect = estimate.in_mavlink(self._world), self._dialect
-        local = dialect.MAV_FRAME_LOCAL_FRD if self._world == FRD else dialect.MAV_FRAME_LOCAL_NED
+        """Send ODOMETRY, in the frames of MAVLink."""
+        ours, dialect = estimate.in_mavlink(self._world_frame), self._dialect
+        is_frd = self._world_frame == FRD
+        local = dialect.MAV_FRAME_LOCAL_FRD if is_frd else dialect.MAV_FRAME_LOCAL_NED
         x, y, z, w = ours.q.tolist()
         self._write(
             dialect.MAVLink_odometry_message(
-                ours.stamp // 1000,
+                ours.stamp // 1000,  # us
                 local,
                 dialect.MAV_FRAME_BODY_FRD,
                 *ours.p.tolist(),
@@ -97,18 +98,18 @@ class MavlinkLink(Link):
                 *ours.w.tolist(),
                 ours.pose_covariance[UPPER].tolist(),
                 ours.twist_covariance[UPPER].tolist(),
-                resets % 256,
+                resets % 256,  # MAVLink has 8 bits for it
                 dialect.MAV_ESTIMATOR_TYPE_VIO,
                 ours.quality,
             )
         )
-        self._sent += 1
+        self._odometry_sent += 1
 
     def turn(self) -> None:
         """Answer TIMESYNC, note heartbeats of the autopilot, and send ours."""
         now = time.monotonic()
-        if now >= self._beat + HEARTBEAT:
-            self._beat, dialect = now, self._dialect
+        if now >= self._heartbeat_sent_at + HEARTBEAT:
+            self._heartbeat_sent_at, dialect = now, self._dialect
             self._write(
                 dialect.MAVLink_heartbeat_message(
                     dialect.MAV_TYPE_ONBOARD_CONTROLLER,
@@ -126,9 +127,9 @@ class MavlinkLink(Link):
             kind = message.get_type()
             if kind == "TIMESYNC" and message.tc1 == 0:  # a request; others are answers
                 self._write(self._dialect.MAVLink_timesync_message(self._clock(), message.ts1))
-                self._asked += 1
+                self._timesync_answered += 1
             elif kind == "HEARTBEAT" and message.autopilot != INVALID:
-                self._heard = now
+                self._heartbeat_heard_at = now
                 self._autopilot = NAMES.get(message.autopilot, f"type {message.autopilot}")
 
     def _read(self) -> Any:
@@ -141,19 +142,19 @@ class MavlinkLink(Link):
         try:
             self._port.mav.send(message)
         except OSError:
-            pass  # as above; `report` says that nothing comes any more
+            pass  # as above; `report` returns the missing heartbeats as the trouble
 
     def report(self) -> tuple[str, dict[str, Any]]:
-        """Return the trouble, and the counts."""
-        silent = time.monotonic() - self._heard > SILENT
+        """Return the trouble, "" if there is none, and the counts for /diagnostics."""
+        silent = time.monotonic() - self._heartbeat_heard_at > SILENT
         trouble = (
             "no heartbeat comes from the autopilot: check the connection, and that this port of the "
             "autopilot speaks MAVLink"
         )
         return trouble if silent else "", {
             "autopilot": self._autopilot,
-            "ODOMETRY sent": self._sent,
-            "TIMESYNC answered": self._asked,
+            "ODOMETRY sent": self._odometry_sent,
+            "TIMESYNC answered": self._timesync_answered,
         }
 
     def close(self) -> None:

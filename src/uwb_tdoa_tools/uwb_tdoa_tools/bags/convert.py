@@ -39,7 +39,7 @@ class Converted:
     read : {stream: (samples, s of the first, s of the last)}.
     start, end : s.
     anchors : number of anchors.
-    tdoa_unknown_anchor : number of measurements of anchors outside of the survey.
+    tdoa_unknown_anchor : number of TDOAs and ranges of anchors outside of the survey.
     left_out : {stream without a place in a bag: events}.
     meta : of the Flight.
     apart : sentences on sensors without common time with TDOAs or ranges.
@@ -94,27 +94,25 @@ def convert(
     )
 
 
-def described(made: Converted) -> list[str]:
-    """Return lines on what was read, with counts and seconds, and on what was not."""
-    meta = made.meta
-    out = [
-        f"{made.flight}: {made.end - made.start:.1f} s, {meta.get('protocol', 'protocol unknown')}"
-    ]
+def described(converted: Converted) -> list[str]:
+    """Return a conversion as lines: what was read and written, with counts, and what was left out."""
+    meta, seconds = converted.meta, converted.end - converted.start
+    out = [f"{converted.flight}: {seconds:.1f} s, {meta.get('protocol', 'protocol unknown')}"]
     if ids := meta.get("anchor_ids"):
         listed = ", ".join(f"{name} is {number}" for name, number in ids.items())
         out.append(f"  ids in the bag: {listed}")
     out += [f"  read {sentence}" for sentence in meta.get("read", ())]
     out += [f"  not read {sentence}" for sentence in meta.get("unread", ())]
     out += [f"  {remark}" for remark in meta.get("remarks", ())]
-    for stream, (count, first, last) in made.read.items():
+    for stream, (count, first, last) in converted.read.items():
         out.append(f"  {stream}: {count}, {first:.1f} to {last:.1f} s")
-    out += [f"  {topic}: {count}" for topic, count in made.messages.items()]
-    for name, count in made.left_out.items():
+    out += [f"  {topic}: {count}" for topic, count in converted.messages.items()]
+    for name, count in converted.left_out.items():
         out.append(f"  {name}: {count} events left out, a bag has no place for them")
     for topic, falls in meta.get("reordered", {}).items():
         out.append(f"  {topic}: sorted, its stamps fell {falls} times")
-    if made.tdoa_unknown_anchor:
-        count = made.tdoa_unknown_anchor
+    if converted.tdoa_unknown_anchor:
+        count = converted.tdoa_unknown_anchor
         out.append(f"  {count} measurements name an anchor that the survey does not have")
     return out
 

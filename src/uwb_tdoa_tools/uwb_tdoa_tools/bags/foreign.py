@@ -60,7 +60,7 @@ _LIMITED: dict[str, Callable[[bytes, int], bytes]] = {  # of ROS 1: unpack at mo
     ),
 }
 _STEP = re.compile(r"([A-Za-z]\w*)((?:\[\d+\])*)")
-_IDL = "=" * 80 + "\n"  # between the parts of a definition
+_BETWEEN_TYPES = "=" * 80 + "\n"  # line between the types of a definition in IDL
 
 
 class ForeignBag:
@@ -259,20 +259,38 @@ def open_foreign(
 
 
 class _Part:
-    """One open bag."""
+    """One open bag.
+
+    Attributes
+    ----------
+    path : of the bag.
+    connections : its topics, with their types.
+    span : first and last time of recording, ns.
+    """
 
     def __init__(
         self,
         path: Path,
         connections: list[Connection],
+        span: tuple[int, int],
         read: Callable[[list[Connection]], Iterator[tuple[Connection, int, bytes]]],
-        definitions: Mapping[str, str] | None,
-        reader: BagReader | None = None,
-        span: tuple[int, int] = (0, 0),
+        *,
+        is_ros_1: bool,
+        definitions: Mapping[str, str],
+        reader: BagReader | None,
     ) -> None:
-        self.path, self.connections, self._read = path, connections, read
-        self._definitions, self._reader = definitions, reader
-        self.span = span  # ns, times of recording
+        """Store an open bag.
+
+        Parameters
+        ----------
+        path, connections, span : see the attributes.
+        read : yields (connection, time of recording in ns, serialized message) of connections.
+        is_ros_1 : whether ROS 1 serialized the messages. Otherwise they are CDR of ROS 2.
+        definitions : {type: text of its .msg file} of types that the bag does not define.
+        reader : reader of a bag of ROS 2, for its remarks and anchors; None for ROS 1.
+        """
+        self.path, self.connections, self.span, self._read = path, connections, span, read
+        self._is_ros_1, self._definitions, self._reader = is_ros_1, definitions, reader
         self._stores: dict[str, Typestore] = {}
         self._unreadable: Counter[str] = Counter()
 
@@ -286,7 +304,7 @@ class _Part:
         stores = {connection.id: self._store(connection) for connection in wanted}
         for connection, received, data in self._read(wanted) if wanted else ():
             store = stores[connection.id]
-            decode = store.deserialize_ros1 if self._definitions is None else store.deserialize_cdr
+            decode = store.deserialize_ros1 if self._is_ros_1 else store.deserialize_cdr
             try:
                 if len(data) > READ_BYTES:
                     raise ValueError
@@ -328,9 +346,9 @@ class _Part:
                 store.register(_types(connection))
             else:
                 store = get_typestore(Stores.ROS2_JAZZY)
-                more = self._definitions or {}
-                for name in [name for name in more if name not in store.fielddefs]:
-                    store.register(get_types_from_msg(more[name], name))
+                undefined = [name for name in self._definitions if name not in store.fielddefs]
+                for name in undefined:
+                    store.register(get_types_from_msg(self._definitions[name], name))
             store.get_msgdef(kind)
         except Exception as error:  # parsers of rosbags raise many types
             raise InputError(
@@ -342,12 +360,13 @@ class _Part:
 
 
 def _types(connection: Connection) -> Any:
-    """Return the types in the definition of a topic."""
+    """Return the types in the definition of a topic, in .msg or IDL syntax, for `Typestore.register`."""
     text = connection.msgdef.data
     if connection.msgdef.format == MessageDefinitionFormat.MSG:
         return get_types_from_msg(text, connection.msgtype)
     types: dict[str, Any] = {}
-    for part in text.split(_IDL):
+    for part in text.split(_BETWEEN_TYPES):
+        # A line "IDL: NAME_OF_THE_TYPE" precedes each type.
         idl = part.partition("\n")[2] if part.startswith("IDL: ") else part
         if idl.strip():
             types |= get_types_from_idl(idl)
@@ -360,10 +379,11 @@ def _ros_2(path: Path, definitions: Mapping[str, str], salvage: bool) -> Iterato
         yield _Part(
             path,
             list(reader.connections),
-            lambda connections: messages(path, reader, connections, written=True),
-            definitions,
-            reader,
             (reader.start_time, reader.end_time),
+            lambda connections: messages(path, reader, connections, written=True),
+            is_ros_1=False,
+            definitions=definitions,
+            reader=reader,
         )
 
 
@@ -380,9 +400,11 @@ def _ros_1(path: Path) -> Iterator[_Part]:
         yield _Part(
             path,
             list(reader.connections),
+            (reader.start_time, reader.end_time),
             lambda connections: _messages_of(reader, path, connections),
-            None,
-            span=(reader.start_time, reader.end_time),
+            is_ros_1=True,
+            definitions={},
+            reader=None,
         )
     finally:
         with suppress(Exception):

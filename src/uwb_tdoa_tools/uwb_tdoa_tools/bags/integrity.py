@@ -100,6 +100,7 @@ def metadata(path: Path) -> dict[str, Any]:
         raise Damaged("metadata.yaml has no rosbag2_bagfile_information")
     information = {"compression_mode": "", "custom_data": None, "files": [], **information}
     information["custom_data"] = information["custom_data"] or {}
+    # rosbag2 writes "", "none", "FILE" or "MESSAGE".
     if isinstance(information["compression_mode"], str):
         information["compression_mode"] = (
             information["compression_mode"].lower().replace("none", "")

@@ -150,7 +150,8 @@ class Arrangement(NamedTuple):
 def find_imu_mistake(recording: OrderedRecording) -> Finding | None:
     """Return the Finding about axes or units of the IMU that do not fit the TDOAs, or None.
 
-    The TDOAs of the OrderedRecording must be right.
+    The TDOAs of the OrderedRecording must be right. The usual mistakes are tried first, and all
+    arrangements of the axes only if one of them helps.
     """
     brief = replace(recording, imu=averaged(recording.imu)).part(PART)
     if (
@@ -168,17 +169,17 @@ def find_imu_mistake(recording: OrderedRecording) -> Finding | None:
     upside_down = _upside_down(base, brief, best.ratio)
     if upside_down is not None:
         return upside_down
-    if abs(scale_of(best.gyro) - 1.0) < 0.03:  # no other unit
+    if abs(scale_of(best.gyro) - 1.0) < 0.03:  # the unit of the rates is right: an axis is wrong
         trials += _all(brief, base)
     least = min(trials, key=_ratio).ratio
-    near = [trial for trial in trials if trial.ratio < least + TIE and trial.z > DEVIATIONS]
-    if not near:
+    equal = [trial for trial in trials if trial.ratio < least + TIE and trial.z > DEVIATIONS]
+    if not equal:
         return None
-    found = min(near, key=lambda trial: _complexity(trial.accel, trial.gyro))
-    evidence = in_words(found.ratio, found.z)
-    if len(near) > 1:
-        evidence += f"; {len(near) - 1} other arrangements fit about as well"
-    return _finding(found, evidence)
+    simplest = min(equal, key=lambda trial: _complexity(trial.accel, trial.gyro))
+    evidence = in_words(simplest.ratio, simplest.z)
+    if len(equal) > 1:
+        evidence += f"; {len(equal) - 1} other arrangements fit about as well"
+    return _finding(simplest, evidence)
 
 
 def _upside_down(base: Unexplained, recording: OrderedRecording, least: float) -> Finding | None:

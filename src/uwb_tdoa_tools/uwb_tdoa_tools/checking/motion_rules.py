@@ -106,12 +106,13 @@ class TrueMotion:
         None is the attitude as written. The cells extend LONGEST beyond both ends of t.
         """
         order, signs = ATTITUDES[name] if name else ([0, 1, 2, 3], (1, 1, 1, 1))
-        turn = Slerp(self._t, Rotation.from_quat(self._q[:, order] * signs))
+        attitude = Slerp(self._t, Rotation.from_quat(self._q[:, order] * signs))  # body to world
         t = self.t[0] + CELL * np.arange(-BEYOND, len(self.t) + BEYOND)
-        gyro = (turn(t - HALF).inv() * turn(t + HALF)).as_rotvec() / (2.0 * HALF)
+        gyro = (attitude(t - HALF).inv() * attitude(t + HALF)).as_rotvec() / (2.0 * HALF)
         before, here, after = (_at(self._t, self._p, t + shift) for shift in (-HALF, 0.0, HALF))
-        force = (after - 2.0 * here + before) / HALF**2
-        return {"gyro": gyro, "accel": turn(t).inv().apply(force + (0.0, 0.0, GRAVITY))}
+        acceleration = (after - 2.0 * here + before) / HALF**2  # world
+        force = attitude(t).inv().apply(acceleration + (0.0, 0.0, GRAVITY))
+        return {"gyro": gyro, "accel": force}
 
     def at(self, true: np.ndarray, late: int = 0) -> np.ndarray:
         """Return the rows (n, 3) of `true` that are so many cells earlier."""
@@ -147,7 +148,7 @@ class TrueMotion:
 
 
 def _slowly_left(values: np.ndarray, block: np.ndarray) -> np.ndarray:
-    """(n, 3) without their means over blocks."""
+    """Return values (n, 3) without their means over blocks."""
     count = np.maximum(np.bincount(block), 1)
     return values - np.stack(
         [(np.bincount(block, column) / count)[block] for column in values.T], axis=1
@@ -155,7 +156,7 @@ def _slowly_left(values: np.ndarray, block: np.ndarray) -> np.ndarray:
 
 
 def _integral(t: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """(m, 3): integral of samples over t (m,)."""
+    """Return the integral of samples (m, 3) over t (m,), (m, 3)."""
     steps = 0.5 * (values[1:] + values[:-1]) * np.diff(t)[:, None]
     return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
 

@@ -338,25 +338,26 @@ def _flipped(recording: OrderedRecording, rows: np.ndarray) -> OrderedRecording:
 
 
 def moved_anchor(recording: OrderedRecording) -> Iterator[MistakeTrial]:
-    """Yield the trial with one anchor moved to where the TDOAs are explained."""
+    """Yield the trial with one anchor moved to where the TDOAs are explained.
+
+    There is none if the survey may be right, or if all anchors moved explain much more than one.
+    """
     fit = recording.survey_fit
     gain = gained(fit)
     if gain is None:
         return
-    heard = fit.heard if len(recording.anchors) > MANY else range(len(recording.anchors))
-    alone = {row: fit.solve([row]) for row in heard}
-    row = min(alone, key=lambda row: alone[row][0])
-    share = (fit.before - alone[row][0]) / gain
-    if share < ALONE:
+    tried = fit.heard if len(recording.anchors) > MANY else range(len(recording.anchors))
+    solved = {row: fit.solve([row]) for row in tried}  # (loss, positions) with this anchor moved
+    row = min(solved, key=lambda row: solved[row][0])
+    loss, positions = solved[row]
+    if (fit.before - loss) / gain < ALONE:
         return
-    shift = alone[row][1][row] - fit.positions[row]
     number = int(recording.anchors.ids[row])
-    where = ", ".join(f"{s:+.1f}" for s in shift)
-    anchors = recording.anchors.at(alone[row][1])
+    shift = ", ".join(f"{s:+.1f}" for s in positions[row] - fit.positions[row])
     yield MistakeTrial(
         "anchor_moved",
-        replace(recording, anchors=anchors),
-        cause=f"anchor {number} is not where the survey has it, but about ({where}) m from there",
+        replace(recording, anchors=recording.anchors.at(positions)),
+        cause=f"anchor {number} is not where the survey has it, but about ({shift}) m from there",
         remedy=(
             f"{number}: {{position: [x, y, z]}}  # measure it again; look for exchanged digits and "
             "axes"

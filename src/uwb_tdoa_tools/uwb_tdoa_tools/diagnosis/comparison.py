@@ -23,7 +23,7 @@ from uwb_tdoa_ekf.sensitivity import RANGES
 
 from ..clock import numbered
 from ..outputs import as_json
-from ..scoring.gains import NO_DIFFERENCE, difference
+from ..scoring.gains import NO_DIFFERENCE, clear_change
 from ..scoring.metrics import EVERYTHING, Score, nis, pooled, radio_residuals
 from .regression.table import BLOCK
 
@@ -206,11 +206,11 @@ def why_not(before: dict[str, Any], after: dict[str, Any], shift_std: float) -> 
     """
     sides = before["pooled"]["rmse_3d"], after["pooled"]["rmse_3d"]
     interval = after["pooled"]["rmse_3d_gain_ci"]
-    changed = difference(*sides, interval)
+    change = clear_change(*sides, interval)
     much = f"{100 * sides[0]:.1f} -> {100 * sides[1]:.1f} cm"
     if interval:
         much += f", 95 % interval of the gain {100 * interval[0]:.0f} to {100 * interval[1]:.0f} %"
-    if changed < 0:
+    if change < 0:  # the error rises
         return f"together they make the error larger on held-out data ({much})"
     if shift_std > 0.0 and (
         interval is None or sum(interval) < SURE / Z95 * (interval[1] - interval[0])
@@ -220,7 +220,7 @@ def why_not(before: dict[str, Any], after: dict[str, Any], shift_std: float) -> 
             "on each axis, and the gain is less than that "
             "can feign; measure more marks, or better ones"
         )
-    if changed == 0:
+    if change == 0:
         return f"together they make {NO_DIFFERENCE} ({much})"
     return None
 

@@ -131,8 +131,9 @@ def _everywhere(room: Room, anchors: Anchors, limits: Limits) -> list[TimedPath]
                 out.append(_line(at - reach, at + reach, (0.0, turn), limits, words))
         for share, size in ((1.0, "wide"), (0.5, "narrow")):
             radius = share * min(half[:2])
-            for along, how in ((False, "yaw kept"), (True, "yaw along the track")):
-                out.append(_circle(at, radius, along, limits, f"{size} circle, {name}, {how}"))
+            for yaw_follows, how in ((False, "yaw kept"), (True, "yaw along the track")):
+                words = f"{size} circle, {name}, {how}"
+                out.append(_circle(at, radius, yaw_follows, limits, words))
     for corner in corners[:2]:
         reach = half * [*corner, -1.0]
         out.append(_line(centre + reach, centre - reach, (0.0, 0.0), limits, "rising diagonal"))
@@ -195,14 +196,20 @@ def _line(
     return TimedPath(p, turned, what, (0, len(s) - 1))
 
 
-def _circle(centre: np.ndarray, radius: float, along: bool, limits: Limits, what: str) -> TimedPath:
-    """Return a level circle, from rest to rest."""
+def _circle(
+    centre: np.ndarray, radius: float, yaw_follows: bool, limits: Limits, what: str
+) -> TimedPath:
+    """Return a level circle, from rest to rest.
+
+    yaw_follows : whether the yaw follows the track; otherwise it stays 0
+    """
+    # The centripetal acceleration limits the speed, too.
     speed = min(limits.speed, np.sqrt(limits.acceleration * radius))
-    turned = 2.0 * np.pi if along else 0.0
-    s = _progress(2.0 * np.pi * radius, turned, replace(limits, speed=speed))
+    turn = 2.0 * np.pi if yaw_follows else 0.0
+    s = _progress(2.0 * np.pi * radius, turn, replace(limits, speed=speed))
     angle = 2.0 * np.pi * s
     around = radius * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(s))])
-    yaw = 0.5 * np.pi + angle if along else np.zeros(len(s))
+    yaw = 0.5 * np.pi + angle if yaw_follows else np.zeros(len(s))
     return TimedPath(centre + around, yaw, what, (0, len(s) - 1))
 
 

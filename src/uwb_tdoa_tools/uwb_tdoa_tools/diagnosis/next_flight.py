@@ -132,20 +132,23 @@ class Rivalry:
         return out
 
     def distances(self, information: np.ndarray) -> np.ndarray:
-        """Return the growth of each gap without noise, (true model, other model, DRAWS).
+        """Return by how much a new flight separates the models, (true model, other model, DRAWS).
 
-        It is averaged over draws, since a flight must not settle the question for the fitted values
-        alone. A model has an infinite distance to itself.
+        It is the growth of the gap between both models if the first is true, without noise. There is
+        one growth per draw of its values, since a flight must not settle the question for the fitted
+        values alone. A model has an infinite distance to itself.
+
+        information : (k, k) of the new flight, on all columns
         """
         count = len(self.models)
         out = np.full((count, count, DRAWS), np.inf)
-        for true, model in enumerate(self.models):
-            values = model.draws(len(information))
-            own = model.misfit(information, values)
-            for k, other in enumerate(self.models):
-                if k != true:
-                    growth = other.misfit(information, values) - own
-                    out[true, k] = np.maximum(growth, 0.0)
+        for true, true_model in enumerate(self.models):
+            values = true_model.draws(len(information))
+            own_misfit = true_model.misfit(information, values)
+            for other, other_model in enumerate(self.models):
+                if other != true:
+                    growth = other_model.misfit(information, values) - own_misfit
+                    out[true, other] = np.maximum(growth, 0.0)
         return out
 
     def value(self, information: np.ndarray) -> float:

@@ -69,7 +69,7 @@ def samples_of(anchors: Anchors, motion: bool) -> Samples:
 
 
 def _unlike_any_length(least: int) -> int:
-    """Return a prime above `least` that is no length of another array of an equation."""
+    """Return a prime from `least` on, so that no other array of an equation has this length."""
     n = max(least, 1009) | 1
     while any(n % k == 0 for k in range(3, math.isqrt(n) + 1, 2)):
         n += 2
@@ -93,11 +93,15 @@ class TracedSamples(Samples):
 class Traced(NDArrayOperatorsMixin, SymbolicArray):
     """An array of symbols: (blocks * n, ...) for numpy, a node of shape (blocks, ...) in the graph.
 
-    n : rows of a block, a number that no other array has as length; `pairs` of them are meant
+    Attributes
+    ----------
+    node : Node of the array.
+    n : number of rows of a block. No other array has this length.
+    pairs : only the first `pairs` rows of a block are used; the rest is padding.
     """
 
     def __init__(self, node: Node, n: int, pairs: int) -> None:
-        """Set the node and the rows of a block."""
+        """Store the attributes."""
         self.node, self.n, self.pairs = node, n, pairs
 
     @property
@@ -133,7 +137,10 @@ class Traced(NDArrayOperatorsMixin, SymbolicArray):
     # The protocols of numpy
 
     def __array__(self, *args: Any, **more: Any) -> np.ndarray:
-        raise TypeError("an equation makes numbers of symbols; write it with functions of numpy")
+        raise TypeError(
+            "an effect may not convert its inputs to an array; write the equation with functions of "
+            "numpy"
+        )
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **more: Any) -> Any:
         more.pop("out", None)  # in place: the caller takes the result
@@ -154,15 +161,25 @@ class Traced(NDArrayOperatorsMixin, SymbolicArray):
     # What equations use of arrays
 
     def __getitem__(self, key: Any) -> Traced:
+        """Return all rows of some blocks. Other axes have the indices of numpy."""
         key = key if isinstance(key, tuple) else (key,)
         if key[0] is Ellipsis:
-            missing = self.ndim - sum(one is not None for one in key[1:])
-            key = (slice(None),) * missing + key[1:]
+            indexed = [one for one in key[1:] if one is not None]  # None adds an axis
+            key = (slice(None),) * (self.ndim - len(indexed)) + key[1:]
         first, *others = key
-        start, stop, step = first.indices(len(self))
+        blocks = self._blocks(first) if isinstance(first, slice) else None
+        if blocks is None:
+            raise TypeError(
+                f"an effect may not select single rows ({first!r}); write the equation for all rows"
+            )
+        return self._of(taken(self.node, (blocks, *others)))
+
+    def _blocks(self, rows: slice) -> slice | None:
+        """Return the slice of the blocks that rows consist of; None if these are not whole blocks."""
+        start, stop, step = rows.indices(len(self))
         if start % self.n or stop % self.n or step != 1:
-            raise TypeError(f"an equation takes rows {first} of all samples; write it for all rows")
-        return self._of(taken(self.node, (slice(start // self.n, stop // self.n), *others)))
+            return None
+        return slice(start // self.n, stop // self.n)
 
     @property
     def T(self) -> list[Traced]:  # noqa: N802  # as of numpy
@@ -326,7 +343,10 @@ def _power(like: Traced, base: Any, exponent: Any) -> Node:
         scaled = apply("mul", exponent.node, scalar(math.log(base)))
         return apply("exp", scaled)
     if exponent != round(exponent) or exponent < 1:
-        raise TypeError(f"an equation takes the power {exponent!r}; write it with numpy.sqrt")
+        raise TypeError(
+            f"an effect may not take the power {exponent!r}, only positive integers; write the "
+            "equation with numpy.sqrt"
+        )
     return _integer_power(like.lifted(base), int(exponent))
 
 

@@ -337,20 +337,24 @@ class Equations:
         return out
 
     def response(
-        self, radio: np.ndarray, accel: np.ndarray, rest: tuple[np.ndarray, np.ndarray]
+        self, radio: np.ndarray, accel: np.ndarray, others: tuple[np.ndarray, np.ndarray]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return errors of the columns, (k, s), and residuals, (n, s), for errors of measurements.
+        """Return the errors of the columns (k, s) that s draws of errors of measurements cause.
 
-        radio : (n, s) m; accel : (m, 3, s) m/s^2 at the middle bins
-        rest : gradients by the columns (k, s) and by the path (3J, s) that other errors make
+        Also return the residuals of radio measurements with these errors, (n, s) m.
+
+        radio : (n, s) m, errors of radio measurements
+        accel : (m, 3, s) m/s^2, errors of accelerations at the middle bins
+        others : gradients by the columns (k, s) and by the path (3J, s) that other errors make, as of
+            `others`
         """
         problem = self.problem
         weighted = -self.weight[:, None] * radio
-        of_columns = rest[0] + self.by_columns.T @ weighted
+        column_gradient = others[0] + self.by_columns.T @ weighted
         spread = problem.spread(-problem.motion_weight[:, None, None] * accel)
-        of_path = rest[1] + self.by_tag @ weighted + spread.reshape(-1, radio.shape[1])
-        solved = _solved(self.path_factor, of_path)
-        columns = -self.covariance @ (of_columns - self.cross.T @ solved)
+        path_gradient = others[1] + self.by_tag @ weighted + spread.reshape(-1, radio.shape[1])
+        solved = _solved(self.path_factor, path_gradient)
+        columns = -self.covariance @ (column_gradient - self.cross.T @ solved)
         path = -(solved + self.path_by_columns @ columns)
         return columns, self.by_columns @ columns + self.by_tag.T @ path - radio
 

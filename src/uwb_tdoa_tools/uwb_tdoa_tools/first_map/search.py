@@ -38,27 +38,31 @@ MOVING = 20  # fewest bins with accelerations
 def minima(
     seen: Observations, rng: np.random.Generator, progress: Callable[[str], object]
 ) -> tuple[list[Fit], int]:
-    """Return the distinct minima in the frame, best first, and how many starts reached the best shape."""
-    found, reached = _shapes(seen, rng, progress)
-    rough, fine = (Problem(seen, Stage(wide=wide)) for wide in WIDTHS[1:])
+    """Return the distinct minima of the cost, best first, and how many starts reached the best shape.
+
+    First come shapes without a frame. Each shape is placed in the frame in several ways. Each way,
+    and reflections of the best fit so far, are a starting point of a fit in the frame.
+    """
+    shapes, reached = _shapes(seen, rng, progress)
+    wide, exact = (Problem(seen, Stage(wide=wide)) for wide in WIDTHS[1:])
     fits: list[Fit] = []
 
-    def keep(path: np.ndarray, columns: np.ndarray) -> None:
-        coarse = rough.solve(path, columns)
-        fit = fine.solve(coarse.path, coarse.columns)
+    def fit_from(path: np.ndarray, columns: np.ndarray) -> None:
+        rough = wide.solve(path, columns)
+        fit = exact.solve(rough.path, rough.columns)
         if np.isfinite(fit.cost):
             fits.append(fit)
 
-    for shape in found:
+    for shape in shapes:
         for turn, shift in _places(seen, shape, rng):
             progress("placing the map in its frame")
-            keep(*_placed(seen, shape, turn, shift))
+            fit_from(*_placed(seen, shape, turn, shift))
     fits.sort(key=lambda fit: fit.cost)
     for _ in range(ROUNDS):
         best = fits[0]
         for path, columns in _reflections(seen, best):
             progress("looking for second places of anchors")
-            keep(path, columns)
+            fit_from(path, columns)
         fits.sort(key=lambda fit: fit.cost)
         if fits[0].cost > best.cost - BETTER:
             break

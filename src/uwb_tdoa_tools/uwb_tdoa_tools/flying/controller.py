@@ -42,6 +42,10 @@ class Controller:
 
     Attributes
     ----------
+    vehicle : Vehicle
+        Vehicle as the controller assumes it.
+    weight : float
+        Its weight, N.
     thrust : float
         Wanted thrust of all rotors together, N.
     lift : float
@@ -53,13 +57,7 @@ class Controller:
     """
 
     def __init__(self, vehicle: Vehicle | None = None) -> None:
-        """Start at rest.
-
-        Parameters
-        ----------
-        vehicle : Vehicle, optional
-            Vehicle as the controller assumes it.
-        """
+        """Start with the rotors off. The default is a Vehicle without deviations."""
         self.vehicle = vehicle or Vehicle()
         self.weight = self.vehicle.mass * GRAVITY
         self.rates, self.integral = np.zeros(3), np.zeros(3)

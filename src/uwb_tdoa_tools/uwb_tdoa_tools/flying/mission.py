@@ -131,25 +131,34 @@ class Polyline:
     """
 
     def __init__(self, places: np.ndarray, height: float) -> None:
-        """Store places (n, 2), m, and their height, m."""
+        """Store the places.
+
+        Parameters
+        ----------
+        places : numpy.ndarray
+            (n, 2), m. Successive places must differ.
+        height : float
+            Height of all places, m.
+        """
         self._places, self._height = places, height
-        self._ways = np.diff(places, axis=0)
-        self._lengths = np.linalg.norm(self._ways, axis=1)
-        self._stamps = np.concatenate([[0.0], np.cumsum(self._lengths)])
-        self.length, self.end = float(self._stamps[-1]), places[-1]
+        self._segments = np.diff(places, axis=0)
+        self._segment_lengths = np.linalg.norm(self._segments, axis=1)
+        self._arc_lengths = np.concatenate([[0.0], np.cumsum(self._segment_lengths)])
+        self.length, self.end = float(self._arc_lengths[-1]), places[-1]
 
     def at(self, along: np.ndarray) -> np.ndarray:
         """Return the points (n, 3), m, at arc lengths `along` (n,), m."""
-        x, y = (np.interp(along, self._stamps, column) for column in self._places.T)
+        x, y = (np.interp(along, self._arc_lengths, column) for column in self._places.T)
         return np.column_stack([x, y, np.full(len(x), self._height)])
 
     def nearest(self, p: np.ndarray, first: float = 0.0, last: float = np.inf) -> np.ndarray:
         """Return the arc lengths (n,), m, nearest to p (n, 2) m, between `first` and `last`, m."""
-        since = p[:, None] - self._places[:-1]
-        shares = np.sum(since * self._ways, axis=2) / self._lengths**2
-        along = self._stamps[:-1] + np.clip(shares, 0.0, 1.0) * self._lengths  # of each line
+        from_start = p[:, None] - self._places[:-1]
+        shares = np.sum(from_start * self._segments, axis=2) / self._segment_lengths**2
+        # (n, segments): the nearest point of each segment
+        along = self._arc_lengths[:-1] + np.clip(shares, 0.0, 1.0) * self._segment_lengths
         along = np.clip(along, first, min(last, self.length))
-        off = self.at(along.ravel())[:, :2].reshape(since.shape) - p[:, None]
+        off = self.at(along.ravel())[:, :2].reshape(from_start.shape) - p[:, None]
         best = np.argmin(np.linalg.norm(off, axis=2), axis=1)
         out: np.ndarray = along[np.arange(len(p)), best]
         return out

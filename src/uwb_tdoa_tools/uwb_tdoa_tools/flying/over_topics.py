@@ -120,7 +120,7 @@ FARTHEST, FASTEST = 1e3, 100.0  # m, m/s: limits of plausible odometry
 CLOSEST = 0.5e-3  # s, least time between stored odometries: limits the memory
 LATCHED_LIMIT = 5.0  # s, wait for acknowledgement of latched messages
 MARKER_SIZE = 0.12  # m
-# {stream: (topic, class of its messages, {field: values} of its part)}
+# {stream: (topic, type of its messages, function from samples to {field: values} of messages)}
 STREAMS: dict[str, tuple[str, type, Callable[[Any], dict[str, Any]]]] = {
     "imu": (
         "imu/data",
@@ -297,19 +297,35 @@ class OverTopics(EstimateSource):
 
 
 class _Output:
-    """Publish a stream of messages with few nonzero fields."""
+    """Publish the samples of one stream as messages.
+
+    Messages are serialized in bulk, because a message object takes tens of microseconds. Nothing is
+    sent without a subscriber.
+    """
 
     def __init__(
         self,
         node: StreamNode,
         topic: str,
-        kind: type,
-        content: Callable[[Any], dict[str, np.ndarray]],
+        message_type: type,
+        fields_of: Callable[[Any], dict[str, np.ndarray]],
         frame: str = BODY_FRAME,
     ) -> None:
-        self._content, self._kind, self._frame = content, kind, frame
+        """Create the publisher.
+
+        Parameters
+        ----------
+        node : StreamNode
+        topic : str
+        message_type : type
+        fields_of : callable
+            Returns {field: (n, ...)} of n samples. Other fields of a message keep their default.
+        frame : str
+            frame_id of the messages.
+        """
+        self._fields_of, self._message_type, self._frame = fields_of, message_type, frame
         self._template: CdrTemplate | None = None
-        self._output = StreamOutput(node, kind, topic)
+        self._output = StreamOutput(node, message_type, topic)
 
     @property
     def subscribers(self) -> int:
@@ -317,17 +333,17 @@ class _Output:
         return self._output.publisher.get_subscription_count()
 
     def publish(self, seconds: np.ndarray, nanoseconds: np.ndarray, part: Any) -> None:
-        """Publish the rows of a part of a stream.
+        """Publish one message per sample.
 
-        `seconds` and `nanoseconds` (n,) are its stamps.
+        `part` holds n samples of the stream; `seconds` and `nanoseconds` (n,) are their stamps.
         """
-        content = self._content(part)
+        fields = self._fields_of(part)
         if self._template is None:
-            blank = self._kind()
+            blank = self._message_type()
             blank.header.frame_id = self._frame
-            self._template = CdrCodec(self._kind, *content).template(blank)
+            self._template = CdrCodec(self._message_type, *fields).template(blank)
         rows = self._template.rows(len(seconds))
         rows["sec"], rows["nanosec"] = seconds, nanoseconds
-        for field, values in content.items():
+        for field, values in fields.items():
             rows[field] = values
         self._output.publish(self._frame, self._template, rows)

@@ -260,7 +260,7 @@ class Trial:
         return "flew into the ceiling" if z > size[2] + OUTSIDE else ""
 
     def _predicted_attitude(self, attitude: np.ndarray, since: float) -> np.ndarray:
-        """Return an attitude (4,) of the time `since`, s, rotated by the gyroscope until now."""
+        """Return the present attitude (4,): that of the time `since`, s, rotated by the gyroscope."""
         k = self.simulator.done
         times, samples = self.simulator.times[: k + 1], self.simulator.samples
         attitude = attitude.copy()

@@ -19,9 +19,9 @@ from uwb_tdoa_ekf.results import VERDICTS, Odometry, Residuals
 from ..scoring.metrics import has_innovation
 
 RESIDUAL_COLUMNS = "t", "a", "b", "residual", "std", "weight", "verdict"
-SHOWN = 20  # pairs in the picture at most, those with the most TDOAs
-FEWEST = 20  # TDOAs of a pair in the picture
-# robust standard deviations that the draw_residuals reaches; what is farther off is drawn at its edge
+SHOWN = 20  # largest number of pairs in the picture: those with the most TDOAs
+FEWEST = 20  # fewest TDOAs of a pair in the picture
+# range of the axes in robust standard deviations; larger residuals are drawn at the edge
 SPREAD = 6.0
 ZONE_COLUMNS = "x", "y", "seconds", "heard", "tdoas_per_s", "used", "left", "std", "anchors"
 SHORTEST = 0.5  # s in a zone that is listed
@@ -233,15 +233,19 @@ def write_zones(path: Path, zones: list[Zone]) -> None:
 
 
 def draw_zones(path: Path, zones: list[Zone], anchors: Anchors, size: float, title: str) -> None:
-    """Draw maps of the number of heard anchors and of the standard deviation of the position."""
+    """Draw maps of the number of heard anchors and of the standard deviation of the position.
+
+    size : m, of a square
+    """
     import matplotlib.pyplot as plt  # takes a second to import
 
     figure, axes = plt.subplots(1, 2, figsize=(13.0, 5.5), layout="constrained")
     heard = {anchor for zone in zones for anchor, _ in zone.anchors}
     silent = np.array([anchor not in heard for anchor in anchors.ids.tolist()])
-    x, y = (np.unique([getattr(zone, name) for zone in zones]) for name in "xy")
-    x, y = (np.arange(some.min(), some.max() + 0.5 * size, size) for some in (x, y))
-    for ax, name, label, colours in (
+    middles = (np.array([getattr(zone, name) for zone in zones]) for name in "xy")
+    # all squares from the first to the last; those without a zone stay white
+    x, y = (np.arange(one.min(), one.max() + 0.5 * size, size) for one in middles)
+    for ax, name, label, colour_map in (
         (axes[0], "heard", "anchors heard in a second", "viridis"),
         (axes[1], "std", "standard deviation, cm", "viridis_r"),
     ):
@@ -251,7 +255,7 @@ def draw_zones(path: Path, zones: list[Zone], anchors: Anchors, size: float, tit
             values[round((zone.y - y[0]) / size), round((zone.x - x[0]) / size)] = (
                 value if name == "heard" else 100.0 * value
             )
-        mesh = ax.pcolormesh(x, y, values, shading="nearest", cmap=colours)
+        mesh = ax.pcolormesh(x, y, values, shading="nearest", cmap=colour_map)
         ax.plot(*anchors.positions[~silent, :2].T, "k^", ms=4, label="heard")
         ax.plot(*anchors.positions[silent, :2].T, "rx", ms=5, label="never heard")
         ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")

@@ -226,10 +226,12 @@ def _tdoas(x: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _directions(dimensions: int) -> np.ndarray:
-    """Return evenly spread unit vectors: (DIRECTIONS, 2), or a sphere of (3 DIRECTIONS, 3)."""
+    """Return evenly spread unit vectors: (DIRECTIONS, 2) in a plane, (3 DIRECTIONS, 3) in space."""
     if dimensions == 2:
+        # With this offset no direction is along an axis.
         angle = 2.0 * np.pi * (np.arange(DIRECTIONS) + 0.31) / DIRECTIONS
         return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    # a spiral from pole to pole that turns by the golden angle (Fibonacci sphere)
     k = np.arange(3 * DIRECTIONS) + 0.5
     z, angle = 1.0 - 2.0 * k / (3 * DIRECTIONS), np.pi * (1.0 + np.sqrt(5.0)) * k
     return np.column_stack(

@@ -74,18 +74,23 @@ class Hall:
         return Chart(whole.covariance, whole.error, whole.status, grid, heard)
 
     def judge(self, points: np.ndarray) -> tuple[Judged, np.ndarray]:
-        """Return (Judged, anchors heard (n,)) of points (n, 3) m that are near each other."""
+        """Return (Judged, number of anchors heard (n,)) of points (n, 3) m.
+
+        Points near each other hear the same few anchors, which limits time and memory. Points with
+        too few anchors stay `unheard`.
+        """
         if self.reach == np.inf and self.walls is None:
             found = judge(points, self.installation, self.demand)
             return found, np.full(len(points), len(self.anchors))
-        rows = self.heard(points)
-        counts = np.array([len(each) for each in rows], int)
+        heard = self.heard(points)
+        counts = np.array([len(rows) for rows in heard], int)
         whole = self.unheard(points)
-        near = np.unique(np.concatenate([np.empty(0, int), *rows]))
+        heard_somewhere = np.unique(np.concatenate([np.empty(0, int), *heard]))
+        # Points with the same number of anchors are judged at once.
         for count in np.unique(counts[counts > self.installation.unknowns]):
             cells = np.flatnonzero(counts == count)
-            installation = self.installation.with_anchors(self.anchors.only(near))
-            columns = np.searchsorted(near, np.stack([rows[cell] for cell in cells]))
+            installation = self.installation.with_anchors(self.anchors.only(heard_somewhere))
+            columns = np.searchsorted(heard_somewhere, np.stack([heard[cell] for cell in cells]))
             whole.assign(cells, judge(points[cells], installation, self.demand, columns))
         return whole, counts
 

@@ -51,6 +51,7 @@ ANCHOR, HULL = "#1f3a93", "#8e44ad"
 HEARD_COLOURS = [0, 1, 2, 3, 4, 5, 6, 8, 10, 13, 17, 25]  # bounds of the colours of the picture
 COLOURS = "viridis_r"
 _MOST_LAYERS = 3
+_ARROWS_ACROSS = 25.0  # lengths of an arrow at an anchor along the x axis of a map
 ACROSS = 9  # ellipses along the longer side of a map
 NEAR = 0.1  # of the size of a map: anchors so close to it are drawn too
 
@@ -100,7 +101,7 @@ def plot_flyable(
     walls: Walls | None = None,
     pairings: Installation | None = None,
 ) -> None:
-    """Draw where it can be flown, and why not elsewhere.
+    """Draw which cells can be flown, and why the others cannot.
 
     pairings : Installation whose bifurcation curves are drawn, one for each choice of anchors; or
     None.
@@ -226,17 +227,17 @@ def plot_flips(
 
 
 def plot_accuracy(installation: Installation, found: AccuracyMap, path: str | Path) -> None:
-    """Draw measured error, bias, stated error and bound, 3D, seen from above.
+    """Draw measured error, its bias, stated error and bound, 3D, seen from above.
 
-    All have one colour scale.
+    A square shows the root mean square over the height. All have one colour scale.
     """
     columns = (
         ("measured error (RMSE)", found.rmse),
-        ("of it bias", found.bias),
+        ("its bias", found.bias),
         ("the filter claims", found.claimed),
         ("bound of one round", found.bound),
     )
-    flat = []
+    from_above = []
     for _, values in columns:
         weight = np.where(np.isfinite(values[:, 0]), found.count, 0)
         squared = (
@@ -245,10 +246,10 @@ def plot_accuracy(installation: Installation, found: AccuracyMap, path: str | Pa
             .sum(axis=2)
         )
         counted = weight.reshape(found.grid.shape).sum(axis=2)
-        flat.append(
+        from_above.append(
             100.0 * np.sqrt(np.where(counted > 0, squared, np.nan) / np.maximum(counted, 1)).T
         )
-    every = np.concatenate([values.ravel() for values in flat])
+    every = np.concatenate([values.ravel() for values in from_above])
     scale = _scale(every[np.isfinite(every)])
     x, y, _ = found.grid.axes
     ratio = np.ptp(y) / max(np.ptp(x), 1e-9)
@@ -260,7 +261,7 @@ def plot_accuracy(installation: Installation, found: AccuracyMap, path: str | Pa
         sharex=True,
         sharey=True,
     )
-    for ax, (label, _), values in zip(axes.ravel(), columns, flat):
+    for ax, (label, _), values in zip(axes.ravel(), columns, from_above):
         mesh = ax.pcolormesh(
             x,
             y,
@@ -541,15 +542,15 @@ def _anchors(ax: Axes, anchors: Anchors) -> None:
         scalex=False,
         scaley=False,
     )
-    turned = np.isfinite(anchors.orientations).all(axis=1)
-    if turned.any():
-        front = _directions(anchors)[turned]
+    oriented = np.isfinite(anchors.orientations).all(axis=1)
+    if oriented.any():
+        front = _directions(anchors)[oriented]
         ax.quiver(
-            *p[turned, :2].T,
+            *p[oriented, :2].T,
             *front.T,
             color=ANCHOR,
             width=0.005,
-            scale=25,
+            scale=_ARROWS_ACROSS,
             edgecolor="w",
             linewidth=0.5,
             zorder=5,
@@ -557,17 +558,18 @@ def _anchors(ax: Axes, anchors: Anchors) -> None:
 
 
 def _directions(anchors: Anchors) -> np.ndarray:
-    """Return the fronts of anchors from above: (n, 2), 0 without an orientation."""
+    """Return the directions of the fronts of anchors from above: (n, 2), 0 without an orientation."""
     out = np.zeros((len(anchors), 2))
-    turned = np.isfinite(anchors.orientations).all(axis=1)
-    if turned.any():
-        out[turned] = Rotation.from_quat(anchors.orientations[turned]).apply([1.0, 0.0, 0.0])[:, :2]
+    oriented = np.isfinite(anchors.orientations).all(axis=1)
+    if oriented.any():
+        fronts = Rotation.from_quat(anchors.orientations[oriented]).apply([1.0, 0.0, 0.0])
+        out[oriented] = fronts[:, :2]
     return out
 
 
-def _fronts(ax: Axes, anchors: Anchors) -> np.ndarray:
-    """Return middles and tips of the arrows of the fronts of anchors: (2 n, 2) m."""
-    arrow = _directions(anchors) * np.ptp(ax.get_xlim()) / 25.0
+def _points_on_arrows(ax: Axes, anchors: Anchors) -> np.ndarray:
+    """Return the middles and tips of the arrows of `_anchors`, that labels avoid: (2 n, 2) m."""
+    arrow = _directions(anchors) * np.ptp(ax.get_xlim()) / _ARROWS_ACROSS
     return np.vstack([anchors.positions[:, :2] + share * arrow for share in (0.5, 1.0)])
 
 
@@ -576,8 +578,9 @@ def _hull_line() -> Line2D:
 
 
 def _anchor_mark(anchors: Anchors) -> Line2D:
-    turned = ", arrow: its front" if np.isfinite(anchors.orientations).all(axis=1).any() else ""
-    return Line2D([], [], color=ANCHOR, marker="^", ls="", label=f"anchor{turned}")
+    oriented = np.isfinite(anchors.orientations).all(axis=1).any()
+    label = "anchor, arrow: its front" if oriented else "anchor"
+    return Line2D([], [], color=ANCHOR, marker="^", ls="", label=label)
 
 
 def _some_cells(chart: Chart, k: int) -> np.ndarray:
@@ -632,24 +635,24 @@ def _finish(
     """Draw title and legend, then the ids of anchors, and write the picture."""
     figure.suptitle(title, fontsize=12)
     if marks:
-        wide = max(len(str(mark.get_label())) for mark in marks)
+        longest = max(len(str(mark.get_label())) for mark in marks)
         figure.legend(
             handles=marks,
             loc="outside lower center",
-            ncols=3 if wide < 28 else 2,
+            ncols=3 if longest < 28 else 2,
             frameon=False,
             fontsize=9,
         )
     figure.set_dpi(DPI)
-    figure.draw_without_rendering()
+    figure.draw_without_rendering()  # labels need the final layout
     for ax, anchors in labelled:
-        draw_labels(
-            ax, anchors.ids.tolist(), anchors.positions[:, :2], _fronts(ax, anchors), ANCHOR
-        )
-    _save(figure, title, path)
+        avoided = _points_on_arrows(ax, anchors)
+        draw_labels(ax, anchors.ids.tolist(), anchors.positions[:, :2], avoided, ANCHOR)
+    _save(figure, path)
 
 
-def _save(figure: Figure, title: str, path: str | Path) -> None:
+def _save(figure: Figure, path: str | Path) -> None:
+    """Write a figure as a small PNG, and close it."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     image = Image.frombuffer("RGBA", canvas.get_width_height(), canvas.buffer_rgba())

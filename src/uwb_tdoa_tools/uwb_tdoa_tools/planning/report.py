@@ -348,7 +348,7 @@ def publish_messages(found: dict[str, Any]) -> None:
 
 
 def _occupancy(store: Typestore, grid: Grid, values: np.ndarray, k: int, frame: str) -> Any:
-    """Return values (n,) of layer k as an OccupancyGrid at the height of the layer's middle."""
+    """Return the layer k of values (n,), -1 to 100, as an OccupancyGrid at its height."""
     types, (nx, ny, _) = store.types, grid.shape
     header = header_of(store, 0, frame)
     corner = pose_of(store, (*grid.lower[:2], grid.axes[2][k]))

@@ -25,7 +25,7 @@ from .tables import CsvFiles, table_of
 from .ulog import ULogFile, is_ulog
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from uwb_tdoa_bias.common.flight import Flight
 
@@ -190,7 +190,15 @@ def _name(path: Path) -> str:
 
 
 class _Request:
-    """The streams of one source in one table, and what was gathered of them."""
+    """The streams of one source in one table, and the records read so far.
+
+    Attributes
+    ----------
+    tags : {tag: records}.
+    positions : {name of an anchor: position, m, in the axes of the source}.
+    moved : {name of an anchor: largest change of a coordinate, m}.
+    unstamped : messages without a stamp.
+    """
 
     def __init__(self, table: str, source: Source, names: dict[str, str], tables: Foreign) -> None:
         self.table, self.source, self._names = table, source, names
@@ -219,7 +227,7 @@ class _Request:
         self.positions: dict[str, tuple[float, float, float]] = {}
         self.moved: dict[str, float] = {}
         self._left_out = 0
-        self.unstamped = 0  # messages without a stamp
+        self.unstamped = 0
         self._by_stamp = default is not None and any(
             mine.get("t") == default for mine in self._wanted.values()
         )
@@ -297,22 +305,25 @@ class _Request:
         )
         self._first.setdefault(stream, f"{place}: {sentence}")
 
-    def _take_anchor(self, value: Any) -> None:
-        mine = self._wanted[SURVEY]
-        number, *place = (value(mine[name][0]) for name in STREAMS[SURVEY])
-        numbers = [as_number(each) for each in place]
+    def _take_anchor(self, value: Callable[[str], Any]) -> None:
+        """Store the position of an anchor, and by how much it differs from the one before.
+
+        `value` returns the value of the record at a path.
+        """
+        columns = self._wanted[SURVEY]
+        anchor, *coordinates = (value(columns[name][0]) for name in STREAMS[SURVEY])
+        numbers = [as_number(each) for each in coordinates]
         if None in numbers:
             return
-        factors = [mine[f"anchor_{axis}"][1] for axis in "xyz"]
+        factors = [columns[f"anchor_{axis}"][1] for axis in "xyz"]
         at = [each * factor for each, factor in zip(numbers, factors) if each is not None]
-        name = as_text(number)
+        name = as_text(anchor)
         last = self.positions.get(name)
         if last is not None and not any(at):
             return  # drivers write zeros where they do not know the position
         if last is not None and any(last):
-            self.moved[name] = max(
-                self.moved.get(name, 0.0), float(np.abs(np.subtract(at, last)).max())
-            )
+            shift = float(np.abs(np.subtract(at, last)).max())
+            self.moved[name] = max(self.moved.get(name, 0.0), shift)
         self.positions[name] = (at[0], at[1], at[2])
 
     def surveyed(self) -> dict[str, np.ndarray]:
@@ -534,7 +545,10 @@ def _check_tag(path: Path, requests: Sequence[_Request], tag: str) -> None:
 
 
 def _joined(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Return the columns of a stream that several sources give; what one of them lacks is left out."""
+    """Return the columns of a stream from all its sources, sorted by time.
+
+    A column that one of the sources lacks is left out.
+    """
     names = set.intersection(*({*part} for part in parts))
     joined = {name: np.concatenate([part[name] for part in parts]) for name in sorted(names)}
     if len(parts) > 1:

@@ -433,7 +433,7 @@ def _distance_by_lag(
 
 
 def transform_truth(truth: Truth, axes: np.ndarray, shift: np.ndarray) -> Truth:
-    """Return the Truth with axes (3, 3) and shift (3,) m applied.
+    """Return the Truth with axes (3, 3), then shift (3,) m, applied to its positions and attitudes.
 
     A mirrored frame leaves the attitudes unchanged: rotations of the body are the same.
     """

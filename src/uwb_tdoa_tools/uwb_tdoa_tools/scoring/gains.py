@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     Errors = dict[str, dict[float | None, float]]
 
 
-SAME = 0.005  # of the error: what rounds to no per cent
+SAME = 0.005  # share of the error: a smaller change rounds to 0 %
 LOSS = 0.03  # share of the error: a smaller loss may be risked for a larger expected gain
 NO_DIFFERENCE = "no difference that these flights can show"
 SHARES = 0.0, 0.5, 0.75, 1.0
@@ -41,12 +41,12 @@ def gain_in_words(gained: float) -> str:
     )
 
 
-def difference(before: float, after: float, interval: Sequence[float] | None = None) -> int:
-    """Return 1 if an error falls, -1 if it rises, and 0 without a difference that can be shown.
+def clear_change(before: float, after: float, interval: Sequence[float] | None = None) -> int:
+    """Return 1 if an error clearly falls, -1 if it clearly rises, and 0 otherwise.
 
-    A difference counts if its `interval` excludes zero. A gain counts, too, if more than LOSS is
-    expected, and the probability of a loss above LOSS is below 2.5 %. Without an interval a
-    difference counts if it does not round to nothing.
+    A change is clear if its `interval` excludes zero. A gain is clear, too, if more than LOSS is
+    expected, and the probability of a loss above LOSS is below 2.5 %. Without an interval a change
+    is clear from SAME on.
 
     Parameters
     ----------
@@ -57,9 +57,11 @@ def difference(before: float, after: float, interval: Sequence[float] | None = N
     """
     gained = gain(before, after) if before else 0.0
     low, high = (gained - SAME, gained + SAME) if interval is None else interval
-    expected, half = 0.5 * (low + high), 0.5 * (high - low)
-    worth_it = interval is not None and expected > LOSS and expected + LOSS > half
-    return int(low > 0.0 or worth_it) - int(high < 0.0)
+    expected, half_width = 0.5 * (low + high), 0.5 * (high - low)
+    # With the second condition a loss of LOSS lies outside of the interval.
+    worth_the_risk = interval is not None and expected > LOSS and expected + LOSS > half_width
+    falls, rises = low > 0.0 or worth_the_risk, high < 0.0
+    return int(falls) - int(rises)
 
 
 @dataclass(frozen=True)

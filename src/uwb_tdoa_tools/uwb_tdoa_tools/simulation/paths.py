@@ -77,9 +77,9 @@ def sines(
     def position(u: np.ndarray) -> np.ndarray:
         return 0.5 * (low + high) + reach * np.prod(np.sin(rate * u[:, None, None] + phase), axis=1)
 
-    u = np.linspace(0.0, 240.0, 4801)
-    pace = np.gradient(position(u), u, axis=0)
-    return position(s * config.speed / np.sqrt(np.mean(np.sum(pace**2, axis=1))))
+    u = np.linspace(0.0, 240.0, 4801)  # long enough for the mean over all periods
+    velocity = np.gradient(position(u), u, axis=0)
+    return position(s * config.speed / np.sqrt(np.mean(np.sum(velocity**2, axis=1))))
 
 
 def square(
@@ -107,12 +107,13 @@ def line_y(
 def waypoints(
     s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator
 ) -> np.ndarray:
-    """Fly through the points of `path` and back to the first, repeatedly, with rounded corners."""
+    """Fly through the points of `config.path` and back to the first, repeatedly, corners rounded."""
     assert config.path is not None and config.height is not None  # complete
+    # A point x, y is at `config.height`.
     points = np.array([(*point, config.height)[:3] for point in config.path])
-    around = np.vstack([points, points[:1]])
-    ends = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(around, axis=0), axis=1))])
-    return _round(s, config.speed, around, ends, 0.0)
+    closed = np.vstack([points, points[:1]])
+    lengths = np.linalg.norm(np.diff(closed, axis=0), axis=1)
+    return _round(s, config.speed, closed, np.concatenate([[0.0], np.cumsum(lengths)]), 0.0)
 
 
 def timed(

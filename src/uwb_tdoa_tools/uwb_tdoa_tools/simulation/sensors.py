@@ -43,6 +43,10 @@ def measure_imu(
     motion = trajectory.motion(t)
 
     def bias_of(part: str, initial: float, walk: float) -> np.ndarray:
+        """Return a random walk (n, 3) from a random value.
+
+        initial : standard deviation of that value; walk : that of the walk after one second
+        """
         rng = random(part)
         start = initial * rng.standard_normal(3)
         steps = walk * np.sqrt(dt) * rng.standard_normal((n, 3))

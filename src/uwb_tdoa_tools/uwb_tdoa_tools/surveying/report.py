@@ -171,7 +171,7 @@ def as_text(found: SelfCalibration) -> str:
 
 
 def picture(found: SelfCalibration, path: str | Path) -> None:
-    """Draw plan and elevation, before and after, with 95 % intervals."""
+    """Draw given and surveyed anchors, from above and from the side, with 95 % intervals."""
     from matplotlib.figure import Figure  # takes a second to import
 
     figure = Figure(figsize=(11.0, 5.0), layout="constrained")

@@ -505,9 +505,11 @@ def _inverse_diagonal(factor: np.ndarray) -> np.ndarray:
 def _normal_equations(
     design: Design, groups: Sequence[tuple[int, int, np.ndarray]], size: int, weight: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return both sides of the normal equations, (size + q, size + q) and (size + q,).
+    """Return both sides of the normal equations without priors, (size + q, size + q), (size + q,).
 
-    They lack the priors. groups : of `_groups`; size : sites * m; weight : (n,) 1/m^2, of the rows
+    A row predicts the map of site b minus that of site a, plus its dense part (`predict`).
+
+    groups : of `_groups`; size : sites * m; weight : (n,) 1/m^2, of the rows
     """
     m, q = design.phi.shape[1], design.dense.shape[1]
     left, right = np.zeros((size + q, size + q)), np.zeros(size + q)
@@ -521,9 +523,9 @@ def _normal_equations(
         left[of_b, of_b] += gram
         left[of_a, of_b] -= gram
         left[of_b, of_a] -= gram
-        for block, sign in ((of_a, -1.0), (of_b, 1.0)):
-            right[block] += sign * vector
-            left[block, size:] += sign * cross
+        for weights_of_site, sign in ((of_a, -1.0), (of_b, 1.0)):
+            right[weights_of_site] += sign * vector
+            left[weights_of_site, size:] += sign * cross
     left[size:, :size] = left[:size, size:].T
     left[size:, size:] = design.dense.T @ (weight[:, None] * design.dense)
     right[size:] = design.dense.T @ (weight * design.y)

@@ -135,9 +135,19 @@ class RadioResidual(ChannelResidual):
 
 
 class Cells:
-    """The cells of one flight, and averages over them."""
+    """The cells of one flight, and averages over them.
+
+    Attributes
+    ----------
+    chosen : (c,) indices in `samples` of the measurements that are in a cell.
+    group : (c,) number of the cell of each of them.
+    size : (m,) number of measurements of each cell.
+    t : (m,) s, mean stamp.
+    pair : (m,) number of the pair of anchors.
+    """
 
     def __init__(self, part: RadioResidual) -> None:
+        """Assign the fitted measurements of a residual to cells, without outliers."""
         samples, chosen = part.samples, np.flatnonzero(part.fitted)
         n = len(samples.anchors)
         t = samples.t[chosen]
@@ -165,16 +175,18 @@ class Cells:
         self.pair = samples.a[self.chosen][start] * n + samples.b[self.chosen][start]
 
     def means(self, values: np.ndarray, rows: np.ndarray | None = None) -> Matrix:
-        """Return means of values (n, k) over the cells, (m, k).
+        """Return means of values (n, k) of all n measurements over the m cells, (m, k).
 
-        rows : (r,) of the TDOAs that values (r, k) belong to; other values are zero, and the result
-            is sparse
+        rows : (r,) indices of the measurements in `samples` to which values (r, k) belong. All
+            other measurements count as 0, and the result is sparse.
         """
         if rows is None:
             return np.stack([self.mean(column) for column in values.T], axis=1)
-        # for each TDOA its row of `values`, or -1
+        # For each measurement its row of `values`, or -1. Measurements after the last one in a cell
+        # have no entry.
         row_of = np.full(self.chosen.max(initial=-1) + 1, -1)
-        row_of[rows[rows < len(row_of)]] = np.flatnonzero(rows < len(row_of))
+        has_entry = rows < len(row_of)
+        row_of[rows[has_entry]] = np.flatnonzero(has_entry)
         inside = np.flatnonzero(row_of[self.chosen] >= 0)
         group = self.group[inside]
         members = csr_array(
@@ -184,7 +196,7 @@ class Cells:
         return (members @ csc_array(values)).tocsc()
 
     def mean(self, values: np.ndarray) -> np.ndarray:
-        """Return means of values of all TDOAs (n,) over the cells, (m,)."""
+        """Return means of values (n,) of all n measurements over the m cells, (m,)."""
         return np.bincount(self.group, values[self.chosen]) / self.size
 
 

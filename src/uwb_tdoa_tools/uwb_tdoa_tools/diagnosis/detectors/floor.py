@@ -114,17 +114,21 @@ class _Trials:
         self._count = np.minimum(count, ENOUGH)
 
     def best(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return (delays (anchors,) m, indices of the heights (anchors,))."""
-        count = self._columns.shape[2]
-        at = self._best(np.full(count, k) for k in range(len(self._columns)))
+        """Return (delays (anchors,) m, indices of the heights (anchors,)) of the least loss found.
+
+        The search starts with the best height for all anchors. Each sweep then tries all heights for
+        one anchor after the other.
+        """
+        heights, _, anchors = self._columns.shape
+        at = self._least_loss(np.full(anchors, height) for height in range(heights))
         for _ in range(SWEEPS):
-            for anchor in range(count):
-                tried = np.repeat(at[None], len(self._columns), axis=0)
-                tried[:, anchor] = range(len(tried))
-                at = self._best(tried)
+            for anchor in range(anchors):
+                tried = np.repeat(at[None], heights, axis=0)
+                tried[:, anchor] = range(heights)
+                at = self._least_loss(tried)
         return self._fit(at)[1], at
 
-    def _best(self, tried: Iterable[np.ndarray]) -> np.ndarray:
+    def _least_loss(self, tried: Iterable[np.ndarray]) -> np.ndarray:
         return min(tried, key=lambda at: self._fit(at)[0])
 
     def noises(self, at: np.ndarray) -> np.ndarray:
@@ -135,7 +139,10 @@ class _Trials:
         return np.sqrt(nnls(root[:, None] * both, root * power)[0][:-1])
 
     def _fit(self, at: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return (loss, delays) of robust least squares with delays of 0 or more."""
+        """Return (loss, delays (anchors,) m) of robust least squares with delays of 0 or more.
+
+        at : (anchors,) index of the height of each anchor
+        """
         x, weight = self._columns[at, :, np.arange(len(at))].T, self._count
         for _ in range(ITERATIONS):
             root = np.linalg.cholesky((x * weight[:, None]).T @ x + LITTLE * np.eye(x.shape[1])).T

@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from .table import RegressionTable
     from .terms import Candidate, Column
 
-# Largest set that may be skipped, and the gain of its columns alone (twice a log-likelihood) below
-# which it is.
-FEW, NOTHING = (3, 3.0)
+# Largest set of columns that may be skipped. It is skipped if the gains of its single columns, twice a
+# log-likelihood, sum up to NOTHING or less.
+FEW, NOTHING = 3, 3.0
 # Columns per product with the base: limits memory, since all columns are never copied at once.
 AT_ONCE = 128
 
@@ -59,21 +59,23 @@ class Scorer:
 
         base : Columns in the model; model : Fit that gives the weights; others : Columns to score
         """
+        # The columns of the base come first.
         self._place = {column: k for k, column in enumerate(dict.fromkeys([*base, *others]))}
         self._base = np.arange(len(base))
-        columns, root = list(self._place), model.information(table)
+        columns, weights = list(self._place), model.information(table)
         if table.sparse:
             effects = _effects(columns, len(base))
             self._parts = [
-                _sparse_part(table, columns, effects, len(base), root, rows)
+                _sparse_part(table, columns, effects, len(base), weights, rows)
                 for _, rows in table.groups
             ]
         else:
-            self._parts = [self._part(table, columns, root, rows) for _, rows in table.groups]
+            self._parts = [self._part(table, columns, weights, rows) for _, rows in table.groups]
         self._group_sizes = [model.size[group] for group, _ in table.groups]
         self._channels = [table.channels[group // AXES] for group, _ in table.groups]
-        self._sizes = prior_sizes(list(self._place))
+        self._sizes = prior_sizes(columns)
         sizes = self._sizes[self._base]
+        # The fit of the base alone, with which each gain is compared.
         gram = sum((part.cross[:, self._base] for part in self._parts), start=np.zeros(()))
         vector = sum((part.vector[self._base] for part in self._parts), start=np.zeros(()))
         beta, _, self._determined = solve(gram, vector, sizes)
@@ -90,19 +92,21 @@ class Scorer:
         self,
         table: RegressionTable,
         columns: list[Column],
-        root: np.ndarray,
+        weights: np.ndarray,
         rows: np.ndarray | slice,
     ) -> _Part:
-        root, y = root[rows], table.y[rows]
-        base = weighted(table.matrix([columns[place] for place in self._base.tolist()], rows), root)
+        """Return the _Part of some rows of a dense RegressionTable. weights : (n,) of all rows."""
+        weights, y = weights[rows], table.y[rows]
+        base_columns = [columns[place] for place in self._base.tolist()]
+        base = weighted(table.matrix(base_columns, rows), weights)
         cross, vector = np.empty((len(self._base), len(columns))), np.empty(len(columns))
         acting = np.zeros(len(columns), dtype=bool)
         for first in range(0, len(columns), AT_ONCE):
             some = slice(first, first + AT_ONCE)
             x = table.matrix(columns[some], rows)
-            cross[:, some], vector[some] = product(base, x), x.T @ (root * y)
+            cross[:, some], vector[some] = product(base, x), x.T @ (weights * y)
             acting[some] = x.any(axis=0)
-        return _Part(table, columns, rows, root, cross, vector, float(root @ y**2), acting)
+        return _Part(table, columns, rows, weights, cross, vector, float(weights @ y**2), acting)
 
     def _gains_alone(self, beta: np.ndarray) -> np.ndarray:
         """Return the least-squares gain of each column alone, (columns,), twice a log-likelihood.
@@ -181,7 +185,7 @@ class Scorer:
 class _Part:
     """Products of columns with the base, for the rows of one group.
 
-    root : (n,) weights of the rows; power : y' W y
+    weights : (n,) of the rows, the diagonal of W; power : y' W y
     cross : (base, k) X_base' W X; vector : (k,) X' W y
     acting : (k,) bool, columns that are not zero in these rows; None for sparse columns
     products : products between columns of one effect, for sparse columns only
@@ -190,7 +194,7 @@ class _Part:
     table: RegressionTable
     columns: list[Column]
     rows: np.ndarray | slice
-    root: np.ndarray
+    weights: np.ndarray
     cross: np.ndarray
     vector: np.ndarray
     power: float
@@ -198,12 +202,13 @@ class _Part:
     products: _Products | None = None
 
     def gram(self, places: np.ndarray) -> np.ndarray:
+        """Return X' W X of the columns at some places."""
         if self.products is not None:
             return self.products.gram(places)
         if self.acting is not None and not self.acting[places].any():
             return np.zeros((len(places), len(places)))
         x = self.table.matrix([self.columns[place] for place in places], self.rows)
-        return x.T @ (x * self.root[:, None])
+        return x.T @ (x * self.weights[:, None])
 
     def squares(self, beta: np.ndarray, places: np.ndarray, own: np.ndarray | None = None) -> float:
         """Return the weighted sum of squared residuals for beta.
@@ -285,7 +290,7 @@ def _sparse_part(
     columns: list[Column],
     effects: Sequence[np.ndarray],
     base: int,
-    root: np.ndarray,
+    weights: np.ndarray,
     rows: np.ndarray | slice,
 ) -> _Part:
     """Return the _Part of some rows of a sparse RegressionTable.
@@ -293,17 +298,18 @@ def _sparse_part(
     Products between two effects are computed on demand.
 
     effects : places of the columns of each effect; base : number of leading columns in the base
-    root : (n,) weights of all rows
+    weights : (n,) of all rows
     """
-    root, y, x = root[rows], table.y[rows], table.matrix(columns, rows)
-    cross = product(x, weighted(x[:, :base], root)).T  # this order multiplies x as stored in memory
+    weights, y, x = weights[rows], table.y[rows], table.matrix(columns, rows)
+    # This order multiplies x as stored in memory.
+    cross = product(x, weighted(x[:, :base], weights)).T
     return _Part(
         table,
         columns,
         rows,
-        root,
+        weights,
         cross,
-        x.T @ (root * y),
-        float(root @ y**2),
-        products=_Products.of(x, root, effects),
+        x.T @ (weights * y),
+        float(weights @ y**2),
+        products=_Products.of(x, weights, effects),
     )

@@ -146,24 +146,28 @@ class RegressionTable:
         return replace(self, columns=columns)
 
     def _values(self, effect: Effect, keys: tuple[str, ...]) -> Any:
-        """Return regressors of parameters of an Effect, an iterable in the form of `columns`."""
-        made = (
-            (row, part.columns(effect, keys))
-            for _, channel, row, part in self.parts
+        """Return one column per key, the derivatives of y by this parameter of an Effect.
+
+        Dense: (k, n). Sparse: an iterator of k pairs (rows, values). Rows of channels on which the
+        effect does not act are 0.
+        """
+        blocks = (
+            (first_row, part.columns(effect, keys))
+            for _, channel, first_row, part in self.parts
             if channel in effect.channels
         )
         if self.sparse:
             parts = [
                 (
-                    row,
+                    first_row,
                     csc_array(np.nan_to_num(values)) if isinstance(values, np.ndarray) else values,
                 )
-                for row, values in made
+                for first_row, values in blocks
             ]
             return _joined(parts, len(keys))
         x = np.zeros((len(self.y), len(keys)), order="F")
-        for row, values in made:
-            x[row : row + len(values)] = np.nan_to_num(values)
+        for first_row, values in blocks:
+            x[first_row : first_row + len(values)] = np.nan_to_num(values)
         return x.T
 
     def rows(self, chosen: np.ndarray) -> RegressionTable:
@@ -203,11 +207,12 @@ def _joined(parts: Sequence[tuple[int, Any]], k: int) -> Iterator[tuple[np.ndarr
     parts : [(first row, csc_array (n, k))], by rising first row; none gives empty columns
     """
     for column in range(k):
-        some = [(row, x, slice(*x.indptr[column : column + 2])) for row, x in parts]
-        rows = [row + x.indices[its].astype(np.int64) for row, x, its in some]
+        # the entries of this column in each matrix
+        some = [(first_row, x, slice(*x.indptr[column : column + 2])) for first_row, x in parts]
+        rows = [first_row + x.indices[entries].astype(np.int64) for first_row, x, entries in some]
         yield (
             np.concatenate([np.empty(0, np.int64), *rows]),
-            np.concatenate([np.empty(0), *(x.data[its] for _, x, its in some)]),
+            np.concatenate([np.empty(0), *(x.data[entries] for _, x, entries in some)]),
         )
 
 

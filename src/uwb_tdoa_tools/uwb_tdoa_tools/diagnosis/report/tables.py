@@ -77,9 +77,9 @@ def anchors(diagnosis: Diagnosis) -> Table:
         for key, value in effect.values.items():
             anchor, _, axis = key.partition(".")
             std = effect.std.get(key, np.nan)
-            sure = "" if abs(value) >= SURE * std else " ?"
-            found.setdefault(anchor, {})[axis] = f"{CM * value:+.0f} ± {CM * std:.0f}{sure}"
-    columns = {"x, cm": "x", "y, cm": "y", "z, cm": "z", "late by, cm": ""}
+            doubt = "" if abs(value) >= SURE * std else " ?"
+            found.setdefault(anchor, {})[axis] = f"{CM * value:+.0f} ± {CM * std:.0f}{doubt}"
+    columns = {"x, cm": "x", "y, cm": "y", "z, cm": "z", "late by, cm": ""}  # a delay has no axis
     names = sorted(found, key=int)
     cells = {
         title: [found[anchor].get(axis, "") for anchor in names] for title, axis in columns.items()
@@ -145,8 +145,10 @@ def phases(diagnosis: Diagnosis) -> Table:
 
 
 def _phase(before: dict[str, Any] | None, after: dict[str, Any] | None) -> str:
-    """Return the cell of one phase, before and after."""
-    if before is None or after is None or before["rmse_3d"] is after["rmse_3d"] is None:
+    """Return the cell of one phase, before and after; "" without the phase or its errors."""
+    if before is None or after is None:
+        return ""
+    if before["rmse_3d"] is None and after["rmse_3d"] is None:
         return ""
     errors = " → ".join(_figure(side, "rmse_3d", CM) for side in (before, after))
     nees = " → ".join(_figure(side, "nees_mean", 1.0) for side in (before, after))

@@ -12,7 +12,7 @@ import numpy as np
 from uwb_tdoa_bias.effects.base import listed, measured
 from uwb_tdoa_bias.effects.smooth_term import causes, described
 
-from ...scoring.gains import LOSS, NO_DIFFERENCE, difference
+from ...scoring.gains import LOSS, NO_DIFFERENCE, clear_change
 from ...scoring.phases import TITLES
 from ..channels.figures import rows_by_value
 from ..findings import prefixes_of
@@ -137,7 +137,8 @@ def _with_errors(diagnosis: Diagnosis) -> Verdict:
         return Verdict(headline, more, "same")
     if interval and interval[0] > 0.0:
         return Verdict(f"{ERROR} falls {change}: {share} of it is gone.", more, "better")
-    if interval and difference(before["rmse_3d"], after["rmse_3d"], interval) > 0:
+    # The interval includes zero, but a loss above LOSS is improbable.
+    if interval and clear_change(before["rmse_3d"], after["rmse_3d"], interval) > 0:
         headline = (
             f"{ERROR} falls {change}: {share} of it is gone. A loss above {100 * LOSS:.0f} % has a "
             "probability below 2.5 %."
@@ -278,7 +279,7 @@ def worse_phases(before: dict[str, Any], after: dict[str, Any]) -> Iterator[str]
     for name in (name for name in TITLES if name in sides[0] and name in sides[1]):
         first, second = (side[name] for side in sides)
         known = first["rmse_3d"] is not None and second["rmse_3d"] is not None
-        if known and difference(first["rmse_3d"], second["rmse_3d"]) < 0:
+        if known and clear_change(first["rmse_3d"], second["rmse_3d"]) < 0:  # it rises
             yield f"{TITLES[name]} from {_of_phase(first)} to {_of_phase(second)}"
 
 

@@ -101,10 +101,10 @@ class Misfit:
         misfits: dict[int, float] = {}
         placed: dict[int, Anchors] = {}
         rows = range(len(self.flights[0].anchors))
-        for row, one in enumerate(map_function(partial(_placed, self, effects), rows)):
+        for row, result in enumerate(map_function(partial(_placed, self, effects), rows)):
             progress()
-            if one is not None:
-                placed[row], misfits[row] = one
+            if result is not None:  # enough TDOAs determine this anchor
+                placed[row], misfits[row] = result
         best = sorted(misfits, key=misfits.__getitem__)[:TRIED]
         return {row: placed[row] for row in best}
 
@@ -194,6 +194,6 @@ def _distances(
     )
     chosen = chosen[:: max(1, len(chosen) // MOST)]
     p = np.stack([np.interp(tdoa.t[chosen], path.t, path.p[:, k]) for k in range(3)], axis=1)
-    of_b = b[chosen] == row  # d = |x - p_b| - |x - p_a|
-    other = positions[np.where(of_b, a[chosen], b[chosen])]
-    return p, np.linalg.norm(p - other, axis=1) + np.where(of_b, 1.0, -1.0) * tdoa.d[chosen]
+    row_is_b = b[chosen] == row  # d = |x - p_b| - |x - p_a|
+    other = positions[np.where(row_is_b, a[chosen], b[chosen])]
+    return p, np.linalg.norm(p - other, axis=1) + np.where(row_is_b, 1.0, -1.0) * tdoa.d[chosen]

@@ -304,9 +304,9 @@ def _calibrated(
     progress: Callable[[], object],
     map_function: MapFunction,
 ) -> SelfCalibration:
-    """Return the SelfCalibration for one Tape.
+    """Return the SelfCalibration for one Tape; the other arguments as of `self_calibrate`.
 
-    known : the Tape, and Anchors with its unknown ones placed; None to place them
+    known : the Tape, and Anchors with its unknown ones placed; None to place them here
     """
     tape, placed = known
     given = flights[0].anchors
@@ -317,6 +317,7 @@ def _calibrated(
             f"--unknown {given.ids[rows[0]]}: only TDOAs place an anchor; measure it roughly, "
             "and give --std."
         )
+    # `start` is the prior of the solution. `std` is reported as the uncertainty before it.
     start, start_std = given, std.copy()
     if rows:
         start = placed if placed is not None else place(flights, rows, config)
@@ -335,19 +336,19 @@ def _calibrated(
         return given.at(x[: 3 * n].reshape(n, 3)), x[3 * n :]
 
     first = runs.equations(*parts(mean), prior.loose, progress, map_function)
-    found = solve(first.gram, first.vector, prior, np.zeros(4 * n))
-    best = mean + found.step
+    solution = solve(first.gram, first.vector, prior, np.zeros(4 * n))
+    best = mean + solution.step
     # The second solution is linearized at the first one.
     last = runs.equations(*parts(best), prior.loose, progress, map_function)
-    found = solve(last.gram, last.vector, prior, best - mean)
+    solution = solve(last.gram, last.vector, prior, best - mean)
     if last.seconds < LEAST:
         raise InputError(
             f"the flights are {last.seconds:g} s in the air, or in motion on the floor, together; "
             f"{LEAST:g} s are needed: record motion for longer."
         )
     names = tuple(flight.name for flight in flights)
-    shares = _shares(last, best - mean, found, names) if n <= MANY else {}
-    best = best + found.step
+    shares = _shares(last, best - mean, solution, names) if n <= MANY else {}
+    best = best + solution.step
     moved, delays = parts(best)
     return SelfCalibration(
         given=given,
@@ -356,12 +357,12 @@ def _calibrated(
         base=base,
         surveyed=moved,
         delays=delays,
-        solution=found,
+        solution=solution,
         seconds=last.seconds,
         before=runs.slow_innovations(start, no_delays) if ranged else first.slow_scale,
         left=runs.slow_innovations(moved, delays),
         tdoa_std=last.tdoa_std(config) if tdoas else None,
-        changes=_changes(prior, found, best - mean),
+        changes=_changes(prior, solution, best - mean),
         marks=_left_out(first, prior),
         grounded=last.grounded,
         shares=shares,
