@@ -122,6 +122,16 @@ def test_uses_the_newest_pose_a_lag_before_the_preceding_measurement(poses, aske
         assert status == (NETWORK if height <= 2.0 else PASSED)
 
 
+def test_a_constant_correction_waits_for_no_pose():
+    constant = EffectSet((AnchorDelay({"5": 0.25}),))
+    corrector = Corrector(ANCHORS, constant)
+    corrector.add_pose(0.0, np.ones(3), np.array([0.0, 0.0, 0.0, 1.0]))
+    assert corrector.ready(1e9) and not Corrector(ANCHORS, ARM).ready(1e9)
+    first = correct(corrector, 5.0).bias[0]
+    climbing(corrector, [4.0, 5.0])
+    assert first == correct(corrector, 5.0).bias[0] != 0.0
+
+
 @given(
     st.lists(st.integers(0, 60), max_size=20),
     st.integers(0, 60),

@@ -29,7 +29,8 @@ ANCHORS = corners()  # ids 10 ... 17
 
 
 EFFECTS = """effects: {anchor_delay: {values: {10: 0.1, 14: -0.05}}, anchor_ids: {values: {98: 11}},
-  pair_sign: {values: {11-15: -1}}, tdoa_time_offset: {values: {offset: 0.03}}}"""
+  pair_sign: {values: {11-15: -1}}, tdoa_time_offset: {values: {offset: 0.03}},
+  tag_lever_arm: {values: {z: 0.0}}}"""  # a lever arm needs poses
 LATE = 0.03  # s, delay of every TDOA, corrected by EFFECTS
 
 

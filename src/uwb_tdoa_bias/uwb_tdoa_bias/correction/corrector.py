@@ -191,7 +191,7 @@ class Corrector:
         preceding : s, stamp of the TDOA before it, as in `Poses.for_tdoas`
         """
         return (
-            self.idle
+            not self.uses_pose
             or self._poses.newest > preceding - self.lag
             or preceding < self._poses.begin < math.inf
         )
