@@ -90,13 +90,17 @@ MARK_TIME, MARK_STD = 2.0, 0.05  # s, m
 NOISES = {f"{name}_noise": 0.1 for name, sensor in SENSORS.items() if not sensor.locates}
 NOISES |= {"height_noise": 0.01, "pressure_noise": 0.1, "velocity_noise": 0.05}
 YAW_RATE_NOISE = 0.02  # rad/s
+# Hz; fewer samples than a tag gives. Diagnoses take half of the time, and have less to find
+# effects by.
+SPARSE = {"tdoa_rate": 200.0, "imu_rate": 200.0, "truth_rate": 100.0}
 
 
-def clean_flight(seed, duration=50.0, aided=False, ranged=False):
+def clean_flight(seed, duration=50.0, aided=False, ranged=False, rates=None):
     """Return a simulated flight without any effect.
 
     aided : with height, pressure, velocity and yaw rate
     ranged : with distances to anchors
+    rates : {setting: Hz}, such as SPARSE
     """
     flight = simulate(
         SimulationConfig(
@@ -108,9 +112,15 @@ def clean_flight(seed, duration=50.0, aided=False, ranged=False):
             **CLEAN,
             **(NOISES if aided else {}),
             **({"range_noise": 0.1} if ranged else {}),
+            **(rates or {}),
         )
     )
     return with_yaw_rate(flight, YAW_RATE_NOISE, seed) if aided else flight
+
+
+def sparse_flight(seed, duration=50.0, **sensors):
+    """Return the flight of `clean_flight` with the rates of SPARSE."""
+    return clean_flight(seed, duration, rates=SPARSE, **sensors)
 
 
 def with_yaw_rate(flight, noise, seed=0):

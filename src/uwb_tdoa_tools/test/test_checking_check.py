@@ -4,7 +4,8 @@
 
 from dataclasses import replace
 
-from checking_flights import QUICK, recording
+import checking_flights
+from checking_flights import QUICK
 from known_effects import clean_flight
 from mistakes import MISTAKES
 import numpy as np
@@ -25,7 +26,13 @@ NO_TDOAS = Tdoas(*(np.empty(0, kind) for kind in (float, int, int, float)))
 # with these errors, `check` examines the streams only
 NOTHING_TRIED = ["stamp_zero", "clipped", "jump"]
 LONGER = {"mirrored_survey": {"duration": 30.0}}  # visible once the yaw is known
+RATE = 200.0  # TDOAs a second: half of what a tag hears, and trials take half of the time
 HARMLESS = "clipped_accel"  # a smooth simulated flight does not reach the limits
+
+
+def recording(seed=0, **settings):
+    """Return the Recording of a simulated flight with RATE TDOAs a second."""
+    return checking_flights.recording(seed, tdoa_rate=RATE, **settings)
 
 
 def rules(report):

@@ -56,6 +56,14 @@ COMMANDS = {  # words: (expected output as a regular expression, exit code)
 
 
 PATIENCE = 300.0  # s
+# Runs the script with this patience for nodes that do not answer, s.
+IMPATIENT = """
+import runpy, sys
+path, patience, *sys.argv[1:] = sys.argv[1:]
+script = runpy.run_path(path)
+script["_run"].__globals__["PATIENCE"] = float(patience)
+sys.exit(script["cli"].run(script["_run"], script["parser"]()))
+"""
 
 
 def spin_until(node, condition, what=lambda: "it did not happen"):
@@ -87,9 +95,11 @@ def driver():
     rclpy.shutdown()
 
 
-def start(words, stdout=subprocess.PIPE):
+def start(words, stdout=subprocess.PIPE, patience=None):
+    """Start `./dev ros2 WORDS`. patience : s, in place of that of the script"""
+    script = [SCRIPT] if patience is None else ["-c", IMPATIENT, SCRIPT, str(patience)]
     return subprocess.Popen(
-        [sys.executable, "-u", SCRIPT, *words.split()],
+        [sys.executable, "-u", *script, *words.split()],
         stdout=stdout,
         stderr=subprocess.STDOUT,
         text=True,
@@ -131,7 +141,7 @@ def test_a_node_that_does_not_answer_does_not_hide_the_others(driver):
     rclpy.init(context=context)
     silent = rclpy.create_node("a_silent_one", context=context)  # it is not spun
     try:
-        asked = start("param list")
+        asked = start("param list", patience=5.0)
         spin_until(driver, lambda: asked.poll() is not None)
     finally:
         silent.destroy_node()

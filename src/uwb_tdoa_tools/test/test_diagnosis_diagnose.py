@@ -7,7 +7,7 @@ from importlib import import_module
 import json
 from types import SimpleNamespace
 
-from known_effects import clean_flight, effect_of
+from known_effects import clean_flight, effect_of, sparse_flight
 import pytest
 
 from uwb_tdoa_bias.common.anchors import Anchors
@@ -29,7 +29,7 @@ from uwb_tdoa_tools.diagnosis.validation import ValidatedSelection
 
 @pytest.fixture(scope="module")
 def flight():
-    return clean_flight(100, 40.0)
+    return sparse_flight(100, 40.0)
 
 
 def test_anchors_of_two_installations_are_refused(flight):
@@ -122,7 +122,7 @@ def test_an_effect_that_a_repeated_search_leaves_out_is_not_called_unobservable(
 def test_the_loop_is_closed(flight, tmp_path, capsys):
     write_bag(effect_of("anchor_delay", True, 4).inject(flight), tmp_path / "late")
     write_bag(
-        effect_of("anchor_delay", True, 4).inject(clean_flight(101, 30.0)), tmp_path / "other"
+        effect_of("anchor_delay", True, 4).inject(sparse_flight(101, 30.0)), tmp_path / "other"
     )
     out = tmp_path / "out"
     assert (
@@ -205,7 +205,7 @@ def test_a_late_ground_truth_is_no_fault_of_the_robot(inertial):
 
     Its tdoa_time_offset of -0.41 s made another flight worse.
     """
-    fitted, other = (clean_flight(seed, 40.0) for seed in (100, 101))
+    fitted, other = (sparse_flight(seed, 40.0) for seed in (100, 101))
     if not inertial:
         fitted, other = fitted.without("imu"), other.without("imu")
     result = diagnose([shifted(fitted, "truth", 0.4)], [other])
@@ -221,7 +221,7 @@ def test_a_late_ground_truth_is_no_fault_of_the_robot(inertial):
 @pytest.mark.slow
 def test_without_inertial_sensor_the_clock_of_the_tdoas_is_left_alone():
     # too small for the checks that come first
-    late = shifted(clean_flight(100, 40.0).without("imu"), "tdoa", 0.06)
+    late = shifted(sparse_flight(100, 40.0).without("imu"), "tdoa", 0.06)
     result = diagnose([late])
     assert "tdoa_time_offset" not in {effect.name for effect in result.effects}
     assert "tdoa_time_offset" in {item.effect for item in result.unobservable}

@@ -3,7 +3,7 @@
 
 from dataclasses import replace
 
-from known_effects import clean_flight, effect_of, marks_of
+from known_effects import effect_of, marks_of, sparse_flight
 import numpy as np
 import pytest
 
@@ -25,12 +25,12 @@ NONSENSE = np.array([100.0, -50.0, 7.0])
 
 @pytest.fixture(scope="module")
 def flight():
-    return effect_of("anchor_delay", True, 4).inject(clean_flight(100, 30.0))
+    return effect_of("anchor_delay", True, 4).inject(sparse_flight(100, 30.0))
 
 
 @pytest.fixture(scope="module")
 def aided():
-    return clean_flight(100, 30.0, aided=True)
+    return sparse_flight(100, 30.0, aided=True)
 
 
 def with_wrong_truth(flight):
@@ -49,7 +49,7 @@ def test_what_is_told_to_do_without_the_truth_has_none_to_read(flight):
 
 @pytest.mark.slow
 def test_without_truth_a_wrong_one_changes_nothing(flight):
-    other = effect_of("anchor_delay", True, 4).inject(clean_flight(101, 30.0))
+    other = effect_of("anchor_delay", True, 4).inject(sparse_flight(101, 30.0))
     cases = [
         diagnose([with_wrong_truth(flight)], [with_wrong_truth(other)], reference=Nothing()),
         diagnose([replace(flight, truth=None)], [replace(other, truth=None)], reference=Nothing()),
@@ -98,7 +98,7 @@ def test_a_flight_without_a_range_finder_cannot_be_compared_with_heights(flight)
 
 @pytest.mark.slow
 def test_marks_tell_which_anchor_is_late_without_the_truth():
-    flight = effect_of("anchor_delay", True, 4).inject(clean_flight(100, 40.0))
+    flight = effect_of("anchor_delay", True, 4).inject(sparse_flight(100, 40.0))
     marks = marks_of(flight, 6, np.random.default_rng(0))
     found = [
         diagnose([each], reference=Marks(None, marks))

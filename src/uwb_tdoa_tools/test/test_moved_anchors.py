@@ -33,7 +33,13 @@ from uwb_tdoa_tools.surveying.report import as_text
 
 SHIFT, ROW = np.array([0.4, -0.3, 0.3]), 3
 CONFIG = SimulationConfig(
-    seed=21, duration=40.0, imu_rate=200.0, truth_rate=100.0, bias=False, multipath=False
+    seed=21,
+    duration=40.0,
+    tdoa_rate=200.0,
+    imu_rate=200.0,
+    truth_rate=100.0,
+    bias=False,
+    multipath=False,
 )
 
 
@@ -96,7 +102,7 @@ def far_moved():
 
     Returns (Flight, row of the anchor, shift (3,) m).
     """
-    config = SimulationConfig(seed=2, constellation="random-2-8", bias=False)
+    config = SimulationConfig(seed=2, constellation="random-2-8", bias=False, imu_rate=200.0)
     filled, room = config.complete()
     anchors, row = filled.anchors, 6
     positions = anchors.positions.copy()
@@ -288,6 +294,7 @@ def test_anchors_of_a_hall_that_are_left_behind_are_no_fault():
         radius=30.0,
         speed=3.0,
         duration=35.0,
+        imu_rate=200.0,
         bias=False,
     )
     found = said(simulate(drive))

@@ -7,7 +7,7 @@ import json
 import re
 from types import SimpleNamespace
 
-from known_effects import clean_flight
+from known_effects import clean_flight, sparse_flight
 import numpy as np
 import pytest
 
@@ -23,6 +23,7 @@ from uwb_tdoa_tools.diagnosis import self_calibration
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
 from uwb_tdoa_tools.diagnosis.self_calibration.equations import delay_effect, tdoa_std_of
 from uwb_tdoa_tools.diagnosis.self_calibration.single import place
+from uwb_tdoa_tools.diagnosis.self_calibration.solve import LEFT
 from uwb_tdoa_tools.scoring.evaluation import evaluate
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.surveying import report
@@ -52,7 +53,7 @@ def error(flight, **options):
 def flights():
     delays = EFFECTS["anchor_delay"]({"3": 0.15})
     return [
-        delays.inject(clean_flight(seed, 40.0), np.random.default_rng(0))
+        delays.inject(sparse_flight(seed, 40.0), np.random.default_rng(0))
         for seed in (200, 201, 202)
     ]
 
@@ -141,17 +142,18 @@ def solved(result, monkeypatch):
     return seen
 
 
-def test_nothing_is_applied_where_something_else_is_wrong_too(flights, tmp_path, capsys):
-    region = {"2.x": 1.0, "2.y": 0.0, "2.z": 1.0, "2.radius": 1.5, "2.delay": 1.5}
-    blocked = EFFECTS["nlos"](region).inject(flights[0], np.random.default_rng(0))
-    blocked = EFFECTS["noise_correlation"]({"std": 0.2, "time": 1.0}).inject(
-        blocked, np.random.default_rng(0)
-    )
-    write_bag(blocked, tmp_path / "flight.bag")
+def test_nothing_is_applied_where_something_else_is_wrong_too(
+    flights, result, solved, tmp_path, capsys
+):
+    """test_diagnosis_self_calibration.py finds that of a flight."""
+    solved.result = replace(result, before=0.1, left=1.1 * LEFT, marks=None)
+    assert "something else is wrong too" in solved.result.why_not
+    write_bag(flights[0], tmp_path / "flight.bag")
     assert main([str(tmp_path / "flight.bag"), "--out", str(tmp_path / "out")]) == 1
     assert "nothing is applied, anchors stay as given" in capsys.readouterr().out
     kept = read_survey(tmp_path / "out" / "anchors.yaml").positions
-    np.testing.assert_allclose(kept, blocked.anchors.positions, atol=1e-9)
+    np.testing.assert_allclose(kept, result.given.positions, atol=1e-9)
+    assert np.abs(kept - result.surveyed.positions).max() > 0.01
     assert not len(EffectSet.from_yaml(tmp_path / "out" / "effects.yaml"))
 
 
@@ -159,11 +161,12 @@ def test_flights_that_are_too_short_are_refused():
     with pytest.raises(
         InputError, match="s in the air, or in motion on the floor, together; 30 s are needed"
     ):
-        self_calibrate([clean_flight(203, 20.0)], Tape())
+        self_calibrate([sparse_flight(203, 20.0)], Tape())
 
 
-def test_marks_hold_the_frame_where_no_anchor_is_trusted(flights, tmp_path):
-    flight = flights[0]
+def test_marks_hold_the_frame_where_no_anchor_is_trusted(tmp_path):
+    late = EFFECTS["anchor_delay"]({"3": 0.15})
+    flight = late.inject(clean_flight(200, 40.0), np.random.default_rng(0))
     away = flight.anchors.positions + [0.2, -0.15, 0.1]  # a common shift, which TDOAs do not show
     moved = [at(flight, away)]
     marks = read_marks(marks_file(tmp_path / "marks.yaml", flight, 6), moved)

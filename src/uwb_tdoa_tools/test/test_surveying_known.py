@@ -5,7 +5,7 @@
 from dataclasses import replace
 import re
 
-from known_effects import clean_flight
+from known_effects import clean_flight, sparse_flight
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -27,7 +27,7 @@ LATE = EFFECTS["anchor_delay"]({"3": 0.15})
 
 @pytest.fixture(scope="module")
 def flights():
-    return [LATE.inject(clean_flight(seed, 40.0), np.random.default_rng(0)) for seed in (200, 201)]
+    return [LATE.inject(sparse_flight(seed, 40.0), np.random.default_rng(0)) for seed in (200, 201)]
 
 
 @pytest.fixture(scope="module")
@@ -153,8 +153,9 @@ def ends(flight, std=0.05):
 def test_a_path_laid_beside_the_filters_is_where_the_tag_was_and_takes_its_shift_from_marks(
     flights,
 ):
+    late = LATE.inject(clean_flight(200, 40.0), np.random.default_rng(0))
     flight = EFFECTS["anchor_position"]({"1.z": 0.4, "6.x": -0.3}).inject(
-        flights[0], np.random.default_rng(0)
+        late, np.random.default_rng(0)
     )
     wrong = replace(flight, truth=replace(flight.truth, p=flight.truth.p[::-1] + 30.0))
     shifts = []
