@@ -3,8 +3,8 @@
 """The data that a new user has in the first hour.
 
 The user has a recording in CSV files of another tool. Anchor positions are measured by tape with a
-standard deviation of 10 cm. The ground truth is in a separate file. It is of another epoch or
-in another frame.
+standard deviation of 10 cm. The ground truth is in a separate file. It is late, of another epoch,
+or in another frame.
 
 The tests evaluate each step on a hold-out flight, with the true ground truth. The error must fall,
 or the step must have reported that its result is not to be used.
@@ -34,10 +34,11 @@ TAPE = 0.1  # m, standard deviation of each coordinate measured by tape
 CLEAN = dict(trajectory="sines", imu_rate=100.0, truth_rate=50.0, bias=False)
 # s, length of each flight. The steps need 30 s in the air.
 SIMULATED, MEASURED = 40.0, 45.0
-EPOCH = 1.7e9  # s
+LATE, EPOCH = 0.4, 1.7e9  # s
 TURNED = Rotation.from_euler("z", 8.0, degrees=True).as_matrix()
 TRUTHS = {  # errors of a ground truth: functions of a Truth
     "in time": lambda truth: truth,
+    "late": lambda truth: replace(truth, t=truth.t + LATE),
     "in another frame": lambda truth: transform_truth(truth, TURNED, np.array([0.5, -0.3, 0.0])),
     "z down, on another epoch": lambda truth: transform_truth(
         replace(truth, t=truth.t + EPOCH), np.diag([1.0, 1.0, -1.0]), np.zeros(3)
