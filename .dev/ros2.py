@@ -18,6 +18,8 @@ import yaml
 from uwb_tdoa_bias.common.errors import Failure
 from uwb_tdoa_bias.common.text import printable
 from uwb_tdoa_tools import cli
+from uwb_tdoa_tools.bags.files import new_bag
+from uwb_tdoa_tools.live.record import Recorder
 from uwb_tdoa_tools.live.session import message_class, session, subscription_qos
 
 SETTLED = 1.5  # s without news of the graph after which it is complete
@@ -25,9 +27,9 @@ PATIENCE = 15.0  # s for a first topic, node or publisher to be seen, and for a 
 WINDOW = 1000  # messages that a rate is averaged over
 OF_EVERY_NODE = {"/parameter_events", "/rosout"}
 
-DESCRIPTION = """Topics, nodes and parameters, as the command of ROS 2 shows them; for those who have no ROS.
+DESCRIPTION = """Topics, nodes, parameters and recording, as the command of ROS 2 has them; for those who have no ROS.
 
-Launch files, recording and the rest need ROS 2; `./dev run uwb_tdoa_tools replay` plays bags without."""
+Launch files and the rest need ROS 2. `./dev run uwb_tdoa_tools replay` plays bags without it."""
 
 
 def parser():
@@ -39,11 +41,12 @@ def parser():
         "./dev ros2 topic info -v uwb/tdoa",
         "./dev ros2 topic hz imu/data",
         "./dev ros2 topic echo odometry --once",
+        "./dev ros2 bag record -o flown.bag odometry uwb/residual",
         "./dev ros2 node list",
         "./dev ros2 param describe ekf_node tdoa_std",
         "./dev ros2 param set ekf_node tdoa_std 0.3",
     )
-    things = made.add_subparsers(dest="thing", required=True, metavar="topic|node|param")
+    things = made.add_subparsers(dest="thing", required=True, metavar="topic|bag|node|param")
 
     def commands(thing, text, rows):
         verbs = things.add_parser(thing, help=text).add_subparsers(dest="verb", required=True)
@@ -71,6 +74,19 @@ def parser():
                 topic,
                 (("--once",), {"action": "store_true", "help": "only one"}),
             ),
+        ],
+    )
+    commands(
+        "bag",
+        "recordings",
+        [
+            (
+                "record",
+                bag_record,
+                "messages of topics to a new bag, until Ctrl-C",
+                (("topics",), {"nargs": "+", "metavar": "topic"}),
+                (("-o", "--output"), {"required": True, "metavar": "BAG", "help": "new folder"}),
+            )
         ],
     )
     commands("node", "who is there", [("list", node_list, "all nodes")])
@@ -198,6 +214,23 @@ def _topic(node, stop, name, needs_publisher):
             )
         rclpy.spin_once(node, timeout_sec=0.05)
     raise KeyboardInterrupt
+
+
+# --- bags ---
+
+
+def bag_record(node, stop, args):
+    wanted = {node.resolve_topic_name(topic) for topic in args.topics}
+    with new_bag(args.output) as writer:
+        recorder = Recorder(node, writer, wanted, show)
+        show(f"waiting for {', '.join(sorted(wanted))}; Ctrl-C ends the recording")
+        recorder.run(lambda: stop)
+        if not any(recorder.counts.values()):
+            raise Failure("no message came, so no bag is written; see ros2 topic list")
+    for topic, count in sorted(recorder.counts.items()):
+        show(f"{topic}: {count} messages")
+    for topic in sorted(wanted - {*recorder.counts}):
+        show(f"{topic}: nobody published it")
 
 
 # --- nodes and parameters ---

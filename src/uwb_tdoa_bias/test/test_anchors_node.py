@@ -15,9 +15,10 @@ from tf2_msgs.msg import TFMessage  # noqa: E402
 from visualization_msgs.msg import MarkerArray  # noqa: E402
 
 from uwb_tdoa_bias.anchors_node import PARAMETERS, AnchorsNode  # noqa: E402
+from uwb_tdoa_bias.bias_node import BiasNode  # noqa: E402
 from uwb_tdoa_bias.common.anchors import Anchors  # noqa: E402
 from uwb_tdoa_bias.common.errors import InputError  # noqa: E402
-from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS, same_anchors  # noqa: E402
+from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS, anchors_to_message, same_anchors  # noqa: E402
 from uwb_tdoa_bias.ros.frames import TF_STATIC_QOS  # noqa: E402
 from uwb_tdoa_msgs.msg import AnchorArray  # noqa: E402
 
@@ -65,6 +66,25 @@ def test_whoever_comes_later_gets_anchors_frames_and_markers():
         "3",
     }
     late.destroy_node()
+    node.destroy_node()
+
+
+def test_other_anchors_than_those_of_the_file_name_their_publisher_until_it_is_gone(tmp_path):
+    node, player = BiasNode(), rclpy.create_node("player")
+    moved = Anchors(ANCHORS.ids, ANCHORS.positions + 0.5, ANCHORS.orientations, frame="hall")
+    publisher = player.create_publisher(AnchorArray, "uwb/anchors", ANCHORS_QOS)
+    publisher.publish(anchors_to_message(moved))
+    until = time.monotonic() + 120.0
+    while "/player" not in (node._anchors.refused or ""):
+        assert time.monotonic() < until, node._anchors.refused
+        rclpy.spin_once(node, timeout_sec=0.05)
+    file = tmp_path / "anchors.yaml"
+    assert f"convert the bag with --survey {file}" in node._anchors.refused
+    assert same_anchors(node._anchors.anchors, ANCHORS)
+    player.destroy_node()
+    while node._anchors.refused is not None:
+        assert time.monotonic() < until
+        rclpy.spin_once(node, timeout_sec=0.05)
     node.destroy_node()
 
 

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 from pathlib import Path
+import time
 
 from node_parameters import written_and_declared
 import numpy as np
@@ -9,6 +10,8 @@ import pytest
 
 rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
+
+from nav_msgs.msg import Odometry  # noqa: E402
 
 from uwb_tdoa_bias.bias_node import MEASURED, BiasNode  # noqa: E402
 from uwb_tdoa_bias.common.anchors import Anchors  # noqa: E402
@@ -30,6 +33,18 @@ def node():
 def test_every_parameter_is_in_the_parameter_file_with_its_default(node):
     parameters, declared = written_and_declared(node, CONFIG)
     assert parameters == declared
+
+
+def test_an_ekf_node_that_runs_is_not_to_be_started(node, monkeypatch):
+    monkeypatch.setattr(BiasNode, "_idle", False)
+    node._anchors.anchors = Anchors.from_positions(np.eye(3))
+    text = node._health(1.0, 0)[1]
+    assert text.startswith("no poses on odometry yet") and text.endswith("start ekf_node")
+    odometry = node.create_publisher(Odometry, "odometry", 10)
+    until = time.monotonic() + 60.0
+    while not odometry.get_subscription_count() or "runs" not in node._health(1.0, 0)[1]:
+        assert time.monotonic() < until
+        time.sleep(0.01)
 
 
 def test_an_antenna_that_would_be_too_far_from_the_body_is_said_and_taken_as_the_body(node):

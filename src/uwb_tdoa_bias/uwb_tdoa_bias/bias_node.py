@@ -509,9 +509,11 @@ class BiasNode(StreamNode):
         if trouble:
             return DiagnosticStatus.WARN, f"model_file {trouble}"
         if self._poses.newest == -math.inf:
+            runs = self.streams.inputs["odometry"].get_publisher_count()
+            remedy = "see the status of ekf_node, which runs" if runs else "start ekf_node"
             return (
                 DiagnosticStatus.WARN,
-                "no poses on odometry yet: what needs one is not corrected; start ekf_node",
+                f"no poses on odometry yet: what needs one is not corrected; {remedy}",
             )
         if unready:
             return (

@@ -73,6 +73,13 @@ def test_says_what_is_missing(judge, estimator, options, level, words):
     assert said[2]["state"] == ("lost" if estimator is LOST else said[2]["state"])
 
 
+def test_bias_node_that_runs_and_waits_is_not_to_be_started(judge):
+    assert "start bias_node" in judge.second(STARTING, tdoa=0)[1]
+    judge.corrects = True
+    level, text, _ = judge.second(STARTING, tdoa=0)
+    assert level == ERROR and "though bias_node runs" in text and "start" not in text
+
+
 def test_without_use_of_an_imu_none_is_missing(monkeypatch):
     judge = Judge(monkeypatch, FilterConfig(use_imu=False))
     assert judge.second(RUNNING, imu=0)[0] == OK

@@ -144,6 +144,15 @@ def test_a_silent_stream_is_waited_for_no_longer_than_lag_and_a_sensor_only_wher
     assert buffer.watermark == 3.0
 
 
+def test_inertial_samples_that_nobody_publishes_are_awaited_from_the_first_one_on():
+    buffer, *_ = buffer_of(lag=0.4, reorder=0.0)
+    buffer.imu_expected = False
+    buffer.add(TDOA_STREAM, *rows(TDOA_ROW, 0.0, 0.5))
+    assert buffer.watermark == pytest.approx(0.5)
+    buffer.add(IMU_STREAM, *rows(IMU_SAMPLE, 0.3))
+    assert buffer.watermark == pytest.approx(0.3)
+
+
 def test_a_stamp_that_is_no_number_begins_nothing():
     buffer, *_ = buffer_of(lag=0.4)
     buffer.add(IMU_STREAM, rows(IMU_SAMPLE, math.nan)[0], np.array([False]))

@@ -144,7 +144,10 @@ class DebiasNode(StreamNode):
 
     def _status(self, recent: dict[str, int], total: int) -> tuple[bytes, str]:
         if not total:
-            return DiagnosticStatus.WARN, "no odometry: start ekf_node in this namespace"
+            return (
+                DiagnosticStatus.WARN,
+                "no odometry: start ekf_node in this namespace, or see its status",
+            )
         if recent["invalid"]:
             what = (
                 f"odometry is not finite, or not in the map's frame '{self._map.frame}', and is "

@@ -386,6 +386,8 @@ class EkfNode(StreamNode):
     def _advance(self) -> None:
         self._frames.catch_up()
         if self._estimator is not None:
+            # else the first poses come `lag` late, and bias_node does not wait so long for them
+            self._estimator.expect_imu(self.streams.inputs["imu/data"].get_publisher_count() > 0)
             self._publish(*self._estimator.advance())
             self._say_restart()
 
@@ -538,6 +540,7 @@ class EkfNode(StreamNode):
         if estimator is not None:
             waiting = Counter(dict(zip(STREAMS, estimator.waiting)))
         self._health.behind = self._behind()
+        self._health.corrects = self.streams.inputs["uwb/tdoa_corrected"].get_publisher_count() > 0
         self._findings = self._stream_findings()
         level, text, values = self._health.report(
             self._anchors.refused, estimator, counts, self._wiring(), self._findings

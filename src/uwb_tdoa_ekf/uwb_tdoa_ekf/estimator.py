@@ -383,6 +383,10 @@ class Estimator:
         )
         self._poses.sort(key=lambda pose: pose["t"][0])
 
+    def expect_imu(self, expected: bool) -> None:
+        """Set whether the filter waits for inertial samples before the first one has come."""
+        self._buffer.imu_expected = expected
+
     def configure(self, config: FilterConfig) -> None:
         """Replace the FilterConfig; parameters that are fixed must be equal (see FilterConfig)."""
         self.config = config

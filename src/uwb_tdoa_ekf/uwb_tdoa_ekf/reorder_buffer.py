@@ -87,6 +87,11 @@ class ReorderBuffer:
     back, or if another stream has moved the time ahead. Every other stream is compared with the
     reference. Rows too far ahead are refused as invalid, rows behind as late, and neither moves the
     time. A recording is added with `load`.
+
+    Attributes
+    ----------
+    imu_expected : bool
+        False: do not wait for inertial samples before the first one. Nobody publishes them.
     """
 
     def __init__(
@@ -111,6 +116,7 @@ class ReorderBuffer:
             `restart(cause)` is called when the filter must restart.
         """
         self.reorder, self.lag = reorder, lag
+        self.imu_expected = True
         self._awaited = TDOA_STREAM, *([IMU_STREAM] if use_imu else [])
         # stream that defines the time while no stream locates the tag
         self._moving = IMU_STREAM if use_imu else VELOCITY_STREAM
@@ -180,6 +186,8 @@ class ReorderBuffer:
         for place in self._awaited:
             stream = self._streams[place]
             silent = stream.gate.newest < newest - SILENT and newest > self.began + SILENT
+            if place == IMU_STREAM and not self.imu_expected and stream.gate.newest == -math.inf:
+                silent = True
             if not silent:
                 passed.append(max(stream.watermark(self.reorder), newest - self.lag))
         for place, stream in enumerate(self._streams[FIRST_SENSOR:], FIRST_SENSOR):

@@ -11,7 +11,7 @@ import pytest
 from test_bag_odometry import ODOMETRY, bag_of
 
 from uwb_tdoa_bias.common.anchors import Anchors
-from uwb_tdoa_bias.common.flight import Tdoas, Truth
+from uwb_tdoa_bias.common.flight import Imu, Tdoas, Truth
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.monitoring.finding import ERROR, Finding
@@ -31,7 +31,7 @@ from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.command_lines import evaluate_line, lines_of_use
 from uwb_tdoa_tools.commands import calibrate, diagnose, survey
 from uwb_tdoa_tools.commands import check as check_command
-from uwb_tdoa_tools.diagnosis.noise import write_parameters
+from uwb_tdoa_tools.diagnosis.noise import has_imu, write_parameters
 from uwb_tdoa_tools.diagnosis.references import Nothing
 from uwb_tdoa_tools.estimate import FlightEstimator
 from uwb_tdoa_tools.scoring.evaluation import score_of
@@ -401,6 +401,15 @@ def test_a_sensor_that_is_switched_off_stays_off_in_what_is_written_and_printed(
     lines = [line for line, _ in lines_of_use(tmp_path, ["other.bag"], parameters=True)]
     assert f"--config {file}" in lines[0] and f"--params-file {file}" in lines[2]
     assert write_parameters(file, None, FilterConfig()) is None and not file.exists()
+
+
+def test_without_inertial_samples_the_nodes_are_told_so(tmp_path):
+    inertial = Imu(np.zeros(2), np.zeros((2, 3)), np.zeros((2, 3)))
+    some, none = (SimpleNamespace(imu=imu) for imu in (inertial, None))
+    assert has_imu([none, some]) and not has_imu([none, none])
+    file = write_parameters(tmp_path / "ekf_node.yaml", None, FilterConfig(), has_imu([none]))
+    assert FilterConfig.from_yaml(file) == replace(FilterConfig(), use_imu=False)
+    assert "use_imu: false  # no recording has inertial samples" in file.read_text()
 
 
 def test_the_line_that_judges_reads_as_the_command_did():

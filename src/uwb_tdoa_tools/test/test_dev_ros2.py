@@ -27,6 +27,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
 
 from uwb_tdoa_bias.ros.parameters import Parameter, declare_all  # noqa: E402
 from uwb_tdoa_msgs.msg import Tdoa, TdoaResidual  # noqa: E402
+from uwb_tdoa_tools.bags.files import open_bag  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[3]
 SCRIPT = ROOT / ".dev" / "ros2.py"
@@ -164,6 +165,28 @@ def test_the_rate_of_a_topic(driver, tmp_path):
             hz.terminate()
             hz.wait()
     assert hz.returncode in (0, -signal.SIGTERM), said.read_text()
+
+
+@pytest.mark.slow
+def test_messages_are_recorded_until_a_signal(driver, tmp_path):
+    said, bag = tmp_path / "record.txt", tmp_path / "minute.bag"
+    got = []
+    with said.open("w") as file:
+        record = start(f"bag record -o {bag} /tag1/uwb/tdoa /tag1/imu/data", file)
+        driver.create_timer(0.02, lambda: got.append(driver.count_subscribers("/tag1/uwb/tdoa")))
+        try:
+            spin_until(driver, lambda: sum(map(bool, got)) > 100, said.read_text)
+            record.send_signal(signal.SIGINT)
+            spin_until(driver, lambda: record.poll() is not None, said.read_text)
+        finally:
+            record.kill()
+            record.wait()
+    found = re.search(r"/tag1/uwb/tdoa: (\d+) messages", said.read_text())
+    assert record.returncode == 0 and found and int(found[1]) > 20, said.read_text()
+    assert "/tag1/imu/data: nobody published it" in said.read_text()
+    with open_bag(bag) as reader:
+        (connection,) = reader.connections
+        assert (connection.topic, connection.msgcount) == ("/tag1/uwb/tdoa", int(found[1]))
 
 
 def rates_in(text):

@@ -6,6 +6,7 @@ The nodes have their default parameters and best-effort connections.
 """
 
 from dataclasses import replace
+import re
 import subprocess
 import sys
 
@@ -23,6 +24,7 @@ from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag  # noqa: 
 from uwb_tdoa_tools.bags.files import messages, new_bag, open_bag  # noqa: E402
 from uwb_tdoa_tools.bags.message_types import typestore  # noqa: E402
 from uwb_tdoa_tools.calibrating import between  # noqa: E402
+from uwb_tdoa_tools.live.follow import SILENCE  # noqa: E402
 from uwb_tdoa_tools.live.processes import DiagnosticsListener, Processes, own_domain, wait  # noqa: E402
 from uwb_tdoa_tools.live.record import recorded_odometry  # noqa: E402
 from uwb_tdoa_tools.live.session import session  # noqa: E402
@@ -160,6 +162,33 @@ def test_nodes_that_do_not_wait_long_enough_are_not_followed(tmp_path):
         )
         in said
     )
+
+
+@pytest.mark.slow
+def test_a_recording_without_imu_and_with_other_anchors_than_the_nodes_needs_no_parameter(tmp_path):
+    flight = simulate(SimulationConfig(seed=3, duration=8.0, start_in_air=True))
+    bag, file = tmp_path / "flight.bag", tmp_path / "surveyed.yaml"
+    flight.anchors.to_yaml(file)
+    moved = flight.anchors.at(flight.anchors.positions + 0.3)
+    write_bag(replace(flight, imu=None, anchors=moved), bag)
+    given = "-p", f"anchors_file:={file}"
+    model = "-p", f"model_file:={tmp_path / 'known_answer.onnx'}"
+    nodes = {
+        "bias_node": ("--ros-args", *model, *given),
+        "ekf_node": ("--ros-args", *given),
+    }
+    code, said, told, recorded = replayed(bag, tmp_path, "--rate", 0.5, nodes=nodes)
+    assert code == 0, said
+    before = said.partition("playing")[0]
+    assert "has no inertial samples" in before and "Start it with -p use_imu:=false" in before
+    assert "leaving out /uwb/anchors: /bias_node, /ekf_node have anchors_file" in before
+    assert re.search(r"played [\d.]+ of 8.0 s in \d+ s, of which \d s waiting for odometry", said)
+    assert float(re.search(r"waited ([\d.]+) s for odometry", said)[1]) < SILENCE
+    assert_equal_to_offline(replace(read_bag(bag), anchors=flight.anchors), told, recorded)
+    for name in ("bias_node", "ekf_node"):
+        log = (tmp_path / f"{name}.log").read_text()
+        assert "other anchors" not in log
+        assert "start bias_node" not in log.partition("though bias_node runs")[2]
 
 
 def delayed(bag, out, count=10, delay=1_000_000_000):

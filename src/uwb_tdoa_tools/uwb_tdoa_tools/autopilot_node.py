@@ -197,7 +197,9 @@ class AutopilotNode(StreamNode):
             self._input.refusals.trouble()
             or self._status.refusals.trouble()
             or trouble
-            or ("" if recent else "no odometry: start ekf_node in this namespace")
+            or (
+                "" if recent else "no odometry: start ekf_node in this namespace, or see its status"
+            )
             or (self._gate.why and f"nothing is sent to the autopilot: {self._gate.why}")
         )
         if text:

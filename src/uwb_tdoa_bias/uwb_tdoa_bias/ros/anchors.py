@@ -17,7 +17,7 @@ from ..common.anchors import SAME_PLACE, Anchors
 from ..common.errors import InputError
 from ..common.survey import read_survey, refuse_faulty
 from .parameters import Parameter
-from .topics import Input, Refusals
+from .topics import Input, Refusals, publishers_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -96,7 +96,6 @@ class AnchorsInput:
     Attributes
     ----------
     anchors : Anchors or None
-    refused : str or None, the fault of the last message that was refused
     """
 
     def __init__(
@@ -111,7 +110,7 @@ class AnchorsInput:
         file : path, "" for none; a faulty file raises InputError
         """
         self.anchors: Anchors | None = None
-        self.refused: str | None = None
+        self._refused: str | None = None
         self._node, self._on_change, self._file = node, on_change, file
         self._of_file = refuse_faulty(read_survey(file), file) if file else None
         self._repeated: Input | None = None  # subscription to volatile publishers
@@ -125,6 +124,16 @@ class AnchorsInput:
         if self._of_file is not None:
             self.anchors = self._of_file
             self._on_change(self.anchors)
+
+    @property
+    def refused(self) -> str | None:
+        """The fault of the last message that was refused, or None.
+
+        With a file, it is forgotten once nobody publishes anchors any more.
+        """
+        if self._of_file is not None and not self._node.count_publishers("uwb/anchors"):
+            self._refused = None
+        return self._refused
 
     @property
     def refusals(self) -> list[Refusals]:
@@ -143,9 +152,9 @@ class AnchorsInput:
 
     def _on_message(self, message: AnchorArray) -> None:
         try:
-            anchors, self.refused = refuse_faulty(Anchors.from_message(message)), None
+            anchors, self._refused = refuse_faulty(Anchors.from_message(message)), None
         except InputError as error:
-            self.refused = str(error)
+            self._refused = str(error)
             return
         if self._node.frozen and self.anchors is not None:
             if not same_anchors(anchors, self.anchors):
@@ -153,9 +162,10 @@ class AnchorsInput:
             return
         if self._of_file is not None:
             if not same_anchors(anchors, self._of_file):
-                self.refused = (
+                self._refused = (
                     f"uwb/anchors has other anchors than anchors_file, {self._file}, which "
-                    "counts: stop one"
+                    f"counts: stop {publishers_of(self._node, 'uwb/anchors')}, or, if that plays "
+                    f"a bag, convert the bag with --survey {self._file}"
                 )
             return
         if self.anchors is not None:

@@ -172,6 +172,11 @@ class Refusals:
         return _names(end for end in ends if str(end.topic_type_hash) not in own)
 
 
+def publishers_of(node: Node, topic: str) -> str:
+    """Return the names of the nodes that publish on a topic, in words; "" without any."""
+    return _names(node.get_publishers_info_by_topic(node.resolve_topic_name(topic)))
+
+
 def _names(ends: Iterable[TopicEndpointInfo]) -> str:
     return ", ".join(sorted({f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in ends}))
 

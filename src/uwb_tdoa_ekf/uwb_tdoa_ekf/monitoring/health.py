@@ -64,6 +64,8 @@ class Health:
         self.last_position: tuple[np.ndarray, np.ndarray] | None = None
         # s from the stamp of the newest odometry to the current ROS time
         self.behind: float | None = None
+        # whether a node publishes corrected TDOAs, as bias_node does
+        self.corrects = False
         self._use_imu, self._lag, self._volume = config.use_imu, lag, volume
         self._imu_rate, self._tdoa_rate, self._located_rate = Rate(), Rate(), Rate()
         # at the last report: messages of each stream, and totals by verdict
@@ -169,6 +171,11 @@ class Health:
         """
         if estimator is None:
             return "no anchors yet: publish them on uwb/anchors, reliable and transient local"
+        if not located and self.corrects:
+            return (
+                "no TDOAs on uwb/tdoa_corrected, though bias_node runs: check the tag's driver, "
+                "and see the status of bias_node"
+            )
         if not located:
             return (
                 "no TDOAs on uwb/tdoa_corrected: start bias_node in this namespace and the tag's "

@@ -80,6 +80,7 @@ def _calibrate(args: Namespace) -> int:
     from uwb_tdoa_bias.effects import EffectSet
 
     from ..calibrating import expectation, usable_paths, with_truth, without_truth
+    from ..diagnosis.noise import has_imu
     from ..estimate import FlightEstimator
 
     if not (args.out or args.quick):
@@ -129,7 +130,8 @@ def _calibrate(args: Namespace) -> int:
     )
     if made.why_not is not None:
         return _stop(made.why_not)
-    return _write(made, config, args, judges or paths, all(known))
+    imu = has_imu([*flights, *holdout])
+    return _write(made, config, args, judges or paths, all(known), imu)
 
 
 def _stop(why: str) -> int:
@@ -143,10 +145,12 @@ def _write(
     args: Namespace,
     recordings: Sequence[str | Path],
     truth: bool,
+    imu: bool,
 ) -> int:
     """Write the files of a Calibration, print the lines that use them, and return the exit code.
 
     recordings : hold-out data, or all flights without any; truth : whether they have ground truth
+    imu : whether a recording has inertial samples
     """
     from ..diagnosis.noise import write_parameters
 
@@ -159,7 +163,7 @@ def _write(
     made.anchors.to_yaml(anchors)
     made.effects.to_yaml(effects)
     # no file, and an earlier one removed, if all parameters have their defaults
-    write_parameters(parameters, made.tdoa_std, config)
+    write_parameters(parameters, made.tdoa_std, config, imu)
     survey, corrected, tuned = (file if file.exists() else None for file in files)
     cli.show(
         f"wrote {', '.join(file.name for file in files if file.exists())} and "

@@ -145,7 +145,7 @@ def _diagnose(args: Namespace) -> int:
     from ..diagnosis import diagnose, output, references, with_noise
     from ..diagnosis.motions import Limits, motions
     from ..diagnosis.next_flight import plan_flight
-    from ..diagnosis.noise import write_parameters
+    from ..diagnosis.noise import has_imu, write_parameters
     from ..estimate import FlightEstimator
     from ..localizing.pictures import write_diagnosis
     from ..readers import inputs
@@ -212,7 +212,9 @@ def _diagnose(args: Namespace) -> int:
 
     out.mkdir(parents=True, exist_ok=True)
     (_, its_survey), *_ = found
-    parameters = write_parameters(out / "ekf_node.yaml", result.tdoa_std, config)
+    parameters = write_parameters(
+        out / "ekf_node.yaml", result.tdoa_std, config, has_imu([*flights, *holdout])
+    )
     truth = all(flight.truth is not None for flight in holdout or flights)
     more = [*options.words_of_reading(args)]
     more += [word for sensor in reference.left_out for word in ("--without", sensor)]

@@ -18,9 +18,9 @@ subscriptions too. A reliable subscription gets every message at any rate: the r
 one may miss messages. The replay starts with the first subscription. With --follow it stays within 2 s of the followed
 topic. While ekf_node publishes uwb/residual, it also waits until older TDOAs (0.08 s) have left the filter: a slow
 computer takes longer, and gets the same result. The replay ends when every reliable subscription has every message. It
-prints the counts and the largest delay, and ends with code 1 if the followed nodes were late or lost messages. ROS
+prints its progress, the counts and the largest delay, and ends with code 1 if the followed nodes were late or lost messages. ROS
 arguments move all topics (except /tf, /clock and the like) into the namespace of a tag, or single topics, as in the
-last examples.
+last examples. If all nodes that subscribe to the anchors have anchors_file, the anchors of the bag are left out.
 """
 
 
@@ -108,11 +108,9 @@ def _replay(args: argparse.Namespace) -> int:
         return 0 if args.loop else 128 + done.stopped_by
     if not done.acknowledged:
         say(f"not every subscription acknowledged every message within {ACKNOWLEDGE_LIMIT:g} s")
+    slower = ", or replay slower (--rate)" if args.rate > 1.0 else ""
     for what, count in done.wrong.items():
-        say(
-            f"{count} {what}; the result is not that of the bag: look at /diagnostics, or "
-            "replay slower (--rate)"
-        )
+        say(f"{count} {what}; the result is not that of the bag: look at /diagnostics{slower}")
     return int(bool(done.wrong) or not done.acknowledged)
 
 

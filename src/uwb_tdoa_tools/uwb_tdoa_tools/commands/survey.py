@@ -74,7 +74,7 @@ def _survey(args: Namespace) -> int:
     from uwb_tdoa_bias.effects import EffectSet
 
     from ..checking.report import nothing_comes_first
-    from ..diagnosis.noise import write_parameters
+    from ..diagnosis.noise import has_imu, write_parameters
     from ..diagnosis.self_calibration import self_calibrate
     from ..estimate import FlightEstimator
     from ..surveying.report import as_dict, as_text, picture, with_blocked
@@ -104,7 +104,7 @@ def _survey(args: Namespace) -> int:
     rows = (f"{i},{x:.4f},{y:.4f},{z:.4f}" for i, (x, y, z) in zip(anchors.ids, anchors.positions))
     write_text(out / "anchors.csv", "\n".join(["id,x,y,z", *rows, ""]))
     result.effects.to_yaml(out / "effects.yaml")
-    config_file = write_parameters(out / "ekf_node.yaml", result.tdoa_std, config)
+    config_file = write_parameters(out / "ekf_node.yaml", result.tdoa_std, config, has_imu(flights))
     cli.write_json(out / "survey.json", as_dict(result))
     picture(result, out / "survey.png")
     cli.show(as_text(result))

@@ -12,15 +12,19 @@ from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_ekf.core.config import FilterConfig
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
     from pathlib import Path
+
+    from uwb_tdoa_bias.common.flight import Flight
 
 DECIMALS = 3  # of tdoa_std, m, in the file
 HEAD = "/**:\n  ros__parameters:\n"
+NO_IMU = "no recording has inertial samples; with an IMU on the tag, delete this line"
 MEASURED = "m; measured: as many TDOAs count as independent as there are"
 
 
 def write_parameters(
-    path: Path, tdoa_std: float | None, config: FilterConfig | None = None
+    path: Path, tdoa_std: float | None, config: FilterConfig | None = None, has_imu: bool = True
 ) -> Path | None:
     """Write parameters of ekf_node, and return the path, or None if all have their defaults.
 
@@ -29,6 +33,7 @@ def write_parameters(
 
     path : of the file; tdoa_std : m, measured, or None
     config : FilterConfig with which tdoa_std was measured
+    has_imu : whether a recording has inertial samples; without, the file sets use_imu to false
     """
     default = FilterConfig()
     given = {one.name: getattr(config or default, one.name) for one in fields(FilterConfig)}
@@ -41,8 +46,15 @@ def write_parameters(
         lines = {"tdoa_std": f"{tdoa_std:.{DECIMALS}f}  # {MEASURED}"} | {
             name: line for name, line in lines.items() if name != "tdoa_std"
         }
+    if not has_imu:
+        lines["use_imu"] = f"false  # {NO_IMU}"
     if not lines:
         path.unlink(missing_ok=True)
         return None
     write_text(path, HEAD + "".join(f"    {name}: {line}\n" for name, line in lines.items()))
     return path
+
+
+def has_imu(flights: Iterable[Flight]) -> bool:
+    """Return whether a recording has inertial samples."""
+    return any(flight.imu is not None and len(flight.imu) for flight in flights)

@@ -5,21 +5,20 @@
 from __future__ import annotations
 
 from collections import deque
-from functools import partial
 import math
 import struct
 import time
 from typing import TYPE_CHECKING, Any
 
 import rclpy
-from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.sensors import SENSORS
 
+from .asking import ANSWER_LIMIT, SPIN, parameter_of, wait_for_names
 from .processes import DiagnosticsListener
-from .session import READER_DEPTH, answer_of, message_class, subscription_qos
+from .session import READER_DEPTH, message_class, subscription_qos
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -241,10 +240,7 @@ def stamp_of(data: bytes) -> int:
     return seconds * 10**9 + nanoseconds
 
 
-SPIN = 0.05  # s
-ANSWER_LIMIT = 10.0  # s for a node's parameters
 SETTLE_LIMIT = 60.0  # s for the diagnostics of the nodes to settle
-UNKNOWN = "_NODE_NAME_UNKNOWN_"  # what rmw calls a node whose name has not come yet
 PATIENCE = {"bias_node": "hold", "ekf_node": "lag"}  # parameters, s of stamps
 TROUBLE = {  # {node: {key in its diagnostics: words}}
     "bias_node": {"released before their pose": "TDOAs corrected before their pose was there"},
@@ -281,7 +277,7 @@ class Nodes:
         """
         self._node, self._diagnostics = node, DiagnosticsListener(node)
         space = node.get_namespace()
-        self._wait_for_names()
+        wait_for_names(node)
         there = node.get_node_names_and_namespaces()
         self._names = {
             name: f"{space.rstrip('/')}/{name}" for name in TROUBLE if (name, space) in there
@@ -358,28 +354,11 @@ class Nodes:
                 f"{least:g} s < hold < lag."
             )
 
-    def _wait_for_names(self) -> None:
-        """Wait until the node of each publisher and subscription has a name: DDS sends names later."""
-        node, until = self._node, time.monotonic() + ANSWER_LIMIT
-        while time.monotonic() < until:
-            ends = [node.get_publishers_info_by_topic, node.get_subscriptions_info_by_topic]
-            topics = [topic for topic, _ in node.get_topic_names_and_types()]
-            if not any(
-                end.node_name == UNKNOWN for find in ends for topic in topics for end in find(topic)
-            ):
-                return
-            time.sleep(SPIN)
-
     def _parameter(self, name: str, parameter: str) -> float:
-        client = AsyncParameterClient(self._node, self._names[name])
-        answered, future = answer_of(partial(client.get_parameters, [parameter])), None
-        if client.wait_for_services(ANSWER_LIMIT):
-            until = time.monotonic() + ANSWER_LIMIT
-            while (future := answered()) is None and time.monotonic() < until:
-                rclpy.spin_once(self._node, timeout_sec=SPIN)
-        if future is None or future.result() is None:
+        value = parameter_of(self._node, self._names[name], parameter)
+        if value is None:
             raise InputError(
                 f"--follow: {self._names[name]} does not answer for {ANSWER_LIMIT:g} s; start "
                 "it again."
             )
-        return future.result().values[0].double_value
+        return float(value)

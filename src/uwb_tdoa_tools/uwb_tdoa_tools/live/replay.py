@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections import Counter
 from contextlib import closing
 from dataclasses import dataclass, field
+from functools import partial
 import itertools
 import queue
 import threading
@@ -23,6 +24,7 @@ from uwb_tdoa_bias.common.sensors import SENSORS
 
 from ..bags.files import messages, open_bag
 from ..choices import WAIT
+from .asking import parameter_of, wait_for_names
 from .follow import Follower, Nodes, is_stamped, stamp_of
 from .session import message_class, publisher_qos, session
 
@@ -91,6 +93,7 @@ RCLError = rclpy_implementation.RCLError
 LARGEST_CATCH_UP = 0.1  # s; a longer delay shifts all later messages: a burst overruns queues
 LATCHED_LIMIT = 5.0  # s for the acknowledgement of latched messages
 LONGEST_SLEEP = 0.05  # s until a signal is seen
+PROGRESS = 5.0  # s between two lines on the progress
 ACKNOWLEDGE_LIMIT = 30.0  # s; longer than the 20 s after which DDS forgets a subscription that died
 
 
@@ -133,6 +136,11 @@ def is_sensor(publisher: Publisher) -> bool:
     )
 
 
+def is_imu(publisher: Publisher) -> bool:
+    """Return whether a publisher has inertial samples for ekf_node."""
+    return _kind(publisher) == "Imu" and not is_sensor(publisher)
+
+
 def _kind(publisher: Publisher) -> str:
     """Return the name of the class of the messages."""
     return publisher.msg_type.__name__  # type: ignore[attr-defined]  # rclpy says of the class that it is a message
@@ -148,6 +156,7 @@ class Player:
         rate: float,
         clock_rate: float | None,
         stop: Stop,
+        tell: Callable[[float, float, float], object] = lambda played, took, waited: None,
     ) -> None:
         """Store the publishers.
 
@@ -161,8 +170,12 @@ class Player:
             Hz of /clock.
         stop : Stop
             True once the process was asked to end.
+        tell : callable
+            tell(played, took, waited) is called every PROGRESS s, with s of stamps played, s since
+            the beginning, and s of `Played.waited` since then.
         """
         self.played = Played()
+        self._tell = tell
         self.follower: Follower | None = None
         self._publishers, self._rate, self._stop = publishers, rate, stop
         self._clock = (
@@ -176,7 +189,7 @@ class Player:
         self._sensors = {topic for topic, publisher in publishers.items() if is_sensor(publisher)}
         self._latched = [publisher for publisher in publishers.values() if is_latched(publisher)]
         self._start: int | None = None  # ns, stamp of the first message
-        self._began = self._next_tick = 0.0
+        self._began = self._next_tick = self._tell_next = 0.0
 
     def count(self, what: str) -> int:
         """Return how many "TDOAs" or "IMU samples" were published."""
@@ -189,11 +202,16 @@ class Player:
 
     def play(self, recorded: Iterable[tuple[Connection, int, bytes]]) -> None:
         """Publish an iterable of (connection, stamp ns, bytes) from the beginning."""
-        self._start = None
+        self._start, first = None, time.perf_counter()
+        waited_before, self._tell_next = self.played.waited, first + PROGRESS
         for connection, stamp, data in recorded:
             if self._start is None:
                 self._start, self._began = stamp, time.perf_counter()
                 self._next_tick = self._began
+            if (now := time.perf_counter()) > self._tell_next:
+                self._tell_next = now + PROGRESS
+                waited = self.played.waited - waited_before
+                self._tell((stamp - self._start) / 1e9, now - first, waited)
             behind = self._sleep_until(self._began + (stamp - self._start) / (1e9 * self._rate))
             if self._stop:
                 return
@@ -282,6 +300,8 @@ GLOBAL = "/tf", "/tf_static", "/clock", "/diagnostics", "/rosout", "/parameter_e
 # s from the last match to the first message, and from the last message to the end: the other side
 # discovers a little later
 SETTLE = 0.2
+# parameter `anchors_file`: they need no uwb/anchors with it
+TAKE_ANCHORS_FILE = frozenset(("bias_node", "ekf_node", "debias_node"))
 DISCOVERY = 2.0  # s without a new subscription after which the present ones suffice
 
 
@@ -375,13 +395,19 @@ def replay(
         count = sum(connection.msgcount for connection in connections)
         if not count:
             raise InputError(f"{bag}: has no message to replay.")
-        player = Player(node, publishers, options.rate, options.clock_rate, stop)
         _wait_for_listeners(node, publishers, options, stop, say)
+        wait_for_names(node)
+        _leave_out_anchors(node, publishers, say)
+        _remark_imu(node, publishers, connections, bag, say)
+        connections = [each for each in connections if each.topic in publishers]
+        count = sum(connection.msgcount for connection in connections)
+        length = (reader.end_time - reader.start_time) / 1e9
+        tell = partial(_tell_progress, length, options.follow, say)
+        player = Player(node, publishers, options.rate, options.clock_rate, stop, tell)
         nodes = Nodes(node) if options.follow else None
         player.follower = (
             Follower(node, options.follow, nodes.lag) if options.follow and nodes else None
         )
-        length = (reader.end_time - reader.start_time) / 1e9
         say(f"playing {count} messages, {length:.1f} s at rate {options.rate:g}")
         began = time.perf_counter()
         while not stop:
@@ -504,6 +530,61 @@ def _wait_for_listeners(
     if missing:
         say(f"nobody subscribes to {', '.join(without)}")
     time.sleep(SETTLE)
+
+
+def _leave_out_anchors(
+    node: Node, publishers: dict[str, Publisher], say: Callable[[str], object]
+) -> None:
+    """Drop the publisher of anchors if each node that hears it has anchors of its own."""
+    for topic, publisher in [*publishers.items()]:
+        if _kind(publisher) != "AnchorArray":
+            continue
+        ends = node.get_subscriptions_info_by_topic(publisher.topic_name)
+        if not ends or not {end.node_name for end in ends} <= TAKE_ANCHORS_FILE:
+            continue
+        names = sorted({f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in ends})
+        if all(parameter_of(node, name, "anchors_file") for name in names):
+            say(f"leaving out {topic}: {', '.join(names)} have anchors_file, which counts")
+            node.destroy_publisher(publisher)
+            del publishers[topic]
+
+
+def _remark_imu(
+    node: Node,
+    publishers: dict[str, Publisher],
+    connections: Iterable[Connection],
+    bag: str | Path,
+    say: Callable[[str], object],
+) -> None:
+    """Give the remedy if ekf_node uses an IMU and the bag has no inertial samples."""
+    space = node.get_namespace()
+    if ("ekf_node", space) not in node.get_node_names_and_namespaces() or any(
+        connection.msgcount and is_imu(publishers[connection.topic])
+        for connection in connections
+        if connection.topic in publishers
+    ):
+        return
+    name = f"{space.rstrip('/')}/ekf_node"
+    if parameter_of(node, name, "use_imu"):
+        say(
+            f"{bag} has no inertial samples, and {name} uses an IMU: it will report an error on "
+            "/diagnostics. Start it with -p use_imu:=false"
+        )
+
+
+def _tell_progress(
+    length: float,
+    followed: str | None,
+    say: Callable[[str], object],
+    played: float,
+    took: float,
+    waited: float,
+) -> None:
+    """Say how much of a recording was played, and estimate the rest. All times in s."""
+    left = took * (length / played - 1.0) if played > 0.0 else float("nan")
+    rest = f", about {left:.0f} s left" if left >= 0.0 else ""
+    waiting = f", of which {waited:.0f} s waiting for {followed}" if followed else ""
+    say(f"played {played:.1f} of {length:.1f} s in {took:.0f} s{waiting}{rest}")
 
 
 def _wait_acknowledged(publishers: Iterable[Publisher], stop: Stop) -> bool:
