@@ -375,13 +375,22 @@ def cause(entry: Entry) -> str:
         )
         return f"errors that depend on {covariates}, anchor by anchor; at most {said}"
     effect = entry.findings[0].effect
-    significant = effect.significant() or effect.values
-    key = max(significant, key=lambda name: abs(significant[name]))
-    unit, factor = for_people(effect.unit, key)
+    what, key = effect.physics.partition(":")[0], effect.largest_size()
+    if key is None:
+        return f"{what} ({effect.name})"
+    unit, factor = for_people(effect.unit_of(key))
     std = effect.std.get(key)
     largest = measured(factor * effect.values[key], std and factor * std, unit)
-    most = "largest " if len(effect.values) > 1 else ""
-    return f"{effect.physics.partition(':')[0]} ({effect.name}; {most}{key} = {largest})"
+    sizes = sum(not effect.is_condition(name) for name in effect.values)
+    most = "largest " if sizes > 1 else ""
+    if not effect.significant_sizes():
+        values = f"none of its {sizes} values is" if sizes > 1 else "its value is not"
+        means = f", {effect.if_undetermined}" if effect.if_undetermined else ""
+        return (
+            f"a fitted correction ({effect.name}; {most}{key} = {largest}): {values} twice the "
+            f"standard deviation{means}"
+        )
+    return f"{what} ({effect.name}; {most}{key} = {largest})"
 
 
 def _functions(entry: Entry) -> list[SmoothTerm]:
