@@ -24,7 +24,7 @@ from uwb_tdoa_tools.diagnosis.regression.terms import Candidate, Term
 from uwb_tdoa_tools.diagnosis.report import curves, maps, pictures
 from uwb_tdoa_tools.diagnosis.report.entries import doubt_in_words, entries, worth_in_words
 from uwb_tdoa_tools.diagnosis.report.page import TERMS, html
-from uwb_tdoa_tools.diagnosis.report.tables import anchors
+from uwb_tdoa_tools.diagnosis.report.tables import BASIS, anchors, basis, by_reason
 from uwb_tdoa_tools.diagnosis.report.unclear import CANCELS, by_remedy, undetermined
 from uwb_tdoa_tools.diagnosis.report.verdict import _flights, cause, left_over, verdict
 from uwb_tdoa_tools.scoring.gains import NO_DIFFERENCE
@@ -146,6 +146,14 @@ def test_a_phase_that_becomes_worse_is_in_the_verdict_with_the_flights_by_name(r
     more = verdict(replace(changed, written=written, tdoa_std=0.12)).more
     worse = "until z > 0.3 m from 33.9 cm (NEES 4.1) to 41.0 cm (NEES 4.1)"
     assert f"Worse: {worse}." in more
+    # the same again is said once, other figures are said
+    assert "With tdoa_std 0.120 m of ekf_node.yaml too it is 19.0 cm." in more
+    (outside,) = [sentence for sentence in more if sentence.startswith("Outside of that")]
+    assert "until z > 0.3 m" not in outside
+    until = {"rmse_3d": 0.45, "nees_mean": 4.1}
+    written["pooled"]["phases"] = {**written["pooled"]["phases"], "to_0.3_m": until}
+    more = verdict(replace(changed, written=written, tdoa_std=0.12)).more
+    worse = "until z > 0.3 m from 33.9 cm (NEES 4.1) to 45.0 cm (NEES 4.1)"
     assert f"With tdoa_std 0.120 m of ekf_node.yaml too it is 19.0 cm; worse: {worse}." in more
     assert "; one and two." in more[1]
 
@@ -420,6 +428,22 @@ def test_values_are_shown_as_far_as_they_are_significant(result, name, values, s
     effect = EFFECTS[name](values, dict.fromkeys(values, std))
     (entry,) = entries(replace(result, findings=[finding(effect)]))
     assert entry.values == words
+
+
+def test_figures_of_trials_have_one_order_and_one_unit():
+    rows = by_reason(
+        [
+            ("one", "the filter does better without it: 0.166 m with, 0.146 m without"),
+            ("two", "does not make the filter better: 0.146 m without, 0.166 m with"),
+            ("three", "another flight may not have it (probability 30%)"),
+        ]
+    ).rows
+    assert rows == [
+        ("the filter does better without it", "one (14.6 cm without, 16.6 cm with)"),
+        ("does not make the filter better", "two (14.6 cm without, 16.6 cm with)"),
+        ("another flight may not have it", "three (probability 30%)"),
+    ]
+    assert basis(rows) == BASIS and basis(rows[2:]) == ""
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_text
 
 from .. import cli, command_lines, options, parallel
-from ..choices import DRIFT, NONE, PLAN_SPEED, PLAN_TIME, REFERENCES
+from ..choices import DRIFT, NONE, PLAN_SPEED, PLAN_TIME, REFERENCES, TAPE_STD
 from ..parallel import Progress
 
 if TYPE_CHECKING:
@@ -141,7 +141,7 @@ def parser() -> ArgumentParser:
 def _diagnose(args: Namespace) -> int:
     from uwb_tdoa_bias.effects import EffectSet
 
-    from ..checking.report import nothing_comes_first, remarks_on
+    from ..checking.report import nothing_comes_first, remark_on_surveys, remarks_on
     from ..diagnosis import diagnose, output, references, with_noise
     from ..diagnosis.motions import Limits, motions
     from ..diagnosis.next_flight import plan_flight
@@ -160,7 +160,7 @@ def _diagnose(args: Namespace) -> int:
     reading = options.reading_of(args)
     judge = FlightEstimator(config, effects)
     if args.reference in BLIND and not nothing_comes_first(
-        "diagnose", reading, args.flights, judge
+        "diagnose", reading, args.flights, judge, TAPE_STD
     ):
         return 1
     found = reading.find(args.flights)
@@ -172,7 +172,10 @@ def _diagnose(args: Namespace) -> int:
     options.check_holdout((flight.name for flight in flights), (flight.name for flight in holdout))
     if args.reference in ("heights", "odometry"):
         inputs.require_tdoas([*flights, *holdout], f"--reference {args.reference}")
+    surveys = [its_survey for _, its_survey in (*found, *reading.find(args.holdout))]
     for remark in remarks_on([*flights, *holdout]):
+        cli.say("diagnose", remark)
+    for remark in remark_on_surveys(surveys, [*flights, *holdout]):
         cli.say("diagnose", remark)
     for option in ("marks", "odometry"):
         if args.reference == option and getattr(args, option) is None:

@@ -238,16 +238,28 @@ def _named(diagnosis: Diagnosis) -> str:
 
 def _worse_phases(diagnosis: Diagnosis) -> list[str]:
     """Return a sentence on phases in which the error grows."""
-    worse = "; ".join(worse_phases(diagnosis.before["pooled"], diagnosis.after["pooled"]))
+    worse = "; ".join(_worse(diagnosis).values())
     return [f"Worse: {worse}."] if worse else []
+
+
+def _worse(diagnosis: Diagnosis) -> dict[str, str]:
+    """Return {phase: clause} of the phases in which the error grows; {} if nothing is added."""
+    if not any(finding.added for finding in diagnosis.findings):
+        return {}
+    return _of_worse_phases(diagnosis.before["pooled"], diagnosis.after["pooled"])
 
 
 def _with_noise(diagnosis: Diagnosis) -> list[str]:
     """Return a sentence on the error with all files as they are written."""
     if diagnosis.written is None or diagnosis.tdoa_std is None:
         return []
-    after = diagnosis.written["pooled"]
-    worse = "; ".join(worse_phases(diagnosis.before["pooled"], after))
+    after, said = diagnosis.written["pooled"], _worse(diagnosis)
+    phases = after.get("phases", {}), diagnosis.after["pooled"].get("phases", {})
+    worse = "; ".join(
+        clause
+        for name, clause in _of_worse_phases(diagnosis.before["pooled"], after).items()
+        if name not in said or difference(*(side[name]["rmse_3d"] for side in phases))
+    )
     also = f"; worse: {worse}" if worse else ""
     return [
         f"With tdoa_std {diagnosis.tdoa_std:.3f} m of ekf_node.yaml too it is "
@@ -260,9 +272,9 @@ def _over_phases(diagnosis: Diagnosis) -> list[str]:
     before, after = (
         side["pooled"].get("phases", {}) for side in (diagnosis.before, diagnosis.after)
     )
-    judged = {score.part for score in diagnosis.before["scores"]}
+    said = {score.part for score in diagnosis.before["scores"]} | set(_worse(diagnosis))
     parts = []
-    for name in (name for name in TITLES if name in before and name not in judged):
+    for name in (name for name in TITLES if name in before and name not in said):
         sides = [_of_phase(side[name]) for side in (before, after)]
         parts.append(f"{TITLES[name]} {' to '.join(dict.fromkeys(sides))}")
     return [f"Outside of that, before and after: {'; '.join(parts)}."] if parts else []
@@ -273,12 +285,19 @@ def worse_phases(before: dict[str, Any], after: dict[str, Any]) -> Iterator[str]
 
     before, after : pooled figures of a side of `compare`
     """
+    yield from _of_worse_phases(before, after).values()
+
+
+def _of_worse_phases(before: dict[str, Any], after: dict[str, Any]) -> dict[str, str]:
+    """Return {phase: clause} as of `worse_phases`."""
+    out = {}
     sides = before.get("phases", {}), after.get("phases", {})
     for name in (name for name in TITLES if name in sides[0] and name in sides[1]):
         first, second = (side[name] for side in sides)
         known = first["rmse_3d"] is not None and second["rmse_3d"] is not None
         if known and difference(first["rmse_3d"], second["rmse_3d"]) < 0:
-            yield f"{TITLES[name]} from {_of_phase(first)} to {_of_phase(second)}"
+            out[name] = f"{TITLES[name]} from {_of_phase(first)} to {_of_phase(second)}"
+    return out
 
 
 def _of_phase(figures: dict[str, Any]) -> str:
