@@ -149,14 +149,21 @@ def _listed(ids: Iterable[int]) -> str:
     return ", ".join(map(str, ids))
 
 
-def remarks_on(flights: Sequence[Flight]) -> Iterator[str]:
-    """Yield sentences on the surveys of Flights, each alone and in comparison."""
+def remarks_on(
+    flights: Sequence[Flight], surveys: Sequence[str | Path | None] = ()
+) -> Iterator[str]:
+    """Yield sentences on the surveys of Flights, each alone and in comparison.
+
+    surveys : files of the surveys, as of `remark_on_surveys`; () to name none
+    """
     for flight in flights:
         yield from (f"{flight.name}: {remark}" for remark in survey_remarks(flight))
     yield from (
         f"{finding.cause}: {finding.evidence}; {finding.remedy}."
         for finding in different_surveys(flights)
     )
+    if surveys:
+        yield from remark_on_surveys(surveys, flights)
 
 
 def nothing_comes_first(

@@ -127,32 +127,18 @@ def _calibrate(args: Namespace) -> int:
         out / "calibration.json", {"flights": [flight.name for flight in flights], **made.as_dict()}
     )
     if made.why_not is not None:
-        code = _stop(made.why_not)
         cli.show(f"wrote calibration.json, the figures of this, to {out}")
-        cli.show(*_next(args, paths, all(known)))
-        return code
+        more = options.words_of_reading(args)
+        cli.show(
+            *command_lines.lines_without_use(paths, args.survey, args.effects, all(known), more)
+        )
+        return _stop(made.why_not)
     return _write(made, config, args, judges or paths, all(known))
 
 
 def _stop(why: str) -> int:
     cli.say("calibrate", f"stopped, and nothing to use is written: {why}.")
     return 1
-
-
-def _next(args: Namespace, paths: Sequence[Path], truth: bool) -> tuple[str, str]:
-    """Return what to do after a calibration that is not used, and the line for it."""
-    given = (("--survey", args.survey), ("--effects", args.effects))
-    words = [*paths, *(word for option, file in given if file for word in (option, file))]
-    words += options.words_of_reading(args)
-    if truth:
-        return (
-            "next: add flights, or read which effects were found, and why they are not applied:",
-            command_lines.tool("diagnose", *words, "--out", "diagnosis/"),
-        )
-    return (
-        "next: write the places where the tag stood to marks.yaml (docs/calibration.md), then:",
-        command_lines.tool("survey", *words, "--marks", "marks.yaml", "--out", "surveyed/"),
-    )
 
 
 def _write(

@@ -27,7 +27,8 @@ Computes the residuals of every channel, and traces them to effects that the mod
 alternatives. Adds the effects that help, and reports the error before and after on hold-out data.
 Writes diagnosis.json, effects.yaml (for evaluate, bias_node and ekf_node), ekf_node.yaml (the noise that the filter should
 assume with them; --config of evaluate) and report.html.
-Exit code: 0 done; 1 ids, signs or units are wrong and --no-truth or --reference marks is given; 2 bad input."""
+Exit code: 0 done; 1 ids, signs or units are wrong, or the survey is of another room, and --no-truth or --reference marks is given;
+2 bad input."""
 
 MOST = 300_000  # TDOAs; what they take: docs/notebook/speed.md
 FEW = (
@@ -141,7 +142,7 @@ def parser() -> ArgumentParser:
 def _diagnose(args: Namespace) -> int:
     from uwb_tdoa_bias.effects import EffectSet
 
-    from ..checking.report import nothing_comes_first, remark_on_surveys, remarks_on
+    from ..checking.report import nothing_comes_first, remarks_on
     from ..diagnosis import diagnose, output, references, with_noise
     from ..diagnosis.motions import Limits, motions
     from ..diagnosis.next_flight import plan_flight
@@ -172,10 +173,10 @@ def _diagnose(args: Namespace) -> int:
     options.check_holdout((flight.name for flight in flights), (flight.name for flight in holdout))
     if args.reference in ("heights", "odometry"):
         inputs.require_tdoas([*flights, *holdout], f"--reference {args.reference}")
-    surveys = [its_survey for _, its_survey in (*found, *reading.find(args.holdout))]
-    for remark in remarks_on([*flights, *holdout]):
-        cli.say("diagnose", remark)
-    for remark in remark_on_surveys(surveys, [*flights, *holdout]):
+    for remark in remarks_on(
+        [*flights, *holdout],
+        [its_survey for _, its_survey in (*found, *reading.find(args.holdout))],
+    ):
         cli.say("diagnose", remark)
     for option in ("marks", "odometry"):
         if args.reference == option and getattr(args, option) is None:

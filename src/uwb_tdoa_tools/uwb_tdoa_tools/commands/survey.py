@@ -33,8 +33,8 @@ Writes anchors.yaml and anchors.csv (for --survey, anchors_file and the rest), e
 anchors, and how well all is known), ekf_node.yaml (noise of TDOAs that the filter should assume with them), survey.json
 (covariance) and survey.png (before and after) to --out.
 
-Exit code: 0 done; 1 ids, signs or units are wrong, or something else that other anchors might make worse: they stay as given; 2 bad
-input."""
+Exit code: 0 done; 1 ids, signs or units are wrong, the survey is of another room, or something else that other anchors might make
+worse: they stay as given; 2 bad input."""
 
 
 def parser() -> ArgumentParser:
