@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files: how they are written, and which contents are refused when they are read."""
 
+from functools import partial
 import io
 import math
 import os
@@ -23,7 +24,15 @@ import yaml
 from uwb_tdoa_bias.common import files
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.files import keeping, read_arrays, write_bytes, write_filled, write_text
+from uwb_tdoa_bias.common.files import (
+    keeping,
+    read_arrays,
+    read_bytes,
+    read_head,
+    write_bytes,
+    write_filled,
+    write_text,
+)
 from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.common.flyable import FlyableVolume
 from uwb_tdoa_bias.common.limits import YAML_BYTES
@@ -406,6 +415,16 @@ def test_files(tmp_path):
         read_yaml(tmp_path)
     with pytest.raises(InputError, match="nowhere.yaml: cannot be read as YAML"):
         read_yaml(tmp_path / "nowhere.yaml")
+
+
+def test_a_file_that_is_missing_or_empty_is_named_by_what_it_should_be(tmp_path):
+    (tmp_path / "empty").touch()
+    for read in (partial(read_bytes, most=9), partial(read_head, size=9)):
+        for what, words in ({}, "recording"), ({"what": "survey file"}, "survey file"):
+            with pytest.raises(InputError, match=f"nope: .*; give the path of a {words}."):
+                read(tmp_path / "nope", **what)
+            with pytest.raises(InputError, match=f"empty: .*; copy the {words} again."):
+                read(tmp_path / "empty", **what)
 
 
 @given(

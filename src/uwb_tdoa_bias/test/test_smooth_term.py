@@ -344,6 +344,91 @@ def test_a_function_in_words(found, part, words):
     assert described(found, part) == words
 
 
+def of_two(covariate, knots, factor, factor_knots):
+    return SmoothTerm(
+        {"6.c0": 0.0, "6.c1": 0.824},
+        {"6.c1": 0.018},
+        covariate=covariate,
+        form="anchor",
+        knots=knots,
+        shape="interval",
+        factor=factor,
+        factor_shape="interval",
+        factor_knots=factor_knots,
+    )
+
+
+RANGES, BEARINGS, ELEVATIONS = (2.0, 4.75, 4.94, 7.0), (-1.0, 0.925, 0.969, 2.0), (0, 0.5, 0.6, 1)
+FARTHER = "anchor 6 seems 0.824 ± 0.018 m farther where "
+
+
+@pytest.mark.parametrize(
+    "found, words",
+    [
+        (
+            of_two("range", RANGES, "bearing", BEARINGS),
+            "range is between 4.75 m and 4.94 m, while bearing is between 53 degrees and 55.5 degrees "
+            "(seen from 2 m to 7 m): there the tag is -2.8 m in x and -3.9 m in y from the anchor, at "
+            "most",
+        ),
+        (
+            of_two("elevation", ELEVATIONS, "range", RANGES),
+            "elevation is between 28.6 degrees and 34.4 degrees, while range is between 4.75 m and "
+            "4.94 m (seen from 0 degrees to 57.3 degrees): there the tag is -2.5 m in z and 4.1 m "
+            "level from the anchor",
+        ),
+        (
+            of_two("bearing", BEARINGS, "elevation", ELEVATIONS),
+            "bearing is between 53 degrees and 55.5 degrees, while elevation is between 28.6 degrees "
+            "and 34.4 degrees (seen from -57.3 degrees to 115 degrees): there the tag is in the "
+            "direction (-0.50, -0.69, -0.52) from the anchor",
+        ),
+        (
+            of_two("range", (1.0, 2.0, 6.0, 7.0), "bearing", BEARINGS),
+            "range is between 2 m and 6 m, while bearing is between 53 degrees and 55.5 degrees "
+            "(seen from 1 m to 7 m)",
+        ),
+    ],
+)
+def test_angles_are_in_degrees_and_narrow_intervals_name_the_place(found, words):
+    assert described(found, "6") == FARTHER + words
+
+
+@pytest.mark.parametrize(
+    "covariate, knots, shape, words",
+    [
+        (
+            "y",
+            (-1.54, -1.4, 1.0),
+            "below",
+            "where y is -1.54 m than where it is -1.4 m or more (seen from -1.54 m to 1 m)",
+        ),
+        (
+            "y",
+            (-1.0, 1.4, 1.54),
+            "beyond",
+            "where y is 1.54 m than where it is 1.4 m or less (seen from -1 m to 1.54 m)",
+        ),
+        (
+            "height",
+            (1.0, 1.5),
+            "line",
+            "where height is 1.5 m than where it is 1 m (seen from 1 m to 1.5 m)",
+        ),
+        (
+            "elevation",
+            (0.0, 1.5),
+            "line",
+            "where elevation is 85.9 degrees than where it is 0 degrees (seen from 0 degrees to "
+            "85.9 degrees)",
+        ),
+    ],
+)
+def test_a_slope_over_less_than_a_metre_is_not_extrapolated(covariate, knots, shape, words):
+    found = found_term({"1.c0": 0.0, "1.c1": 0.69}, covariate, "anchor", knots, shape)
+    assert described(found, "1") == f"anchor 1 seems 0.69 ± 0.02 m farther {words}"
+
+
 def test_what_all_anchors_share_over_the_room_is_no_advice():
     values = {f"{anchor}.c0": 0.1 for anchor in range(8)}
     assert SmoothTerm(values, {}, "", "tdoa", "x", "anchor", (0.0, 1.0)).advice() == ()

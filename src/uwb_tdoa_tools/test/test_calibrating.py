@@ -4,6 +4,8 @@
 
 from dataclasses import replace
 import json
+from pathlib import Path
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -312,10 +314,37 @@ def test_what_is_not_to_be_used_is_not_written(room, monkeypatch, capsys):
     assert calibrate.main(["flight1.bag", "--out", "out"]) == 1
     assert [path.name for path in (room / "out").iterdir()] == ["calibration.json"]
     assert json.loads((room / "out" / "calibration.json").read_text())["offered"] is False
+    printed = capsys.readouterr()
     assert (
-        "calibrate: stopped, and nothing to use is written: it makes things worse."
-        in capsys.readouterr().err
+        "calibrate: stopped, and nothing to use is written: it makes things worse." in printed.err
     )
+    assert "wrote calibration.json, the figures of this, to out" in printed.out
+    assert re.search(
+        r"^next: add flights.*\n.*diagnose flight1.bag --out diagnosis/$", printed.out, re.M
+    )
+    assert calibrate.main(["flight1.bag", "--no-truth", "--out", "out"]) == 1
+    said = capsys.readouterr().out
+    (line,) = re.findall(r"^next: .*marks.yaml.*\n(.*)$", said, re.M)
+    words = line.partition(" survey ")[2].split()
+    assert survey.parser().parse_args(words).marks == "marks.yaml"
+
+
+def test_different_surveys_of_one_installation_are_named(room, flights, monkeypatch, capsys):
+    stub(monkeypatch, GOOD, [])
+    Path("surveys").mkdir()
+    for name, shift in (("one", 0.0), ("two", 0.01)):
+        moved = flights[0].anchors.at(flights[0].anchors.positions + [0.0, 0.0, shift])
+        moved.to_yaml(Path("surveys") / f"anchor_{name}.yaml")
+        write_bag(replace(flights[0], anchors=moved), f"{name}.bag")
+    given = ["one.bag", "two.bag", "--out", "out", "--survey"]
+    assert calibrate.main([*given, "surveys"]) == 0
+    said = " ".join(capsys.readouterr().err.split())
+    assert (
+        "one: surveys/anchor_one.yaml; two: surveys/anchor_two.yaml), in which the same ids" in said
+    )
+    assert "up to 1.0 cm apart" in said and "for the nodes is for surveys/anchor_one.yaml" in said
+    assert calibrate.main([*given, "surveys/anchor_one.yaml"]) == 0
+    assert "different surveys" not in capsys.readouterr().err
 
 
 def test_it_stops_where_check_finds_an_error(room, flights, monkeypatch, capsys):
@@ -420,7 +449,7 @@ def test_the_line_that_judges_reads_as_the_command_did():
 
 
 def test_a_tape_that_is_off_does_not_stop_it_and_another_room_does(flights):
-    flight, findings = flights[0], [Finding(library.MISFIT, ERROR, "", "", "", 0.0)]
+    flight, findings = flights[0], [Finding(library.report.MISFIT, ERROR, "", "", "", 0.0)]
     assert library.blocking_errors(of_flight(flight), findings, 0.1) == []
     far = flight.anchors.at(
         flight.anchors.positions

@@ -24,9 +24,9 @@ from uwb_tdoa_tools.diagnosis.regression.terms import Candidate, Term
 from uwb_tdoa_tools.diagnosis.report import curves, maps, pictures
 from uwb_tdoa_tools.diagnosis.report.entries import doubt_in_words, entries, worth_in_words
 from uwb_tdoa_tools.diagnosis.report.page import TERMS, html
-from uwb_tdoa_tools.diagnosis.report.tables import anchors
+from uwb_tdoa_tools.diagnosis.report.tables import BASIS, anchors, basis, by_reason
 from uwb_tdoa_tools.diagnosis.report.unclear import CANCELS, by_remedy, undetermined
-from uwb_tdoa_tools.diagnosis.report.verdict import _flights, left_over, verdict
+from uwb_tdoa_tools.diagnosis.report.verdict import _flights, cause, left_over, verdict
 from uwb_tdoa_tools.scoring.gains import NO_DIFFERENCE
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
@@ -146,6 +146,14 @@ def test_a_phase_that_becomes_worse_is_in_the_verdict_with_the_flights_by_name(r
     more = verdict(replace(changed, written=written, tdoa_std=0.12)).more
     worse = "until z > 0.3 m from 33.9 cm (NEES 4.1) to 41.0 cm (NEES 4.1)"
     assert f"Worse: {worse}." in more
+    # the same again is said once, other figures are said
+    assert "With tdoa_std 0.120 m of ekf_node.yaml too it is 19.0 cm." in more
+    (outside,) = [sentence for sentence in more if sentence.startswith("Outside of that")]
+    assert "until z > 0.3 m" not in outside
+    until = {"rmse_3d": 0.45, "nees_mean": 4.1}
+    written["pooled"]["phases"] = {**written["pooled"]["phases"], "to_0.3_m": until}
+    more = verdict(replace(changed, written=written, tdoa_std=0.12)).more
+    worse = "until z > 0.3 m from 33.9 cm (NEES 4.1) to 45.0 cm (NEES 4.1)"
     assert f"With tdoa_std 0.120 m of ekf_node.yaml too it is 19.0 cm; worse: {worse}." in more
     assert "; one and two." in more[1]
 
@@ -398,7 +406,20 @@ def test_what_else_it_could_be_stands_in_one_place(result):
             "anchor_delay",
             {str(k): 0.3 for k in range(8)},
             0.2,
-            "8 values, none twice its standard deviation",
+            "8 values, none twice its standard deviation: a fitted correction",
+        ),
+        (
+            "anchor_position",
+            {f"{anchor}.{axis}": 0.3 for anchor in range(3) for axis in "xyz"},
+            0.2,
+            "9 values, none twice its standard deviation: a fitted correction, no anchor has to be "
+            "moved",
+        ),
+        (
+            "truth_frame",
+            {"x": 0.3, "yaw": 0.075},
+            0.01,
+            "x = 0.30 ± 0.01 m, yaw = 4.3 ± 0.6 degrees",
         ),
         ("imu_misalignment", {"z": 0.075}, 0.01, "z = 4.3 ± 0.6 (degrees)"),
     ],
@@ -407,6 +428,83 @@ def test_values_are_shown_as_far_as_they_are_significant(result, name, values, s
     effect = EFFECTS[name](values, dict.fromkeys(values, std))
     (entry,) = entries(replace(result, findings=[finding(effect)]))
     assert entry.values == words
+
+
+def test_figures_of_trials_have_one_order_and_one_unit():
+    rows = by_reason(
+        [
+            ("one", "the filter does better without it: 0.166 m with, 0.146 m without"),
+            ("two", "does not make the filter better: 0.146 m without, 0.166 m with"),
+            ("three", "another flight may not have it (probability 30%)"),
+        ]
+    ).rows
+    assert rows == [
+        ("the filter does better without it", "one (14.6 cm without, 16.6 cm with)"),
+        ("does not make the filter better", "two (14.6 cm without, 16.6 cm with)"),
+        ("another flight may not have it", "three (probability 30%)"),
+    ]
+    assert basis(rows) == BASIS and basis(rows[2:]) == ""
+
+
+@pytest.mark.parametrize(
+    "name, values, std, words",
+    [
+        (
+            "nlos",
+            {"7.delay": 0.69, "7.x": 1.2, "7.y": -3.0, "7.z": 1.51, "7.radius": 1.0},
+            {"7.delay": 0.02},
+            "something between tag and anchor (nlos; 7.delay = 0.69 ± 0.02 m)",
+        ),
+        (
+            "nlos",
+            {"7.delay": 0.69, "7.end": 30.0, "2.delay": 0.8, "2.start": 40.0},
+            {"7.delay": 0.02, "2.delay": 0.02},
+            "something between tag and anchor (nlos; largest 2.delay = 0.80 ± 0.02 m)",
+        ),
+        (
+            "floor_multipath",
+            {"x": -3.1, "y": 2.0, "0.delay": 1.5, "0.height": 0.2, "1.delay": 2.5},
+            {"0.delay": 0.1, "1.delay": 0.1},
+            "(floor_multipath; largest 1.delay = 2.5 ± 0.1 m)",
+        ),
+        (
+            "floor_step",
+            {"1.height": 0.4, "1.start": 3.0, "1.end": 21.0},
+            {"1.height": 0.01},
+            "(floor_step; 1.height = 0.40 ± 0.01 m)",
+        ),
+        (
+            "velocity_slip",
+            {"1.share": 0.4, "1.start": 3.0, "1.end": 21.0},
+            {"1.share": 0.01},
+            "(velocity_slip; 1.share = 0.40 ± 0.01)",
+        ),
+        (
+            "noise_correlation",
+            {"std": 0.2, "time": 3.0},
+            {},
+            "(noise_correlation; std = 0.2 m)",
+        ),
+        (
+            "truth_frame",
+            {"z": 0.16, "yaw": 0.1},
+            {"z": 0.01, "yaw": 0.01},
+            "(truth_frame; largest yaw = 5.7 ± 0.6 degrees)",
+        ),
+        (
+            "anchor_position",
+            {"2.y": 0.9, "2.z": 0.3},
+            {"2.y": 0.8, "2.z": 0.4},
+            "a fitted correction (anchor_position; largest 2.y = 0.9 ± 0.8 m): none of its 2 values is "
+            "twice the standard deviation, no anchor has to be moved",
+        ),
+    ],
+)
+def test_the_largest_size_is_no_place_and_no_time_and_has_its_own_unit(
+    result, name, values, std, words
+):
+    (entry,) = entries(replace(result, findings=[finding(EFFECTS[name](values, std))]))
+    assert cause(entry).endswith(words)
 
 
 # ----------------------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ from recordings import ANCHORS, SURVEY
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.survey import ARM_TIPS, orientation_from_tips, read_survey
+from uwb_tdoa_bias.common.survey import ARM_TIPS, UNITS, orientation_from_tips, read_survey
 
 SOME = Rotation.from_euler("zyx", [0.7, -0.2, 3.0])  # nearly upside down
 CENTRE = np.array([3.0, -2.0, 1.5])
@@ -100,8 +100,32 @@ def test_refused_with_the_line(read, text, sentence):
         read(text)
 
 
+@pytest.mark.parametrize("unit", UNITS)
+def test_the_unit_of_a_total_station_is_named(read, unit):
+    lines = []
+    for line in survey_lines()[0]:
+        name, *point = line.split(",")
+        lines.append(",".join([name, *(f"{UNITS[unit] * float(x):.6f}" for x in point)]))
+    with pytest.raises(InputError) as refused:
+        read("\n".join(lines))
+    assert f"the survey looks like {unit} (the arms" in str(refused.value)
+    assert f"give metres: divide all coordinates by {UNITS[unit]:.6g}." in str(refused.value)
+
+
+def test_arm_tips_alone_in_another_unit_are_named(read):
+    lines = []
+    for line in survey_lines()[0]:
+        name, *point = line.split(",")
+        factor = 1.0 if "Ant" in name else 1000.0
+        lines.append(",".join([name, *(f"{factor * float(x):.6f}" for x in point)]))
+    with pytest.raises(
+        InputError, match="the arm tips of anchor 4 look like millimetres .*: divide "
+    ):
+        read("\n".join(lines))
+
+
 def test_missing_and_binary(tmp_path):
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="cannot be read .*; give the path of a survey file"):
         read_survey(tmp_path / "nowhere.txt")
     (tmp_path / "binary").write_bytes(b"\xbc\xff\xfe")
     with pytest.raises(InputError, match="is not text"):

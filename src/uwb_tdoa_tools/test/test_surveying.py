@@ -157,6 +157,25 @@ def test_nothing_is_applied_where_something_else_is_wrong_too(
     assert not len(EffectSet.from_yaml(tmp_path / "out" / "effects.yaml"))
 
 
+def test_a_survey_of_another_room_is_named_before_anything_is_estimated(
+    flights, solved, tmp_path, monkeypatch, capsys
+):
+    flight = clean_flight(203, 40.0)
+    monkeypatch.chdir(tmp_path)
+    for name, std in (("rough", 0.1), ("other", 0.6)):
+        write_bag(at(flight, shaken(flight.anchors, std, 3)), f"{name}.bag")
+    main(["rough.bag", "--out", "out"])
+    assert "does not fit" not in "".join(capsys.readouterr()) and len(solved.tapes) == 1
+    assert main(["other.bag", "--out", "nothing"]) == 1
+    printed = capsys.readouterr()
+    assert "ERROR: the survey does not fit" in printed.out
+    assert "stopped, and nothing is written: the survey does not fit other, as said" in printed.err
+    assert len(solved.tapes) == 1 and not (tmp_path / "nothing").exists()
+    (std,) = re.findall(r"survey improves them with --std ([0-9.]+) \(m, ", printed.err)
+    main(["other.bag", "--std", std, "--out", "out"])
+    assert len(solved.tapes) == 2
+
+
 def test_flights_that_are_too_short_are_refused():
     with pytest.raises(
         InputError, match="s in the air, or in motion on the floor, together; 30 s are needed"

@@ -21,7 +21,6 @@ from uwb_tdoa_ekf.monitoring.finding import ERROR
 from . import cli, command_lines
 from .checking import report
 from .checking.check import check, different_surveys
-from .checking.ordered import OrderedRecording, displacement
 from .checking.recording import read_recording
 from .diagnosis import diagnose, output, with_noise
 from .diagnosis.attribution import first_fit
@@ -30,7 +29,7 @@ from .diagnosis.references import GroundTruth, Nothing
 from .diagnosis.report.verdict import percent, worse_phases
 from .diagnosis.self_calibration import SelfCalibration, Tape, self_calibrate
 from .diagnosis.self_calibration.equations import slow_innovations
-from .diagnosis.self_calibration.solve import CLEARLY_OF_RANGES, IMPROVED, LEFT
+from .diagnosis.self_calibration.solve import CLEARLY_OF_RANGES, IMPROVED, LEFT, MEASURE
 from .diagnosis.validation import cross_fitted
 from .estimate import FlightEstimator
 from .parallel import Progress
@@ -49,10 +48,6 @@ if TYPE_CHECKING:
 
 
 RMSE = "3D RMSE"  # name of the figure with ground truth
-# the rule of `check` for a survey that does not fit without another mistake
-MISFIT = "survey_misfit"
-# largest median shift of the anchors, in standard deviations, that a calibration can correct
-LARGEST_SHIFT = 3.0
 # smallest ratio of the slow innovations before and after, on hold-out data without ground truth
 SMALLEST_RATIO = 1.5
 # share of the last flight that is fitted without a hold-out flight; the rest validates
@@ -124,10 +119,8 @@ def blocking_errors(recording: Recording, findings: Iterable[Finding], std: floa
     These are all errors, except for a survey within the accuracy `std`, m, of a coordinate.
     """
     errors = [finding for finding in findings if finding.severity == ERROR]
-    if any(finding.rule == MISFIT for finding in errors):
-        fit = OrderedRecording.of(recording).survey_fit
-        if np.median(displacement(fit.positions, fit.all_moved[1])) <= LARGEST_SHIFT * std:
-            errors = [finding for finding in errors if finding.rule != MISFIT]
+    if report.misfit_beyond(recording, errors, std) is None:
+        errors = [finding for finding in errors if finding.rule != report.MISFIT]
     return errors
 
 
@@ -179,6 +172,9 @@ def usable_paths(
             progress.update()
     for finding in different_surveys(list(usable.values())):
         raise InputError(f"{finding.cause}: {finding.evidence}; {finding.remedy}.")
+    surveys = [survey for path, survey in (*found, *held) if path in usable]
+    for remark in report.remark_on_surveys(surveys, list(usable.values())):
+        cli.say("calibrate", remark)
     paths, judges = ([path for path, _ in some if path in usable] for some in recordings)
     if held and paths and not judges:
         cli.say("calibrate", "no flight of --holdout is left: the last of the others judges.")
@@ -269,7 +265,7 @@ def _reason_against_unverified(before: float, after: float, of_ranges: bool, on:
     return (
         f"{100 * after:.1f} cm of the innovations are slow with it on {on}, more than "
         f"{100 * LEFT:.1f} cm: something else is wrong too, of which anchors may take the place; "
-        "record ground truth, or give survey some --marks"
+        f"{MEASURE}"
     )
 
 

@@ -119,6 +119,34 @@ def survey_line(
     return tool("survey", *words, "--out", "surveyed/")
 
 
+def lines_without_use(
+    recordings: Iterable[str | Path],
+    survey: str | Path | None = None,
+    effects: str | Path | None = None,
+    truth: bool = True,
+    more: Iterable[str] = (),
+) -> tuple[str, str]:
+    """Return what to do after a calibration that is not used, and the line for it.
+
+    The parameters are those of `evaluate_line`.
+    """
+    options = {"--survey": survey, "--effects": effects}
+    words = [
+        *recordings,
+        *(word for option, file in options.items() if file for word in (option, file)),
+        *more,
+    ]
+    if truth:
+        return (
+            "next: add flights, or read which effects were found, and why they are not applied:",
+            tool("diagnose", *words, "--out", "diagnosis/"),
+        )
+    return (
+        "next: write the places where the tag stood to marks.yaml (docs/calibration.md), then:",
+        tool("survey", *words, "--marks", "marks.yaml", "--out", "surveyed/"),
+    )
+
+
 def node_lines(
     anchors: str | Path | None = None,
     effects: str | Path | None = None,

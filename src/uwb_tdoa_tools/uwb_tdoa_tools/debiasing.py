@@ -292,7 +292,9 @@ def static_parts(
 
 def is_table(path: str | Path) -> bool:
     """Return whether a file is a CSV of positions."""
-    return not Path(path).is_dir() and b"true_x" in read_head(path, 1000)
+    return not Path(path).is_dir() and b"true_x" in read_head(
+        path, 1000, "recording or CSV file of positions"
+    )
 
 
 def _from_table(path: str | Path, planar: bool) -> list[Part]:

@@ -251,5 +251,6 @@ def settings_of(
         name: Path(asked[name]) for name in files if asked[name] and Path(asked[name]).is_file()
     }
     return asked | {
-        name: hashlib.sha256(read_bytes(path)).hexdigest()[:16] for name, path in named.items()
+        name: hashlib.sha256(read_bytes(path, what="file")).hexdigest()[:16]
+        for name, path in named.items()
     }

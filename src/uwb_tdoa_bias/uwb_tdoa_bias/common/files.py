@@ -44,27 +44,32 @@ _KEPT: list[
 ] = []  # of `keeping`: path, resolved path, state, whether it is a bag
 
 
-def read_bytes(path: str | Path, most: int = RECORDING_BYTES) -> bytes:
+def read_bytes(path: str | Path, most: int = RECORDING_BYTES, what: str = "recording") -> bytes:
     """Return the content of a file.
 
     Raises InputError if it cannot be read, is empty, or has more than `most` bytes.
+
+    what : words for the expected file, for messages
     """
-    content = read_head(path, most + 1)
+    content = read_head(path, most + 1, what)
     Budget(path).spend("bytes", len(content), most)
     return content
 
 
-def read_head(path: str | Path, size: int) -> bytes:
-    """Return the first `size` bytes of a file; raise InputError if it is unreadable or empty."""
+def read_head(path: str | Path, size: int, what: str = "recording") -> bytes:
+    """Return the first `size` bytes of a file; raise InputError if it is unreadable or empty.
+
+    what : words for the expected file, for messages
+    """
     try:
         with open_file(path) as file:
             content = b"".join(_blocks(file, size))
     except OSError as error:
         raise InputError(
-            f"{path}: cannot be read ({error.strerror}); give the path of a recording."
+            f"{path}: cannot be read ({error.strerror}); give the path of a {what}."
         ) from error
     if not content:
-        raise InputError(f"{path}: is empty (0 bytes); copy the recording again.")
+        raise InputError(f"{path}: is empty (0 bytes); copy the {what} again.")
     return content
 
 

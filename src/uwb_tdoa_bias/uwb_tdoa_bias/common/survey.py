@@ -129,6 +129,7 @@ def _listed(ids: np.ndarray) -> str:
 # within 1 degree. In all stands the antenna is then 11 mm forward, 26 mm to -y and 49 mm up. These
 # distances count from the point where the arms meet.
 ARM_TIPS = np.array([[0.0, 0.0, 0.110], [0.0, -0.121, 0.0], [0.080, 0.0, 0.0]])
+LARGEST_STAND = 0.5  # m, largest distance of an antenna from the middle of the arm tips
 MAX_TIP_RESIDUAL = 0.010  # m RMS; measured: 0.5 ... 2.2 mm
 
 _ANTENNA = re.compile(r"anchorAnt_?([0-9]{1,9})$")
@@ -185,7 +186,7 @@ def read_entries(path: str | Path) -> tuple[list[Entry], str]:
     frame. NaN if not surveyed. Raises InputError.
     """
     try:
-        text = read_bytes(path, SURVEY_BYTES).decode("utf-8-sig")
+        text = read_bytes(path, SURVEY_BYTES, "survey file").decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(
             f"{path}: byte {error.start} is not text; give a survey file (.txt, .csv, .yaml "
@@ -256,10 +257,38 @@ def _total_station(path: str | Path, lines: Lines) -> list[Entry]:
                 f"{path}: anchor {anchor} has arm tips but no line 'anchorAnt{anchor},x,y,z'; "
                 "add it."
             )
+    _refuse_unit(path, antennas, tips)
     return [
         Entry(str(i), antennas[i], _orientation(path, i, tips), f"anchorAnt{i}")
         for i in sorted(antennas)
     ]
+
+
+def _refuse_unit(
+    path: str | Path,
+    antennas: dict[int, list[float]],
+    tips: dict[tuple[int, int], list[float]],
+) -> None:
+    """Raise InputError if the arms of a stand have their true lengths in another unit than metres.
+
+    antennas : {anchor: [x, y, z]}; tips : {(anchor, arm 1 to 3): [x, y, z]}
+    """
+    for anchor, antenna in antennas.items():
+        found = [tips[anchor, k] for k in (1, 2, 3) if (anchor, k) in tips]
+        if len(found) < 3 or orientation_from_tips(np.array(found))[1] <= MAX_TIP_RESIDUAL:
+            continue
+        for unit, count in UNITS.items():
+            stand = np.array([antenna, *found]) / count
+            if orientation_from_tips(stand[1:])[1] > MAX_TIP_RESIDUAL:
+                continue
+            who, lines = "the survey looks", "all coordinates"
+            if np.linalg.norm(stand[0] - stand[1:].mean(axis=0)) > LARGEST_STAND:
+                who = f"the arm tips of anchor {anchor} look"
+                lines = f"the lines anchor{anchor}_1, _2 and _3"
+            raise InputError(
+                f"{path}: {who} like {unit} (the arms of the stand of anchor {anchor} have their "
+                f"lengths in {unit}); give metres: divide {lines} by {count:.6g}."
+            )
 
 
 def _orientation(

@@ -114,7 +114,7 @@ def session_of(path: str | Path) -> Session:
         raise InputError(
             f"model: {path} does not exist; give an .onnx file or leave the model empty."
         )
-    content = read_bytes(path, MODEL_BYTES)
+    content = read_bytes(path, MODEL_BYTES, "model, an .onnx file")
     from .trial import Session, Unplayable, tried_out
 
     try:

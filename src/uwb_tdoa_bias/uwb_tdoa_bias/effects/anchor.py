@@ -204,6 +204,7 @@ class AnchorPosition(GeometryEffect):
     )
     portable = False
     key_form = rf"{ANCHOR}\.[xyz]", "an anchor and an axis; write '3.x: 0.05'"
+    if_undetermined = "no anchor has to be moved"
 
     @classmethod
     def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
@@ -315,6 +316,8 @@ class Nlos(SearchedDelay):
         rf"{ANCHOR}\.(delay|start|end|x|y|z|radius)",
         "an anchor and one of delay, start, end, x, y, z, radius",
     )
+    conditions = ("start", "end", "x", "y", "z", "radius")
+    other_units = {"start": "s", "end": "s"}
 
     @classmethod
     def bound_of(cls, key: str) -> float:

@@ -245,6 +245,8 @@ class IntervalEffect(Effect):
     """
 
     part: ClassVar[str]
+    conditions = LIMITS
+    other_units = dict.fromkeys(LIMITS, "s")
     parameters = ()
     portable = False
     fitted = False

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..common.errors import InputError
 from ..common.sensors import STREAM_OF, measured_on
-from .covariates import OF_ARRIVAL, UNITS, checked_domain, covariate_of, fade_weight
+from .covariates import OF_ARRIVAL, checked_domain, covariate_of, fade_weight, shown_in
 from .samples import RADIO, Samples, true_samples
 
 if TYPE_CHECKING:
@@ -241,6 +241,12 @@ class Effect:
     # Parameters of a fixed set; None: the example alone. An effect with `key_form` has no fixed set.
     parameters: ClassVar[tuple[str, ...] | None] = None
     key_form: ClassVar[tuple[str, str] | None] = None
+    # Last parts of parameters that state when or where it acts, not how large it is
+    conditions: ClassVar[tuple[str, ...]] = ()
+    # {last part of a parameter: its unit} of parameters that are not in the first unit of `unit`
+    other_units: ClassVar[dict[str, str]] = {}
+    # What it means for people that no single value is significant, a clause; "" for nothing
+    if_undetermined: ClassVar[str] = ""
     channels: ClassVar[tuple[str, ...]] = ("tdoa",)  # channels of `diagnose` on which it shows
     fitted: ClassVar[bool] = True  # False: a detector finds it, not linear regression
     portable: ClassVar[bool] = True  # True: stays valid in another installation of anchors
@@ -308,6 +314,19 @@ class Effect:
     def prior_std_of(cls, key: str) -> float:
         """Return the prior standard deviation of the parameter `key`, in its unit."""
         return cls.prior_std
+
+    @classmethod
+    def unit_of(cls, key: str) -> str:
+        """Return the unit of the parameter `key`."""
+        return cls.other_units.get(key.rpartition(".")[2], cls.unit.partition(",")[0])
+
+    @classmethod
+    def is_condition(cls, key: str) -> bool:
+        """Return whether the parameter `key` states when or where the effect acts.
+
+        The others state how large it is.
+        """
+        return key.rpartition(".")[2] in cls.conditions
 
     @classmethod
     def within_bounds(cls, values: dict[str, float]) -> bool:
@@ -450,10 +469,10 @@ class Effect:
     @property
     def domain_words(self) -> str:
         """Return its label and its domain as a phrase."""
-        limits = (
-            f"{name} {low:.3g} to {high:.3g} {UNITS[name]}"
-            for name, (low, high) in self.domain.items()
-        )
+        limits = []
+        for name, (low, high) in self.domain.items():
+            unit, factor = shown_in(name)
+            limits.append(f"{name} {factor * low:.3g} to {factor * high:.3g} {unit}")
         return f"{self.label} ({', '.join(limits)})"
 
     # Reports
@@ -472,6 +491,21 @@ class Effect:
         return dict(
             sorted(known.items(), key=lambda item: -abs(item[1]) / (std.get(item[0]) or math.inf))
         )
+
+    def largest_size(self) -> str | None:
+        """Return the parameter of the largest size, of the significant ones if there are any.
+
+        Sizes of different units are compared in prior standard deviations. None without a size.
+        """
+        sizes = {key: value for key, value in self.values.items() if not self.is_condition(key)}
+        among = self.significant_sizes() or sizes
+        return max(among, key=lambda key: abs(sizes[key]) / self.prior_std_of(key), default=None)
+
+    def significant_sizes(self) -> dict[str, float]:
+        """Return those of `significant` that state how large the effect is."""
+        return {
+            key: value for key, value in self.significant().items() if not self.is_condition(key)
+        }
 
     def advice(self) -> tuple[str, ...]:
         """Return imperative sentences for people, the most important first.

@@ -128,8 +128,18 @@ UNITS = {
     **dict.fromkeys((name for name in OF_IMU if name.startswith("rate_")), "rad/s"),
     **dict.fromkeys((name for name in OF_IMU if name.startswith("accel")), "m/s^2"),
 }
+DEGREES = math.degrees(1.0)  # degrees per radian
 EXTRA = "extra."  # prefix of further columns of a log: "extra.STREAM.COLUMN"
 OF_ACCEL = ("accel", "accel_x", "accel_y", "accel_z")  # specific force, m/s^2
+
+
+def shown_in(covariate: str, unknown: str = "") -> tuple[str, float]:
+    """Return (unit, factor from its unit) in which people read a covariate: angles in degrees.
+
+    unknown : unit of columns of logs
+    """
+    unit = UNITS.get(covariate, unknown)
+    return ("degrees", DEGREES) if unit == "rad" else (unit, 1.0)
 
 
 def sensor_covariate(name: str, samples: ImuSamples | SensorSamples) -> np.ndarray | None:

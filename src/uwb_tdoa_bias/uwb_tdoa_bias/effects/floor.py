@@ -57,6 +57,7 @@ class FloorMultipath(SearchedDelay):
         rf"x|y|{ANCHOR}\.(delay|height|noise)",
         "x, y, or an anchor and one of delay, height, noise",
     )
+    conditions = (*PLACE, "height")
 
     @classmethod
     def bound_of(cls, key: str) -> float:

@@ -177,6 +177,8 @@ class NoiseCorrelation(Effect):
         confounded_with=("noise_level",),
     )
     parameters = ("std", "time")
+    conditions = ("time",)
+    other_units = {"time": "s"}
     portable = False
     fitted = False
 

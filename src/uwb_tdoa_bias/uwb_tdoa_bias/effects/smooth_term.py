@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+import math
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -39,11 +40,11 @@ from .covariates import (
     OF_STATE,
     OF_TDOA,
     STATES,
-    UNITS,
     covariate_of,
     fade_weight,
     has_domain,
     sensor_covariate,
+    shown_in,
 )
 from .pair import of_pair
 from .samples import RADIO, tile
@@ -64,6 +65,9 @@ FORMS = ("common", "arrival", "anchor", "pair", "direction")
 OF_LINKS = ("pair", "direction")  # forms with one function per pair of anchors
 # Prior standard deviations of functions with few coefficients: m, rad/s and m/s^2
 RADIO_PRIOR_STD, PRIOR_STD = 0.3, {"gyro": 0.1, "accel": 0.5}
+LEAST_WIDTH = 1.0  # of the covariate, below which a slope per unit would extrapolate
+# widest intervals that determine a place, m and rad
+NARROW = {"range": 1.0, "bearing": 0.5, "elevation": 0.5}
 MOST_PARTS = 3  # anchors or pairs whose functions are described
 # {shape: (knots, coefficients)}. Knots are the ends, and points between them where a part begins or
 # ends. The knots of a wave are one period apart. Those of a pulse are its start, its end, and the
@@ -698,9 +702,9 @@ _CAUSES = (
 def described(term: SmoothTerm, part: str = "") -> str:
     """Return the function of an anchor "3", of a pair "0-1" or of all, "", as a clause."""
     prefix = f"{part}." if part else ""
-    name, unit = _named(term.covariate), UNITS.get(term.covariate, "")
-    knots = [f"{rounded(knot)} {unit}".strip() for knot in term.knots]
-    seen = f"{_factor_clause(term)} (seen from {knots[0]} to {knots[-1]})"
+    name, unit = _named(term.covariate), shown_in(term.covariate)[0]
+    knots = _in_words(term.covariate, term.knots)
+    seen = f"{_factor_clause(term)} (seen from {knots[0]} to {knots[-1]}){_place(term)}"
     size = term.values.get(f"{prefix}c1", 0.0)
     std = term.std.get(f"{prefix}c1")
     if term.shape in ("step", "interval"):
@@ -714,14 +718,16 @@ def described(term: SmoothTerm, part: str = "") -> str:
             where = f"where {name} is between {knots[1]} and {knots[2]}"
         return _off(term, part, size, std, f" {where}{seen}")
     if term.shape == "pulse":
-        on, period = (
-            f"{rounded(value - term.knots[0])} {unit}".strip() for value in term.knots[1:]
-        )
+        on, period = _in_words(term.covariate, np.subtract(term.knots[1:], term.knots[0]))
         where = f" for {on} in each {period} of {name}, first at {knots[0]}{_factor_clause(term)}"
         return _off(term, part, size, std, where)
     if term.shape in ("line", "beyond", "below"):
         first, last = {"line": (0, 1), "beyond": (1, 2), "below": (1, 0)}[term.shape]
         width = term.knots[last] - term.knots[first]
+        if unit == "degrees" or abs(width) < LEAST_WIDTH:
+            reach = {"line": "", "beyond": " or less", "below": " or more"}[term.shape]
+            where = f" where {name} is {knots[last]} than where it is {knots[first]}{reach}"
+            return _off(term, part, size, std, f"{where}{seen}")
         error = None if std is None else std / abs(width)
         side = {"line": "", "beyond": f", above {knots[1]}", "below": f", below {knots[1]}"}
         how = f" for each {unit or 'unit'} more of {name}{side[term.shape]}{seen}"
@@ -731,21 +737,52 @@ def described(term: SmoothTerm, part: str = "") -> str:
     top, bottom = int(np.argmax(course)), int(np.argmin(course))
     swing = course[top] - course[bottom]
     if term.shape == "wave":
-        length = f"{rounded(term.knots[1] - term.knots[0])} {unit}".strip()
+        (length,) = _in_words(term.covariate, [term.knots[1] - term.knots[0]])
         how = f" and less in turn, every {length} of {name}{_factor_clause(term)}"
         return _off(term, part, swing, None, how)
-    where = (
-        f"where {name} is {rounded(at[top])} {unit} than where it is {rounded(at[bottom])} {unit}"
-    )
-    return _off(term, part, swing, None, f" {where}{seen}")
+    high, low = _in_words(term.covariate, at[[top, bottom]])
+    return _off(term, part, swing, None, f" where {name} is {high} than where it is {low}{seen}")
+
+
+def _in_words(covariate: str, values: Iterable[float]) -> list[str]:
+    """Return values of a covariate with its unit, for people."""
+    unit, factor = shown_in(covariate)
+    return [f"{rounded(factor * value)} {unit}".strip() for value in values]
+
+
+def _place(term: SmoothTerm) -> str:
+    """Return the place, seen from the anchor, to which intervals of range and angle limit the tag.
+
+    It is a part of a clause; "" if they determine none.
+    """
+    if term.shape != "interval" or term.factor_shape != "interval":
+        return ""
+    knots = {term.covariate: term.knots, term.factor: term.factor_knots}
+    middle = {name: 0.5 * (low + high) for name, (_, low, high, _) in knots.items()}
+    if any(
+        high - low > NARROW[name] for name, (_, low, high, _) in knots.items() if name in NARROW
+    ):
+        return ""
+    # Bearing and elevation are of the anchor, seen from the tag. Level, if there is no elevation.
+    away, up = middle.get("range", 1.0), -math.sin(middle.get("elevation", 0.0))
+    level = math.cos(middle.get("elevation", 0.0))
+    x, y = (-level * turn(middle.get("bearing", 0.0)) for turn in (math.cos, math.sin))
+    if set(middle) == {"range", "bearing"}:
+        where = f"{away * x:+.1f} m in x and {away * y:+.1f} m in y from the anchor, at most"
+    elif set(middle) == {"range", "elevation"}:
+        where = f"{away * up:+.1f} m in z and {away * level:.1f} m level from the anchor"
+    elif set(middle) == {"bearing", "elevation"}:
+        where = f"in the direction ({x:+.2f}, {y:+.2f}, {up:+.2f}) from the anchor"
+    else:
+        return ""
+    return f": there the tag is {where}"
 
 
 def _factor_clause(term: SmoothTerm) -> str:
     """Return a clause on where the factor lets the function act; "" without a factor."""
     if not term.factor:
         return ""
-    name, unit = _named(term.factor), UNITS.get(term.factor, "")
-    knots = [f"{rounded(knot)} {unit}".strip() for knot in term.factor_knots]
+    name, knots = _named(term.factor), _in_words(term.factor, term.factor_knots)
     return {
         "line": f", with opposite signs at a {name} of {knots[0]} and of {knots[-1]}",
         "beyond": f", growing from none at a {name} of {knots[1]} to this at {knots[-1]}",

@@ -53,6 +53,7 @@ class TruthFrame(GeometryEffect):
         ),
         phrase="{key} {value}",
     )
+    other_units = dict.fromkeys(KEYS[3:], "rad")
     needs_reference = True
     portable = False
     usable = False

@@ -5,23 +5,26 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.effects.base import listed
 
 from .. import cli, command_lines
 from ..outputs import as_json
 from ..parallel import Progress
 from .check import check, different_surveys
-from .ordered import OrderedRecording
+from .ordered import OrderedRecording, displacement
 from .recording import of_flight, read_recording
-from .tdoa_rules import gained
+from .tdoa_rules import SAME, gained, largest_displacement
 from .watch import BEFORE_TRUTH, EXCHANGED, FIRST
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
+    from pathlib import Path
 
     from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_ekf.monitoring.finding import Finding
@@ -29,8 +32,13 @@ if TYPE_CHECKING:
     from ..estimate import FlightEstimator
     from ..readers.inputs import Reading
     from .check import Report
+    from .recording import Recording
 
 
+# the rule of `check` for a survey that does not fit without another mistake
+MISFIT = "survey_misfit"
+# largest median shift of the anchors, in standard deviations, that a calibration can correct
+LARGEST_SHIFT = 3.0
 SYMBOL = {"error": "ERROR", "warning": "warning", "note": "note"}
 
 
@@ -141,36 +149,57 @@ def _listed(ids: Iterable[int]) -> str:
     return ", ".join(map(str, ids))
 
 
-def remarks_on(flights: Sequence[Flight]) -> Iterator[str]:
-    """Yield sentences on the surveys of Flights, each alone and in comparison."""
+def remarks_on(
+    flights: Sequence[Flight], surveys: Sequence[str | Path | None] = ()
+) -> Iterator[str]:
+    """Yield sentences on the surveys of Flights, each alone and in comparison.
+
+    surveys : files of the surveys, as of `remark_on_surveys`; () to name none
+    """
     for flight in flights:
         yield from (f"{flight.name}: {remark}" for remark in survey_remarks(flight))
     yield from (
         f"{finding.cause}: {finding.evidence}; {finding.remedy}."
         for finding in different_surveys(flights)
     )
+    if surveys:
+        yield from remark_on_surveys(surveys, flights)
 
 
 def nothing_comes_first(
-    command: str, reading: Reading, paths: Sequence[str], estimator: FlightEstimator
+    command: str, reading: Reading, paths: Sequence[str], estimator: FlightEstimator, std: float
 ) -> bool:
-    """Return whether `check` finds no mistake of ids, signs, units or the scale of the survey.
+    """Return whether `check` finds no mistake that looks like misplaced anchors.
 
-    Such mistakes look like misplaced anchors: they are printed, and a command that estimates anchors
-    must stop.
+    These are mistakes of ids, signs, units and the scale of the survey, and a survey of another
+    room. They are printed, and a command that estimates anchors must stop.
 
     command : name of the command, for its messages; reading : how recordings are read
     paths : files and folders to read; raises InputError
+    std : standard deviation of a coordinate of an anchor as given, m
     """
-    found = []
+    found, misfits = [], []
     with Progress(command) as progress:
         for path, survey in progress.over(reading.find(paths), "checking recordings"):
             recording = read_recording(reading, path, survey)
             findings = check(recording, others=(), estimator=estimator).findings
             found += [finding for finding in findings if finding.rule in (*FIRST, EXCHANGED)]
+            off = misfit_beyond(recording, findings, std)
+            if off is not None:
+                misfits.append((recording.name, off))
+                found += [finding for finding in findings if finding.rule == MISFIT]
     for finding in found:
         cli.show(*lines(finding))
-    if found:
+    if misfits:
+        needed = max(off for _, off in misfits) / LARGEST_SHIFT
+        cli.say(
+            command,
+            f"stopped, and nothing is written: the survey does not fit {listed(n for n, _ in misfits)}"
+            ", as said above. Give the survey of that room. If its anchors can be off by that much, "
+            f"survey improves them with --std {math.ceil(20.0 * needed) / 20.0:g} (m, standard "
+            f"deviation of a coordinate; {std:g} is assumed).",
+        )
+    elif found:
         cli.say(
             command,
             "stopped, and nothing is written: ids, signs, units and scale first, as said above; "
@@ -178,3 +207,42 @@ def nothing_comes_first(
             "anchors.",
         )
     return not found
+
+
+def misfit_beyond(recording: Recording, findings: Iterable[Finding], std: float) -> float | None:
+    """Return by how much anchors are off in the median, m, if that is beyond their accuracy.
+
+    None if no finding is about a survey that does not fit, or if a calibration can correct that.
+    std : standard deviation of a coordinate of an anchor, m
+    """
+    if not any(finding.rule == MISFIT for finding in findings):
+        return None
+    fit = OrderedRecording.of(recording).survey_fit
+    off = float(np.median(displacement(fit.positions, fit.all_moved[1])))
+    return off if off > LARGEST_SHIFT * std else None
+
+
+def remark_on_surveys(
+    surveys: Sequence[str | Path | None], recordings: Sequence[Recording | Flight]
+) -> Iterator[str]:
+    """Yield a sentence if some recordings have different surveys of one installation.
+
+    surveys : their files, None for the anchors of a bag
+    """
+    off = [largest_displacement(recordings[0].anchors, one.anchors) for one in recordings]
+    if not any(0.0 < distance <= SAME for distance in off):
+        return
+    names: dict[str, list[str]] = {}
+    for survey, one in zip(surveys, recordings):
+        names.setdefault("the anchors in the bag" if survey is None else str(survey), []).append(
+            one.name
+        )
+    if len(names) < 2:
+        return
+    each = "; ".join(f"{', '.join(of)}: {survey}" for survey, of in names.items())
+    apart = max(distance for distance in off if distance <= SAME)
+    yield (
+        f"the flights have different surveys ({each}), in which the same ids are up to "
+        f"{100.0 * apart:.1f} cm apart. Each flight is used with its own, one correction is fitted to "
+        f"all, and what is written and printed for the nodes is for {next(iter(names))}."
+    )

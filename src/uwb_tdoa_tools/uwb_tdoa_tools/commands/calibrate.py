@@ -122,13 +122,17 @@ def _calibrate(args: Namespace) -> int:
         else:
             made = without_truth(flights, holdout, tape, base, config, progress)
     cli.show(made.text, made.as_text())
-    cli.show(*(f"the error grows {clause}" for clause in made.worse))
     out = args.out  # only --quick does without
     out.mkdir(parents=True, exist_ok=True)
     cli.write_json(
         out / "calibration.json", {"flights": [flight.name for flight in flights], **made.as_dict()}
     )
     if made.why_not is not None:
+        cli.show(f"wrote calibration.json, the figures of this, to {out}")
+        more = options.words_of_reading(args)
+        cli.show(
+            *command_lines.lines_without_use(paths, args.survey, args.effects, all(known), more)
+        )
         return _stop(made.why_not)
     imu = has_imu([*flights, *holdout])
     return _write(made, config, args, judges or paths, all(known), imu)

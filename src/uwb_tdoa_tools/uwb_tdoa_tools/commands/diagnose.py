@@ -13,7 +13,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_text
 
 from .. import cli, command_lines, options, parallel
-from ..choices import DRIFT, NONE, PLAN_SPEED, PLAN_TIME, REFERENCES
+from ..choices import DRIFT, NONE, PLAN_SPEED, PLAN_TIME, REFERENCES, TAPE_STD
 from ..parallel import Progress
 
 if TYPE_CHECKING:
@@ -27,7 +27,8 @@ Computes the residuals of every channel, and traces them to effects that the mod
 alternatives. Adds the effects that help, and reports the error before and after on hold-out data.
 Writes diagnosis.json, effects.yaml (for evaluate, bias_node and ekf_node), ekf_node.yaml (the noise that the filter should
 assume with them; --config of evaluate) and report.html.
-Exit code: 0 done; 1 ids, signs or units are wrong and --no-truth or --reference marks is given; 2 bad input."""
+Exit code: 0 done; 1 ids, signs or units are wrong, or the survey is of another room, and --no-truth or --reference marks is given;
+2 bad input."""
 
 MOST = 300_000  # TDOAs; what they take: docs/notebook/speed.md
 FEW = (
@@ -160,7 +161,7 @@ def _diagnose(args: Namespace) -> int:
     reading = options.reading_of(args)
     judge = FlightEstimator(config, effects)
     if args.reference in BLIND and not nothing_comes_first(
-        "diagnose", reading, args.flights, judge
+        "diagnose", reading, args.flights, judge, TAPE_STD
     ):
         return 1
     found = reading.find(args.flights)
@@ -172,7 +173,10 @@ def _diagnose(args: Namespace) -> int:
     options.check_holdout((flight.name for flight in flights), (flight.name for flight in holdout))
     if args.reference in ("heights", "odometry"):
         inputs.require_tdoas([*flights, *holdout], f"--reference {args.reference}")
-    for remark in remarks_on([*flights, *holdout]):
+    for remark in remarks_on(
+        [*flights, *holdout],
+        [its_survey for _, its_survey in (*found, *reading.find(args.holdout))],
+    ):
         cli.say("diagnose", remark)
     for option in ("marks", "odometry"):
         if args.reference == option and getattr(args, option) is None:

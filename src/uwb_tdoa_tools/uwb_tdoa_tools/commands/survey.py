@@ -33,8 +33,8 @@ Writes anchors.yaml and anchors.csv (for --survey, anchors_file and the rest), e
 anchors, and how well all is known), ekf_node.yaml (noise of TDOAs that the filter should assume with them), survey.json
 (covariance) and survey.png (before and after) to --out.
 
-Exit code: 0 done; 1 ids, signs or units are wrong, or something else that other anchors might make worse: they stay as given; 2 bad
-input."""
+Exit code: 0 done; 1 ids, signs or units are wrong, the survey is of another room, or something else that other anchors might make
+worse: they stay as given; 2 bad input."""
 
 
 def parser() -> ArgumentParser:
@@ -73,7 +73,7 @@ def parser() -> ArgumentParser:
 def _survey(args: Namespace) -> int:
     from uwb_tdoa_bias.effects import EffectSet
 
-    from ..checking.report import nothing_comes_first
+    from ..checking.report import nothing_comes_first, remark_on_surveys
     from ..diagnosis.noise import has_imu, write_parameters
     from ..diagnosis.self_calibration import self_calibrate
     from ..estimate import FlightEstimator
@@ -84,12 +84,18 @@ def _survey(args: Namespace) -> int:
     base, tape = effects or EffectSet(), options.tape_of(args, effects)
     reading = options.reading_of(args)
     if not args.unknown and not nothing_comes_first(
-        "survey", reading, args.flights, FlightEstimator(config, base)
+        "survey",
+        reading,
+        args.flights,
+        FlightEstimator(config, base),
+        max(tape.std, tape.height_std or 0.0),
     ):
         return 1
     jobs, dask = parallel.workers_for(args, len(reading.find(args.flights)), FEW)
     over = partial(parallel.over, jobs=jobs, dask=dask, unit=None)  # only Progress prints a line
     flights = reading.flights(args.flights, None, jobs, dask)
+    for remark in remark_on_surveys([its for _, its in reading.find(args.flights)], flights):
+        cli.say("survey", remark)
     known = options.known_of(args, flights)
     with Progress("survey") as progress:
         result = self_calibrate(

@@ -15,7 +15,7 @@ from .. import outputs
 from .findings import prefixes_of
 from .over_flights import course
 from .report.entries import doubts, entries, worth_in_words
-from .report.tables import ANCHORS, SURE, anchors, by_reason
+from .report.tables import ANCHORS, SURE, anchors, basis, by_reason
 from .report.unclear import by_remedy, undetermined
 from .report.verdict import cause, faults_in_words, truth_in_words, verdict
 
@@ -101,7 +101,9 @@ def as_text(diagnosis: Diagnosis) -> str:
         first, *others_of_it = diagnosis.next_flight.sentences
         lines += [("fly", first), *(("", sentence) for sentence in others_of_it)]
     left_out = [(entry.title, entry.why_not) for entry in found if not entry.added]
-    lines += [("not added", "{1}: {0}.".format(*row)) for row in by_reason(left_out).rows]
+    not_added = by_reason(left_out).rows
+    lines += [("not added", "{1}: {0}.".format(*row)) for row in not_added]
+    lines += [("", f"({basis(not_added)})")] if basis(not_added) else []
     text = [_wrapped(*line) for line in lines]
     values = anchors(diagnosis)
     if values.rows:

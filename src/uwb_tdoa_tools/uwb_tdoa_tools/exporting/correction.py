@@ -48,9 +48,6 @@ PER_UNIT_OF_CHANNEL = {
     ("accel", "1"): (0.5, "after 1 s without TDOAs at 1 m/s^2"),
     ("gyro", "1"): (G / 6.0, "after 1 s without TDOAs at 1 rad/s"),
 }
-# Parameters that say when or where an effect acts, or are in its second unit
-TIMES = "time", "start", "end"
-CONDITIONS = {"floor_multipath": ("x", "y", "height"), "truth_frame": ("roll", "pitch", "yaw")}
 SENSOR_UNITS = {"gyro": "rad/s", "accel": "m/s^2", "velocity": "m/s", "yaw_rate": "rad/s"}
 
 
@@ -89,14 +86,13 @@ def left_out(effect: Effect, anchors: Anchors) -> LeftOut:
 def _unit(effect: Effect) -> str:
     if isinstance(effect, SmoothTerm):
         return SENSOR_UNITS.get(effect.channels[0], "m")
-    return effect.unit.partition(",")[0]
+    return effect.unit_of(effect.example)
 
 
 def _own(effect: Effect, key: str) -> float:
-    """Return a value if it is in the first unit of the effect, else 0."""
-    part = key.rpartition(".")[2]
-    is_condition = part in CONDITIONS.get(effect.name, ()) or part in TIMES and "," in effect.unit
-    return 0.0 if is_condition else effect.values[key]
+    """Return a value if it is a size in the first unit of the effect, else 0."""
+    other = effect.is_condition(key) or effect.unit_of(key) != effect.unit_of(effect.example)
+    return 0.0 if other else effect.values[key]
 
 
 def _why(effect: Effect) -> str:

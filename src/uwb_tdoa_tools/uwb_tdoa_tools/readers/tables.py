@@ -78,7 +78,8 @@ class CsvTable:
         self, path: str | Path, columns: Sequence[str] | None, most: int, complete: bool = True
     ) -> None:
         self._path, self._most, self._complete = path, most, complete
-        content = read_bytes(path, TABLE_BYTES)
+        named = f" with columns {', '.join(columns)}" if columns else ""
+        content = read_bytes(path, TABLE_BYTES, f"CSV file{named}")
         if content.startswith(GZIP_MAGIC):
             content, problem = unpacked(path, content, TABLE_BYTES)
             if problem:

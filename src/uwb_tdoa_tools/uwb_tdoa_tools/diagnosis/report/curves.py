@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.effects.base import listed
-from uwb_tdoa_bias.effects.covariates import UNITS
+from uwb_tdoa_bias.effects.covariates import shown_in
 from uwb_tdoa_bias.effects.smooth_term import described
 
 from ..channels import CHANNELS
@@ -136,13 +136,16 @@ def _product(effect: SmoothTerm) -> Picture:
     part = CHANNELS[effect.channel.partition(".")[0]]
     figure, ax = drawing(2.6)
     most = np.abs(values).max()
+    (x_unit, x_factor), (y_unit, y_factor) = (
+        shown_in(name, "as recorded") for name in effect.arguments
+    )
+    x, y = x_factor * x, y_factor * y
     mesh = ax.pcolormesh(
         x, y, values, shading="nearest", cmap="RdBu_r", vmin=-most, vmax=most, rasterized=True
     )
     figure.colorbar(mesh, ax=ax, label=f"part of {effect.channel} [{part.unit}]")
     names = [name.replace("_", " ") for name in effect.arguments]
-    units = (UNITS.get(name, "as recorded") for name in effect.arguments)
-    ax.set(**dict(zip(("xlabel", "ylabel"), (f"{n} [{u}]" for n, u in zip(names, units)))))
+    ax.set(xlabel=f"{names[0]} [{x_unit}]", ylabel=f"{names[1]} [{y_unit}]")
     said = described(effect, prefix.rstrip(".")).capitalize()
     caption = f"{said}. Beyond these values it fades."
     subject = effect.label.rpartition(" over ")[0]
@@ -153,13 +156,21 @@ def _function(effect: SmoothTerm) -> Picture:
     at = np.linspace(effect.knots[0], effect.knots[-1], 60)
     prefixes = prefixes_of(effect)
     covariate, part = effect.covariate.replace("_", " "), CHANNELS[effect.channel.partition(".")[0]]
+    unit, factor = shown_in(effect.covariate, "as recorded")
     figure, ax = drawing(2.6)
     for k, prefix in enumerate(prefixes):
         style = ("-", "--", ":", "-.")[k // len(COLOURS) % 4]
         colour = COLOURS[k % len(COLOURS)]
-        ax.plot(at, effect.curve(at, prefix), colour, ls=style, lw=1.4, label=prefix.rstrip("."))
+        ax.plot(
+            factor * at,
+            effect.curve(at, prefix),
+            colour,
+            ls=style,
+            lw=1.4,
+            label=prefix.rstrip("."),
+        )
     ax.set(
-        xlabel=f"{covariate} [{UNITS.get(effect.covariate, 'as recorded')}]",
+        xlabel=f"{covariate} [{unit}]",
         ylabel=f"part of {effect.channel} [{part.unit}]",
     )
     ax.grid(True)
@@ -168,7 +179,9 @@ def _function(effect: SmoothTerm) -> Picture:
         caption = f"What depends on {covariate} without having a name, a curve for each anchor."
     else:
         spread, course = effect.spread(at, prefixes[0]), effect.curve(at, prefixes[0])
-        ax.fill_between(at, course - spread, course + spread, color=COLOURS[0], alpha=0.2, lw=0)
+        ax.fill_between(
+            factor * at, course - spread, course + spread, color=COLOURS[0], alpha=0.2, lw=0
+        )
         said = described(effect, prefixes[0].rstrip("."))
         caption = f"{said}. The band is twice the standard deviation wide.".capitalize()
     subject = effect.label.rpartition(" over ")[0]

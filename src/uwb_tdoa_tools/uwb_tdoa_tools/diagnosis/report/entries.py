@@ -190,14 +190,11 @@ def bar(entry: Entry, found: Iterable[Entry]) -> float:
     return LONGEST * entry.worth / largest
 
 
-def for_people(unit: str, key: str = "") -> tuple[str, float]:
-    """Return (unit, factor) that show a value of an effect: angles in degrees.
-
-    key : parameter, which decides between several units
-    """
-    if unit == "m, rad":
-        unit = "m" if key in ("x", "y", "z") else "rad"
-    return (unit.replace("rad", "degrees"), DEGREES) if unit in ("rad", "rad/s") else (unit, 1.0)
+def for_people(unit: str) -> tuple[str, float]:
+    """Return (unit, factor) that show a value of an effect: angles in degrees."""
+    if unit in ("rad", "rad/s"):
+        return unit.replace("rad", "degrees"), DEGREES
+    return "" if unit == "1" else unit, 1.0
 
 
 def _title(findings: Sequence[EffectFinding]) -> str:
@@ -215,21 +212,25 @@ def _values(finding: EffectFinding) -> str:
     effect = finding.effect
     if finding.function:
         return f"a function without a name ({finding.function.shape})"
-    significant = effect.significant()
+    significant = effect.significant() if effect.significant_sizes() else {}
     vague = len(effect.values) - len(significant)
     if not significant and vague > SHOWN:
-        return f"{vague} values, none twice its standard deviation"
+        means = f", {effect.if_undetermined}" if effect.if_undetermined else ""
+        return f"{vague} values, none twice its standard deviation: a fitted correction{means}"
     shown = []
+    units = {for_people(effect.unit_of(key))[0] for key in effect.values}
+    one_unit = units.pop() if len(units) == 1 else ""
     for key, value in sorted(effect.values.items(), key=lambda item: not effect.std.get(item[0])):
         if key in (significant or effect.values):  # without significant values, all are named
-            factor = for_people(effect.unit, key)[1]
+            unit, factor = for_people(effect.unit_of(key))
             std = factor * (effect.std.get(key) or 0.0)
-            shown.append(f"{key} = {measured(factor * value, std)}")
+            shown.append(f"{key} = {measured(factor * value, std, '' if one_unit else unit)}")
     if len(shown) > SHOWN:
         shown[SHOWN:] = [f"{len(shown) - SHOWN} more"]
-    words = f"{', '.join(shown)} ({effect.unit.replace('rad', 'degrees')})"
+    words = ", ".join(shown) + (f" ({one_unit})" if one_unit else "")
     if not significant:
-        return f"{words}; not twice the standard deviation"
+        means = f": {effect.if_undetermined}" if effect.if_undetermined else ""
+        return f"{words}; not twice the standard deviation{means}"
     return f"{words}; {vague} not significant" if vague else words
 
 

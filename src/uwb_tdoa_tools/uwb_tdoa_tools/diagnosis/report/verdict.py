@@ -239,8 +239,15 @@ def _named(diagnosis: Diagnosis) -> str:
 
 def _worse_phases(diagnosis: Diagnosis) -> list[str]:
     """Return a sentence on phases in which the error grows."""
-    worse = "; ".join(worse_phases(diagnosis.before["pooled"], diagnosis.after["pooled"]))
+    worse = "; ".join(_worse(diagnosis).values())
     return [f"Worse: {worse}."] if worse else []
+
+
+def _worse(diagnosis: Diagnosis) -> dict[str, str]:
+    """Return {phase: clause} of the phases in which the error grows; {} if nothing is added."""
+    if not any(finding.added for finding in diagnosis.findings):
+        return {}
+    return _of_worse_phases(diagnosis.before["pooled"], diagnosis.after["pooled"])
 
 
 def _with_noise(diagnosis: Diagnosis) -> list[str]:
@@ -248,8 +255,13 @@ def _with_noise(diagnosis: Diagnosis) -> list[str]:
     if diagnosis.written is None or diagnosis.tdoa_std is None:
         refused = (item for item in diagnosis.refused if item.what.startswith("tdoa_std"))
         return [f"{item.what} is not written to ekf_node.yaml: {item.why}." for item in refused]
-    after = diagnosis.written["pooled"]
-    worse = "; ".join(worse_phases(diagnosis.before["pooled"], after))
+    after, said = diagnosis.written["pooled"], _worse(diagnosis)
+    phases = after.get("phases", {}), diagnosis.after["pooled"].get("phases", {})
+    worse = "; ".join(
+        clause
+        for name, clause in _of_worse_phases(diagnosis.before["pooled"], after).items()
+        if name not in said or clear_change(*(side[name]["rmse_3d"] for side in phases))
+    )
     also = f"; worse: {worse}" if worse else ""
     return [
         f"With tdoa_std {diagnosis.tdoa_std:.3f} m of ekf_node.yaml too it is "
@@ -262,9 +274,9 @@ def _over_phases(diagnosis: Diagnosis) -> list[str]:
     before, after = (
         side["pooled"].get("phases", {}) for side in (diagnosis.before, diagnosis.after)
     )
-    judged = {score.part for score in diagnosis.before["scores"]}
+    said = {score.part for score in diagnosis.before["scores"]} | set(_worse(diagnosis))
     parts = []
-    for name in (name for name in TITLES if name in before and name not in judged):
+    for name in (name for name in TITLES if name in before and name not in said):
         sides = [_of_phase(side[name]) for side in (before, after)]
         parts.append(f"{TITLES[name]} {' to '.join(dict.fromkeys(sides))}")
     return [f"Outside of that, before and after: {'; '.join(parts)}."] if parts else []
@@ -275,12 +287,19 @@ def worse_phases(before: dict[str, Any], after: dict[str, Any]) -> Iterator[str]
 
     before, after : pooled figures of a side of `compare`
     """
+    yield from _of_worse_phases(before, after).values()
+
+
+def _of_worse_phases(before: dict[str, Any], after: dict[str, Any]) -> dict[str, str]:
+    """Return {phase: clause} as of `worse_phases`."""
+    out = {}
     sides = before.get("phases", {}), after.get("phases", {})
     for name in (name for name in TITLES if name in sides[0] and name in sides[1]):
         first, second = (side[name] for side in sides)
         known = first["rmse_3d"] is not None and second["rmse_3d"] is not None
         if known and clear_change(first["rmse_3d"], second["rmse_3d"]) < 0:  # it rises
-            yield f"{TITLES[name]} from {_of_phase(first)} to {_of_phase(second)}"
+            out[name] = f"{TITLES[name]} from {_of_phase(first)} to {_of_phase(second)}"
+    return out
 
 
 def _of_phase(figures: dict[str, Any]) -> str:
@@ -377,13 +396,22 @@ def cause(entry: Entry) -> str:
         )
         return f"errors that depend on {covariates}, anchor by anchor; at most {said}"
     effect = entry.findings[0].effect
-    significant = effect.significant() or effect.values
-    key = max(significant, key=lambda name: abs(significant[name]))
-    unit, factor = for_people(effect.unit, key)
+    what, key = effect.physics.partition(":")[0], effect.largest_size()
+    if key is None:
+        return f"{what} ({effect.name})"
+    unit, factor = for_people(effect.unit_of(key))
     std = effect.std.get(key)
     largest = measured(factor * effect.values[key], std and factor * std, unit)
-    most = "largest " if len(effect.values) > 1 else ""
-    return f"{effect.physics.partition(':')[0]} ({effect.name}; {most}{key} = {largest})"
+    sizes = sum(not effect.is_condition(name) for name in effect.values)
+    most = "largest " if sizes > 1 else ""
+    if not effect.significant_sizes():
+        values = f"none of its {sizes} values is" if sizes > 1 else "its value is not"
+        means = f", {effect.if_undetermined}" if effect.if_undetermined else ""
+        return (
+            f"a fitted correction ({effect.name}; {most}{key} = {largest}): {values} twice the "
+            f"standard deviation{means}"
+        )
+    return f"{what} ({effect.name}; {most}{key} = {largest})"
 
 
 def _functions(entry: Entry) -> list[SmoothTerm]:

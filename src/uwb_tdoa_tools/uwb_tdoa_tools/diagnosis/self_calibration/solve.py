@@ -47,6 +47,10 @@ CLEARLY = 2.6
 CLEARLY_OF_RANGES = 1.25
 PLAINLY = 5.0  # smallest shift, in standard deviations, of an anchor that moved alone
 WELL_PLACED = 0.08  # m, 3D standard deviation of a moved anchor below which no advice is given
+MEASURE = (
+    "hold the tag at some measured places in the air and give them to survey with --marks "
+    "(docs/calibration.md), or record ground truth, which diagnose uses"
+)
 NEARER = 0.75  # smallest share of marks, each left out once, at which the estimate must improve
 
 
@@ -146,7 +150,7 @@ class SelfCalibration:
                 f"at marks, each left out once, the estimate is off by {100 * before:.1f} cm "
                 f"with the anchors as given, and by {100 * after:.1f} cm with "
                 f"others, and nearer at {nearer:.0%} of them: the position would suffer; "
-                "measure more marks, or fly where it is known"
+                "give more marks, or record ground truth, which diagnose uses"
             )
         slow = (
             f"{100 * self.before:.1f} cm of the innovations are slow with the anchors as "
@@ -157,14 +161,13 @@ class SelfCalibration:
                 return None
             return (
                 f"{slow}: that is less than {CLEARLY_OF_RANGES:g} times as much. The anchors are "
-                "not the largest error, and the position might suffer; give --marks, or fly where "
-                "it is known"
+                f"not the largest error, and the position might suffer; {MEASURE}"
             )
         if self.left <= LEFT or self.before > CLEARLY * self.left:
             return None
         return (
             f"{slow}: more than {100 * LEFT:.1f} cm: something else is wrong too, and the position might "
-            "suffer; give --marks, or fly where it is known"
+            f"suffer; {MEASURE}"
         )
 
     @property
