@@ -177,7 +177,7 @@ def test_what_is_worth_little_is_kept_of_several_flights_and_not_of_one(flights)
         "gyro_bias",
     }
     assert {candidate.name for candidate in alone.selection.chosen} == {"anchor_delay"}
-    assert "of one flight, worth less than 5% of the error" in alone.refused[-1].why
+    assert "of one flight, worth less than 5 % of the error" in alone.refused[-1].why
     assert sorted(candidate.name for candidate in alone.worth) == ["anchor_delay", "gyro_bias"]
     assert np.array_equal(
         alone.selection.fit.weight, found[1].selection.fit.weight
@@ -212,7 +212,7 @@ def test_noise_that_the_filter_should_know_of_is_kept_and_noise_that_it_should_n
     assert kept.detections == (noise,) and kept.worth[noise] > 0.0
     noisy = flights
     kept, noise = judged(3.0)
-    assert kept.detections == () and "it gains less than 0.5% of the error" in kept.refused[-1].why
+    assert kept.detections == () and "it gains less than 0.5 % of the error" in kept.refused[-1].why
 
 
 def test_a_run_corrected_at_the_poses_of_the_run_itself_is_that_run(flights):
@@ -353,7 +353,7 @@ def test_what_makes_one_flight_worse_is_not_applied(changes, worst):
     found = _worse_in_one(of_both, ["a", "b"])
     assert (found and found[0]) == worst
     if worst:
-        assert f"1.000 m with, {1.0 + min(changes):.3f} m without; a third flight" in found[1]
+        assert f"a third flight decides: 1.000 m with, {1.0 + min(changes):.3f} m" in found[1]
 
 
 class Some(str):

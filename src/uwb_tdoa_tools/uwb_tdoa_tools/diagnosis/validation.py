@@ -220,7 +220,7 @@ def select_by_error(
             worth[detection] = error - trial
             error = trial
         else:
-            useless = f"it gains less than {WORSE:.1%} of the error: "
+            useless = f"it gains less than {100.0 * WORSE:g} % of the error: "
             useless += _with_and_without(trial, error)
             why = useless if trial >= error * (1.0 - WORSE) else why_without(trial, error)
             refused.append(Refused(detection.effect.label, why))
@@ -275,8 +275,8 @@ def _worse_in_one(
         return None
     return (
         worst,
-        f"one of both flights gets worse by it: {_with_and_without(after, before)}; a third flight "
-        "decides it",
+        "one of both flights gets worse by it, and a third flight decides: "
+        + _with_and_without(after, before),
     )
 
 
@@ -347,7 +347,7 @@ def why_without(error: float, without: float) -> str:
     if without < error + min(LEAST_WORTH, LEAST_SHARE * error):
         return f"it is worth nothing for the position: {figures}"
     return (
-        f"of one flight, worth less than {WORTH_OF_ONE:.0%} of the error, it may as well do harm to "
+        f"of one flight, worth less than {100.0 * WORTH_OF_ONE:g} % of the error, it may as well do harm to "
         f"another; {SECOND}: {figures}"
     )
 
