@@ -101,6 +101,7 @@ MOST_FRAMES = 100  # frames of the IMU to remember; a topic may carry any number
 MOST_NAMED = 3  # frames that one message names
 MAST = 0.1  # m, height of an antenna over the body from which the two heights differ visibly
 EARLY = 5000  # messages kept until anchors arrive
+DISCOVERY = 1.0  # s in which the publishers of all streams are discovered
 
 
 class EkfNode(StreamNode):
@@ -154,6 +155,7 @@ class EkfNode(StreamNode):
         # Messages that arrived before the anchors, as (stream, (frame, stamps, rows, arrivals))
         # with one message each.
         self._early: deque[tuple[str, tuple[Any, ...]]] = deque()
+        self._only_tdoas_since = math.inf  # s of time.monotonic
         # counts of earlier estimators, and of messages that no estimator received
         self._past: Counter[str] = Counter()
         self._lately: list[
@@ -387,9 +389,22 @@ class EkfNode(StreamNode):
         self._frames.catch_up()
         if self._estimator is not None:
             # else the first poses come `lag` late, and bias_node does not wait so long for them
-            self._estimator.expect_imu(self.streams.inputs["imu/data"].get_publisher_count() > 0)
+            self._estimator.expect_imu(self._imu_may_come())
             self._publish(*self._estimator.advance())
             self._say_restart()
+
+    def _imu_may_come(self) -> bool:
+        """Return False if nobody publishes inertial samples, though TDOAs are published.
+
+        The publishers of a driver are not discovered at the same time, so this takes DISCOVERY.
+        """
+        inputs, now = self.streams.inputs, time.monotonic()
+        only_tdoas = (
+            inputs["uwb/tdoa_corrected"].get_publisher_count() > 0
+            and inputs["imu/data"].get_publisher_count() == 0
+        )
+        self._only_tdoas_since = min(self._only_tdoas_since, now) if only_tdoas else math.inf
+        return now < self._only_tdoas_since + DISCOVERY
 
     def _take_imu(self, frame: str, t: np.ndarray, rows: np.ndarray, arrival: np.ndarray) -> None:
         mount = self._place_imu(frame)
