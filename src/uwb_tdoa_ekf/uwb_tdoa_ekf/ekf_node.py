@@ -101,7 +101,6 @@ MOST_FRAMES = 100  # frames of the IMU to remember; a topic may carry any number
 MOST_NAMED = 3  # frames that one message names
 MAST = 0.1  # m, height of an antenna over the body from which the two heights differ visibly
 EARLY = 5000  # messages kept until anchors arrive
-DISCOVERY = 1.0  # s in which the publishers of all streams are discovered
 
 
 class EkfNode(StreamNode):
@@ -155,7 +154,7 @@ class EkfNode(StreamNode):
         # Messages that arrived before the anchors, as (stream, (frame, stamps, rows, arrivals))
         # with one message each.
         self._early: deque[tuple[str, tuple[Any, ...]]] = deque()
-        self._only_tdoas_since = math.inf  # s of time.monotonic
+        self._imu_missing = False  # whether only TDOAs had a publisher at the last report
         # counts of earlier estimators, and of messages that no estimator received
         self._past: Counter[str] = Counter()
         self._lately: list[
@@ -388,23 +387,8 @@ class EkfNode(StreamNode):
     def _advance(self) -> None:
         self._frames.catch_up()
         if self._estimator is not None:
-            # else the first poses come `lag` late, and bias_node does not wait so long for them
-            self._estimator.expect_imu(self._imu_may_come())
             self._publish(*self._estimator.advance())
             self._say_restart()
-
-    def _imu_may_come(self) -> bool:
-        """Return False if nobody publishes inertial samples, though TDOAs are published.
-
-        The publishers of a driver are not discovered at the same time, so this takes DISCOVERY.
-        """
-        inputs, now = self.streams.inputs, time.monotonic()
-        only_tdoas = (
-            inputs["uwb/tdoa_corrected"].get_publisher_count() > 0
-            and inputs["imu/data"].get_publisher_count() == 0
-        )
-        self._only_tdoas_since = min(self._only_tdoas_since, now) if only_tdoas else math.inf
-        return now < self._only_tdoas_since + DISCOVERY
 
     def _take_imu(self, frame: str, t: np.ndarray, rows: np.ndarray, arrival: np.ndarray) -> None:
         mount = self._place_imu(frame)
@@ -548,6 +532,19 @@ class EkfNode(StreamNode):
             return math.nan
         return rotation_std(*self._attitude)[0, 2]
 
+    def _look_for_imu(self) -> None:
+        """Do not wait for inertial samples if two successive reports find no publisher of them.
+
+        Otherwise the first poses come `lag` late, and bias_node does not wait so long for them. One
+        report does not suffice: the publishers of a driver are discovered one after another.
+        """
+        missing = (
+            self._health.corrects and not self.streams.inputs["imu/data"].get_publisher_count()
+        )
+        if self._estimator is not None:
+            self._estimator.expect_imu(not (missing and self._imu_missing))
+        self._imu_missing = missing
+
     def _report(self) -> Report:
         self._frames.catch_up()  # without odometry, no other call reads /tf
         counts, estimator = self._counts(), self._estimator
@@ -556,6 +553,7 @@ class EkfNode(StreamNode):
             waiting = Counter(dict(zip(STREAMS, estimator.waiting)))
         self._health.behind = self._behind()
         self._health.corrects = self.streams.inputs["uwb/tdoa_corrected"].get_publisher_count() > 0
+        self._look_for_imu()
         self._findings = self._stream_findings()
         level, text, values = self._health.report(
             self._anchors.refused, estimator, counts, self._wiring(), self._findings

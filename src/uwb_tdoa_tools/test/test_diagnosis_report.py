@@ -433,8 +433,8 @@ def test_values_are_shown_as_far_as_they_are_significant(result, name, values, s
 def test_figures_of_trials_have_one_order_and_one_unit():
     rows = by_reason(
         [
-            ("one", "the filter does better without it: 0.166 m with, 0.146 m without"),
-            ("two", "does not make the filter better: 0.146 m without, 0.166 m with"),
+            ("one", "the filter does better without it: 14.6 cm without, 16.6 cm with"),
+            ("two", "does not make the filter better: 14.6 cm without, 16.6 cm with"),
             ("three", "another flight may not have it (probability 30%)"),
         ]
     ).rows

@@ -353,7 +353,7 @@ def test_what_makes_one_flight_worse_is_not_applied(changes, worst):
     found = _worse_in_one(of_both, ["a", "b"])
     assert (found and found[0]) == worst
     if worst:
-        assert f"a third flight decides: 1.000 m with, {1.0 + min(changes):.3f} m" in found[1]
+        assert f"decides: {100.0 + 100.0 * min(changes):.1f} cm without, 100.0 cm with" in found[1]
 
 
 class Some(str):

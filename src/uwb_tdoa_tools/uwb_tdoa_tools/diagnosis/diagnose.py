@@ -342,14 +342,14 @@ def _by_error(
     )
     work.progress("judging")
     cases, judged_on = validation.validation_cases(model, fitted, held_out, base, effects)
-    before, after = comparison.compare(
-        cases,
-        baseline,
-        work.saying("judging"),
-        work.reference.shift_std,
-        map_function,
-        selected.runs,
+    judged = partial(
+        comparison.compare,
+        baseline=baseline,
+        progress=work.saying("judging"),
+        shift_std=work.reference.shift_std,
+        map_function=map_function,
     )
+    before, after = judged(cases, known=selected.runs)
     refused = list(selected.refused)
     shift_std = max(work.reference.shift_std(flight.name).max() for flight in fitted)
     why_not = comparison.why_not(before, after, shift_std)
@@ -365,13 +365,7 @@ def _by_error(
         cases = [replace(case, effects=effects) for case in cases]
         after = before
         if attribution.of_floor:
-            before, after = comparison.compare(
-                cases,
-                baseline,
-                work.saying("judging"),
-                work.reference.shift_std,
-                map_function,
-            )
+            before, after = judged(cases)
     findings = _findings(
         model.findings(), attribution.findings(), attribution.detections, selected.worth
     )

@@ -354,7 +354,7 @@ def why_without(error: float, without: float) -> str:
 
 def _with_and_without(error: float, without: float) -> str:
     """Return errors with and without an effect, m, as text."""
-    return f"{error:.3f} m with, {without:.3f} m without"
+    return f"{100.0 * without:.1f} cm without, {100.0 * error:.1f} cm with"
 
 
 def _momentary(candidate: Candidate) -> bool:

@@ -29,8 +29,6 @@ SURE = 2.0  # standard deviations of a value of an anchor that is not marked wit
 MANY = 3  # largest number of anchors whose positions or delays stand in a sentence
 # a reason, and its figures: after ": ", or in brackets at the end
 FIGURES_OF_REASON = re.compile(r"(.*?)(?:: (.*\d.*)| \(([^()]*\d[^()]*)\))?")
-# the figures of a trial, in either order
-TRIAL = re.compile(r"(\d+\.\d+) m (with|without), (\d+\.\d+) m (?:with|without)")
 BASIS = (
     "figures: position error without and with it in trials, beside the effects that were left then; "
     "so those of two effects do not compare"
@@ -177,16 +175,6 @@ def not_added(found: Sequence[Entry]) -> Table:
     )
 
 
-def _ordered(figures: str) -> str:
-    """Return the figures of a trial in cm, the error without an effect first; others unchanged."""
-    trial = TRIAL.fullmatch(figures)
-    if not trial:
-        return figures
-    errors = [float(trial[k]) * CM for k in (1, 3)]
-    without, with_it = errors if trial[2] == "without" else errors[::-1]
-    return f"{without:.1f} cm without, {with_it:.1f} cm with"
-
-
 def basis(rows: Iterable[Sequence[object]]) -> str:
     """Return the BASIS if rows of `by_reason` hold figures of trials, else ""."""
     return BASIS if any(" cm without, " in str(row[1]) for row in rows) else ""
@@ -201,7 +189,7 @@ def by_reason(items: Iterable[tuple[str, str]]) -> Table:
     for what, why in items:
         split = FIGURES_OF_REASON.fullmatch(why)
         reason, figures = split.group(1, 2) if split else (why, "")
-        figures = _ordered(figures or why[len(reason) :].strip(" ()"))
+        figures = figures or why[len(reason) :].strip(" ()")
         rows.setdefault(reason, []).append(f"{what} ({figures})" if figures else what)
     return Table(
         ("why not", "what"), [(reason, "; ".join(whats)) for reason, whats in rows.items()]
