@@ -116,6 +116,18 @@ def leaning_accel(flight):
     return _imu(flight, accel=0.3 * (height - height.mean())[:, None] * [0.0, 0.0, 1.0])
 
 
+def accel_of_place_beside_drift(flight):
+    """The bias of the accelerometer's z grows with y; x and y wander by 2 m/s^2 within 1.5 s."""
+    t = flight.imu.t
+    y = np.interp(t, flight.truth.t, flight.truth.p[:, 1])
+    step = np.median(np.diff(t)) / 1.5
+    drift = np.zeros((len(t), 3))
+    kicks = np.random.default_rng(0).normal(0.0, 2.0 * np.sqrt(2.0 * step), (len(t), 2))
+    for k in range(1, len(t)):
+        drift[k, :2] = (1.0 - step) * drift[k - 1, :2] + kicks[k]
+    return _imu(flight, accel=drift + 1.2 * np.maximum(y, 0.0)[:, None] * [0.0, 0.0, 1.0])
+
+
 def _of_anchor(flight, anchor, late):
     ids = flight.anchors.ids
     return _tdoa(

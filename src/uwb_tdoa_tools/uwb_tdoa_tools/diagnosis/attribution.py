@@ -54,8 +54,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.effects import Covariance, Effect
 
     from ..parallel import MapFunction
-    from .channels import ChannelResidual, ChannelResiduals
-    from .channels.views import CovariateView
+    from .channels import ChannelResiduals
     from .detectors import Detection, Detector
     from .references import Reference
     from .regression.fit import Fit
@@ -192,7 +191,7 @@ def attribute(
     remaining = searching.residuals(effects_of(selection))
     alone: tuple[tuple[str, Selection], ...] = ()
     if undeclared and len(flights) > 1 and all(reference.positions_known):
-        found = of_one(remaining, searching.inflation, _views, searching.search, map_function)
+        found = of_one(remaining, searching.inflation, searching.search, map_function)
         alone = tuple((names[k], own) for k, own in found)
     near = [(name, part) for name, part in zip(names, map(near_floor, remaining)) if part]
     floor = None
@@ -336,7 +335,7 @@ class _Searching:
     def _scan_of(self, table: RegressionTable) -> Scan:
         """Return the Scan of a table, one per number of rows: stamp offsets change the number."""
         if len(table.y) not in self._scans:
-            self._scans[len(table.y)] = Scan(table, _views(table))
+            self._scans[len(table.y)] = Scan(table, table.views())
         return self._scans[len(table.y)]
 
 
@@ -398,7 +397,7 @@ def on_floor(
     if undeclared and not found.chosen:
         views = {
             name: [view for view in views if view.covariate in UPWARDS]
-            for name, views in _views(table).items()
+            for name, views in table.views().items()
         }
         scan = Scan(table, views)
         inflation = inflation_of(table, [], lambda *fitted: scan(*fitted)[:1])
@@ -501,14 +500,6 @@ def _smooth(
         for term in channel.smooth_terms(parts) if parts else ():
             out += candidates_of(term, *installation)[:1]
     return out
-
-
-def _views(table: RegressionTable) -> dict[str, list[CovariateView]]:
-    """Return {channel: [CovariateView]} of the channels in a RegressionTable."""
-    parts: dict[str, list[ChannelResidual]] = {}
-    for _, name, _, part in table.parts:
-        parts.setdefault(name, []).append(part)
-    return {name: CHANNELS[name].views(several) for name, several in parts.items()}
 
 
 def _is_large(candidate: Candidate, selection: Selection) -> bool:

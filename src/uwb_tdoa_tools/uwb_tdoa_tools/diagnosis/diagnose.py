@@ -26,13 +26,14 @@ from .channels import CHANNELS, health
 from .findings import EffectFinding, Refused, usable
 from .noise import DECIMALS
 from .references import GroundTruth, Reference
-from .refinement import written
+from .refinement import effects_of, written
 from .regression.confounding import unobservable
 from .result import Diagnosis
 from .self_calibration import Tape, self_calibrate
 from .self_calibration.equations import measured_noise
 from .self_calibration.prior import with_calibration
 from .self_calibration.solve import same_anchors
+from .single_axes import beside, functions_of_axes
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Sequence
@@ -113,7 +114,7 @@ def diagnose(
     )
     sound, rest = repairing.sound(fitted, base, repairs)
     if reference.tells_errors:
-        found, selected = _searched(work, sound, rest)
+        found, selected = _with_functions_of_axes(work, sound, rest, *_searched(work, sound, rest))
         outcome = _by_error(work, found, selected, fitted, held_out, repairs)
     else:
         found = _attributed(work, sound, rest)
@@ -303,6 +304,47 @@ def _searched(
         others = sorted(names.difference(one.what for one in known))
         refused = (*refused, *known, *(Refused(name, better) for name in others))
         kinds, best = kinds - names, trial
+
+
+def _with_functions_of_axes(
+    work: _Work,
+    flights: Flights,
+    base: EffectSet,
+    found: Attribution,
+    selected: validation.ValidatedSelection,
+) -> tuple[Attribution, validation.ValidatedSelection]:
+    """Return the result of `_searched` with functions of single axes of sensors.
+
+    They are taken only if the error falls by more than LOSS, so other results do not change.
+    """
+    model = EffectSet((*base.effects, *effects_of(selected.selection)))
+    tracing = work.saying("tracing residuals of single axes")
+    remaining = residuals_of(flights, work.reference, model, tracing, work.map_function)
+    refused: list[Refused] = []
+    functions = functions_of_axes(remaining, refused, tracing)
+    if not functions:
+        return found, selected
+    trial = validation.select_by_error(
+        replace(found, selection=beside(selected.selection, functions)),
+        flights,
+        comparison.Baseline(base, work.config),
+        work.saying("running the filter without each"),
+        work.map_function,
+    )
+    if gain(selected.error, trial.error) <= LOSS:
+        return found, selected
+    found = replace(
+        found,
+        selection=beside(found.selection, functions),
+        refused=(*found.refused, *refused),
+    )
+    decided = {one.what for one in trial.refused}
+    earlier = [one for one in selected.refused if one.what not in decided]
+    return found, replace(
+        trial,
+        refused=(*earlier, *trial.refused),
+        worth={**selected.worth, **trial.worth},
+    )
 
 
 def _suspects(found: Attribution, selected: validation.ValidatedSelection) -> list[frozenset[str]]:

@@ -16,13 +16,11 @@ from .regression.select import select
 from .regression.table import table_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from ..parallel import MapFunction
     from .channels import ChannelResiduals
-    from .channels.views import CovariateView
     from .regression.select import Search, Selection
-    from .regression.table import RegressionTable
     from .regression.terms import Candidate
 
 DETERMINED = 0.25  # largest standard deviation of a share that a flight determines
@@ -176,7 +174,6 @@ def in_words(several: Sequence[Share]) -> str:
 def of_one(
     remaining: list[ChannelResiduals],
     inflation: np.ndarray,
-    views: Callable[[RegressionTable], dict[str, list[CovariateView]]],
     search: Search,
     map_function: MapFunction = map,
 ) -> list[tuple[int, Selection]]:
@@ -185,12 +182,11 @@ def of_one(
     An effect that another flight shows too is left out.
 
     remaining : [{channel: ChannelResidual}] under the common model; inflation : of the common fit
-    views : views(table) returns {channel: [CovariateView]}; search : as of `select`
-    map_function : as of `attribute`
+    search : as of `select`; map_function : as of `attribute`
     """
     out = []
     for number, selection in enumerate(
-        map_function(partial(_selection, inflation, views, search), remaining)
+        map_function(partial(_selection, inflation, search), remaining)
     ):
         if selection is None:
             continue
@@ -206,13 +202,12 @@ def of_one(
 
 def _selection(
     inflation: np.ndarray,
-    views: Callable[[RegressionTable], dict[str, list[CovariateView]]],
     search: Search,
     residuals: ChannelResiduals,
 ) -> Selection | None:
     """Return the Selection for the residuals of one flight; None if it is empty."""
     table = table_of([residuals])
-    selection = select(table, [], inflation, search, Scan(table, views(table)))
+    selection = select(table, [], inflation, search, Scan(table, table.views()))
     return selection if selection.chosen else None
 
 

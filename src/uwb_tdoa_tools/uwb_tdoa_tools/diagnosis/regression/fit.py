@@ -149,7 +149,9 @@ def fit(
         if np.all(np.abs(change) < 0.01 * scale[group]):
             break
     if inflation is None:
-        inflation = measure_inflation(table, residual, weight, scale, columns)
+        inflation = _median_of_axes(
+            table, measure_inflation(table, residual, weight, scale, columns)
+        )
     root = weight / (scale[group] ** 2 * inflation[group])
     cov = (
         _covariance(table, columns, residual, root) if columns and covariance else np.zeros((0, 0))
@@ -254,8 +256,7 @@ def measure_inflation(
 
     It is the larger of two measures. The first is 1 + 2 sum(rho) over the autocorrelation of each
     series up to 3 s. The second is the ratio of the variance of block sums of scores to independent
-    rows, averaged over the columns. It includes correlation between series. All axes of a channel
-    get their median: an excess on one axis only is an effect.
+    rows, averaged over the columns. It includes correlation between series.
 
     residual : (n,) of a fit with all columns, because effects that are left count as noise
     weight : (n,) robust weights; scale : (groups,)
@@ -270,6 +271,15 @@ def measure_inflation(
         raw = raw / (1.0 - min(spent, 0.6)) if raw > 1.2 else raw
         # Blocks are independent, so at most a block's rows count as one.
         out[k] = max(1.0, min(raw, len(r) / len(np.unique(table.block[rows]))))
+    return out
+
+
+def _median_of_axes(table: RegressionTable, inflation: np.ndarray) -> np.ndarray:
+    """Return an inflation with the median of a channel for each of its axes, (groups,).
+
+    An excess on one axis only is an effect.
+    """
+    out = inflation.copy()
     for name in table.present:
         axes = np.unique(table.group[table.rows_of(name)])
         out[axes] = np.median(out[axes])

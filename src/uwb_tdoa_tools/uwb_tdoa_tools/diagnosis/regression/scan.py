@@ -367,16 +367,20 @@ class _Group:
             yield float(gains[row, k]), shapes, shape, tuple(map(float, at)), gains.shape[1]
 
 
-def _prior(view: CovariateView) -> float:
-    """Return the information of the prior of the functions of a view."""
-    line = SmoothTerm(
+def line_over(view: CovariateView) -> SmoothTerm:
+    """Return the line over 0 to 1 in the covariate of a view."""
+    return SmoothTerm(
         channel=view.channel,
         covariate=view.covariate,
         form=view.form,
         knots=(0.0, 1.0),
         shape="line",
     )
-    return line.prior_std_of("c0") ** -2
+
+
+def _prior(view: CovariateView) -> float:
+    """Return the information of the prior of the functions of a view."""
+    return line_over(view).prior_std_of("c0") ** -2
 
 
 def _products(

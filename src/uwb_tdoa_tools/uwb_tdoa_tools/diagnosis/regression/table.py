@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.effects import Effect
 
     from ..channels import ChannelResidual, ChannelResiduals
+    from ..channels.views import CovariateView
     from .terms import Column, Term
 
 BLOCK = 5.0  # s, length of a block; blocks count as independent
@@ -90,6 +91,13 @@ class RegressionTable:
     def flights(self) -> int:
         """Return the number of flights."""
         return int(self.flight.max()) + 1
+
+    def views(self) -> dict[str, list[CovariateView]]:
+        """Return {channel: [CovariateView]} of its channels."""
+        parts: dict[str, list[ChannelResidual]] = {}
+        for _, name, _, part in self.parts:
+            parts.setdefault(name, []).append(part)
+        return {name: CHANNELS[name].views(several) for name, several in parts.items()}
 
     @property
     def radio_parts(self) -> list[RadioResidual]:
