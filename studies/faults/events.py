@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Truth
+from uwb_tdoa_bias.common.flight import Truth
 from uwb_tdoa_bias.common.sensors import Height, Pressure, Ranges
 from uwb_tdoa_bias.common.sensors.pressure import SITE, pressure_at
 from uwb_tdoa_tools.scoring.metrics import position_at, scored_phase
@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 
 BEFORE = 1.5  # s on the floor before take-off
 IMU_EVERY = 4  # send each fourth inertial sample, to keep the computer idle enough
-RATES = {"height": 50.0, "velocity": 100.0, "pressure": 25.0, "range": 100.0}  # Hz
+RATES = {"height": 50.0, "pressure": 25.0, "velocity": 100.0, "range": 100.0}  # Hz
+PLAYED = tuple(RATES)  # sensors that the study plays, in the order of SENSORS
 HEIGHT_STD, PRESSURE_STD, RANGE_STD = 0.02, 0.1, 0.1  # m
 # {stream: the fields of its values that are numbers}
 NUMBERS = {
@@ -77,7 +78,7 @@ def part_of(flight: Flight, seconds: float) -> Flight:
         columns = {name: column[rows] for name, column in vars(stream).items()}
         return replace(stream, **columns | {"t": columns["t"] - begin})
 
-    parts = {name: cut(getattr(flight, name)) for name in ("tdoa", "truth", *SENSOR_NAMES)}
+    parts = {name: cut(getattr(flight, name)) for name in ("tdoa", "truth", *PLAYED)}
     return flight.replaced(**parts, imu=cut(flight.imu, IMU_EVERY))
 
 

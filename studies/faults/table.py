@@ -10,8 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from uwb_tdoa_bias.common.flight import SENSOR_NAMES
-
 from .changes import (
     Change,
     chain,
@@ -39,13 +37,14 @@ from .changes import (
     second_sender,
     valued,
 )
+from .events import PLAYED
 
 # s: from the first message to a fault, how long it lasts, and what follows
 BEGIN, LASTS, AFTER = (14.0, 6.0, 7.0)
 EARLY, LONG = 5.0, 22.0  # s: begin and length of one whose effect needs long
 FEET, LIGHT = 3.280839895, 0.299792458  # in a metre; m in a nanosecond
 NORMAL = 9.80665  # m/s^2 in g
-STREAMS = ("tdoa", "imu", *SENSOR_NAMES)
+STREAMS = ("tdoa", "imu", *PLAYED)
 ALL = " ".join(STREAMS)
 
 
@@ -116,7 +115,7 @@ def ekf(**parameters: Any) -> dict[str, dict[str, Any]]:
 
 def of_stream(name: str) -> dict[str, Fault]:
     """What can be wrong with the time or the sequence of any stream."""
-    plays = (name,) if name in SENSOR_NAMES else ()
+    plays = (name,) if name in PLAYED else ()
     rows = {
         "ahead 0.3 s": Fault("stamps are 0.3 s ahead", during(name, restamped(0.3))),
         "ahead 5 s": Fault("stamps are 5 s ahead", during(name, restamped(5.0))),
@@ -181,34 +180,32 @@ EXCHANGED, SHIFTED, UNKNOWN = (
 FAULTS: dict[str, Fault] = {
     "nothing": Fault("nothing"),
     "nothing, all sensors": Fault(
-        "nothing; with height, pressure, velocity and ranges", plays=SENSOR_NAMES
+        "nothing; with height, pressure, velocity and ranges", plays=PLAYED
     ),
     **{key: row for name in STREAMS for key, row in of_stream(name).items()},
     # Several streams
     "all: jump +5 s": jump(
         "all clocks jump by 5 s ahead and stay there",
         for_good(during(ALL, restamped(5.0))),
-        plays=SENSOR_NAMES,
+        plays=PLAYED,
     ),
     "all: jump -5 s": jump(
         "all clocks jump by 5 s back and stay there",
         for_good(during(ALL, restamped(-5.0))),
-        plays=SENSOR_NAMES,
+        plays=PLAYED,
     ),
     "all: bursts": Fault(
         "all messages come together, each half a second",
         during(ALL, in_bursts(0.5)),
-        plays=SENSOR_NAMES,
+        plays=PLAYED,
     ),
     "all: silent 1 s": Fault(
-        "no message at all for 1 s", during(ALL, lost), plays=SENSOR_NAMES, lasts=1.0
+        "no message at all for 1 s", during(ALL, lost), plays=PLAYED, lasts=1.0
     ),
     "all: silent 5 s": Fault(
-        "no message at all for 5 s", during(ALL, lost), plays=SENSOR_NAMES, lasts=5.0
+        "no message at all for 5 s", during(ALL, lost), plays=PLAYED, lasts=5.0
     ),
-    "all: flood": Fault(
-        "each message comes ten times", during(ALL, repeated(10)), plays=SENSOR_NAMES
-    ),
+    "all: flood": Fault("each message comes ten times", during(ALL, repeated(10)), plays=PLAYED),
     "tdoa and imu: silent 10 s": Fault(
         "no TDOA and no IMU sample for 10 s", during("tdoa imu", lost), lasts=10.0
     ),

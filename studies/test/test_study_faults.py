@@ -26,10 +26,10 @@ from studies.faults.changes import (  # noqa: E402
     first,
     restamped,
 )
-from studies.faults.events import NUMBERS, Event, Scene, events_of, part_of, turned, yaws_at  # noqa: E402
+from studies.faults.events import NUMBERS, PLAYED, Event, Scene, events_of, part_of, turned, yaws_at  # noqa: E402
 from studies.faults.play import Heard, message_of  # noqa: E402
 from studies.faults.table import FAULTS, STREAMS, Fault  # noqa: E402
-from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Truth  # noqa: E402
+from uwb_tdoa_bias.common.flight import Truth  # noqa: E402
 from uwb_tdoa_msgs.msg import EstimatorStatus  # noqa: E402
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate  # noqa: E402
 
@@ -79,7 +79,7 @@ def test_all_sensors_are_made_of_the_ground_truth(part):
     true = np.interp(part.pressure.t, part.truth.t, part.truth.p[:, 2])
     altitude = part.pressure.values[:, 0]
     assert np.std(altitude - true) == pytest.approx(0.1, rel=0.2)
-    for name in SENSOR_NAMES:
+    for name in PLAYED:
         assert len(getattr(part, name)) > 500, name
 
 

@@ -9,10 +9,11 @@ import pytest
 pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
-from geometry_msgs.msg import TwistWithCovarianceStamped  # noqa: E402
+from geometry_msgs.msg import TwistStamped, TwistWithCovarianceStamped  # noqa: E402
 from nav_msgs.msg import Odometry, Path  # noqa: E402
 from rclpy.serialization import deserialize_message, serialize_message  # noqa: E402
 from sensor_msgs.msg import FluidPressure, Imu, Range  # noqa: E402
+from std_msgs.msg import Float64  # noqa: E402
 
 from uwb_tdoa_bias.ros import cdr  # noqa: E402
 from uwb_tdoa_bias.ros.cdr import (
@@ -201,3 +202,14 @@ def test_noise_is_refused_or_read_and_nothing_else(way):
             data[place] ^= 1 << rng.integers(8)
         read += sum(len(rows) for _, rows, _ in codec.read([bytes(data)], refused.append))
     assert read + len(refused) == 300 and read > 50 and len(refused) > 50
+
+
+@pytest.mark.parametrize("field", ["twist.linear.w", "twst"])
+def test_a_field_that_a_type_lacks_is_named(field):
+    with pytest.raises(ValueError, match=f"TwistStamped has no field {field}; check its spelling"):
+        CdrCodec(TwistStamped, field)
+
+
+def test_a_type_without_a_header_is_named():
+    with pytest.raises(ValueError, match="Float64 has no field header.stamp.sec"):
+        CdrCodec(Float64, "data")

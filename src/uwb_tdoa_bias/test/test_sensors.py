@@ -17,6 +17,7 @@ from uwb_tdoa_bias.common.sensors import (
     Ranges,
     Velocity,
 )
+from uwb_tdoa_bias.common.sensors.returned import check_values
 from uwb_tdoa_bias.common.sensors.sensor import Stream
 
 N = 5
@@ -33,7 +34,7 @@ def simulated(sensor):
     turn = Rotation.from_euler("xyz", np.full((N, 3), 0.1))
     room = SimpleNamespace(lower=np.zeros(3))
     columns = sensor.simulated(config, room, motion, turn, lambda *shape: np.zeros((N, *shape)))
-    return sensor.stream(T, *columns)
+    return sensor.stream_of("simulated", T, columns)
 
 
 STREAMS = {name: simulated(sensor) for name, sensor in SENSORS.items()} | {
@@ -73,8 +74,11 @@ def test_what_is_written_is_read(name):
         and issubclass(sensor.stream, Stream)
     )
     fields = of_message(sensor, stream)
-    for one, other in zip(sensor.read(T, fields).columns, stream.columns):
-        np.testing.assert_array_equal(one, other)
+    read = sensor.read(T, fields)
+    for one, other in zip(read.columns, stream.columns):
+        np.testing.assert_array_equal(
+            one, other, err_msg="`columns` reads something else than `content` writes"
+        )
     table = np.column_stack(list(fields.values()))  # format of a table of a bag
     for one, other in zip(sensor.read(T, sensor.split(table)).columns, stream.columns):
         np.testing.assert_array_equal(one, other)
@@ -85,28 +89,25 @@ def test_what_is_written_is_read(name):
 @pytest.mark.parametrize("name", SENSORS)
 def test_values_that_effects_change(name):
     stream = STREAMS[name]
-    assert stream.values.shape in ((N, 1), (N, 3)) and len(stream) == N
+    check_values(name, stream)
+    assert stream.values.shape[1] in (1, 3), "effects and channels expect 1 or 3 `values`"
+    assert len(stream) == N
     np.testing.assert_allclose(stream.with_values(stream.values + 0.1).values, stream.values + 0.1)
     assert stream.sensed(stream.values).t is stream.t
 
 
 @pytest.mark.parametrize("name", SENSORS)
 def test_what_the_filter_gets(name):
-    rows, usable = SENSORS[name].measured(STREAMS[name])
-    assert SENSORS[name].measured(simulated(SENSORS[name]))[1].tolist() == [True] * N
-    assert (
-        usable.all()
-        and rows.keys() <= {"value", "std", "anchor"}
-        and np.isfinite(rows["value"]).all()
-    )
-    for field in rows.keys() - {"anchor"}:
-        shape = rows[field].shape
-        assert len(shape) == 2 and shape[1] <= 4, f"{field}: {shape}, not (n, k) with k <= 4"
+    sensor = SENSORS[name]
+    rows, usable = sensor.rows(STREAMS[name])  # checks names and shapes
+    _, simulated_usable = sensor.rows(simulated(sensor))
+    assert simulated_usable.all(), "`measured` refuses what `simulated` returns: units differ"
+    assert usable.all() and np.isfinite(rows["value"]).all()
     # NaN is not a measurement, in any column.
     if name != "velocity":
         missing = np.full_like(STREAMS[name].values, np.nan)
         *_, broken = SENSORS[name].measured(STREAMS[name].with_values(missing))
-        assert not broken.any()
+        assert not broken.any(), "`measured` takes NaN for a measurement"
 
 
 def test_the_yaw_rate_is_a_part_of_the_velocity_stream():

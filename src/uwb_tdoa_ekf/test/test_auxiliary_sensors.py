@@ -18,9 +18,10 @@ from priors import Prior, with_offset
 import pytest
 from scipy.spatial.transform import Rotation
 
+from uwb_tdoa_bias.common.compiled import compiled
 from uwb_tdoa_bias.common.robust_loss import LOSSES
 from uwb_tdoa_bias.common.sensors import SENSORS
-from uwb_tdoa_ekf.core import auxiliary, height, plane, update, velocity
+from uwb_tdoa_ekf.core import auxiliary, height, plane, sensors, update, velocity
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
 from uwb_tdoa_ekf.core.engine import feed
 from uwb_tdoa_ekf.core.history import NOTHING
@@ -309,6 +310,24 @@ def test_a_sensor_without_a_branch_in_the_filter_is_refused_at_the_start():
     run = subprocess.run([sys.executable, "-c", UNKNOWN_SENSOR], capture_output=True, text=True)
     assert run.returncode == 1
     assert "NotImplementedError: the filter has no branch for sonar of SENSORS" in run.stderr
+
+
+def test_an_update_that_compiled_code_cannot_call_is_named():
+    @compiled
+    def short(ekf, parameters, sensor):
+        pass
+
+    for wrong in (height.observe.py_func, short):
+        with pytest.raises(NotImplementedError, match="`observe` of core.sonar must be @compiled"):
+            sensors._check("core.sonar", wrong)
+    sensors._check("core.sonar", height.observe)
+
+
+def test_a_parameter_that_the_filter_has_already_is_named():
+    script = UNKNOWN_SENSOR.replace('{"use_sonar"', '{"gyro_noise"')
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert run.returncode == 1
+    assert "InputError: sensor sonar, `parameters`: the filter has gyro_noise already" in run.stderr
 
 
 def test_a_kind_without_a_branch_raises():

@@ -95,6 +95,8 @@ class CdrCodec:
         spaces = {leaf: (code, count) for leaf, code, count in self._leaves}
         columns = []
         for name, leaves in self._paths.items():
+            if not leaves:
+                raise ValueError(f"{kind.__name__} has no field {paths[name]}; check its spelling.")
             code, count = spaces[leaves[0]][0], sum(spaces[leaf][1] for leaf in leaves)
             columns.append((name, code, count) if count > 1 else (name, code))
         self.dtype = np.dtype(columns)

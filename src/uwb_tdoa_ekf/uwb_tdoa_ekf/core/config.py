@@ -13,6 +13,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.robust_loss import LOSSES
 from uwb_tdoa_bias.common.safe_yaml import read_yaml
 from uwb_tdoa_bias.common.sensors import SENSORS
+from uwb_tdoa_bias.common.sensors.returned import mistake
 from uwb_tdoa_bias.common.sensors.sensor import parameter
 
 ROBUST = ("innovation", "gate", "m_estimation")
@@ -160,6 +161,13 @@ class _FilterParameters:
 
 
 # Parameters of the sensors other than IMU and TDOA.
+for _sensor in SENSORS.values():
+    if _taken := set(_sensor.parameters) & {each.name for each in fields(_FilterParameters)}:
+        raise mistake(
+            _sensor.name,
+            "parameters",
+            f"the filter has {', '.join(sorted(_taken))} already. Choose another name.",
+        )
 _PARAMETERS = [
     (name, type(each.default), each)
     for sensor in SENSORS.values()

@@ -493,7 +493,7 @@ def sensor_rows(
     tuple
         (n,) SENSOR_ROW, and (n,) bool.
     """
-    columns, usable = SENSORS[name].measured(stream)
+    columns, usable = SENSORS[name].rows(stream)
     rows = np.zeros(len(stream), SENSOR_ROW)
     rows["t"], rows["kind"] = stream.t, list(SENSORS).index(name)
     if "anchor" in columns:

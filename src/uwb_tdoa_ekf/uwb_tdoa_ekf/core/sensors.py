@@ -11,13 +11,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from importlib import import_module
 from importlib.util import find_spec
+from inspect import signature
 
 import numpy as np
 
+from uwb_tdoa_bias.common.callees import OURS
 from uwb_tdoa_bias.common.compiled import Record, compiled
 from uwb_tdoa_bias.common.sensors import SENSORS
 
 Update = Callable[[Record, Record, Record, Record, np.ndarray], None]  # `observe` of a sensor
+ARGUMENTS = "ekf", "parameters", "sensor", "residual", "records"  # of `observe`
 
 STREAMS = tuple(SENSORS)  # names of the sensors; SENSOR_ROW.kind is an index into them
 # kinds that engine.py names
@@ -33,7 +36,18 @@ def _update_of(name: str) -> Update:
             f"in the module {place}; docs/add_sensor.md describes it."
         )
     update: Update = import_module(place).observe
+    _check(place, update)
     return update
+
+
+def _check(place: str, update: Update) -> None:
+    """Raise NotImplementedError if `observe` of a module cannot be called by compiled code."""
+    arguments = signature(getattr(update, "py_func", update)).parameters
+    if not getattr(update, OURS, False) or len(arguments) != len(ARGUMENTS):
+        raise NotImplementedError(
+            f"`observe` of {place} must be @compiled, with the arguments {', '.join(ARGUMENTS)}; "
+            "docs/add_sensor.md describes it."
+        )
 
 
 def _with_branch(kind: int, update: Update, otherwise: Update) -> Update:

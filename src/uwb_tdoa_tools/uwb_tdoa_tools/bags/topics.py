@@ -26,6 +26,7 @@ from ..clock import straightened
 from ..command_lines import suggest_line
 from . import messages as bag_messages
 from .files import connections_of, readable
+from .message_types import typestore
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.common.sensors import Sensor
@@ -194,6 +195,7 @@ def read_sensor(
 
     Raises InputError as `read_topic`.
     """
+    bag_messages.check_messages(sensor, typestore())
     row, _, _ = bag_messages.of_sensor(sensor)
     parts = [read_topic(path, reader, name_of(topic), kind, row) for topic, kind in sensor.topics]
     filled = [part for part in parts if len(part.stamps)]

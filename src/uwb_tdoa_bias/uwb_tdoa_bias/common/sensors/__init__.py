@@ -9,9 +9,9 @@ docs/add_sensor.md.
 from __future__ import annotations
 
 from dataclasses import replace
-from importlib import import_module
 from typing import Any
 
+from .definition import load
 from .height import Height
 from .pressure import Pressure
 from .ranges import Ranges
@@ -21,8 +21,7 @@ from .velocity import Velocity
 # One file each, in the filter's order of kinds: append new ones.
 MODULES = "height", "pressure", "velocity", "ranges"
 
-_sensors = [import_module(f".{name}", __name__).SENSOR for name in MODULES]
-SENSORS = {sensor.name: sensor for sensor in _sensors}  # by name, in the order of MODULES
+SENSORS = load(__name__, MODULES)  # by name, in the order of MODULES
 
 LOCATING = tuple(
     name for name, sensor in SENSORS.items() if sensor.locates

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from . import returned
+
 # Variance in a message, in its unit squared; components at or above it were not measured. Messages
 # need finite covariances.
 UNKNOWN_VARIANCE = 1e6
@@ -185,7 +187,25 @@ class Sensor:
 
     def read(self, t: np.ndarray, fields: dict) -> Stream:
         """Return the Stream of messages; t : (n,) stamps, s; fields : {field: (n,) or (n, k)}."""
-        return self.stream(t, *self.columns(fields))
+        try:
+            columns = self.columns(fields)
+        except KeyError as error:
+            raise returned.mistake(
+                self.name, "columns", f"{error} is none of `fields`: {', '.join(self.fields)}."
+            ) from error
+        return self.stream_of("columns", t, columns)
+
+    def stream_of(self, source: str, t: np.ndarray, columns: tuple) -> Stream:
+        """Return the Stream of columns that a function of this Sensor returned, `source`.
+
+        Raises InputError if their number or lengths are wrong.
+        """
+        stream: Stream = returned.stream_of(self.name, self.stream, source, t, columns)
+        return stream
+
+    def rows(self, stream: Stream) -> tuple[dict, np.ndarray]:
+        """Return `measured` of a Stream; an InputError if its form is wrong."""
+        return returned.check_rows(self.name, self.measured(stream), len(stream))
 
 
 def parameter(
