@@ -72,7 +72,13 @@ class CsvRows:
 
 
 class CsvTable:
-    """Iterate over (line, {column: text}) of the rows of a CSV file; `names` are its columns."""
+    """Iterate over (line, {column: text}) of the rows of a CSV file.
+
+    Attributes
+    ----------
+    names : columns of the file.
+    delimiter : the most frequent of comma, semicolon and tab in the header.
+    """
 
     def __init__(
         self, path: str | Path, columns: Sequence[str] | None, most: int, complete: bool = True
@@ -88,12 +94,8 @@ class CsvTable:
                 )
             Budget(path).spend("bytes of text", len(content), TABLE_BYTES)
         header = content[:ROW_CHARACTERS].lstrip().split(b"\n", 1)[0]
-        self._rows = CsvRows(
-            path,
-            content,
-            skipinitialspace=True,
-            delimiter=max(",;\t", key=lambda each: header.count(each.encode())),
-        )
+        self.delimiter = max(",;\t", key=lambda each: header.count(each.encode()))
+        self._rows = CsvRows(path, content, skipinitialspace=True, delimiter=self.delimiter)
         self._cells = self._each()
         self.names = [name.strip() for name in next(self._cells, [])]
         self._columns = columns if columns is not None else [name for name in self.names if name]
@@ -158,8 +160,6 @@ def read_table(
 ) -> CsvTable:
     """Return the CsvTable of a CSV file that has at least the columns; default: all of its columns.
 
-    The delimiter is the most frequent of comma, semicolon and tab in the header.
-
     Parameters
     ----------
     most : largest number of cells.
@@ -220,6 +220,10 @@ class CsvFiles:
     def fields(self, table: str) -> list[str]:
         """Return the columns of a file."""
         return self._tables[table].names
+
+    def delimiter_of(self, table: str) -> str:
+        """Return the delimiter of a file."""
+        return self._tables[table].delimiter
 
     def time_of(self, table: str) -> None:
         """Return None: a profile names the column with the time."""
