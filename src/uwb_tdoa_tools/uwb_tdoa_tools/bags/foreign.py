@@ -468,9 +468,9 @@ def _limit_and_cache_unpacking(reader: Ros1Reader, path: Path) -> None:
         most = min(CHUNK_BYTES, remaining)
         content = function(data, most + 1)
         if len(content) > most:
-            what, limit = ("a chunk", CHUNK_BYTES) if most < remaining else ("it", total_limit)
+            limit = CHUNK_BYTES if most < remaining else total_limit
             raise TooMuch(
-                f"{path}: {what} unpacks to more than {limit} bytes; give another file, or split it."
+                f"{path}: unpacks to more than {limit} bytes; give another file, or split it."
             )
         kept[position], sizes[position] = content, len(content)
         while sum(map(len, kept.values())) > KEPT_BYTES and len(kept) > 1:

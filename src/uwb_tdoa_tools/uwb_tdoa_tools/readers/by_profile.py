@@ -211,7 +211,7 @@ class _Request:
         self.table, self.source, self._names = table, source, names
         self._fields = tables.fields(table)
         # Then a comma in a cell may be a thousands separator.
-        self._between_commas = isinstance(tables, CsvFiles) and tables.delimiter_of(table) == ","
+        self._between_commas = isinstance(tables, CsvFiles) and tables.delimiters[table] == ","
         default = tables.time_of(table)
         self._wanted: dict[str, dict[str, tuple[str, float]]] = {}
         for stream, known in STREAMS.items():
@@ -313,10 +313,10 @@ class _Request:
             if wrong in ANCHORS
             else "a finite number"
         )
-        sentence = (
-            f"{self._wanted[stream][wrong][0]} is {str(raw[wrong])[:40]!r}; it must be {what}"
+        column = self._wanted[stream][wrong][0]
+        self._first.setdefault(
+            stream, f"{place}: {column} is {str(raw[wrong])[:40]!r}; it must be {what}"
         )
-        self._first.setdefault(stream, f"{place}: {sentence}")
 
     def _number(self, value: Any, column: str, place: str) -> float | None:
         """Return `as_number`; raise InputError if a comma may be a thousands separator."""

@@ -205,6 +205,7 @@ class CsvFiles:
     Attributes
     ----------
     types : {path: "CSV"}.
+    delimiters : {path: delimiter of the cells}.
     counts : {path: rows that were read}.
     remarks : always empty.
     """
@@ -214,16 +215,13 @@ class CsvFiles:
             str(path): read_table(path, most=TABLE_CELLS, complete=False) for path in paths
         }
         self.types = dict.fromkeys(self._tables, "CSV")
+        self.delimiters = {path: table.delimiter for path, table in self._tables.items()}
         self.counts: Counter[str] = Counter()
         self.remarks: list[str] = []
 
     def fields(self, table: str) -> list[str]:
         """Return the columns of a file."""
         return self._tables[table].names
-
-    def delimiter_of(self, table: str) -> str:
-        """Return the delimiter of a file."""
-        return self._tables[table].delimiter
 
     def time_of(self, table: str) -> None:
         """Return None: a profile names the column with the time."""
