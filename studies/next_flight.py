@@ -195,7 +195,7 @@ def settles(found, effect, left):
 def at_random(planned, room, limits, rng, turn):
     """A TimedPath of the same length through random places, with random yaws up to `turn`, rad."""
     count = 2 + int(planned.duration)
-    places = rng.uniform(*room.flyable, (count, 3))
+    places = rng.uniform(*room.path_box, (count, 3))
     out = route(places, rng.uniform(-turn, turn, count), limits)
     rows = len(planned.p)
     return type(out)(out.p[:rows], out.yaw[:rows], "random", (0, rows - 1))

@@ -182,7 +182,7 @@ class FaultyFilter:
     def _look(self) -> None:
         estimator, newest = self._ours.estimator, self._ours.newest
         self._looked = self._now
-        self._use.look(self._now, self._received, estimator.counts, estimator.running)
+        self._use.update(self._now, self._received, estimator.counts, estimator.running)
         if self._now >= self._reported + REPORT:
             self._reported = self._now
             if self._restarts != estimator.counts["restarts"]:

@@ -26,6 +26,7 @@ COUNTS = {
 STRUCTURE = {
     "initialization.ANY_YAW",
     "initialization.LATE_ANCHORS",
+    "initialization.YAW_SEARCH_STD",
     "state.GRAVITY",
     "startup.NO_SCALE",
     "startup.SMALLEST",
@@ -320,7 +321,7 @@ RULES = (
         "level after an IMU fault",
         "engine",
         "_switch",
-        "initialization.reset_attitude(ekf, parameters, 2.0 * math.pi, records)",
+        "initialization.reset_attitude(ekf, parameters, initialization.YAW_SEARCH_STD, records)",
         "",
     ),
     Rule(
@@ -422,13 +423,14 @@ RULES = (
         "set_bounds",
         "k < 2 and high - low < FLAT",
     ),
-    Rule("the surroundings follow the tag", "engine", "_prepare", "t >= ekf.next_bounds"),
+    Rule("the surroundings follow the tag", "engine", "_prepare", "t >= ekf.next_workspace"),
     # Start and recovery
     Rule(
         "weigh the ground at the start",
         "initialization",
         "start",
-        "stationary_position.weigh(ekf, pairs, anchors, parameters, known, at_rest, its)",
+        "stationary_position.weigh_explanations(ekf, pairs, anchors, parameters, known, rest_x, "
+        "rest_covariance)",
         "-np.inf",
     ),
     Rule(
@@ -442,7 +444,7 @@ RULES = (
         "a wide start becomes two",
         "initialization",
         "start",
-        "np.trace(its[:3, :3]) > APART**2",
+        "np.trace(rest_covariance[:3, :3]) > APART**2",
     ),
     Rule(
         "a wide slow start becomes two",
@@ -461,7 +463,7 @@ RULES = (
         "a start by rest, not by motion",
         "initialization",
         "start",
-        "still or on_ground or (not (good or cost[1] < np.inf))",
+        "still or on_ground or (not (accepted or cost[1] < np.inf))",
     ),
     Rule(
         "start anyhow after a while",
@@ -510,7 +512,7 @@ RULES = (
         "TDOAs wait after a silence",
         "engine",
         "_on_tdoa",
-        "parameters.recover and initialization.waits(ekf, anchors, parameters, t, "
+        "parameters.recover and initialization.hold_for_search(ekf, anchors, parameters, t, "
         "ekf.position_unknown_until > before, records)",
     ),
     Rule(
@@ -532,7 +534,7 @@ RULES = (
         "recover",
         "share < CLEARLY_MORE + explained",
     ),
-    Rule("a recovery explains most", "initialization", "recover", "share < AGREE_ANYHOW"),
+    Rule("a recovery explains most", "initialization", "recover", "share < AGREE_RECOVERY"),
     Rule(
         "a recovery is within reach",
         "initialization",

@@ -35,7 +35,7 @@ def test_it_begins_and_ends_at_rest_in_one_place_and_then_sinks():
 def test_sines_fill_the_room_stay_inside_and_turn():
     reference, t, wanted = followed(3, (0.0, 0.0))
     air = wanted[(t > 10.0) & (t < 56.0), 0]
-    low, high = ROOM.flyable
+    low, high = ROOM.path_box
     assert (
         (air >= low).all()
         and (air <= high).all()

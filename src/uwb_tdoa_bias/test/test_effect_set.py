@@ -123,7 +123,7 @@ def test_parts_of_a_covariance():
     np.testing.assert_array_equal(places, [1, 2])
     np.testing.assert_array_equal(some, MATRIX[np.ix_([2, 0], [2, 0])])
     assert whole.without(("3",)).keys == KEYS[:1] and whole.without(("3",)).matrix == MATRIX[0, 0]
-    each = whole.of_each_anchor()
+    each = whole.block_diagonal_by_anchor()
     assert each.of(KEYS[:2])[1].tolist() == [[4e-4, 0.0], [0.0, 9e-4]]
     np.testing.assert_array_equal(each.of(KEYS[1:])[1], MATRIX[1:, 1:])
 
@@ -135,7 +135,7 @@ def test_the_covariance_of_a_hall_takes_little_room(tmp_path):
         *(("anchor_delay", str(i)) for i in range(n)),
     )
     root = np.random.default_rng(0).standard_normal((4 * n, 40))
-    each = Covariance(keys, root @ root.T + np.eye(4 * n)).of_each_anchor()
+    each = Covariance(keys, root @ root.T + np.eye(4 * n)).block_diagonal_by_anchor()
     effects = tuple(
         EFFECTS[name]({key: 0.1 for of, key in keys if of == name})
         for name in ("anchor_position", "anchor_delay")

@@ -25,7 +25,7 @@ from uwb_tdoa_bias.common import files
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import (
-    keeping,
+    protected_inputs,
     read_arrays,
     read_bytes,
     read_head,
@@ -102,7 +102,7 @@ def test_nothing_is_written_over_what_is_kept(tmp_path):
         bag / "new",
         flights / "one",
     ]
-    with keeping([survey, bag, flights]):
+    with protected_inputs([survey, bag, flights]):
         for path in refused:
             with pytest.raises(
                 InputError, match=f"{tmp_path}.*(is|lies in) {tmp_path}/.*, which is read"

@@ -45,7 +45,9 @@ def test_after_it_no_node_compiles_anything(make_rig, monkeypatch):
         text=True,
         timeout=300.0,
     )
-    assert ended.returncode == 0 and ended.stdout.startswith("both nodes are compiled; ")
+    assert ended.returncode == 0 and ended.stdout.startswith(
+        "ekf_node and bias_node are compiled; "
+    )
     monkeypatch.setitem(os.environ, "NUMBA_DEBUG_CACHE", "1")
     rig = make_rig()
     processes = rig.start("bias_node", "ekf_node")

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.flight import Tdoas
 from uwb_tdoa_bias.common.geometry import tdoa
+from uwb_tdoa_ekf.core import initialization
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
 from uwb_tdoa_ekf.core.ground import KnownHeight
 from uwb_tdoa_ekf.core.hypotheses import IMPROBABLE, MERGED_WITHIN, YAW_STD, select
@@ -430,3 +431,12 @@ def test_turning_the_world_turns_the_estimate():
     other = run_offline(replace(flight, anchors=anchors)).odometry
     late = one.t > 11.0
     np.testing.assert_allclose(other.p[late], turn.apply(one.p[late]), atol=0.02)
+
+
+def test_a_slow_start_needs_a_tdoa():
+    """Before the first TDOA, as if a range comes first, nothing is read from the empty window."""
+    state = new_state(np.eye(4, 3))
+    initialization.start_slowly.py_func(
+        state.record, state.anchors, FilterConfig().parameters()[0], 0.0, np.empty(0)
+    )
+    assert not state.record.running

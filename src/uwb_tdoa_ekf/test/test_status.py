@@ -21,8 +21,8 @@ from uwb_tdoa_ekf.monitoring.status import (
     WAITING,
     Status,
     Use,
-    doubted,
     status_of,
+    with_fault_covariance,
     yaw_in_words,
 )
 from uwb_tdoa_ekf.offline import run_offline
@@ -66,7 +66,7 @@ def used(
             counts[tdoa] += 80 if received else 0
             counts["imu_used"] += 200 if imu else 0
             counts["velocity_used"] += 10 if velocity else 0
-        use.look(1000.0 + 0.2 * k, arrived, counts, running)
+        use.update(1000.0 + 0.2 * k, arrived, counts, running)
     return use
 
 
@@ -216,7 +216,7 @@ def test_what_does_not_make_the_position_wrong_does_not_end_running():
 
 def test_the_odometry_of_a_fault_states_that_it_may_be_anywhere():
     odometry = run_offline(fly(0, 3.0)).odometry
-    wide = doubted(odometry, np.array([8.0, 9.0, 4.0]))
+    wide = with_fault_covariance(odometry, np.array([8.0, 9.0, 4.0]))
     added = wide.covariance - odometry.covariance
     assert np.allclose(added[:, :3, :3], np.diag([64.0, 81.0, 16.0])) and np.allclose(
         added[:, 3:6, 3:6], 4.0 * np.eye(3)
@@ -267,8 +267,8 @@ class Looked:
             self.counts["imu_used"] += round(LOOK * imu)
             for name, share in shares.items():
                 self.counts[name] += round(LOOK * rate * share)
-            self.use.look(self.now, self.received, self.counts, running)
-            said.append(((k + 1) * LOOK, self.use.trouble))
+            self.use.update(self.now, self.received, self.counts, running)
+            said.append(((k + 1) * LOOK, self.use.why_unused))
         return said
 
     def first(self, seconds, **shares):
@@ -317,7 +317,7 @@ def test_silence_and_restarts_have_an_age():
     assert (
         looked.use.tdoa_age == pytest.approx(3.0) == looked.use.imu_age
         and not looked.use.imu_used
-        and looked.use.trouble is None
+        and looked.use.why_unused is None
     )
     looked.counts["restarts"] += 1
     looked.go(1.0, rejected=1.0)
@@ -331,7 +331,7 @@ def test_shares_are_shares_whatever_comes(steps):
         now += LOOK
         counts.update(dict(zip(("used", "late", "invalid", "rejected"), step)))
         received["tdoa"] += sum(step)
-        use.look(now, received, counts, True)
+        use.update(now, received, counts, True)
         shares = use._shares(1.5)
         assert all(0.0 <= share <= 1.0 for share in shares.values()) and (
             not shares or sum(shares.values()) == pytest.approx(1.0)

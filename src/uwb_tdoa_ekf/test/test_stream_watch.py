@@ -139,8 +139,8 @@ def test_nothing_is_said_of_measured_flights(shared_data):
             estimator.add_tdoa(tdoa.t[j], tdoa.a[j], tdoa.b[j], tdoa.d[j])
             estimator.advance()
             received["tdoa"] += j.stop - j.start
-            use.look(now, received, Counter(estimator.counts), estimator.running)
-            assert use.trouble is None, (name, now - begin, use.trouble)
+            use.update(now, received, Counter(estimator.counts), estimator.running)
+            assert use.why_unused is None, (name, now - begin, use.why_unused)
             if k % 5 == 4:
                 assert watch.findings() == [], (name, now - begin)
         assert estimator.sign_turns == estimator.yaw_doubts == 0, name

@@ -41,7 +41,8 @@ if TYPE_CHECKING:
 def warm_up() -> None:
     """Compile, or load from numba's cache, the functions that the first messages need."""
     estimator = Estimator(Anchors.from_positions([[0, 0, 0], [5, 0, 1], [0, 5, 2], [5, 5, 0]]))
-    watch, steps = StreamWatch(estimator.anchors, 0.25), np.arange(400)
+    # 4 s, so that the filter starts; 20 calls, as messages of a node come in parts
+    watch, steps = StreamWatch(estimator.anchors, lag=0.25), np.arange(400)
     watch.add_imu(
         0.01 * steps, 0.01 * steps, np.zeros((400, 3)), np.tile((0.0, 0.0, 9.81), (400, 1))
     )
@@ -103,10 +104,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return int(ended.code or 0)
     began = time.monotonic()
     warm_up()
-    corrector.warm_up(EffectSet(), None)
+    corrector.warm_up(EffectSet(), model=None)
     # A transform on /tf_static adds this effect while the node runs.
-    corrector.warm_up(EffectSet((TagLeverArm(values={"z": 0.1}),)), None)
-    print(f"both nodes are compiled; {time.monotonic() - began:.0f} s")
+    corrector.warm_up(EffectSet((TagLeverArm(values={"z": 0.1}),)), model=None)
+    print(f"ekf_node and bias_node are compiled; {time.monotonic() - began:.0f} s")
     return 0
 
 

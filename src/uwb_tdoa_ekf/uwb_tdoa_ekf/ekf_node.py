@@ -49,7 +49,7 @@ from .estimator import Estimator
 from .frames import ImuMount, pose_from_message
 from .monitoring.finding import most_severe_first
 from .monitoring.health import OK, WARN, Health, together
-from .monitoring.status import FAULT, Status, doubted, status_of, yaw_in_words
+from .monitoring.status import FAULT, Status, status_of, with_fault_covariance, yaw_in_words
 from .monitoring.stream_rules import FEW_ANCHORS, StreamWatch
 from .outputs import Outputs, StatusOutput
 from .reorder_buffer import STREAMS
@@ -444,7 +444,7 @@ class EkfNode(StreamNode):
         # pose.
         if len(odometry.t):
             if self._fault:
-                odometry = doubted(odometry, self._estimator.workspace)
+                odometry = with_fault_covariance(odometry, self._estimator.workspace)
             self.outputs.publish_odometry(odometry, self._estimator.unsure is not None)
             self._health.last_odometry = time.monotonic()
             self._health.last_position = odometry.p[-1], odometry.covariance[-1, :3, :3]

@@ -21,7 +21,7 @@ import yaml
 
 from uwb_tdoa_bias import anchors_node, bias_node
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.files import folder_of_process, write_text
+from uwb_tdoa_bias.common.files import new_folder_until_exit, write_text
 from uwb_tdoa_bias.common.safe_yaml import read_yaml
 
 from . import debias_node
@@ -502,7 +502,7 @@ def pooled(starts: list[Start], processes: int | str) -> list[Start]:
         if each.parameters
     }  # the key matches the node in any namespace
     # the file stays, because a restarted node reads it again
-    file = folder_of_process() / "tags.yaml"
+    file = new_folder_until_exit() / "tags.yaml"
     write_text(file, yaml.safe_dump(by_node, allow_unicode=True))
     frozen = all(each.parameters and each.parameters[-1].get("frozen") for each in members)
     namespaces, out = (

@@ -84,15 +84,17 @@ class Innovations:
         return np.flatnonzero(self.stream == self.streams.index(stream))
 
     def by_bias(self, regressors: np.ndarray) -> np.ndarray:
-        """Return the derivative of the negative innovations by parameters of a bias, (n, k).
+        """Return the derivative of the innovations by parameters of a bias, (n, k).
 
-        It is what remains of the regressors after the filter has followed the bias. A bias that the
-        position can follow does not change the innovations.
+        The measured values contain the bias, and the run did not model it. A correction of the bias
+        changes the innovations by minus this. The result is what remains of the regressors after
+        the filter has followed the bias. A bias that the position can follow does not change the
+        innovations.
 
         Parameters
         ----------
         regressors : (n, k) array
-            Derivative of the measured values by parameters that the run did not model.
+            Derivative of the measured values by the parameters.
         """
         regressors = np.ascontiguousarray(regressors, dtype=float)
         out, states = np.zeros_like(regressors), np.zeros((2, ERROR_STATES, regressors.shape[1]))
@@ -122,7 +124,8 @@ class Innovations:
         stamps : (m,) array
             Ascending stamps of positions, in s.
         positions : (m, 3, k) array or None
-            Filled with the derivatives of the estimated position at the stamps.
+            Filled with the derivatives of the estimated position at the stamps, as of `by_bias`: a
+            correction moves the estimate by minus this.
 
         Yields
         ------
@@ -131,7 +134,7 @@ class Innovations:
         columns : (c,) int array
             Parameters that matter in the block.
         derivative : (rows, c) array
-            Derivative of the negative innovations.
+            Derivative of the innovations.
         """
         stamps, t = np.asarray(stamps, dtype=float), self.t
         ends = np.append(np.flatnonzero(np.diff(block)) + 1, len(block))
@@ -288,9 +291,9 @@ def _propagate(
     regressors : (n, k) array
         Derivative of the measured values by the parameters.
     states : (2, 15, k) array
-        Derivative of the error state by the parameters, and room for the next one.
+        Derivative of the estimated state by the parameters, and room for the next one.
     out : (n, k) array
-        Filled with derivatives of the negative innovations.
+        Filled with derivatives of the innovations.
     path : ((m,) array, (m, 3, k) array)
         Stamps, in s, and position derivatives to fill.
     passed : int

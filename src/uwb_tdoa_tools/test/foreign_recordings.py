@@ -104,10 +104,11 @@ def ns(t):
     return [BEGIN + round(1e9 * each) for each in t]
 
 
-def write_ros_1(path, topics, compression=None):
-    """Write {topic: (type, [(ns, message)])} as a bag of ROS 1."""
+def write_ros_1(path, topics, compression=None, chunk=1 << 20):
+    """Write {topic: (type, [(ns, message)])} as a bag of ROS 1, with chunks of so many bytes."""
     store = store_of(Stores.ROS1_NOETIC)
     writer = Ros1Writer(path)
+    writer.chunk_threshold = chunk
     if compression:
         writer.set_compression(compression)
     with writer:

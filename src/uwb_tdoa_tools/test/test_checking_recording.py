@@ -317,7 +317,7 @@ def without_3(t, a, b):
         ),
         ({"places": PLACES + [5.0, 0.0, 0.0]}, "outside", "outside of its anchors"),
         ({"places": PLACES + [0.0, 0.0, 0.2]}, None, ""),
-        ({"places": PLACES[:1] + 0.01 * PLACES}, "little_motion", "off a straight line"),
+        ({"places": PLACES[:1] + 0.01 * PLACES}, "little_motion", "across their main direction"),
         ({"seconds": 5}, "little_motion", "5 s"),
         ({"places": np.empty((0, 3))}, None, ""),  # it was not tried
     ],

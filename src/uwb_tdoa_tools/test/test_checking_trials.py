@@ -26,11 +26,11 @@ from uwb_tdoa_tools.checking import imu_rules, tdoa_rules
 from uwb_tdoa_tools.checking.check import check
 from uwb_tdoa_tools.checking.imu_rules import clipped_axes, is_smooth
 from uwb_tdoa_tools.checking.ordered import (
-    SPREAD,
+    LEAST_MOTION,
     OrderedRecording,
     SurveyFit,
     displacement,
-    spread,
+    second_principal_std,
 )
 from uwb_tdoa_tools.checking.recording import of_flight, read_recording
 from uwb_tdoa_tools.checking.recording_rules import sensor_mistakes
@@ -104,8 +104,20 @@ def test_surveys_of_one_room_are_named_together(healthy):
 
 def test_ids_are_not_tried_without_motion():
     hovering = OrderedRecording.of(recording(10, trajectory="hover"))
-    assert spread(hovering.survey_fit.places) < SPREAD
+    assert second_principal_std(hovering.survey_fit.places) < LEAST_MOTION
     assert list(tdoa_rules.swapped_ids(hovering)) == []
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_fewer_than_two_positions_are_no_motion(count):
+    assert second_principal_std(np.ones((count, 3))) == 0.0
+
+
+def test_motion_is_measured_across_the_main_direction():
+    t = np.linspace(-1.0, 1.0, 101)
+    along, across = np.outer(t, [3.0, 0.0, 0.0]), np.outer(t**2, [0.0, 1.0, 0.0])
+    assert second_principal_std(along) == pytest.approx(0.0, abs=1e-9)
+    assert second_principal_std(along + across) == pytest.approx(np.std(t**2))
 
 
 @pytest.mark.parametrize(

@@ -142,6 +142,37 @@ def test_a_bad_file_is_one_sentence(files, rows, said):
         read_columns(["bad.csv"], parse_columns(TDOA), NAMED)
 
 
+def test_a_comma_before_three_digits_is_refused_between_commas(files):
+    """It may be a thousands separator or a decimal comma. Other decimal commas are read."""
+    rows = 't_ms,from,to,diff\n10,0,1,"0,5"\n20,0,1,"{}"\n'
+    for cell in ("1,000", "-12,345"):
+        (files / "big.csv").write_text(rows.format(cell))
+        with pytest.raises(InputError, match=f"line 3: diff is '{cell}', .* or a decimal comma"):
+            read_columns(["big.csv"], parse_columns(TDOA), NAMED)
+    for cell in ("0,123", "1,25", "1,2345"):
+        (files / "small.csv").write_text(rows.format(cell))
+        flight = read_columns(["small.csv"], parse_columns(TDOA), NAMED)
+        np.testing.assert_allclose(flight.tdoa.d, [5e-4, float(cell.replace(",", ".")) / 1e3])
+
+
+def test_a_comma_between_semicolons_or_tabs_is_a_decimal_comma(files):
+    for delimiter in ";\t":
+        rows = "t_ms,from,to,diff\n10,0,1,1\n20,0,1,1\n".replace(",", delimiter)
+        (files / "one.csv").write_text(rows)
+        one = read_columns(["one.csv"], parse_columns(TDOA), NAMED)
+        (files / "one.csv").write_text(rows.replace(f"1{delimiter}1\n2", f"1{delimiter}1,000\n2"))
+        np.testing.assert_array_equal(
+            read_columns(["one.csv"], parse_columns(TDOA), NAMED).tdoa.d, one.tdoa.d
+        )
+
+
+def test_the_file_that_lacks_the_fewest_columns_is_named(files):
+    """`imu.csv` has none of the columns, `ranging.csv` all except one."""
+    for paths in (["imu.csv", "ranging.csv"], ["ranging.csv", "imu.csv"]):
+        with pytest.raises(InputError, match="^ranging.csv: has no column 'dist'; its columns"):
+            read_columns(paths, parse_columns(TDOA.replace("diff", "dist")), NAMED)
+
+
 def test_columns_in_two_files_are_refused(files):
     (files / "again.csv").write_text(RANGING)
     with pytest.raises(InputError, match="give one of them"):

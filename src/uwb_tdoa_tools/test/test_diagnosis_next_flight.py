@@ -65,7 +65,7 @@ def test_motions_stay_clear_of_walls_and_anchors_and_within_limits(lower, size, 
             found = motions(room, of_anchors(anchors), limits)
         except InputError:
             continue
-        low, high = room.flyable
+        low, high = room.path_box
         for path in found.paths:
             assert (path.p >= low - 1e-9).all() and (path.p <= high + 1e-9).all(), path.what
             away = np.linalg.norm(path.p[:, None] - anchors.positions, axis=2)

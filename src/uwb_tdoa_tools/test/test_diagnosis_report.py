@@ -205,6 +205,19 @@ def test_the_verdict_says_why_in_words_of_the_field(result):
     assert titles == ["tdoa over x and height (by anchor)", "anchor_position", "anchor_delay"]
 
 
+def test_an_effect_is_not_most_of_a_gain_that_is_none(result):
+    changed = judged(
+        result,
+        {"one": 0.300},
+        {"one": 0.304},
+        [-0.03, -0.01],
+        findings=[finding(delay(), worth=0.012)],
+    )
+    headline, *more = verdict(changed).sentences
+    assert "rises from 30.0 cm to 30.4 cm" in headline
+    assert any(one.startswith("In part ") and "worth 1.2 cm" in one for one in more)
+
+
 def test_the_verdict_says_where_it_became_worse_and_what_diverged(result):
     before, after = (
         {"one": 0.3, "two": 0.2, "three": (0.9, True)},

@@ -36,6 +36,7 @@ from walking import blocks, section
 import yaml
 
 from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.limits import TooMuch, most_unpacked
 from uwb_tdoa_tools.checking.check import check as judged
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.commands.check import main as check
@@ -533,20 +534,22 @@ def test_an_index_that_lacks_messages_is_damage(twr, survey):
         read_by_profile([twr], load_profile("uwb_msgs"), survey)
 
 
-def test_a_chunk_that_unpacks_to_too_much_is_refused(flight, survey, tmp_path):
-    """Each byte unpacks to a megabyte of zeros."""
+@pytest.mark.parametrize("find", [bytes.index, bytes.rindex])
+def test_a_chunk_that_unpacks_to_too_much_is_refused(flight, survey, tmp_path, find):
+    """Each byte unpacks to a megabyte of zeros, in the first or the last chunk of the bag."""
     bomb = bz2.compress(bytes(200_000_000), 9)
 
     def topics(store):
         return two_way_ranges(flight)(store)
 
-    bag = write_ros_1(tmp_path / "bomb.bag", topics, Ros1Writer.CompressionFormat.BZ2)
+    bag = write_ros_1(tmp_path / "bomb.bag", topics, Ros1Writer.CompressionFormat.BZ2, 20_000)
     content = bag.read_bytes()
-    at = content.index(b"BZh")
+    at = find(content, b"BZh")
     size = int.from_bytes(content[at - 4 : at], "little")
     assert len(bomb) < size
     bag.write_bytes(content[:at] + bomb + bytes(size - len(bomb)) + content[at + size :])
-    with pytest.raises(InputError, match="unpacks to more than"):
+    limit = most_unpacked(len(content))
+    with pytest.raises(TooMuch, match=f"unpacks to more than {limit} bytes"):
         read_by_profile([bag], load_profile("uwb_msgs"), survey)
 
 

@@ -314,7 +314,7 @@ def test_is_a_usable_constellation_that_faces_the_middle(name):
     front = Rotation.from_quat(anchors.orientations).apply([1.0, 0.0, 0.0])
     inwards = -(anchors.positions - anchors.positions.mean(axis=0))
     assert (np.sum(front[:, :2] * inwards[:, :2], axis=1) > 0.0).all()
-    low, high = room_of(anchors).flyable
+    low, high = room_of(anchors).path_box
     assert (high - low > 1.0).all()
 
 
@@ -383,6 +383,11 @@ def test_nothing_is_heard_through_a_wall(monkeypatch):
     behind = (p[:, None, 0] > 15.0) != (anchors.positions[:, 0] > 15.0)
     for rows, blocked in zip(heard_at(p, anchors.positions, 12.0, walls), far | behind):
         np.testing.assert_array_equal(rows, np.flatnonzero(~blocked))
+
+
+@pytest.mark.parametrize("walls", [None, ACROSS])
+def test_no_point_hears_nothing(walls):
+    assert heard_at(np.empty((0, 3)), np.eye(3), 12.0, walls) == []
 
 
 def test_a_flight_hears_nothing_through_walls():

@@ -129,7 +129,7 @@ def test_sines_are_seeded_fill_the_room_and_keep_the_mean_speed():
         )
         motion = trajectory.motion(np.linspace(0.0, 200.0, 4000))
         paths.append(motion.p)
-        low, high = room.flyable
+        low, high = room.path_box
         assert (motion.p > low - 1e-6).all() and (motion.p < high + 1e-6).all()
         assert (np.ptp(motion.p, axis=0) > 0.5 * (high - low)).all()
         assert np.sqrt(np.mean(np.sum(motion.v**2, axis=1))) == pytest.approx(1.2, rel=0.2)

@@ -180,7 +180,7 @@ def test_marks_on_the_floor_tell_nothing_and_those_in_the_air_judge_each_other(f
     on_floor = self_calibrate(flights[:1], Tape(0.05), constraints=ends(flights[0]))
     np.testing.assert_array_equal(on_floor.surveyed.positions, last_week.surveyed.positions)
     assert (
-        on_floor.grounded == 2
+        on_floor.marks_on_floor == 2
         and on_floor.marks is None
         and "left out: 2 marks on the floor" in as_text(on_floor)
     )

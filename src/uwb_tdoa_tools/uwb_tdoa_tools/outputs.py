@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.files import keeping, refuse_output
+from uwb_tdoa_bias.common.files import protected_inputs, refuse_output
 
 if TYPE_CHECKING:
     from argparse import Namespace
@@ -57,14 +57,14 @@ def checked(args: Namespace) -> AbstractContextManager[None]:
     values = list(_flat(value for name, value in vars(args).items() if name != "ros_arguments"))
     outputs = [value for value in values if isinstance(value, Output)]
     inputs = [Path(value) for value in values if not isinstance(value, Output) and _is_there(value)]
-    with keeping(inputs):
+    with protected_inputs(inputs):
         for output in outputs:
             refuse_output(output)
             if isinstance(output, OutputFolder):
                 _check_folder(output)
             elif isinstance(output, OutputFile):
                 _check_file(output)
-    return keeping(inputs)
+    return protected_inputs(inputs)
 
 
 def _flat(values: Any) -> Iterator[Any]:

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from . import executable  # it also imports numba in another folder
-from .files import folder_of_process
+from .files import new_folder_until_exit
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -170,7 +170,7 @@ def _place(name: str) -> Path:
         f"{why} {place}; a temporary folder is used: set NUMBA_CACHE_DIR to a folder of your own.",
         file=sys.stderr,
     )
-    return folder_of_process()
+    return new_folder_until_exit()
 
 
 def _is_ours_alone(folder: Path) -> bool:

@@ -31,7 +31,6 @@ from .limits import ARRAYS_BYTES, RECORDING_BYTES, Budget
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
-    from pathlib import Path
     from zipfile import ZipInfo
 
 
@@ -41,7 +40,7 @@ NO_WAIT = getattr(os, "O_NONBLOCK", 0)  # a pipe without a writer would block; W
 SETTLED = 60.0  # s; older temporary folders without a lock are removed
 _KEPT: list[
     tuple[Path, Path, os.stat_result, bool]
-] = []  # of `keeping`: path, resolved path, state, whether it is a bag
+] = []  # of `protected_inputs`: path, resolved path, state, whether it is a bag
 
 
 def read_bytes(path: str | Path, most: int = RECORDING_BYTES, what: str = "recording") -> bytes:
@@ -124,8 +123,11 @@ def write_bytes(path: str | Path, content: bytes) -> None:
 
 
 @contextmanager
-def keeping(inputs: Iterable[Path]) -> Iterator[None]:
-    """Let `refuse_output` refuse some files and folders, and their content, inside the block."""
+def protected_inputs(inputs: Iterable[Path]) -> Iterator[None]:
+    """Protect some files and folders, and their content: inside the block no output overwrites them.
+
+    `refuse_output` refuses them.
+    """
     before = _KEPT[:]
     _KEPT.extend(
         (path, path.resolve(), path.stat(), (path / "metadata.yaml").exists()) for path in inputs
@@ -139,7 +141,7 @@ def keeping(inputs: Iterable[Path]) -> Iterator[None]:
 def refuse_output(path: str | Path) -> None:
     """Raise InputError if writing to a path would follow a link, or change an input or a bag.
 
-    A link may lead to any file. STREAMS are exempt. `keeping` sets the inputs.
+    A link may lead to any file. STREAMS are exempt. `protected_inputs` sets the inputs.
     """
     path = Path(path)
     if path.is_symlink() and str(path) not in STREAMS:
@@ -183,8 +185,11 @@ def temporary_folder() -> Iterator[Path]:
         yield Path(name)
 
 
-def folder_of_process() -> Path:
-    """Return a temporary folder that is removed when this process ends."""
+def new_folder_until_exit() -> Path:
+    """Return a new temporary folder that is removed when this process ends.
+
+    Each call makes another one. It is for files that outlive a `with` block.
+    """
     stack = ExitStack()
     atexit.register(stack.close)
     return stack.enter_context(temporary_folder())

@@ -245,14 +245,15 @@ class AnchorPosition(GeometryEffect):
             return ()
         many = len(shifts) > 1
         each = [
-            f"{f'anchor {anchor}' if many else 'it'} seems off by "
-            f"{listed(by[axis] for axis in sorted(by))}"
+            f"{f'anchor {anchor}' if many else 'it'} seems to be "
+            f"{listed(by[axis] for axis in sorted(by))} from its surveyed position"
             for anchor, by in shifts.items()
         ]
         return (
             f"Measure {counted(sorted(shifts, key=int), 'anchor')} again before you move "
             f"{'them' if many else 'it'}: {'; '.join(each)}. "
-            "If the survey proves right, ranges to there are wrong by direction.",
+            f"If the survey proves right, the errors of ranges to {'them' if many else 'it'} depend on "
+            "the direction, as those of an antenna do.",
         )
 
     def marks(self, anchors: Anchors) -> tuple[Shift, ...]:

@@ -124,14 +124,18 @@ class Covariance:
     matrix: np.ndarray
 
     def of(self, keys: Sequence[tuple[str, ...]]) -> tuple[np.ndarray, np.ndarray]:
-        """Return (places (m,) of its keys among `keys`, their matrix (m, m))."""
+        """Return (rows (m,) of `keys` that it holds, their matrix (m, m))."""
         known = {key: row for row, key in enumerate(self.keys)}
-        places = [place for place, key in enumerate(keys) if key in known]
-        rows = [known[keys[place]] for place in places]
-        return np.array(places, dtype=int), self.matrix[np.ix_(rows, rows)]
+        held = [row for row, key in enumerate(keys) if key in known]
+        own = [known[keys[row]] for row in held]
+        return np.array(held, dtype=int), self.matrix[np.ix_(own, own)]
 
-    def of_each_anchor(self) -> Covariance:
-        """Return the Covariance without correlation between different anchors, anchor by anchor."""
+    def block_diagonal_by_anchor(self) -> Covariance:
+        """Return the Covariance without correlation between different anchors.
+
+        This limits the size of effects.yaml for many anchors. Parameters of an anchor follow each
+        other, in the order of the ids as text. A key without an anchor ("z") has its own block.
+        """
         anchors = np.array([key[1].partition(".")[0] for key in self.keys])
         order = np.argsort(np.unique(anchors, return_inverse=True)[1], kind="stable")
         matrix = np.where(anchors[:, None] == anchors, self.matrix, 0.0)[np.ix_(order, order)]
@@ -268,7 +272,8 @@ class EffectSet:
 
         Returns bias (n,) m; Jacobian (n, N_STATES), m per m of position and per m/s of velocity;
         standard deviation of the deviation from the line, (n,) m. All are 0 where the state is
-        unknown.
+        unknown. The deviation has the variance of half the second differences: with the biases b+
+        and b- at steps of REACH to both sides, 2 ((b+ + b-) / 2 - b)^2, summed over the states.
         """
         groups: dict[tuple[int, ...], list[Effect]] = {}
         n = len(samples)
@@ -367,7 +372,7 @@ class EffectSet:
     def near_ground_delays(
         self, anchors: Anchors
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """Return delays of some Anchors near the ground, as FloorMultipath does, or None."""
+        """Return delays of anchors near the ground, as `FloorMultipath.near_ground_delays`, or None."""
         for effect in self.effects:
             if effect.is_hypothesis:
                 return effect.near_ground_delays(anchors)

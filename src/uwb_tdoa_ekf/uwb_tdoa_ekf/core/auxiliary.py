@@ -1,8 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Auxiliary states beyond the 15 error states: biases common to all measurements of a sensor.
+"""Auxiliary states beyond the 15 error states: offsets common to all measurements of a sensor.
 
-The filter estimates them together with the position. `offset_cross` is their covariance with the
+The filter estimates them together with the position. `offset` holds them. `offset_cross` is their covariance with the
 error state. `offset_P` is their own covariance. A variance of 0 means that the state does not
 exist. Without auxiliary states nothing is computed. `pressure` and `ranges` define their meaning
 and initialization.
@@ -44,9 +44,14 @@ def forget(hypothesis: Record) -> None:
 
 @compiled
 def add_offset_jacobian(hypothesis: Record, innovation: Record, state: int) -> None:
-    """Add an auxiliary state to an innovation, with a Jacobian entry of 1.
+    """Add an auxiliary state b to an innovation of z = h(x) + b.
 
-    Call after `update.project`.
+    With the Jacobian H of h, the covariance C of b with the error state, and the variance P of b,
+    the prior variance of z grows by 2 H C + P, and its covariance with the error state by C. The
+    measurement noise is not in them.
+
+    Call after `update.project`, at most once for an innovation: a second state would miss its
+    covariance with the first.
 
     Parameters
     ----------
@@ -58,11 +63,11 @@ def add_offset_jacobian(hypothesis: Record, innovation: Record, state: int) -> N
         PRESSURE, PRESSURE_DRIFT or RANGE.
     """
     cross, P = hypothesis.offset_cross, hypothesis.offset_P
-    own = 0.0
+    cross_variance = 0.0  # H C
     for n in range(innovation.entries):
-        own += innovation.row[n] * cross[state, innovation.states[n]]
+        cross_variance += innovation.row[n] * cross[state, innovation.states[n]]
     innovation.cross_covariance[:] += cross[state]
-    innovation.prior_variance += 2.0 * own + P[state, state]
+    innovation.prior_variance += 2.0 * cross_variance + P[state, state]
     innovation.offset_jacobian[state] = 1.0
 
 

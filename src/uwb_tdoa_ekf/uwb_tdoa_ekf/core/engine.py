@@ -142,7 +142,7 @@ def _set_pose(
     ekf, pose = state.ekf[0], poses[0]
     if ekf.running:
         _predict(ekf, parameters[0], pose.t, records)
-    initialization.place(ekf, state.anchors, parameters[0], pose.t, pose, records)
+    initialization.set_pose(ekf, state.anchors, parameters[0], pose.t, pose, records)
 
 
 def set_pose(state: FilterState, parameters: np.ndarray, pose: np.ndarray) -> None:
@@ -211,7 +211,7 @@ def _switch(ekf: Record, parameters: Record, records: np.ndarray) -> None:
     if ekf.running and ekf.imu_faulty:
         initialization.widen(ekf, records)
     elif ekf.running:
-        initialization.reset_attitude(ekf, parameters, 2.0 * math.pi, records)
+        initialization.reset_attitude(ekf, parameters, initialization.YAW_SEARCH_STD, records)
 
 
 # Process a TDOA: reject a repeat, predict, update, and search for a lost tag.
@@ -235,7 +235,7 @@ def _on_tdoa(
         return
     before = ekf.position_unknown_until
     _prepare(ekf, anchors, parameters, t, records)
-    if parameters.recover and initialization.waits(
+    if parameters.recover and initialization.hold_for_search(
         ekf, anchors, parameters, t, ekf.position_unknown_until > before, records
     ):
         ekf.last_tdoa = t
@@ -313,8 +313,8 @@ def _prepare(
             stationarity.check_stationarity(ekf, anchors, parameters, window, t, records)
         if not parameters.use_imu or t - ekf.imu.t > parameters.imu_timeout:
             stationarity.update_zero_velocity(ekf, t, records)
-    if t >= ekf.next_bounds:
-        initialization.look_around(ekf, anchors, parameters, t)
+    if t >= ekf.next_workspace:
+        initialization.update_workspace(ekf, anchors, parameters, t)
     if t - ekf.last_tdoa > parameters.start_window and initialization.is_unsure(ekf):
         ekf.position_unknown_until = t + UNSURE_TIME
 

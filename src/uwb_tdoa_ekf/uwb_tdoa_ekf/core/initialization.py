@@ -27,7 +27,7 @@ from .startup import APART, Places, inliers, level, locate, room_for, split
 from .state import CHECK_PERIOD, GRAVITY, turn_about_vertical, yaw_of
 
 MINIMUM = 12  # least number of TDOAs for a search
-AGREE, AGREE_ANYHOW = 0.7, 0.6  # share of TDOAs that a start, and a recovery, must explain
+AGREE, AGREE_RECOVERY = 0.7, 0.6  # share of TDOAs that a start, and a recovery, must explain
 CLEARLY_MORE = 0.2  # share of TDOAs by which a recovery must exceed the filter
 # s of TDOAs for a recovery, and over which the share of TDOAs that agree with the filter is averaged.
 # It is short, because a tag that leaves the floor must not wait until TDOAs of the floor have left it.
@@ -43,7 +43,9 @@ UNKNOWN, BETTER = (2.0, 0.5)
 # just been switched on.
 LONGEST_GAP = 0.6
 TILT_STD = 0.1  # rad, roll and pitch at the start
-ANY_YAW = math.pi / math.sqrt(3.0)  # rad, standard deviation of an unknown yaw
+ANY_YAW = math.pi / math.sqrt(3.0)  # rad, standard deviation of a yaw that is uniform on the circle
+# rad, standard deviation with which hypotheses of all yaws start, with nearly the same weight
+YAW_SEARCH_STD = 2.0 * math.pi
 WRONG_POSITION = 1.0  # m, standard deviation of the position error after faulty inertial samples
 SMALLEST_STD = 0.03  # m, least standard deviation of a known height at the start
 # m, m/s, m/s^2: a recovery is limited to this distance, as a function of the time since the filter
@@ -119,10 +121,14 @@ def start(
     anchors: np.ndarray,
     parameters: Record,
     t: float,
-    anyhow: bool,
+    timed_out: bool,
     history: np.ndarray,
 ) -> None:
     """Start the filter if the window determines a single position.
+
+    There are three starts. A tag at rest on the ground starts at the most probable place there. A
+    tag at rest elsewhere starts without velocity. A moving tag starts with the velocity that
+    its TDOAs give, at one or two places.
 
     Parameters
     ----------
@@ -134,8 +140,9 @@ def start(
         Tuning of the filter.
     t : float
         Stamp, s.
-    anyhow : bool
-        Start also if the TDOAs contradict each other. Their residuals then widen the covariance.
+    timed_out : bool
+        Whether the start has been awaited for `start_timeout`. Then it is accepted even if the TDOAs
+        contradict each other. Their residuals widen the covariance.
     history : (n,) RECORD
         History for the smoother; empty for no recording.
     """
@@ -145,26 +152,29 @@ def start(
     ekf.next_search = t + CHECK_PERIOD
     places, known = room_for(N_PLACES), _known_height(ekf, parameters, t)
     share = _search(ekf, anchors, parameters, t, window, places)
-    stationary_position.sort(places, ekf, parameters)
+    stationary_position.sort_places(places, ekf, parameters)
     x, covariance, cost = places.x, places.covariance, places.cost
     pairs = ekf.pairs[: ground.find_pairs(window, ekf.pairs)]
-    at_rest, its = x[0].copy(), covariance[0].copy()
-    wide = np.trace(its[:3, :3]) > APART**2  # before the covariance includes other explanations
-    lead = stationary_position.weigh(ekf, pairs, anchors, parameters, known, at_rest, its)
-    still = ground.judge_motion(pairs, anchors, at_rest, ekf.still_covariance) == ground.STILL
-    on_ground = lead > (0.0 if still else stationary_position.DECISIVE)
-    good = still if on_ground else share >= AGREE and workspace.contains(ekf.workspace, x[0])
-    if not (good or anyhow):
+    rest_x, rest_covariance = x[0].copy(), covariance[0].copy()
+    # before the covariance includes other explanations
+    spread_out = np.trace(rest_covariance[:3, :3]) > APART**2
+    ground_log_odds = stationary_position.weigh_explanations(
+        ekf, pairs, anchors, parameters, known, rest_x, rest_covariance
+    )
+    still = ground.judge_motion(pairs, anchors, rest_x, ekf.still_covariance) == ground.STILL
+    on_ground = ground_log_odds > (0.0 if still else stationary_position.DECISIVE)
+    accepted = still if on_ground else share >= AGREE and workspace.contains(ekf.workspace, x[0])
+    if not (accepted or timed_out):
         return
-    if still or on_ground or not (good or cost[1] < np.inf):
-        x[0], covariance[0] = at_rest, its
+    if still or on_ground or not (accepted or cost[1] < np.inf):
+        x[0], covariance[0] = rest_x, rest_covariance
     if on_ground:
         cost[1] = np.inf
-    elif wide:
+    elif spread_out:
         split(places)
-        stationary_position.sort(places, ekf, parameters)
-    for place in range(N_PLACES if still else 0):
-        stationary_position.stop(x[place], covariance[place], ekf.still_covariance)
+        stationary_position.sort_places(places, ekf, parameters)
+    for k in range(N_PLACES if still else 0):
+        stationary_position.set_at_rest(x[k], covariance[k], ekf.still_covariance)
     _start_at(ekf, parameters, t, places, still and parameters.zero_velocity, history)
 
 
@@ -192,23 +202,21 @@ def start_slowly(
     """
     window, stamps = _last(ekf, t)
     enough = len(window) >= SLOW_TDOAS or (stamps >= SLOW_STAMPS and len(window) > 2 * stamps)
+    if not (enough or len(window) >= MINIMUM):
+        return
     span, gap = t - window[0].t, 0.0
     for i in range(1, len(window)):
         gap = max(gap, window[i].t - window[i - 1].t)
-    if (
-        not (enough or len(window) >= MINIMUM)
-        or span < parameters.start_window
-        or gap > LONGEST_GAP * span
-    ):
+    if span < parameters.start_window or gap > LONGEST_GAP * span:
         return
     places = room_for(N_PLACES)
     share = _search(ekf, anchors, parameters, t, window, places)
-    stationary_position.sort(places, ekf, parameters)
+    stationary_position.sort_places(places, ekf, parameters)
     if not (enough or (share >= AGREE and workspace.contains(ekf.workspace, places.x[0]))):
         return
     if np.trace(places.covariance[0, :3, :3]) > APART**2:
         split(places)
-        stationary_position.sort(places, ekf, parameters)
+        stationary_position.sort_places(places, ekf, parameters)
     _start_at(ekf, parameters, t, places, False, history)
 
 
@@ -223,7 +231,7 @@ def is_unsure(ekf: Record) -> bool:
 
 
 @compiled
-def waits(
+def hold_for_search(
     ekf: Record,
     anchors: np.ndarray,
     parameters: Record,
@@ -231,11 +239,12 @@ def waits(
     silent: bool,
     history: np.ndarray,
 ) -> bool:
-    """Return whether a TDOA waits for a search, because the position is unknown after a silence.
+    """Hold a TDOA back for a search, because the position is unknown after a silence.
 
-    With the last required TDOA, the function searches. A single TDOA would be linearized far from
-    the tag, and the covariance would shrink about a wrong position. If few TDOAs come, they do not
-    wait.
+    Return whether the TDOA is held back: it then updates nothing. With the last required TDOA, the
+    function searches and recovers the filter. A single TDOA would be linearized far from
+    the tag, and the covariance would shrink about a wrong position. If few TDOAs come, they are
+    not held back.
 
     Parameters
     ----------
@@ -308,7 +317,7 @@ def relocate(
 def _last(ekf: Record, t: float) -> tuple[np.ndarray, int]:
     """Return the last SLOW_TDOAS, or more until they have SLOW_STAMPS, and their number of stamps.
 
-    None is older than LOST_TIME.
+    None is older than LOST_TIME, except a single one. There are none before the first TDOA.
     """
     first, stamps = ekf.kept - 1, 1
     while first > 0 and ekf.kept - first < WINDOW and ekf.window[first - 1].t > t - LOST_TIME:
@@ -330,17 +339,17 @@ def _find_surroundings(
 
 
 @compiled
-def look_around(ekf: Record, anchors: np.ndarray, parameters: Record, t: float) -> None:
+def update_workspace(ekf: Record, anchors: np.ndarray, parameters: Record, t: float) -> None:
     """Update the workspace of a running tag from the anchors heard up to stamp t (s).
 
     The workspace thus follows the tag through a hall.
     """
-    ekf.next_bounds = t + noise.MEMORY
+    ekf.next_workspace = t + noise.MEMORY
     _find_surroundings(ekf, recent(ekf, noise.MEMORY), anchors, parameters)
 
 
 @compiled
-def place(
+def set_pose(
     ekf: Record,
     anchors: np.ndarray,
     parameters: Record,
@@ -507,7 +516,7 @@ def recover(
     explained = np.mean(inliers(window, anchors, ekf.hypotheses[ekf.best].x[:6]))
     if (
         workspace.distance_outside(ekf.workspace, x[0]) > (workspace.STD if anywhere else 0.0)
-        or share < AGREE_ANYHOW
+        or share < AGREE_RECOVERY
     ):
         return
     if anywhere and cost[count - 1] < np.inf:
@@ -629,7 +638,7 @@ def open_yaw(ekf: Record, parameters: Record, history: np.ndarray) -> None:
     """
     ekf.yaw_test.count += 1
     widen(ekf, history)
-    reset_attitude(ekf, parameters, 2.0 * math.pi, history)
+    reset_attitude(ekf, parameters, YAW_SEARCH_STD, history)
 
 
 @compiled
@@ -640,7 +649,7 @@ def open_unknown_yaw(ekf: Record, parameters: Record, history: np.ndarray) -> No
     """
     unknown = ekf.hypotheses[ekf.best].P[8, 8] > hypotheses.YAW_STD**2
     if unknown and hypotheses.followed(ekf) == 1:
-        reset_attitude(ekf, parameters, 2.0 * math.pi, history)
+        reset_attitude(ekf, parameters, YAW_SEARCH_STD, history)
 
 
 @compiled
@@ -650,7 +659,7 @@ def level_first(ekf: Record, parameters: Record, history: np.ndarray) -> None:
     If a single hypothesis is left, the standard deviation of its yaw stays the same. Otherwise the
     yaw becomes unknown.
     """
-    yaw_std = 2.0 * math.pi
+    yaw_std = YAW_SEARCH_STD
     if hypotheses.followed(ekf) == 1:
         yaw_std = math.sqrt(ekf.hypotheses[ekf.best].P[8, 8])
     reset_attitude(ekf, parameters, yaw_std, history)
@@ -676,7 +685,10 @@ def _known_height(ekf: Record, parameters: Record, t: float) -> KnownHeight:
 
 @compiled
 def recent(ekf: Record, seconds: float) -> np.ndarray:
-    """Return the TDOAs of the last `seconds`, (n,) TDOA."""
+    """Return the TDOAs of the `seconds` before the newest one, with it: (n,) TDOA.
+
+    At most WINDOW are returned; none before the first TDOA.
+    """
     first = ekf.kept - 1
     since = ekf.window[ekf.kept - 1].t - seconds
     while first > 0 and ekf.kept - first < WINDOW and ekf.window[first - 1].t > since:

@@ -242,7 +242,7 @@ EKF = _record(
     # configured
     ("flat", float, 3),
     ("middle", float, 3),  # m, center of the anchors heard lately
-    ("next_bounds", float),  # s, stamp of the next update of the workspace
+    ("next_workspace", float),  # s, stamp of the next update of the workspace
     # 1/m^2, of the position, by a single TDOA of each anchor heard lately, see noise.py
     ("information", float, (3, 3)),
     # s, stamp until which the tag may be anywhere, because its position was uncertain before
@@ -341,7 +341,7 @@ NEVER = (
     "next_rest",
     "next_merge",
     "next_look",
-    "next_bounds",
+    "next_workspace",
     "next_floor",
     "last_agreement",
     "position_unknown_until",

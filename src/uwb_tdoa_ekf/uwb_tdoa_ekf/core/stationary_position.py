@@ -43,7 +43,7 @@ LANDING_STD = (0.2, 0.2, 0.5)
 
 
 @compiled
-def weigh(
+def weigh_explanations(
     ekf: Record,
     pairs: np.ndarray,
     anchors: np.ndarray,
@@ -111,7 +111,7 @@ def _near_anchors(ekf: Record, parameters: Record) -> np.ndarray:
 
 
 @compiled
-def sort(places: Places, ekf: Record, parameters: Record) -> None:
+def sort_places(places: Places, ekf: Record, parameters: Record) -> None:
     """Order two Places by probability, the most probable first.
 
     The costs become relative to the first. A place far above or below the anchors is improbable.
@@ -186,7 +186,7 @@ def _mix(explained: Places) -> int:
 
 
 @compiled
-def stop(x: np.ndarray, covariance: np.ndarray, of_velocity: np.ndarray) -> None:
+def set_at_rest(x: np.ndarray, covariance: np.ndarray, of_velocity: np.ndarray) -> None:
     """Set the velocity of a state and its covariance to a tag at rest.
 
     Parameters
@@ -333,7 +333,7 @@ def set_position(
     """
     x, of_x = np.zeros(6), np.zeros((6, 6))
     x[:3], of_x[:3, :3] = position, covariance
-    stop(x, of_x, ekf.still_covariance)
+    set_at_rest(x, of_x, ekf.still_covariance)
     for h in range(HYPOTHESES):
         set_state(ekf.hypotheses[h], x, of_x)
     ekf.consistency = 1.0

@@ -87,7 +87,7 @@ class Health:
         counts : mapping
             Totals by verdict.
         """
-        self.use.look(
+        self.use.update(
             time.monotonic(), self.received, counts, estimator is not None and estimator.running
         )
 
@@ -191,8 +191,8 @@ class Health:
             return WARN, estimator.lost
         if self._starting is None or now - self._starting <= START_TIMEOUT:
             return OK, "looking for the start position"
-        if self.use.trouble:
-            return WARN, self.use.trouble
+        if self.use.why_unused:
+            return WARN, self.use.why_unused
         if self.use.restart_age < START_TIMEOUT:
             return WARN, (
                 "the filter starts anew again and again, because stamps of a stream fall back: "
@@ -217,7 +217,7 @@ class Health:
         outside : str or None
             Sentence on a position outside of the flyable volume.
         """
-        yield self.use.trouble
+        yield self.use.why_unused
         yield self._trouble_of_sensors(counts)
         yield estimator.side_unknown
         yield outside

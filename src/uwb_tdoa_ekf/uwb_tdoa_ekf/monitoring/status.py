@@ -35,8 +35,9 @@ SETTLED = 5.0
 EARLY = 0.05  # s by which a check may come early
 LARGEST_UNUSED = 0.5  # share of TDOAs that are not used for one reason, before it is reported
 FEWEST = 10  # fewest TDOAs of a window
-# rad and m/s, standard deviations that are published while a fault makes the estimate wrong
-ANY_YAW, ANY_SPEED = math.pi, 2.0
+# rad and m/s, standard deviations that are added while a fault makes the estimate wrong. That of the
+# yaw is more than of a uniform yaw, initialization.ANY_YAW: no user shall rely on a wrong estimate.
+FAULT_YAW_STD, FAULT_SPEED_STD = math.pi, 2.0
 WAITING, STARTING, RUNNING, LOST, FAULT = range(5)  # values of EstimatorStatus
 REASONS = "late", "invalid", "rejected"
 USED = (
@@ -47,7 +48,7 @@ USED = (
 
 
 class Use:
-    """Track which measurements the filter uses; `look` is called several times per second.
+    """Track which measurements the filter uses; `update` is called several times per second.
 
     Attributes
     ----------
@@ -68,7 +69,7 @@ class Use:
         self._running_since = math.inf  # time.monotonic()
         self._now = -math.inf
 
-    def look(
+    def update(
         self, now: float, received: Mapping[str, int], counts: Mapping[str, int], running: bool
     ) -> None:
         """Store totals at one time.
@@ -156,7 +157,7 @@ class Use:
         return settled and self._shares(WINDOW_OF_REJECTED).get("rejected", 0.0) > LARGEST_UNUSED
 
     @property
-    def trouble(self) -> str | None:
+    def why_unused(self) -> str | None:
         """Return a sentence on why most TDOAs are not used, or None."""
         shares = self._shares(WINDOW)
         for name in ("late", "invalid"):
@@ -186,8 +187,8 @@ def flyability(
 ) -> tuple[str | None, dict[str, str]]:
     """Return a sentence on a position that may not be flown, or None, and {key: text}.
 
-    The efficiency is the bound's variance for one round of TDOAs divided by the filter's stated
-    variance. The filter also uses earlier rounds and the IMU. An efficiency of n means the precision
+    The efficiency is the Cramer-Rao bound of one round of TDOAs divided by the filter's stated 3D
+    standard deviation, squared. The filter also uses earlier rounds and the IMU. An efficiency of n means the precision
     of n independent rounds.
 
     Parameters
@@ -312,7 +313,7 @@ def status_of(
         return Status(
             STARTING,
             False,
-            use.trouble
+            use.why_unused
             or (restarted.sentence if restarted else "the start position is looked for"),
         )
     yaw_known = bool(yaw_std <= YAW_KNOWN)  # a message takes no other type for true
@@ -332,7 +333,7 @@ def _reason_against_flying(
     if estimator.unsure:
         return estimator.unsure
     if use.tdoa_age > SILENT:
-        trouble = use.trouble or f"no TDOA was used for more than {SILENT:g} s"
+        trouble = use.why_unused or f"no TDOA was used for more than {SILENT:g} s"
         sources = [
             *(["the IMU"] if use.imu_used and imu_fault is None else []),
             *(["the velocities"] if use.velocity_used else []),
@@ -343,8 +344,8 @@ def _reason_against_flying(
             else "on as the tag moved last, without the IMU and without velocities,"
         )
         return f"{trouble}: the position goes {motion} and drifts"
-    if use.trouble:
-        return use.trouble
+    if use.why_unused:
+        return use.why_unused
     if not yaw_known and imu_fault is not None:
         return (
             f"the yaw is not known, because the filter goes without the IMU: {imu_fault.sentence}"
@@ -367,8 +368,12 @@ def _reason_against_flying(
     return findings[0].sentence if findings and findings[0].severity == "error" else ""
 
 
-def doubted(odometry: Odometry, size: np.ndarray) -> Odometry:
-    """Return Odometry with a covariance for a tag anywhere in its workspace and with any yaw.
+def with_fault_covariance(odometry: Odometry, size: np.ndarray) -> Odometry:
+    """Return Odometry with a covariance for a tag anywhere in its workspace, moving, with any yaw.
+
+    The standard deviation of each coordinate grows by the full size of the workspace, more than
+    that of a uniform position. FAULT_SPEED_STD is added to each velocity. FAULT_YAW_STD is added
+    about the vertical, since gravity still determines roll and pitch.
 
     Parameters
     ----------
@@ -382,6 +387,6 @@ def doubted(odometry: Odometry, size: np.ndarray) -> Odometry:
     # world z axis in the body frame
     up = np.stack([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x**2 + y**2)], axis=1)
     covariance[:, :3, :3] += np.diag(size**2)
-    covariance[:, 3:6, 3:6] += ANY_SPEED**2 * np.eye(3)
-    covariance[:, 6:, 6:] += ANY_YAW**2 * up[:, :, None] * up[:, None, :]
+    covariance[:, 3:6, 3:6] += FAULT_SPEED_STD**2 * np.eye(3)
+    covariance[:, 6:, 6:] += FAULT_YAW_STD**2 * up[:, :, None] * up[:, None, :]
     return replace(odometry, covariance=covariance)

@@ -393,7 +393,7 @@ def _ros_1(path: Path) -> Iterator[_Part]:
     try:
         reader.open()
         _check_counts(reader)
-        _limit(reader, path)
+        _limit_and_cache_unpacking(reader, path)
     except Exception as error:  # rosbags raises whatever its parsers run into
         raise _damaged(path, error) from error
     try:
@@ -447,33 +447,38 @@ def _damaged(path: Path, error: Exception) -> InputError:
     )
 
 
-def _limit(reader: Ros1Reader, path: Path) -> None:
-    """Let the chunks of an open reader unpack to a limited number of bytes, and keep some of them.
+def _limit_and_cache_unpacking(reader: Ros1Reader, path: Path) -> None:
+    """Limit the bytes to which the chunks of an open reader unpack, and cache unpacked chunks.
 
-    rosbags unpacks a chunk for each message if the topics of a bag lie in different chunks.
+    Each chunk is limited, and the sum of all chunks. TooMuch is raised when a message of the chunk
+    is read. rosbags unpacks a chunk for each message if the topics of a bag lie in different
+    chunks, so the latest KEPT_BYTES of chunks are cached.
     """
-    kept: OrderedDict[int, bytes] = OrderedDict()
-    sizes: dict[int, int] = {}
-    most = most_unpacked(path.stat().st_size)
+    kept: OrderedDict[int, bytes] = OrderedDict()  # {position of a chunk: its content}
+    sizes: dict[int, int] = {}  # of all chunks that were unpacked
+    total_limit = most_unpacked(path.stat().st_size)
+    # A chunk names its compression only by the function that unpacks it.
     unpack = {id(decompressors[name]): function for name, function in _LIMITED.items()}
 
-    def unpacked(at: int, data: bytes, function: Callable[[bytes, int], bytes]) -> bytes:
-        if at in kept:
-            kept.move_to_end(at)
-            return kept[at]
-        left = min(CHUNK_BYTES, most - sum(sizes.values()) + sizes.get(at, 0))
-        content = function(data, left + 1)
-        if len(content) > left:
+    def unpacked(position: int, data: bytes, function: Callable[[bytes, int], bytes]) -> bytes:
+        if position in kept:
+            kept.move_to_end(position)
+            return kept[position]
+        remaining = total_limit - sum(sizes.values()) + sizes.get(position, 0)
+        most = min(CHUNK_BYTES, remaining)
+        content = function(data, most + 1)
+        if len(content) > most:
+            limit = CHUNK_BYTES if most < remaining else total_limit
             raise TooMuch(
-                f"{path}: unpacks to more than {left} bytes; give another file, or split it."
+                f"{path}: unpacks to more than {limit} bytes; give another file, or split it."
             )
-        kept[at], sizes[at] = content, len(content)
+        kept[position], sizes[position] = content, len(content)
         while sum(map(len, kept.values())) > KEPT_BYTES and len(kept) > 1:
             kept.popitem(last=False)
         return content
 
-    for at, chunk in reader.chunks.items():
+    for position, chunk in reader.chunks.items():
         function = unpack.get(id(chunk.decompressor))
         if function:
-            of_chunk = partial(unpacked, at, function=function)
-            reader.chunks[at] = chunk._replace(decompressor=of_chunk)
+            of_chunk = partial(unpacked, position, function=function)
+            reader.chunks[position] = chunk._replace(decompressor=of_chunk)

@@ -17,7 +17,7 @@ from uwb_tdoa_ekf.core.workspace import FLAT
 from uwb_tdoa_ekf.monitoring.finding import NOTE, WARNING, Finding
 from uwb_tdoa_ekf.monitoring.monitor import NEARER
 
-from .ordered import SPREAD, spread
+from .ordered import LEAST_MOTION, second_principal_std
 from .pair_rules import MANY
 
 if TYPE_CHECKING:
@@ -295,14 +295,17 @@ def little_motion(view: CoverageView) -> Iterator[Finding]:
     """Yield a finding if the tag hardly moves."""
     if not len(view.places):
         return
-    moved = spread(view.places)
+    moved = second_principal_std(view.places)
     duration = view.windows[-1].stamps.end - view.windows[0].stamps.begin
-    if duration < SHORT or moved < SPREAD:
+    if duration < SHORT or moved < LEAST_MOTION:
         yield Finding(
             "little_motion",
             NOTE,
             cause="sign, ids, survey and axes can hardly be told from this recording",
-            evidence=f"{duration:.0f} s, {moved:.2f} m (rms) off a straight line",
+            evidence=(
+                f"{duration:.0f} s; the positions vary by {moved:.2f} m (standard deviation) across "
+                "their main direction"
+            ),
             remedy=(
                 "record a minute in which the tag is carried through the whole room, turned, "
                 "lifted "

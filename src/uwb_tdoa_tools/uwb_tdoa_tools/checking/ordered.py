@@ -44,8 +44,9 @@ TAG, SPEED = 5.0, 1.0  # m and m/s, the same for the tag about its first positio
 STD, TOGETHER = 0.15, 20.0  # m, of one TDOA; most TDOAs of a window that count as independent
 ROBUST = 0.4  # m, scale of the Geman-McClure weight
 SWEEPS, STEP = 12, 1.0  # Gauss-Newton steps, and the longest of an anchor, m
-# m of `spread`; measured flights 0.50 at least, also with ids swapped, a hovering tag 0.16 at most
-SPREAD = 0.3
+# m of `second_principal_std`; measured flights 0.50 at least, also with ids swapped, a hovering tag
+# 0.16 at most
+LEAST_MOTION = 0.3
 
 
 class SurveyFit:
@@ -159,6 +160,10 @@ class SurveyFit:
     def solve(self, free: Sequence[int] | None = None) -> tuple[float, np.ndarray]:
         """Move the tag, and the anchors in `free`, to the least loss.
 
+        Each Gauss-Newton step eliminates the states of the tag, one per window (Schur complement).
+        With the blocks A of a state, B of state and anchors, and C of the anchors, the anchors are
+        solved from the sum of C - B' A^-1 B over the windows.
+
         Parameters
         ----------
         free : sequence of int or None
@@ -180,13 +185,13 @@ class SurveyFit:
         anchors, start = self.positions.copy(), [x.copy() for x in self._start]
         # In a hall each window has few of the anchors.
         heard = [moved & np.isin(np.arange(len(moved)), ends[1:3]) for ends in self._windows]
-        # Their coordinates among the free ones:
-        places = [np.flatnonzero(np.repeat(some[moved], 3)) for some in heard]
+        # columns of their coordinates
+        heard_columns = [np.flatnonzero(np.repeat(some[moved], 3)) for some in heard]
         for _ in range(SWEEPS):
             H = np.eye(len(columns)) / PRIOR**2
             g = (self.positions - anchors).reshape(-1)[columns] / PRIOR**2
             eliminated = []
-            for x, window, some, its in zip(start, self._windows, heard, places):
+            for x, window, some, own in zip(start, self._windows, heard, heard_columns):
                 by_tag, by_anchors, residual = _linearised(x, window, anchors, some)
                 weight = (
                     min(1.0, TOGETHER / len(residual))
@@ -197,16 +202,16 @@ class SurveyFit:
                 B = left.T @ by_anchors
                 c = left.T @ residual - np.r_[np.zeros(3), x[3:] / SPEED**2]
                 solved = np.linalg.solve(A, np.column_stack([B, c]))
-                H[np.ix_(its, its)] += (
+                H[np.ix_(own, own)] += (
                     by_anchors.T @ (weight[:, None] * by_anchors) - B.T @ solved[:, :-1]
                 )
-                g[its] += by_anchors.T @ (weight * residual) - B.T @ solved[:, -1]
+                g[own] += by_anchors.T @ (weight * residual) - B.T @ solved[:, -1]
                 eliminated.append(solved)
             step = np.linalg.solve(H, g)
             step *= min(1.0, STEP / max(np.abs(step).max(initial=0.0), 1e-9))
             anchors.reshape(-1)[columns] += step
-            for x, solved, its in zip(start, eliminated, places):
-                x += np.clip(solved[:, -1] - solved[:, :-1] @ step[its], -2.0, 2.0)
+            for x, solved, own in zip(start, eliminated, heard_columns):
+                x += np.clip(solved[:, -1] - solved[:, :-1] @ step[own], -2.0, 2.0)
         return self._loss(start, anchors), anchors
 
     def _loss(self, states: list[np.ndarray], anchors: np.ndarray) -> float:
@@ -238,17 +243,18 @@ def displacement(surveyed: np.ndarray, fitted: np.ndarray) -> np.ndarray:
     Source: Kabsch, Acta Cryst. A 32, 1976.
     """
     one, two = surveyed - surveyed.mean(axis=0), fitted - fitted.mean(axis=0)
-    U, _, V = np.linalg.svd(two.T @ one)
-    turn = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ V))]) @ V
+    U, _, Vt = np.linalg.svd(two.T @ one)
+    turn = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
     return np.linalg.norm(two @ turn - one, axis=1)
 
 
-def spread(places: np.ndarray) -> float:
-    """Return the second largest standard deviation of positions (k, 3) m: the distance from a line.
+def second_principal_std(places: np.ndarray) -> float:
+    """Return the second largest principal standard deviation of positions (k, 3) m, in m.
 
-    A tag at rest, or on one line, cannot distinguish an anchor from its mirror image.
+    It is 0 for fewer than two positions, and for a tag at rest or on one line. Such a tag cannot
+    distinguish an anchor from its mirror image.
     """
-    if not len(places):
+    if len(places) < 2:
         return 0.0
     return float(
         np.linalg.svd(places - places.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(places))

@@ -24,7 +24,7 @@ from uwb_tdoa_ekf.monitoring.signs import RIGHT_SIGN, WRONG_SIGN
 from uwb_tdoa_ekf.monitoring.survey_scale import wrong_unit
 from uwb_tdoa_ekf.offline import run_offline
 
-from .ordered import LONG, SHORT, SPREAD, OrderedRecording, spread
+from .ordered import LEAST_MOTION, LONG, SHORT, OrderedRecording, second_principal_std
 from .pair_rules import MANY, OFF
 
 if TYPE_CHECKING:
@@ -234,7 +234,7 @@ def swapped_ids(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     Not for motion along a line: in a room that is symmetrical about it, anchors differ by their
     systematic errors alone.
     """
-    if spread(recording.survey_fit.places) < SPREAD:
+    if second_principal_std(recording.survey_fit.places) < LEAST_MOTION:
         return
     table: dict[int, int] = {}
     trial, brief = recording, recording.part(SHORT)

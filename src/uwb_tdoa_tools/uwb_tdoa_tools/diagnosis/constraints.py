@@ -72,20 +72,24 @@ class Mark:
         return begin + np.linspace(self.first, self.last, WITHIN)
 
     def equations(
-        self, t: np.ndarray, estimate: np.ndarray, covariance: np.ndarray, moved: np.ndarray
+        self, t: np.ndarray, estimate: np.ndarray, covariance: np.ndarray, jacobian: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return normal equations of the error of the estimate, averaged over the mark.
 
         t : (m,) s, `stamps`; estimate : (m, 3) m; covariance : (m, 3, 3) m^2
-        moved : (m, 3, k) derivative of the estimate by the parameters
+        jacobian : (m, 3, k) derivative of the estimate by the parameters, errors that the run did
+            not model. A correction of an error moves the estimate by minus this.
         """
-        off, columns = self.off(estimate, moved)
+        off, columns = self.off(estimate, jacobian)
         weight = 1.0 / (np.diag(covariance[WITHIN // 2]) + self.std**2)
         return (columns * weight[:, None]).T @ columns, columns.T @ (weight * off)
 
-    def off(self, estimate: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return (error of the estimate (3,) m, its decrease per unit of the parameters (3, k))."""
-        return estimate.mean(axis=0) - self.position, moved.mean(axis=0)
+    def off(self, estimate: np.ndarray, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return (estimate minus mark (3,) m, its derivative by the parameters (3, k)).
+
+        Both are means over the mark, with arguments as of `equations`.
+        """
+        return estimate.mean(axis=0) - self.position, jacobian.mean(axis=0)
 
 
 @dataclass(frozen=True, eq=False)

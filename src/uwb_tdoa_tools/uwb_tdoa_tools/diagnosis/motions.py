@@ -98,7 +98,7 @@ def route(places: np.ndarray, yaw: Sequence[float], limits: Limits) -> TimedPath
 def motions(room: Room, flights: Sequence[Flight], limits: Limits) -> Library:
     """Return the Library of motions in a Room: lines, circles, turns, and passes at anchors.
 
-    They keep the clearance of `Room.flyable` to walls, floor and ceiling, and ANCHOR_CLEARANCE to
+    They keep the clearance of `Room.path_box` to walls, floor and ceiling, and ANCHOR_CLEARANCE to
     anchors. Raises InputError if none fits, or if a Flight lacks TDOAs.
     """
     anchors = flights[0].anchors
@@ -116,7 +116,7 @@ def motions(room: Room, flights: Sequence[Flight], limits: Limits) -> Library:
 
 def _everywhere(room: Room, anchors: Anchors, limits: Limits) -> list[TimedPath]:
     """Return the motions in a Room, whether they fit or not."""
-    low, high = room.flyable
+    low, high = room.path_box
     centre, half = 0.5 * (low + high), 0.5 * (high - low)
     levels = {"low": low[2], "middle": centre[2], "high": high[2]}
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])

@@ -33,14 +33,13 @@ import math
 from pathlib import Path
 import shutil
 import subprocess
-import tempfile
 import time
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.files import folder_of_process, temporary_folder, write_text
+from uwb_tdoa_bias.common.files import new_folder_until_exit, temporary_folder, write_text
 from uwb_tdoa_bias.common.text import printable
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet, StreamCorrector
@@ -136,7 +135,7 @@ def _library(folder: Path) -> Path:
             f"--correction: {folder} reads acceleration or rate, which a peer does not give; "
             "export the other effects alone."
         )
-    made = Path(tempfile.mkdtemp(dir=folder_of_process()))
+    made = new_folder_until_exit()
     write_text(made / "loop.c", LOOP)
     sources = [str(made / "loop.c"), str(folder / FILES[1])]
     library = made / "libcorrection.so"

@@ -61,11 +61,11 @@ class RealTime:
         self._clock, self._began, self._now = clock, clock(), 0.0
 
     def sent(self, now: float, streams: Streams) -> None:
-        """Note that all samples up to `now`, s, were published."""
+        """Note that all samples up to the stamp `now`, s, were published."""
         self._now = now
 
     def heard(self, t: float) -> None:
-        """Note an odometry stamped t, s."""
+        """Ignore an odometry stamped t, s: only the clock counts."""
 
     def may_go_on(self) -> bool:
         """Return whether the next turn is due."""
@@ -78,23 +78,25 @@ class RealTime:
 class Lockstep:
     """Allow the next turn when the odometry of the published samples has come.
 
-    The same seed then gives the same flight on any computer. A missing odometry is awaited for PATIENCE.
-    Until the next one comes, the wait is IMPATIENCE.
+    The same seed then gives the same flight on any computer. An odometry is awaited for PATIENCE, but
+    for IMPATIENCE before the first one, and after a missing one until the next comes.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock, self._reach, self._since = clock, 0.0, 0.0
-        self._newest: dict[str, float] = {}
-        self._first: float | None = None
-        self._heard: float | None = None
-        self._periods, self._silent = deque([DT], REMEMBERED), True
+        # s of the wall clock, when samples were published; s of stamps that the filter can have reached
+        self._clock, self._since, self._filter_time = clock, 0.0, 0.0
+        self._newest: dict[str, float] = {}  # {stream: s, newest stamp}
+        self._first: float | None = None  # s, stamp at which samples were published first
+        self._heard: float | None = None  # s, newest stamp of odometry
+        self._periods, self._overdue = deque([DT], REMEMBERED), True
 
     def sent(self, now: float, streams: Streams) -> None:
-        """Note that all samples up to `now`, s, were published."""
+        """Note that all samples up to the stamp `now`, s, were published."""
         self._newest |= {name: part.t[-1] for name, part in streams.items() if len(part.t)}
         self._first = now if self._first is None else self._first
+        # Until the end of TRIAL, the filter waits for messages that are out of order.
         unordered_wait = 0.0 if now > self._first + TRIAL + UNTRUSTED else UNTRUSTED
-        self._reach = (
+        self._filter_time = (
             max(min(self._newest.values(), default=now), now - LONGEST_GAP) - unordered_wait
         )
         self._since = self._clock()
@@ -106,13 +108,13 @@ class Lockstep:
         self._heard = t
 
     def may_go_on(self) -> bool:
-        """Return whether the odometry has come or the wait is over."""
-        if self._heard is not None and self._heard + median_low(self._periods) > self._reach:
-            self._silent = False
+        """Return whether the last odometry up to the time of the filter has come, or the wait is over."""
+        if self._heard is not None and self._heard + median_low(self._periods) > self._filter_time:
+            self._overdue = False
             return True
-        if self._clock() < self._since + (IMPATIENCE if self._silent else PATIENCE):
+        if self._clock() < self._since + (IMPATIENCE if self._overdue else PATIENCE):
             return False
-        self._silent = True
+        self._overdue = True
         return True
 
 
@@ -200,7 +202,10 @@ class OverTopics(EstimateSource):
         self._latched.wait_for_all_acked(Duration(seconds=LATCHED_LIMIT))
 
     def set_pose(self, t: float, p: np.ndarray, std: float, yaw: float) -> None:
-        """Set the initial pose. It is published before the next samples."""
+        """Set the initial pose at stamp t, s. It is published before the next samples.
+
+        p is (3,) m, std its standard deviation in m, and of the yaw in rad. A yaw of NaN is unknown.
+        """
         self._pending_pose = t, p, std, yaw
 
     def take(self, streams: Streams) -> None:
@@ -215,9 +220,10 @@ class OverTopics(EstimateSource):
             self._outputs[name].publish(*self._parts(part.t), part)
 
     def publish_truth(self, t: float, state: np.ndarray) -> None:
-        """Publish the true state at t, s, and the time on /clock.
+        """Publish the true state at t, s, and the time on /clock, and end the turn.
 
-        `state` (17,) is that of `vehicle`. All samples up to t are published already.
+        `state` (17,) is that of `vehicle`. All samples up to t are published already, so `pace` waits
+        for their odometry from now on.
         """
         self._now = t
         self._truth.publish(

@@ -38,8 +38,12 @@ STEP = 80_000_000
 # which passes TDOAs on until it has a pose.
 START_STEP, START = 40_000_000, 1_000_000_000
 LOOK_PERIOD = LEAD // 20  # ns of stamps between two looks at a topic that is in step or silent
-SENSOR_SILENT = 1_000_000_000  # ns until ekf_node stops waiting for a silent sensor: its SILENT
-SENSOR_SHARE = 0.5  # of `lag`: how long ekf_node holds TDOAs back for a sensor: its OF_SENSORS
+SENSOR_SILENT = (
+    1_000_000_000  # ns until ekf_node stops waiting for a silent sensor: reorder_buffer.SILENT
+)
+SENSOR_SHARE = (
+    0.5  # of `lag`: how long ekf_node holds TDOAs back for a sensor: reorder_buffer.OF_SENSORS
+)
 LAG = 0.25  # s, default of `lag`
 SILENCE = 5.0  # s without a message after which the replay waits for a topic no longer
 POLL_PERIOD = 0.001  # s
@@ -58,6 +62,10 @@ class Follower:
 
         Parameters
         ----------
+        node : Node
+            It does not spin: messages are polled.
+        topic : str
+            Name, relative to the namespace of the node or absolute.
         lag : float
             Parameter `lag` of ekf_node, s.
 
@@ -76,12 +84,11 @@ class Follower:
                 f"--follow: messages on {topic} are {types[0]}: not installed, or without a header."
             )
         qos = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-        # Messages are taken, and the node does not spin.
         self._subscription = node.create_subscription(cls, topic, lambda _: None, qos, raw=True)
-        self._newest: int | None = None  # ns, stamp of the newest message
-        self._looked: int | None = None  # ns, stamp of the replay at the last look
-        self._started: int | None = None  # ns, stamp of the first message
-        self._silent = False
+        self._newest: int | None = None  # ns, stamp of the newest message on the topic
+        self._last_look: int | None = None  # ns, stamp of the replay at the last look
+        self._started: int | None = None  # ns, stamp of the first message on the topic
+        self._silent = False  # whether no message came on the topic for SILENCE
         self._tdoas = _Tdoas(node, round(1e9 * SENSOR_SHARE * lag))
 
     def add_tdoa(self, stamp: int) -> None:
@@ -96,7 +103,7 @@ class Follower:
         """Wait until a message may be published, and return how long that took, s.
 
         The topic must not be more than LEAD behind the message. Each TDOA that is older by STEP than
-        the time of the filter must have left the filter. That time is the stamp of the newest TDOA, or
+        the time of the filter must have come back on uwb/residual. That time is the stamp of the newest TDOA, or
         less while the filter waits for a sensor.
 
         Parameters
@@ -126,11 +133,11 @@ class Follower:
 
     def _wait_for_stamps(self, stamp: int, stop: Stop) -> float:
         self._newest = stamp if self._newest is None else self._newest
-        self._looked = stamp if self._looked is None else self._looked
+        self._last_look = stamp if self._last_look is None else self._last_look
         in_step = self._silent or stamp - self._newest <= LEAD
-        if in_step and 0 <= stamp - self._looked <= LOOK_PERIOD:
+        if in_step and 0 <= stamp - self._last_look <= LOOK_PERIOD:
             return 0.0
-        self._looked = stamp
+        self._last_look = stamp
         began = heard = time.monotonic()
         while not stop:
             if self._hear():

@@ -47,7 +47,7 @@ BATCHES_AHEAD = 100
 
 
 def read_ahead(messages: Iterable[Item]) -> Generator[Item, None, None]:
-    """Yield the items of an iterable, read by a thread up to 50,000 items ahead.
+    """Yield the items of an iterable, read by a thread up to BATCH * BATCHES_AHEAD items ahead.
 
     Decoding a chunk of a bag then delays no message. Exceptions of the iterable are raised here.
     """
@@ -169,7 +169,7 @@ class Player:
         clock_rate : float or None
             Hz of /clock.
         stop : Stop
-            True once the process was asked to end.
+            Its truth value becomes True once the process is asked to end.
         tell : callable
             tell(played, took, waited) is called every PROGRESS s, with s of stamps played, s since
             the beginning, and s of `Played.waited` since then.
@@ -201,7 +201,7 @@ class Player:
         )
 
     def play(self, recorded: Iterable[tuple[Connection, int, bytes]]) -> None:
-        """Publish an iterable of (connection, stamp ns, bytes) from the beginning."""
+        """Publish an iterable of (connection, time of recording in ns, bytes) from the beginning."""
         self._start, first = None, time.perf_counter()
         waited_before, self._tell_next = self.played.waited, first + PROGRESS
         for connection, stamp, data in recorded:
@@ -215,7 +215,7 @@ class Player:
             behind = self._sleep_until(self._began + (stamp - self._start) / (1e9 * self._rate))
             if self._stop:
                 return
-            self._count_delay(behind)
+            self._limit_catch_up(behind)
             publisher, topic = self._publishers[connection.topic], connection.topic
             if self._latched and not is_latched(publisher):
                 self._began += self._wait_for_latched()
@@ -268,7 +268,8 @@ class Player:
         message.clock.sec, message.clock.nanosec = divmod(nanoseconds, 10**9)
         self._clock.publish(message)
 
-    def _count_delay(self, behind: float) -> None:
+    def _limit_catch_up(self, behind: float) -> None:
+        """Count a delay, in s. What exceeds LARGEST_CATCH_UP shifts all later messages."""
         self.played.behind = max(self.played.behind, behind)
         if behind > LARGEST_CATCH_UP:
             self._began += behind - LARGEST_CATCH_UP

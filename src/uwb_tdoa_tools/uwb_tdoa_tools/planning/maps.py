@@ -86,7 +86,10 @@ class Judged:
         return Judged(self.covariance[rows], self.error[rows], self.status[rows])
 
     def assign(self, rows: np.ndarray, found: Judged) -> None:
-        """Set the states of some of its places."""
+        """Overwrite the states at `rows` (m,) by those of `found`, m places in this order, in place.
+
+        So a map can be judged in groups of places, such as those that hear equally many anchors.
+        """
         self.covariance[rows] = found.covariance
         self.error[rows] = found.error
         self.status[rows] = found.status
@@ -213,6 +216,7 @@ class Chart(Judged):
 PLACES_ACROSS = {2: 40, 3: 10}  # places along the longest side of a slice, of a volume, at most
 MOST_PAIRINGS = 8  # pairings that are solved, spread over all; each takes thousands of solutions
 _BATCH = 200
+EACH_ARROW = 37  # of so many mirror solutions one is drawn
 
 
 def brute_force(
@@ -221,7 +225,8 @@ def brute_force(
     """Solve for the pairings of an Installation from many starts, all over a grid.
 
     Returns (unique (n,) bool: each pairing has one solution; agrees (n,) bool: each is as predicted;
-    points (n, 3) m; arrows ((m, 2), (m, 2)) m: some of the flips within the grid, from and to).
+    points (n, 3) m; arrows ((m, 2), (m, 2)) m: one of EACH_ARROW mirror solutions within the grid,
+    from and to).
     """
     subsets = Subsets(installation.anchors, installation.unknowns)
     extent = np.array(grid.shape) * grid.step
@@ -246,7 +251,7 @@ def brute_force(
             unique[rows] &= one
             agrees[rows] &= one == predicted[rows, q]
     near = np.flatnonzero(((mirror >= grid.lower) & (mirror <= grid.lower + extent)).all(axis=1))[
-        ::37
+        ::EACH_ARROW
     ]
     return unique, agrees, points, (points[row[near], :2], mirror[near, :2])
 

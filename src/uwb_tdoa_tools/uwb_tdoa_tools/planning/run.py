@@ -253,7 +253,7 @@ def aim_of(args: Namespace, installation: Installation, demand: Demand, height: 
     ):
         if value < least:
             raise InputError(f"{name}: {value} is too few; give at least {least}.")
-    fly = Room.of_numbers("fly", args.fly) if args.fly else Room(*demand.room.flyable)
+    fly = Room.of_numbers("fly", args.fly) if args.fly else Room(*demand.room.path_box)
     lower, upper, k = fly.lower.copy(), fly.upper.copy(), installation.dimensions
     lower[k:] = upper[k:] = height
     step = max(0.1, (np.prod((upper - lower)[:k]) / FLOWN_CELLS) ** (1.0 / k))

@@ -8,6 +8,7 @@ from array import array
 from collections import Counter
 from contextlib import contextmanager
 from pathlib import Path
+import re
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -35,13 +36,17 @@ if TYPE_CHECKING:
 SURVEY = "anchors"  # stream of positions
 SINGLE = "gyro", "acc", "pose", "tof", "baro", "flow"  # streams of one sensor each
 MOST_LISTED = 8  # columns in a sentence
+THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}")  # as 1,000
 MOVED = 0.1  # m that the recorded position of an anchor changes, above which it is reported
 ENU_OF_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 FLU_OF_FRD = np.diag([1.0, -1.0, -1.0])
 
 
 class Record(Protocol):
-    """A message, or a row of a table."""
+    """A message, or a row of a table.
+
+    A `path` names a field of a message, as "pose.x", or a column.
+    """
 
     def length(self, path: str) -> int:
         """Return the length of an array. Raises KeyError."""
@@ -71,7 +76,7 @@ class Foreign(Protocol):
         """Return the field with the time and its unit in s, if tables of this kind have one."""
 
     def messages(self, tables: Sequence[str]) -> Iterator[tuple[str, str, Record]]:
-        """Yield (table, place, Record)."""
+        """Yield (table, place in its file for messages to the user, Record)."""
 
 
 @contextmanager
@@ -84,6 +89,7 @@ def open_recording(
     ----------
     paths : bags, CSV files, one ULog file, or one folder of these.
     types : {type: definition} for bags that have none.
+    salvage : read the sound part of a damaged file.
     """
     files = files_of(paths)
     bags = [path for path in files if is_bag(path) or is_ros_1(path)]
@@ -138,6 +144,7 @@ def read_by_profile(
     Parameters
     ----------
     paths : its files, or a folder.
+    profile : what the tables and fields of the recording mean.
     survey : anchors; None for those in the recording.
     tag : id of the tag, if the recording has several.
     namespace : of the topics that count, where several fit to the profile.
@@ -203,6 +210,8 @@ class _Request:
     def __init__(self, table: str, source: Source, names: dict[str, str], tables: Foreign) -> None:
         self.table, self.source, self._names = table, source, names
         self._fields = tables.fields(table)
+        # Then a comma in a cell may be a thousands separator.
+        self._between_commas = isinstance(tables, CsvFiles) and tables.delimiters[table] == ","
         default = tables.time_of(table)
         self._wanted: dict[str, dict[str, tuple[str, float]]] = {}
         for stream, known in STREAMS.items():
@@ -264,7 +273,7 @@ class _Request:
             self._left_out += named is not None
             return
         if named is None:
-            self._take_anchor(value)
+            self._take_anchor(value, place)
             return
         if self.source.tag:
             of = as_text(value(self.source.tag))
@@ -286,7 +295,11 @@ class _Request:
 
     def _keep(self, stream: str, raw: dict[str, Any], place: str, named: NamedAnchors) -> None:
         record = {
-            name: named.id_of(as_text(each)) if name in ANCHORS else as_number(each)
+            name: (
+                named.id_of(as_text(each))
+                if name in ANCHORS
+                else self._number(each, self._wanted[stream][name][0], place)
+            )
             for name, each in raw.items()
         }
         wrong = next((name for name, number in record.items() if number is None), None)
@@ -300,22 +313,31 @@ class _Request:
             if wrong in ANCHORS
             else "a finite number"
         )
-        sentence = (
-            f"{self._wanted[stream][wrong][0]} is {str(raw[wrong])[:40]!r}; it must be {what}"
+        column = self._wanted[stream][wrong][0]
+        self._first.setdefault(
+            stream, f"{place}: {column} is {str(raw[wrong])[:40]!r}; it must be {what}"
         )
-        self._first.setdefault(stream, f"{place}: {sentence}")
 
-    def _take_anchor(self, value: Callable[[str], Any]) -> None:
+    def _number(self, value: Any, column: str, place: str) -> float | None:
+        """Return `as_number`; raise InputError if a comma may be a thousands separator."""
+        if self._between_commas and isinstance(value, str) and THOUSANDS.fullmatch(value):
+            raise InputError(
+                f"{self.table}: {place}: {column} is {value!r}, with a thousands separator or a "
+                "decimal comma; write a decimal point, or put semicolons between the cells."
+            )
+        return as_number(value)
+
+    def _take_anchor(self, value: Callable[[str], Any], place: str) -> None:
         """Store the position of an anchor, and by how much it differs from the one before.
 
         `value` returns the value of the record at a path.
         """
-        columns = self._wanted[SURVEY]
-        anchor, *coordinates = (value(columns[name][0]) for name in STREAMS[SURVEY])
-        numbers = [as_number(each) for each in coordinates]
+        paths = [self._wanted[SURVEY][name][0] for name in STREAMS[SURVEY]]
+        anchor = value(paths[0])
+        numbers = [self._number(value(path), path, place) for path in paths[1:]]
         if None in numbers:
             return
-        factors = [columns[f"anchor_{axis}"][1] for axis in "xyz"]
+        factors = [self._wanted[SURVEY][f"anchor_{axis}"][1] for axis in "xyz"]
         at = [each * factor for each, factor in zip(numbers, factors) if each is not None]
         name = as_text(anchor)
         last = self.positions.get(name)
@@ -410,7 +432,7 @@ def _requests(
     requests = []
     for number, source in enumerate(profile.sources, start=1):
         if isinstance(tables, CsvFiles) and not source.topic:
-            requests.append(_Request(_having(tables, source), source, {}, tables))
+            requests.append(_Request(_csv_with_columns(tables, source), source, {}, tables))
             continue
         found: dict[str, dict[str, str]] = {}
         for table, kind in tables.types.items() if source.topic or source.type else ():
@@ -446,12 +468,16 @@ def _in_namespace(
     )
 
 
-def _having(tables: CsvFiles, source: Source) -> str:
-    """Return the single CSV file that has all columns of a source."""
+def _csv_with_columns(tables: CsvFiles, source: Source) -> str:
+    """Return the path of the single CSV file that has all columns of a source.
+
+    Raises InputError for several files. If none has all columns, the error names a file that lacks
+    the fewest.
+    """
     wanted = {
         path
         for path in (
-            *(theirs for theirs, _ in _used(source).values()),
+            *(column for column, _ in _used(source).values()),
             *(condition.path for condition in source.where),
             source.tag,
         )
@@ -464,7 +490,7 @@ def _having(tables: CsvFiles, source: Source) -> str:
         raise InputError(
             f"{having[1]}: has column {min(wanted)!r} as {having[0]} has; give one of them."
         )
-    table = next(iter(tables.types))
+    table = min(tables.types, key=lambda each: len(wanted - {*tables.fields(each)}))
     names = tables.fields(table)
     raise InputError(
         f"{table}: has no column {min(wanted - {*names})!r}; its columns are {', '.join(names)}."
@@ -591,7 +617,7 @@ def _is_empty(value: Any) -> bool:
 
 
 def as_number(value: Any) -> float | None:
-    """Return a finite number, with a point or a comma; None if a value is not one."""
+    """Return a finite number, with a decimal point or comma; None if a value is not one."""
     try:
         number = float(value.replace(",", ".") if isinstance(value, str) else value)
     except (TypeError, ValueError):

@@ -72,7 +72,13 @@ class CsvRows:
 
 
 class CsvTable:
-    """Iterate over (line, {column: text}) of the rows of a CSV file; `names` are its columns."""
+    """Iterate over (line, {column: text}) of the rows of a CSV file.
+
+    Attributes
+    ----------
+    names : columns of the file.
+    delimiter : the most frequent of comma, semicolon and tab in the header.
+    """
 
     def __init__(
         self, path: str | Path, columns: Sequence[str] | None, most: int, complete: bool = True
@@ -88,12 +94,8 @@ class CsvTable:
                 )
             Budget(path).spend("bytes of text", len(content), TABLE_BYTES)
         header = content[:ROW_CHARACTERS].lstrip().split(b"\n", 1)[0]
-        self._rows = CsvRows(
-            path,
-            content,
-            skipinitialspace=True,
-            delimiter=max(",;\t", key=lambda each: header.count(each.encode())),
-        )
+        self.delimiter = max(",;\t", key=lambda each: header.count(each.encode()))
+        self._rows = CsvRows(path, content, skipinitialspace=True, delimiter=self.delimiter)
         self._cells = self._each()
         self.names = [name.strip() for name in next(self._cells, [])]
         self._columns = columns if columns is not None else [name for name in self.names if name]
@@ -158,8 +160,6 @@ def read_table(
 ) -> CsvTable:
     """Return the CsvTable of a CSV file that has at least the columns; default: all of its columns.
 
-    The delimiter is the most frequent of comma, semicolon and tab in the header.
-
     Parameters
     ----------
     most : largest number of cells.
@@ -205,6 +205,7 @@ class CsvFiles:
     Attributes
     ----------
     types : {path: "CSV"}.
+    delimiters : {path: delimiter of the cells}.
     counts : {path: rows that were read}.
     remarks : always empty.
     """
@@ -214,6 +215,7 @@ class CsvFiles:
             str(path): read_table(path, most=TABLE_CELLS, complete=False) for path in paths
         }
         self.types = dict.fromkeys(self._tables, "CSV")
+        self.delimiters = {path: table.delimiter for path, table in self._tables.items()}
         self.counts: Counter[str] = Counter()
         self.remarks: list[str] = []
 

@@ -319,7 +319,7 @@ class SimulationConfig(_Noises):
         if self.poses is not None:
             room = room.around(np.array(self.poses)[:, 1:4])
             height = self.poses[0][3] if height is None else height
-        low, high = room.flyable
+        low, high = room.path_box
         x, y = room.centre[:2] if self.place is None else self.place
         place = float(x), float(y)
         reach = min(np.min(high[:2] - place), np.min(np.asarray(place) - low[:2]))

@@ -55,7 +55,7 @@ def rising_circle(
     """Fly the circle with a height that rises and falls in a sine, up to 0.6 m, 0.7 times per turn."""
     assert config.height is not None and config.radius is not None  # complete
     p = circle(s, config, room, rng)
-    low, high = room.flyable
+    low, high = room.path_box
     swing = np.clip(min(high[2] - config.height, config.height - low[2]), 0.0, 0.6)
     p[:, 2] += swing * np.sin(0.7 * config.speed * s / config.radius)
     return p
@@ -69,7 +69,7 @@ def sines(
     They fill the flyable room. `speed` is the root mean square here. Source: the training
     trajectories of Zhao et al. (RA-L 2021), section V-B.
     """
-    low, high = room.flyable
+    low, high = room.path_box
     reach = 0.5 * (high - low) * rng.uniform(0.75, 1.0, 3)
     rate = 2.0 * np.pi / rng.uniform([[8.0], [13.0]], [[13.0], [24.0]], (2, 3))
     phase = rng.uniform(0.0, 2.0 * np.pi, (2, 3))

@@ -247,13 +247,14 @@ class Room:
         """Return the centre of the room, or of the area, if there is one: (3,) m."""
         if self.area is None:
             return 0.5 * (self.lower + self.upper)
-        return 0.5 * np.sum(self.flyable, axis=0)
+        return 0.5 * np.sum(self.path_box, axis=0)
 
     @property
-    def flyable(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the box for paths, (lower, upper), (3,) m each.
+    def path_box(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the box for paths of vehicles, (lower, upper), (3,) m each.
 
-        It is the area, or the room less a clearance.
+        It is the room less a clearance, at most a quarter of the size on each side. The area
+        replaces x and y, and has no clearance.
         """
         margin = np.minimum(
             [CLEARANCE, CLEARANCE, FLOOR_CLEARANCE], 0.25 * (self.upper - self.lower)
@@ -309,26 +310,26 @@ class Walls:
             tuple(_segment(path, number, entry) for number, entry in enumerate(entries, start=1))
         )
 
-    def between(self, p: np.ndarray, q: np.ndarray) -> np.ndarray:
-        """Return whether a wall stands between points p and q, (n, 3) m each: (n,) bool.
+    def between(self, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
+        """Return whether a wall stands between pairs of points, (n, 3) m each: (n,) bool.
 
         The points are not on a wall.
         """
-        out = np.zeros(len(p), bool)
+        line, out = ends - starts, np.zeros(len(starts), bool)
         with np.errstate(
             divide="ignore", invalid="ignore"
         ):  # lines along a wall, which cross it nowhere
             for x0, y0, x1, y1, height in self.segments:
-                d, e, w = q - p, (x1 - x0, y1 - y0), (x0 - p[:, 0], y0 - p[:, 1])
-                crossed = d[:, 0] * e[1] - d[:, 1] * e[0]
-                along_line = (w[0] * e[1] - w[1] * e[0]) / crossed
-                along_wall = (w[0] * d[:, 1] - w[1] * d[:, 0]) / crossed
+                wall, to_wall = (x1 - x0, y1 - y0), (x0 - starts[:, 0], y0 - starts[:, 1])
+                crossed = line[:, 0] * wall[1] - line[:, 1] * wall[0]
+                along_line = (to_wall[0] * wall[1] - to_wall[1] * wall[0]) / crossed
+                along_wall = (to_wall[0] * line[:, 1] - to_wall[1] * line[:, 0]) / crossed
                 out |= (
                     (along_line > 0.0)
                     & (along_line < 1.0)
                     & (along_wall >= 0.0)
                     & (along_wall <= 1.0)
-                    & (p[:, 2] + along_line * d[:, 2] < height)
+                    & (starts[:, 2] + along_line * line[:, 2] < height)
                 )
         return out
 
@@ -336,19 +337,21 @@ class Walls:
 def heard_at(
     p: np.ndarray, positions: np.ndarray, reach: float, walls: Walls | None = None
 ) -> list[np.ndarray]:
-    """Return the rows of the anchors within reach, m, and not behind a wall, at each point.
+    """Return the rows of the anchors that are heard at each point.
 
     Parameters
     ----------
-    p : (n, 3) m.
+    p : (n, 3) m, points that are not on a wall.
     positions : (N, 3) m, of the anchors.
+    reach : m, largest distance of an anchor that is heard.
+    walls : Walls that hide anchors; None for no walls.
 
     Returns
     -------
     List of n arrays (k,).
     """
     near = cKDTree(positions).query_ball_point(p, reach, return_sorted=True)
-    if walls is None:
+    if walls is None or not len(p):
         return [np.array(rows, int) for rows in near]
     out: list[np.ndarray] = []
     counts = np.array([len(rows) for rows in near], int)

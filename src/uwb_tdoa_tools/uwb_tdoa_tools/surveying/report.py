@@ -85,7 +85,7 @@ def as_dict(found: SelfCalibration) -> dict[str, Any]:
         "applied": found.why_not is None,
         "blocked": list(found.blocked),
         "marks_left_out": found.marks,
-        "marks_on_the_floor": found.grounded,
+        "marks_on_the_floor": found.marks_on_floor,
         "slow_before": found.before,
         "slow_left": found.left,
         "covariance": found.solution.covariance.tolist(),
@@ -160,9 +160,9 @@ def as_text(found: SelfCalibration) -> str:
             f"marks, each left out once: the estimate there is {off}, and nearer at "
             f"{nearer:.0%} of them"
         )
-    if found.grounded:
+    if found.marks_on_floor:
         lines.append(
-            f"left out: {found.grounded} marks on the floor, where estimates are metres off "
+            f"left out: {found.marks_on_floor} marks on the floor, where estimates are metres off "
             "and do not know it; mark places in the air"
         )
     if found.why_not:

@@ -181,8 +181,8 @@ def _without_truth(diagnosis: Diagnosis, added: bool) -> Verdict:
     before, after = (
         side["pooled"]["residual_spread"] for side in (diagnosis.before, diagnosis.after)
     )
-    measured = "TDOAs" if any(len(flight.tdoa) for flight in diagnosis.flights) else "ranges"
-    scatter = f"Innovations (measured minus predicted {measured}) scatter by {centimetres(before)}"
+    stream = "TDOAs" if any(len(flight.tdoa) for flight in diagnosis.flights) else "ranges"
+    scatter = f"Innovations (measured minus predicted {stream}) scatter by {centimetres(before)}"
     if not diagnosis.findings:
         return Verdict(NOTHING_FOUND, (UNKNOWN, f"{scatter}."), "nothing")
     if not added:
@@ -201,7 +201,7 @@ def _without_truth(diagnosis: Diagnosis, added: bool) -> Verdict:
         f"{CLEARLY_OF_RANGES:g} times smaller than it was, a limit that was set on simulated "
         "flights"
     )
-    if measured == "TDOAs":
+    if stream == "TDOAs":
         limit = (
             f"not above {CM * LEFT:.1f} cm, or {CLEARLY:g} times smaller than it was, limits that "
             "were set on measured flights"
@@ -358,9 +358,11 @@ def _diverged(diagnosis: Diagnosis) -> list[str]:
 
 
 def reasons(diagnosis: Diagnosis) -> list[str]:
-    """Return sentences on what makes the error, the largest worth first; [] if nothing is known.
+    """Return sentences on the added effects that make the error before, the largest worth first.
 
-    An effect without a name is described by its largest part, with its most likely causes.
+    There are NAMED at most. The worth is in m of 3D RMSE, so ground truth is needed: without it the
+    result is []. A fitted function, which is no declared effect, is described by its largest part,
+    with its most likely causes.
     """
     before, after = (side["pooled"]["rmse_3d"] for side in (diagnosis.before, diagnosis.after))
     out: list[str] = []
@@ -373,7 +375,7 @@ def reasons(diagnosis: Diagnosis) -> list[str]:
 
 def _sentence(entry: Entry, place: int, gain: float) -> str:
     worth = entry.worth or 0.0
-    begin = "Then" if place else "Mostly" if worth >= MOST * gain else "In part"
+    begin = "Then" if place else "Mostly" if worth >= MOST * gain > 0.0 else "In part"
     much = f"{CM * worth:.1f} cm"
     if not place and worth <= gain:
         much = f"{CM * worth:.1f} of {CM * gain:.1f} cm"
@@ -385,7 +387,7 @@ def _sentence(entry: Entry, place: int, gain: float) -> str:
 
 
 def cause(entry: Entry) -> str:
-    """Return what is wrong, as a clause: for a function without a name its largest part."""
+    """Return what is wrong, as a clause; for a fitted function its largest part."""
     if not entry.findings[0].declared:
         said = described(*_largest(entry))
         terms = _functions(entry)

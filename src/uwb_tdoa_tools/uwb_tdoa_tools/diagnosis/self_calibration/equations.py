@@ -75,10 +75,10 @@ def tdoa_std_of(
     map_function : as of `attribution.attribute`
     """
     config, anchors = config or FilterConfig(), flights[0].anchors
-    loose = Prior.of(anchors, np.full((len(anchors), 3), MOVED)).loose
+    prior_std = Prior.of(anchors, np.full((len(anchors), 3), MOVED)).loose
     runs, no_delays = Runs(flights, effects, config, streams=(TDOAS,)), np.zeros(len(anchors))
     return runs.equations(
-        anchors, no_delays, loose, map_function=map_function, functions=False
+        anchors, no_delays, prior_std, map_function=map_function, functions=False
     ).tdoa_std(config)
 
 
@@ -115,10 +115,13 @@ def slow_innovations(
 class Equations:
     """Normal equations of one flight, or of all flights.
 
+    The parameters are the errors of positions and delays that the run did not model.
+
     gram : (k, k); vector : (k,); marks : [_Mark] that add to them
     slow : (n,) m, slow innovations
-    inflation : variance of score sums over blocks, relative to independent errors
-    seconds : s of data used; grounded : number of marks left out, on the floor
+    inflation : variance of score sums over blocks, relative to independent errors, for which it is 1.
+        A score is the gradient of the log-likelihood.
+    seconds : s of data used; marks_on_floor : number of marks on the floor, which are not used
     flights : [Equations] of single flights; empty above MANY anchors, where they would take
         gigabytes
     """
@@ -129,7 +132,7 @@ class Equations:
     slow: np.ndarray
     inflation: float
     seconds: float
-    grounded: int
+    marks_on_floor: int
     flights: Sequence[Equations] = ()
 
     @property
@@ -138,7 +141,11 @@ class Equations:
         return student_scale(self.slow)
 
     def tdoa_std(self, config: FilterConfig) -> float:
-        """Return the tdoa_std, m, at which the filter's information matches the inflated noise."""
+        """Return the tdoa_std, m, at which the filter's information matches the inflated noise.
+
+        The filter divides the information of each TDOA by tdoa_correlation_length. The data ask for
+        a division by the inflation.
+        """
         return config.tdoa_std * float(np.sqrt(self.inflation / config.tdoa_correlation_length))
 
 
@@ -178,26 +185,34 @@ class Runs:
 
         delays : (N,) m
         """
-        by = Corrector(anchors, _with_delays(self._base, anchors, delays))
+        corrector = Corrector(anchors, _with_delays(self._base, anchors, delays))
         slow = []
-        for one in self.flights:
-            flight = without_unknown_offset(replace(one, anchors=anchors), self._config, by)
-            about = self._base, self._of_innovations, anchors, delays
-            slow.append(_slow(_residuals(*about, flight, self.spans.get(one.name))[1]))
+        for prepared in self.flights:
+            flight = without_unknown_offset(
+                replace(prepared, anchors=anchors), self._config, corrector
+            )
+            span = self.spans.get(flight.name)
+            slow.append(
+                _slow(
+                    _residuals(self._base, self._of_innovations, anchors, delays, flight, span)[1]
+                )
+            )
         return student_scale(_joined(slow))
 
     def equations(
         self,
         anchors: Anchors,
         delays: np.ndarray,
-        loose: np.ndarray,
+        prior_std: np.ndarray,
         progress: Callable[[], object] = lambda: None,
         map_function: MapFunction = map,
         functions: bool = True,
     ) -> Equations:
         """Return the Equations linearized at Anchors and delays.
 
-        delays : (N,) m; loose : (4N,) m, prior standard deviations of the preliminary solution
+        delays : (N,) m
+        prior_std : (4N,) m, of positions and delays in the preliminary solution. At this solution
+            the mean score is near 0, and the inflation is measured.
         functions : whether to include functions of the place; the inflation does not need them
         """
         items = [
@@ -209,7 +224,7 @@ class Runs:
             for flight in self.flights
         ]
         of_flight = partial(
-            _of_flight, self._base, self._reference, (anchors, delays), loose, functions
+            _of_flight, self._base, self._reference, (anchors, delays), prior_std, functions
         )
         several = []
         for (one, span), flight in zip(map_function(of_flight, items), self.flights):
@@ -227,7 +242,7 @@ class Runs:
             slow=_joined([one.slow for one in several]),
             inflation=float(np.mean([one.inflation for one in several])),
             seconds=sum(one.seconds for one in several),
-            grounded=sum(one.grounded for one in several),
+            marks_on_floor=sum(one.marks_on_floor for one in several),
             flights=several if len(anchors) <= MANY else (),
         )
 
@@ -275,13 +290,13 @@ def _of_flight(
     base: EffectSet,
     reference: Nothing,
     about: tuple[Anchors, np.ndarray],
-    loose: np.ndarray,
+    prior_std: np.ndarray,
     functions: bool,
     item: tuple[Flight, tuple[float, float] | None, list[Mark]],
 ) -> tuple[Equations, tuple[float, float]]:
     """Return the Equations and the span of one flight.
 
-    about : Anchors and their delays (N,) m; loose, functions : as of `Runs.equations`
+    about : Anchors and their delays (N,) m; prior_std, functions : as of `Runs.equations`
     item : Flight, span or None, its marks
     """
     flight, known_span, marks = item
@@ -289,8 +304,8 @@ def _of_flight(
     on_floor = reference.on_floor(comparison.poses)
     some = [one for one in marks if on_floor or one.position[2] > AIRBORNE]
     gram, vector, blocks, known = _equations(parts, flight, some, functions)
-    n = len(loose)
-    inflation = _inflation(gram[:n, :n], vector[:n], blocks, loose)
+    n = len(prior_std)
+    inflation = _inflation(gram[:n, :n], vector[:n], blocks, prior_std)
     less = SYSTEMATIC * inflation
     made = Equations(
         gram=gram / less,
@@ -299,7 +314,7 @@ def _of_flight(
         slow=_slow(parts),
         inflation=inflation,
         seconds=BLOCK * len(blocks),
-        grounded=len(marks) - len(some),
+        marks_on_floor=len(marks) - len(some),
     )
     return made, comparison.span
 
@@ -344,8 +359,8 @@ def _equations(
         placed.append(own if len(places) == len(t) else _selection(places, len(t)) @ own)
     regressors = sum(placed[1:], placed[0])
     stamps = [one.stamps(flight.start) for one in constraints]
-    # derivatives of the position at the stamps of marks; in_blocks fills them
-    moved = np.zeros((sum(map(len, stamps)), 3, regressors.shape[1]))
+    # derivatives of the estimated position at the stamps of marks; in_blocks fills them
+    jacobian = np.zeros((sum(map(len, stamps)), 3, regressors.shape[1]))
     error = innovations.value[air] / np.sqrt(innovations.variance[air])
     scale = max(1.4826 * np.median(np.abs(error)), 1e-3)  # for the weights alone
     gram = np.zeros((regressors.shape[1],) * 2)
@@ -353,7 +368,7 @@ def _equations(
     blocks = []
     number = np.floor((t - t[air][0]) / BLOCK).astype(int)
     for rows, columns, derivative in innovations.in_blocks(
-        regressors, number, np.sort(np.concatenate([[], *stamps])), moved
+        regressors, number, np.sort(np.concatenate([[], *stamps])), jacobian
     ):
         inside = air[rows]
         if not inside.any():
@@ -368,7 +383,8 @@ def _equations(
         last = np.searchsorted(columns, n)  # without functions
         # a copy, since a view would keep all of `more` in memory: megabytes
         blocks.append(_BlockEquations(columns[:last], more[:last, :last].copy(), right[:last]))
-    return gram, vector, blocks, _known(constraints, stamps, moved, innovations.run.odometry)
+    marks = _mark_equations(constraints, stamps, jacobian, innovations.run.odometry)
+    return gram, vector, blocks, marks
 
 
 def _regressors(samples: Samples, functions: bool) -> csr_array:
@@ -443,7 +459,9 @@ class _BlockEquations:
 class _Mark:
     """Normal equations of a mark of a flight.
 
-    gram : (k, k); vector : (k,); off : (3,) m, columns : (3, k), as of Mark.off
+    gram : (k, k); vector : (k,)
+    off : (3,) m, estimate minus mark, axes of the world; columns : (3, k), its derivative by the
+        parameters
     """
 
     gram: np.ndarray
@@ -452,22 +470,25 @@ class _Mark:
     columns: np.ndarray
 
 
-def _known(
-    constraints: Sequence[Mark], stamps: Sequence[np.ndarray], moved: np.ndarray, odometry: Odometry
+def _mark_equations(
+    constraints: Sequence[Mark],
+    stamps: Sequence[np.ndarray],
+    jacobian: np.ndarray,
+    odometry: Odometry,
 ) -> list[_Mark]:
     """Return the [_Mark] of marks of a flight.
 
     stamps : s, of the estimates that each mark needs
-    moved : (m, 3, k) derivatives of the estimate at all stamps, in order of time
+    jacobian : (m, 3, k) derivative of the estimate by the parameters, at all stamps in order of time
     """
     order = np.argsort(np.concatenate([[], *stamps]), kind="stable")
-    moved = moved[np.argsort(order, kind="stable")]
+    jacobian = jacobian[np.argsort(order, kind="stable")]  # in the order of the marks
     first, out = 0, []
     for one, t in zip(constraints, stamps):
         estimate = np.stack([np.interp(t, odometry.t, odometry.p[:, k]) for k in range(3)], axis=1)
         rows = np.minimum(np.searchsorted(odometry.t, t), len(odometry.t) - 1)
-        here = moved[first : first + len(t)]
-        # errors of anchors, which persist, are unknowns
+        here = jacobian[first : first + len(t)]
+        # persistent errors of anchors are unknowns of the equations
         covariance = odometry.covariance[rows, :3, :3] - odometry.consider_covariance[rows]
         out.append(_Mark(*one.equations(t, estimate, covariance, here), *one.off(estimate, here)))
         first += len(t)
@@ -497,7 +518,10 @@ def _inflation(
 
 
 def features(p: np.ndarray, length: float = FUNCTION_LENGTH) -> np.ndarray:
-    """Return random Fourier features of a Gaussian kernel, (n, FEATURES).
+    """Return random Fourier features f of a Gaussian kernel, (n, FEATURES).
+
+    The mean of f(p)' f(q) over random waves is exp(-|p - q|^2 / (2 length^2)). The seed is fixed, so
+    that all flights share the features.
 
     p : (n, 3) m, places; length : m, length scale of the kernel
     """

@@ -209,7 +209,11 @@ def to_keep(keys: tuple[tuple[str, ...], ...], matrix: np.ndarray) -> Covariance
     Above MANY anchors only the block of each anchor is kept, to limit the file size.
     """
     out = Covariance(keys, matrix)
-    return out.of_each_anchor() if len({key.partition(".")[0] for _, key in keys}) > MANY else out
+    return (
+        out.block_diagonal_by_anchor()
+        if len({key.partition(".")[0] for _, key in keys}) > MANY
+        else out
+    )
 
 
 def with_calibration(

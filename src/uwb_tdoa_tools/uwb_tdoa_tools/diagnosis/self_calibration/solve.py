@@ -111,7 +111,7 @@ class SelfCalibration:
     changes : (AnchorChange, ...) since the last calibration
     marks : (before, after, nearer): RMS error of the estimate at marks in the air, m, and the share
         of marks at which it falls; each mark is left out of its fit. None without marks.
-    grounded : number of marks left out on the floor, where estimates err by metres without showing
+    marks_on_floor : number of marks left out on the floor, where estimates err by metres without showing
         it
     shares : {effect: (Share, ...)}, its amount in each flight; inflation : as of Equations
     blocked : sentences on blocked anchors, filled by `surveying/blocked.py`
@@ -130,7 +130,7 @@ class SelfCalibration:
     tdoa_std: float | None
     changes: tuple[AnchorChange, ...]
     marks: tuple[float, float, float] | None
-    grounded: int
+    marks_on_floor: int
     shares: dict[str, tuple[Share, ...]]
     inflation: float = 1.0
     blocked: tuple[str, ...] = ()
@@ -367,7 +367,7 @@ def _calibrated(
         tdoa_std=last.tdoa_std(config) if tdoas else None,
         changes=_changes(prior, solution, best - mean),
         marks=_left_out(first, prior),
-        grounded=last.grounded,
+        marks_on_floor=last.marks_on_floor,
         shares=shares,
         inflation=last.inflation,
     )
