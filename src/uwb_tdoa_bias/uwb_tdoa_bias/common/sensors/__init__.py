@@ -21,7 +21,7 @@ from .velocity import Velocity
 # One file each, in the filter's order of kinds: append new ones.
 MODULES = "height", "pressure", "velocity", "ranges"
 
-SENSORS = load(__name__, MODULES)  # by name, in the order of MODULES
+SENSORS: dict[Any, Any] = load(__name__, MODULES)  # by name, in the order of MODULES
 
 LOCATING = tuple(
     name for name, sensor in SENSORS.items() if sensor.locates
