@@ -7,7 +7,7 @@ import json
 import re
 from types import SimpleNamespace
 
-from known_effects import sparse_flight
+from known_effects import clean_flight, sparse_flight
 import numpy as np
 import pytest
 
@@ -160,7 +160,7 @@ def test_nothing_is_applied_where_something_else_is_wrong_too(
 def test_a_survey_of_another_room_is_named_before_anything_is_estimated(
     flights, solved, tmp_path, monkeypatch, capsys
 ):
-    flight = sparse_flight(203, 40.0)
+    flight = clean_flight(203, 40.0)
     monkeypatch.chdir(tmp_path)
     for name, std in (("rough", 0.1), ("other", 0.6)):
         write_bag(at(flight, shaken(flight.anchors, std, 3)), f"{name}.bag")
@@ -185,10 +185,10 @@ def test_flights_that_are_too_short_are_refused():
 
 def test_marks_hold_the_frame_where_no_anchor_is_trusted(tmp_path):
     late = EFFECTS["anchor_delay"]({"3": 0.15})
-    flight = late.inject(sparse_flight(200, 40.0), np.random.default_rng(0))
+    flight = late.inject(clean_flight(200, 40.0), np.random.default_rng(0))
     away = flight.anchors.positions + [0.2, -0.15, 0.1]  # a common shift, which TDOAs do not show
     moved = [at(flight, away)]
-    marks = read_marks(marks_file(tmp_path / "marks.yaml", flight, 8), moved)
+    marks = read_marks(marks_file(tmp_path / "marks.yaml", flight, 6), moved)
     with_marks, without = (
         self_calibrate(moved, Tape(0.3), constraints=some).surveyed.positions
         for some in (marks, ())
