@@ -79,10 +79,18 @@ def pytest_collection_finish():
     gc.freeze()
 
 
+@cache
+def _begin_file(path):
+    """Exclude what earlier files left from the collections before each test of this file."""
+    gc.collect()
+    gc.freeze()
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
     """Give each test that starts nodes its own ROS domain."""
     if domain_id is not None and _uses_ros(item.path):
+        _begin_file(item.path)
         _take_domain()
 
 

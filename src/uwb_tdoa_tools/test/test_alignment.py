@@ -5,7 +5,7 @@
 from dataclasses import replace
 import re
 
-from known_effects import clean_flight
+from known_effects import sparse_flight
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -33,7 +33,7 @@ TURN = Rotation.from_euler("z", 8.0, degrees=True).as_matrix()
 
 @pytest.fixture(scope="module")
 def flight():
-    return clean_flight(100, 40.0)
+    return sparse_flight(100, 40.0)
 
 
 @pytest.fixture(scope="module")

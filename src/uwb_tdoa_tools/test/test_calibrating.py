@@ -25,6 +25,7 @@ from uwb_tdoa_tools.calibrating import (
     Calibration,
     Forecast,
     Prospect,
+    between,
     prospect,
     without_truth,
 )
@@ -57,6 +58,11 @@ def shaken_flight(seed):
     return replace(
         flight, name=f"flight{seed}", anchors=flight.anchors.at(flight.anchors.positions + off)
     )
+
+
+def beginning(flight, seconds):
+    """Return the first seconds of a Flight."""
+    return between(flight, flight.tdoa.t[0], flight.tdoa.t[0] + seconds)
 
 
 @pytest.fixture(scope="module")
@@ -240,11 +246,12 @@ def test_quick_says_what_is_to_be_expected(flights):
 
 @pytest.fixture(scope="module")
 def bags(flights, tmp_path_factory):
-    """Write flights as bags and return their folder."""
+    """Write the beginnings of flights as bags and return their folder."""
     folder = tmp_path_factory.mktemp("bags")
-    for flight in flights:
+    begun = [beginning(flight, 5.0) for flight in flights]
+    for flight in begun:
         write_bag(flight, folder / f"{flight.name}.bag")
-    write_bag(replace(flights[0], truth=None, name="blind"), folder / "blind.bag")
+    write_bag(replace(begun[0], truth=None, name="blind"), folder / "blind.bag")
     return folder
 
 
@@ -335,7 +342,7 @@ def test_different_surveys_of_one_installation_are_named(room, flights, monkeypa
     for name, shift in (("one", 0.0), ("two", 0.01)):
         moved = flights[0].anchors.at(flights[0].anchors.positions + [0.0, 0.0, shift])
         moved.to_yaml(Path("surveys") / f"anchor_{name}.yaml")
-        write_bag(replace(flights[0], anchors=moved), f"{name}.bag")
+        write_bag(replace(beginning(flights[0], 5.0), anchors=moved), f"{name}.bag")
     given = ["one.bag", "two.bag", "--out", "out", "--survey"]
     assert calibrate.main([*given, "surveys"]) == 0
     said = " ".join(capsys.readouterr().err.split())
@@ -350,7 +357,8 @@ def test_different_surveys_of_one_installation_are_named(room, flights, monkeypa
 def test_it_stops_where_check_finds_an_error(room, flights, monkeypatch, capsys):
     for name in ("with_truth", "without_truth"):
         monkeypatch.setattr(library, name, lambda *_: pytest.fail("it went on"))
-    wrong = replace(flights[0], tdoa=replace(flights[0].tdoa, d=-flights[0].tdoa.d))
+    flight = beginning(flights[0], 20.0)
+    wrong = replace(flight, tdoa=replace(flight.tdoa, d=-flight.tdoa.d))
     write_bag(wrong, "wrong.bag")
     assert calibrate.main(["wrong.bag", "--out", "out"]) == 1
     printed = capsys.readouterr()

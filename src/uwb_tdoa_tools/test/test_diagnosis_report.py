@@ -7,7 +7,7 @@ from pathlib import Path
 import re
 from types import SimpleNamespace
 
-from known_effects import clean_flight
+from known_effects import clean_flight, sparse_flight
 import numpy as np
 import pytest
 from reports import Tags, delay, finding, judged, keys_of, said
@@ -55,7 +55,7 @@ def result():
 @pytest.fixture(scope="module")
 def without_truth():
     return diagnose(
-        [EFFECTS["anchor_delay"]({"3": 0.4}).inject(clean_flight(100, 40.0))], reference=Nothing()
+        [EFFECTS["anchor_delay"]({"3": 0.4}).inject(sparse_flight(100, 40.0))], reference=Nothing()
     )
 
 

@@ -7,7 +7,7 @@ The tests cover the conditions of its use, and `diagnose`.
 
 from dataclasses import replace
 
-from known_effects import clean_flight, sparse_flight
+from known_effects import SPARSE, clean_flight, sparse_flight
 import numpy as np
 import pytest
 
@@ -27,17 +27,22 @@ DELAYS = {"1": 0.3, "4": -0.2, "6": 0.25}
 LATE = EFFECTS["anchor_delay"](DELAYS)
 
 
-def flight_with(*effects, seed=100, seconds=40.0, make=clean_flight):
+def flight_with(*effects, seed=100, seconds=40.0, make=sparse_flight):
     flight = make(seed, seconds)
     for effect in effects:
         flight = effect.inject(flight, np.random.default_rng(0))
     return flight
 
 
+def all_tdoas(seed, seconds):
+    """Return a flight with all TDOAs of its protocol, and few inertial samples."""
+    return clean_flight(seed, seconds, rates={**SPARSE, "tdoa_rate": None})
+
+
 @pytest.fixture(scope="module")
 def flights():
     """Return two flights with late anchors."""
-    return [flight_with(LATE, seed=seed) for seed in (100, 101)]
+    return [flight_with(LATE, seed=seed, make=all_tdoas) for seed in (100, 101)]
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +58,8 @@ def diagnosis(flights):
 
 def test_delays_of_several_anchors_are_told_well_enough_from_the_innovations_alone(late):
     assert late.why_not is None and late.explained > 0.5 and late.left < LEFT
-    other, given = flight_with(LATE, seed=102, seconds=30.0), EffectSet(late.found(late.shifts))
+    other = flight_with(LATE, seed=102, seconds=30.0, make=all_tdoas)
+    given = EffectSet(late.found(late.shifts))
     errors = [
         evaluate(other, effects=effects)[0].row()["rmse_3d"] for effects in (EffectSet(), given)
     ]
@@ -102,7 +108,8 @@ def test_the_noise_that_the_filter_is_told_asks_for_no_functions_of_the_place():
 
 
 def test_a_delay_of_one_flight_is_no_delay_of_the_other():
-    found = self_calibrate([flight_with(LATE, seconds=28.0), flight_with(seed=101, seconds=28.0)])
+    short = {"seconds": 28.0, "make": all_tdoas}
+    found = self_calibrate([flight_with(LATE, **short), flight_with(seed=101, **short)])
     one, other = (share.share for share in found.shares["anchor_delay"])
     assert one - other > 1.0
 
@@ -118,7 +125,7 @@ def why_not_of(flight):
 
 
 def test_nothing_is_a_finding_in_a_flight_of_which_nothing_is_wrong():
-    assert "of what is slow in the innovations" in why_not_of(flight_with(make=sparse_flight))
+    assert "of what is slow in the innovations" in why_not_of(flight_with())
 
 
 def test_flights_that_are_too_short_say_so():
@@ -130,7 +137,7 @@ def test_flights_that_are_too_short_say_so():
 def test_nothing_is_applied_if_something_else_is_wrong_too():
     blocked = {"2.x": 1.0, "2.y": 0.0, "2.z": 1.0, "2.radius": 1.5, "2.delay": 1.5}
     other = EFFECTS["nlos"](blocked), LATE, EFFECTS["noise_correlation"]({"std": 0.2, "time": 1.0})
-    assert "something else is wrong too" in why_not_of(flight_with(*other, make=sparse_flight))
+    assert "something else is wrong too" in why_not_of(flight_with(*other))
 
 
 @pytest.mark.parametrize("ratio, applied", [(0.95, False), (1.05, True)])

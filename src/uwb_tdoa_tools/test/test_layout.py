@@ -84,18 +84,25 @@ def modules():
 
 
 @cache
+def statements(path):
+    """Return (import statements at any depth, those at the top level outside of try blocks)."""
+    tree = ast.parse(path.read_text())
+    kinds = ast.Import, ast.ImportFrom
+    return tuple(
+        [node for node in nodes if isinstance(node, kinds)] for nodes in (ast.walk(tree), tree.body)
+    )
+
+
+@cache
 def imports(module, top_only=False):
     """Return the imports of a module: full names of our modules, and top-level names of others."""
     path = modules()[module]
-    tree = ast.parse(path.read_text())
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
     found = set()
-    for node in tree.body if top_only else ast.walk(tree):
-        if isinstance(node, ast.Try) and top_only:  # optional parts are imported in a try block
-            continue
+    for node in statements(path)[top_only]:
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
+        else:
             base = (
                 ".".join(package.split(".")[: len(package.split(".")) + 1 - node.level])
                 if node.level
@@ -116,7 +123,7 @@ def test_relative_imports_lead_to_modules():
     """Imports in functions count, too. They fail only when the function runs."""
     for module, path in modules().items():
         package = module if path.name == "__init__.py" else module.rpartition(".")[0]
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in statements(path)[0]:
             if isinstance(node, ast.ImportFrom) and node.level:
                 parts = package.split(".")[: len(package.split(".")) + 1 - node.level]
                 assert ".".join([*parts, *filter(None, [node.module])]) in modules(), (
@@ -222,6 +229,7 @@ def names_of_messages(package):
     return set(re.findall(r'"(\w+)/msg/\w+"', texts)) - {"pkg", package}  # from a docstring
 
 
+@cache
 def needed(package, *folders):
     """Return the external packages that the files in some folders of a package import.
 
@@ -235,7 +243,7 @@ def needed(package, *folders):
             else set()
         )
         for path in (SRC / package / folder).rglob("*.py"):
-            for node in ast.walk(ast.parse(path.read_text())):
+            for node in statements(path)[0]:
                 if isinstance(node, ast.Import):
                     names |= {alias.name.partition(".")[0] for alias in node.names}
                 elif isinstance(node, ast.ImportFrom) and not node.level:

@@ -124,9 +124,9 @@ READY = "echo '[INFO] [1.5] [node]: ready; correcting with: none'"
 def test_a_process_that_compiles_is_waited_for_without_limit(start, quick, tmp_path):
     start("node", *COMPILING)
     wait_for_output(tmp_path / "node.log", "compiling")
-    until, told = time.monotonic() + 6.0, []
+    until, told = time.monotonic() + 2.5, []
     processes.wait(
-        3.0,
+        1.0,
         "the node",
         start.processes,
         None,

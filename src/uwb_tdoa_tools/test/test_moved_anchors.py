@@ -18,6 +18,7 @@ from uwb_tdoa_ekf.evidence import keys_of
 from uwb_tdoa_ekf.monitoring.finding import ERROR, WARNING, Finding
 from uwb_tdoa_ekf.results import concatenated, rows_of
 from uwb_tdoa_tools.bags.bag import write_bag
+from uwb_tdoa_tools.calibrating import between
 from uwb_tdoa_tools.checking import watch
 from uwb_tdoa_tools.checking.check import check
 from uwb_tdoa_tools.checking.recording import of_flight
@@ -102,7 +103,8 @@ def far_moved():
 
     Returns (Flight, row of the anchor, shift (3,) m).
     """
-    config = SimulationConfig(seed=2, constellation="random-2-8", bias=False, imu_rate=200.0)
+    rates = {"tdoa_rate": 200.0, "imu_rate": 200.0, "truth_rate": 100.0}
+    config = SimulationConfig(seed=2, constellation="random-2-8", bias=False, **rates)
     filled, room = config.complete()
     anchors, row = filled.anchors, 6
     positions = anchors.positions.copy()
@@ -209,7 +211,8 @@ def test_with_exchanged_ids_evaluate_blames_neither_the_truth_nor_itself(
 )
 def test_ids_are_asked_for_before_anchors(exchanged, tmp_path, capsys, command, options):
     """`survey` moved a third anchor by 58, 56 and 91 cm."""
-    write_bag(exchanged, tmp_path / "flight")
+    begin = exchanged.tdoa.t[0]
+    write_bag(between(exchanged, begin, begin + 25.0), tmp_path / "flight")
     out = tmp_path / "out"
     assert command.main([str(tmp_path / "flight"), *options, "--out", str(out)]) == 1
     said = capsys.readouterr()

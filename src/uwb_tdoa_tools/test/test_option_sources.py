@@ -6,6 +6,7 @@ The option overrides the file, or is refused with a message. Nothing is ignored 
 """
 
 from dataclasses import replace
+import shutil
 
 import numpy as np
 import pytest
@@ -33,6 +34,7 @@ from uwb_tdoa_tools.simulation import SimulationConfig, simulate  # noqa: E402
 CLEAN = dict(
     duration=14.0,
     floor_time=1.0,
+    tdoa_rate=200.0,
     imu_rate=100.0,
     bias=False,
     multipath=False,
@@ -40,16 +42,23 @@ CLEAN = dict(
 )
 
 
-@pytest.fixture
-def desk(tmp_path, monkeypatch):
-    """A working directory with a bag whose anchors are wrong, and a correct survey."""
-    monkeypatch.chdir(tmp_path)
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Return a folder with a bag whose anchors are wrong, and a correct survey."""
+    folder = tmp_path_factory.mktemp("made")
     flight = simulate(SimulationConfig(seed=1, **CLEAN))
-    flight.anchors.to_yaml("right.yaml")
+    flight.anchors.to_yaml(folder / "right.yaml")
     off = 0.4 * np.random.default_rng(2).standard_normal(flight.anchors.positions.shape)
-    write_bag(
-        replace(flight, anchors=flight.anchors.at(flight.anchors.positions + off)), "flight.bag"
-    )
+    flight = replace(flight, anchors=flight.anchors.at(flight.anchors.positions + off))
+    write_bag(flight, folder / "flight.bag")
+    return folder
+
+
+@pytest.fixture
+def desk(made, tmp_path, monkeypatch):
+    """A working directory with copies of the made files."""
+    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
@@ -134,16 +143,11 @@ def test_every_tool_reads_the_recording_with_the_survey(desk, monkeypatch, comma
 def test_a_parameter_counts_before_the_config(desk, monkeypatch):
     parameters = {"/**": {"ros__parameters": {"tdoa_std": 5.0}}}
     (desk / "ekf_node.yaml").write_text(yaml.safe_dump(parameters))
-    plain = rmse(["flight.bag", "--no-bias"], monkeypatch)
-    of_file = rmse(["flight.bag", "--no-bias", "--config", "ekf_node.yaml"], monkeypatch)
-    assert (
-        of_file
-        != plain
-        == rmse(
-            ["flight.bag", "--no-bias", "--config", "ekf_node.yaml", "-p", "tdoa_std:=0.25"],
-            monkeypatch,
-        )
-    )
+    words = ["flight.bag", "--survey", "right.yaml", "--no-bias"]
+    plain = rmse(words, monkeypatch)
+    of_file = rmse([*words, "--config", "ekf_node.yaml"], monkeypatch)
+    both = rmse([*words, "--config", "ekf_node.yaml", "-p", "tdoa_std:=0.25"], monkeypatch)
+    assert of_file != plain == both
 
 
 def test_the_arm_of_an_effect_counts_before_that_of_a_bag(desk):

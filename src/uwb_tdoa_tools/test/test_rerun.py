@@ -18,7 +18,8 @@ from uwb_tdoa_tools.estimate import FlightEstimator
 from uwb_tdoa_tools.localizing import pictures
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
-CLEAN = dict(floor_time=1.0, imu_rate=100.0, bias=False, multipath=False, outlier_probability=0.0)
+RATES = {"tdoa_rate": 200.0, "imu_rate": 100.0, "truth_rate": 100.0}
+CLEAN = dict(floor_time=1.0, bias=False, multipath=False, outlier_probability=0.0, **RATES)
 ALWAYS = {
     "world/anchors",
     "world/path",
@@ -39,10 +40,17 @@ def flight():
     )
 
 
+@pytest.fixture(scope="module")
+def bag(flight, tmp_path_factory):
+    path = tmp_path_factory.mktemp("flight") / "flight.bag"
+    write_bag(flight, path)
+    return path
+
+
 @pytest.fixture
-def desk(flight, tmp_path, monkeypatch):
+def desk(bag, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    write_bag(flight, "flight.bag")
+    (tmp_path / "flight.bag").symlink_to(bag)
     return tmp_path
 
 
