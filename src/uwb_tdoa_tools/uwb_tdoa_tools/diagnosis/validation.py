@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 Made = TypeVar("Made")
 
-TRIAL_FLIGHTS = 3  # largest number of flights, or halves of one, in trials
+TRIAL_FLIGHTS = 6  # largest number of flights, or halves of one, in trials
 # shapes of a function of the time that can recur, like the warm-up of a clock
 DRIFTS = ("line", "beyond", "below", "parabola")
 # Smallest share of an error that counts as a difference.
@@ -85,12 +85,12 @@ class ValidatedSelection:
     def misleading(self) -> set[str]:
         """Return the names of declared effects that explain residuals and mislead the filter.
 
-        Without one of them the error falls by more than LOSS.
+        Without one of them the error falls by more than WORSE.
         """
         return {
             one.name
             for one, gained in self.worth.items()
-            if isinstance(one, Candidate) and one.name in EFFECTS and -gained > LOSS * self.error
+            if isinstance(one, Candidate) and one.name in EFFECTS and -gained > WORSE * self.error
         }
 
     def applied(self, attribution: Attribution) -> Attribution:
