@@ -27,8 +27,10 @@ from uwb_tdoa_tools.diagnosis.comparison import (
 from uwb_tdoa_tools.diagnosis.detectors import Detection
 from uwb_tdoa_tools.diagnosis.over_flights import Share
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
+from uwb_tdoa_tools.diagnosis.regression.terms import Candidate, Term
 from uwb_tdoa_tools.diagnosis.validation import (
     Displacements,
+    ValidatedSelection,
     _dropped,
     _Trials,
     _worse_in_one,
@@ -60,6 +62,22 @@ def test_every_flight_is_judged_with_effects_that_it_took_no_part_in(flights, at
     values = [list(case.effects.effects[0].values.values()) for case in cases]
     assert values[0] != values[1]
     assert attribution.selection.table.flights == 2
+
+
+def test_each_of_six_flights_is_tried(flights):
+    """Three of them left out that a function does harm to a flight of the fit."""
+    six = [replace(flight, name=str(k)) for k, flight in enumerate(3 * flights)]
+    attribution = attribute(six, TRUTH, undeclared=False)
+    trials = _Trials(attribution, six, Baseline(NONE), lambda: None, map)
+    cases = trials._cases(attribution.selection.chosen, ())
+    assert [case.flight.name for case in cases] == list("012345")
+
+
+@pytest.mark.parametrize("loss, misleads", [(0.004, True), (0.001, False)])
+def test_a_named_effect_that_raises_the_error_misleads(loss, misleads):
+    candidate = Candidate((Term(EFFECTS["nlos"](), ()),))
+    selected = ValidatedSelection(None, (), (), {candidate: -loss}, 0.3)
+    assert selected.misleading == ({"nlos"} if misleads else set())
 
 
 def test_a_model_that_no_trial_changes_is_not_run_again(flights, attribution, monkeypatch):
