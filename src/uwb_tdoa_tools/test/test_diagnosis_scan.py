@@ -12,6 +12,7 @@ from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.channels import CHANNELS, residuals
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.regression.fit import fit
+from uwb_tdoa_tools.diagnosis.regression.products import FINE, _Bins, _Subset
 from uwb_tdoa_tools.diagnosis.regression.scan import Scan, _held
 from uwb_tdoa_tools.diagnosis.regression.table import table_of
 from uwb_tdoa_tools.diagnosis.regression.terms import Candidate, Term
@@ -85,6 +86,39 @@ def test_a_product_of_two_covariates_or_what_recurs_is_proposed_first(flight, te
         inner = zip(term.knots[1:-1], first.term.knots[1:-1])
         alike = first.term.arguments == term.arguments and len(first.term.knots) == len(term.knots)
         assert all(abs(one - other) < 0.15 for one, other in inner if alike)
+
+
+@pytest.mark.parametrize("term", RARE[:2], ids=lambda term: term.covariate)
+def test_a_finer_search_of_a_product_never_loses_gain(flight, term):
+    table, model, scan = scanned(term.inject(flight))
+    weights, products = model.information(table), scan._products
+    found = [one for one in products(weights, model.residual) if one.term.factor]
+    assert found
+    for one in found:
+        (subset,) = (each for each in products._subsets if each.key == one.key)
+        bins = [_Bins.of(name, subset.values[name], FINE) for name in one.term.arguments]
+        gain, _ = subset.best_product(subset.weighted(weights, model.residual), bins)
+        assert one.gain >= gain
+
+
+@pytest.mark.parametrize("form", ["anchor", "pair"])
+def test_the_gain_of_a_product_counts_the_rows_that_a_fit_uses(form):
+    """A fit has no level of an anchor where a covariate is unknown, but a level of a pair."""
+    rng, n = np.random.default_rng(0), 400
+    x, y = rng.exponential(1.0, (2, n))
+    known = np.arange(n) < 300
+    x[~known] = np.nan
+    residual = np.where((x > 1.0) & (y > 0.7), 0.5, 0.1) + 0.1 * rng.standard_normal(n)
+    residual[~known] += 0.3
+    subset = _Subset(("tdoa", form, "3"), np.arange(n), np.ones(n), {}, 0.5)
+    pair = [_Bins.of(name, values, 8) for name, values in (("x", x), ("y", y))]
+    weights = np.full(n, 100.0)
+    gain, indices = subset.best_product(subset.weighted(weights, residual), pair)
+    shapes = [bins.shapes[bins.cell, k] for bins, k in zip(pair, indices)]
+    level = np.where(known, 1.0, 0.0 if form == "anchor" else 1.0)
+    columns = np.stack([level, shapes[0] * shapes[1]], axis=1)
+    gram, vector = 100.0 * columns.T @ columns + 0.5 * np.eye(2), 100.0 * columns.T @ residual
+    assert gain == pytest.approx(vector @ np.linalg.solve(gram, vector))
 
 
 def test_what_changes_fast_is_no_noise_of_its_series():

@@ -36,7 +36,7 @@ FOR_MAPS = 3
 COARSE, FINE = 8, 16  # bins of a covariate in the search, and around its best products
 REFINED = 6  # products that are searched again with FINE bins
 WIDEST = 0.75  # share of the bins, longest interval
-FINER = 9  # places around a knot of a product that are tried at last
+FINER = 9  # values around a knot of a product that are tried at last
 CYCLES = tuple(np.arange(1.5, 20.01, 0.1).tolist())  # numbers of periods over the range of the time
 TIME_BINS = 240
 SHORTEST = 1.0  # s, smallest range of the time
@@ -69,8 +69,9 @@ class Proposal:
 class _Subset:
     """Rows of a table that functions of one anchor, pair or axis act on.
 
+    key : (channel, form, anchor or pair or axis)
     signs : (m,) of the function in the rows (m,); values : {covariate: (m,)}
-    prior : information of the prior of a coefficient
+    prior : information of the prior of a coefficient, 1 / variance
     """
 
     key: tuple[str, str, str]
@@ -80,12 +81,42 @@ class _Subset:
 
     prior: float
 
-    def weighted(
-        self, information: np.ndarray, residual: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the weights of its rows, and weighted residuals times signs, (m,) each."""
-        weight = information[self.rows]
+    def weighted(self, weights: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the weights of its rows, and weighted residuals times signs, (m,) each.
+
+        weights : (n,) of all rows of the table, 1 / variance
+        """
+        weight = weights[self.rows]
         return weight * self.signs**2, weight * self.signs * residual[self.rows]
+
+    def best_product(
+        self, weighted: tuple[np.ndarray, np.ndarray], pair: Sequence[_Bins]
+    ) -> tuple[float, tuple[int, int]]:
+        """Return (gain, indices of both shapes) of the product that gains most.
+
+        The model is a level and a column h = f(x) g(y). The bins give the scalar products of all
+        columns at once: <1, h> = F' W G, <h, h> = (F^2)' W G^2, <h, r> = F' V G. W and V are the
+        weights and the weighted residuals in each pair of bins. F and G are the shapes in the bins,
+        squared by element.
+
+        weighted : as of `weighted`
+        """
+        x, y = pair
+        m, n = len(x.shapes), len(y.shapes)
+        cell = x.cell * n + y.cell
+        power, vector = (np.bincount(cell, part, m * n).reshape(m, n) for part in weighted)
+        # A fit has no level of an anchor in rows with an unknown value: those of the last bin.
+        known = slice(-1 if self.key[1] == "anchor" else None)
+        gains = _gain(
+            level=vector[known, known].sum(),
+            power=power[known, known].sum(),
+            first=x.shapes.T @ vector @ y.shapes,
+            crossed=x.shapes.T @ power @ y.shapes,
+            square=(x.shapes**2).T @ power @ y.shapes**2,
+            prior=self.prior,
+        )
+        i, j = np.unravel_index(int(np.argmax(gains)), gains.shape)
+        return float(gains[i, j]), (int(i), int(j))
 
 
 class Products:
@@ -116,33 +147,36 @@ class Products:
         pairs = combinations([name for name in names if name != "time"], 2)
         return [pair for pair in pairs if not (self._with_maps and {*pair} <= {*OF_PLACE})]
 
-    def __call__(self, information: np.ndarray, residual: np.ndarray) -> list[Proposal]:
+    def __call__(self, weights: np.ndarray, residual: np.ndarray) -> list[Proposal]:
         """Return Proposals for a residual (n,), the largest gain minus price first.
 
-        information : (n,) of each row
+        weights : (n,) of each row, 1 / variance
         """
         found = []
         for subset, binned in self._of_two:
-            sums = subset.weighted(information, residual)
+            weighted = subset.weighted(weights, residual)
             for pair in self._pairs(binned):
-                gain, place = _best_product(sums, subset.prior, *(binned[name] for name in pair))
+                gain, _ = subset.best_product(weighted, [binned[name] for name in pair])
                 if gain > LEAST_GAIN:
-                    found.append((gain, subset, pair, place))
+                    found.append((gain, subset, pair))
         found.sort(key=lambda item: -item[0])
         out = []
-        for _, subset, pair, _ in found[:REFINED]:
+        for _, subset, pair in found[:REFINED]:
             both = [_Bins.of(name, subset.values[name], FINE) for name in pair]
-            finer = [bins for bins in both if bins is not None]
-            if len(finer) == len(both):
-                sums = subset.weighted(information, residual)
-                _, place = _best_product(sums, subset.prior, *finer)
-                tried = len(finer[0].of_shapes) * len(finer[1].of_shapes) * FINER
-                moved = [bins.around(k, subset.values[bins.name]) for bins, k in zip(finer, place)]
-                gain, place = _best_product(sums, subset.prior, *moved)
-                out.append(self._proposal(subset, moved, gain, place, tried))
+            fine = [bins for bins in both if bins is not None]
+            if len(fine) == len(both):
+                weighted = subset.weighted(weights, residual)
+                gain, indices = subset.best_product(weighted, fine)
+                moved = [bins.around(k, subset.values[bins.name]) for bins, k in zip(fine, indices)]
+                # These bins leave out the present knots, and are wide elsewhere.
+                finer_gain, finer_indices = subset.best_product(weighted, moved)
+                tried = len(fine[0].of_shapes) * len(fine[1].of_shapes) * FINER
+                if finer_gain > gain:
+                    fine, gain, indices = moved, finer_gain, finer_indices
+                out.append(self._proposal(subset, fine, gain, indices, tried))
         for subset in self._subsets:
             if "time" in subset.values:
-                out += self._recurring(subset, information, residual)
+                out += self._recurring(subset, weights, residual)
         return sorted(out, key=lambda one: one.price - one.gain)
 
     def _proposal(
@@ -150,15 +184,18 @@ class Products:
         subset: _Subset,
         pair: Sequence[_Bins],
         gain: float,
-        place: tuple[int, int],
+        indices: tuple[int, int],
         tried: int,
     ) -> Proposal:
         """Return the Proposal of a product.
 
-        place : of the shape in each of both _Bins; tried : number of products that were tried
+        The price includes twice the logarithm of the number of products that were tried, because
+        the best of many gains by chance (multiple testing).
+
+        indices : of the shape in each of both _Bins; tried : number of products that were tried
         """
         (shape, knots), (factor_shape, factor_knots) = (
-            bins.of_shapes[k] for bins, k in zip(pair, place)
+            bins.of_shapes[k] for bins, k in zip(pair, indices)
         )
         channel, form, _ = subset.key
         term = SmoothTerm(
@@ -174,14 +211,14 @@ class Products:
         return Proposal(gain, self._price_of_two + 2.0 * np.log(tried), subset.key, term)
 
     def _recurring(
-        self, subset: _Subset, information: np.ndarray, residual: np.ndarray
+        self, subset: _Subset, weights: np.ndarray, residual: np.ndarray
     ) -> Iterator[Proposal]:
         """Yield the best wave and the best pulse over the time."""
         t = subset.values["time"]
         low, high = map(float, np.quantile(t, [0.005, 0.995]))
         if high - low < SHORTEST:
             return
-        weighted = subset.weighted(information, residual)
+        weighted = subset.weighted(weights, residual)
 
         def sums(bins: int) -> _Sums:
             cell = np.clip((t - low) / (high - low) * bins, 0, bins - 1).astype(np.int64)
@@ -214,7 +251,11 @@ class _Sums:
     prior: float
 
     def gains_of_waves(self, cycles: tuple[float, ...]) -> np.ndarray:
-        """Return the gain of a wave of each number of periods, (c,), by least squares."""
+        """Return the gain of a wave of each number of periods, (c,), by least squares.
+
+        It is b' (G + prior I)^-1 b, with the Gram matrix G and the scalar products b with the
+        residual of the columns level, sine and cosine.
+        """
         basis, squares = _waves(cycles, len(self.power))
         gram = np.tensordot(squares, self.power, axes=(1, 0)) + self.prior * np.eye(3)
         right = np.tensordot(basis, self.vector, axes=(1, 0))
@@ -323,9 +364,12 @@ class _Bins:
             return None
         return cls.between(name, values, edges)
 
-    def around(self, place: int, values: np.ndarray) -> _Bins:
-        """Return bins of the same values (m,), finer around the inner knots of a shape."""
-        inner = np.searchsorted(self.edges, self.of_shapes[place][1][1:-1])
+    def around(self, index: int, values: np.ndarray) -> _Bins:
+        """Return bins of the same values (m,), finer around the inner knots of a shape.
+
+        index : of the shape in `of_shapes`
+        """
+        inner = np.searchsorted(self.edges, self.of_shapes[index][1][1:-1])
         near = [np.linspace(self.edges[k - 1], self.edges[k + 1], FINER) for k in inner]
         edges = np.unique(np.concatenate([self.edges[[0, -1]], *near])) if near else self.edges
         return _Bins.between(self.name, values, edges)
@@ -348,24 +392,6 @@ def _all_binned(subset: _Subset) -> dict[str, _Bins]:
     """Return {covariate: its _Bins} of the covariates that vary."""
     every = {name: _Bins.of(name, values, COARSE) for name, values in subset.values.items()}
     return {name: bins for name, bins in every.items() if bins is not None}
-
-
-def _best_product(
-    sums: tuple[np.ndarray, np.ndarray], prior: float, one: _Bins, other: _Bins
-) -> tuple[float, tuple[int, int]]:
-    """Return (gain, places of both shapes) of the product that gains most.
-
-    sums : as of `_Subset.weighted`; prior : information of the prior
-    """
-    m, n = len(one.shapes), len(other.shapes)
-    cell = one.cell * n + other.cell
-    power, vector = (np.bincount(cell, part, m * n).reshape(m, n) for part in sums)
-    crossed = one.shapes.T @ power @ other.shapes
-    square = (one.shapes**2).T @ power @ other.shapes**2
-    first = one.shapes.T @ vector @ other.shapes
-    gain = _gain(vector.sum(), power.sum(), first, crossed, square, prior)
-    row, column = np.unravel_index(int(np.argmax(gain)), gain.shape)
-    return float(gain[row, column]), (int(row), int(column))
 
 
 def _shapes(edges: tuple[float, ...]) -> Iterator[tuple[str, tuple[float, ...]]]:
@@ -419,9 +445,9 @@ def _gain(
     square: np.ndarray,
     prior: float,
 ) -> np.ndarray:
-    """Return the gain of a level and one column.
+    """Return the gains of a level and one column, twice a log-likelihood.
 
-    level, first : products of the level and of the column with the residual
+    level, first : scalar products of the level, and of the column, with the residual
     power, crossed, square : of the level with itself, with the column, and of the column with itself
     """
     power = power + prior
