@@ -31,7 +31,7 @@ from uwb_tdoa_ekf.core.ground import (
     may_be_late,
 )
 from uwb_tdoa_ekf.core.memory import TDOA, new_state, structured
-from uwb_tdoa_ekf.core.stationary_position import weigh
+from uwb_tdoa_ekf.core.stationary_position import weigh_explanations
 from uwb_tdoa_ekf.core.workspace import set_bounds
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.offline import run_offline
@@ -155,7 +155,9 @@ def placed(p, elsewhere, late=0.0, seed=0, state=None):
     set_bounds(state.record.extent, 1.0, state.record.workspace)
     x, covariance = np.array([*elsewhere, 0.0, 0.0, 0.0]), 0.04 * np.eye(6)
     pairs, nothing = heard(p, late=late, seed=seed), KnownHeight(np.nan, np.nan)
-    lead = weigh(state.ekf[0], pairs, state.anchors, PARAMETERS[0], nothing, x, covariance)
+    lead = weigh_explanations(
+        state.ekf[0], pairs, state.anchors, PARAMETERS[0], nothing, x, covariance
+    )
     return x[:3], np.sqrt(np.diag(covariance)[:3]), lead > 0.0
 
 
