@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Auxiliary states beyond the 15 error states: offsets common to all measurements of a sensor.
 
-The filter estimates them together with the position. `offset` holds them. `offset_cross` is their covariance with the
-error state. `offset_P` is their own covariance. A variance of 0 means that the state does not
+The filter estimates them together with the position. `offset` holds them. `offset_cross` is their
+covariance with the error state. `offset_P` is their own covariance. A variance of 0 means that the state does not
 exist. Without auxiliary states nothing is computed. `pressure` and `ranges` define their meaning
 and initialization.
 """

@@ -188,8 +188,8 @@ def flyability(
     """Return a sentence on a position that may not be flown, or None, and {key: text}.
 
     The efficiency is the Cramer-Rao bound of one round of TDOAs divided by the filter's stated 3D
-    standard deviation, squared. The filter also uses earlier rounds and the IMU. An efficiency of n means the precision
-    of n independent rounds.
+    standard deviation, squared. The filter also uses earlier rounds and the IMU. An efficiency
+    of n means the precision of n independent rounds.
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Checks of the definitions of all sensors.
+"""Load the definitions of all sensors, and check them.
 
 A mistake is an InputError with the sensor, the attribute, and the remedy.
 """

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Checks of what the functions of a Sensor return.
+"""Check the values that the functions of a Sensor return.
 
 A mistake is an InputError with the sensor, the function, and the remedy.
 """
@@ -20,7 +20,7 @@ ROW_WIDTHS = {"value": 4, "std": 4, "anchor": 1}
 
 
 def mistake(name: str, attribute: str, text: str) -> InputError:
-    """Return the error of an attribute of a sensor; `text` is what was seen and the remedy."""
+    """Return the error of an attribute of a sensor; `text` is the mistake and its remedy."""
     return InputError(f"sensor {name}, `{attribute}`: {text} See {PAGE}.")
 
 
@@ -79,7 +79,7 @@ def check_values(name: str, stream: Any) -> None:
 
 
 def check_rows(name: str, returned: Any, n: int) -> tuple[dict, np.ndarray]:
-    """Return what `measured` of a Sensor returned for n measurements.
+    """Return the rows and their validity that `measured` of a Sensor gave for n measurements.
 
     Raises InputError if the rows or their validity have another form.
     """
