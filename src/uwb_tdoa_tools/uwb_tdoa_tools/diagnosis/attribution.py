@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING
@@ -179,36 +180,8 @@ def attribute(
     map_function : function
         Like map(function, items), possibly in parallel processes.
     """
-    searching = _Searching(_ModelResiduals(flights, reference, base, progress, map_function), kinds)
-    refused: list[Refused] = []
-    selection = cross_validated(searching.named(), refused)
-    if undeclared:
-        selection = cross_validated(searching.with_functions(selection), refused)
-    names = tuple(flight.name for flight in flights)
-    selection = searching.with_alternatives(selection, undeclared)
-    if undeclared and len(flights) >= FOR_MAPS:
-        selection = with_maps(selection, searching.smooth, refused)
-    remaining = searching.residuals(effects_of(selection))
-    alone: tuple[tuple[str, Selection], ...] = ()
-    if undeclared and len(flights) > 1 and all(reference.positions_known):
-        found = of_one(remaining, searching.inflation, searching.search, map_function)
-        alone = tuple((names[k], own) for k, own in found)
-    near = [(name, part) for name, part in zip(names, map(near_floor, remaining)) if part]
-    floor = None
-    if near:
-        parts = [part for _, part in near]
-        floor = on_floor(parts, searching.floor_detectors, undeclared, refused, progress)
-    return Attribution(
-        searching.under_base,
-        with_deviations(selection),
-        searching.detections(remaining),
-        searching.declared,
-        tuple(refused),
-        names,
-        alone,
-        floor,
-        tuple(name for name, _ in near),
-    )
+    search = EffectSearch(flights, reference, base, kinds, undeclared, progress, map_function)
+    return search.reported(search.found())
 
 
 class _ModelResiduals:
@@ -247,50 +220,121 @@ class _ModelResiduals:
         return made
 
 
-class _Searching:
-    """The steps of the search for effects in the residuals of some flights.
+class EffectSearch:
+    """The search for effects in the residuals of some flights, in steps.
 
     under_base : residuals under the base model; declared : Candidates of declared effects
     inflation : (groups,) variance inflation of the noise
-    floor_detectors : Detectors of effects near the floor
     """
 
-    def __init__(self, residuals: _ModelResiduals, kinds: Collection[str] | None) -> None:
-        """Measure the noise.
-
-        kinds : names of the declared effects to search for, None for all
-        """
-        self.residuals = residuals
-        self.progress = residuals.progress
-        self.under_base = residuals(())
+    def __init__(
+        self,
+        flights: Sequence[Flight],
+        reference: Reference,
+        base: EffectSet = EffectSet(),
+        kinds: Collection[str] | None = None,
+        undeclared: bool = True,
+        progress: Callable[[], object] = lambda: None,
+        map_function: MapFunction = map,
+    ) -> None:
+        """Measure the noise, with the arguments of `attribute`."""
+        self.residuals = _ModelResiduals(flights, reference, base, progress, map_function)
+        self.progress = progress
+        self._map_function = map_function
+        self._undeclared = undeclared
+        self._left_out: frozenset[str] = frozenset()
+        self.names = tuple(flight.name for flight in flights)
+        self.under_base = self.residuals(())
         self._current = self.under_base
         shown = {name for flight in self.under_base for name in flight}
-        wanted = [
+        self._detectors = [
             detector
             for name, detector in DETECTORS.items()
             if (kinds is None or name in kinds) and shown & set(detector.effect.channels)
         ]
-        self._detectors = [detector for detector in wanted if not detector.on_floor]
-        self.floor_detectors = [detector for detector in wanted if detector.on_floor]
-        self._installation = _installation(residuals.flights)
-        self.declared = _declared(self.under_base, residuals.reference, kinds, self._installation)
+        self._installation = _installation(flights)
+        self.declared = _declared(self.under_base, reference, kinds, self._installation)
         self._unmoved = linearised(self.under_base, self.declared, ())
-        first = [detector for detector in self._detectors if detector.searched_first]
+        first = [detector for detector in self._in_the_air if detector.searched_first]
         self.inflation = inflation_of(self._unmoved, self.declared, partial(_search, first))
         self._scans: dict[int, Scan] = {}
         self.progress()
 
+    def without(self, names: Collection[str]) -> EffectSearch:
+        """Return the search without some declared effects, with the same measured noise."""
+        fewer = copy(self)
+        fewer._left_out = self._left_out.union(names)
+        fewer.declared = [one for one in self.declared if one.name not in names]
+        fewer._detectors = [one for one in self._detectors if one.effect.name not in names]
+        return fewer
+
+    def found(self, start: Selection | None = None) -> Attribution:
+        """Return the Attribution with what it needs to validate effects.
+
+        start : Selection of an earlier search. The search goes on from those of its effects that
+            this search may find. By default it begins with none.
+        """
+        refused: list[Refused] = []
+        if start is None:
+            selection = cross_validated(self._named(), refused)
+            if self._undeclared:
+                selection = cross_validated(self._with_functions(selection), refused)
+        else:
+            selection = cross_validated(self._resumed(start), refused)
+        if self._undeclared and len(self.names) >= FOR_MAPS:
+            selection = with_maps(selection, self._smooth, refused)
+        return Attribution(
+            self.under_base,
+            with_deviations(selection),
+            self._detections(selection),
+            self.declared,
+            tuple(refused),
+            self.names,
+        )
+
+    def reported(self, found: Attribution) -> Attribution:
+        """Return an Attribution of this search with what a report shows beside its effects.
+
+        That are rivals of effects, effects in one flight only, and effects near the floor.
+        """
+        selection = self._with_alternatives(found.selection)
+        remaining = self.residuals(effects_of(selection))
+        alone: tuple[tuple[str, Selection], ...] = ()
+        positions_known = all(self.residuals.reference.positions_known)
+        if self._undeclared and len(self.names) > 1 and positions_known:
+            own = of_one(remaining, self.inflation, self.search, self._map_function)
+            alone = tuple((self.names[k], of_flight) for k, of_flight in own)
+        near = [(name, part) for name, part in zip(self.names, map(near_floor, remaining)) if part]
+        floor, refused = None, list(found.refused)
+        if near:
+            detectors = [one for one in self._detectors if one.on_floor]
+            parts = [part for _, part in near]
+            floor = on_floor(parts, detectors, self._undeclared, refused, self.progress)
+        return replace(
+            found,
+            selection=selection,
+            refused=tuple(refused),
+            alone=alone,
+            floor=floor,
+            floor_names=tuple(name for name, _ in near),
+        )
+
     @property
     def search(self) -> Search:
         """Return the search of the detectors."""
-        return partial(_search, self._detectors)
+        return partial(_search, self._in_the_air)
+
+    @property
+    def _in_the_air(self) -> list[Detector]:
+        """Return the detectors of effects that do not need the floor."""
+        return [one for one in self._detectors if not one.on_floor]
 
     @cached_property
-    def smooth(self) -> list[Candidate]:
+    def _smooth(self) -> list[Candidate]:
         """Return the Candidates of functions without a name."""
         return _smooth(self._current, self._installation)
 
-    def named(self) -> Selection:
+    def _named(self) -> Selection:
         """Select declared effects, ROUNDS times, each time linearized at the values found before."""
         table = self._unmoved
         for step in range(ROUNDS):
@@ -305,7 +349,7 @@ class _Searching:
             table = linearised(self._current, self.declared, found)
         return selection
 
-    def with_functions(self, selection: Selection) -> Selection:
+    def _with_functions(self, selection: Selection) -> Selection:
         """Return the Selection after a search that includes functions without a name."""
         scan = self._scan_of(selection.table)
         selection = with_measured_noise(selection, self.declared, scan, self.progress)
@@ -313,23 +357,41 @@ class _Searching:
             selection,
             self._unmoved,
             self.declared,
-            self.smooth,
+            self._smooth,
             self.search,
             self._scan_of,
             self.progress,
         )
-        return relinearised(selection, self.residuals, self.declared + self.smooth)
+        return relinearised(selection, self.residuals, self.declared + self._smooth)
 
-    def with_alternatives(self, selection: Selection, undeclared: bool) -> Selection:
-        """Return the Selection with the rivals of each effect; undeclared : as of `attribute`."""
-        if not undeclared:
+    def _resumed(self, start: Selection) -> Selection:
+        """Return the Selection after one more search, from those effects that it may find.
+
+        start : Selection of an earlier search for more effects
+        """
+        kept = [one for one in start.chosen if one.name not in self._left_out]
+        selection = select(
+            start.table,
+            [*self._smooth, *self.declared],
+            start.fit.inflation,
+            self.search,
+            self._scan_of(start.table),
+            kept,
+            self.progress,
+        )
+        return relinearised(selection, self.residuals, self.declared + self._smooth)
+
+    def _with_alternatives(self, selection: Selection) -> Selection:
+        """Return the Selection with the rivals of each effect."""
+        if not self._undeclared:
             return with_rivals(selection, self.declared, None, self.progress)
-        candidates = self.declared + self.smooth
+        candidates = self.declared + self._smooth
         return with_rivals(selection, candidates, self._scan_of(selection.table), self.progress)
 
-    def detections(self, remaining: list[ChannelResiduals]) -> tuple[Detection, ...]:
-        """Return what the detectors find in the residuals under the whole model."""
-        detected = (detector.detect(remaining) for detector in self._detectors)
+    def _detections(self, selection: Selection) -> tuple[Detection, ...]:
+        """Return what the detectors find in the residuals under a Selection."""
+        remaining = self.residuals(effects_of(selection))
+        detected = (detector.detect(remaining) for detector in self._in_the_air)
         return tuple(detection for detection in detected if detection is not None)
 
     def _scan_of(self, table: RegressionTable) -> Scan:

@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from ..parallel import MapFunction
 
     Spans = tuple[tuple[float, float], ...]  # (first, last) s
-    KnownRuns = Sequence[tuple["ValidationCase", Run]]
 
 BOOTSTRAPS = 400  # number of bootstrap samples
 Z95 = 1.96  # standard deviations, half of a 95 % interval
@@ -99,7 +98,6 @@ def compare(
     progress: Callable[[], object] = lambda: None,
     shift_std: Callable[[str], np.ndarray] = lambda name: np.zeros(3),
     map_function: MapFunction = map,
-    known: KnownRuns = (),
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Run the filter on ValidationCases before and after, and return both sides.
 
@@ -109,9 +107,8 @@ def compare(
     references that are common to a flight.
 
     shift_std : as of a Reference; map_function : as of `attribute`
-    known : runs with these flights and effects are not computed again
     """
-    sides = _both_sides(cases, baseline, progress, map_function, known)
+    sides = _both_sides(cases, baseline, progress, map_function)
     before, after = (_side(runs) for runs in sides)
     after["pooled"]["rmse_3d_gain_ci"] = _gain_interval(before, after, shift_std)
     return before, after
@@ -230,29 +227,17 @@ def _both_sides(
     baseline: Baseline,
     progress: Callable[[], object],
     map_function: MapFunction,
-    known: KnownRuns = (),
 ) -> Iterator[Iterator[tuple[ValidationCase, Run]]]:
     """Yield the cases with runs of the baseline, then with their own runs, computed on demand."""
     baseline.prepare([case.flight for case in cases], progress, map_function)
     yield ((replace(case, effects=baseline.base), baseline.run(case.flight)) for case in cases)
 
     def after() -> Iterator[tuple[ValidationCase, Run]]:
-        again = [_known_run(case, known) for case in cases]
-        missing = [case for case, run in zip(cases, again) if run is None]
-        made = iter(map_function(partial(_run, baseline.config), missing))
-        for case, run in zip(cases, again):
-            yield case, next(made) if run is None else run
+        for case, run in zip(cases, map_function(partial(_run, baseline.config), cases)):
+            yield case, run
             progress()
 
     yield after()
-
-
-def _known_run(case: ValidationCase, known: KnownRuns) -> Run | None:
-    """Return the known Run of the flight and the effects of a case; None without one."""
-    for other, run in known:
-        if other.flight is case.flight and other.effects == case.effects:
-            return run
-    return None
 
 
 def _run(config: FilterConfig | None, case: ValidationCase) -> Run:

@@ -21,7 +21,7 @@ from ..checking.flight_rules import judge_flight
 from ..scoring.gains import LOSS, gain
 from ..scoring.metrics import Score, radio_residuals
 from . import comparison, repairing, validation
-from .attribution import Attribution, attribute, residuals_of
+from .attribution import Attribution, EffectSearch, residuals_of
 from .channels import CHANNELS, health
 from .findings import EffectFinding, Refused, usable
 from .noise import DECIMALS
@@ -36,7 +36,7 @@ from .self_calibration.solve import same_anchors
 from .single_axes import beside, functions_of_axes
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Sequence
+    from collections.abc import Callable, Sequence
 
     from uwb_tdoa_bias.common.flight import Flight
 
@@ -117,7 +117,8 @@ def diagnose(
         found, selected = _with_functions_of_axes(work, sound, rest, *_searched(work, sound, rest))
         outcome = _by_error(work, found, selected, fitted, held_out, repairs)
     else:
-        found = _attributed(work, sound, rest)
+        search = work.search(sound, rest)
+        found = search.reported(search.found())
         outcome = _by_self_calibration(work, found, (fitted, sound), held_out, rest)
     judging = work.saying("judging")
     remaining = residuals_of(fitted, reference, outcome.effects, judging, map_function)
@@ -236,6 +237,13 @@ class _Work(NamedTuple):
         """Return a function that passes a text to `progress`."""
         return lambda: self.progress(what)
 
+    def search(self, flights: Flights, base: EffectSet) -> EffectSearch:
+        """Return the search for effects of Flights beyond the EffectSet `base`."""
+        tracing = self.saying("tracing residuals to effects")
+        return EffectSearch(
+            flights, self.reference, base, progress=tracing, map_function=self.map_function
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class _Outcome:
@@ -259,51 +267,41 @@ class _Outcome:
     changes: tuple[str, ...] = ()
 
 
-def _attributed(
-    work: _Work, flights: Flights, base: EffectSet, kinds: Collection[str] | None = None
-) -> Attribution:
-    """Return the Attribution of Flights with the EffectSet `base`; kinds : as of `attribute`."""
-    tracing = work.saying("tracing residuals to effects")
-    return attribute(
-        flights, work.reference, base, kinds, progress=tracing, map_function=work.map_function
-    )
-
-
 def _searched(
     work: _Work, flights: Flights, base: EffectSet
 ) -> tuple[Attribution, validation.ValidatedSelection]:
     """Return the Attribution of Flights with known errors, and what of it helps the filter.
 
     A declared effect can explain residuals in place of another one, and mislead the filter. The
-    search is repeated without such effects, as long as the error falls by more than LOSS.
+    search goes on without such effects, as long as the error falls by more than LOSS.
     """
     trying = work.saying("running the filter without each")
     baseline = comparison.Baseline(base, work.config)
 
-    def searched(kinds: Collection[str]) -> tuple[Attribution, validation.ValidatedSelection]:
-        found = _attributed(work, flights, base, kinds)
+    def judged(found: Attribution) -> validation.ValidatedSelection:
         # The report keeps a finding that does not help the filter, but it is not added.
         model = replace(found, selection=written(found.selection, found.candidates))
-        return found, validation.select_by_error(
-            model, flights, baseline, trying, work.map_function
-        )
+        return validation.select_by_error(model, flights, baseline, trying, work.map_function)
 
-    kinds = frozenset(EFFECTS)
-    best = searched(kinds)
+    search = work.search(flights, base)
+    found = search.found()
+    selected = judged(found)
     refused: tuple[Refused, ...] = ()
     while True:
-        for names in _suspects(*best):
-            trial = searched(kinds - names)
-            if gain(best[1].error, trial[1].error) > LOSS:
+        for names in _suspects(found, selected):
+            fewer = search.without(names)
+            other = fewer.found(found.selection)
+            trial = judged(other)
+            if gain(selected.error, trial.error) > LOSS:
                 break
         else:
-            return best[0], replace(best[1], refused=(*refused, *best[1].refused))
+            return search.reported(found), replace(selected, refused=(*refused, *selected.refused))
         # The repeated search does not report these effects.
-        known = [one for one in best[1].refused if one.what in names]
-        better = validation.why_without(best[1].error, trial[1].error)
+        known = [one for one in selected.refused if one.what in names]
+        better = validation.why_without(selected.error, trial.error)
         others = sorted(names.difference(one.what for one in known))
         refused = (*refused, *known, *(Refused(name, better) for name in others))
-        kinds, best = kinds - names, trial
+        search, found, selected = fewer, other, trial
 
 
 def _with_functions_of_axes(
@@ -325,11 +323,16 @@ def _with_functions_of_axes(
     if not functions:
         return found, selected
     trial = validation.select_by_error(
-        replace(found, selection=beside(selected.selection, functions)),
+        replace(
+            found,
+            selection=beside(selected.selection, functions),
+            detections=selected.detections,
+        ),
         flights,
         comparison.Baseline(base, work.config),
         work.saying("running the filter without each"),
         work.map_function,
+        validated=selected.selection.chosen,
     )
     if gain(selected.error, trial.error) <= LOSS:
         return found, selected
@@ -391,7 +394,7 @@ def _by_error(
         shift_std=work.reference.shift_std,
         map_function=map_function,
     )
-    before, after = judged(cases, known=selected.runs)
+    before, after = judged(cases)
     refused = list(selected.refused)
     shift_std = max(work.reference.shift_std(flight.name).max() for flight in fitted)
     why_not = comparison.why_not(before, after, shift_std)

@@ -12,9 +12,9 @@ import numpy as np
 from uwb_tdoa_bias.effects import EffectSet, LabelEffect
 
 from ..checking.pair_rules import KnownPath, repairs
-from .comparison import ValidationCase
+from .comparison import Baseline, ValidationCase, score
 from .detectors import Detection
-from .validation import TRIAL_FLIGHTS, WORSE, error_of
+from .validation import TRIAL_FLIGHTS, WORSE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -107,9 +107,10 @@ def _error(
     progress: Callable[[], object],
 ) -> float:
     """Return the mean 3D RMSE, m, of at most TRIAL_FLIGHTS flights."""
-    errors = []
+    model, errors = Baseline(EffectSet(tuple(effects)), config), []
     for flight in flights[:: -(-len(flights) // TRIAL_FLIGHTS)]:
-        errors.append(error_of(config, (ValidationCase(flight, EffectSet(tuple(effects))), None)))
+        case = ValidationCase(flight, model.base)
+        errors.append(score(case, model.run(flight)).rmse_3d)
         progress()
     return float(np.mean(errors))
 

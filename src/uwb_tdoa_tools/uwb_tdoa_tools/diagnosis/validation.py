@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from uwb_tdoa_bias.correction.corrector import Corrector, FixedPoseCorrector
+from uwb_tdoa_bias.correction.corrector import FixedPoseCorrector
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.results import poses_of
@@ -29,7 +29,7 @@ from .regression.table import BLOCK
 from .regression.terms import Candidate, columns_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Collection, Sequence
 
     from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_ekf.core.config import FilterConfig
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 
     from ..parallel import MapFunction
     from .attribution import Attribution
-    from .comparison import KnownRuns
     from .detectors import Detection
 
     Poses = tuple[np.ndarray, ...]  # return value of `poses_of`
@@ -71,7 +70,6 @@ class ValidatedSelection:
     worth : {candidate or detection: increase of the mean 3D RMSE without it, m}; for dropped ones,
         at the time they were dropped
     error : mean 3D RMSE of the trials, m
-    runs : runs of the filter as in the nodes, made on the way, by their cases
     """
 
     selection: Selection
@@ -79,7 +77,6 @@ class ValidatedSelection:
     refused: tuple[Refused, ...]
     worth: dict[Candidate | Detection, float]
     error: float
-    runs: KnownRuns = ()
 
     @property
     def misleading(self) -> set[str]:
@@ -165,17 +162,17 @@ def select_by_error(
     baseline: Baseline,
     progress: Callable[[], object] = lambda: None,
     map_function: MapFunction = map,
+    validated: Collection[Candidate] = (),
 ) -> ValidatedSelection:
     """Return the ValidatedSelection of effects that do not make the filter worse on hold-out data.
 
     The filter runs without each candidate. The displacements of the position by all candidates
     then predict the error without several of them, and candidates are dropped one by one by this
     prediction. The filter runs again with the rest, until no candidate is dropped. Detections stay
-    only if the error falls with them. At most TRIAL_FLIGHTS flights are judged. Trials correct
-    measurements at the poses of a run with all effects. Of two flights none may get worse by an
+    only if the error falls with them. At most TRIAL_FLIGHTS flights are judged. Of two flights none may get worse by an
     effect. Events at a time of a single flight are tried for their worth, but not kept.
 
-    map_function : as of `attribute`
+    map_function : as of `attribute`; validated : Candidates that stay without another trial
     """
     candidates, refused = list(attribution.selection.chosen), []
     detections: list[Detection] = []
@@ -183,7 +180,7 @@ def select_by_error(
     trials = _Trials(attribution, flights, baseline, progress, map_function)
     worth: dict[Candidate | Detection, float] = {}
     error = trials.start(candidates, detections)
-    while applicable := _applicable(candidates):
+    while applicable := [one for one in _applicable(candidates) if one not in validated]:
         displacements = trials.displacements(candidates, applicable)
         gone = _dropped(displacements, applicable, alone)
         if not gone:
@@ -236,9 +233,7 @@ def select_by_error(
         )
         candidates = [one for one in candidates if one is not momentary]
     selection = attribution.selection.kept(candidates)  # with the weights of the trials
-    return ValidatedSelection(
-        selection, tuple(detections), tuple(refused), worth, error, trials.runs
-    )
+    return ValidatedSelection(selection, tuple(detections), tuple(refused), worth, error)
 
 
 def _harmful(
@@ -371,8 +366,9 @@ def _momentary(candidate: Candidate) -> bool:
 class _Trials:
     """Mean 3D RMSE, m, of cross-fitted models.
 
-    The first model runs like the nodes. Later models use the poses of that run, which takes a tenth
-    of the time.
+    Measurements are corrected at the poses of an earlier run, which takes a fifth of the time of
+    the corrections in the nodes. The first model runs at the poses of the baseline, and then again
+    at its own.
     """
 
     def __init__(
@@ -390,20 +386,24 @@ class _Trials:
             progress,
         )
         self._map_function = map_function
-        self._poses: Sequence[Poses | None] = [None]
-        self._now: list[tuple[Run, Score]] = []
-        self.runs: KnownRuns = ()
+        self._poses: list[Poses] = []
+        self._now: list[Score] = []
         # {candidate: (return value of `_moved`, [return value of `_change`] of each case)}
         self._known: dict[Candidate, tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]]] = {}
 
     def start(self, candidates: Sequence[Candidate], detections: Sequence[Detection]) -> float:
-        """Return the error of a model, m, and keep its runs and their poses for later trials."""
+        """Return the error of a model, m, and keep its scores and poses for later trials."""
         cases = self._cases(candidates, detections)
-        self._now = self._tried(_judged, cases)
-        if self._poses == [None]:
-            self.runs = tuple((case, run) for case, (run, _) in zip(cases, self._now))
-        self._poses = [poses_of(run.odometry) for run, _ in self._now]
-        return float(np.mean([judged.rmse_3d for _, judged in self._now]))
+        if not self._poses:
+            flights = [case.flight for case in cases]
+            self._baseline.prepare(flights, self._progress, self._map_function)
+            runs = [self._baseline.run(flight) for flight in flights]
+            self._poses = [poses_of(run.odometry) for run in runs]
+            self._poses = [poses_of(run.odometry) for run, _ in self._tried(_judged, cases)]
+        judged = self._tried(_judged, cases)
+        self._now = [of_case for _, of_case in judged]
+        self._poses = [poses_of(run.odometry) for run, _ in judged]
+        return float(np.mean([of_case.rmse_3d for of_case in self._now]))
 
     def error(self, candidates: Sequence[Candidate], detections: Sequence[Detection]) -> float:
         """Return the error of a model, m."""
@@ -423,10 +423,10 @@ class _Trials:
         models = [self._cases([c for c in candidates if c is not one], ()) for one in anew]
         tried = iter(self._tried(_scored, list(chain.from_iterable(models))))
         for one in anew:
-            self._known[one] = moves[one], [_change(now, next(tried)) for _, now in self._now]
+            self._known[one] = moves[one], [_change(now, next(tried)) for now in self._now]
         errors = []
         changes: dict[Candidate, list[np.ndarray]] = {one: [] for one in each}
-        for k, (_, now) in enumerate(self._now):
+        for k, now in enumerate(self._now):
             several = {one: self._known[one][1][k] for one in each}
             t = reduce(np.intersect1d, [of_one for of_one, _ in several.values()], now.t)
             errors.append(now.error[np.isin(now.t, t)])
@@ -460,7 +460,7 @@ class _Trials:
 
     def _tried(
         self,
-        function: Callable[[FilterConfig | None, tuple[ValidationCase, Poses | None]], Made],
+        function: Callable[[FilterConfig | None, tuple[ValidationCase, Poses]], Made],
         cases: Sequence[ValidationCase],
     ) -> list[Made]:
         """Return function of each trial; several models follow each other."""
@@ -478,29 +478,14 @@ def _change(now: Score, other: Score) -> tuple[np.ndarray, np.ndarray]:
     return t, other.error[np.isin(other.t, t)] - now.error[np.isin(now.t, t)]
 
 
-def error_of(config: FilterConfig | None, trial: tuple[ValidationCase, Poses | None]) -> float:
-    """Return the 3D RMSE of a trial, m."""
-    return _scored(config, trial).rmse_3d
-
-
-def _scored(config: FilterConfig | None, trial: tuple[ValidationCase, Poses | None]) -> Score:
+def _scored(config: FilterConfig | None, trial: tuple[ValidationCase, Poses]) -> Score:
     return _judged(config, trial)[1]
 
 
-def _judged(
-    config: FilterConfig | None, trial: tuple[ValidationCase, Poses | None]
-) -> tuple[Run, Score]:
-    """Return the Run and the Score of a trial.
-
-    trial : ValidationCase, and the poses for corrections, None to use the poses of the run
-    """
+def _judged(config: FilterConfig | None, trial: tuple[ValidationCase, Poses]) -> tuple[Run, Score]:
+    """Return the Run and the Score of a trial: ValidationCase, and the poses for corrections."""
     case, poses = trial
-    anchors, effects = case.flight.anchors, case.effects
-    corrector = (
-        Corrector(anchors, effects)
-        if poses is None
-        else FixedPoseCorrector(anchors, effects, poses)
-    )
+    corrector = FixedPoseCorrector(case.flight.anchors, case.effects, poses)
     run = run_offline(case.flight, config, corrector)
     return run, score(case, run)
 
