@@ -9,7 +9,7 @@ import undeclared
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, LabelEffect, SmoothTerm
 from uwb_tdoa_tools.calibrating import between
 from uwb_tdoa_tools.diagnosis import attribution, refinement
-from uwb_tdoa_tools.diagnosis.attribution import attribute, residuals_of
+from uwb_tdoa_tools.diagnosis.attribution import EffectSearch, attribute, residuals_of
 from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.refinement import _simpler, effects_of, relinearised
@@ -98,6 +98,21 @@ def test_an_interval_of_nlos_is_found_with_its_anchor_and_time(flight):
 def test_noise_is_told_from_bias(flight, name):
     rng = np.random.default_rng(0)
     assert names_found(quick(effect_of(name, True, 3).inject(flight, rng))) == [name]
+
+
+def test_a_search_goes_on_without_an_effect_and_keeps_the_others(flight):
+    both = effect_of("anchor_delay", True, 3).inject(
+        effect_of("accel_bias", True, 1).inject(flight)
+    )
+    search = EffectSearch([both], TRUTH, undeclared=False)
+    found = search.found()
+    assert set(names_found(found)) == {"accel_bias", "anchor_delay"}
+    fewer = search.without({"anchor_delay"})
+    other = fewer.found(found.selection)
+    assert "accel_bias" in names_found(other) and "anchor_delay" not in names_found(other)
+    assert "anchor_delay" not in {one.name for one in other.candidates}
+    assert names_found(search.found(found.selection)) == names_found(found)
+    assert "anchor_position" not in names_found(fewer.without({"anchor_position"}).found())
 
 
 def test_an_undeclared_effect_is_found_by_its_covariate(flight):

@@ -52,7 +52,7 @@ def test_streams_that_the_filter_does_not_use_are_left_out_of_everything(flight,
         raise InputError("seen")
 
     module = import_module("uwb_tdoa_tools.diagnosis.diagnose")
-    monkeypatch.setattr(module, "attribute", stop)
+    monkeypatch.setattr(module, "EffectSearch", stop)
     height = Height(flight.truth.t, flight.truth.p[:, 2])
     config = FilterConfig(use_height=False, use_imu=False)
     with pytest.raises(InputError, match="seen"):
@@ -65,11 +65,31 @@ def test_streams_that_the_filter_does_not_use_are_left_out_of_everything(flight,
 
 @dataclass(frozen=True)
 class Found:
-    """The result of `attribute` without the effects that are left out."""
+    """The result of a search without the effects that are left out."""
 
     left_out: frozenset
     selection: SimpleNamespace
     candidates: tuple = ()
+
+
+@dataclass(frozen=True)
+class ScriptedSearch:
+    """A search that finds an error of the ground truth, if it may."""
+
+    left_out: frozenset = frozenset()
+
+    def without(self, names):
+        return ScriptedSearch(self.left_out | names)
+
+    def found(self, start=None):
+        assert (start is None) == (not self.left_out), "a repeated search goes on from the last"
+        frame = Candidate((Term(EFFECTS["truth_frame"](), ()),))
+        chosen = (frame,) * ("truth_frame" not in self.left_out)
+        return Found(self.left_out, SimpleNamespace(chosen=chosen))
+
+    def reported(self, found):
+        assert found.left_out == self.left_out
+        return found
 
 
 @pytest.mark.parametrize(
@@ -86,11 +106,6 @@ def test_the_search_is_repeated_without_what_misleads_the_filter(errors, without
     module = import_module("uwb_tdoa_tools.diagnosis.diagnose")
     several = iter(errors)
 
-    def attributed(flights, reference, base, kinds, **_):
-        left_out = frozenset(EFFECTS) - kinds
-        frame = Candidate((Term(EFFECTS["truth_frame"](), ()),))
-        return Found(left_out, SimpleNamespace(chosen=(frame,) * ("truth_frame" in kinds)))
-
     def validated(found, *_):
         error = next(several)
         worst = next(one for one in ("anchor_delay", "nlos", "") if one not in found.left_out)
@@ -98,7 +113,7 @@ def test_the_search_is_repeated_without_what_misleads_the_filter(errors, without
         refused = (Refused(worst, "misleads"), Refused("other", str(error)))
         return ValidatedSelection(None, (), refused, worth, error)
 
-    monkeypatch.setattr(module, "attribute", attributed)
+    monkeypatch.setattr(module, "EffectSearch", lambda *_, **__: ScriptedSearch())
     monkeypatch.setattr(module, "written", lambda selection, _: selection)
     monkeypatch.setattr(module.validation, "select_by_error", validated)
     work = module._Work(None, EffectSet(), None, print, map)

@@ -99,7 +99,7 @@ def test_functions_are_taken_only_with_a_clear_gain(wandering, found, monkeypatc
     refused = (Refused("nlos", "as before"), Refused("noise_level", "as before"))
     first = ValidatedSelection(nothing, (), refused, {}, 1.0)
     second = ValidatedSelection(nothing, (), (Refused("noise_level", "anew"),), {}, error)
-    monkeypatch.setattr(module.validation, "select_by_error", lambda *_: second)
+    monkeypatch.setattr(module.validation, "select_by_error", lambda *_, **__: second)
     monkeypatch.setattr(module, "functions_of_axes", lambda *_: found)
     work = module._Work(GroundTruth(), EffectSet(), None, lambda what: None, map)
     searched = module._with_functions_of_axes(work, wandering, EffectSet(), attribution, first)

@@ -73,6 +73,19 @@ def test_each_of_six_flights_is_tried(flights):
     assert [case.flight.name for case in cases] == list("012345")
 
 
+def test_a_validated_effect_stays_without_another_trial(attribution):
+    """The delay does harm to flights without it."""
+    clean = [sparse_flight(seed, 30.0) for seed in (100, 101)]
+    chosen = attribution.selection.chosen
+    dropped, kept = (
+        select_by_error(attribution, clean, Baseline(NONE), validated=validated)
+        for validated in ((), chosen)
+    )
+    assert dropped.selection.chosen == () and dropped.worth.keys() == set(chosen)
+    assert kept.selection.chosen == chosen and not kept.worth
+    assert kept.error > 2.0 * dropped.error
+
+
 @pytest.mark.parametrize("loss, misleads", [(0.004, True), (0.001, False)])
 def test_a_named_effect_that_raises_the_error_misleads(loss, misleads):
     candidate = Candidate((Term(EFFECTS["nlos"](), ()),))

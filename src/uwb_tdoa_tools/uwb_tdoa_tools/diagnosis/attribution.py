@@ -331,8 +331,8 @@ class EffectSearch:
 
     @cached_property
     def _smooth(self) -> list[Candidate]:
-        """Return the Candidates of functions without a name."""
-        return _smooth(self._current, self._installation)
+        """Return the Candidates of functions without a name, if such are searched."""
+        return _smooth(self._current, self._installation) if self._undeclared else []
 
     def _named(self) -> Selection:
         """Select declared effects, ROUNDS times, each time linearized at the values found before."""
@@ -370,23 +370,17 @@ class EffectSearch:
         start : Selection of an earlier search for more effects
         """
         kept = [one for one in start.chosen if one.name not in self._left_out]
+        scan = self._scan_of(start.table) if self._undeclared else None
+        everything, inflation = [*self._smooth, *self.declared], start.fit.inflation
         selection = select(
-            start.table,
-            [*self._smooth, *self.declared],
-            start.fit.inflation,
-            self.search,
-            self._scan_of(start.table),
-            kept,
-            self.progress,
+            start.table, everything, inflation, self.search, scan, kept, self.progress
         )
         return relinearised(selection, self.residuals, self.declared + self._smooth)
 
     def _with_alternatives(self, selection: Selection) -> Selection:
         """Return the Selection with the rivals of each effect."""
-        if not self._undeclared:
-            return with_rivals(selection, self.declared, None, self.progress)
-        candidates = self.declared + self._smooth
-        return with_rivals(selection, candidates, self._scan_of(selection.table), self.progress)
+        scan = self._scan_of(selection.table) if self._undeclared else None
+        return with_rivals(selection, self.declared + self._smooth, scan, self.progress)
 
     def _detections(self, selection: Selection) -> tuple[Detection, ...]:
         """Return what the detectors find in the residuals under a Selection."""
