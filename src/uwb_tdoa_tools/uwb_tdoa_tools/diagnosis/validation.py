@@ -80,14 +80,11 @@ class ValidatedSelection:
 
     @property
     def misleading(self) -> set[str]:
-        """Return the names of declared effects that explain residuals and mislead the filter.
-
-        Without one of them the error falls by more than WORSE.
-        """
+        """Return the names of declared effects that explain residuals and do not help the filter."""
         return {
             one.name
-            for one, gained in self.worth.items()
-            if isinstance(one, Candidate) and one.name in EFFECTS and -gained > WORSE * self.error
+            for one in self.worth
+            if isinstance(one, Candidate) and one.declared and one not in self.selection.chosen
         }
 
     def applied(self, attribution: Attribution) -> Attribution:

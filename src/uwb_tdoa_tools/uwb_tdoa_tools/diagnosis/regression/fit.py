@@ -196,10 +196,10 @@ def _one_each(table: RegressionTable) -> np.ndarray:
 
 def student_scale(r: np.ndarray) -> float:
     """Return the scale of Student's t for residuals r (n,), in their unit."""
-    scale = max(1.4826 * np.median(np.abs(r)), 1e-9)
+    scale, square = max(1.4826 * np.median(np.abs(r)), 1e-9), r * r
     for _ in range(15):
-        w = (NU + 1.0) / (NU + (r / scale) ** 2)
-        scale = max(np.sqrt(np.mean(w * r**2)), 1e-9)
+        mean = (square / (NU + square / scale**2)).sum() / len(r)
+        scale = max(np.sqrt((NU + 1.0) * mean), 1e-9)
     return scale
 
 
