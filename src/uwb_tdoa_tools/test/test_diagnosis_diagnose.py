@@ -109,9 +109,8 @@ def test_the_search_is_repeated_without_what_misleads_the_filter(errors, without
     def validated(found, *_):
         error = next(several)
         worst = next(one for one in ("anchor_delay", "nlos", "") if one not in found.left_out)
-        worth = {Candidate((Term(EFFECTS[worst](), ()),)): -0.1} if worst else {}
         refused = (Refused(worst, "misleads"), Refused("other", str(error)))
-        return ValidatedSelection(None, (), refused, worth, error)
+        return ValidatedSelection(None, (), refused, {}, error, frozenset((worst,)) - {""})
 
     monkeypatch.setattr(module, "EffectSearch", lambda *_, **__: ScriptedSearch())
     monkeypatch.setattr(module, "written", lambda selection, _: selection)

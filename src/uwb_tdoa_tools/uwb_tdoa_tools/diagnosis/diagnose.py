@@ -272,7 +272,7 @@ def _searched(
 ) -> tuple[Attribution, validation.ValidatedSelection]:
     """Return the Attribution of Flights with known errors, and what of it helps the filter.
 
-    A declared effect can explain residuals in place of another one, and mislead the filter. The
+    A declared effect can explain residuals in place of another one, and not help the filter. The
     search goes on without such effects, as long as the error falls by more than LOSS.
     """
     trying = work.saying("running the filter without each")
@@ -353,7 +353,7 @@ def _with_functions_of_axes(
 def _suspects(found: Attribution, selected: validation.ValidatedSelection) -> list[frozenset[str]]:
     """Return the names of effects to search without: errors of the reference, and misleading ones.
 
-    The first are tried beside misleading ones only. Nodes do not get them, and the values of other
+    The first are tried only if there are misleading ones. Nodes do not get them, and the values of other
     effects depend on them.
     """
     misleading = selected.misleading

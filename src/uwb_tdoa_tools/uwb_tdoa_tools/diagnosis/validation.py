@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from uwb_tdoa_bias.correction.corrector import FixedPoseCorrector
-from uwb_tdoa_bias.effects import EFFECTS, EffectSet
+from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.results import poses_of
 
@@ -70,6 +70,7 @@ class ValidatedSelection:
     worth : {candidate or detection: increase of the mean 3D RMSE without it, m}; for dropped ones,
         at the time they were dropped
     error : mean 3D RMSE of the trials, m
+    misleading : names of declared effects that explain residuals and do not help the filter
     """
 
     selection: Selection
@@ -77,15 +78,7 @@ class ValidatedSelection:
     refused: tuple[Refused, ...]
     worth: dict[Candidate | Detection, float]
     error: float
-
-    @property
-    def misleading(self) -> set[str]:
-        """Return the names of declared effects that explain residuals and do not help the filter."""
-        return {
-            one.name
-            for one in self.worth
-            if isinstance(one, Candidate) and one.declared and one not in self.selection.chosen
-        }
+    misleading: frozenset[str] = frozenset()
 
     def applied(self, attribution: Attribution) -> Attribution:
         """Return the Attribution with the selected effects only."""
@@ -176,6 +169,7 @@ def select_by_error(
     alone = len(flights) == 1
     trials = _Trials(attribution, flights, baseline, progress, map_function)
     worth: dict[Candidate | Detection, float] = {}
+    misleading: set[str] = set()
     error = trials.start(candidates, detections)
     while applicable := [one for one in _applicable(candidates) if one not in validated]:
         displacements = trials.displacements(candidates, applicable)
@@ -204,6 +198,7 @@ def select_by_error(
         for one, (before, after) in gone.items():
             refused.append(Refused(one.label, why_without(before, after)))
             worth[one] = after - before
+        misleading.update(one.name for one in gone if one.declared)
         candidates = kept
     for detection in attribution.detections:
         if not detection.effect.usable:
@@ -230,7 +225,9 @@ def select_by_error(
         )
         candidates = [one for one in candidates if one is not momentary]
     selection = attribution.selection.kept(candidates)  # with the weights of the trials
-    return ValidatedSelection(selection, tuple(detections), tuple(refused), worth, error)
+    return ValidatedSelection(
+        selection, tuple(detections), tuple(refused), worth, error, frozenset(misleading)
+    )
 
 
 def _harmful(
