@@ -367,16 +367,15 @@ def test_what_makes_one_flight_worse_is_not_applied(changes, worst):
 
 
 class Some(str):
-    """The label of a candidate that the nodes can correct."""
+    """The label of a declared candidate that the nodes can correct."""
 
-    label = property(str)
+    label = name = property(str)
+    declared = True
     terms = (SimpleNamespace(effect=SimpleNamespace(usable=True), function=None),)
 
 
 class Worth:
     """Trials of effects with known worth. Without both "a" and "b", the error is 0.5 m larger."""
-
-    runs = ()
 
     def __init__(self, worth):
         self.worth = worth
@@ -417,6 +416,7 @@ def test_fewer_are_dropped_where_displacements_do_not_add_up(monkeypatch):
         "c": pytest.approx(0.2),
     }
     assert "the filter does better without it" in found.refused[0].why
+    assert found.misleading == {"a"}
 
 
 def test_what_another_flight_may_not_have_is_said_and_not_kept(monkeypatch):
