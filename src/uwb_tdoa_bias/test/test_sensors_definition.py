@@ -202,7 +202,7 @@ def test_values_of_another_form_are_named():
         (
             {"content": lambda of: {"variance": of.pressure}},
             "`content`: it writes variance. From fluid_pressure, `columns` then reads another "
-            "`pressure`. Write the fields that are read",
+            "`pressure`. Check the names in `fields`, and write these fields in the unit that is read",
         ),
         ({"content": lambda of: {}}, "`content`: it writes nothing. From fluid_pressure"),
         (
@@ -228,6 +228,10 @@ def test_values_of_another_form_are_named():
         (
             {"measured": lambda of: ({"value": of.values}, np.zeros(3, dtype=bool))},
             "`measured`: it takes none of the simulated measurements. Compare units",
+        ),
+        (
+            {"measured": lambda of: ({"value": np.nan * of.values}, np.ones(3, dtype=bool))},
+            "`measured`: a usable `value` is not finite. Refuse it in usable",
         ),
         ({"measured": lambda of: None}, "`measured`: return two things"),
     ],

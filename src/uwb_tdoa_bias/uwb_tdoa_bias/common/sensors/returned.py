@@ -177,7 +177,8 @@ def check_read_back(name: str, content: dict, wanted: dict, stream: Any, back: A
                 name,
                 "content",
                 f"it writes {', '.join(content) or 'nothing'}. From {', '.join(wanted)}, `columns` "
-                f"then reads another `{array.name}`. Write the fields that are read, in their unit.",
+                f"then reads another `{array.name}`. Check the names in `fields`, and write these "
+                "fields in the unit that is read.",
             )
 
 

@@ -215,7 +215,11 @@ class Sensor:
         returned.check_sound(self.name, numbers, self.sound(numbers))
         back = self.read(stream.t, numbers)
         returned.check_read_back(self.name, content, self.fields, stream, back)
-        _, usable = self.rows(stream)
+        rows, usable = self.rows(stream)
+        if not np.isfinite(np.asarray(rows["value"])[usable]).all():
+            raise returned.mistake(
+                self.name, "measured", "a usable `value` is not finite. Refuse it in usable."
+            )
         if len(stream) and not usable.any():
             raise returned.mistake(
                 self.name,
