@@ -39,6 +39,22 @@ class Mute(Empty):
 
 
 @dataclass(frozen=True)
+class Pair(Mute):
+    @property
+    def values(self):
+        return np.column_stack([self.depth, self.depth])
+
+    def with_values(self, values):
+        return replace(self, depth=values[:, 0])
+
+
+@dataclass(frozen=True)
+class Forgetful(Pressure):
+    def with_values(self, values):
+        replace(self, pressure=values[:, 0])
+
+
+@dataclass(frozen=True)
 class Late(Pressure):
     depth: np.ndarray
     t: np.ndarray
@@ -80,6 +96,9 @@ def registry(monkeypatch):
         ({"fields": {"fluid_pressure": 0}}, "`fields`: give {field of the message: count"),
         ({"measured": None}, "`measured`: this is no function"),
         ({"noise": 0.1}, "`noise`: give (unit, words, standard deviation)"),
+        ({"noise": (0.1, "M", "write depths")}, "`noise`: give (unit, words, standard deviation)"),
+        ({"rate": 0.0}, "`rate`: 0.0 is no rate. Give Hz, above 0"),
+        ({"rate": None}, "`rate`: None is no rate"),
         ({"stream": dict}, "`stream`: give a class that inherits from Stream"),
         ({"stream": Undecorated}, "`stream`: put @dataclass(frozen=True) before Undecorated"),
         ({"stream": Late}, "`stream`: the first array of Late must be t"),
@@ -171,6 +190,56 @@ def test_values_of_another_form_are_named():
     check_values(NEW.name, Pressure(T, T))
     with pytest.raises(InputError, match=re.escape("`values` has the shape (3, 1, 1), not (n, k)")):
         check_values(NEW.name, Pressure(T, T[:, None]))
+    with pytest.raises(InputError, match="`values` has 2 columns. Effects change 1 value, or 3"):
+        check_values(NEW.name, Pair(T, T))
+    with pytest.raises(InputError, match="`with_values` returns NoneType. Return `replace"):
+        check_values(NEW.name, Forgetful(T, T))
+
+
+@pytest.mark.parametrize(
+    "changes, text",
+    [
+        (
+            {"content": lambda of: {"variance": of.pressure}},
+            "`content`: it writes variance. From fluid_pressure, `columns` then reads another "
+            "`pressure`. Check the names in `fields`, and write these fields in the unit that is read",
+        ),
+        ({"content": lambda of: {}}, "`content`: it writes nothing. From fluid_pressure"),
+        (
+            {"content": lambda of: {"fluid_pressure": 0.01 * of.pressure}},
+            "`content`: it writes fluid_pressure. From fluid_pressure, `columns` then reads another",
+        ),
+        ({"content": lambda of: None}, "`content`: it returns NoneType. Return {field of the"),
+        (
+            {"content": lambda of: {"fluid_pressure": of.pressure[:, None]}},
+            "`content`: fluid_pressure has the shape (3, 1), not (3,)",
+        ),
+        ({"columns": lambda fields: None}, "`columns`: it returns no tuple"),
+        ({"sound": lambda fields: None}, "`sound`: return {field: bool} for fluid_pressure"),
+        ({"sound": lambda fields: {}}, "`sound`: return {field: bool} for fluid_pressure"),
+        (
+            {"sound": lambda fields: {"fluid_pressure": True}},
+            "`sound`: fluid_pressure has the shape (), not (3,), as its numbers",
+        ),
+        (
+            {"sound": lambda fields: {"fluid_pressure": np.zeros(3, dtype=bool)}},
+            "`simulated`: `sound` refuses some numbers of fluid_pressure. Return finite ones",
+        ),
+        (
+            {"measured": lambda of: ({"value": of.values}, np.zeros(3, dtype=bool))},
+            "`measured`: it takes none of the simulated measurements. Compare units",
+        ),
+        (
+            {"measured": lambda of: ({"value": np.nan * of.values}, np.ones(3, dtype=bool))},
+            "`measured`: a usable `value` is not finite. Refuse it in usable",
+        ),
+        ({"measured": lambda of: None}, "`measured`: return two things"),
+    ],
+)
+def test_a_simulated_stream_that_cannot_be_written_read_or_measured_is_named(changes, text):
+    NEW.check_simulated(Pressure(T, np.full(3, 1e5)))
+    with pytest.raises(InputError, match=re.escape(f"sensor sonar, {text}")):
+        replace(NEW, **changes).check_simulated(Pressure(T, np.full(3, 1e5)))
 
 
 @pytest.mark.parametrize(
@@ -183,6 +252,8 @@ def test_values_of_another_form_are_named():
         (({"std": np.ones((3, 5))}, T > 0), "std has the shape (3, 5), not (n, k) with k <= 4"),
         (({"anchor": T[:, None]}, T > 0), "anchor has the shape (3, 1), not (n,)"),
         (({"value": T[:, None]}, T[:, None] > 0), "usable has the shape (3, 1), not (n,)"),
+        (({"value": T[:, None]}, T), "return {'value': numbers, ...}, and usable (n,) bool"),
+        (({"std": T[:, None]}, T > 0), "return {'value': numbers, ...}, and usable (n,) bool"),
     ],
 )
 def test_measured_rows_of_another_form_are_named(returned, text):

@@ -6,6 +6,7 @@ The tests compare each update with the textbook, and fly with sensor faults.
 """
 
 from dataclasses import replace
+from importlib import import_module
 import subprocess
 import sys
 
@@ -304,6 +305,23 @@ def test_any_sensors_in_any_mode_leave_covariances(seed, robust, loss, names, sl
                 ]
             )
             assert_covariance(joint[np.ix_(there, there)], tolerance=1e-6)
+
+
+@pytest.mark.parametrize("name", [name for name in SENSORS if name != "range"])  # engine.py has it
+def test_two_measurements_of_one_stamp_leave_a_finite_state(name):
+    """Call `observe` alone: compiled code raises no error for a division by 0."""
+    ekf, parameters = new_state(np.eye(3)).record, FilterConfig().parameters()[0]
+    ekf.hypotheses[0]["log_weight"], ekf.hypotheses[0]["P"] = 0.0, np.eye(15)
+    ekf.hypotheses[0]["x"][:] = np.eye(16)[9]
+    rows, residuals = np.zeros(2, SENSOR_ROW), np.zeros(2, RESIDUAL)
+    rows["t"], rows["value"], rows["std"] = 5.0, 0.1, 0.1
+    observe = import_module(f"uwb_tdoa_ekf.core.{name}").observe
+    for row, residual in zip(rows.view(np.recarray), residuals.view(np.recarray)):
+        observe(ekf, parameters, row, residual, NOTHING)
+    finite = all(np.isfinite(ekf.hypotheses[0][field]).all() for field in ("x", "P", "log_weight"))
+    assert finite and np.isfinite(residuals["innovation"]).all(), (
+        f"`observe` of core/{name}.py divides by 0: limit a difference of stamps from below"
+    )
 
 
 def test_a_sensor_without_a_branch_in_the_filter_is_refused_at_the_start():

@@ -70,6 +70,13 @@ def test_a_bag_is_not_read_with_a_wrong_field(tmp_path, monkeypatch):
         read_bag(tmp_path / "sim.bag")
 
 
+def test_a_field_that_is_written_but_not_read_is_named_by_the_simulation(monkeypatch):
+    wrong = replace(OLD, content=lambda of: {"variance": of.pressure})
+    monkeypatch.setitem(SENSORS, "pressure", wrong)
+    with pytest.raises(InputError, match="sensor pressure, `content`: it writes variance"):
+        simulate(SimulationConfig(duration=16.0, pressure_noise=0.1))
+
+
 def test_a_field_that_is_written_wrongly_is_named():
     wrong = replace(OLD, content=lambda of: {"fluid_presure": of.pressure})
     with pytest.raises(

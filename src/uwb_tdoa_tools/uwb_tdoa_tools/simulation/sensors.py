@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.flight import Imu
 from uwb_tdoa_bias.common.sensors import SENSORS, Stream, Velocity
-from uwb_tdoa_bias.common.sensors.returned import check_values
 
 from .config import WHEELS_RATE, ImuErrors, SimulationConfig
 
@@ -89,7 +88,7 @@ def measure_sensors(config: SimulationConfig, room: Room, trajectory: Flyable) -
             lambda *shape: random.standard_normal((len(t), *shape)),
         )
         stream = sensor.stream_of("simulated", t, columns)
-        check_values(name, stream)
+        sensor.check_simulated(stream)
         out[name] = _of_wheels(stream, config, motion.body_rates[:, 2]) if wheels else stream
     return out
 

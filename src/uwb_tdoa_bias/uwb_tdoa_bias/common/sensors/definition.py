@@ -96,8 +96,10 @@ def check(sensor: Sensor) -> None:
     for attribute in FUNCTIONS:
         if not callable(getattr(sensor, attribute)):
             raise mistake(name, attribute, "this is no function.")
-    if not (isinstance(sensor.noise, tuple) and len(sensor.noise) == 3):
-        raise mistake(name, "noise", "give (unit, words, standard deviation).")
+    if [*map(type, sensor.noise if isinstance(sensor.noise, tuple) else ())] != [str, str, float]:
+        raise mistake(name, "noise", "give (unit, words, standard deviation), text, text, float.")
+    if not (isinstance(sensor.rate, int | float) and sensor.rate > 0.0):
+        raise mistake(name, "rate", f"{sensor.rate!r} is no rate. Give Hz, above 0.")
     _check_stream(sensor)
     _check_parameters(name, sensor.parameters)
 

@@ -207,6 +207,27 @@ class Sensor:
         """Return `measured` of a Stream; an InputError if its form is wrong."""
         return returned.check_rows(self.name, self.measured(stream), len(stream))
 
+    def check_simulated(self, stream: Stream) -> None:
+        """Raise an InputError if a simulated Stream cannot be written, read and measured."""
+        returned.check_values(self.name, stream)
+        content = self.content(stream)
+        numbers = returned.written(self.name, self.fields, content, len(stream))
+        returned.check_sound(self.name, numbers, self.sound(numbers))
+        back = self.read(stream.t, numbers)
+        returned.check_read_back(self.name, content, self.fields, stream, back)
+        rows, usable = self.rows(stream)
+        if not np.isfinite(np.asarray(rows["value"])[usable]).all():
+            raise returned.mistake(
+                self.name, "measured", "a usable `value` is not finite. Refuse it in usable."
+            )
+        if len(stream) and not usable.any():
+            raise returned.mistake(
+                self.name,
+                "measured",
+                "it takes none of the simulated measurements. Compare units and limits of "
+                "`measured` with `simulated`, and use less noise.",
+            )
+
 
 def parameter(
     default: float | str,
