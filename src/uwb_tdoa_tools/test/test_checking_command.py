@@ -31,6 +31,7 @@ def checked(tmp_path_factory):
     return folder, code, out.getvalue(), json.loads((folder / "out.json").read_text())
 
 
+@pytest.mark.slow
 def test_a_healthy_bag_is_ok(checked):
     _, _, out, content = checked
     (good,) = (line for line in out.splitlines() if line.startswith("good"))

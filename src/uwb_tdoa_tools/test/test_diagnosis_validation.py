@@ -64,6 +64,7 @@ def test_every_flight_is_judged_with_effects_that_it_took_no_part_in(flights, at
     assert attribution.selection.table.flights == 2
 
 
+@pytest.mark.slow
 def test_each_of_six_flights_is_tried(flights):
     """Three of them left out that a function does harm to a flight of the fit."""
     six = [replace(flight, name=str(k)) for k, flight in enumerate(3 * flights)]
@@ -93,6 +94,7 @@ def test_a_model_that_no_trial_changes_is_not_run_again(flights, attribution, mo
     assert known["pooled"] == again["pooled"]
 
 
+@pytest.mark.slow
 def test_a_displacement_is_used_again_where_corrections_have_not_changed(monkeypatch):
     """Without an accelerometer bias, the correction by the delay of an anchor stays the same."""
     flights = [
@@ -146,6 +148,7 @@ def test_what_does_harm_is_left_out_with_a_reason(flights, attribution):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "effect, recurs",
     [
@@ -184,6 +187,7 @@ def test_what_happened_at_a_time_of_one_flight_is_said_and_not_kept(effect, recu
         )
 
 
+@pytest.mark.slow
 def test_what_is_worth_little_is_kept_of_several_flights_and_not_of_one(flights):
     two = [EFFECTS["gyro_bias"]({"z": 0.006}).inject(flight) for flight in flights]
     found = [attribute(some, TRUTH, undeclared=False) for some in (two, two[:1])]
@@ -202,6 +206,7 @@ def test_what_is_worth_little_is_kept_of_several_flights_and_not_of_one(flights)
     )  # it is applied as tried
 
 
+@pytest.mark.slow
 def test_what_no_node_can_take_out_is_not_tried():
     flight = sparse_flight(100, 30.0)
     acceleration = np.linalg.norm(Track(flight.truth).motion(flight.imu.t).acceleration, axis=1)

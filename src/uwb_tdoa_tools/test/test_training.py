@@ -202,6 +202,7 @@ def test_learns_stops_early_and_says_the_same_as_its_file(data, tmp_path):
     assert (known == 1.0).all()
 
 
+@pytest.mark.slow
 def test_the_seed_decides(data):
     models, curves = zip(*(network.fit(*data, False, seed) for seed in (0, 0, 1)))
     assert curves[0] == curves[1] != curves[2]
@@ -240,6 +241,7 @@ def one_place():
     return injected([flight(seed, **PLAIN) for seed in range(3)], DELAY, PUSHED)
 
 
+@pytest.mark.slow
 def test_finds_what_is_wrong_with_anchors_and_imu(one_place):
     found = physics.find_effects(one_place)
     values = {effect.name: effect.values for effect in found.effects.effects}
@@ -432,6 +434,7 @@ def test_effects_alone_are_taken_as_they_are():
     )
 
 
+@pytest.mark.slow
 def test_a_flight_is_judged_by_what_it_took_no_part_in(monkeypatch):
     monkeypatch.setattr(structured, "CENTRES", 10)
     late = EFFECTS["anchor_delay"]({"3": 0.4, "5": -0.4})
