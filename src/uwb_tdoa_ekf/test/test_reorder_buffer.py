@@ -76,6 +76,7 @@ def test_an_odometry_waits_for_nothing_where_no_stamp_comes_twice():
     assert_same_as_offline(flight)
 
 
+@pytest.mark.slow
 @settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1), st.floats(0.0, 0.2), st.sampled_from([IMU, TDOA]))
 def test_the_first_stamp_that_comes_twice_late_in_a_flight_is_late_however_the_streams_arrive(

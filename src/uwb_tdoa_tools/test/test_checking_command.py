@@ -39,6 +39,7 @@ def test_a_healthy_bag_is_ok(checked):
     assert content["recordings"][1]["findings"] == [] and content["together"] == []
 
 
+@pytest.mark.slow
 def test_errors_have_code_one_and_a_line_to_copy(checked):
     _, code, out, content = checked
     assert code == 1 and "flipped: 1 error" in out

@@ -220,6 +220,7 @@ def test_a_right_survey_is_not_moved():
     assert displacement(BOX, anchors).max() < SAME
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "row, shift", [(0, [1.0, 0.0, 0.0]), (5, [0.0, -1.5, 0.0]), (7, [0.5, 0.5, -1.0])]
 )

@@ -39,12 +39,17 @@ def test_nothing_is_found_where_nothing_is(flight):
     "name",
     [
         "anchor_delay",
-        "pair_offset",
-        "tag_lever_arm",
-        "tdoa_time_offset",
-        "truth_time_offset",
         "gyro_scale",
-        "imu_misalignment",
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in (
+                "pair_offset",
+                "tag_lever_arm",
+                "tdoa_time_offset",
+                "truth_time_offset",
+                "imu_misalignment",
+            )
+        ),
     ],
 )
 def test_a_declared_effect_is_found_with_its_size(flight, name):

@@ -56,6 +56,7 @@ def attribution(flights):
     return attribute(flights, TRUTH, undeclared=False)
 
 
+@pytest.mark.slow
 def test_every_flight_is_judged_with_effects_that_it_took_no_part_in(flights, attribution):
     cases = cross_fitted(attribution, flights, NONE, attribution.selection.chosen, ())
     assert [case.flight.name for case in cases] == [flight.name for flight in flights]
@@ -125,6 +126,7 @@ def test_a_displacement_is_used_again_where_corrections_have_not_changed(monkeyp
     assert used.error(fewer) == pytest.approx(computed.error(fewer), rel=0.03)
 
 
+@pytest.mark.slow
 def test_halves_of_a_single_flight_judge_each_other(flights):
     single = attribute(flights[:1], TRUTH, undeclared=False)
     first, second = cross_fitted(single, flights[:1], NONE, single.selection.chosen, ())
@@ -265,6 +267,7 @@ def test_before_and_after_with_intervals(flights):
     assert second < first
 
 
+@pytest.mark.slow
 def test_halves_of_a_flight_count_what_is_before_and_after_the_fit_once(flights):
     single = attribute(flights[:1], TRUTH, undeclared=False)
     cases, run = cross_fitted(single, flights[:1], NONE, (), ()), Baseline(NONE).run(flights[0])

@@ -277,6 +277,7 @@ def test_flights_without_truth_are_refused_in_one_sentence(flight, odometry, tmp
         assert "ground truth" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_picture_and_trajectories(flight, bag, tmp_path):
     assert (
         main([str(bag), "--plot", str(tmp_path / "error.png"), "--tum", str(tmp_path / "tum")]) == 0
@@ -304,6 +305,7 @@ def test_a_run_that_never_starts_has_a_picture_and_a_report_in_strict_json(fligh
     assert found["runs"][0]["diverged"] is True
 
 
+@pytest.mark.slow
 def test_table_beside_others(flight, bag, tmp_path):
     peers = tmp_path / "peers.csv"
     peers.write_text(
@@ -363,6 +365,7 @@ def test_smoothing_is_better(bag, tmp_path):
     assert smoothed["runs"][0]["rmse_3d"] < 0.9 * filtered["runs"][0]["rmse_3d"]
 
 
+@pytest.mark.slow
 def test_a_name_is_no_command_to_picture_table_or_terminal(flight, tmp_path, capsys):
     name, folder = "$\\frac$ <b>|\x1b[31m", tmp_path / "\x1b[2Jflights"
     folder.mkdir()

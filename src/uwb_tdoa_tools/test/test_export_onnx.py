@@ -54,7 +54,10 @@ def assert_equal(effects, network, model, samples):
         np.testing.assert_allclose(one, other, rtol=0.0, atol=most, err_msg=name)
 
 
-@pytest.mark.parametrize("name", EFFECTS)
+@pytest.mark.parametrize(
+    "name",
+    [name if name in DECLARED else pytest.param(name, marks=pytest.mark.slow) for name in EFFECTS],
+)
 def test_each_effect(tmp_path, name):
     effects = EffectSet((EFFECTS[name],))
     model = exported(tmp_path / "bias.onnx", effects)

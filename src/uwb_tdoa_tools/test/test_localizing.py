@@ -178,6 +178,7 @@ def ranged():
     return replace(made, tdoa=rows_of(made.tdoa, slice(0)), truth=None)
 
 
+@pytest.mark.slow
 def test_ranges_alone_are_assessed_like_tdoas(ranged, tmp_path):
     found = assessed(ranged)
     assert found.level == GOOD and not found.reasons and not found.lost
