@@ -98,6 +98,7 @@ def test_it_refuses_to_start_where_it_does_not_know_where_it_is():
     assert np.ptp(one.states[:, :2], axis=0).max() == 0.0 and not verdict["arrived"]
 
 
+@pytest.mark.slow
 def test_a_verdict_of_a_rover_that_stops_elsewhere(drives):
     truth = drives[0].flight.truth
     moved = Truth(truth.t, truth.p + [0.5, 0.0, 0.0], truth.q)
