@@ -231,7 +231,6 @@ def test_one_figure_of_the_room_and_an_anchor_that_makes_it_larger(
     assert again["bound_flyable"] == pytest.approx(more["bound_flyable"], abs=0.01)
 
 
-@pytest.mark.slow
 def test_where_no_anchor_helps_it_says_so(anchors, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(run, "PLACES_TRIED", 4)
     monkeypatch.setattr(optimisation, "LEAST_PRECISION", 0.9)

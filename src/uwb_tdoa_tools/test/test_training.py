@@ -437,7 +437,6 @@ def test_effects_alone_are_taken_as_they_are():
     )
 
 
-@pytest.mark.slow
 def test_a_flight_is_judged_by_what_it_took_no_part_in(monkeypatch):
     monkeypatch.setattr(structured, "CENTRES", 10)
     late = EFFECTS["anchor_delay"]({"3": 0.4, "5": -0.4})
