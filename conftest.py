@@ -9,6 +9,7 @@ import os
 from pathlib import Path
 import random
 import signal
+import sys
 
 import pytest
 
@@ -16,6 +17,9 @@ import pytest
 # Child processes of the tests would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 gc.set_threshold(20_000, 5, 100)  # as in commands: modules and tests are many objects that stay
+# As in ./dev: without bytecode, each process compiles all tests and modules that it imports.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 # Before anything imports rclpy: only processes on this machine are discovered.
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 # Before anything imports numpy, as in the executables: BLAS threads only wait for each other.

@@ -3,6 +3,7 @@
 """The study of maps of the bias in a simulated set-up."""
 
 import numpy as np
+import pytest
 
 from studies.debiasing import set_up
 from studies.debiasing.report import set_up_tables
@@ -41,6 +42,7 @@ def test_delays_belong_to_the_seed_and_noise_to_the_run():
     assert np.linalg.norm(bias[0] - bias[1]) < 0.02 < np.linalg.norm(bias[0] - bias[2])
 
 
+@pytest.mark.slow
 def test_all_of_it_on_a_coarser_grid(monkeypatch):
     for name, value in {"STEP": 1.0, "STAY": 2.0, "PASSES": 1, "RAILS": set_up.RAILS[::3]}.items():
         monkeypatch.setattr(set_up, name, value)

@@ -62,6 +62,7 @@ def test_values_are_compared_by_their_bits(one, other, differing, largest):
         assert len(lines) == 3 + (differing > 0) and lines[2].startswith("| flight | 1 |")
 
 
+@pytest.mark.slow
 def test_the_cases_are_what_estimates_are_made_of(tmp_path, monkeypatch):
     """Without an emulator: twice by this Python. A changed recording differs."""
     here = tmp_path / "here"

@@ -126,6 +126,7 @@ def test_a_shifted_frame_is_a_function_of_the_direction_to_every_anchor_and_a_tu
     )
 
 
+@pytest.mark.slow
 def test_cases_cost_what_they_must():
     drawn = (blind.case(blind.Simulated(), seed) for seed in range(20))
     effect, flown, plain, base, where = next(one for one in drawn if one is not None)
@@ -135,6 +136,7 @@ def test_cases_cost_what_they_must():
     )
 
 
+@pytest.mark.slow
 def test_of_several_flights_all_but_the_last_are_diagnosed_and_the_last_one_judges(monkeypatch):
     seen = []
 

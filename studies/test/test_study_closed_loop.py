@@ -7,6 +7,7 @@ the study alone.
 import json
 
 import numpy as np
+import pytest
 from test_flying_verdict import made_up
 
 from studies import __main__ as study
@@ -51,6 +52,7 @@ def test_halls_differ_in_where_anchors_are_and_how_they_are_turned_and_in_nothin
     )
 
 
+@pytest.mark.slow
 def test_it_trains_flies_tells_and_draws(tmp_path, monkeypatch, capsys):
     trained = tmp_path / "before"
     (trained / "paper").mkdir(parents=True)

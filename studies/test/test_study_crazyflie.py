@@ -9,8 +9,9 @@ import pytest
 from studies.crazyflie import table
 from uwb_tdoa_tools.readers import inputs
 
+pytestmark = pytest.mark.slow
 
-@pytest.mark.slow
+
 def test_measured_logs_lose_little(shared_data):
     flights = inputs.Reading(shared_data / "surveys").flights([shared_data / "flights" / "0426"])
     tdoa2 = [f for f in flights if f.meta["protocol"] == "tdoa2"][:2]

@@ -94,6 +94,7 @@ def test_events_are_in_order_and_are_all_messages(part):
     assert events[0].stream == "anchors" and events[0].at < 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FAULTS)
 def test_every_fault_changes_something_while_it_lasts_and_nothing_before(part, few, texts, name):
     fault = FAULTS[name]

@@ -2,7 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The study of first maps, on two halls: the first gives a map, the second a mirror ambiguity."""
 
+import pytest
+
 from studies.first_map import CERTAIN, judged
+
+pytestmark = pytest.mark.slow
 
 
 def test_halls_are_drawn_and_judged():

@@ -109,6 +109,7 @@ def test_a_changed_file_is_read_or_refused(name):
         targets.run(name, mutations.changed(name, chance.choice(seeds), chance))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", targets.TARGETS)
 def test_any_bytes_are_read_or_refused(name):
     chance = random.Random(0)

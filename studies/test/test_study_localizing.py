@@ -3,11 +3,14 @@
 """The study of how far trajectories are to be believed."""
 
 import numpy as np
+import pytest
 
 from studies import calibrating, localizing
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.readers.inputs import Reading
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
+
+pytestmark = pytest.mark.slow  # runs a study
 
 
 def test_verdicts_are_compared_with_what_is_true(tmp_path, monkeypatch):

@@ -17,16 +17,8 @@ FEW = 100
 GROWTH = 100e6  # bytes in the second half; an effect that is compiled takes 50 MB
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "ekf_node",
-        *(
-            pytest.param(name, marks=pytest.mark.slow)
-            for name in ("bias_node", "debias_node", "autopilot_node")
-        ),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["ekf_node", "bias_node", "debias_node", "autopilot_node"])
 def test_no_message_ends_a_node_and_each_is_accounted_for(name, tmp_path):
     account = odd_messages.ordeal(name, FEW, tmp_path)
     assert not odd_messages.wrong(account)
@@ -35,13 +27,8 @@ def test_no_message_ends_a_node_and_each_is_accounted_for(name, tmp_path):
     assert account.memory[-1] < account.memory[len(account.memory) // 2] + GROWTH
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=() if name == "vehicle_node" else pytest.mark.slow)
-        for name in odd_messages.SERVICES
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", odd_messages.SERVICES)
 def test_no_request_ends_a_node_and_each_is_answered(name, tmp_path):
     answered, used = odd_messages.request_ordeal(name, FEW // 4, tmp_path)
     assert (

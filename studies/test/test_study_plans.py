@@ -46,9 +46,8 @@ def test_a_wall_hides_anchors_behind_it():
     assert one.heard(np.array([2.0, 9.0, 1.0])).tolist() == [0, 1, 2, 3]
 
 
-@pytest.mark.parametrize(
-    ("points", "seed"), [(30, 2), pytest.param(12, 101, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("points", "seed"), [(30, 2), (12, 101)])
 def test_a_case_agrees_with_the_solver_and_with_its_rerun(points, seed):
     row = plans.compared(points, seed)
     share, gain, bound = plans.differences(row)

@@ -23,6 +23,7 @@ def drawn(flight):
     return [processes.draw(seed, flight) for seed in range(60)]
 
 
+@pytest.mark.slow
 def test_a_seed_is_an_effect_and_all_kinds_are_drawn(flight, drawn):
     again = processes.draw(3, flight)
     assert again.name == drawn[3].name

@@ -51,6 +51,7 @@ def made(tmp_path_factory):
     return tuned.copy_to(tmp_path_factory.mktemp("copy"))
 
 
+@pytest.mark.slow
 def test_every_rule_of_the_catalogue_stands_in_the_core_once_by_name(made):
     assert [entry.name for entry in made.rules] and len({rule.name for rule in RULES}) == len(RULES)
     assert {entry.name for entry in made.rules} == {rule.name for rule in RULES}
@@ -62,6 +63,7 @@ def test_the_modules_of_all_sensors_are_known():
     assert known["ranges"] == "range" and known["velocity"] == "velocity"
 
 
+@pytest.mark.slow
 def test_a_rule_that_is_not_there_is_named(tmp_path):
     with pytest.raises(ValueError, match="no such place: wings"):
         tuned.copy_to(tmp_path, (Rule("wings", "noise", "learn", "wings > 2"),))
@@ -80,6 +82,7 @@ def test_the_constants_of_compiled_functions_are_in_the_table(made):
     assert len(set(places)) == len(places) and max(places) < tuned.FIRST_RULE
 
 
+@pytest.mark.slow
 def test_the_copy_changes_while_it_runs_and_is_the_filter_otherwise(made, tmp_path):
     import pickle
 
@@ -132,6 +135,7 @@ def test_what_is_said_less_more_or_later_is_told():
     assert watching.differs(after, {}) == dict.fromkeys(after, "lost")
 
 
+@pytest.mark.slow
 def test_patches_change_modules_only_while_they_are_applied(made):
     named = {patch.name: patch for patch in watching.patches(made)}
     from uwb_tdoa_ekf.monitoring import monitor, ranging_rules
@@ -148,6 +152,7 @@ def test_patches_change_modules_only_while_they_are_applied(made):
     assert "monitoring.windows.NO_TDOA x 2" not in named
 
 
+@pytest.mark.slow
 def test_every_switch_of_a_rule_over_streams_and_residuals_is_there(made):
     """Each changes something that is there, and puts it back."""
     made = {patch.name.removeprefix("without: "): patch for patch in watching.patches(made)}

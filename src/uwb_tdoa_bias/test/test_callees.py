@@ -11,6 +11,8 @@ import pytest
 
 from uwb_tdoa_bias.common import callees
 
+pytestmark = pytest.mark.slow
+
 SOURCES = Path(callees.__file__).parents[2]
 PROGRAM = """
 import numpy as np
@@ -148,6 +150,7 @@ def test_functions_of_other_packages_compile_as_usual_before_and_after_ours(run,
     assert printed[:-1] == first[0]
 
 
+@pytest.mark.quick
 def test_another_version_of_numba_compiles_as_usual(monkeypatch):
     usual = callees.dispatcher.Dispatcher.compile
     for version in ((0, 56, 4), (0, callees.TRIED[1][1] + 1, 0), (1, 0, 0)):

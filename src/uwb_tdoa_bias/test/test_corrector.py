@@ -229,6 +229,7 @@ def test_parts_of_odometry_hold_the_velocity_in_the_world(seed):
     assert np.isnan(v[2]).all() and np.isnan(q[2]).all()
 
 
+@pytest.mark.slow
 @given(st.floats(0.0, 0.999 * START))
 def test_the_first_pose_may_be_late_and_changes_nothing(late):
     """TDOAs arrive at 100 Hz. The poses up to `late` s arrive together, all later ones on time.

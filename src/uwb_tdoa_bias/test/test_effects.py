@@ -8,7 +8,7 @@ from pathlib import Path
 import re
 
 from finite_differences import numerical_jacobian
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
@@ -175,6 +175,7 @@ def test_is_in_the_document(effect):
 
 
 @pytest.mark.parametrize("effect, channel", FITTED_ON_RADIO)
+@settings(max_examples=25)
 @given(seeds)
 def test_regressors_are_derivatives_of_the_bias(effect, channel, seed):
     samples, rng = random_samples(seed), np.random.default_rng(seed)
@@ -256,6 +257,7 @@ def test_a_flight_without_its_stream_is_refused(effect):
 
 
 @pytest.mark.parametrize("effect", ON_BOTH)
+@settings(max_examples=25)
 @given(seeds)
 def test_a_tdoa_errs_as_the_ranges_whose_difference_it_is(effect, seed):
     samples, rng = random_samples(seed), np.random.default_rng(seed)
@@ -298,6 +300,7 @@ def test_advice_is_imperative_sentences_with_the_size(effect):
 
 
 @pytest.mark.parametrize("effect", ESTIMATED)
+@settings(max_examples=25)
 @given(st.floats(0.0, 0.2), st.floats(1.001, 5.0))
 def test_nothing_is_advised_on_what_the_data_do_not_determine(effect, value, doubt):
     assume(value > 1e-6)

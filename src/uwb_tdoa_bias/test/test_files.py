@@ -350,6 +350,7 @@ CONTENT = st.recursive(
 )
 
 
+@pytest.mark.slow
 @given(CONTENT)
 def test_what_others_write_comes_back(content):
     text = yaml.safe_dump(content)

@@ -358,6 +358,7 @@ def test_a_kind_without_a_branch_raises():
         feed(state, FilterConfig().parameters(), fed._replace(sensors=rows))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("followed", [0, 1])
 def test_a_range_finder_decides_between_mirrored_places(followed):
     """Two equally probable hypotheses lie 1.4 m below and above anchors in a plane.

@@ -21,6 +21,8 @@ from test_anchor_table import BOX, CHANGE, after, cut, flight_through  # noqa: E
 from uwb_tdoa_bias.ros.diagnostics import AGAIN  # noqa: E402
 from uwb_tdoa_msgs.msg import EstimatorStatus, TdoaCorrected  # noqa: E402
 
+pytestmark = pytest.mark.slow  # starts nodes
+
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -82,6 +84,7 @@ def test_anchors_that_are_certainly_wrong_give_no_odometry(rig, change, words):
     assert len(rig.odometry) == odometry
 
 
+@pytest.mark.quick
 def test_status_says_what_may_be_flown_by_and_why_not(rig):
     flight = recording(2.0)
     rig.send_anchors(flight.anchors)

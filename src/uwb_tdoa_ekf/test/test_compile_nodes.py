@@ -13,6 +13,8 @@ pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from rig import make_rig  # noqa: E402, F401
 
+pytestmark = pytest.mark.slow
+
 IN_FLIGHT = """
 import sys
 from flights import fly
@@ -37,7 +39,6 @@ print([function.__name__ for function, count in compiled().items() if count > be
 """
 
 
-@pytest.mark.slow
 def test_after_it_no_node_compiles_anything(make_rig, monkeypatch):
     ended = subprocess.run(
         [sys.executable, "-m", "uwb_tdoa_ekf.compile_nodes"],
@@ -56,7 +57,6 @@ def test_after_it_no_node_compiles_anything(make_rig, monkeypatch):
         assert "data loaded from" in said and "data saved to" not in said
 
 
-@pytest.mark.slow
 def test_nothing_is_compiled_in_flight():
     environment = {
         **os.environ,

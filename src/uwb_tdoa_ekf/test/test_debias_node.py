@@ -84,6 +84,7 @@ def test_every_parameter_is_in_the_parameter_file_with_its_default_described_and
     assert all(descriptor.description and descriptor.read_only for descriptor in descriptors)
 
 
+@pytest.mark.slow
 def test_positions_are_debiased_and_accounted_for(make_rig, file):
     rig = make_rig()
     rig.start("debias_node", debias_node=parameters_of(file))

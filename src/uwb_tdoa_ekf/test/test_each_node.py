@@ -25,6 +25,8 @@ from uwb_tdoa_bias.ros.anchors import anchors_to_message  # noqa: E402
 from uwb_tdoa_ekf.offline import run_offline  # noqa: E402
 from uwb_tdoa_msgs.msg import TdoaCorrected, TdoaResidual  # noqa: E402
 
+pytestmark = pytest.mark.slow  # starts nodes
+
 ANCHORS = corners()  # ids 10 ... 17
 
 

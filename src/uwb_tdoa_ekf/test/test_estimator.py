@@ -194,6 +194,7 @@ def test_an_inertial_sample_that_is_not_finite_is_as_if_it_had_never_come():
     assert estimator.counts["imu_invalid"] == 31
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(seeds, st.booleans())
 def test_every_message_is_accounted_for_once(seed, use_imu):
@@ -544,6 +545,7 @@ def with_a_late_anchor(size=0.8, since=20.0):
     return flight, replace(flight, tdoa=replace(tdoa, d=tdoa.d + size * sign * (tdoa.t > since)))
 
 
+@pytest.mark.slow
 def test_a_delay_that_comes_in_flight_is_taken_out_if_asked_for_whatever_the_arrival():
     flight, harmed = with_a_late_anchor()
     config = FilterConfig(compensate_changes=True)

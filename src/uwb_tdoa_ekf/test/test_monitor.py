@@ -266,6 +266,7 @@ def test_a_swap_is_named_until_something_else_has_been_true_for_a_while(monkeypa
     assert kept == [(), (1, 2), (), (3, 4)] and named.count((1, 2)) > 12
 
 
+@pytest.mark.slow
 def test_names_an_anchor_that_was_moved_before_the_start_and_where_it_stands(row=4):
     """Nothing changes in flight. The monitor once reported nothing for the whole flight."""
     shift = np.array([0.4, -0.5, 0.3])
@@ -288,6 +289,7 @@ def test_names_an_anchor_that_was_moved_before_the_start_and_where_it_stands(row
     assert np.linalg.norm(found - shift) < 0.3
 
 
+@pytest.mark.slow
 def test_an_anchor_that_is_late_for_the_last_calibration_is_named_and_what_the_calibration_knows_counts():
     unknown, known = (
         watch(lambda t, p: only(3, 0.35), seconds=50, calibrated=of)[-1][1]
@@ -328,6 +330,7 @@ def displaced(seed, std, shift=(0.0, 0.0, 0.0), row=3):
     return [(one.row, one.others) for one in comparison.find()]
 
 
+@pytest.mark.slow
 def test_errors_of_antennas_are_no_shift():
     """The slope of antenna errors was once assumed to be at most their variation between cells.
 
@@ -336,6 +339,7 @@ def test_errors_of_antennas_are_no_shift():
     assert [displaced(seed, 0.1) for seed in range(30)] == [[]] * 30
 
 
+@pytest.mark.slow
 def test_the_moved_anchor_is_named_in_spite_of_errors_of_antennas():
     """At least 12 of 20 flights name an anchor, always including the moved one.
 

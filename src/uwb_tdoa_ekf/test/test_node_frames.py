@@ -33,6 +33,8 @@ from uwb_tdoa_bias.ros.frames import TF_QOS, TF_STATIC_QOS  # noqa: E402
 from uwb_tdoa_ekf.offline import run_offline  # noqa: E402
 from uwb_tdoa_msgs.msg import AnchorArray  # noqa: E402
 
+pytestmark = pytest.mark.slow  # starts nodes
+
 # attitude of the IMU on the body: upside down
 TURN = Rotation.from_euler("ZYX", [90.0, 0.0, 180.0], degrees=True)
 ARM = [0.05, 0.0, 0.1]  # m, position of the antenna on the body

@@ -24,6 +24,8 @@ from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_ekf.offline import run_offline  # noqa: E402
 from uwb_tdoa_ekf.results import rows_of, to_odometry  # noqa: E402
 
+pytestmark = pytest.mark.slow  # starts nodes
+
 SOURCES = Path(__file__).resolve().parents[2]
 EFFECTS = (
     "effects: {anchor_delay: {values: {10: 0.1, 14: -0.05}}, tag_lever_arm: {values: {x: 0.05, z: "

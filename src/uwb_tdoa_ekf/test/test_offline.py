@@ -88,7 +88,13 @@ class Doubt(Network):
 
 @pytest.mark.parametrize(
     ("lag", "network", "grid"),
-    [(0.01, None, False), (0.05, Doubt(), False), (0.2, Doubt(), False), (0.05, Doubt(), True)],
+    [
+        (0.05, Doubt(), False),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in ((0.01, None, False), (0.2, Doubt(), False), (0.05, Doubt(), True))
+        ),
+    ],
 )
 def test_corrections_are_those_of_live_feeding(lag, network, grid):
     """With `grid`, poses exactly `lag` old and ends of batches coincide with stamps of TDOAs."""

@@ -76,6 +76,7 @@ def test_an_odometry_waits_for_nothing_where_no_stamp_comes_twice():
     assert_same_as_offline(flight)
 
 
+@pytest.mark.slow
 @settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1), st.floats(0.0, 0.2), st.sampled_from([IMU, TDOA]))
 def test_the_first_stamp_that_comes_twice_late_in_a_flight_is_late_however_the_streams_arrive(
@@ -341,6 +342,7 @@ class Played:
         assert self.most_waiting <= MOST_WAITING + MOST_HELD
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
 @given(st.sampled_from([VELOCITY_STREAM, HEIGHT_STREAM, RANGE_STREAM]), faults, seeds)
 def test_no_clock_of_a_sensor_costs_a_tdoa_or_an_inertial_sample(place, fault, seed):
@@ -355,6 +357,7 @@ def test_no_clock_of_a_sensor_costs_a_tdoa_or_an_inertial_sample(place, fault, s
     assert all(given - measured < LAG for measured, given in played.used[TDOA_STREAM])
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
 @given(faults, seeds, st.booleans())
 def test_a_clock_of_the_imu_starts_the_filter_anew_once_at_most_and_costs_no_second_of_tdoas(
@@ -372,6 +375,7 @@ def test_a_clock_of_the_imu_starts_the_filter_anew_once_at_most_and_costs_no_sec
         assert len(used) >= (LENGTH - END - DECIDED) * RATE[IMU_STREAM] - 1.0
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
 @given(kinds, sizes, seeds)
 def test_a_clock_of_the_tdoas_costs_them_no_more_than_the_fault_and_a_second(kind, size, seed):
@@ -391,6 +395,7 @@ def test_a_clock_of_the_tdoas_costs_them_no_more_than_the_fault_and_a_second(kin
         assert len(played.restarts) <= 2 and played.gap(TDOA_STREAM) < DECIDED  # one jump each way
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
 @given(sizes, seeds)
 def test_a_jump_of_all_clocks_starts_the_filter_anew_only_where_time_falls_back_and_costs_no_second(

@@ -249,6 +249,7 @@ def test_two_late_anchors_do_not_overrule_wheels(seed, rows, config):
     assert run.recoveries == 0 and found.xy.max() < 0.3 and found.steps.max() < 0.2
 
 
+@pytest.mark.slow
 def test_a_tag_that_two_places_are_possible_for_says_so():
     """`unsure` is set while TDOAs agree on another position. The deviation then covers it.
 
@@ -273,6 +274,7 @@ def test_a_tag_that_two_places_are_possible_for_says_so():
     assert np.median(std[since < 33.0]) < 0.3 < 0.5 < std[(since > 33.0) & (since < 38.5)].max()
 
 
+@pytest.mark.slow
 def test_a_rover_that_is_lost_is_found(config=WHEELS):
     """The filter gets a wrong pose, and the wheels are good.
 

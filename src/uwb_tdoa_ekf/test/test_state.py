@@ -3,9 +3,10 @@
 
 from covariances import assert_covariance, random_covariance
 from finite_differences import numerical_jacobian
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
+import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
@@ -105,6 +106,7 @@ def test_inject_and_minus_undo_each_other(seed):
     np.testing.assert_allclose(plus(x, 2 * error), plus(x, error, 2.0), atol=1e-15)
 
 
+@settings(max_examples=20)
 @given(seeds)
 def test_many_small_steps_solve_the_equations_of_motion(seed):
     """Compare with Eq. 14 of Zhao et al. at constant rates and specific force, solved by scipy."""
@@ -166,6 +168,7 @@ def test_covariance_is_phi_p_phi_of_the_documented_phi(seed):
     assert_covariance(after)
 
 
+@pytest.mark.slow
 @given(seeds)
 def test_covariance_follows_the_nominal_state_to_first_order_in_dt(seed):
     """Compare with Phi from finite differences of the nominal prediction.

@@ -324,6 +324,7 @@ def test_silence_and_restarts_have_an_age():
     assert looked.use.restart_age == pytest.approx(0.8)
 
 
+@pytest.mark.slow
 @given(st.lists(st.tuples(*[st.integers(0, 50)] * 4), min_size=20, max_size=60))
 def test_shares_are_shares_whatever_comes(steps):
     use, counts, received, now = Use(0.25), Counter(), Counter(), 0.0

@@ -24,6 +24,8 @@ from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS, anchors_to_message  # noqa: E
 from uwb_tdoa_bias.ros.frames import TF_STATIC_QOS  # noqa: E402
 from uwb_tdoa_msgs.msg import Tdoa  # noqa: E402
 
+pytestmark = pytest.mark.slow  # starts nodes
+
 LATCHED = {"/tf_static": TF_STATIC_QOS, "uwb/anchors": ANCHORS_QOS}
 NAN, INF = math.nan, math.inf
 

@@ -21,6 +21,8 @@ from stream_faults import PUBLISHERS, lanes_of, play, process_of, publish_twice 
 
 from uwb_tdoa_msgs.msg import EstimatorStatus  # noqa: E402
 
+pytestmark = pytest.mark.slow  # starts nodes
+
 # --- stream faults ---
 
 
@@ -187,7 +189,6 @@ def tried(lanes, heards, names):
     return out
 
 
-@pytest.mark.slow
 def test_status_odometry_and_diagnostics_agree_while_what_is_measured_is_wrong(
     make_rig,  # noqa: F811
     monkeypatch,

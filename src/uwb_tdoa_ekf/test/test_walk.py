@@ -23,6 +23,8 @@ from uwb_tdoa_ekf.core import engine  # noqa: E402
 from uwb_tdoa_ekf.ekf_node import EkfNode  # noqa: E402
 from uwb_tdoa_msgs.msg import Tdoa  # noqa: E402
 
+pytestmark = pytest.mark.slow  # starts nodes
+
 DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "architecture.md"
 FILE = re.compile(r"`([\w/]+\.py)`")
 OURS = re.compile(r".*/(?:uwb_tdoa_bias|uwb_tdoa_ekf)/(?!test/)(.*\.py)")

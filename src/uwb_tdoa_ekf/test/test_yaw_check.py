@@ -96,7 +96,13 @@ def test_a_wrong_yaw_that_is_told_is_opened_within_seconds(seed, wrong):
     assert error[odometry.t > 15.0].max() < 0.3
 
 
-@pytest.mark.parametrize(("seed", "degrees"), [(0, 3.0), (1, 12.0), (3, 3.0), (5, 12.0)])
+@pytest.mark.parametrize(
+    ("seed", "degrees"),
+    [
+        (0, 3.0),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in ((1, 12.0), (3, 3.0), (5, 12.0))),
+    ],
+)
 def test_a_right_yaw_is_not(seed, degrees):
     flight = fly(seed, 20.0, outliers=0.05, accel_bias=0.1, gyro_bias=0.005, **NOISE)
     for config in (

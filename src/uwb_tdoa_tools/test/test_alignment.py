@@ -227,6 +227,7 @@ def test_wrong_ids_and_signs_are_no_other_frame(name, request):
         assert said == () and np.array_equal(same.truth.p, one.truth.p)
 
 
+@pytest.mark.slow
 def test_delays_of_anchors_that_shift_the_estimate_are_no_other_frame(flight, tmp_path, capsys):
     """The delays of all anchors imitate a tag that is shifted by 0.4 m along x.
 

@@ -32,6 +32,8 @@ from uwb_tdoa_tools.live.processes import Processes, own_domain, wait  # noqa: E
 from uwb_tdoa_tools.live.session import session  # noqa: E402
 from uwb_tdoa_tools.readers import read_flight  # noqa: E402
 
+pytestmark = pytest.mark.slow  # starts nodes
+
 EPOCH = 1_700_000_000  # s
 STEP = 0.05  # s of the flight
 PATIENCE, IMPATIENCE = (
@@ -177,7 +179,6 @@ def playing(folder, flight, px4):
         yield player
 
 
-@pytest.mark.slow
 def test_an_autopilot_gets_a_measured_flight(shared_data, tmp_path):
     log, survey = shared_data / "flights/0426/0426-traj7", shared_data / "surveys/anchor_0426.txt"
     flight, px4 = read_flight(log, survey), Px4()

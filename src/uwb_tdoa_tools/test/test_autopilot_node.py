@@ -96,6 +96,7 @@ def nees(error, covariance):
     return error @ np.linalg.solve(covariance, error)
 
 
+@pytest.mark.slow
 def test_px4_gets_a_flight_and_silence_when_it_is_lost():
     pytest.importorskip("pymavlink")
     px4, path = Px4(), Path(6.0)

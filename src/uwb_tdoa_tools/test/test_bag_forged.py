@@ -429,7 +429,7 @@ def shared_children(file, table, levels=10):
     return len(data)
 
 
-@pytest.mark.parametrize("salvage", [False, True])
+@pytest.mark.parametrize("salvage", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("table", ["sqlite_master", "topics", "messages"])
 @pytest.mark.usefixtures("must_end")
 def test_pages_that_share_their_children_are_not_walked_for_ever(
@@ -445,6 +445,7 @@ def test_pages_that_share_their_children_are_not_walked_for_ever(
         read_bag(bag, salvage=salvage)
 
 
+@pytest.mark.slow
 def test_an_interrupt_ends_a_walk_through_a_database(tables):
     bag, _ = tables
     shared_children(data_file(bag), "topics")

@@ -200,6 +200,7 @@ def test_one_sentence_alone_judges_the_motion(better, path, sentence):
     assert not any(word in " ".join(others) for word in ("enough", "farther", "closer", "fly more"))
 
 
+@pytest.mark.slow
 def test_with_ground_truth_quick_forecasts_what_a_diagnosis_gains(flights):
     """Forecast from one flight and from two, within seconds.
 
@@ -354,6 +355,7 @@ def test_different_surveys_of_one_installation_are_named(room, flights, monkeypa
     assert "different surveys" not in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_it_stops_where_check_finds_an_error(room, flights, monkeypatch, capsys):
     for name in ("with_truth", "without_truth"):
         monkeypatch.setattr(library, name, lambda *_: pytest.fail("it went on"))

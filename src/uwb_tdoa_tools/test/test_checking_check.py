@@ -157,6 +157,7 @@ def test_a_measured_flight_and_its_mistakes(shared_data):
 OF_ANOTHER_ROOM = {"ids_swapped", "pair_sign", "imu_rate_unit", "imu_axes", "tdoa_sign"}
 
 
+@pytest.mark.slow
 def test_a_survey_of_another_room_is_named():
     """Eight anchors have other positions but the same ids.
 

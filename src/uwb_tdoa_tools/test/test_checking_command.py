@@ -31,6 +31,7 @@ def checked(tmp_path_factory):
     return folder, code, out.getvalue(), json.loads((folder / "out.json").read_text())
 
 
+@pytest.mark.slow
 def test_a_healthy_bag_is_ok(checked):
     _, _, out, content = checked
     (good,) = (line for line in out.splitlines() if line.startswith("good"))
@@ -38,6 +39,7 @@ def test_a_healthy_bag_is_ok(checked):
     assert content["recordings"][1]["findings"] == [] and content["together"] == []
 
 
+@pytest.mark.slow
 def test_errors_have_code_one_and_a_line_to_copy(checked):
     _, code, out, content = checked
     assert code == 1 and "flipped: 1 error" in out

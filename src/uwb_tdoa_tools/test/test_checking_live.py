@@ -71,6 +71,7 @@ def process():
         each.communicate(timeout=120)
 
 
+@pytest.mark.slow
 def test_mistakes_of_a_live_driver_are_found(tmp_path, process, capsys, monkeypatch):
     pytest.importorskip("uwb_tdoa_msgs.msg")
     process(sys.executable, "-c", FAULTY)

@@ -50,10 +50,8 @@ def test_missing_anchors_are_named(flight):
     assert "no anchor 7: " in remark and "% of the TDOAs" in remark
 
 
-@pytest.mark.parametrize(
-    ("seed", "said"),
-    [(0, "does not fit"), pytest.param(2, "is of another room", marks=pytest.mark.slow)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "said"), [(0, "does not fit"), (2, "is of another room")])
 def test_the_survey_of_another_room_is_blamed_and_no_sign(seed, said):
     """With wrong anchors, some pairs seem to have a wrong sign, and some ids seem exchanged."""
     (remark,) = survey_remarks(replace(flown(seed), anchors=constellation("staircase")))
@@ -76,6 +74,7 @@ def test_measured_flights_have_no_remark(shared_data):
         assert list(survey_remarks(inputs.Reading().read(pair))) == []
 
 
+@pytest.mark.slow
 def test_evaluate_prints_remarks(flight, tmp_path, capsys):
     write_bag(renamed(flight, [0, 1, 2, 3, 4, 5, 6]), tmp_path / "f.bag")
     assert evaluate.main([str(tmp_path / "f.bag"), "--jobs", "1"]) == 0
@@ -85,6 +84,7 @@ def test_evaluate_prints_remarks(flight, tmp_path, capsys):
     assert "give the survey of that room" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_diagnose_prints_remarks_first(flight, tmp_path, capsys, monkeypatch):
     write_bag(flight, tmp_path / "f.bag")
     other = replace(
@@ -127,6 +127,7 @@ def test_inject_refuses_an_anchor_that_is_not_there(flight, tmp_path, name, key,
     assert not (tmp_path / "late.bag").exists()
 
 
+@pytest.mark.slow
 def test_a_model_without_its_effects_is_reported(flight, tmp_path, capsys):
     onnx = pytest.importorskip("onnx")
     import known_answer

@@ -120,6 +120,7 @@ def test_motion_is_measured_across_the_main_direction():
     assert second_principal_std(along + across) == pytest.approx(np.std(t**2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, begin, seconds",
     [
@@ -219,6 +220,7 @@ def test_a_right_survey_is_not_moved():
     assert displacement(BOX, anchors).max() < SAME
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "row, shift", [(0, [1.0, 0.0, 0.0]), (5, [0.0, -1.5, 0.0]), (7, [0.5, 0.5, -1.0])]
 )
@@ -273,6 +275,7 @@ def with_positions(made, positions):
 # The survey
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("factor", "said"),
     [*((UNITS[unit], unit) for unit in ("feet", "decimetres", "inches")), (25.0, "")],
@@ -321,6 +324,7 @@ def test_every_command_refuses_the_cases(command, shared, tmp_path, monkeypatch,
     assert not any(path.is_file() for path in tmp_path.rglob("*"))
 
 
+@pytest.mark.slow
 def test_the_case_in_feet_names_its_factor(shared):
     flight = read_flight(shared / "data/flights/0426/0426-traj5", shared / "cases/anchors/feet.csv")
     report = check(of_flight(flight))
@@ -328,6 +332,7 @@ def test_the_case_in_feet_names_its_factor(shared):
     assert "3.28" in report.findings[0].cause
 
 
+@pytest.mark.slow
 def test_the_case_of_another_room_has_no_error(shared):
     flight = read_flight(
         shared / "cases/recordings/other_room", shared / "data/surveys/anchor_0425.txt"
@@ -357,6 +362,7 @@ def flown(seconds=20.0, rate=300.0, seed=0, place=None, errors=(0.0, 0.0), ancho
     return OrderedRecording(anchors, Tdoas(t, a, b, d, np.zeros(len(t))), None)
 
 
+@pytest.mark.slow
 def test_errors_that_change_are_no_errors_of_the_survey():
     """Other anchor positions explain much of one half, but nothing of the other half."""
     fits = [flown(seed=seed, errors=(0.45, -0.3)).survey_fit for seed in range(6)]
@@ -397,6 +403,7 @@ def test_a_tag_that_stands_does_not_determine_the_unit_of_its_gyroscope(seed, er
 # Time stamps that wrap
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.08, 0.3])
 def test_a_time_stamp_that_wraps_is_the_only_finding(share):
     made = recording()

@@ -79,8 +79,8 @@ def bag(path, clock, storage="mcap", arrivals=True, imu=lambda t: t):
     return path
 
 
-@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-@pytest.mark.parametrize("arrivals", [True, False])
+@pytest.mark.parametrize("storage", ["mcap", pytest.param("sqlite3", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("arrivals", [True, pytest.param(False, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", KINDS)
 def test_a_bag_is_read_on_one_time_and_check_names_the_jump(tmp_path, name, arrivals, storage):
     rule, clock = KINDS[name]
@@ -118,6 +118,7 @@ def test_restarts_outside_of_the_flight_change_nothing():
     np.testing.assert_array_equal(run.odometry.p, whole.odometry.p)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arrivals", [True, False])
 @pytest.mark.parametrize("ahead", [-1e5, -50.0, 10.0, 1e5])
 def test_an_imu_of_another_time_is_named(tmp_path, capsys, ahead, arrivals):
@@ -130,6 +131,7 @@ def test_an_imu_of_another_time_is_named(tmp_path, capsys, ahead, arrivals):
     assert "none of its" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_sensor_of_another_time_is_named_with_its_count():
     aided = sparse_flight(101, 20.0, aided=True)
     from uwb_tdoa_tools.checking.recording import of_flight
@@ -163,6 +165,7 @@ for by in map(float, sys.argv[1:]):
 """
 
 
+@pytest.mark.slow
 def test_a_gap_of_any_length_takes_no_more_memory():
     """The streams are not put on a continuous time first, as with a pause of days."""
     from pathlib import Path

@@ -37,6 +37,7 @@ def desk(tmp_path, monkeypatch):
         write_tables(late.inject(simulate(config)), tmp_path / day)
 
 
+@pytest.mark.slow
 def test_the_recording_becomes_a_bag_of_the_same_numbers(desk):
     convert, *_ = blocks(WALK)
     run(convert)

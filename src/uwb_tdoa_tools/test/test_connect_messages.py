@@ -29,6 +29,8 @@ from uwb_tdoa_ekf.monitoring.finding import ERROR
 from uwb_tdoa_ekf.monitoring.stream_rules import StreamRules  # noqa: E402
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa  # noqa: E402
 
+pytestmark = pytest.mark.slow  # starts publishers
+
 STAND_IN = """
 #pragma once
 #include <builtin_interfaces/msg/time.hpp>

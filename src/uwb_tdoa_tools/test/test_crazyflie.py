@@ -102,6 +102,7 @@ def test_heights_and_pressures_are_in_si_units_and_come_once(no_target):
     assert stream == "height" and np.isinf(height)
 
 
+@pytest.mark.slow
 def test_the_example_says_what_is_missing():
     pytest.importorskip("rclpy")
     pytest.importorskip("uwb_tdoa_msgs.msg")

@@ -117,6 +117,7 @@ def flights(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_flights_make_a_map_and_are_judged_by_it(tmp_path, flights, capsys):
     one, two, out = str(flights / "one.bag"), str(flights / "two.bag"), str(tmp_path / "m.npz")
     fitted = [
@@ -212,6 +213,7 @@ def test_a_map_is_refused_among_other_anchors(tmp_path, flights, capsys):
     assert "no gain: the 3D RMSE stays on these flights" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_as_much_of_a_map_is_taken_as_flights_left_out_bear_out(tmp_path, flights, capsys):
     both, out = [str(flights / "one.bag"), str(flights / "two.bag")], str(tmp_path / "m.npz")
     assert (

@@ -133,6 +133,7 @@ def diagnosis(recorded):
         return diagnose(loop.read(recorded[:2]))
 
 
+@pytest.mark.slow
 def test_the_diagnosis_needs_the_recordings_alone(diagnosis):
     """The diagnosis finds the effect although its declaration is removed."""
     really = inject.hidden_effect(LATE, corners())
@@ -144,6 +145,7 @@ def test_the_diagnosis_needs_the_recordings_alone(diagnosis):
     assert by == pytest.approx(late, abs=0.01)
 
 
+@pytest.mark.slow
 def test_no_recording_declares_the_effect(recorded):
     words = [word.encode() for word in ("anchor_delay", "hidden", "injected")]
     for bag in recorded:
@@ -153,6 +155,7 @@ def test_no_recording_declares_the_effect(recorded):
         assert not {"config", "parameters"} & set(flight.meta) and not flight.extra
 
 
+@pytest.mark.slow
 def test_the_correction_takes_the_residual_of_the_third_flight_away(recorded, diagnosis, tmp_path):
     written = loop.write_correction(tmp_path / "bias.onnx", diagnosis)
     assert [effect.name for effect in written.effects] == ["anchor_delay"]
@@ -170,6 +173,7 @@ def test_the_correction_takes_the_residual_of_the_third_flight_away(recorded, di
     assert corrected < 0.3 * raw
 
 
+@pytest.mark.slow
 def test_nothing_is_written_where_nothing_helps(diagnosis, tmp_path):
     nothing = replace(diagnosis, effects=EffectSet())
     assert loop.write_correction(tmp_path / "bias.onnx", nothing) is None
@@ -177,7 +181,13 @@ def test_nothing_is_written_where_nothing_helps(diagnosis, tmp_path):
     assert loop.added_in_words(tmp_path, None, nothing)[0].startswith("nothing: ")
 
 
-@pytest.mark.parametrize("kind", inject.KINDS)
+@pytest.mark.parametrize(
+    "kind",
+    [
+        kind if kind == "lever arm" else pytest.param(kind, marks=pytest.mark.slow)
+        for kind in inject.KINDS
+    ],
+)
 def test_every_kind_of_hidden_effect_costs_something(kind):
     """Each effect causes an error of 0.08 to 0.7 m. Its correction at least halves the error."""
     effect = inject.KINDS[kind](np.random.default_rng(1), corners())

@@ -139,6 +139,7 @@ def test_a_jazzy_without_rclpy(workspace):
     assert err.startswith("dev: error: ROS_DISTRO is jazzy, but ") and "cannot import rclpy" in err
 
 
+@pytest.mark.slow
 def test_what_is_not_what_was_locked_is_not_installed(workspace, machine):
     environment = machine(python3=BASE_PYTHON, **{"c++": script(workspace / "c++", "exit 1")})
     # replaces the locked wheel of the same name and version
@@ -187,6 +188,7 @@ def canonical(name):
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
+@pytest.mark.slow
 def test_a_step_that_fails_shows_the_end_of_its_log(workspace, machine):
     compiler = script(workspace / "c++", "exit 1")
     environment = machine(python3=BASE_PYTHON, **{"c++": compiler})

@@ -39,12 +39,17 @@ def test_nothing_is_found_where_nothing_is(flight):
     "name",
     [
         "anchor_delay",
-        "pair_offset",
-        "tag_lever_arm",
-        "tdoa_time_offset",
-        "truth_time_offset",
         "gyro_scale",
-        "imu_misalignment",
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in (
+                "pair_offset",
+                "tag_lever_arm",
+                "tdoa_time_offset",
+                "truth_time_offset",
+                "imu_misalignment",
+            )
+        ),
     ],
 )
 def test_a_declared_effect_is_found_with_its_size(flight, name):
@@ -100,6 +105,7 @@ def test_noise_is_told_from_bias(flight, name):
     assert names_found(quick(effect_of(name, True, 3).inject(flight, rng))) == [name]
 
 
+@pytest.mark.slow
 def test_a_search_goes_on_without_an_effect_and_keeps_the_others(flight):
     both = effect_of("anchor_delay", True, 3).inject(
         effect_of("accel_bias", True, 1).inject(flight)
@@ -115,6 +121,7 @@ def test_a_search_goes_on_without_an_effect_and_keeps_the_others(flight):
     assert "anchor_position" not in names_found(fewer.without({"anchor_position"}).found())
 
 
+@pytest.mark.slow
 def test_an_undeclared_effect_is_found_by_its_covariate(flight):
     dragged = undeclared.drag_on_cable(flight)
     attribution = attribute([dragged], TRUTH)
@@ -144,11 +151,13 @@ def of_slow_wave(flight):
     return found, inflation[0]
 
 
+@pytest.mark.slow
 def test_a_wave_over_time_is_named_first(of_slow_wave):
     first, *_ = of_slow_wave[0].findings()
     assert first.effect.label.startswith("tdoa of anchor 3 over time")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "effect, named",
     [
@@ -166,6 +175,7 @@ def test_what_was_missed_once_is_named_first(flight, effect, named):
     assert first.effect.label.startswith(named)
 
 
+@pytest.mark.slow
 def test_a_function_does_not_hide_itself_as_noise(flight, of_slow_wave):
     """An undeclared effect is correlated in time, like noise."""
     (before, after), alone = of_slow_wave[1], inflation_alone(flight)
@@ -203,6 +213,7 @@ def aided():
     return sparse_flight(101, 40.0, aided=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", AIDED)
 def test_what_is_wrong_with_height_pressure_and_velocity_is_found_with_its_size(aided, name):
     put_in = effect_of(name, True, 1)
@@ -214,6 +225,7 @@ def test_what_is_wrong_with_height_pressure_and_velocity_is_found_with_its_size(
         )
 
 
+@pytest.mark.slow
 def test_nothing_is_found_in_sound_heights_pressures_and_velocities(aided):
     assert attribute([aided], TRUTH).effects == ()
 
@@ -252,6 +264,7 @@ def test_of_two_models_of_the_same_things_the_one_that_is_worth_more_counts(flig
     assert _simpler(more, fewer, 10) is _simpler(fewer, more, 10) is more
 
 
+@pytest.mark.slow
 def test_maps_of_the_place_are_looked_for_in_three_flights_or_more(monkeypatch):
     looked = []
     monkeypatch.setattr(

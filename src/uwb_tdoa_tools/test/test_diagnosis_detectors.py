@@ -141,11 +141,13 @@ def test_nothing_is_found_on_a_floor_that_does_nothing(clean):
     assert not on_the_floor(clean) and not on_the_floor(clean, named=False)
 
 
+@pytest.mark.slow
 def test_one_anchor_that_is_late_there_is_not_the_floor(clean):
     blocked = EFFECTS["floor_multipath"]({"2.delay": 1.9, "2.height": 0.1}).inject(clean)
     assert all(effect.name != "floor_multipath" for effect in on_the_floor(blocked))
 
 
+@pytest.mark.slow
 def test_what_is_found_in_the_air_does_not_depend_on_the_floor(clean, landed):
     assert [
         e.values for e in effects_of(attribute([landed], GroundTruth(), undeclared=False).selection)

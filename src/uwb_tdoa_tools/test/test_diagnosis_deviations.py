@@ -53,6 +53,7 @@ def test_what_is_no_anchor_keeps_its_deviation():
     assert with_deviations(found.selection) is found.selection
 
 
+@pytest.mark.slow
 def test_a_delay_beside_others_that_are_zero_is_stated_as_well_as_it_is_known():
     """TDOAs do not determine the mean delay. It adds nothing to the deviation of a single delay."""
     errors, stated = [], []

@@ -163,6 +163,7 @@ def test_what_is_late_on_the_floor_goes_to_the_file_whatever_the_air_says(flight
     assert result.after["pooled"]["rmse_3d"] == result.before["pooled"]["rmse_3d"]
 
 
+@pytest.mark.slow
 def test_the_floor_is_judged_without_the_effects_that_were_refused(flight, monkeypatch):
     """The report once showed the errors before for both sides, and hid a gain from 40 to 23 cm."""
     on_floor = effect_of("floor_multipath", True, 0).inject(flight)
@@ -178,6 +179,7 @@ def test_the_floor_is_judged_without_the_effects_that_were_refused(flight, monke
     assert after["pooled"]["phases"] != before["pooled"]["phases"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("times, written", [(1.0, True), (200.0, False)])
 def test_noise_that_raises_the_error_is_not_written(flight, monkeypatch, times, written):
     module = import_module("uwb_tdoa_tools.diagnosis.diagnose")

@@ -151,6 +151,7 @@ def names_left(found):
     return {one.name for one in found.selection.chosen}, near
 
 
+@pytest.mark.slow
 def test_the_planned_flight_turns_and_settles_the_question(planned):
     first, found, library, plan = planned
     chosen, near = names_left(found)

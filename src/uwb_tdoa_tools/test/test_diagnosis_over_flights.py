@@ -72,6 +72,7 @@ def test_shares_are_those_that_were_put_in():
     assert course(found) == GROWS
 
 
+@pytest.mark.slow
 def test_a_function_that_one_flight_alone_can_show_is_not_applied():
     """Anchor 3 is late from 26 to 34 s. The other flight ends before."""
     late = SmoothTerm(

@@ -135,6 +135,7 @@ def test_without_ground_truth_the_delay_of_the_tag_is_found_with_that_of_an_anch
     assert "predicted ranges" in output.as_text(result).replace("\n", " ")
 
 
+@pytest.mark.slow
 def test_without_ground_truth_nothing_is_added_where_nothing_is_wrong(both):
     result = diagnose([alone(both)], reference=Nothing())
     assert not result.effects and not any(finding.added for finding in result.findings)

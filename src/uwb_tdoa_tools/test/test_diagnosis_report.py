@@ -68,6 +68,7 @@ def page(result):
 # verdict
 
 
+@pytest.mark.slow
 def test_the_verdict_has_the_error_before_and_after_its_interval_and_how_many_flights(result):
     found = verdict(
         judged(result, {"one": 0.3, "two": 0.3}, {"one": 0.2, "two": 0.2}, [0.24, 0.44])
@@ -256,6 +257,7 @@ def test_what_errors_are_against_is_said_where_only_heights_are_known(result):
     assert not any("Errors are against" in sentence for sentence in verdict(result).more)
 
 
+@pytest.mark.slow
 def test_without_ground_truth_anchors_are_found_and_it_is_said_what_is_not(without_truth):
     added = {finding.effect.name for finding in without_truth.findings if finding.added}
     assert added == {"anchor_position", "anchor_delay"}
@@ -263,6 +265,7 @@ def test_without_ground_truth_anchors_are_found_and_it_is_said_what_is_not(witho
     assert {"truth_frame", "accel_bias", "truth_time_offset"} <= hidden
 
 
+@pytest.mark.slow
 def test_without_ground_truth_no_error_is_claimed(without_truth):
     found = verdict(without_truth)
     text = " ".join(found.sentences)
@@ -277,6 +280,7 @@ def test_without_ground_truth_no_error_is_claimed(without_truth):
     assert verdict(calm).kind == "nothing"
 
 
+@pytest.mark.slow
 def test_without_ground_truth_what_is_not_borne_out_is_not_added_with_the_reason_in_one_place(
     without_truth,
 ):
@@ -559,6 +563,7 @@ def test_what_the_flights_have_is_not_asked_for(result):
     assert asked == ["a gyroscope", "a velocity (wheels, optical flow, visual odometry)"]
 
 
+@pytest.mark.slow
 def test_without_truth_ground_truth_would_tell(without_truth):
     remedies = {item.effect: item.remedy for item in undetermined(without_truth)}
     assert "ground truth" in remedies["truth_frame"]
@@ -636,6 +641,7 @@ def test_findings_and_alternatives_in_json(result):
     assert json.loads(json.dumps(content, allow_nan=False)) == content
 
 
+@pytest.mark.slow
 def test_every_key_of_json_is_in_the_document(result, without_truth):
     text = (DOCS / "diagnosis_report.md").read_text()
     term = SmoothTerm({"c0": 0.1}, {}, knots=(0.0, 1.0))
@@ -654,6 +660,7 @@ def all_pages(page, result, without_truth):
     return [page, html(none), html(without_truth)]
 
 
+@pytest.mark.slow
 def test_names_of_others_are_text(result):
     name = """</title><script>alert('"')</script>"""
     flights = tuple(replace(flight, name=name) for flight in result.flights)
@@ -669,6 +676,7 @@ def test_names_of_others_are_text(result):
     assert any(name in attributes["alt"] for tag, attributes, _ in Tags(page).seen if tag == "img")
 
 
+@pytest.mark.slow
 def test_a_page_is_light_well_formed_holds_all_itself_and_describes_its_pictures(all_pages):
     for page in all_pages:
         assert len(page) < 1_000_000
@@ -682,6 +690,7 @@ def test_a_page_is_light_well_formed_holds_all_itself_and_describes_its_pictures
         assert len({item["alt"] for item in pictures}) == len(pictures)
 
 
+@pytest.mark.slow
 def test_every_abbreviation_is_spelled_out_and_every_effect_explained(all_pages):
     for page in all_pages:
         text, _, meanings = said(page).rpartition("What abbreviations and names of effects mean")

@@ -15,6 +15,8 @@ from uwb_tdoa_tools.diagnosis.regression.fit import refit
 from uwb_tdoa_tools.diagnosis.regression.terms import columns_of
 from uwb_tdoa_tools.simulation import ImuErrors, SimulationConfig, simulate
 
+pytestmark = pytest.mark.slow
+
 SCALE = 0.02
 NO_TDOAS = Tdoas(*(np.empty(0, kind) for kind in (float, int, int, float)))
 ERRORS = ImuErrors(gyro_bias=0.01)
@@ -41,6 +43,7 @@ def of_wheels():
     return traced(rover(1), "velocity")
 
 
+@pytest.mark.quick
 def test_a_rover_is_diagnosed_from_where_it_starts_to_where_it_stops():
     flight = rover(2)
     first, last = GroundTruth().span(flight, flight.truth)
@@ -83,6 +86,7 @@ def test_an_accelerometer_on_a_level_floor_has_a_bias_and_what_it_could_be_is_li
         assert {"accel_scale", "imu_gravity"} <= {other.effect for other in found.alternatives}
 
 
+@pytest.mark.quick
 def test_a_rate_that_is_noise_explains_nothing():
     rng = np.random.default_rng(1)
     turning = np.column_stack([np.zeros(300), 0.3 * np.sin(np.linspace(0.0, 20.0, 300))])

@@ -17,6 +17,8 @@ from uwb_tdoa_tools.diagnosis.regression.scan import Scan, _held
 from uwb_tdoa_tools.diagnosis.regression.table import table_of
 from uwb_tdoa_tools.diagnosis.regression.terms import Candidate, Term
 
+pytestmark = pytest.mark.slow
+
 TRUTH = GroundTruth()
 
 
@@ -101,6 +103,7 @@ def test_a_finer_search_of_a_product_never_loses_gain(flight, term):
         assert one.gain >= gain
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize("form", ["anchor", "pair"])
 def test_the_gain_of_a_product_counts_the_rows_that_a_fit_uses(form):
     """A fit has no level of an anchor where a covariate is unknown, but a level of a pair."""
@@ -151,6 +154,7 @@ def test_of_thousands_the_right_function_is_proposed_first(flight, term):
     }
 
 
+@pytest.mark.quick
 def test_the_gain_is_that_of_normal_equations_with_the_same_weights(flight):
     """The closed form for thousands of functions agrees with one fit.
 

@@ -56,6 +56,7 @@ def diagnosis(flights):
     return diagnose(flights, reference=Nothing())
 
 
+@pytest.mark.slow
 def test_delays_of_several_anchors_are_told_well_enough_from_the_innovations_alone(late):
     assert late.why_not is None and late.explained > 0.5 and late.left < LEFT
     other = flight_with(LATE, seed=102, seconds=30.0, make=all_tdoas)
@@ -107,6 +108,7 @@ def test_the_noise_that_the_filter_is_told_asks_for_no_functions_of_the_place():
     assert alone.tdoa_std(config) == pytest.approx(with_all.tdoa_std(config), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_a_delay_of_one_flight_is_no_delay_of_the_other():
     short = {"seconds": 28.0, "make": all_tdoas}
     found = self_calibrate([flight_with(LATE, **short), flight_with(seed=101, **short)])
@@ -124,6 +126,7 @@ def why_not_of(flight):
     )
 
 
+@pytest.mark.slow
 def test_nothing_is_a_finding_in_a_flight_of_which_nothing_is_wrong():
     assert "of what is slow in the innovations" in why_not_of(flight_with())
 
@@ -134,12 +137,14 @@ def test_flights_that_are_too_short_say_so():
     )
 
 
+@pytest.mark.slow
 def test_nothing_is_applied_if_something_else_is_wrong_too():
     blocked = {"2.x": 1.0, "2.y": 0.0, "2.z": 1.0, "2.radius": 1.5, "2.delay": 1.5}
     other = EFFECTS["nlos"](blocked), LATE, EFFECTS["noise_correlation"]({"std": 0.2, "time": 1.0})
     assert "something else is wrong too" in why_not_of(flight_with(*other))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio, applied", [(0.95, False), (1.05, True)])
 def test_slow_errors_of_ranges_ask_for_a_smaller_fall(late, ratio, applied):
     """The rule for ranges does not depend on the size of the remaining errors.
@@ -153,6 +158,7 @@ def test_slow_errors_of_ranges_ask_for_a_smaller_fall(late, ratio, applied):
         assert (replace(found, tdoa_std=None).why_not is None) == applied
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "before, left, marks, applied",
     [

@@ -41,6 +41,7 @@ def found(wandering):
     return functions_of_axes(residuals(*wandering), [])
 
 
+@pytest.mark.slow
 def test_an_axis_is_searched_with_its_own_noise(found):
     assert "accel.z over y" in labels(found)
     (of_accel,) = found
@@ -48,6 +49,7 @@ def test_an_axis_is_searched_with_its_own_noise(found):
     assert 4.0 * z < min(x, y)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_nothing_is_found_where_nothing_is(seed):
     flights = [clean_flight(10 * seed + k, 30.0, aided=True) for k in range(2)]
@@ -58,6 +60,7 @@ def test_flights_without_inertial_samples_have_no_axes(wandering):
     assert functions_of_axes(residuals(wandering[0].without("imu")), []) == []
 
 
+@pytest.mark.slow
 def test_what_one_of_both_flights_shows_is_left_out(wandering):
     alone = functions_of_axes(residuals(wandering[0]), [])
     both = functions_of_axes(residuals(wandering[0], sparse_flight(101, 40.0)), [])
@@ -80,6 +83,7 @@ def test_functions_join_a_selection_with_the_noise_that_they_leave(wandering, fo
     )
 
 
+@pytest.mark.slow
 def test_a_diagnosis_names_the_axis_first_and_takes_its_error_out(wandering):
     """Without functions of single axes the error stays, and the axis is not named."""
     other = undeclared.accel_of_place_beside_drift(sparse_flight(102, 40.0))

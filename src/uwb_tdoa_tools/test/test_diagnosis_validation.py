@@ -54,6 +54,7 @@ def attribution(flights):
     return attribute(flights, TRUTH, undeclared=False)
 
 
+@pytest.mark.slow
 def test_every_flight_is_judged_with_effects_that_it_took_no_part_in(flights, attribution):
     cases = cross_fitted(attribution, flights, NONE, attribution.selection.chosen, ())
     assert [case.flight.name for case in cases] == [flight.name for flight in flights]
@@ -62,6 +63,7 @@ def test_every_flight_is_judged_with_effects_that_it_took_no_part_in(flights, at
     assert attribution.selection.table.flights == 2
 
 
+@pytest.mark.slow
 def test_each_of_six_flights_is_tried(flights):
     """Three of them left out that a function does harm to a flight of the fit."""
     six = [replace(flight, name=str(k)) for k, flight in enumerate(3 * flights)]
@@ -85,6 +87,7 @@ def test_a_validated_effect_stays_without_another_trial(attribution):
     assert kept.error > 2.0 * dropped.error
 
 
+@pytest.mark.slow
 def test_a_displacement_is_used_again_where_corrections_have_not_changed(monkeypatch):
     """Without an accelerometer bias, the correction by the delay of an anchor stays the same."""
     flights = [
@@ -115,6 +118,7 @@ def test_a_displacement_is_used_again_where_corrections_have_not_changed(monkeyp
     assert used.error(fewer) == pytest.approx(computed.error(fewer), rel=0.03)
 
 
+@pytest.mark.slow
 def test_halves_of_a_single_flight_judge_each_other(flights):
     single = attribute(flights[:1], TRUTH, undeclared=False)
     first, second = cross_fitted(single, flights[:1], NONE, single.selection.chosen, ())
@@ -138,6 +142,7 @@ def test_what_does_harm_is_left_out_with_a_reason(flights, attribution):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "effect, recurs",
     [
@@ -176,6 +181,7 @@ def test_what_happened_at_a_time_of_one_flight_is_said_and_not_kept(effect, recu
         )
 
 
+@pytest.mark.slow
 def test_what_is_worth_little_is_kept_of_several_flights_and_not_of_one(flights):
     two = [EFFECTS["gyro_bias"]({"z": 0.006}).inject(flight) for flight in flights]
     found = [attribute(some, TRUTH, undeclared=False) for some in (two, two[:1])]
@@ -194,6 +200,7 @@ def test_what_is_worth_little_is_kept_of_several_flights_and_not_of_one(flights)
     )  # it is applied as tried
 
 
+@pytest.mark.slow
 def test_what_no_node_can_take_out_is_not_tried():
     flight = sparse_flight(100, 30.0)
     acceleration = np.linalg.norm(Track(flight.truth).motion(flight.imu.t).acceleration, axis=1)
@@ -252,6 +259,7 @@ def test_before_and_after_with_intervals(flights):
     assert second < first
 
 
+@pytest.mark.slow
 def test_halves_of_a_flight_count_what_is_before_and_after_the_fit_once(flights):
     single = attribute(flights[:1], TRUTH, undeclared=False)
     cases, run = cross_fitted(single, flights[:1], NONE, (), ()), Baseline(NONE).run(flights[0])

@@ -101,6 +101,7 @@ def topics():
     return {str(one).replace("~", "ekf_node").strip("/") for one in found if isinstance(one, str)}
 
 
+@pytest.mark.slow
 def test_the_reference_has_every_topic_and_service():
     text = (ROOT / "docs" / "reference.md").read_text()
     section = text.partition("\n## Topics\n")[2].partition("\n## ")[0]

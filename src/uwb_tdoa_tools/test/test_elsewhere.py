@@ -47,6 +47,7 @@ def run(code, *words, folder, **variables):
     )
 
 
+@pytest.mark.slow
 def test_all_that_needs_no_ros_is_imported_without_posix(tmp_path):
     off_line = [name for name in modules() if name not in ROS]
     done = run(

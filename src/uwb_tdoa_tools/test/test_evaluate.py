@@ -101,6 +101,7 @@ def test_report_of_one_flight(flight, bag, tmp_path, capsys):
     assert table[1].startswith(flight.name) and f"{row['rmse_3d']:.3f}" in table[1]
 
 
+@pytest.mark.slow
 def test_report_of_the_phases_of_one_flight_and_of_several(bag, tmp_path, capsys):
     one = report([bag, "--no-bias"], tmp_path)["runs"][0]
     expected = [
@@ -172,6 +173,7 @@ def test_a_result_that_somebody_has_forged_is_refused(bag, tmp_path, capsys):
     assert main(options) == 0
 
 
+@pytest.mark.slow
 def test_corrects_with_nothing_unless_effects_or_a_network_are_given(flight, bag, tmp_path, capsys):
     known_answer = pytest.importorskip("known_answer")
     model = known_answer.write(tmp_path)
@@ -192,6 +194,7 @@ def test_corrects_with_nothing_unless_effects_or_a_network_are_given(flight, bag
     ]
 
 
+@pytest.mark.slow
 def test_no_bias_runs_without_effects(flight, bag, tmp_path):
     effects = tmp_path / "effects.yaml"
     EffectSet((AnchorDelay({int(flight.anchors.ids[0]): 0.8}),)).to_yaml(effects)
@@ -274,6 +277,7 @@ def test_flights_without_truth_are_refused_in_one_sentence(flight, odometry, tmp
         assert "ground truth" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_picture_and_trajectories(flight, bag, tmp_path):
     assert (
         main([str(bag), "--plot", str(tmp_path / "error.png"), "--tum", str(tmp_path / "tum")]) == 0
@@ -301,6 +305,7 @@ def test_a_run_that_never_starts_has_a_picture_and_a_report_in_strict_json(fligh
     assert found["runs"][0]["diverged"] is True
 
 
+@pytest.mark.slow
 def test_table_beside_others(flight, bag, tmp_path):
     peers = tmp_path / "peers.csv"
     peers.write_text(
@@ -354,11 +359,13 @@ def test_a_bad_parameter_is_told(bag, text, capsys):
     assert "error" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_smoothing_is_better(bag, tmp_path):
     filtered, smoothed = report([bag], tmp_path), report([bag, "--smooth"], tmp_path)
     assert smoothed["runs"][0]["rmse_3d"] < 0.9 * filtered["runs"][0]["rmse_3d"]
 
 
+@pytest.mark.slow
 def test_a_name_is_no_command_to_picture_table_or_terminal(flight, tmp_path, capsys):
     name, folder = "$\\frac$ <b>|\x1b[31m", tmp_path / "\x1b[2Jflights"
     folder.mkdir()

@@ -200,6 +200,7 @@ def hall(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_the_cheap_ones_of_the_first_pages_run(documented, hall, capsys):
     ran = []
     for where, name, words in documented:

@@ -50,11 +50,13 @@ def agree(folder, effect_set, network=None):
     np.testing.assert_allclose(both, expected[1], atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*KINDS, "all"])
 def test_every_effect_is_equal_to_numpy_and_python(tmp_path, name):
     agree(tmp_path, chosen(*(KINDS if name == "all" else (name,))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("orientations", [True, False])
 def test_both_networks_are_equal_to_numpy_and_python(tmp_path, orientations):
     held = chosen("anchor_delay", "tag_lever_arm")
@@ -89,6 +91,7 @@ def odd_cases(n):
     return some
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("with_network", [False, True])
 def test_no_input_is_a_fault(tmp_path, with_network):
     network = c.network(tmp_path) if with_network else None
@@ -115,6 +118,7 @@ def calls_libm(name):
     return any(one.kind in c.LIBM for program in programs for one in program.scalars)
 
 
+@pytest.mark.slow
 @needs_board
 def test_the_board_computes_the_same_bits(tmp_path):
     """+, -, *, / and the square root follow IEEE 754, so effects without libm agree."""
@@ -126,6 +130,7 @@ def test_the_board_computes_the_same_bits(tmp_path):
     same_bits(results, code, some)
 
 
+@pytest.mark.slow
 @needs_board
 def test_the_board_agrees_with_the_flags_of_the_firmware(tmp_path):
     network, some = c.network(tmp_path), cases(1000)
@@ -139,6 +144,7 @@ def test_the_board_agrees_with_the_flags_of_the_firmware(tmp_path):
     assert np.isfinite(odd["bias"]).all() and set(odd["wrong"]) == {0, NO_PAIR, NOT_FINITE}
 
 
+@pytest.mark.slow
 @needs_board
 def test_it_fits_a_small_vehicle(tmp_path):
     ten = c.cost_of(tmp_path / "ten", vehicle_code(ANCHORS, chosen(*c.COMMON)))

@@ -18,6 +18,8 @@ from uwb_tdoa_ekf.offline import run_offline  # noqa: E402
 from uwb_tdoa_tools.exporting.onnx_file import write_onnx  # noqa: E402
 from uwb_tdoa_tools.training.network import WITHOUT  # noqa: E402
 
+pytestmark = pytest.mark.slow  # starts nodes
+
 EQUAL = 1e-4  # m
 
 

@@ -54,7 +54,10 @@ def assert_equal(effects, network, model, samples):
         np.testing.assert_allclose(one, other, rtol=0.0, atol=most, err_msg=name)
 
 
-@pytest.mark.parametrize("name", EFFECTS)
+@pytest.mark.parametrize(
+    "name",
+    [name if name in DECLARED else pytest.param(name, marks=pytest.mark.slow) for name in EFFECTS],
+)
 def test_each_effect(tmp_path, name):
     effects = EffectSet((EFFECTS[name],))
     model = exported(tmp_path / "bias.onnx", effects)
@@ -65,6 +68,7 @@ def test_each_effect(tmp_path, name):
     assert max(np.abs(prediction.bias).max(), prediction.std.max()) > 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("names", [FEATURES, WITHOUT], ids=["14", "8"])
 def test_networks(tmp_path, names):
     """Test a network alone, a network with all limits, and a network with all declared effects."""
@@ -192,6 +196,7 @@ def test_a_file_that_no_node_would_load_is_not_written(tmp_path):
     assert not (tmp_path / "bias.onnx").exists()
 
 
+@pytest.mark.slow
 def test_a_measured_flight_has_the_same_figures_by_the_file_and_by_effects(shared_data, tmp_path):
     """The filter is in the loop.
 

@@ -22,11 +22,12 @@ from walking import blocks, commands, main, run
 from uwb_tdoa_bias.common.survey import read_survey
 from uwb_tdoa_bias.effects import EffectSet
 
+pytestmark = pytest.mark.slow
+
 # `check` reads no ground truth, so its result is the same for the other cases
 CHECKED = (("simulated", "in another frame"), ("measured", "late"))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("source", "name"),
     [

@@ -25,6 +25,8 @@ from walking import blocks, commands, main, run, section
 
 from uwb_tdoa_bias.common.survey import read_survey
 
+pytestmark = pytest.mark.slow
+
 
 def ended(name, words):
     """Return the exit code of a step: 0, or 1 if its result is not to be used."""
@@ -33,7 +35,6 @@ def ended(name, words):
     return code
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("source", ["simulated", "measured"])
 def test_from_tape_to_calibrated_without_ground_truth(
     tmp_path, monkeypatch, capsys, shared_data, source
@@ -118,7 +119,6 @@ def write_log(flight, path):
     Path(path).write_bytes(log_bytes([(name, round(1e6 * t), values) for name, t, values in rows]))
 
 
-@pytest.mark.slow
 def test_the_four_steps_of_the_guide(tmp_path, monkeypatch, capsys):
     """check, calibrate, diagnose, survey, localize: guide.md, from a log and a survey."""
     at_desk(tmp_path, monkeypatch)

@@ -151,6 +151,7 @@ def test_gradient_is_that_of_the_cost(flight, inertial):
         assert equations.path_gradient[3 * row + 1] == pytest.approx(slope, rel=1e-3, abs=1e-2)
 
 
+@pytest.mark.slow
 @settings(max_examples=4, deadline=None)
 @given(st.integers(0, 1000))
 def test_distances_with_heights_and_a_side_give_the_map_or_a_reason(seed):
@@ -159,6 +160,7 @@ def test_distances_with_heights_and_a_side_give_the_map_or_a_reason(seed):
     assert found.why_not or largest_z(found, true) < CERTAIN
 
 
+@pytest.mark.slow
 def test_distances_alone_leave_the_map_open():
     true = room(1)
     found = map_anchors(measured(true))
@@ -192,17 +194,20 @@ def test_a_flight_gives_the_map(flight):
     assert np.linalg.norm(found.positions - true, axis=1).max() < 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("trajectory", ["hover", "line_x"])
 def test_a_flight_that_shows_too_little_is_refused(trajectory):
     assert map_anchors(seen_of([flown(trajectory=trajectory)])).why_not
 
 
+@pytest.mark.slow
 def test_a_faulty_inertial_sensor_is_refused(flight):
     still = replace(flight.imu, gyro=0.0 * flight.imu.gyro)
     found = map_anchors(seen_of([replace(flight, imu=still)]))
     assert "accelerations" in found.why_not
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("signs", [(-1.0, 1.0, 1.0), (-1.0, -1.0, -1.0)])
 def test_a_gyroscope_with_wrong_signs_mirrors_no_map(flight, signs):
     """The mirror image fits all TDOAs, so only the IMU itself can reveal it."""
@@ -210,6 +215,7 @@ def test_a_gyroscope_with_wrong_signs_mirrors_no_map(flight, signs):
     assert "accelerations" in map_anchors(seen_of([replace(flight, imu=imu)])).why_not
 
 
+@pytest.mark.slow
 def test_a_flat_path_needs_heights(flight):
     flat = flown(trajectory="circle")
     assert map_anchors(seen_of([flat])).why_not
@@ -218,6 +224,7 @@ def test_a_flat_path_needs_heights(flight):
     assert found.why_not or largest_z(found, flat.anchors.positions) < CERTAIN
 
 
+@pytest.mark.slow
 def test_a_flight_without_inertial_sensor_leaves_the_frame_open(flight):
     found = map_anchors(seen_of([flight.without("imu")]))
     assert "turn about the line" in found.why_not or "mirror image" in found.why_not
@@ -249,6 +256,7 @@ def desk(tmp_path_factory, flight):
     return folder
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_map_and_a_next_line_that_runs(desk, flight, capsys, monkeypatch):
     monkeypatch.chdir(desk)
     out = desk / "map"
@@ -268,6 +276,7 @@ def test_the_command_writes_a_map_and_a_next_line_that_runs(desk, flight, capsys
     assert off.max() < 1.0
 
 
+@pytest.mark.slow
 def test_the_command_refuses_and_writes_no_anchors(desk, flight, capsys):
     p = flight.anchors.positions
     pairs = [(a, b) for a in range(len(p)) for b in range(a)]

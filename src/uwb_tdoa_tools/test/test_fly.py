@@ -13,6 +13,7 @@ from uwb_tdoa_tools.flying.verdict import verdict_of
 from uwb_tdoa_tools.readers import read_flight
 
 
+@pytest.mark.slow
 def test_a_flight_is_counted_drawn_and_recorded_for_the_other_tools(tmp_path, capsys):
     out, picture, record = tmp_path / "flown.json", tmp_path / "flown.png", tmp_path / "flown"
     options = ["--flights", "1", "--no-floor-effect", "--told", "place", "--sensor", "height"]

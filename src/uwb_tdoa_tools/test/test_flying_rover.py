@@ -31,6 +31,7 @@ def drives():
     return [rover.drive(replace(TASK, seed=seed)) for seed in SEEDS]
 
 
+@pytest.mark.slow
 def test_it_arrives_and_the_verdict_is_that_of_its_truth(drives):
     verdicts = [verdict_of(one) for one in drives]
     for one, verdict in zip(drives, verdicts):
@@ -50,6 +51,7 @@ def test_it_arrives_and_the_verdict_is_that_of_its_truth(drives):
     assert "3 of 3 arrived" in text(summed) and "largest distance to the path" in text(summed)
 
 
+@pytest.mark.slow
 def test_wheels_say_more_or_less_than_is_true_and_the_imu_what_is():
     """Between slips, the wheels are wrong by their scale.
 
@@ -96,6 +98,7 @@ def test_it_refuses_to_start_where_it_does_not_know_where_it_is():
     assert np.ptp(one.states[:, :2], axis=0).max() == 0.0 and not verdict["arrived"]
 
 
+@pytest.mark.slow
 def test_a_verdict_of_a_rover_that_stops_elsewhere(drives):
     truth = drives[0].flight.truth
     moved = Truth(truth.t, truth.p + [0.5, 0.0, 0.0], truth.q)
@@ -116,6 +119,7 @@ def test_the_nearest_point_of_a_polyline(along, off):
     assert np.linalg.norm(nearest - p) <= best + 1e-9
 
 
+@pytest.mark.slow
 def test_it_drives_where_the_radio_is_silent_for_a_while():
     silent = replace(WORLDS["silence-3s"], sensors=rover.SENSOR_NAMES)
     one = rover.drive(replace(TASK, world=silent, seed=8))
@@ -145,6 +149,7 @@ def test_what_a_rover_has_nothing_to_do_with_is_refused(options, said, capsys):
     assert said in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_command_counts_draws_and_records_drives(tmp_path, capsys):
     options = ["--vehicle", "rover", "--flights", "1", "--seed", "3", "--at-least", "1"]
     assert main([*options, "--plot", str(tmp_path / "x.png"), "--record", str(tmp_path / "r")]) == 0

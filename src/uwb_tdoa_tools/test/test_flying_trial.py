@@ -230,6 +230,7 @@ def test_it_takes_off_follows_the_path_and_lands(plain):
     assert [*verdict["phases"]] == ["before", "lift_off", "air", "landing", "after"]
 
 
+@pytest.mark.slow
 def test_the_same_task_is_the_same_flight_and_another_seed_another_one(plain):
     again = fly(plain.task)
     np.testing.assert_array_equal(again.states, plain.states)
@@ -277,6 +278,7 @@ def test_an_effect_is_in_the_loop_what_inject_makes_of_it(plain):
     assert not np.array_equal(with_it.tdoa.d, without.tdoa.d)
 
 
+@pytest.mark.slow
 def test_after_a_minute_it_flies_once_more_from_where_it_was_carried():
     flown = fly(
         Task(replace(PERFECT, outlier_share=0.01), seed=3, given="place", path=SHORT, again=True)
@@ -296,6 +298,7 @@ def test_after_a_minute_it_flies_once_more_from_where_it_was_carried():
     assert position_at(np.array([truth.t[-1]]), truth)[0, 2] < 0.05
 
 
+@pytest.mark.slow
 def test_it_is_flown_by_what_a_network_corrects(tmp_path):
     path = Circles(turns=1, turn_time=4.0)
     task = Task(PERFECT, seed=1, given="place", path=path, model=str(known_answer.write(tmp_path)))
@@ -306,6 +309,7 @@ def test_it_is_flown_by_what_a_network_corrects(tmp_path):
     assert np.abs(plain.odometry.p[:n] - corrected.odometry.p[:n]).max() > 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["table", "person", "three-kinds", "tdoa3", "jitter", "rectifying", "gusts"]
 )

@@ -61,6 +61,7 @@ def aloft(vehicle, height=50.0, speed=None):
     return state
 
 
+@pytest.mark.slow
 def test_a_vehicle_that_stands_stays():
     vehicle = Vehicle()
     state, feet = flown(vehicle, vehicle.at_rest(1.0, -2.0, 0.7), np.zeros(4), 5.0)
@@ -196,6 +197,7 @@ def at(p):
     return np.array([p, np.zeros(3), np.zeros(3)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turn", [0.0, 1.0, -2.5])
 def test_it_goes_where_it_is_wanted_and_turns_there(turn):
     states = flown_of_controller(at([1.0, -0.5, 2.5]), 0.3, 8.0, turn)

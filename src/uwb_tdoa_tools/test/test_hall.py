@@ -157,6 +157,7 @@ def test_an_anchor_that_stands_apart_from_the_others_is_named_even_if_the_tape_a
     assert not misplaced_anchors(replace(found, surveyed=given.at(given.positions + still)))
 
 
+@pytest.mark.slow
 def test_check_tries_few_exchanges_of_ids_in_a_hall(sound, monkeypatch):
     runs, whole = [], OrderedRecording.of(of_flight(sound))
     brief, judged = whole.part(SHORT), OrderedRecording.unexplained
@@ -190,6 +191,7 @@ def test_a_fast_tag_does_not_speak_against_the_survey():
     )  # with the initial positions of the tag, it would contradict the survey
 
 
+@pytest.mark.slow
 def test_a_hall_is_no_plane_unless_those_that_are_heard_together_lie_in_one(sound):
     level = np.column_stack([sound.anchors.positions[:, :2], np.full(len(sound.anchors), 4.0)])
     for anchors, is_flat in ((sound.anchors, False), (Anchors.from_positions(level), True)):
@@ -208,6 +210,7 @@ def test_tdoas_that_are_late_in_a_hall_are_found_and_others_are_not(sound, late,
     assert of.drift()[0] > DRIFTS and of.jump()[0] > JUMPS
 
 
+@pytest.mark.slow
 def test_check_says_in_one_line_who_is_not_heard_in_a_hall(sound):
     found = [
         finding

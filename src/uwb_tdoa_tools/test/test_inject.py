@@ -47,6 +47,7 @@ def test_noise_has_the_size_asked_for(flight):
     assert np.mean(wrong) == pytest.approx(0.1, rel=0.2)
 
 
+@pytest.mark.slow
 def test_executable_writes_the_bag(flight, tmp_path, capsys):
     write_bag(flight, tmp_path / "in")
     arguments = [

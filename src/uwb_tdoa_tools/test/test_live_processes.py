@@ -121,6 +121,7 @@ COMPILING = ("echo 'compiling, which is done once: 40%, 20 s'", "while true; do 
 READY = "echo '[INFO] [1.5] [node]: ready; correcting with: none'"
 
 
+@pytest.mark.slow
 def test_a_process_that_compiles_is_waited_for_without_limit(start, quick, tmp_path):
     start("node", *COMPILING)
     wait_for_output(tmp_path / "node.log", "compiling")
@@ -151,6 +152,7 @@ def test_without_progress_the_wait_ends(start, quick, tmp_path, lines):
         processes.wait(0.5, "the node", start.processes, None, lambda: False)
 
 
+@pytest.mark.slow
 def test_changing_counters_extend_the_wait(start, quick):
     start("node", READY, "sleep 600")
     until = time.monotonic() + 2.0

@@ -35,6 +35,8 @@ from uwb_tdoa_msgs.msg import AnchorArray, Tdoa  # noqa: E402
 from uwb_tdoa_tools.commands import replay  # noqa: E402
 from uwb_tdoa_tools.live.record import recorded_odometry  # noqa: E402
 
+pytestmark = pytest.mark.slow  # starts players and subscriptions
+
 LIMIT = 180.0  # s, limit of each step
 STREAMS = ["imu/data", "uwb/tdoa", "ground_truth/pose"]
 DEEP = QoSProfile(depth=100_000, reliability=ReliabilityPolicy.RELIABLE)
@@ -187,7 +189,6 @@ def test_late_subscriptions_receive_the_anchors(tmp_path, start, node):
     assert "replay: stopped\n" in replaying.said and "/uwb/anchors: 1 messages" in out
 
 
-@pytest.mark.slow
 def test_slow_reliable_subscription_loses_nothing(tmp_path, start, node):
     """The subscription sleeps for 1 s.
 
@@ -235,6 +236,7 @@ def test_loop_starts_again_until_stopped(tmp_path, start, node):
     assert replaying.end(signal.SIGTERM)[0] == 0
 
 
+@pytest.mark.quick
 def test_all_topics_of_a_tag_move_to_a_namespace(tmp_path, start, node):
     """The command is the example in --help.
 

@@ -54,6 +54,7 @@ def run(arguments, code=0):
 # --- the trajectory ---
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("more", [(), ("--smooth",)])
 def test_ground_truth_is_not_read_and_the_trajectory_is_that_of_evaluate_to_the_bit(
     bags, tmp_path, more
@@ -74,6 +75,7 @@ def test_ground_truth_is_not_read_and_the_trajectory_is_that_of_evaluate_to_the_
     assert judged.read_bytes() == (tmp_path / "wrong" / "flight.tum").read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ranges", [False, True])
 def test_evaluate_and_localize_state_the_same_nis(bags, ranges, tmp_path, capsys):
     """They reported 5.26 and 0.93 for one flight. Later, `evaluate` left out ranges."""
@@ -90,6 +92,7 @@ def test_evaluate_and_localize_state_the_same_nis(bags, ranges, tmp_path, capsys
     assert run_of_it["nis_mean"] == pytest.approx(told["nis"], abs=1e-9)
 
 
+@pytest.mark.slow
 def test_what_is_written_says_the_same(bags, flight, tmp_path, capsys):
     run(
         [
@@ -175,6 +178,7 @@ def ranged():
     return replace(made, tdoa=rows_of(made.tdoa, slice(0)), truth=None)
 
 
+@pytest.mark.slow
 def test_ranges_alone_are_assessed_like_tdoas(ranged, tmp_path):
     found = assessed(ranged)
     assert found.level == GOOD and not found.reasons and not found.lost
@@ -225,6 +229,7 @@ def test_silence_is_where_the_tag_was_lost(flight, ranged, stream):
     assert any("inertial" in sentence for sentence in found.remedies)
 
 
+@pytest.mark.slow
 def test_an_error_of_check_is_bad_with_a_remedy_and_exit_code_1(flight, tmp_path, capsys):
     wrong = replace(flight, tdoa=replace(flight.tdoa, d=-flight.tdoa.d))
     found = assessed(wrong)
@@ -344,6 +349,7 @@ def test_zones_say_who_is_heard_where_and_how_well():
     )
 
 
+@pytest.mark.slow
 def test_zones_are_written_as_a_table_and_a_map(bags, tmp_path, capsys):
     run([bags / "none" / "flight.bag", "--zones", "2", "--out", tmp_path])
     lines = (tmp_path / "flight_zones.csv").read_text().splitlines()

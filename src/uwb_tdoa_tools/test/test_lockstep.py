@@ -33,6 +33,8 @@ from uwb_tdoa_tools.scoring.evaluation import evaluate  # noqa: E402
 from uwb_tdoa_tools.scoring.metrics import Score  # noqa: E402
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 VERDICTS = ("used", "rejected", "late", "invalid", "startup", "waiting")
 READY_LIMIT, SETTLE_LIMIT = 180.0, 60.0  # s
 
@@ -115,7 +117,6 @@ def assert_equal_to_offline(flight, told, recorded):
     return offline
 
 
-@pytest.mark.slow
 def test_ranges_are_used_as_off_line_and_heights_with_holes_do_not_delay_the_replay(tmp_path):
     """In a gap of the heights, ekf_node waits for a height and holds back all TDOAs."""
     flight = simulate(
@@ -139,7 +140,6 @@ def test_ranges_are_used_as_off_line_and_heights_with_holes_do_not_delay_the_rep
     ) <= 1  # after the end of the replay
 
 
-@pytest.mark.slow
 def test_a_measured_flight_beside_three_busy_processes(shared_data, tmp_path, load):
     log, survey = shared_data / "flights/0426/0426-traj3", shared_data / "surveys/anchor_0426.txt"
     flight = read_flight(log, survey)
@@ -152,7 +152,6 @@ def test_a_measured_flight_beside_three_busy_processes(shared_data, tmp_path, lo
     assert offline.row()["rmse_3d"] < 0.35
 
 
-@pytest.mark.slow
 def test_nodes_that_do_not_wait_long_enough_are_not_followed(tmp_path):
     write_bag(
         simulate(SimulationConfig(seed=3, duration=8.0, imu_rate=200.0, start_in_air=True)),
@@ -170,7 +169,6 @@ def test_nodes_that_do_not_wait_long_enough_are_not_followed(tmp_path):
     )
 
 
-@pytest.mark.slow
 def test_a_recording_without_imu_and_with_other_anchors_than_the_nodes_needs_no_parameter(tmp_path):
     flight = simulate(SimulationConfig(seed=3, duration=8.0, start_in_air=True))
     bag, file = tmp_path / "flight.bag", tmp_path / "surveyed.yaml"
@@ -220,7 +218,6 @@ def delayed(bag, out, count=10, delay=1_000_000_000):
             writer.write(made[topic], stamp, data)
 
 
-@pytest.mark.slow
 def test_late_messages_give_code_1(tmp_path):
     write_bag(
         simulate(SimulationConfig(seed=3, duration=8.0, imu_rate=200.0, start_in_air=True)),

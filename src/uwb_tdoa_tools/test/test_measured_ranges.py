@@ -38,6 +38,7 @@ def test_a_tag_of_which_nobody_knows_the_delay_is_located_and_honest(tag):
     assert row["nees_mean"] < 3.0 < 15.0 < wrong["nees_mean"]
 
 
+@pytest.mark.slow
 def test_a_survey_of_ranges_is_applied_and_the_position_gets_better(tag):
     """The flight determines the anchors without its ground truth."""
     found = self_calibrate([tag])

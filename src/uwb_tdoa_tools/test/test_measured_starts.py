@@ -19,6 +19,8 @@ from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.readers.inputs import Reading
 from uwb_tdoa_tools.scoring.metrics import scored_phase
 
+pytestmark = pytest.mark.slow
+
 FLIGHTS = (
     "0422-log00",
     "0425-traj13",
@@ -68,7 +70,6 @@ def rms(flight, t, p, low, high):
     return np.sqrt(np.mean(np.sum((p[chosen] - truth) ** 2, axis=1)))
 
 
-@pytest.mark.slow
 def test_a_filter_put_aside_or_started_in_flight_is_back_within_three_seconds(flights):
     """The limit is twice the error of the undisturbed filter.
 
@@ -97,7 +98,6 @@ def test_a_filter_put_aside_or_started_in_flight_is_back_within_three_seconds(fl
         print(f"{flight.name:16s}{steady:8.3f}" + "".join(f"{error:14.3f}" for error in cells))
 
 
-@pytest.mark.slow
 def test_a_wrong_yaw_is_mended_or_honestly_doubted(flights):
     print(
         f"\n{'flight':16s}"

@@ -32,6 +32,8 @@ from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.vehicles import Trajectory
 from uwb_tdoa_tools.surveying.report import as_text
 
+pytestmark = pytest.mark.slow  # diagnoses and surveys whole flights
+
 SHIFT, ROW = np.array([0.4, -0.3, 0.3]), 3
 CONFIG = SimulationConfig(
     seed=21,
@@ -152,6 +154,7 @@ def test_an_anchor_that_was_moved_before_the_start_is_named_with_the_command_tha
     assert one.remedy.startswith("survey flight.bag --effects effects.yaml")
 
 
+@pytest.mark.quick
 def test_what_check_says_of_an_anchor_holds_the_doubt_of_the_monitor():
     """The monitor could not separate two anchors, but `check` named only the first."""
     one = Finding(
@@ -254,7 +257,6 @@ def test_a_sound_flight_has_no_moved_anchor(sound):
     assert not self_calibrate([replace(sound, truth=None)], Tape(std=0.05)).changes
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["0422-log02", "0426-traj13"])
 def test_errors_of_antennas_are_no_moved_anchor(shared_data, name):
     """Measured flights with the surveyed anchors.
@@ -266,6 +268,7 @@ def test_errors_of_antennas_are_no_moved_anchor(shared_data, name):
     assert not self_calibrate([replace(flight, truth=None)], Tape(std=0.05)).changes
 
 
+@pytest.mark.quick
 def test_a_place_that_is_hardly_determined_is_stated_as_such():
     sure = AnchorChange("anchor_position", "3", np.full(3, 0.4), np.full(3, 0.02))
     assert sure.as_text().endswith("cm (x, y, z)")
@@ -283,7 +286,6 @@ def test_nothing_is_said_to_be_untold_of_an_anchor_that_has_moved(calibration):
     assert "3" not in line and "anchor 3 has moved" in as_text(told)
 
 
-@pytest.mark.slow
 def test_anchors_of_a_hall_that_are_left_behind_are_no_fault():
     """There were 44 warnings such as "look at its power"."""
     grid = np.array(

@@ -76,6 +76,7 @@ def rmse(words, monkeypatch):
 # --- --survey, and the anchors of a bag ---
 
 
+@pytest.mark.slow
 def test_evaluate_takes_the_survey(desk, monkeypatch, capsys):
     own, given = (
         rmse(["flight.bag", "--no-bias"], monkeypatch),
@@ -85,6 +86,7 @@ def test_evaluate_takes_the_survey(desk, monkeypatch, capsys):
     assert "right.yaml count here, whatever anchors the bag holds" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_convert_and_inject_put_the_survey_into_the_bag(desk):
     right = read_survey("right.yaml").positions
     assert convert.main(["flight.bag", "--survey", "right.yaml", "--out", "new.bag"]) == 0
@@ -140,6 +142,7 @@ def test_every_tool_reads_the_recording_with_the_survey(desk, monkeypatch, comma
 # --- other options, and files that say the same ---
 
 
+@pytest.mark.slow
 def test_a_parameter_counts_before_the_config(desk, monkeypatch):
     parameters = {"/**": {"ros__parameters": {"tdoa_std": 5.0}}}
     (desk / "ekf_node.yaml").write_text(yaml.safe_dump(parameters))

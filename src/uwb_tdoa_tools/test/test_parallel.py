@@ -91,6 +91,7 @@ def test_bad_input_in_another_process_is_the_same_sentence(importable, jobs, cap
     assert err == "count: error: number: 3 is too few; give more.\n"
 
 
+@pytest.mark.slow
 def test_an_interrupt_ends_all_processes_silently(importable):
     code = (
         "import sys, time; from uwb_tdoa_tools import cli, parallel\n"
@@ -116,6 +117,7 @@ def test_an_interrupt_ends_all_processes_silently(importable):
     )
 
 
+@pytest.mark.slow
 def test_modules_in_the_present_folder_do_not_run(tmp_path, importable):
     """With -m, as joblib uses it, Python imports modules from the working directory.
 

@@ -55,6 +55,7 @@ def report(out):
     return json.loads((out / "plan.json").read_text())
 
 
+@pytest.mark.slow
 def test_a_volume(anchors, tmp_path, capsys):
     out = tmp_path / "new" / "plan"
     assert (
@@ -98,6 +99,7 @@ def test_a_volume(anchors, tmp_path, capsys):
     assert "what the anchors span; if yours is another: --room" in text
 
 
+@pytest.mark.slow
 def test_a_round_of_ranges_and_of_both(anchors, tmp_path, capsys):
     """Ranges have one solution. They determine more than TDOAs."""
     bounds = {}
@@ -129,6 +131,7 @@ def test_a_round_of_ranges_and_of_both(anchors, tmp_path, capsys):
         assert "ranges have none; leave it out" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_slice_of_known_height(square, tmp_path, capsys):
     out = tmp_path / "out"
     options = [
@@ -178,6 +181,7 @@ def test_options_change_the_bound(anchors, tmp_path):
     assert median("--covariance", "ring_uncorrelated") != pytest.approx(base, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_one_figure_of_the_room_and_an_anchor_that_makes_it_larger(
     tmp_path, capsys, request, without_pictures
 ):
@@ -237,6 +241,7 @@ def test_where_no_anchor_helps_it_says_so(anchors, tmp_path, capsys, monkeypatch
     assert report(tmp_path / "out")["addition"] is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turned", [True, False], ids=["orientations surveyed", "not surveyed"])
 @pytest.mark.parametrize("how", ["add", "move"])
 @pytest.mark.usefixtures("without_advice")
@@ -318,6 +323,7 @@ def test_bad_input_is_told_in_one_sentence(options, says, anchors, tmp_path, mon
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_maps_are_published_to_late_subscribers(anchors, tmp_path):
     rclpy = pytest.importorskip("rclpy")
     pytest.importorskip("uwb_tdoa_msgs")
@@ -390,6 +396,7 @@ def test_with_a_height_sensor_four_anchors_at_one_height_serve_a_volume(square, 
     assert "height std" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_advice")
 def test_flights_are_judged_with_the_height_that_they_hold(anchors, tmp_path, capsys):
     config = SimulationConfig(duration=20.0, tdoa_rate=200.0, imu_rate=200.0, height_noise=0.01)

@@ -68,6 +68,7 @@ def test_where_all_are_heard_it_is_the_chart_of_a_room():
     np.testing.assert_array_equal(found.status, whole.status)
 
 
+@pytest.mark.slow
 def test_one_more_anchor_is_proposed_near_the_hole_and_gains_what_is_promised():
     anchors = anchors_of(8, 8, hole=(28.0, 28.0))
     hall = hall_of(anchors, accuracy=0.4)
@@ -97,6 +98,7 @@ def test_what_differs_in_one_place_is_judged_as_the_whole_is():
     assert (changed.status != before.status).any()
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_picture_and_says_who_hears_how_many(tmp_path, capsys):
     anchors_of(6, 5).to_yaml(tmp_path / "hall.yaml")
     command = [
@@ -164,6 +166,7 @@ def test_the_reach_is_asked_for_where_a_room_is_larger_than_30_m(tmp_path, capsy
     assert "--radio-reach 25" in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_anchors_of_a_hall_are_designed_and_give_what_was_wanted(tmp_path, capsys):
     """The design is the smallest sufficient number of anchors, behind a wall too.
 
@@ -212,6 +215,7 @@ def test_anchors_of_a_hall_are_designed_and_give_what_was_wanted(tmp_path, capsy
     assert again["map"]["flyable_share"] == pytest.approx(found["map"]["flyable_share"], abs=0.001)
 
 
+@pytest.mark.slow
 def test_a_hall_that_cannot_be_had_is_refused_with_what_can(tmp_path, capsys):
     asked = [
         "--hall",

@@ -146,6 +146,7 @@ def test_a_layout_gets_better(objective):
     assert np.isfinite(better.orientations).all() and len(set(better.ids)) == 5
 
 
+@pytest.mark.slow
 def test_one_more_anchor():
     fixed = Anchors([4, 0, 9, 2, 1], bad_anchors().positions, bad_anchors().orientations, "hall")
     aim = goal(Installation(fixed), "round")
@@ -412,6 +413,7 @@ def test_anchors_a_little_beyond_a_map_are_inside_the_picture(figures):
     assert np.ptp(other.get_xlim()) < 1.3 * (high - low)[0]
 
 
+@pytest.mark.slow
 def test_every_picture_is_700_pixels_wide(found, tmp_path):
     anchors, places = corners(), AnchorPlaces.walls((-3.5, -4, 0), (3.5, 4, 3))
     goal = Goal(FLOWN, Installation(anchors))

@@ -87,6 +87,7 @@ AT_HEIGHTS = Anchors.from_positions([[0, 0, 0.2], [4, 0, 3.0], [4, 4, 0.4], [0, 
 IN_SPACE = np.random.default_rng(2).uniform([-4, -4.5, -0.5], [4, 4.5, 3.5], (60, 3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("anchors", "dimensions", "points", "chosen"),
     [  # away from the diagonals

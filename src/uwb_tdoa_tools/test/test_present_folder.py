@@ -205,6 +205,7 @@ def test_the_entry_point_of_the_container_leaves_no_empty_entry(tmp_path):
     assert after["SKIP_DEFAULT_XML_FILE"] == "1" and empty_entries(after) == []
 
 
+@pytest.mark.slow
 @built
 def test_a_study_takes_no_module_there(tmp_path):
     for name in ("studies", "numpy", "matplotlib", "argparse", "runpy", "uwb_tdoa_tools"):
@@ -216,6 +217,7 @@ def test_a_study_takes_no_module_there(tmp_path):
     assert not (tmp_path / "ran").exists()
 
 
+@pytest.mark.slow
 @built
 @pytest.mark.skipif(not shutil.which("cc") and not shutil.which("gcc"), reason="needs a compiler")
 def test_a_library_beside_a_recording_is_not_run_by_check(tmp_path):

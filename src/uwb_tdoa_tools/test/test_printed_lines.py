@@ -170,6 +170,7 @@ def test_whoever_prints_lines_to_copy_is_tested_here():
     assert made == PRINT
 
 
+@pytest.mark.slow
 def test_no_text_is_a_command_that_does_not_run_as_it_stands():
     """A command that begins like ROS must run with ./dev ros2, too.
 

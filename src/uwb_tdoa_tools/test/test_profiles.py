@@ -182,6 +182,7 @@ def test_the_streams_of_a_recording_come_back(recording, flight, tmp_path, capsy
     same(flight, ours, streams, BEGIN / 1e9 if ours.start > 1e9 else 0.0)
 
 
+@pytest.mark.slow
 def test_a_recording_becomes_a_trajectory_with_one_command(recording, flight, tmp_path, capsys):
     path, words, _ = recording
     assert localize([*words, "--out", str(tmp_path / "out")]) in (0, 1)
@@ -534,6 +535,7 @@ def test_an_index_that_lacks_messages_is_damage(twr, survey):
         read_by_profile([twr], load_profile("uwb_msgs"), survey)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("find", [bytes.index, bytes.rindex])
 def test_a_chunk_that_unpacks_to_too_much_is_refused(flight, survey, tmp_path, find):
     """Each byte unpacks to a megabyte of zeros, in the first or the last chunk of the bag."""
@@ -652,6 +654,7 @@ def test_the_measured_ranges_of_starloc(shared_data, tag, error):
     assert 0.1 < np.median(read.range.d - expected) < 0.3
 
 
+@pytest.mark.slow
 def test_the_measured_walk_of_isas(shared_data):
     bag = shared_data / "ranging" / "isas" / "ISAS-Walk1.bag"
     read = read_by_profile([bag], load_profile("isas"))

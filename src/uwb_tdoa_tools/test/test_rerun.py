@@ -75,6 +75,7 @@ def verdict(viewer):
     return viewer.TextDocument.call_args.args[0]
 
 
+@pytest.mark.slow
 def test_localize_writes_no_truth(desk, viewer):
     assert localize.main(["flight.bag", "--out", "out", "--rerun", "flight.rrd"]) in (0, 1)
     found = names(viewer)
@@ -117,6 +118,7 @@ def test_errors_are_those_of_each_path(flight, viewer, tmp_path):
     assert np.median(told[-2]) < 0.3 and np.median(told[-1]) > 0.7
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["localize", "evaluate", "diagnose"])
 def test_it_is_left_out_with_a_sentence_where_it_is_not_installed(desk, capsys, monkeypatch, name):
     monkeypatch.setattr(pictures, "find_spec", lambda name: None)

@@ -72,6 +72,7 @@ def test_commands_of_the_page_are_command_lines():
         parsers[name]().parse_args(words)
 
 
+@pytest.mark.slow
 def test_a_simulated_rover_is_evaluated_and_checked(tmp_path, capsys):
     bag = str(tmp_path / "rover.bag")
     assert simulate.main(["--vehicle", "rover", "--duration", "30", "--no-bias", "--out", bag]) == 0

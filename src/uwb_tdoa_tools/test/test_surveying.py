@@ -66,6 +66,7 @@ def result(flights):
     )
 
 
+@pytest.mark.slow
 def test_anchors_come_nearer_to_where_they_are_and_say_how_near(flights, result):
     true, found = flights[0].anchors.positions, result
     free = result.given_std > 0.1
@@ -76,6 +77,7 @@ def test_anchors_come_nearer_to_where_they_are_and_say_how_near(flights, result)
     assert np.abs((found.surveyed.positions - true)[~free]).max() < 0.02
 
 
+@pytest.mark.slow
 def test_a_flight_that_took_no_part_gains(flights, result):
     other, found = flights[2], result
     before = error(at(other, result.given.positions))
@@ -142,6 +144,7 @@ def solved(result, monkeypatch):
     return seen
 
 
+@pytest.mark.slow
 def test_nothing_is_applied_where_something_else_is_wrong_too(
     flights, result, solved, tmp_path, capsys
 ):
@@ -157,6 +160,7 @@ def test_nothing_is_applied_where_something_else_is_wrong_too(
     assert not len(EffectSet.from_yaml(tmp_path / "out" / "effects.yaml"))
 
 
+@pytest.mark.slow
 def test_a_survey_of_another_room_is_named_before_anything_is_estimated(
     flights, solved, tmp_path, monkeypatch, capsys
 ):
@@ -183,6 +187,7 @@ def test_flights_that_are_too_short_are_refused():
         self_calibrate([sparse_flight(203, 20.0)], Tape())
 
 
+@pytest.mark.slow
 def test_marks_hold_the_frame_where_no_anchor_is_trusted(tmp_path):
     late = EFFECTS["anchor_delay"]({"3": 0.15})
     flight = late.inject(clean_flight(200, 40.0), np.random.default_rng(0))
@@ -243,6 +248,7 @@ def test_a_tape_that_does_not_fit_is_refused(flights, options, words):
         tape.position_std(flights[0].anchors), tape.unknown_rows(flights[0].anchors)
 
 
+@pytest.mark.slow
 def test_the_command_writes_surveys_that_are_read(flights, solved, tmp_path, capsys):
     measured = shaken(flights[0].anchors, 0.1, 1)
     write_bag(flights[0], tmp_path / "flight.bag")
@@ -301,6 +307,7 @@ def by_ranges(ranged):
     return self_calibrate(ranged[0][:1], Tape(0.1, trusted=TRUSTED))
 
 
+@pytest.mark.slow
 def test_ranges_tell_of_anchors_and_of_the_delay_of_the_tag(ranged, by_ranges):
     (given, true), found = ranged, by_ranges
     assert found.why_not is None and found.tdoa_std is None
@@ -339,6 +346,7 @@ def test_tdoas_know_nothing_of_the_delay_of_the_tag(flights, result):
     assert abs(np.mean(result.delays)) < 0.05 and result.prior.common == 0.0
 
 
+@pytest.mark.slow
 def test_survey_of_a_recording_of_ranges(ranged, tmp_path, capsys):
     bag, out = tmp_path / "ranged.bag", tmp_path / "out"
     write_bag(ranged[0][0], bag)

@@ -150,6 +150,7 @@ def ends(flight, std=0.05):
     ]
 
 
+@pytest.mark.slow
 def test_a_path_laid_beside_the_filters_is_where_the_tag_was_and_takes_its_shift_from_marks(
     flights,
 ):

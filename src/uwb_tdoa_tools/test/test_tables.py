@@ -60,6 +60,7 @@ def test_a_cell_that_is_no_number(write, cell):
             number(file, line, row, "a")
 
 
+@pytest.mark.slow
 def test_numbers_take_less_memory_than_their_text_would(write):
     file = write(b"a,b\n" + b"1,2\n" * 150_000)
     tracemalloc.start()

@@ -35,6 +35,7 @@ def files(out):
     return sorted(path.name for path in out.iterdir())
 
 
+@pytest.mark.slow
 def test_trains_on_flights_with_and_without_attitude_in_one_command(folder, tmp_path, capsys):
     out = tmp_path / "model"
     arguments = [
@@ -79,6 +80,7 @@ def test_trains_on_flights_with_and_without_attitude_in_one_command(folder, tmp_
     assert np.isfinite(network.predict(held.samples)[0]).all()
 
 
+@pytest.mark.slow
 def test_physics_alone_is_no_network_and_leaves_none_behind(folder, tmp_path):
     (tmp_path / "model.onnx").write_text("of an earlier training")
     assert (
@@ -104,6 +106,7 @@ def test_says_what_is_missing(folder, tmp_path, capsys, flights, model, message)
     assert message in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_a_resumed_training_writes_the_same_files(folder, tmp_path, monkeypatch, capsys):
     done, left = [], shrinking._left_out
 

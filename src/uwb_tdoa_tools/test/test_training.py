@@ -202,6 +202,7 @@ def test_learns_stops_early_and_says_the_same_as_its_file(data, tmp_path):
     assert (known == 1.0).all()
 
 
+@pytest.mark.slow
 def test_the_seed_decides(data):
     models, curves = zip(*(network.fit(*data, False, seed) for seed in (0, 0, 1)))
     assert curves[0] == curves[1] != curves[2]
@@ -240,6 +241,7 @@ def one_place():
     return injected([flight(seed, **PLAIN) for seed in range(3)], DELAY, PUSHED)
 
 
+@pytest.mark.slow
 def test_finds_what_is_wrong_with_anchors_and_imu(one_place):
     found = physics.find_effects(one_place)
     values = {effect.name: effect.values for effect in found.effects.effects}
@@ -251,6 +253,7 @@ def test_finds_what_is_wrong_with_anchors_and_imu(one_place):
         assert fewer["anchor_delay"] != values["anchor_delay"]
 
 
+@pytest.mark.slow
 def test_of_several_constellations_only_what_carries_over(one_place):
     elsewhere = [flight(seed, "pillars", **PLAIN) for seed in (3, 4)]
     flights = [*one_place[:2], *injected(elsewhere, DELAY, PUSHED)]
@@ -324,6 +327,7 @@ def rms(values):
     return np.sqrt(np.mean(values**2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", ["one_place_of_structured", "two_places"])
 def test_its_file_says_what_it_says(which, request):
     model, network = request.getfixturevalue(which)
@@ -383,6 +387,7 @@ def test_fades_away_from_where_it_was(one_place_of_structured):
     assert (far[1] > near[1].max()).all() and (far[2] < 0.1).all()
 
 
+@pytest.mark.slow
 def test_flights_with_and_without_attitude_together(tmp_path):
     flights = [
         flight(0),

@@ -13,6 +13,8 @@ import sys
 from documented import ROOT
 import pytest
 
+pytestmark = pytest.mark.slow
+
 # Each comment is the kind of error that mypy must find in its line.
 WRONG = """
 from nav_msgs.msg import Odometry
@@ -69,7 +71,6 @@ def annotated():
     return [name.removeprefix("mypy-").removesuffix(".*") for name in sections]
 
 
-@pytest.mark.slow
 def test_annotations(monkeypatch):
     """The wrong module always has the same path, because mypy caches it.
 

@@ -276,6 +276,7 @@ def test_the_time_for_a_header_does_not_grow_with_the_square_of_its_types(read):
     assert len(read(log_bytes(events=events)).tdoa) == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("types", "variables", "said"),
     [(40, 60_000, "more than 10000 variables"), (20_000, 0, "more than 1000 event types")],
@@ -295,6 +296,7 @@ def test_a_header_of_millions_of_variables_takes_no_memory(read, types, variable
     tracemalloc.stop()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "setting",
     [

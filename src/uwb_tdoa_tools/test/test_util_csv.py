@@ -106,6 +106,7 @@ def test_changed_byte_in_gzip_is_refused(read):
         read(bytes(packed))
 
 
+@pytest.mark.slow
 def test_plain_file_cut_within_a_line_is_refused(read):
     whole = csv_text()
     for cut in range(1, len(whole)):
@@ -177,6 +178,7 @@ def test_two_members_and_padding_are_one_file(read):
     )
 
 
+@pytest.mark.slow
 def test_a_gzip_that_unfolds_without_end_is_refused(read, monkeypatch):
     monkeypatch.setattr(util_csv, "CSV_BYTES", 2_000_000)
     packed = gzip.compress(csv_text(TDOA, ["1,0,1,1"]).encode() + b"\n" * 500_000_000, 1)
@@ -187,6 +189,7 @@ def test_a_gzip_that_unfolds_without_end_is_refused(read, monkeypatch):
     tracemalloc.stop()
 
 
+@pytest.mark.slow
 def test_short_cells_take_less_memory_than_their_text_would(read):
     content = csv_text(TDOA, ["1,1,0,1"] * 200_000).encode()
     tracemalloc.start()

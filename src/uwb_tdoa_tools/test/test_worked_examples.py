@@ -17,6 +17,8 @@ from uwb_tdoa_tools.diagnosis.channels import CHANNELS
 from uwb_tdoa_tools.diagnosis.detectors import DETECTORS
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 
+pytestmark = pytest.mark.slow  # diagnoses whole flights
+
 DOCS = Path(__file__).resolve().parents[3] / "docs"
 
 

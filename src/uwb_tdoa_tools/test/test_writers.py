@@ -131,6 +131,7 @@ def read(path):
     return json.loads(text) if str(path).endswith(".json") else text
 
 
+@pytest.mark.slow
 def test_evaluate_writes_its_files_in_an_ascii_locale(bag, tmp_path):
     words = ("--json", "é.json", "--markdown", "é.md", "--plot", "é è.png", "--tum", "ü ü")
     in_ascii(tmp_path, "evaluate", bag, *words, encoding="latin-1")
@@ -138,6 +139,7 @@ def test_evaluate_writes_its_files_in_an_ascii_locale(bag, tmp_path):
     assert "flüge" in read(tmp_path / "é.md") and read(tmp_path / "é.json")["runs"]
 
 
+@pytest.mark.slow
 def test_localize_writes_its_files_in_an_ascii_locale(bag, tmp_path):
     in_ascii(tmp_path, "localize", bag, "--residuals", "--zones", "2", "--out", "wo_ü")
     assert {path.suffix for path in (tmp_path / "wo_ü").rglob("*")} >= {".png", ".csv", ".tum"}
