@@ -106,11 +106,13 @@ def test_the_search_is_repeated_without_what_misleads_the_filter(errors, without
     module = import_module("uwb_tdoa_tools.diagnosis.diagnose")
     several = iter(errors)
 
-    def validated(found, *_):
+    def validated(found, *_, poses):
+        assert poses == ((None,) if not found.left_out else "of the run before")
         error = next(several)
         worst = next(one for one in ("anchor_delay", "nlos", "") if one not in found.left_out)
         refused = (Refused(worst, "misleads"), Refused("other", str(error)))
-        return ValidatedSelection(None, (), refused, {}, error, frozenset((worst,)) - {""})
+        misleading = frozenset((worst,)) - {""}
+        return ValidatedSelection(None, (), refused, {}, error, misleading, "of the run before")
 
     monkeypatch.setattr(module, "EffectSearch", lambda *_, **__: ScriptedSearch())
     monkeypatch.setattr(module, "written", lambda selection, _: selection)

@@ -73,6 +73,7 @@ def test_each_of_six_flights_is_tried(flights):
     assert [case.flight.name for case in cases] == list("012345")
 
 
+@pytest.mark.slow
 def test_a_validated_effect_stays_without_another_trial(attribution):
     """The delay does harm to flights without it."""
     clean = [sparse_flight(seed, 30.0) for seed in (100, 101)]
@@ -384,6 +385,8 @@ class Some(str):
 
 class Worth:
     """Trials of effects with known worth. Without both "a" and "b", the error is 0.5 m larger."""
+
+    poses = (None,)
 
     def __init__(self, worth):
         self.worth = worth

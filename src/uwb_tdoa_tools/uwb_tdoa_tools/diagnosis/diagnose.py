@@ -278,10 +278,14 @@ def _searched(
     trying = work.saying("running the filter without each")
     baseline = comparison.Baseline(base, work.config)
 
-    def judged(found: Attribution) -> validation.ValidatedSelection:
+    def judged(
+        found: Attribution, poses: Sequence[validation.Poses | None] = (None,)
+    ) -> validation.ValidatedSelection:
         # The report keeps a finding that does not help the filter, but it is not added.
         model = replace(found, selection=written(found.selection, found.candidates))
-        return validation.select_by_error(model, flights, baseline, trying, work.map_function)
+        return validation.select_by_error(
+            model, flights, baseline, trying, work.map_function, poses=poses
+        )
 
     search = work.search(flights, base)
     found = search.found()
@@ -291,7 +295,7 @@ def _searched(
         for names in _suspects(found, selected):
             fewer = search.without(names)
             other = fewer.found(found.selection)
-            trial = judged(other)
+            trial = judged(other, selected.poses)
             if gain(selected.error, trial.error) > LOSS:
                 break
         else:
@@ -333,6 +337,7 @@ def _with_functions_of_axes(
         work.saying("running the filter without each"),
         work.map_function,
         validated=selected.selection.chosen,
+        poses=selected.poses,
     )
     if gain(selected.error, trial.error) <= LOSS:
         return found, selected

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from uwb_tdoa_bias.correction.corrector import FixedPoseCorrector
+from uwb_tdoa_bias.correction.corrector import Corrector, FixedPoseCorrector
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.results import poses_of
@@ -71,6 +71,7 @@ class ValidatedSelection:
         at the time they were dropped
     error : mean 3D RMSE of the trials, m
     misleading : names of declared effects that explain residuals and do not help the filter
+    poses : of the last run of the filter, of each trial
     """
 
     selection: Selection
@@ -79,6 +80,7 @@ class ValidatedSelection:
     worth: dict[Candidate | Detection, float]
     error: float
     misleading: frozenset[str] = frozenset()
+    poses: Sequence[Poses | None] = (None,)
 
     def applied(self, attribution: Attribution) -> Attribution:
         """Return the Attribution with the selected effects only."""
@@ -153,6 +155,7 @@ def select_by_error(
     progress: Callable[[], object] = lambda: None,
     map_function: MapFunction = map,
     validated: Collection[Candidate] = (),
+    poses: Sequence[Poses | None] = (None,),
 ) -> ValidatedSelection:
     """Return the ValidatedSelection of effects that do not make the filter worse on hold-out data.
 
@@ -163,11 +166,12 @@ def select_by_error(
     effect. Events at a time of a single flight are tried for their worth, but not kept.
 
     map_function : as of `attribute`; validated : Candidates that stay without another trial
+    poses : of an earlier ValidatedSelection of these flights, for the first corrections
     """
     candidates, refused = list(attribution.selection.chosen), []
     detections: list[Detection] = []
     alone = len(flights) == 1
-    trials = _Trials(attribution, flights, baseline, progress, map_function)
+    trials = _Trials(attribution, flights, baseline, progress, map_function, poses)
     worth: dict[Candidate | Detection, float] = {}
     misleading: set[str] = set()
     error = trials.start(candidates, detections)
@@ -226,7 +230,13 @@ def select_by_error(
         candidates = [one for one in candidates if one is not momentary]
     selection = attribution.selection.kept(candidates)  # with the weights of the trials
     return ValidatedSelection(
-        selection, tuple(detections), tuple(refused), worth, error, frozenset(misleading)
+        selection,
+        tuple(detections),
+        tuple(refused),
+        worth,
+        error,
+        frozenset(misleading),
+        trials.poses,
     )
 
 
@@ -360,9 +370,8 @@ def _momentary(candidate: Candidate) -> bool:
 class _Trials:
     """Mean 3D RMSE, m, of cross-fitted models.
 
-    Measurements are corrected at the poses of an earlier run, which takes a fifth of the time of
-    the corrections in the nodes. The first model runs at the poses of the baseline, and then again
-    at its own.
+    The first model runs like the nodes, if no poses are known. Later models use the poses of the
+    run before, which takes a fifth of the time.
     """
 
     def __init__(
@@ -372,6 +381,7 @@ class _Trials:
         baseline: Baseline,
         progress: Callable[[], object],
         map_function: MapFunction,
+        poses: Sequence[Poses | None] = (None,),
     ) -> None:
         self._attribution, self._flights, self._baseline, self._progress = (
             attribution,
@@ -380,7 +390,7 @@ class _Trials:
             progress,
         )
         self._map_function = map_function
-        self._poses: list[Poses] = []
+        self.poses = poses  # of the last `start`, of each case; None before the first one
         self._now: list[Score] = []
         # {candidate: (return value of `_moved`, [return value of `_change`] of each case)}
         self._known: dict[Candidate, tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]]] = {}
@@ -388,15 +398,9 @@ class _Trials:
     def start(self, candidates: Sequence[Candidate], detections: Sequence[Detection]) -> float:
         """Return the error of a model, m, and keep its scores and poses for later trials."""
         cases = self._cases(candidates, detections)
-        if not self._poses:
-            flights = [case.flight for case in cases]
-            self._baseline.prepare(flights, self._progress, self._map_function)
-            runs = [self._baseline.run(flight) for flight in flights]
-            self._poses = [poses_of(run.odometry) for run in runs]
-            self._poses = [poses_of(run.odometry) for run, _ in self._tried(_judged, cases)]
         judged = self._tried(_judged, cases)
         self._now = [of_case for _, of_case in judged]
-        self._poses = [poses_of(run.odometry) for run, _ in judged]
+        self.poses = [poses_of(run.odometry) for run, _ in judged]
         return float(np.mean([of_case.rmse_3d for of_case in self._now]))
 
     def error(self, candidates: Sequence[Candidate], detections: Sequence[Detection]) -> float:
@@ -454,12 +458,12 @@ class _Trials:
 
     def _tried(
         self,
-        function: Callable[[FilterConfig | None, tuple[ValidationCase, Poses]], Made],
+        function: Callable[[FilterConfig | None, tuple[ValidationCase, Poses | None]], Made],
         cases: Sequence[ValidationCase],
     ) -> list[Made]:
         """Return function of each trial; several models follow each other."""
         results = []
-        trials = zip(cases, cycle(self._poses))
+        trials = zip(cases, cycle(self.poses))
         for of_case in self._map_function(partial(function, self._baseline.config), trials):
             results.append(of_case)
             self._progress()
@@ -472,14 +476,24 @@ def _change(now: Score, other: Score) -> tuple[np.ndarray, np.ndarray]:
     return t, other.error[np.isin(other.t, t)] - now.error[np.isin(now.t, t)]
 
 
-def _scored(config: FilterConfig | None, trial: tuple[ValidationCase, Poses]) -> Score:
+def _scored(config: FilterConfig | None, trial: tuple[ValidationCase, Poses | None]) -> Score:
     return _judged(config, trial)[1]
 
 
-def _judged(config: FilterConfig | None, trial: tuple[ValidationCase, Poses]) -> tuple[Run, Score]:
-    """Return the Run and the Score of a trial: ValidationCase, and the poses for corrections."""
+def _judged(
+    config: FilterConfig | None, trial: tuple[ValidationCase, Poses | None]
+) -> tuple[Run, Score]:
+    """Return the Run and the Score of a trial.
+
+    trial : ValidationCase, and the poses for corrections, None to use the poses of the run
+    """
     case, poses = trial
-    corrector = FixedPoseCorrector(case.flight.anchors, case.effects, poses)
+    anchors, effects = case.flight.anchors, case.effects
+    corrector = (
+        Corrector(anchors, effects)
+        if poses is None
+        else FixedPoseCorrector(anchors, effects, poses)
+    )
     run = run_offline(case.flight, config, corrector)
     return run, score(case, run)
 
