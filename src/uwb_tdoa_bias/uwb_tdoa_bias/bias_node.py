@@ -33,7 +33,7 @@ from .effects import EffectSet, LabelCorrector
 from .effects.tag import TagLeverArm
 from .ros import process
 from .ros.anchors import ANCHORS_FILE, AnchorsInput
-from .ros.cdr import CdrCodec
+from .ros.cdr import CdrCodec, CdrTemplate
 from .ros.diagnostics import Diagnostics, Rate, Report
 from .ros.frames import FramesInput, unknown_frame
 from .ros.node import StreamNode
@@ -51,7 +51,6 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Sequence
 
     from .common.anchors import Anchors
-    from .ros.cdr import CdrTemplate
 
 PARAMETERS = {  # in the order of config/bias_node.yaml
     "anchors_file": ANCHORS_FILE,

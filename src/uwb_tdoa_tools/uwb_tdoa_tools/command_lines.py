@@ -9,14 +9,11 @@ node("ekf_node", {"effects_file": "effects.yaml"})
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sequence
 import os
+from pathlib import Path
 import shlex
 import shutil
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-    from pathlib import Path
 
 SALVAGE = "read what is sound of it with --salvage"
 RUN = "UWB_TDOA_RUN"  # environment variable in which ./dev and COMMAND pass how the user started it

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import atexit
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 import io
 import math
@@ -15,8 +16,8 @@ import shutil
 import stat
 import tempfile
 import time
-from typing import TYPE_CHECKING, BinaryIO
-from zipfile import BadZipFile, ZipFile
+from typing import BinaryIO
+from zipfile import BadZipFile, ZipFile, ZipInfo
 import zlib
 
 import numpy as np
@@ -28,11 +29,6 @@ except ImportError:  # Windows locks no folders
 
 from .errors import InputError
 from .limits import ARRAYS_BYTES, RECORDING_BYTES, Budget
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
-    from zipfile import ZipInfo
-
 
 TEMPORARY = "uwb_tdoa_temporary_"  # prefix of the project's temporary folders
 STREAMS = "/dev/stdout", "/dev/stderr"  # links that the user redirects

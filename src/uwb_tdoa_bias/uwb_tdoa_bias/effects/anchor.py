@@ -29,13 +29,12 @@ from .base import (
     measured,
     with_each,
 )
-from .samples import RADIO, tile
+from .samples import RADIO, Samples, tile
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Sequence
 
     from ..common.anchors import Anchors
-    from .samples import Samples
 
 
 class AnchorEffect(Effect):

@@ -17,7 +17,7 @@ import yaml
 
 from ..common.errors import InputError
 from ..common.files import write_text
-from ..common.flight import SENSOR_NAMES
+from ..common.flight import SENSOR_NAMES, Flight
 from ..common.safe_yaml import read_yaml
 from ..common.text import written_by
 from .anchor import (
@@ -51,7 +51,7 @@ from .imu import (
     ImuMisalignment,
 )
 from .pair import NoiseCorrelation, NoiseLevel, OutlierRate, PairOffset, PairSign
-from .samples import N_STATES
+from .samples import N_STATES, ImuSamples, Samples, SensorSamples
 from .smooth_term import SmoothTerm
 from .stamps import RangeDelay, TdoaTimeOffset, VelocityDelay
 from .tag import AntennaPattern, RangeBias, RangeScale, ReceivedPowerBias, TagLeverArm
@@ -61,8 +61,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Sequence
 
     from ..common.anchors import Anchors
-    from ..common.flight import Flight
-    from .samples import ImuSamples, Samples, SensorSamples
 
 # In the order in which `diagnose` lists them
 EFFECTS: dict[str, type[Effect]] = {

@@ -10,13 +10,12 @@ import numpy as np
 
 from .anchor import SearchedDelay
 from .base import ANCHOR, UNLIMITED, Row, cached_by_anchors, counted, id_texts, measured
-from .samples import tile
+from .samples import Samples, tile
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from ..common.anchors import Anchors
-    from .samples import Samples
 
 PLACE = ("x", "y")
 HEIGHT = 0.12  # m, default of "i.height"

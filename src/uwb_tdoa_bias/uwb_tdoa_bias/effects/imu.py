@@ -12,13 +12,12 @@ import numpy as np
 from ..common.lazy import rotations
 from .base import FADED_BELOW, IDENTITY, Affine, Effect, Row, SensorEffect, require, undoing
 from .covariates import OF_IMU, ImuFeatures, fade_weight
-from .samples import Track
+from .samples import ImuSamples, Track
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
 
     from ..common.flight import Flight
-    from .samples import ImuSamples
 
 SENSORS = ("gyro", "accel")
 # `penalty` of effects that look like a bias of the accelerometer without tilt and manoeuvres

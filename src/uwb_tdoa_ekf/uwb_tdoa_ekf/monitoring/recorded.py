@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..core.initialization import LOST_TIME
-from ..results import rows_of
+from ..results import Odometry, Residuals, rows_of
 from .monitor import Event, Monitor, Part
 
 if TYPE_CHECKING:
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.common.anchors import Anchors
     from uwb_tdoa_bias.effects.effect_set import Covariance
-
-    from ..results import Odometry, Residuals
 
 
 def watched(

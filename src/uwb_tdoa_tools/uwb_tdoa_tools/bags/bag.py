@@ -16,7 +16,7 @@ The time of a message is its header stamp. `Flight.extra` has no message type an
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 import heapq
 import json
@@ -37,7 +37,7 @@ from uwb_tdoa_bias.common.text import printable, written_by
 from ..clock import sentences
 from . import frames
 from . import messages as bag_messages
-from .files import check_output, connections_of, new_bag, open_bag, readable, remarks_of
+from .files import BagReader, check_output, connections_of, new_bag, open_bag, readable, remarks_of
 from .frames import recorded_anchors
 from .integrity import metadata
 from .mcap import Damaged
@@ -55,15 +55,11 @@ from .topics import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-
     from rosbags.interfaces import Connection, Qos
     from rosbags.rosbag2 import Writer
     from rosbags.typesys.store import Typestore
 
     from uwb_tdoa_ekf.results import Odometry
-
-    from .files import BagReader
 
     # {topic: (type, QoS, (stamp ns, message) in order)}
     Topics = dict[str, tuple[str, Qos, Iterable[tuple[int, Any]]]]

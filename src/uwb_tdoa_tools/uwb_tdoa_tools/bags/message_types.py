@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rosbags.interfaces import MessageDefinitionFormat, Nodetype
+from rosbags.interfaces import Connection, MessageDefinitionFormat, Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from uwb_tdoa_bias.common.errors import InputError
@@ -18,7 +18,6 @@ from uwb_tdoa_bias.common.limits import DEFINITION_BYTES
 from uwb_tdoa_bias.common.sensors import SENSORS
 
 if TYPE_CHECKING:
-    from rosbags.interfaces import Connection
     from rosbags.typesys.store import Typestore
 
 OUR_PACKAGE = "uwb_tdoa_msgs"

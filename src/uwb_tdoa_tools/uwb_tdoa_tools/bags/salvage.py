@@ -5,10 +5,10 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 import sqlite3
 import struct
-from typing import TYPE_CHECKING
 
 from rosbags.interfaces import (
     Connection,
@@ -23,9 +23,6 @@ from uwb_tdoa_bias.common.errors import InputError
 from . import integrity, mcap
 from .mcap import Damaged
 from .message_types import check_type, earlier_types, typestore, upgraded
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 MESSAGES = "messages"
 LATEST = 2**63  # ns

@@ -13,7 +13,7 @@ import numpy as np
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.text import written_by
 from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.correction.model import INPUTS, KIND, OUTPUTS
+from uwb_tdoa_bias.correction.model import INPUTS, KIND, OUTPUTS, Model
 from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.effects import Effect, EffectSet, LabelEffect, SmoothTerm
 from uwb_tdoa_bias.effects.base import listed
@@ -22,7 +22,6 @@ from .tracing import nodes_of, samples_of
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.correction.model import Model
 
     from .graph import Node
 

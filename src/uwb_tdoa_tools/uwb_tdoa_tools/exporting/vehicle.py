@@ -23,7 +23,7 @@ from uwb_tdoa_bias.effects.effect_set import REACH
 
 from . import crazyflie
 from .c_code import Printer, number
-from .correction import left_out
+from .correction import LeftOut, TracedCorrection, left_out
 from .scalars import Program, Unsupported
 from .tracing import nodes_of, samples_of
 
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.common.anchors import Anchors
     from uwb_tdoa_bias.correction.network import Network
 
-    from .correction import LeftOut, TracedCorrection
 
 MEMBERS = {  # of the state, by the names of inputs
     **{name: f"position[{k}]" for k, name in enumerate(("x", "y", "z"))},

@@ -18,14 +18,13 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_filled
 
 from ..choices import MAP_ACCURACY
-from .least_squares import MOTION, Problem, Stage
+from .least_squares import MOTION, Equations, Fit, Problem, Stage
 from .search import SAME_MAP, SAME_SHAPE, minima, misfit_of, rigid_distance
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from .least_squares import Equations, Fit
     from .observations import Observations
 
 

@@ -24,15 +24,13 @@ from uwb_tdoa_bias.common.errors import InputError
 
 from .. import parallel
 from ..checking.coverage import sides_of
-from ..simulation.rooms import facing, heard_at
+from ..simulation.rooms import Room, Walls, facing, heard_at
 from .layout import UNUSABLE
-from .maps import TOO_FEW, Chart, Judged, judge
+from .maps import TOO_FEW, Chart, Demand, Grid, Judged, judge
 
 if TYPE_CHECKING:
     from ..parallel import Progress
-    from ..simulation.rooms import Room, Walls
     from .installation import Installation
-    from .maps import Demand, Grid
 
 PLANE_NEAREST = 10  # anchors that are looked at for a plane through them
 JUDGED_AT_ONCE = 100_000  # times points: anchors that are judged at once, wherever they are

@@ -22,7 +22,7 @@ from uwb_tdoa_bias.common.files import write_filled
 
 from ..scoring.plots import draw_labels
 from .bifurcation import Subsets
-from .maps import FLYABLE, IMPRECISE, OUTSIDE, TOO_FEW, TWO_SOLUTIONS
+from .maps import FLYABLE, IMPRECISE, OUTSIDE, TOO_FEW, TWO_SOLUTIONS, AccuracyMap, Chart, Grid
 from .precision import ellipses
 
 if TYPE_CHECKING:
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from ..simulation.rooms import Walls
     from .installation import Installation
     from .layout import AnchorPlaces
-    from .maps import AccuracyMap, Chart, Grid
 
 WIDTH, DPI = 7.0, 100  # inches, pixels an inch
 STATES = {  # of a cell: what it is called, and its colour

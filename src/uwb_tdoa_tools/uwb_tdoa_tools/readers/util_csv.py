@@ -4,27 +4,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 import csv
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import read_bytes
+from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.common.limits import CSV_BYTES, CSV_CELLS, Budget, most_unpacked
 
 from ..command_lines import SALVAGE
-from .streams import make_flight
+from .streams import Columns, make_flight
 from .tables import GZIP_MAGIC, CsvRows, check_text, unpacked
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.common.flight import Flight
-
-    from .streams import Columns
 
 # Each sensor has its own time column and its own length: they are only set side by side, a row is
 # not one instant.

@@ -32,9 +32,9 @@ if TYPE_CHECKING:
     from .network import Paper
     from .structured import Structured
 
-    # label, x, training and validation RMS, m
-    LearningCurve = tuple[str, list[int], list[float], list[float]]
 
+# label, x, training and validation RMS, m
+LearningCurve = tuple[str, list[int], list[float], list[float]]
 
 SPACING = 0.01  # s between training samples: closer samples hold no more information
 CLIP = 1.0  # m

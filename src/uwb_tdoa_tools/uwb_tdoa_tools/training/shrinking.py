@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.common.files import temporary_folder
-from uwb_tdoa_bias.common.flight import SENSOR_NAMES
+from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Flight
 from uwb_tdoa_bias.correction.network import Network
 
 from ..scoring.evaluation import evaluate
@@ -27,7 +27,6 @@ from . import models, physics
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_bias.effects import EffectSet
 
     from ..parallel import MapFunction

@@ -36,7 +36,7 @@ from scipy.spatial.distance import cdist
 from uwb_tdoa_bias.correction.features import columns
 
 from ..exporting.onnx_file import GraphBuilder
-from .labels import SAME_PLACE, constellations
+from .labels import SAME_PLACE, Labels, constellations
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -45,8 +45,6 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.common.anchors import Anchors
     from uwb_tdoa_bias.effects import Samples
-
-    from .labels import Labels
 
 
 # Priors, chosen on the validation flights of docs/notebook/bias.md. The data scale those of the maps.
