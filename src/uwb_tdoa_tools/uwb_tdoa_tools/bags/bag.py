@@ -69,7 +69,6 @@ __all__ = [
     "check_output",
     "late_tdoas",
     "read_bag",
-    "read_fields",
     "read_odometry",
     "write_bag",
     "write_odometry",
@@ -409,31 +408,6 @@ def late_tdoas(
             residual.verdict == residual.VERDICT_LATE
             for _, _, residual in readable(path, reader, found)
         )
-
-
-def read_fields(path: str | Path, topic: str) -> dict[str, np.ndarray]:
-    """Read the columns of a topic with header stamps, e.g. uwb/residual or uwb/tdoa_corrected.
-
-    Returns {"t": (n,) s, field: (n,) array, ...} for every field with a number or a string, in
-    order of stamps. Raises InputError.
-    """
-    with open_bag(path) as reader:
-        topic = Names()(topic)
-        found = connections_of(path, reader, topic)
-        if not found:
-            raise InputError(f"{path}: has no topic {topic}; record it.")
-        recorded = [message for _, _, message in readable(path, reader, found)]
-    stamps = np.array(
-        [bag_messages.stamp_of(message.header) for message in recorded], dtype=np.int64
-    )
-    order = np.argsort(stamps, kind="stable")
-    columns = {"t": stamps[order] / 1e9}
-    _, fields = typestore().fielddefs[found[0].msgtype]
-    for name, _ in fields if recorded else ():
-        values = [getattr(message, name) for message in recorded]
-        if isinstance(values[0], (bool, int, float, str)):
-            columns[name] = np.array(values)[order]
-    return columns
 
 
 def _about(path: str | Path) -> dict[str, Any]:

@@ -42,19 +42,6 @@ MEMBERS = {  # of the state, by the names of inputs
     **{name: f"rate[{k}]" for k, name in enumerate(("wx", "wy", "wz"))},
     **{name: name for name in ("time", "interval", "previous_anchor")},
 }
-# The state in C, all of 4 bytes each
-STATE = np.dtype(
-    [
-        ("position", np.float32, 3),
-        ("attitude", np.float32, 4),
-        ("velocity", np.float32, 3),
-        ("acceleration", np.float32, 3),
-        ("rate", np.float32, 3),
-        ("time", np.float32),
-        ("interval", np.float32),
-        ("previous_anchor", np.float32),
-    ]
-)
 RATES = {"ax", "ay", "az", "wx", "wy", "wz"}  # inputs of acceleration and rate
 NOT_ESTIMATED = "the filter of the firmware estimates no acceleration and no rate"
 NO_PAIR, NOT_FINITE = 1, 2  # results of the functions in C
