@@ -9,7 +9,6 @@ import sys
 
 import pytest
 
-from uwb_tdoa_bias.common import executable as module
 from uwb_tdoa_bias.common.executable import executable, node_executable
 
 SLOW = """
@@ -56,17 +55,6 @@ def start(module):
 def test_what_main_returns_is_returned(write):
     write("weigh", "def main(*arguments): return 3 + len(arguments)")
     assert executable("weigh")() == 3 and executable("weigh")(["heavy"]) == 4
-
-
-def test_an_import_that_takes_long_is_said(write, monkeypatch, capsys):
-    waits = (
-        "import sys, time\nend = time.monotonic() + 120.0\nwhile 'starting' not in "
-        "sys.stderr.getvalue() and time.monotonic() < end: pass\n"
-    )
-    write("takes_long", waits + "def main(): return 0")
-    monkeypatch.setattr(module, "SAID", 0.01)
-    assert executable("takes_long")() == 0
-    assert capsys.readouterr().err == "takes_long: starting\n"
 
 
 @pytest.mark.parametrize("module, code", [(SLOW, 130), (LOSSY, 7)])

@@ -22,7 +22,7 @@ from importlib.machinery import ModuleSpec, PathFinder
 import os
 import signal
 import sys
-from threading import Timer, main_thread
+from threading import Timer
 from types import FrameType
 from typing import Any
 
@@ -33,7 +33,6 @@ HAS_ALARM = hasattr(signal, "SIGALRM")  # Windows has none
 # compilers make many objects that stay. A command takes 4 % less time than with the usual ones, a
 # compilation 10 % less and 60 MB more.
 COLLECT = 20_000, 5, 100
-SAID = 1.5  # s after which a line reports that the imports take long
 # Path variables in which an empty entry or a dot means the present folder. `.dev/paths.sh` has the
 # same list, for programs that a shell starts.
 PATHS = (
@@ -153,9 +152,6 @@ def _run(module: str, *arguments: Any) -> Any:
     name = module.rpartition(".")[2]
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, interrupt)
-    slow = Timer(SAID, _say_if_importing, [name])
-    slow.daemon = True
-    slow.start()
     try:
         with outside_present_folder():
             main = import_module(module).main
@@ -171,14 +167,6 @@ def _run(module: str, *arguments: Any) -> Any:
         return 2
     except KeyboardInterrupt:
         return INTERRUPTED
-    finally:
-        slow.cancel()
-
-
-def _say_if_importing(name: str) -> None:
-    """Report on stderr that an executable starts if its main thread imports."""
-    if is_importing(sys._current_frames().get(main_thread().ident or 0)):
-        print(f"{name}: starting", file=sys.stderr, flush=True)
 
 
 def _run_node(module: str, *arguments: Any) -> Any:
