@@ -4,10 +4,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Hashable, Sequence
 
 import numpy as np
 
+from ..common.anchors import Anchors
 from ..common.geometry import ranges
 from .base import (
     ANCHOR,
@@ -30,11 +31,6 @@ from .base import (
     with_each,
 )
 from .samples import RADIO, Samples, tile
-
-if TYPE_CHECKING:
-    from collections.abc import Hashable, Sequence
-
-    from ..common.anchors import Anchors
 
 
 class AnchorEffect(Effect):

@@ -7,14 +7,16 @@ EFFECTS lists all declared effects.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import yaml
 
+from ..common.anchors import Anchors
 from ..common.errors import InputError
 from ..common.files import write_text
 from ..common.flight import SENSOR_NAMES, Flight
@@ -56,11 +58,6 @@ from .smooth_term import SmoothTerm
 from .stamps import RangeDelay, TdoaTimeOffset, VelocityDelay
 from .tag import AntennaPattern, RangeBias, RangeScale, ReceivedPowerBias, TagLeverArm
 from .truth import TruthFrame, TruthTimeOffset
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Sequence
-
-    from ..common.anchors import Anchors
 
 # In the order in which `diagnose` lists them
 EFFECTS: dict[str, type[Effect]] = {

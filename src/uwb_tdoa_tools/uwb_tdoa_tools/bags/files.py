@@ -13,8 +13,9 @@ import re
 import shutil
 import sys
 import tempfile
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from uwb_tdoa_bias.common.errors import InputError
@@ -42,9 +43,6 @@ from .mcap import Damaged, zstd
 from .message_types import check_type, typestore
 from .salvage import as_written
 from .salvage import salvage as write_sound_part
-
-if TYPE_CHECKING:
-    from rosbags.interfaces import Connection
 
 PLUGINS = dict(zip(STORAGES, (StoragePlugin.MCAP, StoragePlugin.SQLITE3)))
 

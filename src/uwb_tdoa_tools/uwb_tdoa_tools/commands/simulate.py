@@ -4,17 +4,14 @@
 
 from __future__ import annotations
 
+from argparse import ArgumentParser, Namespace
 import sys
-from typing import TYPE_CHECKING
 
 from .. import cli
 from ..choices import STORAGES
 from ..outputs import OutputBag, OutputFile
 from ..parallel import Progress
 from ..simulation_options import add_options
-
-if TYPE_CHECKING:
-    from argparse import ArgumentParser, Namespace
 
 
 def parser() -> ArgumentParser:

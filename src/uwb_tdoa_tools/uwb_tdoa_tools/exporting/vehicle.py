@@ -10,14 +10,16 @@ everything else. Only the first part is computed again for the Jacobian, at stat
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_bias.common.text import version
 from uwb_tdoa_bias.correction.corrector import Corrector
+from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.effect_set import REACH
 
@@ -26,13 +28,6 @@ from .c_code import Printer, number
 from .correction import LeftOut, TracedCorrection, left_out
 from .scalars import Program, Unsupported
 from .tracing import nodes_of, samples_of
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.correction.network import Network
-
 
 MEMBERS = {  # of the state, by the names of inputs
     **{name: f"position[{k}]" for k, name in enumerate(("x", "y", "z"))},
