@@ -34,7 +34,6 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flyable import FlyableVolume
 from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_bias.effects import EffectSet, ImuCorrector, SensorCorrector
-from uwb_tdoa_bias.effects.tag import TagLeverArm
 from uwb_tdoa_bias.ros import process
 from uwb_tdoa_bias.ros.anchors import AnchorsInput
 from uwb_tdoa_bias.ros.cdr import CdrCodec, message_class
@@ -91,7 +90,6 @@ TOPICS = {
 }
 MOST_FRAMES = 100  # frames of the IMU to remember; a topic may carry any number of names
 MOST_NAMED = 3  # frames that one message names
-MAST = 0.1  # m, height of an antenna over the body from which the two heights differ visibly
 EARLY = 5000  # messages kept until anchors arrive
 
 
@@ -157,7 +155,6 @@ class EkfNode(StreamNode):
             # by frame of the IMU, in order of arrival: ImuMount (None for the body frame), and the
             # problem with it
         ] = {}
-        self._remark_height()
         self._health = Health(
             self._config, self._lag, FlyableVolume.load(volume) if volume else None
         )
@@ -191,24 +188,6 @@ class EkfNode(StreamNode):
             say_unused([self], files_of(arguments))
             self.turns = process.StreamPoller([self.streams])
         self.ready = "ready"
-
-    def _remark_height(self) -> None:
-        """Log a warning if fixed_height seems to be the height of the antenna."""
-        arm = sum(
-            effect.values.get("z", 0.0)
-            for effect in self._effects.effects
-            if isinstance(effect, TagLeverArm)
-        )
-        if (
-            self._config.fixed_height_std > 0.0
-            and abs(arm) > MAST
-            and abs(self._config.fixed_height - arm) < 0.5 * MAST
-        ):
-            self.get_logger().warning(
-                f"fixed_height is that of {self._body}, and equals the height of the antenna "
-                f"over it ({TagLeverArm.name} of effects_file): "
-                f"give 0.0 for a {self._body} on the floor"
-            )
 
     def _subscribe(self, handed: Collection[str]) -> Streams:
         """Return Streams of all measurements that the filter takes.

@@ -40,8 +40,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
     from pathlib import Path
 
-    from .readers.inputs import Reading
-    from .readers.inputs import Recording as ReadingPair
+    from .readers.inputs import Reading, Recording as ReadingPair
 
 
 RMSE = "3D RMSE"  # name of the figure with ground truth

@@ -10,8 +10,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.clock import Clock as SteadyClock
-from rclpy.clock import ClockType, ROSClock
+from rclpy.clock import Clock as SteadyClock, ClockType, ROSClock
 from rclpy.qos import QoSProfile
 
 if TYPE_CHECKING:

@@ -14,8 +14,7 @@ import numpy as np
 from uwb_tdoa_bias.common.sensors import LOCATING, SENSORS
 from uwb_tdoa_bias.ros.diagnostics import Rate, Report
 
-from .finding import ERROR as SEVERE
-from .finding import Finding
+from .finding import ERROR as SEVERE, Finding
 from .status import LARGEST_UNUSED, Use, flyability
 
 if TYPE_CHECKING:

@@ -29,9 +29,7 @@ from .finding import ERROR, WARNING, Finding
 from .reference import Displaced, SurveyComparison
 from .signs import turned
 from .slices import LENGTH, Slice, reduced
-from .swap import Residuals as SwapResiduals
-from .swap import clear_exchange, mean_of
-from .swap import residuals as residuals_of
+from .swap import Residuals as SwapResiduals, clear_exchange, mean_of, residuals as residuals_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

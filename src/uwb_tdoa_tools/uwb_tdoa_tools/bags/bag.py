@@ -35,8 +35,7 @@ from uwb_tdoa_bias.common.survey import refuse_faulty
 from uwb_tdoa_bias.common.text import printable, written_by
 
 from ..clock import sentences
-from . import frames
-from . import messages as bag_messages
+from . import frames, messages as bag_messages
 from .files import BagReader, check_output, connections_of, new_bag, open_bag, readable, remarks_of
 from .frames import recorded_anchors
 from .integrity import metadata

@@ -30,19 +30,16 @@ from .completion import completed
 from .integrity import (
     CHECKSUM_KEY,
     NO_CHECKSUM,
+    check as check_whole,
     data_files,
     is_mcap,
     metadata,
     sqlite_messages,
     write_checksums,
 )
-from .integrity import (
-    check as check_whole,
-)
 from .mcap import Damaged, zstd
 from .message_types import check_type, typestore
-from .salvage import as_written
-from .salvage import salvage as write_sound_part
+from .salvage import as_written, salvage as write_sound_part
 
 PLUGINS = dict(zip(STORAGES, (StoragePlugin.MCAP, StoragePlugin.SQLITE3)))
 

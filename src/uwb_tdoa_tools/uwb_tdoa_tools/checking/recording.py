@@ -17,8 +17,7 @@ from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas
 from uwb_tdoa_bias.common.sensors import LOCATING, SENSORS
 from uwb_tdoa_bias.common.survey import refuse_faulty
 
-from ..bags import frames, is_bag
-from ..bags import messages as bag_messages
+from ..bags import frames, is_bag, messages as bag_messages
 from ..bags.files import open_bag, remarks_of
 from ..bags.frames import TF_STATIC, Place, recorded_anchors
 from ..bags.topics import Names, TopicMessages, arrivals, on_one_clock, read_sensor, read_topic

@@ -118,8 +118,7 @@ def _write(
     args: Namespace, several: Sequence[Flight], over: MapFunction, progress: Progress
 ) -> None:
     """Train on several Flights, and write all results. over : as in `shrinking.train`."""
-    from ..training import labels as labelling
-    from ..training import models, shrinking
+    from ..training import labels as labelling, models, shrinking
 
     flights = {flight.name: flight for flight in several}
     names = labelling.split(list(flights), args.seed, args.validation)

@@ -21,8 +21,7 @@ from uwb_tdoa_bias.correction.features import columns
 from uwb_tdoa_bias.effects import EffectSet
 
 from ..choices import MODELS
-from . import labels as labelling
-from . import network, physics, structured
+from . import labels as labelling, network, physics, structured
 from .labels import Labels
 from .network import Paper
 from .structured import Structured
