@@ -41,7 +41,7 @@ MODULES = {
     name: name
     for name in "hypothesis joblib matplotlib numba onnx onnxruntime rosbags scipy tqdm".split()
 }
-MODULES |= {"PIL": "pillow", "jinja2": "Jinja2", "sklearn": "scikit-learn", "yaml": "PyYAML"}
+MODULES |= {"jinja2": "Jinja2", "sklearn": "scikit-learn", "yaml": "PyYAML"}
 # Jazzy is built for numpy 1.26, and a pytest plugin of its launch_testing breaks newer pytests.
 LIMITS = ["numpy<2", "pytest<8"]
 

@@ -39,14 +39,11 @@ from studies import (
     warehouse,
 )
 from studies.bench import soak, suite
-from studies.checking import figures as checking
-from studies.checking import in_flight
+from studies.checking import figures as checking, in_flight
 from studies.closed_loop import experiment
 from studies.debiasing import measured, set_up
-from studies.diagnosis import figures
-from studies.diagnosis import ranges as diagnosed_ranges
-from studies.faults import figures as faults
-from studies.faults import flown
+from studies.diagnosis import figures, ranges as diagnosed_ranges
+from studies.faults import figures as faults, flown
 from studies.fuzzing import figures as fuzz
 from studies.rules import figures as rules
 from studies.training import compare, spin, splits

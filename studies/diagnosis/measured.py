@@ -5,8 +5,7 @@
 import json
 import time
 
-from known_effects import AIDED as ON_SENSORS
-from known_effects import RANGED, SIZES, effect_of
+from known_effects import AIDED as ON_SENSORS, RANGED, SIZES, effect_of
 import numpy as np
 
 from uwb_tdoa_bias.common.files import write_text

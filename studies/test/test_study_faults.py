@@ -15,8 +15,7 @@ import pytest
 pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
-from hypothesis import given, settings  # noqa: E402
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
 
 from studies.__main__ import main  # noqa: E402

@@ -12,8 +12,7 @@ import random
 import pytest
 
 from studies.__main__ import main
-from studies.fuzzing import figures as fuzz
-from studies.fuzzing import mutations, targets
+from studies.fuzzing import figures as fuzz, mutations, targets
 from uwb_tdoa_bias.common.errors import InputError
 
 SLOW = {

@@ -8,8 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from studies import __main__ as study
-from studies import situations
+from studies import __main__ as study, situations
 from studies.situations import SITUATIONS, again, measure
 
 FEW = ["situations", "--only", "on the floor, low", "1 m high", "--seeds", "2", "--jobs", "1"]

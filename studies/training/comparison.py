@@ -12,8 +12,7 @@ from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_tools.scoring.evaluation import evaluate
 from uwb_tdoa_tools.scoring.metrics import pooled
-from uwb_tdoa_tools.training import labels as labelling
-from uwb_tdoa_tools.training import models, physics
+from uwb_tdoa_tools.training import labels as labelling, models, physics
 
 from . import bounds
 from .pictures import plot_bars, plot_histograms

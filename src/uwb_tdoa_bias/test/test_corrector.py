@@ -3,8 +3,7 @@
 
 from dataclasses import fields
 
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -17,16 +16,13 @@ from uwb_tdoa_bias.correction.corrector import (
     PASSED,
     START,
     Correction,
+    Corrector as LateCorrector,
     Poses,
     parts_of,
     rotated_in_yaw,
 )
-from uwb_tdoa_bias.correction.corrector import (
-    Corrector as LateCorrector,
-)
 from uwb_tdoa_bias.correction.network import Network
-from uwb_tdoa_bias.effects import EFFECTS as CATALOGUE
-from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm
+from uwb_tdoa_bias.effects import EFFECTS as CATALOGUE, AnchorDelay, EffectSet, TagLeverArm
 
 ANCHORS = Anchors.from_positions([[0, 0, 0], [8, 0, 0], [0, 8, 0], [0, 0, 3]], ids=[4, 5, 6, 7])
 DELAYS = EffectSet((AnchorDelay({4: 0.1, 6: -0.2}),))

@@ -8,8 +8,7 @@ from pathlib import Path
 import re
 
 from finite_differences import numerical_jacobian
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
+from hypothesis import assume, given, settings, strategies as st
 import numpy as np
 import pytest
 from random_samples import random_samples, ranges_of

@@ -15,8 +15,7 @@ import threading
 import tracemalloc
 import zipfile
 
-from hypothesis import HealthCheck, example, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, example, given, settings, strategies as st
 import numpy as np
 import pytest
 import yaml

@@ -5,8 +5,7 @@
 import math
 
 from finite_differences import numerical_jacobian
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 import numpy as np
 import pytest
 from random_samples import random_rotation

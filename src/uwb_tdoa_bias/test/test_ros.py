@@ -13,8 +13,10 @@ from fractions import Fraction  # noqa: E402
 
 from builtin_interfaces.msg import Time  # noqa: E402
 from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
-from hypothesis import given  # noqa: E402
-from hypothesis import strategies as st  # noqa: E402
+from hypothesis import (
+    given,  # noqa: E402
+    strategies as st,  # noqa: E402
+)
 import numpy as np  # noqa: E402
 from rclpy.qos import (  # noqa: E402
     QoSCompatibility,

@@ -2,8 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Accepted stamps, and the pose that belongs to a stamp."""
 
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 import pytest
 
 from uwb_tdoa_bias.common.stamps import (

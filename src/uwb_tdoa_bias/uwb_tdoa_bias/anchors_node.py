@@ -11,12 +11,14 @@ config/anchors_node.yaml.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import sys
-from typing import TYPE_CHECKING
 
 from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import Marker, MarkerArray
+
+from uwb_tdoa_msgs.msg import AnchorArray
 
 from .common.errors import InputError
 from .common.survey import read_survey, refuse_faulty
@@ -32,11 +34,6 @@ from .ros.parameters import (
     refuse_unknown,
     say_unused,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from uwb_tdoa_msgs.msg import AnchorArray
 
 PARAMETERS = {  # in the order of config/anchors_node.yaml
     "anchors_file": Parameter(

@@ -11,12 +11,13 @@ Every parameter is documented in config/bias_node.yaml.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import groupby
 import math
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
@@ -24,6 +25,7 @@ import numpy as np
 
 from uwb_tdoa_msgs.msg import Tdoa, TdoaCorrected
 
+from .common.anchors import Anchors
 from .common.errors import InputError
 from .common.stamps import LARGEST_STEP_BACK, PoseQueue, StampGate
 from .correction.corrector import Correction, Corrector, Poses, parts_of, warm_up
@@ -33,7 +35,7 @@ from .effects import EffectSet, LabelCorrector
 from .effects.tag import TagLeverArm
 from .ros import process
 from .ros.anchors import ANCHORS_FILE, AnchorsInput
-from .ros.cdr import CdrCodec
+from .ros.cdr import CdrCodec, CdrTemplate
 from .ros.diagnostics import Diagnostics, Rate, Report
 from .ros.frames import FramesInput, unknown_frame
 from .ros.node import StreamNode
@@ -46,12 +48,6 @@ from .ros.parameters import (
     say_unused,
 )
 from .ros.topics import Epoch, StreamOutput, Streams, several_publishers
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Sequence
-
-    from .common.anchors import Anchors
-    from .ros.cdr import CdrTemplate
 
 PARAMETERS = {  # in the order of config/bias_node.yaml
     "anchors_file": ANCHORS_FILE,

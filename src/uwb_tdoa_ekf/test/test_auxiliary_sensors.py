@@ -12,8 +12,7 @@ import sys
 
 from covariances import assert_covariance
 from flights import corners, fly, measurements, position_at, with_ranges, with_sensors
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 import numpy as np
 from priors import Prior, with_offset
 import pytest

@@ -5,8 +5,7 @@
 from dataclasses import replace
 
 from flights import corners, errors_of, fly, rms_error
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -37,9 +36,13 @@ from uwb_tdoa_ekf.core.memory import (
 from uwb_tdoa_ekf.core.noise import learn
 from uwb_tdoa_ekf.core.state import GRAVITY
 from uwb_tdoa_ekf.core.update import SMALLEST, second_order_variance
-from uwb_tdoa_ekf.core.workspace import SMALLEST as WORKSPACE_SMALLEST
-from uwb_tdoa_ekf.core.workspace import STD as WORKSPACE_STD
-from uwb_tdoa_ekf.core.workspace import constrain, contains, set_bounds
+from uwb_tdoa_ekf.core.workspace import (
+    SMALLEST as WORKSPACE_SMALLEST,
+    STD as WORKSPACE_STD,
+    constrain,
+    contains,
+    set_bounds,
+)
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.results import rotation_std, to_odometry
 

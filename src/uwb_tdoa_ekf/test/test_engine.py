@@ -9,8 +9,7 @@ import re
 from covariances import assert_covariance
 from driving import assert_equal, assert_sound, cut, drive, errors, state_for
 from flights import fly, kept, leaving, measurements, position_at, without_tdoas
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
 

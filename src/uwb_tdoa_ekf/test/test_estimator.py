@@ -6,8 +6,7 @@ from dataclasses import replace
 import math
 
 from flights import corners, errors_of, fly, kept, position_at, with_sensors, without_tdoas
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from live import (
     FIRST_SENSOR,
     IMU,

@@ -5,8 +5,7 @@
 from dataclasses import replace
 
 from flights import corners, errors_of, fly, without_tdoas
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 import numpy as np
 import pytest
 

@@ -4,8 +4,7 @@
 
 from dataclasses import replace
 
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from hypothesis.extra import numpy as hnp
 from monitor_cost import cost, odometry_of, residuals_of, row_of
 import numpy as np

@@ -4,8 +4,7 @@
 
 from dataclasses import replace
 
-from flights import errors_of, fly, only_ranges, rms_error
-from flights import rms_error as error
+from flights import errors_of, fly, only_ranges, rms_error, rms_error as error
 from live import IMU, TDOA, assert_same, feed, messages
 import numpy as np
 import pytest
@@ -23,11 +22,11 @@ from uwb_tdoa_ekf.core.memory import (
     ODOMETRY,
     REPEATED,
     SENSOR_ROW,
+    TDOA as TDOA_ROW,
     USED,
     Measurements,
     new_state,
 )
-from uwb_tdoa_ekf.core.memory import TDOA as TDOA_ROW
 from uwb_tdoa_ekf.core.sensors import STREAMS
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.offline import run_offline, without_offset

@@ -6,15 +6,13 @@ from dataclasses import dataclass, replace
 import math
 
 from flights import fly, kept
-from hypothesis import Phase, given, settings
-from hypothesis import strategies as st
+from hypothesis import Phase, given, settings, strategies as st
 from live import IMU, TDOA, arriving, assert_same, assert_same_as_offline, feed, messages, send
 import numpy as np
 import pytest
 
 from uwb_tdoa_bias.common.stamps import MOST_HELD
-from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, INVALID, LATE, SENSOR_ROW
-from uwb_tdoa_ekf.core.memory import TDOA as TDOA_ROW
+from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, INVALID, LATE, SENSOR_ROW, TDOA as TDOA_ROW
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.monitoring.filter_findings import clock_ahead, restarted
 from uwb_tdoa_ekf.reorder_buffer import (

@@ -6,8 +6,7 @@ from dataclasses import replace
 import math
 
 from flights import corners, fly, with_sensors, without_tdoas
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from live import assert_same, feed, joined, messages, send
 import numpy as np
 import pytest

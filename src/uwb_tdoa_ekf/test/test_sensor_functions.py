@@ -4,8 +4,7 @@
 from dataclasses import replace
 
 from flights import fly, rms_error
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from live import assert_same
 import numpy as np
 import pytest

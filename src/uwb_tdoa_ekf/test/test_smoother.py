@@ -5,8 +5,7 @@ from dataclasses import replace
 
 from covariances import assert_covariance
 from flights import WORKSPACE, corners, errors_of, fly, kept, leaving, with_ranges, without_tdoas
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
 

@@ -5,11 +5,9 @@
 from dataclasses import replace
 
 from covariances import assert_covariance
-from driving import assert_sound, drive, state_for
-from driving import errors as distances_off
+from driving import assert_sound, drive, errors as distances_off, state_for
 from flights import GRAVITY, corners, fly
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

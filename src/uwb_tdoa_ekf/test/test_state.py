@@ -3,8 +3,7 @@
 
 from covariances import assert_covariance, random_covariance
 from finite_differences import numerical_jacobian
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp

@@ -7,8 +7,7 @@ import math
 from types import SimpleNamespace
 
 from flights import fly
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 import numpy as np
 import pytest
 

@@ -3,11 +3,9 @@
 """One update of a hypothesis, plain and robust, compared with the textbook and the paper."""
 
 from covariances import assert_covariance
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 import numpy as np
-from priors import Prior, with_offset
-from priors import kalman as textbook
+from priors import Prior, kalman as textbook, with_offset
 import pytest
 
 from uwb_tdoa_bias.common.robust_loss import LOSSES, weight

@@ -12,10 +12,11 @@ compiled at the first start of `bias_node` with one.
 from __future__ import annotations
 
 import argparse
+from argparse import ArgumentParser
+from collections.abc import Sequence
 from functools import cache
 import sys
 import time
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -31,10 +32,6 @@ from .monitoring.slices import LENGTH, Slice
 from .monitoring.stream_rules import StreamWatch
 from .monitoring.survey_scale import SurveyScale
 from .results import pose_and_twist, rotation_std
-
-if TYPE_CHECKING:
-    from argparse import ArgumentParser
-    from collections.abc import Sequence
 
 
 @cache

@@ -11,14 +11,16 @@ Every parameter is documented in config/debias_node.yaml.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from copy import copy
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 import numpy as np
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.ros import process
 from uwb_tdoa_bias.ros.anchors import ANCHORS_FILE, AnchorsInput
@@ -35,11 +37,6 @@ from uwb_tdoa_bias.ros.parameters import (
 from uwb_tdoa_bias.ros.topics import OVERRIDES, STREAM_QOS, Input, publish_stream
 
 from .debias import BiasMap
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from uwb_tdoa_bias.common.anchors import Anchors
 
 LARGEST_OUTSIDE = 0.5  # share of positions outside the map that raises a warning
 # in the order of config/debias_node.yaml

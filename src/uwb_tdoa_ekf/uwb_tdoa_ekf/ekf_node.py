@@ -15,18 +15,21 @@ Every parameter is documented in config/ekf_node.yaml.
 from __future__ import annotations
 
 from collections import Counter, deque
+from collections.abc import Collection, Sequence
 from functools import partial
 import math
 import sys
 import time
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 import numpy as np
+from rclpy.clock import ROSClock
 from rclpy.time import Time
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flyable import FlyableVolume
 from uwb_tdoa_bias.common.sensors import SENSORS
@@ -35,7 +38,7 @@ from uwb_tdoa_bias.effects.tag import TagLeverArm
 from uwb_tdoa_bias.ros import process
 from uwb_tdoa_bias.ros.anchors import AnchorsInput
 from uwb_tdoa_bias.ros.cdr import CdrCodec, message_class
-from uwb_tdoa_bias.ros.diagnostics import Diagnostics
+from uwb_tdoa_bias.ros.diagnostics import Diagnostics, Report
 from uwb_tdoa_bias.ros.frames import FramesInput, unknown_frame
 from uwb_tdoa_bias.ros.node import StreamNode
 from uwb_tdoa_bias.ros.parameters import files_of, refuse_unknown, say_unused
@@ -43,29 +46,18 @@ from uwb_tdoa_bias.ros.topics import Epoch, Input, Refusals, Streams, several_pu
 from uwb_tdoa_msgs.msg import TdoaCorrected
 
 from .compile_nodes import warm_up
+from .core.config import FilterConfig
 from .core.memory import INVALID
 from .ekf_parameters import ODOM, declare_parameters, follow_changes
 from .estimator import Estimator
 from .frames import ImuMount, pose_from_message
-from .monitoring.finding import most_severe_first
+from .monitoring.finding import Finding, most_severe_first
 from .monitoring.health import OK, WARN, Health, together
 from .monitoring.status import FAULT, Status, status_of, with_fault_covariance, yaw_in_words
 from .monitoring.stream_rules import FEW_ANCHORS, StreamWatch
 from .outputs import Outputs, StatusOutput
 from .reorder_buffer import STREAMS
-from .results import VERDICTS, Residuals, rotation_std
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
-
-    from rclpy.clock import ROSClock
-
-    from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.ros.diagnostics import Report
-
-    from .core.config import FilterConfig
-    from .monitoring.finding import Finding
-    from .results import Odometry
+from .results import VERDICTS, Odometry, Residuals, rotation_std
 
 # Topic, message type and fields to read, for each stream.
 TOPICS = {

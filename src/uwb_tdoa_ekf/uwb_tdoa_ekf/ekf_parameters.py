@@ -11,7 +11,7 @@ from rcl_interfaces.msg import SetParametersResult
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.ros.anchors import ANCHORS_FILE
-from uwb_tdoa_bias.ros.parameters import FROZEN, Parameter, declare, declare_all
+from uwb_tdoa_bias.ros.parameters import FROZEN, Parameter, ParameterNode, declare, declare_all
 
 from .core.config import CHOICES, FilterConfig
 
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from rclpy.node import Node
     from rclpy.parameter import Parameter as RosParameter
 
-    from uwb_tdoa_bias.ros.parameters import ParameterNode
 
 PUBLISH_TF = NONE, BASE, ODOM = "none", "base", "odom"
 PARAMETERS = {  # in the order of config/ekf_node.yaml

@@ -30,9 +30,9 @@ from .core.memory import (
 )
 from .core.startup import APART
 from .monitoring.filter_findings import clock_ahead, implausible, restarted
-from .monitoring.finding import Steady
-from .pipeline import Pipeline, odometry_of
-from .reorder_buffer import IMU_STREAM, STREAMS, TDOA_STREAM, ReorderBuffer
+from .monitoring.finding import Finding, Steady
+from .pipeline import Pipeline, PipelineOutput, odometry_of
+from .reorder_buffer import IMU_STREAM, STREAMS, TDOA_STREAM, ReorderBuffer, Restart
 from .results import VERDICTS, Odometry, Residuals, concatenated
 
 if TYPE_CHECKING:
@@ -42,9 +42,6 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.common.compiled import Record
     from uwb_tdoa_bias.common.sensors import Stream
 
-    from .monitoring.finding import Finding
-    from .pipeline import PipelineOutput
-    from .reorder_buffer import Restart
 
 # s, largest lead of a pose that the user sets over the newest measurement
 LARGEST_POSE_AHEAD = 10.0

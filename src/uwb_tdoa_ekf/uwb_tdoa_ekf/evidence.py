@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.effects.effect_set import Covariance
 
-    ChangeKey = tuple[str, int]  # effect, number of an anchor
-    Change = tuple[np.ndarray, float]  # places (m,) among the unknowns, m, standard deviation
+ChangeKey = tuple[str, int]  # effect, number of an anchor
+Change = tuple[np.ndarray, float]  # places (m,) among the unknowns, m, standard deviation
 
 # m, standard deviation of the drift that every coordinate and delay may have without a change
 DRIFT = 0.005

@@ -16,7 +16,7 @@ from launch_ros.actions import Node
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.executable import leave_present_folder_out
 
-from .launching import Lives, discovery, network
+from .launching import Lives, Start, discovery, network
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from launch.action import Action
     from launch.events.process import ProcessExited
     from launch.launch_context import LaunchContext
-
-    from .launching import Start
 
 
 def actions(

@@ -15,12 +15,13 @@ bias_node and ekf_node may be given too, for all tags, or in a parameter file fo
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from functools import partial
 import math
 import sys
 import time
 import traceback
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
@@ -28,7 +29,7 @@ from uwb_tdoa_bias import bias_node
 from uwb_tdoa_bias.bias_node import BiasNode
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.ros import process
-from uwb_tdoa_bias.ros.diagnostics import Diagnostics
+from uwb_tdoa_bias.ros.diagnostics import Diagnostics, Report
 from uwb_tdoa_bias.ros.node import StreamNode
 from uwb_tdoa_bias.ros.parameters import (
     FROZEN,
@@ -41,11 +42,6 @@ from uwb_tdoa_bias.ros.topics import InMemoryReceiver
 
 from .ekf_node import EkfNode
 from .ekf_parameters import names_of_parameters
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from uwb_tdoa_bias.ros.diagnostics import Report
 
 PARAMETERS = {
     "tags": Parameter(

@@ -4,12 +4,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet
 
@@ -28,16 +29,9 @@ from .core.memory import (
     usable_tdoas,
 )
 from .core.sensors import STREAMS as SENSOR_NAMES
-from .pipeline import Pipeline, odometry_of
+from .pipeline import Pipeline, PipelineOutput, odometry_of
 from .reorder_buffer import FIRST_SENSOR, IMU_STREAM, TDOA_STREAM, ReorderBuffer
 from .results import VERDICTS, Odometry, Residuals, poses_of
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from uwb_tdoa_bias.common.flight import Flight
-
-    from .pipeline import PipelineOutput
 
 # TDOAs per call of the filter while a history is recorded; memory is reserved for the worst case
 RECORDED_AT_ONCE = 256

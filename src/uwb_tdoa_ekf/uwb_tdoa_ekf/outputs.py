@@ -17,21 +17,19 @@ from uwb_tdoa_bias.common.lazy import rotations
 from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS as STATUS_QOS
 from uwb_tdoa_bias.ros.cdr import CdrCodec
 from uwb_tdoa_bias.ros.frames import TF_QOS
-from uwb_tdoa_bias.ros.topics import StreamOutput
+from uwb_tdoa_bias.ros.topics import Epoch, StreamOutput
 from uwb_tdoa_msgs.msg import EstimatorStatus, TdoaResidual
 
 from .ekf_parameters import NONE, ODOM
-from .results import pose_and_twist
+from .results import Odometry, Residuals, pose_and_twist
 
 if TYPE_CHECKING:
     import numpy as np
 
     from uwb_tdoa_bias.common.transforms import Frames
     from uwb_tdoa_bias.ros.node import StreamNode
-    from uwb_tdoa_bias.ros.topics import Epoch
 
     from .monitoring.status import Status
-    from .results import Odometry, Residuals
 
 STATUS_PERIOD = 0.95  # s; the node checks five times a second
 ODOMETRY = "pose", "twist"

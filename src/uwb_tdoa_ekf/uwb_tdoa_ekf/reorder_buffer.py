@@ -4,8 +4,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,9 +22,6 @@ from uwb_tdoa_bias.common.stamps import (
 
 from .core import sensors
 from .core.memory import IMU_SAMPLE, INVALID, LATE, SENSOR_ROW, TDOA, Measurements, joined
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
 
 STREAMS = "imu", "tdoa", *sensors.STREAMS
 KINDS = IMU_SAMPLE, TDOA, *[SENSOR_ROW] * len(sensors.STREAMS)

@@ -11,14 +11,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.common.compiled import compiled
-from uwb_tdoa_bias.common.flight import Truth
+from uwb_tdoa_bias.common.compiled import Record, compiled
+from uwb_tdoa_bias.common.flight import Flight, Truth
 from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.effects import RADIO, true_samples
+from uwb_tdoa_bias.effects import RADIO, EffectSet, true_samples
 
 from .core import auxiliary, plane
 from .core.config import FilterConfig
@@ -26,15 +25,8 @@ from .core.history import RESET
 from .core.hypotheses import YAW_STD
 from .core.memory import ODOMETRY
 from .core.state import ERROR_STATES, MOVING_STATES, inject
-from .offline import may_have_offset, run_offline, without_offset
+from .offline import Run, may_have_offset, run_offline, without_offset
 from .results import Odometry
-
-if TYPE_CHECKING:
-    from uwb_tdoa_bias.common.compiled import Record
-    from uwb_tdoa_bias.common.flight import Flight
-    from uwb_tdoa_bias.effects import EffectSet
-
-    from .offline import Run
 
 RANGE = "range"
 LAGS = 64  # most ranges of one anchor over which their errors are compared

@@ -18,7 +18,7 @@ from uwb_tdoa_bias.correction.features import FEATURES
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, Samples, SmoothTerm
 from uwb_tdoa_bias.effects.samples import Motion
 from uwb_tdoa_tools.exporting.graph import ELEMENTWISE
-from uwb_tdoa_tools.exporting.vehicle import MEMBERS, STATE
+from uwb_tdoa_tools.exporting.vehicle import MEMBERS
 from uwb_tdoa_tools.training.network import WITHOUT
 
 HERE = Path(__file__).parent / "cortex_m"
@@ -33,6 +33,19 @@ FIRMWARE = (
     *("-Wall", "-Wextra", "-Wmissing-braces", "-Wdouble-promotion", "-Werror"),
 )
 CLOCK = 168e6  # Hz, of the emulated processor. It executes one instruction in 1 ns.
+# The state in C, all of 4 bytes each
+STATE = np.dtype(
+    [
+        ("position", np.float32, 3),
+        ("attitude", np.float32, 4),
+        ("velocity", np.float32, 3),
+        ("acceleration", np.float32, 3),
+        ("rate", np.float32, 3),
+        ("time", np.float32),
+        ("interval", np.float32),
+        ("previous_anchor", np.float32),
+    ]
+)
 CASE = np.dtype([("a", np.int32), ("b", np.int32), ("state", STATE)])
 RESULT = np.dtype(
     [

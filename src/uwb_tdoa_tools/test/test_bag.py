@@ -6,8 +6,7 @@ import os
 from pathlib import Path
 import tempfile
 
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
+from hypothesis import assume, given, settings, strategies as st
 from hypothesis.extra.numpy import arrays
 import numpy as np
 import pytest
@@ -15,7 +14,6 @@ from recordings import ANCHORS, differences, small_flight
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.rosbag2 import Reader, Writer
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 import yaml
 
 from uwb_tdoa_bias.common.anchors import Anchors
@@ -23,8 +21,8 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
 from uwb_tdoa_bias.common.sensors import SENSORS, Height, Pressure, Velocity
 from uwb_tdoa_bias.common.survey import survey_fault
-from uwb_tdoa_tools.bags.bag import read_bag, read_fields, read_odometry, write_bag
-from uwb_tdoa_tools.bags.files import messages, new_bag, open_bag
+from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag
+from uwb_tdoa_tools.bags.files import new_bag, open_bag
 from uwb_tdoa_tools.bags.message_types import typestore
 from uwb_tdoa_tools.bags.messages import of_sensor, sensor_messages, tdoa_messages
 from uwb_tdoa_tools.checking.recording import read_recording
@@ -385,103 +383,6 @@ def test_odometry(tmp_path):
     np.testing.assert_array_equal(odometry.covariance[0], 2 * covariance.reshape(6, 6))
     with pytest.raises(InputError, match="no message on /tag1/odometry"):
         read_odometry(tmp_path / "bag", namespace="tag1")
-
-
-# before `variance`
-EARLIER = "std_msgs/Header header\nuint16 anchor_a\nuint16 anchor_b\nfloat64 distance_difference\n"
-
-
-@BOTH
-@pytest.mark.parametrize("file_alone", [False, True])
-def test_a_bag_from_before_the_variance(tmp_path, storage, file_alone):
-    store, msgtype, header = (
-        get_typestore(Stores.ROS2_JAZZY),
-        "uwb_tdoa_msgs/msg/Tdoa",
-        "std_msgs/msg/Header",
-    )
-    store.register(get_types_from_msg(EARLIER, msgtype))
-    with new_bag(tmp_path / "old", storage) as writer:
-        connection = writer.add_connection("/uwb/tdoa", msgtype, typestore=store)
-        for k in range(3):
-            stamp = store.types[header](
-                store.types["builtin_interfaces/msg/Time"](k + 1, 0), "x" * k
-            )  # any alignment
-            message = store.types[msgtype](stamp, k, 7, 0.25 * k)
-            writer.write(connection, 10**9 * (k + 1), store.serialize_cdr(message, msgtype))
-    path = next((tmp_path / "old").glob("old.*")) if file_alone else tmp_path / "old"
-    for salvage in (False, True):
-        tdoa = read_bag(path, anchors=ANCHORS, salvage=salvage).tdoa
-        assert (
-            tdoa.a.tolist() == [0, 1, 2]
-            and tdoa.d.tolist() == [0.0, 0.25, 0.5]
-            and tdoa.variance.tolist() == [0.0] * 3
-        )
-    with open_bag(path) as reader:  # as `replay` publishes them
-        for _, stamp, data in messages(path, reader, reader.connections):
-            assert typestore().deserialize_cdr(data, msgtype).variance == 0.0 and stamp
-            assert type(data) is bytes  # rclpy publishes nothing else
-
-
-@pytest.mark.parametrize(
-    "lacking", [("bias_slope", "bias_state"), ("variance", "bias_slope", "bias_state")]
-)
-def test_corrected_tdoas_of_a_bag_from_before_fields_were_added(tmp_path, lacking):
-    store, msgtype = get_typestore(Stores.ROS2_JAZZY), "uwb_tdoa_msgs/msg/TdoaCorrected"
-    constants, fields = typestore().fielddefs[msgtype]
-    store.register({msgtype: (constants, [field for field in fields if field[0] not in lacking])})
-    values = {
-        "anchor_a": 1,
-        "anchor_b": 2,
-        "raw": 0.5,
-        "bias": 0.1,
-        "bias_std": 0.2,
-        "corrected": 0.4,
-        "variance": 0.3,
-        "status": 1,
-        "model": "x",
-    }
-    header = store.types["std_msgs/msg/Header"](
-        store.types["builtin_interfaces/msg/Time"](1, 0), "map"
-    )
-    with new_bag(tmp_path / "old", "mcap") as writer:
-        connection = writer.add_connection("/uwb/tdoa_corrected", msgtype, typestore=store)
-        message = store.types[msgtype](
-            header=header, **{name: value for name, value in values.items() if name not in lacking}
-        )
-        writer.write(connection, 10**9, store.serialize_cdr(message, msgtype))
-    with open_bag(tmp_path / "old") as reader:
-        ((_, _, data),) = messages(tmp_path / "old", reader, reader.connections)
-    message = typestore().deserialize_cdr(data, msgtype)
-    assert {name: getattr(message, name) for name in values} == {
-        **values,
-        **({"variance": 0.0} if "variance" in lacking else {}),
-    }
-    assert message.bias_slope.tolist() == message.bias_state.tolist() == [0.0] * 6
-
-
-def test_fields_of_any_topic(tmp_path):
-    store = typestore()
-    Residual = store.types["uwb_tdoa_msgs/msg/TdoaResidual"]
-    header = next(iter(tdoa_messages(small_flight(0.01).tdoa, store)))[1].header
-    messages = [
-        (7, Residual(header, 1, 2, 0.25, np.nan, 0.5, 3)),
-        (8, Residual(header, 2, 1, -0.25, 1.0, 1.0, 0)),
-    ]
-    write_topics(tmp_path / "bag", ("/uwb/residual", "uwb_tdoa_msgs/msg/TdoaResidual", messages))
-    fields = read_fields(tmp_path / "bag", "uwb/residual")
-    assert set(fields) == {
-        "t",
-        "anchor_a",
-        "anchor_b",
-        "innovation",
-        "innovation_variance",
-        "weight",
-        "verdict",
-    }
-    np.testing.assert_array_equal(fields["verdict"], [3, 0])
-    np.testing.assert_array_equal(fields["innovation"], [0.25, -0.25])
-    with pytest.raises(InputError, match="no topic /uwb/tdoa_corrected; record it"):
-        read_fields(tmp_path / "bag", "uwb/tdoa_corrected")
 
 
 @pytest.mark.parametrize("metadata", ["", "rosbag2_bagfile_information: 3", "{", "a: b"])

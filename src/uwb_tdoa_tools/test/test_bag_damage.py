@@ -13,8 +13,7 @@ import sqlite3
 import struct
 import zlib
 
-from hypothesis import HealthCheck, example, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, example, given, settings, strategies as st
 import numpy as np
 import pytest
 from recordings import differences, small_flight

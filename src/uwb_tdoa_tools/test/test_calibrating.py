@@ -18,8 +18,7 @@ from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.monitoring.finding import ERROR, Finding
 from uwb_tdoa_ekf.offline import without_offset
-from uwb_tdoa_tools import calibrating as library
-from uwb_tdoa_tools import options
+from uwb_tdoa_tools import calibrating as library, options
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.calibrating import (
     Calibration,
@@ -32,8 +31,7 @@ from uwb_tdoa_tools.calibrating import (
 from uwb_tdoa_tools.checking.check import Report
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.command_lines import evaluate_line, lines_of_use
-from uwb_tdoa_tools.commands import calibrate, diagnose, survey
-from uwb_tdoa_tools.commands import check as check_command
+from uwb_tdoa_tools.commands import calibrate, check as check_command, diagnose, survey
 from uwb_tdoa_tools.diagnosis.noise import has_imu, write_parameters
 from uwb_tdoa_tools.diagnosis.references import Nothing
 from uwb_tdoa_tools.estimate import FlightEstimator

@@ -9,8 +9,7 @@ from dataclasses import replace
 import importlib
 
 from checking_flights import recording
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
 from scipy.signal import lfilter

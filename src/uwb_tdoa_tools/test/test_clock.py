@@ -2,8 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Continuous time from clocks that restart, wrap or are set, by the order of the messages."""
 
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
 

@@ -9,8 +9,7 @@ import subprocess
 import sys
 
 from documented import ROOT
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
+from hypothesis import assume, given, settings, strategies as st
 import numpy as np
 import pytest
 

@@ -5,8 +5,7 @@
 from argparse import ArgumentParser
 from types import SimpleNamespace
 
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from known_effects import CLEAN
 import numpy as np
 import pytest

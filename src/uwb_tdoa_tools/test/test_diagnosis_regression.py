@@ -6,8 +6,7 @@ from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
 
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from known_effects import clean_flight, effect_of
 import numpy as np
 import pytest

@@ -17,12 +17,19 @@ from known_effects import SIZES, effect_of  # noqa: E402
 from uwb_tdoa_bias.common.anchors import Anchors  # noqa: E402
 from uwb_tdoa_bias.common.errors import InputError  # noqa: E402
 from uwb_tdoa_bias.correction.corrector import Corrector  # noqa: E402
-from uwb_tdoa_bias.correction.model import EFFECTS as EFFECTS_ONLY  # noqa: E402
-from uwb_tdoa_bias.correction.model import INPUTS, NETWORK, PASSED, ExportedCorrection  # noqa: E402
+from uwb_tdoa_bias.correction.model import (  # noqa: E402
+    EFFECTS as EFFECTS_ONLY,  # noqa: E402
+    INPUTS,
+    NETWORK,
+    PASSED,
+    ExportedCorrection,
+)
 from uwb_tdoa_bias.correction.network import load_network  # noqa: E402
 from uwb_tdoa_bias.correction.session import Session  # noqa: E402
-from uwb_tdoa_bias.effects import EFFECTS as DECLARED  # noqa: E402
-from uwb_tdoa_bias.effects import EffectSet  # noqa: E402
+from uwb_tdoa_bias.effects import (
+    EFFECTS as DECLARED,  # noqa: E402
+    EffectSet,  # noqa: E402
+)
 from uwb_tdoa_bias.effects.effect_set import REACH  # noqa: E402
 from uwb_tdoa_tools.commands import export  # noqa: E402
 from uwb_tdoa_tools.estimate import with_antenna  # noqa: E402

@@ -4,17 +4,13 @@
 from dataclasses import replace
 import os
 from pathlib import Path
-import subprocess
-import sys
-import tempfile
-import time
 
 import numpy as np
 import pytest
 from recordings import ROWS, SURVEY, log_bytes, small_flight
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.files import read_arrays, read_bytes, temporary_folder
+from uwb_tdoa_bias.common.files import read_arrays, read_bytes
 from uwb_tdoa_bias.common.flight import Tdoas
 from uwb_tdoa_bias.common.limits import FOLDER_DEPTH, TooMuch
 from uwb_tdoa_bias.common.safe_yaml import read_yaml
@@ -279,30 +275,6 @@ def test_a_pipe_among_surveys_is_no_survey(tmp_path):
     os.mkfifo(tmp_path / "anchor_a.txt")
     with pytest.raises(InputError, match="is a pipe, a device or a folder"):
         read_flight(tmp_path / "flight_a", survey_for(tmp_path / "flight_a", tmp_path))
-
-
-def test_a_folder_that_a_killed_process_left_is_removed_by_the_next(tmp_path, monkeypatch):
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    code = (
-        "import tempfile, sys; tempfile.tempdir = sys.argv[1]\n"
-        "from uwb_tdoa_bias.common.files import temporary_folder\n"
-        "with temporary_folder() as folder: print(folder, flush=True); sys.stdin.read()"
-    )
-    killed = subprocess.Popen(
-        [sys.executable, "-c", code, str(tmp_path)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    left = Path(killed.stdout.readline().strip())
-    old = time.time() - 3600.0
-    os.utime(left, (old, old))
-    with temporary_folder():
-        assert left.is_dir()  # it is in use
-    killed.kill()
-    killed.communicate()
-    with temporary_folder() as own:
-        assert not left.exists() and own.is_dir()
 
 
 @pytest.mark.parametrize(

@@ -39,7 +39,6 @@ IS_ROS = re.compile(r"rclpy|\w+_msgs|\w+_interfaces|domain_coordinator|ament_ind
 # import name: (rosdep key, name on the Python package index)
 # ROS packages are imported under their own name
 KEYS = {
-    "PIL": ("python3-pil", "Pillow"),
     "backports": (None, "backports.zstd"),  # installed with rosbags, like lz4
     "cflib": (None, "cflib"),  # for protocol crazyflie
     "dask": (None, "distributed"),

@@ -25,8 +25,7 @@ from foreign_recordings import (
     write_starloc,
     write_ulog,
 )
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer as Ros1Writer

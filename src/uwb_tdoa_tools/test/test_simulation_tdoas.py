@@ -2,8 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Simulated TDOAs: schedules, radio links, errors."""
 
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

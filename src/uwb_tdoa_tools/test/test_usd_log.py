@@ -9,8 +9,7 @@ import sys
 import tracemalloc
 import zlib
 
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 import numpy as np
 import pytest
 from recordings import ANCHORS, EVENTS, ROWS, log_bytes

@@ -160,8 +160,7 @@ def simulate(vehicle: str = "quadrotor", **settings: Any) -> Flight:
     settings
         Fields of `uwb_tdoa_tools.simulation.SimulationConfig`, e.g. duration=30.0, seed=3.
     """
-    from uwb_tdoa_tools.simulation import SimulationConfig
-    from uwb_tdoa_tools.simulation import simulate as run
+    from uwb_tdoa_tools.simulation import SimulationConfig, simulate as run
 
     return run(SimulationConfig.of(vehicle, **settings))
 
@@ -269,8 +268,7 @@ def diagnose(
         What the Flights are compared with: "truth", "heights" of a range finder, or "nothing".
     """
     from uwb_tdoa_bias.effects import EffectSet
-    from uwb_tdoa_tools.diagnosis import diagnose as run
-    from uwb_tdoa_tools.diagnosis import with_noise
+    from uwb_tdoa_tools.diagnosis import diagnose as run, with_noise
     from uwb_tdoa_tools.diagnosis.references import REFERENCES
 
     compared = REFERENCES[reference](config, ())

@@ -13,8 +13,9 @@ Every parameter is documented in config/autopilot_node.yaml.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
@@ -41,9 +42,6 @@ from .autopilot.estimate import FRD, WORLDS, Estimate, Link
 from .autopilot.gate import Gate
 from .autopilot.mavlink import FORMS, MavlinkLink
 from .autopilot.topics import TOPICS, VehicleTopics
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 REST = 0.004  # s between two turns: PX4 uses a TIMESYNC answer that took less than 10 ms
 NONE, MAVLINK, CRAZYFLIE = "none", "mavlink", "crazyflie"

@@ -16,12 +16,12 @@ from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Flight, Truth
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.base import counted
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.monitoring.finding import ERROR
+from uwb_tdoa_ekf.monitoring.finding import ERROR, Finding
 
 from . import cli, command_lines
 from .checking import report
 from .checking.check import check, different_surveys
-from .checking.recording import read_recording
+from .checking.recording import Recording, read_recording
 from .diagnosis import diagnose, output, with_noise
 from .diagnosis.attribution import first_fit
 from .diagnosis.comparison import Baseline, compare
@@ -40,11 +40,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
     from pathlib import Path
 
-    from uwb_tdoa_ekf.monitoring.finding import Finding
-
-    from .checking.recording import Recording
-    from .readers.inputs import Reading
-    from .readers.inputs import Recording as ReadingPair
+    from .readers.inputs import Reading, Recording as ReadingPair
 
 
 RMSE = "3D RMSE"  # name of the figure with ground truth

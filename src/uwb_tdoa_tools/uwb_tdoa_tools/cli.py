@@ -13,22 +13,20 @@ main = cli.executable(_convert, parser)          # _convert(args) -> exit code, 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable, Iterable, Sequence
 import errno
 import io
 import json
 import os
 from pathlib import Path
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from uwb_tdoa_bias.common.errors import Failure, InputError
 from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_bias.common.text import line_of, printable, written_by
 
 from . import command_lines, outputs
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
 
 FULL = {
     errno.ENOSPC: "the disk is full",

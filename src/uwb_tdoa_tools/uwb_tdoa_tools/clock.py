@@ -8,16 +8,14 @@ one flight of two.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from uwb_tdoa_bias.common.sensors import LOCATING, SENSORS
 from uwb_tdoa_bias.common.stamps import LARGEST_STEP_BACK
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
 
 LEADING = "tdoa", "imu", "gyro", "acc", *LOCATING  # streams whose clock restarts the filter
 AHEAD = 10.0  # s; a longer step forward of a quick stream is a pause, or a clock that was set

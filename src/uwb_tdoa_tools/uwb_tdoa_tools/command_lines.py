@@ -9,14 +9,11 @@ node("ekf_node", {"effects_file": "effects.yaml"})
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sequence
 import os
+from pathlib import Path
 import shlex
 import shutil
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-    from pathlib import Path
 
 SALVAGE = "read what is sound of it with --salvage"
 RUN = "UWB_TDOA_RUN"  # environment variable in which ./dev and COMMAND pass how the user started it
@@ -85,6 +82,11 @@ def node(name: str, parameters: Mapping[str, object], files: Iterable[str | Path
     )
 
 
+def _given(**files: str | Path | None) -> list[str | Path]:
+    """Return the options of the files that are not None, e.g. --survey and its path."""
+    return [word for name, file in files.items() if file for word in (f"--{name}", file)]
+
+
 def evaluate_line(
     recordings: Iterable[str | Path],
     survey: str | Path | None = None,
@@ -98,12 +100,7 @@ def evaluate_line(
     Without ground truth (`truth`), `localize` states how far the estimate can be trusted. `more`
     are further options, such as those of reading.
     """
-    options = {"--survey": survey, "--effects": effects, "--config": config}
-    words = [
-        *recordings,
-        *(word for option, file in options.items() if file for word in (option, file)),
-        *more,
-    ]
+    words = [*recordings, *_given(survey=survey, effects=effects, config=config), *more]
     return tool("evaluate", *words) if truth else tool("localize", *words, "--out", "localized/")
 
 
@@ -111,12 +108,8 @@ def survey_line(
     recording: str | Path, survey: str | Path | None = None, effects: str | Path | None = None
 ) -> str:
     """Return the line that surveys anchors with a recording; None for a missing file."""
-    options = {"--survey": survey, "--effects": effects}
-    words = [
-        recording,
-        *(word for option, file in options.items() if file for word in (option, file)),
-    ]
-    return tool("survey", *words, "--out", "surveyed/")
+    given = _given(survey=survey, effects=effects)
+    return tool("survey", recording, *given, "--out", "surveyed/")
 
 
 def lines_without_use(
@@ -130,12 +123,7 @@ def lines_without_use(
 
     The parameters are those of `evaluate_line`.
     """
-    options = {"--survey": survey, "--effects": effects}
-    words = [
-        *recordings,
-        *(word for option, file in options.items() if file for word in (option, file)),
-        *more,
-    ]
+    words = [*recordings, *_given(survey=survey, effects=effects), *more]
     if truth:
         return (
             "next: add flights, or read which effects were found, and why they are not applied:",

@@ -12,15 +12,12 @@ arrives. On average it is half a period old. Nothing here needs ROS.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import re
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .readers.streams import GRAVITY, NO_TARGET
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 PERIOD = 0.01  # s, the shortest of a log block
 RATES, FORCES = [f"gyro.{axis}" for axis in "xyz"], [f"acc.{axis}" for axis in "xyz"]  # deg/s, g

@@ -7,19 +7,21 @@ Flights, and places where a tag stood still, give a map. Cross-validation over f
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import read_head
 from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.debias import Part, fit
+from uwb_tdoa_ekf.debias import BiasMap, Part, fit
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.results import Odometry
 
@@ -30,13 +32,6 @@ from .readers.tables import read_numbers
 from .scoring.evaluation import corrected_truth, evaluate, with_aligned_truth
 from .scoring.gains import SHARES, Shrinkage, best_share, change_in_words, gain, gain_in_words
 from .scoring.metrics import Score, position_at
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
-
-    from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_ekf.debias import BiasMap
-
 
 Scored = tuple[Flight, Score, Odometry]  # flight, errors, and estimate
 

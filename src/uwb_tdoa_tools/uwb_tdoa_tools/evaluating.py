@@ -15,7 +15,7 @@ from uwb_tdoa_bias.common.text import sanitize
 from uwb_tdoa_bias.effects import EffectSet
 
 from . import parallel
-from .bags.bag import late_tdoas, read_odometry
+from .bags.bag import RecordedOdometry, late_tdoas, read_odometry
 from .checking.check import check
 from .checking.flight_rules import judge_truth
 from .checking.recording import of_flight
@@ -29,7 +29,7 @@ from .outputs import file_name
 from .readers.inputs import Reading, report_remarks
 from .readers.tables import number, read_table
 from .results_file import ResultsFile, fingerprint_of
-from .scoring.alignment import estimate_alignment, require_truth
+from .scoring.alignment import Alignment, estimate_alignment, require_truth
 from .scoring.evaluation import corrected_truth, delays_fit
 from .scoring.metrics import Score, radio_residuals
 from .scoring.phases import NEAR_THE_FLOOR, TITLES
@@ -41,9 +41,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_ekf.results import Odometry, Residuals
 
-    from .bags.bag import RecordedOdometry
     from .readers.inputs import Recording
-    from .scoring.alignment import Alignment
 COLUMNS = {
     "rmse_x": "x",
     "rmse_y": "y",

@@ -10,19 +10,16 @@ from __future__ import annotations
 
 import argparse
 import ast
+from collections.abc import Iterator, Sequence
 from importlib import import_module
 import os
 from pathlib import Path
 import sys
-from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.executable import executable
 from uwb_tdoa_bias.common.text import written_by
 
 from .command_lines import COMMAND, RUN
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
 
 FOLDER = Path(__file__).parent / "commands"
 NAMES = tuple(sorted(path.stem for path in FOLDER.glob("[a-z]*.py")))

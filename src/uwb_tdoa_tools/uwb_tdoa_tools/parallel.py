@@ -15,6 +15,7 @@ last result ends them too.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
 from functools import cache
 import os
@@ -22,15 +23,11 @@ import signal
 import sys
 from threading import Event, Thread
 import time
-from typing import TYPE_CHECKING, Any, Protocol, TextIO, TypeVar
+from typing import Any, Protocol, TextIO, TypeVar
 import warnings
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.executable import outside_present_folder
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
-
 
 Item = TypeVar("Item")
 

@@ -4,17 +4,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from uwb_tdoa_ekf.offline import Run
 
 from .localizing.localize import COLUMNS, trajectory_rows
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 AXES = {3: "xyz", 4: "xyzw"}  # names of the parts of a vector
 

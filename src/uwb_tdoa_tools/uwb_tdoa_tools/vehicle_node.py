@@ -13,11 +13,13 @@ Every parameter is documented in config/vehicle_node.yaml.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 import json
 import sys
 import time
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
+from builtin_interfaces.msg import Duration as DurationMessage
 from rclpy.duration import Duration
 from std_msgs.msg import String
 
@@ -44,11 +46,6 @@ from .flying.sensors import SENSOR_NAMES
 from .flying.trial import Task, Trial
 from .flying.verdict import reached, sentence, verdict_of
 from .flying.world import WORLDS, world_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from builtin_interfaces.msg import Duration as DurationMessage
 
 Response = TypeVar("Response", Takeoff.Response, GoTo.Response, Land.Response)
 PARAMETERS = {  # in the order of config/vehicle_node.yaml

@@ -14,16 +14,14 @@ numba compiles as usual, which takes longer. Functions of other packages compile
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 import threading
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from numba import version_info
 from numba.core import codegen, cpu, dispatcher, sigutils
 from numba.core.caching import NullCache
 from numba.core.environment import lookup_environment
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
 
 TRIED = (0, 57), (0, 68)  # first and last version of numba
 WITHOUT_WRAPPERS = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}

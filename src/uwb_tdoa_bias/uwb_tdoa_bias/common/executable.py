@@ -13,21 +13,18 @@ This module imports only the standard library.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
 import gc
 from importlib import import_module
-from importlib.machinery import PathFinder
+from importlib.machinery import ModuleSpec, PathFinder
 import os
 import signal
 import sys
 from threading import Timer, main_thread
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from importlib.machinery import ModuleSpec
-    from types import FrameType
+from types import FrameType
+from typing import Any
 
 INTERRUPTED = 130  # exit code, as a shell gives it: 128 + SIGINT
 SOON = 0.05  # s, until a lost interrupt is repeated

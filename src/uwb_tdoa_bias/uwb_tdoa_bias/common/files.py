@@ -5,39 +5,27 @@
 from __future__ import annotations
 
 import atexit
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 import io
 import math
 import os
 from pathlib import Path
 import secrets
-import shutil
 import stat
 import tempfile
-import time
-from typing import TYPE_CHECKING, BinaryIO
-from zipfile import BadZipFile, ZipFile
+from typing import BinaryIO
+from zipfile import BadZipFile, ZipFile, ZipInfo
 import zlib
 
 import numpy as np
 
-try:
-    import fcntl
-except ImportError:  # Windows locks no folders
-    fcntl = None  # type: ignore[assignment]  # None marks the missing module
-
 from .errors import InputError
 from .limits import ARRAYS_BYTES, RECORDING_BYTES, Budget
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
-    from zipfile import ZipInfo
-
 
 TEMPORARY = "uwb_tdoa_temporary_"  # prefix of the project's temporary folders
 STREAMS = "/dev/stdout", "/dev/stderr"  # links that the user redirects
 NO_WAIT = getattr(os, "O_NONBLOCK", 0)  # a pipe without a writer would block; Windows has none
-SETTLED = 60.0  # s; older temporary folders without a lock are removed
 _KEPT: list[
     tuple[Path, Path, os.stat_result, bool]
 ] = []  # of `protected_inputs`: path, resolved path, state, whether it is a bag
@@ -172,16 +160,8 @@ def open_file(path: str | Path) -> BinaryIO:
 
 @contextmanager
 def temporary_folder() -> Iterator[Path]:
-    """Give a folder that is removed when the block ends.
-
-    If this process is killed, the next process of this project removes the folder.
-    """
-    for old in Path(tempfile.gettempdir()).glob(f"{TEMPORARY}*"):
-        with suppress(OSError):  # owned by another user, in use, or gone
-            if time.time() - old.lstat().st_mtime > SETTLED:
-                with _held(old, alone=True):
-                    shutil.rmtree(old)
-    with tempfile.TemporaryDirectory(prefix=TEMPORARY) as name, _held(Path(name)):
+    """Give a folder that is removed when the block ends."""
+    with tempfile.TemporaryDirectory(prefix=TEMPORARY) as name:
         yield Path(name)
 
 
@@ -193,28 +173,6 @@ def new_folder_until_exit() -> Path:
     stack = ExitStack()
     atexit.register(stack.close)
     return stack.enter_context(temporary_folder())
-
-
-@contextmanager
-def _held(folder: Path, alone: bool = False) -> Iterator[None]:
-    """Hold a lock on a folder of the user inside the block; raise OSError.
-
-    alone : whether no other process may hold the folder. Without locks this raises OSError.
-    """
-    if fcntl is None:
-        if alone:
-            raise PermissionError
-        yield
-        return
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-    try:
-        if os.fstat(descriptor).st_uid != os.getuid():
-            raise PermissionError
-        kind = fcntl.LOCK_EX if alone else fcntl.LOCK_SH
-        fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
-        yield
-    finally:
-        os.close(descriptor)
 
 
 def _blocks(file: BinaryIO, size: int) -> Iterator[bytes]:

@@ -11,13 +11,10 @@ the need: a log of an hour has 300 MB, the project's YAML files have some kB, mo
 from __future__ import annotations
 
 from collections import Counter
+from pathlib import Path
 import time
-from typing import TYPE_CHECKING
 
 from .errors import InputError
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 # s, and s per byte: processor time for one file. The limit suffices for the slowest reader on a
 # machine four times slower than the development machine.

@@ -12,9 +12,10 @@ from __future__ import annotations
 import math
 from pathlib import Path
 import re
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import yaml
+from yaml import CollectionNode, MappingNode, Mark, Node, ScalarNode
 from yaml.composer import Composer
 from yaml.constructor import SafeConstructor
 from yaml.resolver import Resolver
@@ -22,9 +23,6 @@ from yaml.resolver import Resolver
 from .errors import InputError
 from .files import open_file
 from .limits import YAML_BYTES, YAML_DEPTH, YAML_NODES, Budget
-
-if TYPE_CHECKING:
-    from yaml import CollectionNode, MappingNode, Mark, Node, ScalarNode
 
 
 def read_yaml(path: str | Path) -> Any:

@@ -5,13 +5,11 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable, Iterable, Sequence
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from .compiled import compiled
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
 
 # s behind the newest stamp of a stream. With one clock, messages are out of order by less.
 LARGEST_STEP_BACK = 1.0

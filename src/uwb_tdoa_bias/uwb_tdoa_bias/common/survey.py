@@ -4,8 +4,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
 import re
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -16,13 +18,6 @@ from .files import read_bytes
 from .lazy import rotations
 from .limits import SURVEY_BYTES
 from .survey_forms import Entry, Lines
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from .anchors import Anchors
-
 
 SAME_PLACE = 0.001  # m; two antennas are at least some cm apart
 # m. A UWB radio reaches at most 300 m, and a tag must receive several anchors at once. An anchor with

@@ -4,18 +4,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 import math
+from pathlib import Path
 import re
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from .errors import InputError
 from .safe_yaml import parse_yaml
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
 
 Lines = list[tuple[int, list[str]]]  # numbers of lines, and their cells
 

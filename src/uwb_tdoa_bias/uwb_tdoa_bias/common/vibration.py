@@ -4,12 +4,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import numpy as np
 
 from .compiled import compiled
-
-if TYPE_CHECKING:
-    import numpy as np
 
 VIBRATION_CORNER = 0.05  # s, time constant; faster motion counts as vibration
 VIBRATION_AVERAGE = 0.3  # s, time constant of the mean power

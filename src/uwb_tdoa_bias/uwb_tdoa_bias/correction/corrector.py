@@ -15,14 +15,12 @@ from ..common.compiled import compiled
 from ..common.errors import InputError
 from ..effects import EffectSet, Samples
 from ..effects.samples import N_STATES, POSE_LAG, motion_at, precede
-from .model import EFFECTS, FADED, NETWORK, PASSED, Prediction
+from .model import EFFECTS, FADED, NETWORK, PASSED, Model, Prediction
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import ArrayLike
-
-    from .model import Model
 
 
 # rad. A yaw with a larger standard deviation is unknown: then the filter follows four yaws,

@@ -16,10 +16,9 @@ from ..common.files import read_bytes
 from ..common.limits import MODEL_BYTES
 from ..common.text import printable, sanitize
 from ..effects.base import cached_by_anchors, counted
-from ..effects.samples import N_STATES
+from ..effects.samples import N_STATES, Samples
 
 if TYPE_CHECKING:
-    from ..effects.samples import Samples
     from .session import Session
 
 

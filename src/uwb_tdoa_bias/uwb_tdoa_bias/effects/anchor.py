@@ -4,10 +4,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Hashable, Sequence
 
 import numpy as np
 
+from ..common.anchors import Anchors
 from ..common.geometry import ranges
 from .base import (
     ANCHOR,
@@ -29,13 +30,7 @@ from .base import (
     measured,
     with_each,
 )
-from .samples import RADIO, tile
-
-if TYPE_CHECKING:
-    from collections.abc import Hashable, Sequence
-
-    from ..common.anchors import Anchors
-    from .samples import Samples
+from .samples import RADIO, Samples, tile
 
 
 class AnchorEffect(Effect):

@@ -4,15 +4,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Hashable, Sequence
 from dataclasses import replace
 import math
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
-from ..common.flight import SENSOR_NAMES
+from ..common.flight import SENSOR_NAMES, Flight
 from ..common.sensors import STREAM_OF, with_measured
-from ..common.sensors.sensor import UNKNOWN_STD, UNKNOWN_VARIANCE
+from ..common.sensors.sensor import UNKNOWN_STD, UNKNOWN_VARIANCE, Stream
 from .base import (
     IDENTITY,
     UNLIMITED,
@@ -26,14 +27,7 @@ from .base import (
     require,
     undoing,
 )
-from .samples import Track, sensor_samples
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Hashable, Sequence
-
-    from ..common.flight import Flight
-    from ..common.sensors.sensor import Stream
-    from .samples import SensorSamples
+from .samples import SensorSamples, Track, sensor_samples
 
 LIMITS = ("start", "end")  # s after the first TDOA
 

@@ -4,24 +4,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import wraps
 import math
 import re
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
+from ..common.anchors import Anchors
 from ..common.errors import InputError
+from ..common.flight import Flight
 from ..common.sensors import STREAM_OF, measured_on
 from .covariates import OF_ARRIVAL, checked_domain, covariate_of, fade_weight, shown_in
 from .samples import RADIO, Samples, true_samples
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Hashable, Iterable, Sequence
-
-    from ..common.anchors import Anchors
-    from ..common.flight import Flight
 
 __all__ = ["ArrivalEffect", "Effect", "Row", "Samples"]
 

@@ -4,8 +4,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,12 +14,7 @@ from ..common.compiled import compiled
 from ..common.errors import InputError
 from ..common.radio import into_frame
 from ..common.vibration import VIBRATION_CORNER, low_pass, track_vibration
-from .samples import ImuSamples, tile
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from .samples import Samples, SensorSamples
+from .samples import ImuSamples, Samples, SensorSamples, tile
 
 FADE = 0.5  # share of the width of a domain; this far beyond it, exp(-1/2) of an effect is left
 CATEGORIES = ("previous_anchor",)  # values are names, not sizes

@@ -7,17 +7,19 @@ EFFECTS lists all declared effects.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import yaml
 
+from ..common.anchors import Anchors
 from ..common.errors import InputError
 from ..common.files import write_text
-from ..common.flight import SENSOR_NAMES
+from ..common.flight import SENSOR_NAMES, Flight
 from ..common.safe_yaml import read_yaml
 from ..common.text import written_by
 from .anchor import (
@@ -51,18 +53,11 @@ from .imu import (
     ImuMisalignment,
 )
 from .pair import NoiseCorrelation, NoiseLevel, OutlierRate, PairOffset, PairSign
-from .samples import N_STATES
+from .samples import N_STATES, ImuSamples, Samples, SensorSamples
 from .smooth_term import SmoothTerm
 from .stamps import RangeDelay, TdoaTimeOffset, VelocityDelay
 from .tag import AntennaPattern, RangeBias, RangeScale, ReceivedPowerBias, TagLeverArm
 from .truth import TruthFrame, TruthTimeOffset
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Sequence
-
-    from ..common.anchors import Anchors
-    from ..common.flight import Flight
-    from .samples import ImuSamples, Samples, SensorSamples
 
 # In the order in which `diagnose` lists them
 EFFECTS: dict[str, type[Effect]] = {

@@ -4,19 +4,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 
+from ..common.anchors import Anchors
 from .anchor import SearchedDelay
 from .base import ANCHOR, UNLIMITED, Row, cached_by_anchors, counted, id_texts, measured
-from .samples import tile
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from ..common.anchors import Anchors
-    from .samples import Samples
+from .samples import Samples, tile
 
 PLACE = ("x", "y")
 HEIGHT = 0.12  # m, default of "i.height"

@@ -4,21 +4,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
+from ..common.flight import Flight
 from ..common.lazy import rotations
 from .base import FADED_BELOW, IDENTITY, Affine, Effect, Row, SensorEffect, require, undoing
 from .covariates import OF_IMU, ImuFeatures, fade_weight
-from .samples import Track
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
-
-    from ..common.flight import Flight
-    from .samples import ImuSamples
+from .samples import ImuSamples, Track
 
 SENSORS = ("gyro", "accel")
 # `penalty` of effects that look like a bias of the accelerometer without tilt and manoeuvres

@@ -4,19 +4,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..common.anchors import Anchors
+from ..common.flight import Flight
 from .base import OF_PAIR, Effect, LabelEffect, Row, listed, with_each
 from .samples import Samples
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from ..common.anchors import Anchors
-    from ..common.flight import Flight
 
 OUTLIERS = 0.5, 5.0  # m, smallest and largest error of an injected outlier
 GRID = 0.01  # s, spacing of the random process of an injected noise_correlation

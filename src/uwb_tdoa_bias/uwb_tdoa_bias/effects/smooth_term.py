@@ -47,7 +47,7 @@ from .covariates import (
     shown_in,
 )
 from .pair import of_pair
-from .samples import RADIO, tile
+from .samples import RADIO, ImuSamples, Samples, SensorSamples, tile
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -55,7 +55,6 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from ..common.anchors import Anchors
-    from .samples import ImuSamples, Samples, SensorSamples
 
 DEGREE = 2  # of splines
 GONE = 4 * FADE  # widths of a domain beyond which nothing of a function is left

@@ -4,18 +4,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
+from ..common.flight import Flight
 from .base import Effect, Row, require
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from ..common.flight import Flight
-    from .samples import Samples, SensorSamples
+from .samples import Samples, SensorSamples
 
 # The part of a row that all effects on stamps share
 STAMP = Row(

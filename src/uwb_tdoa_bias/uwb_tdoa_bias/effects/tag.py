@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -20,12 +20,7 @@ from ..common.radio import (
     received_power_dbm,
 )
 from .base import ArrivalEffect, Effect, GeometryEffect, Row, measured
-from .samples import RADIO, tile
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from .samples import Samples
+from .samples import RADIO, Samples, tile
 
 EXAMPLES = 4.0, 8.0  # m, distances in the advice of range_bias
 LINK = RadioLink()

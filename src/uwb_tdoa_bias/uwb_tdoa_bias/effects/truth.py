@@ -4,21 +4,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from ..common.anchors import Anchors
 from ..common.lazy import rotations
 from ..common.sensors import DIAGNOSED
 from .base import GeometryEffect, Row, Shift, central_differences
+from .samples import Samples
 from .stamps import STAMP, StampEffect
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from ..common.anchors import Anchors
-    from .samples import Samples
 
 KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
 DEGREES = 180.0 / np.pi

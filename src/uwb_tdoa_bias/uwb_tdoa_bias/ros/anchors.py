@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from geometry_msgs.msg import Point, Pose, Quaternion
 import numpy as np
-from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.event_handler import QoSRequestedIncompatibleQoSInfo, SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from uwb_tdoa_msgs.msg import Anchor, AnchorArray
@@ -21,8 +21,6 @@ from .topics import Input, Refusals, publishers_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-
-    from rclpy.event_handler import QoSRequestedIncompatibleQoSInfo
 
     from .node import StreamNode
 

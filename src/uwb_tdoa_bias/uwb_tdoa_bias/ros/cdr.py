@@ -15,18 +15,16 @@ Unreadable, with the reason.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache, reduce
 from importlib import import_module
 import struct
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from rclpy.impl.implementation_singleton import rclpy_implementation as implementation
 from rclpy.serialization import deserialize_message, serialize_message
 from rosidl_parser.definition import AbstractString, Array, BasicType, NamespacedType
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
 
 Message = TypeVar("Message")
 Leaves = list[tuple[str, str, int]]  # names, codes and counts, see `_leaves`

@@ -10,14 +10,12 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.clock import Clock as SteadyClock
-from rclpy.clock import ClockType
+from rclpy.clock import Clock as SteadyClock, ClockType, ROSClock
 from rclpy.qos import QoSProfile
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rclpy.clock import ROSClock
     from rclpy.node import Node
 
     from .node import StreamNode

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rosgraph_msgs.msg import Clock
 
-from .cdr import decode
+from .cdr import Message, decode
 from .parameters import ParameterNode
 from .topics import unserved, waiting
 
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from rclpy.subscription import Subscription
     from rclpy.timer import Timer
 
-    from .cdr import Message
 
 Events = TypeVar("Events", SubscriptionEventCallbacks, PublisherEventCallbacks)
 

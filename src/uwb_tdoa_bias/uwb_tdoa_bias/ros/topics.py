@@ -14,23 +14,21 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar, overload
 
 from builtin_interfaces.msg import Time
 import numpy as np
-from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.event_handler import QoSMessageLostInfo, SubscriptionEventCallbacks
 from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from ..common.stamps import LARGEST_STEP_BACK
-from .cdr import Message, Unreadable, decode, name_of
+from .cdr import CdrCodec, CdrTemplate, Message, Unreadable, decode, name_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-    from rclpy.event_handler import QoSMessageLostInfo
     from rclpy.node import Node
     from rclpy.publisher import Publisher
     from rclpy.subscription import Subscription
     from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-    from .cdr import CdrCodec, CdrTemplate
     from .parameters import ParameterNode
 
     # frame, stamps, rows and arrivals

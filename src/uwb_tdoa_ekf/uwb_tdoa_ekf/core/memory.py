@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from uwb_tdoa_bias.common.compiled import Record, compiled
-from uwb_tdoa_bias.common.sensors import SENSORS
+from uwb_tdoa_bias.common.sensors import SENSORS, Stream
 from uwb_tdoa_bias.effects.samples import N_STATES
 
 from .auxiliary import OFFSET_STATES
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.common.sensors import Stream
     from uwb_tdoa_bias.effects.base import SensorFunction
 
     from ..anchor_table import AnchorTable

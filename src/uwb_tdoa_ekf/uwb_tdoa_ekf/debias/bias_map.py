@@ -8,14 +8,17 @@ the radial-basis-function network of their appendix A, extended to 3D.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import RBFInterpolator
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import read_arrays, write_filled
 from uwb_tdoa_bias.common.limits import MAP_MARKERS
@@ -178,12 +181,6 @@ def _over_direction(
     total = weight.sum(axis=1, keepdims=True)
     return np.einsum("pk,pkc->pc", weight / np.where(total > 0.0, total, 1.0), widths)
 
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from uwb_tdoa_bias.common.anchors import Anchors
 
 FORMAT, VERSION = "uwb_tdoa position bias map", 2
 UNITS = (

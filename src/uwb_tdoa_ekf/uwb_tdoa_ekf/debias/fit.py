@@ -5,12 +5,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 
 from .bias_map import BiasMap
@@ -111,10 +112,6 @@ def corrected_bias(markers: Markers) -> np.ndarray:
 def measured_places(markers: Markers, bias: np.ndarray) -> np.ndarray:
     """Return where the markers are measured, (n, d) m: the deformed grid X + b* of eq. 19."""
     return markers.true + bias
-
-
-if TYPE_CHECKING:
-    from uwb_tdoa_bias.common.anchors import Anchors
 
 
 FOLDS = 5  # folds for cross-validation, if there are more parts

@@ -19,20 +19,15 @@ slice, and only for slices that may hold an onset.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.common.compiled import compiled
 
-from .slices import DELAY_STD, LENGTH
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from .slices import Slice
+from .slices import DELAY_STD, LENGTH, Slice
 
 # m, standard deviation of the place-dependent part, and its correlation length
 PLACE_STD, PLACE_LENGTH = 0.2, 0.9

@@ -9,20 +9,15 @@ either loss.
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from dataclasses import dataclass
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..core.config import FilterConfig
 from ..core.engine import feed
-from ..core.memory import IMU_SAMPLE, Measurements, new_state, usable_tdoas
-
-if TYPE_CHECKING:
-    from collections.abc import Generator
-
-    from ..core.memory import FilterState
+from ..core.memory import IMU_SAMPLE, FilterState, Measurements, new_state, usable_tdoas
 
 SCALE = 0.5  # m, scale of the Geman-McClure loss: an innovation of this size has a loss of one half
 # s, length of a block; the first does not count, because the filter initializes

@@ -4,12 +4,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 import math
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Mapping
 
 # ERROR: the estimate is wrong. WARNING: it may be worse than possible. NOTE: information.
 ERROR, WARNING, NOTE = "error", "warning", "note"

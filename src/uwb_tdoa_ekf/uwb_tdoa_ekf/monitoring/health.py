@@ -12,20 +12,18 @@ from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 
 from uwb_tdoa_bias.common.sensors import LOCATING, SENSORS
-from uwb_tdoa_bias.ros.diagnostics import Rate
+from uwb_tdoa_bias.ros.diagnostics import Rate, Report
 
-from .finding import ERROR as SEVERE
+from .finding import ERROR as SEVERE, Finding
 from .status import LARGEST_UNUSED, Use, flyability
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from uwb_tdoa_bias.common.flyable import FlyableVolume
-    from uwb_tdoa_bias.ros.diagnostics import Report
 
     from ..core.config import FilterConfig
     from ..estimator import Estimator
-    from .finding import Finding
 
 START_TIMEOUT = 5.0  # s of data without an initialization before a warning
 # s, age of the newest odometry: below the first it is normal, above the second the clocks are

@@ -23,14 +23,13 @@ from uwb_tdoa_bias.common.geometry import tdoa
 
 from ..core.initialization import LOST_TIME
 from ..core.memory import REJECTED
-from ..results import concatenated, rows_of
-from .change import ChangeDetector
+from ..results import Odometry, Residuals, concatenated, rows_of
+from .change import Change, ChangeDetector
 from .finding import ERROR, WARNING, Finding
 from .reference import Displaced, SurveyComparison
 from .signs import turned
-from .slices import LENGTH, reduced
-from .swap import clear_exchange, mean_of
-from .swap import residuals as residuals_of
+from .slices import LENGTH, Slice, reduced
+from .swap import Residuals as SwapResiduals, clear_exchange, mean_of, residuals as residuals_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -39,10 +38,6 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.effects.effect_set import Covariance
 
     from ..anchor_table import AnchorTable
-    from ..results import Odometry, Residuals
-    from .change import Change
-    from .slices import Slice
-    from .swap import Residuals as SwapResiduals
 
 # m/s, speed above which the tag is in motion; on the floor, residuals differ from those in the air
 MOVING = 0.3

@@ -7,7 +7,7 @@ A rule takes windows and yields Findings.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -15,12 +15,7 @@ from uwb_tdoa_bias.common.radio import SPEED_OF_LIGHT, TICK
 
 from .finding import ERROR, NOTE, WARNING, Finding
 from .stamp_rules import median, share_of, total
-from .windows import GRIDS
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from .windows import TdoaWindow
+from .windows import GRIDS, TdoaWindow
 
 LARGE = 0.2  # share of TDOAs longer than the distance of their anchors; healthy 0.008 at most
 OUTLIERS = 0.05  # the same, from which on many TDOAs count as outliers

@@ -4,23 +4,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.effects.effect_set import Covariance
+
 from ..core.initialization import LOST_TIME
-from ..results import rows_of
+from ..results import Odometry, Residuals, rows_of
 from .monitor import Event, Monitor, Part
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.effects.effect_set import Covariance
-
-    from ..results import Odometry, Residuals
 
 
 def watched(

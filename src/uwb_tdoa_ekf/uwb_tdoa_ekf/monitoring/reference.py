@@ -24,6 +24,7 @@ from ..evidence import (
     DELAY,
     FUNCTION_LENGTH,
     POSITION,
+    ChangeKey,
     Part,
     changes_of,
     eliminated,
@@ -31,7 +32,7 @@ from ..evidence import (
     most_likely_changes,
     smallest_delays,
 )
-from .slices import TDOA_VARIANCE
+from .slices import TDOA_VARIANCE, Slice
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -40,8 +41,6 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.effects.effect_set import Covariance
 
     from ..anchor_table import AnchorTable
-    from ..evidence import ChangeKey
-    from .slices import Slice
 
 CELL = 0.7  # m, size of a cell of the room
 # cells in a comparison, the latest ones; and anchors that are heard in them

@@ -8,18 +8,14 @@ losses are compared, as in `check`.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+
+from uwb_tdoa_bias.common.anchors import Anchors
 
 from ..core.memory import TDOA, new_state, structured
 from .explain import Unexplained, compare, innovations
 from .finding import ERROR, Finding
 from .slices import FEWEST
-
-if TYPE_CHECKING:
-    from uwb_tdoa_bias.common.anchors import Anchors
-
 
 LARGE = 0.75  # m, change of a TDOA with its sign below which it shows nothing
 GAIN = 0.35  # largest share of that change that the other sign may leave

@@ -8,24 +8,19 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING, Any, TypeVar
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
+
+from uwb_tdoa_bias.common.anchors import Anchors
 
 from . import inertial_rules, ranging_rules, stamp_rules
 from .finding import ERROR, NOTE, Finding, Steady, explained_by, most_severe_first
 from .signs import SignWatch
 from .stamp_rules import median_of
 from .survey_scale import KEPT, SurveyScale
-from .windows import Cutter, imu_window, tdoa_window
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-
-    from uwb_tdoa_bias.common.anchors import Anchors
-
-    from .windows import ImuWindow, TdoaWindow
-
+from .windows import Cutter, ImuWindow, TdoaWindow, imu_window, tdoa_window
 
 Window = TypeVar("Window", "ImuWindow", "TdoaWindow")
 

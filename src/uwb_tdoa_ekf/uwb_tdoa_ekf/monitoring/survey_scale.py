@@ -13,19 +13,17 @@ from __future__ import annotations
 from collections import deque
 from itertools import combinations
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.compiled import compiled
 from uwb_tdoa_bias.common.radio import SPEED_OF_LIGHT
 from uwb_tdoa_bias.common.survey import UNITS
 
 from .explain import SCALE, compare_losses, in_words
 from .finding import ERROR, Finding
-
-if TYPE_CHECKING:
-    from uwb_tdoa_bias.common.anchors import Anchors
 
 # most pairs of a snapshot; fewest anchors: three coordinates and a scale need four differences
 PAIRS, HEARD = (32, 5)

@@ -8,8 +8,8 @@ own best position near the filter's position. The survey without an exchange get
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,11 +17,8 @@ from uwb_tdoa_bias.common.geometry import ranges, tdoa
 
 from .slices import CLIP, FEWEST
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    # m, mean absolute residual by rows of two exchanged anchors; () without an exchange
-    Residuals = dict[tuple[int, ...], float]
+# m, mean absolute residual by rows of two exchanged anchors; () without an exchange
+Residuals = dict[tuple[int, ...], float]
 
 SUSPECTS = 8  # number of anchors with the largest innovations, whose exchanges are tested
 LARGE = 0.3  # m, smallest largest mean innovation at which exchanges are tested

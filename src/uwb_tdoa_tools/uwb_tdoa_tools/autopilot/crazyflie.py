@@ -16,12 +16,11 @@ from typing import TYPE_CHECKING, Any
 from uwb_tdoa_bias.common.errors import InputError
 
 from ..crazyflie import BLOCKS, LogBlock
-from .estimate import Link, missing
+from .estimate import Estimate, Link, missing
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from .estimate import Estimate
     from .topics import VehicleTopics
 
 ADDRESS = re.compile(r"(radio|usb|udp|tcp)://\S+")

@@ -17,6 +17,7 @@ import math
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.sensors.sensor import UNKNOWN_VARIANCE
@@ -28,9 +29,7 @@ _WORLD = {
     FRD: np.diag([1.0, -1.0, -1.0]),
     NED: np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
 }
-_HALF = math.sqrt(0.5)
-_TURN = {FRD: (1.0, 0.0, 0.0, 0.0), NED: (_HALF, _HALF, 0.0, 0.0)}  # of _WORLD; x y z w
-_BODY, _BODY_TURN = _WORLD[FRD], _TURN[FRD]  # FLU to FRD
+_BODY = _WORLD[FRD]  # FLU to FRD
 UPPER = np.triu_indices(6)
 LOWEST_QUALITY, BEST_QUALITY = 1, 100  # %, of an estimate that can be used
 
@@ -112,7 +111,8 @@ class Estimate:
             FRD: x stays the x axis of the anchors' frame. NED: that frame has x east and y north.
         """
         turn = _WORLD[world_frame]
-        q = _product(_product(_TURN[world_frame], self.q), _BODY_TURN)
+        attitude = turn @ Rotation.from_quat(self.q).as_matrix() @ _BODY
+        q = Rotation.from_matrix(attitude).as_quat()
         return replace(
             self,
             p=turn @ self.p,
@@ -129,20 +129,6 @@ def _turned(turn: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     both = np.zeros((6, 6))
     both[:3, :3] = both[3:, 3:] = turn
     return both @ covariance @ both.T
-
-
-def _product(a: tuple[float, ...] | np.ndarray, b: tuple[float, ...] | np.ndarray) -> np.ndarray:
-    """Return the quaternion x y z w of rotation b followed by rotation a."""
-    ax, ay, az, aw = a
-    bx, by, bz, bw = b
-    return np.array(
-        [
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-            aw * bw - ax * bx - ay * by - az * bz,
-        ]
-    )
 
 
 def missing(protocol: str, error: ImportError, package: str) -> InputError:

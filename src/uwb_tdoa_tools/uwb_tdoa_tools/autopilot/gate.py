@@ -12,6 +12,7 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 if TYPE_CHECKING:
     from .estimate import Estimate
@@ -126,22 +127,10 @@ def changes(before: Estimate, after: Estimate) -> np.ndarray:
     dt = 1e-9 * (after.stamp - before.stamp)
     if not 0.0 <= dt < BREAK:
         return np.full(3, math.inf)
-    turn = _rotation(before.q)
+    turn = Rotation.from_quat(before.q).as_matrix()
     moved = after.p - before.p - turn @ before.v * dt
-    faster = _rotation(after.q) @ after.v - turn @ before.v
+    faster = Rotation.from_quat(after.q).as_matrix() @ after.v - turn @ before.v
     turned = 2.0 * math.acos(min(1.0, abs(float(before.q @ after.q))))
     sizes = np.array([*(math.sqrt(float(change @ change)) for change in (moved, faster)), turned])
     motion = np.array([ACCELERATION * dt * dt, ACCELERATION * dt, TURN_RATE * dt])
     return np.maximum(sizes - motion, 0.0)
-
-
-def _rotation(q: np.ndarray) -> np.ndarray:
-    """Return the (3, 3) rotation matrix of a quaternion x y z w."""
-    x, y, z, w = q.tolist()
-    return np.array(
-        [
-            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
-            [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)],
-            [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)],
-        ]
-    )

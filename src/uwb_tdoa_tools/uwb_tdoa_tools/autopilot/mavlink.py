@@ -8,18 +8,15 @@ converts the stamps itself; ArduPilot finds the offset from the stamps alone.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import os
 import re
 import time
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from uwb_tdoa_bias.common.errors import InputError
 
 from .estimate import FRD, UPPER, Estimate, Link, missing
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
 
 CONNECTION = re.compile(r"(udpin|udpout|tcp|tcpin):[^:\s]+:\d{1,5}|/dev/[\w./-]+")
 FORMS = "udpout:HOST:PORT, udpin:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT or /dev/NAME"

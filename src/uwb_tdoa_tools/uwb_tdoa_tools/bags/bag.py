@@ -16,7 +16,7 @@ The time of a message is its header stamp. `Flight.extra` has no message type an
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 import heapq
 import json
@@ -35,9 +35,8 @@ from uwb_tdoa_bias.common.survey import refuse_faulty
 from uwb_tdoa_bias.common.text import printable, written_by
 
 from ..clock import sentences
-from . import frames
-from . import messages as bag_messages
-from .files import check_output, connections_of, new_bag, open_bag, readable, remarks_of
+from . import frames, messages as bag_messages
+from .files import BagReader, check_output, connections_of, new_bag, open_bag, readable, remarks_of
 from .frames import recorded_anchors
 from .integrity import metadata
 from .mcap import Damaged
@@ -55,15 +54,11 @@ from .topics import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-
     from rosbags.interfaces import Connection, Qos
     from rosbags.rosbag2 import Writer
     from rosbags.typesys.store import Typestore
 
     from uwb_tdoa_ekf.results import Odometry
-
-    from .files import BagReader
 
     # {topic: (type, QoS, (stamp ns, message) in order)}
     Topics = dict[str, tuple[str, Qos, Iterable[tuple[int, Any]]]]
@@ -73,7 +68,6 @@ __all__ = [
     "check_output",
     "late_tdoas",
     "read_bag",
-    "read_fields",
     "read_odometry",
     "write_bag",
     "write_odometry",
@@ -413,31 +407,6 @@ def late_tdoas(
             residual.verdict == residual.VERDICT_LATE
             for _, _, residual in readable(path, reader, found)
         )
-
-
-def read_fields(path: str | Path, topic: str) -> dict[str, np.ndarray]:
-    """Read the columns of a topic with header stamps, e.g. uwb/residual or uwb/tdoa_corrected.
-
-    Returns {"t": (n,) s, field: (n,) array, ...} for every field with a number or a string, in
-    order of stamps. Raises InputError.
-    """
-    with open_bag(path) as reader:
-        topic = Names()(topic)
-        found = connections_of(path, reader, topic)
-        if not found:
-            raise InputError(f"{path}: has no topic {topic}; record it.")
-        recorded = [message for _, _, message in readable(path, reader, found)]
-    stamps = np.array(
-        [bag_messages.stamp_of(message.header) for message in recorded], dtype=np.int64
-    )
-    order = np.argsort(stamps, kind="stable")
-    columns = {"t": stamps[order] / 1e9}
-    _, fields = typestore().fielddefs[found[0].msgtype]
-    for name, _ in fields if recorded else ():
-        values = [getattr(message, name) for message in recorded]
-        if isinstance(values[0], (bool, int, float, str)):
-            columns[name] = np.array(values)[order]
-    return columns
 
 
 def _about(path: str | Path) -> dict[str, Any]:

@@ -9,9 +9,10 @@ decides. The files stay unchanged.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 import re
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import yaml
 
@@ -22,9 +23,6 @@ from . import DATA, ROS_2, ZSTD, integrity
 from .mcap import Damaged, zstd
 from .salvage import as_written
 from .write_ahead import BESIDE
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
 
 METADATA = "metadata.yaml"
 STORAGES = {"mcap": ".mcap", "sqlite3": ".db3"}  # storage_identifier: suffix of its data files

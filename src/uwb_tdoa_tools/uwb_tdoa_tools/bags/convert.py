@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.flight import SENSOR_NAMES
+from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Flight, Imu, Tdoas, Truth
 from uwb_tdoa_ekf.results import rows_of
 
 from ..choices import STREAMS
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
     from uwb_tdoa_bias.common.sensors import Stream
 
     Timed = Tdoas | Imu | Truth | Stream

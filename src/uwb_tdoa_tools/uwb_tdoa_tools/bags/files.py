@@ -13,8 +13,9 @@ import re
 import shutil
 import sys
 import tempfile
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from uwb_tdoa_bias.common.errors import InputError
@@ -29,22 +30,16 @@ from .completion import completed
 from .integrity import (
     CHECKSUM_KEY,
     NO_CHECKSUM,
+    check as check_whole,
     data_files,
     is_mcap,
     metadata,
     sqlite_messages,
     write_checksums,
 )
-from .integrity import (
-    check as check_whole,
-)
 from .mcap import Damaged, zstd
-from .message_types import check_type, earlier_types, typestore, upgraded
-from .salvage import as_written
-from .salvage import salvage as write_sound_part
-
-if TYPE_CHECKING:
-    from rosbags.interfaces import Connection
+from .message_types import check_type, typestore
+from .salvage import as_written, salvage as write_sound_part
 
 PLUGINS = dict(zip(STORAGES, (StoragePlugin.MCAP, StoragePlugin.SQLITE3)))
 
@@ -271,9 +266,8 @@ def messages(
 ) -> Iterator[tuple[Connection, int, bytes]]:
     """Yield (connection, stamp ns, bytes) of the given connections.
 
-    The bytes are converted to the present version of their type. Messages that do not fit their type
-    are left out and counted in `reader.unreadable`. Raises InputError for another number of messages
-    than the bag states, or for more bytes than `reader.most`.
+    Raises InputError for another number of messages than the bag states, or for more bytes than
+    `reader.most`.
 
     written : use the order of writing if the times fall back; default: the bag's order
     """
@@ -287,10 +281,7 @@ def messages(
     left = {(connection.topic, connection.msgtype): 0 for connection in connections}
     for connection in connections:
         left[connection.topic, connection.msgtype] += connection.msgcount
-    earlier, room = (
-        {connection.id: earlier_types(path, connection) for connection in connections},
-        reader.most,
-    )
+    room = reader.most
     while True:
         try:
             connection, stamp, data = next(found)
@@ -305,12 +296,6 @@ def messages(
                 f"{path}: has more than {reader.most} bytes of messages; give another file, "
                 "or split it."
             )
-        if store := earlier[connection.id]:
-            try:
-                data = upgraded(data, connection.msgtype, store)
-            except Exception:  # as in _opened
-                reader.unreadable[connection.topic] += 1
-                continue
         yield connection, stamp, data
     for (topic, _), count in left.items():
         if count:

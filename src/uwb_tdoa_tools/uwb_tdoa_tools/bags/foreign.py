@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import bz2
 from collections import Counter, OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from functools import lru_cache, partial
 import re
 from typing import TYPE_CHECKING, Any
 
 import lz4.frame
-from rosbags.interfaces import MessageDefinitionFormat
+from rosbags.interfaces import Connection, MessageDefinitionFormat
 from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag1.reader import Compression, decompressors
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
@@ -31,21 +31,16 @@ from uwb_tdoa_bias.common.limits import (
 )
 
 from . import is_ros_1
-from .files import messages, open_bag, remarks_of
-from .frames import recorded_anchors
+from .files import BagReader, messages, open_bag, remarks_of
+from .frames import Recorded, recorded_anchors
 from .mcap import Damaged
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from rosbags.interfaces import Connection
     from rosbags.typesys.store import Typestore
 
-    from .files import BagReader
-    from .frames import Recorded
-
-    Path_ = tuple[str | int, ...]  # parsed path of a field
+Path_ = tuple[str | int, ...]  # parsed path of a field
 
 # Paths of no field: the time of recording, the place in the array, and the stamp of the header or of the field
 # `stamp`. Where that is zero or missing, the time of recording counts.

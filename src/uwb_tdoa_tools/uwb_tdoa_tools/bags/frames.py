@@ -7,11 +7,14 @@ Sensors outside of the body frame are transformed as in the nodes.
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from pathlib import Path
 import re
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
@@ -19,21 +22,11 @@ from uwb_tdoa_bias.common.flight import Imu
 from uwb_tdoa_bias.common.transforms import Frames
 from uwb_tdoa_ekf.frames import ImuMount
 
-from .files import connections_of, readable
+from .files import BagReader, connections_of, readable
 from .message_types import check_type
 from .messages import BODY_FRAME
 
-if TYPE_CHECKING:
-    from collections import Counter
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from scipy.spatial.transform import Rotation
-
-    from .files import BagReader
-
-    Place = tuple[Rotation, np.ndarray]  # of a sensor in the body: its turn, and its arm (3,) m
-
+Place = tuple[Rotation, np.ndarray]  # of a sensor in the body: its turn, and its arm (3,) m
 
 TF_STATIC = "/tf_static"
 ANCHORS, TRANSFORMS, MARKERS = (

@@ -4,10 +4,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 import re
 import sqlite3
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import quote
 import zlib
 
@@ -17,9 +18,6 @@ from uwb_tdoa_bias.common.safe_yaml import read_yaml
 
 from . import mcap
 from .mcap import Damaged, zstd
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 # in the custom data of the bag: CRC-32 of the data file, 8 hexadecimal digits
 CHECKSUM_KEY = "uwb_tdoa_tools.crc32"

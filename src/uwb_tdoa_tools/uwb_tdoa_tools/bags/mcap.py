@@ -9,19 +9,17 @@ the checksums that rosbags leaves out.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 import struct
 import sys
-from typing import TYPE_CHECKING, BinaryIO
+from typing import BinaryIO
 import zlib
 
 import lz4.frame
 
 from uwb_tdoa_bias.common.limits import CHUNK_BYTES, most_unpacked
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 if sys.version_info >= (3, 14):
     from compression import zstd

@@ -4,13 +4,12 @@
 
 from __future__ import annotations
 
-from functools import cache, lru_cache
+from functools import lru_cache
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import numpy as np
-from rosbags.interfaces import MessageDefinitionFormat, Nodetype
+from rosbags.interfaces import Connection, MessageDefinitionFormat, Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from uwb_tdoa_bias.common.errors import InputError
@@ -18,7 +17,6 @@ from uwb_tdoa_bias.common.limits import DEFINITION_BYTES
 from uwb_tdoa_bias.common.sensors import SENSORS
 
 if TYPE_CHECKING:
-    from rosbags.interfaces import Connection
     from rosbags.typesys.store import Typestore
 
 OUR_PACKAGE = "uwb_tdoa_msgs"
@@ -35,15 +33,6 @@ OUR_TYPES = (
         if of.message.startswith(OUR_PACKAGE)
     ),
 )
-# Fields added to the project's types since their first recording, latest last, and the value of a
-# missing field.
-ADDED: dict[str, tuple[dict[str, Any], ...]] = {
-    f"{OUR_PACKAGE}/msg/Tdoa": ({"variance": 0.0},),
-    f"{OUR_PACKAGE}/msg/TdoaCorrected": (
-        {"variance": 0.0},
-        {"bias_slope": np.zeros(6), "bias_state": np.zeros(6)},
-    ),
-}
 # where folders of message packages are besides installed ones: in a wheel, and in the sources
 _OURS = Path(__file__).parent, Path(__file__).resolve().parents[3]
 
@@ -76,57 +65,12 @@ def check_type(path: str | Path, connection: Connection) -> None:
     store = typestore()
     add_type(store, connection.msgtype)
     recorded = _recorded_hash(path, connection)
-    if (
-        recorded
-        and recorded != store.hash_rihs01(connection.msgtype)
-        and not earlier_types(path, connection)
-    ):
+    if recorded and recorded != store.hash_rihs01(connection.msgtype):
         raise InputError(
             f"{path}: {connection.topic} was recorded with another version of "
             f"{connection.msgtype}; use the version of "
             "this software that recorded it."
         )
-
-
-def earlier_types(path: str | Path, connection: Connection) -> Typestore | None:
-    """Return the types at the time of the recording, if the type has ADDED fields since; else None.
-
-    Raises InputError.
-    """
-    versions = _earlier(connection.msgtype)
-    recorded = _recorded_hash(path, connection) if versions else None
-    return next(
-        (store for store in versions if store.hash_rihs01(connection.msgtype) == recorded), None
-    )
-
-
-def upgraded(data: bytes, msgtype: str, store: Typestore) -> bytes:
-    """Convert a message of `earlier_types` to its current type, as bytes."""
-    message = store.deserialize_cdr(data, msgtype)
-    defaults: dict[str, Any] = {}
-    for fields in ADDED[msgtype]:
-        defaults |= fields
-    known = {name: getattr(message, name) for name, _ in store.fielddefs[msgtype][1]}
-    return bytes(
-        typestore().serialize_cdr(typestore().types[msgtype](**{**defaults, **known}), msgtype)
-    )
-
-
-@cache
-def _earlier(msgtype: str) -> tuple[Typestore, ...]:
-    """Return the types as they were before each addition of fields."""
-    out, added = [], ADDED.get(msgtype, ())
-    for k in range(len(added)):
-        lacking, store = (
-            {name for fields in added[k:] for name in fields},
-            get_typestore(Stores.ROS2_JAZZY),
-        )
-        constants, fields = typestore().fielddefs[msgtype]
-        store.register(
-            {msgtype: (constants, [field for field in fields if field[0] not in lacking])}
-        )
-        out.append(store)
-    return tuple(out)
 
 
 def _recorded_hash(path: str | Path, connection: Connection) -> str:

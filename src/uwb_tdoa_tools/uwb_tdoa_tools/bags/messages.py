@@ -9,7 +9,7 @@ orientation_covariance[0] of -1, covariances of 0 for unknown.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import reduce
 from typing import TYPE_CHECKING, Any
 
@@ -21,15 +21,12 @@ from uwb_tdoa_bias.common.flight import Imu, Tdoas, Truth
 from uwb_tdoa_bias.common.sensors import Sensor, Stream
 from uwb_tdoa_bias.common.sensors.returned import mistake
 from uwb_tdoa_bias.common.sensors.sensor import LARGEST_NUMBER
-from uwb_tdoa_ekf.results import pose_and_twist
+from uwb_tdoa_ekf.results import Odometry, pose_and_twist
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
     from rosbags.typesys.store import Typestore
 
     from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_ekf.results import Odometry
 
     # A message has no type here: rosbags makes the classes while it runs.
     RowOfMessage = Callable[[Any], tuple[float, ...]]

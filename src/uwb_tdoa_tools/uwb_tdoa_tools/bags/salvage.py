@@ -5,10 +5,10 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 import sqlite3
 import struct
-from typing import TYPE_CHECKING
 
 from rosbags.interfaces import (
     Connection,
@@ -22,10 +22,7 @@ from uwb_tdoa_bias.common.errors import InputError
 
 from . import integrity, mcap
 from .mcap import Damaged
-from .message_types import check_type, earlier_types, typestore, upgraded
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
+from .message_types import check_type, typestore
 
 MESSAGES = "messages"
 LATEST = 2**63  # ns
@@ -108,12 +105,6 @@ def _copy(
             key = connection.topic, connection.msgtype
             if key not in connections:
                 connections[key] = _added(path, connection, writer)
-            if earlier := earlier_types(path, connection):
-                try:
-                    data = upgraded(data, connection.msgtype, earlier)
-                except Exception:  # parsers of rosbags raise many types
-                    lost[MESSAGES] += 1
-                    continue
             writer.write(connections[key], stamp, data)
             count += 1
     except Damaged as damage:

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from rosbags.interfaces import (
@@ -20,19 +20,13 @@ from rosbags.interfaces import (
     QosTime,
 )
 
-from uwb_tdoa_bias.common.sensors import SENSORS
+from uwb_tdoa_bias.common.sensors import SENSORS, Sensor
 
-from ..clock import straightened
+from ..clock import Straightened, straightened
 from ..command_lines import suggest_line
 from . import messages as bag_messages
-from .files import connections_of, readable
+from .files import BagReader, connections_of, readable
 from .message_types import typestore
-
-if TYPE_CHECKING:
-    from uwb_tdoa_bias.common.sensors import Sensor
-
-    from ..clock import Straightened
-    from .files import BagReader
 
 
 def _qos(durability: QosDurability, depth: int) -> Qos:

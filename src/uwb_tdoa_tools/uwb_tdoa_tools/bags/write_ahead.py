@@ -8,15 +8,12 @@ holds pages that an unfinished transaction has overwritten. SQLite merges both i
 
 from __future__ import annotations
 
+from pathlib import Path
 import shutil
 import sqlite3
 import struct
-from typing import TYPE_CHECKING
 
 from .mcap import Damaged
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 LOG, INDEX, JOURNAL = "-wal", "-shm", "-journal"  # suffixes of files next to the database file
 BESIDE = LOG, INDEX, JOURNAL

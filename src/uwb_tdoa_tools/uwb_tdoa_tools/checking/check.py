@@ -23,7 +23,7 @@ from uwb_tdoa_ekf.monitoring.stream_rules import StreamRules
 from ..estimate import FlightEstimator
 from ..readers.streams import protocol
 from . import coverage, imu_rules, recording_rules, tdoa_rules
-from .ordered import OrderedRecording, differences, displacement
+from .ordered import OrderedRecording, SurveyFit, differences, displacement
 from .tdoa_rules import SAME, largest_displacement
 from .watch import found_by_monitor, together
 
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.common.flight import Flight
 
     from ..live.record import End
-    from .ordered import SurveyFit
     from .recording import Recording
     from .tdoa_rules import Survey
 

@@ -7,8 +7,8 @@ A rule takes a CoverageView and yields Findings.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,15 +16,10 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_ekf.core.workspace import FLAT
 from uwb_tdoa_ekf.monitoring.finding import NOTE, WARNING, Finding
 from uwb_tdoa_ekf.monitoring.monitor import NEARER
+from uwb_tdoa_ekf.monitoring.windows import TdoaWindow
 
 from .ordered import LEAST_MOTION, second_principal_std
 from .pair_rules import MANY
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from uwb_tdoa_ekf.monitoring.windows import TdoaWindow
-
 
 CEILING = 1.5  # m; anchors whose mean height is larger hang at a ceiling
 

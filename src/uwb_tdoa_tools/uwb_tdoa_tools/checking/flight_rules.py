@@ -8,10 +8,11 @@ have been measured.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 import numpy as np
 
+from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.effects.anchor import AnchorIds
 from uwb_tdoa_ekf.monitoring.finding import NOTE, WARNING, Finding, most_severe_first
 
@@ -20,12 +21,6 @@ from .check import processed_streams
 from .motion_rules import TrueMotion
 from .pair_rules import KnownPath, least_height, repairs_of
 from .recording import of_flight
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from uwb_tdoa_bias.common.flight import Flight
-
 
 HOLE = 1.0  # s without ground truth in the air
 LEAP, LEAST_LEAP = 20.0, 0.2  # m/s, and m, between two poses; healthy 0.11 m

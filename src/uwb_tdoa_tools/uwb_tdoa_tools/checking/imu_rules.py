@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from uwb_tdoa_bias.common.flight import Imu
+from uwb_tdoa_bias.common.flight import Flight, Imu
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.memory import TDOA, imu_rows, structured
 from uwb_tdoa_ekf.monitoring.explain import (
@@ -31,8 +31,6 @@ from uwb_tdoa_ekf.monitoring.inertial_rules import AXES
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-
-    from uwb_tdoa_bias.common.flight import Flight
 
     from .ordered import OrderedRecording
 

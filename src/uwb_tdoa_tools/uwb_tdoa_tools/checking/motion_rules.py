@@ -8,22 +8,16 @@ removal of constant biases and slow changes.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_ekf.monitoring.finding import ERROR, Finding
 
 from .imu_rules import ARRANGEMENTS, SCALES, is_smooth, scale_of, signed_axis
-from .time_rules import BLOCK, LONGEST, delays, drift_or_jump
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from uwb_tdoa_bias.common.flight import Flight
-
-    from .time_rules import Delays
+from .time_rules import BLOCK, LONGEST, Delays, delays, drift_or_jump
 
 CELL, HALF = 0.05, 0.1  # s between cells, and half the time over which a cell is averaged
 BEYOND = round(LONGEST / CELL)  # further cells at both ends, to try delays

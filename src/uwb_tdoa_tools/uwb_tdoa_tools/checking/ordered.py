@@ -24,19 +24,18 @@ from uwb_tdoa_ekf.core.ground import KnownHeight
 from uwb_tdoa_ekf.core.memory import TDOA, new_state, structured
 from uwb_tdoa_ekf.core.ranges import APART
 from uwb_tdoa_ekf.core.startup import locate, room_for
-from uwb_tdoa_ekf.monitoring.explain import SCALE, unexplained
+from uwb_tdoa_ekf.monitoring.explain import SCALE, Unexplained, unexplained
 from uwb_tdoa_ekf.monitoring.windows import BEYOND
 from uwb_tdoa_ekf.results import rows_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    Window = tuple[np.ndarray, ...]  # t (n,) s, a and b (n,) rows of the anchors, d (n,) m
     from uwb_tdoa_bias.common.sensors import Ranges
-    from uwb_tdoa_ekf.monitoring.explain import Unexplained
 
     from .recording import Recording
 
+Window = tuple[np.ndarray, ...]  # t (n,) s, a and b (n,) rows of the anchors, d (n,) m
 
 WINDOWS, LENGTH, FEWEST = 40, 0.5, 30  # windows over the recording; s each; least TDOAs in each
 PRIOR = 0.5  # m, standard deviation of the survey, for each anchor

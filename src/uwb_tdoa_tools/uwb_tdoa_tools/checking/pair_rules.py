@@ -8,25 +8,19 @@ remains. The healthy values in comments are the extremes over the pairs of 37 me
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.common.flight import Flight, Truth
 from uwb_tdoa_bias.common.geometry import tdoa
-from uwb_tdoa_bias.effects import EffectSet, Track, true_samples
+from uwb_tdoa_bias.effects import EffectSet, LabelEffect, Track, true_samples
 from uwb_tdoa_bias.effects.anchor import AnchorIds
 from uwb_tdoa_bias.effects.pair import PairSign
 from uwb_tdoa_ekf.monitoring.finding import ERROR, Finding
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from uwb_tdoa_bias.common.flight import Flight, Truth
-    from uwb_tdoa_bias.effects import LabelEffect
-
-    Fault = tuple[str, str, str, float]  # fault of the pair, evidence, remedy, deciding number
-
+Fault = tuple[str, str, str, float]  # fault of the pair, evidence, remedy, deciding number
 
 AIRBORNE = 0.3  # m of z
 MANY = 64  # anchors beyond which a tag hears a small part of them, as in a hall

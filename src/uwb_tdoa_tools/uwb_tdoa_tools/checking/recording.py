@@ -13,26 +13,22 @@ import numpy as np
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import temporary_folder
-from uwb_tdoa_bias.common.flight import Imu, Tdoas
+from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas
 from uwb_tdoa_bias.common.sensors import LOCATING, SENSORS
 from uwb_tdoa_bias.common.survey import refuse_faulty
 
-from ..bags import frames, is_bag
-from ..bags import messages as bag_messages
+from ..bags import frames, is_bag, messages as bag_messages
 from ..bags.files import open_bag, remarks_of
-from ..bags.frames import TF_STATIC, recorded_anchors
-from ..bags.topics import Names, arrivals, on_one_clock, read_sensor, read_topic
+from ..bags.frames import TF_STATIC, Place, recorded_anchors
+from ..bags.topics import Names, TopicMessages, arrivals, on_one_clock, read_sensor, read_topic
 from ..command_lines import suggest_line
 from ..readers import read_survey
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_bias.common.sensors.sensor import Sensor, Stream
 
-    from ..bags.frames import Place
-    from ..bags.topics import TopicMessages
     from ..clock import Jump
     from ..live.record import End
     from ..readers.inputs import Reading

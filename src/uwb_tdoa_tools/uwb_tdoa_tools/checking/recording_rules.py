@@ -15,10 +15,10 @@ import numpy as np
 from uwb_tdoa_bias.common.sensors import SENSORS, Ranges
 from uwb_tdoa_ekf.monitoring.finding import ERROR, NOTE, WARNING, Finding
 
-from ..bags.frames import is_body
+from ..bags.frames import Place, is_body
 from ..bags.messages import BODY_FRAME
 from ..clock import SET, SILENCE, WORDS, WRAP, apart, in_words
-from .recording import IMU
+from .recording import IMU, Recording
 from .tdoa_rules import largest_displacement, same_place
 
 if TYPE_CHECKING:
@@ -26,9 +26,7 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.common.anchors import Anchors
 
-    from ..bags.frames import Place
     from ..live.record import End
-    from .recording import Recording
 
 
 WHEELS = "velocity/odometry"

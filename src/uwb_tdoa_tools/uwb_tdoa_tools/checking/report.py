@@ -16,9 +16,9 @@ from uwb_tdoa_bias.effects.base import listed
 from .. import cli, command_lines
 from ..outputs import as_json
 from ..parallel import Progress
-from .check import check, different_surveys
+from .check import Report, check, different_surveys
 from .ordered import OrderedRecording, displacement
-from .recording import of_flight, read_recording
+from .recording import Recording, of_flight, read_recording
 from .tdoa_rules import SAME, gained, largest_displacement
 from .watch import BEFORE_TRUTH, EXCHANGED, FIRST
 
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
     from ..estimate import FlightEstimator
     from ..readers.inputs import Reading
-    from .check import Report
-    from .recording import Recording
 
 
 # the rule of `check` for a survey that does not fit without another mistake

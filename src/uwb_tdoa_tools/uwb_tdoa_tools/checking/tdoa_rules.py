@@ -24,7 +24,7 @@ from uwb_tdoa_ekf.monitoring.signs import RIGHT_SIGN, WRONG_SIGN
 from uwb_tdoa_ekf.monitoring.survey_scale import wrong_unit
 from uwb_tdoa_ekf.offline import run_offline
 
-from .ordered import LEAST_MOTION, LONG, SHORT, OrderedRecording, second_principal_std
+from .ordered import LEAST_MOTION, LONG, SHORT, OrderedRecording, SurveyFit, second_principal_std
 from .pair_rules import MANY, OFF
 
 if TYPE_CHECKING:
@@ -32,8 +32,6 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.common.anchors import Anchors
     from uwb_tdoa_bias.common.flight import Tdoas
-
-    from .ordered import SurveyFit
 
     Survey = tuple[str, Anchors]  # its name, and what it says
 

@@ -10,9 +10,9 @@ measured recordings.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,13 +20,7 @@ from uwb_tdoa_bias.common.geometry import tdoa, tdoa_jacobian
 from uwb_tdoa_ekf.monitoring.finding import ERROR, Finding
 
 from ..clock import numbered
-from .pair_rules import MANY
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from .pair_rules import KnownPath
-
+from .pair_rules import MANY, KnownPath
 
 LONGEST, STEP = 1.5, 0.05  # s, largest delay to both sides, and steps between the trials
 DELAYS = np.arange(-LONGEST, LONGEST + 0.5 * STEP, STEP)

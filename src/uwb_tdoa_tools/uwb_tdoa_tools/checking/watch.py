@@ -10,7 +10,7 @@ from dataclasses import replace
 import re
 from typing import TYPE_CHECKING
 
-from uwb_tdoa_ekf.monitoring.monitor import SURVEYING
+from uwb_tdoa_ekf.monitoring.monitor import SURVEYING, Event
 from uwb_tdoa_ekf.monitoring.recorded import watched
 
 from .tdoa_rules import FEWEST, POOR, gained, relabelled
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_ekf.monitoring.finding import Finding
-    from uwb_tdoa_ekf.monitoring.monitor import Event
     from uwb_tdoa_ekf.offline import Run
 
     from ..estimate import FlightEstimator

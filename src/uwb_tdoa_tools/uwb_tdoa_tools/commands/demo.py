@@ -4,20 +4,17 @@
 
 from __future__ import annotations
 
+from argparse import ArgumentParser, Namespace
+from collections.abc import Sequence
 from functools import partial
 import sys
 import textwrap
 import time
-from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli, options, parallel
 from ..outputs import OutputFile, OutputFolder
-
-if TYPE_CHECKING:
-    from argparse import ArgumentParser, Namespace
-    from collections.abc import Sequence
 
 DESCRIPTION = """Find a systematic error of the measurements, write its correction, and fly with it.
 

@@ -4,19 +4,16 @@
 
 from __future__ import annotations
 
+from argparse import ArgumentParser, Namespace
 from dataclasses import replace
 from functools import partial
 import sys
-from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_text
 
 from .. import cli, options, parallel
 from ..outputs import OutputFile, OutputFolder, as_json
-
-if TYPE_CHECKING:
-    from argparse import ArgumentParser, Namespace
 
 # Options without influence on the figures of a flight.
 WITHOUT_INFLUENCE = "flights", "survey", "json", "markdown", "beside", "resume", "jobs", "dask"

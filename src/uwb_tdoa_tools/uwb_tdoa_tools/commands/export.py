@@ -4,18 +4,15 @@
 
 from __future__ import annotations
 
+from argparse import ArgumentParser, Namespace
 from functools import partial
 import sys
-from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli, options
 from ..outputs import OutputFile, OutputFolder
 from ..parallel import Progress
-
-if TYPE_CHECKING:
-    from argparse import ArgumentParser, Namespace
 
 
 def parser() -> ArgumentParser:

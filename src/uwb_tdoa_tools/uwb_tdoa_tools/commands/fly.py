@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import argparse
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 import sys
 from typing import TYPE_CHECKING
@@ -18,8 +18,6 @@ from ..choices import FLOWN, MOMENTS, WORLDS
 from ..outputs import OutputFile, OutputFolder
 
 if TYPE_CHECKING:
-    from contextlib import AbstractContextManager
-
     from ..flying.mission import Circles, Waypoints
 
 # Options without influence on a flight.

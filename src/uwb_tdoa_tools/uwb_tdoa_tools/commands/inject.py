@@ -4,17 +4,14 @@
 
 from __future__ import annotations
 
+from argparse import ArgumentParser, Namespace
 import sys
-from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli, options
 from ..outputs import OutputBag
 from ..parallel import Progress
-
-if TYPE_CHECKING:
-    from argparse import ArgumentParser, Namespace
 
 DESCRIPTION = """Add a declared effect to a flight, and write the flight that would have been recorded with it as a
 ROS 2 bag.

@@ -4,17 +4,14 @@
 
 from __future__ import annotations
 
+from argparse import ArgumentParser, Namespace
 from functools import partial
 import sys
-from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli, options, parallel
 from ..outputs import OutputFile
-
-if TYPE_CHECKING:
-    from argparse import ArgumentParser, Namespace
 
 DESCRIPTION = """Where the tag was: trajectories of recordings, without ground truth, which is not read.
 

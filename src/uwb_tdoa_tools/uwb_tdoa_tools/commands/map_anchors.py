@@ -4,17 +4,14 @@
 
 from __future__ import annotations
 
+from argparse import ArgumentParser, Namespace
 import sys
-from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_text
 
 from .. import choices, cli, command_lines, options
 from ..parallel import Progress
-
-if TYPE_CHECKING:
-    from argparse import ArgumentParser, Namespace
 
 DESCRIPTION = """Make a first map of anchors whose positions are unknown.
 

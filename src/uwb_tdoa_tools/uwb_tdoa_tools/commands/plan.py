@@ -4,9 +4,10 @@
 
 from __future__ import annotations
 
+from argparse import ArgumentParser, Namespace
 from pathlib import Path
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from uwb_tdoa_bias.common.radio import RadioLink
 from uwb_tdoa_bias.common.sensors import SENSORS
@@ -22,10 +23,6 @@ from ..choices import (
     VOLTAGE,
 )
 from ..outputs import OutputFile, OutputFolder
-
-if TYPE_CHECKING:
-    from argparse import ArgumentParser, Namespace
-
 
 ROUND = (
     "what a round holds: N TDOAs in a ring (tdoa2), TDOAs between any two of N anchors, each "

@@ -4,17 +4,14 @@
 
 from __future__ import annotations
 
+from argparse import ArgumentParser, Namespace
 import sys
-from typing import TYPE_CHECKING
 
 from .. import cli
 from ..choices import STORAGES
 from ..outputs import OutputBag, OutputFile
 from ..parallel import Progress
-from ..simulation_options import add_options
-
-if TYPE_CHECKING:
-    from argparse import ArgumentParser, Namespace
+from ..simulation_options import add_options, config_of
 
 
 def parser() -> ArgumentParser:
@@ -74,7 +71,6 @@ def _simulate(args: Namespace) -> None:
     from ..bags.bag import check_output, write_bag
     from ..simulation import simulate
     from ..simulation.report import catalogue, check_image, plot, summary
-    from ..simulation_options import config_of
 
     if args.list:
         cli.show(catalogue())

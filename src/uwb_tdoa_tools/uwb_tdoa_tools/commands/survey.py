@@ -4,17 +4,14 @@
 
 from __future__ import annotations
 
+from argparse import ArgumentParser, Namespace
 from functools import partial
 import sys
-from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.files import write_text
 
 from .. import cli, command_lines, options, parallel
 from ..parallel import Progress
-
-if TYPE_CHECKING:
-    from argparse import ArgumentParser, Namespace
 
 FEW = (
     20  # flights; what fewer gain by other processes, these take to start (docs/notebook/speed.md)

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 import sys
 from typing import TYPE_CHECKING
@@ -12,16 +12,14 @@ from typing import TYPE_CHECKING
 from .. import cli, options, parallel
 from ..choices import MODELS
 from ..outputs import OutputFile, OutputFolder
-from ..parallel import Progress
+from ..parallel import MapFunction, Progress
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
     from collections.abc import Sequence
-    from contextlib import AbstractContextManager
 
     from uwb_tdoa_bias.common.flight import Flight
 
-    from ..parallel import MapFunction
     from ..readers.inputs import Reading
     from ..results_file import ResultsFile
 
@@ -120,8 +118,7 @@ def _write(
     args: Namespace, several: Sequence[Flight], over: MapFunction, progress: Progress
 ) -> None:
     """Train on several Flights, and write all results. over : as in `shrinking.train`."""
-    from ..training import labels as labelling
-    from ..training import models, shrinking
+    from ..training import labels as labelling, models, shrinking
 
     flights = {flight.name: flight for flight in several}
     names = labelling.split(list(flights), args.seed, args.validation)

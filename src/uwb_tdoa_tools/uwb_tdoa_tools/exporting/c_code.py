@@ -5,17 +5,13 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable, Sequence
 import re
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from .scalars import Program, Scalar, needed
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from .scalars import Dense, Pieces
+from .scalars import Dense, Pieces, Program, Scalar, needed
 
 LONGEST = 72  # characters of an expression that is not given a name
 OPERATORS = {

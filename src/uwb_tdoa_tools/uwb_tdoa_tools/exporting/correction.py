@@ -6,25 +6,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import json
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.text import written_by
 from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.correction.model import INPUTS, KIND, OUTPUTS
+from uwb_tdoa_bias.correction.model import INPUTS, KIND, OUTPUTS, Model
 from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.effects import Effect, EffectSet, LabelEffect, SmoothTerm
 from uwb_tdoa_bias.effects.base import listed
 
+from .graph import Node
 from .tracing import nodes_of, samples_of
-
-if TYPE_CHECKING:
-    from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.correction.model import Model
-
-    from .graph import Node
 
 FARTHEST = 500.0  # m from the origin: single precision resolves 0.03 mm there
 G = 9.81  # m/s^2

@@ -23,12 +23,10 @@ ones only once, inputs first.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
 
 ELEMENTWISE: dict[str, Callable[..., Any]] = {
     "neg": np.negative,

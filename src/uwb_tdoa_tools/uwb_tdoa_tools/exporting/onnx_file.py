@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from onnx import (
+    ModelProto,
     NodeProto,
     TensorProto,
     checker,
@@ -22,7 +23,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_bytes
 from uwb_tdoa_bias.common.limits import MODEL_BYTES
 from uwb_tdoa_bias.common.text import version
-from uwb_tdoa_bias.correction.model import INPUTS, OUTPUTS
+from uwb_tdoa_bias.correction.model import INPUTS, OUTPUTS, Model
 from uwb_tdoa_bias.correction.trial import Unplayable, tried_out
 
 from .correction import TracedCorrection, trace
@@ -33,10 +34,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from numpy.typing import ArrayLike
-    from onnx import ModelProto
 
     from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.correction.model import Model
     from uwb_tdoa_bias.effects import EffectSet
 
 

@@ -17,19 +17,15 @@ Equal Scalars are one. A sum adds its terms one by one.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache, reduce
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import onnx
 from onnx import numpy_helper
 
-from .graph import COMPARISONS, ELEMENTWISE, LOGICAL, ordered
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
-
-    from .graph import Node
+from .graph import COMPARISONS, ELEMENTWISE, LOGICAL, Node, ordered
 
 ACTIVATIONS = ("Relu",)
 SAME = 1e-9  # m; a smaller difference of constants is rounding

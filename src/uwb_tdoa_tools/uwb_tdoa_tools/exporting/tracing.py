@@ -10,24 +10,21 @@ the protocols of numpy, compiled functions by `Kernel`.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 import math
 from types import FunctionType, SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.arrays import SymbolicArray
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.effects import Samples
 from uwb_tdoa_bias.effects.samples import Motion
 
 from .graph import Node, apply, as_number, constant, joined, pick, scalar, taken, total
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from uwb_tdoa_bias.common.anchors import Anchors
 
 MOST_ANCHORS = 128  # constants of pairs grow with the square
 LN_10 = math.log(10.0)

@@ -10,30 +10,24 @@ everything else. Only the first part is computed again for the Jacobian, at stat
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_bias.common.text import version
 from uwb_tdoa_bias.correction.corrector import Corrector
+from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.effect_set import REACH
 
 from . import crazyflie
 from .c_code import Printer, number
-from .correction import left_out
+from .correction import LeftOut, TracedCorrection, left_out
 from .scalars import Program, Unsupported
 from .tracing import nodes_of, samples_of
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.correction.network import Network
-
-    from .correction import LeftOut, TracedCorrection
 
 MEMBERS = {  # of the state, by the names of inputs
     **{name: f"position[{k}]" for k, name in enumerate(("x", "y", "z"))},
@@ -43,19 +37,6 @@ MEMBERS = {  # of the state, by the names of inputs
     **{name: f"rate[{k}]" for k, name in enumerate(("wx", "wy", "wz"))},
     **{name: name for name in ("time", "interval", "previous_anchor")},
 }
-# The state in C, all of 4 bytes each
-STATE = np.dtype(
-    [
-        ("position", np.float32, 3),
-        ("attitude", np.float32, 4),
-        ("velocity", np.float32, 3),
-        ("acceleration", np.float32, 3),
-        ("rate", np.float32, 3),
-        ("time", np.float32),
-        ("interval", np.float32),
-        ("previous_anchor", np.float32),
-    ]
-)
 RATES = {"ax", "ay", "az", "wx", "wy", "wz"}  # inputs of acceleration and rate
 NOT_ESTIMATED = "the filter of the firmware estimates no acceleration and no rate"
 NO_PAIR, NOT_FINITE = 1, 2  # results of the functions in C

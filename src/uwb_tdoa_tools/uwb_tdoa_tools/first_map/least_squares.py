@@ -10,16 +10,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, cho_solve_banded, cholesky_banded
 from scipy.sparse import csr_matrix
 
-from .observations import STEP
-
-if TYPE_CHECKING:
-    from .observations import Observations
+from .observations import STEP, Observations
 
 NU = 4.0  # degrees of freedom of Student's t, of TDOAs, ranges, heights and distances
 DELAY = 0.1  # m, prior of the delay of an anchor

@@ -4,22 +4,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import Flight, Imu
 
 from ..readers.names import read_survey
 from ..surveying.known import read_coordinates, read_distances
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from uwb_tdoa_bias.common.flight import Flight, Imu
 
 MOST = 64  # anchors of a map
 STEP = 0.2  # s, length of a time bin; the tag has one position in it

@@ -4,21 +4,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.sparse.csgraph import shortest_path
 from scipy.spatial.transform import Rotation
 
-from .least_squares import Problem, Stage
-from .observations import STEP
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from .least_squares import Fit
-    from .observations import Observations
+from .least_squares import Fit, Problem, Stage
+from .observations import STEP, Observations
 
 STARTS, MOST_STARTS = 6, 24  # starting points of shapes, and the most if only one reached the best
 WIDTHS = 10.0, 3.0, 1.0  # factors on standard deviations, one after the other

@@ -7,9 +7,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,16 +20,9 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_filled
 
 from ..choices import MAP_ACCURACY
-from .least_squares import MOTION, Problem, Stage
+from .least_squares import MOTION, Equations, Fit, Problem, Stage
+from .observations import Observations
 from .search import SAME_MAP, SAME_SHAPE, minima, misfit_of, rigid_distance
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from .least_squares import Equations, Fit
-    from .observations import Observations
-
 
 LENGTH = 1.2  # m, of the smooth error of each anchor, as in `survey`
 DRAWS = 300  # of the errors

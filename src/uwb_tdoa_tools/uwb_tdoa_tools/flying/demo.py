@@ -4,13 +4,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 import os
 from pathlib import Path
 import time
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.correction.network import load_network
 from uwb_tdoa_bias.effects import EffectSet
@@ -19,6 +21,7 @@ from uwb_tdoa_ekf.offline import run_offline
 from .. import command_lines
 from ..bags.bag import RecordedOdometry, read_odometry, write_bag
 from ..diagnosis import diagnose
+from ..diagnosis.result import Diagnosis
 from ..live.run import accounts, run_live
 from ..localizing.pictures import write_rerun
 from ..outputs import as_json
@@ -26,13 +29,6 @@ from ..parallel import Progress
 from ..scoring.gains import change_in_words
 from ..scoring.metrics import Estimate, Score
 from . import loop
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from uwb_tdoa_bias.common.flight import Flight
-
-    from ..diagnosis.result import Diagnosis
 
 CORRECTION = "bias.onnx"  # file of the correction of a simulated hall
 MISSING = ("lost", "late", "imu_late", "imu_lost")  # outcomes of messages

@@ -8,11 +8,12 @@ The origin of the body is the antenna, MAST above the floor.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from uwb_tdoa_bias.common.sensors import SENSORS
+from uwb_tdoa_bias.common.sensors.sensor import Stream
 
 from ..simulation.config import WHEELS_RATE
 from ..simulation.sensors import YAW_RATE_STD, slips
@@ -21,11 +22,7 @@ from .sensors import AuxiliarySensor, random
 from .simulator import Simulator
 from .trial import REST_AFTER, Task, Trial, TrialResult
 from .vehicle import GRAVITY, IMU_RATE
-
-if TYPE_CHECKING:
-    from uwb_tdoa_bias.common.sensors.sensor import Stream
-
-    from .world import World
+from .world import World
 
 MAST = 0.4  # m
 # parameters of the filter of a rover

@@ -5,9 +5,10 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,10 +19,6 @@ from .mission import DONE, REFUSED, Journey, Mission
 from .rover import Drive
 from .trial import REST_AFTER, TrialResult
 from .vehicle import POSITION, VELOCITY
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
 
 AIR = 0.3  # m above the ground, least height in the air
 UPRIGHT = math.radians(30.0)

@@ -4,10 +4,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -19,9 +20,6 @@ from ..choices import MOMENTS
 from ..simulation.config import ImuErrors
 from ..simulation.inject import parse_effect
 from ..simulation.rooms import corners
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
 
 # of a flight; a circle of no radius is hovering
 LONGEST_SILENCE = 60.0  # s

@@ -18,15 +18,13 @@ from uwb_tdoa_bias.common.sensors import SENSORS
 
 from .asking import ANSWER_LIMIT, SPIN, parameter_of, wait_for_names
 from .processes import DiagnosticsListener
-from .session import READER_DEPTH, message_class, subscription_qos
+from .session import READER_DEPTH, Stop, message_class, subscription_qos
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rclpy.node import Node
     from rclpy.subscription import Subscription
-
-    from .session import Stop
 
 
 LEAD = 2_000_000_000  # ns of stamps that may be played ahead

@@ -10,7 +10,7 @@ from functools import partial
 import time
 from typing import TYPE_CHECKING
 
-from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from uwb_tdoa_bias.common.errors import InputError
 
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rclpy.node import Node
-    from rclpy.qos import QoSProfile
     from rclpy.subscription import Subscription
     from rosbags.interfaces import Connection
     from rosbags.rosbag2 import Writer

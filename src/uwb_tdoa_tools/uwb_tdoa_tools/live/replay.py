@@ -22,11 +22,11 @@ from rosgraph_msgs.msg import Clock
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.sensors import SENSORS
 
-from ..bags.files import messages, open_bag
+from ..bags.files import BagReader, messages, open_bag
 from ..choices import WAIT
 from .asking import parameter_of, wait_for_names
 from .follow import Follower, Nodes, is_stamped, stamp_of
-from .session import message_class, publisher_qos, session
+from .session import Stop, message_class, publisher_qos, session
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Sequence
@@ -35,9 +35,6 @@ if TYPE_CHECKING:
     from rclpy.node import Node
     from rclpy.publisher import Publisher
     from rosbags.interfaces import Connection
-
-    from ..bags.files import BagReader
-    from .session import Stop
 
 
 Item = TypeVar("Item")

@@ -7,10 +7,11 @@ The assessment uses the recording and the run, without ground truth.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -31,10 +32,6 @@ from ..estimate import FlightEstimator
 from ..readers.inputs import Reading
 from ..scoring.metrics import LOST, has_innovation, nis, radio_residuals
 from . import pictures, residuals
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
-
 
 GOOD, DOUBTFUL, BAD = "good", "doubtful", "bad"
 # standard deviations that contain the 3D position for 95 % of the time; 1.6 to 2.0 by its shape

@@ -7,7 +7,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -49,17 +48,6 @@ class PairResiduals:
     def name(self) -> str:
         """Return the name for pictures."""
         return f"{self.a} - {self.b}" if self.a != self.b else f"range {self.a}"
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the figures for JSON."""
-        return {
-            "a": self.a,
-            "b": self.b,
-            "tdoas": len(self.t),
-            "median": float(np.median(self.value)),
-            "std": float(self.value.std()),
-            "explained": float(self.explained.mean()),
-        }
 
 
 def explained(residuals: Residuals) -> np.ndarray:

@@ -45,14 +45,13 @@ from uwb_tdoa_bias.common.compiled import compiled
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.geometry import ranges
 
-from .installation import principal_extents
+from .installation import Installation, principal_extents
 from .precision import round_weights
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.common.anchors import Anchors
 
     from ..simulation.rooms import Room
-    from .installation import Installation
 
 
 # thickness over length: anchors so close to a line (plane) mirror each position in it

@@ -12,7 +12,7 @@ one while the share can still be flown, and the neighbours of each are moved.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize, minimize_scalar
@@ -24,15 +24,11 @@ from uwb_tdoa_bias.common.errors import InputError
 
 from .. import parallel
 from ..checking.coverage import sides_of
-from ..simulation.rooms import facing, heard_at
+from ..parallel import Progress
+from ..simulation.rooms import Room, Walls, facing, heard_at
+from .installation import Installation
 from .layout import UNUSABLE
-from .maps import TOO_FEW, Chart, Judged, judge
-
-if TYPE_CHECKING:
-    from ..parallel import Progress
-    from ..simulation.rooms import Room, Walls
-    from .installation import Installation
-    from .maps import Demand, Grid
+from .maps import TOO_FEW, Chart, Demand, Grid, Judged, judge
 
 PLANE_NEAREST = 10  # anchors that are looked at for a plane through them
 JUDGED_AT_ONCE = 100_000  # times points: anchors that are judged at once, wherever they are

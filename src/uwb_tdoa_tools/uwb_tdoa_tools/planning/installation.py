@@ -4,8 +4,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial import Delaunay
@@ -17,10 +19,6 @@ from uwb_tdoa_bias.common.safe_yaml import read_yaml
 
 from ..checking.coverage import sides_of, to_copy
 from ..choices import TEMPERATURE, VOLTAGE
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 
 BOLTZMANN = 1.380649e-23  # J/K
 ZERO_CELSIUS = 273.15  # K

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.flight import SENSOR_NAMES
+from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Flight
 from uwb_tdoa_bias.common.flyable import FlyableVolume
 
 from ..choices import ACCURACY
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.common.flight import Flight
 
     from .installation import Installation
 

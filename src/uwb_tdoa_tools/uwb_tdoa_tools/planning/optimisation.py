@@ -15,14 +15,13 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.geometry import ranges
 
-from .layout import UNUSABLE, AnchorPlaces, Layout, free_ids, spread
+from .layout import UNUSABLE, AnchorPlaces, Goal, Layout, free_ids, spread
 from .precision import bound, position_error, round_weights, weigh
 from .report import quantiles
 
 if TYPE_CHECKING:
     from ..parallel import Progress
     from .hall import Hall
-    from .layout import Goal
     from .maps import Chart, Judged, Wrap
 
 LEAST_GAIN = 1e-4  # of the objective: a step that gains less is the last

@@ -4,9 +4,9 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import EllipseCollection
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.lines import Line2D
@@ -14,7 +14,6 @@ from matplotlib.patches import Patch, Rectangle
 from matplotlib.patheffects import withStroke
 import matplotlib.pyplot as plt
 import numpy as np
-from PIL import Image
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
@@ -22,7 +21,7 @@ from uwb_tdoa_bias.common.files import write_filled
 
 from ..scoring.plots import draw_labels
 from .bifurcation import Subsets
-from .maps import FLYABLE, IMPRECISE, OUTSIDE, TOO_FEW, TWO_SOLUTIONS
+from .maps import FLYABLE, IMPRECISE, OUTSIDE, TOO_FEW, TWO_SOLUTIONS, AccuracyMap, Chart, Grid
 from .precision import ellipses
 
 if TYPE_CHECKING:
@@ -37,7 +36,6 @@ if TYPE_CHECKING:
     from ..simulation.rooms import Walls
     from .installation import Installation
     from .layout import AnchorPlaces
-    from .maps import AccuracyMap, Chart, Grid
 
 WIDTH, DPI = 7.0, 100  # inches, pixels an inch
 STATES = {  # of a cell: what it is called, and its colour
@@ -652,11 +650,6 @@ def _finish(
 
 
 def _save(figure: Figure, path: str | Path) -> None:
-    """Write a figure as a small PNG, and close it."""
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    image = Image.frombuffer("RGBA", canvas.get_width_height(), canvas.buffer_rgba())
+    """Write a figure to an image file, and close it."""
+    write_filled(path, partial(figure.savefig, dpi=DPI))
     plt.close(figure)
-    # 256 colours are enough, and a third of the size
-    few = image.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-    write_filled(path, lambda file: few.save(file, "PNG", optimize=True))

@@ -8,16 +8,12 @@ Fisher information, the Cramer-Rao bound, dilution of precision and ellipses.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.common.geometry import ranges
 
-from .installation import FixedNoise, variance_gradient
-
-if TYPE_CHECKING:
-    from .installation import Installation, Pairing
+from .installation import FixedNoise, Installation, Pairing, variance_gradient
 
 # standard deviations of a normal variable that hold 99 %, as rounded in Grasso et al., sec. 2.2.3
 NORMAL_99 = 2.58

@@ -14,7 +14,7 @@ from ..bags.messages import anchors_message, header_of, pose_of
 from ..bags.topics import LATCHED_QOS
 from ..checking.coverage import to_copy
 from ..scoring.gains import change_in_words
-from .maps import FLYABLE, IMPRECISE, OUTSIDE, TOO_FEW, TWO_SOLUTIONS
+from .maps import FLYABLE, IMPRECISE, OUTSIDE, TOO_FEW, TWO_SOLUTIONS, Chart, Grid
 from .precision import NORMAL_99, dilution
 
 if TYPE_CHECKING:
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
     from ..simulation.rooms import Room
     from .installation import Installation
-    from .maps import Chart, Grid
 
 SHARES = {
     "flyable": FLYABLE,

@@ -25,14 +25,13 @@ from . import maps, optimisation, plots, report
 from .hall import Hall, design, placements, step_of
 from .installation import FixedNoise, Installation, RadioNoise, antenna_from_yaml
 from .layout import AnchorPlaces, Goal, lattice
-from .maps import Demand, Grid, brute_force
+from .maps import Chart, Demand, Grid, brute_force
 
 if TYPE_CHECKING:
     from argparse import Namespace
     from collections.abc import Iterable
 
     from ..readers.inputs import Recording
-    from .maps import Chart
 
 FARTHEST = 30.0  # m, size of a room from which on the radio's reach must be given
 # cells along the longest side, without --step

@@ -7,13 +7,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 import re
-from typing import TYPE_CHECKING
 import zlib
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import read_head
+from uwb_tdoa_bias.common.flight import Flight
 
 from ..bags import is_bag, is_ros_1
 from ..command_lines import suggest_line
@@ -24,12 +26,6 @@ from .tables import GZIP_MAGIC
 from .ulog import is_ulog
 from .usd_log import MAGIC, read_usd_log
 from .util_csv import is_util_csv, read_util_csv
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.common.flight import Flight
 
 
 def reader_of(path: Path) -> Callable[[Path, Anchors, bool, bool], Flight]:

@@ -6,32 +6,37 @@ from __future__ import annotations
 
 from array import array
 from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 import re
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.common.survey import refuse_faulty
 from uwb_tdoa_bias.common.survey_forms import Entry
 
 from ..bags import is_bag, is_ros_1
 from .names import NamedAnchors, named_anchors
-from .profile import ANCHORS, ATTITUDE, EMPTY, MOST_SKIPPED, RADIO, STREAMS, as_text, time_column
-from .streams import make_flight
+from .profile import (
+    ANCHORS,
+    ATTITUDE,
+    EMPTY,
+    MOST_SKIPPED,
+    RADIO,
+    STREAMS,
+    Profile,
+    Source,
+    as_text,
+    time_column,
+)
+from .streams import Streams, make_flight
 from .tables import CsvFiles, table_of
 from .ulog import ULogFile, is_ulog
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-
-    from uwb_tdoa_bias.common.flight import Flight
-
-    from .profile import Profile, Source
-    from .streams import Streams
 
 SURVEY = "anchors"  # stream of positions
 SINGLE = "gyro", "acc", "pose", "tof", "baro", "flow"  # streams of one sensor each

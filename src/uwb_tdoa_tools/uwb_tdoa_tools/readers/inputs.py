@@ -13,7 +13,7 @@ import numpy as np
 from tqdm import tqdm
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.flight import SENSOR_NAMES
+from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Flight
 from uwb_tdoa_bias.common.limits import FOLDER_DEPTH, FOLDER_ENTRIES, Budget
 from uwb_tdoa_bias.common.sensors import LOCATING
 from uwb_tdoa_bias.common.text import printable
@@ -27,8 +27,6 @@ from .names import read_named_anchors
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
-
-    from uwb_tdoa_bias.common.flight import Flight
 
     from .profile import Profile
 

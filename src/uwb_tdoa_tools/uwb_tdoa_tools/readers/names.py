@@ -5,16 +5,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 import re
-from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common import survey
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.survey import refuse_faulty
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 LARGEST_ID = 65535
 

@@ -8,11 +8,12 @@ profile = Profile.of_columns(parse_columns("time=t_ms:ms,anchor=id,range=dist:mm
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 import math
 from pathlib import Path
 import re
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -150,10 +151,6 @@ def check_columns(where: str, columns: Columns, time: bool = True) -> None:
 def time_column(stream: str, columns: Columns) -> tuple[str, float] | None:
     """Return the column with the time of a stream, or None."""
     return next((columns[name] for name in (*TIMES[stream], "time") if name in columns), None)
-
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 
 SHIPPED = Path(__file__).resolve().parent / "profiles"

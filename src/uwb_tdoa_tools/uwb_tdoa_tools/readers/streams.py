@@ -4,12 +4,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
 from uwb_tdoa_bias.common.sensors import Height, Pressure, Velocity
@@ -19,12 +20,8 @@ from uwb_tdoa_bias.common.sensors.sensor import LARGEST_NUMBER
 
 from ..clock import sentences, straightened
 
-if TYPE_CHECKING:
-    from uwb_tdoa_bias.common.anchors import Anchors
-
-    Columns = dict[str, np.ndarray]  # of a stream, each (n,)
-    Streams = dict[str, Columns]
-
+Columns = dict[str, np.ndarray]  # of a stream, each (n,)
+Streams = dict[str, Columns]
 
 # m/s^2 in one g of the Crazyflie's accelerometer, as in its firmware and in the UTIL scripts
 GRAVITY = 9.81

@@ -4,26 +4,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import islice
+from pathlib import Path
 import re
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.text import printable
 
-from .by_profile import SINGLE, as_number, open_recording
-from .profile import RADIO, STREAMS, load_profile, shipped
+from .by_profile import SINGLE, Foreign, as_number, open_recording
+from .profile import RADIO, STREAMS, Source, load_profile, shipped
 from .tables import CsvFiles, table_of
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from .by_profile import Foreign
-    from .profile import Source
 
 SAMPLE = 300  # messages of each table that are looked at
 ENTRIES = 8  # of an array in each of them

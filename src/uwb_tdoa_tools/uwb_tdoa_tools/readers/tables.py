@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from array import array
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 import csv
 from gzip import GzipFile
 import io
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 import zlib
 
 import numpy as np
@@ -29,10 +29,6 @@ from uwb_tdoa_bias.common.limits import (
     TABLE_CELLS,
     Budget,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
 
 GZIP_MAGIC = b"\x1f\x8b"
 _BLOCK = 1 << 20  # bytes that are unpacked at once

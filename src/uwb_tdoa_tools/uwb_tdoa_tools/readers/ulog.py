@@ -5,18 +5,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import read_bytes, read_head
 
 from ..command_lines import SALVAGE
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
-
-    import numpy as np
 
 MAGIC = b"ULog\x01\x12\x35"
 _TIME = "timestamp"  # us since the start of the autopilot

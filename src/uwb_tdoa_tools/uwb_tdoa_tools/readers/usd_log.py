@@ -5,26 +5,21 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 import zlib
 
 import numpy as np
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.compiled import compiled
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import read_bytes
+from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.common.limits import USD_TYPES, USD_VARIABLES, Budget
 from uwb_tdoa_bias.common.text import sanitize
 
 from ..command_lines import SALVAGE
-from .streams import make_flight
-
-if TYPE_CHECKING:
-    from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.common.flight import Flight
-
-    from .streams import Columns
-
+from .streams import Columns, make_flight
 
 MAGIC = 0xBC
 _CRC_SIZE = 4

@@ -4,27 +4,25 @@
 
 from __future__ import annotations
 
+from array import array
+from collections.abc import Iterable
 import csv
+from itertools import islice
+import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import read_bytes
+from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.common.limits import CSV_BYTES, CSV_CELLS, Budget, most_unpacked
 
 from ..command_lines import SALVAGE
-from .streams import make_flight
+from .streams import Columns, make_flight
 from .tables import GZIP_MAGIC, CsvRows, check_text, unpacked
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.common.flight import Flight
-
-    from .streams import Columns
 
 # Each sensor has its own time column and its own length: they are only set side by side, a row is
 # not one instant.
@@ -44,7 +42,6 @@ _STREAMS = {  # our stream: {column of the file: column of the stream}, the time
 _QUATERNION = {"pose_qx": "qx", "pose_qy": "qy", "pose_qz": "qz", "pose_qw": "qw"}
 TDOA_COLUMNS = tuple(_STREAMS["tdoa"])
 _KNOWN = {name for rename in _STREAMS.values() for name in rename} | {*_QUATERNION}
-_ROWS = 4096  # that are text at a time
 
 
 def read_util_csv(
@@ -84,7 +81,8 @@ def read_util_csv(
                 "none must be there."
             )
         streams[stream] = {
-            rename[name]: values for name, values in _numbers(path, rename, cells, salvage).items()
+            rename[name]: values
+            for name, values in _numbers(path, content, rename, cells, salvage).items()
         }
     tdoa = streams["tdoa"]
     if salvage:
@@ -129,8 +127,11 @@ def _text(path: str | Path, remarks: list[str], salvage: bool) -> bytes:
 
 def _table(
     path: str | Path, content: bytes, remarks: list[str], salvage: bool
-) -> tuple[list[str], dict[str, _Column]]:
-    """Return the header and {name: _Column} of the known columns."""
+) -> tuple[list[str], Columns]:
+    """Return the header, and {name: `_value` of each row} of the known columns.
+
+    The cells as text would exceed the memory.
+    """
     if not content.endswith((b"\n", b"\r")):
         check_text(path, content)
         line = content.count(b"\n") + content.count(b"\r") - content.count(b"\r\n") + 1
@@ -143,20 +144,19 @@ def _table(
         remarks.append(f"line {line} is cut and left out.")
         content = content[: max(content.rfind(b"\n"), content.rfind(b"\r")) + 1]
     rows, header, budget = CsvRows(path, content), None, Budget(path, len(content))
-    block: list[list[str]] = []
-    columns: dict[str, _Column] = {}
+    columns: dict[str, array] = {}
     try:
         for row in rows:
             if header is None:
                 header = [name.strip() for name in row]
                 _check_header(path, header)
-                columns = {name: _Column() for name in header if name in _KNOWN}
+                columns = {name: array("d") for name in header if name in _KNOWN}
             elif len(row) != len(header):
                 raise csv.Error(f"has {len(row)} cells, the header has {len(header)}")
             else:
-                block.append(row)
-            if len(block) == _ROWS:
-                _add(block, header, columns)
+                for name, cell in zip(header, row):
+                    if name in columns:
+                        columns[name].append(_value(cell))
             budget.spend("cells", len(row), CSV_CELLS)
     except csv.Error as error:
         if header is None or not salvage:
@@ -166,67 +166,18 @@ def _table(
         remarks.append(f"line {rows.line} {error}: read up to there.")
     if header is None:
         raise InputError(f"{path}: holds no line that is whole; copy the file again.")
-    _add(block, header, columns)
-    return header, columns
+    return header, {name: np.array(values) for name, values in columns.items()}
 
 
-def _add(block: list[list[str]], header: list[str], columns: dict[str, _Column]) -> None:
-    """Move rows to the columns."""
-    for name, cells in zip(header, zip(*block)):
-        if name in columns:
-            columns[name].add(cells)
-    block.clear()
-
-
-class _Column:
-    """Numbers of a column; the cells as text would exceed the memory."""
-
-    def __init__(self) -> None:
-        self._parts: list[np.ndarray] = []  # numbers or NaN, up to the first empty cell
-        self._count = 0
-        self.end: int | None = None  # row of the first empty cell
-        # (row, text, is a number) of the first cell that is no finite number
-        self.odd: tuple[int, str, bool] | None = None
-        self.after: int | None = None  # row of the first cell after an empty one
-
-    def add(self, cells: Sequence[str]) -> None:
-        """Append cells."""
-        cells = [cell.strip() for cell in cells]
-        if self.end is None:
-            filled = cells.index("") if "" in cells else len(cells)
-            self._take(cells[:filled])
-            if filled < len(cells):
-                self.end = self._count + filled
-        if self.end is not None and self.after is None and any(cells):
-            self.after = next(
-                (
-                    self._count + k
-                    for k, cell in enumerate(cells)
-                    if cell and self._count + k > self.end
-                ),
-                None,
-            )
-        self._count += len(cells)
-
-    def _take(self, cells: list[str]) -> None:
-        try:
-            self._parts.append(np.array(cells, dtype=float))
-        except ValueError:
-            self._parts.append(
-                np.array([float(cell) if _is_number(cell) else np.nan for cell in cells])
-            )
-        bad = np.flatnonzero(~np.isfinite(self._parts[-1]))
-        if self.odd is None and len(bad):
-            self.odd = self._count + bad[0], cells[bad[0]], _is_number(cells[bad[0]])
-
-    @property
-    def length(self) -> int:
-        """Return the number of rows before the first empty cell."""
-        return self._count if self.end is None else self.end
-
-    def values(self, length: int) -> np.ndarray:
-        """Return the first numbers: (length,)."""
-        return np.concatenate([np.empty(0), *self._parts])[:length]
+def _value(cell: str) -> float:
+    """Return the finite number in a cell, NaN for an empty cell, infinity for anything else."""
+    if not cell.strip():
+        return math.nan
+    try:
+        value = float(cell)
+    except ValueError:
+        return math.inf
+    return value if math.isfinite(value) else math.inf
 
 
 def _check_header(path: str | Path, header: list[str]) -> None:
@@ -245,43 +196,35 @@ def _check_header(path: str | Path, header: list[str]) -> None:
 
 
 def _numbers(
-    path: str | Path, names: Iterable[str], cells: dict[str, _Column], salvage: bool
+    path: str | Path, content: bytes, names: Iterable[str], cells: Columns, salvage: bool
 ) -> Columns:
     """Return {name: (n,) floats} of the columns of one sensor, up to the first empty cell.
 
     With salvage, invalid cells become NaN.
     """
     columns = {name: cells[name] for name in names}
-    length = min(column.length for column in columns.values())
-    for name, column in {} if salvage else columns.items():
-        first = length if column.length > length else column.after
-        if first is not None:
+    length = min(int(np.argmax(np.isnan(np.append(values, np.nan)))) for values in columns.values())
+    for name, values in {} if salvage else columns.items():
+        filled = np.flatnonzero(~np.isnan(values[length:]))
+        if len(filled):
             raise InputError(
-                f"{path}: line {first + 2}: {name} is filled although {', '.join(names)} "
-                "ended with an "
-                f"empty cell at line {length + 2}; fill the columns of one sensor from the "
-                "top, without holes."
+                f"{path}: line {length + filled[0] + 2}: {name} is filled although "
+                f"{', '.join(names)} ended with an empty cell at line {length + 2}; fill the "
+                "columns of one sensor from the top, without holes."
             )
-        row, text, is_number = column.odd or (length, "", False)
-        if row < length and not is_number:
+        invalid = np.flatnonzero(np.isinf(values[:length]))
+        if len(invalid):
+            header, row = islice(CsvRows(path, content), 0, invalid[0] + 2, invalid[0] + 1)
+            text = dict(zip(map(str.strip, header), row))[name].strip()
             raise InputError(
-                f"{path}: line {row + 2}: {name} is {text[:40]!r}; it must be a number."
+                f"{path}: line {invalid[0] + 2}: {name} is {text[:40]!r}; it must be a finite "
+                "number: leave the cells after the end of a sensor empty, and delete broken "
+                "measurements."
             )
-        if row < length:
-            raise InputError(
-                f"{path}: line {row + 2}: {name} is {text[:40]!r}; it must be finite: leave "
-                "the cells after "
-                "the end of a sensor empty, and delete broken measurements."
-            )
-    return {name: column.values(length) for name, column in columns.items()}
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
+    return {
+        name: np.where(np.isinf(values[:length]), np.nan, values[:length])
+        for name, values in columns.items()
+    }
 
 
 def _ids(path: str | Path, name: str, values: np.ndarray) -> np.ndarray:

@@ -12,14 +12,17 @@ only the difference between the clocks of ground truth and TDOAs is known.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import Flight, Truth
+from uwb_tdoa_bias.effects.samples import PoseColumns
 
 from ..checking.imu_rules import ARRANGEMENTS, signed_axis
 from ..checking.motion_rules import FEWEST, TrueMotion
@@ -28,13 +31,6 @@ from ..checking.time_rules import Delays, delays_of_tdoas
 from ..choices import NONE, TIME
 from ..clock import grid
 from .metrics import position_at, scored_phase
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from uwb_tdoa_bias.common.flight import Flight, Truth
-    from uwb_tdoa_bias.effects.samples import PoseColumns
-
 
 # Limits beside measured values were set on 37 recordings with a correct ground truth.
 OVERLAP = 1.0  # s that ground truth and TDOAs must have in common

@@ -4,12 +4,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.common.flight import Flight, Truth
+from uwb_tdoa_bias.correction.model import Model
 from uwb_tdoa_bias.effects import RADIO, EffectSet, Samples, true_samples
+from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.offline import Run
 
 from ..checking.pair_rules import repairs
 from ..choices import FRAME, NONE, TIME
@@ -24,15 +28,6 @@ from .alignment import (
     require_truth,
 )
 from .metrics import Score, radio_residuals
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from uwb_tdoa_bias.common.flight import Flight, Truth
-    from uwb_tdoa_bias.correction.model import Model
-    from uwb_tdoa_ekf.core.config import FilterConfig
-    from uwb_tdoa_ekf.offline import Run
-
 
 # largest ratio of the distances with repaired ids and signs, and with another frame
 LARGEST_LABEL_RATIO = 1.5

@@ -4,17 +4,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    # {flight: {share, None for no correction: 3D RMSE of the filter, m}}
-    Errors = dict[str, dict[float | None, float]]
-
+# {flight: {share, None for no correction: 3D RMSE of the filter, m}}
+Errors = dict[str, dict[float | None, float]]
 
 SAME = 0.005  # share of the error: a smaller change rounds to 0 %
 LOSS = 0.03  # share of the error: a smaller loss may be risked for a larger expected gain

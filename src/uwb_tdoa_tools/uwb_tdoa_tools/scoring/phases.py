@@ -31,16 +31,13 @@ all the time.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+
+from uwb_tdoa_bias.common.flight import Truth
 
 from ..checking.pair_rules import AIRBORNE
 
-if TYPE_CHECKING:
-    from uwb_tdoa_bias.common.flight import Truth
-
-    Span = tuple[float, float]  # from when to when, s
+Span = tuple[float, float]  # from when to when, s
 
 RISE = 0.07  # m above its height at rest: away, for a tag on the floor
 MOVED = 0.1  # m from its place at rest: away, for a tag without a floor

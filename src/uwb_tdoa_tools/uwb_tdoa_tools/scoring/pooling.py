@@ -5,19 +5,16 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ..choices import ALIGN
 from ..outputs import as_json
 from .phases import TITLES
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
 
 RATIO = 1.01  # ratio of the limits of a bin
 SMALLEST = 1e-9  # smaller samples count as this

@@ -6,20 +6,18 @@ from __future__ import annotations
 
 from functools import partial
 import inspect
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_filled
+from uwb_tdoa_bias.common.flight import Flight
 
 from .paths import TRAJECTORIES
 from .rooms import CONSTELLATIONS, constellation
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from uwb_tdoa_bias.common.flight import Flight
 SUFFIXES = (".png", ".pdf", ".svg")
 
 

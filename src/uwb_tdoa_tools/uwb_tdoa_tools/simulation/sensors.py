@@ -4,8 +4,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -14,13 +14,8 @@ from uwb_tdoa_bias.common.flight import Imu
 from uwb_tdoa_bias.common.sensors import SENSORS, Stream, Velocity
 
 from .config import WHEELS_RATE, ImuErrors, SimulationConfig
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from .rooms import Room
-    from .vehicles import Flyable
-
+from .rooms import Room
+from .vehicles import Flyable
 
 YAW_RATE_STD = 0.02  # rad/s
 SLIP_EVERY, SLIP_TIME = 10.0, 0.5  # s

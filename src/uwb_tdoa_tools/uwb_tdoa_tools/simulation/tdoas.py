@@ -4,8 +4,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -15,14 +16,9 @@ from uwb_tdoa_bias.common.flight import Tdoas
 from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_bias.common.radio import FLAT_MOUNT, Antenna, RadioLink, arrival_bias
 
+from .config import SimulationConfig
 from .rooms import Room, heard_at
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from .config import SimulationConfig
-    from .vehicles import Flyable
-
+from .vehicles import Flyable
 
 SLOT = 2.0e-3  # s, TDOA2: one packet per slot
 SLOT_JITTER = 1.0e-4  # s, standard deviation of a stamp around its slot

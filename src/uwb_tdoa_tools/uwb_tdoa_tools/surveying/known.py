@@ -5,12 +5,15 @@
 from __future__ import annotations
 
 from array import array
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.common.limits import TABLE_CELLS
 from uwb_tdoa_bias.common.safe_yaml import read_yaml
 
@@ -18,13 +21,6 @@ from ..bags.bag import read_odometry
 from ..choices import DRIFT
 from ..diagnosis.constraints import Distance, Mark, OdometryPath
 from ..readers.tables import number, read_table
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.common.flight import Flight
-
 
 MARK_KEYS = ("flight", "from", "to", "position", "std")
 MARK_EXAMPLE = "{flight: monday, from: 12.0, to: 14.0, position: [1.0, -2.0, 0.5], std: 0.05}"

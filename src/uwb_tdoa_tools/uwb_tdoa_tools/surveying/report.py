@@ -4,28 +4,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from uwb_tdoa_bias.common.files import write_filled
+from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.effects import Effect, EffectSet
+from uwb_tdoa_ekf.core.config import FilterConfig
 
 from ..checking.pair_rules import MANY
 from ..diagnosis.attribution import attribute
 from ..diagnosis.references import Nothing
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-    from pathlib import Path
-
-    from uwb_tdoa_bias.common.flight import Flight
-    from uwb_tdoa_ekf.core.config import FilterConfig
-
-    from ..diagnosis.self_calibration import SelfCalibration
-
+from ..diagnosis.self_calibration import SelfCalibration
 
 # smallest shift of a misplaced anchor: standard deviations, and multiples of the usual shift
 CLEAR_SHIFT = 5.0

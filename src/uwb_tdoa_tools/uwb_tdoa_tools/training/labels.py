@@ -4,24 +4,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 import hashlib
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import Flight, Truth
 from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_bias.effects import EffectSet, Samples, samples_at
 
 from ..checking.pair_rules import least_height
 from ..scoring.metrics import scored_phase
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-
-    from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.common.flight import Flight, Truth
 
 # s after take-off and before landing that are excluded: near the floor TDOAs are wrong by metres
 MARGIN = 0.5

@@ -4,37 +4,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+from onnx import ModelProto
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_bytes, write_filled
+from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.correction.corrector import LARGEST_YAW_STD
 from uwb_tdoa_bias.correction.features import columns
 from uwb_tdoa_bias.effects import EffectSet
 
 from ..choices import MODELS
-from . import labels as labelling
-from . import network, physics, structured
+from . import labels as labelling, network, physics, structured
+from .labels import Labels
+from .network import Paper
+from .structured import Structured
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
-    from pathlib import Path
-
-    from onnx import ModelProto
-
-    from uwb_tdoa_bias.common.flight import Flight
-
-    from .labels import Labels
-    from .network import Paper
-    from .structured import Structured
-
-    # label, x, training and validation RMS, m
-    LearningCurve = tuple[str, list[int], list[float], list[float]]
-
+# label, x, training and validation RMS, m
+LearningCurve = tuple[str, list[int], list[float], list[float]]
 
 SPACING = 0.01  # s between training samples: closer samples hold no more information
 CLIP = 1.0  # m

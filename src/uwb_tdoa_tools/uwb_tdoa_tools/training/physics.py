@@ -4,12 +4,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.effects import EFFECTS, RADIO, EffectSet
+from uwb_tdoa_bias.common.flight import Flight
+from uwb_tdoa_bias.effects import EFFECTS, RADIO, EffectSet, Samples
 
 from ..diagnosis.attribution import Attribution, attribute
 from ..diagnosis.comparison import Baseline
@@ -20,12 +21,6 @@ from ..diagnosis.regression.fit import refit
 from ..diagnosis.regression.terms import columns_of
 from ..diagnosis.validation import select_by_error
 from .labels import constellations, with_level_attitude
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from uwb_tdoa_bias.common.flight import Flight
-    from uwb_tdoa_bias.effects import Samples
 
 # effects of the tag, the vehicle and the anchor modules, valid in another installation
 PORTABLE = tuple(name for name, effect in EFFECTS.items() if effect.portable)

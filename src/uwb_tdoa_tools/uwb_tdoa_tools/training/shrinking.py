@@ -10,28 +10,22 @@ correlated. The effects are those found in all flights. Their values are fitted 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.common.files import temporary_folder
-from uwb_tdoa_bias.common.flight import SENSOR_NAMES
+from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Flight
 from uwb_tdoa_bias.correction.network import Network
+from uwb_tdoa_bias.effects import EffectSet
 
+from ..parallel import MapFunction
 from ..scoring.evaluation import evaluate
 from ..scoring.gains import SHARES, Shrinkage, best_share
 from . import models, physics
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from uwb_tdoa_bias.common.flight import Flight
-    from uwb_tdoa_bias.effects import EffectSet
-
-    from ..parallel import MapFunction
-    from .models import Recipe
+from .models import Recipe
 
 FOLDS = 5
 

@@ -24,30 +24,23 @@ are summed block by block.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from onnx import ModelProto
 from scipy.cluster.vq import kmeans2
 from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.linalg.lapack import dpotri, dtrtri
 from scipy.spatial.distance import cdist
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.correction.features import columns
+from uwb_tdoa_bias.effects import Samples
 
 from ..exporting.onnx_file import GraphBuilder
-from .labels import SAME_PLACE, constellations
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from onnx import ModelProto
-
-    from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.effects import Samples
-
-    from .labels import Labels
-
+from .labels import SAME_PLACE, Labels, constellations
 
 # Priors, chosen on the validation flights of docs/notebook/bias.md. The data scale those of the maps.
 SITE_STD = (0.1, 0.1)  # m, of the short and the long part of a site map
