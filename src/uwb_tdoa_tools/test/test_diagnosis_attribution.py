@@ -1,6 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
 
+from dataclasses import replace
+
 from known_effects import AIDED, SIZES, effect_of, names_found, sparse_flight
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from uwb_tdoa_tools.calibrating import between
 from uwb_tdoa_tools.diagnosis import attribution, refinement
 from uwb_tdoa_tools.diagnosis.attribution import EffectSearch, attribute, residuals_of
 from uwb_tdoa_tools.diagnosis.channels import residuals
+from uwb_tdoa_tools.diagnosis.findings import Refused
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.refinement import _simpler, effects_of, relinearised
 from uwb_tdoa_tools.diagnosis.regression.fit import fit
@@ -114,10 +117,14 @@ def test_a_search_goes_on_without_an_effect_and_keeps_the_others(flight):
     found = search.found()
     assert set(names_found(found)) == {"accel_bias", "anchor_delay"}
     fewer = search.without({"anchor_delay"})
-    other = fewer.found(found.selection)
+    refused = (Refused("nlos of 7", "before"), Refused("accel_bias", "before"))
+    other = fewer.found(replace(found, refused=refused))
+    assert refused[0] in other.refused
+    accel_bias = next(one for one in other.selection.chosen if one.name == "accel_bias")
+    assert accel_bias.label not in {one.what for one in other.refused}
     assert "accel_bias" in names_found(other) and "anchor_delay" not in names_found(other)
     assert "anchor_delay" not in {one.name for one in other.candidates}
-    assert names_found(search.found(found.selection)) == names_found(found)
+    assert names_found(search.found(found)) == names_found(found)
     assert "anchor_position" not in names_found(fewer.without({"anchor_position"}).found())
 
 

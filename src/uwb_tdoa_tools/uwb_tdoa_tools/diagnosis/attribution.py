@@ -268,10 +268,10 @@ class EffectSearch:
         fewer._detectors = [one for one in self._detectors if one.effect.name not in names]
         return fewer
 
-    def found(self, start: Selection | None = None) -> Attribution:
+    def found(self, start: Attribution | None = None) -> Attribution:
         """Return the Attribution with what it needs to validate effects.
 
-        start : Selection of an earlier search. The search goes on from those of its effects that
+        start : Attribution of an earlier search. The search goes on from those of its effects that
             this search may find. By default it begins with none.
         """
         refused: list[Refused] = []
@@ -280,9 +280,12 @@ class EffectSearch:
             if self._undeclared:
                 selection = cross_validated(self._with_functions(selection), refused)
         else:
-            selection = cross_validated(self._resumed(start), refused)
+            refused += start.refused
+            selection = cross_validated(self._resumed(start.selection), refused)
         if self._undeclared and len(self.names) >= FOR_MAPS:
             selection = with_maps(selection, self._smooth, refused)
+        labels = {one.label for one in selection.chosen}
+        refused = [one for one in refused if one.what not in labels]
         return Attribution(
             self.under_base,
             with_deviations(selection),

@@ -294,7 +294,7 @@ def _searched(
     while True:
         for names in _suspects(found, selected):
             fewer = search.without(names)
-            other = fewer.found(found.selection)
+            other = fewer.found(found)
             trial = judged(other, selected.poses)
             if gain(selected.error, trial.error) > LOSS:
                 break
