@@ -296,9 +296,9 @@ class EffectSearch:
         )
 
     def reported(self, found: Attribution) -> Attribution:
-        """Return an Attribution of this search with what a report shows beside its effects.
+        """Return an Attribution of this search with all that a report shows.
 
-        That are rivals of effects, effects in one flight only, and effects near the floor.
+        Added are rivals of effects, effects in one flight only, and effects near the floor.
         """
         selection = self._with_alternatives(found.selection)
         remaining = self.residuals(effects_of(selection))

@@ -358,8 +358,8 @@ def _with_functions_of_axes(
 def _suspects(found: Attribution, selected: validation.ValidatedSelection) -> list[frozenset[str]]:
     """Return the names of effects to search without: errors of the reference, and misleading ones.
 
-    The first are tried only if there are misleading ones. Nodes do not get them, and the values of other
-    effects depend on them.
+    The first are tried only if there are misleading ones. Nodes do not get them, and the values of
+    other effects depend on them.
     """
     misleading = selected.misleading
     of_reference = {

@@ -162,8 +162,9 @@ def select_by_error(
     The filter runs without each candidate. The displacements of the position by all candidates
     then predict the error without several of them, and candidates are dropped one by one by this
     prediction. The filter runs again with the rest, until no candidate is dropped. Detections stay
-    only if the error falls with them. At most TRIAL_FLIGHTS flights are judged. Of two flights none may get worse by an
-    effect. Events at a time of a single flight are tried for their worth, but not kept.
+    only if the error falls with them. At most TRIAL_FLIGHTS flights are judged. Of two flights none
+    may get worse by an effect. Events at a time of a single flight are tried for their worth, but
+    not kept.
 
     map_function : as of `attribute`; validated : Candidates that stay without another trial
     poses : of an earlier ValidatedSelection of these flights, for the first corrections
