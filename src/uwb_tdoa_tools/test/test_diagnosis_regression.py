@@ -14,6 +14,7 @@ import pytest
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_tools.diagnosis.channels import CHANNELS, residuals
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
+from uwb_tdoa_tools.diagnosis.refinement import effects_of, with_fewer_pairs
 from uwb_tdoa_tools.diagnosis.regression import confounding
 from uwb_tdoa_tools.diagnosis.regression.confounding import (
     alternatives,
@@ -31,12 +32,14 @@ PAIRS = np.array([[k, (k + 1) % 8] for k in range(8)])
 
 
 def table_with(
-    *flights, names=("anchor_delay", "pair_offset", "anchor_position", "gyro_bias", "accel_bias")
+    *flights,
+    names=("anchor_delay", "pair_offset", "anchor_position", "gyro_bias", "accel_bias"),
+    pairs=PAIRS,
 ):
     """Return (Table, [Candidate]) of flights with the columns of some effects."""
     parts = [residuals(flight, GroundTruth(), EffectSet()) for flight in flights]
     candidates = [
-        c for name in names for c in candidates_of(EFFECTS[name](), flights[0].anchors, PAIRS)
+        c for name in names for c in candidates_of(EFFECTS[name](), flights[0].anchors, pairs)
     ]
     table = table_of(parts).with_terms(
         [term for candidate in candidates for term in candidate.terms]
@@ -203,6 +206,54 @@ def test_an_alternative_is_named_where_the_flight_cannot_tell(late):
     }
     assert "pair_offset" in names  # TDoA2: a delay of an anchor equals two pair offsets
     assert "gyro_bias" not in names
+
+
+LATE = {str(k): value for k, value in enumerate((0.3, -0.2, 0.1, 0.25, -0.3, 0.2, -0.1, -0.25))}
+
+
+def with_all_pairs(*effects, seed=100):
+    """Return (Selection of the offsets of all pairs, its declared Candidates) of a flight with Effects.
+
+    seed : of the flight; 100 hears a ring, 102 all pairs
+    """
+    flight = clean_flight(seed, 30.0)
+    for effect in effects:
+        flight = effect.inject(flight)
+    pairs = np.unique(np.sort(np.column_stack([flight.tdoa.a, flight.tdoa.b]), axis=1), axis=0)
+    heard = PAIRS if seed == 100 else pairs
+    table, candidates = table_with(flight, names=("anchor_delay", "pair_offset"), pairs=heard)
+    group = named(candidates, "pair_offset")
+    assert len(group.columns) == len(heard)
+    return select(table, [group], fit(table, columns_of(candidates)).inflation), candidates
+
+
+def test_offsets_of_a_ring_are_delays_of_anchors_and_one_offset():
+    """Flights that hear other pairs have the delays, too; offsets of the ring tell them nothing."""
+    offset = EFFECTS["pair_offset"]({"7-0": 0.3})
+    selection, declared = with_all_pairs(EFFECTS["anchor_delay"](LATE), offset)
+    delays, offsets = effects_of(with_fewer_pairs(selection, declared))
+    assert (delays.name, offsets.name) == ("anchor_delay", "pair_offset")
+    assert len(offsets.values) == 1
+    (of_pair,) = offsets.values.values()
+    assert abs(of_pair) == pytest.approx(0.3, abs=0.03)  # of any pair: the sum around the ring
+    selection, declared = with_all_pairs(EFFECTS["anchor_delay"](LATE))
+    (delays,) = effects_of(with_fewer_pairs(selection, declared))
+    mean = np.mean(list(delays.values.values()))
+    assert {k: v - mean for k, v in delays.values.items()} == pytest.approx(LATE, abs=0.02)
+
+
+def test_offsets_of_few_pairs_stay_offsets_of_these():
+    put_in = {"0-1": 0.3, "2-3": 0.25, "4-5": 0.35, "6-7": -0.3}
+    selection, declared = with_all_pairs(EFFECTS["pair_offset"](put_in))
+    (offsets,) = effects_of(with_fewer_pairs(selection, declared))
+    assert offsets.values == pytest.approx(put_in, abs=0.02)
+
+
+def test_offsets_of_many_pairs_that_no_delay_explains_stay():
+    sizes = np.random.default_rng(1).uniform(0.1, 0.4, (8, 8)) * (-1.0) ** np.arange(8)
+    put_in = {f"{a}-{b}": float(sizes[a, b]) for a in range(8) for b in range(a + 1, 8)}
+    selection, declared = with_all_pairs(EFFECTS["pair_offset"](put_in), seed=102)
+    assert with_fewer_pairs(selection, declared) is selection
 
 
 def test_what_no_tdoa_can_tell_is_named(late):

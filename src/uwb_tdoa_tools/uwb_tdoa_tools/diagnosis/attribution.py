@@ -34,6 +34,7 @@ from .refinement import (
     linearised,
     maps_of,
     relinearised,
+    with_fewer_pairs,
     with_maps,
     with_measured_noise,
     with_smooth,
@@ -276,12 +277,14 @@ class EffectSearch:
         """
         refused: list[Refused] = []
         if start is None:
-            selection = cross_validated(self._named(), refused)
+            selection = cross_validated(with_fewer_pairs(self._named(), self.declared), refused)
             if self._undeclared:
-                selection = cross_validated(self._with_functions(selection), refused)
+                selection = with_fewer_pairs(self._with_functions(selection), self.declared)
+                selection = cross_validated(selection, refused)
         else:
             refused += start.refused
-            selection = cross_validated(self._resumed(start.selection), refused)
+            selection = with_fewer_pairs(self._resumed(start.selection), self.declared)
+            selection = cross_validated(selection, refused)
         if self._undeclared and len(self.names) >= FOR_MAPS:
             selection = with_maps(selection, self._smooth, refused)
         labels = {one.label for one in selection.chosen}

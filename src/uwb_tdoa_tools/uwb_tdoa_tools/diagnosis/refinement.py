@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.effects import SmoothTerm
+from uwb_tdoa_bias.effects.base import OF_PAIR
 
 from .channels import CHANNELS
 from .findings import Refused
 from .over_flights import of_one_flight
 from .regression.fit import fit
 from .regression.held_out import held_out
-from .regression.select import criterion_of, select, worth
+from .regression.select import AMBIGUOUS, LARGE, criterion_of, select, worth
 from .regression.table import table_of
 from .regression.terms import Candidate, Term, columns_of
 
@@ -228,6 +229,35 @@ def _simpler(after: Selection, anew: Selection, choices: int) -> Selection:
         candidate.label for candidate in anew.chosen
     }
     return fewer if least >= most * (1.0 if same else 1.0 - SAME_STORY) else more
+
+
+def with_fewer_pairs(selection: Selection, declared: Sequence[Candidate]) -> Selection:
+    """Return the Selection with fewer parameters of pairs, if they explain the flights as well.
+
+    Other flights may hear other pairs. Offsets of all pairs in a ring are delays of anchors and the
+    offset of one pair, and the flights cannot distinguish them. So a large group of parameters of
+    pairs competes with some of them alone, and with each effect that it can be confounded with and
+    some of them. It stays if it is better by more than AMBIGUOUS.
+
+    declared : Candidates, the full set of each effect before its parts
+    """
+    full = {one.name: one for one in reversed(declared)}
+    for group in selection.chosen:
+        effect = group.terms[0].effect
+        if effect.key_form != OF_PAIR or len(group.columns) <= LARGE:
+            continue
+        others = [one for one in selection.chosen if one is not group]
+        taken = {one.name for one in others}
+        instead = [full[name] for name in effect.confounded_with if name in full.keys() - taken]
+        single = [one for one in declared if one.name == group.name and len(one.columns) == 1]
+        trials = [
+            select(selection.table, single, selection.fit.inflation, start=start)
+            for start in (others, *([*others, one] for one in instead))
+        ]
+        criteria = [worth(trial, len(declared)) for trial in trials]
+        if max(criteria) > worth(selection, len(declared)) - AMBIGUOUS:
+            selection = trials[int(np.argmax(criteria))]
+    return selection
 
 
 def with_maps(
