@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 from dataclasses import fields, replace
+import pickle
 from types import SimpleNamespace
 
 from known_effects import effect_of, sparse_flight
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.correction.corrector import Corrector, FixedPoseCorrector
+from uwb_tdoa_bias.correction.corrector import Corrector, FixedPoseCorrector, FixedPoses
 from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, EffectSet, SmoothTerm, TagLeverArm
 from uwb_tdoa_bias.effects.samples import Track
 from uwb_tdoa_ekf.offline import run_offline
@@ -237,9 +238,59 @@ def test_a_run_corrected_at_the_poses_of_the_run_itself_is_that_run(flights):
     effects = EffectSet((AnchorDelay({"1": 0.3}), TagLeverArm({"x": 0.1, "z": 0.1})))
     run = run_offline(flights[0], None, Corrector(flights[0].anchors, effects))
     again = run_offline(
-        flights[0], None, FixedPoseCorrector(flights[0].anchors, effects, poses_of(run.odometry))
+        flights[0],
+        None,
+        FixedPoseCorrector(flights[0].anchors, effects, FixedPoses(poses_of(run.odometry))),
     )
     np.testing.assert_allclose(again.odometry.p, run.odometry.p, atol=1e-9)
+
+
+def with_functions(size, start):
+    """Return an EffectSet: functions of several forms, and effects by velocity, time and position."""
+    function = {"knots": (1.0, 2.0, 3.0), "shape": "beyond"}
+    return EffectSet(
+        (
+            AnchorDelay({"1": size}),
+            TagLeverArm({"x": 0.1}),
+            SmoothTerm(
+                {"3.c0": 0.0, "3.c1": size},
+                covariate="range",
+                form="anchor",
+                domain={"height": (0.5, 1.0)},
+                **function,
+            ),
+            SmoothTerm({"c0": 0.1, "c1": -size}, covariate="speed", **function),
+            SmoothTerm(
+                {"0-1.c0": size, "0-1.c1": 0.1},
+                covariate="height",
+                form="pair",
+                factor="x",
+                factor_shape="beyond",
+                factor_knots=(0.5, 1.0, 1.5),
+                **function,
+            ),
+            EFFECTS["nlos"]({"2.start": start, "2.end": 20.0, "2.delay": size}),
+        )
+    )
+
+
+def test_models_that_share_poses_correct_as_alone(flights):
+    """Trials share covariates, domains and basis functions, not values."""
+    flight = flights[0]
+    odometry = run_offline(flight, None, Corrector(flight.anchors)).odometry
+    shared = FixedPoses(poses_of(odometry))
+    models = [with_functions(0.2, 0.0), with_functions(-0.3, 5.0), with_functions(0.2, 0.0)]
+    models.insert(1, models[0].where(lambda effect: not effect.needs_motion))
+    for effects in models:
+        alone = FixedPoses(poses_of(odometry))
+        expected, found = (
+            run_offline(flight, None, FixedPoseCorrector(flight.anchors, effects, fixed))
+            for fixed in (alone, shared)
+        )
+        np.testing.assert_array_equal(found.bias, expected.bias)
+        np.testing.assert_array_equal(found.bias_std, expected.bias_std)
+        np.testing.assert_array_equal(found.odometry.p, expected.odometry.p)
+    assert len(pickle.dumps(shared)) < 1.1 * len(pickle.dumps(poses_of(odometry)))
 
 
 def test_before_and_after_with_intervals(flights):

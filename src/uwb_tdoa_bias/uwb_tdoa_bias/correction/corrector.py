@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 import math
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -14,7 +14,7 @@ from ..common.anchors import Anchors
 from ..common.compiled import compiled
 from ..common.errors import InputError
 from ..effects import EffectSet, Samples
-from ..effects.samples import N_STATES, POSE_LAG, motion_at, precede
+from ..effects.samples import N_STATES, POSE_LAG, Motion, motion_at, precede
 from .model import EFFECTS, FADED, NETWORK, PASSED, Model, Prediction
 
 if TYPE_CHECKING:
@@ -276,25 +276,61 @@ class Corrector:
         )
 
 
+class FixedPoses:
+    """The poses of an earlier run, and the Samples of a recording at them.
+
+    Models that are tried at these poses share the Samples, and with them what their effects have in
+    common: covariates, domains and basis functions.
+    """
+
+    def __init__(self, poses: Sequence[np.ndarray]) -> None:
+        """Set the poses.
+
+        poses : (t (k,) s, p (k, 3) m, q (k, 4), v (k, 3) m/s, yaw_std (k,) rad), as for
+            `Corrector.add_pose`
+        """
+        self.poses = poses
+        self._samples: list[Samples] = []
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the Samples: another process computes its own."""
+        return {"poses": self.poses, "_samples": []}
+
+    def shared(self, samples: Samples) -> Samples:
+        """Return the Samples of an earlier model if they are equal, else these."""
+        same = next((one for one in self._samples if _equal(one, samples)), None)
+        if same is None:
+            self._samples = [*self._samples[-1:], samples]  # with and without motion
+        return samples if same is None else same
+
+
+def _equal(one: Any, other: Any) -> bool:
+    """Return whether two Samples, or fields of them, are equal."""
+    if isinstance(one, (Samples, Motion)):
+        pairs = ((getattr(one, each.name), getattr(other, each.name)) for each in fields(one))
+        return type(one) is type(other) and all(_equal(*pair) for pair in pairs)
+    if isinstance(one, np.ndarray) and isinstance(other, np.ndarray):
+        return np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
+    return bool(one is other or one == other)
+
+
 class FixedPoseCorrector(Corrector):
     """Corrects a recording at the poses of an earlier run with another model."""
 
     uses_pose = False  # it has all poses, so it waits for none
 
-    def __init__(
-        self, anchors: Anchors, effects: EffectSet | None, poses: Sequence[np.ndarray]
-    ) -> None:
-        """Set the poses of the earlier run.
-
-        poses : (t (k,) s, p (k, 3) m, q (k, 4), v (k, 3) m/s, yaw_std (k,) rad), as for `add_pose`
-        """
-        self._known = poses
-        super().__init__(anchors, effects, poses=Poses(max(len(poses[0]), 1)))
+    def __init__(self, anchors: Anchors, effects: EffectSet | None, fixed: FixedPoses) -> None:
+        """Set the poses of the earlier run."""
+        self._fixed = fixed
+        super().__init__(anchors, effects, poses=Poses(max(len(fixed.poses[0]), 1)))
         self.reset()
 
     def reset(self) -> None:
         super().reset()
-        self.add_pose(*self._known)
+        self.add_pose(*self._fixed.poses)
+
+    def samples(self, t: np.ndarray, a: np.ndarray, b: np.ndarray) -> Samples:
+        return self._fixed.shared(super().samples(t, a, b))
 
 
 def _joined(*names: str) -> str:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import wraps
+from functools import partial, wraps
 import math
 import re
 from typing import Any, ClassVar, TypeVar
@@ -430,15 +430,8 @@ class Effect:
 
     def domain_weight(self, samples: Samples) -> np.ndarray:
         """Return the weight of the effect, (n,): 1 within its domain, less beyond."""
-        n = len(samples)
-        weight = np.ones(n)
-        for covariate, limits in self.domain.items():
-            if covariate in OF_ARRIVAL:
-                of_arrivals = fade_weight(covariate_of(samples, covariate), limits)
-                weight *= of_arrivals.reshape(-1, n).min(axis=0)
-            elif (values := covariate_of(samples, covariate)) is not None:
-                weight *= fade_weight(values, limits)
-        return weight
+        limits = tuple(self.domain.items())
+        return samples.kept(("domain", limits), partial(_domain_weight, samples, limits))
 
     def corrected_bias(self, samples: Samples) -> np.ndarray:
         """Return the bias that is corrected, (n,) m: it fades beyond the domain.
@@ -721,6 +714,21 @@ def finite(effect: Effect, flight: Flight, error: np.ndarray) -> np.ndarray:
             f"{flight.name}: has no attitude in its ground truth, which {effect.name} needs."
         )
     return error
+
+
+def _domain_weight(
+    samples: Samples, domain: tuple[tuple[str, tuple[float, float]], ...]
+) -> np.ndarray:
+    """Return the weight (n,) of an effect with the items of a domain."""
+    n = len(samples)
+    weight = np.ones(n)
+    for covariate, limits in domain:
+        if covariate in OF_ARRIVAL:
+            of_arrivals = fade_weight(covariate_of(samples, covariate), limits)
+            weight *= of_arrivals.reshape(-1, n).min(axis=0)
+        elif (values := covariate_of(samples, covariate)) is not None:
+            weight *= fade_weight(values, limits)
+    return weight
 
 
 def with_each(keys: tuple[str, ...]) -> list[tuple[str, ...]]:

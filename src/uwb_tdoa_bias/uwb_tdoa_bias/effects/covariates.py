@@ -161,12 +161,10 @@ def covariate_of(samples: Samples, name: str) -> Any:
 
     Effects on the same samples share it; it is computed once, and must not be changed.
     """
-    if name not in samples.known:
-        of_arrival = OF_ARRIVAL.get(name)
-        samples.known[name] = (
-            OF_TDOA[name](samples) if of_arrival is None else of_arrival(samples, samples.rows)
-        )
-    return samples.known[name]
+    of_arrival = OF_ARRIVAL.get(name)
+    if of_arrival is None:
+        return samples.kept(name, lambda: OF_TDOA[name](samples))
+    return samples.kept(name, lambda: of_arrival(samples, samples.rows))
 
 
 def has_domain(name: str) -> bool:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -277,7 +277,7 @@ class EffectSet:
             if effect.jacobian_states:
                 groups.setdefault(effect.jacobian_states, []).append(effect)
         for states, group in groups.items():
-            moved = _moved(samples, states)
+            moved = samples.kept(("moved", states), partial(_moved, samples, states))
             parts = (_finite_or_zero(effect.corrected_bias(moved)) for effect in group)
             here, *sides = sum(parts, np.zeros(len(moved))).reshape(-1, n)
             bias += here

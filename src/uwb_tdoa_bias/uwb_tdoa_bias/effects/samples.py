@@ -7,7 +7,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 import math
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar, cast
 
 import numpy as np
 
@@ -19,7 +19,11 @@ from ..common.lazy import rotations
 from ..common.sensors import COMPARED
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Hashable
+
     from ..common.flight import Flight
+
+Made = TypeVar("Made")
 
 STEP = 0.1  # s, interval of the central difference that gives a velocity
 SPAN = 0.2  # s, interval of the backward differences of Motion
@@ -140,9 +144,17 @@ class Samples:
         return len(self.t)
 
     @cached_property
-    def known(self) -> dict[str, Any]:
-        """Return the covariates that effects have asked for, by name: see `covariate_of`."""
+    def _kept(self) -> dict[Hashable, Any]:
         return {}
+
+    def kept(self, key: Hashable, make: Callable[[], Made]) -> Made:
+        """Return make(), which is called once for each key.
+
+        Effects on the same samples share it, so it must not be changed.
+        """
+        if key not in self._kept:
+            self._kept[key] = make()
+        return cast("Made", self._kept[key])
 
     def repeated(self, times: int) -> Samples:
         """Return the whole batch `times` times, one after the other."""

@@ -310,6 +310,10 @@ class SmoothTerm(Effect):
         return np.array(self.knots, dtype=float)
 
     @property
+    def _is_spline(self) -> bool:
+        return self.shape == "spline" and self.covariate not in CATEGORIES
+
+    @property
     def count(self) -> int:
         """Return the number of coefficients of each function."""
         if self.shape != "spline":
@@ -324,7 +328,7 @@ class SmoothTerm(Effect):
         factor: np.ndarray | None = None,
     ) -> np.ndarray:
         """Return the values (n,) of functions with weights (m, k); function rows (n,)."""
-        if self.shape != "spline" or self.covariate in CATEGORIES:
+        if not self._is_spline:
             return np.einsum("nk,nk->n", self.basis(values, factor), weights[rows])
 
         def curves(at: np.ndarray) -> np.ndarray:
@@ -352,7 +356,7 @@ class SmoothTerm(Effect):
         return tile(samples, values)
 
     def _arguments(self, samples: Samples) -> tuple[np.ndarray | None, np.ndarray | None]:
-        """Return values of the covariate, and of the factor's shape or None, as of `_values_of`.
+        """Return values of the covariate, and of the factor or None, as of `_values_of`.
 
         The first is None if samples lack a covariate.
         """
@@ -360,13 +364,14 @@ class SmoothTerm(Effect):
         if not self.factor:
             return values, None
         at = self._values_of(self.factor, samples)
-        if at is None:
-            return None, None
-        return values, self.factor_course(at)
+        return (None, None) if at is None else (values, at)
 
     def factor_course(self, values: np.ndarray) -> np.ndarray:
         """Return the shape of the factor at values (n,) of its covariate, (n,)."""
         return shape_basis(self.factor_shape, self.factor_knots, values)[:, 1]
+
+    def _course(self, values: np.ndarray | None) -> np.ndarray | None:
+        return None if values is None else self.factor_course(values)
 
     def bias(self, samples: Samples) -> np.ndarray:
         n = len(samples)
@@ -374,18 +379,29 @@ class SmoothTerm(Effect):
         if self.channel != samples.channel or values is None:
             return np.zeros(n)
         if self.form == "common":
-            return self.curve(values, "", factor)
+            return self.curve(values, "", self._course(factor))
         if self.form in OF_LINKS:
             links = dict.fromkeys(key.rpartition(".")[0] for key in self.values)
-            parts = (self._of_link(samples, k) * self.curve(values, f"{k}.", factor) for k in links)
+            course = self._course(factor)
+            parts = (self._of_link(samples, k) * self.curve(values, f"{k}.", course) for k in links)
             return sum(parts, np.zeros(n))
         rows, weights = samples.rows, self._weights(samples.anchors)
-        mine = np.flatnonzero(np.count_nonzero(weights, axis=1)[rows])
-        if len(mine) == len(rows) or not isinstance(values, np.ndarray):
-            return samples.difference(self._functions(values, weights, rows, factor))
+        if not isinstance(values, np.ndarray):
+            return samples.difference(self._functions(values, weights, rows, self._course(factor)))
+        has_function = np.count_nonzero(weights, axis=1) > 0
         late = np.where(np.isnan(values), np.nan, 0.0)  # of anchors without a function
-        of_mine = None if factor is None else factor[mine]
-        late[mine] = self._functions(values[mine], weights, rows[mine], of_mine)
+        if self._is_spline:
+            mine = np.flatnonzero(has_function[rows])
+            late[mine] = self._functions(values[mine], weights, rows[mine])
+            return samples.difference(late)
+
+        def basis_of() -> tuple[np.ndarray, np.ndarray]:
+            mine = np.flatnonzero(has_function[rows])
+            course = None if factor is None else self.factor_course(factor[mine])
+            return mine, self.basis(values[mine], course)
+
+        mine, basis = samples.kept((self.merge_key, has_function.tobytes()), basis_of)
+        late[mine] = np.einsum("nk,nk->n", basis, weights[rows[mine]])
         return samples.difference(late)
 
     def _of_link(self, samples: Samples, link: str) -> np.ndarray:
@@ -438,7 +454,7 @@ class SmoothTerm(Effect):
         values, factor = self._arguments(samples)
         if self.channel != samples.channel or values is None:
             return out
-        basis = self.basis(values, factor)
+        basis = self.basis(values, self._course(factor))
         if self.form == "common":
             return basis[:, [int(key[1:]) for key in keys]]
         if self.form in OF_LINKS:

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from uwb_tdoa_bias.common.flight import Flight
+    from uwb_tdoa_bias.correction.corrector import FixedPoses
 
     from ..parallel import MapFunction
     from .detectors import Detection
@@ -279,7 +280,7 @@ def _searched(
     baseline = comparison.Baseline(base, work.config)
 
     def judged(
-        found: Attribution, poses: Sequence[validation.Poses | None] = (None,)
+        found: Attribution, poses: Sequence[FixedPoses | None] = (None,)
     ) -> validation.ValidatedSelection:
         # The report keeps a finding that does not help the filter, but it is not added.
         model = replace(found, selection=written(found.selection, found.candidates))

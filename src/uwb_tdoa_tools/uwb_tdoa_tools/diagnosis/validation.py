@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from uwb_tdoa_bias.correction.corrector import Corrector, FixedPoseCorrector
+from uwb_tdoa_bias.correction.corrector import Corrector, FixedPoseCorrector, FixedPoses
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.results import poses_of
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from .attribution import Attribution
     from .detectors import Detection
 
-    Poses = tuple[np.ndarray, ...]  # return value of `poses_of`
 
 Made = TypeVar("Made")
 
@@ -80,7 +79,7 @@ class ValidatedSelection:
     worth: dict[Candidate | Detection, float]
     error: float
     misleading: frozenset[str] = frozenset()
-    poses: Sequence[Poses | None] = (None,)
+    poses: Sequence[FixedPoses | None] = (None,)
 
     def applied(self, attribution: Attribution) -> Attribution:
         """Return the Attribution with the selected effects only."""
@@ -155,7 +154,7 @@ def select_by_error(
     progress: Callable[[], object] = lambda: None,
     map_function: MapFunction = map,
     validated: Collection[Candidate] = (),
-    poses: Sequence[Poses | None] = (None,),
+    poses: Sequence[FixedPoses | None] = (None,),
 ) -> ValidatedSelection:
     """Return the ValidatedSelection of effects that do not make the filter worse on hold-out data.
 
@@ -382,7 +381,7 @@ class _Trials:
         baseline: Baseline,
         progress: Callable[[], object],
         map_function: MapFunction,
-        poses: Sequence[Poses | None] = (None,),
+        poses: Sequence[FixedPoses | None] = (None,),
     ) -> None:
         self._attribution, self._flights, self._baseline, self._progress = (
             attribution,
@@ -401,7 +400,7 @@ class _Trials:
         cases = self._cases(candidates, detections)
         judged = self._tried(_judged, cases)
         self._now = [of_case for _, of_case in judged]
-        self.poses = [poses_of(run.odometry) for run, _ in judged]
+        self.poses = [FixedPoses(poses_of(run.odometry)) for run, _ in judged]
         return float(np.mean([of_case.rmse_3d for of_case in self._now]))
 
     def error(self, candidates: Sequence[Candidate], detections: Sequence[Detection]) -> float:
@@ -459,7 +458,7 @@ class _Trials:
 
     def _tried(
         self,
-        function: Callable[[FilterConfig | None, tuple[ValidationCase, Poses | None]], Made],
+        function: Callable[[FilterConfig | None, tuple[ValidationCase, FixedPoses | None]], Made],
         cases: Sequence[ValidationCase],
     ) -> list[Made]:
         """Return function of each trial; several models follow each other."""
@@ -477,12 +476,12 @@ def _change(now: Score, other: Score) -> tuple[np.ndarray, np.ndarray]:
     return t, other.error[np.isin(other.t, t)] - now.error[np.isin(now.t, t)]
 
 
-def _scored(config: FilterConfig | None, trial: tuple[ValidationCase, Poses | None]) -> Score:
+def _scored(config: FilterConfig | None, trial: tuple[ValidationCase, FixedPoses | None]) -> Score:
     return _judged(config, trial)[1]
 
 
 def _judged(
-    config: FilterConfig | None, trial: tuple[ValidationCase, Poses | None]
+    config: FilterConfig | None, trial: tuple[ValidationCase, FixedPoses | None]
 ) -> tuple[Run, Score]:
     """Return the Run and the Score of a trial.
 
