@@ -4,27 +4,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection, Hashable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.common.anchors import Anchors
-from uwb_tdoa_bias.common.flight import SENSOR_NAMES
-from uwb_tdoa_bias.effects import EFFECTS, EffectSet
+from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Flight
+from uwb_tdoa_bias.effects import EFFECTS, Covariance, Effect, EffectSet
 from uwb_tdoa_bias.effects.covariates import UPWARDS
 from uwb_tdoa_bias.effects.samples import RADIO
 from uwb_tdoa_ekf.evidence import OF_ANCHORS
 
-from .channels import CHANNELS, residuals
+from ..parallel import MapFunction
+from .channels import CHANNELS, ChannelResiduals, residuals
 from .channels.base import Seen
 from .channels.views import MOST_LINKS
-from .detectors import DETECTORS
+from .detectors import DETECTORS, Detection, Detector
 from .deviations import with_deviations
 from .findings import EffectFinding, Refused
 from .over_flights import of_one, shares
+from .references import Reference
 from .refinement import (
     ROUNDS,
     cross_validated,
@@ -40,28 +42,14 @@ from .refinement import (
     with_smooth,
 )
 from .regression.confounding import alternatives
-from .regression.fit import fit, in_common, prior_sizes
+from .regression.fit import Fit, fit, in_common, prior_sizes
 from .regression.held_out import held_out
 from .regression.products import FOR_MAPS
 from .regression.scan import Scan
-from .regression.select import Selection, select, with_rivals
-from .regression.table import table_of
+from .regression.select import Rival, Search, Selection, select, with_rivals
+from .regression.table import RegressionTable, table_of
 from .regression.terms import Candidate, candidates_of, columns_of
 from .self_calibration.prior import to_keep
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Hashable, Sequence
-
-    from uwb_tdoa_bias.common.flight import Flight
-    from uwb_tdoa_bias.effects import Covariance, Effect
-
-    from ..parallel import MapFunction
-    from .channels import ChannelResiduals
-    from .detectors import Detection, Detector
-    from .references import Reference
-    from .regression.fit import Fit
-    from .regression.select import Rival, Search
-    from .regression.table import RegressionTable
 
 ON_FLOOR = 0.5  # m, smallest change of a reported function of UPWARDS near the floor
 RANGED = tuple(

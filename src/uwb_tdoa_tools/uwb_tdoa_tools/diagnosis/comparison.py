@@ -7,36 +7,31 @@ Where errors are unknown, it compares innovations.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.stamps import shifted
-from uwb_tdoa_ekf.offline import run_offline
+from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.offline import Run, run_offline
 from uwb_tdoa_ekf.results import VERDICTS
 from uwb_tdoa_ekf.sensitivity import RANGES
 
 from ..clock import numbered
 from ..outputs import as_json
+from ..parallel import MapFunction
 from ..scoring.gains import NO_DIFFERENCE, clear_change
 from ..scoring.metrics import EVERYTHING, Score, nis, pooled, radio_residuals
 from .regression.table import BLOCK
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
-
-    from uwb_tdoa_bias.common.flight import Flight
-    from uwb_tdoa_ekf.core.config import FilterConfig
-    from uwb_tdoa_ekf.offline import Run
-
-    from ..parallel import MapFunction
-
-    Spans = tuple[tuple[float, float], ...]  # (first, last) s
+Spans = tuple[tuple[float, float], ...]  # (first, last) s
 
 BOOTSTRAPS = 400  # number of bootstrap samples
 Z95 = 1.96  # standard deviations, half of a 95 % interval

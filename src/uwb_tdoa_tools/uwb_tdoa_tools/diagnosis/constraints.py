@@ -11,16 +11,14 @@ delays, then further parameters.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.anchors import Anchors
 
 WITHIN = 5  # stamps of a mark over which the estimate is averaged
 ALOFT = 0.3  # m above its lowest point, from which a path counts: on the floor TDOAs err by metres

@@ -14,8 +14,8 @@ between both fits counts as an error.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.special import softmax
@@ -24,18 +24,12 @@ from uwb_tdoa_bias.effects.samples import RADIO
 from uwb_tdoa_ekf.evidence import DELAY, OF_ANCHORS, POSITION, Part, eliminated
 
 from .regression.algebra import beside_each_other, counts, each_times, product, weighted
-from .regression.fit import in_common, prior_sizes
+from .regression.fit import Fit, in_common, prior_sizes
+from .regression.select import Selection
+from .regression.table import RegressionTable
+from .regression.terms import Column
 from .self_calibration.equations import features
-from .self_calibration.prior import FUNCTION_STDS, posterior
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from .regression.fit import Fit
-    from .regression.select import Selection
-    from .regression.table import RegressionTable
-    from .regression.terms import Column
-    from .self_calibration.prior import Solution
+from .self_calibration.prior import FUNCTION_STDS, Solution, posterior
 
 # m, length scale of functions of the place; the error of an anchor shift varies equally slowly
 LENGTH = 4.0

@@ -4,50 +4,43 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.flight import SENSOR_NAMES
+from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Flight
+from uwb_tdoa_bias.correction.corrector import FixedPoses
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.evidence import OF_ANCHORS
 from uwb_tdoa_ekf.offline import may_have_offset
 
 from ..checking.flight_rules import judge_flight
+from ..parallel import MapFunction
 from ..scoring.gains import LOSS, gain
 from ..scoring.metrics import Score, radio_residuals
 from . import comparison, repairing, validation
 from .attribution import Attribution, EffectSearch, residuals_of
 from .channels import CHANNELS, health
+from .detectors import Detection
 from .findings import EffectFinding, Refused, usable
 from .noise import DECIMALS
 from .references import GroundTruth, Reference
 from .refinement import effects_of, written
-from .regression.confounding import unobservable
+from .regression.confounding import Unobservable, unobservable
+from .regression.terms import Candidate
 from .result import Diagnosis
-from .self_calibration import Tape, self_calibrate
+from .self_calibration import SelfCalibration, Tape, self_calibrate
 from .self_calibration.equations import measured_noise
 from .self_calibration.prior import with_calibration
 from .self_calibration.solve import same_anchors
 from .single_axes import beside, functions_of_axes
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from uwb_tdoa_bias.common.flight import Flight
-    from uwb_tdoa_bias.correction.corrector import FixedPoses
-
-    from ..parallel import MapFunction
-    from .detectors import Detection
-    from .regression.confounding import Unobservable
-    from .regression.terms import Candidate
-    from .self_calibration import SelfCalibration
-
-    Flights = tuple[Flight, ...]
+Flights = tuple[Flight, ...]
 
 # smallest share of the power of slow innovations that a self-calibration must explain
 EXPLAINED = 0.1

@@ -4,18 +4,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.effects import Effect, EffectSet, SmoothTerm
 
-if TYPE_CHECKING:
-    from collections.abc import Hashable, Iterable
-
-    from .over_flights import Share
-    from .regression.confounding import Alternative
-    from .regression.terms import Candidate
-
+from .over_flights import Share
+from .regression.confounding import Alternative
+from .regression.terms import Candidate
 
 # m, added to the worth of a finding, so that a certain finding precedes an uncertain worthless one
 LEAST_WORTH = 0.005

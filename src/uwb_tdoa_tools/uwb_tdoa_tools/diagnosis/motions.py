@@ -7,23 +7,19 @@ A motion begins and ends at rest. A planned flight joins motions by the straight
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import Flight
 
 from ..choices import PLAN_SPEED, PLAN_TIME
 from ..simulation.paths import SPEED_UP, STEP
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.common.flight import Flight
-
-    from ..simulation.rooms import Room
+from ..simulation.rooms import Room
 
 RATE = 20.0  # Hz, of planned poses
 ANCHOR_CLEARANCE = 0.8  # m, smallest distance of the path to an anchor

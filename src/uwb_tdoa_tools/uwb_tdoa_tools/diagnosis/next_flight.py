@@ -12,39 +12,31 @@ second. The worth of a finding, in metres, is the weight of its gain.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtr
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.base import listed
 
 from ..simulation.vehicles import Trajectory
-from .channels import CHANNELS, Comparison, of_comparison
-from .motions import RATE, continued, is_clear
+from .attribution import Attribution
+from .channels import CHANNELS, ChannelResiduals, Comparison, of_comparison
+from .findings import EffectFinding
+from .motions import RATE, Library, TimedPath, continued, is_clear
 from .references import GroundTruth
 from .refinement import recurs
 from .regression.algebra import dense, product, weighted
 from .regression.fit import NU, prior_sizes, refit
-from .regression.select import AMBIGUOUS
+from .regression.select import AMBIGUOUS, Selection
 from .regression.table import AXES, table_of
-from .regression.terms import columns_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-
-    from uwb_tdoa_bias.common.anchors import Anchors
-
-    from .attribution import Attribution
-    from .channels import ChannelResiduals
-    from .findings import EffectFinding
-    from .motions import Library, TimedPath
-    from .regression.select import Selection
-    from .regression.terms import Candidate, Column
+from .regression.terms import Candidate, Column, columns_of
 
 SHORTEST = 8.0  # s, a shorter flight is continued: its ends do not count in a diagnosis
 ENOUGH = 0.95  # value of all questions, relative to their worth, from which no motion is added

@@ -4,18 +4,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import fields
 import json
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from uwb_tdoa_bias.common.files import write_text
+from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_ekf.core.config import FilterConfig
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-    from pathlib import Path
-
-    from uwb_tdoa_bias.common.flight import Flight
 
 DECIMALS = 3  # of tdoa_std, m, in the file
 HEAD = "/**:\n  ros__parameters:\n"

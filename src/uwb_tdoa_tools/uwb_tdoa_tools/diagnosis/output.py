@@ -5,25 +5,21 @@
 from __future__ import annotations
 
 import textwrap
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from uwb_tdoa_bias.effects import SmoothTerm
 from uwb_tdoa_bias.effects.base import listed
 
 from .. import outputs
-from .findings import prefixes_of
+from .findings import EffectFinding, prefixes_of
 from .over_flights import course
 from .report.entries import doubts, entries, worth_in_words
 from .report.tables import ANCHORS, SURE, anchors, basis, by_reason
 from .report.unclear import by_remedy, undetermined
 from .report.verdict import cause, faults_in_words, truth_in_words, verdict
-
-if TYPE_CHECKING:
-    from uwb_tdoa_bias.effects import SmoothTerm
-
-    from .findings import EffectFinding
-    from .result import Diagnosis
+from .result import Diagnosis
 
 WIDTH, LABEL = 120, 10  # characters of a line on the screen, and of its label
 

@@ -4,24 +4,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.special import stdtr
 
+from ..parallel import MapFunction
+from .channels import ChannelResiduals
 from .regression.scan import Scan
-from .regression.select import select
+from .regression.select import Search, Selection, select
 from .regression.table import table_of
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from ..parallel import MapFunction
-    from .channels import ChannelResiduals
-    from .regression.select import Search, Selection
-    from .regression.terms import Candidate
+from .regression.terms import Candidate
 
 DETERMINED = 0.25  # largest standard deviation of a share that a flight determines
 SURE = 4.0  # standard deviations of a significant difference

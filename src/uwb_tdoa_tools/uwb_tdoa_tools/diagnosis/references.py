@@ -4,19 +4,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Truth
+from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Flight, Truth
 from uwb_tdoa_bias.correction.corrector import Corrector
+from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.stamps import shifted
 from uwb_tdoa_ekf.core import auxiliary
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import without_unknown_offset
-from uwb_tdoa_ekf.sensitivity import RANGES, TDOAS, record_innovations
+from uwb_tdoa_ekf.sensitivity import RANGES, TDOAS, Innovations, record_innovations
 from uwb_tdoa_ekf.smoother import smooth
 
 from ..choices import NONE
@@ -24,16 +26,7 @@ from ..clock import grid
 from ..scoring.evaluation import align_truth
 from ..scoring.metrics import scored_phase
 from ..scoring.phases import AIRBORNE, TITLES
-from .constraints import Mark, OdometryPath
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from uwb_tdoa_bias.common.flight import Flight
-    from uwb_tdoa_bias.effects import EffectSet
-    from uwb_tdoa_ekf.sensitivity import Innovations
-
-    from .constraints import Constraint
+from .constraints import Constraint, Mark, OdometryPath
 
 MARGIN = 0.5  # s left out at both ends of the phase that is diagnosed
 SHORTEST = 5.0  # s that can be diagnosed

@@ -4,32 +4,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.effects import SmoothTerm
+from uwb_tdoa_bias.effects import Effect, SmoothTerm
 from uwb_tdoa_bias.effects.base import OF_PAIR
 
-from .channels import CHANNELS
+from .channels import CHANNELS, ChannelResiduals
 from .findings import Refused
 from .over_flights import of_one_flight
 from .regression.fit import fit
 from .regression.held_out import held_out
-from .regression.select import AMBIGUOUS, LARGE, criterion_of, select, worth
-from .regression.table import table_of
+from .regression.scan import Scan
+from .regression.select import AMBIGUOUS, LARGE, Search, Selection, criterion_of, select, worth
+from .regression.table import RegressionTable, table_of
 from .regression.terms import Candidate, Term, columns_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Hashable, Sequence
-
-    from uwb_tdoa_bias.effects import Effect
-
-    from .channels import ChannelResiduals
-    from .regression.scan import Scan
-    from .regression.select import Search, Selection
-    from .regression.table import RegressionTable
 
 ROUNDS = 2  # number of linearizations
 LINEARITY_LIMIT = 0.1  # largest RMS error of linearization, relative to the channel's scale

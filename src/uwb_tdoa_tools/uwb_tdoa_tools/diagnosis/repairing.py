@@ -4,28 +4,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.effects import EffectSet, LabelEffect
+from uwb_tdoa_bias.common.flight import Flight
+from uwb_tdoa_bias.effects import Effect, EffectSet, LabelEffect
+from uwb_tdoa_ekf.core.config import FilterConfig
 
 from ..checking.pair_rules import KnownPath, repairs
+from .attribution import Attribution
 from .comparison import Baseline, ValidationCase, score
 from .detectors import Detection
-from .validation import TRIAL_FLIGHTS, WORSE
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
-
-    from uwb_tdoa_bias.common.flight import Flight
-    from uwb_tdoa_bias.effects import Effect
-    from uwb_tdoa_ekf.core.config import FilterConfig
-
-    from .attribution import Attribution
-    from .regression.terms import Candidate
-    from .validation import ValidatedSelection
+from .regression.terms import Candidate
+from .validation import TRIAL_FLIGHTS, WORSE, ValidatedSelection
 
 
 def repaired(

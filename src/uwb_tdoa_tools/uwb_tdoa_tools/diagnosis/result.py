@@ -5,22 +5,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from uwb_tdoa_bias.common.flight import Flight
+from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_ekf.monitoring.finding import Finding as NumbersFinding
+
+from .attribution import Attribution
+from .channels import ChannelResiduals
+from .channels.base import Figures
+from .comparison import ValidationCase
 from .findings import EffectFinding, Refused
-
-if TYPE_CHECKING:
-    from uwb_tdoa_bias.common.flight import Flight
-    from uwb_tdoa_bias.effects import EffectSet
-    from uwb_tdoa_ekf.monitoring.finding import Finding as NumbersFinding
-
-    from .attribution import Attribution
-    from .channels import ChannelResiduals
-    from .channels.base import Figures
-    from .comparison import ValidationCase
-    from .next_flight import NextFlight
-    from .references import Reference
-    from .regression.confounding import Unobservable
+from .next_flight import NextFlight
+from .references import Reference
+from .regression.confounding import Unobservable
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,29 +9,22 @@ the common one, in what that one leaves.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.effects import RADIO
 
+from .channels import ChannelResiduals
+from .channels.views import CovariateView
+from .findings import Refused
 from .refinement import cross_validated
-from .regression.fit import fit, measure_inflation
+from .regression.fit import Fit, fit, measure_inflation
 from .regression.scan import Scan, line_over
 from .regression.select import Selection, criterion_of, select, with_rivals
-from .regression.table import table_of
-from .regression.terms import columns_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from .channels import ChannelResiduals
-    from .channels.views import CovariateView
-    from .findings import Refused
-    from .regression.fit import Fit
-    from .regression.table import RegressionTable
-    from .regression.terms import Candidate
+from .regression.table import RegressionTable, table_of
+from .regression.terms import Candidate, columns_of
 
 MOST = 4  # largest number of functions of an axis
 

@@ -4,21 +4,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
 from itertools import chain, cycle
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
+from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.correction.corrector import Corrector, FixedPoseCorrector, FixedPoses
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_ekf.offline import run_offline
+from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.offline import Run, run_offline
 from uwb_tdoa_ekf.results import poses_of
 
+from ..parallel import MapFunction
 from ..scoring.gains import LOSS, gain
 from ..scoring.metrics import EVERYTHING, Score, rms
+from .attribution import Attribution
 from .comparison import Baseline, ValidationCase, score
+from .detectors import Detection
 from .deviations import with_deviations
 from .findings import Refused, usable
 from .over_flights import harm, in_words, shares
@@ -27,18 +33,6 @@ from .regression.fit import refit
 from .regression.select import Selection
 from .regression.table import BLOCK
 from .regression.terms import Candidate, columns_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Sequence
-
-    from uwb_tdoa_bias.common.flight import Flight
-    from uwb_tdoa_ekf.core.config import FilterConfig
-    from uwb_tdoa_ekf.offline import Run
-
-    from ..parallel import MapFunction
-    from .attribution import Attribution
-    from .detectors import Detection
-
 
 Made = TypeVar("Made")
 

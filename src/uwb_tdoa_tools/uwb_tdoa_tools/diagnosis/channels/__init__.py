@@ -4,26 +4,21 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 
+from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.common.sensors import BY_POSE, DIAGNOSED
+from uwb_tdoa_bias.effects import EffectSet
 
-from .base import Channel, ChannelResidual, ChannelResiduals, Comparison, Rows
+from ...scoring.metrics import Score
+from ..references import Reference
+from .base import Channel, ChannelResidual, ChannelResiduals, Comparison, Figures, Rows
 from .inertial import Accel, Gyro
 from .radio import RadioResidual, Ranging, Tdoa, TdoaResidual
 from .sensor import Sensor
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from uwb_tdoa_bias.common.flight import Flight
-    from uwb_tdoa_bias.effects import EffectSet
-
-    from ...scoring.metrics import Score
-    from ..references import Reference
-    from .base import Figures
 
 _ALL: tuple[Channel[Any], ...] = (
     Tdoa(),

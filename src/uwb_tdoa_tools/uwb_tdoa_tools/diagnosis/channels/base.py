@@ -4,26 +4,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 
-from uwb_tdoa_bias.common.flight import Flight
-from uwb_tdoa_bias.effects import EffectSet, Track
+from uwb_tdoa_bias.common.flight import Flight, Truth
+from uwb_tdoa_bias.effects import (
+    Effect,
+    EffectSet,
+    ImuSamples,
+    Samples,
+    SensorSamples,
+    SmoothTerm,
+    Track,
+)
 from uwb_tdoa_bias.effects.covariates import OF_IMU, ImuFeatures
 
 from ..references import Reference, ReferenceView
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from uwb_tdoa_bias.common.flight import Truth
-    from uwb_tdoa_bias.effects import Effect, ImuSamples, Samples, SensorSamples, SmoothTerm
-
-    from ..regression.algebra import Matrix
-    from .views import CovariateView
+from ..regression.algebra import Matrix
+from .views import CovariateView
 
 FEWEST_ATTITUDES = 10  # fewest poses with an attitude, for a reference with known attitude
 # of the health of channels: {"pairs", "anchors", "axes", ...: rows}

@@ -4,15 +4,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from .base import Figures
+from .base import Figures
 
 APART = 1e4  # s, gap between the stamps of two flights, so that they do not correlate
 LAG_TIMES = (0.1, 0.5, 1.0, 2.0)  # s, lags of the autocorrelation

@@ -4,25 +4,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from uwb_tdoa_bias.common.flight import Imu, Truth
 from uwb_tdoa_bias.effects import ImuSamples
 from uwb_tdoa_bias.effects.covariates import OF_IMU
 from uwb_tdoa_ekf.core.state import GRAVITY
 
+from .base import Comparison
 from .sensor import CELL, AxesChannel, AxesResidual
-from .views import extra_at, extra_names, views_of_axes
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from uwb_tdoa_bias.common.flight import Imu, Truth
-
-    from .base import Comparison
-    from .views import CovariateView
+from .views import CovariateView, extra_at, extra_names, views_of_axes
 
 # s, half the step of time derivatives of measured rates: true rates are noisy, and noise in
 # a regressor shrinks the estimate

@@ -9,15 +9,16 @@ correlation that remains between cells.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, ClassVar, TypeVar
+from typing import ClassVar, TypeVar
 
 import numpy as np
 from scipy.sparse import csc_array, csr_array
 
 from uwb_tdoa_bias.common.sensors import COMPARED
-from uwb_tdoa_bias.effects import RADIO, Samples, SmoothTerm, samples_at
+from uwb_tdoa_bias.effects import RADIO, Effect, Samples, SmoothTerm, samples_at
 from uwb_tdoa_bias.effects.covariates import CATEGORIES, EXTRA, OF_ARRIVAL, OF_MOTION, OF_TDOA
 from uwb_tdoa_bias.effects.smooth_term import OF_LINKS
 from uwb_tdoa_ekf.sensitivity import Innovations
@@ -25,17 +26,9 @@ from uwb_tdoa_ekf.sensitivity import Innovations
 from ...checking.pair_rules import MANY
 from ...scoring.phases import in_the_air
 from ..regression.algebra import Matrix
-from .base import Channel, ChannelResidual, Rows
+from .base import Channel, ChannelResidual, Comparison, Figures, Rows
 from .figures import APART, figures, health_of_pairs, rows_by_value
-from .views import OF_EACH, extra_at, extra_names, knots_of, views_of_arrivals
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from uwb_tdoa_bias.effects import Effect
-
-    from .base import Comparison, Figures
-    from .views import CovariateView
+from .views import OF_EACH, CovariateView, extra_at, extra_names, knots_of, views_of_arrivals
 
 CELL = 0.5  # s, length of a cell
 LOWEST, LEVEL = 0.02, 0.5  # m, and span of the logarithm of the height of a cell near the floor

@@ -4,25 +4,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.common.sensors import COMPARED, STREAM_OF, measured_on
-from uwb_tdoa_bias.effects import ImuSamples, SensorSamples, SmoothTerm, sensor_samples
+from uwb_tdoa_bias.effects import Effect, ImuSamples, SensorSamples, SmoothTerm, sensor_samples
 from uwb_tdoa_bias.effects.covariates import OF_SENSORS, sensor_covariate
 
-from .base import Channel, ChannelResidual, Rows
+from .base import Channel, ChannelResidual, Comparison, Figures, Rows
 from .figures import APART, figures
 from .views import knots_of
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from uwb_tdoa_bias.effects import Effect
-
-    from .base import Comparison, Figures
 
 CELL = 0.25  # s, length of a cell; both sides of a residual are averaged over it
 FEWEST_CELLS = 8  # fewest cells of a residual

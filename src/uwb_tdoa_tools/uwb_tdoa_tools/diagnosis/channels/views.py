@@ -4,19 +4,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.common.flight import Flight
+from uwb_tdoa_bias.effects import ImuSamples, Samples, SensorSamples
 from uwb_tdoa_bias.effects.covariates import CATEGORIES, EXTRA
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from uwb_tdoa_bias.common.flight import Flight
-    from uwb_tdoa_bias.effects import ImuSamples, Samples, SensorSamples
-
 
 MOST_LINKS = 400  # pairs, both directions, whose functions are searched: as of 20 anchors
 OF_EACH = "time", "range"  # covariates of single anchors if there are many anchors

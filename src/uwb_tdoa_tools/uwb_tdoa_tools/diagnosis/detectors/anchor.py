@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.sparse import csc_array, csr_array
@@ -12,15 +12,11 @@ from scipy.spatial import cKDTree
 
 from uwb_tdoa_bias.effects import EFFECTS
 
+from ..regression.fit import Fit
+from ..regression.table import RegressionTable
 from ..regression.terms import Candidate, Term
 from .auxiliary import LEAST_GAIN, LONGEST, best_interval
 from .base import Detector
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from ..regression.fit import Fit
-    from ..regression.table import RegressionTable
 
 RADII = (0.6, 1.0, 1.5)  # m, radii of spheres that are tried
 CENTRES = 60  # approximate number of centres of spheres

@@ -4,20 +4,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from collections.abc import Sequence
+from typing import ClassVar
 
 import numpy as np
 
 from uwb_tdoa_bias.effects.auxiliary import FloorStep, IntervalEffect, VelocitySlip
 
+from ..regression.fit import Fit
+from ..regression.table import RegressionTable
 from ..regression.terms import Candidate, Term
 from .base import Detector
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from ..regression.fit import Fit
-    from ..regression.table import RegressionTable
 
 BIN = 1.0  # s, resolution of the limits of an interval
 SHORTEST = 2  # bins, shortest interval

@@ -4,18 +4,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from uwb_tdoa_bias.effects import Effect
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from ..channels import ChannelResiduals
-    from ..regression.fit import Fit
-    from ..regression.table import RegressionTable
-    from ..regression.terms import Candidate
+from ..channels import ChannelResiduals
+from ..regression.fit import Fit
+from ..regression.table import RegressionTable
+from ..regression.terms import Candidate
 
 
 @dataclass(frozen=True, eq=False)

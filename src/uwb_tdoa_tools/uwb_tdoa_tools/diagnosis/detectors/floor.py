@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from scipy.optimize import nnls
@@ -12,15 +12,11 @@ from scipy.optimize import nnls
 from uwb_tdoa_bias.effects import EFFECTS
 
 from ...checking.pair_rules import MANY
+from ..channels.radio import TdoaResidual
+from ..regression.fit import Fit
+from ..regression.table import RegressionTable
 from ..regression.terms import Candidate, Term
 from .base import Detector
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from ..channels.radio import TdoaResidual
-    from ..regression.fit import Fit
-    from ..regression.table import RegressionTable
 
 NEAR = 0.4  # m above z = 0; no flight showed the effect above
 HEIGHTS = np.geomspace(0.05, 0.3, 12)  # m, limits that are tried

@@ -4,24 +4,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.effects import EFFECTS
 
 from ...clock import numbered
-from ..channels import tdoa_parts
+from ..channels import ChannelResiduals, tdoa_parts
 from ..channels.figures import rows_by_value
+from ..channels.radio import TdoaResidual
 from ..regression.table import BLOCK
 from .base import Detection, Detector
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from ..channels import ChannelResiduals
-    from ..channels.radio import TdoaResidual
 
 # noise_correlation
 SURE_CORRELATION = 4.0  # standard errors of the autocovariance at the shortest lag

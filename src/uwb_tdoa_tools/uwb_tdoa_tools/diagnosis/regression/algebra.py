@@ -4,13 +4,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from scipy.sparse import csc_array, csr_array, hstack, issparse
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 Matrix = Any  # np.ndarray, or a sparse array of scipy
 

@@ -4,8 +4,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,13 +13,8 @@ from uwb_tdoa_bias.effects import EFFECTS
 
 from .algebra import dense, product, weighted
 from .fit import prior_sizes
-from .terms import columns_of
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from .select import Selection
-    from .terms import Candidate, Column
+from .select import Selection
+from .terms import Candidate, Column, columns_of
 
 ALIKE = 0.9  # smallest explained share of a finding's contribution, for an alternative
 DISTINCT = 0.4  # smallest named weight of a combination, relative to the largest

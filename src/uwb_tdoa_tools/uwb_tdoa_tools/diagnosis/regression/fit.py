@@ -10,20 +10,15 @@ of time.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from .algebra import counts, dense, product, sums_by, weighted
-from .table import AXES
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from .table import RegressionTable
-    from .terms import Column
+from .table import AXES, RegressionTable
+from .terms import Column
 
 CANCELS = 1e-9  # smallest sum of regressors of an effect that does not cancel, in the unit of a row
 NU = 4.0  # degrees of freedom of Student's t

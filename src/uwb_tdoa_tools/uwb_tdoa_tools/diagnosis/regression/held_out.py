@@ -4,22 +4,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .algebra import counts, product, weighted
-from .fit import NU, prior_sizes, solve
-from .terms import columns_of
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from .fit import Fit
-    from .select import Selection
-    from .table import RegressionTable
-    from .terms import Column
+from .fit import NU, Fit, prior_sizes, solve
+from .select import Selection
+from .table import RegressionTable
+from .terms import Column, columns_of
 
 FOLDS = 4  # folds of the cross-validation over blocks of time
 CLIP = 5.0  # spreads, limit of a residual

@@ -11,10 +11,10 @@ are too many functions for this. So a gain is a lower bound. Separate fits score
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,13 +22,9 @@ from uwb_tdoa_bias.effects import RADIO, SmoothTerm
 from uwb_tdoa_bias.effects.covariates import CATEGORIES, has_domain
 from uwb_tdoa_bias.effects.smooth_term import OF_PLACE, shape_basis
 
+from ..channels.views import CovariateView
+from .table import RegressionTable
 from .terms import Candidate, Term
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
-
-    from ..channels.views import CovariateView
-    from .table import RegressionTable
 
 # Flights, fewest for a map. With fewer, the map depends on their paths and does not generalize; two
 # similar paths validate each other.

@@ -12,8 +12,8 @@ were tried.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -22,22 +22,15 @@ from uwb_tdoa_bias.effects import SmoothTerm
 from uwb_tdoa_bias.effects.covariates import CATEGORIES
 from uwb_tdoa_bias.effects.smooth_term import SHAPES
 
+from ..channels.views import CovariateView
 from .algebra import dense
-from .fit import prior_sizes, refit
-from .products import Products
+from .fit import Fit, prior_sizes, refit
+from .products import Products, Proposal
+from .table import RegressionTable
 from .terms import Candidate, Term, columns_of
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-
-    from ..channels.views import CovariateView
-    from .fit import Fit
-    from .products import Proposal
-    from .table import RegressionTable
-
-    _Held = tuple[np.ndarray, np.ndarray, np.ndarray]  # return value of `_held`
-    # gain, shapes, shape, knots, number tried
-    _Item = tuple[float, "_Shapes", str, tuple[float, ...], int]
+_Held = tuple[np.ndarray, np.ndarray, np.ndarray]  # return value of `_held`
+_Item = tuple[float, "_Shapes", str, tuple[float, ...], int]
 
 BINS = 16  # number of bins; steps, intervals and rises begin and end at their edges
 # numbers of waves over the range of the covariate

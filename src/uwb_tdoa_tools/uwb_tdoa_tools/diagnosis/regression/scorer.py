@@ -9,21 +9,15 @@ complement).
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .algebra import Matrix, product, weighted
-from .fit import prior_sizes, solve
-from .table import AXES
-
-if TYPE_CHECKING:
-    from collections.abc import Hashable, Sequence
-
-    from .fit import Fit
-    from .table import RegressionTable
-    from .terms import Candidate, Column
+from .fit import Fit, prior_sizes, solve
+from .table import AXES, RegressionTable
+from .terms import Candidate, Column
 
 # Largest set of columns that may be skipped. It is skipped if the gains of its single columns, twice a
 # log-likelihood, sum up to NOTHING or less.

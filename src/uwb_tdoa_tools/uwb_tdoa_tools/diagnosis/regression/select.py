@@ -10,24 +10,20 @@ the false-alarm rate of the whole catalogue.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
+from uwb_tdoa_bias.effects import Effect
+
 from ..channels import CHANNELS
 from .fit import Fit, fit, refit
+from .scan import Scan
 from .scorer import Scorer
 from .table import RegressionTable
-from .terms import columns_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Sequence
-
-    from uwb_tdoa_bias.effects import Effect
-
-    from .scan import Scan
-    from .terms import Candidate
+from .terms import Candidate, columns_of
 
 MAX_STEPS = 14  # largest number of forward steps
 FITTED = 9  # proposals of a scan that separate fits score

@@ -4,27 +4,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.sparse import csc_array
 
+from uwb_tdoa_bias.effects import Effect
 from uwb_tdoa_bias.effects.samples import RADIO
 
 from ...checking.pair_rules import MANY
-from ..channels import CHANNELS, RadioResidual, TdoaResidual
+from ..channels import CHANNELS, ChannelResidual, ChannelResiduals, RadioResidual, TdoaResidual
+from ..channels.views import CovariateView
 from .algebra import stacked
-
-if TYPE_CHECKING:
-    from collections.abc import Hashable, Iterable, Iterator, Sequence
-
-    from uwb_tdoa_bias.effects import Effect
-
-    from ..channels import ChannelResidual, ChannelResiduals
-    from ..channels.views import CovariateView
-    from .terms import Column, Term
+from .terms import Column, Term
 
 BLOCK = 5.0  # s, length of a block; blocks count as independent
 AXES = 3  # largest number of axes of a channel

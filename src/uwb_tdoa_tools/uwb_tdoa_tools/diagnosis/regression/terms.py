@@ -4,18 +4,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
+import numpy as np
+
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.effects import Effect, SmoothTerm
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Hashable, Iterable
-
-    import numpy as np
-
-    from uwb_tdoa_bias.common.anchors import Anchors
 
 
 class Column(NamedTuple):

@@ -4,27 +4,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from uwb_tdoa_bias.effects import SmoothTerm
 from uwb_tdoa_bias.effects.base import listed
 from uwb_tdoa_bias.effects.covariates import shown_in
 from uwb_tdoa_bias.effects.smooth_term import described
 
-from ..channels import CHANNELS
+from ..channels import CHANNELS, ChannelResiduals
 from ..findings import prefixes_of
+from ..result import Diagnosis
 from .entries import CM
-from .maps import changed, flown
+from .maps import Flown, changed, flown
 from .pictures import AFTER, BEFORE, COLOURS, Picture, drawing, embedded
 from .tables import labels
-
-if TYPE_CHECKING:
-    from uwb_tdoa_bias.effects import SmoothTerm
-
-    from ..channels import ChannelResiduals
-    from ..result import Diagnosis
-    from .maps import Flown
 
 BINS = 300  # bins of a curve over time; the largest value of each is drawn
 MOST = 12  # largest number of drawn flights

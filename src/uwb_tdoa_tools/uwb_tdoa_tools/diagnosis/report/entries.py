@@ -4,22 +4,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.effects import LabelEffect
 from uwb_tdoa_bias.effects.base import listed, measured
 
+from ..findings import EffectFinding, Refused
 from ..over_flights import ALL, course, in_words
-
-if TYPE_CHECKING:
-    from collections.abc import Hashable, Iterable, Sequence
-
-    from ..findings import EffectFinding, Refused
-    from ..regression.confounding import Alternative
-    from ..result import Diagnosis
+from ..regression.confounding import Alternative
+from ..result import Diagnosis
 
 CM = 100.0  # cm per metre
 LEAST_WORTH = 0.0005  # m, smallest difference

@@ -4,30 +4,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Ellipse
 import numpy as np
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.effects.base import Region, Shift, listed
 
+from ...scoring.metrics import Score
 from ...scoring.plots import draw_labels
+from ..channels import ChannelResiduals
+from ..result import Diagnosis
 from .pictures import COLOURS, FOUND, REGION, WIDTH, Picture, drawing, embedded, plt
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-    from uwb_tdoa_bias.common.anchors import Anchors
-
-    from ...scoring.metrics import Score
-    from ..channels import ChannelResiduals
-    from ..result import Diagnosis
 
 VIEWS = {"From above": [0, 1], "From the side": [0, 2]}  # drawn axes: x and y, x and z
 POINTS = 1500  # points of all paths together

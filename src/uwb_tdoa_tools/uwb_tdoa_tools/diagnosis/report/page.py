@@ -5,16 +5,13 @@
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from uwb_tdoa_bias.effects import EFFECTS
 
+from ..result import Diagnosis
 from . import curves, entries, maps, tables, verdict
-
-if TYPE_CHECKING:
-    from ..result import Diagnosis
 
 TERMS = {
     "UWB": "ultra-wideband: the radio that anchors and tag speak.",

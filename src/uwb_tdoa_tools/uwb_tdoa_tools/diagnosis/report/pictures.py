@@ -6,12 +6,10 @@ from __future__ import annotations
 
 import base64
 import io
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
+from matplotlib.figure import Figure
 import matplotlib.pyplot as plt
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 # Distinct for colour-blind readers (Okabe and Ito); purple and yellow are darker than in the
 # original.

@@ -4,25 +4,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 import re
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from uwb_tdoa_bias.effects import Effect
 from uwb_tdoa_bias.effects.base import listed
 from uwb_tdoa_ekf.evidence import OF_ANCHORS
 
 from ...scoring.phases import TITLES
-from .entries import CM
+from ..result import Diagnosis
+from .entries import CM, Entry
 from .unclear import by_remedy, undetermined
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from uwb_tdoa_bias.effects import Effect
-
-    from ..result import Diagnosis
-    from .entries import Entry
 
 ANCHORS = "Values that make these data fit; measure again before you move an anchor"
 SURE = 2.0  # standard deviations of a value of an anchor that is not marked with "?"

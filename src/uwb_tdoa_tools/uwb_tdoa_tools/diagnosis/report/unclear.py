@@ -4,8 +4,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,12 +13,8 @@ from uwb_tdoa_bias.effects import EFFECTS
 from uwb_tdoa_bias.effects.base import listed
 
 from ..channels import CHANNELS
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from ..regression.confounding import Unobservable
-    from ..result import Diagnosis
+from ..regression.confounding import Unobservable
+from ..result import Diagnosis
 
 # largest contribution of a combination that cancels, relative to its parts
 NOTHING = 1e-9

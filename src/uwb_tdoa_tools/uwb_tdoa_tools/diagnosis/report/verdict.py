@@ -4,31 +4,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from uwb_tdoa_bias.effects import SmoothTerm
 from uwb_tdoa_bias.effects.base import listed, measured
 from uwb_tdoa_bias.effects.smooth_term import causes, described
+from uwb_tdoa_ekf.monitoring.finding import Finding as NumbersFinding
 
 from ...scoring.gains import LOSS, NO_DIFFERENCE, clear_change
 from ...scoring.phases import TITLES
+from ..channels import ChannelResidual
 from ..channels.figures import rows_by_value
 from ..findings import prefixes_of
 from ..regression.table import BLOCK
+from ..result import Diagnosis
 from ..self_calibration.solve import CLEARLY, CLEARLY_OF_RANGES, LEFT
-from .entries import CM, LEAST_WORTH, WORTH_DOING, entries, for_people
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from uwb_tdoa_bias.effects import SmoothTerm
-    from uwb_tdoa_ekf.monitoring.finding import Finding as NumbersFinding
-
-    from ..channels import ChannelResidual
-    from ..result import Diagnosis
-    from .entries import Entry
+from .entries import CM, LEAST_WORTH, WORTH_DOING, Entry, entries, for_people
 
 MOST_NAMES = 6  # largest number of named flights
 NAMED = 3  # largest number of named reasons, and of named places

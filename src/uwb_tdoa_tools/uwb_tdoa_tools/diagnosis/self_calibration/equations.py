@@ -12,42 +12,35 @@ functions explain an error as well as shifts do, the shifts stay at the prior.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.sparse import csr_array, hstack
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
+from uwb_tdoa_bias.effects import AnchorDelay, Effect, EffectSet, Samples
 from uwb_tdoa_bias.effects.anchor import AnchorPosition
 from uwb_tdoa_bias.effects.samples import RADIO
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.evidence import FUNCTION_LENGTH, MOVED
 from uwb_tdoa_ekf.offline import without_unknown_offset
+from uwb_tdoa_ekf.results import Odometry
 from uwb_tdoa_ekf.sensitivity import TDOAS
 
 from ...checking.pair_rules import MANY
+from ...parallel import MapFunction
 from ...scoring.phases import AIRBORNE
 from ..channels import Comparison, RadioResidual
 from ..channels.radio import RangeResidual, TdoaResidual, compared, of_rows
-from ..constraints import Distance, Mark
+from ..constraints import Constraint, Distance, Mark
 from ..references import Nothing
 from ..regression.fit import NU, student_scale
 from .prior import Prior
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from uwb_tdoa_bias.common.flight import Flight
-    from uwb_tdoa_bias.effects import Effect, Samples
-    from uwb_tdoa_ekf.results import Odometry
-
-    from ...parallel import MapFunction
-    from ..constraints import Constraint
 
 BLOCK = 3.0  # s, length of the blocks whose score sums measure the inflation
 # Divisor of the information in addition to the inflation: errors that last a flight are not noise.

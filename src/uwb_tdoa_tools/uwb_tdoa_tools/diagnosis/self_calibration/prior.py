@@ -8,18 +8,21 @@ The evidence selects changes since the last calibration, and the size of unknown
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.effects import Covariance, EffectSet
+from uwb_tdoa_bias.effects import Covariance, Effect, EffectSet
 from uwb_tdoa_ekf.evidence import (
     MOVED,
     ODDS,
     OF_ANCHORS,
     POSITION,
+    Change,
+    ChangeKey,
     Part,
     changes_of,
     eliminated,
@@ -31,13 +34,6 @@ from uwb_tdoa_ekf.evidence import (
 
 from ...checking.pair_rules import MANY
 from ...choices import TAPE_STD, TRUSTED_STD
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.effects import Effect
-    from uwb_tdoa_ekf.evidence import Change, ChangeKey
 
 DELAY_STD = 0.1  # m, prior standard deviation of a delay that the last calibration lacks
 # m, prior standard deviation of the antenna delay of the tag, which lengthens all ranges and

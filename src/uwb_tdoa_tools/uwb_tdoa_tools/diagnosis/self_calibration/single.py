@@ -10,32 +10,27 @@ the others give, and the filter runs again. All innovations count, also rejected
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 import itertools
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.optimize import least_squares
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import Flight
+from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.results import Odometry
 from uwb_tdoa_ekf.smoother import smooth
 
 from ...estimate import FlightEstimator
+from ...parallel import MapFunction
 from ...scoring.metrics import has_innovation
 from ...scoring.phases import AIRBORNE
 from ..regression.fit import NU
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.common.flight import Flight
-    from uwb_tdoa_bias.effects import EffectSet
-    from uwb_tdoa_ekf.core.config import FilterConfig
-    from uwb_tdoa_ekf.results import Odometry
-
-    from ...parallel import MapFunction
 
 # number of anchors that are calibrated as unknown: those with the best likelihood after placing
 TRIED = 2

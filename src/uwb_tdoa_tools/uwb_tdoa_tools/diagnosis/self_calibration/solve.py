@@ -4,34 +4,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.effects import AnchorDelay, Covariance, EffectSet
 from uwb_tdoa_bias.effects.anchor import AnchorPosition
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.evidence import DELAY, ODDS, POSITION, eliminated, keys_of
 
 from ...checking.pair_rules import MANY
+from ...parallel import MapFunction
+from ..constraints import Constraint
 from ..over_flights import Share
-from .equations import SYSTEMATIC, Runs
-from .prior import ANYWHERE, TAG_DELAY, Prior, Tape, solve, to_keep, with_calibration
+from .equations import SYSTEMATIC, Equations, Runs
+from .prior import ANYWHERE, TAG_DELAY, Prior, Solution, Tape, solve, to_keep, with_calibration
 from .single import PLACED_STD, Misfit, place
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.common.flight import Flight
-
-    from ...parallel import MapFunction
-    from ..constraints import Constraint
-    from .equations import Equations
-    from .prior import Solution
 
 LEAST = 30.0  # s in the air, fewest; fewer do not show how correlated errors are
 SAME_PLACE = 0.05  # m, largest difference of an anchor between flights of one installation
