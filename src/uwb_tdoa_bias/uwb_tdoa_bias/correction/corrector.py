@@ -306,10 +306,13 @@ class FixedPoses:
 
 def _equal(one: Any, other: Any) -> bool:
     """Return whether two Samples, or fields of them, are equal."""
+    if type(one) is not type(other):
+        return False
     if isinstance(one, (Samples, Motion)):
-        pairs = ((getattr(one, each.name), getattr(other, each.name)) for each in fields(one))
-        return type(one) is type(other) and all(_equal(*pair) for pair in pairs)
-    if isinstance(one, np.ndarray) and isinstance(other, np.ndarray):
+        return all(
+            _equal(getattr(one, each.name), getattr(other, each.name)) for each in fields(one)
+        )
+    if isinstance(one, np.ndarray):
         return np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
     return bool(one is other or one == other)
 

@@ -273,6 +273,10 @@ class SearchedDelay(ArrivalEffect):
         conditions = (item for item in self.values.items() if not item[0].endswith(".delay"))
         return (self.name, *sorted(conditions))
 
+    @property
+    def delay_keys(self) -> tuple[str, ...]:
+        return tuple(key for key in self.values if key.endswith(".delay"))
+
     def significant_delays(self) -> dict[str, float]:
         """Return {anchor: delay} of the significant delays, m."""
         return {
@@ -323,11 +327,6 @@ class Nlos(SearchedDelay):
     def within_bounds(cls, values: dict[str, float]) -> bool:
         delays = (value for key, value in values.items() if key.endswith(".delay"))
         return super().within_bounds(values) and all(delay >= 0.0 for delay in delays)
-
-    def delays(self, samples: Samples, rows: np.ndarray) -> np.ndarray:
-        keys = [key for key in self.values if key.endswith(".delay")]
-        values = np.array([self.values[key] for key in keys])
-        return self.delay_regressors(samples, rows, keys) @ values
 
     def delay_regressors(
         self, samples: Samples, rows: np.ndarray, keys: Sequence[str]

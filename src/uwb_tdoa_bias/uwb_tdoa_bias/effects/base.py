@@ -559,22 +559,24 @@ class ArrivalEffect(Effect):
 
     channels = tuple(RADIO)
 
-    def delays(self, samples: Samples, rows: np.ndarray) -> np.ndarray:
-        """Return the delays of the anchors in `rows`, (k * n,) m; by default linear in all values.
-
-        rows : (k * n,) rows of anchors, with the samples repeated k times
-        """
-        keys = list(self.values)
-        return self.delay_regressors(samples, rows, keys) @ np.array([self.values[k] for k in keys])
+    @property
+    def delay_keys(self) -> tuple[str, ...]:
+        """Return the parameters in which the delays are linear; by default all."""
+        return tuple(self.values)
 
     def delay_regressors(
         self, samples: Samples, rows: np.ndarray, keys: Sequence[str]
     ) -> np.ndarray:
-        """Return the derivatives of `delays` by the parameters `keys`, (k * n, len(keys))."""
+        """Return the derivatives of delays, m, by the parameters `keys`, (k * n, len(keys)).
+
+        rows : (k * n,) rows of the delayed anchors, with the samples repeated k times
+        """
         raise NotImplementedError
 
     def bias(self, samples: Samples) -> np.ndarray:
-        return samples.difference(self.delays(samples, samples.rows))
+        keys = self.delay_keys
+        by_values = samples.kept((self.merge_key, keys), partial(self.regressors, samples, keys))
+        return by_values @ np.array([self.values[key] for key in keys])
 
     def regressors(self, samples: Samples, keys: Sequence[str]) -> np.ndarray:
         return samples.difference(self.delay_regressors(samples, samples.rows, keys))

@@ -94,7 +94,11 @@ class FloorMultipath(SearchedDelay):
         similarity = np.exp(-0.5 * distance2 / REACH**2)
         return np.clip(0.5 - 0.5 * log_ratio, 0.0, 1.0), tile(samples, similarity)
 
+    def bias(self, samples: Samples) -> np.ndarray:
+        return samples.difference(self.delays(samples, samples.rows))
+
     def delays(self, samples: Samples, rows: np.ndarray) -> np.ndarray:
+        """Return the mean delays of anchors in rows (k * n,), m; the samples are repeated k times."""
         share, similarity = self._late(samples, rows)
         return self.of_each(samples.anchors)[0][rows] * share * similarity
 

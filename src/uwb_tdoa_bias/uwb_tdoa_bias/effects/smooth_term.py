@@ -8,7 +8,7 @@ First the term, then its shapes, then its words.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 import math
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -389,20 +389,36 @@ class SmoothTerm(Effect):
         if not isinstance(values, np.ndarray):
             return samples.difference(self._functions(values, weights, rows, self._course(factor)))
         has_function = np.count_nonzero(weights, axis=1) > 0
+        each = weights[has_function]
+        if len(each) and not self._is_spline and np.all(each == each[0]):
+            key = self.merge_key, has_function.tobytes()
+            used, basis = samples.kept(key, partial(self._of_measurements, samples, has_function))
+            bias = np.zeros(n)
+            bias[used] = basis @ each[0]
+            return bias
+        mine = np.flatnonzero(has_function[rows])
         late = np.where(np.isnan(values), np.nan, 0.0)  # of anchors without a function
-        if self._is_spline:
-            mine = np.flatnonzero(has_function[rows])
-            late[mine] = self._functions(values[mine], weights, rows[mine])
-            return samples.difference(late)
-
-        def basis_of() -> tuple[np.ndarray, np.ndarray]:
-            mine = np.flatnonzero(has_function[rows])
-            course = None if factor is None else self.factor_course(factor[mine])
-            return mine, self.basis(values[mine], course)
-
-        mine, basis = samples.kept((self.merge_key, has_function.tobytes()), basis_of)
-        late[mine] = np.einsum("nk,nk->n", basis, weights[rows[mine]])
+        course = None if factor is None else self.factor_course(factor[mine])
+        late[mine] = self._functions(values[mine], weights, rows[mine], course)
         return samples.difference(late)
+
+    def _of_measurements(
+        self, samples: Samples, has_function: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the rows (m,) of measurements on which a function acts, and its basis, (m, k).
+
+        has_function : (N,) of the anchors; they have the same function
+        """
+        values, factor = self._arguments(samples)
+        assert values is not None
+        mine = np.flatnonzero(has_function[samples.rows])
+        course = None if factor is None else self.factor_course(factor[mine])
+        late = np.zeros((len(values), self.count))
+        late[np.isnan(values)] = np.nan
+        late[mine] = self.basis(values[mine], course)
+        basis = samples.difference(late)
+        used = np.flatnonzero(np.any(basis != 0.0, axis=1))
+        return used, basis[used]
 
     def _of_link(self, samples: Samples, link: str) -> np.ndarray:
         """Return the sign of the function of the pair "0-1" in each d_ab, (n,) 1, -1 or 0."""
