@@ -37,6 +37,7 @@ from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.rooms import corners
 
 SHORT = 40.0  # s of a long recording, in the screen
+LONG = 90.0  # s of a long recording whose residuals are watched
 BEGIN, END, CUT = 12.0, 15.0, 22.0  # s: a fault begins and ends, the recording is cut
 FLOWN_SEED = 5001
 SCREENED = (  # recordings of the screen, each of another constellation, or day
@@ -183,6 +184,15 @@ class Inputs:
     def recording(self, name: str) -> Case:
         """A measured flight by its name, with all its streams."""
         return self.kept(f"{name} whole", lambda: self._recording(self._path(name), sensors=True))
+
+    def measured(self) -> list[str]:
+        """Names of the measured flights that are kept as logs."""
+        return sorted(one.name for one in (self._data / "flights").rglob("*") if one.is_file())
+
+    def long_recording(self, name: str) -> Case:
+        """The first LONG s of a recording of `util`."""
+        path = self._data / "util" / f"{name}.csv.gz"
+        return self.kept(f"{name} first", lambda: self._recording(path, until=LONG))
 
     def _path(self, name: str) -> Path:
         return next((self._data / "flights").rglob(name))

@@ -21,7 +21,7 @@ import numpy as np
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Flight
 from uwb_tdoa_bias.common.geometry import ranges
-from uwb_tdoa_bias.common.radio import TICK
+from uwb_tdoa_bias.common.radio import SPEED_OF_LIGHT, TICK
 from uwb_tdoa_bias.common.survey import UNITS
 from uwb_tdoa_bias.effects import Covariance
 from uwb_tdoa_ekf.evidence import keys_of
@@ -34,12 +34,15 @@ from uwb_tdoa_ekf.results import rows_of
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.readers.streams import protocol
 
+from . import node, pace
 from .rows import FIRST_SEED, HALL, VALUES, Inputs
 
 # {rule, severity and anchors: [first, last s, value of the last finding]}
 Said = dict[str, list[float]]
 HEALTHY = "0426-traj5", "0422-log02", "0425-traj13", "0426-traj1"
 SPOILT = HEALTHY[0]  # measured flight into which mistakes are put
+SETTLES = "const4-trial3-tdoa2-traj2"  # a false alarm comes earlier without the first s of motion
+WEIGHTLESS = "no_gravity"  # of MISTAKES
 EVERY = 1.0  # s between two looks
 UNTIL = 45.0  # s of a measured flight
 RATE = 50.0  # Hz, estimates of a run that are kept
@@ -72,7 +75,11 @@ class Seen:
 
 def rows(inputs: Inputs) -> list[Watched]:
     """All rows, the cheapest first."""
-    return [*_of_streams(inputs), *_of_scale(inputs), *_of_sign(inputs), *_of_anchors(inputs)]
+    parts = (_of_streams, _of_scale, _of_sign, _of_anchors)
+    made = [row for part in parts for row in part(inputs)]
+    for kind, told in (("node", node.rows(inputs)), ("pace", pace.rows(inputs))):
+        made += [Watched(name, kind, said) for name, said in told]
+    return made
 
 
 # Streams
@@ -156,6 +163,13 @@ SPOILING: dict[str, Callable] = {
     "TDOAs rounded to 0.05 m": _tdoa(lambda c, rng: put(c, D, np.round(20.0 * c[D]) / 20.0)),
     "TDOAs rounded to 0.01 m": _tdoa(lambda c, rng: put(c, D, np.round(c[D], 2))),
     "TDOAs of a tag 2 m away between": _tdoa(faults.second_tag),
+    "TDOAs in kilometres": _tdoa(lambda c, rng: put(c, D, c[D] / 1e3)),
+    "TDOAs in seconds": _tdoa(lambda c, rng: put(c, D, c[D] / SPEED_OF_LIGHT)),
+    "TDOAs at random": _tdoa(lambda c, rng: put(c, D, rng.uniform(-3.0, 3.0, len(c[D])))),
+    "half of the TDOAs at random": _tdoa(
+        lambda c, rng: _rarely(0.5, rng, c, rng.uniform(-3.0, 3.0, len(c[D])), D)
+    ),
+    "one TDOA in 40": _tdoa(lambda c, rng: tuple(column[::40] for column in c)),
 }
 
 
@@ -175,7 +189,12 @@ def _of_streams(inputs: Inputs) -> Iterator[Watched]:
         yield Watched(fault, "streams", partial(make, SPOILT, partial(_spoilt, change)))
     change = partial(_spoilt, _imu(lambda c, rng: put(c, T, c[T] + 0.4)))
     yield Watched("IMU 0.4 s ahead in a log", "streams", partial(make, SPOILT, change, log=True))
-    for fault in faults.FAULTS.keys() - faults.OF_THE_CLOCK:
+    for name in inputs.measured():
+        change = partial(_mistaken, WEIGHTLESS)
+        yield Watched(
+            f"{name}, {MISTAKES[WEIGHTLESS].text}", "streams", partial(make, name, change)
+        )
+    for fault in sorted(faults.FAULTS.keys() - faults.OF_THE_CLOCK):
         yield Watched(f"for 6 s: {fault}", "streams", partial(_for_a_while, inputs, fault))
 
 
@@ -305,6 +324,11 @@ def _of_scale(inputs: Inputs) -> Iterator[Watched]:
         yield Watched(name, "scale", partial(_scaled, inputs, SPOILT, change))
     for name in ("nanoseconds", "sign", "millimetres"):
         yield Watched(f"TDOAs: {name}", "scale", partial(_scaled, inputs, SPOILT, _as_it_is, name))
+    for name in UNFIT:
+        yield Watched(f"{name}, scale", "scale", partial(_scaled, inputs, SPOILT, _as_it_is, name))
+        change = partial(_times, UNITS["feet"])
+        words = f"{name}, survey in feet"
+        yield Watched(words, "scale", partial(_scaled, inputs, SPOILT, change, name))
 
 
 def _as_it_is(positions: np.ndarray) -> np.ndarray:
@@ -340,8 +364,20 @@ SURVEYS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 
 
+# What is wrong with TDOAs that fit no survey
+UNFIT = (
+    "TDOAs in kilometres",
+    "TDOAs in seconds",
+    "TDOAs at random",
+    "half of the TDOAs at random",
+    "one TDOA in 40",
+)
+
+
 def _scaled(inputs: Inputs, name: str, change: Callable, mistake: str = "") -> Said:
     of = partial(_mistaken, mistake) if mistake else None
+    if mistake in SPOILING:
+        of = partial(_spoilt, SPOILING[mistake])
     seen = _seen(inputs, name, of, False)
     anchors = seen.anchors
     moved = Anchors(anchors.ids, change(anchors.positions), anchors.orientations)
@@ -359,19 +395,30 @@ def _of_sign(inputs: Inputs) -> Iterator[Watched]:
         "right from 20 s on": lambda t: np.where(t < 20.0, -1.0, 1.0),
         "wrong from 18 s on": lambda t: np.where(t < 18.0, 1.0, -1.0),
     }
-    for name in HEALTHY:
+    for name in [*HEALTHY, *sorted({*inputs.measured()} - {*HEALTHY})]:
         for what, sign in signs.items():
             if name in HEALTHY[:2] or what in ("sound", "wrong"):
                 yield Watched(f"{name}, sign {what}", "sign", partial(_signed, inputs, name, sign))
+    for name in HEALTHY:
+        for what in ("sound", "wrong"):
+            for every in FEW:
+                run = partial(_signed, inputs, name, signs[what], every)
+                yield Watched(f"{name}, one TDOA in {every}, sign {what}", "sign", run)
     flight = f"fly hall {FIRST_SEED}"
     yield Watched(f"{flight}, sign sound", "sign", partial(_signed, inputs, "", signs["sound"]))
     yield Watched(f"{flight}, sign wrong", "sign", partial(_signed, inputs, "", signs["wrong"]))
 
 
-def _signed(inputs: Inputs, name: str, sign: Callable) -> Said:
-    """What a SignWatch finds; the filter doubts 2 s after the signs have become wrong."""
+FEW = 20, 40  # so many TDOAs become one
+
+
+def _signed(inputs: Inputs, name: str, sign: Callable, every: int = 1) -> Said:
+    """What a SignWatch finds; the filter doubts 2 s after the signs have become wrong. every : one
+    TDOA of so many is used.
+    """
     flight = inputs.recording(name).flight if name else inputs.flight_of("hall", FIRST_SEED)
-    watch, tdoa, said = SignWatch(flight.anchors), flight.tdoa, {}
+    tdoa = rows_of(flight.tdoa, slice(None, None, every))
+    watch, said = SignWatch(flight.anchors), {}
     since = tdoa.t - tdoa.t[0]
     for k in range(int(min(since[-1], UNTIL))):
         rows = (since >= k) & (since < k + 1.0)
@@ -390,8 +437,16 @@ def _signed(inputs: Inputs, name: str, sign: Callable) -> Said:
 
 def _of_anchors(inputs: Inputs) -> Iterator[Watched]:
     make = partial(_of_residuals, inputs)
-    for name in HEALTHY:
+    for name in [*HEALTHY, *sorted({*inputs.measured()} - {*HEALTHY})]:
         yield Watched(f"{name} is sound, residuals", "monitoring", partial(make, name))
+    yield Watched(
+        f"{SETTLES} is sound, residuals", "monitoring", partial(_first_of, inputs, SETTLES)
+    )
+    for name in HEALTHY[:3]:
+        for pair in PAIRS:
+            words = "anchors {} and {} exchanged from 25 s on".format(*pair)
+            run = partial(make, name, words, partial(_swapped, *pair), False)
+            yield Watched(f"{name}, {words}", "monitoring", run)
     for world in ("hall", "anchor-late", "anchor-silent"):
         for seed in (FIRST_SEED, FIRST_SEED + 1):
             name = f"fly {world} {seed}"
@@ -399,9 +454,10 @@ def _of_anchors(inputs: Inputs) -> Iterator[Watched]:
     for name in ("tdoa: sign", "tdoa: two ids exchanged", "tdoa: half are outliers"):
         yield Watched(f"{name}, residuals", "monitoring", partial(_faulty, inputs, name))
     yield Watched(HALL, "monitoring", partial(_passing, inputs))
-    for part, size in (("gyro", 0.06), ("accel", 1.2)):
-        words = f"{HEALTHY[1]}, {part} {size:g} off from 30 s on"
-        yield Watched(words, "monitoring", partial(_biased, inputs, part, size))
+    for name, part, axis, size in BIASES:
+        words = f"{name}, {part} {'xyz'[axis]} {size:g} off from 30 s on"
+        run = partial(_biased, inputs, name, part, axis, size)
+        yield Watched(words, "monitoring", run)
     for name, (change, calibrated) in CHANGES.items():
         for flight in HEALTHY[1:3] if name in OFTEN else HEALTHY[1:2]:
             run = partial(make, flight, name, change, calibrated)
@@ -480,6 +536,14 @@ OFTEN = {
     "calibrated",
     "two anchors exchanged from 25 s on",
 }
+# (flight, sensor of the IMU, axis, rad/s or m/s^2) of a bias that moves
+BIASES = (
+    (HEALTHY[1], "gyro", 2, 0.06),
+    (HEALTHY[1], "accel", 2, 1.2),
+    (HEALTHY[0], "gyro", 0, 0.06),
+    (HEALTHY[0], "accel", 2, 2.5),
+)
+PAIRS = (0, 1), (0, 5), (2, 3), (2, 7), (3, 6)  # rows of anchors that are exchanged
 # of calibrated anchors, m
 POSITION_STD, DELAY_STD = 0.03, 0.02
 
@@ -501,6 +565,12 @@ def _of_residuals(
     return _events(flight.anchors, run, covariance)
 
 
+def _first_of(inputs: Inputs, name: str) -> Said:
+    """Residuals of the first seconds of a recording of `util`."""
+    flight = inputs.long_recording(name).flight
+    return _events(flight.anchors, _run(inputs, f"first of {name}", flight))
+
+
 def _delayed(flight: Flight, change: Callable) -> Flight:
     tdoa, truth = flight.tdoa, flight.truth
     p = np.stack([np.interp(tdoa.t, truth.t, truth.p[:, k]) for k in range(3)], axis=1)
@@ -520,14 +590,14 @@ def _faulty(inputs: Inputs, fault: str) -> Said:
     return _events(flight.anchors, _run(inputs, fault.replace(":", ""), flight))
 
 
-def _biased(inputs: Inputs, part: str, size: float) -> Said:
-    """The z axis of a sensor of the IMU reads more from 30 s on: rad/s or m/s^2."""
-    flight = inputs.recording(HEALTHY[1]).flight.without(*SENSOR_NAMES)
+def _biased(inputs: Inputs, name: str, part: str, axis: int, size: float) -> Said:
+    """An axis of a sensor of the IMU reads more from 30 s on: rad/s or m/s^2."""
+    flight = inputs.recording(name).flight.without(*SENSOR_NAMES)
     imu = flight.imu
     values = getattr(imu, part).copy()
-    values[imu.t > flight.tdoa.t[0] + 30.0, 2] += size
+    values[imu.t > flight.tdoa.t[0] + 30.0, axis] += size
     flight = replace(flight, imu=replace(imu, **{part: values}))
-    return _events(flight.anchors, _run(inputs, f"biased {part}", flight))
+    return _events(flight.anchors, _run(inputs, f"biased {name} {part} {axis} {size:g}", flight))
 
 
 def _passing(inputs: Inputs) -> Said:

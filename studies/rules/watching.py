@@ -15,22 +15,25 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import uwb_tdoa_ekf
 
+from . import pace
 from .tuned import Entry, Live, Tuned
 from .watched import Said
 
 # s by which a detection must come later, or end later, to count; and share of the deciding number
 LEAST, NOTICED = 0.99, 0.02
 PACKAGE = "monitoring"
-KINDS = "streams", "scale", "sign", "monitoring"  # of what is watched
+KINDS = "streams", "scale", "sign", "monitoring", "node", "pace"  # of what is watched
 # Kinds of rows that the rules of a module can change
 KINDS_OF = {
     "explain": ("sign",),
     "finding": KINDS,
-    "health": (),
+    "health": ("node",),
     "signs": ("sign", "monitoring"),
-    "status": (),
+    "status": ("node",),
     "survey_scale": ("scale",),
 } | dict.fromkeys(
     (
@@ -42,12 +45,20 @@ KINDS_OF = {
     ),
     ("streams",),
 )
-NO_TUNING = {  # what nature gives, and what nothing returns
-    "survey_scale.NANOSECONDS",
-    "windows.NO_SAMPLE",
-    "windows.NO_STAMP",
-    "windows.NO_TDOA",
+# Numbers that nobody chose: module and name, and what they are
+NO_TUNING = {
+    "ranging_rules.WRAPS": "ranges of a counter",
+    "stamp_rules.UNITS": "units",
+    "status.FAULT_YAW_STD": "more than that of a yaw that may be any",
+    "survey_scale.NANOSECONDS": "a unit",
+    "windows.GRIDS": "steps to which people round",
+    "windows.NO_SAMPLE": "no sensor returns it",
+    "windows.NO_STAMP": "no clock returns it",
+    "windows.NO_TDOA": "no tag returns it",
 }
+# Constants of the core that a module of monitoring uses too: the module, and the kind of its rows
+OF_CORE = {("yaw_check", "YAW_KNOWN"): ("status", "node")}
+FACTORS = 0.5, 2.0
 LISTS = (  # of rules, by module
     ("monitoring.stamp_rules", "OF_ONE"),
     ("monitoring.stamp_rules", "OF_BOTH"),
@@ -82,14 +93,11 @@ SWITCHES: dict[str, tuple[str, Any]] = {
     "signs that turn": ("monitor.turned", lambda *_: False),
     "signs turn only where the filter was right": ("monitor.AGREED", math.inf),
     "signs turn once in a while": ("monitor.TURN_APART", 0.0),
-    "a clock that drifts": ("change.FASTEST_DRIFT", 0.0),
-    "a drift is clearer than a step": ("change.CLEARLY", 1.0),
     "the size of a change is refined": ("change.ChangeDetector.refined", lambda *_: None),
     "the errors of a flight set the limit": ("change.LARGEST_ERROR", 0.0),
     "prior of the errors of a flight": ("change.SCALE_SLICES", 0),
     "smooth errors of each anchor": ("reference.FUNCTION_STDS", (1e-4,)),
     "errors that are constant in a cell": ("reference.ERROR_STDS", (1e-4,)),
-    "enough cells for a comparison": ("reference.FEWEST_CELLS", 0),
     "enough slices for a comparison": ("reference.FEWEST_SLICES", 0),
     "large innovations are clipped": ("slices.CLIP", math.inf),
     "an exchange is looked for at large residuals only": ("swap.LARGE", 0.0),
@@ -102,7 +110,6 @@ SWITCHES: dict[str, tuple[str, Any]] = {
     "doubts of the filter about signs": ("signs.SignWatch.doubt", lambda *_: None),
     "a comparison of signs begins anew": ("signs.LONGEST", math.inf),
     "signs: significant": ("signs.DEVIATIONS", -math.inf),
-    "signs: much better": ("signs.RATIO", 1.0),
     "blocks of few TDOAs do not count": ("explain.FEW", 0),
     "fewest blocks for signs": ("explain.LEAST", 2),
     "blocks of both streams are ours": ("stream_rules.StreamWatch._starved", lambda *_: False),
@@ -117,14 +124,40 @@ SWITCHES: dict[str, tuple[str, Any]] = {
     "a tag at rest": ("inertial_rules.resting", lambda *_: False),
     "the direction of a force without gravity": ("inertial_rules.STEADY", 0.0),
     "the motion outweighs a force without gravity": ("inertial_rules.WEIGHTLESS", math.inf),
+    "most TDOAs contradict": ("status.Use.contradicted", property(lambda *_: False)),
+    "most TDOAs are not used": ("status.Use.why_unused", property(lambda *_: None)),
+    "a start does not contradict": ("status.SETTLED", 0.0),
+    "few TDOAs have no shares": ("status.FEWEST", 0),
+    "a fault states a wide velocity": ("status.FAULT_SPEED_STD", 0.0),
+    "an estimator of few unknown ids runs": ("finding.FEW_UNKNOWN", 0.0),
+    "a number that changes little keeps its text": ("finding.SAME", 0.0),
+    "a start takes a while": ("health.START_TIMEOUT", 0.0),
+    "odometry behind or ahead of the clock": ("health.BEHIND", (math.inf, math.inf)),
+    "clocks that are unrelated": ("health.BEHIND", (1.0, math.inf)),
+    "trouble of a sensor": ("health.Health._trouble_of_sensors", lambda *_: None),
+    "a sensor that stops": ("health.STOPPED", math.inf),
+    "a good sensor may contradict for a second": ("health.REPEATS", 1),
+    "the text has a few sentences": ("health.MOST_SAID", 10**9),
     "the scale of a survey": ("survey_scale.SurveyScale.add", lambda *_: None),
     "one anchor in another unit": ("survey_scale.SINGLE", 0),
     "a scale: significant": ("survey_scale.DEVIATIONS", -math.inf),
     "a scale: much better": ("survey_scale.LEFT", 1.0),
-    "a scale: fits well": ("survey_scale.GOOD", math.inf),
     "a scale: much time or motion where it is less clear": ("survey_scale.CLEARLY", 1.0),
     "a scale: TDOAs that are not in metres": ("survey_scale.SMALL", 0.0),
 }
+
+
+def _wider(units: dict[str, tuple[float, float, float]], factor: float) -> dict:
+    """Ranges of the units of a force: {unit: (size, low, high)}. The sizes stay."""
+    out = {}
+    for unit, (size, low, high) in units.items():
+        middle, half = math.sqrt(low * high), math.sqrt(high / low) ** factor
+        out[unit] = size, middle / half, middle * half
+    return out
+
+
+# How a constant of several parts is scaled
+PARTS: dict[str, Callable[[Any, float], Any]] = {"inertial_rules.FORCE_UNITS": _wider}
 
 
 @dataclass(frozen=True)
@@ -164,6 +197,8 @@ class Patch:
 
 def _found(path: str) -> Any:
     """A module, or a class in one, of the package: "monitoring.monitor", "....Monitor"."""
+    if path == pace.MODULE:
+        return importlib.import_module(path)
     package, module, *inside = path.split(".")
     found = importlib.import_module(f"{uwb_tdoa_ekf.__name__}.{package}.{module}")
     for name in inside:
@@ -172,7 +207,7 @@ def _found(path: str) -> Any:
 
 
 def patches(tuned: Tuned) -> list[Patch]:
-    """Every rule off, every constant halved and doubled."""
+    """Every rule off, every constant halved and doubled. Of the core, those in OF_CORE."""
     made = []
     for module, name in LISTS:
         for rule in getattr(_found(module), name):
@@ -184,10 +219,27 @@ def patches(tuned: Tuned) -> list[Patch]:
         module, *_ = path.split(".")
         owner, _, name = f"{PACKAGE}.{path}".rpartition(".")
         where = [owner] if "." in path.partition(".")[2] else _holders(trees, module, name)
-        instead = _method(value) if callable(value) else value
+        instead = _method(value) if callable(value) and not isinstance(value, property) else value
         changed = {(one, name): instead for one in where}
         made.append(Patch(f"without: {label}", _kinds(module), changed))
-    return made + list(_constants(trees, {entry.name: entry for entry in tuned.constants}))
+    made += _constants(trees, {entry.name: entry for entry in tuned.constants})
+    for (module, name), (holder, kind) in OF_CORE.items():
+        for factor in FACTORS:
+            changed = {
+                (f"{PACKAGE}.{holder}", name): factor * getattr(_found(f"core.{module}"), name)
+            }
+            made.append(Patch(f"{module}.{name} x {factor:g}", (kind,), changed))
+    return made + list(_of_pace())
+
+
+def _of_pace() -> Iterator[Patch]:
+    for label, (name, value) in pace.SWITCHES.items():
+        yield Patch(f"without: {label}", ("pace",), {(pace.MODULE, name): value})
+    for name in pace.CONSTANTS:
+        for factor in FACTORS:
+            value = _scaled(getattr(_found(pace.MODULE), name), factor)
+            key = f"flying.over_topics.{name} x {factor:g}"
+            yield Patch(key, ("pace",), {(pace.MODULE, name): value})
 
 
 def _kinds(module: str) -> tuple[str, ...]:
@@ -219,22 +271,23 @@ def _constants(trees: dict[str, ast.Module], entries: dict[str, Entry]) -> Itera
             for node in ast.walk(function)
             if isinstance(node, ast.Name)
         }
-        for name in _tuned_names(tree):
+        for name in tuned_names(tree):
             found = getattr(_found(f"{PACKAGE}.{module}"), name)
             key, kinds = f"{PACKAGE}.{module}.{name}", _kinds(module)
             entry = entries.get(key)
             is_size = name in frozen and entry is None
-            if is_size or f"{module}.{name}" in NO_TUNING or not kinds or not _is_number(found):
+            if is_size or f"{module}.{name}" in NO_TUNING or not kinds or not is_number(found):
                 continue
             where = _holders(trees, module, name)
-            for factor in (0.5, 2.0):
-                scaled = _scaled(found, factor)
-                if scaled != found:
+            scale = PARTS.get(f"{module}.{name}", _scaled)
+            for factor in FACTORS:
+                scaled = scale(found, factor)
+                if repr(scaled) != repr(found):
                     changed = {(one, name): scaled for one in where}
                     yield Patch(f"{key} x {factor:g}", kinds, changed, entry, factor)
 
 
-def _tuned_names(tree: ast.Module) -> list[str]:
+def tuned_names(tree: ast.Module) -> list[str]:
     names = []
     for node in tree.body:
         if isinstance(node, ast.Assign):
@@ -246,18 +299,35 @@ def _tuned_names(tree: ast.Module) -> list[str]:
     return names
 
 
-def _is_number(value: object) -> bool:
-    parts = value if isinstance(value, tuple) else (value,)
-    return bool(parts) and all(
-        type(one) in (int, float) and math.isfinite(one) and one for one in parts
-    )
+def is_number(value: object) -> bool:
+    """Whether a value is a number, or holds some, and all of them can be scaled."""
+    parts = list(_numbers(value))
+    return bool(parts) and all(math.isfinite(one) and one for one in parts)
+
+
+def _numbers(value: object) -> Iterator[float]:
+    """Numbers in a value, in tuples, and in the values of a dict; names of units count as none."""
+    if isinstance(value, np.ndarray) and value.dtype == float:
+        yield from value[value != 0.0].tolist()
+    elif isinstance(value, dict):
+        for one in value.values():
+            yield from _numbers(one)
+    elif isinstance(value, tuple):
+        for one in value:
+            yield from _numbers(one)
+    elif isinstance(value, (int, float)) and not isinstance(value, bool):
+        yield value
 
 
 def _scaled(value: Any, factor: float) -> Any:
-    """A number, or some, times a factor; a count is at least 1."""
+    """What `is_number` accepts, with its numbers times a factor; a count is at least 1."""
     if isinstance(value, tuple):
         return tuple(_scaled(one, factor) for one in value)
-    return max(1, round(factor * value)) if isinstance(value, int) else factor * value
+    if isinstance(value, dict):
+        return {key: _scaled(one, factor) for key, one in value.items()}
+    if type(value) is int:
+        return max(1, round(factor * value))
+    return factor * value if isinstance(value, (float, np.ndarray)) else value
 
 
 def _imports(tree: ast.Module, module: str, name: str) -> bool:

@@ -4,12 +4,15 @@
 
 import json
 import os
+from pathlib import Path
 import subprocess
 import sys
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
-from studies.rules import figures, tuned, watching, work
+from studies.rules import figures, listed, pace, tuned, watching, work
 from studies.rules.catalogue import RULES, Rule
 from studies.rules.worth import noise_of, worth
 from uwb_tdoa_bias.common.sensors import SENSORS
@@ -85,8 +88,6 @@ def test_the_constants_of_compiled_functions_are_in_the_table(made):
 @pytest.mark.slow
 def test_the_copy_changes_while_it_runs_and_is_the_filter_otherwise(made, tmp_path):
     import pickle
-
-    import numpy as np
 
     job = tmp_path / "made.pickle"
     job.write_bytes(pickle.dumps(made))
@@ -193,3 +194,34 @@ def test_the_table_says_what_half_and_double_of_a_constant_change():
     found = {work.BASE: {"a": said}, "monitoring.monitor.LIMIT x 0.5": {"a": {}}}
     last = figures.table_of_watch(found).splitlines()[-1]
     assert last == "| `monitoring.monitor.LIMIT` | a: `gap` lost (1 of 1) |  |"
+
+
+def test_each_number_of_the_core_and_of_monitoring_is_in_a_table_of_the_notebook():
+    """Run the study for a new constant, and list in the notebook what it is worth."""
+    page = Path(__file__).parents[2] / "docs/notebook/constants.md"
+    text = page.read_text()
+    assert listed.unlisted(text) == []
+    without = text.replace("| `monitoring.status.SILENT` |", "| - |")
+    assert listed.unlisted(without) == ["monitoring.status.SILENT"]
+
+
+def test_numbers_in_a_dict_are_scaled_and_its_words_stay():
+    limits = {"gyroscope": (0.03, "rad/s"), "accelerometer": (0.6, "m/s^2")}
+    assert watching.is_number(limits) and not watching.is_number({"imu/data": "uwb/tdoa"})
+    assert watching._scaled(limits, 2.0)["gyroscope"] == (0.06, "rad/s")
+    low, high = watching._wider({"g": (9.81, 0.5, 2.0)}, 2.0)["g"][1:]
+    assert (low, high) == (pytest.approx(0.25), pytest.approx(4.0))
+
+
+def test_a_vehicle_waits_for_a_filter_that_hangs_and_not_for_one_that_is_dead():
+    def flown(delay):
+        return pace._flown(turns, delay)["s of the clock"][2]
+
+    turns = []
+    for turn in range(1, 301):
+        now = 0.01 * turn
+        part = SimpleNamespace(t=np.array([now]))
+        turns.append((now, part, part, np.array([now - 0.006, now - 0.001])))
+    quick = flown(lambda now, rng: 0.001)
+    assert flown(lambda now, rng: 2.0 if now == turns[250][0] else 0.001) - quick > 1.9
+    assert 5.0 < flown(lambda now, rng: np.inf if now > 2.5 else 0.001) - quick < 10.0

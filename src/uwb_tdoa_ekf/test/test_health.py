@@ -113,15 +113,6 @@ def test_most_tdoas_rejected_for_seconds_is_a_warning(judge):
     assert said[-1][0] == WARN and "contradict" in said[-1][1]
 
 
-def test_a_filter_that_starts_anew_again_and_again_is_not_blamed_on_the_anchors(judge):
-    said = [judge.second(STARTING, startup=100 * k, restarts=k) for k in range(10)]
-    assert (
-        said[-1][0] == WARN
-        and "starts anew" in said[-1][1]
-        and "ids and positions" not in said[-1][1]
-    )
-
-
 def test_rates_and_age(judge):
     values = judge.second(STARTING)[2]
     assert (values["state"], values["age of last odometry"]) == ("starting", "none yet")

@@ -8,8 +8,8 @@ prediction errors contain the new information.
 
 The test considers each anchor and each onset within the last seconds. It is a generalized
 likelihood ratio (Willsky and Jones, IEEE Trans. Automatic Control 21, 1976). It compares a delay
-that begins at the onset, as a step or a ramp, with no delay. The response to the delay is whitened
-like the errors. The ratio is divided by the mean square of the errors before the onset. A flight
+that begins at the onset with no delay. A delay that grows becomes several such steps. The response
+to the delay is whitened like the errors. The ratio is divided by the mean square of the errors before the onset. A flight
 with larger errors than the kernel expects therefore needs a larger change.
 
 Memory and time grow with the anchors that are heard, not with those that are installed. An anchor
@@ -44,8 +44,6 @@ SMALLEST_SCALE = 1.0
 SCALE, SCALE_SLICES = (2.0, 20)
 # slices in which the test searches for an onset, and smallest age of an onset in slices
 WINDOW, YOUNGEST = 24, 4
-# m/s, largest drift of a clock; factor by which a ramp must be better than all steps
-FASTEST_DRIFT, CLEARLY = 0.1, 1.5
 CAPACITY = 240  # slices that are stored
 
 
@@ -60,9 +58,7 @@ class Change:
     since : float
         Stamp of the onset, in s.
     size : float
-        Delay at the onset, in m.
-    slope : float
-        Drift, in m/s.
+        Delay, in m.
     ratio : float
         Twice the log of the likelihood ratio of the change, over the scale of the errors before it.
     rival : float
@@ -74,14 +70,13 @@ class Change:
     row: int
     since: float
     size: float
-    slope: float
     ratio: float
     rival: float
     left: float
 
     def at(self, t: float) -> np.ndarray:
         """Return the delay, in m, at stamps t, in s."""
-        return np.where(t > self.since, self.size + self.slope * (t - self.since), 0.0)
+        return np.where(t > self.since, self.size, 0.0)
 
 
 class ChangeDetector:
@@ -164,24 +159,17 @@ class ChangeDetector:
             Earliest stamp of an onset, in s.
         """
         first = self._first(after)
-        onsets = self._count - first - YOUNGEST
-        if onsets <= 0:
+        if self._count - first <= YOUNGEST:
             return None
         value, ratio, scales = self._compare(first)
-        ratio[onsets:][np.abs(value[onsets:]) > FASTEST_DRIFT] = 0.0
-        ratio[onsets:] /= CLEARLY
-        shape, column = np.unravel_index(np.argmax(ratio), ratio.shape)
-        is_ramp = bool(shape >= onsets)
-        onset = first + int(shape) % onsets
-        best, change = float(ratio[shape, column]), float(value[shape, column])
-        explained = best * scales[shape] * (CLEARLY if is_ramp else 1.0)
-        left = np.sum(self._white[onset : self._count] ** 2) - explained
-        expected = np.sum(self._freedom[onset : self._count]) * scales[shape]
+        step, column = np.unravel_index(np.argmax(ratio), ratio.shape)
+        onset, best = first + int(step), float(ratio[step, column])
+        left = np.sum(self._white[onset : self._count] ** 2) - best * scales[step]
+        expected = np.sum(self._freedom[onset : self._count]) * scales[step]
         return Change(
             row=int(self._rows[column]),
             since=float(self._t[onset] - 0.5 * LENGTH),
-            size=0.0 if is_ramp else change,
-            slope=change if is_ramp else 0.0,
+            size=float(value[step, column]),
             ratio=best,
             rival=float(np.max(np.delete(ratio, column, axis=1), initial=0.0)),
             left=float(left / max(expected, 1e-9)),
@@ -190,11 +178,7 @@ class ChangeDetector:
     def refined(self, change: Change) -> Change | None:
         """Return the last compensated step with its new size, or None, and compensate that."""
         first = self._first(change.since)
-        if (
-            change.slope
-            or self._t[first] - change.since > LENGTH
-            or self._count - first <= YOUNGEST
-        ):
+        if self._t[first] - change.since > LENGTH or self._count - first <= YOUNGEST:
             return None
         more = float(self._compare(first)[0][0, self._columns[change.row]])
         better = replace(change, size=change.size + more)
@@ -231,15 +215,15 @@ class ChangeDetector:
         return max(0, self._count - WINDOW, int(np.searchsorted(self._t[: self._count], after)))
 
     def _compare(self, first: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Compare steps and ramps that begin with each slice from `first`, except the youngest.
+        """Compare steps that begin with each slice from `first`, except the youngest.
 
         Returns
         -------
-        value : (2 k, N) array
-            Most likely steps, in m, then ramps, in m/s.
-        ratio : (2 k, N) array
+        value : (k, N) array
+            Most likely steps, in m.
+        ratio : (k, N) array
             Likelihood ratios.
-        scale : (2 k,) array
+        scale : (k,) array
             Mean square of the errors before each onset.
         """
         n, turns = self._count - first, self._turn(np.arange(first, self._count))
@@ -248,15 +232,14 @@ class ChangeDetector:
         # contiguous, or numba compiles a second version in flight
         of_slices = (np.ascontiguousarray(self._index[turns][:, some]), self._response[turns])
         scores, information = _seen(*of_slices, inverse.T @ white, inverse.T @ inverse)
-        # age of slices (columns) since each onset (rows)
-        age = np.arange(n) - np.arange(n - YOUNGEST)[:, None]
-        shapes = np.concatenate([(age >= 0).astype(float), LENGTH * np.maximum(age + 0.5, 0.0)])
+        # slices (columns) since each onset (rows)
+        shapes = (np.arange(n) >= np.arange(n - YOUNGEST)[:, None]).astype(float)
         score = shapes @ scores
         power = np.sum(np.tensordot(shapes, information, axes=1) * shapes[:, :, None], axis=1)
         value = np.zeros((len(shapes), self._white.shape[1]))
         value[:, some] = score / (power + 1e-9)
         squares = np.minimum(self._squares[: self._count], LARGEST_ERROR)
-        before = first + np.tile(np.arange(n - YOUNGEST), 2)  # slices before each onset
+        before = first + np.arange(n - YOUNGEST)  # slices before each onset
         scale = SCALE_SLICES * SCALE + np.concatenate([[0.0], np.cumsum(squares)])[before]
         scale = np.maximum(scale / (SCALE_SLICES + before), SMALLEST_SCALE)
         ratio = np.zeros_like(value)

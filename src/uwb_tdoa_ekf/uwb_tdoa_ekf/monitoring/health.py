@@ -191,11 +191,6 @@ class Health:
             return OK, "looking for the start position"
         if self.use.why_unused:
             return WARN, self.use.why_unused
-        if self.use.restart_age < START_TIMEOUT:
-            return WARN, (
-                "the filter starts anew again and again, because stamps of a stream fall back: "
-                "see restarts, and correct its clock"
-            )
         return WARN, (
             "no start position found: check ids and positions of the anchors, and that four are "
             "heard"

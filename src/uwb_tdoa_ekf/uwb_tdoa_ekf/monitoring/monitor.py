@@ -533,7 +533,7 @@ class Monitor:
         again = [
             change for change in found if change.at(end) * size > 0.0
         ]  # changes in the same direction
-        if found[-1].slope or len(again) > 1:
+        if len(again) > 1:
             what = f"its clock drifts ({size / (end - again[0].since):+.3f} m/s)"
         elif size > 0.0:
             what = "it is late: blocked (NLOS), moved, or its delay has changed"

@@ -55,7 +55,7 @@ FUNCTION_STDS = (0.01, 0.03, 0.1, 0.3)
 MOST_COMPONENTS, SMALLEST_COMPONENT = 10, 0.02
 SURVEY_STD = 0.05  # m, prior standard deviation of coordinates without a calibration
 ODDS = 1e3  # factor by which a change must raise the probability of the flight
-FEWEST_CELLS, FEWEST_SLICES = 12, 40  # fewest cells and slices of a comparison
+FEWEST_SLICES = 40  # fewest slices of a comparison
 MORE = TDOA_VARIANCE / TDOA_STD**2
 
 
@@ -181,7 +181,7 @@ class SurveyComparison:
     def find(self) -> list[Displaced]:
         """Return anchors that differ from the survey or calibration, the clearest first."""
         rows, cells = self._latest()
-        if len(cells) < FEWEST_CELLS or sum(cell.slices for cell in cells) < FEWEST_SLICES:
+        if sum(cell.slices for cell in cells) < FEWEST_SLICES:
             return []
         # The unknowns are 3 n coordinates, then n delays. The survey is the mean of their prior.
         n, ids, no_offset = len(rows), self._anchors.ids[rows], np.zeros(4 * len(rows))

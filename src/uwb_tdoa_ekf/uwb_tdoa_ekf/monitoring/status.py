@@ -32,7 +32,6 @@ WINDOW = 1.5  # s over which shares of TDOAs are computed
 WINDOW_OF_REJECTED = 4.0
 # s after initialization before rejected TDOAs are reported: on the floor, 85 % for 3 s
 SETTLED = 5.0
-EARLY = 0.05  # s by which a check may come early
 LARGEST_UNUSED = 0.5  # share of TDOAs that are not used for one reason, before it is reported
 FEWEST = 10  # fewest TDOAs of a window
 # rad and m/s, standard deviations that are added while a fault makes the estimate wrong. That of the
@@ -97,7 +96,7 @@ class Use:
         before = self._looks[-1][1] if self._looks else dict.fromkeys(totals, 0)
         self._since |= {
             kind: now
-            for kind in ("arrival", "tdoa", "imu", "velocity", "restarts")
+            for kind in ("arrival", "tdoa", "imu", "velocity")
             if totals[kind] > before[kind]
         }
         if not running or totals["restarts"] > before["restarts"]:
@@ -125,11 +124,6 @@ class Use:
         return self._age("imu")
 
     @property
-    def restart_age(self) -> float:
-        """Return the time since the filter restarted, in s."""
-        return self._age("restarts")
-
-    @property
     def imu_used(self) -> bool:
         """Return whether inertial samples were used lately."""
         return self.imu_age < SILENT
@@ -141,7 +135,7 @@ class Use:
 
     def _shares(self, window: float) -> dict[str, float]:
         """Return {result: share of the TDOAs, 0 to 1} over the last `window` s; {} for too few."""
-        until = self._now - window + EARLY
+        until = self._now - window
         first = next((totals for at, totals in reversed(self._looks) if at <= until), None)
         if first is None:
             return {}

@@ -44,7 +44,6 @@ STARTS = np.array(
 # the loss remains for a tape with errors of 0.1 m. With a survey in feet, 0.50 remains on measured
 # flights.
 LEFT, DEVIATIONS = 0.65, 3.5
-GOOD = 0.35  # largest loss of a survey that fits; healthy flights of three days have 0.10 to 0.25
 # m by which the tag must have moved; share of the loss that is clear even after a few seconds and
 # at rest
 MOVED, CLEARLY = (0.3, 0.5)
@@ -130,7 +129,7 @@ class SurveyScale:
         best = int(np.argmin(np.where(is_scale, mean, np.inf)))
         rival = int(np.argmin(np.where(is_scale, np.inf, mean)))
         left, z = compare_losses(losses[:, rival], losses[:, best])
-        if left > LEFT or z < DEVIATIONS or mean[best] > GOOD:
+        if left > LEFT or z < DEVIATIONS:
             return None
         moved = _spread(np.array([places[best] for places in self._places]))
         if left > CLEARLY and (len(losses) < MANY or moved < MOVED):
