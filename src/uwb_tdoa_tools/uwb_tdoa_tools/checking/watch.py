@@ -10,8 +10,7 @@ from dataclasses import replace
 import re
 from typing import TYPE_CHECKING
 
-from uwb_tdoa_ekf.monitoring.monitor import SURVEYING, Event
-from uwb_tdoa_ekf.monitoring.recorded import watched
+from uwb_tdoa_ekf.monitoring.monitor import SURVEYING, Event, watched
 
 from .tdoa_rules import FEWEST, POOR, gained, relabelled
 

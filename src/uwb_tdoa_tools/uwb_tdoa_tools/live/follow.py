@@ -16,9 +16,17 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.sensors import SENSORS
 
-from .asking import ANSWER_LIMIT, SPIN, parameter_of, wait_for_names
 from .processes import DiagnosticsListener
-from .session import READER_DEPTH, Stop, message_class, subscription_qos
+from .session import (
+    ANSWER_LIMIT,
+    READER_DEPTH,
+    SPIN,
+    Stop,
+    message_class,
+    parameter_of,
+    subscription_qos,
+    wait_for_names,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -24,9 +24,8 @@ from uwb_tdoa_bias.common.sensors import SENSORS
 
 from ..bags.files import BagReader, messages, open_bag
 from ..choices import WAIT
-from .asking import parameter_of, wait_for_names
 from .follow import Follower, Nodes, is_stamped, stamp_of
-from .session import Stop, message_class, publisher_qos, session
+from .session import Stop, message_class, parameter_of, publisher_qos, session, wait_for_names
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Sequence
