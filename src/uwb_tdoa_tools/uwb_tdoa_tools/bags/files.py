@@ -13,9 +13,10 @@ import re
 import shutil
 import sys
 import tempfile
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rosbags.interfaces import Connection
+from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from uwb_tdoa_bias.common.errors import InputError
@@ -41,9 +42,6 @@ from .mcap import Damaged, zstd
 from .message_types import check_type, typestore
 from .salvage import as_written, salvage as write_sound_part
 
-if TYPE_CHECKING:
-    from .foreign import Ros1Bag
-
 PLUGINS = dict(zip(STORAGES, (StoragePlugin.MCAP, StoragePlugin.SQLITE3)))
 
 
@@ -66,6 +64,16 @@ class BagReader(Reader):
     falls_back: bool
     unreadable: Counter[str]
     most: int
+
+
+class Ros1Bag(Ros1Reader):
+    """A bag of ROS 1, for `files.messages`."""
+
+    def __init__(self, path: Path) -> None:
+        """Limit what all messages together may hold."""
+        super().__init__(path)
+        self.most = most_unpacked(path.stat().st_size)
+        self.remarks, self.unreadable = list[str](), Counter[str]()
 
 
 @contextmanager

@@ -31,7 +31,7 @@ from uwb_tdoa_bias.common.limits import (
 )
 
 from . import is_ros_1
-from .files import BagReader, damaged, messages, open_bag, remarks_of
+from .files import BagReader, Ros1Bag, damaged, messages, open_bag, remarks_of
 from .frames import Recorded, recorded_anchors
 from .mcap import Damaged
 
@@ -351,16 +351,6 @@ def _types(connection: Connection) -> Any:
         if idl.strip():
             types |= get_types_from_idl(idl)
     return types
-
-
-class Ros1Bag(Ros1Reader):
-    """A bag of ROS 1, for `files.messages`."""
-
-    def __init__(self, path: Path) -> None:
-        """Limit what all messages together may hold."""
-        super().__init__(path)
-        self.most = most_unpacked(path.stat().st_size)
-        self.remarks, self.unreadable = list[str](), Counter[str]()
 
 
 @contextmanager

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-import sys
 from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.errors import InputError
@@ -251,6 +250,3 @@ def _diagnose(args: Namespace) -> int:
 
 
 main = cli.executable(_diagnose, parser)
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from functools import partial
-import sys
 
 from uwb_tdoa_bias.common.files import write_text
 
@@ -126,6 +125,3 @@ def _survey(args: Namespace) -> int:
 
 
 main = cli.executable(_survey, parser)
-
-if __name__ == "__main__":
-    sys.exit(main())
