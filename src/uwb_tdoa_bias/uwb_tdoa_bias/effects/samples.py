@@ -7,19 +7,17 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 import math
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
 from ..common.anchors import Anchors
 from ..common.arrays import filled, floats
 from ..common.compiled import compiled
+from ..common.flight import Flight
 from ..common.geometry import ranges, tdoa_each
 from ..common.lazy import rotations
 from ..common.sensors import COMPARED
-
-if TYPE_CHECKING:
-    from ..common.flight import Flight
 
 STEP = 0.1  # s, interval of the central difference that gives a velocity
 SPAN = 0.2  # s, interval of the backward differences of Motion

@@ -13,11 +13,11 @@ reported until it no longer holds, and stays in the history.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 import math
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_bias.effects.effect_set import Covariance
 
+from ..anchor_table import AnchorTable
 from ..core.initialization import LOST_TIME
 from ..core.memory import REJECTED
 from ..results import Odometry, Residuals, concatenated, rows_of
@@ -34,14 +35,6 @@ from .reference import Displaced, SurveyComparison
 from .signs import turned
 from .slices import LENGTH, Slice, reduced
 from .swap import Residuals as SwapResiduals, clear_exchange, mean_of, residuals as residuals_of
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.effects.effect_set import Covariance
-
-    from ..anchor_table import AnchorTable
 
 # m/s, speed above which the tag is in motion; on the floor, residuals differ from those in the air
 MOVING = 0.3

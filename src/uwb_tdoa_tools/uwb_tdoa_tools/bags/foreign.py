@@ -12,14 +12,16 @@ from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from functools import lru_cache, partial
+from pathlib import Path
 import re
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import lz4.frame
 from rosbags.interfaces import Connection, MessageDefinitionFormat
 from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag1.reader import Compression, decompressors
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.limits import (
@@ -34,11 +36,6 @@ from . import is_ros_1
 from .files import BagReader, Ros1Bag, damaged, messages, open_bag, remarks_of
 from .frames import Recorded, recorded_anchors
 from .mcap import Damaged
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from rosbags.typesys.store import Typestore
 
 Path_ = tuple[str | int, ...]  # parsed path of a field
 

@@ -5,13 +5,16 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 import math
 import struct
 import time
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import rclpy
+from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.sensors import SENSORS
@@ -27,13 +30,6 @@ from .session import (
     subscription_qos,
     wait_for_names,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from rclpy.node import Node
-    from rclpy.subscription import Subscription
-
 
 LEAD = 2_000_000_000  # ns of stamps that may be played ahead
 # ns; the replay waits for each TDOA that is older than the newest by more than STEP. STEP exceeds

@@ -4,20 +4,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from importlib import import_module
 import math
 import signal
 import time
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import rclpy
+from rclpy.duration import Duration
 from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
 from rosbags.interfaces import (
     Qos,
     QosDurability,
@@ -29,13 +33,6 @@ from rosbags.interfaces import (
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.ros.process import refusal
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-
-    from rclpy.duration import Duration
-    from rclpy.node import Node
-    from rclpy.task import Future
 
 KNOWN = frozenset(  # packages of message types: the usual ones of ROS, and ours
     """actionlib_msgs action_msgs builtin_interfaces diagnostic_msgs geometry_msgs lifecycle_msgs nav_msgs rcl_interfaces rosgraph_msgs
