@@ -30,7 +30,7 @@ from .localizing.localize import write_tum
 from .localizing.pictures import write_rerun
 from .outputs import file_name
 from .readers.inputs import Reading, Recording, report_remarks
-from .readers.tables import number, read_table
+from .readers.tables import CsvTable, number
 from .results_file import ResultsFile, fingerprint_of
 from .scoring.alignment import Alignment, estimate_alignment, require_truth
 from .scoring.evaluation import corrected_truth, delays_fit
@@ -359,7 +359,7 @@ def read_others(path: str | Path) -> dict[str, dict[str, str]]:
     Raises InputError.
     """
     others: dict[str, dict[str, str]] = {}
-    for line, row in read_table(path, ("flight", "peer", "mode", "rmse_3d", "diverged")):
+    for line, row in CsvTable(path, ("flight", "peer", "mode", "rmse_3d", "diverged")):
         cell = (
             "diverged" if row["diverged"] == "True" else f"{number(path, line, row, 'rmse_3d'):.3f}"
         )

@@ -21,7 +21,7 @@ import json
 import os
 from pathlib import Path
 import sys
-from typing import Any, TypeVar
+from typing import Any
 
 from tqdm import tqdm
 
@@ -30,10 +30,7 @@ from uwb_tdoa_bias.common.files import read_bytes, refuse_output
 from uwb_tdoa_bias.common.limits import FOLDER_ENTRIES, Budget
 from uwb_tdoa_bias.common.text import written_by
 
-from .parallel import MapFunction
-
-Item = TypeVar("Item")
-Made = TypeVar("Made")
+from .parallel import Item, Made, MapFunction
 
 BEGIN = b'{"asked"'
 LINE = 64 << 20  # bytes of one result

@@ -70,7 +70,7 @@ class CsvRows:
 
 
 class CsvTable:
-    """Iterate over (line, {column: text}) of the rows of a CSV file.
+    """Iterate over (line, {column: text}) of the rows of a CSV file. Raises InputError.
 
     Attributes
     ----------
@@ -79,8 +79,21 @@ class CsvTable:
     """
 
     def __init__(
-        self, path: str | Path, columns: Sequence[str] | None, most: int, complete: bool = True
+        self,
+        path: str | Path,
+        columns: Sequence[str] | None = None,
+        most: int = SMALL_TABLE_CELLS,
+        complete: bool = True,
     ) -> None:
+        """Read the header of a file that has at least the columns; default: all of its columns.
+
+        Parameters
+        ----------
+        most : largest number of cells.
+        complete : refuse rows with fewer cells than the header; otherwise missing cells are empty.
+
+        Raises InputError, also during the iteration.
+        """
         self._path, self._most, self._complete = path, most, complete
         named = f" with columns {', '.join(columns)}" if columns else ""
         content = read_bytes(path, TABLE_BYTES, f"CSV file{named}")
@@ -150,28 +163,10 @@ def unpacked(path: str | Path, content: bytes, most: int) -> tuple[bytes, str]:
     return out.getvalue(), problem
 
 
-def read_table(
-    path: str | Path,
-    columns: Sequence[str] | None = None,
-    most: int = SMALL_TABLE_CELLS,
-    complete: bool = True,
-) -> CsvTable:
-    """Return the CsvTable of a CSV file that has at least the columns; default: all of its columns.
-
-    Parameters
-    ----------
-    most : largest number of cells.
-    complete : refuse rows with fewer cells than the header; otherwise missing cells are empty.
-
-    Raises InputError, also during the iteration.
-    """
-    return CsvTable(path, columns, most, complete)
-
-
 def read_numbers(path: str | Path, columns: Sequence[str]) -> np.ndarray:
     """Return the columns of a CSV file as finite numbers: (n, k). Raise InputError."""
     out = array("d")
-    for line, row in read_table(path, columns, TABLE_CELLS):
+    for line, row in CsvTable(path, columns, TABLE_CELLS):
         out.extend(number(path, line, row, name) for name in columns)
     return np.array(out).reshape(-1, len(columns))
 
@@ -210,7 +205,7 @@ class CsvFiles:
 
     def __init__(self, paths: Sequence[Path]) -> None:
         self._tables: dict[str, CsvTable] = {
-            str(path): read_table(path, most=TABLE_CELLS, complete=False) for path in paths
+            str(path): CsvTable(path, most=TABLE_CELLS, complete=False) for path in paths
         }
         self.types = dict.fromkeys(self._tables, "CSV")
         self.delimiters = {path: table.delimiter for path, table in self._tables.items()}
