@@ -276,7 +276,7 @@ def _plan(one, anchors, folder):
         (x, y), path = one.wall, folder / "walls.yaml"
         write_text(path, f"walls: [[{x}, 0.0, {x}, {y}]]\n")
         words += ["--radio-reach", one.reach, "--walls", path]
-    command = [sys.executable, "-m", "uwb_tdoa_tools.commands.plan", *map(str, words)]
+    command = [sys.executable, "-m", "uwb_tdoa_tools.commands", "plan", *map(str, words)]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
         raise Failure(f"plan: ended with code {done.returncode}: {done.stderr}")

@@ -115,7 +115,8 @@ def measure(case, folder):
     command = [
         sys.executable,
         "-m",
-        f"uwb_tdoa_tools.commands.{case.tool}",
+        "uwb_tdoa_tools.commands",
+        case.tool,
         *map(str, flights),
         *TOOLS[case.tool],
     ]

@@ -51,7 +51,7 @@ from uwb_tdoa_tools.readers import (
 from uwb_tdoa_tools.readers.names import NamedAnchors
 from uwb_tdoa_tools.readers.profile import Profile, parse_columns
 from uwb_tdoa_tools.readers.suggest import suggest
-from uwb_tdoa_tools.readers.tables import number, read_table
+from uwb_tdoa_tools.readers.tables import CsvTable, number
 from uwb_tdoa_tools.results_file import ResultsFile
 from uwb_tdoa_tools.simulation.rooms import Walls
 from uwb_tdoa_tools.surveying.known import read_distances, read_marks
@@ -116,7 +116,7 @@ def survey(data):
 
 def table(data):
     path = _file(data)
-    for line, row in read_table(path, ("true_x", "x")):
+    for line, row in CsvTable(path, ("true_x", "x")):
         number(path, line, row, "x")
 
 

@@ -232,7 +232,7 @@ def test_list_parameters_of_a_launch_file_of_others_and_ours_in_their_namespace(
 PLAYER = """#!/bin/sh
 # ros2 bag play BAG --clock HZ --delay S --rate R, for those who have no ros2 bag
 shift 2
-exec {python} -m uwb_tdoa_tools.commands.replay "$1" --clock "$3" --rate "$7" --wait-topics imu/data uwb/tdoa --wait-matched 100
+exec {python} -m uwb_tdoa_tools.commands replay "$1" --clock "$3" --rate "$7" --wait-topics imu/data uwb/tdoa --wait-matched 100
 """
 
 

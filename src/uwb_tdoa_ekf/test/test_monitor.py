@@ -15,8 +15,7 @@ from uwb_tdoa_bias.effects import Covariance
 from uwb_tdoa_ekf.core.memory import INVALID, REJECTED, USED
 from uwb_tdoa_ekf.evidence import POSITION, Part, changes_of, keys_of, most_likely_changes
 from uwb_tdoa_ekf.monitoring.change import CAPACITY, ChangeDetector
-from uwb_tdoa_ekf.monitoring.monitor import LIMIT, Monitor, _matters, _surest
-from uwb_tdoa_ekf.monitoring.recorded import watched
+from uwb_tdoa_ekf.monitoring.monitor import LIMIT, Monitor, _matters, _surest, watched
 from uwb_tdoa_ekf.monitoring.reference import Displaced, SurveyComparison, smooth_functions
 from uwb_tdoa_ekf.monitoring.slices import LENGTH, MOST, reduced
 from uwb_tdoa_ekf.results import concatenated

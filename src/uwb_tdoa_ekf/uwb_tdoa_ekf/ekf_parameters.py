@@ -4,23 +4,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.ros.anchors import ANCHORS_FILE
 from uwb_tdoa_bias.ros.parameters import FROZEN, Parameter, ParameterNode, declare, declare_all
 
 from .core.config import CHOICES, FilterConfig
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from rclpy.node import Node
-    from rclpy.parameter import Parameter as RosParameter
-
 
 PUBLISH_TF = NONE, BASE, ODOM = "none", "base", "odom"
 PARAMETERS = {  # in the order of config/ekf_node.yaml

@@ -5,11 +5,14 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.compiled import Record
 from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.sensors import Stream
 from uwb_tdoa_bias.common.stamps import LARGEST_STEP_BACK
 from uwb_tdoa_bias.effects import EffectSet
 
@@ -34,14 +37,6 @@ from .monitoring.finding import Finding, Steady
 from .pipeline import Pipeline, PipelineOutput, odometry_of
 from .reorder_buffer import IMU_STREAM, STREAMS, TDOA_STREAM, ReorderBuffer, Restart
 from .results import VERDICTS, Odometry, Residuals, concatenated
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.common.compiled import Record
-    from uwb_tdoa_bias.common.sensors import Stream
-
 
 # s, largest lead of a pose that the user sets over the newest measurement
 LARGEST_POSE_AHEAD = 10.0

@@ -4,8 +4,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,19 +15,14 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.samples import RADIO
 
 from .anchor_table import AnchorTable
+from .core.config import FilterConfig
 from .core.engine import feed, set_pose
 from .core.memory import ODOMETRY, RESIDUAL, TDOA, FilterState, Measurements, joined, new_state
 from .core.sensors import STREAMS
 from .monitoring.monitor import Monitor
 from .monitoring.slices import LENGTH
+from .reorder_buffer import ReorderBuffer
 from .results import Odometry, Residuals, poses_of
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from .core.config import FilterConfig
-    from .reorder_buffer import ReorderBuffer
-
 
 SLICE = 0.05  # s; ranges in a slice are corrected at the last pose of earlier slices
 _NOWHERE = np.zeros(1, ODOMETRY)

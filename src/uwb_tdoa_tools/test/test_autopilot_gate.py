@@ -11,8 +11,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.sensors.sensor import UNKNOWN_VARIANCE
-from uwb_tdoa_tools.autopilot.estimate import FRD, NED, UPPER, WORLDS, Estimate
-from uwb_tdoa_tools.autopilot.gate import NOT_HEARD, Gate, jumped
+from uwb_tdoa_tools.autopilot.estimate import (
+    FRD,
+    NED,
+    NOT_HEARD,
+    UPPER,
+    WORLDS,
+    Estimate,
+    Gate,
+    jumped,
+)
 
 NOW = 1_700_000_000 * 10**9  # ns
 RUNNING, STARTING, LOST, FAULT = 2, 1, 3, 4

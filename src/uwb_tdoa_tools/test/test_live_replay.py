@@ -49,7 +49,7 @@ class Process:
     """A running tool of ours, with its lines on stderr."""
 
     def __init__(self, name, *arguments):
-        command = [sys.executable, "-m", f"uwb_tdoa_tools.commands.{name}", *map(str, arguments)]
+        command = [sys.executable, "-m", "uwb_tdoa_tools.commands", name, *map(str, arguments)]
         self.process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )

@@ -334,7 +334,8 @@ def test_maps_are_published_to_late_subscribers(anchors, tmp_path):
     command = [
         sys.executable,
         "-m",
-        "uwb_tdoa_tools.commands.plan",
+        "uwb_tdoa_tools.commands",
+        "plan",
         anchors,
         *COARSE,
         "--out",

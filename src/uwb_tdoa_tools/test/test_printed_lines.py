@@ -103,9 +103,7 @@ def test_remedies_begin_as_the_user_began(monkeypatch):
 PACKAGES = [
     ROOT / "src" / name / name for name in ("uwb_tdoa_bias", "uwb_tdoa_ekf", "uwb_tdoa_tools")
 ]
-TOOLS = tuple(
-    path.stem for path in (PACKAGES[2] / "commands").glob("*.py") if path.stem != "__init__"
-)
+TOOLS = tuple(path.stem for path in (PACKAGES[2] / "commands").glob("[a-z]*.py"))
 # Modules whose printed lines are run: below, and in test_first_hour_without_truth.py, test_demo.py
 # and test_first_map.py
 PRINT = {

@@ -107,7 +107,8 @@ def in_ascii(folder, command, *arguments, encoding="ascii"):
     line = [
         sys.executable,
         "-m",
-        f"uwb_tdoa_tools.commands.{command}",
+        "uwb_tdoa_tools.commands",
+        command,
         *map(os.fsencode, arguments),
     ]
     variables = os.environ | ASCII | {"PYTHONIOENCODING": encoding}

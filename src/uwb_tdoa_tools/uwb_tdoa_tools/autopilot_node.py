@@ -38,8 +38,7 @@ from uwb_tdoa_bias.ros.topics import OVERRIDES, STREAM_QOS, Input, publish_strea
 from uwb_tdoa_msgs.msg import EstimatorStatus
 
 from .autopilot.crazyflie import POSE, POSITION, CrazyflieLink
-from .autopilot.estimate import FRD, WORLDS, Estimate, Link
-from .autopilot.gate import Gate
+from .autopilot.estimate import FRD, WORLDS, Estimate, Gate, Link
 from .autopilot.mavlink import FORMS, MavlinkLink
 from .autopilot.topics import TOPICS, VehicleTopics
 

@@ -4,9 +4,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -33,15 +35,9 @@ from .diagnosis.self_calibration.solve import CLEARLY_OF_RANGES, IMPROVED, LEFT,
 from .diagnosis.validation import cross_fitted
 from .estimate import FlightEstimator
 from .parallel import Progress
+from .readers.inputs import Reading, Recording as ReadingPair
 from .scoring.gains import NO_DIFFERENCE, change_in_words, clear_change
 from .surveying.report import as_text
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
-    from pathlib import Path
-
-    from .readers.inputs import Reading, Recording as ReadingPair
-
 
 RMSE = "3D RMSE"  # name of the figure with ground truth
 # smallest ratio of the slow innovations before and after, on hold-out data without ground truth

@@ -4,15 +4,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.common.text import sanitize
 from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_ekf.results import Odometry, Residuals
 
 from . import parallel
 from .bags.bag import RecordedOdometry, late_tdoas, read_odometry
@@ -26,8 +29,8 @@ from .estimate import FlightEstimator
 from .localizing.localize import write_tum
 from .localizing.pictures import write_rerun
 from .outputs import file_name
-from .readers.inputs import Reading, report_remarks
-from .readers.tables import number, read_table
+from .readers.inputs import Reading, Recording, report_remarks
+from .readers.tables import CsvTable, number
 from .results_file import ResultsFile, fingerprint_of
 from .scoring.alignment import Alignment, estimate_alignment, require_truth
 from .scoring.evaluation import corrected_truth, delays_fit
@@ -35,13 +38,6 @@ from .scoring.metrics import Score, radio_residuals
 from .scoring.phases import NEAR_THE_FLOOR, TITLES
 from .scoring.pooling import Pool, Result
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-
-    from uwb_tdoa_bias.common.flight import Flight
-    from uwb_tdoa_ekf.results import Odometry, Residuals
-
-    from .readers.inputs import Recording
 COLUMNS = {
     "rmse_x": "x",
     "rmse_y": "y",
@@ -363,7 +359,7 @@ def read_others(path: str | Path) -> dict[str, dict[str, str]]:
     Raises InputError.
     """
     others: dict[str, dict[str, str]] = {}
-    for line, row in read_table(path, ("flight", "peer", "mode", "rmse_3d", "diverged")):
+    for line, row in CsvTable(path, ("flight", "peer", "mode", "rmse_3d", "diverged")):
         cell = (
             "diverged" if row["diverged"] == "True" else f"{number(path, line, row, 'rmse_3d'):.3f}"
         )

@@ -13,20 +13,18 @@ The types below mark options that name outputs. No output follows a link.
 
 from __future__ import annotations
 
+from argparse import Namespace
+from collections.abc import Iterator
 from contextlib import AbstractContextManager
 import os
 from pathlib import Path
 import tempfile
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import protected_inputs, refuse_output
-
-if TYPE_CHECKING:
-    from argparse import Namespace
-    from collections.abc import Iterator
 
 
 class Output(type(Path())):  # type: ignore[misc]  # the kind of path of this system: Path itself has no subclasses before Python 3.12

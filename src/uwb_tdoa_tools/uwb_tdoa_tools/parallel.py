@@ -33,6 +33,8 @@ Item = TypeVar("Item")
 
 FIRST, EVERY = 0.5, 4.0  # s until the first line where there is no terminal, and between two
 OFTEN = 0.5  # s between two changes of the line on a terminal
+# flights; what fewer gain by other processes, these take to start (docs/notebook/speed.md)
+FEW = 20
 
 
 class Progress:
@@ -160,7 +162,9 @@ def add_options(parser: argparse._ActionsContainer) -> None:
     )
 
 
-def workers_for(args: argparse.Namespace, count: int, few: int) -> tuple[int | None, str | None]:
+def workers_for(
+    args: argparse.Namespace, count: int, few: int = FEW
+) -> tuple[int | None, str | None]:
     """Return (jobs, dask) for several calls of `over`, about `count` items.
 
     Without options there are as many jobs as cores and items, and one for fewer items than `few`.

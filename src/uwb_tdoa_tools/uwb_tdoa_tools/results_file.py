@@ -13,13 +13,15 @@ file; memory holds only the places of the lines.
 
 from __future__ import annotations
 
+from argparse import Namespace
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 import hashlib
 import json
 import os
 from pathlib import Path
 import sys
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any
 
 from tqdm import tqdm
 
@@ -28,14 +30,7 @@ from uwb_tdoa_bias.common.files import read_bytes, refuse_output
 from uwb_tdoa_bias.common.limits import FOLDER_ENTRIES, Budget
 from uwb_tdoa_bias.common.text import written_by
 
-if TYPE_CHECKING:
-    from argparse import Namespace
-    from collections.abc import Callable, Iterable, Iterator, Sequence
-
-    from .parallel import MapFunction
-
-Item = TypeVar("Item")
-Made = TypeVar("Made")
+from .parallel import Item, Made, MapFunction
 
 BEGIN = b'{"asked"'
 LINE = 64 << 20  # bytes of one result

@@ -5,19 +5,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 import yaml
 
 from .errors import InputError
 from .files import write_text
 from .text import written_by
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import ArrayLike
 
 SAME_PLACE = 0.01  # m; a smaller change of a repeated anchor is no change
 # m. Data made for other anchors, e.g. a flyable volume, hold only if every anchor moved less.

@@ -12,21 +12,17 @@ all samples have the shapes (m, 3) and (n, 1, 3).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .arrays import floats, piecewise
 from .errors import InputError
 from .lazy import interpolate
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from numpy.typing import ArrayLike
-
 
 # Gain in dBi every 30 degrees around the full circle, of a DWM1000-like module near 4 GHz. These
 # are not measured values. Their shape follows the plots in the DWM1000 data sheet, an uneven

@@ -4,11 +4,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..common.anchors import Anchors
 from ..common.compiled import compiled
@@ -16,12 +18,6 @@ from ..common.errors import InputError
 from ..effects import EffectSet, Samples
 from ..effects.samples import N_STATES, POSE_LAG, Motion, motion_at, precede
 from .model import EFFECTS, FADED, NETWORK, PASSED, Model, Prediction
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import ArrayLike
-
 
 # rad. A yaw with a larger standard deviation is unknown: then the filter follows four yaws,
 # 90 degrees apart.

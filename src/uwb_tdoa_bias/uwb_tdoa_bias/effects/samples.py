@@ -4,24 +4,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 import math
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar, cast
+from typing import Any, ClassVar, Protocol, TypeVar, cast
 
 import numpy as np
 
 from ..common.anchors import Anchors
 from ..common.arrays import filled, floats
 from ..common.compiled import compiled
+from ..common.flight import Flight
 from ..common.geometry import ranges, tdoa_each
 from ..common.lazy import rotations
 from ..common.sensors import COMPARED
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Hashable
-
-    from ..common.flight import Flight
 
 Made = TypeVar("Made")
 

@@ -7,13 +7,16 @@ First the term, then its shapes, then its words.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 import math
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from ..common.anchors import Anchors
 from ..common.arrays import filled, floats, piecewise
 from ..common.compiled import compiled
 from ..common.errors import InputError
@@ -48,13 +51,6 @@ from .covariates import (
 )
 from .pair import of_pair
 from .samples import RADIO, ImuSamples, Samples, SensorSamples, tile
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from numpy.typing import ArrayLike
-
-    from ..common.anchors import Anchors
 
 DEGREE = 2  # of splines
 GONE = 4 * FADE  # widths of a domain beyond which nothing of a function is left

@@ -4,24 +4,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import wraps
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+from rclpy.subscription import Subscription
+from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock
 
 from .cdr import Message, decode
 from .parameters import ParameterNode
 from .topics import unserved, waiting
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
-
-    from rclpy.publisher import Publisher
-    from rclpy.qos import QoSProfile
-    from rclpy.subscription import Subscription
-    from rclpy.timer import Timer
-
 
 Events = TypeVar("Events", SubscriptionEventCallbacks, PublisherEventCallbacks)
 

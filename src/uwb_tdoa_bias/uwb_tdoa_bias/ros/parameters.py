@@ -8,13 +8,15 @@ no peer can exceed.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import wraps
 from pathlib import Path
 import sys
 import time
-from typing import TYPE_CHECKING, Any, ClassVar
+from types import CodeType
+from typing import Any, ClassVar
 
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -27,22 +29,16 @@ from rclpy.exceptions import (
     InvalidParameterValueException,
     ParameterUninitializedException,
 )
+from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
 from rclpy.qos import QoSProfile
+from rclpy.service import Service
 import yaml
+from yaml import MappingNode
 
 from ..common.errors import InputError
 from ..common.text import line_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-    from types import CodeType
-
-    from rclpy.impl.rcutils_logger import RcutilsLogger
-    from rclpy.parameter import Parameter as RosParameter
-    from rclpy.service import Service
-    from yaml import MappingNode
-
 
 KINDS = {
     float: "a number with a decimal point, e.g. 1.0",

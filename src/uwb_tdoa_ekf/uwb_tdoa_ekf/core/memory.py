@@ -9,29 +9,24 @@ record as a single pointer. Python sees the same bytes (`FilterState.record`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.compiled import Record, compiled
 from uwb_tdoa_bias.common.sensors import SENSORS, Stream
+from uwb_tdoa_bias.effects.base import SensorFunction
 from uwb_tdoa_bias.effects.samples import N_STATES
 
+from ..anchor_table import AnchorTable
 from .auxiliary import OFFSET_STATES
 from .ground import MOST_PAIRS, PAIR
 from .inertial import rows_of
 from .state import ERROR_STATES, GRAVITY, NOMINAL_STATES, TRANSITION
 from .update import INNOVATION
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.effects.base import SensorFunction
-
-    from ..anchor_table import AnchorTable
-
 
 # Verdict of a measurement.
 USED, REJECTED, LATE, INVALID, STARTUP, COMPENSATED, REPEATED = range(7)

@@ -7,7 +7,7 @@ A rule takes windows and yields Findings.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -15,11 +15,7 @@ from ..core.imu_fault_detector import AXIS, UPRIGHT
 from ..core.state import GRAVITY
 from .finding import ERROR, WARNING, Finding
 from .stamp_rules import median
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from .windows import ImuWindow
+from .windows import ImuWindow
 
 # m/s^2, limits of the median length of the mean specific force; healthy 9.7 - 10.5
 FORCE_RANGE = 7.0, 14.0

@@ -13,14 +13,19 @@ reported until it no longer holds, and stays in the history.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from itertools import pairwise
 import math
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.geometry import tdoa
+from uwb_tdoa_bias.effects.effect_set import Covariance
 
+from ..anchor_table import AnchorTable
 from ..core.initialization import LOST_TIME
 from ..core.memory import REJECTED
 from ..results import Odometry, Residuals, concatenated, rows_of
@@ -30,14 +35,6 @@ from .reference import Displaced, SurveyComparison
 from .signs import turned
 from .slices import LENGTH, Slice, reduced
 from .swap import Residuals as SwapResiduals, clear_exchange, mean_of, residuals as residuals_of
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.effects.effect_set import Covariance
-
-    from ..anchor_table import AnchorTable
 
 # m/s, speed above which the tag is in motion; on the floor, residuals differ from those in the air
 MOVING = 0.3
@@ -619,3 +616,50 @@ def _matters(one: Displaced) -> bool:
 def _is_clear(change: Change) -> bool:
     """Return whether a Change is large, clearly of one anchor, and explains most of the errors."""
     return change.ratio > max(LIMIT, CLEARLY * change.rival) and change.left < MOST_LEFT
+
+
+# Run the Monitor on a recording, with the results of ekf_node and their times.
+
+
+def watched(
+    anchors: Anchors,
+    odometry: Odometry,
+    residuals: Residuals,
+    calibrated: Covariance | None = None,
+    restarts: Sequence[float] = (),
+) -> list[Event]:
+    """Return the Events of a recording.
+
+    Parameters
+    ----------
+    anchors : Anchors
+        Anchors in the world frame.
+    odometry : Odometry
+        Estimates.
+    residuals : Residuals
+        Outcome of each TDOA.
+    calibrated : Covariance or None
+        As for Monitor.
+    restarts : sequence of float
+        Stamps at which the filter restarts, in s.
+    """
+    odometry, residuals = _sorted(odometry), _sorted(residuals)
+    events: list[Event] = []
+    for low, high in pairwise([-math.inf, *restarts, math.inf]):
+        monitor, t = Monitor(anchors, calibrated), _between(residuals, low, high).t
+        for begin, end in pairwise([low, *t[1:][np.diff(t) > LOST_TIME].tolist(), high]):
+            heard = _between(residuals, begin, end)
+            monitor.add(_between(odometry, begin, end), heard)
+            monitor.update(float(heard.t[-1]) if len(heard) else low)
+        events += monitor.history
+    return events
+
+
+def _sorted(part: Part) -> Part:
+    """Return Odometry or Residuals in the order of their stamps."""
+    return rows_of(part, np.argsort(part.t, kind="stable"))
+
+
+def _between(part: Part, low: float, high: float) -> Part:
+    """Return the rows of sorted Odometry or Residuals with stamps from `low` to `high`, in s."""
+    return rows_of(part, slice(*np.searchsorted(part.t, [low, high])))

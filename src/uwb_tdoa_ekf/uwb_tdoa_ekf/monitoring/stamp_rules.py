@@ -7,18 +7,15 @@ A rule takes windows and yields Findings. Rules of one stream also take the name
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
 import math
 import statistics
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from .finding import ERROR, NOTE, WARNING, Finding
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-
-    from .windows import StampWindow
+from .windows import StampWindow
 
 STAMP_LINE = (
     "message.header.stamp = ...  # when the sample was measured, ROS time, in seconds and "

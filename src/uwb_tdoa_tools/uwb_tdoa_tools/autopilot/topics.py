@@ -4,8 +4,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Collection, Sequence
 
+from rclpy.node import Node
 from rclpy.time import Time
 from sensor_msgs.msg import FluidPressure, Imu, Range
 
@@ -15,12 +16,6 @@ from uwb_tdoa_msgs.msg import Tdoa
 
 from ..bags.messages import BODY_FRAME
 from ..crazyflie import LogBlock, VehicleClock
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
-
-    from rclpy.node import Node
-
 
 TOPICS = {
     "tdoa": ("uwb/tdoa", Tdoa),

@@ -21,9 +21,12 @@ from dataclasses import dataclass
 import heapq
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from rosbags.interfaces import Connection, Qos
+from rosbags.rosbag2 import Writer
+from rosbags.typesys.store import Typestore
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.anchors import Anchors
@@ -33,6 +36,7 @@ from uwb_tdoa_bias.common.sensors import LOCATING, SENSORS
 from uwb_tdoa_bias.common.sensors.sensor import LARGEST_NUMBER
 from uwb_tdoa_bias.common.survey import refuse_faulty
 from uwb_tdoa_bias.common.text import printable, written_by
+from uwb_tdoa_ekf.results import Odometry
 
 from ..clock import sentences
 from . import frames, messages as bag_messages
@@ -53,15 +57,8 @@ from .topics import (
     topics_of,
 )
 
-if TYPE_CHECKING:
-    from rosbags.interfaces import Connection, Qos
-    from rosbags.rosbag2 import Writer
-    from rosbags.typesys.store import Typestore
-
-    from uwb_tdoa_ekf.results import Odometry
-
-    # {topic: (type, QoS, (stamp ns, message) in order)}
-    Topics = dict[str, tuple[str, Qos, Iterable[tuple[int, Any]]]]
+# {topic: (type, QoS, (stamp ns, message) in order)}
+Topics = dict[str, tuple[str, Qos, Iterable[tuple[int, Any]]]]
 
 __all__ = [
     "RecordedOdometry",

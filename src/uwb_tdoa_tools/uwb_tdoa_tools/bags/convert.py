@@ -4,25 +4,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Flight, Imu, Tdoas, Truth
+from uwb_tdoa_bias.common.sensors import Stream
 from uwb_tdoa_ekf.results import rows_of
 
 from ..choices import STREAMS
 from .bag import check_output, write_bag
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from uwb_tdoa_bias.common.sensors import Stream
-
-    Timed = Tdoas | Imu | Truth | Stream
+Timed = Tdoas | Imu | Truth | Stream
 
 SENSORS = *STREAMS, *SENSOR_NAMES
 

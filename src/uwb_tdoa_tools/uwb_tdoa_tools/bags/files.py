@@ -16,6 +16,7 @@ import tempfile
 from typing import Any
 
 from rosbags.interfaces import Connection
+from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from uwb_tdoa_bias.common.errors import InputError
@@ -25,7 +26,7 @@ from uwb_tdoa_bias.common.stamps import LARGEST_STEP_BACK
 
 from ..choices import STORAGES
 from ..command_lines import SALVAGE
-from . import is_bag, mcap, write_ahead
+from . import is_bag, is_ros_1, mcap, write_ahead
 from .completion import completed
 from .integrity import (
     CHECKSUM_KEY,
@@ -63,6 +64,16 @@ class BagReader(Reader):
     falls_back: bool
     unreadable: Counter[str]
     most: int
+
+
+class Ros1Bag(Ros1Reader):
+    """A bag of ROS 1, for `files.messages`."""
+
+    def __init__(self, path: Path) -> None:
+        """Limit what all messages together may hold."""
+        super().__init__(path)
+        self.most = most_unpacked(path.stat().st_size)
+        self.remarks, self.unreadable = list[str](), Counter[str]()
 
 
 @contextmanager
@@ -187,7 +198,7 @@ def _opened(path: Path, folder: Path, salvage: bool) -> BagReader:
     except InputError:
         raise
     except Exception as error:  # rosbags raises whatever its parsers run into
-        raise _damaged(given, error) from error
+        raise damaged(given, error) from error
     return reader
 
 
@@ -262,9 +273,12 @@ def _falls_back(file: Path) -> bool:
 
 
 def messages(
-    path: str | Path, reader: BagReader, connections: list[Connection], written: bool = False
+    path: str | Path,
+    reader: BagReader | Ros1Bag,
+    connections: list[Connection],
+    written: bool = False,
 ) -> Iterator[tuple[Connection, int, bytes]]:
-    """Yield (connection, stamp ns, bytes) of the given connections.
+    """Yield (connection, stamp ns, bytes) of the given connections, of a bag of ROS 1 or ROS 2.
 
     Raises InputError for another number of messages than the bag states, or for more bytes than
     `reader.most`.
@@ -275,7 +289,7 @@ def messages(
     if connections:
         found = (
             _as_written(reader, connections)
-            if written and reader.falls_back
+            if written and isinstance(reader, BagReader) and reader.falls_back
             else reader.messages(connections=connections)
         )
     left = {(connection.topic, connection.msgtype): 0 for connection in connections}
@@ -287,8 +301,10 @@ def messages(
             connection, stamp, data = next(found)
         except StopIteration:
             break
+        except InputError:
+            raise
         except Exception as error:  # as in _opened
-            raise _damaged(path, error) from error
+            raise damaged(path, error) from error
         left[connection.topic, connection.msgtype] -= 1
         room -= len(data)
         if room < 0:
@@ -302,7 +318,7 @@ def messages(
             what = (
                 f"{count} messages are missing" if count > 0 else f"{-count} messages are too many"
             )
-            raise _damaged(path, f"{what} on {topic}")
+            raise damaged(path, f"{what} on {topic}")
 
 
 def readable(
@@ -338,7 +354,7 @@ def connections_of(
     return found
 
 
-def remarks_of(reader: BagReader) -> list[str]:
+def remarks_of(reader: BagReader | Ros1Bag) -> list[str]:
     """Return sentences on all missing parts found so far."""
     return [
         *reader.remarks,
@@ -349,8 +365,14 @@ def remarks_of(reader: BagReader) -> list[str]:
     ]
 
 
-def _damaged(path: str | Path, error: Exception | str) -> InputError:
+def damaged(path: str | Path, error: Exception | str) -> InputError:
+    """Return the error of a bag that cannot be read, with the remedy."""
     said = " ".join(str(error).split()) or type(error).__name__
+    if is_ros_1(path):
+        return InputError(
+            f"{path}: this bag of ROS 1 is cut or damaged ({said}); copy it again, or repair it "
+            f"with rosbag reindex {Path(path).name}."
+        )
     return InputError(
         f"{path}: the bag is cut or damaged ({said}); copy it again, record it again, or {SALVAGE}."
     )

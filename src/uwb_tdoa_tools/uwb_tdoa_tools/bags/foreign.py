@@ -12,14 +12,16 @@ from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from functools import lru_cache, partial
+from pathlib import Path
 import re
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import lz4.frame
 from rosbags.interfaces import Connection, MessageDefinitionFormat
 from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag1.reader import Compression, decompressors
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.limits import (
@@ -31,14 +33,9 @@ from uwb_tdoa_bias.common.limits import (
 )
 
 from . import is_ros_1
-from .files import BagReader, messages, open_bag, remarks_of
+from .files import BagReader, Ros1Bag, damaged, messages, open_bag, remarks_of
 from .frames import Recorded, recorded_anchors
 from .mcap import Damaged
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from rosbags.typesys.store import Typestore
 
 Path_ = tuple[str | int, ...]  # parsed path of a field
 
@@ -247,8 +244,12 @@ def open_foreign(
     bag = ForeignBag()
     with ExitStack() as stack:
         for path in paths:
-            opened = _ros_1(path) if is_ros_1(path) else _ros_2(path, definitions, salvage)
-            bag.add(stack.enter_context(opened))
+            reader: BagReader | Ros1Bag
+            if is_ros_1(path):
+                reader = stack.enter_context(_ros_1(path))
+            else:
+                reader = stack.enter_context(open_bag(path, salvage))
+            bag.add(_Part(path, reader, definitions))
         bag.check_parts()
         yield bag
 
@@ -264,28 +265,12 @@ class _Part:
     """
 
     def __init__(
-        self,
-        path: Path,
-        connections: list[Connection],
-        span: tuple[int, int],
-        read: Callable[[list[Connection]], Iterator[tuple[Connection, int, bytes]]],
-        *,
-        is_ros_1: bool,
-        definitions: Mapping[str, str],
-        reader: BagReader | None,
+        self, path: Path, reader: BagReader | Ros1Bag, definitions: Mapping[str, str]
     ) -> None:
-        """Store an open bag.
-
-        Parameters
-        ----------
-        path, connections, span : see the attributes.
-        read : yields (connection, time of recording in ns, serialized message) of connections.
-        is_ros_1 : whether ROS 1 serialized the messages. Otherwise they are CDR of ROS 2.
-        definitions : {type: text of its .msg file} of types that the bag does not define.
-        reader : reader of a bag of ROS 2, for its remarks and anchors; None for ROS 1.
-        """
-        self.path, self.connections, self.span, self._read = path, connections, span, read
-        self._is_ros_1, self._definitions, self._reader = is_ros_1, definitions, reader
+        """Store an open bag; see `open_foreign` for the definitions."""
+        self.path, self.connections = path, list(reader.connections)
+        self.span = reader.start_time, reader.end_time
+        self._reader, self._definitions = reader, definitions
         self._stores: dict[str, Typestore] = {}
         self._unreadable: Counter[str] = Counter()
 
@@ -297,9 +282,10 @@ class _Part:
         """Yield (topic, ns of recording, message)."""
         wanted = [connection for connection in self.connections if connection.topic in topics]
         stores = {connection.id: self._store(connection) for connection in wanted}
-        for connection, received, data in self._read(wanted) if wanted else ():
+        for connection, received, data in messages(self.path, self._reader, wanted, written=True):
             store = stores[connection.id]
-            decode = store.deserialize_ros1 if self._is_ros_1 else store.deserialize_cdr
+            is_ros_1 = isinstance(self._reader, Ros1Bag)
+            decode = store.deserialize_ros1 if is_ros_1 else store.deserialize_cdr
             try:
                 if len(data) > READ_BYTES:
                     raise ValueError
@@ -312,7 +298,7 @@ class _Part:
     def remarks(self) -> list[str]:
         """Return sentences on missing messages."""
         return [
-            *(remarks_of(self._reader) if self._reader else ()),
+            *remarks_of(self._reader),
             *(
                 f"{topic}: {count} messages left out, they do not fit to their type."
                 for topic, count in self._unreadable.items()
@@ -321,7 +307,7 @@ class _Part:
 
     def anchors(self) -> Recorded | None:
         """Return the anchors in frames or markers, or None."""
-        if self._reader is None:
+        if isinstance(self._reader, Ros1Bag):
             return None
         return recorded_anchors(self.path, self._reader, "/uwb/anchors")
 
@@ -369,57 +355,19 @@ def _types(connection: Connection) -> Any:
 
 
 @contextmanager
-def _ros_2(path: Path, definitions: Mapping[str, str], salvage: bool) -> Iterator[_Part]:
-    with open_bag(path, salvage) as reader:
-        yield _Part(
-            path,
-            list(reader.connections),
-            (reader.start_time, reader.end_time),
-            lambda connections: messages(path, reader, connections, written=True),
-            is_ros_1=False,
-            definitions=definitions,
-            reader=reader,
-        )
-
-
-@contextmanager
-def _ros_1(path: Path) -> Iterator[_Part]:
-    reader = Ros1Reader(path)
+def _ros_1(path: Path) -> Iterator[Ros1Bag]:
+    reader = Ros1Bag(path)
     try:
         reader.open()
         _check_counts(reader)
         _limit_and_cache_unpacking(reader, path)
     except Exception as error:  # rosbags raises whatever its parsers run into
-        raise _damaged(path, error) from error
+        raise damaged(path, error) from error
     try:
-        yield _Part(
-            path,
-            list(reader.connections),
-            (reader.start_time, reader.end_time),
-            lambda connections: _messages_of(reader, path, connections),
-            is_ros_1=True,
-            definitions={},
-            reader=None,
-        )
+        yield reader
     finally:
         with suppress(Exception):
             reader.close()
-
-
-def _messages_of(
-    reader: Ros1Reader, path: Path, connections: list[Connection]
-) -> Iterator[tuple[Connection, int, bytes]]:
-    found = reader.messages(connections)
-    while True:
-        try:
-            message = next(found)
-        except StopIteration:
-            return
-        except InputError:
-            raise
-        except Exception as error:  # as in _ros_1
-            raise _damaged(path, error) from error
-        yield message
 
 
 def _check_counts(reader: Ros1Reader) -> None:
@@ -432,14 +380,6 @@ def _check_counts(reader: Ros1Reader) -> None:
             raise Damaged(f"messages are missing on {connection.topic}")
     if stated:
         raise Damaged("messages belong to no topic")
-
-
-def _damaged(path: Path, error: Exception) -> InputError:
-    said = " ".join(str(error).split()) or type(error).__name__
-    return InputError(
-        f"{path}: this bag of ROS 1 is cut or damaged ({said}); copy it again, or repair it with "
-        f"rosbag reindex {path.name}."
-    )
 
 
 def _limit_and_cache_unpacking(reader: Ros1Reader, path: Path) -> None:

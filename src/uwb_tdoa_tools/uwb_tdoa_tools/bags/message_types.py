@@ -7,17 +7,14 @@ from __future__ import annotations
 from functools import lru_cache
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from rosbags.interfaces import Connection, MessageDefinitionFormat, Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.limits import DEFINITION_BYTES
 from uwb_tdoa_bias.common.sensors import SENSORS
-
-if TYPE_CHECKING:
-    from rosbags.typesys.store import Typestore
 
 OUR_PACKAGE = "uwb_tdoa_msgs"
 OUR_TYPES = (

@@ -9,10 +9,11 @@ seen, because the yaw is unknown. Nor can a sign about an axis about which the t
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from heapq import heappop, heappush
 from itertools import permutations, product
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,11 +30,7 @@ from uwb_tdoa_ekf.monitoring.explain import (
 from uwb_tdoa_ekf.monitoring.finding import ERROR, WARNING, Finding
 from uwb_tdoa_ekf.monitoring.inertial_rules import AXES
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from .ordered import OrderedRecording
-
+from .ordered import OrderedRecording
 
 # Clipped: at least HITS samples have the extreme value, more than MORE times the mean count of the
 # NEXT values beside it. In healthy recordings it is about 1 time.

@@ -8,12 +8,14 @@ report if that explains much more.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.flight import Tdoas
 from uwb_tdoa_bias.common.radio import SPEED_OF_LIGHT, TICK
 from uwb_tdoa_bias.common.survey import UNITS as SURVEY_UNITS
 from uwb_tdoa_ekf.core.config import FilterConfig
@@ -27,13 +29,7 @@ from uwb_tdoa_ekf.offline import run_offline
 from .ordered import LEAST_MOTION, LONG, SHORT, OrderedRecording, SurveyFit, second_principal_std
 from .pair_rules import MANY, OFF
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.common.flight import Tdoas
-
-    Survey = tuple[str, Anchors]  # its name, and what it says
+Survey = tuple[str, Anchors]  # its name, and what it says
 
 # ratio of the remaining loss, and its standard errors; healthy recordings: 1.02 at least in any
 # trial

@@ -6,24 +6,18 @@ before it began or while it lasts.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 import re
-from typing import TYPE_CHECKING
 
-from uwb_tdoa_ekf.monitoring.monitor import SURVEYING, Event
-from uwb_tdoa_ekf.monitoring.recorded import watched
+from uwb_tdoa_bias.common.flight import Flight
+from uwb_tdoa_ekf.monitoring.finding import Finding
+from uwb_tdoa_ekf.monitoring.monitor import SURVEYING, Event, watched
+from uwb_tdoa_ekf.offline import Run
 
+from ..estimate import FlightEstimator
+from .ordered import OrderedRecording
 from .tdoa_rules import FEWEST, POOR, gained, relabelled
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from uwb_tdoa_bias.common.flight import Flight
-    from uwb_tdoa_ekf.monitoring.finding import Finding
-    from uwb_tdoa_ekf.offline import Run
-
-    from ..estimate import FlightEstimator
-    from .ordered import OrderedRecording
 
 CHANGED, EXCHANGED, DISPLACED = "anchor_changed", "ids_exchanged", "anchor_displaced"
 OF_ANCHORS = CHANGED, EXCHANGED, DISPLACED

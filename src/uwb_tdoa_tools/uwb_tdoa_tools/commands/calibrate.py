@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import sys
 from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.errors import InputError
@@ -181,6 +180,3 @@ def _write(
 
 
 main = cli.executable(_calibrate, parser)
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -7,7 +7,6 @@ from __future__ import annotations
 from functools import partial
 import math
 from pathlib import Path
-import sys
 from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.errors import InputError
@@ -118,6 +117,3 @@ def _surveys(folder: Path) -> list[tuple[str, Anchors]]:
 
 
 main = cli.executable(_check, parser)
-
-if __name__ == "__main__":
-    sys.exit(main())

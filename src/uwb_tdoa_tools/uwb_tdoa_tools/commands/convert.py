@@ -8,7 +8,6 @@ from dataclasses import asdict, replace
 import json
 import math
 from pathlib import Path
-import sys
 from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.errors import InputError
@@ -176,6 +175,3 @@ def _reading(args: Namespace) -> Reading:
 
 
 main = cli.executable(_convert, parser)
-
-if __name__ == "__main__":
-    sys.exit(main())

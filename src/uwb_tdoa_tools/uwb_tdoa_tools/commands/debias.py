@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-import sys
 from typing import TYPE_CHECKING, Any
 
 from uwb_tdoa_bias.common.errors import InputError
@@ -171,6 +170,3 @@ def _write(path: str | Path | None, figures: dict[str, Any]) -> None:
 
 
 main = cli.executable(lambda args: {"fit": _fit, "judge": _judge}[args.command](args), parser)
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -7,7 +7,6 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from functools import partial
-import sys
 import textwrap
 import time
 
@@ -154,6 +153,3 @@ def _measured(args: Namespace) -> int:
 
 
 main = cli.executable(_demo, parser)
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-import sys
 from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.errors import InputError
@@ -31,9 +30,6 @@ Exit code: 0 done; 1 ids, signs or units are wrong, or the survey is of another 
 2 bad input."""
 
 MOST = 300_000  # TDOAs; what they take: docs/notebook/speed.md
-FEW = (
-    20  # flights; what fewer gain by other processes, these take to start (docs/notebook/speed.md)
-)
 BLIND = "nothing", "marks"  # references of which no path shows that ids are wrong
 UNUSED = {  # by references, of the options of what is known
     "truth": ("marks", "distances", "odometry"),
@@ -166,7 +162,7 @@ def _diagnose(args: Namespace) -> int:
         return 1
     found = reading.find(args.flights)
     rerun = options.rerun_of(args, len(found), partial(cli.say, "diagnose"))
-    jobs, dask = parallel.workers_for(args, len(found), FEW)
+    jobs, dask = parallel.workers_for(args, len(found))
     flights, holdout = (
         reading.flights(paths, args.most, jobs, dask) for paths in (args.flights, args.holdout)
     )
@@ -251,6 +247,3 @@ def _diagnose(args: Namespace) -> int:
 
 
 main = cli.executable(_diagnose, parser)
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -7,7 +7,6 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from dataclasses import replace
 from functools import partial
-import sys
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_text
@@ -154,6 +153,3 @@ def _evaluate(args: Namespace) -> int:
 
 
 main = cli.executable(_evaluate, parser)
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from functools import partial
-import sys
 
 from uwb_tdoa_bias.common.errors import InputError
 
@@ -78,6 +77,3 @@ def _export(args: Namespace) -> None:
 
 
 main = cli.executable(_export, parser)
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -7,7 +7,6 @@ from __future__ import annotations
 import argparse
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
-import sys
 from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.errors import InputError
@@ -265,6 +264,3 @@ def _check_rover(args: argparse.Namespace) -> None:
 
 
 main = cli.executable(_fly, parser)
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-import sys
 
 from uwb_tdoa_bias.common.errors import InputError
 
@@ -74,6 +73,3 @@ def _inject(args: Namespace) -> None:
 
 
 main = cli.executable(_inject, parser)
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from functools import partial
-import sys
 
 from uwb_tdoa_bias.common.errors import InputError
 
@@ -94,6 +93,3 @@ def _localize(args: Namespace) -> int:
 
 
 main = cli.executable(_localize, parser)
-
-if __name__ == "__main__":
-    sys.exit(main())

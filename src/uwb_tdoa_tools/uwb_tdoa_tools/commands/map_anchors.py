@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-import sys
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_text
@@ -129,6 +128,3 @@ def _check(args: Namespace) -> None:
 
 
 main = cli.executable(_map_anchors, parser)
-
-if __name__ == "__main__":
-    sys.exit(main())

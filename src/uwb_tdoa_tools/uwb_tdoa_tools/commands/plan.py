@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
-import sys
 from typing import Any
 
 from uwb_tdoa_bias.common.radio import RadioLink
@@ -240,6 +239,3 @@ def _plan(args: Namespace) -> int:
 
 
 main = cli.executable(_plan, parser)
-
-if __name__ == "__main__":
-    sys.exit(main())

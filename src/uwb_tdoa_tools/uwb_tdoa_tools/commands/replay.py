@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import argparse
 from functools import partial
-import sys
 
 from .. import cli
 from ..choices import WAIT
@@ -125,6 +124,3 @@ def _positive(text: str) -> float:
 
 
 main = cli.executable(_replay, parser, ros=True)
-
-if __name__ == "__main__":
-    sys.exit(main())

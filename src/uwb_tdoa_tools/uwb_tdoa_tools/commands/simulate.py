@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-import sys
 
 from .. import cli
 from ..choices import STORAGES
@@ -103,6 +102,3 @@ def _simulate(args: Namespace) -> None:
 
 
 main = cli.executable(_simulate, parser)
-
-if __name__ == "__main__":
-    sys.exit(main())

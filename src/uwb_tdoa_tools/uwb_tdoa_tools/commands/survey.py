@@ -6,16 +6,11 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from functools import partial
-import sys
 
 from uwb_tdoa_bias.common.files import write_text
 
 from .. import cli, command_lines, options, parallel
 from ..parallel import Progress
-
-FEW = (
-    20  # flights; what fewer gain by other processes, these take to start (docs/notebook/speed.md)
-)
 
 DESCRIPTION = """Improve a tape-measured survey, from flights alone.
 
@@ -88,7 +83,7 @@ def _survey(args: Namespace) -> int:
         max(tape.std, tape.height_std or 0.0),
     ):
         return 1
-    jobs, dask = parallel.workers_for(args, len(reading.find(args.flights)), FEW)
+    jobs, dask = parallel.workers_for(args, len(reading.find(args.flights)))
     over = partial(parallel.over, jobs=jobs, dask=dask, unit=None)  # only Progress prints a line
     flights = reading.flights(args.flights, None, jobs, dask)
     for remark in remark_on_surveys([its for _, its in reading.find(args.flights)], flights):
@@ -126,6 +121,3 @@ def _survey(args: Namespace) -> int:
 
 
 main = cli.executable(_survey, parser)
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
-import sys
 from typing import TYPE_CHECKING
 
 from .. import cli, options, parallel
@@ -153,6 +152,3 @@ def _write(
 
 
 main = cli.executable(_train, parser)
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -4,10 +4,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sequence
 import json
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from onnx import (
     ModelProto,
     NodeProto,
@@ -19,25 +22,17 @@ from onnx import (
     numpy_helper,
 )
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_bytes
 from uwb_tdoa_bias.common.limits import MODEL_BYTES
 from uwb_tdoa_bias.common.text import version
 from uwb_tdoa_bias.correction.model import INPUTS, OUTPUTS, Model
 from uwb_tdoa_bias.correction.trial import Unplayable, tried_out
+from uwb_tdoa_bias.effects import EffectSet
 
 from .correction import TracedCorrection, trace
 from .graph import Node, ordered
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-    from pathlib import Path
-
-    from numpy.typing import ArrayLike
-
-    from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.effects import EffectSet
-
 
 # `trial.py` lists the operators of these versions
 OPSET, LAST_OPSET, IR_VERSION = 13, 17, 8

@@ -240,34 +240,12 @@ class Program:
         return self._known[key]
 
     def _simpler(self, kind: str, inputs: tuple[int, ...]) -> int | None:
-        """Return the place of an equal Scalar that is known already, or of a constant."""
+        """Return the place of an equal Scalar that C computes without a slow function of libm."""
         known = [self.scalars[k] for k in inputs]
-        if all(one.kind == "constant" for one in known):
-            with np.errstate(all="ignore"):
-                value = ELEMENTWISE[kind](*(one.value for one in known))
-            return self.add("constant", (), value)
-        numbers = [one.value if one.kind == "constant" else None for one in known]
-        if any(number is not None and np.isnan(number) for number in numbers):
-            if kind in COMPARISONS:
-                return self.add("constant", (), 0.0)
-            if kind != "where" and kind not in LOGICAL:
-                return self.add("constant", (), np.nan)
-        if kind == "add" and 0.0 in numbers:
-            return inputs[1 - numbers.index(0.0)]
-        if kind == "mul" and 1.0 in numbers:
-            return inputs[1 - numbers.index(1.0)]
-        if (kind == "sub" and numbers[1] == 0.0) or (kind == "div" and numbers[1] == 1.0):
-            return inputs[0]
         if kind in ("sin", "cos") and known[0].kind == "atan2":
             return self._of_angle(kind, *known[0].inputs)
         if kind == "sub" and known[1].kind == "mul":
             return self._wrapped(*inputs)
-        if kind == "mul" and 0.0 in numbers:
-            return self.add("constant", (), 0.0)  # as of finite numbers
-        if kind == "where" and known[0].kind == "constant":
-            return inputs[1] if known[0].value else inputs[2]
-        if kind == "where" and inputs[1] == inputs[2]:
-            return inputs[1]
         return None
 
     def _of_angle(self, kind: str, y: int, x: int) -> int:

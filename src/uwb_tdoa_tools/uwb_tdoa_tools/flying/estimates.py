@@ -34,29 +34,25 @@ from pathlib import Path
 import shutil
 import subprocess
 import time
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import new_folder_until_exit, temporary_folder, write_text
+from uwb_tdoa_bias.common.flight import Imu, Tdoas
 from uwb_tdoa_bias.common.text import printable
 from uwb_tdoa_bias.correction.corrector import Corrector
+from uwb_tdoa_bias.correction.model import Model
 from uwb_tdoa_bias.effects import EffectSet, StreamCorrector
+from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.results import Odometry, concatenated, poses_of
 
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.common.flight import Imu, Tdoas
-    from uwb_tdoa_bias.correction.model import Model
-    from uwb_tdoa_ekf.core.config import FilterConfig
-
-    from .mission import Pose
-    from .simulator import Streams
-
+from .mission import Pose
+from .simulator import Streams
 
 FILES = "uwb_bias.h", "uwb_bias.c"
 FLAGS = "-std=c99", "-O2", "-ffp-contract=off", "-shared", "-fPIC"

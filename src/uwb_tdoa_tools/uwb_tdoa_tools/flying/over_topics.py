@@ -8,11 +8,12 @@ Sensor samples are published. Odometry and status are received.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 import math
 from statistics import median_low
 import time
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
@@ -37,12 +38,7 @@ from ..bags.messages import BODY_FRAME
 from .estimates import EstimateSource
 from .simulator import DT, Streams
 from .vehicle import ATTITUDE, POSITION
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from .world import World
-
+from .world import World
 
 LARGEST_CATCH_UP = 0.1  # s: a longer delay shifts all later turns
 # s of stamps, more than the parameter `lag` of ekf_node: then the filter continues without a stream

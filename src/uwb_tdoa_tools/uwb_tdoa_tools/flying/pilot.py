@@ -7,9 +7,9 @@ A command that cannot be executed raises an InputError with the reason.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.interpolate import BPoly
@@ -17,12 +17,7 @@ from scipy.interpolate import BPoly
 from uwb_tdoa_bias.common.errors import InputError
 
 from .mission import FLYING, LOST, SETTLE, Mission, with_descent, yaw_of
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from .trial import Trial
-
+from .trial import Trial
 
 MAX_SPEED, MAX_ACCELERATION = 1.5, 1.2  # m/s and m/s^2 of a motion to a goal
 # peaks of a motion over 1 m in 1 s from rest to rest

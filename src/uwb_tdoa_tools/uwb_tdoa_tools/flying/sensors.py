@@ -7,10 +7,11 @@ Errors that do not depend on the path are drawn in advance, by seed.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 import math
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -26,11 +27,7 @@ from uwb_tdoa_bias.effects.floor import FloorMultipath
 
 from ..simulation.tdoas import make_schedule, outliers, tag_link, tdoa_noise
 from .vehicle import IMU_RATE
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from .world import World
+from .world import World
 
 NEAR_FLOOR = 0.5  # m, largest height at which the floor acts
 FLOOR_DELAY, FLOOR_HEIGHT = (3.0, 3.9), (0.06, 0.2)  # m, of low anchors, and up to which height

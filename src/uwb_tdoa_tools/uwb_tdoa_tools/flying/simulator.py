@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.common.compiled import compiled
 from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
 from uwb_tdoa_bias.common.sensors import SENSORS
+from uwb_tdoa_bias.common.sensors.sensor import Stream
 from uwb_tdoa_ekf.results import concatenated, rows_of
 
 from .controller import inner
@@ -31,12 +32,7 @@ from .vehicle import (
     specific_force,
     step,
 )
-
-if TYPE_CHECKING:
-    from uwb_tdoa_bias.common.sensors.sensor import Stream
-
-    from .world import World
-
+from .world import World
 
 STEPS = round(1.0 / (IMU_RATE * STEP))  # of the integration, per sample
 TURNING = 50.0  # rad/s, rotor speed above which the vehicle vibrates

@@ -5,27 +5,31 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 import math
 import struct
 import time
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import rclpy
+from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.sensors import SENSORS
 
-from .asking import ANSWER_LIMIT, SPIN, parameter_of, wait_for_names
 from .processes import DiagnosticsListener
-from .session import READER_DEPTH, Stop, message_class, subscription_qos
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from rclpy.node import Node
-    from rclpy.subscription import Subscription
-
+from .session import (
+    ANSWER_LIMIT,
+    READER_DEPTH,
+    SPIN,
+    Stop,
+    message_class,
+    parameter_of,
+    subscription_qos,
+    wait_for_names,
+)
 
 LEAD = 2_000_000_000  # ns of stamps that may be played ahead
 # ns; the replay waits for each TDOA that is older than the newest by more than STEP. STEP exceeds

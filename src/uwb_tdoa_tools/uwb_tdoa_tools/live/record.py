@@ -4,28 +4,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 import time
-from typing import TYPE_CHECKING
 
+from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
+from rosbags.interfaces import Connection
+from rosbags.rosbag2 import Writer
 
 from uwb_tdoa_bias.common.errors import InputError
 
 from ..bags.files import new_bag
 from ..bags.message_types import add_type, typestore
 from .session import message_class, recorded_qos, session, subscription_qos
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-    from pathlib import Path
-
-    from rclpy.node import Node
-    from rclpy.subscription import Subscription
-    from rosbags.interfaces import Connection
-    from rosbags.rosbag2 import Writer
 
 
 @dataclass(frozen=True)

@@ -5,18 +5,23 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
 import itertools
+from pathlib import Path
 import queue
 import threading
 import time
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 from rclpy.duration import Duration
 from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from rosbags.interfaces import Connection
 from rosgraph_msgs.msg import Clock
 
 from uwb_tdoa_bias.common.errors import InputError
@@ -24,18 +29,8 @@ from uwb_tdoa_bias.common.sensors import SENSORS
 
 from ..bags.files import BagReader, messages, open_bag
 from ..choices import WAIT
-from .asking import parameter_of, wait_for_names
 from .follow import Follower, Nodes, is_stamped, stamp_of
-from .session import Stop, message_class, publisher_qos, session
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterable, Sequence
-    from pathlib import Path
-
-    from rclpy.node import Node
-    from rclpy.publisher import Publisher
-    from rosbags.interfaces import Connection
-
+from .session import Stop, message_class, parameter_of, publisher_qos, session, wait_for_names
 
 Item = TypeVar("Item")
 

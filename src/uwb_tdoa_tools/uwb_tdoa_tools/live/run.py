@@ -4,12 +4,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 import json
 from pathlib import Path
 import shutil
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from rclpy.node import Node
+
+from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_ekf.results import VERDICTS
 
@@ -17,13 +21,6 @@ from ..bags.files import open_bag
 from .processes import DiagnosticsListener, Processes, own_domain, wait
 from .record import recorded_odometry
 from .session import session
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from rclpy.node import Node
-
-    from uwb_tdoa_bias.common.flight import Flight
 
 INPUTS = ("/uwb/anchors", "/uwb/tdoa", "/imu/data")
 # Matches that must exist before the first message: topic -> (publishers, subscriptions)

@@ -8,11 +8,14 @@ second solutions, and measured flights check the precision.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Flight
 from uwb_tdoa_bias.common.flyable import FlyableVolume
@@ -22,19 +25,11 @@ from ..scoring.evaluation import evaluate
 from ..scoring.metrics import position_at
 from ..simulation.rooms import Room
 from .bifurcation import CLEAR, Subsets, other_solutions, same_place, solutions
+from .installation import Installation
 from .precision import bound, information, position_error
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
-
-    from numpy.typing import ArrayLike
-
-    from uwb_tdoa_bias.common.anchors import Anchors
-
-    from .installation import Installation
-
-    # gives the same items, and prints how many are done
-    Wrap = Callable[[Iterable[Any]], Iterable[Any]]
+# gives the same items, and prints how many are done
+Wrap = Callable[[Iterable[Any]], Iterable[Any]]
 
 # States of a place. OUTSIDE of the hull counts with "pairings" only.
 FLYABLE, TWO_SOLUTIONS, IMPRECISE, TOO_FEW, OUTSIDE = range(5)

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment, minimize
@@ -15,14 +15,12 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.geometry import ranges
 
+from ..parallel import Progress
+from .hall import Hall
 from .layout import UNUSABLE, AnchorPlaces, Goal, Layout, free_ids, spread
+from .maps import Chart, Judged, Wrap
 from .precision import bound, position_error, round_weights, weigh
 from .report import quantiles
-
-if TYPE_CHECKING:
-    from ..parallel import Progress
-    from .hall import Hall
-    from .maps import Chart, Judged, Wrap
 
 LEAST_GAIN = 1e-4  # of the objective: a step that gains less is the last
 _CHUNK = 1_000_000  # numbers in the largest array of one step

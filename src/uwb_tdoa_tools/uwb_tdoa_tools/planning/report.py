@@ -4,9 +4,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from rosbags.typesys.store import Typestore
+
+from uwb_tdoa_bias.common.anchors import Anchors
 
 from ..bags.files import new_bag
 from ..bags.message_types import typestore
@@ -14,19 +19,10 @@ from ..bags.messages import anchors_message, header_of, pose_of
 from ..bags.topics import LATCHED_QOS
 from ..checking.coverage import to_copy
 from ..scoring.gains import change_in_words
+from ..simulation.rooms import Room
+from .installation import Installation
 from .maps import FLYABLE, IMPRECISE, OUTSIDE, TOO_FEW, TWO_SOLUTIONS, Chart, Grid
 from .precision import NORMAL_99, dilution
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from rosbags.typesys.store import Typestore
-
-    from uwb_tdoa_bias.common.anchors import Anchors
-
-    from ..simulation.rooms import Room
-    from .installation import Installation
 
 SHARES = {
     "flyable": FLYABLE,

@@ -4,10 +4,12 @@
 
 from __future__ import annotations
 
+from argparse import Namespace
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -19,19 +21,13 @@ from .. import cli, parallel
 from ..choices import OF_PROTOCOL
 from ..parallel import Progress
 from ..readers import read_survey
-from ..readers.inputs import Reading
+from ..readers.inputs import Reading, Recording
 from ..simulation.rooms import Room, Walls, room_of
 from . import maps, optimisation, plots, report
 from .hall import Hall, design, placements, step_of
 from .installation import FixedNoise, Installation, RadioNoise, antenna_from_yaml
 from .layout import AnchorPlaces, Goal, lattice
 from .maps import Chart, Demand, Grid, brute_force
-
-if TYPE_CHECKING:
-    from argparse import Namespace
-    from collections.abc import Iterable
-
-    from ..readers.inputs import Recording
 
 FARTHEST = 30.0  # m, size of a room from which on the radio's reach must be given
 # cells along the longest side, without --step

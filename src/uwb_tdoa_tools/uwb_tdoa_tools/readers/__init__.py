@@ -22,8 +22,7 @@ from ..command_lines import suggest_line
 from .by_profile import read_by_profile
 from .names import read_survey
 from .profile import load_profile
-from .tables import GZIP_MAGIC
-from .ulog import is_ulog
+from .tables import GZIP_MAGIC, is_ulog
 from .usd_log import MAGIC, read_usd_log
 from .util_csv import is_util_csv, read_util_csv
 

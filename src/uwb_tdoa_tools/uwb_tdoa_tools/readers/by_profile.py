@@ -35,8 +35,7 @@ from .profile import (
     time_column,
 )
 from .streams import Streams, make_flight
-from .tables import CsvFiles, table_of
-from .ulog import ULogFile, is_ulog
+from .tables import CsvFiles, ULogFile, is_ulog, table_of
 
 SURVEY = "anchors"  # stream of positions
 SINGLE = "gyro", "acc", "pose", "tof", "baro", "flow"  # streams of one sensor each

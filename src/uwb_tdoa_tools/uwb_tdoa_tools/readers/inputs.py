@@ -4,10 +4,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 import sys
-from typing import TYPE_CHECKING
 
 import numpy as np
 from tqdm import tqdm
@@ -24,13 +24,9 @@ from ..bags.write_ahead import BESIDE
 from ..clock import apart, sentence_on
 from . import read_by_profile, read_flight
 from .names import read_named_anchors
+from .profile import Profile
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from .profile import Profile
-
-    Recording = tuple[Path, str | Path | None]  # and its survey
+Recording = tuple[Path, str | Path | None]  # and its survey
 
 
 _REPORTED: set[str | Path | None] = set()  # surveys whose use for bags was printed

@@ -21,7 +21,7 @@ import zlib
 import numpy as np
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.files import read_bytes
+from uwb_tdoa_bias.common.files import read_bytes, read_head
 from uwb_tdoa_bias.common.limits import (
     ROW_CHARACTERS,
     SMALL_TABLE_CELLS,
@@ -29,6 +29,8 @@ from uwb_tdoa_bias.common.limits import (
     TABLE_CELLS,
     Budget,
 )
+
+from ..command_lines import SALVAGE
 
 GZIP_MAGIC = b"\x1f\x8b"
 _BLOCK = 1 << 20  # bytes that are unpacked at once
@@ -68,7 +70,7 @@ class CsvRows:
 
 
 class CsvTable:
-    """Iterate over (line, {column: text}) of the rows of a CSV file.
+    """Iterate over (line, {column: text}) of the rows of a CSV file. Raises InputError.
 
     Attributes
     ----------
@@ -77,8 +79,21 @@ class CsvTable:
     """
 
     def __init__(
-        self, path: str | Path, columns: Sequence[str] | None, most: int, complete: bool = True
+        self,
+        path: str | Path,
+        columns: Sequence[str] | None = None,
+        most: int = SMALL_TABLE_CELLS,
+        complete: bool = True,
     ) -> None:
+        """Read the header of a file that has at least the columns; default: all of its columns.
+
+        Parameters
+        ----------
+        most : largest number of cells.
+        complete : refuse rows with fewer cells than the header; otherwise missing cells are empty.
+
+        Raises InputError, also during the iteration.
+        """
         self._path, self._most, self._complete = path, most, complete
         named = f" with columns {', '.join(columns)}" if columns else ""
         content = read_bytes(path, TABLE_BYTES, f"CSV file{named}")
@@ -148,28 +163,10 @@ def unpacked(path: str | Path, content: bytes, most: int) -> tuple[bytes, str]:
     return out.getvalue(), problem
 
 
-def read_table(
-    path: str | Path,
-    columns: Sequence[str] | None = None,
-    most: int = SMALL_TABLE_CELLS,
-    complete: bool = True,
-) -> CsvTable:
-    """Return the CsvTable of a CSV file that has at least the columns; default: all of its columns.
-
-    Parameters
-    ----------
-    most : largest number of cells.
-    complete : refuse rows with fewer cells than the header; otherwise missing cells are empty.
-
-    Raises InputError, also during the iteration.
-    """
-    return CsvTable(path, columns, most, complete)
-
-
 def read_numbers(path: str | Path, columns: Sequence[str]) -> np.ndarray:
     """Return the columns of a CSV file as finite numbers: (n, k). Raise InputError."""
     out = array("d")
-    for line, row in read_table(path, columns, TABLE_CELLS):
+    for line, row in CsvTable(path, columns, TABLE_CELLS):
         out.extend(number(path, line, row, name) for name in columns)
     return np.array(out).reshape(-1, len(columns))
 
@@ -208,7 +205,7 @@ class CsvFiles:
 
     def __init__(self, paths: Sequence[Path]) -> None:
         self._tables: dict[str, CsvTable] = {
-            str(path): read_table(path, most=TABLE_CELLS, complete=False) for path in paths
+            str(path): CsvTable(path, most=TABLE_CELLS, complete=False) for path in paths
         }
         self.types = dict.fromkeys(self._tables, "CSV")
         self.delimiters = {path: table.delimiter for path, table in self._tables.items()}
@@ -250,3 +247,101 @@ class Row:
 def table_of(table: str) -> str:
     """Return the name of a file that the topic of a profile is compared with."""
     return Path(table).name
+
+
+# ULog files of PX4 as a foreign recording. pyulog, an optional extra, parses them.
+
+
+MAGIC = b"ULog\x01\x12\x35"
+_TIME = "timestamp"  # us since the start of the autopilot
+
+
+def is_ulog(path: Path) -> bool:
+    """Return whether a file is a ULog."""
+    return path.is_file() and path.stat().st_size > 0 and read_head(path, 16).startswith(MAGIC)
+
+
+class ULogFile:
+    """Messages of one ULog file, with the interface of a `ForeignBag`.
+
+    Attributes
+    ----------
+    types, counts : {message: the same}, {message: number}. Instances but the first are called NAME.1, NAME.2, ...
+    remarks : sentences on what the autopilot could not log.
+    """
+
+    def __init__(self, paths: Sequence[Path], salvage: bool = False) -> None:
+        """Read a file. Raises InputError."""
+        path, *more = paths
+        if more:
+            raise InputError(f"{more[0]}: a ULog is one recording; convert one by one.")
+        try:
+            from pyulog.core import ULog
+        except ImportError as error:
+            raise InputError(
+                f"{path}: is a ULog of PX4, which needs pyulog; run `pip install pyulog` first."
+            ) from error
+        read_bytes(path)  # limits its size
+        try:
+            log = ULog(str(path))
+        except Exception as error:  # pyulog raises whatever its parser runs into
+            raise _damaged(path, str(error)) from error
+        if log.file_corruption and not salvage:
+            raise _damaged(path, "pyulog finds messages that do not fit")
+        self._data: dict[str, dict[str, np.ndarray]] = {
+            each.name + (f".{each.multi_id}" if each.multi_id else ""): each.data
+            for each in log.data_list
+        }
+        self.types = {name: name for name in self._data}
+        self.counts = Counter({name: len(data[_TIME]) for name, data in self._data.items()})
+        self.remarks: list[str] = []
+        if log.file_corruption:
+            self.remarks.append("the log is damaged: read what fits.")
+        if log.dropouts:
+            lost = sum(each.duration for each in log.dropouts)
+            self.remarks.append(
+                f"the autopilot dropped messages {len(log.dropouts)} times, {lost} ms in all."
+            )
+
+    def fields(self, table: str) -> list[str]:
+        """Return the fields of a message; entries of arrays are fields as gyro_rad[0]."""
+        return [*self._data[table]]
+
+    def time_of(self, table: str) -> tuple[str, float]:
+        """Return the field with the time, and its unit in s."""
+        return _TIME, 1e-6
+
+    def messages(self, tables: Sequence[str]) -> Iterator[tuple[str, str, ULogRow]]:
+        """Yield (message, its place, ULogRow)."""
+        for table in tables:
+            for number in range(self.counts[table]):
+                yield table, f"message {number + 1}", ULogRow(self._data[table], number)
+
+
+class ULogRow:
+    """One message of a ULog."""
+
+    def __init__(self, data: dict[str, np.ndarray], number: int) -> None:
+        self._data, self._number = data, number
+
+    def length(self, path: str) -> int:
+        """Return the length of an array. Raises KeyError."""
+        length = 0
+        while f"{path}[{length}]" in self._data:
+            length += 1
+        if not length:
+            raise KeyError(path)
+        return length
+
+    def value(self, path: str, index: int | None = None) -> Any:
+        """Return the number of a field; raise KeyError if there is none."""
+        if path == "index":
+            return index
+        entry = f"{path}[{index}]"
+        return self._data[entry if entry in self._data else path][self._number]
+
+
+def _damaged(path: Path, said: str) -> InputError:
+    return InputError(
+        f"{path}: this ULog is cut or damaged ({said}); copy it from the autopilot again, or {SALVAGE}."
+    )

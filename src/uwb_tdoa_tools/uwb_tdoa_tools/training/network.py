@@ -10,26 +10,20 @@ that on the validation flights.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 import copy
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from onnx import ModelProto
 from sklearn.neural_network import MLPRegressor
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.correction.features import FEATURES, columns
+from uwb_tdoa_bias.effects import Samples
 
 from ..exporting.onnx_file import GraphBuilder
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from onnx import ModelProto
-
-    from uwb_tdoa_bias.effects import Samples
-
-    from .labels import Labels
-
+from .labels import Labels
 
 LAYERS = (30, 30, 30)
 PATIENCE, MOST_EPOCHS = 5, 200
