@@ -85,12 +85,23 @@ def test_help_of_its_own_commands(name, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["ekf_node", "check"])
-def test_help_as_a_process(name):
+@pytest.mark.parametrize(
+    "name, words",
+    [("ekf_node", [EVERY["ekf_node"]]), ("check", ["uwb_tdoa_tools.commands", "check"])],
+)
+def test_help_as_a_process(name, words):
     done = subprocess.run(
-        [sys.executable, "-m", EVERY[name], "--help"], capture_output=True, text=True, timeout=600
+        [sys.executable, "-m", *words, "--help"], capture_output=True, text=True, timeout=600
     )
     assert (done.returncode, done.stderr) == (0, "") and done.stdout.startswith(f"usage: {name} ")
+
+
+@pytest.mark.parametrize("words", [[], ["chek"], ["__main__"]])
+def test_an_unknown_command_as_a_process_is_named(words):
+    line = [sys.executable, "-m", "uwb_tdoa_tools.commands", *words]
+    done = subprocess.run(line, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 1 and "expected one of: calibrate, check, " in done.stderr
+    assert "Traceback" not in done.stderr
 
 
 # --- examples and documentation ---

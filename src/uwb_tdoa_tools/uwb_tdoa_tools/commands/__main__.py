@@ -5,5 +5,10 @@
 from importlib import import_module
 import sys
 
-_, name, *words = sys.argv
-sys.exit(import_module(f"{__package__}.{name}").main(words))
+from ..main import NAMES
+
+if __name__ == "__main__":
+    name, *words = sys.argv[1:] or [""]
+    if name not in NAMES:
+        sys.exit(f"{name!r} is no command; expected one of: {', '.join(NAMES)}.")
+    sys.exit(import_module(f"{__package__}.{name}").main(words))
