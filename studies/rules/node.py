@@ -90,7 +90,7 @@ class Look:
 
 
 def rows(inputs: Inputs) -> Iterator[tuple[str, Callable[[], dict]]]:
-    """(name, what is said) of all rows: sound flights first."""
+    """(name, sentences) of all rows: sound flights first."""
     for name in inputs.measured():
         yield f"{name} is sound, status", partial(_row, inputs, name, "")
     for fault in CHANGES:

@@ -48,7 +48,7 @@ Turns = list[tuple[float, SimpleNamespace, SimpleNamespace, np.ndarray]]
 
 
 def rows(inputs: Inputs) -> Iterator[tuple[str, Callable[[], dict]]]:
-    """(name, what is said) of all rows."""
+    """(name, sentences) of all rows."""
     for name, (change, config, delay) in WAYS.items():
         yield f"pace, {name}", partial(_row, inputs, name, change, config, delay)
     for name, hangs in HANGS.items():

@@ -26,7 +26,7 @@ from .watched import Said
 # s by which a detection must come later, or end later, to count; and share of the deciding number
 LEAST, NOTICED = 0.99, 0.02
 PACKAGE = "monitoring"
-KINDS = "streams", "scale", "sign", "monitoring", "node", "pace"  # of what is watched
+KINDS = "streams", "scale", "sign", "monitoring", "node", "pace"  # kinds of watched rows
 # Kinds of rows that the rules of a module can change
 KINDS_OF = {
     "explain": ("sign",),

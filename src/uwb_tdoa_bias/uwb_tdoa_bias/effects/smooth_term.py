@@ -366,8 +366,11 @@ class SmoothTerm(Effect):
         """Return the shape of the factor at values (n,) of its covariate, (n,)."""
         return shape_basis(self.factor_shape, self.factor_knots, values)[:, 1]
 
-    def _course(self, values: np.ndarray | None) -> np.ndarray | None:
-        return None if values is None else self.factor_course(values)
+    def _course(
+        self, values: np.ndarray | None, rows: slice | np.ndarray = slice(None)
+    ) -> np.ndarray | None:
+        """Return `factor_course` at some rows of values; None without a factor."""
+        return None if values is None else self.factor_course(values[rows])
 
     def bias(self, samples: Samples) -> np.ndarray:
         n = len(samples)
@@ -394,7 +397,7 @@ class SmoothTerm(Effect):
             return bias
         mine = np.flatnonzero(has_function[rows])
         late = np.where(np.isnan(values), np.nan, 0.0)  # of anchors without a function
-        course = None if factor is None else self.factor_course(factor[mine])
+        course = self._course(factor, mine)
         late[mine] = self._functions(values[mine], weights, rows[mine], course)
         return samples.difference(late)
 
@@ -408,7 +411,7 @@ class SmoothTerm(Effect):
         values, factor = self._arguments(samples)
         assert values is not None
         mine = np.flatnonzero(has_function[samples.rows])
-        course = None if factor is None else self.factor_course(factor[mine])
+        course = self._course(factor, mine)
         late = np.zeros((len(values), self.count))
         late[np.isnan(values)] = np.nan
         late[mine] = self.basis(values[mine], course)

@@ -265,14 +265,12 @@ class EffectSearch:
         """
         refused: list[Refused] = []
         if start is None:
-            selection = cross_validated(with_fewer_pairs(self._named(), self.declared), refused)
+            selection = self._validated(self._named(), refused)
             if self._undeclared:
-                selection = with_fewer_pairs(self._with_functions(selection), self.declared)
-                selection = cross_validated(selection, refused)
+                selection = self._validated(self._with_functions(selection), refused)
         else:
             refused += start.refused
-            selection = with_fewer_pairs(self._resumed(start.selection), self.declared)
-            selection = cross_validated(selection, refused)
+            selection = self._validated(self._resumed(start.selection), refused)
         if self._undeclared and len(self.names) >= FOR_MAPS:
             selection = with_maps(selection, self._smooth, refused)
         labels = {one.label for one in selection.chosen}
@@ -327,6 +325,10 @@ class EffectSearch:
     def _smooth(self) -> list[Candidate]:
         """Return the Candidates of functions without a name, if such are searched."""
         return _smooth(self._current, self._installation) if self._undeclared else []
+
+    def _validated(self, selection: Selection, refused: list[Refused]) -> Selection:
+        """Return the Selection with fewer pairs, and without Candidates that hold-out rows refuse."""
+        return cross_validated(with_fewer_pairs(selection, self.declared), refused)
 
     def _named(self) -> Selection:
         """Select declared effects, ROUNDS times, each time linearized at the values found before."""
