@@ -15,7 +15,7 @@ pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from flights import position_at  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
-from rig import make_shared_rig, recording, seconds_of, stamp  # noqa: E402, F401
+from rig import EPOCH, make_shared_rig, recording, seconds_of, stamp  # noqa: E402, F401
 from test_anchor_table import BOX, CHANGE, after, cut, flight_through  # noqa: E402
 
 from uwb_tdoa_bias.ros.diagnostics import AGAIN  # noqa: E402
@@ -31,6 +31,7 @@ def rig(make_shared_rig):  # noqa: F811
     """Return a Rig with both nodes: rig.processes, and their published rig.statuses."""
     rig = make_shared_rig()
     rig.processes, rig.statuses = rig.start("bias_node", "ekf_node"), []
+    rig.epochs = itertools.count(EPOCH - 100, 10)  # of recordings before the one at EPOCH
     rig.node.create_subscription(EstimatorStatus, "status", rig.statuses.append, LATCHED)
     return rig
 
@@ -67,17 +68,18 @@ def test_without_anchors_tdoas_pass_and_the_status_says_what_is_missing(rig):
     ],
 )
 def test_anchors_that_are_certainly_wrong_give_no_odometry(rig, change, words):
-    flight, odometry = recording(1.0), len(rig.odometry)
+    flight, odometry, epoch = recording(1.0), len(rig.odometry), next(rig.epochs)
     rig.send_anchors(flight.anchors.at(change(flight.anchors.positions)))
     rig.wait(lambda: re.search(words, rig.fresh_status("ekf_node").message), "a refusal")
     before = int(rig.values("ekf_node")["TDOAs received"])
-    for k in range(200):
-        rig.send_imu(0.005 * k)
-        rig.send_tdoa(0.005 * k, *(getattr(flight.tdoa, name)[k % 50] for name in "abd"))
+    for imu in zip(flight.imu.t, flight.imu.gyro, flight.imu.accel):
+        rig.send_imu(*imu, epoch=epoch)
+    for tdoa in zip(*(getattr(flight.tdoa, name) for name in "tabd")):
+        rig.send_tdoa(*tdoa, epoch=epoch)
 
     def arrived():
         rig.fresh_status("ekf_node")
-        return int(rig.values("ekf_node")["TDOAs received"]) > before + 100
+        return int(rig.values("ekf_node")["TDOAs received"]) >= before + len(flight.tdoa)
 
     rig.wait(arrived, "TDOAs to arrive")
     assert re.search(words, rig.fresh_status("ekf_node").message)
