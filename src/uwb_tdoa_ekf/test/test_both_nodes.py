@@ -83,6 +83,8 @@ def test_anchors_that_are_certainly_wrong_give_no_odometry(rig, change, words):
 
     rig.wait(arrived, "TDOAs to arrive")
     assert re.search(words, rig.fresh_status("ekf_node").message)
+    rig.wait(lambda: re.search(words, rig.statuses[-1].why), "the refusal on status")
+    assert rig.statuses[-1].status == EstimatorStatus.STATUS_WAITING
     assert len(rig.odometry) == odometry
 
 

@@ -503,7 +503,14 @@ class EkfNode(StreamNode):
         """Return the current Status: whether a vehicle may fly by the odometry."""
         last = self._health.last_odometry
         age = math.inf if last is None else time.monotonic() - last
-        status = status_of(self._estimator, self._yaw_std(), age, self._health.use, self._findings)
+        status = status_of(
+            self._estimator,
+            self._yaw_std(),
+            age,
+            self._health.use,
+            self._findings,
+            self._anchors.refused,
+        )
         self._fault = status.status == FAULT
         return status
 

@@ -272,6 +272,7 @@ def status_of(
     odometry_age: float,
     use: Use,
     findings: Sequence[Finding] = (),
+    refused_anchors: str | None = None,
 ) -> Status:
     """Return the Status of an Estimator.
 
@@ -287,13 +288,13 @@ def status_of(
         Measurements that the filter uses.
     findings : sequence of Finding
         Findings that hold now, the most severe first.
+    refused_anchors : str or None
+        Reason why the last anchors were refused.
     """
     if estimator is None:
-        return Status(
-            WAITING,
-            False,
-            "there are no anchors yet: publish them on uwb/anchors, or set anchors_file",
-        )
+        missing = "there are no anchors yet: publish them on uwb/anchors, or set anchors_file"
+        why = f"the anchors are refused: {refused_anchors}" if refused_anchors else missing
+        return Status(WAITING, False, why)
     if estimator.lost:
         return Status(LOST, False, estimator.lost)
     left_out = estimator.without_imu
