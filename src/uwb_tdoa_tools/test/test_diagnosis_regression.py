@@ -21,7 +21,7 @@ from uwb_tdoa_tools.diagnosis.regression.confounding import (
     flight_to_tell,
     unobservable,
 )
-from uwb_tdoa_tools.diagnosis.regression.fit import fit, refit
+from uwb_tdoa_tools.diagnosis.regression.fit import APPLIED_STD, fit, refit
 from uwb_tdoa_tools.diagnosis.regression.held_out import held_out
 from uwb_tdoa_tools.diagnosis.regression.scorer import Scorer
 from uwb_tdoa_tools.diagnosis.regression.select import rank, select
@@ -194,6 +194,25 @@ def test_what_is_kept_is_fitted_with_the_weights_of_all_that_was_chosen(late):
     np.testing.assert_allclose(kept.fit.beta, half.beta, rtol=1e-6)
     assert (np.diag(kept.fit.cov) >= np.diag(half.cov) * (1.0 - 1e-6)).all()
     assert np.abs(spoilt.only([delay]).fit.beta - half.beta).max() > 1e-4
+
+
+def test_applied_positions_have_a_tight_prior_and_all_other_values_the_usual_one(late):
+    table, candidates = late
+    delay, position = named(candidates, "anchor_delay"), named(candidates, "anchor_position")
+    columns = [*delay.columns, *position.columns]
+    moved = np.arange(len(columns)) >= len(delay.columns)
+    model = fit(table, columns)
+    applied = refit(table, columns, model, applied=True)
+    x, information = table.matrix(columns), model.information(table)
+    prior = np.where(moved, APPLIED_STD, EFFECTS["anchor_delay"].prior_std)
+    gram = x.T @ (information[:, None] * x) + np.diag(prior**-2.0)
+    expected = np.linalg.solve(gram, x.T @ (information * table.y))
+    np.testing.assert_allclose(applied.beta, expected, atol=1e-9)
+    searched = refit(table, columns, model)
+    sizes = [np.linalg.norm(one.beta[moved]) for one in (applied, searched)]
+    assert 0.0 < sizes[0] < sizes[1]
+    alone = [refit(table, delay.columns, model, applied=flag).beta for flag in (True, False)]
+    np.testing.assert_array_equal(*alone)
 
 
 def test_an_alternative_is_named_where_the_flight_cannot_tell(late):

@@ -92,6 +92,7 @@ def cross_fitted(
     candidates: Sequence[Candidate],
     detections: Sequence[Detection],
     most: int | None = None,
+    applied: bool = False,
 ) -> list[ValidationCase]:
     """Return ValidationCases with effects of `candidates` fitted to the other flights.
 
@@ -99,6 +100,7 @@ def cross_fitted(
     effects fitted to the other half.
 
     most : largest number of cases, evenly taken; None for all
+    applied : as of `refit`
     """
     table, selection = attribution.selection.table, attribution.selection
     if len(flights) > 1:
@@ -126,7 +128,9 @@ def cross_fitted(
     out, columns = [], columns_of(candidates)
     for case, k, rows in parts[:: -(-len(parts) // (most or len(parts)))]:
         others = replace(
-            selection, chosen=tuple(candidates), fit=refit(table, columns, selection.fit, rows)
+            selection,
+            chosen=tuple(candidates),
+            fit=refit(table, columns, selection.fit, rows, applied),
         )
         found = usable([*effects_of(others), *(detection.effect for detection in detections)])
         fitted = [other for other in range(len(flights)) if other != k] or [k]
@@ -222,7 +226,8 @@ def select_by_error(
             )
         )
         candidates = [one for one in candidates if one is not momentary]
-    selection = attribution.selection.kept(candidates)  # with the weights of the trials
+    # with the weights of the trials
+    selection = attribution.selection.kept(candidates, applied=True)
     return ValidatedSelection(
         selection,
         tuple(detections),
@@ -511,6 +516,11 @@ def validation_cases(
     if len(flights) > 1:
         on = "each flight with effects fitted to the others"
     cases = cross_fitted(
-        attribution, flights, base, attribution.selection.chosen, attribution.detections
+        attribution,
+        flights,
+        base,
+        attribution.selection.chosen,
+        attribution.detections,
+        applied=True,
     )
     return cases, on + SELECTED_ON

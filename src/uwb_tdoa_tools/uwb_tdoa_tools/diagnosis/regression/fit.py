@@ -16,6 +16,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
+from uwb_tdoa_ekf.evidence import POSITION
+
 from .algebra import counts, dense, product, sums_by, weighted
 from .table import AXES, RegressionTable
 from .terms import Column
@@ -25,6 +27,9 @@ NU = 4.0  # degrees of freedom of Student's t
 ITERATIONS = 12  # largest number of re-weighted least squares
 MIN_BLOCKS = 6  # fewest blocks for a sandwich covariance and for the correlation within blocks
 LONGEST_MEMORY = 3.0  # s, longest lag of the autocorrelation of a series
+# m, largest prior standard deviation of a coordinate of an anchor in a model that is applied:
+# positions absorb errors that other flights have elsewhere
+APPLIED_STD = 0.08
 # share of rows in which a column is not 0; fewer do not show correlation between blocks
 LASTING = 0.1
 
@@ -156,14 +161,22 @@ def fit(
 
 
 def refit(
-    table: RegressionTable, columns: Sequence[Column], model: Fit, rows: np.ndarray | None = None
+    table: RegressionTable,
+    columns: Sequence[Column],
+    model: Fit,
+    rows: np.ndarray | None = None,
+    applied: bool = False,
 ) -> Fit:
     """Fit some Columns with the weights and scales of another Fit.
 
     rows : (n,) bool, rows that determine beta; None for all. With rows, the covariance is the
         covariance of the model.
+    applied : whether the values are applied, with a prior of APPLIED_STD for positions of anchors
     """
     x, sizes, root = table.matrix(columns), prior_sizes(columns), model.information(table)
+    if applied:
+        moved = [column.effect == (POSITION,) for column in columns]
+        sizes = np.where(moved, np.minimum(sizes, APPLIED_STD), sizes)
     some = slice(None) if rows is None else rows
     xw = weighted(x[some], root[some])
     beta, cov, _ = solve(product(xw, x[some]), xw.T @ table.y[some], sizes)
