@@ -24,7 +24,7 @@ from uwb_tdoa_bias.effects.samples import RADIO
 from uwb_tdoa_ekf.evidence import DELAY, OF_ANCHORS, POSITION, Part, eliminated
 
 from .regression.algebra import beside_each_other, counts, each_times, product, weighted
-from .regression.fit import Fit, in_common, prior_sizes
+from .regression.fit import Fit, in_common, prior_sizes, refit
 from .regression.select import Selection
 from .regression.table import RegressionTable
 from .regression.terms import Column
@@ -53,16 +53,19 @@ def with_deviations(selection: Selection) -> Selection:
     places = [k for k, column in enumerate(model.columns) if column.effect[0] in LASTS]
     if not places or any(part.innovations is not None for part in table.radio_parts):
         return selection
-    away, covariance = _beside_others(table, model)
-    apart = np.eye(len(away)) - in_common(table, model.columns)
+    others, covariance = _beside_others(table, model)
+    apart = np.eye(len(others)) - in_common(table, model.columns)
+    # values that are applied have a tighter prior, and are nearer to the others
+    several = model.beta, refit(table, model.columns, model).beta
+    away = np.max([np.abs(apart @ (others - beta)) for beta in several], axis=0)
     fitted, std = np.sqrt(np.diag(model.cov)), np.sqrt(np.diag(apart @ covariance @ apart))
     grow = np.ones(len(fitted))
-    grow[places] = (np.maximum(fitted, np.hypot(std, apart @ away)) / fitted)[places]
+    grow[places] = (np.maximum(fitted, np.hypot(std, away)) / fitted)[places]
     return replace(selection, fit=replace(model, cov=model.cov * np.outer(grow, grow)))
 
 
 def _beside_others(table: RegressionTable, model: Fit) -> tuple[np.ndarray, np.ndarray]:
-    """Return the change of the values of a Fit (k,), and their covariance (k, k).
+    """Return other values of the columns of a Fit (k,), and their covariance (k, k).
 
     Parameters that can replace anchor errors are marginalized.
     """
@@ -108,7 +111,7 @@ def _beside_others(table: RegressionTable, model: Fit) -> tuple[np.ndarray, np.n
     covariances = np.stack([one.covariance for one in several])
     step = shares @ steps
     spread = (steps - step).T @ (shares[:, None] * (steps - step))
-    return step - model.beta, np.tensordot(shares, covariances, axes=1) + spread
+    return step, np.tensordot(shares, covariances, axes=1) + spread
 
 
 def _common_delay(table: RegressionTable, columns: Sequence[Column], n: int) -> np.ndarray:
