@@ -463,7 +463,9 @@ def selected(monkeypatch, worth, shares=((1.0, 1.0),)):
         "shares",
         lambda _, one, names: [Share(*of) for of in zip("fg", of_each[one], (0.05, 0.05))],
     )
-    selection = SimpleNamespace(chosen=tuple(map(Some, worth)), kept=tuple)
+    selection = SimpleNamespace(
+        chosen=tuple(map(Some, worth)), kept=lambda candidates, applied=False: tuple(candidates)
+    )
     attribution = SimpleNamespace(selection=selection, detections=(), names=("f", "g"))
     return select_by_error(attribution, [None, None], Baseline(NONE))
 
