@@ -38,12 +38,12 @@ def add_options(add):
 def run(args):
     """Print the table."""
     print(
-        (
-            "| recordings | off by, m | coordinates: fit alone | as stated | each | delays: fit "
-            "alone | as stated |\n|---|"
-        )
-        + 6 * "---:|"
+        "| recordings | off by, m | coordinates: fit alone | as stated | each | delays: fit alone "
+        "| as stated | coordinates of the search, m | applied, m | applied over stated |\n|---|"
+        + 9
+        * "---:|"
     )
+    positions, delays = ANCHORS_FOUND
     for name, recordings in SETS.items():
         flights = [
             clean_flight(one, SECONDS)
@@ -53,20 +53,23 @@ def run(args):
         ]
         for std in OFF:
             told = [normalised(flight, std, FIRST + k) for k, flight in enumerate(flights)]
-            stated, alone = (
-                {kind: [one[kind][k] for one in told] for kind in ANCHORS_FOUND} for k in range(2)
-            )
-            each = [f"{root([one]):.2f}" for one in stated[ANCHORS_FOUND[0]] if len(one)]
-            cells = [
-                root(alone[ANCHORS_FOUND[0]]),
-                root(stated[ANCHORS_FOUND[0]]),
-                " - ".join(sorted({min(each), max(each)})),
-                root(alone[ANCHORS_FOUND[1]]),
-                root(stated[ANCHORS_FOUND[1]]),
+
+            def rms(kind, fit, of_deviation=1):
+                return root([one[kind][fit][of_deviation] for one in told])  # noqa: B023
+
+            each = [
+                f"{root([ratio]):.2f}"
+                for ratio in (one[positions]["stated"][1] for one in told)
+                if len(ratio)
             ]
-            print(
-                f"| {name} | {std} | "
-                + " | ".join(cell if isinstance(cell, str) else f"{cell:.2f}" for cell in cells)
-                + " |",
-                flush=True,
-            )
+            figures = [
+                f"{rms(positions, 'alone'):.2f}",
+                f"{rms(positions, 'stated'):.2f}",
+                " - ".join(sorted({min(each), max(each)})),
+                f"{rms(delays, 'alone'):.2f}",
+                f"{rms(delays, 'stated'):.2f}",
+                f"{rms(positions, 'stated', 0):.3f}",
+                f"{rms(positions, 'applied', 0):.3f}",
+                f"{rms(positions, 'applied'):.2f}",
+            ]
+            print(f"| {name} | {std} | " + " | ".join(figures) + " |", flush=True)

@@ -45,6 +45,7 @@ PARTS = (
     "floor",
     "references",
     "rows",
+    "few",
     "splits",
     "speed",
 )
@@ -82,7 +83,7 @@ def add_options(add):
         metavar="N",
         type=whole_number,
         default=1,
-        help="cases of blind, processes, several, rows and splits at once (default: %(default)s)",
+        help="cases of blind, processes, several, rows, few and splits at once (default: %(default)s)",
     )
     add(
         "--cases",
@@ -104,6 +105,7 @@ def run(args):
             "floor",
             "references",
             "rows",
+            "few",
             "splits",
         ),
         ("data",),
@@ -127,6 +129,7 @@ def run(args):
         "floor": _floor,
         "references": _references,
         "rows": _rows,
+        "few": _few,
         "splits": _splits,
         "speed": _speed,
     }[args.part](args)
@@ -294,8 +297,24 @@ def _references(args):
 
 
 def _rows(args):
-    """The first table of docs/diagnosis.md, and flights that hear other pairs; kept as they come."""
-    tables = {**splits.ROWS, **splits.OTHER_PAIRS}
+    """The first table of docs/diagnosis.md, and flights that hear other pairs."""
+    results = _judged(args, {**splits.ROWS, **splits.OTHER_PAIRS})
+    figures = {name: splits.row(result) for name, result in results.items()}
+    return {"figures": figures, "cases": results}
+
+
+def _few(args):
+    """Diagnoses of one flight and of two, by the number of flights and the day."""
+    results = _judged(args, splits.FEW)
+    kinds = {name.partition(":")[0]: [] for name in results}
+    for name, result in results.items():
+        kinds[name.partition(":")[0]].append(result)
+    figures = {kind: splits.figures(several) for kind, several in kinds.items()}
+    return {"figures": figures, "cases": results}
+
+
+def _judged(args, tables):
+    """{name: result of `splits.judged`} of splits, kept as they come."""
     with ResultsFile(args.out / f"{args.part}.jsonl", {"data": str(args.data)}) as done:
         missing = [name for name in tables if name not in done]
         made = over(
@@ -303,9 +322,7 @@ def _rows(args):
         )
         for name, result in zip(missing, made):
             done[name] = result
-        results = {name: done[name] for name in tables}
-    figures = {name: splits.row(result) for name, result in results.items()}
-    return {"figures": figures, "cases": results}
+        return {name: done[name] for name in tables}
 
 
 def _splits(args):

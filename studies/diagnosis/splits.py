@@ -85,6 +85,20 @@ OTHER_PAIRS = {
     "0425: 13, 14": (_of_0425(13, 14), _of_0425(*TDOA2_OF_0425)),
     "0425: 17, 21": (_of_0425(17, 21), _of_0425(*TDOA2_OF_0425)),
 }
+# the same of single flights, and of flights with the next one of their day
+FEW = {
+    f"{number} of {day}: {k}": (
+        [paths[(k + step) % len(paths)] for step in range(number)],
+        [path for step, path in enumerate(paths) if (step - k) % len(paths) >= number],
+    )
+    for number, days in (
+        (1, ("0425", "0426", "const1", "const4 trial 1", "const4 trial 3")),
+        (2, ("0425", "0426")),
+    )
+    for day in days
+    for paths in (DAYS[day],)
+    for k in range(len(paths))
+}
 SHARES = (0.3, 0.3, 0.02, 0.1, 0.12, 0.08, 0.08)  # of the draws, by day
 FITTED, JUDGED = (5, 4)  # flights of a split at most
 WORSE = 1.05  # error after over before, above which a flight counts as worse

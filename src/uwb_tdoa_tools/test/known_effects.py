@@ -14,6 +14,7 @@ from uwb_tdoa_bias.common.sensors import BY_POSE, COMPARED, SENSORS
 from uwb_tdoa_bias.effects import EFFECTS, Track
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.constraints import Mark
+from uwb_tdoa_tools.diagnosis.deviations import with_deviations
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.scoring.metrics import scored_phase
 from uwb_tdoa_tools.simulation import ImuErrors, SimulationConfig, simulate
@@ -183,8 +184,9 @@ def normalised(flight, std, seed):
     Anchors are displaced by random errors of std, m. The true shifts undo them. The true delays are
     0.
 
-    Returns {effect: (errors over the stated deviations (n,), errors over the deviations of the fit
-    (n,))}.
+    Returns {effect: {fit: (errors (n,) m, errors over their deviations (n,))}}. The fits are "stated",
+    with the values and deviations of the search, "alone", with the deviations of this fit alone, and
+    "applied", with what would be applied.
     """
     off = std * np.random.default_rng(seed).standard_normal((len(flight.anchors), 3))
     shaken = replace(flight, anchors=flight.anchors.at(flight.anchors.positions + off))
@@ -194,13 +196,19 @@ def normalised(flight, std, seed):
         for row, i in enumerate(flight.anchors.ids)
         for k, axis in enumerate("xyz")
     }
-    # the second fit leaves out the validated deviations
-    stated, alone = (found.fit, found.only(found.chosen).fit)
+    fits = {
+        "stated": found.fit,
+        "alone": found.only(found.chosen).fit,
+        "applied": with_deviations(found.kept(found.chosen, share=1.0)).fit,
+    }
     out = {}
     for kind in ANCHORS_FOUND:
-        rows = [k for k, column in enumerate(stated.columns) if column.effect == (kind,)]
-        error = stated.beta[rows] - np.array([true.get(stated.columns[k].key, 0.0) for k in rows])
-        out[kind] = tuple(error / np.sqrt(np.diag(fit.cov))[rows] for fit in (stated, alone))
+        rows = [k for k, column in enumerate(found.fit.columns) if column.effect == (kind,)]
+        shifts = np.array([true.get(found.fit.columns[k].key, 0.0) for k in rows])
+        out[kind] = {}
+        for name, fit in fits.items():
+            error = fit.beta[rows] - shifts
+            out[kind][name] = error, error / np.sqrt(np.diag(fit.cov))[rows]
     return out
 
 

@@ -167,6 +167,15 @@ def test_held_out_gain_is_large_for_what_is_there_and_none_for_what_is_not(late)
     assert held_out(with_idle)[-1].gain < 2.0
 
 
+def test_a_share_of_the_values_is_applied(late):
+    table, candidates = late
+    columns = named(candidates, "anchor_delay").columns
+    model = fit(table, columns)
+    whole, part = (refit(table, columns, model, share=share) for share in (1.0, 0.7))
+    np.testing.assert_allclose(part.beta, 0.7 * whole.beta)
+    np.testing.assert_allclose(part.residual, table.y - table.matrix(columns) @ part.beta)
+
+
 def test_a_refit_to_some_rows_does_not_look_at_the_others(late):
     table, candidates = late
     columns = named(candidates, "anchor_delay").columns
@@ -202,7 +211,7 @@ def test_applied_positions_have_a_tight_prior_and_all_other_values_the_usual_one
     columns = [*delay.columns, *position.columns]
     moved = np.arange(len(columns)) >= len(delay.columns)
     model = fit(table, columns)
-    applied = refit(table, columns, model, applied=True)
+    applied = refit(table, columns, model, share=1.0)
     x, information = table.matrix(columns), model.information(table)
     prior = np.where(moved, APPLIED_STD, EFFECTS["anchor_delay"].prior_std)
     gram = x.T @ (information[:, None] * x) + np.diag(prior**-2.0)
@@ -211,7 +220,7 @@ def test_applied_positions_have_a_tight_prior_and_all_other_values_the_usual_one
     searched = refit(table, columns, model)
     sizes = [np.linalg.norm(one.beta[moved]) for one in (applied, searched)]
     assert 0.0 < sizes[0] < sizes[1]
-    alone = [refit(table, delay.columns, model, applied=flag).beta for flag in (True, False)]
+    alone = [refit(table, delay.columns, model, share=share).beta for share in (1.0, None)]
     np.testing.assert_array_equal(*alone)
 
 

@@ -240,6 +240,12 @@ def test_a_single_judged_flight_and_a_judge_that_was_fitted_are_named_as_such(re
     assert not any("decided on these same flights" in sentence for sentence in alone)
 
 
+def test_the_verdict_says_which_share_of_the_values_a_single_flight_supports(result):
+    for share, expected in ((0.79, True), (1.0, False)):
+        more = verdict(replace(result, share=share)).more
+        assert any("79 % of each fitted value is applied" in one for one in more) == expected
+
+
 def test_nothing_found_and_nothing_added_are_told_apart(result):
     nothing = judged(
         result, {"one": 0.1}, {"one": 0.1}, [0.0, 0.0], findings=[], effects=EffectSet()

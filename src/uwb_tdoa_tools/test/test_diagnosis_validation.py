@@ -431,7 +431,7 @@ class Some(str):
 
     label = name = property(str)
     declared = True
-    terms = (SimpleNamespace(effect=SimpleNamespace(usable=True), function=None),)
+    terms = (SimpleNamespace(effect=SimpleNamespace(usable=True, values={}), function=None),)
 
 
 class Worth:
@@ -446,6 +446,8 @@ class Worth:
         lost = sum(by for name, by in self.worth.items() if name not in candidates)
         return 1.0 + lost + 0.5 * (not {"a", "b"} & set(candidates))
 
+    error = start
+
     def displacements(self, candidates, each):
         without = {one: self.start(set(candidates) - {one}, ()) for one in each}
         now = self.start(candidates, ())
@@ -453,7 +455,7 @@ class Worth:
         return Displacements([np.array([[now, 0.0, 0.0]])], off)
 
 
-def selected(monkeypatch, worth, shares=((1.0, 1.0),)):
+def selected(monkeypatch, worth, shares=((1.0, 1.0),), flights=2):
     """Return the ValidatedSelection of effects by their worth. shares : of each in two flights."""
     trials = Worth(worth)
     of_each = dict(zip(worth, [*shares, *[(1.0, 1.0)] * len(worth)]))
@@ -464,10 +466,10 @@ def selected(monkeypatch, worth, shares=((1.0, 1.0),)):
         lambda _, one, names: [Share(*of) for of in zip("fg", of_each[one], (0.05, 0.05))],
     )
     selection = SimpleNamespace(
-        chosen=tuple(map(Some, worth)), kept=lambda candidates, applied=False: tuple(candidates)
+        chosen=tuple(map(Some, worth)), kept=lambda candidates, share=None: tuple(candidates)
     )
     attribution = SimpleNamespace(selection=selection, detections=(), names=("f", "g"))
-    return select_by_error(attribution, [None, None], Baseline(NONE))
+    return select_by_error(attribution, [None] * flights, Baseline(NONE))
 
 
 def test_fewer_are_dropped_where_displacements_do_not_add_up(monkeypatch):
@@ -481,6 +483,38 @@ def test_fewer_are_dropped_where_displacements_do_not_add_up(monkeypatch):
     }
     assert "the filter does better without it" in found.refused[0].why
     assert found.misleading == {"a"}
+
+
+@pytest.mark.parametrize(
+    ("worth", "flights", "share"),
+    [
+        (1.0, 1, 1.0 - 0.5 * (1.0 / 2.5) ** 2),
+        (0.5, 1, 1.0 - 0.5 * (1.0 / 2.0) ** 2),
+        (1.0, 2, 1.0 - 0.25 * (1.0 / 2.5) ** 2),
+        (-1.0, 1, 1.0),
+    ],
+)
+def test_values_shrink_by_the_power_of_the_error_that_remains(monkeypatch, worth, flights, share):
+    """Without "a", the error is its worth and 0.5 m larger than 1 m. It is not applied at -1 m."""
+    assert selected(monkeypatch, {"a": worth}, flights=flights).share == pytest.approx(share)
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "why"),
+    [
+        ("nlos", 2.3, "an error above 2 m is an obstruction of this flight"),
+        (None, -2.3, "an error above 2 m is an obstruction of this flight"),
+        (None, 1.4, None),
+        ("anchor_delay", 2.3, None),
+    ],
+)
+def test_a_large_error_at_a_place_of_a_single_flight_is_an_obstruction(name, size, why):
+    table = SimpleNamespace(matrix=lambda _: np.eye(3)[:, :1], radio_rows=np.array([0, 1]))
+    fitted = SimpleNamespace(values=lambda _: np.array([size]))
+    selection = SimpleNamespace(table=table, fit=fitted)
+    term = SimpleNamespace(effect=SimpleNamespace(values={}), function=None)
+    one = SimpleNamespace(name=name, declared=name is not None, terms=(term,), columns=("c",))
+    assert validation._why_of_this_flight(selection, one) == why
 
 
 def test_what_another_flight_may_not_have_is_said_and_not_kept(monkeypatch):

@@ -143,6 +143,7 @@ def diagnose(
         outcome.changes,
         judge_truth=judge_truth,
         cases=tuple(outcome.cases),
+        share=outcome.share,
     )
 
 
@@ -247,7 +248,7 @@ class _Outcome:
     sides : (before, after) and judged_on, as of Diagnosis
     attribution : Attribution with repairs of ids and signs; baseline : Baseline; changes :
         sentences
-    cases : the judged ValidationCases
+    cases : the judged ValidationCases; share : of the values that is applied
     """
 
     findings: list[EffectFinding]
@@ -259,6 +260,7 @@ class _Outcome:
     baseline: comparison.Baseline
     cases: Sequence[comparison.ValidationCase]
     changes: tuple[str, ...] = ()
+    share: float = 1.0
 
 
 def _searched(
@@ -385,7 +387,9 @@ def _by_error(
         comparison.Baseline(base, config),
     )
     work.progress("judging")
-    cases, judged_on = validation.validation_cases(model, fitted, held_out, base, effects)
+    cases, judged_on = validation.validation_cases(
+        model, fitted, held_out, base, effects, selected.share
+    )
     judged = partial(
         comparison.compare,
         baseline=baseline,
@@ -414,7 +418,17 @@ def _by_error(
         model.findings(), attribution.findings(), attribution.detections, selected.worth
     )
     sides = before, after
-    return _Outcome(findings, effects, refused, sides, judged_on, attribution, baseline, cases)
+    return _Outcome(
+        findings,
+        effects,
+        refused,
+        sides,
+        judged_on,
+        attribution,
+        baseline,
+        cases,
+        share=selected.share,
+    )
 
 
 def _by_self_calibration(

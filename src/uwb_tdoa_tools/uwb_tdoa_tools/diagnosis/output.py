@@ -57,6 +57,7 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
             "before": {key: diagnosis.before[key] for key in ("runs", "pooled")},
             "after": {key: diagnosis.after[key] for key in ("runs", "pooled")},
             "judged_on": diagnosis.judged_on,
+            "share": diagnosis.share,
             "tdoa_std": diagnosis.tdoa_std,
             "written": diagnosis.written
             and {key: diagnosis.written[key] for key in ("runs", "pooled")},

@@ -43,6 +43,7 @@ class Diagnosis:
     applying : ((command line, its purpose), ...), commands that apply the effects
     judge_truth : {name of a flight: sentences}, clock or frame errors of its ground truth
     cases : (ValidationCase, ...) that `after` is of
+    share : of the fitted values that is applied, because few flights support less
     tdoa_std : m, noise for the filter beside these effects, None if it was not measured
     next_flight : NextFlight that settles what is left open, None if none was asked for
     written : as `after`, with this noise too: what the written files give; None if not judged
@@ -65,6 +66,7 @@ class Diagnosis:
     applying: tuple[tuple[str, str], ...] = ()
     judge_truth: dict[str, tuple[str, ...]] = field(default_factory=dict)
     cases: tuple[ValidationCase, ...] = ()
+    share: float = 1.0
     tdoa_std: float | None = None
     written: dict[str, Any] | None = None
     next_flight: NextFlight | None = None

@@ -46,6 +46,10 @@ MOST_HARM = 0.2
 # In a single flight an effect stays only if the error grows by this share without it, because
 # flights differ.
 WORTH_OF_ONE = 0.05
+# m, error of a TDOA or a range in the air: walls and furniture cause less, people who move cause more
+OBSTRUCTED = 2.0
+# share of the remaining power of the error by which the values of a single flight shrink
+UNEXPLAINED = 0.5
 # m, and share of the error: with a smaller worth an effect is not written, as it rounds to nothing.
 LEAST_WORTH, LEAST_SHARE = 0.0005, 0.005
 # Largest relative change of a candidate's contribution with which its displacement is used again.
@@ -62,7 +66,7 @@ class ValidatedSelection:
     refused : (Refused, ...) of the others
     worth : {candidate or detection: increase of the mean 3D RMSE without it, m}; for dropped ones,
         at the time they were dropped
-    error : mean 3D RMSE of the trials, m
+    error : mean 3D RMSE of the trials, m; share : of the values that is applied
     misleading : names of declared effects that explain residuals and do not help the filter
     poses : of the last run of the filter, of each trial
     """
@@ -72,6 +76,7 @@ class ValidatedSelection:
     refused: tuple[Refused, ...]
     worth: dict[Candidate | Detection, float]
     error: float
+    share: float = 1.0
     misleading: frozenset[str] = frozenset()
     poses: Sequence[FixedPoses | None] = (None,)
 
@@ -92,7 +97,7 @@ def cross_fitted(
     candidates: Sequence[Candidate],
     detections: Sequence[Detection],
     most: int | None = None,
-    applied: bool = False,
+    share: float | None = None,
 ) -> list[ValidationCase]:
     """Return ValidationCases with effects of `candidates` fitted to the other flights.
 
@@ -100,7 +105,7 @@ def cross_fitted(
     effects fitted to the other half.
 
     most : largest number of cases, evenly taken; None for all
-    applied : as of `refit`
+    share : as of `refit`
     """
     table, selection = attribution.selection.table, attribution.selection
     if len(flights) > 1:
@@ -130,7 +135,7 @@ def cross_fitted(
         others = replace(
             selection,
             chosen=tuple(candidates),
-            fit=refit(table, columns, selection.fit, rows, applied),
+            fit=refit(table, columns, selection.fit, rows, share),
         )
         found = usable([*effects_of(others), *(detection.effect for detection in detections)])
         fitted = [other for other in range(len(flights)) if other != k] or [k]
@@ -215,25 +220,25 @@ def select_by_error(
             useless += _with_and_without(trial, error)
             why = useless if trial >= error * (1.0 - WORSE) else why_without(trial, error)
             refused.append(Refused(detection.effect.label, why))
-    for momentary in (one for one in candidates if alone and _momentary(one)):
-        refused.append(
-            Refused(
-                momentary.label,
-                (
-                    "it happened at a time of this flight; of another one that tells nothing: "
-                    f"{SECOND}"
-                ),
+    for one in list(candidates) if alone else []:
+        if reason := _why_of_this_flight(attribution.selection, one):
+            refused.append(
+                Refused(one.label, f"{reason}; of another one that tells nothing: {SECOND}")
             )
-        )
-        candidates = [one for one in candidates if one is not momentary]
+            candidates.remove(one)
+    # The fit takes errors of its flights alone for effects of all flights. They are likely where much
+    # of the error remains, and average out over flights.
+    remains = min(error / trials.error([], detections), 1.0) if candidates else 0.0
+    share = 1.0 - UNEXPLAINED * remains**2 / len(flights)
     # with the weights of the trials
-    selection = attribution.selection.kept(candidates, applied=True)
+    selection = attribution.selection.kept(candidates, share)
     return ValidatedSelection(
         selection,
         tuple(detections),
         tuple(refused),
         worth,
         error,
+        share,
         frozenset(misleading),
         trials.poses,
     )
@@ -364,6 +369,19 @@ def _momentary(candidate: Candidate) -> bool:
     return not recurs(candidate) or any(
         one.covariate == "time" and one.shape not in DRIFTS for one in functions
     )
+
+
+def _why_of_this_flight(selection: Selection, candidate: Candidate) -> str | None:
+    """Return why a Candidate belongs to a single flight alone, or None."""
+    if _momentary(candidate):
+        return "it happened at a time of this flight"
+    if candidate.declared and candidate.name != "nlos":
+        return None
+    table = selection.table
+    part = table.matrix(candidate.columns) @ selection.fit.values(candidate.columns)
+    if np.abs(part[table.radio_rows]).max(initial=0.0) > OBSTRUCTED:
+        return f"an error above {OBSTRUCTED:g} m is an obstruction of this flight"
+    return None
 
 
 class _Trials:
@@ -503,12 +521,14 @@ def validation_cases(
     holdout: Sequence[Flight],
     base: EffectSet,
     effects: EffectSet,
+    share: float = 1.0,
 ) -> tuple[list[ValidationCase], str]:
     """Return the cases that validate an Attribution, and a description of the data.
 
     They are the hold-out Flights, or without any, cross-fitted cases of the fitted flights.
 
     base : EffectSet before; effects : EffectSet with the found effects
+    share : of the values that is applied
     """
     if holdout:
         return [ValidationCase(flight, effects) for flight in holdout], HELD_OUT
@@ -521,6 +541,6 @@ def validation_cases(
         base,
         attribution.selection.chosen,
         attribution.detections,
-        applied=True,
+        share=share,
     )
     return cases, on + SELECTED_ON

@@ -165,21 +165,23 @@ def refit(
     columns: Sequence[Column],
     model: Fit,
     rows: np.ndarray | None = None,
-    applied: bool = False,
+    share: float | None = None,
 ) -> Fit:
     """Fit some Columns with the weights and scales of another Fit.
 
     rows : (n,) bool, rows that determine beta; None for all. With rows, the covariance is the
         covariance of the model.
-    applied : whether the values are applied, with a prior of APPLIED_STD for positions of anchors
+    share : of the values that is applied, fitted with a prior of APPLIED_STD for positions of
+        anchors; None for the values of the search
     """
     x, sizes, root = table.matrix(columns), prior_sizes(columns), model.information(table)
-    if applied:
+    if share is not None:
         moved = [column.effect == (POSITION,) for column in columns]
         sizes = np.where(moved, np.minimum(sizes, APPLIED_STD), sizes)
     some = slice(None) if rows is None else rows
     xw = weighted(x[some], root[some])
     beta, cov, _ = solve(product(xw, x[some]), xw.T @ table.y[some], sizes)
+    beta = beta if share is None else share * beta
     residual = table.y - x @ beta
     if rows is None and columns:
         cov = _covariance(table, columns, residual, root)

@@ -78,16 +78,16 @@ class Selection:
             self, **chosen, fit=fit(self.table, columns_of(chosen["chosen"]), self.fit.inflation)
         )
 
-    def kept(self, candidates: Collection[Candidate], applied: bool = False) -> Selection:
+    def kept(self, candidates: Collection[Candidate], share: float | None = None) -> Selection:
         """Return the Selection of some of the chosen Candidates, with the present weights.
 
         With these weights, contributions of the dropped candidates do not count as outliers.
 
-        applied : as of `refit`
+        share : as of `refit`
         """
         chosen = self._chosen_of(candidates)
         columns = columns_of(chosen["chosen"])
-        return replace(self, **chosen, fit=refit(self.table, columns, self.fit, applied=applied))
+        return replace(self, **chosen, fit=refit(self.table, columns, self.fit, share=share))
 
     def where(self, keeps: Callable[[Effect], bool]) -> Selection:
         """Return the Selection of terms whose Effects `keeps` accepts, with the present weights.

@@ -27,6 +27,7 @@ from .entries import CM, LEAST_WORTH, WORTH_DOING, Entry, entries, for_people
 
 MOST_NAMES = 6  # largest number of named flights
 NAMED = 3  # largest number of named reasons, and of named places
+WHOLE = 0.995  # share of the values from which it rounds to 100 %
 MOST = 0.5  # share of the gain from which an effect is most of it
 POINTS = 60  # at which a function is evaluated
 # smallest RMS residual of a named pair over BLOCK s: m, and relative to the RMS of all rows
@@ -327,6 +328,12 @@ def _caveats(diagnosis: Diagnosis) -> list[str]:
         )
     if len(_names(diagnosis)) == 1:
         out.append("One flight does not tell how much flights differ.")
+    if diagnosis.share < WHOLE:
+        shows = "these show" if len(diagnosis.flights) > 1 else "this one shows"
+        out.append(
+            f"Other flights have less of what {shows}, so {100.0 * diagnosis.share:.0f} % of each "
+            "fitted value is applied; more flights raise that."
+        )
     return out
 
 
