@@ -512,7 +512,10 @@ def test_a_large_error_at_a_place_of_a_single_flight_is_an_obstruction(name, siz
     table = SimpleNamespace(matrix=lambda _: np.eye(3)[:, :1], radio_rows=np.array([0, 1]))
     fitted = SimpleNamespace(values=lambda _: np.array([size]))
     selection = SimpleNamespace(table=table, fit=fitted)
-    term = SimpleNamespace(effect=SimpleNamespace(values={}), function=None)
+    effect = (
+        EFFECTS[name]({"3.x": 1.0, "3.radius": 0.6} if name == "nlos" else {}) if name else None
+    )
+    term = SimpleNamespace(effect=effect or SimpleNamespace(values={}), function=None)
     one = SimpleNamespace(name=name, declared=name is not None, terms=(term,), columns=("c",))
     assert validation._why_of_this_flight(selection, one) == why
 

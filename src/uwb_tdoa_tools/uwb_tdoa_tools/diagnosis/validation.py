@@ -375,7 +375,10 @@ def _why_of_this_flight(selection: Selection, candidate: Candidate) -> str | Non
     """Return why a Candidate belongs to a single flight alone, or None."""
     if _momentary(candidate):
         return "it happened at a time of this flight"
-    if candidate.declared and candidate.name != "nlos":
+    of_place = any(
+        term.effect.is_condition(key) for term in candidate.terms for key in term.effect.values
+    )
+    if candidate.declared and not of_place:
         return None
     table = selection.table
     part = table.matrix(candidate.columns) @ selection.fit.values(candidate.columns)
