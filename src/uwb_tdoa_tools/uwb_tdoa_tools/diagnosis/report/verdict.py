@@ -28,8 +28,8 @@ from .entries import CM, LEAST_WORTH, WORTH_DOING, Entry, entries, for_people
 MOST_NAMES = 6  # largest number of named flights
 NAMED = 3  # largest number of named reasons, and of named places
 WHOLE = 0.995  # share of the values from which it rounds to 100 %
-# gain of other flights over the promised gain of a single one, measured (docs/notebook/diagnosis.md)
-OF_OTHERS = "0.6 to 0.9"
+# gain of other flights over the promised gain of FEW, measured (docs/notebook/diagnosis.md)
+FEW, OF_OTHERS = 2, "0.5 to 0.9"
 MOST = 0.5  # share of the gain from which an effect is most of it
 POINTS = 60  # at which a function is evaluated
 # smallest RMS residual of a named pair over BLOCK s: m, and relative to the RMS of all rows
@@ -331,14 +331,14 @@ def _caveats(diagnosis: Diagnosis) -> list[str]:
     if len(_names(diagnosis)) == 1:
         out.append("One flight does not tell how much flights differ.")
     if diagnosis.share < WHOLE:
-        alone = len(diagnosis.flights) == 1
-        shows = "this one shows" if alone else "these show"
+        count = len(diagnosis.flights)
+        shows = "these show" if count > 1 else "this one shows"
         said = (
             f"Other flights have less of what {shows}, so {100.0 * diagnosis.share:.0f} % of each "
         )
         said += "fitted value is applied"
-        if alone:
-            said += f"; expect {OF_OTHERS} of this gain on them, and give a second flight"
+        if count <= FEW:
+            said += f"; expect {OF_OTHERS} of this gain on them, and more with further flights"
         out.append(f"{said}.")
     return out
 
