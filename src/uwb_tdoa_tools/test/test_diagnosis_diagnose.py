@@ -112,7 +112,9 @@ def test_the_search_is_repeated_without_what_misleads_the_filter(errors, without
         worst = next(one for one in ("anchor_delay", "nlos", "") if one not in found.left_out)
         refused = (Refused(worst, "misleads"), Refused("other", str(error)))
         misleading = frozenset((worst,)) - {""}
-        return ValidatedSelection(None, (), refused, {}, error, misleading, "of the run before")
+        return ValidatedSelection(
+            None, (), refused, {}, error, misleading=misleading, poses="of the run before"
+        )
 
     monkeypatch.setattr(module, "EffectSearch", lambda *_, **__: ScriptedSearch())
     monkeypatch.setattr(module, "written", lambda selection, _: selection)
