@@ -29,6 +29,8 @@ SETS = {
 # m, that each coordinate is put off by; seed of the first recording of a set; s
 OFF, FIRST, SECONDS = ((0.05, 0.1, 0.2), 700, 60.0)
 
+METRES, OVER_DEVIATION = 0, 1  # places of errors in a result of `normalised`
+
 
 def add_options(add):
     """The options of the study."""
@@ -39,9 +41,8 @@ def run(args):
     """Print the table."""
     print(
         "| recordings | off by, m | coordinates: fit alone | as stated | each | delays: fit alone "
-        "| as stated | coordinates of the search, m | applied, m | applied over stated |\n|---|"
-        + 9
-        * "---:|"
+        "| as stated | coordinates of the search, m | applied, m | applied over stated |"
+        "\n|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|"
     )
     positions, delays = ANCHORS_FOUND
     for name, recordings in SETS.items():
@@ -53,23 +54,24 @@ def run(args):
         ]
         for std in OFF:
             told = [normalised(flight, std, FIRST + k) for k, flight in enumerate(flights)]
-
-            def rms(kind, fit, of_deviation=1):
-                return root([one[kind][fit][of_deviation] for one in told])  # noqa: B023
-
             each = [
                 f"{root([ratio]):.2f}"
                 for ratio in (one[positions]["stated"][1] for one in told)
                 if len(ratio)
             ]
             figures = [
-                f"{rms(positions, 'alone'):.2f}",
-                f"{rms(positions, 'stated'):.2f}",
+                f"{_rms(told, positions, 'alone'):.2f}",
+                f"{_rms(told, positions, 'stated'):.2f}",
                 " - ".join(sorted({min(each), max(each)})),
-                f"{rms(delays, 'alone'):.2f}",
-                f"{rms(delays, 'stated'):.2f}",
-                f"{rms(positions, 'stated', 0):.3f}",
-                f"{rms(positions, 'applied', 0):.3f}",
-                f"{rms(positions, 'applied'):.2f}",
+                f"{_rms(told, delays, 'alone'):.2f}",
+                f"{_rms(told, delays, 'stated'):.2f}",
+                f"{_rms(told, positions, 'stated', METRES):.3f}",
+                f"{_rms(told, positions, 'applied', METRES):.3f}",
+                f"{_rms(told, positions, 'applied'):.2f}",
             ]
             print(f"| {name} | {std} | " + " | ".join(figures) + " |", flush=True)
+
+
+def _rms(several, effect, fit, unit=OVER_DEVIATION):
+    """Root mean square of the errors of an effect in a fit, over all results of `normalised`."""
+    return root([one[effect][fit][unit] for one in several])

@@ -46,7 +46,7 @@ MOST_HARM = 0.2
 # In a single flight an effect stays only if the error grows by this share without it, because
 # flights differ.
 WORTH_OF_ONE = 0.05
-# m, error of a TDOA or a range in the air: walls and furniture cause less, people who move cause more
+# m, error of a TDOA or a range in the air. Walls and furniture cause less; people who move cause this.
 OBSTRUCTED = 2.0
 # share of the remaining power of the error by which the values of a single flight shrink
 UNEXPLAINED = 0.5
@@ -223,7 +223,7 @@ def select_by_error(
     for one in list(candidates) if alone else []:
         if reason := _why_of_this_flight(attribution.selection, one):
             refused.append(
-                Refused(one.label, f"{reason}; of another one that tells nothing: {SECOND}")
+                Refused(one.label, f"{reason}, and another one may not have it: {SECOND}")
             )
             candidates.remove(one)
     # The fit takes errors of its flights alone for effects of all flights. They are likely where much
