@@ -18,6 +18,7 @@ from uwb_tdoa_tools.command_lines import lines_of_use
 from uwb_tdoa_tools.diagnosis import diagnose, output
 from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.findings import EffectFinding, Refused
+from uwb_tdoa_tools.diagnosis.over_flights import Share, in_words
 from uwb_tdoa_tools.diagnosis.references import GroundTruth, Heights, Nothing
 from uwb_tdoa_tools.diagnosis.regression.confounding import Alternative, Unobservable
 from uwb_tdoa_tools.diagnosis.regression.terms import Candidate, Term
@@ -240,12 +241,17 @@ def test_a_single_judged_flight_and_a_judge_that_was_fitted_are_named_as_such(re
     assert not any("decided on these same flights" in sentence for sentence in alone)
 
 
-def test_the_verdict_says_which_share_of_the_values_few_flights_support(result):
+def test_the_verdict_says_which_share_few_flights_support_and_what_others_will_gain(result):
     for share, flights, expected in ((0.79, 1, True), (0.79, 3, True), (1.0, 1, False)):
         several = result.flights[:1] * flights
-        more = " ".join(verdict(replace(result, flights=several, share=share)).more)
-        assert ("79 % of each fitted value is applied" in more) == expected
-        assert ("expect 0.5 to 0.9 of this gain" in more) == (expected and flights == 1)
+        own = result.flights[0].name
+        for name in (own, "other"):
+            sides = {name: 0.3}, {name: 0.1}
+            diagnosed = replace(judged(result, *sides, [0.5, 0.8]), flights=several, share=share)
+            more = " ".join(verdict(diagnosed).more)
+            assert ("79 % of each fitted value is applied" in more) == expected
+            few = expected and flights == 1 and name == own
+            assert ("expect 0.5 to 0.9 of this gain, and one in ten to get worse" in more) == few
 
 
 def test_nothing_found_and_nothing_added_are_told_apart(result):
@@ -604,6 +610,25 @@ def test_the_numbers_of_findings_are_those_of_effects_yaml(result, page, tmp_pat
             assert sentence in text and sentence in screen
     value = measured(written["anchor_delay"].values["3"], written["anchor_delay"].std["3"])
     assert f"3 = {value}" in screen and value in text
+
+
+def test_what_all_flights_share_is_said_once(result):
+    alike, other = ((Share("a", first, 0.1), Share("b", 2.0 - first, 0.1)) for first in (1.0, 1.7))
+
+    def both(*several):
+        effects = delay(), EFFECTS["anchor_position"]({"1.x": 0.2})
+        findings = [
+            replace(finding(effect), shares=shares) for effect, shares in zip(effects, several)
+        ]
+        diagnosed = replace(result, findings=findings)
+        return " ".join(output.as_text(diagnosed).split()), said(html(diagnosed))
+
+    for text in both(alike, alike):
+        assert text.count("in all flights") == 1 and "All of it is the same in all flights." in text
+    for text in both(alike, other):
+        assert "The same in all flights: anchor_delay." in text and in_words(other) in text
+    for text in both(other):
+        assert "in all flights" not in text
 
 
 def test_all_outputs_say_the_same(result, page):

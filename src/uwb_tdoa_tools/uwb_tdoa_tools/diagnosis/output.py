@@ -15,7 +15,7 @@ from uwb_tdoa_bias.effects.base import listed
 from .. import outputs
 from .findings import EffectFinding, prefixes_of
 from .over_flights import course
-from .report.entries import doubts, entries, worth_in_words
+from .report.entries import agreement, doubts, entries, worth_in_words
 from .report.tables import ANCHORS, SURE, anchors, basis, by_reason
 from .report.unclear import by_remedy, undetermined
 from .report.verdict import cause, faults_in_words, truth_in_words, verdict
@@ -89,7 +89,11 @@ def as_text(diagnosis: Diagnosis) -> str:
         what = f"{entry.title}: {entry.values}" if entry.findings[0].declared else cause(entry)
         label = "found" if entry.findings[0].declared else "no name"
         lines.append((label, f"{what}; worth {worth_in_words(entry)}."))
-        lines += [("", sentence) for sentence in (entry.shared, *others[entry.title]) if sentence]
+        lines += [
+            ("", sentence) for sentence in (entry.differing, *others[entry.title]) if sentence
+        ]
+    if agreement(added):
+        lines.append(("", agreement(added)))
     for remedy, several in by_remedy(undetermined(diagnosis)).items():
         lines.append(("not told", f"{listed(several)}; what would tell: {remedy}."))
     if added:

@@ -23,6 +23,7 @@ WORTH_DOING = 0.005  # m, smallest gain in position that is worth an action
 DEGREES = float(np.degrees(1.0))  # degrees per radian
 FORMS = {"arrival": " (of each arrival)", "anchor": " (by anchor)"}
 SHOWN = 6  # largest number of shown values
+NAMED = 3  # largest number of entries that are named as alike
 LONGEST = 8.0  # em, longest bar
 
 
@@ -73,10 +74,14 @@ class Entry:
         return "structure that no effect of the catalogue explains"
 
     @property
-    def shared(self) -> str:
-        """Return in a few words how flights differ; "" for a single flight."""
-        shares = self.findings[0].shares
-        return "the same in all flights" if course(shares) == ALL else in_words(shares)
+    def alike(self) -> bool:
+        """Return whether all flights show the same of it."""
+        return course(self.findings[0].shares) == ALL
+
+    @property
+    def differing(self) -> str:
+        """Return in a few words how flights differ; "" if they do not, or are one."""
+        return "" if self.alike else in_words(self.findings[0].shares)
 
     @property
     def alternatives(self) -> list[Alternative]:
@@ -142,6 +147,17 @@ def _doubts(sentence: str, alternatives: Iterable[Alternative]) -> list[str]:
     for other in alternatives:
         groups.setdefault(other.tell_apart, []).append(other.effect)
     return [sentence.format(listed(names, "or"), flight) for flight, names in groups.items()]
+
+
+def agreement(found: Sequence[Entry]) -> str:
+    """Return which entries all flights show alike, as a sentence; "" for none."""
+    alike = [entry.title for entry in found if entry.alike]
+    if not alike:
+        return ""
+    if len(alike) == len(found) > 1:
+        return "All of it is the same in all flights."
+    several = listed(alike) if len(alike) <= NAMED else f"{len(alike)} of {len(found)} findings"
+    return f"The same in all flights: {several}."
 
 
 def doubts(found: Iterable[Entry]) -> dict[str, list[str]]:

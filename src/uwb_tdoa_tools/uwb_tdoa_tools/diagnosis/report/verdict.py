@@ -28,8 +28,9 @@ from .entries import CM, LEAST_WORTH, WORTH_DOING, Entry, entries, for_people
 MOST_NAMES = 6  # largest number of named flights
 NAMED = 3  # largest number of named reasons, and of named places
 WHOLE = 0.995  # share of the values from which it rounds to 100 %
-# gain of other flights over the promised gain of FEW, measured (docs/notebook/diagnosis.md)
-FEW, OF_OTHERS = 2, "0.5 to 0.9"
+# What other flights show of a diagnosis of FEW flights, measured (docs/notebook/diagnosis.md): their
+# gain over the promised one, and how many get worse by 5 %
+FEW, OF_OTHERS, WORSE_OF_OTHERS = 2, "0.5 to 0.9", "one in ten"
 MOST = 0.5  # share of the gain from which an effect is most of it
 POINTS = 60  # at which a function is evaluated
 # smallest RMS residual of a named pair over BLOCK s: m, and relative to the RMS of all rows
@@ -323,23 +324,25 @@ def _caveats(diagnosis: Diagnosis) -> list[str]:
     if base > 0:
         effects = "effects" if base > 1 else "effect"
         out.append(f"Before is with the {base} {effects} that the model held already.")
+    count = len(diagnosis.flights)
+    if diagnosis.share < WHOLE:
+        shows = "these show" if count > 1 else "this one shows"
+        out.append(
+            f"Other flights have less of what {shows}, so {100.0 * diagnosis.share:.0f} % of each "
+            "fitted value is applied."
+        )
     if set(_names(diagnosis)) & {flight.name for flight in diagnosis.flights}:
         out.append(
             "Which effects to add was decided on these same flights; flights given as "
             "--holdout judge that too."
         )
+        if diagnosis.share < WHOLE and count <= FEW:
+            out.append(
+                f"On other flights, expect {OF_OTHERS} of this gain, and {WORSE_OF_OTHERS} to get "
+                "worse by 5 % or more. Further flights make both better."
+            )
     if len(_names(diagnosis)) == 1:
         out.append("One flight does not tell how much flights differ.")
-    if diagnosis.share < WHOLE:
-        count = len(diagnosis.flights)
-        shows = "these show" if count > 1 else "this one shows"
-        said = (
-            f"Other flights have less of what {shows}, so {100.0 * diagnosis.share:.0f} % of each "
-        )
-        said += "fitted value is applied"
-        if count <= FEW:
-            said += f"; expect {OF_OTHERS} of this gain on them, and more with further flights"
-        out.append(f"{said}.")
     return out
 
 
