@@ -43,15 +43,11 @@ DRIFTS = ("line", "beyond", "below", "parabola")
 WORSE = 0.005
 # largest probability that an effect of several flights does harm to another flight
 MOST_HARM = 0.2
-# In a single flight an effect stays only if the error grows by this share without it, because
-# flights differ.
-WORTH_OF_ONE = 0.05
 # m, error of a TDOA or a range in the air. Walls and furniture cause less; people who move cause this.
 OBSTRUCTED = 2.0
 # share of the remaining power of the error by which the values of a single flight shrink
 UNEXPLAINED = 0.5
-# m, and share of the error: with a smaller worth an effect is not written, as it rounds to nothing.
-LEAST_WORTH, LEAST_SHARE = 0.0005, 0.005
+LEAST_WORTH = 0.0005  # m, below which an effect is not written, because it rounds to nothing
 # Largest relative change of a candidate's contribution with which its displacement is used again.
 SAME_MOVE = 0.1
 SELECTED_ON = ", chosen on all of them (--holdout judges the choice too)"
@@ -180,7 +176,7 @@ def select_by_error(
     error = trials.start(candidates, detections)
     while applicable := [one for one in _applicable(candidates) if one not in validated]:
         displacements = trials.displacements(candidates, applicable)
-        gone = _dropped(displacements, applicable, alone)
+        gone = _dropped(displacements, applicable)
         if not gone:
             whole = displacements.error([])
             for one in applicable:
@@ -211,15 +207,13 @@ def select_by_error(
         if not detection.effect.usable:
             continue
         trial = trials.error(candidates, [*detections, detection])
-        if trial < error * (1.0 - max(WORTH_OF_ONE if alone else 0.0, WORSE)):
+        if trial < error * (1.0 - WORSE):
             detections.append(detection)
             worth[detection] = error - trial
             error = trial
         else:
-            useless = f"it gains less than {100.0 * WORSE:g} % of the error: "
-            useless += _with_and_without(trial, error)
-            why = useless if trial >= error * (1.0 - WORSE) else why_without(trial, error)
-            refused.append(Refused(detection.effect.label, why))
+            why = f"it gains less than {100.0 * WORSE:g} % of the error: "
+            refused.append(Refused(detection.effect.label, why + _with_and_without(trial, error)))
     for one in list(candidates) if alone else []:
         if reason := _why_of_this_flight(attribution.selection, one):
             refused.append(
@@ -284,30 +278,23 @@ def _worse_in_one(
 
 
 def _dropped(
-    displacements: Displacements, candidates: Sequence[Candidate], alone: bool
+    displacements: Displacements, candidates: Sequence[Candidate]
 ) -> dict[Candidate, tuple[float, float]]:
     """Return the Candidates to drop, with the predicted errors before and after, m.
 
     The one without which the error is smallest goes first.
-
-    alone : whether the flight is a single one
     """
     gone: dict[Candidate, tuple[float, float]] = {}
     error = lowest = displacements.error([])
     while len(gone) < len(candidates):
         tried = {one: displacements.error([*gone, one]) for one in candidates if one not in gone}
         one = min(tried, key=tried.__getitem__)
-        if tried[one] > _limit(error if alone else lowest, alone):
+        if tried[one] > lowest + LEAST_WORTH:
             break
         gone[one] = error, tried[one]
         error = tried[one]
         lowest = min(lowest, error)
     return gone
-
-
-def _limit(error: float, alone: bool) -> float:
-    """Return up to which error without it, m, an effect is dropped; error : with it."""
-    return error + (WORTH_OF_ONE * error if alone else min(LEAST_WORTH, LEAST_SHARE * error))
 
 
 @dataclass(frozen=True, eq=False)
@@ -347,12 +334,7 @@ def why_without(error: float, without: float) -> str:
     figures = _with_and_without(error, without)
     if without <= error * (1.0 - WORSE):
         return f"the filter does better without it: {figures}"
-    if without < error + min(LEAST_WORTH, LEAST_SHARE * error):
-        return f"it is worth nothing for the position: {figures}"
-    return (
-        f"of one flight, worth less than {100.0 * WORTH_OF_ONE:g} % of the error, it may as well do harm to "
-        f"another; {SECOND}: {figures}"
-    )
+    return f"it is worth nothing for the position: {figures}"
 
 
 def _with_and_without(error: float, without: float) -> str:

@@ -16,9 +16,9 @@ from ..findings import EffectFinding, Refused
 from ..over_flights import ALL, course, in_words
 from ..regression.confounding import Alternative
 from ..result import Diagnosis
+from ..validation import LEAST_WORTH
 
 CM = 100.0  # cm per metre
-LEAST_WORTH = 0.0005  # m, smallest difference
 WORTH_DOING = 0.005  # m, smallest gain in position that is worth an action
 DEGREES = float(np.degrees(1.0))  # degrees per radian
 FORMS = {"arrival": " (of each arrival)", "anchor": " (by anchor)"}

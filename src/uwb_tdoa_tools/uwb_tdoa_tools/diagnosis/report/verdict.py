@@ -23,7 +23,8 @@ from ..findings import prefixes_of
 from ..regression.table import BLOCK
 from ..result import Diagnosis
 from ..self_calibration.solve import CLEARLY, CLEARLY_OF_RANGES, LEFT
-from .entries import CM, LEAST_WORTH, WORTH_DOING, Entry, entries, for_people
+from ..validation import LEAST_WORTH
+from .entries import CM, WORTH_DOING, Entry, entries, for_people
 
 MOST_NAMES = 6  # largest number of named flights
 NAMED = 3  # largest number of named reasons, and of named places
