@@ -257,6 +257,16 @@ def test_the_course_of_a_shape(shape, at, second):
     )
 
 
+@pytest.mark.parametrize("shape", ["line", "beyond", "below", "step", "interval"])
+def test_several_shapes_at_once_are_those_of_each(shape):
+    one = np.array(KNOTS[SHAPES[shape][0]])
+    several = np.stack([one, one + 0.3, 1.7 * one])
+    at = np.array([0.5, 1.0, 1.6, 2.2, 3.7, 9.0, np.nan])
+    together = shape_basis(shape, several.T, at[:, None])
+    for k, knots in enumerate(several):
+        np.testing.assert_array_equal(together[:, k], shape_basis(shape, knots, at))
+
+
 def test_a_pair_counts_both_ways_and_a_direction_one():
     samples = random_samples(1)
     ids = samples.anchors.ids

@@ -572,8 +572,10 @@ def known_covariates() -> dict[str, tuple[str, ...]]:
     }
 
 
-def shape_basis(shape: str, knots: Sequence[float], values: np.ndarray) -> np.ndarray:
+def shape_basis(shape: str, knots: Sequence[float] | np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return the basis functions of a shape at covariate values (n,), (n, k); NaN of NaN.
+
+    Knots may be arrays (m,), of m shapes, with values (n, 1). The result is (n, m, k) then.
 
     The first is 1, the level. The second is, for
     line, parabola : a rise from -1/2 to 1/2 between the knots; a parabola has its square too
@@ -582,16 +584,16 @@ def shape_basis(shape: str, knots: Sequence[float], values: np.ndarray) -> np.nd
     pulse : 1 from the first knot to the second, and again from the third
     wave : the sine of the period between the knots, and the cosine
     """
-    v, one = floats(values), np.ones(len(values))
+    v = floats(values)
     if shape == "wave":
         phase = 2.0 * np.pi * (v - knots[0]) / (knots[1] - knots[0])
-        return np.stack([one, np.sin(phase), np.cos(phase)], axis=1)
+        return np.stack([np.ones_like(phase), np.sin(phase), np.cos(phase)], axis=-1)
     low, high = knots[0], knots[-1]
     held = np.clip(v, low, high)
     if shape in ("line", "parabola"):
         second = (held - low) / (high - low) - 0.5
         if shape == "parabola":
-            return np.stack([one, second, second**2], axis=1)
+            return np.stack([np.ones_like(second), second, second**2], axis=-1)
     elif shape == "beyond":
         second = np.maximum(held - knots[1], 0.0) / (high - knots[1])
     elif shape == "below":
@@ -602,7 +604,7 @@ def shape_basis(shape: str, knots: Sequence[float], values: np.ndarray) -> np.nd
     else:
         inside = (v >= knots[1]) & (v < knots[2] if shape == "interval" else True)
         second = np.where(np.isnan(v), np.nan, 1.0 * inside)
-    return np.stack([one, second], axis=1)
+    return np.stack([np.ones_like(second), second], axis=-1)
 
 
 AXES = {"gyro": "the gyroscope reads {} about {}", "accel": "the accelerometer reads {} along {}"}

@@ -379,8 +379,11 @@ class _Bins:
         sums = np.bincount(cell[known], np.clip(values[known], edges[0], edges[-1]), n)
         centres = np.where(counted, sums / np.maximum(counted, 1), 0.5 * (edges[:-1] + edges[1:]))
         of_shapes = list(_shapes(tuple(map(float, edges))))
-        columns = [shape_basis(shape, knots, centres)[:, 1] for shape, knots in of_shapes]
-        shapes = np.pad(np.stack(columns, axis=1), ((0, 1), (0, 0)))
+        shapes = np.zeros((n + 1, len(of_shapes)))
+        for shape in dict.fromkeys(one for one, _ in of_shapes):
+            places = [k for k, (one, _) in enumerate(of_shapes) if one == shape]
+            knots = np.transpose([of_shapes[k][1] for k in places])
+            shapes[:n, places] = shape_basis(shape, knots, centres[:, None])[..., 1]
         return cls(name, edges, np.where(known, cell, n), shapes, of_shapes)
 
 
