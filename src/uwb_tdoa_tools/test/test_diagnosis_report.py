@@ -14,6 +14,7 @@ from reports import Tags, delay, finding, judged, keys_of, said
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, SmoothTerm
 from uwb_tdoa_bias.effects.base import measured
+from uwb_tdoa_bias.effects.smooth_term import causes
 from uwb_tdoa_tools.command_lines import lines_of_use
 from uwb_tdoa_tools.diagnosis import diagnose, output
 from uwb_tdoa_tools.diagnosis.channels import residuals
@@ -629,6 +630,26 @@ def test_what_all_flights_share_is_said_once(result):
         assert "The same in all flights: anchor_delay." in text and in_words(other) in text
     for text in both(other):
         assert "in all flights" not in text
+
+
+def test_causes_that_functions_share_are_said_once(result):
+    functions = [
+        SmoothTerm(
+            {f"{anchor}.c0": 0.0, f"{anchor}.c1": 0.4},
+            covariate=covariate,
+            form="anchor",
+            knots=(0.0, 1.0, 2.0),
+            shape="step",
+        )
+        for anchor, covariate in ((1, "x"), (4, "y"), (2, "time"))
+    ]
+    diagnosed = replace(result, findings=[finding(one, worth=0.03) for one in functions])
+    of_place, of_time = ("an obstacle or a reflector on that side of it", causes(functions[2])[0])
+    for text in (" ".join(output.as_text(diagnosed).split()), said(html(diagnosed))):
+        for one in functions:
+            assert one.advice()[0] in text
+        assert of_time not in of_place and text.count(f"Likely causes: {of_time}") == 2
+        assert text.count(f"Likely causes: {of_place}") == 2  # in the verdict, and in what to do
 
 
 def test_all_outputs_say_the_same(result, page):

@@ -503,7 +503,7 @@ class SmoothTerm(Effect):
             return ()
         cause, trial = causes(self)
         functions = listed(described(self, part) for part in parts)
-        return (f"Look for why {functions}: {cause}. To tell: {trial}.",)
+        return f"Look for why {functions}.", f"Likely causes: {cause}. To tell: {trial}."
 
 
 def _rising(name: str, knots: Any) -> tuple[float, ...]:

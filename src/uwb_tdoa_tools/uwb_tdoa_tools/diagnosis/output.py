@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from operator import methodcaller
 import textwrap
 from typing import Any
 
@@ -16,7 +17,7 @@ from .. import outputs
 from .findings import EffectFinding, prefixes_of
 from .over_flights import course
 from .report.entries import agreement, doubts, entries, worth_in_words
-from .report.tables import ANCHORS, SURE, anchors, basis, by_reason
+from .report.tables import ANCHORS, SURE, anchors, basis, by_reason, tasks
 from .report.unclear import by_remedy, undetermined
 from .report.verdict import cause, faults_in_words, truth_in_words, verdict
 from .result import Diagnosis
@@ -82,7 +83,9 @@ def as_text(diagnosis: Diagnosis) -> str:
     lines += [
         ("changed", f"since the last calibration, {sentence}") for sentence in diagnosis.changes
     ]
-    lines += [("do", sentence) for entry in found if entry.matters for sentence in entry.advice]
+    for task in tasks([entry for entry in found if entry.matters], methodcaller("advice")):
+        sentences = [sentence for _, several in task for sentence in several]
+        lines += [("" if k else "do", sentence) for k, sentence in enumerate(sentences)]
     added = [entry for entry in found if entry.added]
     others = doubts(added)
     for entry in added:

@@ -74,6 +74,12 @@ class Entry:
         return "structure that no effect of the catalogue explains"
 
     @property
+    def causes(self) -> tuple[str, ...]:
+        """Return the sentences of its advice that other functions without a name may share."""
+        nameless = [finding.effect for finding in self.findings if not finding.declared]
+        return tuple(sentence for effect in nameless for sentence in effect.advice()[1:])
+
+    @property
     def alike(self) -> bool:
         """Return whether all flights show the same of it."""
         return course(self.findings[0].shares) == ALL
@@ -181,7 +187,7 @@ def doubts(found: Iterable[Entry]) -> dict[str, list[str]]:
 
 def known_with(entry: Entry) -> list[str]:
     """Return sentences that qualify its advice: worth and doubt."""
-    together = ", together" if len(entry.advice) > 1 else ""
+    together = ", together" if len(entry.advice) > 1 + len(entry.causes) else ""
     out = []
     if entry.worth is not None:
         out.append(f"Worth {worth_in_words(entry)} of position{together}.")

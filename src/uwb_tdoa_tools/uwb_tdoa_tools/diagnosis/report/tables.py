@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 import re
 from typing import Any, NamedTuple
 
@@ -101,6 +101,24 @@ def advice(effect: Effect) -> Sequence[str]:
     _, _, after = its_values.partition(". ")
     rest = [after] if after else []
     return [f"{what}: the table of anchors has the values.", *rest, *sentences[1:]]
+
+
+def tasks(
+    found: Iterable[Entry], advice_on: Callable[[Effect], Sequence[str]] = advice
+) -> list[list[tuple[Entry, list[str]]]]:
+    """Return what to do: entries with the same causes together, each with its sentences.
+
+    Only the first one of them states the causes.
+
+    advice_on : returns the sentences on an Effect
+    """
+    out: dict[Hashable, list[tuple[Entry, list[str]]]] = {}
+    for entry in found:
+        task = out.setdefault(entry.causes or entry.title, [])
+        said = [sentence for one in entry.findings for sentence in advice_on(one.effect)]
+        known = entry.causes if task else ()
+        task.append((entry, [one for one in dict.fromkeys(said) if one not in known]))
+    return list(out.values())
 
 
 def remedies(diagnosis: Diagnosis) -> Table:

@@ -374,15 +374,28 @@ def reasons(diagnosis: Diagnosis) -> list[str]:
 
     There are NAMED at most. The worth is in m of 3D RMSE, so ground truth is needed: without it the
     result is []. A fitted function, which is no declared effect, is described by its largest part,
-    with its most likely causes.
+    with its most likely causes, unless these are said already.
     """
     before, after = (side["pooled"]["rmse_3d"] for side in (diagnosis.before, diagnosis.after))
     out: list[str] = []
+    said: set[str] = set()
     for entry in entries(diagnosis):
         worth = entry.worth or 0.0
-        if entry.added and worth >= (WORTH_DOING if out else LEAST_WORTH):
-            out.append(_sentence(entry, len(out), before - after))
-    return out[:NAMED]
+        if len(out) < NAMED and entry.added and worth >= (WORTH_DOING if out else LEAST_WORTH):
+            likely = _causes(entry)
+            out.append(
+                _sentence(entry, len(out), before - after) + ("" if likely in said else likely)
+            )
+            said.add(likely)
+    return out
+
+
+def _causes(entry: Entry) -> str:
+    """Return the most likely causes of a function without a name, after a space; "" for others."""
+    if entry.findings[0].declared:
+        return ""
+    others = [other.effect for other in entry.undecided[:1]]
+    return f" Likely causes: {listed([causes(_largest(entry)[0])[0], *others], 'or')}."
 
 
 def _sentence(entry: Entry, place: int, gain: float) -> str:
@@ -391,11 +404,7 @@ def _sentence(entry: Entry, place: int, gain: float) -> str:
     much = f"{CM * worth:.1f} cm"
     if not place and worth <= gain:
         much = f"{CM * worth:.1f} of {CM * gain:.1f} cm"
-    sentence = f"{begin} {cause(entry)}, worth {much}."
-    if entry.findings[0].declared:
-        return sentence
-    others = [other.effect for other in entry.undecided[:1]]
-    return f"{sentence} Likely causes: {listed([causes(_largest(entry)[0])[0], *others], 'or')}."
+    return f"{begin} {cause(entry)}, worth {much}."
 
 
 def cause(entry: Entry) -> str:
