@@ -47,6 +47,9 @@ MOST_HARM = 0.2
 OBSTRUCTED = 2.0
 # share of the remaining power of the error by which the values of a single flight shrink
 UNEXPLAINED = 0.5
+# In a single flight, an effect may stand in place of another one if the error grows by a smaller
+# share without it.
+LITTLE = 0.05
 LEAST_WORTH = 0.0005  # m, below which an effect is not written, because it rounds to nothing
 # Largest relative change of a candidate's contribution with which its displacement is used again.
 SAME_MOVE = 0.1
@@ -63,7 +66,8 @@ class ValidatedSelection:
     worth : {candidate or detection: increase of the mean 3D RMSE without it, m}; for dropped ones,
         at the time they were dropped
     error : mean 3D RMSE of the trials, m; share : of the values that is applied
-    misleading : names of declared effects that explain residuals and do not help the filter
+    misleading : names of declared effects that explain residuals, and do not help the filter or,
+        of a single flight, help it little
     poses : of the last run of the filter, of each trial
     """
 
@@ -214,6 +218,9 @@ def select_by_error(
         else:
             why = f"it gains less than {100.0 * WORSE:g} % of the error: "
             refused.append(Refused(detection.effect.label, why + _with_and_without(trial, error)))
+    if alone:
+        little = [one for one in candidates if worth.get(one, error) < LITTLE * error]
+        misleading.update(one.name for one in little if one.declared)
     for one in list(candidates) if alone else []:
         if reason := _why_of_this_flight(attribution.selection, one):
             refused.append(
