@@ -232,7 +232,7 @@ def test_noise_that_the_filter_should_know_of_is_kept_and_noise_that_it_should_n
     assert kept.detections == (noise,) and kept.worth[noise] > 0.0
     noisy = flights
     kept, noise = judged(3.0)
-    assert kept.detections == () and "it gains less than 0.5 % of the error" in kept.refused[-1].why
+    assert kept.detections == () and "the filter does better without it" in kept.refused[-1].why
 
 
 def test_a_run_corrected_at_the_poses_of_the_run_itself_is_that_run(flights):

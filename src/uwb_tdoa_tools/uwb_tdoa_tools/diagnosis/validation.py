@@ -216,8 +216,7 @@ def select_by_error(
             worth[detection] = error - trial
             error = trial
         else:
-            why = f"it gains less than {100.0 * WORSE:g} % of the error: "
-            refused.append(Refused(detection.effect.label, why + _with_and_without(trial, error)))
+            refused.append(Refused(detection.effect.label, why_without(trial, error)))
     if alone:
         little = [one for one in candidates if worth.get(one, error) < LITTLE * error]
         misleading.update(one.name for one in little if one.declared)
