@@ -197,6 +197,19 @@ def test_noise_that_raises_the_error_is_not_written(flight, monkeypatch, times, 
         assert result.refused[-1].what.startswith("tdoa_std")
 
 
+@pytest.mark.parametrize(
+    "nees, better",
+    [((1.0, 2.6), True), ((1.2, 4.0), True), ((3.2, 1.0), False), ((3.0, 5.0), False)],
+)
+def test_refused_noise_that_makes_deviations_honest_is_named(nees, better):
+    without, written = (
+        {"rmse_3d": error, "nees_mean": value} for error, value in zip((0.1, 0.12), nees)
+    )
+    why = import_module("uwb_tdoa_tools.diagnosis.diagnose")._why_not_noise(without, written)
+    assert "the filter does better without it" in why
+    assert ("the stated deviations fit better" in why) == better
+
+
 @pytest.mark.slow
 def test_two_processes_give_the_same_to_the_bit():
     flights = [

@@ -29,6 +29,7 @@ from uwb_tdoa_tools.diagnosis.report.page import TERMS, html
 from uwb_tdoa_tools.diagnosis.report.tables import BASIS, anchors, basis, by_reason
 from uwb_tdoa_tools.diagnosis.report.unclear import CANCELS, by_remedy, undetermined
 from uwb_tdoa_tools.diagnosis.report.verdict import _flights, cause, left_over, verdict
+from uwb_tdoa_tools.diagnosis.validation import SELECTED_ON
 from uwb_tdoa_tools.scoring.gains import NO_DIFFERENCE
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
@@ -206,6 +207,8 @@ def test_the_verdict_says_why_in_words_of_the_field(result):
     )
     titles = [entry.title for entry in entries(changed)]
     assert titles == ["tdoa over x and height (by anchor)", "anchor_position", "anchor_delay"]
+    more_than_all = replace(changed, findings=[finding(shift, worth=0.2)])
+    assert any("worth 20.0 cm beside the others." in one for one in verdict(more_than_all).more)
 
 
 def test_an_effect_is_not_most_of_a_gain_that_is_none(result):
@@ -238,8 +241,10 @@ def test_a_single_judged_flight_and_a_judge_that_was_fitted_are_named_as_such(re
     assert all(
         "One flight does not tell how much flights differ." in more for more in (alone, halves)
     )
-    assert any("decided on these same flights" in sentence for sentence in halves)
-    assert not any("decided on these same flights" in sentence for sentence in alone)
+    both = "Some of the judged flights are flights of the fit."
+    assert both in halves and both not in alone
+    usual = replace(judged(result, {own: 0.3}, {own: 0.1}, [0.5, 0.8]), judged_on=SELECTED_ON)
+    assert both not in verdict(usual).more
 
 
 def test_the_verdict_says_which_share_few_flights_support_and_what_others_will_gain(result):
@@ -252,7 +257,9 @@ def test_the_verdict_says_which_share_few_flights_support_and_what_others_will_g
             more = " ".join(verdict(diagnosed).more)
             assert ("79 % of each fitted value is applied" in more) == expected
             few = expected and flights == 1 and name == own
-            assert ("expect 0.5 to 0.9 of this gain, and one in ten to get worse" in more) == few
+            assert (
+                "expect 0.5 to 0.9 of this gain, and one in ten to get worse by 5 %" in more
+            ) == few
 
 
 def test_nothing_found_and_nothing_added_are_told_apart(result):

@@ -176,7 +176,10 @@ def lines_of_use(
     effects, config = folder / "effects.yaml", folder / "ekf_node.yaml" if parameters else None
     bias, ekf = node_lines(anchors, effects, config)
     return (
-        (evaluate_line(recordings, survey, effects, config, truth, more), "judges it"),
+        (
+            evaluate_line(recordings, survey, effects, config, truth, more),
+            "judges it; flights of the fit judge it too well",
+        ),
         (bias, "in flight: takes it out of TDOAs"),
         (ekf, "in flight: takes it out of the IMU, and assumes the noise that is left"),
     )

@@ -770,8 +770,8 @@ def described(term: SmoothTerm, part: str = "") -> str:
     swing = course[top] - course[bottom]
     if term.shape == "wave":
         (length,) = _in_words(term.covariate, [term.knots[1] - term.knots[0]])
-        how = f" and less in turn, every {length} of {name}{_factor_clause(term)}"
-        return _off(term, part, swing, None, how)
+        where = f" at the crests of a wave over {name}, every {length}, compared with its troughs"
+        return _off(term, part, swing, None, f"{where}{_factor_clause(term)}")
     high, low = _in_words(term.covariate, at[[top, bottom]])
     return _off(term, part, swing, None, f" where {name} is {high} than where it is {low}{seen}")
 

@@ -46,6 +46,7 @@ Flights = tuple[Flight, ...]
 EXPLAINED = 0.1
 # m, increase of the error that counts as a loss by the measured noise for the filter
 LEAST_LOSS = 0.005
+HONEST = 3.0  # NEES of positions whose stated deviations are right
 CANNOT_JUDGE = "without ground truth nobody can tell whether taking it out helps the position"
 
 
@@ -187,7 +188,7 @@ def _why_not_noise(without: dict[str, Any], written: dict[str, Any]) -> str | No
     if gain(*errors) >= -LOSS or errors[1] - errors[0] < LEAST_LOSS:
         return None
     why = validation.why_without(errors[1], errors[0])
-    if None in nees or abs(nees[1] - 1.0) >= abs(nees[0] - 1.0):
+    if None in nees or abs(nees[1] - HONEST) >= abs(nees[0] - HONEST):
         return why
     return f"{why}. With it the stated deviations fit better (NEES {nees[0]:.1f} to {nees[1]:.1f})"
 

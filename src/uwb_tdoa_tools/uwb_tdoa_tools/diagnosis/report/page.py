@@ -34,6 +34,14 @@ TERMS = {
     "NEES": "normalised estimation error squared: the same for the estimated position, 3 if the "
     "filter judges itself "
     "rightly.",
+    "elevation": (
+        "angle above the horizontal at which the tag sees the anchor; in the tag: in the frame of "
+        "the tag; in the anchor: at which the anchor sees the tag, in the frame of the anchor."
+    ),
+    "bearing": (
+        "angle about the vertical, from the x axis, at which the tag sees the anchor; in the tag "
+        "and in the anchor: as of elevation."
+    ),
     "NLOS": (
         "non-line-of-sight: something stands between anchor and tag, and a later path is taken "
         "for the direct one."

@@ -23,7 +23,7 @@ from ..findings import prefixes_of
 from ..regression.table import BLOCK
 from ..result import Diagnosis
 from ..self_calibration.solve import CLEARLY, CLEARLY_OF_RANGES, LEFT
-from ..validation import LEAST_WORTH
+from ..validation import LEAST_WORTH, SELECTED_ON
 from .entries import CM, WORTH_DOING, Entry, entries, for_people
 
 MOST_NAMES = 6  # largest number of named flights
@@ -332,16 +332,14 @@ def _caveats(diagnosis: Diagnosis) -> list[str]:
             f"Other flights have less of what {shows}, so {100.0 * diagnosis.share:.0f} % of each "
             "fitted value is applied."
         )
-    if set(_names(diagnosis)) & {flight.name for flight in diagnosis.flights}:
+    own = not {flight.name for flight in diagnosis.flights}.isdisjoint(_names(diagnosis))
+    if own and SELECTED_ON not in diagnosis.judged_on:
+        out.append("Some of the judged flights are flights of the fit.")
+    if own and diagnosis.share < WHOLE and count <= FEW:
         out.append(
-            "Which effects to add was decided on these same flights; flights given as "
-            "--holdout judge that too."
+            f"On other flights, expect {OF_OTHERS} of this gain, and {WORSE_OF_OTHERS} to get "
+            "worse by 5 % or more. Diagnose three flights or more together to avoid that."
         )
-        if diagnosis.share < WHOLE and count <= FEW:
-            out.append(
-                f"On other flights, expect {OF_OTHERS} of this gain, and {WORSE_OF_OTHERS} to get "
-                "worse by 5 % or more. Further flights make both better."
-            )
     if len(_names(diagnosis)) == 1:
         out.append("One flight does not tell how much flights differ.")
     return out
@@ -402,7 +400,9 @@ def _sentence(entry: Entry, place: int, gain: float) -> str:
     worth = entry.worth or 0.0
     begin = "Then" if place else "Mostly" if worth >= MOST * gain > 0.0 else "In part"
     much = f"{CM * worth:.1f} cm"
-    if not place and worth <= gain:
+    if worth > gain:
+        much += " beside the others"
+    elif not place:
         much = f"{CM * worth:.1f} of {CM * gain:.1f} cm"
     return f"{begin} {cause(entry)}, worth {much}."
 
@@ -463,7 +463,7 @@ def left_over(diagnosis: Diagnosis) -> tuple[str, ...]:
         for part in residuals.values():
             found += _left_over(part, of)
     places = [f"{said} ({CM * size:.0f} cm)" for size, said in sorted(found, reverse=True)[:NAMED]]
-    return (f"What is left is largest for {'; '.join(places)}.",) if places else ()
+    return (f"The largest residuals that nothing explains: {'; '.join(places)}.",) if places else ()
 
 
 def _left_over(part: ChannelResidual, of: str) -> Iterator[tuple[float, str]]:
