@@ -4,6 +4,7 @@
 
 from dataclasses import replace
 import json
+import os
 from pathlib import Path
 import re
 from types import SimpleNamespace
@@ -313,6 +314,23 @@ def test_what_judges_takes_no_part(room, monkeypatch, more, seen):
         "effects.yaml",
         "ekf_node.yaml",
     ]
+
+
+@pytest.mark.parametrize("more", [(), ("--no-truth",)])
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_jobs_are_processes(room, monkeypatch, jobs, more):
+    stub(monkeypatch, GOOD, [])
+    processes = set()
+
+    def instead(*given):
+        processes.update(given[-1](lambda _: os.getpid(), range(2)))
+        return GOOD
+
+    for name in ("with_truth", "without_truth"):
+        monkeypatch.setattr(library, name, instead)
+    given = ["flight1.bag", "flight2.bag", *more, "--jobs", str(jobs), "--out", "out"]
+    assert calibrate.main(given) == 0
+    assert (processes == {os.getpid()}) == (jobs == 1)
 
 
 def test_what_is_not_to_be_used_is_not_written(room, monkeypatch, capsys):

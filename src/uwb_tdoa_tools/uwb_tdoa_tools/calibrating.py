@@ -34,7 +34,7 @@ from .diagnosis.self_calibration.equations import slow_innovations
 from .diagnosis.self_calibration.solve import CLEARLY_OF_RANGES, IMPROVED, LEFT, MEASURE
 from .diagnosis.validation import cross_fitted
 from .estimate import FlightEstimator
-from .parallel import Progress
+from .parallel import MapFunction, Progress
 from .readers.inputs import Reading, Recording as ReadingPair
 from .scoring.gains import NO_DIFFERENCE, change_in_words, clear_change
 from .surveying.report import as_text
@@ -179,14 +179,17 @@ def with_truth(
     base: EffectSet = EffectSet(),
     config: FilterConfig | None = None,
     progress: Callable[[str], object] = lambda what: None,
+    map_function: MapFunction = map,
 ) -> Calibration:
     """Calibrate with ground truth, by `diagnose`.
 
     It is validated on `holdout`, or on halves of a single flight, with what the files hold.
+
+    map_function : as of `diagnose`
     """
-    found = diagnose(flights, holdout, base, config, None, progress)
+    found = diagnose(flights, holdout, base, config, None, progress, map_function)
     progress("measuring the noise")
-    found = with_noise(found, config)
+    found = with_noise(found, config, map_function)
     before, after = found.before["pooled"], (found.written or found.after)["pooled"]
     interval = after.get("rmse_3d_gain_ci")
     calibration = Calibration(
@@ -212,11 +215,14 @@ def without_truth(
     base: EffectSet = EffectSet(),
     config: FilterConfig | None = None,
     progress: Callable[[str], object] = lambda what: None,
+    map_function: MapFunction = map,
 ) -> Calibration:
     """Calibrate without ground truth, by `self_calibrate`.
 
     It is validated on `holdout`, or on the end of the last flight. Wrong anchors leave slowly
     varying innovations: these must decrease.
+
+    map_function : as of `diagnose`
     """
     judges, fitted, on = holdout, flights, _names(holdout)
     if not holdout:
@@ -224,14 +230,15 @@ def without_truth(
         first, rest = split(last, FITTED_SHARE)
         judges, fitted, on = [rest], [*fitted, first], f"the last third of {last.name}"
     report = partial(progress, "solving")
-    found = self_calibrate(fitted, tape, base, config, (), report)
+    found = self_calibrate(fitted, tape, base, config, (), report, map_function)
     progress("judging")
     before = slow_innovations(judges, base, config)
     after = slow_innovations(
         [replace(one, anchors=found.anchors) for one in judges], found.effects, config
     )
     if not holdout and found.why_not is None and after <= before:
-        found = self_calibrate(flights, tape, base, config, (), report)  # the same on all data
+        # the same on all data
+        found = self_calibrate(flights, tape, base, config, (), report, map_function)
     calibration = Calibration(
         found.anchors,
         found.effects,

@@ -4,11 +4,12 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.errors import InputError
 
-from .. import cli, command_lines, options
+from .. import cli, command_lines, options, parallel
 from ..parallel import Progress
 
 if TYPE_CHECKING:
@@ -72,6 +73,7 @@ def parser() -> ArgumentParser:
     )
     add("--keep", action="store_true", help="use flights in which check finds an error, too")
     options.add_out(made, required=False)
+    parallel.add_options(made)
     return made
 
 
@@ -115,11 +117,13 @@ def _calibrate(args: Namespace) -> int:
     if not holdout and len(flights) > 1:
         flights, holdout = flights[:-1], flights[-1:]
         judges = paths[-1:]
+    jobs, dask = parallel.workers_for(args, len(flights))
+    over = partial(parallel.over, jobs=jobs, dask=dask, unit=None)  # only Progress prints a line
     with Progress("calibrate") as progress:
         if all(known):
-            made = with_truth(flights, holdout, base, config, progress)
+            made = with_truth(flights, holdout, base, config, progress, over)
         else:
-            made = without_truth(flights, holdout, tape, base, config, progress)
+            made = without_truth(flights, holdout, tape, base, config, progress, over)
     cli.show(made.text, made.as_text())
     out = args.out  # only --quick does without
     out.mkdir(parents=True, exist_ok=True)
