@@ -323,14 +323,14 @@ def test_jobs_are_processes(room, monkeypatch, jobs, more):
     processes = set()
 
     def instead(*given):
-        processes.update(given[-1](lambda _: os.getpid(), range(2)))
+        processes.update(given[-1](lambda _: os.getpid(), range(4)))
         return GOOD
 
     for name in ("with_truth", "without_truth"):
         monkeypatch.setattr(library, name, instead)
     given = ["flight1.bag", "flight2.bag", *more, "--jobs", str(jobs), "--out", "out"]
     assert calibrate.main(given) == 0
-    assert (processes == {os.getpid()}) == (jobs == 1)
+    assert os.getpid() in processes and (len(processes) == 1) == (jobs == 1)
 
 
 def test_what_is_not_to_be_used_is_not_written(room, monkeypatch, capsys):
