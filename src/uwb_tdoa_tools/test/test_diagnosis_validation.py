@@ -421,9 +421,10 @@ def test_what_makes_one_flight_worse_is_not_applied(changes, worst):
     along = [np.tile([by, 0.0, 0.0], (4, 1)) for by in (1.0, *changes)]
     of_both = Displacements([along[0], along[0]], {"a": along[1:], "b": [along[0], along[0]]})
     found = _worse_in_one(of_both, ["a", "b"])
-    assert (found and found[0]) == worst
+    assert list(found) == ([worst] if worst else [])
     if worst:
-        assert f"decides: {100.0 + 100.0 * min(changes):.1f} cm without, 100.0 cm with" in found[1]
+        figures = f"{100.0 + 100.0 * min(changes):.1f} cm without, 100.0 cm with"
+        assert f"decides: {figures}" in found[worst]
 
 
 class Some(str):

@@ -185,14 +185,17 @@ def select_by_error(
             whole = displacements.error([])
             for one in applicable:
                 worth[one] = displacements.error([one]) - whole
-            harmful = _harmful(attribution, candidates, applicable)
-            if harmful is None and len(flights) == 2:
-                harmful = _worse_in_one(displacements, applicable)
-            if harmful is None:
+            if alone:
+                unsure = _of_this_flight(attribution.selection, applicable)
+            else:
+                unsure = _harmful(attribution, candidates, applicable)
+                if len(flights) == 2:
+                    unsure = unsure or _worse_in_one(displacements, applicable)
+            if not unsure:
                 break
-            one, why = harmful
-            refused.append(Refused(one.label, why))
-            candidates.remove(one)
+            # The others were judged beside these, and are judged again without them.
+            refused += [Refused(one.label, why) for one, why in unsure.items()]
+            candidates = [one for one in candidates if one not in unsure]
             error = trials.start(candidates, detections)
             continue
         kept = [one for one in candidates if one not in gone]
@@ -220,12 +223,6 @@ def select_by_error(
     if alone:
         little = [one for one in candidates if worth.get(one, error) < LITTLE * error]
         misleading.update(one.name for one in little if one.declared)
-    for one in list(candidates) if alone else []:
-        if reason := _why_of_this_flight(attribution.selection, one):
-            refused.append(
-                Refused(one.label, f"{reason}, and another one may not have it: {SECOND}")
-            )
-            candidates.remove(one)
     # The fit takes errors of its flights alone for effects of all flights. They are likely where much
     # of the error remains, and average out over flights.
     remains = min(error / trials.error([], detections), 1.0) if candidates else 0.0
@@ -246,8 +243,8 @@ def select_by_error(
 
 def _harmful(
     attribution: Attribution, candidates: Sequence[Candidate], applicable: Sequence[Candidate]
-) -> tuple[Candidate, str] | None:
-    """Return the Candidate that most likely does harm to another flight, and why; None without one.
+) -> dict[Candidate, str]:
+    """Return the Candidate that most likely does harm to another flight, and why; {} without one.
 
     Flights show different shares of it, beside the other candidates.
     """
@@ -256,17 +253,17 @@ def _harmful(
     probability = {one: harm(of_flights) for one, of_flights in several.items()}
     worst = max(probability, key=probability.__getitem__)
     if probability[worst] <= MOST_HARM:
-        return None
-    return worst, (
-        f"another flight may not have it (probability {probability[worst]:.0%}). "
+        return {}
+    return {
+        worst: f"another flight may not have it (probability {probability[worst]:.0%}). "
         f"{in_words(several[worst])}"
-    )
+    }
 
 
 def _worse_in_one(
     displacements: Displacements, applicable: Sequence[Candidate]
-) -> tuple[Candidate, str] | None:
-    """Return the Candidate with the largest loss in one of two flights, and why; None without one.
+) -> dict[Candidate, str]:
+    """Return the Candidate with the largest loss in one of two flights, and why; {} without one.
 
     A loss counts above LOSS. What helps one flight and does harm to the other may do either to a
     third one. Of more flights, the mean decides.
@@ -275,12 +272,9 @@ def _worse_in_one(
     worst = max(losses, key=lambda one: losses[one][0])
     loss, before, after = losses[worst]
     if loss <= LOSS:
-        return None
-    return (
-        worst,
-        "one of both flights gets worse by it, and a third flight decides: "
-        + _with_and_without(after, before),
-    )
+        return {}
+    figures = _with_and_without(after, before)
+    return {worst: f"one of both flights gets worse by it, and a third flight decides: {figures}"}
 
 
 def _dropped(
@@ -357,6 +351,16 @@ def _momentary(candidate: Candidate) -> bool:
     return not recurs(candidate) or any(
         one.covariate == "time" and one.shape not in DRIFTS for one in functions
     )
+
+
+def _of_this_flight(selection: Selection, candidates: Sequence[Candidate]) -> dict[Candidate, str]:
+    """Return the Candidates that belong to a single flight alone, and why."""
+    reasons = {one: _why_of_this_flight(selection, one) for one in candidates}
+    return {
+        one: f"{reason}, and another one may not have it: {SECOND}"
+        for one, reason in reasons.items()
+        if reason
+    }
 
 
 def _why_of_this_flight(selection: Selection, candidate: Candidate) -> str | None:
