@@ -500,6 +500,27 @@ def test_values_shrink_by_the_power_of_the_error_that_remains(monkeypatch, worth
     assert selected(monkeypatch, {"a": worth}, flights=flights).share == pytest.approx(share)
 
 
+def test_effects_beside_an_event_of_one_flight_are_judged_again_without_it(monkeypatch):
+    """ "d" helps beside the event "c", and does harm without it."""
+
+    def start(self, candidates, detections):
+        here = set(candidates)
+        return 1.0 + 0.4 * ("c" not in here) + 0.2 * (("d" in here) != ("c" in here))
+
+    monkeypatch.setattr(Worth, "start", start)
+    monkeypatch.setattr(Worth, "error", start)
+    reason = "it happened at a time of this flight"
+    monkeypatch.setattr(
+        validation, "_why_of_this_flight", lambda _, one: reason if one == "c" else None
+    )
+    found = selected(monkeypatch, {"c": 0.0, "d": 0.0}, flights=1)
+    assert found.selection == () and found.error == pytest.approx(1.4)
+    assert found.worth == {"c": pytest.approx(0.6), "d": pytest.approx(-0.2)}
+    event, harmful = found.refused
+    assert event.what == "c" and event.why.startswith(f"{reason}, and another one may not have it")
+    assert harmful.what == "d" and "the filter does better without it: 140.0 cm" in harmful.why
+
+
 @pytest.mark.parametrize(
     ("name", "size", "why"),
     [
