@@ -54,8 +54,9 @@ def test_a_gyroscope_that_drifts_with_the_temperature_is_told_in_words(flight):
         finding.effect.covariate == "extra.baro.temperature" and finding.effect.channel == "gyro.y"
     )
     assert not finding.effect.usable
-    (advice,) = finding.effect.advice()
-    assert "too much about y" in advice and "baro temperature" in advice
+    what, why = finding.effect.advice()
+    assert "too much about y" in what and "baro temperature" in what
+    assert why.startswith("Likely causes: what warms, loads or supplies it. To tell: ")
     ends = finding.effect.curve(np.array(finding.effect.knots)[[0, -1]])
     assert np.diff(ends) / np.ptp(finding.effect.knots) == pytest.approx(0.02, rel=0.1)
 
