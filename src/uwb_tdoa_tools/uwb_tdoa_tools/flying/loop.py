@@ -166,11 +166,19 @@ def residuals_of(flight: Flight, corrector: Corrector | None = None) -> PairResi
 
 
 def found_in_words(diagnosis: Diagnosis) -> list[str]:
-    """Return what the residuals of TDOAs were traced to, with values, worth and cause."""
-    return [
-        f"{entry.title}: {entry.values}, worth {worth_in_words(entry)}: {entry.physics}"
+    """Return what the residuals of TDOAs were traced to, with values and cause.
+
+    Of several effects each has its worth; that of one is the whole gain.
+    """
+    found = [
+        entry
         for entry in entries(diagnosis)
         if entry.added and "tdoa" in entry.findings[0].effect.channels
+    ]
+    worths = [f", worth {worth_in_words(entry)}" if len(found) > 1 else "" for entry in found]
+    return [
+        f"{entry.title}: {entry.values}{worth}: {entry.physics}"
+        for entry, worth in zip(found, worths)
     ]
 
 
