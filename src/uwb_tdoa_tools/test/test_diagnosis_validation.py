@@ -501,7 +501,7 @@ def test_values_shrink_by_the_power_of_the_error_that_remains(monkeypatch, worth
 
 
 def test_effects_beside_an_event_of_one_flight_are_judged_again_without_it(monkeypatch):
-    """ "d" helps beside the event "c", and does harm without it."""
+    """The event is "c". Effect "d" helps beside it, and does harm without it."""
 
     def start(self, candidates, detections):
         here = set(candidates)

@@ -77,7 +77,8 @@ class Entry:
     def causes(self) -> tuple[str, ...]:
         """Return the sentences of its advice that other functions without a name may share."""
         nameless = [finding.effect for finding in self.findings if not finding.declared]
-        return tuple(sentence for effect in nameless for sentence in effect.advice()[1:])
+        said = (sentence for effect in nameless for sentence in effect.advice()[1:])
+        return tuple(dict.fromkeys(said))
 
     @property
     def alike(self) -> bool:

@@ -380,10 +380,8 @@ def reasons(diagnosis: Diagnosis) -> list[str]:
     for entry in entries(diagnosis):
         worth = entry.worth or 0.0
         if len(out) < NAMED and entry.added and worth >= (WORTH_DOING if out else LEAST_WORTH):
-            likely = _causes(entry)
-            out.append(
-                _sentence(entry, len(out), before - after) + ("" if likely in said else likely)
-            )
+            sentence, likely = _sentence(entry, len(out), before - after), _causes(entry)
+            out.append(sentence if likely in said else f"{sentence}{likely}")
             said.add(likely)
     return out
 
