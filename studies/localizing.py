@@ -10,12 +10,13 @@ deviation for 95 % of the time. Time in which the tag was lost does not count.
 from dataclasses import replace
 from functools import partial
 import json
+from types import SimpleNamespace
 
 from mistakes import MISTAKES
 import numpy as np
 
 from uwb_tdoa_bias.common.files import write_text
-from uwb_tdoa_tools import options, parallel
+from uwb_tdoa_tools import cli, options, parallel
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.estimate import FlightEstimator
 from uwb_tdoa_tools.localizing.localize import GOOD, assess
@@ -27,7 +28,7 @@ NOTHING, ALIKE = "nothing", 0.95  # no mistake; share of the time
 
 def add_options(add):
     """add : add_argument of a parser."""
-    options.add_recordings(type("", (), {"add_argument": staticmethod(add)}))
+    cli.add(SimpleNamespace(add_argument=add), options.recordings())
     add("--mistakes", action="store_true", help="with the mistakes of `study checking`, too")
     add("--json", metavar="FILE", type=OutputFile, help="write what was said of each")
     add("--jobs", type=int, metavar="N", help="flights at once")

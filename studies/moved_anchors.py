@@ -13,6 +13,7 @@ from dataclasses import replace
 from functools import partial
 import json
 import re
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.results import concatenated, rows_of
-from uwb_tdoa_tools import options, parallel
+from uwb_tdoa_tools import cli, options, parallel
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
 from uwb_tdoa_tools.estimate import FlightEstimator
 from uwb_tdoa_tools.localizing.localize import GOOD, assess
@@ -49,7 +50,7 @@ _NAMED = re.compile(
 def add_options(add):
     """add : add_argument of a parser."""
     add("flights", nargs="*", metavar="FLIGHT", help="measured flights, in which nothing was moved")
-    options.add_reading(type("", (), {"add_argument": staticmethod(add)}))
+    cli.add(SimpleNamespace(add_argument=add), options.READING)
     words = "recordings of each kind, and twice as many without a change (default 10)"
     add("--draws", type=whole_number, default=10, metavar="N", help=words)
     add(

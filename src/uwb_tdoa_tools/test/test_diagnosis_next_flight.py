@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The flight that resolves the open questions of a diagnosis."""
 
-from argparse import ArgumentParser
 from types import SimpleNamespace
 
 from hypothesis import given, settings, strategies as st
@@ -12,6 +11,7 @@ import pytest
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.effects import EFFECTS
+from uwb_tdoa_tools import cli
 from uwb_tdoa_tools.commands import diagnose
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.motions import ANCHOR_CLEARANCE, RATE, Limits, motions, route
@@ -20,7 +20,7 @@ from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.report import maps
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.rooms import Room, corners, pillars, room_of
-from uwb_tdoa_tools.simulation_options import POSE, add_options, config_of
+from uwb_tdoa_tools.simulation_options import OPTIONS, POSE, config_of
 
 RATES = {"imu_rate": 200.0, "truth_rate": 100.0, "start_in_air": True}
 
@@ -171,8 +171,7 @@ def test_its_files_are_flown_and_read(planned, tmp_path):
         (tmp_path / name).write_text(text)
     table = np.genfromtxt(tmp_path / "next_flight.csv", delimiter=",", names=True)
     assert table.dtype.names == POSE
-    parser = ArgumentParser()
-    add_options(parser)
+    parser = cli.parser("simulate", "Simulate.", options=OPTIONS)
     config = config_of(parser.parse_args(["--poses", str(tmp_path / "next_flight.csv")]))
     assert np.allclose(np.array(config.poses)[:, 1:4], plan.path.p, atol=1e-3)
     tum = np.loadtxt(tmp_path / "next_flight.tum")

@@ -19,6 +19,7 @@ import pytest
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_tools import cli, parallel
+from uwb_tdoa_tools.options import JOBS
 from uwb_tdoa_tools.parallel import Progress
 
 
@@ -140,10 +141,7 @@ def test_modules_in_the_present_folder_do_not_run(tmp_path, importable):
 
 
 def options(*argv):
-    parser = cli.parser("tool", "A tool.")
-    parser.add_argument("--out")
-    parallel.add_options(parser)
-    return parser.parse_args(argv)
+    return cli.parser("tool", "A tool.", options=[cli.option("--out"), JOBS]).parse_args(argv)
 
 
 def test_few_items_run_in_one_process_by_default():

@@ -511,7 +511,6 @@ def test_bad_values_are_refused():
 
 
 REGISTERED = """
-import argparse
 from dataclasses import fields, replace
 from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_bias.common.sensors.sensor import parameter
@@ -519,15 +518,15 @@ use = {"use_side_sonar": parameter(True, "use it", fixed=True)}
 SENSORS["side_sonar"] = replace(SENSORS["pressure"], name="side_sonar", parameters=use)
 from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_tools import cli
 from uwb_tdoa_tools.bags.topics import topics_of
 from uwb_tdoa_tools.simulation import SimulationConfig
-from uwb_tdoa_tools.simulation_options import add_options, config_of
+from uwb_tdoa_tools.simulation_options import OPTIONS, config_of
 names = [{each.name for each in fields(kind)} for kind in (Flight, FilterConfig, SimulationConfig)]
 assert "side_sonar" in names[0] and "use_side_sonar" in names[1]
 assert "side_sonar_noise" in names[2]
 assert topics_of("side_sonar") == (("side_sonar", "sensor_msgs/msg/FluidPressure"),)
-parser = argparse.ArgumentParser()
-add_options(parser)
+parser = cli.parser("simulate", "Simulate.", options=OPTIONS)
 assert config_of(parser.parse_args(["--side-sonar-noise", "0.1"])).side_sonar_noise == 0.1
 """
 

@@ -3,9 +3,8 @@
 """Share the look of --help, and the handling of failures, between all executables.
 
 def parser():
-    made = cli.parser("convert", "Convert a log to a bag.", "convert flight.log --out flight.bag")
-    made.add_argument("log")
-    return made
+    example = "convert flight.log --out flight.bag"
+    return cli.parser("convert", "Convert a log to a bag.", example, options=[cli.option("log")])
 
 main = cli.executable(_convert, parser)          # _convert(args) -> exit code, None for 0
 """
@@ -35,7 +34,34 @@ FULL = {
 }
 
 
-def parser(name: str, description: str, *examples: str) -> argparse.ArgumentParser:
+# adds one or several options to a parser, or to a group of options
+Option = Callable[[argparse._ActionsContainer], object]
+
+
+def option(*names: str, **settings: Any) -> Option:
+    """Return an Option; names and settings are those of `add_argument`."""
+    return lambda parser: parser.add_argument(*names, **settings)
+
+
+def exclusive(*options: Option) -> Option:
+    """Return Options of which a command line has at most one."""
+    return lambda parser: add(parser.add_mutually_exclusive_group(), options)
+
+
+def group(title: str, *options: Option) -> Option:
+    """Return Options that --help shows under a title."""
+    return lambda parser: add(parser.add_argument_group(title), options)
+
+
+def add(parser: argparse._ActionsContainer, options: Iterable[Option]) -> None:
+    """Add Options to a parser."""
+    for each in options:
+        each(parser)
+
+
+def parser(
+    name: str, description: str, *examples: str, options: Iterable[Option] = ()
+) -> argparse.ArgumentParser:
     """Return an ArgumentParser that keeps line breaks and ends its help with example command lines.
 
     Examples that begin with `name` are printed as they run where the user is.
@@ -52,6 +78,7 @@ def parser(name: str, description: str, *examples: str) -> argparse.ArgumentPars
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     made.add_argument("--version", action="version", version=f"{name} of {written_by()}")
+    add(made, options)
     return made
 
 

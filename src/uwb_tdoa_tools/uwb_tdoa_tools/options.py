@@ -2,16 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Options that several commands share, and the values that they give.
 
-options.add_recordings(parser)                  # FLIGHT..., --survey, --namespace, --topic, --salvage
-options.add_filter(parser)                      # --effects, --config, --without
-options.add_estimator(parser)                   # and --model, --no-bias, -p, --smooth
-options.add_most(parser, 10**6)                 # --most
-options.add_bag(parser)                         # --storage, --force
-options.add_holdout(parser)                     # --holdout
-options.add_known(parser)                       # --marks, --distances
-options.add_tape(parser)                        # --std, --height-std, --trusted, --unknown, ...
-options.add_align(parser)                       # --align
-options.add_rerun(parser)                       # --rerun
+parser = cli.parser(..., options=[*options.recordings(), *options.ESTIMATOR, *options.JOBS])
 reading, (config, effects) = options.reading_of(args), options.filter_of(args)
 """
 
@@ -27,11 +18,12 @@ from uwb_tdoa_bias.common.sensors import SENSORS
 
 from . import choices
 from .choices import ALIGN, NONE, STORAGES
+from .cli import Option, exclusive, option
 from .outputs import OutputFile, OutputFolder
 from .parallel import whole_number
 
 if TYPE_CHECKING:
-    from argparse import ArgumentParser, Namespace
+    from argparse import Namespace
     from collections.abc import Callable, Iterable, Sequence
 
     from uwb_tdoa_bias.common.flight import Flight
@@ -54,31 +46,188 @@ TOPICS = (  # that are read from bags
 )
 
 
-def add_recordings(parser: ArgumentParser, nargs: str = "+") -> None:
-    """Add FLIGHT... and the options of reading."""
-    parser.add_argument("flights", nargs=nargs, metavar="FLIGHT", help=choices.RECORDINGS)
-    add_reading(parser)
-
-
-def add_reading(parser: ArgumentParser) -> None:
-    """Add --survey, --namespace, --topic, --profile, --tag and --salvage: how to read recordings."""
-    add = parser.add_argument
-    add("--survey", metavar="S", help=choices.SURVEY)
-    add("--namespace", default="", metavar="NS", help="of the tag's topics in bags, e.g. tag1")
-    add(
+READING = (
+    option("--survey", metavar="S", help=choices.SURVEY),
+    option("--namespace", default="", metavar="NS", help="of the tag's topics in bags, e.g. tag1"),
+    option(
         "--topic",
         dest="topics",
         action="append",
         default=[],
         metavar="OURS=THEIRS",
         help="a topic of bags that has another name there, e.g. uwb/tdoa=/my/tdoa; may be repeated",
-    )
-    add("--profile", metavar="P", help=choices.PROFILE)
-    add("--tag", default="", metavar="ID", help="of a recording with several tags, with --profile")
-    add(
+    ),
+    option("--profile", metavar="P", help=choices.PROFILE),
+    option(
+        "--tag", default="", metavar="ID", help="of a recording with several tags, with --profile"
+    ),
+    option(
         "--salvage",
         action="store_true",
         help="read cut or damaged recordings as far as they are sound, with a remark",
+    ),
+)
+PARAMETERS = option(
+    "-p",
+    dest="parameters",
+    metavar="NAME:=VALUE",
+    action="append",
+    default=[],
+    help="one filter parameter, before --config",
+)
+MODEL = option("--model", metavar="FILE", help="ONNX file of `train` or `export` to correct with")
+BAG = (
+    option("--storage", choices=STORAGES, default="mcap", help="kind of bag (default: mcap)"),
+    option("--force", action="store_true", help="replace an existing bag"),
+)
+HOLDOUT = option(
+    "--holdout", nargs="+", default=[], metavar="FLIGHT", help="flights to judge on, not to fit"
+)
+TAPE = (  # how well anchors are known
+    option(
+        "--std",
+        type=float,
+        metavar="M",
+        help=f"m, standard deviation of a coordinate as given (default {choices.TAPE_STD:g})",
+    ),
+    option(
+        "--height-std",
+        type=float,
+        metavar="M",
+        help="m, the same of heights, which are easier to measure",
+    ),
+    option(
+        "--trusted",
+        nargs="+",
+        default=[],
+        metavar="A",
+        help="anchors (3) or coordinates (3.z) that are known well",
+    ),
+    option(
+        "--trusted-std",
+        type=float,
+        metavar="M",
+        help=f"m, how well those are known (default {choices.TRUSTED_STD:g})",
+    ),
+    option(
+        "--unknown",
+        nargs="+",
+        default=[],
+        metavar="A",
+        help="anchors whose position is not known at all",
+    ),
+)
+# fields of Tape, which the covariance of the last calibration replaces
+OF_TAPE = "std", "height_std", "trusted", "trusted_std"
+RERUN = option("--rerun", metavar="FILE", type=OutputFile, help=choices.RERUN)
+DISTANCES = option(
+    "--distances",
+    metavar="FILE",
+    help="CSV with columns a, b, distance, std: measured distances between anchors, m",
+)
+KNOWN = (
+    option(
+        "--marks",
+        metavar="FILE",
+        help="YAML: measured places where the tag stood or passed, and when (docs/calibration.md)",
+    ),
+    DISTANCES,
+)
+JOBS = exclusive(
+    option(
+        "--jobs",
+        metavar="N",
+        type=whole_number,
+        help="flights at once (default: as many as there are cores)",
+    ),
+    option(
+        "--dask",
+        metavar="ADDRESS",
+        help="run on the Dask cluster whose scheduler is there, e.g. tcp://10.0.0.1:8786; its "
+        "workers need these "
+        "packages, and the recordings at the same paths; tls://... takes the certificates of "
+        "Dask's configuration",
+    ),
+)  # of tools that run over many flights
+
+
+def recordings(nargs: str = "+") -> tuple[Option, ...]:
+    """Return FLIGHT... and the options of reading."""
+    return option("flights", nargs=nargs, metavar="FLIGHT", help=choices.RECORDINGS), *READING
+
+
+def filtering(
+    effects: str = "effects.yaml to correct the TDOAs with, before the filter",
+) -> tuple[Option, ...]:
+    """Return --effects, with this help, --config and --without."""
+    return (
+        option("--effects", metavar="FILE", help=effects),
+        option(
+            "--config", metavar="FILE", help="filter parameters, as for ekf_node (ekf_node.yaml)"
+        ),
+        option(
+            "--without",
+            metavar="SENSOR",
+            action="append",
+            default=[],
+            choices=tuple(SENSORS),
+            help=f"not to be used though it is there: {', '.join(SENSORS)}; may be repeated",
+        ),
+    )
+
+
+ESTIMATOR = (
+    *filtering("effects.yaml: systematic effects to correct for"),
+    MODEL,
+    option("--no-bias", action="store_true", help="correct for nothing, whatever else is given"),
+    PARAMETERS,
+    option(
+        "--smooth", action="store_true", help="smooth: use later measurements for each estimate too"
+    ),
+)
+
+
+def most(default: int) -> Option:
+    """Return --most: the largest number of TDOAs to learn from."""
+    return option(
+        "--most",
+        metavar="N",
+        type=whole_number,
+        default=default,
+        help=(
+            "TDOAs to hold at most, by which memory and time are bounded: of flights with more, "
+            "some are drawn (default %(default)s)"
+        ),
+    )
+
+
+def align(judges: bool = False) -> Option:
+    """Return --align: none or time; for tools that judge by ground truth, frame too.
+
+    judges : whether the tool only scores with the ground truth; a tool that learns from it must not
+        move its frame
+    """
+    text = (
+        "ground truth on another clock (another epoch): none refuses it (default), time estimates "
+        "the offset"
+    )
+    if judges:
+        text = (
+            "move the ground truth onto the estimate before the evaluation: none (default); time, "
+            "its stamps; frame, its frame too, rotated and shifted (as evo -a, without scale). "
+            "The result is printed in any case, with the error of each"
+        )
+    return option("--align", choices=ALIGN if judges else ALIGN[:2], default=NONE, help=text)
+
+
+def out(required: bool = True) -> Option:
+    """Return --out, a folder for everything that the command writes."""
+    return option(
+        "--out",
+        metavar="DIR",
+        type=OutputFolder,
+        required=required,
+        help="where to write; made if it is not there",
     )
 
 
@@ -114,37 +263,6 @@ def words_of_reading(args: Namespace) -> tuple[str, ...]:
     return (*words, *["--salvage"][: args.salvage])
 
 
-def add_filter(
-    parser: ArgumentParser,
-    effects: str = "effects.yaml to correct the TDOAs with, before the filter",
-) -> None:
-    """Add --effects, with this help, --config and --without."""
-    parser.add_argument("--effects", metavar="FILE", help=effects)
-    parser.add_argument(
-        "--config", metavar="FILE", help="filter parameters, as for ekf_node (ekf_node.yaml)"
-    )
-    parser.add_argument(
-        "--without",
-        metavar="SENSOR",
-        action="append",
-        default=[],
-        choices=tuple(SENSORS),
-        help=f"not to be used though it is there: {', '.join(SENSORS)}; may be repeated",
-    )
-
-
-def add_parameters(parser: ArgumentParser) -> None:
-    """Add -p; it overrides --config."""
-    parser.add_argument(
-        "-p",
-        dest="parameters",
-        metavar="NAME:=VALUE",
-        action="append",
-        default=[],
-        help="one filter parameter, before --config",
-    )
-
-
 def filter_of(args: Namespace) -> tuple[FilterConfig, EffectSet | None]:
     """Return the FilterConfig of --config, -p and --without, and the EffectSet of --effects or None.
 
@@ -157,25 +275,6 @@ def filter_of(args: Namespace) -> tuple[FilterConfig, EffectSet | None]:
     switched_off = [f"use_{stream}:=false" for stream in args.without]
     config = with_parameters(config, [*getattr(args, "parameters", ()), *switched_off])
     return config, EffectSet.from_yaml(args.effects) if args.effects else None
-
-
-def add_estimator(parser: ArgumentParser) -> None:
-    """Add --effects, --config, --without, --model, --no-bias, -p and --smooth."""
-    add_filter(parser, "effects.yaml: systematic effects to correct for")
-    add_model(parser)
-    add = parser.add_argument
-    add("--no-bias", action="store_true", help="correct for nothing, whatever else is given")
-    add_parameters(parser)
-    add(
-        "--smooth", action="store_true", help="smooth: use later measurements for each estimate too"
-    )
-
-
-def add_model(parser: ArgumentParser) -> None:
-    """Add --model."""
-    parser.add_argument(
-        "--model", metavar="FILE", help="ONNX file of `train` or `export` to correct with"
-    )
 
 
 def estimator_of(args: Namespace, say: Callable[[str], object]) -> FlightEstimator:
@@ -228,21 +327,6 @@ def refuse(args: Namespace, names: Iterable[str], because: str) -> None:
             raise InputError(f"{option}: {because}; leave it out.")
 
 
-def add_bag(parser: ArgumentParser) -> None:
-    """Add --storage and --force: how to write a bag."""
-    parser.add_argument(
-        "--storage", choices=STORAGES, default="mcap", help="kind of bag (default: mcap)"
-    )
-    parser.add_argument("--force", action="store_true", help="replace an existing bag")
-
-
-def add_holdout(parser: ArgumentParser) -> None:
-    """Add --holdout."""
-    parser.add_argument(
-        "--holdout", nargs="+", default=[], metavar="FLIGHT", help="flights to judge on, not to fit"
-    )
-
-
 def check_holdout(fitted: Iterable[str | Path], held: Iterable[str | Path]) -> None:
     """Raise InputError if a flight, by its name or its path, is both fitted and held out."""
     shared = set(fitted) & set(held)
@@ -251,64 +335,6 @@ def check_holdout(fitted: Iterable[str | Path], held: Iterable[str | Path]) -> N
             f"--holdout: {min(map(str, shared))} is also a FLIGHT to fit; leave it out of one "
             "of them."
         )
-
-
-def add_most(parser: ArgumentParser, default: int) -> None:
-    """Add --most: the largest number of TDOAs to learn from."""
-    parser.add_argument(
-        "--most",
-        metavar="N",
-        type=whole_number,
-        default=default,
-        help=(
-            "TDOAs to hold at most, by which memory and time are bounded: of flights with more, "
-            "some are drawn (default %(default)s)"
-        ),
-    )
-
-
-# fields of Tape, which the covariance of the last calibration replaces
-OF_TAPE = "std", "height_std", "trusted", "trusted_std"
-
-
-def add_tape(parser: ArgumentParser) -> None:
-    """Add --std, --height-std, --trusted, --trusted-std and --unknown.
-
-    They state how well anchors are known.
-    """
-    add = parser.add_argument
-    add(
-        "--std",
-        type=float,
-        metavar="M",
-        help=f"m, standard deviation of a coordinate as given (default {choices.TAPE_STD:g})",
-    )
-    add(
-        "--height-std",
-        type=float,
-        metavar="M",
-        help="m, the same of heights, which are easier to measure",
-    )
-    add(
-        "--trusted",
-        nargs="+",
-        default=[],
-        metavar="A",
-        help="anchors (3) or coordinates (3.z) that are known well",
-    )
-    add(
-        "--trusted-std",
-        type=float,
-        metavar="M",
-        help=f"m, how well those are known (default {choices.TRUSTED_STD:g})",
-    )
-    add(
-        "--unknown",
-        nargs="+",
-        default=[],
-        metavar="A",
-        help="anchors whose position is not known at all",
-    )
 
 
 def tape_of(args: Namespace, effects: EffectSet | None) -> Tape:
@@ -330,41 +356,6 @@ def tape_of(args: Namespace, effects: EffectSet | None) -> Tape:
     )
 
 
-def add_align(parser: ArgumentParser, judges: bool = False) -> None:
-    """Add --align: none or time; for tools that judge by ground truth, frame too.
-
-    judges : whether the tool only scores with the ground truth; a tool that learns from it must not
-        move its frame
-    """
-    text = (
-        "ground truth on another clock (another epoch): none refuses it (default), time estimates "
-        "the offset"
-    )
-    if judges:
-        text = (
-            "move the ground truth onto the estimate before the evaluation: none (default); time, "
-            "its stamps; frame, its frame too, rotated and shifted (as evo -a, without scale). "
-            "The result is printed in any case, with the error of each"
-        )
-    parser.add_argument("--align", choices=ALIGN if judges else ALIGN[:2], default=NONE, help=text)
-
-
-def add_out(parser: ArgumentParser, required: bool = True) -> None:
-    """Add --out, a folder for everything that the command writes."""
-    parser.add_argument(
-        "--out",
-        metavar="DIR",
-        type=OutputFolder,
-        required=required,
-        help="where to write; made if it is not there",
-    )
-
-
-def add_rerun(parser: ArgumentParser) -> None:
-    """Add --rerun: a recording for the viewer Rerun."""
-    parser.add_argument("--rerun", metavar="FILE", type=OutputFile, help=choices.RERUN)
-
-
 def rerun_of(args: Namespace, count: int, say: Callable[[str], object]) -> Path | None:
     """Return the path of --rerun; None without it, or without the library. Raises InputError.
 
@@ -377,21 +368,6 @@ def rerun_of(args: Namespace, count: int, say: Callable[[str], object]) -> Path 
     if count != 1:
         raise InputError(f"--rerun: needs exactly one flight, got {count}.")
     return args.rerun if pictures.rerun_is_installed(say) else None
-
-
-def add_known(parser: ArgumentParser) -> None:
-    """Add --marks and --distances: measured positions and distances."""
-    add = parser.add_argument
-    add(
-        "--marks",
-        metavar="FILE",
-        help="YAML: measured places where the tag stood or passed, and when (docs/calibration.md)",
-    )
-    add(
-        "--distances",
-        metavar="FILE",
-        help="CSV with columns a, b, distance, std: measured distances between anchors, m",
-    )
 
 
 def known_of(args: Namespace, flights: Sequence[Flight]) -> tuple[Mark | Distance, ...]:

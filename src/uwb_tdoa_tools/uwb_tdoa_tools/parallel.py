@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Run one function over many flights, on every core or on an existing Dask cluster; show progress.
 
-    parallel.add_options(parser)                                         # --jobs, --dask
     for row in parallel.over(judge, found, args.jobs, args.dask):        # in the order of `found`
         ...
     with Progress("diagnose") as progress:                               # a thread prints
@@ -141,25 +140,6 @@ class MapFunction(Protocol):
     def __call__(
         self, function: Callable[[Item], Made], items: Iterable[Item], /
     ) -> Iterable[Made]: ...
-
-
-def add_options(parser: argparse._ActionsContainer) -> None:
-    """Add --jobs N and --dask ADDRESS to a tool that runs over many flights."""
-    add = parser.add_mutually_exclusive_group().add_argument
-    add(
-        "--jobs",
-        metavar="N",
-        type=whole_number,
-        help="flights at once (default: as many as there are cores)",
-    )
-    add(
-        "--dask",
-        metavar="ADDRESS",
-        help="run on the Dask cluster whose scheduler is there, e.g. tcp://10.0.0.1:8786; its "
-        "workers need these "
-        "packages, and the recordings at the same paths; tls://... takes the certificates of "
-        "Dask's configuration",
-    )
 
 
 def workers_for(

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli, command_lines, options, parallel
+from ..cli import option
 from ..parallel import Progress
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ Exit code: 0 calibrated, or predicted (--quick), 1 stopped, 2 bad input."""
 
 def parser() -> ArgumentParser:
     """Its options."""
-    made = cli.parser(
+    return cli.parser(
         "calibrate",
         DESCRIPTION,
         "calibrate flight.bag --out calibrated/",
@@ -52,29 +53,32 @@ def parser() -> ArgumentParser:
             "calibrate today.bag --no-truth --survey calibrated/anchors.yaml --effects "
             "calibrated/effects.yaml --out today/"
         ),
+        options=[
+            *options.recordings(),
+            *options.filtering(
+                "effects.yaml: effects in the model already; without ground truth its covariance is "
+                "the prior"
+            ),
+            options.PARAMETERS,
+            options.HOLDOUT,
+            option(
+                "--no-truth",
+                action="store_true",
+                help="do without ground truth, and leave it unread",
+            ),
+            *options.TAPE,
+            option(
+                "--quick",
+                action="store_true",
+                help="say within a minute what to expect of a calibration, and of more flights",
+            ),
+            option(
+                "--keep", action="store_true", help="use flights in which check finds an error, too"
+            ),
+            options.out(required=False),
+            options.JOBS,
+        ],
     )
-    options.add_recordings(made)
-    options.add_filter(
-        made,
-        (
-            "effects.yaml: effects in the model already; without ground truth its covariance is "
-            "the prior"
-        ),
-    )
-    options.add_parameters(made)
-    add = made.add_argument
-    options.add_holdout(made)
-    add("--no-truth", action="store_true", help="do without ground truth, and leave it unread")
-    options.add_tape(made)
-    add(
-        "--quick",
-        action="store_true",
-        help="say within a minute what to expect of a calibration, and of more flights",
-    )
-    add("--keep", action="store_true", help="use flights in which check finds an error, too")
-    options.add_out(made, required=False)
-    parallel.add_options(made)
-    return made
 
 
 def _calibrate(args: Namespace) -> int:

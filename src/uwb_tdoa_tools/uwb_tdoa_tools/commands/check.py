@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli, command_lines, options
+from ..cli import option
 from ..outputs import OutputFile
 from ..parallel import Progress
 
@@ -38,7 +39,7 @@ Exit code: 0 nothing is wrong (there may be warnings), 1 there are errors, 2 bad
 
 def parser() -> ArgumentParser:
     """Its options."""
-    made = cli.parser(
+    return cli.parser(
         "check",
         DESCRIPTION,
         "check flight.bag",
@@ -49,16 +50,20 @@ def parser() -> ArgumentParser:
         "check --live 60",
         "check --live 60 --namespace tag1 --survey anchors.yaml",
         "check tags.bag --topic uwb/tdoa=/tag1/tdoa --topic imu/data=/tag1/imu",
+        options=[
+            *options.recordings(nargs="*"),
+            *options.filtering(
+                "effects.yaml: what is calibrated; its covariance says how well anchors are known"
+            ),
+            option(
+                "--live",
+                metavar="S",
+                type=float,
+                help="listen to live topics for S seconds instead",
+            ),
+            option("--json", metavar="FILE", type=OutputFile, help="write all findings"),
+        ],
     )
-    options.add_recordings(made, nargs="*")
-    options.add_filter(
-        made, "effects.yaml: what is calibrated; its covariance says how well anchors are known"
-    )
-    made.add_argument(
-        "--live", metavar="S", type=float, help="listen to live topics for S seconds instead"
-    )
-    made.add_argument("--json", metavar="FILE", type=OutputFile, help="write all findings")
-    return made
 
 
 def _check(args: Namespace) -> int:

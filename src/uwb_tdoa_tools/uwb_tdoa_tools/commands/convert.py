@@ -16,6 +16,7 @@ from uwb_tdoa_bias.common.sensors import SENSORS
 
 from .. import cli, options
 from ..choices import COLUMNS, STREAMS
+from ..cli import option
 from ..command_lines import tool
 from ..outputs import OutputBag, OutputFile
 from ..parallel import Progress
@@ -38,7 +39,7 @@ The new bag has imu/data, uwb/tdoa, uwb/anchors, ground_truth/pose and /tf_stati
 
 def parser() -> ArgumentParser:
     """Its options."""
-    made = cli.parser(
+    return cli.parser(
         "convert",
         DESCRIPTION,
         "convert 0425-traj1 --survey anchor_0425.txt --out 0425-traj1.bag",
@@ -52,48 +53,53 @@ def parser() -> ArgumentParser:
             "convert theirs.bag --topic uwb/tdoa=/dwm/tdoa --topic imu/data=/fcu/imu --survey "
             "anchors.yaml --out our.bag"
         ),
-        "convert ranging.csv --columns time=t_ms:ms,anchor_a=from,anchor_b=to,tdoa=diff_mm:mm "
-        "--survey anchors.yaml "
-        "--out our.bag",
-        "convert ranging.csv mocap.csv --columns "
-        "time=t,anchor_a=from,anchor_b=to,tdoa=d,pose_x=x,pose_y=y,pose_z=z "
-        "--time-offset truth=-0.4 --survey anchors.csv --out our.bag",
+        (
+            "convert ranging.csv --columns time=t_ms:ms,anchor_a=from,anchor_b=to,tdoa=diff_mm:mm "
+            "--survey anchors.yaml "
+            "--out our.bag"
+        ),
+        (
+            "convert ranging.csv mocap.csv --columns "
+            "time=t,anchor_a=from,anchor_b=to,tdoa=d,pose_x=x,pose_y=y,pose_z=z "
+            "--time-offset truth=-0.4 --survey anchors.csv --out our.bag"
+        ),
         "convert theirs.bag --suggest profile.yaml",
         "convert theirs.bag --profile profile.yaml --survey anchors.yaml --out our.bag",
         "convert theirs.bag --profile dwm1001 --tag 5722 --out our.bag",
+        options=[
+            option(
+                "input",
+                metavar="IN",
+                nargs="+",
+                help="the recording; its kind is found by its content",
+            ),
+            option("--columns", metavar="MAP", help=COLUMNS),
+            *options.READING,
+            options.align(),
+            option(
+                "--time-offset",
+                dest="offsets",
+                action="append",
+                default=[],
+                metavar="SENSOR=SECONDS",
+                help=(
+                    f"add this to the stamps of a sensor with another clock: {', '.join((*STREAMS, *SENSORS))}; "
+                    "may be repeated"
+                ),
+            ),
+            option(
+                "--out", metavar="BAG", type=OutputBag, help="the bag to write, a new directory"
+            ),
+            option(
+                "--suggest",
+                metavar="FILE",
+                type=OutputFile,
+                help="write a first profile of IN instead: what it seems to hold, and what is missing",
+            ),
+            *options.BAG,
+            option("--json", action="store_true", help="print the summary as JSON"),
+        ],
     )
-    made.add_argument(
-        "input", metavar="IN", nargs="+", help="the recording; its kind is found by its content"
-    )
-    made.add_argument("--columns", metavar="MAP", help=COLUMNS)
-    options.add_reading(made)
-    options.add_align(made)
-    made.add_argument(
-        "--time-offset",
-        dest="offsets",
-        action="append",
-        default=[],
-        metavar="SENSOR=SECONDS",
-        help=(
-            f"add this to the stamps of a sensor with another clock: {', '.join((*STREAMS, *SENSORS))}; "
-            "may be repeated"
-        ),
-    )
-    made.add_argument(
-        "--out",
-        metavar="BAG",
-        type=OutputBag,
-        help="the bag to write, a new directory",
-    )
-    made.add_argument(
-        "--suggest",
-        metavar="FILE",
-        type=OutputFile,
-        help="write a first profile of IN instead: what it seems to hold, and what is missing",
-    )
-    options.add_bag(made)
-    made.add_argument("--json", action="store_true", help="print the summary as JSON")
-    return made
 
 
 def _convert(args: Namespace) -> None:

@@ -11,6 +11,7 @@ from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli, options, parallel
 from ..choices import INTERPOLATORS
+from ..cli import option
 from ..outputs import OutputFile
 
 if TYPE_CHECKING:
@@ -47,38 +48,56 @@ def parser() -> ArgumentParser:
         ),
         "debias judge map.npz 0426-traj1 --survey surveys/ --json errors.json",
     )
-    commands = made.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    fitting = commands.add_parser("fit", help="make a map")
-    judging = commands.add_parser("judge", help="errors before and after a map")
-    judging.add_argument("map", metavar="MAP", type=Path, help="file that `debias fit` wrote")
-    for one, nargs in ((fitting, "*"), (judging, "+")):
-        options.add_recordings(one, nargs)
-        options.add_filter(one)
-        options.add_align(one)
-        one.add_argument("--json", metavar="FILE", type=OutputFile, help="write all figures")
-        parallel.add_options(one)
-    add = fitting.add_argument
-    add(
-        "--static",
-        nargs="+",
-        default=[],
-        metavar="FILE",
-        help=(
-            "of a tag that stood still: CSV with true_x, true_y, true_z, x, y, z in metres, or "
-            "recordings with truth"
+    shared = (
+        *options.filtering(),
+        options.align(),
+        option("--json", metavar="FILE", type=OutputFile, help="write all figures"),
+        options.JOBS,
+    )
+    fitting = (
+        *options.recordings("*"),
+        *shared,
+        option(
+            "--static",
+            nargs="+",
+            default=[],
+            metavar="FILE",
+            help=(
+                "of a tag that stood still: CSV with true_x, true_y, true_z, x, y, z in metres, or "
+                "recordings with truth"
+            ),
+        ),
+        options.HOLDOUT,
+        option(
+            "--out",
+            metavar="FILE",
+            type=OutputFile,
+            required=True,
+            help="the map to write (.npz)",
+        ),
+        option(
+            "--step",
+            metavar="M",
+            type=float,
+            default=0.35,
+            help="of the grid of markers, m (default: 0.35)",
+        ),
+        option("--planar", action="store_true", help="map x and y only, whatever the height"),
+        option(
+            "--interpolator",
+            choices=INTERPOLATORS,
+            default="thin_plate",
+            help="(default: thin_plate)",
         ),
     )
-    options.add_holdout(fitting)
-    add("--out", metavar="FILE", type=OutputFile, required=True, help="the map to write (.npz)")
-    add(
-        "--step",
-        metavar="M",
-        type=float,
-        default=0.35,
-        help="of the grid of markers, m (default: 0.35)",
+    judging = (
+        option("map", metavar="MAP", type=Path, help="file that `debias fit` wrote"),
+        *options.recordings(),
+        *shared,
     )
-    add("--planar", action="store_true", help="map x and y only, whatever the height")
-    add("--interpolator", choices=INTERPOLATORS, default="thin_plate", help="(default: thin_plate)")
+    commands = made.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    cli.add(commands.add_parser("fit", help="make a map"), fitting)
+    cli.add(commands.add_parser("judge", help="errors before and after a map"), judging)
     return made
 
 

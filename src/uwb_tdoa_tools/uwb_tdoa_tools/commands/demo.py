@@ -13,6 +13,7 @@ import time
 from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli, options, parallel
+from ..cli import option
 from ..outputs import OutputFile, OutputFolder
 
 DESCRIPTION = """Find a systematic error of the measurements, write its correction, and fly with it.
@@ -32,7 +33,7 @@ SEED, RATES = 1, {"simulated": 20.0, "measured": 1.0}  # times as fast as flown
 
 def parser() -> ArgumentParser:
     """Its options."""
-    made = cli.parser(
+    return cli.parser(
         "demo",
         DESCRIPTION,
         "demo",
@@ -40,39 +41,46 @@ def parser() -> ArgumentParser:
         "demo --flight 0607/tdoa2-obs-log1 --survey anchor_0607.txt --rate 4",
         "demo --flight flight.bag --rerun out/flight.rrd",
         "demo --flight flight.bag --effects effects.yaml --out out/corrected",
+        options=[
+            option(
+                "--flight",
+                metavar="LOG",
+                help="a recording: micro-SD log, UTIL CSV or bag (default: simulate three)",
+            ),
+            option(
+                "--seed",
+                metavar="N",
+                type=parallel.whole_number,
+                help=f"of the simulated hall and its hidden effect (default {SEED})",
+            ),
+            *options.READING,
+            option(
+                "--rate",
+                metavar="R",
+                type=float,
+                help=(
+                    "replay R times as fast as flown (default 1; 20 of a simulated flight, or as fast as "
+                    "this machine can)"
+                ),
+            ),
+            option(
+                "--out",
+                metavar="DIR",
+                type=OutputFolder,
+                default="out/demo",
+                help="for all files (default out/demo)",
+            ),
+            option("--effects", metavar="FILE", help="effects.yaml to correct with"),
+            options.MODEL,
+            options.RERUN,
+            option(
+                "--json",
+                metavar="FILE",
+                type=OutputFile,
+                help="write all figures of the simulated hall",
+            ),
+        ],
     )
-    add = made.add_argument
-    add(
-        "--flight",
-        metavar="LOG",
-        help="a recording: micro-SD log, UTIL CSV or bag (default: simulate three)",
-    )
-    add(
-        "--seed",
-        metavar="N",
-        type=parallel.whole_number,
-        help=f"of the simulated hall and its hidden effect (default {SEED})",
-    )
-    options.add_reading(made)
-    add(
-        "--rate",
-        metavar="R",
-        type=float,
-        help="replay R times as fast as flown (default 1; 20 of a simulated flight, or as fast as "
-        "this machine can)",
-    )
-    add(
-        "--out",
-        metavar="DIR",
-        type=OutputFolder,
-        default="out/demo",
-        help="for all files (default out/demo)",
-    )
-    add("--effects", metavar="FILE", help="effects.yaml to correct with")
-    options.add_model(made)
-    options.add_rerun(made)
-    add("--json", metavar="FILE", type=OutputFile, help="write all figures of the simulated hall")
-    return made
 
 
 def _demo(args: Namespace) -> int:

@@ -13,6 +13,7 @@ from uwb_tdoa_bias.common.files import write_text
 
 from .. import cli, command_lines, options, parallel
 from ..choices import DRIFT, NONE, PLAN_SPEED, PLAN_TIME, REFERENCES, TAPE_STD
+from ..cli import exclusive, option
 from ..parallel import Progress
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ UNUSED = {  # by references, of the options of what is known
 
 def parser() -> ArgumentParser:
     """Its options."""
-    made = cli.parser(
+    return cli.parser(
         "diagnose",
         DESCRIPTION,
         "diagnose flight.bag --out diagnosis/",
@@ -60,79 +61,83 @@ def parser() -> ArgumentParser:
         "diagnose flight.bag --plan-flight -3 3 -4 4 0 3 --out diagnosis/",
         "diagnose flight.bag --no-truth --out without/",
         "diagnose today.bag --no-truth --effects last-week/effects.yaml --out today/",
+        options=[
+            *options.recordings(),
+            *options.filtering(
+                "effects.yaml: effects in the model already; without ground truth its covariance is "
+                "the prior"
+            ),
+            options.PARAMETERS,
+            options.HOLDOUT,
+            exclusive(
+                option(
+                    "--reference",
+                    choices=REFERENCES,
+                    default="truth",
+                    help=(
+                        "what flights are compared with: their ground truth (default), the heights of a range "
+                        "finder, --marks, "
+                        "--odometry, or nothing; other references are not read"
+                    ),
+                ),
+                option(
+                    "--no-truth",
+                    dest="reference",
+                    action="store_const",
+                    const="nothing",
+                    help="short for --reference nothing",
+                ),
+            ),
+            *options.KNOWN,
+            option(
+                "--odometry",
+                metavar="CSV|TOPIC",
+                help=(
+                    "path of another odometry or SLAM, in a frame of its own with z up: a CSV file with "
+                    "columns flight, t, x, y, z, or a "
+                    "topic (nav_msgs/Odometry) of the bags; with --marks, e.g. where it took off and "
+                    "landed, it goes through them"
+                ),
+            ),
+            option(
+                "--drift",
+                type=float,
+                default=DRIFT,
+                metavar="M",
+                help="of that, m per square root of a second (default %(default)s)",
+            ),
+            option(
+                "--plan-flight",
+                nargs=6,
+                type=float,
+                metavar=("X0", "X1", "Y0", "Y1", "Z0", "Z1"),
+                help=(
+                    "plan the flight that settles what stays ambiguous, m, between these walls, floor and "
+                    "ceiling; needs ground truth. Writes next_flight.csv (t, x, y, z, yaw; for simulate "
+                    "--poses), .tum and _waypoints.csv"
+                ),
+            ),
+            option(
+                "--plan-time",
+                type=float,
+                metavar="S",
+                default=PLAN_TIME,
+                help="of that flight, s at most (default %(default)s)",
+            ),
+            option(
+                "--plan-speed",
+                type=float,
+                metavar="M/S",
+                default=PLAN_SPEED,
+                help="of that flight, m/s at most (default %(default)s)",
+            ),
+            options.most(MOST),
+            options.align(),
+            options.RERUN,
+            options.JOBS,
+            options.out(),
+        ],
     )
-    options.add_recordings(made)
-    options.add_filter(
-        made,
-        (
-            "effects.yaml: effects in the model already; without ground truth its covariance is "
-            "the prior"
-        ),
-    )
-    options.add_parameters(made)
-    add = made.add_argument
-    options.add_holdout(made)
-    known = made.add_mutually_exclusive_group().add_argument
-    known(
-        "--reference",
-        choices=REFERENCES,
-        default="truth",
-        help="what flights are compared with: their ground truth (default), the heights of a range "
-        "finder, --marks, "
-        "--odometry, or nothing; other references are not read",
-    )
-    known(
-        "--no-truth",
-        dest="reference",
-        action="store_const",
-        const="nothing",
-        help="short for --reference nothing",
-    )
-    options.add_known(made)
-    add(
-        "--odometry",
-        metavar="CSV|TOPIC",
-        help="path of another odometry or SLAM, in a frame of its own with z up: a CSV file with "
-        "columns flight, t, x, y, z, or a "
-        "topic (nav_msgs/Odometry) of the bags; with --marks, e.g. where it took off and "
-        "landed, it goes through them",
-    )
-    add(
-        "--drift",
-        type=float,
-        default=DRIFT,
-        metavar="M",
-        help="of that, m per square root of a second (default %(default)s)",
-    )
-    add(
-        "--plan-flight",
-        nargs=6,
-        type=float,
-        metavar=("X0", "X1", "Y0", "Y1", "Z0", "Z1"),
-        help="plan the flight that settles what stays ambiguous, m, between these walls, floor and "
-        "ceiling; needs ground truth. Writes next_flight.csv (t, x, y, z, yaw; for simulate "
-        "--poses), .tum and _waypoints.csv",
-    )
-    add(
-        "--plan-time",
-        type=float,
-        metavar="S",
-        default=PLAN_TIME,
-        help="of that flight, s at most (default %(default)s)",
-    )
-    add(
-        "--plan-speed",
-        type=float,
-        metavar="M/S",
-        default=PLAN_SPEED,
-        help="of that flight, m/s at most (default %(default)s)",
-    )
-    options.add_most(made, MOST)
-    options.add_align(made)
-    options.add_rerun(made)
-    parallel.add_options(made)
-    options.add_out(made)
-    return made
 
 
 def _diagnose(args: Namespace) -> int:
@@ -174,9 +179,9 @@ def _diagnose(args: Namespace) -> int:
         [its_survey for _, its_survey in (*found, *reading.find(args.holdout))],
     ):
         cli.say("diagnose", remark)
-    for option in ("marks", "odometry"):
-        if args.reference == option and getattr(args, option) is None:
-            raise InputError(f"--reference {option}: --{option} says which, and is missing.")
+    for name in ("marks", "odometry"):
+        if args.reference == name and getattr(args, name) is None:
+            raise InputError(f"--reference {name}: --{name} says which, and is missing.")
     known: tuple[Mark | Distance | OdometryPath, ...] = options.known_of(args, (*flights, *holdout))
     if args.odometry is not None:
         known = (

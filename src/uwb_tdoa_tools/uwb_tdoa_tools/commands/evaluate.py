@@ -11,7 +11,8 @@ from functools import partial
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_text
 
-from .. import cli, options, parallel
+from .. import cli, options
+from ..cli import option
 from ..outputs import OutputFile, OutputFolder, as_json
 
 # Options without influence on the figures of a flight.
@@ -21,17 +22,19 @@ NOT_OF_ODOMETRY = "effects", "config", "model", "no_bias", "parameters", "withou
 
 def parser() -> ArgumentParser:
     """Its options."""
-    made = cli.parser(
+    return cli.parser(
         "evaluate",
-        "Errors of the estimate against ground truth, in metres: in the air (truth z > 0.3 "
-        "m), and in each phase of the recording,\n"
-        "at rest before and after too (without: s with no estimate; step: the largest jump of "
-        "the error between two estimates).\n"
-        "Runs bias correction and filter here, as the nodes would, or takes a recorded "
-        "odometry.\n\n"
-        "Exit code: 0 done, 1 a run DIVERGED, or TDOAs were late for a recorded odometry (as "
-        "far as uwb/residual was recorded too),\n"
-        "2 bad input.",
+        (
+            "Errors of the estimate against ground truth, in metres: in the air (truth z > 0.3 "
+            "m), and in each phase of the recording,\n"
+            "at rest before and after too (without: s with no estimate; step: the largest jump of "
+            "the error between two estimates).\n"
+            "Runs bias correction and filter here, as the nodes would, or takes a recorded "
+            "odometry.\n\n"
+            "Exit code: 0 done, 1 a run DIVERGED, or TDOAs were late for a recorded odometry (as "
+            "far as uwb/residual was recorded too),\n"
+            "2 bad input."
+        ),
         "evaluate flight.bag",
         "evaluate 0425-traj2 --survey anchor_0425.txt --plot error.png",
         "evaluate flights/ --survey surveys/ --no-bias --json errors.json",
@@ -41,48 +44,54 @@ def parser() -> ArgumentParser:
         "evaluate flights/ --survey surveys/ --without height --without pressure",
         "evaluate flights/ --survey surveys/ --resume judged.jsonl --json errors.json",
         "evaluate flights/ --survey surveys/ --dask tcp://10.0.0.1:8786",
+        options=[
+            *options.recordings(),
+            *options.ESTIMATOR,
+            options.align(judges=True),
+            option(
+                "--odometry",
+                metavar="BAG",
+                help="judge the odometry of this bag; needs exactly one FLIGHT",
+            ),
+            option(
+                "--json", metavar="FILE", type=OutputFile, help="write all figures: runs, pooled"
+            ),
+            option(
+                "--markdown", metavar="FILE", type=OutputFile, help="write the table as Markdown"
+            ),
+            option(
+                "--beside",
+                metavar="CSV",
+                help=(
+                    "add the 3D RMSE that others reach to that table: columns flight, peer, mode, "
+                    "rmse_3d, diverged"
+                ),
+            ),
+            option(
+                "--plot",
+                metavar="FILE",
+                type=OutputFile,
+                help="picture of the errors over time (one FLIGHT)",
+            ),
+            option(
+                "--tum",
+                metavar="DIR",
+                type=OutputFolder,
+                help="write estimates and truths as TUM trajectories, e.g. for evo",
+            ),
+            options.RERUN,
+            option(
+                "--resume",
+                metavar="FILE",
+                type=OutputFile,
+                help=(
+                    "keep each flight's figures there as soon as they are computed, a line of JSON each; "
+                    "flights in the file are not evaluated again"
+                ),
+            ),
+            options.JOBS,
+        ],
     )
-    add = made.add_argument
-    options.add_recordings(made)
-    options.add_estimator(made)
-    options.add_align(made, judges=True)
-    add(
-        "--odometry", metavar="BAG", help="judge the odometry of this bag; needs exactly one FLIGHT"
-    )
-    add("--json", metavar="FILE", type=OutputFile, help="write all figures: runs, pooled")
-    add("--markdown", metavar="FILE", type=OutputFile, help="write the table as Markdown")
-    add(
-        "--beside",
-        metavar="CSV",
-        help=(
-            "add the 3D RMSE that others reach to that table: columns flight, peer, mode, "
-            "rmse_3d, diverged"
-        ),
-    )
-    add(
-        "--plot",
-        metavar="FILE",
-        type=OutputFile,
-        help="picture of the errors over time (one FLIGHT)",
-    )
-    add(
-        "--tum",
-        metavar="DIR",
-        type=OutputFolder,
-        help="write estimates and truths as TUM trajectories, e.g. for evo",
-    )
-    options.add_rerun(made)
-    add(
-        "--resume",
-        metavar="FILE",
-        type=OutputFile,
-        help=(
-            "keep each flight's figures there as soon as they are computed, a line of JSON each; "
-            "flights in the file are not evaluated again"
-        ),
-    )
-    parallel.add_options(made)
-    return made
 
 
 def _evaluate(args: Namespace) -> int:
@@ -102,9 +111,9 @@ def _evaluate(args: Namespace) -> int:
     found = (replace(reading, topics={}, namespace="") if args.odometry else reading).find(
         args.flights, bool(args.dask)
     )
-    for option in ("odometry", "plot"):
-        if getattr(args, option) and len(found) != 1:
-            raise InputError(f"--{option}: needs exactly one flight, got {len(found)}.")
+    for name in ("odometry", "plot"):
+        if getattr(args, name) and len(found) != 1:
+            raise InputError(f"--{name}: needs exactly one flight, got {len(found)}.")
     trajectories = args.tum.absolute() if args.tum else None
     rerun = options.rerun_of(args, len(found), partial(cli.say, "evaluate"))
     evaluator = Evaluator(

@@ -10,38 +10,57 @@ from functools import partial
 from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli, options
+from ..cli import option
 from ..outputs import OutputFile, OutputFolder
 from ..parallel import Progress
 
 
 def parser() -> ArgumentParser:
     """Its options."""
-    made = cli.parser(
+    return cli.parser(
         "export",
-        "Write the correction of TDOAs by effects and network as one file, for the anchors of a "
-        "survey.\n"
-        "bias_node, evaluate and fly take bias.onnx in place of effects.yaml and network; so does "
-        "any other ONNX runtime.\n"
-        "What a file cannot hold is named on stderr, with its worth in metres. docs/export.md "
-        "describes the files.",
+        (
+            "Write the correction of TDOAs by effects and network as one file, for the anchors of a "
+            "survey.\n"
+            "bias_node, evaluate and fly take bias.onnx in place of effects.yaml and network; so does "
+            "any other ONNX runtime.\n"
+            "What a file cannot hold is named on stderr, with its worth in metres. docs/export.md "
+            "describes the files."
+        ),
         "export --survey anchors.yaml --effects effects.yaml --onnx bias.onnx",
         "export --survey anchors.yaml --effects effects.yaml --model model.onnx --onnx bias.onnx",
         "export --survey anchors.yaml --effects effects.yaml --c correction/",
         "export --survey anchors.yaml --effects effects.yaml --crazyflie crazyflie/",
+        options=[
+            option(
+                "--survey", metavar="S", required=True, help="anchors .yaml or survey (.txt, .csv)"
+            ),
+            option(
+                "--effects",
+                metavar="FILE",
+                help="effects.yaml, as diagnose, calibrate or train writes it",
+            ),
+            option("--model", metavar="FILE", help="ONNX bias network, as train writes it"),
+            option(
+                "--onnx",
+                metavar="FILE",
+                type=OutputFile,
+                help="write the correction as an ONNX file",
+            ),
+            option(
+                "--c",
+                metavar="DIR",
+                type=OutputFolder,
+                help="write it as C99: uwb_bias.h and uwb_bias.c",
+            ),
+            option(
+                "--crazyflie",
+                metavar="DIR",
+                type=OutputFolder,
+                help="write it as an out-of-tree build of the Crazyflie firmware",
+            ),
+        ],
     )
-    add = made.add_argument
-    add("--survey", metavar="S", required=True, help="anchors .yaml or survey (.txt, .csv)")
-    add("--effects", metavar="FILE", help="effects.yaml, as diagnose, calibrate or train writes it")
-    add("--model", metavar="FILE", help="ONNX bias network, as train writes it")
-    add("--onnx", metavar="FILE", type=OutputFile, help="write the correction as an ONNX file")
-    add("--c", metavar="DIR", type=OutputFolder, help="write it as C99: uwb_bias.h and uwb_bias.c")
-    add(
-        "--crazyflie",
-        metavar="DIR",
-        type=OutputFolder,
-        help="write it as an out-of-tree build of the Crazyflie firmware",
-    )
-    return made
 
 
 def _export(args: Namespace) -> None:

@@ -14,6 +14,7 @@ from uwb_tdoa_bias.common.sensors import SENSORS
 
 from .. import cli, options, parallel
 from ..choices import FLOWN, MOMENTS, WORLDS
+from ..cli import option
 from ..outputs import OutputFile, OutputFolder
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ last place, and touched no wall. Its filter has planar, fixed_height and non_hol
 
 def parser() -> argparse.ArgumentParser:
     """Its options."""
-    made = cli.parser(
+    return cli.parser(
         "fly",
         DESCRIPTION,
         "fly",
@@ -58,134 +59,140 @@ def parser() -> argparse.ArgumentParser:
         "fly --silence circle:3 --effects effects.yaml",
         "fly --installation 7 --flights 3 --seed 101 --record flown/",
         "fly --flights 1000 --resume flown.jsonl --dask tcp://10.0.0.1:8786",
+        options=[
+            option(
+                "--flights",
+                metavar="N",
+                type=parallel.whole_number,
+                default=10,
+                help="how many (default: 10)",
+            ),
+            option(
+                "--seed",
+                metavar="S",
+                type=parallel.whole_number,
+                default=1,
+                help="of the first flight; each later one has the next seed (default: 1)",
+            ),
+            option(
+                "--vehicle",
+                choices=FLOWN,
+                default="quadrotor",
+                help="what is flown, or driven (default: quadrotor)",
+            ),
+            option(
+                "--world",
+                choices=WORLDS,
+                default="hall",
+                help="what it flies in (default: hall; docs/flying.md)",
+            ),
+            option(
+                "--installation",
+                metavar="N",
+                type=parallel.whole_number,
+                help="the same anchors' errors in every flight (default: its own)",
+            ),
+            option(
+                "--told",
+                choices=("nothing", "place"),
+                default="nothing",
+                help="at the start: its place, to 0.1 m (default: nothing)",
+            ),
+            option(
+                "--yaw",
+                choices=("known", "unknown"),
+                default="known",
+                help="at the start, to 0.1 rad (default: known)",
+            ),
+            option(
+                "--sensor",
+                action="append",
+                default=[],
+                choices=tuple(SENSORS),
+                help="what else it measures: "
+                + ", ".join(sensor.plural for sensor in SENSORS.values()),
+            ),
+            option(
+                "--floor-effect",
+                action=argparse.BooleanOptionalAction,
+                help="low anchors are late near the floor (default: the world's)",
+            ),
+            option(
+                "--silence",
+                metavar="MOMENT:S",
+                help=f"nothing is heard for S seconds: MOMENT is one of {', '.join(MOMENTS)}",
+            ),
+            option("--hover", action="store_true", help="instead of circles"),
+            option(
+                "--again",
+                action="store_true",
+                help="a minute later, carried by 2 m meanwhile, fly once more, without a restart",
+            ),
+            option(
+                "--inject",
+                nargs="+",
+                action="append",
+                default=[],
+                metavar=("EFFECT", "KEY=NUMBER"),
+                help="an effect, as of inject",
+            ),
+            *options.filtering(),
+            option(
+                "--model",
+                metavar="FILE",
+                help="ONNX bias network to correct with, e.g. one that train wrote (default: none)",
+            ),
+            option(
+                "--set",
+                metavar="NAME:=VALUE",
+                action="append",
+                default=[],
+                help="a filter parameter; may be repeated",
+            ),
+            option(
+                "--peer",
+                metavar="LIBRARY",
+                help="fly by this shared library of another filter (docs/flying.md), which gets its yaw",
+            ),
+            option(
+                "--correction",
+                metavar="FOLDER",
+                help="correct the TDOAs of the peer by this folder of export --c (docs/export.md)",
+            ),
+            options.JOBS,
+            option(
+                "--at-least",
+                metavar="N",
+                type=int,
+                default=0,
+                help="flights that are to land, drives to arrive (default: 0)",
+            ),
+            option(
+                "--record",
+                metavar="DIR",
+                type=OutputFolder,
+                help="write every flight as a bag, DIR/flown-SEED, e.g. for diagnose",
+            ),
+            option(
+                "--resume",
+                metavar="FILE",
+                type=OutputFile,
+                help="keep the verdict of each flight in this file, and continue from there",
+            ),
+            option(
+                "--json",
+                metavar="FILE",
+                type=OutputFile,
+                help="write the summary and every verdict",
+            ),
+            option(
+                "--plot",
+                metavar="FILE",
+                type=OutputFile,
+                help="draw a map of all flights, and the errors of the worst with three sigma",
+            ),
+        ],
     )
-    add = made.add_argument
-    add(
-        "--flights",
-        metavar="N",
-        type=parallel.whole_number,
-        default=10,
-        help="how many (default: 10)",
-    )
-    add(
-        "--seed",
-        metavar="S",
-        type=parallel.whole_number,
-        default=1,
-        help="of the first flight; each later one has the next seed (default: 1)",
-    )
-    add(
-        "--vehicle",
-        choices=FLOWN,
-        default="quadrotor",
-        help="what is flown, or driven (default: quadrotor)",
-    )
-    add(
-        "--world",
-        choices=WORLDS,
-        default="hall",
-        help="what it flies in (default: hall; docs/flying.md)",
-    )
-    add(
-        "--installation",
-        metavar="N",
-        type=parallel.whole_number,
-        help="the same anchors' errors in every flight (default: its own)",
-    )
-    add(
-        "--told",
-        choices=("nothing", "place"),
-        default="nothing",
-        help="at the start: its place, to 0.1 m (default: nothing)",
-    )
-    add(
-        "--yaw",
-        choices=("known", "unknown"),
-        default="known",
-        help="at the start, to 0.1 rad (default: known)",
-    )
-    add(
-        "--sensor",
-        action="append",
-        default=[],
-        choices=tuple(SENSORS),
-        help="what else it measures: " + ", ".join(sensor.plural for sensor in SENSORS.values()),
-    )
-    add(
-        "--floor-effect",
-        action=argparse.BooleanOptionalAction,
-        help="low anchors are late near the floor (default: the world's)",
-    )
-    add(
-        "--silence",
-        metavar="MOMENT:S",
-        help=f"nothing is heard for S seconds: MOMENT is one of {', '.join(MOMENTS)}",
-    )
-    add("--hover", action="store_true", help="instead of circles")
-    add(
-        "--again",
-        action="store_true",
-        help="a minute later, carried by 2 m meanwhile, fly once more, without a restart",
-    )
-    add(
-        "--inject",
-        nargs="+",
-        action="append",
-        default=[],
-        metavar=("EFFECT", "KEY=NUMBER"),
-        help="an effect, as of inject",
-    )
-    options.add_filter(made)
-    add(
-        "--model",
-        metavar="FILE",
-        help="ONNX bias network to correct with, e.g. one that train wrote (default: none)",
-    )
-    add(
-        "--set",
-        metavar="NAME:=VALUE",
-        action="append",
-        default=[],
-        help="a filter parameter; may be repeated",
-    )
-    add(
-        "--peer",
-        metavar="LIBRARY",
-        help="fly by this shared library of another filter (docs/flying.md), which gets its yaw",
-    )
-    add(
-        "--correction",
-        metavar="FOLDER",
-        help="correct the TDOAs of the peer by this folder of export --c (docs/export.md)",
-    )
-    parallel.add_options(made)
-    add(
-        "--at-least",
-        metavar="N",
-        type=int,
-        default=0,
-        help="flights that are to land, drives to arrive (default: 0)",
-    )
-    add(
-        "--record",
-        metavar="DIR",
-        type=OutputFolder,
-        help="write every flight as a bag, DIR/flown-SEED, e.g. for diagnose",
-    )
-    add(
-        "--resume",
-        metavar="FILE",
-        type=OutputFile,
-        help="keep the verdict of each flight in this file, and continue from there",
-    )
-    add("--json", metavar="FILE", type=OutputFile, help="write the summary and every verdict")
-    add(
-        "--plot",
-        metavar="FILE",
-        type=OutputFile,
-        help="draw a map of all flights, and the errors of the worst with three sigma",
-    )
-    return made
 
 
 def _fly(args: argparse.Namespace) -> int:

@@ -9,6 +9,7 @@ from argparse import ArgumentParser, Namespace
 from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli, options
+from ..cli import option
 from ..outputs import OutputBag
 from ..parallel import Progress
 
@@ -21,7 +22,7 @@ them."""
 
 def parser() -> ArgumentParser:
     """Its options."""
-    made = cli.parser(
+    return cli.parser(
         "inject",
         DESCRIPTION,
         (
@@ -31,21 +32,31 @@ def parser() -> ArgumentParser:
         "inject flight.bag --effect tag_lever_arm --value x=0.05 z=0.1 --out arm.bag",
         "inject flight.bag --effect nlos --value 2.delay=0.4 2.start=20 2.end=35 --out blocked.bag",
         "inject --list",
+        options=[
+            option(
+                "flight", metavar="FLIGHT", nargs="?", help="a raw log, a UTIL CSV file or a bag"
+            ),
+            option(
+                "--list",
+                action="store_true",
+                help="list effects, parameters and units, and do nothing else",
+            ),
+            *options.READING,
+            option("--effect", metavar="NAME", help="the effect to add, one of --list"),
+            option("--value", metavar="KEY=NUMBER", nargs="+", default=[], help="its parameters"),
+            option(
+                "--seed",
+                metavar="N",
+                type=int,
+                default=0,
+                help="of effects that are random (default: 0)",
+            ),
+            option(
+                "--out", metavar="BAG", type=OutputBag, help="the bag to write: a new directory"
+            ),
+            *options.BAG,
+        ],
     )
-    add = made.add_argument
-    add("flight", metavar="FLIGHT", nargs="?", help="a raw log, a UTIL CSV file or a bag")
-    add(
-        "--list",
-        action="store_true",
-        help="list effects, parameters and units, and do nothing else",
-    )
-    options.add_reading(made)
-    add("--effect", metavar="NAME", help="the effect to add, one of --list")
-    add("--value", metavar="KEY=NUMBER", nargs="+", default=[], help="its parameters")
-    add("--seed", metavar="N", type=int, default=0, help="of effects that are random (default: 0)")
-    add("--out", metavar="BAG", type=OutputBag, help="the bag to write: a new directory")
-    options.add_bag(made)
-    return made
 
 
 def _inject(args: Namespace) -> None:
@@ -54,9 +65,9 @@ def _inject(args: Namespace) -> None:
     if args.list:
         cli.show(catalogue())
         return
-    for option in ("flight", "effect", "value", "out"):
-        if not getattr(args, option):
-            raise InputError(f"{option}: is missing; see inject --help.")
+    for name in ("flight", "effect", "value", "out"):
+        if not getattr(args, name):
+            raise InputError(f"{name}: is missing; see inject --help.")
     effect = parse_effect(args.effect, args.value)
     with Progress("inject", what="reading and writing"):
         name = inject(

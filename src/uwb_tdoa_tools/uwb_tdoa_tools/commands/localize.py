@@ -10,6 +10,7 @@ from functools import partial
 from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli, options, parallel
+from ..cli import option
 from ..outputs import OutputFile
 
 DESCRIPTION = """Where the tag was: trajectories of recordings, without ground truth, which is not read.
@@ -27,7 +28,7 @@ Exit code: 0 all are good, 1 some are not, 2 bad input."""
 
 def parser() -> ArgumentParser:
     """Its options."""
-    made = cli.parser(
+    return cli.parser(
         "localize",
         DESCRIPTION,
         "localize flight.bag --out out/",
@@ -39,27 +40,27 @@ def parser() -> ArgumentParser:
         "localize flight.bag --bag --json located.json --out out/",
         "localize flight.bag --rerun flight.rrd --out out/",
         "localize hall.bag --zones 20 --out out/",
+        options=[
+            *options.recordings(),
+            *options.ESTIMATOR,
+            option("--bag", action="store_true", help="write the odometry as a bag, too"),
+            option(
+                "--residuals",
+                action="store_true",
+                help="write what is left of each TDOA, too: a table, and a picture",
+            ),
+            option(
+                "--zones",
+                metavar="M",
+                type=float,
+                help="write who is heard in squares of that size, and how well, too: a table, and a map",
+            ),
+            options.RERUN,
+            option("--json", metavar="FILE", type=OutputFile, help="write all figures"),
+            options.JOBS,
+            options.out(),
+        ],
     )
-    options.add_recordings(made)
-    options.add_estimator(made)
-    add = made.add_argument
-    add("--bag", action="store_true", help="write the odometry as a bag, too")
-    add(
-        "--residuals",
-        action="store_true",
-        help="write what is left of each TDOA, too: a table, and a picture",
-    )
-    add(
-        "--zones",
-        metavar="M",
-        type=float,
-        help="write who is heard in squares of that size, and how well, too: a table, and a map",
-    )
-    options.add_rerun(made)
-    add("--json", metavar="FILE", type=OutputFile, help="write all figures")
-    parallel.add_options(made)
-    options.add_out(made)
-    return made
 
 
 def _localize(args: Namespace) -> int:

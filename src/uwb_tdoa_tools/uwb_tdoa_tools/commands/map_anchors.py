@@ -10,6 +10,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_text
 
 from .. import choices, cli, command_lines, options
+from ..cli import option
 from ..parallel import Progress
 
 DESCRIPTION = """Make a first map of anchors whose positions are unknown.
@@ -29,51 +30,49 @@ Exit code: 0 a map; 1 the data leave the map open or contradict each other; 2 ba
 
 def parser() -> ArgumentParser:
     """Its options."""
-    made = cli.parser(
+    return cli.parser(
         "map_anchors",
         DESCRIPTION,
         "map_anchors flight.bag --survey two.yaml --out map/",
         "map_anchors first.bag second.bag --survey two.yaml --coordinates heights.csv --out map/",
         "map_anchors --survey three.yaml --distances laser.csv --coordinates side.csv --out map/",
         "map_anchors --survey three.yaml --distances radio.csv --delay-std 0.1 --out map/",
+        options=[
+            *options.recordings(nargs="*"),
+            option(
+                "--coordinates",
+                metavar="FILE",
+                help="CSV with columns anchor, axis, value, std: single coordinates of anchors, m; rough ones too",
+            ),
+            options.DISTANCES,
+            option(
+                "--delay-std",
+                type=float,
+                default=0.0,
+                metavar="M",
+                help=(
+                    "m, standard deviation of the antenna delay of each anchor in --distances, if a radio "
+                    "measured them (default 0: by laser)"
+                ),
+            ),
+            option(
+                "--trusted-std",
+                type=float,
+                default=choices.TRUSTED_STD,
+                metavar="M",
+                help="m, standard deviation of the coordinates in --survey (default %(default)s)",
+            ),
+            option(
+                "--accuracy",
+                type=float,
+                default=choices.MAP_ACCURACY,
+                metavar="M",
+                help="m, largest 3D standard deviation of an anchor in a map that is written (default %(default)s)",
+            ),
+            option("--seed", type=int, default=0, metavar="N", help="of the search (default 0)"),
+            options.out(),
+        ],
     )
-    options.add_recordings(made, nargs="*")
-    add = made.add_argument
-    add(
-        "--coordinates",
-        metavar="FILE",
-        help="CSV with columns anchor, axis, value, std: single coordinates of anchors, m; rough ones too",
-    )
-    add(
-        "--distances",
-        metavar="FILE",
-        help="CSV with columns a, b, distance, std: measured distances between anchors, m",
-    )
-    add(
-        "--delay-std",
-        type=float,
-        default=0.0,
-        metavar="M",
-        help="m, standard deviation of the antenna delay of each anchor in --distances, if a radio "
-        "measured them (default 0: by laser)",
-    )
-    add(
-        "--trusted-std",
-        type=float,
-        default=choices.TRUSTED_STD,
-        metavar="M",
-        help="m, standard deviation of the coordinates in --survey (default %(default)s)",
-    )
-    add(
-        "--accuracy",
-        type=float,
-        default=choices.MAP_ACCURACY,
-        metavar="M",
-        help="m, largest 3D standard deviation of an anchor in a map that is written (default %(default)s)",
-    )
-    add("--seed", type=int, default=0, metavar="N", help="of the search (default 0)")
-    options.add_out(made)
-    return made
 
 
 def _map_anchors(args: Namespace) -> int:

@@ -9,6 +9,7 @@ from functools import partial
 
 from .. import cli
 from ..choices import WAIT
+from ..cli import option
 
 DESCRIPTION = """Replay a bag over ROS topics with its own timing, like `ros2 bag play`.
 
@@ -25,7 +26,7 @@ last examples. If all nodes that subscribe to the anchors have anchors_file, the
 
 def parser() -> argparse.ArgumentParser:
     """Its options."""
-    made = cli.parser(
+    return cli.parser(
         "replay",
         DESCRIPTION,
         "replay flight.bag",
@@ -34,45 +35,53 @@ def parser() -> argparse.ArgumentParser:
         "replay flight.bag --wait-matched 30 --wait-topics imu/data uwb/tdoa",
         "replay flight.bag --ros-args -r __ns:=/tag1",
         "replay flight.bag --ros-args -r uwb/tdoa:=uwb/raw",
+        options=[
+            option("bag", help="bag directory, or its .mcap or .db3 file"),
+            option(
+                "-r",
+                "--rate",
+                type=_positive,
+                default=1.0,
+                help="times as fast as recorded (default 1)",
+            ),
+            option(
+                "-l", "--loop", action="store_true", help="start again at the end, until stopped"
+            ),
+            option(
+                "--clock",
+                type=_positive,
+                nargs="?",
+                const=40.0,
+                metavar="HZ",
+                help="publish the bag's time on /clock (default 40 Hz)",
+            ),
+            option(
+                "--wait-matched",
+                type=_positive,
+                default=WAIT,
+                metavar="SECONDS",
+                help=f"wait at most this long until somebody subscribes, or fail (default {WAIT:g})",
+            ),
+            option(
+                "--wait-topics",
+                nargs="+",
+                default=[],
+                metavar="TOPIC",
+                help="wait until somebody subscribes to each of these topics",
+            ),
+            option("--follow", metavar="TOPIC", help="keep in step with this topic, e.g. odometry"),
+            option(
+                "--package",
+                action="append",
+                default=[],
+                metavar="NAME",
+                help=(
+                    "import message types of this package, too; the usual ones of ROS, and ours, are known; "
+                    "may be repeated"
+                ),
+            ),
+        ],
     )
-    add = made.add_argument
-    add("bag", help="bag directory, or its .mcap or .db3 file")
-    add("-r", "--rate", type=_positive, default=1.0, help="times as fast as recorded (default 1)")
-    add("-l", "--loop", action="store_true", help="start again at the end, until stopped")
-    add(
-        "--clock",
-        type=_positive,
-        nargs="?",
-        const=40.0,
-        metavar="HZ",
-        help="publish the bag's time on /clock (default 40 Hz)",
-    )
-    add(
-        "--wait-matched",
-        type=_positive,
-        default=WAIT,
-        metavar="SECONDS",
-        help=(f"wait at most this long until somebody subscribes, or fail (default {WAIT:g})"),
-    )
-    add(
-        "--wait-topics",
-        nargs="+",
-        default=[],
-        metavar="TOPIC",
-        help="wait until somebody subscribes to each of these topics",
-    )
-    add("--follow", metavar="TOPIC", help="keep in step with this topic, e.g. odometry")
-    add(
-        "--package",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help=(
-            "import message types of this package, too; the usual ones of ROS, and ours, are known; "
-            "may be repeated"
-        ),
-    )
-    return made
 
 
 def _replay(args: argparse.Namespace) -> int:

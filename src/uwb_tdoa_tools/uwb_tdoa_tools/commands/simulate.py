@@ -8,14 +8,15 @@ from argparse import ArgumentParser, Namespace
 
 from .. import cli
 from ..choices import STORAGES
+from ..cli import option
 from ..outputs import OutputBag, OutputFile
 from ..parallel import Progress
-from ..simulation_options import add_options, config_of
+from ..simulation_options import OPTIONS, config_of
 
 
 def parser() -> ArgumentParser:
     """Its options."""
-    made = cli.parser(
+    return cli.parser(
         "simulate",
         (
             "Simulate a quadrotor, a rover or a person with a UWB tag among fixed anchors, and "
@@ -39,31 +40,37 @@ def parser() -> ArgumentParser:
         ),
         "simulate --no-bias --no-multipath --no-outliers --noise 0 --perfect-imu --out exact.bag",
         "simulate --list",
+        options=[
+            option(
+                "--list",
+                action="store_true",
+                help="list trajectories and constellations, and do nothing else",
+            ),
+            option(
+                "--out",
+                metavar="BAG",
+                type=OutputBag,
+                help="the bag to write: a new directory; without it, nothing is written",
+            ),
+            option(
+                "--storage", choices=STORAGES, default="mcap", help="kind of bag (default: mcap)"
+            ),
+            option("--force", action="store_true", help="replace an existing bag"),
+            option(
+                "--json",
+                metavar="FILE",
+                type=OutputFile,
+                help="write the configuration, the true parameters and the counts",
+            ),
+            option(
+                "--plot",
+                metavar="FILE",
+                type=OutputFile,
+                help="draw the path and the errors of the TDOAs",
+            ),
+            *OPTIONS,
+        ],
     )
-    add = made.add_argument
-    add(
-        "--list",
-        action="store_true",
-        help="list trajectories and constellations, and do nothing else",
-    )
-    add(
-        "--out",
-        metavar="BAG",
-        type=OutputBag,
-        help="the bag to write: a new directory; without it, nothing is written",
-    )
-    add("--storage", choices=STORAGES, default="mcap", help="kind of bag (default: mcap)")
-    add("--force", action="store_true", help="replace an existing bag")
-    add(
-        "--json",
-        metavar="FILE",
-        type=OutputFile,
-        help="write the configuration, the true parameters and the counts",
-    )
-    add("--plot", metavar="FILE", type=OutputFile, help="draw the path and the errors of the TDOAs")
-
-    add_options(made)
-    return made
 
 
 def _simulate(args: Namespace) -> None:

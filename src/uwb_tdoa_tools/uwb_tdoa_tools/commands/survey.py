@@ -31,7 +31,7 @@ worse: they stay as given; 2 bad input."""
 
 def parser() -> ArgumentParser:
     """Its options."""
-    made = cli.parser(
+    return cli.parser(
         "survey",
         DESCRIPTION,
         "survey flight.bag --survey tape.yaml --trusted 0 4 1.z 2.z --out surveyed/",
@@ -48,18 +48,18 @@ def parser() -> ArgumentParser:
             "survey today.bag --survey surveyed/anchors.yaml --effects surveyed/effects.yaml "
             "--out today/"
         ),
+        options=[
+            *options.recordings(),
+            *options.filtering(
+                "effects.yaml: effects in the model already; the file of an earlier survey is the prior"
+            ),
+            options.PARAMETERS,
+            *options.TAPE,
+            *options.KNOWN,
+            options.JOBS,
+            options.out(),
+        ],
     )
-    options.add_recordings(made)
-    options.add_filter(
-        made,
-        "effects.yaml: effects in the model already; the file of an earlier survey is the prior",
-    )
-    options.add_parameters(made)
-    options.add_tape(made)
-    options.add_known(made)
-    parallel.add_options(made)
-    options.add_out(made)
-    return made
 
 
 def _survey(args: Namespace) -> int:

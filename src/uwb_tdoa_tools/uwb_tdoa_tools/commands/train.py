@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from .. import cli, options, parallel
 from ..choices import MODELS
+from ..cli import option
 from ..outputs import OutputFile, OutputFolder
 from ..parallel import MapFunction, Progress
 
@@ -29,56 +30,62 @@ MOST = 1_500_000  # TDOAs; what they take: docs/notebook/speed.md
 
 def parser() -> ArgumentParser:
     """Its options."""
-    made = cli.parser(
+    return cli.parser(
         "train",
-        "Learn the systematic error of TDOAs from flights with ground truth. Writes to --out: "
-        "model.onnx, for\n"
-        "bias_node and evaluate --model (not for physics); effects.yaml, for both nodes and "
-        "evaluate --effects (for\n"
-        "both physics); training.png, the learning curve; training.json, all figures. Without "
-        "measured attitude a\n"
-        "flight counts as level, at yaw 0. What differs between days or vehicles is best "
-        "trained apart. Every flight is left out\n"
-        "once: the hold-out gain scales the correction, and is printed as the gain to expect.\n\n"
-        "models:\n"
-        "  paper                 the network of Zhao et al. (RA-L 2021), with the "
-        "orientations of the anchors\n"
-        "  paper_no_orientation  the same without them\n"
-        "  structured            the difference of two one-anchor errors, robust, with an "
-        "honest standard deviation\n"
-        "  physics               the effects that diagnose can name; of several "
-        "constellations, those that carry over\n"
-        "  physics+structured    these, and the structured model on what they leave",
+        (
+            "Learn the systematic error of TDOAs from flights with ground truth. Writes to --out: "
+            "model.onnx, for\n"
+            "bias_node and evaluate --model (not for physics); effects.yaml, for both nodes and "
+            "evaluate --effects (for\n"
+            "both physics); training.png, the learning curve; training.json, all figures. Without "
+            "measured attitude a\n"
+            "flight counts as level, at yaw 0. What differs between days or vehicles is best "
+            "trained apart. Every flight is left out\n"
+            "once: the hold-out gain scales the correction, and is printed as the gain to expect.\n\n"
+            "models:\n"
+            "  paper                 the network of Zhao et al. (RA-L 2021), with the "
+            "orientations of the anchors\n"
+            "  paper_no_orientation  the same without them\n"
+            "  structured            the difference of two one-anchor errors, robust, with an "
+            "honest standard deviation\n"
+            "  physics               the effects that diagnose can name; of several "
+            "constellations, those that carry over\n"
+            "  physics+structured    these, and the structured model on what they leave"
+        ),
         "train flights/0425 --survey surveys/ --model physics+structured --out model/",
         "train flights/ util/ --survey surveys/ --model structured --out model/ --seed 1",
         "train a.bag b.bag c.bag --validation c --model paper --out model/",
         "train flights/ --model physics+structured --resume parts.jsonl --out model/",
+        options=[
+            *options.recordings(),
+            option("--model", choices=MODELS, required=True, help="what to train"),
+            options.most(MOST),
+            options.align(),
+            option("--out", metavar="DIR", type=OutputFolder, required=True, help="where to write"),
+            option(
+                "--validation",
+                metavar="NAME",
+                nargs="+",
+                help="flights to validate on (default: one in five)",
+            ),
+            option(
+                "--name", help="of the model, goes into every corrected message (default: the kind)"
+            ),
+            option(
+                "--seed", metavar="N", type=int, default=0, help="of everything random (default: 0)"
+            ),
+            option(
+                "--resume",
+                metavar="FILE",
+                type=OutputFile,
+                help=(
+                    "keep results of flights left out there, a line of JSON each; results in the file are "
+                    "not computed again"
+                ),
+            ),
+            options.JOBS,
+        ],
     )
-    add = made.add_argument
-    options.add_recordings(made)
-    add("--model", choices=MODELS, required=True, help="what to train")
-    options.add_most(made, MOST)
-    options.add_align(made)
-    add("--out", metavar="DIR", type=OutputFolder, required=True, help="where to write")
-    add(
-        "--validation",
-        metavar="NAME",
-        nargs="+",
-        help="flights to validate on (default: one in five)",
-    )
-    add("--name", help="of the model, goes into every corrected message (default: the kind)")
-    add("--seed", metavar="N", type=int, default=0, help="of everything random (default: 0)")
-    add(
-        "--resume",
-        metavar="FILE",
-        type=OutputFile,
-        help=(
-            "keep results of flights left out there, a line of JSON each; results in the file are "
-            "not computed again"
-        ),
-    )
-    parallel.add_options(made)
-    return made
 
 
 def _train(args: Namespace) -> None:
