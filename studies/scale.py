@@ -17,7 +17,6 @@ from uwb_tdoa_bias.common.files import refuse_output
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.outputs import OutputFolder
-from uwb_tdoa_tools.results_file import ResultsFile
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 FLYING = dict(duration=10.0, start_in_air=True, imu_rate=100.0, truth_rate=50.0, protocol="tdoa3")
@@ -63,7 +62,7 @@ def add_options(add):
         metavar="DIR",
         type=OutputFolder,
         required=True,
-        help="for flights, 0.1 MB each, and results",
+        help="for flights, 0.1 MB each",
     )
     add("--only", choices=tuple(TOOLS), nargs="+", default=list(TOOLS), help="(default: all)")
     add(
@@ -76,25 +75,22 @@ def add_options(add):
 
 
 def run(args):
-    """Do the cases that are missing, and print the table of all."""
+    """Do all cases, and print their table."""
     args.out.mkdir(parents=True, exist_ok=True)
     cases = [case for case in all_cases() if case.tool in args.only and case.flights <= args.most]
-    with ResultsFile(args.out / "scale.jsonl", {"flying": FLYING}) as done:
-        missing = [case for case in cases if case.key not in done]
-        for tool in {case.tool for case in missing}:
-            measure(Case(tool, FEWEST[tool]), args.out)  # compiles, which is not to count
-        for case in missing:
-            done[case.key] = measure(case, args.out)
-            print(
-                f"{case.key}: {done[case.key]['cpu']:.1f} s, {done[case.key]['memory']:.0f} MB",
-                file=sys.stderr,
-                flush=True,
-            )
-        order = list(TOOLS)
-        cases.sort(
-            key=lambda case: (order.index(case.tool), case.anchors, case.effects, case.flights)
+    for tool in {case.tool for case in cases}:
+        measure(Case(tool, FEWEST[tool]), args.out)  # compiles, which is not to count
+    done = {}
+    for case in cases:
+        done[case] = measure(case, args.out)
+        print(
+            f"{case.key}: {done[case]['cpu']:.1f} s, {done[case]['memory']:.0f} MB",
+            file=sys.stderr,
+            flush=True,
         )
-        print(table({case: done[case.key] for case in cases}))
+    order = list(TOOLS)
+    cases.sort(key=lambda case: (order.index(case.tool), case.anchors, case.effects, case.flights))
+    print(table({case: done[case] for case in cases}))
 
 
 def all_cases():

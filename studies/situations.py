@@ -12,19 +12,15 @@ TDOA3. Each row judges one stretch of its recordings, all seeds together.
 from dataclasses import dataclass, field, replace
 from functools import partial
 import math
-from pathlib import Path as File
-import sys
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from tqdm import tqdm
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools import cli, parallel
 from uwb_tdoa_tools.outputs import OutputFile
-from uwb_tdoa_tools.results_file import ResultsFile
 from uwb_tdoa_tools.scoring.metrics import READY, Score
 from uwb_tdoa_tools.scoring.pooling import PooledErrors
 from uwb_tdoa_tools.simulation import ImuErrors, SimulationConfig, simulate
@@ -84,12 +80,6 @@ def add_options(add):
         help="simulations at once (default: as many as there are cores)",
     )
     add(
-        "--resume",
-        metavar="FILE",
-        type=OutputFile,
-        help="keep what each simulation gave there, and go on with what is missing",
-    )
-    add(
         "--json",
         metavar="FILE",
         type=OutputFile,
@@ -98,7 +88,7 @@ def add_options(add):
 
 
 def run(args):
-    """Simulate the missing cases, and print the table."""
+    """Simulate all cases, and print the table."""
     chosen = [one for one in SITUATIONS if any(word in one.name for word in args.only)]
     if not chosen:
         raise InputError(
@@ -106,7 +96,7 @@ def run(args):
             f"{'; '.join(one.name for one in SITUATIONS)}."
         )
     items = [(one.name, seed) for one in chosen for seed in range(args.seeds)]
-    found = dict(zip(items, _results(items, args.resume, args.jobs)))
+    found = dict(zip(items, parallel.over(measure, items, args.jobs, unit="simulation")))
     together = {
         one.name: figures([found[one.name, seed] for seed in range(args.seeds)]) for one in chosen
     }
@@ -117,30 +107,6 @@ def run(args):
             args.json,
             {"situations": {name: _plain(of) for name, of in together.items()}, "seeds": of_seeds},
         )
-
-
-def _results(items, path, jobs):
-    """Generator of `measure` of each item. Items that the file `path` holds are not repeated."""
-    if path is None:
-        yield from parallel.over(measure, items, jobs, unit="simulation")
-        return
-    keys = [f"{name}, seed {seed}" for name, seed in items]
-    with ResultsFile(File(path), {"study": "situations"}) as done:
-        missing = {key: item for key, item in zip(keys, items) if key not in done}
-        if len(missing) < len(items):
-            tqdm.write(
-                (
-                    f"{path} holds {len(items) - len(missing)} of {len(items)} simulations; going "
-                    "on with the others"
-                ),
-                sys.stderr,
-            )
-        made = parallel.over(measure, missing.values(), jobs, unit="simulation")
-        for key in keys:
-            if key not in done:
-                done[key] = next(made)
-            yield done[key]
-        next(made, None)  # to its end, so that its processes are kept
 
 
 def measure(item):

@@ -25,7 +25,6 @@ from uwb_tdoa_tools.diagnosis.references import Heights, Nothing
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
 from uwb_tdoa_tools.outputs import OutputFolder
 from uwb_tdoa_tools.parallel import over, whole_number
-from uwb_tdoa_tools.results_file import ResultsFile
 from uwb_tdoa_tools.surveying.report import with_blocked
 
 from . import bank, blind, faults, floor, measured, processes, referenced, splits, undeclared
@@ -232,18 +231,13 @@ def _source(args):
 
 
 def _drawn(args, function):
-    """What a function of a seed returns, of the first seeds for which that is not None; kept as it
-    comes.
-    """
+    """What a function of a seed returns, of the first seeds for which that is not None."""
     results, seed = [], args.first
-    with ResultsFile(args.out / f"{args.part}.jsonl", {"data": str(args.data)}) as done:
-        while len(results) < args.seeds:
-            seeds = range(seed, seed + args.seeds - len(results))
-            missing = [one for one in seeds if str(one) not in done]
-            for one, result in zip(missing, over(function, missing, args.jobs, unit="case")):
-                done[str(one)] = result
-            results += [done[str(one)] for one in seeds if done[str(one)] is not None]
-            seed = seeds.stop
+    while len(results) < args.seeds:
+        seeds = range(seed, seed + args.seeds - len(results))
+        made = over(function, seeds, args.jobs, unit="case")
+        results += [result for result in made if result is not None]
+        seed = seeds.stop
     return results
 
 
@@ -314,15 +308,9 @@ def _few(args):
 
 
 def _judged(args, tables):
-    """{name: result of `splits.judged`} of splits, kept as they come."""
-    with ResultsFile(args.out / f"{args.part}.jsonl", {"data": str(args.data)}) as done:
-        missing = [name for name in tables if name not in done]
-        made = over(
-            partial(splits.judged, args.data), map(tables.get, missing), args.jobs, unit="row"
-        )
-        for name, result in zip(missing, made):
-            done[name] = result
-        return {name: done[name] for name in tables}
+    """{name: result of `splits.judged`} of splits."""
+    made = over(partial(splits.judged, args.data), tables.values(), args.jobs, unit="row")
+    return dict(zip(tables, made))
 
 
 def _splits(args):

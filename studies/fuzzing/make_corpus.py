@@ -75,12 +75,6 @@ TEXTS = {
         )
     ],
     "peers": ["flight,peer,mode,rmse_3d,diverged\na,ours,raw,0.25,False\nb,theirs,raw,0.5,True\n"],
-    "results": [
-        (
-            '{"asked": {"written_by": "WRITTEN_BY", "seed": 1}}\n{"key": "a", "result": {"x": '
-            '1.5}}\n{"key": "b", "result": [1, null]}\n'
-        )
-    ],
     "columns": [
         "t,from,to,d,gx,gy,gz,ax,ay,az\n10,0,1,250,,,,,,\n11,,,,0.1,0,0,0,0,9.81\n12,1,5,-500,0,0,0,0,0.5,9.81\n"
     ],

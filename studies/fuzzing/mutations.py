@@ -361,7 +361,6 @@ STRUCTURES = {
             "columns",
             "distances",
             "peers",
-            "results",
         ),
         of_text,
     ),

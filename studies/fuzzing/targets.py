@@ -27,7 +27,6 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Flight, Tdoas
 from uwb_tdoa_bias.common.flyable import FlyableVolume
 from uwb_tdoa_bias.common.safe_yaml import parse_yaml
-from uwb_tdoa_bias.common.text import written_by
 from uwb_tdoa_bias.correction import trial
 from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.effects import EffectSet
@@ -52,7 +51,6 @@ from uwb_tdoa_tools.readers.names import NamedAnchors
 from uwb_tdoa_tools.readers.profile import Profile, parse_columns
 from uwb_tdoa_tools.readers.suggest import suggest
 from uwb_tdoa_tools.readers.tables import CsvTable, number
-from uwb_tdoa_tools.results_file import ResultsFile
 from uwb_tdoa_tools.simulation.rooms import Walls
 from uwb_tdoa_tools.surveying.known import read_distances, read_marks
 
@@ -247,14 +245,6 @@ def peers(data):
     read_others(_file(data))
 
 
-def results(data):
-    with ResultsFile(
-        _file(data.replace(b"WRITTEN_BY", written_by().encode())), {"seed": 1}
-    ) as done:
-        for key in list(done._places):
-            done[key]
-
-
 def flyable(data):
     FlyableVolume.load(_file(data))
 
@@ -414,7 +404,6 @@ TARGETS = {
         distances,
         tags,
         peers,
-        results,
         flyable,
         flyable_sealed,
         bias_map,

@@ -5,7 +5,7 @@ the rules over streams and residuals.
 
 Each rule is switched off, and each constant is halved and doubled, one at a time. The study then
 compares the errors on recordings, flights of `fly`, starts and faults. The filter is compiled once:
-see `studies/rules/tuned.py`. An interrupted study continues where it stopped.
+see `studies/rules/tuned.py`.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def add_options(add: Callable) -> None:
         required=True,
         type=OutputFile,
         metavar="FILE",
-        help="results line by line; what is there is not made again",
+        help="results are written there, JSON",
     )
     add(
         "--cache",
@@ -55,7 +55,7 @@ def add_options(add: Callable) -> None:
 
 
 def run(args: Namespace) -> None:
-    """Run the missing variants, and print the table."""
+    """Run the variants, and print the table."""
     cache = Path(args.cache).absolute()
     cache.mkdir(parents=True, exist_ok=True)
     made = tuned.copy_to(cache)
@@ -95,10 +95,8 @@ Figures = dict[str, dict[str, dict[str, list]]]  # of each variant and row: span
 def read(path: Path) -> Figures:
     """{variant: {row: {span: figures}}} of a file of results."""
     found: Figures = defaultdict(dict)
-    for line in path.read_text().splitlines()[1:]:
-        kept = json.loads(line)
-        variant, row = kept["key"].split(" | ", 1)
-        result = kept["result"]
+    for key, result in json.loads(path.read_text()).items():
+        variant, row = key.split(" | ", 1)
         found[variant][row] = result["said"] if "said" in result else result["figures"]
     return dict(found)
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
+import json
 from pathlib import Path
 import pickle
 import sys
@@ -14,7 +15,7 @@ from typing import Any
 from tqdm import tqdm
 
 from uwb_tdoa_bias.common import sensors
-from uwb_tdoa_tools.results_file import ResultsFile
+from uwb_tdoa_bias.common.files import write_text
 
 from . import watched, watching
 from .catalogue import OF_SENSORS, RULES
@@ -109,27 +110,27 @@ def main(job: dict[str, Any]) -> None:
     base: dict[str, dict[str, list]] = {}
     nudged: list[dict[str, dict[str, list]]] = []
     noise: dict[str, float] = {}
-    with ResultsFile(job["results"], {"study": "rules"}) as done:
-        for variant in tqdm(chosen, unit="variant", disable=None, file=sys.stderr):
-            found: dict[str, dict[str, list]] = {}
-            for row in rows:
-                key = f"{variant.name} | {row.name}"
-                if not variant.concerns(row, job["screen"]):
-                    continue
-                if job["stop"] and variant.is_decided(worth(base, found, noise)):
-                    break
-                if key not in done:
-                    case = inputs.case(row)  # is made by the filter as it is
-                    if not variant.apply(live):
-                        break
-                    done[key] = {"figures": judged(case)}
-                    live.restore()
-                found[row.name] = done[key]["figures"]
-            if variant.name == BASE:
-                base = found
-            elif variant.entry is None:
-                nudged.append(found)
-                noise = noise_of(base, nudged)
+    done: dict[str, Any] = {}
+    for variant in tqdm(chosen, unit="variant", disable=None, file=sys.stderr):
+        found: dict[str, dict[str, list]] = {}
+        for row in rows:
+            key = f"{variant.name} | {row.name}"
+            if not variant.concerns(row, job["screen"]):
+                continue
+            if job["stop"] and variant.is_decided(worth(base, found, noise)):
+                break
+            case = inputs.case(row)  # is made by the filter as it is
+            if not variant.apply(live):
+                break
+            done[key] = {"figures": judged(case)}
+            live.restore()
+            found[row.name] = done[key]["figures"]
+        if variant.name == BASE:
+            base = found
+        elif variant.entry is None:
+            nudged.append(found)
+            noise = noise_of(base, nudged)
+    write_text(job["results"], json.dumps(done))
 
 
 def _watch(job: dict[str, Any], inputs: Inputs, live: Live) -> None:
@@ -142,23 +143,23 @@ def _watch(job: dict[str, Any], inputs: Inputs, live: Live) -> None:
     ]
     base: dict[str, watched.Said] = {}
     hits: Counter[tuple[str, str]] = Counter()  # how often a row changes, by its name and a module
-    with ResultsFile(job["results"], {"study": "rules, watch"}) as done:
-        for patch in tqdm(chosen, unit="variant", disable=None, file=sys.stderr):
-            changed, module = 0, patch.name.split(" x ")[0].rpartition(".")[0]
-            enough = CHANGED_ROWS if patch.factor == 1.0 else 1
-            for row in sorted(rows, key=lambda one: -hits[one.name, module]):
-                key = f"{patch.name} | {row.name}"
-                if row.of not in patch.of or (job["stop"] and changed >= enough):
-                    continue
-                if key not in done:
-                    inputs.anew = patch.entry is not None
-                    done[key] = {"said": _said(patch, row, live)}
-                said = done[key]["said"]
-                if patch.name == BASE:
-                    base[row.name] = said
-                elif watching.differs(base[row.name], said):
-                    changed += 1
-                    hits[row.name, module] += 1
+    done: dict[str, Any] = {}
+    for patch in tqdm(chosen, unit="variant", disable=None, file=sys.stderr):
+        changed, module = 0, patch.name.split(" x ")[0].rpartition(".")[0]
+        enough = CHANGED_ROWS if patch.factor == 1.0 else 1
+        for row in sorted(rows, key=lambda one: -hits[one.name, module]):
+            key = f"{patch.name} | {row.name}"
+            if row.of not in patch.of or (job["stop"] and changed >= enough):
+                continue
+            inputs.anew = patch.entry is not None
+            done[key] = {"said": _said(patch, row, live)}
+            said = done[key]["said"]
+            if patch.name == BASE:
+                base[row.name] = said
+            elif watching.differs(base[row.name], said):
+                changed += 1
+                hits[row.name, module] += 1
+    write_text(job["results"], json.dumps(done))
 
 
 def _said(patch: watching.Patch, row: watched.Watched, live: Live) -> watched.Said:

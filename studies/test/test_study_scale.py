@@ -18,8 +18,7 @@ def test_cases_are_done_once_and_make_one_table(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(scale, "measure", measure)
     parser = argparse.ArgumentParser()
     scale.add_options(parser.add_argument)
-    for most in ("10", "100"):
-        scale.run(parser.parse_args(["--out", str(tmp_path), "--only", "evaluate", "--most", most]))
+    scale.run(parser.parse_args(["--out", str(tmp_path), "--only", "evaluate", "--most", "100"]))
     counted = [case for case in made if case != scale.Case("evaluate", 1)]
     assert len(counted) == len(set(counted)) and {case.flights for case in counted} == {3, 10, 100}
     first, rule, *rows = capsys.readouterr().out.splitlines()[-12:]

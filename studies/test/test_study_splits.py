@@ -35,12 +35,8 @@ def test_splits_are_done_once_and_summed_up(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(splits.shrinking, "uncorrected", lambda _: {})
     parser = argparse.ArgumentParser()
     splits.add_options(parser.add_argument)
-    for count in ("1", "2"):
-        splits.run(
-            parser.parse_args(
-                ["x", "--out", str(tmp_path / "rows"), "--models", "structured", "--splits", count]
-            )
-        )
+    options = ["--models", "structured", "--splits", "2"]
+    splits.run(parser.parse_args(["x", "--out", str(tmp_path / "rows"), *options]))
     assert made == [("structured", 0), ("structured", 1)]
     assert (
         "| structured | 2 | -20.0% | 0.0% | -20.0% | 1.20 | 2 of 2 | 30.0% | 1.00 |"

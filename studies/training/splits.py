@@ -2,23 +2,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """random-splits: train every kind of bias model on random flights, and judge it on all others.
 
-Each split goes to --out as one line of JSON as soon as it is done. A second run skips the splits in
---out.
+The rows of all splits go to --out.
 """
 
 from collections import defaultdict
+import json
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 from tqdm import tqdm
 
+from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_bias.common.flight import SENSOR_NAMES
 from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_tools import choices
 from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.readers import inputs
-from uwb_tdoa_tools.results_file import ResultsFile
 from uwb_tdoa_tools.scoring.gains import best_share
 from uwb_tdoa_tools.training import models, physics, shrinking
 
@@ -34,7 +34,7 @@ def add_options(add):
         metavar="FILE",
         type=OutputFile,
         required=True,
-        help="lines of JSON, one for each split and kind",
+        help="JSON, a row for each split and kind",
     )
     add(
         "--models",
@@ -49,7 +49,7 @@ def add_options(add):
 
 
 def run(args):
-    """Do the splits that are missing, and print the table of all."""
+    """Do all splits, write their rows, and print the table."""
     flights = [
         flight.without(*SENSOR_NAMES)
         for flight in inputs.Reading(args.survey).flights(args.flights)
@@ -58,14 +58,12 @@ def run(args):
         range(args.first, args.first + args.splits),
         shrinking.uncorrected(flights),
     )
-    with ResultsFile(
-        args.out, {"fit": args.fit, "flights": [flight.name for flight in flights]}
-    ) as done:
-        for seed in tqdm(seeds, unit="split", disable=None):
-            missing = [kind for kind in args.models if f"{kind} {seed}" not in done]
-            for row in split(flights, uncorrected_errors, seed, args.fit, missing):
-                done[f"{row['kind']} {seed}"] = row
-        rows = [done[f"{kind} {seed}"] for kind in args.models for seed in seeds]
+    made = {}
+    for seed in tqdm(seeds, unit="split", disable=None):
+        for row in split(flights, uncorrected_errors, seed, args.fit, args.models):
+            made[row["kind"], seed] = row
+    rows = [made[kind, seed] for kind in args.models for seed in seeds]
+    write_text(args.out, json.dumps(rows))
     print(table(rows, shrunk=False) + "\n" + table(rows, shrunk=True))
 
 

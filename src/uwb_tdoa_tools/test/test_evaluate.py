@@ -143,36 +143,6 @@ def test_report_of_the_phases_of_one_flight_and_of_several(bag, tmp_path, capsys
             assert title in text
 
 
-FORGED = (
-    "5",
-    "{}",
-    '{"row": {}, "sums": {}, "distributions": {}, "phases": {}}',
-    '{"row": [], "sums": 1, "distributions": {}, "phases": {}}',
-)
-
-
-def test_a_result_that_somebody_has_forged_is_refused(bag, tmp_path, capsys):
-    kept = tmp_path / "kept"
-    options = [str(bag), "--no-bias", "--resume", str(kept)]
-    assert main(options) == 0
-    first, line = kept.read_text().splitlines()
-    forged = [json.loads(result) for result in FORGED] + [
-        json.loads(line)["result"] for _ in range(3)
-    ]
-    forged[-3]["row"]["rmse_3d"] = "a"
-    forged[-2]["distributions"]["distance"][3] = [0, 1]
-    forged[-1]["phases"]["in_the_air"] = {}
-    for result in forged:
-        kept.write_text(
-            f"{first}\n{json.dumps({'key': json.loads(line)['key'], 'result': result})}\n"
-        )
-        capsys.readouterr()
-        assert main(options) == 2, result
-        assert "kept: holds something else than results" in capsys.readouterr().err
-    kept.write_text(f"{first}\n{line}\n")
-    assert main(options) == 0
-
-
 @pytest.mark.slow
 def test_corrects_with_nothing_unless_effects_or_a_network_are_given(flight, bag, tmp_path, capsys):
     known_answer = pytest.importorskip("known_answer")
@@ -202,38 +172,6 @@ def test_no_bias_runs_without_effects(flight, bag, tmp_path):
     spoiled = report([bag, "--effects", effects], tmp_path)["runs"]
     assert report([bag, "--effects", effects, "--no-bias"], tmp_path)["runs"] == plain
     assert spoiled[0]["rmse_3d"] > plain[0]["rmse_3d"] + 0.05
-
-
-def test_an_interrupted_run_over_many_goes_on_where_it_was(tmp_path, capsys):
-    short = simulate(
-        SimulationConfig(
-            seed=2,
-            duration=4.0,
-            start_in_air=True,
-            imu_rate=100.0,
-            truth_rate=50.0,
-            protocol="tdoa3",
-        )
-    )
-    bags, kept, alone = (
-        [tmp_path / name for name in ("one", "two", "three")],
-        tmp_path / "kept",
-        ["--jobs", "1"],
-    )
-    for bag in bags:
-        write_bag(short, bag)
-    whole = report([*bags, "--no-bias", *alone], tmp_path)
-    assert main([*map(str, bags[:2]), "--no-bias", "--resume", str(kept), *alone]) == 0
-    first = kept.read_bytes()
-    kept.write_bytes(first[:-20])  # the second entry was being written
-    capsys.readouterr()
-    assert report([*bags, "--no-bias", "--resume", kept, *alone], tmp_path) == whole
-    assert "holds 1 of 3 flights; going on with the others" in capsys.readouterr().err
-    assert kept.read_bytes().startswith(first)
-    assert report([*bags, "--no-bias", "--resume", kept, *alone], tmp_path) == whole
-    assert "holds 3 of 3 flights" in capsys.readouterr().err
-    assert main([*map(str, bags), "--smooth", "--resume", str(kept)]) == 2
-    assert "made with another no_bias and smooth" in capsys.readouterr().err
 
 
 def test_recorded_odometry_is_judged(odometry, bag, tmp_path):

@@ -5,11 +5,8 @@
 import json
 
 import pytest
-from test_flying_verdict import made_up
 
 from uwb_tdoa_tools.commands.fly import main
-from uwb_tdoa_tools.flying import fleet
-from uwb_tdoa_tools.flying.verdict import verdict_of
 from uwb_tdoa_tools.readers import read_flight
 
 
@@ -38,7 +35,6 @@ def test_a_flight_is_counted_drawn_and_recorded_for_the_other_tools(tmp_path, ca
         (["--silence", "circle:x"], "'circle:x' is not MOMENT:S"),
         (["--inject", "gremlins", "1=2"], "'gremlins' needs the name of an effect"),
         (["--inject", "anchor_delay", "3=x"], "anchor_delay"),
-        (["--resume", "kept.jsonl", "--plot", "x.png"], "--resume: keeps verdicts alone"),
         (["--model", "nowhere.onnx"], "nowhere.onnx"),
         (["--peer", "nowhere.so"], "nowhere.so cannot be loaded"),
         (["--json", "nowhere/x.json"], "its directory does not exist"),
@@ -47,40 +43,3 @@ def test_a_flight_is_counted_drawn_and_recorded_for_the_other_tools(tmp_path, ca
 def test_an_unusable_option_is_named(options, message, capsys):
     assert main([*options, "--flights", "1"]) == 2
     assert message in capsys.readouterr().err
-
-
-def test_resume_skips_the_flights_in_the_file(tmp_path, capsys, monkeypatch):
-    kept, out = tmp_path / "kept.jsonl", tmp_path / "flown.json"
-    options = [
-        "--no-floor-effect",
-        "--flights",
-        "2",
-        "--jobs",
-        "1",
-        "--resume",
-        str(kept),
-        "--json",
-        str(out),
-    ]
-    flown = []
-
-    def one(task):
-        flown.append(task.seed)
-        return task.seed
-
-    verdict = verdict_of(made_up())
-    monkeypatch.setattr(fleet, "fly", one)
-    monkeypatch.setattr(fleet, "verdict_of", lambda seed: {**verdict, "seed": seed})
-    main(options)
-    assert flown == [1, 2]
-    main(["--no-floor-effect", "--flights", "3", *options[3:]])
-    assert flown == [1, 2, 3] and [
-        one["seed"] for one in json.loads(out.read_text())["flights"]
-    ] == [1, 2, 3]
-    assert main(["--flights", "3", *options[3:]]) == 2
-    assert "another floor_effect" in capsys.readouterr().err
-    kept.write_text(
-        kept.read_text().splitlines()[0] + '\n{"key": "1", "result": {"landed": true}}\n'
-    )
-    assert main(["--no-floor-effect", "--flights", "1", *options[3:]]) == 2
-    assert "holds something else than results" in capsys.readouterr().err

@@ -1,7 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-from functools import wraps
 import json
 
 import numpy as np
@@ -12,7 +11,7 @@ from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands import train
-from uwb_tdoa_tools.training import shrinking, structured
+from uwb_tdoa_tools.training import structured
 from uwb_tdoa_tools.training.labels import labels
 
 
@@ -104,41 +103,3 @@ def test_says_what_is_missing(folder, tmp_path, capsys, flights, model, message)
     paths = [str(folder / name) if name.endswith(".bag") else name for name in flights]
     assert train.main([*paths, "--model", model, "--out", str(tmp_path / "out")]) == 2
     assert message in capsys.readouterr().err and not (tmp_path / "out").exists()
-
-
-@pytest.mark.slow
-def test_a_resumed_training_writes_the_same_files(folder, tmp_path, monkeypatch, capsys):
-    done, left = [], shrinking._left_out
-
-    @wraps(left)
-    def interrupted(*args):
-        if len(done) == 2:
-            raise KeyboardInterrupt
-        done.append(args[-1][0])
-        return left(*args)
-
-    def trained(out, *more):
-        options = ["--model", "structured", "--validation", "corners-1", "--jobs", "1"]
-        code = train.main([str(folder), *options, "--out", str(tmp_path / out), *more])
-        if code:
-            return code, None
-        assert files(tmp_path / out) == ["model.onnx", "training.json", "training.png"]
-        names = "model.onnx", "training.json"
-        return code, [(tmp_path / out / name).read_bytes() for name in names]
-
-    whole, resume = trained("whole"), ("--resume", str(tmp_path / "parts.jsonl"))
-    monkeypatch.setattr(shrinking, "_left_out", interrupted)
-    assert trained("out", *resume)[0] == 130 and len(done) == 2
-    before, done[:] = list(done), []
-    assert (
-        trained("out", *resume) == whole
-        and len(done) == 2
-        and not any(fold in before for fold in done)
-    )
-    assert "holds 4 of 4 parts" in capsys.readouterr().err  # errors without correction
-    assert trained("again", *resume) == whole and len(done) == 2
-    assert trained("other", "--seed", "5", *resume)[0] == 2
-    assert (
-        "parts.jsonl: its results were made with another seed; ask for the same"
-        in capsys.readouterr().err
-    )

@@ -25,7 +25,6 @@ ELSEWHERE = {  # these files are not handed to a user directly
     "uwb_tdoa_tools/bags/completion.py",  # files unpacked in a temporary folder
     "uwb_tdoa_tools/bags/integrity.py",  # a bag unpacked in a temporary folder
     "uwb_tdoa_tools/bags/mcap.py",  # checksums into a bag that is not yet in its place
-    "uwb_tdoa_tools/results_file.py",  # grows line by line
     "uwb_tdoa_tools/live/processes.py",  # output of a process
     "studies/scale.py",  # the same
     "studies/fuzzing/figures.py",  # a setting of the kernel

@@ -17,7 +17,6 @@ from uwb_tdoa_bias.common.text import sanitize
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf.results import Odometry, Residuals
 
-from . import parallel
 from .bags.bag import RecordedOdometry, late_tdoas, read_odometry
 from .checking.check import check
 from .checking.flight_rules import judge_truth
@@ -31,7 +30,6 @@ from .localizing.pictures import write_rerun
 from .outputs import file_name
 from .readers.inputs import Reading, Recording, report_remarks
 from .readers.tables import CsvTable, number
-from .results_file import ResultsFile, fingerprint_of
 from .scoring.alignment import Alignment, estimate_alignment, require_truth
 from .scoring.evaluation import corrected_truth, delays_fit
 from .scoring.metrics import Score, radio_residuals
@@ -194,44 +192,6 @@ class Evaluator:
     @property
     def _where(self) -> tuple[str, bool, dict[str, str]]:
         return self.reading.namespace, self.reading.salvage, self.reading.topics
-
-
-def results(
-    evaluator: Evaluator,
-    recordings: Sequence[Recording],
-    path: str | Path | None,
-    asked: dict[str, Any],
-    jobs: int | None = None,
-    dask: str | None = None,
-) -> Iterator[Result]:
-    """Yield the Result of each recording; reuse those in the file `path`.
-
-    Parameters
-    ----------
-    path : of a ResultsFile, or None.
-    asked : everything else that results depend on, see ResultsFile.
-    jobs, dask : see `parallel.over`.
-    """
-    if path is None:
-        yield from parallel.over(evaluator, recordings, jobs, dask)
-        return
-    keys = [" ".join(map(fingerprint_of, recording)) for recording in recordings]
-    with ResultsFile(path, asked) as done:
-
-        def make(missing: Iterable[Recording]) -> Iterator[dict[str, Any]]:
-            return (result.as_dict() for result in parallel.over(evaluator, missing, jobs, dask))
-
-        for key in done.keys_done(keys, recordings, make, "flights"):
-            yield done.read(key, _checked)
-
-
-def _checked(content: dict[str, Any]) -> Result:
-    """Return the Result of a stored dict; raise if a figure is missing."""
-    result, pool = Result.from_dict(content), Pool()
-    pool.add(result)
-    line_of_run({**result.row, **pool.figures()})
-    lines_of_phases(result.phases)
-    return result
 
 
 def head_line() -> str:

@@ -11,12 +11,10 @@ from functools import partial
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_text
 
-from .. import cli, options
+from .. import cli, options, parallel
 from ..cli import option
 from ..outputs import OutputFile, OutputFolder, as_json
 
-# Options without influence on the figures of a flight.
-WITHOUT_INFLUENCE = "flights", "survey", "json", "markdown", "beside", "resume", "jobs", "dask"
 NOT_OF_ODOMETRY = "effects", "config", "model", "no_bias", "parameters", "without", "smooth"
 
 
@@ -42,7 +40,6 @@ def parser() -> ArgumentParser:
         "evaluate flight.bag --odometry tags.bag --topic odometry=/tag1/odometry",
         "evaluate flights/ --survey surveys/ -p adapt_noise:=false -p loss:=huber",
         "evaluate flights/ --survey surveys/ --without height --without pressure",
-        "evaluate flights/ --survey surveys/ --resume judged.jsonl --json errors.json",
         "evaluate flights/ --survey surveys/ --dask tcp://10.0.0.1:8786",
         options=[
             *options.recordings(),
@@ -80,15 +77,6 @@ def parser() -> ArgumentParser:
                 help="write estimates and truths as TUM trajectories, e.g. for evo",
             ),
             options.RERUN,
-            option(
-                "--resume",
-                metavar="FILE",
-                type=OutputFile,
-                help=(
-                    "keep each flight's figures there as soon as they are computed, a line of JSON each; "
-                    "flights in the file are not evaluated again"
-                ),
-            ),
             options.JOBS,
         ],
     )
@@ -96,9 +84,8 @@ def parser() -> ArgumentParser:
 
 def _evaluate(args: Namespace) -> int:
     from .. import evaluating
-    from ..evaluating import Evaluator, results
-    from ..results_file import settings_of
-    from ..scoring.pooling import FIGURES, Pool
+    from ..evaluating import Evaluator
+    from ..scoring.pooling import Pool
 
     if args.odometry:
         options.refuse(
@@ -123,10 +110,7 @@ def _evaluate(args: Namespace) -> int:
         cli.show(f"correcting with: {estimator.correction}")
     cli.show(evaluating.head_line())
     kept, pool = [], Pool()
-    asked = settings_of(args, WITHOUT_INFLUENCE, ("effects", "config", "model")) | {
-        "version of the figures": FIGURES
-    }
-    for result in results(evaluator, found, args.resume, asked, args.jobs, args.dask):
+    for result in parallel.over(evaluator, found, args.jobs, args.dask):
         pool.add(result)
         # else nothing grows with the number of flights
         kept += [result] if args.json or args.markdown else []

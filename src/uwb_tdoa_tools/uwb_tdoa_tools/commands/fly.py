@@ -5,8 +5,8 @@
 from __future__ import annotations
 
 import argparse
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.errors import InputError
@@ -20,20 +20,7 @@ from ..outputs import OutputFile, OutputFolder
 if TYPE_CHECKING:
     from ..flying.mission import Circles, Waypoints
 
-# Options without influence on a flight.
-WITHOUT_INFLUENCE = (
-    "flights",
-    "seed",
-    "jobs",
-    "dask",
-    "at_least",
-    "json",
-    "plot",
-    "record",
-    "resume",
-)  # to what becomes of a flight
 NOT_OF_ROVERS = ("hover", "again", "peer", "correction", "sensor")  # options
-INPUTS = ("config", "effects", "model", "peer", "correction")  # options that name files
 DESCRIPTION = """Fly a simulated quadrotor in closed loop, in lockstep and without ROS: its controller gets position, velocity and
 attitude from nothing but the estimate, by the very code of ekf_node, and its rates from the gyroscope. Four seconds at rest, up to
 1.2 m, two circles, down, land. The verdict is by ground truth alone.
@@ -58,7 +45,7 @@ def parser() -> argparse.ArgumentParser:
         "fly --vehicle rover --flights 20 --plot driven.png",
         "fly --silence circle:3 --effects effects.yaml",
         "fly --installation 7 --flights 3 --seed 101 --record flown/",
-        "fly --flights 1000 --resume flown.jsonl --dask tcp://10.0.0.1:8786",
+        "fly --flights 1000 --json flown.json --dask tcp://10.0.0.1:8786",
         options=[
             option(
                 "--flights",
@@ -174,12 +161,6 @@ def parser() -> argparse.ArgumentParser:
                 help="write every flight as a bag, DIR/flown-SEED, e.g. for diagnose",
             ),
             option(
-                "--resume",
-                metavar="FILE",
-                type=OutputFile,
-                help="keep the verdict of each flight in this file, and continue from there",
-            ),
-            option(
                 "--json",
                 metavar="FILE",
                 type=OutputFile,
@@ -203,15 +184,9 @@ def _fly(args: argparse.Namespace) -> int:
     from ..flying.trial import Task
     from ..flying.verdict import summary, text, wording_of
     from ..flying.world import world_of
-    from ..results_file import ResultsFile, settings_of
 
     if args.record is not None:
         args.record.mkdir(parents=True, exist_ok=True)
-    if args.resume and (args.plot or args.record):
-        raise InputError(
-            "--resume: keeps verdicts alone; leave it out with --plot and --record, which "
-            "need the flights themselves."
-        )
     config, effects = options.filter_of(args)
     if args.correction is not None and args.peer is None:
         raise InputError(
@@ -244,12 +219,8 @@ def _fly(args: argparse.Namespace) -> int:
         )
         for seed in seeds
     ]
-    kept: AbstractContextManager[ResultsFile | None] = nullcontext()
-    if args.resume is not None:
-        kept = ResultsFile(args.resume, settings_of(args, WITHOUT_INFLUENCE, INPUTS))
-    with kept as done:
-        flown = fleet.fly_all(tasks, done, args.record, args.plot is not None, args.jobs, args.dask)
-        verdicts, pictures = zip(*flown)
+    one = partial(fleet.fly_task, args.record, args.plot is not None)
+    verdicts, pictures = zip(*parallel.over(one, tasks, args.jobs, args.dask))
     summed = summary(verdicts)
     cli.show(text(summed))
     if args.json is not None:

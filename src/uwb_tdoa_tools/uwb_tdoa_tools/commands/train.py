@@ -4,14 +4,13 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from typing import TYPE_CHECKING
 
 from .. import cli, options, parallel
 from ..choices import MODELS
 from ..cli import option
-from ..outputs import OutputFile, OutputFolder
+from ..outputs import OutputFolder
 from ..parallel import MapFunction, Progress
 
 if TYPE_CHECKING:
@@ -20,11 +19,7 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.common.flight import Flight
 
-    from ..readers.inputs import Reading
-    from ..results_file import ResultsFile
 
-# Options without influence on the results of a training; recordings count by their state.
-WITHOUT_INFLUENCE = "flights", "survey", "name", "out", "resume", "jobs", "dask"
 MOST = 1_500_000  # TDOAs; what they take: docs/notebook/speed.md
 
 
@@ -55,7 +50,6 @@ def parser() -> ArgumentParser:
         "train flights/0425 --survey surveys/ --model physics+structured --out model/",
         "train flights/ util/ --survey surveys/ --model structured --out model/ --seed 1",
         "train a.bag b.bag c.bag --validation c --model paper --out model/",
-        "train flights/ --model physics+structured --resume parts.jsonl --out model/",
         options=[
             *options.recordings(),
             option("--model", choices=MODELS, required=True, help="what to train"),
@@ -74,15 +68,6 @@ def parser() -> ArgumentParser:
             option(
                 "--seed", metavar="N", type=int, default=0, help="of everything random (default: 0)"
             ),
-            option(
-                "--resume",
-                metavar="FILE",
-                type=OutputFile,
-                help=(
-                    "keep results of flights left out there, a line of JSON each; results in the file are "
-                    "not computed again"
-                ),
-            ),
             options.JOBS,
         ],
     )
@@ -90,34 +75,20 @@ def parser() -> ArgumentParser:
 
 def _train(args: Namespace) -> None:
     from ..readers import inputs
-    from ..results_file import resumed
     from ..scoring.evaluation import with_aligned_truth
 
     reading = options.reading_of(args)
     # As many for folds as for flights: with another number, joblib restarts all processes.
     jobs, dask = parallel.workers_for(args, len(reading.find(args.flights)), 2)
-    with _kept(args, reading) as done:
-        # Only Progress prints a line.
-        over = partial(parallel.over, jobs=jobs, dask=dask, unit=None)
-        flights = reading.flights(args.flights, args.most, jobs, dask)
-        inputs.require_tdoas(flights, "train")
-        flights = list(
-            parallel.over(partial(with_aligned_truth, align=args.align), flights, jobs, dask)
-        )
-        with Progress("train") as progress:
-            _write(args, flights, resumed(over, done) if done else over, progress)
-
-
-def _kept(args: Namespace, reading: Reading) -> AbstractContextManager[ResultsFile | None]:
-    """Return the ResultsFile of --resume, or a context of None."""
-    from ..results_file import ResultsFile, fingerprint_of, settings_of
-
-    if args.resume is None:
-        return nullcontext()
-    recordings = [
-        " ".join(map(fingerprint_of, recording)) for recording in reading.find(args.flights)
-    ]
-    return ResultsFile(args.resume, {**settings_of(args, WITHOUT_INFLUENCE), "flights": recordings})
+    # Only Progress prints a line.
+    over = partial(parallel.over, jobs=jobs, dask=dask, unit=None)
+    flights = reading.flights(args.flights, args.most, jobs, dask)
+    inputs.require_tdoas(flights, "train")
+    flights = list(
+        parallel.over(partial(with_aligned_truth, align=args.align), flights, jobs, dask)
+    )
+    with Progress("train") as progress:
+        _write(args, flights, over, progress)
 
 
 def _write(

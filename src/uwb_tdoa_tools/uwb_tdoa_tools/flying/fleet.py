@@ -13,19 +13,16 @@ import numpy as np
 
 from uwb_tdoa_bias.common.files import write_filled
 
-from .. import parallel
 from ..bags.bag import write_bag
 from ..scoring.metrics import position_at
 from .rover import drive
 from .trial import Task, TrialResult, fly
-from .verdict import reached, sampled, summary, text, verdict_of, wording_of
+from .verdict import reached, sampled, verdict_of, wording_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Sequence
 
     from uwb_tdoa_bias.common.anchors import Anchors
-
-    from ..results_file import ResultsFile
 
 
 SPACING = 0.05  # s
@@ -117,50 +114,16 @@ def _error_key(one: DrawnFlight) -> tuple[bool, float]:
     return not reached(one.verdict), one.verdict["tracking"] or 0.0
 
 
-def fly_all(
-    tasks: Sequence[Task],
-    done: ResultsFile | None = None,
-    record: str | Path | None = None,
-    draw: bool = False,
-    jobs: int | None = None,
-    dask: str | None = None,
-) -> Iterator[tuple[dict[str, Any], DrawnFlight | None]]:
-    """Fly tasks and yield (verdict, DrawnFlight or None) of each in turn.
-
-    Parameters
-    ----------
-    tasks : sequence of Task
-    done : ResultsFile, optional
-        Verdicts by seed. Their tasks are not flown again, and nothing is drawn.
-    record : str or Path, optional
-        Folder for a bag of each flight.
-    draw : bool
-        Whether to yield figures to draw.
-    jobs, dask
-        See `parallel.over`.
-    """
-    over = partial(parallel.over, partial(fly_task, record, draw), jobs=jobs, dask=dask)
-    if done is None:
-        yield from over(tasks)
-        return
-
-    def verdicts(missing: Iterable[Task]) -> Iterator[dict[str, Any]]:
-        return (verdict for verdict, _ in over(missing))
-
-    for key in done.keys_done([str(task.seed) for task in tasks], tasks, verdicts, "flights"):
-        yield done.read(key, _validated), None
-
-
-def _validated(verdict: dict[str, Any]) -> dict[str, Any]:
-    """Return a stored verdict. Raise an error if `summary` cannot use it."""
-    text(summary([verdict]))
-    return verdict
-
-
 def fly_task(
     record: str | Path | None, draw: bool, task: Task
 ) -> tuple[dict[str, Any], DrawnFlight | None]:
-    """Fly a Task and return (verdict, DrawnFlight or None), see `fly_all`."""
+    """Fly a Task and return (verdict, DrawnFlight or None).
+
+    record : str or Path, optional
+        Folder for a bag of the flight.
+    draw : bool
+        Whether to return figures to draw.
+    """
     one = drive(task) if task.vehicle == "rover" else fly(task)
     verdict = verdict_of(one)
     if record is not None:

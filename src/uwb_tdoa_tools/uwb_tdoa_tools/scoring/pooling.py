@@ -21,7 +21,6 @@ SMALLEST = 1e-9  # smaller samples count as this
 WHOLE = ("duration", "count", "without_estimate", "without_truth")  # sums over runs
 ROOTS = ("rmse_x", "rmse_y", "rmse_z", "rmse_3d", "std_3d")  # root mean squares
 COVERAGE = ("coverage_3sigma_x", "coverage_3sigma_y", "coverage_3sigma_z")
-FIGURES = 3  # version of the content of a Result
 
 
 def or_nan(function: Callable[[np.ndarray], float], values: np.ndarray) -> float:
@@ -83,21 +82,6 @@ class Distribution:
             below += self.bins[place]
         raise AssertionError("the bins hold fewer than were counted")
 
-    def as_list(self) -> list[Any]:
-        """Return plain numbers for JSON; floats that may be NaN or infinite become texts."""
-        return [
-            self.count,
-            repr(self.total),
-            repr(self.largest),
-            [number for item in sorted(self.bins.items()) for number in item],
-        ]
-
-    @classmethod
-    def from_list(cls, numbers: list[Any]) -> Distribution:
-        """Restore a Distribution from `as_list`."""
-        count, total, largest, bins = numbers
-        return cls(count, float(total), float(largest), Counter(dict(zip(bins[::2], bins[1::2]))))
-
 
 class PooledErrors:
     """The figures of one phase, pooled over runs."""
@@ -148,34 +132,6 @@ class Result:
     distributions: dict[str, Distribution]
     phases: dict[str, dict[str, Any]]
     aligned: dict[str, Any] = field(default_factory=dict)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return a dict for JSON, without loss."""
-        parts = {name: part.as_list() for name, part in self.distributions.items()}
-        of_phases = {name: _as_texts(figures) for name, figures in self.phases.items()}
-        return {
-            "row": _as_texts(self.row),
-            "sums": _as_texts(self.sums),
-            "distributions": parts,
-            "phases": of_phases,
-            "aligned": as_json(self.aligned),
-        }
-
-    @classmethod
-    def from_dict(cls, content: dict[str, Any]) -> Result:
-        """Restore a Result from `as_dict`."""
-        parts = {
-            name: Distribution.from_list(numbers)
-            for name, numbers in content["distributions"].items()
-        }
-        of_phases = {name: _from_texts(figures) for name, figures in content["phases"].items()}
-        return cls(
-            _from_texts(content["row"]),
-            _from_texts(content["sums"]),
-            parts,
-            of_phases,
-            content["aligned"],
-        )
 
     def as_json(self) -> dict[str, Any]:
         """Return all figures of the run for JSON; NaN becomes null."""
@@ -239,18 +195,3 @@ class Pool:
         out["rmse_3d_mean_of_runs"] = sum(errors) / len(errors)
         out["rmse_3d_max_of_runs"] = float(np.max(errors))
         return {**out, "phases": self.phases()}
-
-
-def _as_texts(numbers: dict[str, Any]) -> dict[str, Any]:
-    """Return a dict with floats as texts, because JSON has no NaN."""
-    return {
-        key: repr(value) if isinstance(value, float) else value for key, value in numbers.items()
-    }
-
-
-def _from_texts(numbers: dict[str, Any]) -> dict[str, Any]:
-    """Restore floats from `_as_texts`."""
-    return {
-        key: float(value) if isinstance(value, str) and key not in ("flight", "part") else value
-        for key, value in numbers.items()
-    }
