@@ -6,13 +6,10 @@ ros2 launch uwb_tdoa_ekf tags.launch.py tags:=tags.yaml
 ros2 launch uwb_tdoa_ekf tags.launch.py tags:=tags.yaml processes:=auto    # takes a fraction of the CPU time
 
     anchors_file: anchors.yaml        # what all share: any parameters of bias_node and ekf_node
-    processes: auto                   # localization_nodes that share the tags of a machine: one for each core
+    processes: auto                   # localization_nodes that share the tags: one for each core
     tags:
       tag1: {}                        # topics /tag1/imu/data ..., frame tag1/base_link
       tag2: {effects_file: tag2.yaml, tdoa_std: 0.3}
-
-With `host: NAME` for each tag, the same file is launched on every machine, and each starts the
-nodes of its tags.
 """
 
 from __future__ import annotations
@@ -38,7 +35,6 @@ OTHERS = {
             "default: as the file says, or two nodes for each tag"
         ),
     ),
-    "host": ("", "start the tags of this host; default: the name of this machine"),
     "use_sim_time": ("", "true for bags that are played with --clock"),
     "frozen": ("", FROZEN),
     "log_level": ("info", "debug, info, warn, error"),
@@ -71,7 +67,7 @@ def _nodes(context: LaunchContext) -> list[Action]:
         for name in ("tags", *OTHERS, *RESPAWN, *NETWORK)
     }
     values = typed({name: given[name] for name in ("use_sim_time", "frozen")})
-    starts = tags(given["tags"], values, given["log_level"], given["processes"], given["host"])
+    starts = tags(given["tags"], values, given["log_level"], given["processes"])
     return actions(
         starts,
         *(given[name] for name in (*RESPAWN, *NETWORK, "rviz")),

@@ -192,8 +192,6 @@ def test_tags_of_a_file(tmp_path):
         ("tags: {a: {gaet: 1}}", "gaet: .* write gate"),
         ("tags: {a: {gate: }}", "gate: None is no value"),
         ("tags: {a: {gate: {b: 1}}}", "gate: .* is no value"),
-        ("tags: {a: {host: x}, b: {}}", "b: names no host"),
-        ("tags: {a: {host: 3}}", "3 is no name of a machine"),
         ("tags: {a: {remaps: odom}}", "remaps: 'odom' must be"),
         ("remaps: {velocity: 3}\ntags: {a: }", "remaps: .* must be"),
         ("anchors_file: []\ntags: {a: {}}", ".. is no path"),
@@ -218,31 +216,6 @@ def test_topics_of_tags_have_other_names(tmp_path):
     assert second.words[2:6] == ["-r", "velocity/odometry:=wheels", "-r", "imu/data:=/imu2"]
     with pytest.raises(InputError, match="remaps: do not go with processes"):
         tags(file, {}, processes="1")
-
-
-def test_each_host_starts_its_tags_and_the_first_the_anchors(tmp_path):
-    file = tmp_path / "tags.yaml"
-    file.write_text(
-        "anchors_file: a.yaml\nprocesses: 1\ntags: {a: {host: one}, b: {host: two}, c: {host: "
-        "one, tdoa_std: 0.3}}"
-    )
-    one, two = (tags(file, {}, host=host) for host in ("one.lan", "two"))
-    assert [node.executable for node in one] == ["anchors_node", "localization_node"]
-    assert one[1].parameters[1] == {"tags": ["a", "c"]}
-    told = yaml.safe_load(Path(one[1].parameters[0]).read_text())
-    assert told["/**/c/ekf_node"]["ros__parameters"].keys() == {
-        "body_frame",
-        "tdoa_std",
-        "anchors_file",
-    }
-    assert [(node.executable, node.parameters[1]) for node in two] == [
-        ("localization_node", {"tags": ["b"]})
-    ]
-    assert [node.namespace for node in tags(file, {}, processes="2", host="one")[1:]] == ["", ""]
-    with pytest.raises(InputError, match="no tag has the host three; those named are one, two"):
-        tags(file, {}, host="three")
-    file.write_text("host: one\ntags: {a: {}, b: {}}")
-    assert len(tags(file, {}, host="one")) == 4
 
 
 def test_as_many_processes_as_cores(tmp_path):

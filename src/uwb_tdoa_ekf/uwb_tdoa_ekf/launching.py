@@ -14,8 +14,7 @@ import json
 import os
 from pathlib import Path
 import signal
-import socket
-from typing import NamedTuple
+from typing import Any
 
 import yaml
 
@@ -288,146 +287,12 @@ def tag(
     ]
 
 
-class FleetTag(NamedTuple):
-    """Store one tag of a YAML file of tags.
+def tags(path: str, values: Mapping, log_level: str = "info", processes: str = "") -> list[Start]:
+    """Return the Starts for a YAML file of tags.
 
-    Attributes
-    ----------
-    parameters : dict
-        {parameter: value} of its nodes.
-    host : str or None
-        Name of the machine that runs its nodes; None if the file gives no host.
-    remaps : dict
-        {topic: name}.
-    """
-
-    parameters: dict
-    host: str | None
-    remaps: dict[str, str]
-
-
-@dataclass(frozen=True)
-class Fleet:
-    """Store the content of a YAML file of tags.
-
-    The file has the form `tags: {NAMESPACE: {parameter: value, host: HOST, remaps: {topic:
-    name}}}`. Keys next to `tags` hold for all tags.
-
-    Attributes
-    ----------
-    path : str
-        Path of the file.
-    tags : dict
-        {namespace: FleetTag}.
-    processes : str
-        Number of processes, or "" if the file does not give it.
-    """
-
-    path: str
-    tags: dict[str, FleetTag]
-    processes: str
-
-    @classmethod
-    def read(cls, path: str) -> Fleet:
-        """Read a YAML file of tags; raise InputError if it cannot be used."""
-        content = read_yaml(path)
-        listed = content.pop("tags", None) if isinstance(content, dict) else None
-        if not isinstance(listed, dict) or not listed:
-            raise InputError(
-                f"{path}: expected a mapping 'tags' of namespace to parameters, e.g. 'tags: "
-                f"{{tag1: {{}}}}'."
-            )
-        tags: dict[str, FleetTag] = {}
-        processes = content.pop("processes", "")
-        shared = _remaps(path, content.pop("remaps", None))
-        for namespace, own in listed.items():
-            if not isinstance(own or {}, dict):
-                raise InputError(
-                    f"{path}: tags: {namespace}: {own!r} must be a mapping of parameters, or {{}}."
-                )
-            parameters = {"body_frame": f"{namespace}/base_link", **content, **(own or {})}
-            host = parameters.pop("host", None)
-            remaps = shared | _remaps(path, parameters.pop("remaps", None))
-            if not isinstance(host, str | None):
-                raise InputError(
-                    f"{path}: tags: {namespace}: host: {host!r} is no name of a machine; "
-                    "write a text."
-                )
-            tags[str(namespace)] = FleetTag(parameters, host, remaps)
-        without = [namespace for namespace, tag in tags.items() if tag.host is None]
-        if without and len(without) < len(tags):
-            raise InputError(
-                f"{path}: tags: {without[0]}: names no host, and other tags do; name it, or a host "
-                "for all beside 'tags'."
-            )
-        return cls(str(path), tags, str(processes))
-
-    def at(self, host: str) -> Fleet:
-        """Return the tags whose nodes the machine `host` runs: all, if the file names no host.
-
-        Raise InputError if there is none.
-        """
-        hosts = dict.fromkeys(tag.host for tag in self.tags.values())
-        if None in hosts:
-            return self
-        names = host, host.partition(".")[0]
-        here = {namespace: tag for namespace, tag in self.tags.items() if tag.host in names}
-        if not here:
-            known = ", ".join(map(str, hosts))
-            raise InputError(
-                f"{self.path}: no tag has the host {host}; those named are {known}: correct "
-                "the file, or give host:=NAME."
-            )
-        return replace(self, tags=here)
-
-    def starts(self, values: Mapping, log_level: str = "info") -> list[Start]:
-        """Return the Starts of bias_node and ekf_node of each tag.
-
-        Each tag has its own body frame NAMESPACE/base_link, unless the file names another.
-
-        Parameters
-        ----------
-        values : mapping
-            {parameter: value} that overrides the file.
-        log_level : str
-            Log level of the nodes.
-
-        Raises
-        ------
-        InputError
-            If a value is wrong.
-        """
-        starts = []
-        try:
-            for namespace, own in self.tags.items():
-                merged = {**own.parameters, **values}
-                file = merged.pop("params_file", None)
-                files = (
-                    {name: [_beside(self.path, file)] for name in ("bias_node", "ekf_node")}
-                    if file not in (None, "")
-                    else {}
-                )
-                merged |= {
-                    name: _beside(self.path, merged[name])
-                    for name in PATHS
-                    if merged.get(name) not in (None, "")
-                }
-                starts += [
-                    replace(each, remaps=own.remaps)
-                    for each in tag(namespace, merged, files, log_level)
-                ]
-        except InputError as error:
-            raise InputError(f"{self.path}: {error}") from error
-        return starts
-
-
-def tags(
-    path: str, values: Mapping, log_level: str = "info", processes: str = "", host: str = ""
-) -> list[Start]:
-    """Return the Starts of this machine for a YAML file of tags (Fleet); raise InputError if wrong.
-
-    If all tags name the same anchors_file, one anchors_node starts too. If the file names hosts,
-    only the host of the first tag starts it.
+    The file has the form `tags: {NAMESPACE: {parameter: value, remaps: {topic: name}}}`. Keys next
+    to `tags` hold for all tags. Each tag has its own body frame NAMESPACE/base_link, unless the file
+    names another. If all tags name the same anchors_file, one anchors_node starts too.
 
     Parameters
     ----------
@@ -439,23 +304,55 @@ def tags(
         Log level of the nodes.
     processes : str
         Overrides the value of the file; see `pooled`.
-    host : str
-        Name of this machine; default: its host name.
+
+    Raises
+    ------
+    InputError
+        If the file is wrong.
     """
-    fleet = Fleet.read(path)
-    here = fleet.at(host or socket.gethostname())
-    starts = here.starts(values, log_level)
+    content = read_yaml(path)
+    listed = content.pop("tags", None) if isinstance(content, dict) else None
+    if not isinstance(listed, dict) or not listed:
+        raise InputError(
+            f"{path}: expected a mapping 'tags' of namespace to parameters, e.g. 'tags: {{tag1: {{}}}}'."
+        )
+    of_file = str(content.pop("processes", ""))
+    shared = _remaps(path, content.pop("remaps", None))
+    starts: list[Start] = []
+    for namespace, own in listed.items():
+        if not isinstance(own or {}, dict):
+            raise InputError(
+                f"{path}: tags: {namespace}: {own!r} must be a mapping of parameters, or {{}}."
+            )
+        parameters = {"body_frame": f"{namespace}/base_link", **content, **(own or {})}
+        remaps = shared | _remaps(path, parameters.pop("remaps", None))
+        try:
+            nodes = _starts_of(path, str(namespace), {**parameters, **values}, log_level)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
+        starts += [replace(each, remaps=remaps) for each in nodes]
     anchors = {node.parameters[-1].get("anchors_file") for node in starts if node.parameters} - {
         None
     }
-    if len(anchors) == 1 and next(iter(here.tags)) == next(iter(fleet.tags)):
-        shared = {
+    if len(anchors) == 1:
+        of_anchors = {
             "anchors_file": anchors.pop(),
             **{name: values[name] for name in (*EVERYWHERE, "frozen") if name in values},
         }
-        starts.append(start("anchors_node", "", shared, (), log_level))
-    processes = processes or fleet.processes
+        starts.append(start("anchors_node", "", of_anchors, (), log_level))
+    processes = processes or of_file
     return pooled(starts, processes) if processes else starts
+
+
+def _starts_of(path: str, namespace: str, values: dict[str, Any], log_level: str) -> list[Start]:
+    """Return the Starts of one tag of a file; its paths are relative to that file."""
+    file = values.pop("params_file", None)
+    files = {}
+    if file not in (None, ""):
+        files = {name: [_beside(path, file)] for name in ("bias_node", "ekf_node")}
+    given = [name for name in PATHS if values.get(name) not in (None, "")]
+    values |= {name: _beside(path, values[name]) for name in given}
+    return tag(namespace, values, files, log_level)
 
 
 def pooled(starts: list[Start], processes: int | str) -> list[Start]:
