@@ -44,7 +44,7 @@ def parser() -> ArgumentParser:
         ),
         "plan anchors.yaml --height 1.2 --out plan/",
         "plan survey.txt --volume --room -3 4 -4 4 0 3 --protocol tdoa3 --out plan/",
-        "plan square.yaml --planar --height 0.2 --check --out plan/",
+        "plan square.yaml --planar --height 0.2 --out plan/",
         "plan survey.txt --volume --with height --flights flights/0425 --out plan/",
         "plan survey.txt --volume --improve add --out plan/",
         "plan survey.txt --volume --protocol tdoa2+ranges --noise 0.1 --out plan/",
@@ -208,11 +208,6 @@ def parser() -> ArgumentParser:
             ),
             group(
                 "more",
-                option(
-                    "--check",
-                    action="store_true",
-                    help="compare the failure map with a solver started from many places",
-                ),
                 option(
                     "--flights",
                     metavar="FLIGHT",

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Find where the TDOAs of k + 1 anchors have two solutions, by a formula and by a solver.
+"""Find where the TDOAs of k + 1 anchors have two solutions, by a formula.
 
 With m_0 one of k + 1 anchors and r the tag's distance to it, the TDOAs D_i = |x - m_i| - r turn
     (r + D_i)^2 = |x - m_i|^2
@@ -16,8 +16,6 @@ TDOAs. So |q| = 1 is the bifurcation curve (k = 2) or surface (k = 3).
 For k = 2, times det(A)^2, this is the polynomial of Compagnoni et al. (Inverse Problems 30, 2014,
 035004) that Grasso et al. use in sec. 2.3.1. If the height is known and the anchors have other
 heights, only the right-hand sides change, not |q|.
-
-The solver starts from many places and does not use this formula.
 
 `other_solutions` weighs all TDOAs of a round. With d(x) the distances from x to the N anchors that
 are heard at p, D the anchor pairs of the TDOAs of a round, F the covariance of these TDOAs, and
@@ -43,7 +41,6 @@ import numpy as np
 
 from uwb_tdoa_bias.common.compiled import compiled
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.geometry import ranges
 
 from .installation import Installation, principal_extents
 from .precision import round_weights
@@ -150,92 +147,6 @@ def _choices(n: int, k: int) -> np.ndarray:
         stretch += 1
     starts = np.array([(0, *rest) for rest in combinations(range(1, stretch), k - 1)])
     return (starts[None] + np.arange(n)[:, None, None]).reshape(-1, k) % n
-
-
-SWEEPS = 40
-SOLVED = 1e-9  # m, residual of a solution
-APART = 3e-4  # of the anchors' extent: two solutions nearer than this are one
-DIRECTIONS = 12  # of the starts in a plane; in space three times as many
-# of the starts, over the anchors' extent
-RADII = (0.03, 0.1, 0.3, 0.7, 1.5, 4.0, 12.0, 40.0, 150.0)
-
-
-def solutions(points: np.ndarray, corners: np.ndarray, dimensions: int) -> np.ndarray:
-    """Return the positions that a solver finds from many starts: (n, s, k) m.
-
-    points : (n, 3) m; corners : (k + 1, 3) m, anchors; dimensions : k. Each of the s starts is a
-    Levenberg-Marquardt descent on the k TDOAs of a point. NaN marks a descent without a solution.
-    """
-    centre = corners[:, :dimensions].mean(axis=0)
-    extent = np.linalg.norm(corners - corners.mean(axis=0), axis=1).max()
-    rays = _directions(dimensions)
-    starts = centre + extent * np.concatenate([radius * rays for radius in RADII])
-    x: np.ndarray = np.tile(starts, (len(points), 1))
-    heights = np.repeat(points[:, 2:], len(starts), axis=0)[:, : 3 - dimensions]
-    wanted = np.repeat(_tdoas(points, corners)[0], len(starts), axis=0)
-
-    found = np.full_like(x, np.nan)
-    row: np.ndarray = np.arange(len(x))  # of the points that are not solved yet
-    cost, gradient, normal = _normal_equations(x, heights, wanted, corners)
-    damping: np.ndarray = np.full(len(x), 1e-3)
-    for _ in range(SWEEPS):
-        scale = np.sqrt(np.maximum(np.einsum("nii->ni", normal), 1e-24))
-        damped = normal / (scale[:, :, None] * scale[:, None, :]) + damping[:, None, None] * np.eye(
-            dimensions
-        )
-        step = np.linalg.solve(damped, (gradient / scale)[..., None])[..., 0] / scale
-        longest = extent + np.linalg.norm(x - centre, axis=1)
-        step *= np.minimum(1.0, longest / np.maximum(np.linalg.norm(step, axis=1), 1e-300))[:, None]
-        new = _normal_equations(x + step, heights, wanted, corners)
-        better = new[0] < cost
-        x[better] += step[better]
-        for old, value in zip((cost, gradient, normal), new):
-            old[better] = value[better]
-        damping = np.clip(damping * np.where(better, 0.2, 5.0), 1e-14, 1e14)
-        solved = cost < SOLVED**2
-        found[row[solved]] = x[solved]
-        row, x, heights, wanted, damping, cost, gradient, normal = (
-            array[~solved] for array in (row, x, heights, wanted, damping, cost, gradient, normal)
-        )
-    return found.reshape(len(points), len(starts), dimensions)
-
-
-def same_place(points: np.ndarray, found: np.ndarray, anchors: np.ndarray) -> np.ndarray:
-    """Return whether positions (..., k) m are points (..., 3) m, within the solver's tolerance.
-
-    The tolerance is a share of the extent of anchors (N, 3) m.
-    """
-    apart = APART * np.linalg.norm(np.ptp(anchors, axis=0))
-    return np.linalg.norm(found - points[..., : found.shape[-1]], axis=-1) <= apart
-
-
-def _normal_equations(
-    x: np.ndarray, heights: np.ndarray, wanted: np.ndarray, corners: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    d, jacobian = _tdoas(np.hstack([x, heights]), corners)
-    jacobian, residual = jacobian[:, :, : x.shape[1]], wanted - d
-    cost = np.einsum("ni,ni->n", residual, residual)
-    return cost, np.einsum("nik,ni->nk", jacobian, residual), jacobian.swapaxes(1, 2) @ jacobian
-
-
-def _tdoas(x: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the TDOAs against the first corner and their derivatives: (n, k) m, (n, k, 3)."""
-    distance, unit = ranges(x[:, None], corners)
-    return distance[:, 1:] - distance[:, :1], unit[:, 1:] - unit[:, :1]
-
-
-def _directions(dimensions: int) -> np.ndarray:
-    """Return evenly spread unit vectors: (DIRECTIONS, 2) in a plane, (3 DIRECTIONS, 3) in space."""
-    if dimensions == 2:
-        # With this offset no direction is along an axis.
-        angle = 2.0 * np.pi * (np.arange(DIRECTIONS) + 0.31) / DIRECTIONS
-        return np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    # a spiral from pole to pole that turns by the golden angle (Fibonacci sphere)
-    k = np.arange(3 * DIRECTIONS) + 0.5
-    z, angle = 1.0 - 2.0 * k / (3 * DIRECTIONS), np.pi * (1.0 + np.sqrt(5.0)) * k
-    return np.column_stack(
-        [np.sqrt(1.0 - z**2) * np.cos(angle), np.sqrt(1.0 - z**2) * np.sin(angle), z]
-    )
 
 
 FLIP = 0.5  # m; a minimum nearer than this is no failure, but imprecision

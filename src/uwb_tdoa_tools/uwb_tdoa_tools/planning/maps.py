@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Judge places: whether a tag can be flown there, and if not, why.
 
-A place hears too few anchors, is imprecise, has two solutions, or can be flown. A solver checks the
-second solutions, and measured flights check the precision.
+A place hears too few anchors, is imprecise, has two solutions, or can be flown. Measured flights check
+the precision.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ..choices import ACCURACY
 from ..scoring.evaluation import evaluate
 from ..scoring.metrics import position_at
 from ..simulation.rooms import Room
-from .bifurcation import CLEAR, Subsets, other_solutions, same_place, solutions
+from .bifurcation import CLEAR, Subsets, other_solutions
 from .installation import Installation
 from .precision import bound, information, position_error
 
@@ -205,49 +205,6 @@ class Chart(Judged):
             anchors.frame,
             dimensions == 2,
         )
-
-
-PLACES_ACROSS = {2: 40, 3: 10}  # places along the longest side of a slice, of a volume, at most
-MOST_PAIRINGS = 8  # pairings that are solved, spread over all; each takes thousands of solutions
-_BATCH = 200
-EACH_ARROW = 37  # of so many mirror solutions one is drawn
-
-
-def brute_force(
-    installation: Installation, grid: Grid, progress: Wrap = iter
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Solve for the pairings of an Installation from many starts, all over a grid.
-
-    Returns (unique (n,) bool: each pairing has one solution; agrees (n,) bool: each is as predicted;
-    points (n, 3) m; arrows ((m, 2), (m, 2)) m: one of EACH_ARROW mirror solutions within the grid,
-    from and to).
-    """
-    subsets = Subsets(installation.anchors, installation.unknowns)
-    extent = np.array(grid.shape) * grid.step
-    across = min(PLACES_ACROSS[3 if grid.shape[2] > 1 else 2], max(grid.shape))
-    points = Grid.box(grid.lower, grid.lower + extent, extent.max() / across).points
-    if grid.shape[2] == 1:
-        points[:, 2] = grid.axes[2][0]
-    row, subset, mirror = subsets.mirrors(points)
-    # on the lines through two anchors they meet
-    other = ~same_place(points[row], mirror, installation.anchors.positions)
-    predicted = np.ones((len(points), len(subsets.rows)), bool)
-    predicted[row[other], subset[other]] = False
-    chosen = np.unique(np.linspace(0, len(subsets.rows) - 1, MOST_PAIRINGS).astype(int))
-    unique, agrees = np.ones(len(points), bool), np.ones(len(points), bool)
-    for q in progress(chosen):
-        corners = installation.anchors.positions[subsets.rows[q]]
-        for rows in np.array_split(np.arange(len(points)), max(1, len(points) // _BATCH)):
-            found = solutions(points[rows], corners, installation.unknowns)
-            one = (np.isnan(found[..., 0]) | same_place(points[rows, None], found, corners)).all(
-                axis=1
-            )
-            unique[rows] &= one
-            agrees[rows] &= one == predicted[rows, q]
-    near = np.flatnonzero(((mirror >= grid.lower) & (mirror <= grid.lower + extent)).all(axis=1))[
-        ::EACH_ARROW
-    ]
-    return unique, agrees, points, (points[row[near], :2], mirror[near, :2])
 
 
 FEWEST = 20  # estimates; a cell with fewer has no figures

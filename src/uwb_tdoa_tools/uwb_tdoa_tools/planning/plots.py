@@ -175,55 +175,6 @@ def plot_heard(
     )
 
 
-def plot_flips(
-    installation: Installation,
-    points: np.ndarray,
-    unique: np.ndarray,
-    agrees: np.ndarray,
-    mirrors: tuple[np.ndarray, np.ndarray],
-    path: str | Path,
-) -> None:
-    """Draw the brute-force check: points with one solution, with two, and contradictions.
-
-    points : (n, 3) m; unique, agrees : (n,) bool; mirrors : (from (m, 2), to (m, 2)) m, flips to draw
-    as arrows.
-    """
-    figure, ax = plt.subplots(figsize=(WIDTH, WIDTH), layout="constrained")
-    for chosen, state, label in (
-        (unique, FLYABLE, "one solution"),
-        (~unique, TWO_SOLUTIONS, "two solutions of a choice of anchors"),
-    ):
-        colour = STATES[state][1]
-        ax.plot(
-            *points[chosen, :2].T,
-            "s",
-            color=colour,
-            ms=4,
-            label=f"{label}: {100.0 * np.mean(chosen):.0f} %",
-        )
-    ax.plot(
-        *points[~agrees, :2].T,
-        "kx",
-        ms=6,
-        label=f"not as predicted: {100.0 * np.mean(~agrees):.1f} %",
-    )
-    for (x0, y0), (x1, y1) in zip(*mirrors):
-        ax.annotate(
-            "", (x1, y1), (x0, y0), arrowprops={"arrowstyle": "->", "color": "0.3", "lw": 0.9}
-        )
-    ax.set(xlabel="x, m", ylabel="y, m", aspect="equal")
-    _hull(ax, installation.anchors)
-    _anchors(ax, installation.anchors)
-    marks = [*ax.get_legend_handles_labels()[0], _hull_line(), _anchor_mark(installation.anchors)]
-    _finish(
-        figure,
-        "Solved from many starts; arrows lead to the other solution",
-        marks,
-        [(ax, installation.anchors)],
-        path,
-    )
-
-
 def plot_accuracy(installation: Installation, found: AccuracyMap, path: str | Path) -> None:
     """Draw measured error, its bias, stated error and bound, 3D, seen from above.
 

@@ -224,14 +224,6 @@ def print_side(side: dict[str, Any] | None) -> None:
         )
 
 
-def print_check(found: dict[str, Any]) -> None:
-    """Print the result of `run.brute_force_check`."""
-    print(
-        f"check: {found['places']} places, agreement with the brute-force solver "
-        f"{found['agreement']:.2%}"
-    )
-
-
 def print_flights(rows: Sequence[dict[str, Any]]) -> None:
     """Print the rows of `maps.comparison`, each with its "flight"."""
     print(

@@ -27,7 +27,7 @@ from . import maps, optimisation, plots, report
 from .hall import Hall, design, placements, step_of
 from .installation import FixedNoise, Installation, RadioNoise, antenna_from_yaml
 from .layout import AnchorPlaces, Goal, lattice
-from .maps import Chart, Demand, Grid, brute_force
+from .maps import Chart, Demand, Grid
 
 FARTHEST = 30.0  # m, size of a room from which on the radio's reach must be given
 # cells along the longest side, without --step
@@ -83,9 +83,6 @@ def plan(args: Namespace) -> bool:
         figures["addition"] = advice(args, whole, found)
         report.print_addition(figures["addition"], about["flyable_share"])
     outgoing = draw_map(whole, found, args.out)
-    if args.check:
-        figures["check"] = brute_force_check(installation, grid, args.out)
-        report.print_check(figures["check"])
     if recordings:
         read = partial(flight_errors, reading, tuple(args.sensors))
         flown = parallel.over(read, recordings, args.jobs, args.dask)
@@ -115,7 +112,7 @@ def check_options(args: Namespace) -> None:
             "walls: are for a hall of which a tag hears a part; give --radio-reach too."
         )
     is_hall = args.hall or args.radio_reach is not None
-    for name in ("check", "flights", "improve"):
+    for name in ("flights", "improve"):
         if is_hall and getattr(args, name):
             raise InputError(
                 f"{name}: is for a room in which every anchor is heard; leave out --{name}, "
@@ -153,13 +150,11 @@ def demand_of(args: Namespace, installation: Installation, room: Room) -> Demand
 
     Raises InputError for a criterion that ranges, or a hall, do not have.
     """
-    if installation.measures_ranges:
-        for name, asked in (("flyable", args.flyable == "pairings"), ("check", args.check)):
-            if asked:
-                raise InputError(
-                    f"{name}: looks for a second solution of TDOAs, and ranges have none; "
-                    "leave it out, or plan for --protocol tdoa2."
-                )
+    if installation.measures_ranges and args.flyable == "pairings":
+        raise InputError(
+            "flyable: looks for a second solution of TDOAs, and ranges have none; "
+            "leave it out, or plan for --protocol tdoa2."
+        )
     if installation.hall and args.flyable == "pairings":
         raise InputError(
             "flyable: pairings are of a room in which every anchor is heard; leave out "
@@ -340,20 +335,6 @@ def draw_map(whole: Hall, found: Chart, out: Path) -> dict[str, Any]:
     outgoing = report.map_messages(found, anchors)
     report.write_messages(outgoing, out / "plan.bag")
     return outgoing
-
-
-def brute_force_check(installation: Installation, grid: Grid, out: Path) -> dict[str, Any]:
-    """Compare the failure map with a solver that is started from many places."""
-    with Progress("plan") as progress:
-        unique, agrees, points, arrows = brute_force(
-            installation, grid, partial(progress.over, what="solving")
-        )
-    plots.plot_flips(installation, points, unique, agrees, arrows, out / "flips.png")
-    return {
-        "places": len(points),
-        "agreement": float(np.mean(agrees)),
-        "unique_share": float(np.mean(unique)),
-    }
 
 
 def flight_errors(
