@@ -1,4 +1,4 @@
-/* The Kalman filter of the Crazyflie firmware as a peer of `study bench --peer` and, with -DFLY, of `fly --peer` (docs/speed.md).
+/* The Kalman filter of the Crazyflie firmware as a peer of `study bench --peer` (docs/notebook/speed.md).
    With -DROBUST=1 it is the M-estimation of the first paper, else the firmware's standard update. */
 #include <math.h>
 #include <stdint.h>
@@ -17,8 +17,7 @@ static kalmanCoreData_t core;
 static kalmanCoreParams_t params;
 static OutlierFilterTdoaState_t outliers;
 static const double *anchors;
-static int started, samples;
-static double next, gyro_sum[3], accel_sum[3];
+static int started;
 
 void abort(void);
 void assertFail(char *what, char *file, int line) { abort(); }
@@ -36,43 +35,23 @@ static void predict(double t, const double *gyro, const double *accel) {
 int32_t tdoa_peer_version(void) { return 1; }
 
 void tdoa_peer_start(const double *where, int32_t count, const double *p, const double *q) {
-  anchors = where; started = samples = 0;
-  memset(gyro_sum, 0, sizeof gyro_sum); memset(accel_sum, 0, sizeof accel_sum);
+  anchors = where; started = 0;
   kalmanCoreDefaultParams(&params);
   params.initialYaw = 2 * atan2(q[2], q[3]);  /* level */
-  int told = !isnan(p[0]);
-  if (told) {
-    params.initialX = p[0]; params.initialY = p[1]; params.initialZ = p[2];
-  }
-#ifdef FLY  /* at rest, and what is said is right to 0.1 m and 0.1 rad */
-  params.stdDevInitialPosition_xy = told ? 0.1f : 3.0f;  /* else somewhere in the hall: with the 100 m of the firmware the state is NaN */
-  if (told) params.stdDevInitialPosition_z = 0.1f;
-  params.stdDevInitialAttitude_yaw = 0.1f;
-#else  /* it flies already */
+  params.initialX = p[0]; params.initialY = p[1]; params.initialZ = p[2];
+  /* it flies already */
   params.stdDevInitialPosition_xy = params.stdDevInitialPosition_z = 0.3f;
   params.stdDevInitialVelocity = 1.0f;
   params.stdDevInitialAttitude_rollpitch = 0.2f;
-#endif
   outlierFilterTdoaReset(&outliers);
 }
 
 void tdoa_peer_run(const tdoa_peer_event *e, int32_t count) {
   for (; count--; e++) {
     uint32_t now = (uint32_t)(1000.0 * e->t + 0.5);
-    if (!started++) { kalmanCoreInit(&core, &params, now); next = e->t + 0.01; }
+    if (!started++) kalmanCoreInit(&core, &params, now);
     if (e->a < 0) {
-#ifdef FLY  /* the firmware predicts at 100 Hz with the mean of the samples since */
-      for (int k = 0; k < 3; k++) { gyro_sum[k] += e->gyro[k]; accel_sum[k] += e->accel[k]; }
-      samples++;
-      if (e->t >= next) {
-        for (int k = 0; k < 3; k++) { gyro_sum[k] /= samples; accel_sum[k] /= samples; }
-        predict(e->t, gyro_sum, accel_sum);
-        samples = 0; next += 0.01;
-        memset(gyro_sum, 0, sizeof gyro_sum); memset(accel_sum, 0, sizeof accel_sum);
-      }
-#else
       predict(e->t, e->gyro, e->accel);
-#endif
       kalmanCoreAddProcessNoise(&core, &params, now);
     } else {
       tdoaMeasurement_t tdoa = {.anchorPositions = {place(e->a), place(e->b)}, .distanceDiff = e->d, .stdDev = 0.15f};
@@ -84,12 +63,3 @@ void tdoa_peer_run(const tdoa_peer_event *e, int32_t count) {
 }
 
 void tdoa_peer_position(double *p) { for (int k = 0; k < 3; k++) p[k] = core.S[KC_STATE_X + k]; }
-
-void tdoa_peer_state(double *p, double *v, double *q) {  /* of fly alone */
-  for (int k = 0; k < 3; k++) {
-    p[k] = core.S[KC_STATE_X + k];
-    v[k] = core.R[k][0] * core.S[KC_STATE_PX] + core.R[k][1] * core.S[KC_STATE_PY] + core.R[k][2] * core.S[KC_STATE_PZ];
-    q[k] = core.q[1 + k];
-  }
-  q[3] = core.q[0];
-}

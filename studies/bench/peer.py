@@ -1,33 +1,96 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Measure the compiled core and another filter in one run."""
+"""Measure the compiled core and another filter in one run.
+
+The other filter is a shared library that the user has built. docs/notebook/speed.md says what it
+exports.
+"""
 
 from __future__ import annotations
 
-import math
+import ctypes
 from pathlib import Path
+import time
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_tools.flying.estimates import Peer, events
-from uwb_tdoa_tools.scoring.alignment import require_truth
-from uwb_tdoa_tools.scoring.metrics import position_at, rms, scored_phase
 
 from .core import BEFORE, MEASURED, RARELY, Core, sample_before
 from .figures import Figure
 from .flights import make_flight
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterator
 
+    from numpy.typing import ArrayLike
+
+    from uwb_tdoa_bias.common.anchors import Anchors
     from uwb_tdoa_bias.common.flight import Flight
-    from uwb_tdoa_tools.flying.estimates import CompiledCorrection
 
 REPEATS = 41
-SAMPLED = 0.01  # s, from one position of a peer to the next
-START = 4.0  # s in the air: until then, errors from the floor persist
+VERSION = 1  # of the interface
+EVENT = np.dtype(
+    [
+        ("t", float),
+        ("gyro", float, 3),
+        ("accel", float, 3),
+        ("d", float),
+        ("a", np.int32),
+        ("b", np.int32),
+    ]
+)
+SYMBOLS = ("version", "start", "run", "position")
+
+
+class Peer:
+    """Call the filter in a shared library; raise InputError if it has another interface."""
+
+    def __init__(self, path: str | Path) -> None:
+        self.name = Path(path).name
+        try:
+            library = ctypes.CDLL(str(Path(path).absolute()))
+        except OSError as error:
+            raise InputError(
+                f"--peer: {path} cannot be loaded as a shared library ({error}); build it anew on "
+                "this machine."
+            ) from error
+        missing = [name for name in SYMBOLS if not hasattr(library, f"tdoa_peer_{name}")]
+        if missing:
+            raise InputError(
+                f"--peer: {path} does not export tdoa_peer_{missing[0]}; add it as "
+                "docs/notebook/speed.md shows."
+            )
+        self._library = library
+        version = library.tdoa_peer_version()
+        if version != VERSION:
+            raise InputError(
+                f"--peer: {path} is of version {version} of the interface, this is {VERSION}; build "
+                "it for that."
+            )
+
+    def start(self, anchors: Anchors, p: ArrayLike, q: ArrayLike) -> None:
+        """Restart at p (3,) m with attitude q (4,) x y z w."""
+        # kept: the library may read them later
+        self._anchors = np.ascontiguousarray(anchors.positions, dtype=float)
+        arrays = (self._anchors, np.array(p, float), np.array(q, float))
+        where, at, attitude = (ctypes.c_void_p(one.ctypes.data) for one in arrays)
+        self._library.tdoa_peer_start(where, ctypes.c_int32(len(anchors)), at, attitude)
+
+    def run(self, events: np.ndarray) -> float:
+        """Process events (n,) of EVENT and return the duration, s."""
+        data, count = ctypes.c_void_p(events.ctypes.data), ctypes.c_int32(len(events))
+        began = time.perf_counter()
+        self._library.tdoa_peer_run(data, count)
+        return time.perf_counter() - began
+
+    def position(self) -> np.ndarray:
+        """(3,) m."""
+        out = np.full(3, np.nan)
+        self._library.tdoa_peer_position(ctypes.c_void_p(out.ctypes.data))
+        return out
 
 
 def events_of(flight: Flight, begin: float, end: float) -> tuple[np.ndarray, np.ndarray]:
@@ -37,8 +100,11 @@ def events_of(flight: Flight, begin: float, end: float) -> tuple[np.ndarray, np.
     as in the measurement of our filter in `Core`.
     """
     assert flight.imu is not None
-    samples, ranges = events(flight.imu, flight.tdoa, flight.anchors)
-    ranges["t"] = sample_before(flight.imu.t, ranges["t"])
+    imu, tdoa = flight.imu, flight.tdoa
+    samples, ranges = np.zeros(len(imu), EVENT), np.zeros(len(tdoa), EVENT)
+    samples["t"], samples["gyro"], samples["accel"], samples["a"] = imu.t, imu.gyro, imu.accel, -1
+    ranges["t"], ranges["d"] = sample_before(imu.t, tdoa.t), tdoa.d
+    ranges["a"], ranges["b"] = flight.anchors.index(tdoa.a), flight.anchors.index(tdoa.b)
     samples, ranges = (part[(part["t"] >= begin) & (part["t"] < end)] for part in (samples, ranges))
     both = np.concatenate([samples, ranges])
     return samples, both[np.argsort(both["t"], kind="stable")]
@@ -79,65 +145,6 @@ def measure(progress: Callable[[str], object], peer: Peer, quick: bool = False) 
         yield Figure.of(section, f"{name}, the other's", "us", other)
         yield Figure.of(section, f"{name}, ours over the other's", "ratio", one / other)
     yield Figure.of(section, "the other's position at the end, off by", "m", off)
-
-
-def errors(
-    flights: Iterable[Flight], library: str, correction: CompiledCorrection | None
-) -> Iterator[Figure]:
-    """Generator of Figures: the 3D RMSE of a peer on Flights with ground truth, m.
-
-    The means are over whole flights, and over the part after START.
-    correction : if given, the figures are the errors without it, with it, and their ratio
-    """
-    ways = {"as it is": None} | ({"corrected": correction} if correction is not None else {})
-    section = f"3D RMSE of {Path(library).name} on measured flights"
-    found: dict[str, list[list[float]]] = {way: [] for way in ways}
-    for flight in flights:
-        for way, known in ways.items():
-            t, off = error_of(flight, Peer(library, own=True, correction=known))
-            found[way].append([float(rms(off)), float(rms(off[t >= START]))])
-            yield Figure.of(section, f"{flight.name}, {way}", "m", found[way][-1][0])
-    if not found["as it is"]:
-        return
-    for way, some in found.items():
-        for part, mean in zip(("", f" after {START:g} s"), np.mean(some, axis=0)):
-            yield Figure.of(section, f"mean{part}, {way}", "m", mean)
-    if correction is not None:
-        ratios = np.array(found["corrected"])[:, 0] / np.array(found["as it is"])[:, 0]
-        yield Figure.of(section, "corrected, over as it is: the flights", "ratio", ratios)
-        yield Figure.of(section, "corrected, over as it is: the worst", "ratio", ratios.max())
-
-
-def error_of(flight: Flight, peer: Peer) -> tuple[np.ndarray, np.ndarray]:
-    """Error of a peer that starts at the true pose of a Flight, where the flight is scored.
-
-    Returns the time since the begin of that part (n,) s, and the distance to the truth (n,) m.
-    """
-    require_truth(flight)
-    assert flight.imu is not None and flight.truth is not None
-    truth = flight.truth
-    _, first, last = scored_phase(truth)
-    parts = events(flight.imu, flight.tdoa, flight.anchors)
-    both = np.concatenate(parts)
-    both = both[np.isfinite(both["d"]) & (both["t"] >= truth.t[0])]
-    both = both[np.argsort(both["t"], kind="stable")]
-    peer.start(flight.anchors, truth.p[0], _level(truth.q[0]))
-    t = np.arange(both["t"][0], both["t"][-1], SAMPLED)
-    p = np.empty((len(t), 3))
-    for k, some in enumerate(np.split(both, np.searchsorted(both["t"], t[1:]))):
-        peer.run(some)
-        p[k] = peer.position()
-    t = t + SAMPLED  # when the events of a slice are over
-    inside = (t >= first) & (t <= last)
-    off = np.linalg.norm(p[inside] - position_at(t[inside], truth), axis=1)
-    return t[inside] - first, off
-
-
-def _level(q: np.ndarray) -> np.ndarray:
-    """The attitude (4,) with the yaw of q, level; yaw 0 if it is unknown."""
-    yaw = math.atan2(2.0 * (q[0] * q[1] + q[2] * q[3]), 1.0 - 2.0 * (q[1] ** 2 + q[2] ** 2))
-    yaw = yaw if math.isfinite(yaw) else 0.0
-    return np.array([0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw)])
 
 
 def _per_event(

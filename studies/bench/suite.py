@@ -16,8 +16,6 @@ graph : time to answer a parameter request, to apply an initial pose and to repo
 while streams, /clock and /tf flow; idle CPU.
 
 With --peer, another filter runs over the same events in turn with ours, and the ratio is printed.
-With --peer and --flights, it also runs over measured flights, and its errors are printed. With
---correction, a folder of export --c, the errors with correction follow. It starts at the true pose.
 Real nodes run in a separate ROS domain. Other work on the machine changes the figures, above all
 the latencies; the study prints the processor time of other processes. To get priority over them:
 sudo -E env PATH=$PATH chrt --fifo 10 ./dev study bench --only nodes tags
@@ -34,11 +32,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm import tqdm
 
-from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_tools import choices, cli
-from uwb_tdoa_tools.flying.estimates import CompiledCorrection, Peer
+from uwb_tdoa_tools import cli
 from uwb_tdoa_tools.outputs import OutputFile, OutputFolder
-from uwb_tdoa_tools.readers import inputs
 
 from . import core, graph, nodes, peer, rates, recordings
 from .figures import as_json, table
@@ -67,13 +62,6 @@ def add_options(add: Callable[..., object]) -> None:
     add("--model", metavar="FILE", help="ONNX bias network whose figures offline prints, too")
     peer_help = "measure this shared library of another filter beside ours (docs/notebook/speed.md)"
     add("--peer", metavar="LIBRARY", help=peer_help)
-    add(
-        "--correction",
-        metavar="FOLDER",
-        help="correct the TDOAs of the peer by this folder of export --c (docs/export.md)",
-    )
-    add("--flights", nargs="+", default=[], metavar="FLIGHT", help=choices.RECORDINGS)
-    add("--survey", metavar="S", help=choices.SURVEY)
     out_help = "for the bags and the output of the nodes (default: out/bench)"
     add("--out", metavar="DIR", type=OutputFolder, default="out/bench", help=out_help)
     add("--json", metavar="FILE", type=OutputFile, help="write the machine and all figures")
@@ -81,11 +69,7 @@ def add_options(add: Callable[..., object]) -> None:
 
 def run(args: Namespace) -> None:
     """Measure, and print the table."""
-    if args.peer is None and (args.correction is not None or args.flights):
-        raise InputError("--correction, --flights: are of another filter; give --peer, too.")
-    correction = None if args.correction is None else CompiledCorrection(args.correction)
-    other = None if args.peer is None else Peer(args.peer, correction=correction)
-    flights = inputs.Reading(args.survey).flights(args.flights) if args.flights else ()
+    other = None if args.peer is None else peer.Peer(args.peer)
     machine, figures = measure(args.only, args.out, args.quick, args.model, other)
     cli.show(
         f"{machine['cpu']}, {machine['cores']} cores, Python {machine['python']}, numpy "
@@ -95,8 +79,6 @@ def run(args: Namespace) -> None:
         f"meanwhile others used {machine['others']:.0%} of its CPU time, its host "
         f"{machine['stolen']:.0%}"
     )
-    if other is not None:
-        figures += peer.errors(flights, args.peer, correction)
     cli.show("\n".join(table(figures)))
     if args.json is not None:
         cli.write_json(args.json, {"machine": machine, "figures": as_json(figures)})
@@ -107,7 +89,7 @@ def measure(
     folder: Path,
     quick: bool = False,
     model: str | Path | None = None,
-    other: Peer | None = None,
+    other: peer.Peer | None = None,
 ) -> tuple[dict[str, Any], list[Figure]]:
     """Measure some of PARTS. Returns (machine, list of Figure).
 

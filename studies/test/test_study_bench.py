@@ -2,19 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pieces of `study bench`, and one quick run of the real thing."""
 
-from dataclasses import replace
+import ctypes
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
 
+from documented import ROOT
 import numpy as np
 import pytest
-from test_flying_estimates import CC, built, exported
 
-from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
-from uwb_tdoa_bias.effects.anchor import AnchorDelay
+from uwb_tdoa_bias.common.errors import InputError
 
 pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
@@ -22,13 +22,44 @@ from studies.__main__ import main  # noqa: E402
 from studies.bench import core, nodes, peer, recordings, source, suite, usage  # noqa: E402
 from studies.bench.figures import Figure  # noqa: E402
 from studies.bench.flights import TDOA_RATE, among, make_flight  # noqa: E402
-from uwb_tdoa_tools.flying.estimates import (
-    CompiledCorrection,
-    Peer,  # noqa: E402
-)
-from uwb_tdoa_tools.flying.world import HALL  # noqa: E402
+from studies.bench.peer import Peer  # noqa: E402
 
 OTHERS = 0.2  # share of the CPU time used by others, above which real-time playback is not judged
+
+CC = shutil.which("cc")
+NEEDS_CC = pytest.mark.skipif(CC is None, reason="no C compiler (cc)")
+SOURCE = """
+#include <math.h>
+#include <stdint.h>
+typedef struct { double t, gyro[3], accel[3], d; int32_t a, b; } tdoa_peer_event;
+static const double *anchors; static double p[3], sum; static int32_t rows, wrong;
+int32_t tdoa_peer_version(void) { return VERSION; }
+void tdoa_peer_start(const double *where, int32_t count, const double *at, const double *q) {
+  anchors = where; rows = count; wrong = 0; sum = q[3];
+  for (int k = 0; k < 3; k++) p[k] = at[k];
+}
+static double far(int32_t row) {
+  double s = 0; for (int k = 0; k < 3; k++) s += pow(anchors[3 * row + k] - p[k], 2);
+  return sqrt(s);
+}
+void tdoa_peer_run(const tdoa_peer_event *e, int32_t count) {
+  for (double last = e->t; count--; last = e++->t) {
+    wrong += e->t < last || e->a >= rows || e->b >= rows;
+    if (e->a < 0) sum += e->gyro[0] + e->accel[2]; else sum += far(e->b) - far(e->a) - e->d;
+  }
+}
+void tdoa_peer_position(double *out) { for (int k = 0; k < 3; k++) out[k] = wrong ? NAN : p[k]; }
+"""
+
+
+def built(folder, source=SOURCE, version=peer.VERSION):
+    """Compile a library and return its path."""
+    (folder / "peer.c").write_text(source.replace("VERSION", str(version)))
+    subprocess.run(
+        [CC, "-O2", "-shared", "-fPIC", "-o", folder / "libpeer.so", folder / "peer.c", "-lm"],
+        check=True,
+    )
+    return folder / "libpeer.so"
 
 
 def test_a_figure_is_the_median_and_the_quartiles_of_what_is_known():
@@ -177,7 +208,7 @@ def test_a_quick_run_of_the_real_nodes(tmp_path, capsys, monkeypatch):
     assert value["ready after its start, ekf_node"] > 0.1 and value["CPU, all nodes"] > 1.0
 
 
-@pytest.mark.skipif(CC is None, reason="no C compiler (cc)")
+@NEEDS_CC
 def test_a_library_gets_the_events_of_a_flight_in_their_order(tmp_path):
     flight, other = make_flight(4.0, start_in_air=True, multipath=False), Peer(built(tmp_path))
     samples, both = peer.events_of(flight, flight.imu.t[0] + 1.0, np.inf)
@@ -197,7 +228,7 @@ def test_a_library_gets_the_events_of_a_flight_in_their_order(tmp_path):
     assert np.isnan(other.position()).all()
 
 
-@pytest.mark.skipif(CC is None, reason="no C compiler (cc)")
+@NEEDS_CC
 def test_both_are_measured_and_their_ratio(tmp_path):
     _, figures = suite.measure((), tmp_path / "out", True, None, Peer(built(tmp_path)))
     assert {figure.section for figure in figures} == {"compiled core beside libpeer.so, 8 anchors"}
@@ -214,43 +245,39 @@ def test_both_are_measured_and_their_ratio(tmp_path):
     )  # this one stays where it is: how fast it is, is worth nothing
 
 
-# A peer whose height is its last TDOA.
-HEIGHT = """
-#include <stdint.h>
-typedef struct { double t, gyro[3], accel[3], d; int32_t a, b; } tdoa_peer_event;
-static double z;
-int32_t tdoa_peer_version(void) { return VERSION; }
-void tdoa_peer_start(const double *a, int32_t n, const double *p, const double *q) { z = p[2]; }
-void tdoa_peer_run(const tdoa_peer_event *e, int32_t n) {
-  for (; n--; e++) if (e->a >= 0) z = e->d;
-}
-void tdoa_peer_position(double *p) { p[0] = p[1] = 0; p[2] = z; }
-void tdoa_peer_state(double *p, double *v, double *q) {
-  for (int k = 0; k < 3; k++) p[k] = v[k] = q[k] = 0;
-  q[3] = 1;
-}
-"""
+@NEEDS_CC
+def test_libraries_that_are_none(tmp_path):
+    with pytest.raises(
+        InputError, match="nowhere.so cannot be loaded as a shared library .*; build it anew"
+    ):
+        Peer(tmp_path / "nowhere.so")
+    (tmp_path / "text.so").write_text("no library")
+    with pytest.raises(InputError, match="text.so cannot be loaded"):
+        Peer(tmp_path / "text.so")
+    with pytest.raises(InputError, match="is of version 7 of the interface, this is 1"):
+        Peer(built(tmp_path, version=7))
+    (tmp_path / "less").mkdir()
+    with pytest.raises(InputError, match="does not export tdoa_peer_position; add it"):
+        Peer(built(tmp_path / "less", SOURCE.replace("tdoa_peer_position", "position")))
 
 
-@pytest.mark.skipif(CC is None, reason="no C compiler (cc)")
-def test_the_errors_of_a_peer_are_given_with_and_without_a_correction(tmp_path):
-    """The peer is 0.5 m off, which the correction takes out of every TDOA."""
-    t, n = np.arange(0.0, 5.0, 0.002), 2500
-    level = np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))
-    truth = Truth(t, np.tile([0.0, 0.0, 2.0], (n, 1)), level)
-    a, b = HALL.anchors.ids[:2]
-    tdoa = Tdoas(t, np.full(n, a), np.full(n, b), np.full(n, 2.5))
-    imu = Imu(t, np.zeros((n, 3)), np.tile([0.0, 0.0, 9.81], (n, 1)))
-    flight = Flight("still", HALL.anchors, tdoa, imu, truth)
-    correction = CompiledCorrection(exported(tmp_path / "c", AnchorDelay({str(b): 0.5})))
-    library = str(built(tmp_path, HEIGHT))
-    figures = {one.name: one.median for one in peer.errors([flight], library, correction)}
-    assert figures["still, as it is"] == pytest.approx(0.5, abs=1e-6)
-    assert figures["still, corrected"] == pytest.approx(0.0, abs=1e-6)
-    assert figures["mean, as it is"] == figures["still, as it is"]
-    assert figures["corrected, over as it is: the worst"] == pytest.approx(0.0, abs=1e-5)
-    alone = [one.name for one in peer.errors([flight], library, None)]
-    assert alone == ["still, as it is", "mean, as it is", "mean after 4 s, as it is"]
-    better = replace(flight, tdoa=replace(tdoa, d=np.where(t < peer.START, 2.5, 2.1)))
-    *_, whole, after = (one.median for one in peer.errors([better], library, None))
-    assert whole > 0.4 and after == pytest.approx(0.1, abs=0.02)
+@NEEDS_CC
+def test_the_stand_in_for_matrices_inverts_and_multiplies(tmp_path):
+    (tmp_path / "inverse.c").write_text(
+        '#include "arm_math.h"\n'
+        "void product(float *a, float *out, int n) {\n"
+        "  float i[256], t[256];\n"
+        "  matrix A = {n, n, a}, I = {n, n, i}, T = {n, n, t}, O = {n, n, out};\n"
+        "  arm_mat_inverse_f32(&A, &I); arm_mat_trans_f32(&I, &T); arm_mat_trans_f32(&T, &I); "
+        "arm_mat_mult_f32(&A, &I, &O);\n"
+        "  arm_mat_scale_f32(&O, 2, &O);\n}"
+    )
+    library = tmp_path / "inverse.so"
+    include = f"-I{ROOT / 'docs' / 'peer'}"
+    subprocess.run(
+        [CC, "-shared", "-fPIC", include, "-o", library, tmp_path / "inverse.c", "-lm"], check=True
+    )
+    a = np.random.default_rng(1).normal(size=(9, 9)).astype(np.float32)
+    out = np.zeros((9, 9), np.float32)
+    ctypes.CDLL(str(library)).product(*(ctypes.c_void_p(x.ctypes.data) for x in (a, out)), 9)
+    assert np.allclose(out, 2.0 * np.eye(9), atol=1e-4)

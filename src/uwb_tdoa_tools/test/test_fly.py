@@ -36,7 +36,6 @@ def test_a_flight_is_counted_drawn_and_recorded_for_the_other_tools(tmp_path, ca
         (["--inject", "gremlins", "1=2"], "'gremlins' needs the name of an effect"),
         (["--inject", "anchor_delay", "3=x"], "anchor_delay"),
         (["--model", "nowhere.onnx"], "nowhere.onnx"),
-        (["--peer", "nowhere.so"], "nowhere.so cannot be loaded"),
         (["--json", "nowhere/x.json"], "its directory does not exist"),
     ],
 )

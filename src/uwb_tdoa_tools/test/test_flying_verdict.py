@@ -81,15 +81,6 @@ def test_a_good_flight_has_landed_and_its_figures_are_right():
         assert verdict["phases"][phase]["nees"] == pytest.approx(1.0)
 
 
-def test_an_estimate_that_is_no_number_is_none():
-    flown = made_up()
-    flown.odometry.p[flown.odometry.t > UP + 5.0] = np.nan
-    verdict = verdict_of(flown)
-    assert [*verdict["phases"]] == ["before", "lift_off", "air"] and verdict["phases"]["air"][
-        "rmse"
-    ] == pytest.approx(0.1)
-
-
 @pytest.mark.parametrize(
     ("why", "safe", "flown"),
     [

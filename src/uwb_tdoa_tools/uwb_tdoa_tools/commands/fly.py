@@ -20,7 +20,7 @@ from ..outputs import OutputFile, OutputFolder
 if TYPE_CHECKING:
     from ..flying.mission import Circles, Waypoints
 
-NOT_OF_ROVERS = ("hover", "again", "peer", "correction", "sensor")  # options
+NOT_OF_ROVERS = ("hover", "again", "sensor")  # options
 DESCRIPTION = """Fly a simulated quadrotor in closed loop, in lockstep and without ROS: its controller gets position, velocity and
 attitude from nothing but the estimate, by the very code of ekf_node, and its rates from the gyroscope. Four seconds at rest, up to
 1.2 m, two circles, down, land. The verdict is by ground truth alone.
@@ -136,16 +136,6 @@ def parser() -> argparse.ArgumentParser:
                 default=[],
                 help="a filter parameter; may be repeated",
             ),
-            option(
-                "--peer",
-                metavar="LIBRARY",
-                help="fly by this shared library of another filter (docs/flying.md), which gets its yaw",
-            ),
-            option(
-                "--correction",
-                metavar="FOLDER",
-                help="correct the TDOAs of the peer by this folder of export --c (docs/export.md)",
-            ),
             options.JOBS,
             option(
                 "--at-least",
@@ -188,10 +178,6 @@ def _fly(args: argparse.Namespace) -> int:
     if args.record is not None:
         args.record.mkdir(parents=True, exist_ok=True)
     config, effects = options.filter_of(args)
-    if args.correction is not None and args.peer is None:
-        raise InputError(
-            "--correction: is of a peer; give --peer, or correct our filter by --model."
-        )
     load_network(args.model)  # or say what is wrong with it, before the first flight
     path: Circles | Waypoints = Circles(radius=0.0) if args.hover else Circles()
     sensors = args.sensor
@@ -213,8 +199,6 @@ def _fly(args: argparse.Namespace) -> int:
             effects,
             args.model,
             args.again,
-            args.peer,
-            args.correction,
             path,
         )
         for seed in seeds

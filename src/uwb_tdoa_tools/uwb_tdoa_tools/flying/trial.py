@@ -20,7 +20,7 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.results import Odometry, concatenated
 
 from .controller import SUPPORT_TIME, Controller, rotate_attitude
-from .estimates import EstimateSource, OwnFilter, PeerFilter
+from .estimates import EstimateSource, OwnFilter
 from .mission import DONE, REFUSED, Circles, Mission, Plan, Rules, Waypoints
 from .sensors import random
 from .simulator import DT, Simulator, Streams, Transport
@@ -55,10 +55,6 @@ class Task:
         Path of a bias network. Both correct the measurements.
     again : bool
         Fly twice. The vehicle is carried by hand in between.
-    peer : str, optional
-        Path of a library to fly by instead of the own filter. Its yaw is always known.
-    correction : str, optional
-        Folder of an exported correction of the TDOAs of the peer.
     path : Circles or Waypoints
         Waypoints make the vehicle a rover.
     rules : Rules
@@ -72,8 +68,6 @@ class Task:
     effects: EffectSet | None = None
     model: str | None = None
     again: bool = False
-    peer: str | None = None
-    correction: str | None = None
     path: Circles | Waypoints = Circles()
     rules: Rules = Rules()
 
@@ -146,7 +140,7 @@ class Trial:
         rng = random(seed, "told")
         place = self.simulator.state[POSITION] + GIVEN_STD * rng.standard_normal(3)
         yaw = self.simulator.yaw + GIVEN_STD * rng.standard_normal()
-        self.source = source or _filter_of(task, place, yaw)
+        self.source = source or _filter_of(task, yaw)
         if task.given == "place":
             self.source.set_pose(
                 GIVEN_AT, place, GIVEN_STD, yaw if task.yaw == "known" else math.nan
@@ -311,19 +305,15 @@ def fly(task: Task) -> TrialResult:
     return trial.result
 
 
-def _filter_of(task: Task, place: np.ndarray, yaw: float) -> EstimateSource:
-    """Return the estimate source of a Task. `place` (3,) m and `yaw`, rad, are given if the task says so."""
-    anchors = task.world.anchors
-    if task.peer is not None:
-        given = place if task.given == "place" else None
-        return PeerFilter(task.peer, anchors, yaw, given, task.correction)
+def _filter_of(task: Task, yaw: float) -> EstimateSource:
+    """Return the filter of a Task. It gets `yaw`, rad, if the task says that it is known."""
     config = task.config
     if task.yaw == "known":
         config = replace(config, initial_yaw=yaw, initial_yaw_std=GIVEN_STD)
     model = load_network(task.model)
     if model is not None:
-        model.require(anchors)
-    return OwnFilter(anchors, config, task.effects, model)
+        model.require(task.world.anchors)
+    return OwnFilter(task.world.anchors, config, task.effects, model)
 
 
 def _silence_start(

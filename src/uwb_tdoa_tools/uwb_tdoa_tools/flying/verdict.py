@@ -218,12 +218,11 @@ def _why(crash: str, mission: Mission, figures: dict[str, Any]) -> str:
 
 
 def sampled(odometry: Odometry, spacing: float) -> Odometry:
-    """Return the finite estimates of an Odometry, `spacing`, s, apart."""
+    """Return the estimates of an Odometry, `spacing`, s, apart."""
     if not len(odometry):
         return odometry
     stamps = np.arange(odometry.t[0], odometry.t[-1], spacing)
-    odometry = rows_of(odometry, np.unique(np.searchsorted(odometry.t, stamps)))
-    return rows_of(odometry, np.isfinite(odometry.p).all(axis=1))  # those of a peer may be NaN
+    return rows_of(odometry, np.unique(np.searchsorted(odometry.t, stamps)))
 
 
 def _estimation(
@@ -243,8 +242,7 @@ def _estimation(
     """
     t, axes = odometry.t, error.shape[1]
     distance, covariance = np.linalg.norm(error, axis=1), odometry.covariance[:, :axes, :axes]
-    has_covariance = np.isfinite(covariance).all()  # a peer gives none
-    normalised = nees(error, covariance) if has_covariance else np.full(len(t), np.nan)
+    normalised = nees(error, covariance)
     stops = [*list(begins.values())[1:], math.inf]
     inside = {name: (t >= begins[name]) & (t < stop) for name, stop in zip(begins, stops)}
     phases = {
@@ -340,7 +338,7 @@ def summary(verdicts: Sequence[dict[str, Any]]) -> dict[str, Any]:
     known = [one["armed_deviations"] for one in verdicts if one["armed_deviations"] is not None]
     out["armed_beyond_three_deviations"] = (
         sum(value > OVERCONFIDENT for value in known) if known else None
-    )  # a peer gives no covariance
+    )
     out["reported_lost"] = sum(one["reported_lost"] is not None for one in verdicts)
     for name in wording.figures:
         out[name] = _spread([one[name] for one in verdicts])
