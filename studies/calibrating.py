@@ -7,20 +7,19 @@ The figures are ratios of the 3D RMSE of the tag after and before; 1 where nothi
 """
 
 from dataclasses import replace
-import json
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
-from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
 from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_tools import cli
 from uwb_tdoa_tools.calibrating import without_truth
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape
-from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
+from . import table
 from .surveying import at, measured_flights, rmse
 
 _UTIL = "util/const{}-trial{}.csv.gz"
@@ -48,8 +47,6 @@ def add_options(add):
         metavar="DATA",
         help="folder of measured flights (not used for the simulated hall)",
     )
-    add("--draws", type=int, default=5, metavar="N", help="of each set (default 5)")
-    add("--first", type=int, default=200, metavar="SEED", help="of the first draw (default 200)")
     add(
         "--std",
         type=float,
@@ -57,32 +54,26 @@ def add_options(add):
         metavar="M",
         help="of each coordinate of an anchor (default 0.1)",
     )
-    add("--only", choices=(*SETS, SIMULATED), help="one set")
-    add("--json", metavar="FILE", type=OutputFile, help="write every draw")
+    table.add_options(add, draws=5, first=200)
+    table.add_only(add)
 
 
 def run(args):
     """Print a table, a row for each set."""
-    print(
-        (
-            "| set | draws | offered | before, m: mean | after | ratio: median | largest | "
-            "largest, had all been offered |\n|---|"
-        )
-        + 7 * "---:|"
-    )
-    every = {}
-    for name in [args.only] if args.only else (*SETS, SIMULATED):
-        flights, holdout, others = flights_of(name, args.data)
-        seeds = range(args.first, args.first + args.draws)
-        every[name] = [
-            draw(flights, holdout, others, args.std, seed)
-            for seed in tqdm(seeds, desc=name, disable=None)
-        ]
-        print(f"| {name} | {len(every[name])} | {summary(every[name])} |", flush=True)
-    if args.json:
-        write_text(args.json, json.dumps(every, indent=1))
+    columns = ("set", "draws", "offered", "before, m: mean", "after", "ratio: median", "largest")
+    cli.show(table.head(*columns, "largest, had all been offered"))
+    names = table.chosen(args, [*SETS, SIMULATED])
+    for name, draws in table.trials(partial(drawn, args.data, args.std), names, args):
+        cli.show(table.line([name, len(draws), *summary(draws)]))
 
 
+def drawn(data, std, trial):
+    """The figures of a trial (set, seed), see `draw`."""
+    name, seed = trial
+    return draw(*flights_of(name, data), std, seed)
+
+
+@lru_cache(maxsize=1)
 def flights_of(name, data):
     """(flights to calibrate with, to judge that on, to judge the tag on) of a set."""
     if name != SIMULATED:
@@ -126,7 +117,5 @@ def summary(draws):
     )
     offered = sum(one["offered"] for one in draws)
     ratio = after / before
-    return (
-        f"{offered} | {before.mean():.3f} | {after.mean():.3f} | {np.median(ratio):.2f} | "
-        f"{ratio.max():.2f} | {(had / before).max():.2f}"
-    )
+    of_all = f"{np.median(ratio):.2f}", f"{ratio.max():.2f}", f"{(had / before).max():.2f}"
+    return offered, f"{before.mean():.3f}", f"{after.mean():.3f}", *of_all

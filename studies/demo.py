@@ -7,15 +7,16 @@ from tempfile import TemporaryDirectory
 import time
 
 from uwb_tdoa_bias.correction.network import load_network
-from uwb_tdoa_tools import cli, parallel
+from uwb_tdoa_tools import cli
 from uwb_tdoa_tools.diagnosis import diagnose
 from uwb_tdoa_tools.diagnosis.report.entries import entries
 from uwb_tdoa_tools.estimate import FlightEstimator
 from uwb_tdoa_tools.flying import loop
-from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.scoring.evaluation import score_of
 from uwb_tdoa_tools.scoring.gains import gain
 from uwb_tdoa_tools.simulation.inject import hidden_effect
+
+from . import table
 
 HARM = -0.05  # smallest gain that is no harm
 
@@ -51,33 +52,22 @@ def rmse(flight, model):
 
 def add_options(add):
     """The options of the study."""
-    add("--seeds", metavar="N", type=parallel.whole_number, default=20, help="1 to N (default 20)")
-    add("--jobs", metavar="N", type=parallel.whole_number, help="seeds at once")
-    add("--json", metavar="FILE", type=OutputFile, help="write the rows")
+    table.add_options(add, draws=20, first=1)
 
 
 def run(args):
     """Print the table, and how many errors fall and rise."""
-    rows = []
-    print(
-        "| seed | really | added | 3D RMSE without, cm | with, cm | change |\n|---:|---|---|---:|---:|---:|"
-    )
-    for row in parallel.over(looped, range(1, args.seeds + 1), args.jobs, unit="seed"):
-        rows.append(row)
-        cells = [
-            row["seed"],
-            row["really"],
-            ", ".join(row["added"]) or "nothing",
-            f"{100.0 * row['without']:.1f}",
-            f"{100.0 * row['with']:.1f}",
-            f"{-100.0 * gain(row['without'], row['with']):+.0f} %",
-        ]
-        cli.show(f"| {' | '.join(map(str, cells))} |")
-    gains = [gain(row["without"], row["with"]) for row in rows]
+    gains = []
+    numbers = "3D RMSE without, cm", "with, cm", "change"
+    cli.show(table.head("seed", "really", "added", *numbers, texts=3))
+    for row in table.results(looped, table.seeds(args), args):
+        gains.append(gain(row["without"], row["with"]))
+        errors = [f"{100.0 * row[key]:.1f}" for key in ("without", "with")]
+        added = ", ".join(row["added"]) or "nothing"
+        change = f"{-100.0 * gains[-1]:+.0f} %"
+        cli.show(table.line([row["seed"], row["really"], added, *errors, change]))
     fell, harmed = sum(one > 0.0 for one in gains), sum(one < HARM for one in gains)
     cli.show(
-        f"\nThe error falls in {fell} of {len(rows)} halls, and rises by more than "
+        f"\nThe error falls in {fell} of {len(gains)} halls, and rises by more than "
         f"{-HARM:.0%} in {harmed}."
     )
-    if args.json:
-        cli.write_json(args.json, {"rows": rows})

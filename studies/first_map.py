@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""First maps of unknown anchors in simulated halls: which are accepted, and how large their errors
+"""first-map: first maps of unknown anchors in simulated halls: which are accepted, and how large their errors
 are.
 
 Size, anchors, path, protocol, noise, outliers and delays of each hall are random. Two anchors are
@@ -12,15 +12,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from uwb_tdoa_bias.common.files import write_text
-from uwb_tdoa_tools import parallel
+from uwb_tdoa_tools import cli
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
 from uwb_tdoa_tools.first_map import map_anchors, observe
-from uwb_tdoa_tools.outputs import OutputFile
-from uwb_tdoa_tools.parallel import whole_number
 from uwb_tdoa_tools.simulation import ImuErrors, SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.rooms import constellation
 
+from . import table
 from .surveying import at, rmse
 
 CERTAIN = 4.0
@@ -39,45 +37,31 @@ NAMED = "hall", "staircase", "pillars", "six", "low_ceiling"
 
 def add_options(add):
     """add : add_argument of a parser."""
-    add("--halls", type=int, default=20, metavar="N", help="(default 20)")
-    add("--first", type=int, default=0, metavar="SEED", help="of the first hall (default 0)")
     add("--chain", action="store_true", help="survey each map of flights, and judge other flights")
-    add("--jobs", type=whole_number, default=1, metavar="N", help="halls at once (default 1)")
-    add("--markdown", metavar="FILE", type=OutputFile, help="write the table")
+    table.add_options(add, draws=20)
 
 
 def run(args):
     """Print a row for each hall, and the sums."""
-    seeds = range(args.first, args.first + args.halls)
-    work = _chained if args.chain else judged
-    head = ["hall", "anchors", "path", "input", "verdict", "error", "stated", "largest z", "NEES"]
-    head += ["tag: true anchors", "map", "surveyed"] if args.chain else []
-    lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
-    print("\n".join(lines), flush=True)
+    texts = ["hall", "anchors", "path", "input", "verdict"]
+    numbers = ["error, m", "stated, m", "largest z", "NEES"]
+    numbers += ["tag: true anchors, m", "map, m", "surveyed, m"] if args.chain else []
+    cli.show(table.head(*texts, *numbers, texts=len(texts)))
     found = []
-    for row in parallel.over(work, seeds, args.jobs, unit="hall"):
+    for row in table.results(_chained if args.chain else judged, table.seeds(args), args):
         found.append(row)
-        lines.append(_line(row))
-        print(lines[-1], flush=True)
+        cells = [row["seed"], row["anchors"], row["path"], row["input"], row["why"] or "a map"]
+        cells += [f"{row['error']:.2f}", f"{row['stated']:.2f}"]
+        cells += [f"{row['z']:.1f}", f"{row['nees']:.2f}"]
+        cli.show(table.line([*cells, *(f"{value:.3f}" for value in row.get("tag", ()))]))
     accepted = [row for row in found if not row["why"]]
     wrong = sum(row["z"] > CERTAIN for row in accepted)
     normalized = [value for row in accepted for value in row["normalized"]]
-    lines.append(
+    cli.show(
         f"{len(accepted)} of {len(found)} accepted, {wrong} wrong and certain; error of an anchor, median "
         f"{np.median([row['error'] for row in accepted]):.2f} m; root mean square of z "
         f"{np.sqrt(np.mean(np.square(normalized))):.2f}"
     )
-    print(lines[-1])
-    if args.markdown:
-        write_text(args.markdown, "\n".join([*lines, ""]))
-
-
-def _line(row):
-    cells = [row["seed"], row["anchors"], row["path"], row["input"], row["why"] or "a map"]
-    cells += [f"{row['error']:.2f} m", f"{row['stated']:.2f} m"]
-    cells += [f"{row['z']:.1f}", f"{row['nees']:.2f}"]
-    cells += [f"{value:.3f} m" for value in row.get("tag", ())]
-    return f"| {' | '.join(map(str, cells))} |"
 
 
 def judged(seed, keep=None):

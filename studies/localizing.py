@@ -9,19 +9,18 @@ deviation for 95 % of the time. Time in which the tag was lost does not count.
 
 from dataclasses import replace
 from functools import partial
-import json
 from types import SimpleNamespace
 
 from mistakes import MISTAKES
 import numpy as np
 
-from uwb_tdoa_bias.common.files import write_text
-from uwb_tdoa_tools import cli, options, parallel
+from uwb_tdoa_tools import cli, options
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.estimate import FlightEstimator
 from uwb_tdoa_tools.localizing.localize import GOOD, assess
-from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.scoring.metrics import position_errors
+
+from . import table
 
 NOTHING, ALIKE = "nothing", 0.95  # no mistake; share of the time
 
@@ -30,52 +29,35 @@ def add_options(add):
     """add : add_argument of a parser."""
     cli.add(SimpleNamespace(add_argument=add), options.recordings())
     add("--mistakes", action="store_true", help="with the mistakes of `study checking`, too")
-    add("--json", metavar="FILE", type=OutputFile, help="write what was said of each")
-    add("--jobs", type=int, metavar="N", help="flights at once")
+    table.add_options(add)
 
 
 def run(args):
     """Print a table: a row for recordings as they are, and one for those with mistakes."""
-    reading, rows = options.reading_of(args), []
-    for told in parallel.over(
-        partial(judge, reading=reading, mistakes=args.mistakes),
-        reading.find(args.flights),
-        args.jobs,
-    ):
-        rows += told
-        if args.json:
-            write_text(args.json, json.dumps(rows, indent=1))
-    print(
-        (
-            "| recordings | number | good | of these within what is stated | not good | of these "
-            "within |\n|---|"
-        )
-        + 5 * "---:|"
-    )
+    reading = options.reading_of(args)
+    judged = partial(judge, reading=reading, mistakes=args.mistakes)
+    found = table.results(judged, reading.find(args.flights), args, unit="flight")
+    rows = [row for several in found for row in several]
+    within = "of these within what is stated"
+    cli.show(table.head("recordings", "number", "good", within, "not good", within))
     for what, some in (
-        ("as they are", [r for r in rows if r["mistake"] == NOTHING]),
-        ("with a mistake", [r for r in rows if r["mistake"] != NOTHING]),
+        ("as they are", [row for row in rows if row["mistake"] == NOTHING]),
+        ("with a mistake", [row for row in rows if row["mistake"] != NOTHING]),
     ):
         if some:
-            print(f"| {what} | {len(some)} | {summary(some)} |")
+            cli.show(table.line([what, len(some), *summary(some)]))
     for row in rows:
         if row["verdict"] == GOOD and not row["within"]:
-            print(
+            cli.show(
                 f"{row['flight']}, {row['mistake']}: called good, off by {row['rmse']:.2f} m "
                 f"at a stated {row['std']:.2f} m"
             )
 
 
 def summary(rows):
-    """Cells of the table."""
-    good, others = (
-        [row for row in rows if (row["verdict"] == GOOD) is what] for what in (True, False)
-    )
-    return " | ".join(
-        str(number)
-        for some in (good, others)
-        for number in (len(some), sum(row["within"] for row in some))
-    )
+    """Numbers of the table: recordings that are called good and are within, and the same of others."""
+    sides = ([row for row in rows if (row["verdict"] == GOOD) is good] for good in (True, False))
+    return [number for some in sides for number in (len(some), sum(row["within"] for row in some))]
 
 
 def judge(recording, reading, mistakes=False):

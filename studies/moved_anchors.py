@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""moved_anchors: recordings in which an anchor was moved by 0.3 to 1 m, or two were exchanged,
+"""moved-anchors: recordings in which an anchor was moved by 0.3 to 1 m, or two were exchanged,
 before the start or in the middle.
 
 A flight of last week calibrates the tag, without ground truth. Then the anchors change, and another
@@ -11,26 +11,24 @@ change, so every named anchor is a false alarm.
 
 from dataclasses import replace
 from functools import partial
-import json
 import re
 from types import SimpleNamespace
 
 import numpy as np
 
-from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.results import concatenated, rows_of
-from uwb_tdoa_tools import cli, options, parallel
+from uwb_tdoa_tools import cli, options
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
 from uwb_tdoa_tools.estimate import FlightEstimator
 from uwb_tdoa_tools.localizing.localize import GOOD, assess
-from uwb_tdoa_tools.outputs import OutputFile
-from uwb_tdoa_tools.parallel import whole_number
 from uwb_tdoa_tools.scoring.metrics import position_errors
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.vehicles import Trajectory
+
+from . import table
 
 KINDS = "moved before", "moved on the way", "exchanged before", "exchanged on the way", "nothing"
 MOVED = 0.3, 1.0  # m
@@ -51,94 +49,75 @@ def add_options(add):
     """add : add_argument of a parser."""
     add("flights", nargs="*", metavar="FLIGHT", help="measured flights, in which nothing was moved")
     cli.add(SimpleNamespace(add_argument=add), options.READING)
-    words = "recordings of each kind, and twice as many without a change (default 10)"
-    add("--draws", type=whole_number, default=10, metavar="N", help=words)
-    add(
-        "--first",
-        type=int,
-        default=1000,
-        metavar="SEED",
-        help="of the first draw (default 1000; limits were set on draws below 100)",
-    )
     words = "judge without a calibration, and survey nothing: in a tenth of the time"
     add("--tape", action="store_true", help=words)
-    add("--only", nargs="+", choices=KINDS, default=KINDS, metavar="KIND", help="(default: all)")
-    add("--json", metavar="FILE", type=OutputFile, help="write what was said of each")
-    add("--jobs", type=whole_number, default=1, metavar="N", help="recordings at once (default 1)")
+    table.add_options(add, draws=10, first=1000)  # limits were set on draws below 100
+    table.add_only(add)
 
 
 def run(args):
     """Print two tables: the named anchors, and the estimated positions of moved anchors."""
-    seeds = range(args.first, args.first + args.draws)
-    twice = range(args.first, args.first + 2 * args.draws)
-    cases = [
-        (kind, seed) for kind in args.only for seed in (seeds if kind in KINDS[:-1] else twice)
-    ]
-    ask = without_calibration if args.tape else judge
-    rows = []
-    for told in parallel.over(ask, cases, args.jobs, unit="recording"):
-        rows += told
-        if args.json:  # an interrupted study keeps what it has
-            write_text(args.json, json.dumps(rows, indent=1))
     reading = options.reading_of(args)
-    found = reading.find(args.flights) if args.flights else []
-    rows += parallel.over(partial(measured, reading), found, args.jobs, unit="flight")
-    if args.json:
-        write_text(args.json, json.dumps(rows, indent=1))
-    print(
-        (
-            "| change | survey | recordings | it costs more than 5 cm | named then: check | "
-            "localize | live "
-        ),
-        end="",
-    )
-    print("| the right one alone: check | localize | live | of these in a pair: check | live |")
-    print("|---|---|" + 10 * "---:|")
+    cases = [
+        *((kind, seed) for kind in table.chosen(args, KINDS) for seed in _seeds(args, kind)),
+        *(reading.find(args.flights) if args.flights else ()),
+    ]
+    found = table.results(partial(_rows_of, reading, args.tape), cases, args, unit="recording")
+    rows = [row for several in found for row in several]
+    numbers = "recordings", "it costs more than 5 cm"
+    numbers += "named then: check", "localize", "live"
+    numbers += "the right one alone: check", "localize", "live"
+    cli.show(table.head("change", "survey", *numbers, "of these in a pair: check", "live", texts=2))
     for kind, calibrated in dict.fromkeys((row["kind"], row["calibrated"]) for row in rows):
         some = [row for row in rows if (row["kind"], row["calibrated"]) == (kind, calibrated)]
-        none = kind not in KINDS[:-1]
-        asked = some if none else [row for row in some if row["cost"] > MATTERS]
-        named = [sum(bool(row[how]) for row in asked) for how in ("check", "localize", "live")]
-        right = [
-            "" if none else sum(_right(row[how], row["ids"]) for row in asked)
-            for how in ("check", "localize", "live")
-        ]
-        pairs = [
-            "" if none else sum(_right(row[how], row["ids"], 2) for row in asked)
-            for how in ("check", "live")
-        ]
-        cells = [
-            kind,
-            "calibrated" if calibrated else "tape",
-            len(some),
-            "" if none else len(asked),
-            *named,
-            *right,
-            *pairs,
-        ]
-        print(f"| {' | '.join(map(str, cells))} |")
-    if args.tape:
-        return
-    print(
-        "\n| surveyed from | moved anchors | named | within 8 cm | stated within 8 cm, and so | "
-        "off by, median [m] | another by more than its deviation |"
-    )
-    print("|---|" + 6 * "---:|")
+        cli.show(table.line([kind, "calibrated" if calibrated else "tape", *_named(some)]))
     surveyed = [one for row in rows for one in row.get("surveyed", ())]
+    if not surveyed:
+        return
+    numbers = "moved anchors", "named", "within 8 cm", "stated within 8 cm, and so"
+    numbers += "off by, median [m]", "another by more than its deviation"
+    cli.show("", table.head("surveyed from", *numbers))
     for source in dict.fromkeys(one["from"] for one in surveyed):
         some = [one for one in surveyed if one["from"] == source]
-        off = np.array([one["off"] for one in some])
-        near, stated = off < NEAR, np.array([one["std"] < NEAR for one in some])
-        cells = [
-            source,
-            len(some),
-            sum(one["named"] for one in some),
-            int(near.sum()),
-            f"{int((near & stated).sum())} of {int(stated.sum())}",
-            f"{np.median(off):.3f}",
-            sum(one["others"] > 1.0 for one in some),
-        ]
-        print(f"| {' | '.join(map(str, cells))} |")
+        cli.show(table.line([source, *_placed(some)]))
+
+
+def _seeds(args, kind):
+    """The seeds of a kind: twice as many without a change."""
+    return range(args.first, args.first + args.draws * (2 if kind == "nothing" else 1))
+
+
+def _rows_of(reading, tape, case):
+    """[{figures}] of a measured flight (path, survey), or of a case (kind, seed)."""
+    if case[0] not in KINDS:
+        return [measured(reading, case)]
+    return without_calibration(case) if tape else judge(case)
+
+
+def _named(rows):
+    """Cells of the first table: how often a change was named. Without a change, these are alarms."""
+    none = not rows[0]["ids"]
+    asked = rows if none else [row for row in rows if row["cost"] > MATTERS]
+    cells = [len(rows), "" if none else len(asked)]
+    cells += [sum(bool(row[how]) for row in asked) for how in ("check", "localize", "live")]
+    if none:
+        return cells + 5 * [""]
+    ways = ("check", None), ("localize", None), ("live", None), ("check", 2), ("live", 2)
+    return cells + [sum(_right(row[how], row["ids"], size) for row in asked) for how, size in ways]
+
+
+def _placed(surveyed):
+    """Cells of the second table: where a survey puts anchors that were moved."""
+    off = np.array([one["off"] for one in surveyed])
+    near, stated = off < NEAR, np.array([one["std"] < NEAR for one in surveyed])
+    return [
+        len(surveyed),
+        sum(one["named"] for one in surveyed),
+        int(near.sum()),
+        f"{int((near & stated).sum())} of {int(stated.sum())}",
+        f"{np.median(off):.3f}",
+        sum(one["others"] > 1.0 for one in surveyed),
+    ]
 
 
 def judge(case):
@@ -211,6 +190,7 @@ def measured(reading, recording):
     return {
         "kind": f"none, measured {flight.name[:4]}",
         "calibrated": False,
+        "ids": [],
         "name": flight.name,
         **said(flight, FlightEstimator()),
     }
@@ -341,11 +321,6 @@ def _groups(sentences):
         numbers = map(int, re.findall(r"\d+", named))
         groups |= {(number,) for number in numbers} if both else {tuple(sorted(numbers))}
     return [list(group) for group in sorted(groups)]
-
-
-def _ids(sentences):
-    """Ids that sentences name, in order."""
-    return sorted({number for group in _groups(sentences) for number in group})
 
 
 def _right(groups, ids, size=None):

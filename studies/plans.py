@@ -21,14 +21,15 @@ from scipy.optimize import least_squares
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import Failure
 from uwb_tdoa_bias.common.files import write_text
-from uwb_tdoa_tools import parallel
-from uwb_tdoa_tools.outputs import OutputFile
+from uwb_tdoa_tools import cli
 from uwb_tdoa_tools.parallel import whole_number
 from uwb_tdoa_tools.planning.bifurcation import CLEAR, FLIP
 from uwb_tdoa_tools.planning.hall import Hall
 from uwb_tdoa_tools.planning.installation import FixedNoise, Installation, RadioNoise
 from uwb_tdoa_tools.planning.maps import FLYABLE, IMPRECISE, TOO_FEW, TWO_SOLUTIONS, Demand
 from uwb_tdoa_tools.simulation.rooms import Room, Walls
+
+from . import table
 
 STATES = {
     FLYABLE: "can be flown",
@@ -77,38 +78,27 @@ class Drawn:
 
 def add_options(add):
     """Add the options of the study. add : add_argument of a parser."""
-    add("--cases", type=whole_number, default=20, metavar="N", help="rooms and halls (default 20)")
-    add("--first", type=int, default=100, metavar="SEED", help="of the first (default 100)")
     words = "places of each that are solved (default 120)"
     add("--places", type=whole_number, default=120, metavar="N", help=words)
-    add("--json", metavar="FILE", type=OutputFile, help="write the figures of each")
-    add("--jobs", type=whole_number, default=1, metavar="N", help="cases at once (default 1)")
+    table.add_options(add, draws=20, first=100)
 
 
 def run(args):
     """Print a row for each room and hall, and the largest differences."""
-    seeds = range(args.first, args.first + args.cases)
-    rows = parallel.over(partial(compared, args.places), seeds, args.jobs, unit="case")
-    rows = list(rows)
-    if args.json:
-        write_text(args.json, json.dumps(rows, indent=1))
-    print(table(rows))
+    rows = list(table.results(partial(compared, args.places), table.seeds(args), args))
+    cli.show(markdown(rows))
 
 
-def table(rows):
-    """Return the Markdown of rows of `compared`."""
-    lines = [
-        "| | anchors | noise | can be flown, % | by the solver | two solutions, % | by the solver | "
-        "imprecise, % | by the solver | promised gain, points | rerun | promised bound, m | rerun |",
-        "|---|" + 12 * "---:|",
-    ]
+def markdown(rows):
+    """The table of rows of `compared`."""
+    columns = ["", "anchors", "noise", "can be flown, %", "by the solver", "two solutions, %"]
+    columns += ["by the solver", "imprecise, %", "by the solver", "promised gain, points", "rerun"]
+    lines = [table.head(*columns, "promised bound, m", "rerun")]
     for row in rows:
         pairs = [f"{100.0 * row[how][k]:.1f}" for k in range(3) for how in ("plan", "solver")]
         kind = f"{row['kind']} {row['seed']}{', planar' if row['planar'] else ''}"
-        cells = [kind, row["anchors"], row["noise"], *pairs, *_gains(row)]
-        lines.append(f"| {' | '.join(map(str, cells))} |")
-    worst = max(differences(row)[0] for row in rows)
-    gain, bound = (max(differences(row)[k] for row in rows) for k in (1, 2))
+        lines.append(table.line([kind, row["anchors"], row["noise"], *pairs, *_gains(row)]))
+    worst, gain, bound = np.max([differences(row) for row in rows], axis=0)
     lines.append(
         f"\nLargest differences: shares {100.0 * worst:.1f} points (allowed {100.0 * SHARE:.0f}), "
         f"gain {100.0 * gain:.2f} points (allowed {100.0 * GAIN:.0f}), "

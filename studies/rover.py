@@ -13,7 +13,6 @@ and by both antennas. 3 % of the TDOAs are outliers, and each of four places blo
 """
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -22,14 +21,16 @@ from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import run_offline
-from uwb_tdoa_tools import parallel
+from uwb_tdoa_tools import cli
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.refinement import effects_of
 from uwb_tdoa_tools.scoring.metrics import position_at
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
-SEEDS, DURATION, NOISE, DELAY_STD = 20, 90.0, 0.1, 0.05  # s, m, m
+from . import table
+
+DURATION, NOISE, DELAY_STD = 90.0, 0.1, 0.05  # s, m, m
 HEIGHT_STD = 0.02  # m, by which the height of the floor is not known
 SETTLED = 15.0  # s after which it is judged: the yaw is known
 LATE_ANCHORS, LATE_FROM, LATE_FOR, LATE_BY = (0, 3), 40.0, 5.0, 1.5  # s, s, m
@@ -65,40 +66,18 @@ VALUES = {  # that a diagnosis is to find
 
 def add_options(add):
     """The options of the study."""
-    add(
-        "--seeds",
-        type=int,
-        default=SEEDS,
-        metavar="N",
-        help="drives of each row (default: %(default)s)",
-    )
-    add(
-        "--diagnose",
-        type=int,
-        default=0,
-        metavar="N",
-        help="diagnose so many drives and flights instead",
-    )
-    add("--jobs", type=int, default=1, metavar="N", help="at once (default: %(default)s)")
+    add("--diagnose", action="store_true", help="diagnose drives and flights instead")
+    table.add_options(add, draws=20)
 
 
 def run(args):
     """Print the table."""
     if args.diagnose:
-        for kind in ("planar", "flown"):
-            found = list(
-                parallel.over(
-                    partial(deviations, kind),
-                    range(args.diagnose),
-                    jobs=args.jobs,
-                    dask=None,
-                    unit=None,
-                )
-            )
-            print(f"{kind}:", *told(found), sep="\n")
+        for kind, found in table.trials(deviations, ("planar", "flown"), args):
+            cli.show(f"{kind}:", *told(found))
         return
-    print(f"| | {' | '.join(HEAD)} |", "| --- |" + " ---: |" * len(HEAD), sep="\n")
-    results = list(parallel.over(judged, range(args.seeds), jobs=args.jobs, dask=None, unit=None))
+    cli.show(table.head("", *HEAD))
+    results = list(table.results(judged, table.seeds(args), args, unit="drive"))
     for name in results[0]:
         columns = np.array([result[name] for result in results])
         means = (
@@ -106,7 +85,7 @@ def run(args):
             columns[:, 2:5].mean(axis=0),
             columns[:, 5:].max(axis=0),
         )
-        print(f"| {name} | {' | '.join(f'{value:.2f}' for value in np.concatenate(means))} |")
+        cli.show(table.line([name, *(f"{value:.2f}" for value in np.concatenate(means))]))
 
 
 def drive(seed):
@@ -250,11 +229,13 @@ def yaw_of(q):
     return np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y**2 + z**2))
 
 
-def deviations(kind, seed):
-    """{value: (error, stated deviation), or None where diagnose finds none} of one drive or flight.
+def deviations(trial):
+    """{value: (error, stated deviation), or None where diagnose finds none} of a drive or a flight:
+    ("planar" or "flown", seed).
 
     The diagnosis uses its ground truth and the effects of the catalogue.
     """
+    kind, seed = trial
     flight, delays = (drive if kind == "planar" else flown)(seed)
     reference = GroundTruth()
     (prepared, _) = reference.settled(reference.prepare(flight), EffectSet())
@@ -295,10 +276,8 @@ def told(results):
     """Lines: of each effect how many values were written, the share within three stated deviations,
     errors and deviations.
     """
-    lines = [
-        "| effect | written | within 3 deviations | error, rms | stated, rms |",
-        "| --- | ---: | ---: | ---: | ---: |",
-    ]
+    columns = "written", "within 3 deviations", "error, rms", "stated, rms"
+    lines = [table.head("effect", *columns)]
     for name in (*VALUES, "anchor_delay"):
         every = [
             pair for result in results for key, pair in result.items() if key.startswith(f"{name}.")
@@ -308,8 +287,8 @@ def told(results):
         errors, std = np.array([pair for pair in every if pair is not None]).reshape(-1, 2).T
         within = np.mean(np.abs(errors) <= 3.0 * std) if len(std) else np.nan
         root = [np.sqrt(np.mean(column**2)) if len(column) else np.nan for column in (errors, std)]
+        written = f"{len(std)} of {len(every)}"
         lines.append(
-            f"| {name} | {len(std)} of {len(every)} | {within:.0%} | {root[0]:.5f} | "
-            f"{root[1]:.5f} |"
+            table.line([name, written, f"{within:.0%}", *(f"{value:.5f}" for value in root)])
         )
     return lines

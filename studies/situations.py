@@ -16,16 +16,16 @@ import math
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import run_offline
-from uwb_tdoa_tools import cli, parallel
-from uwb_tdoa_tools.outputs import OutputFile
+from uwb_tdoa_tools import cli
+from uwb_tdoa_tools.outputs import as_json
 from uwb_tdoa_tools.scoring.metrics import READY, Score
 from uwb_tdoa_tools.scoring.pooling import PooledErrors
 from uwb_tdoa_tools.simulation import ImuErrors, SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.rooms import corners, facing
 
+from . import table
 from .any_path import Path, between
 
 # m: an estimate that is off by less for so many seconds, or to the end, is right again
@@ -59,54 +59,16 @@ class Situation:
 
 def add_options(add):
     """The options of the study."""
-    add(
-        "--seeds",
-        type=parallel.whole_number,
-        default=20,
-        metavar="N",
-        help="of each situation (default: %(default)s)",
-    )
-    add(
-        "--only",
-        nargs="+",
-        metavar="WORD",
-        default=[""],
-        help="situations that have one of these in their name (default: all)",
-    )
-    add(
-        "--jobs",
-        metavar="N",
-        type=parallel.whole_number,
-        help="simulations at once (default: as many as there are cores)",
-    )
-    add(
-        "--json",
-        metavar="FILE",
-        type=OutputFile,
-        help="write all figures, of each situation and of each seed",
-    )
+    table.add_options(add, draws=20)
+    table.add_only(add)
 
 
 def run(args):
-    """Simulate all cases, and print the table."""
-    chosen = [one for one in SITUATIONS if any(word in one.name for word in args.only)]
-    if not chosen:
-        raise InputError(
-            f"--only: no situation has {' or '.join(args.only)} in its name; they are: "
-            f"{'; '.join(one.name for one in SITUATIONS)}."
-        )
-    items = [(one.name, seed) for one in chosen for seed in range(args.seeds)]
-    found = dict(zip(items, parallel.over(measure, items, args.jobs, unit="simulation")))
-    together = {
-        one.name: figures([found[one.name, seed] for seed in range(args.seeds)]) for one in chosen
-    }
-    print(table(together))
-    if args.json:
-        of_seeds = {name: [found[name, seed] for seed in range(args.seeds)] for name in together}
-        cli.write_json(
-            args.json,
-            {"situations": {name: _plain(of) for name, of in together.items()}, "seeds": of_seeds},
-        )
+    """Simulate, and print the table."""
+    names = table.chosen(args, [one.name for one in SITUATIONS])
+    cli.show(table.head("situation", *COLUMNS.values()))
+    for name, results in table.trials(measure, names, args):
+        cli.show(row(name, figures(results)))
 
 
 def measure(item):
@@ -130,7 +92,7 @@ def measure(item):
     ).series
     begin, end = situation.judged
     since = flight.tdoa.t[READY - 1] if situation.over is None else situation.over
-    return {"figures": _plain(judged.figures(begin, end)), "again": again(judged, since)}
+    return {"figures": as_json(judged.figures(begin, end)), "again": again(judged, since)}
 
 
 def again(judged, since):
@@ -187,25 +149,12 @@ COLUMNS = {
 }
 
 
-def table(together):
-    """Markdown of {name: figures}."""
-    lines = [f"| situation | {' | '.join(COLUMNS.values())} |", f"|---|{len(COLUMNS) * '---:|'}"]
-    for name, of in together.items():
-        cells = {key: f"{of[key]:.2f}" for key in COLUMNS} | {
-            "nees_mean": f"{of['nees_mean']:.1f}",
-            "never": str(of["never"]),
-        }
-        cells["without_estimate"] = f"{of['without_estimate'] / of['duration']:.0%}"
-        lines.append(f"| {name} | {' | '.join(cells[key].replace('nan', '') for key in COLUMNS)} |")
-    return "\n".join(lines)
-
-
-def _plain(of):
-    """Return a dict for JSON: None replaces floats that are not finite."""
-    return {
-        name: None if isinstance(value, float) and not math.isfinite(value) else value
-        for name, value in of.items()
-    }
+def row(name, of):
+    """The row of a situation, of its `figures`."""
+    cells = {key: f"{of[key]:.2f}" for key in COLUMNS}
+    cells["nees_mean"], cells["never"] = f"{of['nees_mean']:.1f}", str(of["never"])
+    cells["without_estimate"] = f"{of['without_estimate'] / of['duration']:.0%}"
+    return table.line([name, *(cells[key].replace("nan", "") for key in COLUMNS)])
 
 
 # -------------------------------------------------------------------------------------------------------

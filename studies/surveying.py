@@ -1,33 +1,24 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Add errors to surveys of measured flights, and correct them from the flights alone.
+"""surveying: add errors to surveys of measured flights, and correct them from the flights alone.
 
 The tag is judged on other flights.
 """
 
 from dataclasses import replace
-from functools import partial
-import json
+from functools import lru_cache, partial
 from pathlib import Path
 
-from known_effects import clean_flight, marks_of
+from known_effects import clean_flight
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_bias.common.flight import SENSOR_NAMES
-from uwb_tdoa_tools import parallel
-from uwb_tdoa_tools.diagnosis import diagnose
-from uwb_tdoa_tools.diagnosis.constraints import Mark, OdometryPath
-from uwb_tdoa_tools.diagnosis.references import OdometryReference
+from uwb_tdoa_tools import cli
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
-from uwb_tdoa_tools.outputs import OutputFile
-from uwb_tdoa_tools.parallel import whole_number
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.scoring.evaluation import evaluate
-from uwb_tdoa_tools.surveying.known import DRIFT
 
-from .diagnosis.measured import SPLITS
+from . import table
 
 SHAKES = 0.1, 0.3  # m, default of --tape
 _UTIL, _CONST4, _0425 = (
@@ -54,9 +45,6 @@ SETS = {  # name: (paths to survey with, paths to judge on, sensors that are use
         SENSOR_NAMES,
     ),
 }
-MARKS = 6  # of each split at least
-END_TIME, END_STD = 2.0, 0.1  # s, m
-ODOMETRY_STEP = 0.05  # s
 SIMULATED = 3  # flights of the simulated set, of SECONDS each
 SECONDS = 60.0
 
@@ -64,143 +52,40 @@ SECONDS = 60.0
 def add_options(add):
     """add : add_argument of a parser."""
     add("--data", type=Path, required=True, metavar="DATA", help="folder of measured flights")
-    add(
-        "--draws",
-        type=int,
-        default=20,
-        metavar="N",
-        help="of each set and each size of the errors (default 20)",
-    )
-    add(
-        "--first",
-        type=int,
-        default=0,
-        metavar="SEED",
-        help="of the first draw, or of what is known (default 0)",
-    )
-    add("--only", choices=(*SETS, "simulated"), help="one set")
-    add(
-        "--tape",
-        nargs="+",
-        type=float,
-        default=SHAKES,
-        metavar="M",
-        help="standard deviations of the tape, m (default 0.1 0.3)",
-    )
-    add(
-        "--plain",
-        action="store_true",
-        help="trust no coordinate more than others, as somebody with a tape measure alone",
-    )
-    add("--jobs", type=whole_number, default=1, metavar="N", help="draws at once (default 1)")
-    add(
-        "--known",
-        choices=(*KNOWN, "odometry"),
-        help="instead: flights of every split with this known beside, judged on others",
-    )
-    add("--split", choices=tuple(SPLITS), help="with --known: one of these alone")
-    add("--json", metavar="FILE", type=OutputFile, help="write every draw")
+    words = "standard deviations of the tape, m (default 0.1 0.3)"
+    add("--tape", nargs="+", type=float, default=SHAKES, metavar="M", help=words)
+    words = "trust no coordinate more than others, as somebody with a tape measure alone"
+    add("--plain", action="store_true", help=words)
+    table.add_options(add, draws=20)
+    table.add_only(add)
 
 
 def run(args):
     """Print a table, a row for each set and size."""
-    if args.known:
-        return with_known(args.data, args.known, [args.split] if args.split else SPLITS, args.first)
-    print(
-        (
-            "| set | tape off by [m] | applied | tag, true survey | shaken | surveyed | surveyed "
-            "/ shaken, median (worst) | "
-        ),
-        end="",
-    )
-    print(
-        "worse than shaken | anchors shaken | surveyed | normalised error |\n|---|" + 10 * "---:|"
-    )
-    every = {}
-    for name in [args.only] if args.only else [*SETS, "simulated"]:
-        flights, judged = _simulated() if name == "simulated" else _measured(args.data, *SETS[name])
-        for std in args.tape:
-            seeds = range(args.first, args.first + args.draws)
-            draws = list(
-                parallel.over(
-                    partial(draw, flights, judged, std, plain=args.plain),
-                    seeds,
-                    args.jobs,
-                    unit=f"draw of {name} {std}",
-                )
-            )
-            every[f"{name} {std}"] = draws
-            print(f"| {name} | {std} | {_summary(draws)} |", flush=True)
-    if args.json:
-        write_text(args.json, json.dumps(every, indent=1))
+    columns = "set", "tape off by [m]", "applied", "tag, true survey", "shaken", "surveyed"
+    columns += "surveyed / shaken, median (worst)", "worse than shaken"
+    cli.show(table.head(*columns, "anchors shaken", "surveyed", "normalised error"))
+    names = table.chosen(args, [*SETS, "simulated"])
+    rows = [(name, std) for name in names for std in args.tape]
+    drawn_one = partial(drawn, args.data, args.plain)
+    for (name, std), draws in table.trials(drawn_one, rows, args):
+        cli.show(table.line([name, std, *_summary(draws)]))
 
 
-def with_known(data, kind, splits, seed):
-    """Print a table of the error with surveys good to 0.1 m, before and after a calibration.
-
-    The calibration uses the given kind of knowledge in KNOWN. With "odometry", it is a diagnosis
-    that uses an odometry with known places of take-off and landing.
-    """
-    print(
-        "| fitted to | judged on | mean 3D RMSE before | after | worst ratio | known "
-        "|\n|---|---|---:|---:|---:|---:|"
-    )
-    for name in (name for name in splits if SPLITS[name][1]):
-        flights, judged = _measured(data, *SPLITS[name], ())
-        rng, bare = np.random.default_rng(seed), [replace(flight, truth=None) for flight in flights]
-        if kind == "odometry":
-            known = [
-                one
-                for flight in flights
-                for make in (odometry_of, ends_of)
-                for one in make(flight, 1, rng)
-            ]
-            effects, positions = (
-                diagnose(bare, reference=OdometryReference(None, known)).effects,
-                flights[0].anchors.positions,
-            )
-        else:
-            known = [one for flight in flights for one in KNOWN[kind](flight, len(flights), rng)]
-            result = self_calibrate(bare, Tape(), constraints=known)
-            effects, positions = result.effects, result.anchors.positions
-        before = np.array([rmse([flight]) for flight in judged])
-        after = np.array([rmse([at(flight, positions)], effects) for flight in judged])
-        cells = (
-            f"{before.mean():.3f} | {after.mean():.3f} | {(after / before).max():.2f} | "
-            f"{len(known)}"
-        )
-        print(f"| {name} | {len(judged)} flights | {cells} |", flush=True)
+def drawn(data, plain, trial):
+    """The figures of a trial ((set, standard deviation m), seed), see `draw`."""
+    (name, std), seed = trial
+    return draw(*flights_of(name, data), std, seed, plain)
 
 
-def ends_of(flight, several, rng):
-    """[Mark]: positions of the tag before take-off and after landing, for END_TIME each, with an
-    error of END_STD.
-    """
-    truth, out = flight.truth, []
-    last = flight.tdoa.t[-1] - flight.tdoa.t[0]
-    for since in (0.0, last - END_TIME):
-        first = flight.tdoa.t[0] + since
-        inside = (truth.t >= first) & (truth.t <= first + END_TIME)
-        if inside.any():
-            place = truth.p[inside].mean(axis=0) + END_STD * rng.standard_normal(3)
-            out.append(Mark(flight.name, since, since + END_TIME, tuple(place), END_STD))
-    return out
-
-
-def odometry_of(flight, several, rng):
-    """[OdometryPath]: the ground truth in another frame, with a drift of DRIFT."""
-    truth = flight.truth
-    t = np.arange(truth.t[0], truth.t[-1], ODOMETRY_STEP)
-    p = np.stack([np.interp(t, truth.t, column) for column in truth.p.T], axis=1)
-    walk = np.cumsum(DRIFT * np.sqrt(ODOMETRY_STEP) * rng.standard_normal(p.shape), axis=0)
-    turn = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi))
-    return [OdometryPath(flight.name, t, turn.apply(p) + rng.uniform(-5.0, 5.0, 3) + walk, DRIFT)]
-
-
-KNOWN = {  # kind: function of (Flight, how many there are, Generator) that gives constraints
-    "marks": lambda flight, several, rng: marks_of(flight, -(-MARKS // several), rng),
-    "ends": ends_of,
-}
+@lru_cache(maxsize=1)
+def flights_of(name, data):
+    """([Flight to survey with], [Flight to judge on]) of a set."""
+    if name == "simulated":
+        flights = [clean_flight(300 + seed, SECONDS) for seed in range(SIMULATED + 1)]
+        return flights[:-1], flights[-1:]
+    fit, judge, sensors = SETS[name]
+    return measured_flights(data, fit, sensors), measured_flights(data, judge, sensors)
 
 
 def draw(flights, judged, std, seed, plain=False):
@@ -249,10 +134,6 @@ def at(flight, positions):
     return replace(flight, anchors=flight.anchors.at(positions))
 
 
-def _measured(data, fit, judge, sensors):
-    return [measured_flights(data, some, sensors) for some in (fit, judge)]
-
-
 def measured_flights(data, paths, sensors=()):
     """Flights below a folder, with only the given sensors of SENSOR_NAMES."""
     unused = [sensor for sensor in SENSOR_NAMES if sensor not in sensors]
@@ -260,11 +141,6 @@ def measured_flights(data, paths, sensors=()):
     return [
         flight.without(*unused) for path in paths for flight in reading.flights([str(data / path)])
     ]
-
-
-def _simulated():
-    flights = [clean_flight(300 + seed, SECONDS) for seed in range(SIMULATED + 1)]
-    return flights[:-1], flights[-1:]
 
 
 def rmse(flights, effects=None, config=None):
@@ -286,4 +162,4 @@ def _summary(draws):
     cells += [f"{np.median(ratio):.2f} ({ratio.max():.2f})", f"{worse} of {len(draws)}"]
     cells += [f"{_root(columns[key]):.3f}" for key in ("anchors_shaken", "anchors_surveyed")]
     applied = f"{int(columns['applied'].sum())} of {len(draws)}"
-    return " | ".join([applied, *cells, f"{_root(columns['normalised']):.2f}"])
+    return [applied, *cells, f"{_root(columns['normalised']):.2f}"]

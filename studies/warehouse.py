@@ -5,6 +5,8 @@
 Measure the cost of a tag by the number of installed anchors.
 """
 
+from itertools import islice
+
 from flights import position_at
 from halls import DELAY, HALLS, HEIGHT, RATE, fly, hall, room, walk
 import numpy as np
@@ -12,6 +14,9 @@ from scipy.spatial import cKDTree
 from warehouse_judge import after_gaps, cost, judge
 
 from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_tools import cli, parallel
+
+from . import table
 
 INSTALLED = 20, 100, 1000, 10_000  # anchors
 LARGE = 0.5  # m
@@ -34,177 +39,170 @@ def bound(where, seed, duration=20.0):
     return np.sqrt(np.mean(out, axis=0))
 
 
-def say_bounds(starts, word):
-    """A row for each run in a hall whose bound is above LARGE: RMSE; errors, stated deviations and
-    bounds along the axes; NEES.
-    """
-    print("| hall, seed | RMSE | errors | stated | bound | NEES |\n|---|---:|---|---|---|---:|")
-    for name in (name for name in HALLS if word in name):
-        where = hall(name)
-        for seed in (seed for seed in range(starts) if np.linalg.norm(bound(where, seed)) > LARGE):
-            flight = fly(where, seed)
-            found = judge(flight, FilterConfig())
-            late = found["odometry"].t - flight.tdoa.t[0] >= 10.0
-            error = found["odometry"].x[late, :3] - position_at(flight, found["odometry"].t[late])
-            stated = np.diagonal(found["odometry"].covariance[late, :3, :3], axis1=1, axis2=2)
-            each = (
-                np.sqrt(np.mean(error**2, axis=0)),
-                np.sqrt(np.mean(stated, axis=0)),
-                bound(where, seed),
-            )
-            columns = " | ".join(", ".join(f"{value:.2f}" for value in values) for values in each)
-            print(
-                f"| {name}, {seed} | {found['rmse']:.2f} | {columns} | {found['nees']:.1f} |",
-                flush=True,
-            )
+WITH_IMU, WITHOUT = FilterConfig(), FilterConfig(use_imu=False)
+IMU = {"": WITH_IMU, ", no IMU": WITHOUT}
+FIRST = next(iter(HALLS))
+STARTS = {  # row in a hall: (its hall, options of `fly`, FilterConfig)
+    **{name: (name, {}, WITH_IMU) for name in HALLS},
+    f"{FIRST}, no IMU": (FIRST, {}, WITHOUT),
+    f"{FIRST}, no IMU, 20 TDOAs/s": (FIRST, {"rate": 20.0}, WITHOUT),
+}
+SLOW = {"duration": 40.0, "speed": 1.0}
+LAYOUTS = "ceiling, 4", "ceiling, 8", "wall, 8", "line, 5"
 
 
-def say(name, runs):
-    """A row: right within 1 m at 2 s; RMSE, median and largest; NEES, mean and largest; start,
-    largest; TDOAs and stamps spent, most.
-    """
-    column = {
-        key: np.array([run[key] for run in runs], float)
-        for key in ("at_2", "rmse", "nees", "start", "spent", "stamps")
-    }
-    started = np.isfinite(column["start"])
-    print(
-        f"| {name} | {started.sum()} of {len(runs)} | {np.sum(column['at_2'] < 1.0)} | "
-        f"{np.median(column['rmse']):.2f} | {column['rmse'].max():.2f} | "
-        f"{column['nees'].mean():.1f} | {column['nees'].max():.1f} | "
-        f"{column['start'].max():.1f} | {column['spent'].max():.0f} | "
-        f"{column['stamps'].max():.0f} |",
-        flush=True,
-    )
+def _rows_in_the_room():
+    """{row: (its room, options of `fly`, FilterConfig)}."""
+    rows = {}
+    for imu, config in IMU.items():
+        for rate in (1.0, 2.0, 5.0, 10.0, 20.0):
+            rows[f"room, {rate:g} TDOAs/s{imu}"] = "corners", SLOW | {"rate": rate}, config
+        for blinks in (0.5, 1.0, 2.0, 5.0):
+            rows[f"room, {blinks:g} blinks/s{imu}"] = "corners", SLOW | {"blinks": blinks}, config
+        for name in LAYOUTS:
+            rows[f"room, {name}{imu}"] = name, SLOW, config
+    for name, side in (("ceiling, 4", "below"), ("ceiling, 8", "below"), ("wall, 8", "+x")):
+        rows[f"room, {name}, tag_side {side}"] = name, SLOW, FilterConfig(tag_side=side)
+    return rows
 
 
-def say_walks(name, where, seeds, config):
-    """Print the worst figures of walks of ten minutes with three dead zones and a change of floor.
-
-    Also prints a line for each walk that misses the requirement.
-    """
-    worst, sure, wrong, nees = [], [], [], []
-    for seed in seeds:
-        flight = fly(
-            where, seed, 600.0, dead=[(120.0, 133.3), (220.0, 233.3), (450.0, 463.3)], lift=300.0
-        )
-        found = judge(flight, config)
-        deviations, gaps = found["off"] / found["std"], after_gaps(flight, found)
-        worst.append(float(deviations.max()))
-        sure.append(
-            float(
-                np.sum((found["off"] > WRONG) & (deviations > CERTAIN))
-                * np.median(np.diff(found["odometry"].t))
-            )
-        )
-        wrong.append(max(gaps)), nees.append(found["nees"])
-        if sure[-1] or wrong[-1] > AGAIN:
-            after = ", ".join(f"{gap:.2f}" for gap in gaps)
-            print(
-                (
-                    f"{name}, seed {seed}: wrong and certain for {sure[-1]:.2f} s, wrong after "
-                    f"silences for {after} s"
-                ),
-                flush=True,
-            )
-    print(
-        f"{name}, {len(seeds)} seeds: NEES {np.mean(nees):.2f}, at most {max(nees):.2f}; "
-        f"largest error {max(worst):.1f} deviations; wrong and certain in "
-        f"{np.count_nonzero(sure)}; wrong after silences for {max(wrong):.2f} s at most",
-        flush=True,
-    )
-
-
-def say_costs():
-    """A row for each number of installed anchors."""
-    cost(20, 5.0, 1)  # what is compiled, is
-    print(
-        "| installed | of a core | over that of 20 | memory of a tag, MB | start, s "
-        "|\n|---:|---:|---:|---:|---:|"
-    )
-    least = None
-    for n in INSTALLED:
-        share, memory, start, _ = cost(n)
-        least = least or share
-        print(
-            f"| {n} | {share:.4f} | {share / least:.2f} | {memory / 1e6:.1f} | {start:.2f} |",
-            flush=True,
-        )
+ROOMS = _rows_in_the_room()
+WALKS = {f"ten minutes{imu}": config for imu, config in IMU.items()}
 
 
 def add_options(add):
     """The options of the study."""
-    add("--starts", type=int, default=100, metavar="N", help="in each hall (default: %(default)s)")
-    seeds = "of each row in the room (default: %(default)s)"
-    add("--seeds", type=int, default=20, metavar="N", help=seeds)
-    first = "seed of the walks of ten minutes (default: %(default)s)"
-    add("--first", type=int, default=0, metavar="N", help=first)
-    add("--only", default="", metavar="WORD", help="rows with this in their name")
+    words = "in each hall (default: %(default)s)"
+    add("--starts", type=parallel.whole_number, default=100, metavar="N", help=words)
     bounds = "instead: errors along the axes of the runs in halls where no estimate can be good"
     add("--bound", action="store_true", help=bounds)
     add("--cost", action="store_true", help="instead: what a tag costs")
+    table.add_options(add, draws=20)
+    table.add_only(add)
 
 
 def run(args):
-    """Print the rows whose names have a word in them."""
+    """Print the rows whose names have a word of --only in them."""
     if args.cost:
-        say_costs()
+        show_costs()
         return
     if args.bound:
-        say_bounds(args.starts, args.only)
+        show_bounds(args)
         return
-    print(
-        "| where | started | right at 2 s | RMSE, m, median | largest | NEES, mean | largest "
-        "| start, s, latest | TDOAs spent | stamps |"
+    names = table.chosen(args, [*STARTS, *ROOMS, *WALKS])
+    items = [(name, seed) for name in names for seed in _seeds(args, name)]
+    done = table.results(judged, items, args, unit="run")
+    columns = "started", "right at 2 s", "RMSE, m, median", "largest", "NEES, mean", "largest"
+    cli.show(table.head("where", *columns, "start, s, latest", "TDOAs spent", "stamps"))
+    for name in names:
+        runs = list(islice(done, len(_seeds(args, name))))
+        cli.show(*(of_walks(name, runs) if name in WALKS else [row(name, runs)]))
+
+
+def _seeds(args, name):
+    """The seeds of a row: --first is of walks, --starts of halls."""
+    if name in WALKS:
+        return table.seeds(args)
+    return range(args.starts if name in STARTS else args.draws)
+
+
+def judged(item):
+    """Figures of a run (row, seed), see `row` and `of_walks`."""
+    name, seed = item
+    if name in WALKS:
+        return walked(seed, WALKS[name])
+    where, kind, config = (STARTS | ROOMS)[name]
+    found = judge(fly((hall if name in STARTS else room)(where), seed, **kind), config)
+    keys = "at_2", "rmse", "nees", "start", "spent", "stamps"
+    return {key: float(found[key]) for key in keys}
+
+
+def row(name, runs):
+    """The row of a name: right within 1 m at 2 s; RMSE, median and largest; NEES, mean and largest;
+    start, largest; TDOAs and stamps spent, most.
+    """
+    at_2, rmse, nees, start, spent, stamps = np.array([[*run.values()] for run in runs], float).T
+    cells = [f"{np.isfinite(start).sum()} of {len(runs)}", np.sum(at_2 < 1.0)]
+    cells += [f"{np.median(rmse):.2f}", f"{rmse.max():.2f}"]
+    cells += [f"{nees.mean():.1f}", f"{nees.max():.1f}"]
+    return table.line(
+        [name, *cells, *(f"{start.max():.1f}", f"{spent.max():.0f}", f"{stamps.max():.0f}")]
     )
-    print("|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|")
-    with_imu, without = FilterConfig(), FilterConfig(use_imu=False)
-    rows = [(name, args.starts, lambda n=name: hall(n), {}, with_imu) for name in HALLS]
-    first = next(iter(HALLS))
-    rows += [(f"{first}, no IMU", args.starts, lambda: hall(first), {}, without)]
-    rows += [
-        (f"{first}, no IMU, 20 TDOAs/s", args.starts, lambda: hall(first), {"rate": 20.0}, without)
-    ]
-    slow = {"duration": 40.0, "speed": 1.0}
-    for imu, config in (("", with_imu), (", no IMU", without)):
-        for rate in (1.0, 2.0, 5.0, 10.0, 20.0):
-            rows.append(
-                (
-                    f"room, {rate:g} TDOAs/s{imu}",
-                    args.seeds,
-                    lambda: room("corners"),
-                    slow | {"rate": rate},
-                    config,
-                )
+
+
+def walked(seed, config):
+    """Figures of a walk of ten minutes with three dead zones and a change of floor."""
+    dead = [(120.0, 133.3), (220.0, 233.3), (450.0, 463.3)]
+    flight = fly(hall(FIRST, floors=2), seed, 600.0, dead=dead, lift=300.0)
+    found = judge(flight, config)
+    deviations = found["off"] / found["std"]
+    step = np.median(np.diff(found["odometry"].t))
+    return {
+        "seed": seed,
+        "nees": found["nees"],
+        "worst": float(deviations.max()),
+        "sure": float(np.sum((found["off"] > WRONG) & (deviations > CERTAIN)) * step),
+        "gaps": [float(gap) for gap in after_gaps(flight, found)],
+    }
+
+
+def of_walks(name, runs):
+    """Lines on walks: one for each that misses the requirement, and the worst figures of all."""
+    lines = []
+    for run in runs:
+        if run["sure"] or max(run["gaps"]) > AGAIN:
+            after = ", ".join(f"{gap:.2f}" for gap in run["gaps"])
+            lines.append(
+                f"{name}, seed {run['seed']}: wrong and certain for {run['sure']:.2f} s, wrong after "
+                f"silences for {after} s"
             )
-        for blinks in (0.5, 1.0, 2.0, 5.0):
-            rows.append(
-                (
-                    f"room, {blinks:g} blinks/s{imu}",
-                    args.seeds,
-                    lambda: room("corners"),
-                    slow | {"blinks": blinks},
-                    config,
-                )
-            )
-        for name in ("ceiling, 4", "ceiling, 8", "wall, 8", "line, 5"):
-            rows.append((f"room, {name}{imu}", args.seeds, lambda n=name: room(n), slow, config))
-    for name, side in (("ceiling, 4", "below"), ("ceiling, 8", "below"), ("wall, 8", "+x")):
-        rows.append(
-            (
-                f"room, {name}, tag_side {side}",
-                args.seeds,
-                lambda n=name: room(n),
-                slow,
-                FilterConfig(tag_side=side),
-            )
-        )
-    for name, count, make, kind, config in rows:
-        if args.only in name:
-            where = make()
-            say(name, [judge(fly(where, seed, **kind), config) for seed in range(count)])
-    for imu, config in (("", with_imu), (", no IMU", without)):
-        if args.only in (name := f"ten minutes{imu}"):
-            say_walks(
-                name, hall(first, floors=2), range(args.first, args.first + args.seeds), config
-            )
+    nees = [run["nees"] for run in runs]
+    lines.append(
+        f"{name}, {len(runs)} seeds: NEES {np.mean(nees):.2f}, at most {max(nees):.2f}; "
+        f"largest error {max(run['worst'] for run in runs):.1f} deviations; wrong and certain in "
+        f"{sum(run['sure'] > 0.0 for run in runs)}; wrong after silences for "
+        f"{max(max(run['gaps']) for run in runs):.2f} s at most"
+    )
+    return lines
+
+
+def show_bounds(args):
+    """A row for each run in a hall whose bound is above LARGE: RMSE; errors, stated deviations and
+    bounds along the axes; NEES.
+    """
+    names = table.chosen(args, HALLS)
+    items = [(name, seed) for name in names for seed in range(args.starts)]
+    cli.show(table.head("hall, seed", "errors", "stated", "bound", "RMSE", "NEES", texts=4))
+    for cells in table.results(_beside_bound, items, args, unit="run"):
+        if cells:
+            cli.show(table.line(cells))
+
+
+def _beside_bound(item):
+    """The cells of a row of `show_bounds`; none if a good estimate is possible."""
+    name, seed = item
+    where = hall(name)
+    least = bound(where, seed)
+    if np.linalg.norm(least) <= LARGE:
+        return []
+    flight = fly(where, seed)
+    found = judge(flight, WITH_IMU)
+    late = found["odometry"].t - flight.tdoa.t[0] >= 10.0
+    error = found["odometry"].x[late, :3] - position_at(flight, found["odometry"].t[late])
+    stated = np.diagonal(found["odometry"].covariance[late, :3, :3], axis1=1, axis2=2)
+    each = np.sqrt(np.mean(error**2, axis=0)), np.sqrt(np.mean(stated, axis=0)), least
+    columns = [", ".join(f"{value:.2f}" for value in values) for values in each]
+    return [f"{name}, {seed}", *columns, f"{found['rmse']:.2f}", f"{found['nees']:.1f}"]
+
+
+def show_costs():
+    """A row for each number of installed anchors."""
+    cost(20, 5.0, 1)  # what is compiled, is
+    columns = "of a core", "over that of 20", "memory of a tag, MB", "start, s"
+    cli.show(table.head("installed", *columns))
+    least = None
+    for n in INSTALLED:
+        share, memory, start, _ = cost(n)
+        least = least or share
+        cells = f"{share:.4f}", f"{share / least:.2f}", f"{memory / 1e6:.1f}", f"{start:.2f}"
+        cli.show(table.line([n, *cells]))

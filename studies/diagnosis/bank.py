@@ -6,10 +6,9 @@ from known_effects import AIDED, RANGED, SIZES, clean_flight, effect_of, names_f
 import numpy as np
 
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_tools.diagnosis import diagnose
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.findings import usable
-from uwb_tdoa_tools.diagnosis.references import GroundTruth, Nothing
+from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.scoring.evaluation import evaluate
 from uwb_tdoa_tools.simulation import SimulationConfig
 
@@ -23,55 +22,26 @@ PAIRS = (
     ("received_power_bias", "anchor_delay"),
     ("truth_frame", "imu_misalignment"),
 )
-# Without ground truth an error of the position explains these as well, or nothing else is measured
-# on their channel.
-INVISIBLE = (
-    "tag_lever_arm",
-    "tdoa_time_offset",
-    "truth_time_offset",
-    "truth_frame",
-    "gyro_scale",
-    "accel_bias",
-    "accel_scale",
-    "imu_misalignment",
-    "imu_gravity",
-)
-WORSE = 1.03  # ratio of errors beyond which a case counts as made worse
 
 
-def diagnose_case(effects, seed, aided=False):
-    """dict of one case: the effects put in, those found, and whether their parameters are right.
+def diagnosed(case, aided=False):
+    """dict of a case (kind, effects, seed): the effects put in, those found, and whether their
+    parameters are right.
 
     It also has the errors of the filter on a second flight with the same effects: without
     correction, with the effects found, and with the true effects.
     """
+    kind, effects, seed = case
     flight, other = _flown(effects, seed, aided)
     reference = GroundTruth()
     attribution = attribute([reference.prepare(flight)], reference)
-    case = _case(effects, seed, attribution)
+    case = {"kind": kind, **_case(effects, seed, attribution)}
     for name, model in (
         ("before", EffectSet()),
         ("found_rmse", usable(attribution.effects)),
         ("told_rmse", EffectSet(tuple(effects))),
     ):
         case[name] = _rmse(other, model)
-    return case
-
-
-def case_without_truth(effects, seed):
-    """dict of one case diagnosed without ground truth: the effects put in, found, reported as
-    unobservable, and applied.
-
-    It also has the errors of the filter on a second flight with the same effects, before and after
-    the correction.
-    """
-    flight, other = _flown(effects, seed)
-    result = diagnose([flight], reference=Nothing())
-    case = _case(effects, seed, result.attribution)
-    case["unobservable"] = sorted({item.effect for item in result.unobservable})
-    case["applied"] = [effect.name for effect in result.effects.effects]
-    case["before"] = _rmse(other, EffectSet())
-    case["after"] = _rmse(other, result.effects) if case["applied"] else case["before"]
     return case
 
 
@@ -132,23 +102,23 @@ def _right(effects, attribution):
     return True
 
 
-def cases(seeds, aided=False, first=0):
+def cases(seeds, aided=False):
     """[(kind, effects, seed)] of the whole bank: small, large, pair, clean. aided : of effects on
-    height, pressure and velocity, for flights that have these; first : of the seeds.
+    height, pressure and velocity, for flights that have these.
     """
     out = []
     for name in (name for name in SIZES if name not in RANGED and (name in AIDED) == aided):
         out += [
             ("small" if not large else "large", (effect_of(name, large, s),), 100 + s)
             for large in (False, True)
-            for s in range(first, first + seeds)
+            for s in range(seeds)
         ]
     out += [
         ("pair", (effect_of(a, True, s), effect_of(b, True, s + 1)), 200 + s)
         for a, b in (() if aided else PAIRS)
-        for s in range(first, first + min(seeds, 2))
+        for s in range(min(seeds, 2))
     ]
-    out += [("clean", (), 300 + s) for s in range(8 * first, 8 * (first + seeds))]
+    out += [("clean", (), 300 + s) for s in range(8 * seeds)]
     return out
 
 
@@ -176,32 +146,6 @@ def figures(results):
     clean = [r for r in results if r["kind"] == "clean"]
     out["clean"] = {"cases": len(clean), "false_alarms": share(bool(r["found"]) for r in clean)}
     return out
-
-
-def figures_without_truth(results):
-    """Figures of several `case_without_truth`, with "kind"."""
-    put_in = [r for r in results if r["put_in"]]
-    seen, hidden = (
-        [r for r in put_in if (r["put_in"][0] in INVISIBLE) is unseen] for unseen in (False, True)
-    )
-    harmed = [r for r in results if r["after"] > WORSE * r["before"]]
-    return {
-        "observable": len(seen),
-        "right first": share(r["found"][:1] == r["put_in"] for r in seen),
-        "not observable": len(hidden),
-        "named as such, and nothing found": share(
-            r["put_in"][0] in r["unobservable"] and not r["found"] for r in hidden
-        ),
-        "clean": len(results) - len(put_in),
-        "false alarms": sum(bool(r["found"]) for r in results if not r["put_in"]),
-        "applied": sum(bool(r["applied"]) for r in results),
-        "after over before, where applied": share(
-            r["after"] / r["before"] for r in results if r["applied"]
-        ),
-        "worse by 3 % on another flight": [
-            (r["put_in"], r["seed"], r["before"], r["after"]) for r in harmed
-        ],
-    }
 
 
 def share(values):

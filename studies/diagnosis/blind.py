@@ -3,9 +3,8 @@
 """The blind bank: put effects of the grammar into flights, diagnose them, and judge the result.
 
 An effect is put into two flights. One is diagnosed. The other shows whether the effect is named
-rightly, and removed. With more flights, the last one judges the diagnosis of the first flight, of
-the first two, and so on. Measured flights are corrected first, by a diagnosis of other flights of
-the same day.
+rightly, and removed. Measured flights are corrected first, by a diagnosis of other flights of the
+same day.
 """
 
 from dataclasses import replace
@@ -63,18 +62,13 @@ class Measured:
     def _known(self, split):
         return self._out / measured.folder_of(split) / "effects.yaml"
 
-    def flights(self, rng, number):
-        """([Flight] of that number, EffectSet, name of the split)."""
-        groups = {
-            split: [group for group in GROUPS[split] if len(group) >= number]
-            for split in self._splits
-        }
-        splits = [split for split in self._splits if groups[split]]
-        split = splits[rng.integers(len(splits))]
-        flights = _judged(self._data, split)
-        group = groups[split][rng.integers(len(groups[split]))]
+    def flights(self, rng):
+        """([Flight, Flight], EffectSet, name of the split)."""
+        split = self._splits[rng.integers(len(self._splits))]
+        flights, groups = _judged(self._data, split), GROUPS[split]
+        group = groups[rng.integers(len(groups))]
         first = int(rng.integers(len(group)))
-        chosen = [flights[group[(first + k) % len(group)]] for k in range(number)]
+        chosen = [flights[group[(first + k) % len(group)]] for k in range(2)]
         return chosen, EffectSet.from_yaml(self._known(split)), split
 
 
@@ -86,11 +80,11 @@ def _judged(data, split):
 class Simulated:
     """Simulated flights without any other effect."""
 
-    def flights(self, rng, number):
+    def flights(self, rng):
         """As those of Measured."""
         seed = int(rng.integers(1000, 100000))
-        others = [seed + 20 * int(rng.integers(1, 50)) for _ in range(number - 1)]
-        return [clean_flight(one) for one in (seed, *others)], EffectSet(), "simulated"
+        other = seed + 20 * int(rng.integers(1, 50))
+        return [clean_flight(one) for one in (seed, other)], EffectSet(), "simulated"
 
 
 def rmse(flight, effects):
@@ -100,14 +94,13 @@ def rmse(flight, effects):
     return score.row()["rmse_3d"] if len(score.t) else np.inf
 
 
-def case(source, seed, number=2, draw=grammar.draw):
-    """(Undeclared, `number` flights with it, the same without, base, where) of a seed.
+def case(source, seed):
+    """(Undeclared, two flights with it, the same without, base, where) of a seed.
 
     None if the effect costs too little even when it is enlarged.
-    draw : draw(seed, flight) returns the effect
     """
-    flights, base, where = source.flights(np.random.default_rng([seed, 7]), number)
-    effect = draw(seed, flights[0])
+    flights, base, where = source.flights(np.random.default_rng([seed, 7]))
+    effect = grammar.draw(seed, flights[0])
     before = [rmse(flight, base) for flight in flights]
     for _ in range(1 + GROWTHS):
         flown = [effect.inject(flight) for flight in flights]
@@ -163,51 +156,35 @@ def told(effect, flown, plain, base):
     return rmse(flown, base) if effect.covariate in grammar.OF_POSE[1:] else plain
 
 
-# {(where, flights): ([Claim], m of the judging flight's error)} of this process: seeds share
+# {(where, flight, judge): ([Claim], m of the judging flight's error)} of this process: seeds share
 # flights
 _told_as_they_are = {}
 
 
-def _as_they_are(flights, judge, base, where):
-    """Claims about the unchanged flights, and 3D RMSE, m, of `judge` with their effects."""
-    key = where, *(flight.name for flight in (*flights, judge))
+def _as_they_are(flight, judge, base, where):
+    """Claims about an unchanged flight, and 3D RMSE, m, of `judge` with its effects."""
+    key = where, flight.name, judge.name
     if key not in _told_as_they_are:
-        result = diagnose(flights, base=base)
+        result = diagnose([flight], base=base)
         _told_as_they_are[key] = claims(result.findings), rmse(judge, result.effects)
     return _told_as_they_are[key]
 
 
-def run(source, seed, draw=grammar.draw, count=1):
-    """dict of the case of a seed, `count` flights diagnosed; None if it costs too little.
-
-    draw : as of `case`
-    """
-    drawn = case(source, seed, count + 1, draw)
-    return None if drawn is None else {"seed": seed, **_judge(count, *drawn)}
+def run(source, seed):
+    """dict of the case of a seed; None if it costs too little."""
+    drawn = case(source, seed)
+    return None if drawn is None else {"seed": seed, **_judge(*drawn)}
 
 
-def several(source, number, seed):
-    """[dict] of the case of a seed with `number` flights: one flight diagnosed, two, and so on.
-
-    None if the effect costs too little.
-    """
-    drawn = case(source, seed, number)
-    return (
-        None
-        if drawn is None
-        else [{"seed": seed, **_judge(count, *drawn)} for count in range(1, number)]
-    )
-
-
-def _judge(count, effect, flown, flights, base, where):
-    """dict of a case. The first `count` flights are diagnosed, and the last one judges."""
-    result = diagnose(flown[:count], base=base)
+def _judge(effect, flown, flights, base, where):
+    """dict of a case. The first flight is diagnosed, and the second one judges."""
+    result = diagnose(flown[:1], base=base)
     plain, before, after = (
-        rmse(flights[-1], base),
-        rmse(flown[-1], base),
-        rmse(flown[-1], result.effects),
+        rmse(flights[1], base),
+        rmse(flown[1], base),
+        rmse(flown[1], result.effects),
     )
-    known, plain_after = _as_they_are(flights[:count], flights[-1], base, where)
+    known, plain_after = _as_they_are(*flights, base, where)
     said, true = claims(result.findings), truth_of(effect, flown[0])
     new = [
         claim
@@ -239,7 +216,7 @@ def _judge(count, effect, flown, flights, base, where):
             ],
             "removed": float(1.0 - (after - plain) / (before - plain)),
             "removed_if_told": float(
-                1.0 - (told(effect, flown[-1], plain, base) - plain) / (before - plain)
+                1.0 - (told(effect, flown[1], plain, base) - plain) / (before - plain)
             ),
         }
     )

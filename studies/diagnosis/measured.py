@@ -1,19 +1,15 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Diagnose the measured flights: unchanged, and with additional effects."""
+"""Diagnose the measured flights."""
 
 import json
 import time
 
-from known_effects import AIDED as ON_SENSORS, RANGED, SIZES, effect_of
 import numpy as np
 
 from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_bias.common.flight import SENSOR_NAMES
 from uwb_tdoa_tools.diagnosis import diagnose, output
-from uwb_tdoa_tools.diagnosis.attribution import attribute
-from uwb_tdoa_tools.diagnosis.findings import usable
-from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.report.page import html
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.scoring.phases import NEAR_THE_FLOOR
@@ -58,14 +54,6 @@ SPLITS = {
     ),
 }
 AIDED = ("0425 a", "0425 b")  # all of whose flights hold height and pressure
-INTO = (
-    "flights/0425/TDOA2/0425-traj2",
-    "flights/0425/TDOA3/0425-traj17",
-    "flights/0426/0426-traj3",
-    "flights/0426/0426-traj5",
-)
-# in every measured flight
-PRESENT = ("outlier_rate", "noise_correlation", "floor_multipath")
 
 
 def load(data, paths, sensors=()):
@@ -134,43 +122,3 @@ def run(data, name, out, sensors=()):
         "judged_on": content["judged_on"],
         "seconds": time.monotonic() - started,
     }
-
-
-def injected(data, each):
-    """Put large effects into measured flights whose own effects were diagnosed before: [dict], as
-    of the bank, with "hit" and "imitators": what explains as much, less plausibly.
-    """
-    cases = [
-        (path, name)
-        for path in INTO
-        for name in SIZES
-        if name not in (*PRESENT, *ON_SENSORS, *RANGED)
-    ]
-    known = {}
-
-    def one(path, name):
-        if path not in known:
-            flight = load(data, [path])[0]
-            known[path] = flight, usable(attribute([flight], GroundTruth()).effects)
-        flight, base = known[path]
-        effect = effect_of(name, True, len(path) + len(name))
-        injected_flight = effect.inject(flight, np.random.default_rng(1))
-        findings = attribute([injected_flight], GroundTruth(), base, undeclared=False).findings()
-        names = [f.effect.name for f in findings]
-        same = next((f.effect for f in findings if f.effect.name == name), None)
-        hit = same is not None and bool(set(same.values) & set(effect.values))
-        others = [other for f in findings for other in f.alternatives]
-        rivals, imitators = (
-            sorted({o.effect for o in others if (o.gap is None) == less}) for less in (False, True)
-        )
-        return {
-            "kind": "large",
-            "flight": flight.name,
-            "put_in": [name],
-            "found": names,
-            "ambiguous": rivals,
-            "imitators": imitators,
-            "hit": hit,
-        }
-
-    return each(cases, one)

@@ -12,11 +12,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.flight import Truth
-from uwb_tdoa_bias.common.sensors import Height, Pressure, Ranges
+from uwb_tdoa_bias.common.sensors import Height, Pressure, Ranges, Velocity
 from uwb_tdoa_bias.common.sensors.pressure import SITE, pressure_at
 from uwb_tdoa_tools.scoring.metrics import position_at, scored_phase
-
-from ..sensors import with_velocity
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.common.flight import Flight
@@ -25,7 +23,7 @@ BEFORE = 1.5  # s on the floor before take-off
 IMU_EVERY = 4  # send each fourth inertial sample, to keep the computer idle enough
 RATES = {"height": 50.0, "pressure": 25.0, "velocity": 100.0, "range": 100.0}  # Hz
 PLAYED = tuple(RATES)  # sensors that the study plays, in the order of SENSORS
-HEIGHT_STD, PRESSURE_STD, RANGE_STD = 0.02, 0.1, 0.1  # m
+HEIGHT_STD, PRESSURE_STD, RANGE_STD, VELOCITY_STD = 0.02, 0.1, 0.1, 0.1  # m, m, m, m/s
 # {stream: the fields of its values that are numbers}
 NUMBERS = {
     "imu": ("gyro", "accel"),
@@ -104,8 +102,22 @@ def with_sensors(flight: Flight) -> Flight:
         len(t)
     )
     ranges = Ranges(t, flight.anchors.ids[row], np.maximum(d, 0.0), np.zeros(len(t)))
-    velocity = with_velocity(flight.without("velocity"), RATES["velocity"]).velocity
-    return flight.replaced(height=height, pressure=pressure, range=ranges, velocity=velocity)
+    return flight.replaced(
+        height=height, pressure=pressure, range=ranges, velocity=velocity_of(truth)
+    )
+
+
+def velocity_of(truth: Truth) -> Velocity:
+    """The velocity in the body frame, of the ground truth and noise."""
+    t = np.arange(truth.t[0] + 0.1, truth.t[-1] - 0.1, 1.0 / RATES["velocity"])
+    before, after = (
+        np.stack([np.interp(t + s, truth.t, column) for column in truth.p.T], axis=1)
+        for s in (-0.05, 0.05)
+    )
+    near = truth.q[np.clip(np.searchsorted(truth.t, t), 0, len(truth) - 1)]
+    v = Rotation.from_quat(near).inv().apply((after - before) / 0.1)
+    noise = VELOCITY_STD * np.random.default_rng(0).standard_normal(v.shape)
+    return Velocity(t, v + noise, np.full(v.shape, VELOCITY_STD))
 
 
 def events_of(flight: Flight, streams: tuple[str, ...]) -> list[Event]:

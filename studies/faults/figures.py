@@ -8,22 +8,20 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache, partial
-import json
 from pathlib import Path
 import re
 import tempfile
 from typing import TYPE_CHECKING, Any
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.files import write_text
-from uwb_tdoa_tools import parallel
-from uwb_tdoa_tools.outputs import OutputFile
+from uwb_tdoa_tools import cli
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
+from .. import table
 from . import judge
+from .catalogue import FAULTS
 from .events import Scene, events_of, part_of, turned
-from .table import FAULTS
 
 if TYPE_CHECKING:
     import argparse
@@ -45,11 +43,8 @@ def add_options(add: Callable[..., object]) -> None:
         default="",
         help="faults whose names this regular expression finds",
     )
-    jobs = "faults at once, each in a ROS domain of its own (default %(default)s)"
-    add("--jobs", metavar="N", type=parallel.whole_number, default=1, help=jobs)
-    add("--json", metavar="FILE", type=OutputFile, help="write all figures, and all that was said")
-    add("--out", metavar="FILE", type=OutputFile, help="write the table")
     add("--list", action="store_true", help="print the faults and end")
+    table.add_options(add, jobs=1)  # each fault in a ROS domain of its own
 
 
 def run(args: argparse.Namespace) -> None:
@@ -58,20 +53,14 @@ def run(args: argparse.Namespace) -> None:
     if not names:
         raise InputError(f"--only: no fault is called like {args.only!r}; --list prints them all.")
     if args.list:
-        print("\n".join(f"{name:32} {FAULTS[name].text}" for name in names))
+        cli.show(*(f"{name:32} {FAULTS[name].text}" for name in names))
         return
-    rows = []
-    lines = [f"| {' | '.join(judge.HEAD)} |", f"|---|{4 * '---:|'}---|---|{3 * '---:|'}---|"]
-    print("\n".join(lines), flush=True)
-    for row in parallel.over(partial(row_of, data=args.data), names, args.jobs, unit=None):
-        rows.append(row)
-        lines.append(judge.line(row))
-        print(lines[-1], flush=True)
-        if args.json:
-            write_text(args.json, json.dumps(rows, indent=1))
-        if args.out:
-            write_text(args.out, "\n".join([*lines, ""]))
-    print(f"{sum(row['verdict'].startswith('ok') for row in rows)} of {len(rows)} ok")
+    cli.show(table.head(*judge.HEAD, texts=len(judge.HEAD)))
+    well = 0
+    for row in table.results(partial(row_of, data=args.data), names, args, unit="fault"):
+        well += row["verdict"].startswith("ok")
+        cli.show(judge.line(row))
+    cli.show("", f"{well} of {len(names)} ok")
 
 
 def row_of(name: str, data: Path) -> dict[str, Any]:

@@ -10,26 +10,24 @@ ROS. A fault lasts from 12 to 15 s after switching on, in the first circle.
 from argparse import Namespace
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-import json
 import math
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
-from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_ekf.monitoring.finding import most_severe_first
 from uwb_tdoa_ekf.monitoring.status import RUNNING, Use, status_of
 from uwb_tdoa_ekf.monitoring.stream_rules import StreamWatch
 from uwb_tdoa_ekf.results import concatenated, rotation_std, rows_of
-from uwb_tdoa_tools import parallel
+from uwb_tdoa_tools import cli
 from uwb_tdoa_tools.flying.estimates import OwnFilter
 from uwb_tdoa_tools.flying.simulator import Streams
 from uwb_tdoa_tools.flying.trial import Task, Trial
 from uwb_tdoa_tools.flying.verdict import verdict_of
 from uwb_tdoa_tools.flying.world import world_of
-from uwb_tdoa_tools.outputs import OutputFile
+
+from .. import table
 
 BEGIN, END = 12.0, 15.0  # s
 LOOK, REPORT = 0.2, 1.0  # s between two looks at the status, and two at the streams, as in ekf_node
@@ -233,53 +231,22 @@ def flown(task: tuple[str, int]) -> dict[str, Any]:
 
 def add_options(add: Callable) -> None:
     """add : add_argument of a parser."""
-    add(
-        "--flights",
-        type=parallel.whole_number,
-        default=10,
-        metavar="N",
-        help="of each fault (default: 10)",
-    )
-    add(
-        "--seed",
-        type=parallel.whole_number,
-        default=5001,
-        metavar="S",
-        help="of the first (default: 5001)",
-    )
-    add(
-        "--jobs",
-        type=parallel.whole_number,
-        metavar="N",
-        help="flights at once (default: as many as there are cores)",
-    )
-    add("--json", type=OutputFile, metavar="FILE", help="write all figures")
+    table.add_options(add, draws=10, first=5001)
+    table.add_only(add)
 
 
 def run(args: Namespace) -> None:
     """Fly, and print the table."""
-    tasks = [(name, args.seed + k) for name in FAULTS for k in range(args.flights)]
-    rows = list(tqdm(parallel.over(flown, tasks, args.jobs), total=len(tasks), disable=None))
-    print("\n".join(table(rows)))
-    if args.json:
-        write_text(args.json, json.dumps(rows, indent=1))
+    columns = "fault", "what `status` said first", "flights", "landed", "safe"
+    cli.show(table.head(*columns, texts=2))
+    for name, rows in table.trials(flown, table.chosen(args, FAULTS), args):
+        cli.show(line(name, rows))
 
 
-def table(rows: list[dict[str, Any]]) -> list[str]:
-    """Lines of Markdown, a row for each fault.
-
-    It has the flights that landed at their place, the flights that came down safely, and the first
-    status message.
+def line(name: str, rows: list[dict[str, Any]]) -> str:
+    """The row of a fault: the first status message, the flights that landed at their place, and
+    those that came down safely.
     """
-    lines = [
-        "| fault | flights | landed | safe | what `status` said first |",
-        "|---|---:|---:|---:|---|",
-    ]
-    for name in dict.fromkeys(row["fault"] for row in rows):
-        mine = [row for row in rows if row["fault"] == name]
-        said = next((row["said"] for row in mine if row["said"]), "nothing")
-        lines.append(
-            f"| {name} | {len(mine)} | {sum(r['landed'] for r in mine)} | "
-            f"{sum(r['safe'] for r in mine)} | {said[:90]} |"
-        )
-    return lines
+    said = next((row["said"] for row in rows if row["said"]), "nothing")
+    counts = [len(rows), *(sum(row[key] for row in rows) for key in ("landed", "safe"))]
+    return table.line([name, said[:90], *counts])

@@ -13,11 +13,12 @@ import numpy as np
 from uwb_tdoa_bias.common.flight import SENSOR_NAMES
 from uwb_tdoa_tools.scoring.metrics import position_at
 
+from .. import table
 from .events import Scene, yaws_at
 
 if TYPE_CHECKING:
+    from .catalogue import Fault
     from .play import Heard
-    from .table import Fault
 
 RUNNING = 2  # EstimatorStatus
 STEP = 0.02  # s between two looks
@@ -212,7 +213,7 @@ def verdict(row: dict[str, Any]) -> str:
 def line(row: dict[str, Any]) -> str:
     """A row of the table."""
     if "failed" in row:
-        return f"| {row['fault']} |{(len(HEAD) - 2) * ' |'} {row['verdict']} |"
+        return table.line([row["fault"], *[""] * (len(HEAD) - 2), row["verdict"]])
     recovered = row["recovered"]
     cells = [
         row["fault"],
@@ -223,7 +224,7 @@ def line(row: dict[str, Any]) -> str:
         "" if recovered is None else f"{recovered:.1f}",
         row["verdict"],
     ]
-    return f"| {' | '.join(cells)} |"
+    return table.line(cells)
 
 
 def _warnings(heard: Heard, name: str) -> list[tuple[float, str]]:

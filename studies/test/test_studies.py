@@ -1,35 +1,34 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""All studies: their help, their examples, and the commands that the documentation shows."""
+"""All studies: their list, their options, the commands of the documentation, and a short run of each."""
 
-import shlex
+from collections import defaultdict
+import json
+from types import SimpleNamespace
 
+from checking_flights import QUICK
 from documented import PAGES, commands
+import numpy as np
+from output_attacks import attack, outputs, place, unknown  # noqa: F401
 import pytest
 
-from studies.__main__ import STUDIES, main, parser
+from studies import (
+    __main__ as study,
+    calibrating,
+    crazyflie,
+    demo,
+    first_map,
+    moved_anchors,
+    surveying,
+    table,
+)
+from studies.diagnosis import splits
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_tools.bags.bag import write_bag
+from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
-
-def parses(words):
-    """Whether the words are a valid command line. Prints the error if not."""
-    try:
-        parser().parse_args(words)
-    except SystemExit as stop:
-        return stop.code == 0
-    return True
-
-
-@pytest.mark.parametrize("words", [[], *([name] for name in STUDIES)], ids=" ".join)
-def test_help(words, capsys):
-    assert main([*words, "--help"]) == 0
-    assert capsys.readouterr().out.startswith(" ".join(["usage: study", *words]))
-
-
-def test_every_example_is_a_command_line_and_every_study_has_one():
-    examples = [shlex.split(line) for line in parser().epilog.splitlines()[1:]]
-    assert {name for _, _, name, *_ in examples} == set(STUDIES)
-    for begin, verb, *words in examples:
-        assert (begin, verb) == ("./dev", "study") and parses(words), words
+PARSERS = {name: study.parser(name) for name in study.STUDIES}
+OUTPUTS = [(name, action) for name, parser in PARSERS.items() for action in outputs(parser)]
 
 
 @pytest.fixture(scope="module")
@@ -43,10 +42,174 @@ def documented(tmp_path_factory):
     ]
 
 
-def test_the_documentation_shows_every_study(documented):
-    assert {words[0] for _, words in documented} == set(STUDIES)
+def test_the_list_has_every_study_and_its_help_its_options(capsys):
+    assert study.main([]) == 0
+    listed = capsys.readouterr().out
+    for name, parser in PARSERS.items():
+        assert f"\n  {name} " in listed
+        assert study.main([name, "--help"]) == 0
+        assert capsys.readouterr().out == parser.format_help()
 
 
-def test_every_documented_study_is_a_command_line(documented):
-    for page, words in documented:
-        assert parses(words), (page, words)
+def test_a_wrong_name_is_one_sentence(capsys):
+    assert study.main(["nothing", "--draws", "3"]) == 2
+    said = "study: error: nothing: no study has this name; ./dev study lists them.\n"
+    assert capsys.readouterr() == ("", said)
+
+
+def test_the_documentation_shows_every_study_and_every_command_is_a_command_line(documented):
+    assert {words[0] for _, words in documented} == set(study.STUDIES)
+    for page, (name, *words) in documented:
+        assert PARSERS[name].parse_args(words), page
+
+
+def test_every_option_that_takes_a_path_is_an_output_or_read():
+    assert all(unknown(parser) == [] for parser in PARSERS.values()) and len(OUTPUTS) > 15
+
+
+@pytest.mark.parametrize(("name", "action"), OUTPUTS)
+def test_no_study_writes_through_a_link_or_over_what_it_reads(place, capsys, name, action):  # noqa: F811
+    attack(study.main, ("study", name), PARSERS[name], action, place, capsys)
+
+
+def test_trials_are_drawn_by_name_and_seed_and_kept(tmp_path):
+    args = SimpleNamespace(draws=2, first=7, jobs=1, json=tmp_path / "kept.json", only=["b", "c"])
+    names = table.chosen(args, ["ab", "d", "c"])
+    found = list(table.trials(lambda trial: [*trial, np.nan], names, args))
+    assert [(name, [seed for _, seed, _ in trials]) for name, trials in found] == [
+        ("ab", [7, 8]),
+        ("c", [7, 8]),
+    ]
+    kept = json.loads(args.json.read_text())
+    assert kept == [["ab", 7, None], ["ab", 8, None], ["c", 7, None], ["c", 8, None]]
+    with pytest.raises(InputError, match="no row has b or c in its name; they are: d."):
+        table.chosen(args, ["d"])
+
+
+def test_a_table_has_as_many_cells_in_each_line():
+    head, rule, line = f"{table.head('a', 'b', 'c', texts=2)}\n{table.line([1, 'x', 2])}".split(
+        "\n"
+    )
+    assert (head, rule, line) == ("| a | b | c |", "|---|---|---:|", "| 1 | x | 2 |")
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """A folder with a simulated flight as a bag, and its survey."""
+    folder = tmp_path_factory.mktemp("data")
+    flight = simulate(SimulationConfig(seed=0, **QUICK))
+    write_bag(flight, folder / "flight.bag")
+    rows = zip(flight.anchors.ids, *flight.anchors.positions.T)
+    lines = [",".join(map(str, row)) for row in rows]
+    (folder / "surveys").mkdir()
+    (folder / "surveys" / "anchor_room.csv").write_text("\n".join(["id,x,y,z", *lines, ""]))
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (
+            "checking FLIGHT --survey SURVEYS --only nothing",
+            "| nothing: no error is said |  | 1 | 1 |",
+        ),
+        ("checking FLIGHT --survey SURVEYS --only in_g order", "| accelerometer in g |  | 1 | 1 |"),
+        ("localizing FLIGHT", "| as they are | 1 | "),
+        ("first-map --draws 1 --first 3", "mirror image"),
+        ("moved-anchors --draws 1 --only nothing --tape", "| nothing | tape | 2 |  | "),
+        ("plans --draws 1 --first 101 --places 12", "allowed 3"),
+        ("rover --draws 1", "| hall: TDOAs alone | "),
+        ("situations --draws 1 --only high", "| at rest, 1 m high | 0."),
+        ("fly-faults --draws 1 --only nothing", "| nothing | nothing | 1 | 1 | 1 |"),
+        ("warehouse --draws 1 --only blinks", "| room, 5 blinks/s | 1 of 1 | 1 | "),
+    ],
+)
+def test_a_study_of_one_trial(data, capsys, words, said):
+    paths = {"FLIGHT": str(data / "flight.bag"), "SURVEYS": str(data / "surveys")}
+    name, *words = (paths.get(word, word) for word in words.split())
+    assert study.main([name, *words, "--jobs", "1"]) == 0
+    assert said in capsys.readouterr().out
+
+
+def moved(reading, tape, case):
+    """As `moved_anchors._rows_of`."""
+    kind, seed = case
+    of_kind = {"moved before": [[3, 5]], "moved on the way": [[3]], "exchanged on the way": [[3]]}
+    named = of_kind.get(kind, [])
+    said = {"check": named, "localize": named, "live": [[4]]}
+    ids = [3] if kind != "nothing" else []
+    row = {"kind": kind, "calibrated": False, "ids": ids, "cost": 0.1, **said}
+    if kind == "moved before":
+        found = {"from": "a tape", "off": 0.05, "std": 0.1, "others": 0.4, "named": True}
+        row["surveyed"] = [found, {**found, "off": 0.2, "std": 0.05, "others": 2.0}]
+    return [row]
+
+
+SURVEYED = {
+    "true": 0.1,
+    "shaken": 0.2,
+    "surveyed": 0.15,
+    "applied": True,
+    "anchors_shaken": 0.3,
+    "anchors_surveyed": 0.2,
+    "normalised": 1.0,
+}
+DEMO = {"seed": 1, "really": "late", "added": ["a"], "without": 0.2, "with": 0.1}
+DRAWN = {"offered": True, "before": 0.2, "after": 0.1, "had_it_been": 0.1}
+MAP = defaultdict(float, normalized=[1.0], why="")
+SPLIT = {"promised": [0.4, 0.2], "judged": [["a", 0.3, 0.15], ["b", 0.1, 0.12]], "seconds": 1.0}
+KNOWN = [  # words, module, its function that is replaced, by what, what is printed
+    (
+        "moved-anchors",
+        moved_anchors,
+        "_rows_of",
+        moved,
+        "| moved before | tape | 1 | 1 | 1 | 1 | 1 | 1 | 1 | 0 | 1 | 0 |",
+        "| exchanged before | tape | 1 | 1 | 0 | 0 | 1 | 0 | 0 | 0 | 0 | 0 |",
+        "| nothing | tape | 2 |  | 0 | 0 | 2 |  |  |  |  |  |",
+        "| a tape | 2 | 2 | 1 | 0 of 1 | 0.125 | 1 |",
+    ),
+    ("demo", demo, "looped", DEMO, "| 1 | late | a | 20.0 | 10.0 | -50 % |"),
+    (
+        "surveying --data . --only simulated --tape 0.1",
+        surveying,
+        "drawn",
+        SURVEYED,
+        "| 1 of 1 | 0.100 | 0.200 | 0.150 | 0.75 (0.75) | 0 of 1 | 0.300 | 0.200 | 1.00 |",
+    ),
+    (
+        "calibrating --data . --only simulated",
+        calibrating,
+        "drawn",
+        DRAWN,
+        "| 1 | 1 | 0.200 | 0.100 | 0.50 | 0.50 | 0.50 |",
+    ),
+    ("first-map", first_map, "judged", MAP, "1 of 1 accepted, 0 wrong"),
+    (
+        "diagnosis rows --data . --out OUT",
+        splits,
+        "judged",
+        SPLIT,
+        '"0425: 10": {\n  "before": 0.2,\n  "after": 0.135,',
+    ),
+    ("diagnosis few --data . --out OUT", splits, "judged", SPLIT, '"flights worse by 5 %": 10,'),
+]
+
+
+@pytest.mark.parametrize("known", KNOWN, ids=lambda known: known[0])
+def test_a_study_prints_known_results(tmp_path, capsys, monkeypatch, known):
+    words, module, name, result, *said = known
+    monkeypatch.setattr(module, name, result if callable(result) else lambda *_: result)
+    words = words.replace("OUT", str(tmp_path / "out")).split()
+    assert study.main([*words, "--draws", "1", "--jobs", "1"]) == 0
+    printed = capsys.readouterr().out
+    assert all(text in printed for text in said)
+
+
+def test_ways_through_a_radio_link_are_compared(capsys, monkeypatch):
+    found = [dict.fromkeys(crazyflie.WAYS, (400.0, 100.0, error)) for error in (0.1, 0.3)]
+    monkeypatch.setattr(crazyflie, "_of_recording", lambda reading, number: found[number])
+    monkeypatch.setattr(crazyflie.inputs.Reading, "find", lambda *_: [0, 1])
+    assert study.main(["crazyflie", "x", "--survey", "y", "--jobs", "1"]) == 0
+    assert "| link, converted | 400 | 100 | 0.200 | 0.300 |" in capsys.readouterr().out

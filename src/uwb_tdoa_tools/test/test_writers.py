@@ -26,10 +26,7 @@ ELSEWHERE = {  # these files are not handed to a user directly
     "uwb_tdoa_tools/bags/integrity.py",  # a bag unpacked in a temporary folder
     "uwb_tdoa_tools/bags/mcap.py",  # checksums into a bag that is not yet in its place
     "uwb_tdoa_tools/live/processes.py",  # output of a process
-    "studies/scale.py",  # the same
-    "studies/fuzzing/figures.py",  # a setting of the kernel
-    "studies/fuzzing/make_corpus.py",  # files of the repository
-    "studies/fuzzing/targets.py",  # input of a reader, in a temporary folder
+    "studies/fuzz.py",  # input of a reader, in a temporary folder
 }
 WRITING = re.compile("(?=.*[wax+])[rwaxbt+]{1,3}")  # a mode of `open`
 FILLED = ("savefig", "savetxt", "savez", "savez_compressed")  # they accept an open file

@@ -1,26 +1,25 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Put mistakes of drivers, surveys and clocks into flights, and count what `check` reports.
+"""checking: put mistakes of drivers, surveys and clocks into flights, and count what `check` reports.
 
 The unchanged flights are judged, too.
 """
 
 from functools import partial
-import json
 from pathlib import Path
 
 from mistakes import MISTAKES, arriving
 import numpy as np
 
-from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_ekf.monitoring.finding import ERROR
-from uwb_tdoa_tools import choices, parallel
+from uwb_tdoa_tools import choices, cli
 from uwb_tdoa_tools.checking.check import check
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.checking.tdoa_rules import largest_displacement
-from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.readers import inputs, read_survey
 from uwb_tdoa_tools.readers.streams import protocol
+
+from . import table
 
 ANOTHER = 0.3  # m that an anchor of another room is elsewhere at least
 
@@ -36,8 +35,7 @@ def add_options(add):
         choices=[*MISTAKES, "nothing"],
         help=f"of {', '.join(MISTAKES)}, nothing",
     )
-    add("--json", metavar="FILE", type=OutputFile, help="write what was said of each")
-    add("--jobs", type=int, metavar="N", help="flights at once")
+    table.add_options(add)
 
 
 def run(args):
@@ -53,12 +51,8 @@ def run(args):
         for number, recording in enumerate(found)
     ]
     judge = partial(judge_flight, reading=reading, surveys=surveys, only=args.only)
-    rows = []
-    for said in parallel.over(judge, tasks, args.jobs):
-        rows += said
-        if args.json:
-            write_text(args.json, json.dumps(rows, indent=1))
-    print(table(rows))
+    said = table.results(judge, tasks, args, unit="flight")
+    cli.show(markdown([row for rows in said for row in rows]))
 
 
 def _partner(number, found, kinds):
@@ -117,12 +111,12 @@ def possible(mistake, flight, other, rooms):
     )
 
 
-def table(rows):
+def markdown(rows):
     """Markdown: a line for each mistake, with how often `check` named it.
 
     A column lists other rules that it reported, unless it reports them without the mistake, too.
     """
-    lines = ["| mistake | named | flights | what else was said |", "| --- | ---: | ---: | --- |"]
+    lines = [table.head("mistake", "what else was said", "named", "flights", texts=2)]
     for name in dict.fromkeys(row["mistake"] for row in rows):
         mine = [row for row in rows if row["mistake"] == name]
         usual = _of_flights(rows) if name in MISTAKES else {}
@@ -135,7 +129,7 @@ def table(rows):
         said = ", ".join(
             f"{rule} {count}" for rule, count in sorted(besides.items(), key=lambda item: -item[1])
         )
-        lines.append(f"| {text} | {sum(row['named'] for row in mine)} | {len(mine)} | {said} |")
+        lines.append(table.line([text, said, sum(row["named"] for row in mine), len(mine)]))
     return "\n".join(lines)
 
 

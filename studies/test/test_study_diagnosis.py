@@ -1,9 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The blind study of the diagnosis."""
-
-from dataclasses import replace
-from types import SimpleNamespace
+"""The study of the diagnosis: what it draws, and when a claim is right."""
 
 from known_effects import clean_flight
 import numpy as np
@@ -85,21 +82,6 @@ def test_a_claim_is_what_was_put_in(flight):
     assert said.depends_as(true)
 
 
-def test_what_follows_an_anchor_is_said_as_its_pair_where_no_other_pair_follows(flight):
-    def true(first, a, b):
-        effect = grammar.Undeclared(
-            "tdoa", "all", (), grammar.NAMES, "step", 0.4, (first, first), (0.5, 0.2, 0.5)
-        )
-        return truth_of(effect, replace(flight, tdoa=replace(flight.tdoa, a=a, b=b)))
-
-    a = np.arange(len(flight.tdoa)) % 8
-    b = (a + 1) % 8
-    (said,) = claims([finding(EFFECTS["pair_offset"]({"4-5": 0.4}))])
-    assert said.names(true(4, a, b)) and said.depends_as(true(4, a, b))
-    assert not said.names(true(3, a, b))
-    assert true(4, *np.random.default_rng(0).permutation(np.stack([a, b]), axis=1)).subset == "all"
-
-
 def test_what_has_a_name_in_the_catalogue_is_said_by_that(flight):
     late = grammar.Undeclared(
         "tdoa", "anchor", (3,), "time", "transient", 0.4, (1.0, 2.0), (0.5, 0.2, 0.5)
@@ -108,59 +90,14 @@ def test_what_has_a_name_in_the_catalogue_is_said_by_that(flight):
     assert said.names(truth_of(late, flight)) and said.depends_as(truth_of(late, flight))
 
 
-def test_a_shifted_frame_is_a_function_of_the_direction_to_every_anchor_and_a_turned_one_is_not(
-    flight,
-):
-    late = grammar.Undeclared(
-        "tdoa", "arrivals", (), "elevation", "trend", 0.4, (-0.5, 0.5), (0.5, 0.2, 0.5)
-    )
-    shifted, turned = (
-        claims([finding(EFFECTS["truth_frame"]({key: 0.1}))])[0] for key in ("z", "yaw")
-    )
-    assert shifted.names(truth_of(late, flight)) and shifted.depends_as(truth_of(late, flight))
-    assert not turned.names(truth_of(late, flight))
-    (arm,) = claims([finding(EFFECTS["tag_lever_arm"]({"z": 0.1}))])
-    in_tag = truth_of(replace(late, covariate="bearing_in_tag"), flight)
-    assert (
-        arm.names(in_tag) and arm.depends_as(in_tag) and not arm.depends_as(truth_of(late, flight))
-    )
-
-
 @pytest.mark.slow
 def test_cases_cost_what_they_must():
     drawn = (blind.case(blind.Simulated(), seed) for seed in range(20))
-    effect, flown, plain, base, where = next(one for one in drawn if one is not None)
+    _, flown, plain, base, _ = next(one for one in drawn if one is not None)
     assert all(
         blind.rmse(one, base) - blind.rmse(none, base) >= blind.LEAST_COST
         for one, none in zip(flown, plain)
     )
-
-
-@pytest.mark.slow
-def test_of_several_flights_all_but_the_last_are_diagnosed_and_the_last_one_judges(monkeypatch):
-    seen = []
-
-    def diagnose(flights, base):
-        seen.append(flights)
-        return SimpleNamespace(findings=[], effects=base)
-
-    monkeypatch.setattr(blind, "diagnose", diagnose)
-    source = blind.Simulated()
-    seed = next(seed for seed in range(20) if blind.case(source, seed, 3) is not None)
-    _, flown, flights, _, _ = blind.case(source, seed, 3)
-    one, two = blind.several(source, 3, seed)
-    assert [[flight.name for flight in some] for some in seen[::2]] == [
-        [flown[0].name],
-        [flown[0].name, flown[1].name],
-    ]
-    assert all(
-        np.array_equal(some[0].tdoa.d, flights[0].tdoa.d) for some in seen[1::2]
-    )  # as they are
-    assert one["rmse"] == two["rmse"] and one["rmse"][:2] == [
-        blind.rmse(flights[2], EffectSet()),
-        blind.rmse(flown[2], EffectSet()),
-    ]
-    assert one["removed"] == two["removed"] == 0.0 and one["place"] is two["place"] is None
 
 
 @pytest.mark.parametrize("covariate", ["speed", "x", "previous_anchor", "interval"])
@@ -189,15 +126,3 @@ def test_a_split_fits_and_judges_other_flights_of_one_day():
     for day, fit, judge in several:
         assert fit and judge and not set(fit) & set(judge)
         assert {*fit, *judge} <= set(splits.DAYS[day])
-
-
-def test_splits_are_summed_up():
-    results = [
-        {"promised": [0.4, 0.2], "judged": [["a", 0.3, 0.15], ["b", 0.1, 0.05]]},
-        {"promised": [0.4, 0.4], "judged": [["a", 0.3, 0.33]]},
-    ]
-    found = splits.figures(results)
-    assert found["obtained for each promised"] == pytest.approx(1.0)
-    assert found["mean obtained gain"] == pytest.approx(0.5 * (0.5 - 0.1))
-    assert (found["judged flights"], found["flights worse by 5 %"]) == (3, 1)
-    assert found["worst, error after over before"] == pytest.approx(1.1)

@@ -1,3 +1,0 @@
-# Copyright uwb_tdoa maintainers
-# SPDX-License-Identifier: Apache-2.0
-"""Figures of docs/notebook/debiasing.md."""
