@@ -11,8 +11,8 @@ import pytest
 from uwb_tdoa_tools.outputs import Output, OutputBag, OutputFile, OutputFolder
 
 READ = set(  # options and arguments that name inputs, or no path
-    """flights flight input bag map anchors survey effects config model marks distances holdout odometry beside antenna
-    walls places poses coordinates static data diagnosed trained train test cases columns seed names""".split()
+    """flights flight input bag map anchors survey effects config model peer marks distances holdout odometry beside antenna
+    walls places poses coordinates static data columns seed names""".split()
 )
 NUMBERS = "int", "float", "whole_number"  # names of option types
 PATHS = re.compile("FILE|DIR|BAG|LOG|CSV|MAP|FLIGHT|IN$|S$|ANCHORS|LIBRARY|DATA|DIRECTORY|FOLDER")
