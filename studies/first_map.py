@@ -55,6 +55,9 @@ def run(args):
         cells += [f"{row['z']:.1f}", f"{row['nees']:.2f}"]
         cli.show(table.line([*cells, *(f"{value:.3f}" for value in row.get("tag", ()))]))
     accepted = [row for row in found if not row["why"]]
+    if not accepted:
+        cli.show(f"0 of {len(found)} accepted")
+        return
     wrong = sum(row["z"] > CERTAIN for row in accepted)
     normalized = [value for row in accepted for value in row["normalized"]]
     cli.show(

@@ -26,14 +26,6 @@ def flight():
     return simulate(SimulationConfig(seed=1, outlier_probability=0.0, start_in_air=True, **rates))
 
 
-def test_what_is_sent_fits_the_link(flight):
-    assert sum(map(len, BLOCKS)) == 14 and all(4 * len(block) <= 26 for block in BLOCKS)
-    sent = messages(flight, Link(lost=0.1), np.random.default_rng(0))
-    assert len(sent) / 12.0 == pytest.approx(3 * 0.9 / PERIOD, rel=0.03)
-    arrivals = [message[0] for message in sent]
-    assert arrivals == sorted(arrivals)
-
-
 def test_what_comes_out_was_measured_and_in_time(flight):
     made, late = streamed(flight, Link()), []
     for t, a, b, d in zip(made.tdoa.t, made.tdoa.a, made.tdoa.b, made.tdoa.d):

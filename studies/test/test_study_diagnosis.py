@@ -8,7 +8,7 @@ import pytest
 
 from studies.diagnosis import blind, grammar, splits
 from studies.diagnosis.claims import claims, truth_of
-from uwb_tdoa_bias.effects import EFFECTS, EffectSet, SmoothTerm
+from uwb_tdoa_bias.effects import SmoothTerm
 from uwb_tdoa_tools.diagnosis.findings import EffectFinding
 from uwb_tdoa_tools.diagnosis.regression.confounding import Alternative
 
@@ -82,14 +82,6 @@ def test_a_claim_is_what_was_put_in(flight):
     assert said.depends_as(true)
 
 
-def test_what_has_a_name_in_the_catalogue_is_said_by_that(flight):
-    late = grammar.Undeclared(
-        "tdoa", "anchor", (3,), "time", "transient", 0.4, (1.0, 2.0), (0.5, 0.2, 0.5)
-    )
-    (said,) = claims([finding(EFFECTS["nlos"]({"3.delay": 0.4, "3.start": 1.0, "3.end": 2.0}))])
-    assert said.names(truth_of(late, flight)) and said.depends_as(truth_of(late, flight))
-
-
 @pytest.mark.slow
 def test_cases_cost_what_they_must():
     drawn = (blind.case(blind.Simulated(), seed) for seed in range(20))
@@ -98,25 +90,6 @@ def test_cases_cost_what_they_must():
         blind.rmse(one, base) - blind.rmse(none, base) >= blind.LEAST_COST
         for one, none in zip(flown, plain)
     )
-
-
-@pytest.mark.parametrize("covariate", ["speed", "x", "previous_anchor", "interval"])
-def test_what_is_told_is_removed(flight, covariate):
-    limits = (
-        (2, 2)
-        if covariate == "previous_anchor"
-        else (0.01, 0.05)
-        if covariate == "interval"
-        else (0.0, 1.0)
-    )
-    subset, who = ("all", ()) if covariate == "previous_anchor" else ("anchor", (3,))
-    effect = grammar.Undeclared(
-        "tdoa", subset, who, covariate, "trend", 1.0, limits, (0.5, 0.2, 0.5)
-    )
-    flown = effect.inject(flight)
-    plain, before = (blind.rmse(one, EffectSet()) for one in (flight, flown))
-    assert before > 1.5 * plain
-    assert blind.told(effect, flown, plain, EffectSet()) < plain + 0.25 * (before - plain)
 
 
 def test_a_split_fits_and_judges_other_flights_of_one_day():

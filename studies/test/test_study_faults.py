@@ -15,18 +15,12 @@ import pytest
 pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
-from hypothesis import given, settings, strategies as st  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
 
 from studies.__main__ import main  # noqa: E402
 from studies.faults import flown, judge  # noqa: E402
 from studies.faults.catalogue import FAULTS, STREAMS, Fault  # noqa: E402
-from studies.faults.changes import (  # noqa: E402
-    during,
-    first,
-    restamped,
-)
-from studies.faults.events import PLAYED, Event, Scene, events_of, part_of, turned, yaws_at  # noqa: E402
+from studies.faults.events import Scene, events_of, part_of  # noqa: E402
 from studies.faults.flown import BEGIN, FaultyFilter  # noqa: E402
 from studies.faults.play import Heard, message_of  # noqa: E402
 from uwb_tdoa_bias.common.flight import Imu, Tdoas, Truth  # noqa: E402
@@ -40,7 +34,6 @@ TRUTH = Truth(
     np.array([[0.0, 0.0, 1.0], [100.0, 0.0, 1.0]]),
     np.array([[0.0, 0.0, 0.0, 1.0]] * 2),
 )
-SCENE = Scene(4.0, 6.0, TRUTH)
 
 
 @pytest.fixture(scope="module")
@@ -68,23 +61,6 @@ def texts(few):
     return {id(event): str(event) for event in few}
 
 
-def tdoas(times):
-    return [Event(t, "tdoa", t, {"a": 1, "b": 2, "d": 0.5, "variance": 0.0}) for t in times]
-
-
-TIMES = [0.25 * k for k in range(40)]
-INSIDE = [t for t in TIMES if 4.0 <= t < 6.0]
-
-
-def test_all_sensors_are_made_of_the_ground_truth(part):
-    assert part.tdoa.t[0] >= 0.0 and part.tdoa.t[-1] < 40.0
-    true = np.interp(part.pressure.t, part.truth.t, part.truth.p[:, 2])
-    altitude = part.pressure.values[:, 0]
-    assert np.std(altitude - true) == pytest.approx(0.1, rel=0.2)
-    for name in PLAYED:
-        assert len(getattr(part, name)) > 500, name
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FAULTS)
 def test_every_fault_changes_something_while_it_lasts_and_nothing_before(part, few, texts, name):
@@ -102,37 +78,6 @@ def test_every_fault_changes_something_while_it_lasts_and_nothing_before(part, f
     for event in {event.stream: event for event in after}.values():
         if event.stream not in ("kill", "start", "reset", "parameter", "busy"):
             message_of(event)
-
-
-@given(seconds=st.floats(-100.0, 3600.0), rate=st.floats(-0.01, 0.01))
-@settings(deadline=None, max_examples=30)
-def test_stamps_shift_only_during_the_fault(seconds, rate):
-    out = during("tdoa", restamped(seconds, rate))(tdoas(TIMES), SCENE)
-    assert [event.at for event in out] == TIMES
-    for event in out:
-        shift = seconds + rate * (event.at - 4.0) if event.at in INSIDE else 0.0
-        assert event.t == pytest.approx(event.at + shift)
-
-
-def test_single_stamps():
-    out = first(2, "tdoa", restamped(-5.0))(tdoas(TIMES), SCENE)
-    assert [e.at for e in out if e.t != e.at] == [4.0, 4.25]
-
-
-def test_a_turned_world_turns_everything(part):
-    there = turned(part.truth, 90.0)
-    np.testing.assert_allclose(
-        there.p,
-        np.column_stack([-part.truth.p[:, 1], part.truth.p[:, 0], part.truth.p[:, 2]]),
-        atol=1e-9,
-    )
-    turn = yaws_at(there.t, there) - yaws_at(part.truth.t, part.truth)
-    np.testing.assert_allclose(np.cos(turn - math.pi / 2), 1.0)
-    anchors = FAULTS["survey: rotated"].change(events_of(part, ()), SCENE)[0].values["anchors"]
-    d = np.linalg.norm(there.p[:, None] - anchors.positions, axis=2)
-    np.testing.assert_allclose(
-        d, np.linalg.norm(part.truth.p[:, None] - part.anchors.positions, axis=2)
-    )
 
 
 def heard(

@@ -85,7 +85,7 @@ SIZES = {
 AIDED = tuple(
     name for name in SIZES if set(EFFECTS[name].channels) <= set(BY_POSE)
 )  # effects on height, pressure, velocity, yaw rate
-# effects on ranges only; `study diagnose-ranges` covers them
+# effects on ranges only (docs/notebook/ranges.md)
 RANGED = ("range_offset", "range_delay")
 MARK_TIME, MARK_STD = 2.0, 0.05  # s, m
 NOISES = {f"{name}_noise": 0.1 for name, sensor in SENSORS.items() if not sensor.locates}

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Log variables of a Crazyflie become streams.
 
-studies/test/test_study_radio_link.py runs the example node.
+studies/test/test_study_crazyflie.py runs the example node.
 """
 
 import subprocess

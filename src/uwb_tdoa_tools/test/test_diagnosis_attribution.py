@@ -89,7 +89,7 @@ def test_an_anchor_that_is_far_off_is_fitted_where_it_is(flight):
 def test_every_declared_effect_is_in_the_bank():
     of_numbers = {
         name for name, effect in EFFECTS.items() if issubclass(effect, LabelEffect)
-    }  # see test_study_faults.py
+    }  # see test_checking_flight.py
     assert set(SIZES) == set(EFFECTS) - of_numbers
 
 

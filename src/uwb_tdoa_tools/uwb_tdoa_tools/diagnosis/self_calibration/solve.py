@@ -36,7 +36,7 @@ LEFT = 0.055  # m, largest scale of the remaining slow innovations, set on measu
 CLEARLY = 2.6
 # The same ratio for flights of ranges alone, whatever remains: obstacles and reflections leave slow
 # errors of every range. On simulated flights with such errors and a larger ratio, the position of
-# another flight got at most 6 % worse; with smaller ratios up to 20 % (study survey-ranges).
+# another flight got at most 6 % worse; with smaller ratios up to 20 % (docs/notebook/ranges.md).
 CLEARLY_OF_RANGES = 1.25
 PLAINLY = 5.0  # smallest shift, in standard deviations, of an anchor that moved alone
 WELL_PLACED = 0.08  # m, 3D standard deviation of a moved anchor below which no advice is given
