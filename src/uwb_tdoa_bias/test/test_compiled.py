@@ -4,8 +4,11 @@
 
 import ast
 import gc
+import importlib
 import os
 from pathlib import Path
+import subprocess
+import sys
 
 import pytest
 
@@ -73,6 +76,26 @@ def test_what_belongs_to_somebody_else_is_not_used(named, monkeypatch):
     assert is_temporary(place())
 
 
+@pytest.mark.parametrize("mode, used", [(0o777, False), (0o775, False), (0o1777, True)])
+def test_a_parent_in_which_others_may_rename_is_not_used(named, mode, used):
+    """They could put a folder of theirs in its place."""
+    named.parent.chmod(mode)
+    assert (place() == named / NAME) == used
+
+
+def test_a_parent_of_another_user_is_not_used(named, monkeypatch):
+    named.mkdir(mode=0o700)
+    foreign(monkeypatch, named.parent.resolve())
+    assert is_temporary(place())
+
+
+def test_without_a_home_a_temporary_folder_is_used(monkeypatch):
+    for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path)  # as without HOME and user name
+    assert is_temporary(place())
+
+
 @pytest.mark.parametrize("variables", [{"NUMBA_CACHE_DIR": "cache"}, {"XDG_CACHE_HOME": "cache"}])
 def test_no_folder_of_the_present_folder_is_used(named, monkeypatch, capsys, variables):
     """Unpacked archives keep their modes and belong to the user, so they may hold planted code."""
@@ -122,19 +145,81 @@ def test_a_link_is_followed_once_and_the_default_is_the_cache_of_the_user(named,
     assert place() == named.parents[1] / "uwb_tdoa" / NAME
 
 
-def test_each_state_of_the_sources_and_of_what_compiles_them_has_a_folder(tmp_path, monkeypatch):
-    for name, text in (("one", "x = 1"), ("same", "x = 1"), ("other", "x = 2")):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "code.py").write_text(text)
+CALLER = """
+from uwb_tdoa_probe.{folder} import code
+from uwb_tdoa_probe.{folder}.code import twice
+from uwb_tdoa_bias.common.compiled import compiled
 
-    def name(folder):
-        compiled._digest.cache_clear()
-        return compiled._digest(tmp_path / folder)
+@compiled
+def by_name(x):
+    return twice(x)
 
-    assert name("one") == name("same") != name("other")
-    before = name("one")
+@compiled
+def by_module(x):
+    return code.twice(x)
+
+@compiled
+def by_constant(x):
+    return x + code.SHIFT
+"""
+CODE = """
+from uwb_tdoa_bias.common.compiled import compiled
+SHIFT = {shift}
+
+@compiled
+def twice(x):
+    return {factor} * x
+"""
+
+
+def digests(tmp_path, monkeypatch, folder, shift=1.0, factor=2.0):
+    """Return the digests of three functions that reach another folder."""
+    monkeypatch.syspath_prepend(tmp_path)
+    place = tmp_path / "uwb_tdoa_probe" / folder
+    place.mkdir(parents=True)
+    (place / "code.py").write_text(CODE.format(shift=shift, factor=factor))
+    (place / "caller.py").write_text(CALLER.format(folder=folder))
+    functions = vars(importlib.import_module(f"uwb_tdoa_probe.{folder}.caller"))
+    names = "by_name", "by_module", "by_constant"
+    return {name: compiled._digest(functions[name].py_func) for name in names}
+
+
+def test_the_name_of_a_cache_file_depends_on_all_that_the_function_reaches(tmp_path, monkeypatch):
+    before = digests(tmp_path, monkeypatch, "one")
+    assert len(set(before.values())) == 3
+    assert digests(tmp_path, monkeypatch, "equal") == before
+
+    other_call = digests(tmp_path, monkeypatch, "two", factor=3.0)
+    assert [name for name in before if other_call[name] != before[name]] == ["by_name", "by_module"]
+    other_constant = digests(tmp_path, monkeypatch, "three", shift=2.0)
+    assert [name for name in before if other_constant[name] != before[name]] == ["by_constant"]
+
     monkeypatch.setattr(compiled, "VERSIONS", "0.99 3.0")
-    assert name("one") != before
+    assert not set(digests(tmp_path, monkeypatch, "four").values()) & set(before.values())
+
+
+def test_a_function_of_another_folder_that_changed_is_compiled_anew(tmp_path):
+    """Run one program twice with one cache; the called function changes in between."""
+    package = tmp_path / "uwb_tdoa_probe" / "one"
+    package.mkdir(parents=True)
+    (package / "caller.py").write_text(CALLER.format(folder="one"))
+    program = (
+        "from uwb_tdoa_probe.one.caller import by_name, by_module, by_constant as c;"
+        "print(by_name(1.0), by_module(1.0), c(1.0), sum(by_name.stats.cache_hits.values()))"
+    )
+    cache = {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONDONTWRITEBYTECODE": "1"}
+    paths = os.pathsep.join([str(tmp_path), *sys.path])
+    printed = []
+    for shift, factor in ((1.0, 2.0), (1.0, 2.0), (4.0, 3.0)):
+        (package / "code.py").write_text(CODE.format(shift=shift, factor=factor))
+        command = [sys.executable, "-c", program]
+        environment = {**os.environ, **cache, "PYTHONPATH": paths}
+        printed.append(subprocess.check_output(command, env=environment, text=True).split())
+    assert printed == [
+        ["2.0", "2.0", "2.0", "0"],
+        ["2.0", "2.0", "2.0", "1"],
+        ["3.0", "3.0", "5.0", "0"],
+    ]
 
 
 def test_garbage_is_collected_as_before_after_a_compilation():

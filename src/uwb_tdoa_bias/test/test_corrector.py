@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from uwb_tdoa_bias.common import compiled
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.correction.corrector import (
     EFFECTS,
@@ -20,6 +21,7 @@ from uwb_tdoa_bias.correction.corrector import (
     Poses,
     parts_of,
     rotated_in_yaw,
+    warm_up,
 )
 from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.effects import EFFECTS as CATALOGUE, AnchorDelay, EffectSet, TagLeverArm
@@ -260,3 +262,21 @@ def test_forgets_old_poses_and_keeps_the_last_ones():
     found = correct(corrector, [0.001, 0.990, 0.995, 0.999], dense=True)
     np.testing.assert_allclose(found.bias, [0.0, 0.990, 0.995, 0.999], atol=1e-12)
     assert all(len(column) <= 20 for column in corrector._poses.kept)
+
+
+def signatures():
+    return {function: len(function.signatures) for function in compiled._FUNCTIONS}
+
+
+def test_nothing_is_compiled_after_the_warm_up():
+    """bias_node is ready then; it gives poses and TDOAs in batches of any size, with a new yaw."""
+    effects = EffectSet((TagLeverArm({"z": 0.1}), AnchorDelay({"1": 0.1})))
+    warm_up(effects, None)
+    before = signatures()
+    corrector, k = Corrector(ANCHORS, effects), np.arange(400)
+    for some in np.array_split(k, [1, 5, 40, 200]):
+        pose, twist = np.eye(len(some), 43, 6), np.zeros((len(some), 42))
+        pose[:, 6], pose[:, 42] = 1.0, 9.0 * (some > 100)  # the yaw is unknown after 1 s
+        corrector._poses.add(0.01 * some, *parts_of(pose, twist))
+        corrector.correct(0.01 * some, some % 2, (some + 1) % 2, np.zeros(len(some)))
+    assert signatures() == before

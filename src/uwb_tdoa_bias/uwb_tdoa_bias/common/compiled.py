@@ -1,10 +1,11 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""numba's njit with an on-disk cache that follows every change of the sources.
+"""numba's njit with an on-disk cache that follows every change of the code.
 
 numba's own cache notices a change in the file of a compiled function. It does not notice changes
-in the files of the functions that it calls. Here every state of the sources has its own folder.
-Equal sources share it wherever they are installed: a second installation compiles nothing.
+in the files of the functions that it calls. Here the name of a cache file is a digest of all code
+and constants that the function reaches. Equal code shares it wherever it is installed: a second
+installation compiles nothing.
 """
 
 from __future__ import annotations
@@ -15,8 +16,10 @@ import gc
 import hashlib
 import os
 from pathlib import Path
+import stat
 import sys
 import time
+from types import CodeType, ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -57,6 +60,7 @@ _FUNCTIONS: list[Any] = []  # all compiled functions; numba compiles at the firs
 SAY_EVERY = 4.0  # s
 # Machine code also depends on these. numba names the version of Python in its files.
 VERSIONS = f"{numba.__version__} {np.__version__}"
+PACKAGES = __name__.partition("_bias")[0]  # how the names of our packages begin
 # One row of a structured array. Compiled code reads and writes its fields as attributes. Python
 # has no type for it.
 Record = Any
@@ -75,34 +79,53 @@ class _Locator(caching.CacheImpl._locator_classes[0]):  # type: ignore[misc,vali
         return Path(py_file).parent.name
 
     def get_source_stamp(self) -> str:
-        return ""  # the folder is that of one state of the sources
+        return ""  # the name of the file has the digest of the code
 
 
 class _Files(caching.CompileResultCacheImpl):
+    """Name the files of a function by a digest of what it reaches."""
+
     _locator_classes = [_Locator]
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._digest = _digest(function)
+        super().__init__(function)
+
+    def get_filename_base(self, fullname: str, abiflags: str) -> str:
+        return f"{super().get_filename_base(fullname, abiflags)}-{self._digest}"
 
 
 class _Cache(caching.FunctionCache):
+    """Open the files at the first call, when all that the function reaches is defined."""
+
     _impl_class = _Files
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._py_func = function
+        self._opened = False
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        if not self._opened:
+            before = config.CACHE_DIR  # type: ignore[attr-defined]  # numba adds its settings at import
+            config.CACHE_DIR = str(_place("code"))  # type: ignore[attr-defined]  # as above
+            try:
+                super().__init__(self._py_func)
+            finally:
+                config.CACHE_DIR = before  # type: ignore[attr-defined]  # as above
+            self._opened = True
+        return super().load_overload(sig, target_context)
 
 
 def compiled(function: Function) -> Function:
     """Compile a function with numba and cache it on disk; a decorator.
 
-    The function may call compiled functions below its own folder and in common/. The cache is keyed
-    by the sources of both.
+    The function may call compiled functions of all packages. It may read their constants by name.
     """
-    before = config.CACHE_DIR  # type: ignore[attr-defined]  # numba adds its settings at import
-    place = _place(_digest(Path(function.__code__.co_filename).parent))
-    config.CACHE_DIR = str(place)  # type: ignore[attr-defined]  # as above
-    try:
-        made: Any = njit(error_model="numpy")(function)
-        made._cache = _Cache(function)
-        setattr(made, callees.OURS, True)
-        _FUNCTIONS.append(made)
-        return made
-    finally:
-        config.CACHE_DIR = before  # type: ignore[attr-defined]  # as above
+    made: Any = njit(error_model="numpy")(function)
+    made._cache = _Cache(function)
+    setattr(made, callees.OURS, True)
+    _FUNCTIONS.append(made)
+    return made
 
 
 class _Listener(event.Listener):
@@ -150,9 +173,10 @@ def _place(name: str) -> Path:
     """Return the cache folder `name`.
 
     It lies in NUMBA_CACHE_DIR, by default in the user's cache folder. If other users may write there,
-    they could plant code that this process runs. Then a temporary folder is returned.
+    or may put another folder in its place, they could plant code that this process runs. Then a
+    temporary folder is returned.
     """
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    home = os.environ.get("XDG_CACHE_HOME") or Path(os.path.expanduser("~"), ".cache")
     place = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(home, "uwb_tdoa")) / name
     try:
         if place.is_absolute():
@@ -174,20 +198,66 @@ def _place(name: str) -> Path:
 
 
 def _is_ours_alone(folder: Path) -> bool:
-    """Return whether a folder belongs to the user and gives access to no other user."""
+    """Return whether only the user can enter a folder, and no other user can replace it."""
     if not hasattr(os, "getuid"):  # Windows gives each user a folder that others cannot write
         return True
     found = folder.stat()
-    return found.st_uid == os.getuid() and not found.st_mode & 0o077
+    return (
+        found.st_uid == os.getuid()
+        and not found.st_mode & 0o077
+        and all(_keeps_its_folders(parent.stat()) for parent in folder.parents)
+    )
+
+
+def _keeps_its_folders(found: os.stat_result) -> bool:
+    """Return whether only the user and root can rename what a folder holds."""
+    by_others = found.st_mode & 0o022 and not found.st_mode & stat.S_ISVTX
+    return found.st_uid in (0, os.getuid()) and not by_others
+
+
+def _digest(function: Callable[..., Any]) -> str:
+    """Return a name for all code and constants that a function reaches, and for VERSIONS."""
+    reached, found = {function}, [function]
+    digest = hashlib.sha256()
+    for one in found:  # grows
+        own, called = _content(one)
+        digest.update(own)
+        new = [other for other in called if other not in reached]
+        reached.update(new)
+        found.extend(new)
+    return digest.hexdigest()[:16]
 
 
 @cache
-def _digest(folder: Path) -> str:
-    """Return a name for the present state of the sources below `folder` and beside this file.
-
-    It also depends on VERSIONS.
-    """
-    digest = hashlib.sha256(VERSIONS.encode())
-    for source in sorted({*folder.rglob("*.py"), *Path(__file__).parent.glob("*.py")}):
-        digest.update(source.name.encode() + b"\0" + source.read_bytes())
-    return digest.hexdigest()[:16]
+def _content(function: Callable[..., Any]) -> tuple[bytes, list[Callable[..., Any]]]:
+    """Return a digest of the code of a function and its constants, and the functions it calls."""
+    texts = [VERSIONS, function.__qualname__, repr(function.__defaults__)]
+    names, called = set[str](), []
+    codes = [function.__code__]
+    for code in codes:  # grows by the code of comprehensions
+        codes.extend(constant for constant in code.co_consts if isinstance(constant, CodeType))
+        plain = [constant for constant in code.co_consts if not isinstance(constant, CodeType)]
+        texts.append(repr((code.co_code, code.co_names, code.co_varnames, code.co_freevars, plain)))
+        names.update(code.co_names)
+    read = dict(function.__globals__)
+    read.update(
+        zip(
+            function.__code__.co_freevars,
+            (each.cell_contents for each in function.__closure__ or ()),
+        )
+    )
+    names.update(function.__code__.co_freevars)
+    values = [(name, read[name]) for name in sorted(names & set(read))]
+    for name, value in values:  # grows by what our modules hold
+        if isinstance(value, ModuleType):
+            if value.__name__.startswith(PACKAGES):
+                inside = vars(value)
+                values.extend((f"{name}.{key}", inside[key]) for key in sorted(names & set(inside)))
+        elif hasattr(value, "py_func"):
+            called.append(value.py_func)
+        elif isinstance(value, np.ndarray):
+            texts.append(f"{name} {value.dtype} {value.shape} {value.tobytes().hex()}")
+        else:  # a number, a class with fields, or a function of another package
+            fields = getattr(value, "_fields", "")
+            texts.append(f"{name} {getattr(value, '__qualname__', repr(value))} {fields}")
+    return hashlib.sha256("\0".join(texts).encode()).digest(), called

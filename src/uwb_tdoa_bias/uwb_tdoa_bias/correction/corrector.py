@@ -413,7 +413,8 @@ class Poses:
         yaw_std : (k,) rad
         """
         parts: Any = (t, p, q, v, yaw_std) if np.ndim(t) else ([t], [p], [q], [v], [yaw_std])
-        new = PoseArrays(*(np.ascontiguousarray(part, dtype=float) for part in parts))
+        # writable, because numba compiles a function once more for arrays that are not
+        new = PoseArrays(*(np.require(part, float, ["C", "W"]) for part in parts))
         self._count = _append(self._count, self._columns, new)
         if self._count and self.begin == math.inf:
             self.begin = float(self._columns.t[0]) + self._start
