@@ -135,7 +135,18 @@ def subscribe(node, message_type, topic, qos=DEEP):
     return node.create_subscription(message_type, topic, lambda _: None, qos)
 
 
-def test_subscriptions_receive_the_bag(tmp_path, start, node):
+@pytest.fixture
+def play(tmp_path, capsys):
+    """Return a function that replays a bag in this process: (exit code, stdout, stderr)."""
+
+    def play(*options):
+        code = replay.main([str(tmp_path / "flight.bag"), *map(str, options)])
+        return (code, *capsys.readouterr())
+
+    return play
+
+
+def test_subscriptions_receive_the_bag(tmp_path, play, node):
     flight = small_flight(seconds=4.0)
     write_bag(flight, tmp_path / "flight.bag")
     imu, tdoa = subscribe(node, Imu, "imu/data"), subscribe(node, Tdoa, "uwb/tdoa")
@@ -144,7 +155,7 @@ def test_subscriptions_receive_the_bag(tmp_path, start, node):
         subscribe(node, Clock, "/clock"),
     )
     options = ["--rate", 4, "--clock", 100, "--wait-matched", LIMIT, "--wait-topics", *STREAMS]
-    code, out = start("replay", tmp_path / "flight.bag", *options).end()
+    code, out, _ = play(*options)
     assert code == 0 and "/imu/data: 4000 messages" in out and "/uwb/tdoa: 2000 messages" in out
     took = float(re.search(r"messages in ([0-9.]+) s", out)[1])
     assert took > 0.99 * flight.imu.t[-1] / 4 - 10.0 / 4
@@ -237,7 +248,7 @@ def test_loop_starts_again_until_stopped(tmp_path, start, node):
 
 
 @pytest.mark.quick
-def test_all_topics_of_a_tag_move_to_a_namespace(tmp_path, start, node):
+def test_all_topics_of_a_tag_move_to_a_namespace(tmp_path, play, node):
     """The command is the example in --help.
 
     All topics of the tag get the namespace, also the anchors. The frames do not change.
@@ -251,57 +262,40 @@ def test_all_topics_of_a_tag_move_to_a_namespace(tmp_path, start, node):
         line.split() for line in replay.parser().epilog.splitlines() if "__ns:=/tag1" in line
     ][0]
     options = ["--wait-matched", LIMIT, "--wait-topics", *kinds]
-    start("replay", tmp_path / "flight.bag", *options, *command[command.index("flight.bag") + 1 :])
+    assert play(*options, *command[command.index("flight.bag") + 1 :])[0] == 0
     for topic, count in (("uwb/tdoa", 100), ("imu/data", 200), ("ground_truth/pose", 50)):
         take(streams[topic], lambda messages, count=count: len(messages) == count)
     take(anchors, lambda messages: messages)
     take(frames, lambda messages: messages)
 
 
-def test_without_subscriptions_it_ends_with_an_error(tmp_path, start):
+def test_without_subscriptions_it_ends_with_an_error(tmp_path, play):
     write_bag(small_flight(seconds=0.1), tmp_path / "flight.bag")
-    waited = start(
-        "replay", tmp_path / "flight.bag", "--wait-matched", 0.1, "--wait-topics", "imu/data"
-    )
-    assert waited.end()[0] == 2
-    assert (
+    code, _, said = play("--wait-matched", 0.1, "--wait-topics", "imu/data")
+    assert code == 2 and said.splitlines()[-1].startswith(
         "replay: error: nobody subscribes to /imu/data within 0.1 s; start the nodes first"
-        in waited.said[-1]
     )
-    alone = start("replay", tmp_path / "flight.bag", "--wait-matched", 0.1)
-    code, out = alone.end()
-    assert (
-        code == 2
-        and "nobody subscribes to any topic of the bag within 0.1 s" in alone.said[-1]
-        and out == ""
-    )
+    code, out, said = play("--wait-matched", 0.1)
+    assert code == 2 and "nobody subscribes to any topic of the bag within 0.1 s" in said
+    assert out == ""
 
 
-def test_a_topic_without_a_publisher_cannot_be_followed(tmp_path, start, node):
+def test_a_topic_without_a_publisher_cannot_be_followed(tmp_path, play, node):
     """There are subscriptions, but none to the TDOAs; or the followed topic has no publisher."""
     write_bag(small_flight(seconds=0.1), tmp_path / "flight.bag")
     subscribe(node, Imu, "imu/data")
-    unheard = start("replay", tmp_path / "flight.bag", "--wait-matched", 1, "--follow", "odometry")
-    assert unheard.end()[0] == 2 and "nobody subscribes to /uwb/tdoa within 1 s" in unheard.said[-1]
+    code, _, said = play("--wait-matched", 1, "--follow", "odometry")
+    assert code == 2 and "nobody subscribes to /uwb/tdoa within 1 s" in said
     subscribe(node, Tdoa, "uwb/tdoa")
-    for wait in (
-        2,
-        20,
-        LIMIT,
-    ):  # time to discover the publisher; a loaded machine needs more
-        silent = start(
-            "replay", tmp_path / "flight.bag", "--wait-matched", wait, "--follow", "odometry"
-        )
-        code, _ = silent.end()
-        if "nobody subscribes" not in silent.said[-1]:
+    for wait in (2, 20, LIMIT):  # time to discover the publisher; a loaded machine needs more
+        code, _, said = play("--wait-matched", wait, "--follow", "odometry")
+        if "nobody subscribes" not in said.splitlines()[-1]:
             break
-    assert (
-        code == 2
-        and "--follow: nobody publishes /odometry; start the node that does" in silent.said[-1]
-    )
+    assert code == 2
+    assert "--follow: nobody publishes /odometry; start the node that does" in said
 
 
-def test_no_message_is_lost_for_want_of_discovery(tmp_path, start, node):
+def test_no_message_is_lost_for_want_of_discovery(tmp_path, play, node):
     """The replay is best effort and names no topics to wait for.
 
     Not one message may be lost before discovery.
@@ -311,12 +305,11 @@ def test_no_message_is_lost_for_want_of_discovery(tmp_path, start, node):
     imu = subscribe(
         node, Imu, "imu/data", QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
     )
-    replaying = start("replay", tmp_path / "flight.bag", "--wait-matched", LIMIT)
+    assert play("--wait-matched", LIMIT)[0] == 0
     messages = take(
         imu, lambda messages: messages and messages[-1].header.stamp.nanosec == 299_000_000
     )
     assert len(messages) == 300 and messages[0].header.frame_id == "base_link"
-    assert replaying.end()[0] == 0
 
 
 def test_odometry_is_recorded_as_it_was_sent(tmp_path, node):

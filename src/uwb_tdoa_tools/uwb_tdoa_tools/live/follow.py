@@ -14,7 +14,6 @@ from typing import Any
 import rclpy
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.subscription import Subscription
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.sensors import SENSORS
@@ -86,11 +85,10 @@ class Follower:
                 f"--follow: messages on {topic} are {types[0]}: not installed, or without a header."
             )
         qos = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-        self._subscription = node.create_subscription(cls, topic, lambda _: None, qos, raw=True)
+        self._topic = _Topic(node, cls, topic, qos)
         self._newest: int | None = None  # ns, stamp of the newest message on the topic
         self._last_look: int | None = None  # ns, stamp of the replay at the last look
         self._started: int | None = None  # ns, stamp of the first message on the topic
-        self._silent = False  # whether no message came on the topic for SILENCE
         self._tdoas = _Tdoas(node, round(1e9 * SENSOR_SHARE * lag))
 
     def add_tdoa(self, stamp: int) -> None:
@@ -122,31 +120,65 @@ class Follower:
         if self._started is not None and stamp < self._started - LEAD:  # the recording restarts
             self._started = None
         if self._started is None:
-            self._hear()
+            self._hear(self._topic.stamps())
         return self._started is None or stamp < self._started + START
 
-    def _hear(self) -> bool:
-        """Read the topic, and return whether a message has come."""
-        taken = _taken(self._subscription)
-        if taken:
-            self._newest, self._silent = stamp_of(taken[-1]), False
+    def _hear(self, stamps: list[int]) -> None:
+        """Note the stamps, ns, of the messages that have come."""
+        if stamps:
+            self._newest = stamps[-1]
             self._started = self._newest if self._started is None else self._started
-        return bool(taken)
 
     def _wait_for_stamps(self, stamp: int, stop: Stop) -> float:
         self._newest = stamp if self._newest is None else self._newest
         self._last_look = stamp if self._last_look is None else self._last_look
-        in_step = self._silent or stamp - self._newest <= LEAD
-        if in_step and 0 <= stamp - self._last_look <= LOOK_PERIOD:
+
+        def in_step() -> bool:
+            assert self._newest is not None
+            return stamp - self._newest <= LEAD
+
+        near = self._topic.silent or in_step()
+        if near and 0 <= stamp - self._last_look <= LOOK_PERIOD:
             return 0.0
         self._last_look = stamp
+        return self._topic.wait(self._hear, in_step, stop)
+
+
+class _Topic:
+    """Poll a topic, and wait for its messages unless none came for SILENCE.
+
+    Attributes
+    ----------
+    silent : bool
+        Whether the last wait ended because no message came.
+    """
+
+    def __init__(self, node: Node, cls: Any, topic: str, qos: QoSProfile) -> None:
+        self._subscription = node.create_subscription(cls, topic, lambda _: None, qos, raw=True)
+        self.silent = False
+
+    def stamps(self) -> list[int]:
+        """Return the stamps, ns, of the messages that have arrived."""
+        found = []
+        handle = self._subscription.handle
+        with handle:
+            while (taken := handle.take_message(self._subscription.msg_type, True)) is not None:
+                found.append(stamp_of(taken[0]))
+        self.silent = self.silent and not found
+        return found
+
+    def wait(
+        self, hear: Callable[[list[int]], object], in_step: Callable[[], bool], stop: Stop
+    ) -> float:
+        """Call hear(stamps) until in_step(), silence or `stop`. Return how long that took, s."""
         began = heard = time.monotonic()
         while not stop:
-            if self._hear():
+            if stamps := self.stamps():
                 heard = time.monotonic()
-            if stamp - self._newest <= LEAD or self._silent:
+            hear(stamps)
+            if in_step() or self.silent:
                 break
-            self._silent = time.monotonic() - heard > SILENCE
+            self.silent = time.monotonic() - heard > SILENCE
             time.sleep(POLL_PERIOD)
         return time.monotonic() - began
 
@@ -155,22 +187,22 @@ class _Tdoas:
     """Count how far the published TDOAs have left the filter, in the order of their stamps."""
 
     def __init__(self, node: Node, sensor_wait: int) -> None:
-        self._subscription, self._sensor_wait = None, sensor_wait
+        self._topic: _Topic | None = None
+        self._sensor_wait = sensor_wait
         publishers = node.get_publishers_info_by_topic(node.resolve_topic_name(RESIDUAL))
         cls = message_class(publishers[0].topic_type) if publishers else None
         if cls is not None:
             qos = subscription_qos([publisher.qos_profile for publisher in publishers])
             qos.depth = 10 * READER_DEPTH
-            self._subscription = node.create_subscription(
-                cls, RESIDUAL, lambda _: None, qos, raw=True
-            )
+            self._topic = _Topic(node, cls, RESIDUAL, qos)
         self._start_over()
 
     def _start_over(self) -> None:
         self._begin = -math.inf  # ns; older TDOAs need not leave the filter
         self._newest: int | None = None  # ns, newest stamp that was published
         self._out = -math.inf  # ns, newest stamp that left the filter
-        self._silent = False
+        if self._topic is not None:
+            self._topic.silent = False
         self._first: deque[int] = deque()  # first stamps that were published
         self._shift = 0  # ns by which the same stamps are smaller when they leave the filter
         self._learned = 0  # number of stamps from which `_shift` is known
@@ -191,23 +223,14 @@ class _Tdoas:
         self._sensors[topic] = stamp
 
     def wait(self, starting: bool, stop: Stop) -> float:
-        if self._subscription is None or self._newest is None:
+        if self._topic is None or self._newest is None:
             return 0.0
         step = START_STEP if starting and not self._behind else STEP
         if self._is_in_step(step):
             return 0.0
-        began = heard = time.monotonic()
-        while not stop:
-            taken = _taken(self._subscription)
-            if taken:
-                self._learn(list(map(stamp_of, taken)))
-                heard, self._silent = time.monotonic(), False
-            if self._is_in_step(step) or self._silent:
-                break
-            self._silent = time.monotonic() - heard > SILENCE
-            self._behind = self._behind or self._silent and step == START_STEP
-            time.sleep(POLL_PERIOD)
-        return time.monotonic() - began
+        waited = self._topic.wait(self._learn, lambda: self._is_in_step(step), stop)
+        self._behind = self._behind or self._topic.silent and step == START_STEP
+        return waited
 
     def _is_in_step(self, step: int) -> bool:
         assert self._newest is not None
@@ -219,20 +242,11 @@ class _Tdoas:
 
     def _learn(self, stamps: list[int]) -> None:
         """Note stamps that left the filter. The first ones show by how much an effect shifts them."""
-        self._out = max(self._out, *stamps)
+        self._out = max([self._out, *stamps])
         for stamp in stamps[: len(self._first)]:
             if self._learned < LEARNED:
                 self._shift = max(self._shift, self._first.popleft() - stamp)
                 self._learned += 1
-
-
-def _taken(subscription: Subscription) -> list[bytes]:
-    """Return the messages that have arrived, as bytes."""
-    found = []
-    with subscription.handle:
-        while (taken := subscription.handle.take_message(subscription.msg_type, True)) is not None:
-            found.append(taken[0])
-    return found
 
 
 def is_stamped(cls: Any) -> bool:

@@ -4,15 +4,14 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
 import itertools
 from pathlib import Path
-import queue
-import threading
 import time
 from typing import TypeVar
 
@@ -43,42 +42,29 @@ def read_ahead(messages: Iterable[Item]) -> Generator[Item, None, None]:
 
     Decoding a chunk of a bag then delays no message. Exceptions of the iterable are raised here.
     """
-    batches: queue.Queue[list[Item] | BaseException | None] = queue.Queue(BATCHES_AHEAD)
-    closed = threading.Event()
+    iterator = iter(messages)
 
-    def put(item: list[Item] | BaseException | None) -> None:
-        while not closed.is_set():
-            try:
-                return batches.put(item, timeout=0.1)
-            except queue.Full:
-                pass
-
-    def read() -> None:
+    def read() -> tuple[list[Item], Exception | None]:
         batch: list[Item] = []
         try:
-            for message in messages:
-                batch.append(message)
-                if len(batch) == BATCH:
-                    put(batch)
-                    batch = []
-                if closed.is_set():
-                    return
-            put(batch)
-            put(None)
-        except BaseException as error:
-            put(batch)
-            put(error)
+            batch.extend(itertools.islice(iterator, BATCH))
+        except Exception as error:
+            return batch, error  # `extend` keeps the items before it
+        return batch, None
 
-    thread = threading.Thread(target=read, daemon=True)
-    thread.start()
+    reader = ThreadPoolExecutor(1)
     try:
-        while (batch := batches.get()) is not None:
-            if isinstance(batch, BaseException):
-                raise batch
+        ahead = deque(reader.submit(read) for _ in range(BATCHES_AHEAD))
+        while True:
+            batch, error = ahead.popleft().result()
             yield from batch
+            if error is not None:
+                raise error
+            if not batch:
+                return
+            ahead.append(reader.submit(read))
     finally:
-        closed.set()
-        thread.join()
+        reader.shutdown(cancel_futures=True)
 
 
 RCLError = rclpy_implementation.RCLError
