@@ -12,10 +12,11 @@ import numpy as np
 
 from uwb_tdoa_bias.common.sensors import BY_POSE, COMPARED, SENSORS
 from uwb_tdoa_bias.effects import EFFECTS, Track
+from uwb_tdoa_tools.diagnosis import diagnose
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.constraints import Mark
 from uwb_tdoa_tools.diagnosis.deviations import with_deviations
-from uwb_tdoa_tools.diagnosis.references import GroundTruth
+from uwb_tdoa_tools.diagnosis.references import GroundTruth, Nothing
 from uwb_tdoa_tools.scoring.metrics import scored_phase
 from uwb_tdoa_tools.simulation import ImuErrors, SimulationConfig, simulate
 
@@ -122,6 +123,27 @@ def clean_flight(seed, duration=50.0, aided=False, ranged=False, rates=None):
 def sparse_flight(seed, duration=50.0, **sensors):
     """Return the flight of `clean_flight` with the rates of SPARSE."""
     return clean_flight(seed, duration, rates=SPARSE, **sensors)
+
+
+def diagnosed():
+    """Return the Diagnosis of a flight with a late and a displaced anchor, and a hold-out flight."""
+    flights = [clean_flight(100, 24.0), clean_flight(101, 18.0)]
+    for effect in (
+        EFFECTS["anchor_delay"]({"3": 0.3}),
+        EFFECTS["anchor_position"]({"6.x": 0.25, "6.z": -0.2}),
+    ):
+        flights = [effect.inject(flight) for flight in flights]
+    return diagnose(flights[:1], flights[1:])
+
+
+def late_flight():
+    """Return a flight with a late anchor."""
+    return EFFECTS["anchor_delay"]({"3": 0.4}).inject(sparse_flight(100, 40.0))
+
+
+def diagnosed_without_truth():
+    """Return the Diagnosis of `late_flight`, without ground truth."""
+    return diagnose([late_flight()], reference=Nothing())
 
 
 def with_yaw_rate(flight, noise, seed=0):

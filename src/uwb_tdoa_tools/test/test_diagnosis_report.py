@@ -7,7 +7,7 @@ from pathlib import Path
 import re
 from types import SimpleNamespace
 
-from known_effects import clean_flight, sparse_flight
+from known_effects import clean_flight
 import numpy as np
 import pytest
 from reports import Tags, delay, finding, judged, keys_of, said
@@ -16,11 +16,11 @@ from uwb_tdoa_bias.effects import EFFECTS, EffectSet, SmoothTerm
 from uwb_tdoa_bias.effects.base import measured
 from uwb_tdoa_bias.effects.smooth_term import causes
 from uwb_tdoa_tools.command_lines import lines_of_use
-from uwb_tdoa_tools.diagnosis import diagnose, output
+from uwb_tdoa_tools.diagnosis import output
 from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.findings import EffectFinding, Refused
 from uwb_tdoa_tools.diagnosis.over_flights import Share, in_words
-from uwb_tdoa_tools.diagnosis.references import GroundTruth, Heights, Nothing
+from uwb_tdoa_tools.diagnosis.references import GroundTruth, Heights
 from uwb_tdoa_tools.diagnosis.regression.confounding import Alternative, Unobservable
 from uwb_tdoa_tools.diagnosis.regression.terms import Candidate, Term
 from uwb_tdoa_tools.diagnosis.report import curves, maps, pictures
@@ -38,28 +38,8 @@ AS_WELL = Alternative("anchor_position", 1.0, 2.0, "a flight on several sides")
 
 
 @pytest.fixture(scope="module")
-def result():
-    """Return the Diagnosis of a short flight with a late and a displaced anchor.
-
-    It is validated on a hold-out flight.
-    """
-    effects = (
-        EFFECTS["anchor_delay"]({"3": 0.3}),
-        EFFECTS["anchor_position"]({"6.x": 0.25, "6.z": -0.2}),
-    )
-    flights = [clean_flight(100, 24.0), clean_flight(101, 18.0)]
-    for effect in effects:
-        flights = [effect.inject(flight) for flight in flights]
-    return replace(
-        diagnose(flights[:1], flights[1:]), applying=lines_of_use(Path("out"), ["other.bag"])
-    )
-
-
-@pytest.fixture(scope="module")
-def without_truth():
-    return diagnose(
-        [EFFECTS["anchor_delay"]({"3": 0.4}).inject(sparse_flight(100, 40.0))], reference=Nothing()
-    )
+def result(diagnosed):
+    return replace(diagnosed, applying=lines_of_use(Path("out"), ["other.bag"]))
 
 
 @pytest.fixture(scope="module")
@@ -280,39 +260,41 @@ def test_what_errors_are_against_is_said_where_only_heights_are_known(result):
 
 
 @pytest.mark.slow
-def test_without_ground_truth_anchors_are_found_and_it_is_said_what_is_not(without_truth):
-    added = {finding.effect.name for finding in without_truth.findings if finding.added}
+def test_without_ground_truth_anchors_are_found_and_it_is_said_what_is_not(diagnosed_without_truth):
+    added = {finding.effect.name for finding in diagnosed_without_truth.findings if finding.added}
     assert added == {"anchor_position", "anchor_delay"}
-    hidden = {item.effect for item in without_truth.unobservable}
+    hidden = {item.effect for item in diagnosed_without_truth.unobservable}
     assert {"truth_frame", "accel_bias", "truth_time_offset"} <= hidden
 
 
 @pytest.mark.slow
-def test_without_ground_truth_no_error_is_claimed(without_truth):
-    found = verdict(without_truth)
+def test_without_ground_truth_no_error_is_claimed(diagnosed_without_truth):
+    found = verdict(diagnosed_without_truth)
     text = " ".join(found.sentences)
     assert (
         found.kind == "unknown"
         and "Without ground truth" in text
-        and without_truth.judged_on in text
+        and diagnosed_without_truth.judged_on in text
     )
     assert "what it leaves is not above 5.5 cm" in text
     assert "RMSE" not in text and "falls" not in text
-    calm = replace(without_truth, findings=[])
+    calm = replace(diagnosed_without_truth, findings=[])
     assert verdict(calm).kind == "nothing"
 
 
 @pytest.mark.slow
 def test_without_ground_truth_what_is_not_borne_out_is_not_added_with_the_reason_in_one_place(
-    without_truth,
+    diagnosed_without_truth,
 ):
     findings = [
         replace(item, added=False)
         for item in (finding(delay()), finding(EFFECTS["range_scale"]({"scale": 0.1})))
     ]
     why = Refused("anchor_delay + range_scale", "explain 20 % of what is slow")
-    refused = [*without_truth.attribution.refused, why]
-    doubted = replace(without_truth, findings=findings, refused=refused, effects=EffectSet())
+    refused = [*diagnosed_without_truth.attribution.refused, why]
+    doubted = replace(
+        diagnosed_without_truth, findings=findings, refused=refused, effects=EffectSet()
+    )
     found = verdict(doubted)
     assert found.kind == "unknown" and found.headline.startswith(
         "Nothing of what was found is added"
@@ -586,8 +568,8 @@ def test_what_the_flights_have_is_not_asked_for(result):
 
 
 @pytest.mark.slow
-def test_without_truth_ground_truth_would_tell(without_truth):
-    remedies = {item.effect: item.remedy for item in undetermined(without_truth)}
+def test_without_truth_ground_truth_would_tell(diagnosed_without_truth):
+    remedies = {item.effect: item.remedy for item in undetermined(diagnosed_without_truth)}
     assert "ground truth" in remedies["truth_frame"]
     assert (
         remedies["accel_bias"] == "ground truth of position and attitude"
@@ -703,11 +685,11 @@ def test_findings_and_alternatives_in_json(result):
 
 
 @pytest.mark.slow
-def test_every_key_of_json_is_in_the_document(result, without_truth):
+def test_every_key_of_json_is_in_the_document(result, diagnosed_without_truth):
     text = (DOCS / "diagnosis_report.md").read_text()
     term = SmoothTerm({"c0": 0.1}, {}, knots=(0.0, 1.0))
     shown = replace(result, findings=[*result.findings, finding(term)], refused=[Refused("a", "b")])
-    keys = keys_of(output.as_json(shown)) | keys_of(output.as_json(without_truth))
+    keys = keys_of(output.as_json(shown)) | keys_of(output.as_json(diagnosed_without_truth))
     assert {key for key in keys if f"`{key}`" not in text} == set()
 
 
@@ -716,9 +698,9 @@ def test_every_key_of_json_is_in_the_document(result, without_truth):
 
 
 @pytest.fixture(scope="module")
-def all_pages(page, result, without_truth):
+def all_pages(page, result, diagnosed_without_truth):
     none = judged(result, {"one": 0.1}, {"one": 0.1}, [0.0, 0.0], findings=[], effects=EffectSet())
-    return [page, html(none), html(without_truth)]
+    return [page, html(none), html(diagnosed_without_truth)]
 
 
 @pytest.mark.slow

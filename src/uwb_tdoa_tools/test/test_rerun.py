@@ -92,7 +92,8 @@ def test_evaluate_writes_the_truth_and_the_error(desk, viewer):
 
 
 @pytest.mark.slow
-def test_diagnose_writes_before_and_after_and_what_was_found(desk, viewer):
+def test_diagnose_writes_before_and_after_and_what_was_found(diagnosed, desk, viewer, monkeypatch):
+    monkeypatch.setattr(diagnosis, "diagnose", lambda *_: diagnosed)
     assert diagnose.main(["flight.bag", "--out", "out", "--rerun", "flight.rrd"]) == 0
     assert ALWAYS | {"world/truth", "world/before", "error", "error/before"} <= names(viewer)
     assert "anchor 3" in verdict(viewer)
