@@ -3,6 +3,10 @@
 """Studies that reproduce the figures of the documentation.
 
 Not installed: `./dev study NAME` runs it from the repository.
+
+A study is a module with `add_options(add)` and `run(args)`, and a line in `__main__`. `table` draws
+its trials, runs them in parallel and prints its rows. A study whose question is settled leaves; its
+result stays in docs/notebook, with the commit that has the script.
 """
 
 from pathlib import Path

@@ -5,6 +5,7 @@
 import ctypes
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -18,7 +19,7 @@ from uwb_tdoa_bias.common.errors import InputError
 pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 from studies.__main__ import main  # noqa: E402
-from studies.bench import core, nodes, peer, recordings, source, suite, usage  # noqa: E402
+from studies.bench import core, nodes, peer, recordings, soak, source, suite, usage  # noqa: E402
 from studies.bench.figures import Figure  # noqa: E402
 from studies.bench.flights import among, make_flight  # noqa: E402
 from studies.bench.peer import Peer  # noqa: E402
@@ -157,6 +158,14 @@ def test_a_quick_run_of_the_real_nodes(tmp_path, capsys, monkeypatch):
     assert value["lost at rate 4"] == value["too late at rate 4"] == 0
     assert value["latency p50, TDOA published to odometry arrived"] > 0.0
     assert value["ready after its start, ekf_node"] > 0.1 and value["CPU, all nodes"] > 1.0
+
+
+@pytest.mark.slow
+def test_a_short_soak(capsys, monkeypatch):
+    monkeypatch.setattr(soak, "LAPS", 1)
+    assert main(["soak", "--minutes", "0.1", "--together"]) == 0
+    printed = capsys.readouterr().out
+    assert " MB" in printed and int(re.search(r"published: (\d+) TDOAs", printed)[1]) > 2000
 
 
 @NEEDS_CC

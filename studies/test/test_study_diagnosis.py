@@ -6,7 +6,7 @@ from known_effects import clean_flight
 import numpy as np
 import pytest
 
-from studies.diagnosis import blind, grammar, splits
+from studies.diagnosis import bank, blind, grammar, splits
 from studies.diagnosis.claims import claims, truth_of
 from uwb_tdoa_bias.effects import SmoothTerm
 from uwb_tdoa_tools.diagnosis.findings import EffectFinding
@@ -80,6 +80,15 @@ def test_a_claim_is_what_was_put_in(flight):
     assert said.names(true) and said.shape == true.shape and not said.depends_as(true)
     (said,) = claims([finding(found, (Alternative("tdoa of anchor 3 over x", 0.95, 4.0, ""),))])
     assert said.depends_as(true)
+
+
+@pytest.mark.slow
+def test_an_effect_of_the_bank_is_found():
+    case = next(one for one in bank.cases(1) if one[:1] == ("large",))
+    found = bank.diagnosed(case)
+    figures = bank.figures([found])
+    assert found["kind"] == "large" and found["found_rmse"] < found["before"]
+    assert figures["large"]["cases"] == figures["large"]["first"] == 1
 
 
 @pytest.mark.slow
