@@ -11,24 +11,12 @@ from random_samples import random_samples, ranges_of
 import yaml
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.effects import RADIO, EffectSet, SmoothTerm
+from uwb_tdoa_bias.effects import RADIO, EffectSet, Samples, SmoothTerm
 from uwb_tdoa_bias.effects.covariates import fade_weight
 from uwb_tdoa_bias.effects.smooth_term import FACTORS, SHAPES, described, shape_basis
 
 KNOTS = {2: (1.0, 3.0), 3: (1.0, 2.0, 3.0), 4: (1.0, 1.5, 2.5, 3.0)}
 seeds = st.integers(0, 2**32 - 1)
-
-
-@given(st.lists(st.floats(-5, 15), min_size=1, max_size=20), st.integers(0, 50))
-def test_splines_are_those_of_scipy(values, seed):
-    from scipy.interpolate import BSpline
-
-    rng = np.random.default_rng(seed)
-    knots = np.cumsum(rng.uniform(0.1, 3.0, rng.integers(2, 8)))
-    smooth = SmoothTerm(knots=tuple(knots))
-    clamped = np.array([knots[0]] * 2 + list(knots) + [knots[-1]] * 2)
-    expected = BSpline(clamped, np.eye(len(knots) + 1), 2)(np.clip(values, knots[0], knots[-1]))
-    np.testing.assert_allclose(smooth.basis(np.array(values)), expected, atol=1e-12)
 
 
 def term(**changes):
@@ -65,6 +53,26 @@ def test_what_recurs_goes_on_beyond_its_domain_and_fades(shape, knots):
 def test_a_spline_is_constant_beyond_its_knots():
     at = np.array([-5.0, 1.0, 9.0, 50.0])
     np.testing.assert_allclose(term().curve(at), [0.1, 0.1, 0.3, 0.3], atol=1e-12)
+
+
+@pytest.mark.parametrize("shape", ["spline", *SHAPES])
+@pytest.mark.parametrize("form", ["common", "arrival", "anchor"])
+def test_one_measurement_has_the_bias_that_it_has_among_others(shape, form):
+    """Nodes correct one by one, replays all at once: both are equal to the bit."""
+    samples = random_samples(5)
+    covariate = "height" if form == "common" else "range"
+    knots = (0.0, 1.0, 2.5, 3.0, 7.0) if shape == "spline" else KNOTS[SHAPES[shape][0]]
+    empty = SmoothTerm({}, {}, "", "tdoa", covariate, form, knots, shape)
+    keys = empty.keys(samples.anchors)
+    values = dict(zip(keys, np.random.default_rng(1).standard_normal(len(keys)).tolist()))
+    one = replace(empty, values=values)
+    columns = samples.t, samples.a, samples.b, samples.p, samples.q
+    single = [
+        one.bias(Samples(*(part[k : k + 1] for part in columns), samples.anchors, samples.start))
+        for k in range(len(samples))
+    ]
+    np.testing.assert_array_equal(np.concatenate(single), one.bias(samples))
+    assert np.ptp(single) > 0.1
 
 
 @pytest.mark.parametrize("channel", RADIO)

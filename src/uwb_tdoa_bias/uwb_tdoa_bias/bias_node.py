@@ -31,7 +31,8 @@ from .common.stamps import LARGEST_STEP_BACK, PoseQueue, StampGate
 from .correction.corrector import Correction, Corrector, Poses, parts_of, warm_up
 from .correction.model import EFFECTS, FADED, NETWORK, PASSED
 from .correction.network import load_network
-from .effects import EffectSet, LabelCorrector
+from .effects import EffectSet, LabelEffect
+from .effects.base import relabelled
 from .effects.tag import TagLeverArm
 from .ros import process
 from .ros.anchors import ANCHORS_FILE, AnchorsInput
@@ -154,7 +155,7 @@ class BiasNode(StreamNode):
         self._lag, self._limit, self._body = own["pose_lag"], own["hold"], own["body_frame"]
         self._effects = EffectSet.from_yaml(effects_file) if effects_file else EffectSet()
         self._late = self._effects.stamp_offset("tdoa")  # s
-        self._labels = LabelCorrector(self._effects.effects)
+        self._labels = [one for one in self._effects if isinstance(one, LabelEffect)]
         self._model = load_network(model_file)
         self._known_poses = Poses()  # of all correctors
         self._antennas: dict[str, Antenna] = {}  # by frame of the TDOAs
@@ -326,7 +327,7 @@ class BiasNode(StreamNode):
         self._counts["received"] += len(t)
         antenna = self._antenna(frame)
         antenna.heard += len(t)
-        if not self._labels.idle:
+        if self._labels:
             rows = self._relabelled(rows)
         items = [(frame, *row) for row in rows.tolist()]
         if self._idle:
@@ -337,7 +338,8 @@ class BiasNode(StreamNode):
     def _relabelled(self, rows: np.ndarray) -> np.ndarray:
         """Return rows of TDOAs with corrected ids and signs."""
         rows, names = rows.copy(), MEASURED[:3]
-        for name, column in zip(names, self._labels.correct(*(rows[name] for name in names))):
+        a, b, d = (rows[name] for name in names)
+        for name, column in zip(names, relabelled(self._labels, a, b, d)):
             rows[name] = column
         return rows
 

@@ -27,7 +27,7 @@ from tf2_msgs.msg import TFMessage  # noqa: E402
 from uwb_tdoa_bias.common.flight import Imu  # noqa: E402
 from uwb_tdoa_bias.correction.corrector import Corrector  # noqa: E402
 from uwb_tdoa_bias.effects import EffectSet, SmoothTerm  # noqa: E402
-from uwb_tdoa_bias.effects.imu import AccelBias  # noqa: E402
+from uwb_tdoa_bias.effects.sensor import AccelBias  # noqa: E402
 from uwb_tdoa_bias.effects.tag import TagLeverArm  # noqa: E402
 from uwb_tdoa_bias.ros.frames import TF_QOS, TF_STATIC_QOS  # noqa: E402
 from uwb_tdoa_ekf.offline import run_offline  # noqa: E402

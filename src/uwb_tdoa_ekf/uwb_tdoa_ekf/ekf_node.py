@@ -33,7 +33,7 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flyable import FlyableVolume
 from uwb_tdoa_bias.common.sensors import SENSORS
-from uwb_tdoa_bias.effects import EffectSet, ImuCorrector, SensorCorrector
+from uwb_tdoa_bias.effects import EffectSet, ImuCorrector, StreamCorrector
 from uwb_tdoa_bias.effects.tag import TagLeverArm
 from uwb_tdoa_bias.ros import process
 from uwb_tdoa_bias.ros.anchors import AnchorsInput
@@ -130,7 +130,7 @@ class EkfNode(StreamNode):
             )
         volume, effects_file = own["flyable_volume"], own["effects_file"]
         self._effects = EffectSet.from_yaml(effects_file) if effects_file else EffectSet()
-        self._sensor_corrector = SensorCorrector(self._effects.effects)
+        self._stream_corrector = StreamCorrector(self._effects.effects)
         self._estimator: Estimator = None  # type: ignore[assignment]  # None until anchors arrive
         self._said_restart: Finding | None = None
         self._epoch, self._ros_clock = Epoch(), cast("ROSClock", self.get_clock())
@@ -422,7 +422,7 @@ class EkfNode(StreamNode):
         stream = sensor.read(t, {field: rows[field] for field in sensor.fields})
         if sensor.assumed is not None:
             self._assumed[name] = sensor.assumed(stream)
-        self._estimator.add(name, self._sensor_corrector.correct(name, stream))
+        self._estimator.add(name, self._stream_corrector.correct(name, stream))
 
     def _say_restart(self) -> None:
         """Log why the filter has restarted, once per restart."""

@@ -66,7 +66,7 @@ class Estimator:
         """Create an estimator without measurements.
 
         Streams that are added must already be corrected for all other effects (ImuCorrector,
-        SensorCorrector, bias_node).
+        StreamCorrector, bias_node).
 
         Parameters
         ----------

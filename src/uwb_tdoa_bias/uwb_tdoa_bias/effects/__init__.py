@@ -25,10 +25,8 @@ The file, written by people and by the tools, read by the nodes:
 """
 
 from .anchor import AnchorDelay
-from .auxiliary import SensorCorrector
-from .base import ArrivalEffect, Effect, LabelCorrector, LabelEffect, Row
-from .effect_set import EFFECTS, Covariance, EffectSet, StreamCorrector
-from .imu import ImuCorrector
+from .base import ArrivalEffect, Effect, LabelEffect, Row
+from .effect_set import EFFECTS, Covariance, EffectSet
 from .samples import (
     RADIO,
     ImuSamples,
@@ -41,12 +39,12 @@ from .samples import (
     true_samples,
 )
 from .smooth_term import SmoothTerm
+from .streams import ImuCorrector, StreamCorrector
 from .tag import TagLeverArm
 
 __all__ = [
     "EFFECTS",
     "RADIO",
-    "SensorCorrector",
     "SensorSamples",
     "AnchorDelay",
     "ArrivalEffect",
@@ -55,7 +53,6 @@ __all__ = [
     "EffectSet",
     "ImuCorrector",
     "ImuSamples",
-    "LabelCorrector",
     "LabelEffect",
     "RangeSamples",
     "Row",

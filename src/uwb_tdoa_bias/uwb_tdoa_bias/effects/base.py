@@ -595,23 +595,6 @@ class GeometryEffect(Effect):
         return samples.predicted(**self.antennas(samples)) - samples.predicted()
 
 
-class SensorEffect(Effect):
-    """An effect with an affine sensor model, measured = matrix true + offset, on its channels."""
-
-    def model(self) -> Affine:
-        """Return the Affine from true to measured values."""
-        raise NotImplementedError
-
-    def sensor_model(self, channel: str) -> Affine:
-        return self.model() if channel in self.channels else IDENTITY
-
-    def regressors(self, samples: Any, keys: Sequence[str]) -> np.ndarray:
-        def measured_at(values: dict[str, float]) -> np.ndarray:
-            return type(self)(values).sensor_model(samples.channel)(samples.reading)
-
-        return central_differences(measured_at, self.values, keys, 1e-6)
-
-
 class LabelEffect(Effect):
     """An effect on the ids or on the sign of TDOAs, a mistake of a driver or a survey.
 
@@ -655,21 +638,13 @@ class LabelEffect(Effect):
         return replace(flight, tdoa=replace(tdoa, a=a, b=b, d=d))
 
 
-class LabelCorrector:
-    """Corrector of the LabelEffects of a set, in the order of the set."""
-
-    def __init__(self, effects: Iterable[Effect]) -> None:
-        """Select the LabelEffects among `effects`."""
-        self._effects = [effect for effect in effects if isinstance(effect, LabelEffect)]
-        self.idle = not self._effects
-
-    def correct(
-        self, a: np.ndarray, b: np.ndarray, d: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return corrected ids a, b (n,) and d (n,) m."""
-        for effect in self._effects:
-            a, b, d = effect.relabelled(a, b, d)
-        return a, b, d
+def relabelled(
+    effects: Iterable[LabelEffect], a: np.ndarray, b: np.ndarray, d: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return TDOAs without the mistakes of LabelEffects, in their order: ids a, b (n,) and d (n,) m."""
+    for effect in effects:
+        a, b, d = effect.relabelled(a, b, d)
+    return a, b, d
 
 
 def central_differences(

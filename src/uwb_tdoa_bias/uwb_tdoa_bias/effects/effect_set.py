@@ -19,7 +19,7 @@ import yaml
 from ..common.anchors import Anchors
 from ..common.errors import InputError
 from ..common.files import write_text
-from ..common.flight import SENSOR_NAMES, Flight
+from ..common.flight import Flight
 from ..common.safe_yaml import read_yaml
 from ..common.text import written_by
 from .anchor import (
@@ -30,32 +30,29 @@ from .anchor import (
     Nlos,
     RangeOffset,
 )
-from .auxiliary import (
+from .base import FADED_BELOW, Effect, SensorFunction
+from .floor import FloorMultipath
+from .pair import NoiseCorrelation, NoiseLevel, OutlierRate, PairOffset, PairSign
+from .samples import N_STATES, ImuSamples, Samples, SensorSamples
+from .sensor import (
+    AccelBias,
+    AccelScale,
     BarometerDrift,
     FloorStep,
+    GyroBias,
+    GyroScale,
     HeightOffset,
     HeightScale,
-    SensorCorrector,
+    ImuGravity,
+    ImuMisalignment,
     VelocityMisalignment,
     VelocityScale,
     VelocitySlip,
     YawRateScale,
 )
-from .base import FADED_BELOW, Effect, LabelCorrector, SensorFunction
-from .floor import FloorMultipath
-from .imu import (
-    AccelBias,
-    AccelScale,
-    GyroBias,
-    GyroScale,
-    ImuCorrector,
-    ImuGravity,
-    ImuMisalignment,
-)
-from .pair import NoiseCorrelation, NoiseLevel, OutlierRate, PairOffset, PairSign
-from .samples import N_STATES, ImuSamples, Samples, SensorSamples
 from .smooth_term import SmoothTerm
 from .stamps import RangeDelay, TdoaTimeOffset, VelocityDelay
+from .streams import STREAMS, StreamCorrector
 from .tag import AntennaPattern, RangeBias, RangeScale, ReceivedPowerBias, TagLeverArm
 from .truth import TruthFrame, TruthTimeOffset
 
@@ -101,7 +98,6 @@ EFFECTS: dict[str, type[Effect]] = {
         PairSign,
     )
 }
-STREAMS = ("tdoa", "imu", "truth", *SENSOR_NAMES)  # of a Flight
 ENTRY = ("values", "std", "source", "domain")  # of an effect in effects.yaml
 COVARIANCE_ENTRY = ("parameters", "matrix")
 REACH = 0.3  # m and m/s, half the step of the statistical linearization: an error of the filter
@@ -193,37 +189,6 @@ class Covariance:
                 "semidefinite."
             )
         return cls(keys, matrix)
-
-
-class StreamCorrector:
-    """Corrector of the streams of a recording: ids, signs, stamps and values of all sensors.
-
-    The biases of TDOAs and ranges are corrected by Corrector.
-    """
-
-    def __init__(self, effects: Collection[Effect]) -> None:
-        """Select the effects on streams among `effects`."""
-        self._late = {
-            stream: sum(effect.stamp_offset(stream) for effect in effects)
-            for stream in STREAMS
-            if stream not in SENSOR_NAMES
-        }
-        self._labels, self._imu = LabelCorrector(effects), ImuCorrector(effects)
-        self._sensors = SensorCorrector(effects)
-
-    def correct(self, name: str, stream: Any) -> Any:
-        """Return the corrected stream `name` of a Flight, or its next part."""
-        if name in SENSOR_NAMES:
-            return self._sensors.correct(name, stream)
-        if self._late[name]:
-            stream = replace(stream, t=stream.t - self._late[name])
-        if name == "tdoa" and not self._labels.idle:
-            a, b, d = self._labels.correct(stream.a, stream.b, stream.d)
-            return replace(stream, a=a, b=b, d=d)
-        if name == "imu" and not self._imu.idle:
-            gyro, accel = self._imu.correct(stream.t, stream.gyro, stream.accel)
-            return replace(stream, gyro=gyro, accel=accel)
-        return stream
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 import math
 from typing import Any, ClassVar
 
@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.anchors import Anchors
-from ..common.arrays import filled, floats, piecewise
-from ..common.compiled import compiled
+from ..common.arrays import floats, piecewise
 from ..common.errors import InputError
+from ..common.lazy import interpolate
 from ..common.sensors import BY_POSE, COMPARED
 from .base import (
     Effect,
@@ -58,6 +58,7 @@ IMU_CHANNELS = tuple(f"{sensor}.{axis}" for sensor in ("gyro", "accel") for axis
 SENSOR_CHANNELS = tuple(name + axis for name in BY_POSE for axis in COMPARED[name].axes)
 FORMS = ("common", "arrival", "anchor", "pair", "direction")
 OF_LINKS = ("pair", "direction")  # forms with one function per pair of anchors
+OF_ARRIVALS = ("arrival", "anchor")  # forms with a function of each arrival
 # Prior standard deviations of functions with few coefficients: m, rad/s and m/s^2
 RADIO_PRIOR_STD, PRIOR_STD = 0.3, {"gyro": 0.1, "accel": 0.5}
 LEAST_WIDTH = 1.0  # of the covariate, below which a slope per unit would extrapolate
@@ -76,6 +77,20 @@ SHAPES = {
     "pulse": (3, 2),
     "wave": (2, 3),
     "parabola": (2, 3),
+}
+# {shape: where it acts}, of the name of a covariate and its knots in words; of a time
+WHERE = {
+    "step": "where {name} is above {1}",
+    "interval": "where {name} is between {1} and {2}",
+}
+WHEN = {"step": "after {1}", "interval": "from {1} to {2}"}
+# {covariates of two intervals: the place of the tag}
+PLACES = {
+    frozenset(("range", "bearing")): "{x:+.1f} m in x and {y:+.1f} m in y from the anchor, at most",
+    frozenset(("range", "elevation")): "{z:+.1f} m in z and {level:.1f} m level from the anchor",
+    frozenset(("bearing", "elevation")): (
+        "in the direction ({x:+.2f}, {y:+.2f}, {z:+.2f}) from the anchor"
+    ),
 }
 # Shapes of a factor: those with one function besides the level.
 FACTORS = ("line", "beyond", "below", "step", "interval")
@@ -266,20 +281,25 @@ class SmoothTerm(Effect):
 
         They are NaN for NaN.
 
-        factor : (n,) by which those of c1, ... are multiplied
+        factor : (n,) values of the factor; without it, the factor is 1
         """
         at: np.ndarray = floats(values)
-        if self.shape != "spline":
-            basis = shape_basis(self.shape, self.knots, at)
-            if factor is None:
-                return basis
-            more = (basis[:, k] * factor for k in range(1, self.count))
-            return np.stack([basis[:, 0], *more], axis=1)
-        if self.covariate in CATEGORIES:
-            return 1.0 * (at[:, None] == self._at)
-        out = np.zeros((len(at), self.count))
-        _basis(self._at, at, out)
-        return out
+        if self._is_spline:
+            return self._splines(np.minimum(np.maximum(at, self.knots[0]), self.knots[-1]))
+        if self.covariate in CATEGORIES and self.shape == "spline":
+            return 1.0 * (at[:, None] == np.array(self.knots))
+        basis = shape_basis(self.shape, self.knots, at)
+        if factor is None:
+            return basis
+        by = shape_basis(self.factor_shape, self.factor_knots, factor)[:, 1]
+        return np.stack([basis[:, 0], *(basis[:, k] * by for k in range(1, self.count))], axis=1)
+
+    @cached_property
+    def _splines(self) -> Any:
+        """Return the quadratic B-splines between the knots, a scipy BSpline."""
+        ends = [[end] * DEGREE for end in (self.knots[0], self.knots[-1])]
+        clamped = np.concatenate([ends[0], self.knots, ends[1]])
+        return interpolate.BSpline(clamped, np.eye(self.count), DEGREE)
 
     def curve(
         self, values: np.ndarray, prefix: str = "", factor: np.ndarray | None = None
@@ -289,8 +309,7 @@ class SmoothTerm(Effect):
         prefix : "3." for anchor 3 of the form "anchor", "0-1." for a pair
         factor : (n,) values of the factor, 1 if None
         """
-        weights = np.array([self._coefficients(prefix)])
-        return self._functions(values, weights, np.zeros(len(values), dtype=np.int64), factor)
+        return self._functions(values, np.array(self._coefficients(prefix)), factor)
 
     def spread(self, values: np.ndarray, prefix: str = "") -> np.ndarray:
         """Return the standard deviation of `curve` without its level, (n,).
@@ -300,10 +319,6 @@ class SmoothTerm(Effect):
         std = np.array([self.std.get(f"{prefix}c{k}", 0.0) for k in range(self.count)])
         std[0] *= self.shape == "spline"  # c0 of another shape is the level
         return np.sqrt(self.basis(values) ** 2 @ std**2)
-
-    @cached_property
-    def _at(self) -> np.ndarray:
-        return np.array(self.knots, dtype=float)
 
     @property
     def _is_spline(self) -> bool:
@@ -317,26 +332,51 @@ class SmoothTerm(Effect):
         return len(self.knots) if self.covariate in CATEGORIES else len(self.knots) + DEGREE - 1
 
     def _functions(
-        self,
-        values: np.ndarray,
-        weights: np.ndarray,
-        rows: np.ndarray,
-        factor: np.ndarray | None = None,
+        self, values: np.ndarray, weights: np.ndarray, factor: np.ndarray | None = None
     ) -> np.ndarray:
-        """Return the values (n,) of functions with weights (m, k); function rows (n,)."""
+        """Return the values (n,) of functions with coefficients (n, k), or (k,) for all."""
         if not self._is_spline:
-            return np.einsum("nk,nk->n", self.basis(values, factor), weights[rows])
+            return np.einsum("...k,...k->...", self.basis(values, factor), weights)
 
         def curves(at: np.ndarray) -> np.ndarray:
-            return filled(_curves, at.shape, self._at, at, weights, rows)
+            basis = self.basis(at).reshape(-1, len(values), self.count)
+            return np.einsum("...k,...k->...", basis, weights).ravel()
 
-        return piecewise(curves, floats(values), self._at, DEGREE)
+        return piecewise(curves, floats(values), np.array(self.knots), DEGREE)
+
+    def _weights(self, samples: Samples) -> np.ndarray:
+        """Return the coefficients of each measurement or arrival, (n, k), or (k,) for all."""
+        if self.form == "anchor":
+            return self._of_anchors(samples.anchors)[samples.rows]
+        if self.form not in OF_LINKS:
+            return np.array(self._coefficients(""))
+        weights = np.zeros((len(samples), self.count))
+        for link in self.parts:
+            weights += np.outer(self._share(samples, link), self._coefficients(f"{link}."))
+        return weights
 
     @cached_by_anchors
-    def _weights(self, anchors: Anchors) -> np.ndarray:
-        """Return the coefficients of the function of every anchor, (m, k), 0 if it has none."""
-        prefixes = [f"{i}." if self.form == "anchor" else "" for i in id_texts(anchors)]
-        return np.array([self._coefficients(prefix) for prefix in prefixes])
+    def _of_anchors(self, anchors: Anchors) -> np.ndarray:
+        """Return the coefficients of the function of every anchor, (N, k), 0 if it has none."""
+        return np.array([self._coefficients(f"{i}.") for i in id_texts(anchors)])
+
+    def _share(self, samples: Samples, part: str) -> np.ndarray | float:
+        """Return by what the function of an anchor "3", or of a pair "0-1", is multiplied.
+
+        It is 1, -1 or 0 in each arrival of an anchor, or each measurement of a pair. Without a part
+        it is 1.
+        """
+        if not part:
+            return 1.0
+        if self.form == "anchor":
+            return 1.0 * (samples.anchors.ids[samples.rows] == int(part))
+        forth, back = of_pair(samples, part)
+        return 1.0 * forth - back if self.form == "pair" else 1.0 * forth
+
+    @property
+    def parts(self) -> list[str]:
+        """Return the anchors "3" or pairs "0-1" with a function of their own; "" for all."""
+        return list(dict.fromkeys(key.rpartition(".")[0] for key in self.values))
 
     def _coefficients(self, prefix: str) -> list[float]:
         return [self.values.get(f"{prefix}c{k}", 0.0) for k in range(self.count)]
@@ -357,72 +397,26 @@ class SmoothTerm(Effect):
         The first is None if samples lack a covariate.
         """
         values = self._values_of(self.covariate, samples)
-        if not self.factor:
-            return values, None
-        at = self._values_of(self.factor, samples)
-        return (None, None) if at is None else (values, at)
-
-    def factor_course(self, values: np.ndarray) -> np.ndarray:
-        """Return the shape of the factor at values (n,) of its covariate, (n,)."""
-        return shape_basis(self.factor_shape, self.factor_knots, values)[:, 1]
-
-    def _course(
-        self, values: np.ndarray | None, rows: slice | np.ndarray = slice(None)
-    ) -> np.ndarray | None:
-        """Return `factor_course` at some rows of values; None without a factor."""
-        return None if values is None else self.factor_course(values[rows])
+        factor = self._values_of(self.factor, samples) if self.factor else None
+        return None if self.factor and factor is None else values, factor
 
     def bias(self, samples: Samples) -> np.ndarray:
-        n = len(samples)
         values, factor = self._arguments(samples)
         if self.channel != samples.channel or values is None:
-            return np.zeros(n)
-        if self.form == "common":
-            return self.curve(values, "", self._course(factor))
-        if self.form in OF_LINKS:
-            links = dict.fromkeys(key.rpartition(".")[0] for key in self.values)
-            course = self._course(factor)
-            parts = (self._of_link(samples, k) * self.curve(values, f"{k}.", course) for k in links)
-            return sum(parts, np.zeros(n))
-        rows, weights = samples.rows, self._weights(samples.anchors)
-        if not isinstance(values, np.ndarray):
-            return samples.difference(self._functions(values, weights, rows, self._course(factor)))
-        has_function = np.count_nonzero(weights, axis=1) > 0
-        each = weights[has_function]
-        if len(each) and not self._is_spline and np.all(each == each[0]):
-            key = self.merge_key, has_function.tobytes()
-            used, basis = samples.kept(key, partial(self._of_measurements, samples, has_function))
-            bias = np.zeros(n)
-            bias[used] = basis @ each[0]
-            return bias
-        mine = np.flatnonzero(has_function[rows])
-        late = np.where(np.isnan(values), np.nan, 0.0)  # of anchors without a function
-        course = self._course(factor, mine)
-        late[mine] = self._functions(values[mine], weights, rows[mine], course)
-        return samples.difference(late)
+            return np.zeros(len(samples))
+        if self.form != "anchor" or not isinstance(values, np.ndarray):
+            each = self._functions(values, self._weights(samples), factor)
+            return self._of_measurements(samples, each)
+        table, rows = self._of_anchors(samples.anchors), samples.rows
+        mine = np.flatnonzero(table.any(axis=1)[rows])  # arrivals of anchors with a function
+        each = 0.0 * values  # NaN where unknown
+        some = None if factor is None else factor[mine]
+        each[mine] = self._functions(values[mine], table[rows[mine]], some)
+        return samples.difference(each)
 
-    def _of_measurements(
-        self, samples: Samples, has_function: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the rows (m,) of measurements on which a function acts, and its basis, (m, k).
-
-        has_function : (N,) of the anchors; they have the same function
-        """
-        values, factor = self._arguments(samples)
-        assert values is not None
-        mine = np.flatnonzero(has_function[samples.rows])
-        course = self._course(factor, mine)
-        late = np.zeros((len(values), self.count))
-        late[np.isnan(values)] = np.nan
-        late[mine] = self.basis(values[mine], course)
-        basis = samples.difference(late)
-        used = np.flatnonzero(np.any(basis != 0.0, axis=1))
-        return used, basis[used]
-
-    def _of_link(self, samples: Samples, link: str) -> np.ndarray:
-        """Return the sign of the function of the pair "0-1" in each d_ab, (n,) 1, -1 or 0."""
-        forth, back = of_pair(samples, link)
-        return 1.0 * forth - back if self.form == "pair" else 1.0 * forth
+    def _of_measurements(self, samples: Samples, each: np.ndarray) -> np.ndarray:
+        """Return values of measurements, of values of their arrivals if a function is of these."""
+        return samples.difference(each) if self.form in OF_ARRIVALS else each
 
     def sensor_bias(self, channel: str, features: np.ndarray) -> np.ndarray | None:
         if channel not in self.channels or self.covariate not in OF_IMU:
@@ -469,40 +463,27 @@ class SmoothTerm(Effect):
         values, factor = self._arguments(samples)
         if self.channel != samples.channel or values is None:
             return out
-        basis = self.basis(values, self._course(factor))
-        if self.form == "common":
-            return basis[:, [int(key[1:]) for key in keys]]
-        if self.form in OF_LINKS:
-            for column, key in enumerate(keys):
-                link, _, coefficient = key.rpartition(".")
-                out[:, column] = basis[:, int(coefficient[1:])] * self._of_link(samples, link)
-            return out
-        ids = samples.anchors.ids[samples.rows]
-        unknown = np.isnan(basis).any(axis=1)
-        basis[unknown] = np.nan
-        for column, key in enumerate(keys):
-            anchor, _, coefficient = key.rpartition(".")
-            of_arrivals = basis[:, int(coefficient[1:])]
-            if anchor:
-                of_arrivals = np.where(unknown | (ids == int(anchor)), of_arrivals, 0.0)
-            out[:, column] = samples.difference(of_arrivals)
+        basis = self.basis(values, factor)
+        split = [key.rpartition(".") for key in keys]
+        for part in dict.fromkeys(part for part, _, _ in split):
+            columns = [column for column, names in enumerate(split) if names[0] == part]
+            coefficients = [int(split[column][2][1:]) for column in columns]
+            each = basis[:, coefficients] * np.reshape(self._share(samples, part), (-1, 1))
+            out[:, columns] = self._of_measurements(samples, each)
         return out
 
     def groups(  # type: ignore[override]  # of a term
         self, anchors: Anchors | None, pairs: np.ndarray | None
     ) -> list[tuple[str, ...]]:
-        keys = self.keys(anchors)
-        each = dict.fromkeys(key.rpartition(".")[0] for key in keys)
-        alone = [tuple(key for key in keys if key.rpartition(".")[0] == name) for name in each]
-        return [keys, *alone] if self.form == "anchor" else [keys]
+        if self.form != "anchor":
+            return [self.keys()]
+        return [self.keys(anchors), *(self.keys_of((i,)) for i in id_texts(anchors))]
 
     def advice(self) -> tuple[str, ...]:
-        # the anchors, pairs or axes with a function of their own; "" for one of all
-        parts = list(dict.fromkeys(key.rpartition(".")[0] for key in self.values))
-        if len(parts) > MOST_PARTS or not parts:
+        if not 0 < len(self.parts) <= MOST_PARTS:
             return ()
         cause, trial = causes(self)
-        functions = listed(described(self, part) for part in parts)
+        functions = listed(described(self, part) for part in self.parts)
         return f"Look for why {functions}.", f"Likely causes: {cause}. To tell: {trial}."
 
 
@@ -517,48 +498,6 @@ def _rising(name: str, knots: Any) -> tuple[float, ...]:
             f"effects: smooth_term: {name}: {knots!r} are not two or more rising numbers."
         )
     return out
-
-
-@compiled
-def _pieces(knots: np.ndarray, value: float) -> tuple[int, float, float, float]:
-    """Return (first of the three quadratic B-splines that are not zero at a value, their values).
-
-    de Boor's recursion with clamped ends; a value beyond the knots is held at their ends.
-    """
-    last = len(knots) - 1
-    if not value > knots[0]:
-        value = knots[0] if value == value else value  # NaN stays NaN
-    elif value > knots[last]:
-        value = knots[last]
-    piece = 0
-    while piece < last - 1 and value >= knots[piece + 1]:
-        piece += 1
-    left, right = knots[piece], knots[piece + 1]
-    before = knots[piece - 1] if piece > 0 else knots[0]
-    after = knots[piece + 2] if piece + 2 <= last else knots[last]
-    up, down = (value - left) / (right - left), (right - value) / (right - left)
-    rise, fall = (value - before) / (right - before), (after - value) / (after - left)
-    first = (1.0 - rise) * down
-    third = (1.0 - fall) * up
-    return piece, first, 1.0 - first - third, third
-
-
-@compiled
-def _basis(knots: np.ndarray, values: np.ndarray, out: np.ndarray) -> None:
-    for i in range(len(values)):
-        piece, first, second, third = _pieces(knots, values[i])
-        out[i, piece], out[i, piece + 1], out[i, piece + 2] = first, second, third
-
-
-@compiled
-def _curves(
-    knots: np.ndarray, values: np.ndarray, weights: np.ndarray, rows: np.ndarray, out: np.ndarray
-) -> None:
-    """Write functions at values (m * n,) to out; rows (n,) name the weights, (k, ...)."""
-    for i in range(len(values)):
-        piece, first, second, third = _pieces(knots, values[i])
-        w = weights[rows[i % len(rows)]]
-        out[i] = first * w[piece] + second * w[piece + 1] + third * w[piece + 2]
 
 
 def known_covariates() -> dict[str, tuple[str, ...]]:
@@ -740,14 +679,8 @@ def described(term: SmoothTerm, part: str = "") -> str:
     size = term.values.get(f"{prefix}c1", 0.0)
     std = term.std.get(f"{prefix}c1")
     if term.shape in ("step", "interval"):
-        if name == "time":
-            where = (
-                f"after {knots[1]}" if term.shape == "step" else f"from {knots[1]} to {knots[2]}"
-            )
-        elif term.shape == "step":
-            where = f"where {name} is above {knots[1]}"
-        else:
-            where = f"where {name} is between {knots[1]} and {knots[2]}"
+        words = WHEN if name == "time" else WHERE
+        where = words[term.shape].format(*knots, name=name)
         return _off(term, part, size, std, f" {where}{seen}")
     if term.shape == "pulse":
         on, period = _in_words(term.covariate, np.subtract(term.knots[1:], term.knots[0]))
@@ -787,26 +720,18 @@ def _place(term: SmoothTerm) -> str:
 
     It is a part of a clause; "" if they determine none.
     """
-    if term.shape != "interval" or term.factor_shape != "interval":
-        return ""
     knots = {term.covariate: term.knots, term.factor: term.factor_knots}
-    middle = {name: 0.5 * (low + high) for name, (_, low, high, _) in knots.items()}
-    if any(
-        high - low > NARROW[name] for name, (_, low, high, _) in knots.items() if name in NARROW
-    ):
+    words = PLACES.get(frozenset(knots))
+    if words is None or term.shape != "interval" or term.factor_shape != "interval":
         return ""
+    if any(high - low > NARROW[name] for name, (_, low, high, _) in knots.items()):
+        return ""
+    middle = {name: 0.5 * (low + high) for name, (_, low, high, _) in knots.items()}
     # Bearing and elevation are of the anchor, seen from the tag. Level, if there is no elevation.
     away, up = middle.get("range", 1.0), -math.sin(middle.get("elevation", 0.0))
     level = math.cos(middle.get("elevation", 0.0))
     x, y = (-level * turn(middle.get("bearing", 0.0)) for turn in (math.cos, math.sin))
-    if set(middle) == {"range", "bearing"}:
-        where = f"{away * x:+.1f} m in x and {away * y:+.1f} m in y from the anchor, at most"
-    elif set(middle) == {"range", "elevation"}:
-        where = f"{away * up:+.1f} m in z and {away * level:.1f} m level from the anchor"
-    elif set(middle) == {"bearing", "elevation"}:
-        where = f"in the direction ({x:+.2f}, {y:+.2f}, {up:+.2f}) from the anchor"
-    else:
-        return ""
+    where = words.format(x=away * x, y=away * y, z=away * up, level=away * level)
     return f": there the tag is {where}"
 
 

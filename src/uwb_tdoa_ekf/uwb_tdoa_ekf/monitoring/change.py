@@ -228,7 +228,8 @@ class ChangeDetector:
         """
         n, turns = self._count - first, self._turn(np.arange(first, self._count))
         some = np.flatnonzero((self._index[turns] >= 0).any(axis=0))  # anchors that were heard
-        inverse, white = _inverse(self._factor, first, n), self._white[first : self._count, some]
+        white = self._white[first : self._count, some]
+        inverse = np.linalg.inv(self._factor[first : self._count, first : self._count])
         # contiguous, or numba compiles a second version in flight
         of_slices = (np.ascontiguousarray(self._index[turns][:, some]), self._response[turns])
         scores, information = _seen(*of_slices, inverse.T @ white, inverse.T @ inverse)
@@ -322,18 +323,6 @@ def _whiten(
     squares[k] = np.sum(error**2) / (variance * max(freedom[k], 1e-3))
     row[k] = math.sqrt(variance * max(1.0, squares[k] / OUTLIER))
     white[k] = error / row[k]
-
-
-@compiled
-def _inverse(factor: np.ndarray, first: int, n: int) -> np.ndarray:
-    """Return the inverse, (n, n), of the block of a lower triangular matrix from row `first` on."""
-    out = np.zeros((n, n))
-    for i in range(n):
-        out[i, i] = 1.0
-        for j in range(i):
-            out[i] -= factor[first + i, first + j] * out[j]
-        out[i] /= factor[first + i, first + i]
-    return out
 
 
 @compiled

@@ -433,7 +433,7 @@ def _repeat(like: Traced, values: Traced, count: int, axis: int) -> Node:
 
 
 def _einsum(like: Traced, subscripts: str, one: Any, other: Any) -> Node:
-    assert subscripts == "nk,nk->n"
+    assert subscripts == "...k,...k->..."
     return total(apply("mul", like.lifted(one), like.lifted(other)))
 
 

@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from uwb_tdoa_bias.effects.auxiliary import FloorStep, IntervalEffect, VelocitySlip
+from uwb_tdoa_bias.effects.sensor import FloorStep, IntervalEffect, VelocitySlip
 
 from ..regression.fit import Fit
 from ..regression.table import RegressionTable

@@ -123,9 +123,8 @@ def _product(effect: SmoothTerm) -> Picture:
         low, high = effect.domain.get(effect.covariate, (low, high))
     x = np.linspace(low, high, GRID)
     y = np.linspace(effect.factor_knots[0], effect.factor_knots[-1], GRID)
-    by = np.repeat(effect.factor_course(y), GRID)
     prefix = prefixes_of(effect)[0]
-    values = effect.curve(np.tile(x, GRID), prefix, by).reshape(GRID, GRID)
+    values = effect.curve(np.tile(x, GRID), prefix, np.repeat(y, GRID)).reshape(GRID, GRID)
     part = CHANNELS[effect.channel.partition(".")[0]]
     figure, ax = drawing(2.6)
     most = np.abs(values).max()

@@ -1,58 +1,264 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Effects of auxiliary sensors (height, pressure, velocity), and the corrector of their streams."""
+"""Effects of sensors on the tag: inertial ones, a range finder, a barometer, a velocity sensor."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Hashable, Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import replace
 import math
 from typing import Any, ClassVar
 
 import numpy as np
 
-from ..common.flight import SENSOR_NAMES, Flight
-from ..common.sensors import STREAM_OF, with_measured
-from ..common.sensors.sensor import UNKNOWN_STD, UNKNOWN_VARIANCE, Stream
+from ..common.flight import Flight
+from ..common.lazy import rotations
+from ..common.sensors import with_measured
 from .base import (
     IDENTITY,
     UNLIMITED,
     Affine,
     Effect,
     Row,
-    SensorEffect,
+    central_differences,
     finite,
     interval_words,
     is_within,
     require,
-    undoing,
 )
-from .samples import SensorSamples, Track, sensor_samples
+from .samples import ImuSamples, SensorSamples, Track, sensor_samples
 
+INERTIAL = ("gyro", "accel")  # channels of an IMU
+# `penalty` of effects that look like a bias of the accelerometer without tilt and manoeuvres
+BESIDE_BIAS = 2.0
+AXES = ("x", "y", "z")
 LIMITS = ("start", "end")  # s after the first TDOA
 
 
-class AuxiliaryEffect(SensorEffect):
-    """An effect with an affine sensor model on one channel, its only one."""
+class SensorEffect(Effect):
+    """An effect with an affine sensor model, measured = matrix true + offset, on its channels."""
 
-    def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
-        (channel,) = self.channels
-        part = require(self, flight, channel)
-        changed: Flight = with_measured(flight, channel, part.sensed(self.model()(part.values)))
-        return changed
-
-
-class ScaleEffect(AuxiliaryEffect):
-    """Measured = (1 + `scale`) true."""
-
-    dimensions: ClassVar[int] = 1  # numbers of a measurement
+    def vector(self) -> np.ndarray:
+        """Return the values of its parameters, (k,)."""
+        return np.array([self.values.get(key, 0.0) for key in self.parameters or (self.example,)])
 
     def model(self) -> Affine:
-        scale = 1.0 + self.values.get("scale", 0.0)
-        return Affine(scale * np.eye(self.dimensions), np.zeros(self.dimensions))
+        """Return the Affine from true to measured values."""
+        raise NotImplementedError
+
+    def sensor_model(self, channel: str) -> Affine:
+        return self.model() if channel in self.channels else IDENTITY
+
+    def regressors(self, samples: Any, keys: Sequence[str]) -> np.ndarray:
+        def measured_at(values: dict[str, float]) -> np.ndarray:
+            return type(self)(values).sensor_model(samples.channel)(samples.reading)
+
+        return central_differences(measured_at, self.values, keys, 1e-6)
+
+    def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
+        for channel in self.channels:
+            if channel in INERTIAL:
+                imu = require(self, flight, "imu")
+                sensed = {channel: self.model()(getattr(imu, channel))}
+                flight = replace(flight, imu=replace(imu, **sensed))
+            else:
+                part = require(self, flight, channel)
+                flight = with_measured(flight, channel, part.sensed(self.model()(part.values)))
+        return flight
 
 
-class HeightOffset(AuxiliaryEffect):
+class SensorOffset(SensorEffect):
+    """Measured = true + values."""
+
+    def model(self) -> Affine:
+        return Affine(np.eye(len(self.vector())), self.vector())
+
+
+class SensorScale(SensorEffect):
+    """Measured = (1 + values) true, axis by axis."""
+
+    def model(self) -> Affine:
+        return Affine(np.diag(1.0 + self.vector()), np.zeros(len(self.vector())))
+
+
+class SensorTurn(SensorEffect):
+    """Measured = R^T true, with R of a rotation vector from body to sensor axes."""
+
+    def model(self) -> Affine:
+        return Affine(rotations.Rotation.from_rotvec(self.vector()).as_matrix().T, np.zeros(3))
+
+
+class GyroBias(SensorOffset):
+    """Measured rate = true rate + (x, y, z), body."""
+
+    row = Row(
+        name="gyro_bias",
+        unit="rad/s",
+        bound=1.0,
+        negligible=0.002,
+        prior_std=0.05,
+        example="z",
+        physics="zero-rate offset of a MEMS gyroscope, with temperature and age",
+        reference="BMI088 data sheet: zero-rate offset 1 degree/s",
+        remedy="Let the gyroscope find its zero at rest before take-off: it reads {found}.",
+        phrase="{size} {way} about {key}",
+        ways=("too much", "too little"),
+    )
+    channels = ("gyro",)
+    parameters = AXES
+
+
+class GyroScale(SensorScale):
+    """Measured rate = (1 + (x, y, z)) true rate, axis by axis."""
+
+    row = Row(
+        name="gyro_scale",
+        unit="1",
+        bound=0.5,
+        negligible=0.01,
+        prior_std=0.05,
+        example="z",
+        physics="sensitivity error of a MEMS gyroscope",
+        reference="BMI088 data sheet: sensitivity tolerance 1 %",
+        confounded_with=("truth_time_offset", "imu_misalignment"),
+        remedy="Calibrate the gyroscope on a turntable: it reads {found}.",
+        phrase="{size} {way} about {key}",
+        ways=("too much", "too little"),
+        shown=("%", 100.0),
+    )
+    channels = ("gyro",)
+    parameters = AXES
+
+
+class AccelBias(SensorOffset):
+    """Measured force = true specific force + (x, y, z), body."""
+
+    row = Row(
+        name="accel_bias",
+        unit="m/s^2",
+        bound=10.0,
+        negligible=0.03,
+        prior_std=0.5,
+        example="x",
+        physics="zero-g offset of a MEMS accelerometer, and vibration that it rectifies",
+        reference="BMI088 data sheet: zero-g offset 20 mg",
+        confounded_with=("imu_misalignment", "imu_gravity", "accel_scale"),
+        remedy=(
+            "Calibrate the accelerometer at rest and damp the vibration of its mount: it "
+            "reads {found}."
+        ),
+        phrase="{size} {way} along {key}",
+        ways=("too much", "too little"),
+    )
+    channels = ("accel",)
+    parameters = AXES
+    sizable_share = 0.3  # one axis suffices, else a scale replaces the bias of the others
+
+
+class AccelScale(SensorScale):
+    """Measured force = (1 + (x, y, z)) true specific force, axis by axis."""
+
+    row = Row(
+        name="accel_scale",
+        unit="1",
+        bound=0.5,
+        negligible=0.004,
+        prior_std=0.05,
+        example="z",
+        physics="sensitivity error of a MEMS accelerometer",
+        reference="BMI088 data sheet: sensitivity tolerance 0.7 %",
+        confounded_with=("accel_bias", "imu_gravity"),
+        distinguished_by={
+            "accel_bias": "hard manoeuvres: a scale grows with them, a bias does not"
+        },
+        remedy="Calibrate the accelerometer, each axis up and down: it reads {found}.",
+        phrase="{size} {way} along {key}",
+        ways=("too much", "too little"),
+        shown=("%", 100.0),
+    )
+    channels = ("accel",)
+    parameters = AXES
+    penalty = BESIDE_BIAS
+
+
+class ImuMisalignment(SensorTurn):
+    """Measured = R^T true, with R of the rotation vector (x, y, z) from body to IMU axes."""
+
+    row = Row(
+        name="imu_misalignment",
+        unit="rad",
+        bound=0.6,
+        negligible=0.004,
+        prior_std=0.05,
+        example="x",
+        physics="the sensor, or the frame of the ground truth, is turned against the body's axes",
+        reference="strapdown navigation: mounting misalignment",
+        confounded_with=("accel_bias", "gyro_scale"),
+        distinguished_by={
+            "accel_bias": "quick turns: a misalignment also shows on the gyroscope",
+        },
+        remedy=(
+            "Turn the IMU by {found}: its axes are not those of the body as the ground truth "
+            "has it."
+        ),
+        phrase="{value} about {key}",
+        shown=("degrees", float(-np.degrees(1.0))),  # the turn back
+    )
+    channels = INERTIAL
+    parameters = AXES
+
+
+class ImuGravity(SensorEffect):
+    """Gravity is 9.81 m/s^2 + `excess`, along the vertical of the world.
+
+    It is corrected along the z axis of the body, without an attitude. At the tilt of a flight a few
+    percent of the excess remain.
+    """
+
+    row = Row(
+        name="imu_gravity",
+        unit="m/s^2",
+        bound=1.0,
+        negligible=0.03,
+        prior_std=0.1,
+        example="excess",
+        physics=(
+            "local gravity, or the factor from g to m/s^2, differs from the 9.81 m/s^2 of the "
+            "filter"
+        ),
+        reference="gravity is 9.780 to 9.832 m/s^2 between equator and pole",
+        confounded_with=("accel_bias", "accel_scale"),
+        distinguished_by={
+            "accel_bias": "a flight that tilts, or the vehicle at rest on its sides",
+            "accel_scale": "hard manoeuvres up and down: a scale grows with them, gravity does not",
+        },
+        remedy=(
+            "Check the accelerometer's factor from g to m/s^2, and local gravity: it reads "
+            "{found} upwards."
+        ),
+        ways=("too much", "too little"),
+    )
+    channels = ("accel",)
+    penalty = BESIDE_BIAS
+
+    def model(self) -> Affine:
+        return Affine(np.eye(3), np.array([0.0, 0.0, self.values.get("excess", 0.0)]))
+
+    def regressors(self, samples: ImuSamples, keys: Sequence[str]) -> np.ndarray:
+        return np.repeat(samples.up[:, :, None], len(keys), axis=2)  # the true vertical
+
+    def uncorrected(self, samples: ImuSamples) -> np.ndarray:
+        return self.values.get("excess", 0.0) * (samples.up - [0.0, 0.0, 1.0])
+
+    def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
+        truth, imu = require(self, flight, "truth"), require(self, flight, "imu")
+        error, q = self.model().offset, Track(truth).attitudes(imu.t)
+        if np.isfinite(q).all():
+            error = rotations.Rotation.from_quat(q).inv().apply(error)
+        return replace(flight, imu=replace(imu, accel=imu.accel + error))
+
+
+class HeightOffset(SensorOffset):
     """Measured range = true range from the origin of the body frame + `offset`.
 
     The parameter `height_arm` of the filter is -offset: set one of the two.
@@ -79,11 +285,8 @@ class HeightOffset(AuxiliaryEffect):
     )
     channels = ("height",)
 
-    def model(self) -> Affine:
-        return Affine(np.eye(1), np.array([self.values.get("offset", 0.0)]))
 
-
-class HeightScale(ScaleEffect):
+class HeightScale(SensorScale):
     """Measured range = (1 + `scale`) true range."""
 
     row = Row(
@@ -108,7 +311,7 @@ class HeightScale(ScaleEffect):
     channels = ("height",)
 
 
-class VelocityScale(ScaleEffect):
+class VelocityScale(SensorScale):
     """Measured velocity = (1 + `scale`) true velocity."""
 
     row = Row(
@@ -133,10 +336,12 @@ class VelocityScale(ScaleEffect):
         shown=("%", 100.0),
     )
     channels = ("velocity",)
-    dimensions = 3
+
+    def vector(self) -> np.ndarray:
+        return np.repeat(self.values.get("scale", 0.0), 3)
 
 
-class YawRateScale(ScaleEffect):
+class YawRateScale(SensorScale):
     """Measured yaw rate = (1 + `scale`) true yaw rate."""
 
     row = Row(
@@ -161,7 +366,7 @@ class YawRateScale(ScaleEffect):
     channels = ("yaw_rate",)
 
 
-class VelocityMisalignment(AuxiliaryEffect):
+class VelocityMisalignment(SensorTurn):
     """Measured velocity = R_z(yaw)^T true velocity, with `yaw` from body to sensor axes."""
 
     row = Row(
@@ -186,10 +391,8 @@ class VelocityMisalignment(AuxiliaryEffect):
     )
     channels = ("velocity",)
 
-    def model(self) -> Affine:
-        yaw = self.values.get("yaw", 0.0)
-        cos, sin = math.cos(yaw), math.sin(yaw)
-        return Affine(np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
+    def vector(self) -> np.ndarray:
+        return np.array([0.0, 0.0, self.values.get("yaw", 0.0)])
 
 
 class BarometerDrift(Effect):
@@ -349,39 +552,3 @@ class VelocitySlip(IntervalEffect):
 
     def per_unit(self, samples: SensorSamples) -> np.ndarray:
         return -samples.reading
-
-
-class SensorCorrector:
-    """Corrector of the streams of auxiliary sensors, whole or one measurement after the other."""
-
-    def __init__(self, effects: Collection[Effect]) -> None:
-        """Select the effects on these streams among `effects`; they are undone in their order."""
-        self._late = {
-            stream: sum(effect.stamp_offset(stream) for effect in effects)
-            for stream in SENSOR_NAMES
-        }
-        self._undo = {channel: undoing(effects, channel) for channel in STREAM_OF}
-        undone = any(undo is not IDENTITY for undo in self._undo.values())
-        self.idle = not undone and not any(self._late.values())
-
-    def correct(self, name: str, stream: Stream) -> Stream:
-        """Return the corrected Stream of the sensor `name`."""
-        if self._late[name]:
-            stream = replace(stream, t=stream.t - self._late[name])
-        for channel, part in stream.parts.items():
-            stream = stream.with_part(channel, self._undone(channel, part))
-        return self._undone(name, stream)
-
-    def _undone(self, channel: str, stream: Stream) -> Stream:
-        undo = self._undo[channel]
-        if undo is IDENTITY:
-            return stream
-        std = getattr(stream, "std", None)
-        if std is None:
-            return stream.with_values(undo(stream.values))
-        known = np.isfinite(std)  # an axis that was not measured may hold any value
-        variance = np.where(known, std, UNKNOWN_STD) ** 2 @ undo.matrix.T**2
-        std = np.where(variance < UNKNOWN_VARIANCE, np.sqrt(variance), np.inf)
-        values = undo(np.where(known, stream.values, 0.0))
-        corrected: Any = stream.with_values(values)  # has a std, as `stream` has
-        return replace(corrected, std=std)
