@@ -408,7 +408,8 @@ class SmoothTerm(Effect):
             each = self._functions(values, self._weights(samples), factor)
             return self._of_measurements(samples, each)
         table, rows = self._of_anchors(samples.anchors), samples.rows
-        mine = np.flatnonzero(table.any(axis=1)[rows])  # arrivals of anchors with a function
+        # arrivals of anchors with a function
+        mine = np.flatnonzero(np.count_nonzero(table, axis=1)[rows])
         each = 0.0 * values  # NaN where unknown
         some = None if factor is None else factor[mine]
         each[mine] = self._functions(values[mine], table[rows[mine]], some)

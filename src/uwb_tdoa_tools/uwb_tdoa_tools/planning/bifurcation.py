@@ -61,9 +61,8 @@ _OF_PLACES, _OF_MINIMA = 500_000, 2_000_000
 class Subsets:
     """All choices of k + 1 anchors that are not flat.
 
-    rows : (Q, k + 1) rows of the anchors; left_out : number of flat choices. A flat choice mirrors
-    every position. If there are more than MOST_SUBSETS choices, only anchors that come close together
-    in the round are combined.
+    rows : (Q, k + 1) rows of the anchors. A flat choice mirrors every position. If there are more
+    than MOST_SUBSETS choices, only anchors that come close together in the round are combined.
     """
 
     def __init__(self, anchors: Anchors, dimensions: int) -> None:
@@ -76,7 +75,7 @@ class Subsets:
         corners = anchors.positions[candidates][:, :, :dimensions]
         extents = principal_extents(corners)
         flat = extents[:, -1] <= FLAT_SUBSET * extents[:, 0]
-        self.rows, self.left_out = candidates[~flat], int(flat.sum())
+        self.rows = candidates[~flat]
         if not len(self.rows):
             raise InputError(
                 f"anchors: every {dimensions + 1} of them are nearly in one "
@@ -110,23 +109,6 @@ class Subsets:
     def ambiguous(self, points: np.ndarray) -> np.ndarray:
         """Return the share of the subsets with two solutions: (n,)."""
         return np.mean(self.discriminant(points) > 0.0, axis=1)
-
-    def mirrors(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the other positions with the same TDOAs: (point (m,), subset (m,), position (m, 3) m).
-
-        Only pairs of a point and a subset with two solutions are returned. A known height stays.
-        """
-        k = self.dimensions
-        row, subset = np.nonzero(self.discriminant(points) > 0.0)
-        reference = self.anchors.positions[self.rows[subset, 0]]
-        distances = _distances(points, self.anchors.positions)[row]
-        q = np.einsum("mkn,mn->mk", self._q[subset], distances)
-        away = points[row] - reference
-        r = np.linalg.norm(away, axis=1)
-        p = away[:, :k] - q * r[:, None]
-        squared = np.einsum("mk,mk->m", p, p) + np.einsum("mk,mk->m", away[:, k:], away[:, k:])
-        other = squared / ((np.einsum("mk,mk->m", q, q) - 1.0) * np.maximum(r, 1e-12))
-        return row, subset, np.hstack([reference[:, :k] + p + q * other[:, None], points[row, k:]])
 
 
 def _distances(points: np.ndarray, anchors: np.ndarray) -> np.ndarray:
