@@ -207,10 +207,9 @@ def test_a_faulty_inertial_sensor_is_refused(flight):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("signs", [(-1.0, 1.0, 1.0), (-1.0, -1.0, -1.0)])
-def test_a_gyroscope_with_wrong_signs_mirrors_no_map(flight, signs):
+def test_a_gyroscope_with_wrong_signs_mirrors_no_map(flight):
     """The mirror image fits all TDOAs, so only the IMU itself can reveal it."""
-    imu = replace(flight.imu, gyro=flight.imu.gyro * np.array(signs))
+    imu = replace(flight.imu, gyro=-flight.imu.gyro)
     assert "accelerations" in map_anchors(seen_of([replace(flight, imu=imu)])).why_not
 
 
