@@ -39,9 +39,14 @@ def at(flight, positions):
     return replace(flight, anchors=flight.anchors.at(positions))
 
 
+@pytest.fixture(scope="module")
+def again(flights, last_week):
+    """Return the self-calibration of the second flight, with that of the first as its prior."""
+    return self_calibrate([at(flights[1], last_week.anchors.positions)], Tape(), last_week.effects)
+
+
 @pytest.mark.slow
-def test_nothing_has_changed_since_last_week(flights, last_week):
-    again = self_calibrate([at(flights[1], last_week.anchors.positions)], Tape(), last_week.effects)
+def test_nothing_has_changed_since_last_week(again, last_week):
     assert not again.changes and "no anchor has changed clearly" in as_text(again)
     assert (again.position_std <= last_week.position_std + 0.005).all()
     before, after = (
@@ -273,15 +278,21 @@ def test_paths_are_read_from_tables_and_refused_where_they_cannot_be(flights, tm
 
 
 @pytest.mark.slow
-def test_the_command_goes_on_from_what_it_wrote(flights, last_week, tmp_path, capsys, monkeypatch):
+def test_the_command_goes_on_from_what_it_wrote(
+    flights, last_week, again, tmp_path, capsys, monkeypatch
+):
+    results, priors = iter([last_week, again]), []
+    monkeypatch.setattr(
+        self_calibration,
+        "self_calibrate",
+        lambda _, tape, base, *__: priors.append(base) or next(results),
+    )
+    monkeypatch.setattr(report, "with_blocked", lambda result, *_: result)
     write_bag(flights[0], tmp_path / "first.bag")
     first, second = tmp_path / "first", tmp_path / "second"
-    with monkeypatch.context() as patch:
-        patch.setattr(self_calibration, "self_calibrate", lambda *_: last_week)
-        patch.setattr(report, "with_blocked", lambda result, *_: result)
-        assert main([str(tmp_path / "first.bag"), "--std", "0.05", "--out", str(first)]) == 0
+    assert main([str(tmp_path / "first.bag"), "--std", "0.05", "--out", str(first)]) == 0
     capsys.readouterr()
-    again = [
+    options = [
         "--survey",
         str(first / "anchors.yaml"),
         "--effects",
@@ -289,7 +300,9 @@ def test_the_command_goes_on_from_what_it_wrote(flights, last_week, tmp_path, ca
         "--out",
         str(second),
     ]
-    assert main([str(tmp_path / "first.bag"), *again]) == 0
+    assert main([str(tmp_path / "first.bag"), *options]) == 0
+    written = EffectSet.from_yaml(first / "effects.yaml")
+    assert not priors[0].effects and priors[1].effects == written.effects
     assert "since the last calibration" in capsys.readouterr().out
     known = [EffectSet.from_yaml(folder / "effects.yaml") for folder in (first, second)]
     assert [len(one) for one in known] == [2, 2] and known[1].covariance.keys == known[
