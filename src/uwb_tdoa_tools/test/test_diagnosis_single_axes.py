@@ -50,9 +50,8 @@ def test_an_axis_is_searched_with_its_own_noise(found):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
-def test_nothing_is_found_where_nothing_is(seed):
-    flights = [clean_flight(10 * seed + k, 30.0, aided=True) for k in range(2)]
+def test_nothing_is_found_where_nothing_is():
+    flights = [clean_flight(seed, 30.0, aided=True) for seed in range(2)]
     assert functions_of_axes(residuals(*flights), []) == []
 
 

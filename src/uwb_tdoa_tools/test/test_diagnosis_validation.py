@@ -56,6 +56,12 @@ def attribution(flights):
     return attribute(flights, TRUTH, undeclared=False)
 
 
+@pytest.fixture(scope="module")
+def single(flights):
+    """Return the Attribution of the first flight."""
+    return attribute(flights[:1], TRUTH, undeclared=False)
+
+
 @pytest.mark.slow
 def test_every_flight_is_judged_with_effects_that_it_took_no_part_in(flights, attribution):
     cases = cross_fitted(attribution, flights, NONE, attribution.selection.chosen, ())
@@ -86,6 +92,7 @@ def test_a_validated_effect_stays_without_another_trial(attribution):
     )
     assert dropped.selection.chosen == () and dropped.worth.keys() == set(chosen)
     assert dropped.misleading == {"anchor_delay"}
+    assert "the filter does better without it" in dropped.refused[0].why
     assert kept.selection.chosen == chosen and not kept.worth and not kept.misleading
     assert kept.error > 2.0 * dropped.error
 
@@ -122,8 +129,7 @@ def test_a_displacement_is_used_again_where_corrections_have_not_changed(monkeyp
 
 
 @pytest.mark.slow
-def test_halves_of_a_single_flight_judge_each_other(flights):
-    single = attribute(flights[:1], TRUTH, undeclared=False)
+def test_halves_of_a_single_flight_judge_each_other(flights, single):
     first, second = cross_fitted(single, flights[:1], NONE, single.selection.chosen, ())
     together = sorted([*first.spans, *second.spans])
     assert together[::2] == list(first.spans) and together[1::2] == list(second.spans)
@@ -135,14 +141,6 @@ def test_what_helps_is_kept_and_said_what_it_is_worth(flights, attribution):
     kept = select_by_error(attribution, flights, Baseline(NONE))
     assert kept.selection.chosen == attribution.selection.chosen and not kept.refused
     assert kept.worth[kept.selection.chosen[0]] > 0.05
-
-
-def test_what_does_harm_is_left_out_with_a_reason(flights, attribution):
-    clean = [sparse_flight(seed, 30.0) for seed in (100, 101)]
-    kept = select_by_error(attribution, clean, Baseline(NONE))
-    assert (
-        kept.selection.chosen == () and "the filter does better without it" in kept.refused[0].why
-    )
 
 
 @pytest.mark.slow
@@ -313,8 +311,7 @@ def test_before_and_after_with_intervals(flights):
 
 
 @pytest.mark.slow
-def test_halves_of_a_flight_count_what_is_before_and_after_the_fit_once(flights):
-    single = attribute(flights[:1], TRUTH, undeclared=False)
+def test_halves_of_a_flight_count_what_is_before_and_after_the_fit_once(flights, single):
     cases, run = cross_fitted(single, flights[:1], NONE, (), ()), Baseline(NONE).run(flights[0])
     parts, whole = (
         [score(case, run).phases() for case in cases],
