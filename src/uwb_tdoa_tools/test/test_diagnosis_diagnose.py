@@ -23,6 +23,7 @@ from uwb_tdoa_tools.diagnosis import comparison, diagnose, output, with_noise
 from uwb_tdoa_tools.diagnosis.findings import Refused
 from uwb_tdoa_tools.diagnosis.regression.confounding import Unobservable
 from uwb_tdoa_tools.diagnosis.regression.terms import Candidate, Term
+from uwb_tdoa_tools.diagnosis.report.page import html
 from uwb_tdoa_tools.diagnosis.report.verdict import verdict
 from uwb_tdoa_tools.diagnosis.validation import ValidatedSelection
 
@@ -237,7 +238,11 @@ def test_two_processes_give_the_same_to_the_bit():
         told.append({**output.as_json(result), "std": result.tdoa_std, "values": values})
     assert json.dumps(told[0]) == json.dumps(told[1])
     assert told[0]["findings"][0]["added"]
-    assert told[0]["unattributed"][0]["flight"] == flights[1].name
+    (alone,) = (finding for finding in result.findings if finding.flight)
+    assert alone.flight == told[0]["unattributed"][0]["flight"] == flights[1].name
+    assert not alone.added
+    for said in (output.as_text(result), html(result)):
+        assert f"belongs to {flights[1].name} alone" in said
 
 
 @pytest.mark.slow

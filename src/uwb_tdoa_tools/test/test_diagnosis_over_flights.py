@@ -6,8 +6,7 @@ from dataclasses import replace
 from known_effects import clean_flight, effect_of
 import pytest
 
-from uwb_tdoa_bias.effects import EffectSet, SmoothTerm
-from uwb_tdoa_tools.diagnosis import diagnose, output
+from uwb_tdoa_bias.effects import SmoothTerm
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.over_flights import (
     ALL,
@@ -22,7 +21,6 @@ from uwb_tdoa_tools.diagnosis.over_flights import (
 )
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.refinement import OF_ONE
-from uwb_tdoa_tools.diagnosis.report.page import html
 
 
 def several(*values, std=0.05):
@@ -90,22 +88,6 @@ def test_a_function_that_one_flight_alone_can_show_is_not_applied():
     assert name == attribution.names[0]
     assert {candidate.terms[0].effect.covariate for candidate in alone.chosen} == {"time"}
     assert OF_ONE in {refused.why for refused in attribution.refused}
-
-
-@pytest.mark.slow
-def test_what_came_in_one_flight_is_said_of_that_flight_and_not_applied():
-    """A reflector makes anchor 3 late for x > 0.5 m."""
-    step = SmoothTerm(
-        {"3.c0": 0.0, "3.c1": 0.5}, {}, "", "tdoa", "x", "anchor", (-2.0, 0.5, 2.0), "step"
-    )
-    flights = [clean_flight(seed, 30.0) for seed in (100, 101, 102)]
-    flights[1] = step.inject(flights[1])
-    result = diagnose(flights)
-    (finding,) = (finding for finding in result.findings if finding.flight)
-    assert finding.flight == flights[1].name and not finding.added and result.effects == EffectSet()
-    assert any(key.startswith("3.") for key in finding.effect.values)
-    assert f"belongs to {flights[1].name} alone" in output.as_text(result)
-    assert f"belongs to {flights[1].name} alone" in html(result)
 
 
 def test_what_flights_show_alike_does_no_harm_and_what_one_of_three_lacks_may():
