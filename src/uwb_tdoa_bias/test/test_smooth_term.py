@@ -34,9 +34,9 @@ def test_a_function_of_ranges_adds_nothing_to_tdoas_nor_the_other_way_round():
     samples = random_samples(2)
     np.testing.assert_array_equal(term(channel="range").bias(samples), 0.0)
     np.testing.assert_array_equal(term().bias(ranges_of(samples, samples.b)), 0.0)
-    with pytest.raises(InputError, match="form: pair acts on two anchors"):
+    with pytest.raises(InputError, match="form: 'pair' is not one of common, arrival or anchor"):
         term(channel="range", form="pair", covariate="height")
-    with pytest.raises(InputError, match="'previous_anchor' acts on 'range'"):
+    with pytest.raises(InputError, match="covariate: 'previous_anchor' is not one of"):
         term(channel="range", form="common", covariate="previous_anchor")
 
 
@@ -163,11 +163,14 @@ def test_a_product_is_read_as_it_is_written(tmp_path):
         ({"factor": "speed"}, "'speed' is not one of time, x"),
         ({"factor": "colour"}, "'colour' is not one of"),
         ({"factor": "previous_anchor"}, "'previous_anchor' is not one of"),
-        ({"shape": "spline"}, "'height' multiplies a spline"),
-        ({"factor_shape": "wave", "factor_knots": [0.0, 1.0]}, "'wave' with 2 knots"),
-        ({"factor_knots": [0.0, 1.0]}, "'step' with 2 knots is not one of line"),
-        ({"factor_knots": [1.0, 0.0, 2.0]}, "factor_knots: .* are not two or more rising"),
-        ({"channel": "gyro.x"}, "acts on 'gyro.x'"),
+        ({"shape": "spline"}, "'height' is not possible here"),
+        (
+            {"factor_shape": "wave", "factor_knots": [0.0, 1.0]},
+            "factor_shape: 'wave' is not one of line",
+        ),
+        ({"factor_knots": [0.0, 1.0]}, "are not 3 rising numbers, as the shape step needs"),
+        ({"factor_knots": [1.0, 0.0, 2.0]}, "factor_knots: .* are not 3 rising"),
+        ({"channel": "gyro.x"}, "factor: 'height' is not possible here"),
     ],
 )
 def test_a_factor_that_cannot_be_is_refused(changes, message):
@@ -232,17 +235,14 @@ def test_a_function_of_what_its_channel_does_not_have_is_refused_when_it_is_read
     (tmp_path / "effects.yaml").write_text(yaml.safe_dump({"effects": {"smooth_term_1": entry}}))
     with pytest.raises(
         InputError,
-        match=(
-            f"function of '{covariate}' acts on '{channel}'; forms are .*, covariates of this "
-            "channel time, "
-        ),
+        match=f"covariate: '{covariate}' is not one of time, ",
     ):
         EffectSet.from_yaml(tmp_path / "effects.yaml")
 
 
 def test_a_function_of_no_channel_is_refused_with_those_that_there_are():
     with pytest.raises(
-        InputError, match="acts on 'gyro'; channels are tdoa, range, gyro.x, .* and yaw_rate"
+        InputError, match="channel: 'gyro' is not one of tdoa, range, gyro.x, .* or yaw_rate"
     ):
         SmoothTerm(channel="gyro", covariate="time", knots=(0.0, 1.0))
 

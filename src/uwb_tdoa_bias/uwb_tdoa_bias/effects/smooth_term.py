@@ -7,7 +7,7 @@ First the term, then its shapes, then its words.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 import math
@@ -147,65 +147,29 @@ class SmoothTerm(Effect):
     key_form: ClassVar[tuple[str, str]] = r"(.+\.)?c[0-9]+", "a coefficient such as c0 or 3.c0"
 
     def __post_init__(self) -> None:
-        self.knots = _rising("knots", self.knots)
-        known = known_covariates()
+        covariates = known_covariates()
+        _check("channel", self.channel, covariates)
+        radio = RADIO.get(self.channel)
+        forms = [form for form in FORMS if form not in OF_LINKS or (radio and radio.ends > 1)]
+        _check("form", self.form, forms)
+        known = [
+            name
+            for name in covariates[self.channel]
+            if self.form in OF_ARRIVALS or name not in OF_ARRIVAL
+        ]
         extra = self.covariate.startswith(EXTRA) and self.channel not in SENSOR_CHANNELS
-        if (
-            self.form not in FORMS
-            or self.channel not in known
-            or not (extra or self.covariate in known[self.channel])
-        ):
-            remedy = f"channels are {listed(known)}"
-            if self.channel in known:
-                remedy = (
-                    f"forms are {listed(FORMS)}, covariates of this channel "
-                    f"{listed(known[self.channel])}"
-                )
-            raise InputError(
-                f"effects: smooth_term: no {self.form!r} function of {self.covariate!r} acts "
-                f"on {self.channel!r}; {remedy}."
-            )
-        if self.shape != "spline" and SHAPES.get(self.shape, (0,))[0] != len(self.knots):
-            shapes = ", ".join(f"{shape} ({count})" for shape, (count, _) in SHAPES.items())
-            raise InputError(
-                f"effects: smooth_term: shape: {self.shape!r} with {len(self.knots)} knots is "
-                f"not spline or one of {shapes}."
-            )
-        if self.form in OF_LINKS and self.channel in RADIO and RADIO[self.channel].ends < 2:
-            raise InputError(
-                f"effects: smooth_term: form: {self.form} acts on two anchors, {self.channel} "
-                "is of one; write form: anchor."
-            )
-        if self.form in ("common", *OF_LINKS) and self.covariate in OF_ARRIVAL:
-            raise InputError(
-                f"effects: smooth_term: form: {self.form} acts on both anchors, "
-                f"{self.covariate} is of one; write form: anchor."
-            )
+        if not extra:
+            _check("covariate", self.covariate, known)
+        if self.shape != "spline":
+            _check("shape", self.shape, ["spline", *SHAPES])
+        self.knots = _rising("knots", self.knots, self.shape)
         if self.factor:
-            self._check_factor(known[self.channel])
+            has_factor = radio is not None and self.shape != "spline"
+            others = [name for name in known if has_domain(name) and name != self.covariate]
+            _check("factor", self.factor, others if has_factor else [])
+            _check("factor_shape", self.factor_shape, FACTORS)
+            self.factor_knots = _rising("factor_knots", self.factor_knots, self.factor_shape)
         super().__post_init__()
-
-    def _check_factor(self, known: Sequence[str]) -> None:
-        """Raise InputError if the factor is none; known : covariates of the channel."""
-        self.factor_knots = _rising("factor_knots", self.factor_knots)
-        name = "effects: smooth_term: factor"
-        if self.channel not in RADIO or self.shape == "spline":
-            raise InputError(
-                f"{name}: {self.factor!r} multiplies a spline, or acts on {self.channel!r}; a factor "
-                f"is for shapes on {listed(RADIO)}."
-            )
-        known = [one for one in known if has_domain(one) and one != self.covariate]
-        if self.form in ("common", *OF_LINKS):
-            known = [one for one in known if one not in OF_ARRIVAL]
-        if self.factor not in known:
-            raise InputError(f"{name}: {self.factor!r} is not one of {listed(known)}.")
-        count = SHAPES[self.factor_shape][0] if self.factor_shape in FACTORS else 0
-        if len(self.factor_knots) != count:
-            shapes = ", ".join(f"{shape} ({SHAPES[shape][0]})" for shape in FACTORS)
-            raise InputError(
-                f"{name}_shape: {self.factor_shape!r} with {len(self.factor_knots)} knots is not one "
-                f"of {shapes}."
-            )
 
     @classmethod
     def within_bounds(cls, values: dict[str, float]) -> bool:
@@ -488,15 +452,25 @@ class SmoothTerm(Effect):
         return f"Look for why {functions}.", f"Likely causes: {cause}. To tell: {trial}."
 
 
-def _rising(name: str, knots: Any) -> tuple[float, ...]:
-    """Return knots as a tuple of floats; raise InputError if they are not rising."""
+def _check(setting: str, value: str, known: Collection[str]) -> None:
+    """Raise InputError if the value of a setting is not known."""
+    if value not in known:
+        expected = f"not one of {listed(known, 'or')}" if known else "not possible here"
+        raise InputError(f"effects: smooth_term: {setting}: {value!r} is {expected}.")
+
+
+def _rising(setting: str, knots: Any, shape: str) -> tuple[float, ...]:
+    """Return the knots of a shape as a tuple; raise InputError if they are none."""
     try:
         out = tuple(float(knot) for knot in knots)
     except (TypeError, ValueError):
         out = ()
-    if len(out) < 2 or not (np.diff(out) > 0.0).all():
+    count = SHAPES[shape][0] if shape in SHAPES else max(len(out), 2)
+    if len(out) != count or not (np.diff(out) > 0.0).all():
+        expected = count if shape in SHAPES else "two or more"
         raise InputError(
-            f"effects: smooth_term: {name}: {knots!r} are not two or more rising numbers."
+            f"effects: smooth_term: {setting}: {knots!r} are not {expected} rising numbers, "
+            f"as the shape {shape} needs."
         )
     return out
 
