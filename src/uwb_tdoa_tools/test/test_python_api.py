@@ -27,6 +27,7 @@ SIGNATURES = {
     "effect": "kind",
     "errors": "flight run effects=None",
     "filter": "flight effects=None config=None model=None",
+    "flight": "anchors *units=None *name='flight' **tables",
     "plot": "flight run",
     "plot_errors": "flight run effects=None",
     "read": "path survey=None *namespace='' *topics=None *salvage=False *profile=None *tag=''",

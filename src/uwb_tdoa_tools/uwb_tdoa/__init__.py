@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from matplotlib.figure import Figure
 
@@ -67,6 +67,7 @@ __all__ = [
     "effect",
     "errors",
     "filter",
+    "flight",
     "plot",
     "plot_errors",
     "read",
@@ -141,6 +142,41 @@ def read(
     elif survey is not None:
         known = NamedAnchors(survey)
     return read_by_profile([path], load_profile(profile), known, tag, namespace, salvage)
+
+
+def flight(
+    anchors: Anchors | str | Path | Mapping[Any, Any],
+    *,
+    units: Mapping[str, Any] | None = None,
+    name: str = "flight",
+    **tables: Any,
+) -> Flight:
+    """Return a Flight of arrays, lists or data frames.
+
+    flight = uwb.flight(
+        {0: (0.0, 0.0, 0.3), 1: (7.0, 0.0, 2.8), ...},
+        tdoa={"time": t, "anchor_a": a, "anchor_b": b, "tdoa": d},
+        imu={"time": t_imu, "gyro": gyro, "accel": accel},
+        units={"time": "ms", "gyro": "deg/s"},
+    )
+
+    Parameters
+    ----------
+    anchors : Anchors, path of a survey, or {id or name: (x, y, z) in m}
+    units : {column: unit}, or {table: {column: unit}}
+        Default: s, m, rad/s, m/s^2.
+    tables : {column: (n,) values} or DataFrame
+        One for each set of sensors, under any name, e.g. tdoa, imu, truth. docs/csv.md lists the
+        columns. "gyro", "accel" and "pose" may be (n, 3), "pose_q" (n, 4) x y z w.
+
+    Raises
+    ------
+    InputError
+        If a column or a unit is unknown or missing, or values are no numbers or of other lengths.
+    """
+    from uwb_tdoa_tools.readers.arrays import flight_of_arrays
+
+    return flight_of_arrays(anchors, tables, units, name)
 
 
 def write(flight: Flight, path: str | Path, *, force: bool = False) -> None:

@@ -28,6 +28,9 @@ GRAVITY = 9.81
 NO_TARGET = 32.0  # m; the range finder writes 32.767 or more without a target, and sees 4 m at most
 # mm, and m: the formula of the standard atmosphere ends at 44 km
 LARGEST = {"tof": 1e9, "baro": 4e4}
+# Hz; tags measure 1 to 2000 TDOAs a second, and the slowest in public sets one in 10 s
+POSSIBLE_RATES = 0.02, 2e4
+TIME_STEP, ALIKE, MANY = 1000.0, 0.2, 100  # ratio of two units; its tolerance; records of a stream
 DAY = 86400.0  # s
 # smallest reported ratio of two rates, and share of dropped samples
 UNEQUAL_RATES, DROPPED_SHARE = (1.1, 0.02)
@@ -83,6 +86,9 @@ def make_flight(
     if "pose" in wanted and "qx" not in wanted["pose"]:
         unknown = np.full(len(wanted["pose"]["t"]), np.nan)
         wanted["pose"] = {**wanted["pose"], **dict.fromkeys(("qx", "qy", "qz", "qw"), unknown)}
+    _refuse_other_unit_of_time(
+        meta["source"], {key: np.asarray(columns["t"], float) for key, columns in wanted.items()}
+    )
     clock = straightened({key: columns["t"] for key, columns in (extra | wanted).items()})
     wanted, extra = (
         {key: clock.columns(key, columns) for key, columns in group.items()}
@@ -112,6 +118,27 @@ def make_flight(
         del meta["remarks"]
     sensors = _sensors(streams, imu)
     return Flight(name, anchors, tdoas, imu, poses, extra, meta, clock.restarts, **sensors)
+
+
+def _refuse_other_unit_of_time(source: str, stamps: dict[str, np.ndarray]) -> None:
+    """Raise InputError if a stream is 1000 times as long as another, or has an impossible rate."""
+    spans = {key: float(np.ptp(t)) for key, t in stamps.items() if len(t) >= MANY}
+    spans = {key: span for key, span in spans.items() if 0.0 < span < np.inf}
+    remedy = "give the unit of the time (s, ms, us or ns), or the column that holds it."
+    for key in sorted({"tdoa", "range"} & spans.keys()):
+        rate = (len(stamps[key]) - 1) / spans[key]
+        if not POSSIBLE_RATES[0] <= rate <= POSSIBLE_RATES[1]:
+            raise InputError(f"{source}: {rate:.3g} records of {key} a second cannot be; {remedy}")
+    if not spans:
+        return
+    longest, shortest = max(spans, key=spans.__getitem__), min(spans, key=spans.__getitem__)
+    ratio = spans[longest] / spans[shortest]
+    unit = TIME_STEP ** round(np.log(ratio) / np.log(TIME_STEP))
+    if unit > 1.0 and abs(ratio / unit - 1.0) < ALIKE:
+        raise InputError(
+            f"{source}: {longest} spans {spans[longest]:.4g} s, {shortest} {spans[shortest]:.4g} s, "
+            f"about {unit:.0f} times as long: one is in another unit; {remedy}"
+        )
 
 
 def _in_order(streams: Streams, reordered: dict[str, int]) -> Streams:
