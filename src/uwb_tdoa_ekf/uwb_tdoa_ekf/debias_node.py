@@ -72,8 +72,6 @@ class DebiasNode(StreamNode):
         self._map, self._rate = BiasMap.load(file), Rate()
         self._counts: Counter[str] = Counter()
         self._counts_before: Counter[str] = Counter()
-        # the first call builds the interpolator
-        self._map.correct(np.zeros((1, 3)), np.zeros((1, 3, 3)))
         self._publisher = publish_stream(self, Odometry, "odometry/debiased")
         self._input = Input(
             self,
@@ -89,7 +87,7 @@ class DebiasNode(StreamNode):
         self._anchors.start()
         say_unused([self], files_of(arguments))
         self._diagnostics = Diagnostics(self, self._report)
-        self.ready = f"ready; {len(self._map.at)} markers, {self._map.interpolator}"
+        self.ready = f"ready; {len(self._map.at)} markers"
 
     def _on_anchors(self, anchors: Anchors) -> None:
         self._map_fits_anchors = self._map.belongs_to(anchors)

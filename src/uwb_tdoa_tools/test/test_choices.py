@@ -9,7 +9,6 @@ import pytest
 from test_executables import TOOLS
 
 from uwb_tdoa_bias.common.sensors import SENSORS
-from uwb_tdoa_ekf.debias import INTERPOLATORS
 from uwb_tdoa_tools import choices
 from uwb_tdoa_tools.bags.files import PLUGINS
 from uwb_tdoa_tools.diagnosis.references import REFERENCES
@@ -30,7 +29,6 @@ HEAVY = """PIL apsw jinja2 joblib llvmlite matplotlib numba onnx onnxruntime pan
     [
         (choices.STORAGES, PLUGINS),
         (choices.REFERENCES, REFERENCES),
-        (choices.INTERPOLATORS, INTERPOLATORS),
         (choices.TRAJECTORIES, TRAJECTORIES),
         (choices.CARRIERS, VEHICLE_DEFAULTS),
         (choices.WORLDS, WORLDS),

@@ -46,7 +46,7 @@ WORDS = {  # command: its arguments
     "plan": "anchors.yaml --improve move --out maps",
     "simulate": "--duration 300 --out long.bag",
     "survey": "flight.bag --out surveyed",
-    "train": "flight.bag --model structured --out model",
+    "train": "flight.bag --model paper --out model",
 }
 ELSEWHERE = {"replay"}  # these wait for the time of a recording
 

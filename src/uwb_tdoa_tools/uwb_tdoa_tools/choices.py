@@ -9,8 +9,7 @@ others: registries of functions and classes.
 STORAGES = "mcap", "sqlite3"  # kinds of bags
 ALIGN = NONE, TIME, FRAME = "none", "time", "frame"  # how far a ground truth is aligned
 REFERENCES = "truth", "heights", "marks", "odometry", "nothing"  # of diagnose
-INTERPOLATORS = "thin_plate", "network"  # of a map of the bias
-MODELS = "paper", "paper_no_orientation", "structured", "physics", "physics+structured"
+MODELS = "paper", "physics"  # of train
 # m per square root of a second, of the path of another odometry: 1 % after 200 m at 1 m/s, as
 # visual-inertial odometry
 DRIFT = 0.02

@@ -147,8 +147,6 @@ def map_figures(bias_map: BiasMap) -> dict[str, Any]:
     return {
         "markers": len(bias_map.at),
         "step": bias_map.step,
-        "interpolator": bias_map.interpolator,
-        "planar": bias_map.planar,
         "frame": bias_map.frame,
         "anchors": bias_map.ids.tolist(),
         "source": bias_map.source,
@@ -174,7 +172,7 @@ def comparison_rows(
             {
                 "flight": flight.name,
                 **figures,
-                "known": float(np.mean(bias_map.validity(airborne) == 1.0)),
+                "known": float(np.mean(bias_map.validity(airborne[:, :2]) == 1.0)),
             }
         )
     return out
@@ -231,7 +229,7 @@ def _side(figures: Mapping[str, float]) -> str:
 
 
 LEAST = 10  # positions of flights, 5 ms apart, least number for a marker
-COLUMNS = ("true_x", "true_y", "true_z", "x", "y", "z")
+COLUMNS = ("true_x", "true_y", "x", "y")
 SETTLE = 1.0  # s, excluded at the start of each place
 REST = 0.02  # m, largest motion at rest within SETTLE
 SHORTEST = 100  # positions, least number at one place
@@ -244,17 +242,16 @@ def part_of(score: Score, odometry: Odometry) -> Part:
 
 
 def static_parts(
-    path: str | Path, estimator: PositionEstimator = PositionEstimator(), planar: bool = False
+    path: str | Path, estimator: PositionEstimator = PositionEstimator()
 ) -> list[Part]:
     """Return one Part for each place where a tag stood still.
 
     Parameters
     ----------
     path : str or Path
-        A CSV file with the columns true_x, true_y, true_z, x, y, z in m, one row per measured position,
-        without z if planar. Or a recording with ground truth: the time at rest counts from SETTLE s on.
+        A CSV file with the columns true_x, true_y, x, y in m, one row per measured position. Or a recording
+        with ground truth: the time at rest counts from SETTLE s on.
     estimator : PositionEstimator
-    planar : bool
 
     Raises
     ------
@@ -262,7 +259,7 @@ def static_parts(
         If the file holds no position at rest.
     """
     if is_table(path):
-        return _from_table(path, planar)
+        return _from_table(path)
     flight = estimator.reading.one(path)
     if flight.truth is None:
         raise InputError(
@@ -292,18 +289,13 @@ def is_table(path: str | Path) -> bool:
     )
 
 
-def _from_table(path: str | Path, planar: bool) -> list[Part]:
-    names = [name for name in COLUMNS if not (planar and name.endswith("z"))]
-    table = read_numbers(path, names)
+def _from_table(path: str | Path) -> list[Part]:
+    table = read_numbers(path, COLUMNS)
     if not len(table):
         raise InputError(f"{path}: holds no positions; give one row for each.")
-    d = len(names) // 2
-    _, place, counts = np.unique(table[:, :d], axis=0, return_inverse=True, return_counts=True)
-    true, measured = (np.pad(side, ((0, 0), (0, 3 - d))) for side in (table[:, :d], table[:, d:]))
-    return [
-        Part(measured[rows], true[rows])
-        for rows in np.split(np.argsort(place.ravel(), kind="stable"), np.cumsum(counts)[:-1])
-    ]
+    _, place = np.unique(table[:, :2], axis=0, return_inverse=True)
+    stays = (table[place.ravel() == k] for k in range(place.max() + 1))
+    return [Part(stay[:, 2:], stay[:, :2]) for stay in stays]
 
 
 FEWEST = 2  # flights; a single one cannot be validated
@@ -314,8 +306,6 @@ def fit_map(
     static: Sequence[str | Path],
     estimator: PositionEstimator,
     step: float = 0.35,
-    planar: bool = False,
-    interpolator: str = "thin_plate",
 ) -> BiasMap:
     """Fit a bias map.
 
@@ -328,22 +318,26 @@ def fit_map(
     estimator : PositionEstimator
     step : float
         Spacing of the markers, m.
-    planar, interpolator
-        See `uwb_tdoa_ekf.debias.fit`.
 
     Raises
     ------
     InputError
         If the anchors are unknown or differ.
     """
-    parts = [part for path in static for part in static_parts(path, estimator, planar)]
+    parts = [part for path in static for part in static_parts(path, estimator)]
     flown = list(flown)
     parts += [part_of(score, odometry) for _, score, odometry in flown]
     anchors = _anchors([flight.anchors for flight, _, _ in flown], static, estimator)
     source = ", ".join(
         [flight.name for flight, _, _ in flown] + [Path(path).name for path in static]
     )
-    return fit(parts, step, LEAST if flown else 1, planar, interpolator, anchors, source)
+    return replace(
+        fit(parts, step, LEAST if flown else 1),
+        frame=anchors.frame,
+        ids=anchors.ids,
+        positions=anchors.positions,
+        source=source,
+    )
 
 
 def _anchors(
@@ -379,17 +373,17 @@ def cross_validated(
     flown: Sequence[Scored],
     static: Sequence[str | Path],
     estimator: PositionEstimator,
-    **options: Any,
+    step: float,
 ) -> Shrinkage | None:
     """Return the Shrinkage of maps, or None for fewer than FEWEST flights.
 
-    Each map is fitted without one flight and evaluated on it. `options` are those of `fit_map`.
+    Each map is fitted without one flight and evaluated on it. `step` is that of `fit_map`.
     """
     if len(flown) < FEWEST:
         return None
     errors: dict[str, dict[float | None, float]] = {}
     for number, one in enumerate(flown, start=1):
-        made = fit_map([other for other in flown if other is not one], static, estimator, **options)
+        made = fit_map([other for other in flown if other is not one], static, estimator, step)
         flight, score, _ = one
         name = flight.name if flight.name not in errors else f"{flight.name} ({number})"
         errors[name] = {None: score.row()["rmse_3d"]}

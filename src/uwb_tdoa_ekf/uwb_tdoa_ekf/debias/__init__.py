@@ -11,7 +11,7 @@ Positioning System* (Sensors 2022, 22, 9136)::
     p, covariance, validity = BiasMap.load("map.npz").correct(p, covariance)
 """
 
-from .bias_map import INTERPOLATORS, BiasMap
+from .bias_map import BiasMap
 from .fit import Part, fit
 
-__all__ = ["INTERPOLATORS", "BiasMap", "Part", "fit"]
+__all__ = ["BiasMap", "Part", "fit"]

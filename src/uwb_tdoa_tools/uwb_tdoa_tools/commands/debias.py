@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli, options, parallel
-from ..choices import INTERPOLATORS
 from ..cli import option
 from ..outputs import OutputFile
 
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
     from ..debiasing import PositionEstimator
     from ..readers.inputs import Recording
 
-DESCRIPTION = """Map the bias of estimated positions over the room, after Grasso et al. (Sensors 2022, 22, 9136), and
+DESCRIPTION = """Map the bias of estimated positions in x and y, after Grasso et al. (Sensors 2022, 22, 9136), and
 take it out.
 
   fit       make a map from flights with ground truth, or from places where a tag stood still
@@ -42,10 +41,7 @@ def parser() -> ArgumentParser:
             "debias fit 0425-traj1 0425-traj2 --survey anchor_0425.txt --holdout 0425-traj3 --out "
             "map.npz"
         ),
-        (
-            "debias fit --static points.csv --survey anchors.yaml --planar --step 0.5 "
-            "--interpolator network --out map.npz"
-        ),
+        ("debias fit --static points.csv --survey anchors.yaml --step 0.5 --out map.npz"),
         "debias judge map.npz 0426-traj1 --survey surveys/ --json errors.json",
     )
     shared = (
@@ -63,7 +59,7 @@ def parser() -> ArgumentParser:
             default=[],
             metavar="FILE",
             help=(
-                "of a tag that stood still: CSV with true_x, true_y, true_z, x, y, z in metres, or "
+                "of a tag that stood still: CSV with true_x, true_y, x, y in metres, or "
                 "recordings with truth"
             ),
         ),
@@ -81,13 +77,6 @@ def parser() -> ArgumentParser:
             type=float,
             default=0.35,
             help="of the grid of markers, m (default: 0.35)",
-        ),
-        option("--planar", action="store_true", help="map x and y only, whatever the height"),
-        option(
-            "--interpolator",
-            choices=INTERPOLATORS,
-            default="thin_plate",
-            help="(default: thin_plate)",
         ),
     )
     judging = (
@@ -120,9 +109,8 @@ def _fit(args: Namespace) -> int:
         (path.resolve() for path, _ in recordings), (path.resolve() for path, _ in held)
     )
     fitted = list(parallel.over(estimator, recordings, args.jobs, args.dask))
-    settings = {"step": args.step, "planar": args.planar, "interpolator": args.interpolator}
-    shrinkage = debiasing.cross_validated(fitted, args.static, estimator, **settings)
-    made = debiasing.fit_map(fitted, args.static, estimator, **settings)
+    shrinkage = debiasing.cross_validated(fitted, args.static, estimator, args.step)
+    made = debiasing.fit_map(fitted, args.static, estimator, args.step)
     made = made.scaled(shrinkage.share) if shrinkage else made
     cli.show(debiasing.map_summary(made))
     cli.show(

@@ -3,10 +3,8 @@
 """Learn the bias of TDOAs from flights with ground truth.
 
 labels     errors of the TDOAs of flights at their true poses; training and validation flights
-models     the kinds of models, trained by one call
-network    ONNX graphs, and the network of Zhao et al. (RA-L 2021)
-structured the error of a pair as the difference of two one-anchor errors
+models     both kinds of models, trained by one call
+network    the network of Zhao et al. (RA-L 2021)
 physics    the effects that diagnose finds
 shrinking  the share of a model that cross-validation over flights supports
-linear     robust Bayesian regression on sparse designs, for structured
 """

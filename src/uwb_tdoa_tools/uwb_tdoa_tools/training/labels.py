@@ -4,9 +4,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import hashlib
+from typing import TypeVar
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Flight, Truth
 from uwb_tdoa_bias.common.geometry import tdoa
-from uwb_tdoa_bias.effects import EffectSet, Samples, samples_at
+from uwb_tdoa_bias.effects import Samples, samples_at
 
 from ..checking.pair_rules import least_height
 from ..scoring.metrics import scored_phase
@@ -24,9 +25,8 @@ MARGIN = 0.5
 LARGEST_ERROR = 1.0  # m; a larger error is an outlier, not bias (Zhao et al., section V-B)
 ZERO_ERROR = 1e-3  # m; smaller labels mean that the TDOAs were computed, not measured
 FEWEST_LABELS = 100  # least number of labels of a flight
-CORRELATION_TIME = 1.0  # s over which the errors of one anchor count as one observation
-SAME_PLACE = 0.1  # m, standard deviation of the position of an anchor that was not moved
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
+HasAnchors = TypeVar("HasAnchors", Flight, "Labels")
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,6 @@ class Labels:
         With poses from ground truth.
     error : numpy.ndarray
         Measured minus geometric TDOAs (n,), m.
-    sample_weight : float
-        Independent observations per sample. Errors are correlated over CORRELATION_TIME.
     digest : str
         Hexadecimal digest of the data.
     """
@@ -50,7 +48,6 @@ class Labels:
     name: str
     samples: Samples
     error: np.ndarray
-    sample_weight: float
     digest: str
 
     def __len__(self) -> int:
@@ -61,30 +58,16 @@ class Labels:
         """Return the anchors of the flight."""
         return self.samples.anchors
 
-    def take(self, rows: np.ndarray) -> Labels:
-        """Return some rows, weighted so that their total weight stays the same."""
-        part, sample_weight = (
-            _rows(self.samples, rows),
-            self.sample_weight * len(self) / max(len(rows), 1),
-        )
-        return replace(self, samples=part, error=self.error[rows], sample_weight=sample_weight)
 
-
-def labels(flight: Flight, effects: EffectSet = EffectSet()) -> Labels:
+def labels(flight: Flight) -> Labels:
     """Return the labels of the airborne part of a flight without outliers.
-
-    Parameters
-    ----------
-    flight : Flight
-    effects : EffectSet
-        Known effects. Their bias is subtracted.
 
     Raises
     ------
     InputError
         If the flight has too few usable TDOAs or no ground truth.
     """
-    flight = effects.correct_streams(replace(with_level_attitude(flight), imu=None))
+    flight = with_level_attitude(flight)
     truth, data, anchors = required_truth(flight), flight.tdoa, flight.anchors
     _, first, last = scored_phase(truth)
     first, last = first + MARGIN, last - MARGIN
@@ -105,11 +88,7 @@ def labels(flight: Flight, effects: EffectSet = EffectSet()) -> Labels:
         )
     a, b = anchors.index(data.a[chosen]), anchors.index(data.b[chosen])
     samples = samples_at(data.t[chosen], a, b, truth, anchors, float(data.t[0]), lag=None)
-    error = (
-        data.d[chosen]
-        - tdoa(samples.p, samples.position_a, samples.position_b)
-        - effects.bias(samples)
-    )
+    error = data.d[chosen] - tdoa(samples.p, samples.position_a, samples.position_b)
     kept = (np.abs(error) <= LARGEST_ERROR) & (samples.p[:, 2] > least_height(truth)) & (a != b)
     if kept.sum() < FEWEST_LABELS:
         raise InputError(
@@ -121,9 +100,8 @@ def labels(flight: Flight, effects: EffectSet = EffectSet()) -> Labels:
         raise InputError(
             f"{flight.name}: all labels are zero: its TDOAs were made from the ground truth itself."
         )
-    sample_weight = min(1.0, len(anchors) * (last - first) / CORRELATION_TIME / kept.sum())
     samples = _rows(samples, kept)
-    return Labels(flight.name, samples, error[kept], sample_weight, _digest(samples, error[kept]))
+    return Labels(flight.name, samples, error[kept], _digest(samples, error[kept]))
 
 
 def required_truth(flight: Flight) -> Truth:
@@ -197,7 +175,8 @@ def thinned(all_labels: Sequence[Labels], seconds: float, rng: np.random.Generat
     for one in all_labels:
         duration = one.samples.t[-1] - one.samples.t[0]
         count = min(len(one), int(duration / seconds) + 1)
-        out.append(one.take(np.sort(rng.choice(len(one), count, replace=False))))
+        rows = np.sort(rng.choice(len(one), count, replace=False))
+        out.append(replace(one, samples=_rows(one.samples, rows), error=one.error[rows]))
     return out
 
 
@@ -221,22 +200,27 @@ def digest(all_labels: Sequence[Labels]) -> str:
     ]
 
 
-def constellations(some: Iterable[Flight | Labels]) -> list[dict[str, list[float]]]:
-    """Return the different anchor constellations as {id: position in m}, rounded to 1 cm."""
-    found: list[dict[str, list[float]]] = []
+def by_constellation(some: Sequence[HasAnchors]) -> list[list[HasAnchors]]:
+    """Return flights, or their labels, in groups with the same anchors at the same places."""
+    groups: list[list[HasAnchors]] = []
     for one in some:
-        layout = dict(
-            zip(map(str, one.anchors.ids.tolist()), one.anchors.positions.round(2).tolist())
-        )
-        if not any(_same_place(layout, known) for known in found):
-            found.append(layout)
-    return found
+        known = one.anchors
+        for group in groups:
+            if group[0].anchors.stand_at(known.ids, known.positions, known.frame):
+                group.append(one)
+                break
+        else:
+            groups.append([one])
+    return groups
 
 
-def _same_place(one: Mapping[str, list[float]], other: Mapping[str, list[float]]) -> bool:
-    return set(one) == set(other) and all(
-        np.linalg.norm(np.subtract(one[i], other[i])) < SAME_PLACE for i in one
-    )
+def constellations(some: Sequence[Labels]) -> list[dict[str, list[float]]]:
+    """Return the different anchor constellations as {id: position in m}, rounded to 1 cm."""
+    different = [group[0].anchors for group in by_constellation(some)]
+    return [
+        dict(zip(map(str, anchors.ids.tolist()), anchors.positions.round(2).tolist()))
+        for anchors in different
+    ]
 
 
 def _rows(s: Samples, rows: np.ndarray) -> Samples:

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Train the network of Zhao et al. (RA-L 2021).
 
-The network has three layers of 30 neurons, with or without the orientations of the anchors. As
-published (section V-B), inputs are scaled, and mini-batch gradient descent minimizes squared errors.
-It stops if the validation error has not fallen for five epochs in a row. The standard deviation is
-that on the validation flights.
+The network has three layers of 30 neurons. If the orientation of an anchor is unknown, it has no inputs
+that need orientations. As published (section V-B), inputs are scaled, and mini-batch gradient descent
+minimizes squared errors. It stops if the validation error has not fallen for five epochs in a row. The
+standard deviation is that on the validation flights.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ import numpy as np
 from onnx import ModelProto
 from sklearn.neural_network import MLPRegressor
 
-from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.correction.features import FEATURES, columns
 from uwb_tdoa_bias.effects import Samples
 
@@ -33,8 +32,6 @@ WITHOUT = tuple(name for name in FEATURES if "_A_" not in name)  # without ancho
 
 class Paper:
     """Hold the fitted network of the paper, see `fit`."""
-
-    sees_attitude = True
 
     def __init__(
         self,
@@ -94,7 +91,6 @@ class Paper:
 def fit(
     training: Sequence[Labels],
     validation: Sequence[Labels],
-    orientations: bool,
     seed: int,
     progress: Callable[[int, float], object] = lambda epoch, error: None,
 ) -> tuple[Paper, tuple[list[float], list[float]]]:
@@ -103,8 +99,6 @@ def fit(
     Parameters
     ----------
     training, validation : sequence of Labels
-    orientations : bool
-        Use the orientations of the anchors.
     seed : int
     progress : callable
         Called with epoch and validation error, m.
@@ -113,22 +107,9 @@ def fit(
     -------
     tuple
         Paper, and RMS errors per epoch of training and validation, m.
-
-    Raises
-    ------
-    InputError
-        If an anchor has no orientation but the model needs it.
     """
-    names = FEATURES if orientations else WITHOUT
-    if orientations:
-        for one in (*training, *validation):
-            blind = one.anchors.ids[~np.isfinite(one.anchors.orientations).all(axis=1)]
-            if len(blind):
-                raise InputError(
-                    f"{one.name}: anchor {blind[0]} has no orientation, which this model "
-                    "needs; survey it, or train "
-                    "paper_no_orientation or structured."
-                )
+    oriented = all(np.isfinite(one.anchors.orientations).all() for one in (*training, *validation))
+    names = FEATURES if oriented else WITHOUT
     (x, y), (x_held, y_held) = (_table(group, names) for group in (training, validation))
     low, high = x.min(axis=0), x.max(axis=0)
     offset, scale = 0.5 * (low + high), np.maximum(0.5 * (high - low), 1e-6)
