@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from .scalars import Dense, Pieces, Program, Scalar, needed
+from .graph import Pieces
+from .scalars import Dense, Program, Scalar, needed
 
 LONGEST = 72  # characters of an expression that is not given a name
 OPERATORS = {

@@ -12,6 +12,8 @@ pick      elements of its inputs: all inputs are flattened and joined, and `valu
           array of the result's shape, says which element stands where. This is the only structural
           kind: columns, stacks, concatenations and reshapes are all picks.
 sum       the sum over the last axis
+pieces    a function of its first input; `value` is its Pieces. The second input is the same of
+          other nodes, in tensors.
 network   the output (outputs,) of an ONNX model for its input (width,); `value` is its Session
 Other kinds are elementwise, of inputs that have as many axes as the result and broadcast:
 neg abs sqrt exp log sin cos floor, add sub mul div max min atan2, lt le eq (to bool),
@@ -24,7 +26,7 @@ ones only once, inputs first.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -54,6 +56,7 @@ ELEMENTWISE: dict[str, Callable[..., Any]] = {
 }
 COMPARISONS, LOGICAL = ("lt", "le", "eq"), ("not", "and", "or")
 NEUTRAL = {"add": 0.0, "mul": 1.0}
+EVEN = 1e-5  # share by which the widths of pieces of one width may differ, rounded
 
 
 class Node:
@@ -84,6 +87,37 @@ class Node:
     def size(self) -> int:
         """Return the number of elements per TDOA."""
         return int(np.prod(self.shape, dtype=int))
+
+
+class Pieces(NamedTuple):
+    """A function that is 0 up to the first break, polynomial between breaks, then constant.
+
+    Attributes
+    ----------
+    breaks : k + 1 numbers
+    table : k rows of degree + 1; the value at the begin of each piece, then the coefficients of
+        the powers of the distance from there
+    """
+
+    breaks: tuple[float, ...]
+    table: tuple[tuple[float, ...], ...]
+
+    @classmethod
+    def of(cls, breaks: np.ndarray, coefficients: np.ndarray) -> Pieces:
+        """Return Pieces of k + 1 breaks and of (degree, k) coefficients of the powers 1, 2 ..."""
+        degrees = np.arange(1, len(coefficients) + 1)[:, None]
+        gained = np.sum(coefficients * np.diff(breaks) ** degrees, axis=0)
+        begin = np.concatenate([[0.0], np.cumsum(gained)[:-1]])
+        rows = np.stack([begin, *coefficients], axis=1).astype(np.float32)
+        table: list[list[float]] = rows.tolist()
+        return cls(tuple(map(float, breaks.astype(np.float32))), tuple(map(tuple, table)))
+
+    @property
+    def scale(self) -> np.float32:
+        """Return the number of pieces per unit if all are equally wide, else 0."""
+        width = np.diff(self.breaks)
+        even = np.ptp(width) < EVEN * width.mean()
+        return np.float32(1.0 / width.mean() if even else 0.0)
 
 
 def constant(value: Any) -> Node:
@@ -221,4 +255,4 @@ def _equal(one: np.ndarray, other: np.ndarray) -> bool:
 def _hashable(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return value.dtype.str, value.shape, value.tobytes()
-    return value if isinstance(value, (str, type(None))) else id(value)
+    return value if isinstance(value, (str, tuple, type(None))) else id(value)

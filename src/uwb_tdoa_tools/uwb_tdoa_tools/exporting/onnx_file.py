@@ -92,20 +92,9 @@ class GraphBuilder:
         """Reshape; 0 keeps the length of an axis."""
         return self.op("Reshape", value, self.constant(shape, np.int64))
 
-    def total(self, values: Sequence[str]) -> str:
-        """Sum tensors of one shape."""
-        return values[0] if len(values) == 1 else self.op("Sum", *values)
-
     def row_sum(self, value: str) -> str:
         """Sum along each row: (n, 1)."""
         return self.op("ReduceSum", value, self.constant([1], np.int64), keepdims=1)
-
-    def distance2(self, points: str, centres: np.ndarray) -> str:
-        """Return squared distances (n, m) from points (n, k) to fixed centres (m, k)."""
-        cross = self.op("MatMul", points, -2.0 * centres.T)
-        own = self.row_sum(self.op("Mul", points, points))
-        far = self.op("Add", self.op("Add", cross, own), np.sum(centres**2, axis=1)[None])
-        return self.op("Max", far, [0.0])
 
     def model(self, width: int, outputs: Sequence[str], meta: Mapping[str, Any]) -> ModelProto:
         """Return the ONNX model.
@@ -298,6 +287,8 @@ class _Printer:
         if node.kind == "sum":
             axis = np.array([len(node.shape) + 1])
             return graph.op("ReduceSum", inputs[0], graph.constant(axis, np.int64), keepdims=0)
+        if node.kind == "pieces":
+            return inputs[1]
         if node.kind == "network":
             return graph.inlined(load_model_from_string(node.value.content), inputs[0])
         if node.kind == "atan2":

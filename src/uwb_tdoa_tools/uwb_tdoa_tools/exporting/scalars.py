@@ -10,7 +10,7 @@ constant  `value` is the number
 anchor    `value` is (end, bytes of N float32): the number of the anchor at this end, "a" or "b"
 pair      `value` is the bytes of (N, N) float32: the number of the pair
 network   `value` is (Dense, number of the output); the inputs are those of the network
-pieces    `value` is Pieces, a function of one number that consists of polynomials
+pieces    `value` is Pieces, a function of the input
 
 Equal Scalars are one. A sum adds its terms one by one.
 """
@@ -31,7 +31,6 @@ ACTIVATIONS = ("Relu",)
 SAME = 1e-9  # m; a smaller difference of constants is rounding
 
 ANGLE = 3.1416  # rad, no atan2 is larger in single precision
-EVEN = 1e-5  # share by which the widths of pieces of one width may differ, rounded
 
 
 class Scalar(NamedTuple):
@@ -45,57 +44,6 @@ class Scalar(NamedTuple):
     def is_bool(self) -> bool:
         """Return whether the result is boolean."""
         return self.kind in (*COMPARISONS, *LOGICAL)
-
-
-class Pieces(NamedTuple):
-    """A function that is 0 up to the first break, polynomial between breaks, then constant.
-
-    Attributes
-    ----------
-    breaks : k + 1 numbers
-    table : k rows of degree + 1; the value at the begin of each piece, then the coefficients of
-        the powers of the distance from there
-    """
-
-    breaks: tuple[float, ...]
-    table: tuple[tuple[float, ...], ...]
-
-    @classmethod
-    def of(cls, node: Node) -> tuple[Node, Pieces] | None:
-        """Return (node of x, Pieces) of a sum that `piecewise` recorded, the same for all anchors.
-
-        Return None for another sum.
-        """
-        product = node.inputs[0]
-        if product.kind != "mul" or product.inputs[1].kind != "min":
-            return None
-        held, (positive, width) = product.inputs[1], product.inputs[1].inputs
-        if positive.kind != "max" or positive.inputs[0].kind != "sub":
-            return None
-        x, breaks = positive.inputs[0].inputs
-        powers, rest = [], product.inputs[0]
-        while rest.kind == "add" and rest.inputs[0].kind == "mul":
-            powers.append(rest.inputs[1])
-            if rest.inputs[0].inputs[1] is not held:
-                return None
-            rest = rest.inputs[0].inputs[0]
-        constants = [breaks, width, *powers, rest]
-        if any(one.kind != "constant" or one.value.size != width.size for one in constants):
-            return None
-        start, wide, *coefficients = (one.value.ravel() for one in constants)
-        degrees = np.arange(1, len(coefficients) + 1)[:, None]
-        gained = np.sum(coefficients * wide**degrees, axis=0)
-        begin = np.concatenate([[0.0], np.cumsum(gained)[:-1]])
-        table = np.stack([begin, *coefficients], axis=1).astype(np.float32)
-        edges = np.array([*start, start[-1] + wide[-1]], dtype=np.float32)
-        return x, cls(tuple(edges.tolist()), tuple(map(tuple, table.tolist())))
-
-    @property
-    def scale(self) -> np.float32:
-        """Return the number of pieces per unit if all are equally wide, else 0."""
-        width = np.diff(self.breaks)
-        even = np.ptp(width) < EVEN * width.mean()
-        return np.float32(1.0 / width.mean() if even else 0.0)
 
 
 class Unsupported(ValueError):
@@ -185,11 +133,9 @@ class Program:
             return self._constants(node)
         if node.kind == "pick":
             return np.concatenate([one.ravel() for one in inputs])[node.value]
+        if node.kind == "pieces":
+            return _each(lambda at: self.add("pieces", (at,), node.value), inputs[:1])
         if node.kind == "sum":
-            found = Pieces.of(node)
-            if found is not None:
-                x, pieces = found
-                return _each(lambda at: self.add("pieces", (at,), pieces), [places[id(x)][..., 0]])
             return _each(lambda *terms: reduce(self._plus, terms), np.moveaxis(inputs[0], -1, 0))
         if node.kind == "network":
             network = dense(node.value.content)

@@ -24,7 +24,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.effects import Samples
 from uwb_tdoa_bias.effects.samples import Motion
 
-from .graph import Node, apply, as_number, constant, joined, pick, scalar, taken, total
+from .graph import Node, Pieces, apply, as_number, constant, joined, pick, scalar, taken, total
 
 MOST_ANCHORS = 128  # constants of pairs grow with the square
 LN_10 = math.log(10.0)
@@ -252,6 +252,9 @@ class Traced(NDArrayOperatorsMixin, SymbolicArray):
         for power in powers[-2:0:-1]:
             out = apply("add", apply("mul", out, inside), constant(power))
         gained = total(apply("mul", out, inside))
+        if gained.kind == "sum" and (powers[1:] == powers[1:, :1, :1]).all():
+            pieces = Pieces.of(breaks, powers[1:, 0, 0])
+            gained = Node("pieces", (self.node, gained), gained.shape, pieces)
         return self._of(apply("add", gained, constant(powers[0, :, :, 0])))
 
     def played(self, model: Any) -> Traced:

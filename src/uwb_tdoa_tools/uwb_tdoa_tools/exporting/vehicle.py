@@ -343,7 +343,7 @@ def _code(traced: TracedCorrection, effects: EffectSet) -> VehicleCode:
     except Unsupported as error:
         raise InputError(
             f"--model: C holds networks of dense layers, and of this one not: {error}; train "
-            "--model paper or paper_no_orientation, or write it by --onnx."
+            "--model paper, or write it by --onnx."
         ) from error
 
 
