@@ -19,7 +19,7 @@ from uwb_tdoa_tools.flying.world import HALL, WORLDS
 from uwb_tdoa_tools.scoring.metrics import position_at
 from uwb_tdoa_tools.simulation.config import NO_IMU_ERRORS
 
-SEEDS = 3, 4, 5
+SEEDS = 3, 4
 WORLD = replace(HALL, sensors=rover.SENSOR_NAMES)
 TASK = Task(WORLD, config=FilterConfig(**rover.FILTER), path=Waypoints())
 WALLS = 0.5 * np.array(HALL.size[:2])
@@ -47,7 +47,7 @@ def test_it_arrives_and_the_verdict_is_that_of_its_truth(drives):
         assert [*verdict["phases"]] == ["before", "drive", "after"]
     summed = summary(verdicts)
     assert summed["arrived"] == summed["safe"] == summed["flights"] == len(SEEDS)
-    assert "3 of 3 arrived" in text(summed) and "largest distance to the path" in text(summed)
+    assert "2 of 2 arrived" in text(summed) and "largest distance to the path" in text(summed)
 
 
 @pytest.mark.slow

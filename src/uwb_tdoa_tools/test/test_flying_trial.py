@@ -310,10 +310,8 @@ def test_it_is_flown_by_what_a_network_corrects(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", ["table", "person", "three-kinds", "tdoa3", "jitter", "rectifying", "gusts"]
-)
-def test_every_world_can_be_flown_in(name):
+@pytest.mark.parametrize("name", ["table", "jitter"])
+def test_a_world_that_changes_more_than_the_radio_can_be_flown_in(name):
     world = replace(WORLDS[name], sensors=("height", "pressure", "velocity"))
     flown = fly(
         Task(world, seed=1, path=Circles(turns=1, turn_time=2.0, radius=0.0), given="place")

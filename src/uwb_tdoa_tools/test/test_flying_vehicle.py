@@ -61,14 +61,6 @@ def aloft(vehicle, height=50.0, speed=None):
     return state
 
 
-@pytest.mark.slow
-def test_a_vehicle_that_stands_stays():
-    vehicle = Vehicle()
-    state, feet = flown(vehicle, vehicle.at_rest(1.0, -2.0, 0.7), np.zeros(4), 5.0)
-    np.testing.assert_allclose(state, vehicle.at_rest(1.0, -2.0, 0.7), atol=1e-6)
-    assert feet == 4
-
-
 def test_it_stands_on_a_table_and_beside_it_on_the_floor():
     vehicle = Vehicle(table=0.7, table_radius=0.5)
     assert vehicle.at_rest(0.4, 0.0, 0.0)[2] == pytest.approx(0.7 + vehicle.leg, abs=2e-3)
