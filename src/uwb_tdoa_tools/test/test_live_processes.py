@@ -182,7 +182,7 @@ class NoNode:
         self.queue = Queue()
 
     def create_subscription(self, *_):
-        return SimpleNamespace(handle=self.queue)
+        return SimpleNamespace(handle=self.queue, msg_type=None)
 
 
 def status(node, **values):

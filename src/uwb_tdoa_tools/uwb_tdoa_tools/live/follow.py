@@ -27,6 +27,7 @@ from .session import (
     message_class,
     parameter_of,
     subscription_qos,
+    taken,
     wait_for_names,
 )
 
@@ -159,11 +160,7 @@ class _Topic:
 
     def stamps(self) -> list[int]:
         """Return the stamps, ns, of the messages that have arrived."""
-        found = []
-        handle = self._subscription.handle
-        with handle:
-            while (taken := handle.take_message(self._subscription.msg_type, True)) is not None:
-                found.append(stamp_of(taken[0]))
+        found = [stamp_of(data) for data, _ in taken(self._subscription)]
         self.silent = self.silent and not found
         return found
 

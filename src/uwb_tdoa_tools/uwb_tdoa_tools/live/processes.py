@@ -22,6 +22,8 @@ import rclpy
 from uwb_tdoa_bias.common.errors import Failure
 from uwb_tdoa_bias.common.files import refuse_output
 
+from .session import taken
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
@@ -146,10 +148,8 @@ class DiagnosticsListener:
         Messages that wait to be read are dropped. They are older than this call: a node that was not spun
         would seem settled before anything happened.
         """
-        handle = self._subscription.handle
-        with handle:
-            while handle.take_message(DiagnosticArray, True) is not None:
-                pass
+        for _ in taken(self._subscription):
+            pass
         self._repeated.clear()
 
     def counts(self) -> dict[str, dict[str, str]]:

@@ -21,7 +21,7 @@ from uwb_tdoa_bias.common.errors import InputError
 
 from ..bags.files import new_bag
 from ..bags.message_types import add_type, typestore
-from .session import message_class, recorded_qos, session, subscription_qos
+from .session import message_class, recorded_qos, session, subscription_qos, taken
 
 
 @dataclass(frozen=True)
@@ -135,11 +135,8 @@ class Recorder:
     def take(self) -> None:
         """Write all messages that have arrived to the bag."""
         for subscription, connection in self._pairs:
-            with subscription.handle:
-                while (
-                    message := subscription.handle.take_message(subscription.msg_type, True)
-                ) is not None:
-                    self._write(connection, *message)
+            for data, information in taken(subscription):
+                self._write(connection, data, information)
 
     def _write(self, connection: Connection, data: bytes, information: dict[str, int]) -> None:
         stamp = information["received_timestamp"] or time.time_ns()

@@ -21,6 +21,7 @@ from rclpy.parameter import parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
 from rclpy.task import Future
 from rosbags.interfaces import (
     Qos,
@@ -123,6 +124,15 @@ def message_class(msgtype: str, packages: Sequence[str] = ()) -> type | None:
         return getattr(import_module(f"{package}.msg"), name, None)
     except ImportError:
         return None
+
+
+def taken(subscription: Subscription) -> Iterator[tuple[bytes, dict[str, int]]]:
+    """Yield (bytes, information) of the messages that have arrived at a subscription."""
+    with subscription.handle:
+        while (
+            message := subscription.handle.take_message(subscription.msg_type, True)
+        ) is not None:
+            yield message
 
 
 def publisher_qos(recorded: Sequence[Qos], messages: int) -> QoSProfile:
