@@ -9,7 +9,7 @@ import pytest
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
-from uwb_tdoa_bias.effects.truth import TruthTimeOffset
+from uwb_tdoa_bias.effects.stamps import TruthTimeOffset
 from uwb_tdoa_tools.diagnosis import diagnose, output
 from uwb_tdoa_tools.diagnosis.references import (
     REFERENCES,

@@ -1,15 +1,17 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Effects of single anchors: delays, clocks, surveyed positions, obstacles and ids."""
+"""Effects of anchors: delays, clocks, surveyed positions and their frame, obstacles and ids."""
 
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
+import math
 
 import numpy as np
 
 from ..common.anchors import Anchors
 from ..common.geometry import ranges
+from ..common.lazy import rotations
 from .base import (
     ANCHOR,
     OF_ANCHOR,
@@ -22,6 +24,7 @@ from .base import (
     Row,
     Shift,
     cached_by_anchors,
+    central_differences,
     counted,
     id_texts,
     interval_words,
@@ -31,6 +34,10 @@ from .base import (
     with_each,
 )
 from .samples import RADIO, Samples, tile
+
+AXES_AND_ANGLES = ("x", "y", "z", "roll", "pitch", "yaw")  # of a frame
+FRAME_STEP = 1e-5  # m and rad, of central differences
+ANGLE_BOUND, ANGLE_PRIOR_STD = 0.5, 0.03  # rad
 
 
 class AnchorEffect(Effect):
@@ -260,6 +267,80 @@ class AnchorPosition(GeometryEffect):
         return tuple(Shift(anchor, *shift) for anchor, shift in each.items())
 
 
+class TruthFrame(GeometryEffect):
+    """In the frame of the truth, an anchor surveyed at A is at R A + (x, y, z).
+
+    R turns by the rotation vector (roll, pitch, yaw). The data do not determine which of the two
+    frames is right: `diagnose` gives this effect to no node. In an effects.yaml it moves the
+    anchors, and estimates are in the frame of the truth.
+    """
+
+    row = Row(
+        name="truth_frame",
+        unit="m, rad",
+        bound=5.0,
+        negligible=0.01,
+        prior_std=0.15,
+        example="z",
+        physics=(
+            "survey and motion capture do not share one frame: all anchors are shifted and turned "
+            "together"
+        ),
+        reference="rigid alignment of two coordinate frames",
+        confounded_with=("tag_lever_arm", "anchor_position"),
+        remedy=(
+            "Align the frames of the survey and of the ground truth anew: seen from the "
+            "ground truth, all anchors are shifted and turned together by {found}."
+        ),
+        phrase="{key} {value}",
+    )
+    other_units = dict.fromkeys(AXES_AND_ANGLES[3:], "rad")
+    needs_reference = True
+    portable = False
+    usable = False
+    why_unusable = (
+        "whether the survey or the ground truth is turned or shifted nobody can tell, so that "
+        "nothing goes to the nodes"
+    )
+
+    @classmethod
+    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
+        return [
+            AXES_AND_ANGLES,
+            AXES_AND_ANGLES[:3],
+            AXES_AND_ANGLES[3:],
+            *((key,) for key in AXES_AND_ANGLES),
+        ]
+
+    @classmethod
+    def bound_of(cls, key: str) -> float:
+        return cls.bound if key in "xyz" else ANGLE_BOUND
+
+    @classmethod
+    def prior_std_of(cls, key: str) -> float:
+        return cls.prior_std if key in "xyz" else ANGLE_PRIOR_STD
+
+    def shown_in(self, key: str) -> tuple[str, float]:
+        return ("m", 1.0) if key in "xyz" else ("degrees", math.degrees(1.0))
+
+    def antennas(self, samples: Samples) -> dict[str, np.ndarray]:
+        return {"positions": self._positions(samples.anchors)}
+
+    def _positions(self, anchors: Anchors) -> np.ndarray:
+        at = np.array([self.values.get(key, 0.0) for key in AXES_AND_ANGLES])
+        return anchors.positions @ rotations.Rotation.from_rotvec(at[3:]).as_matrix().T + at[:3]
+
+    def regressors(self, samples: Samples, keys: Sequence[str]) -> np.ndarray:
+        return central_differences(
+            lambda values: TruthFrame(values).bias(samples), self.values, keys, FRAME_STEP
+        )
+
+    def marks(self, anchors: Anchors) -> tuple[Shift, ...]:
+        shifts = self._positions(anchors) - anchors.positions
+        unknown = np.full(3, np.nan)
+        return tuple(Shift(int(i), by, unknown) for i, by in zip(anchors.ids, shifts))
+
+
 class SearchedDelay(ArrivalEffect):
     """Delays "i.delay" of anchors under conditions, further parameters that a detector searches."""
 
@@ -428,7 +509,5 @@ class AnchorIds(LabelEffect):
 
 def _replaced(ids: np.ndarray, table: dict[int, int]) -> np.ndarray:
     """Return ids (n,), each replaced by its entry in the table, all at once."""
-    out = np.array(ids)
-    for old, new in table.items():
-        out[np.asarray(ids) == old] = new
-    return out
+    ids = np.asarray(ids)
+    return np.array([table.get(one, one) for one in ids.tolist()], dtype=ids.dtype)

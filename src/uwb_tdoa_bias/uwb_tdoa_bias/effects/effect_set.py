@@ -29,6 +29,7 @@ from .anchor import (
     AnchorPosition,
     Nlos,
     RangeOffset,
+    TruthFrame,
 )
 from .base import FADED_BELOW, Effect, SensorFunction
 from .floor import FloorMultipath
@@ -51,10 +52,9 @@ from .sensor import (
     YawRateScale,
 )
 from .smooth_term import SmoothTerm
-from .stamps import RangeDelay, TdoaTimeOffset, VelocityDelay
+from .stamps import RangeDelay, TdoaTimeOffset, TruthTimeOffset, VelocityDelay
 from .streams import STREAMS, StreamCorrector
 from .tag import AntennaPattern, RangeBias, RangeScale, ReceivedPowerBias, TagLeverArm
-from .truth import TruthFrame, TruthTimeOffset
 
 # In the order in which `diagnose` lists them
 EFFECTS: dict[str, type[Effect]] = {

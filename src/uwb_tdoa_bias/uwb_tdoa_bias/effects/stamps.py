@@ -6,11 +6,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from ..common.flight import Flight
+from ..common.sensors import DIAGNOSED
 from .base import Effect, Row, require
 from .samples import Samples, SensorSamples
 
@@ -108,6 +109,34 @@ class VelocityDelay(StampEffect):
     )
     stream = "velocity"
     channels = ("velocity", "yaw_rate")
+
+
+class TruthTimeOffset(StampEffect):
+    """Poses of the ground truth are stamped `offset` seconds after their instant.
+
+    Its correction changes the reference, not the estimate.
+    """
+
+    row = replace(
+        STAMP,
+        name="truth_time_offset",
+        physics="motion-capture poses reach the log late, over a radio link",
+        reference=(
+            "UTIL web page: motion-capture poses logged on board have about 10 ms of radio latency"
+        ),
+        confounded_with=("tdoa_time_offset", "range_delay"),
+        remedy=(
+            "Correct the stamps of the ground truth, which are {found}: that changes what the "
+            "estimate is compared with, not the estimate."
+        ),
+    )
+    stream = "truth"
+    needs_reference = True
+    portable = False
+    channels = ("tdoa", "gyro", *DIAGNOSED)  # vibration hides it on the accelerometer
+
+    def regressors(self, samples: Any, keys: Sequence[str]) -> np.ndarray:
+        return -super().regressors(samples, keys)  # at its stamp the tag is farther than the truth
 
 
 def shifted(flight: Flight, stream: str, seconds: float) -> Flight:
