@@ -510,7 +510,7 @@ def test_bad_usage_is_one_sentence(room, monkeypatch, capsys, words, sentence):
 
 @pytest.mark.slow
 def test_a_rover_with_odometry_of_its_wheels_is_calibrated(tmp_path):
-    flight = simulate(SimulationConfig.of("rover", seed=3, duration=50.0, wheel_scale=0.03))
+    flight = simulate(SimulationConfig.of("rover", seed=3, duration=36.0, wheel_scale=0.03))
     path = bag_of(flight, tmp_path, ("/velocity/odometry", ODOMETRY, flight.velocity))
     out = tmp_path / "calibrated"
     words = [str(path), "-p", "planar:=true", "-p", "fixed_height:=0.0", "--out", str(out)]
