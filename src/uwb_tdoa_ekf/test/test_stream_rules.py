@@ -5,6 +5,7 @@
 from dataclasses import replace
 import math
 
+from faults import ACCEL, ARRIVAL, GYRO, D, T, put
 from flights import corners
 from hypothesis import given, settings, strategies as st
 import numpy as np
@@ -60,13 +61,7 @@ def judged(imu, tdoa, arrivals=True):
     return {finding.rule: finding for finding in rules.findings()}
 
 
-def put(columns, place, value):
-    """Return the columns with one replaced."""
-    return (*columns[:place], value, *columns[place + 1 :])
-
-
-T, ARRIVAL, GYRO, FORCE = range(4)
-A, B, D = 2, 3, 4
+A, B = 2, 3  # columns of the TDOAs
 
 
 @pytest.mark.parametrize("arrivals", [True, False])
@@ -76,21 +71,21 @@ def test_nothing_is_said_of_a_healthy_recording(seed, arrivals):
 
 
 IMU_FAULTS = {
-    "imu_force_unit": lambda c, rng: put(c, FORCE, c[FORCE] / GRAVITY),
+    "imu_force_unit": lambda c, rng: put(c, ACCEL, c[ACCEL] / GRAVITY),
     "imu_rate_unit": lambda c, rng: put(c, GYRO, np.rad2deg(c[GYRO])),
-    "imu_no_gravity": lambda c, rng: put(c, FORCE, c[FORCE] - [0.0, 0.0, GRAVITY]),
-    "imu_turned": lambda c, rng: put(c, FORCE, c[FORCE][:, [2, 0, 1]]),
+    "imu_no_gravity": lambda c, rng: put(c, ACCEL, c[ACCEL] - [0.0, 0.0, GRAVITY]),
+    "imu_turned": lambda c, rng: put(c, ACCEL, c[ACCEL][:, [2, 0, 1]]),
     "imu_tilted": lambda c, rng: put(
-        c, FORCE, c[FORCE] @ np.array([[1, 0, 0], [0, 0.7, 0.7], [0, -0.7, 0.7]])
+        c, ACCEL, c[ACCEL] @ np.array([[1, 0, 0], [0, 0.7, 0.7], [0, -0.7, 0.7]])
     ),
-    "imu_silent": lambda c, rng: put(put(c, FORCE, 0.0 * c[FORCE]), GYRO, 0.0 * c[GYRO]),
-    "imu_repeated": lambda c, rng: put(put(c, FORCE, _held(c[FORCE])), GYRO, _held(c[GYRO])),
+    "imu_silent": lambda c, rng: put(put(c, ACCEL, 0.0 * c[ACCEL]), GYRO, 0.0 * c[GYRO]),
+    "imu_repeated": lambda c, rng: put(put(c, ACCEL, _held(c[ACCEL])), GYRO, _held(c[GYRO])),
     "imu_axis_dead": lambda c, rng: put(c, GYRO, c[GYRO] * [1.0, 0.0, 1.0]),
     "imu_invalid": lambda c, rng: put(
         c, GYRO, np.where(rng.random(c[GYRO].shape) < 0.01, np.nan, c[GYRO])
     ),
-    "imu_shaking": lambda c, rng: put(c, FORCE, c[FORCE] + 3.0 * rng.normal(size=c[FORCE].shape)),
-    "imu_clipped": lambda c, rng: put(c, FORCE, np.clip(c[FORCE] + _bumps(c[T]), None, 19.6)),
+    "imu_shaking": lambda c, rng: put(c, ACCEL, c[ACCEL] + 3.0 * rng.normal(size=c[ACCEL].shape)),
+    "imu_clipped": lambda c, rng: put(c, ACCEL, np.clip(c[ACCEL] + _bumps(c[T]), None, 19.6)),
     "stamps_zero": lambda c, rng: put(c, T, 0.0 * c[T]),
     "stamps_stand": lambda c, rng: put(c, T, 7.0 + 0.0 * c[T]),
     "stamps_coarse": lambda c, rng: put(c, T, np.floor(c[T] / 0.05) * 0.05),
@@ -189,7 +184,7 @@ def at_rest(imu, bias):
     rng = np.random.default_rng(5)
     n = len(imu[T])
     still = put(imu, GYRO, bias + 0.01 * rng.normal(size=(n, 3)))
-    return put(still, FORCE, [0.1, -0.2, GRAVITY] + 0.03 * rng.normal(size=(n, 3)))
+    return put(still, ACCEL, [0.1, -0.2, GRAVITY] + 0.03 * rng.normal(size=(n, 3)))
 
 
 @pytest.mark.parametrize(
