@@ -13,6 +13,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.effects import EFFECTS
 from uwb_tdoa_tools import cli
 from uwb_tdoa_tools.commands import diagnose
+from uwb_tdoa_tools.commands.simulate import OPTIONS, POSE, config_of
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.motions import ANCHOR_CLEARANCE, RATE, Limits, motions, route
 from uwb_tdoa_tools.diagnosis.next_flight import Model, Rivalry, plan_flight
@@ -20,7 +21,6 @@ from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.report import maps
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.rooms import Room, corners, pillars, room_of
-from uwb_tdoa_tools.simulation_options import OPTIONS, POSE, config_of
 
 RATES = {"imu_rate": 200.0, "truth_rate": 100.0, "start_in_air": True}
 

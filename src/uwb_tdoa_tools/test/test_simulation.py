@@ -521,7 +521,7 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools import cli
 from uwb_tdoa_tools.bags.topics import topics_of
 from uwb_tdoa_tools.simulation import SimulationConfig
-from uwb_tdoa_tools.simulation_options import OPTIONS, config_of
+from uwb_tdoa_tools.commands.simulate import OPTIONS, config_of
 names = [{each.name for each in fields(kind)} for kind in (Flight, FilterConfig, SimulationConfig)]
 assert "side_sonar" in names[0] and "use_side_sonar" in names[1]
 assert "side_sonar_noise" in names[2]

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Options that several commands share, and the values that they give.
 
-parser = cli.parser(..., options=[*options.recordings(), *options.ESTIMATOR, *options.JOBS])
+parser = cli.parser(..., options=[*options.recordings(), *options.ESTIMATOR, options.JOBS])
 reading, (config, effects) = options.reading_of(args), options.filter_of(args)
 """
 
