@@ -17,11 +17,15 @@ from rclpy.task import Future  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
 from sensor_msgs.msg import FluidPressure  # noqa: E402
 
-from uwb_tdoa_bias.ros import process  # noqa: E402
+from uwb_tdoa_bias.ros import node as served  # noqa: E402
 from uwb_tdoa_bias.ros.cdr import CdrCodec  # noqa: E402
-from uwb_tdoa_bias.ros.node import StreamNode  # noqa: E402
+from uwb_tdoa_bias.ros.node import (  # noqa: E402
+    PERIOD,
+    Spinner,
+    StreamNode,  # noqa: E402
+    StreamPoller,
+)
 from uwb_tdoa_bias.ros.parameters import MOST_ASKED, MOST_REQUESTS  # noqa: E402
-from uwb_tdoa_bias.ros.process import PERIOD, Spinner, StreamPoller  # noqa: E402
 from uwb_tdoa_bias.ros.topics import Epoch, Streams  # noqa: E402
 
 MANY = 300
@@ -32,8 +36,8 @@ DEEP = QoSProfile(depth=1000)
 def surroundings(request, monkeypatch):
     """Return (our node, another node), once with each of the executors."""
     if request.param == "single":
-        monkeypatch.setattr(process, "EventsExecutor", None)
-    elif process.EventsExecutor is None:
+        monkeypatch.setattr(served, "EventsExecutor", None)
+    elif served.EventsExecutor is None:
         pytest.skip("this rclpy has no EventsExecutor")
     rclpy.init()
     node, other = StreamNode("ours"), rclpy.create_node("other")

@@ -17,8 +17,7 @@ from uwb_tdoa_bias.common.sensors import (
     Ranges,
     Velocity,
 )
-from uwb_tdoa_bias.common.sensors.returned import check_values
-from uwb_tdoa_bias.common.sensors.sensor import Stream
+from uwb_tdoa_bias.common.sensors.sensor import Stream, check_values
 
 N = 5
 T = np.arange(N) / 25.0

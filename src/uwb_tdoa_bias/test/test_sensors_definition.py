@@ -14,8 +14,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.common.sensors import SENSORS, Pressure, Stream
 from uwb_tdoa_bias.common.sensors.definition import TAKEN, check, load
-from uwb_tdoa_bias.common.sensors.returned import check_rows, check_values
-from uwb_tdoa_bias.common.sensors.sensor import parameter
+from uwb_tdoa_bias.common.sensors.sensor import check_rows, check_values, parameter
 
 OLD = SENSORS["pressure"]
 FLAG = parameter(True, "use it", fixed=True)

@@ -22,10 +22,9 @@ from uwb_tdoa_msgs.msg import AnchorArray
 
 from .common.errors import InputError
 from .common.survey import read_survey, refuse_faulty
-from .ros import process
 from .ros.anchors import ANCHORS_FILE, ANCHORS_QOS, anchors_to_message
 from .ros.frames import TF_STATIC_QOS
-from .ros.node import StreamNode
+from .ros.node import StreamNode, run
 from .ros.parameters import (
     FROZEN,
     Parameter,
@@ -121,7 +120,7 @@ def _known(q: Quaternion) -> bool:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the node, and return the exit code."""
-    return process.run(AnchorsNode, __doc__, argv)
+    return run(AnchorsNode, __doc__, argv)
 
 
 if __name__ == "__main__":

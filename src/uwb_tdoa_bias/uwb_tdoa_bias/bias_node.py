@@ -34,12 +34,11 @@ from .correction.network import load_network
 from .effects import EffectSet, LabelEffect
 from .effects.base import relabelled
 from .effects.tag import TagLeverArm
-from .ros import process
 from .ros.anchors import ANCHORS_FILE, AnchorsInput
 from .ros.cdr import CdrCodec, CdrTemplate
 from .ros.diagnostics import Diagnostics, Rate, Report
 from .ros.frames import FramesInput, unknown_frame
-from .ros.node import StreamNode
+from .ros.node import StreamNode, StreamPoller, run
 from .ros.parameters import (
     FROZEN,
     Parameter,
@@ -179,7 +178,7 @@ class BiasNode(StreamNode):
         self._anchors.start()
         if member is None:
             say_unused([self], files_of(arguments))
-            self.turns = process.StreamPoller([self.streams])
+            self.turns = StreamPoller([self.streams])
         self.ready = f"ready; correcting with: {self._model_name}"
 
     @property
@@ -523,7 +522,7 @@ class BiasNode(StreamNode):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the node, and return the exit code."""
-    return process.run(BiasNode, __doc__, argv)
+    return run(BiasNode, __doc__, argv)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from uwb_tdoa_ekf.core.engine import feed
 from uwb_tdoa_ekf.core.imu_fault_detector import CLEARED, RATE, TILT, TURN, WEIGHT
 from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, TDOA, Measurements, new_state, structured
 from uwb_tdoa_ekf.core.state import GRAVITY
-from uwb_tdoa_ekf.monitoring.filter_findings import implausible
+from uwb_tdoa_ekf.monitoring.finding import implausible
 
 T = np.arange(3000) / 200.0
 BEGIN, END = 5.0, 9.0  # s, begin and end of a fault

@@ -13,7 +13,7 @@ import rclpy  # noqa: E402
 from rclpy.serialization import serialize_message  # noqa: E402
 from rig import make_rig, recording  # noqa: E402, F401
 
-from uwb_tdoa_bias.ros.process import Spinner  # noqa: E402
+from uwb_tdoa_bias.ros.node import Spinner  # noqa: E402
 from uwb_tdoa_ekf import localization_node  # noqa: E402
 from uwb_tdoa_ekf.localization_node import LocalizationNode, _without_own_remappings  # noqa: E402
 from uwb_tdoa_msgs.msg import AnchorArray  # noqa: E402

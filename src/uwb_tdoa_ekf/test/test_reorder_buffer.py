@@ -14,7 +14,7 @@ import pytest
 from uwb_tdoa_bias.common.stamps import MOST_HELD
 from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, INVALID, LATE, SENSOR_ROW, TDOA as TDOA_ROW
 from uwb_tdoa_ekf.estimator import Estimator
-from uwb_tdoa_ekf.monitoring.filter_findings import clock_ahead, restarted
+from uwb_tdoa_ekf.monitoring.finding import clock_ahead, restarted
 from uwb_tdoa_ekf.reorder_buffer import (
     FIRST_SENSOR,
     IMU_STREAM,

@@ -22,10 +22,9 @@ import numpy as np
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.ros import process
 from uwb_tdoa_bias.ros.anchors import ANCHORS_FILE, AnchorsInput
 from uwb_tdoa_bias.ros.diagnostics import Diagnostics, Rate
-from uwb_tdoa_bias.ros.node import StreamNode
+from uwb_tdoa_bias.ros.node import StreamNode, run
 from uwb_tdoa_bias.ros.parameters import (
     FROZEN,
     Parameter,
@@ -173,7 +172,7 @@ class DebiasNode(StreamNode):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the node and return the exit code."""
-    return process.run(DebiasNode, __doc__, argv)
+    return run(DebiasNode, __doc__, argv)
 
 
 if __name__ == "__main__":

@@ -35,12 +35,11 @@ from uwb_tdoa_bias.common.flyable import FlyableVolume
 from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_bias.effects import EffectSet, ImuCorrector, StreamCorrector
 from uwb_tdoa_bias.effects.tag import TagLeverArm
-from uwb_tdoa_bias.ros import process
 from uwb_tdoa_bias.ros.anchors import AnchorsInput
 from uwb_tdoa_bias.ros.cdr import CdrCodec, message_class
 from uwb_tdoa_bias.ros.diagnostics import Diagnostics, Report
 from uwb_tdoa_bias.ros.frames import FramesInput, unknown_frame
-from uwb_tdoa_bias.ros.node import StreamNode
+from uwb_tdoa_bias.ros.node import StreamNode, StreamPoller, run
 from uwb_tdoa_bias.ros.parameters import files_of, refuse_unknown, say_unused
 from uwb_tdoa_bias.ros.topics import Epoch, Input, Refusals, Streams, several_publishers
 from uwb_tdoa_msgs.msg import TdoaCorrected
@@ -189,7 +188,7 @@ class EkfNode(StreamNode):
         self._anchors.start()
         if member is None:
             say_unused([self], files_of(arguments))
-            self.turns = process.StreamPoller([self.streams])
+            self.turns = StreamPoller([self.streams])
         self.ready = "ready"
 
     def _remark_height(self) -> None:
@@ -610,7 +609,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         for sensor in SENSORS.values()
         for topic, kind in sensor.topics
     )
-    return process.run(EkfNode, __doc__.replace("SENSORS", ",\n".join(topics)), argv)
+    return run(EkfNode, __doc__.replace("SENSORS", ",\n".join(topics)), argv)
 
 
 if __name__ == "__main__":

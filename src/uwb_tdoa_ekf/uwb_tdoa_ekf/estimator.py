@@ -32,8 +32,7 @@ from .core.memory import (
     usable_tdoas,
 )
 from .core.startup import APART
-from .monitoring.filter_findings import clock_ahead, implausible, restarted
-from .monitoring.finding import Finding, Steady
+from .monitoring.finding import Finding, Steady, clock_ahead, implausible, restarted
 from .pipeline import Pipeline, PipelineOutput, odometry_of
 from .reorder_buffer import IMU_STREAM, STREAMS, TDOA_STREAM, ReorderBuffer, Restart
 from .results import VERDICTS, Odometry, Residuals, concatenated

@@ -28,9 +28,8 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from uwb_tdoa_bias import bias_node
 from uwb_tdoa_bias.bias_node import BiasNode
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.ros import process
 from uwb_tdoa_bias.ros.diagnostics import Diagnostics, Report
-from uwb_tdoa_bias.ros.node import StreamNode
+from uwb_tdoa_bias.ros.node import StreamNode, StreamPoller, run
 from uwb_tdoa_bias.ros.parameters import (
     FROZEN,
     Parameter,
@@ -84,7 +83,7 @@ class LocalizationNode(StreamNode):
             raise refused[0]
         self.members = [node for tag in self._tags for node in tag.members]
         say_unused([self, *self.members], files_of(arguments))
-        self.turns = process.StreamPoller(self._tags)
+        self.turns = StreamPoller(self._tags)
         self._diagnostics = Diagnostics(self, self._report)
         self.ready = f"ready; tags: {', '.join(tags) or 'one'}"
 
@@ -275,7 +274,7 @@ def _without_own_remappings(arguments: list[str]) -> list[str]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the node and return the exit code."""
-    return process.run(LocalizationNode, __doc__, argv)
+    return run(LocalizationNode, __doc__, argv)
 
 
 if __name__ == "__main__":

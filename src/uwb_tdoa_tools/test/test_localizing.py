@@ -14,7 +14,7 @@ from uwb_tdoa_ekf.results import Odometry, Residuals, rows_of
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag
 from uwb_tdoa_tools.commands import evaluate, localize
 from uwb_tdoa_tools.estimate import FlightEstimator
-from uwb_tdoa_tools.localizing import residuals
+from uwb_tdoa_tools.localizing import pictures
 from uwb_tdoa_tools.localizing.localize import BAD, GOOD, assess, check_names, name_of, write_tum
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
@@ -250,7 +250,7 @@ def test_residuals_of_a_pair_are_of_one_sign_of_it():
         np.ones(n),
         np.array([USED, USED, REJECTED, USED], np.uint8),
     )
-    first, second = residuals.by_pair(some)
+    first, second = pictures.by_pair(some)
     assert (first.a, first.b, second.a, second.b) == (1, 2, 1, 3)
     np.testing.assert_allclose(first.value, [0.1, 0.2, 5.0])
     np.testing.assert_allclose(second.value, [-0.3])
@@ -322,7 +322,7 @@ def walked(n=600):
 
 
 def test_zones_say_who_is_heard_where_and_how_well():
-    found = residuals.zones_of(*walked(), 10.0)
+    found = pictures.zones_of(*walked(), 10.0)
     assert [(zone.x, zone.y) for zone in found[:4]] == [
         (5.0, 5.0),
         (15.0, 5.0),
@@ -342,7 +342,7 @@ def test_zones_say_who_is_heard_where_and_how_well():
         )
     assert found[3].used == pytest.approx(0.5, abs=0.05)
     assert (
-        residuals.zones_of(
+        pictures.zones_of(
             *(part for part in (walked()[0], Residuals(*(np.empty(0) for _ in range(7))))), 10.0
         )
         == []
@@ -354,9 +354,9 @@ def test_zones_are_written_as_a_table_and_a_map(bags, tmp_path, capsys):
     run([bags / "none" / "flight.bag", "--zones", "2", "--out", tmp_path])
     lines = (tmp_path / "flight_zones.csv").read_text().splitlines()
     assert (
-        lines[0] == ",".join(residuals.ZONE_COLUMNS)
+        lines[0] == ",".join(pictures.ZONE_COLUMNS)
         and len(lines) > 3
-        and all(len(line.split(",")) == len(residuals.ZONE_COLUMNS) for line in lines)
+        and all(len(line.split(",")) == len(pictures.ZONE_COLUMNS) for line in lines)
     )
     assert (tmp_path / "flight_zones.png").stat().st_size > 10_000
     run([bags / "none" / "flight.bag", "--zones", "0", "--out", tmp_path], 2)

@@ -11,7 +11,7 @@ from recordings import ANCHORS, FULL_HEADER, FULL_ROWS, csv_text
 
 from uwb_tdoa_bias.common import limits
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_tools.readers import read_util_csv, util_csv
+from uwb_tdoa_tools.readers import logs, read_util_csv
 
 SUBSET = "t_tdoa,idA,idB,tdoa_meas,t_pose,pose_x,pose_y,pose_z"
 
@@ -180,7 +180,7 @@ def test_two_members_and_padding_are_one_file(read):
 
 @pytest.mark.slow
 def test_a_gzip_that_unfolds_without_end_is_refused(read, monkeypatch):
-    monkeypatch.setattr(util_csv, "CSV_BYTES", 2_000_000)
+    monkeypatch.setattr(logs, "CSV_BYTES", 2_000_000)
     packed = gzip.compress(csv_text(TDOA, ["1,0,1,1"]).encode() + b"\n" * 500_000_000, 1)
     tracemalloc.start()
     with pytest.raises(InputError, match="more than 2000000 bytes of text"):
@@ -207,7 +207,7 @@ def test_a_row_without_end_is_refused(read):
 
 
 def test_more_cells_than_a_flight_has_are_refused(read, monkeypatch):
-    monkeypatch.setattr(util_csv, "CSV_CELLS", 40_000)
+    monkeypatch.setattr(logs, "CSV_CELLS", 40_000)
     content = csv_text(TDOA, ["1,1,0,1"] * 20_000)
     with pytest.raises(InputError, match="has more than 40000 cells"):
         read(content)

@@ -21,11 +21,10 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.ros import process
 from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS as STATUS_QOS
 from uwb_tdoa_bias.ros.cdr import CdrCodec
 from uwb_tdoa_bias.ros.diagnostics import Diagnostics, Rate
-from uwb_tdoa_bias.ros.node import StreamNode
+from uwb_tdoa_bias.ros.node import StreamNode, run
 from uwb_tdoa_bias.ros.parameters import (
     FROZEN,
     Parameter,
@@ -211,7 +210,7 @@ class AutopilotNode(StreamNode):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the node and return the exit code."""
-    return process.run(AutopilotNode, __doc__, argv)
+    return run(AutopilotNode, __doc__, argv)
 
 
 if __name__ == "__main__":

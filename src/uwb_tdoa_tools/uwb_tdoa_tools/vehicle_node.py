@@ -24,9 +24,8 @@ from rclpy.duration import Duration
 from std_msgs.msg import String
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.ros import process
 from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS
-from uwb_tdoa_bias.ros.node import StreamNode
+from uwb_tdoa_bias.ros.node import StreamNode, StreamPoller, run
 from uwb_tdoa_bias.ros.parameters import (
     FROZEN,
     Parameter,
@@ -120,7 +119,7 @@ class VehicleNode(StreamNode):
         )
         self._starts: float | None = None  # time.monotonic() of the start, s, after a subscription
         say_unused([self], files_of(arguments))
-        self.turns = process.StreamPoller([self])
+        self.turns = StreamPoller([self])
         self.get_logger().info(
             "ready; waiting for who listens to imu/data and uwb/tdoa, and publishes odometry"
         )
@@ -198,7 +197,7 @@ def _seconds(duration: DurationMessage) -> float:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the node, and return the exit code."""
-    return process.run(VehicleNode, __doc__, argv)
+    return run(VehicleNode, __doc__, argv)
 
 
 if __name__ == "__main__":

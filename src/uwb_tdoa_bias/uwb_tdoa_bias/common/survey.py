@@ -4,20 +4,483 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+import math
 from pathlib import Path
 import re
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from . import survey_forms
 from .anchors import FARTHEST, Anchors
 from .errors import InputError
 from .files import read_bytes
 from .lazy import rotations
 from .limits import SURVEY_BYTES
-from .survey_forms import Entry, Lines
+from .safe_yaml import parse_yaml
+
+Lines = list[tuple[int, list[str]]]  # numbers of lines, and their cells
+
+NOT_SURVEYED = [math.nan] * 4  # orientation without a survey
+IDS = (
+    "id",
+    "anchor",
+    "anchor id",
+    "anchorid",
+    "name",
+    "anchor name",
+    "label",
+    "address",
+    "addr",
+    "node",
+    "node id",
+    "beacon",
+    "nr",
+    "no",
+    "#",
+    "index",
+)
+LENGTHS = {"": 1.0, "m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "ft": 0.3048, "in": 0.0254}  # m
+# keys that hold a position
+NESTED = ("position", "pos", "pose", "translation", "location", "coordinates", "xyz", "point")
+TURNED = ("orientation", "rotation", "quaternion")
+_UNIT = re.compile(
+    r"^(.*?)[ (\[]+(m|dm|cm|mm|ft|in|metres|meters|metre|meter|feet|foot|inch|inches)[)\]]?$"
+)
+_SPELT = {
+    "metres": "m",
+    "meters": "m",
+    "metre": "m",
+    "meter": "m",
+    "feet": "ft",
+    "foot": "ft",
+    "inch": "in",
+    "inches": "in",
+}
+_NUMBERED = re.compile(
+    r"^(?:anchor|anc|a|beacon|node)[ _-]?([0-9]{1,5})(?:[ _-]?(?:pos|position|xyz))?$",
+    re.IGNORECASE,
+)
+_COMMA = re.compile(r"^[-+]?[0-9]+,[0-9]+$")
+_OPENCV = re.compile(r"^%YAML:1\.0\s*$", re.MULTILINE)
+
+
+class Entry(NamedTuple):
+    """One anchor of a file.
+
+    Attributes
+    ----------
+    name : its id as text, or a name
+    position : (3,) m
+    orientation : (4,) x y z w, NaN if not surveyed
+    where : the line or key, for messages
+    """
+
+    name: str
+    position: list[float]
+    orientation: list[float]
+    where: str
+
+
+class Columns(NamedTuple):
+    """Meaning of the cells of a table.
+
+    Attributes
+    ----------
+    name : place of the id or name, or None
+    axes : places of x, y and z
+    lengths : units of x, y and z, m
+    turn : places of the quaternion x, y, z, w, or ()
+    """
+
+    name: int | None
+    axes: tuple[int, int, int]
+    lengths: tuple[float, float, float]
+    turn: tuple[int, ...] = ()
+
+
+def columns_of(header: Sequence[str]) -> Columns | None:
+    """Return the Columns of a header; None without x, y and z.
+
+    Names may be in upper or lower case, with or without a unit.
+    """
+    roles: dict[str, int] = {}
+    lengths: dict[str, float] = {}
+    for place, cell in enumerate(header):
+        role, length = _role(cell)
+        if role and role not in roles:
+            roles[role], lengths[role] = place, length
+    if not roles.keys() >= {"x", "y", "z"}:
+        return None
+    turn = tuple(roles[name] for name in ("qx", "qy", "qz", "qw") if name in roles)
+    x, y, z = (roles[axis] for axis in "xyz")
+    return Columns(
+        roles.get("name"),
+        (x, y, z),
+        (lengths["x"], lengths["y"], lengths["z"]),
+        turn if len(turn) == 4 else (),
+    )
+
+
+def _role(cell: str) -> tuple[str, float]:
+    """Return ("x", "y", "z", "name", "qx" ... or "", unit in m) of a header cell."""
+    text = " ".join(re.split(r"[\s_.]+", cell.strip().lower())).strip()
+    found = _UNIT.match(text)
+    text, unit = (found[1].strip(), found[2]) if found else (text, "")
+    words = [word for word in text.split() if word not in (*NESTED, "p", "anchor")]
+    if len(words) == 1 and words[0] in ("x", "y", "z", "px", "py", "pz", "tx", "ty", "tz"):
+        return words[0][-1], LENGTHS[_SPELT.get(unit, unit)]
+    words = [word for word in text.split() if word not in TURNED]
+    if len(words) == 1 and words[0] in ("qx", "qy", "qz", "qw"):
+        return words[0], 1.0
+    if len(words) == 1 and len(words[0]) == 1 and words[0] in "xyzw" and text.split()[0] in TURNED:
+        return f"q{words[0]}", 1.0
+    return ("name", 1.0) if text in ("", *IDS) else ("", 1.0)
+
+
+_YAML_KEY = re.compile(r"^\s*(?:- *)?[{\s]*[\"']?[\w /*.-]+[\"']?\s*:(?:\s|$)")
+
+
+def is_table(text: str) -> bool:
+    """Return whether a text is a table, not YAML or JSON; an empty one is a table.
+
+    YAML and JSON begin with one of {, [, %, - or have a line with a key.
+    """
+    lines = [
+        line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")
+    ]
+    if not lines:
+        return True
+    # A table may begin with a negative number, e.g. -3.1.
+    begins_as_yaml = lines[0].lstrip()[0] in "{[%-" and not _is_number(cells_of(lines[0])[0])
+    return not begins_as_yaml and not any(map(_YAML_KEY.match, lines))
+
+
+def cells_of(line: str, delimiter: str | None = None) -> list[str]:
+    """Return the stripped cells of a line; delimiter : default by `delimiter_of`."""
+    delimiter = delimiter or delimiter_of(line)
+    return (
+        line.split()
+        if delimiter == " "
+        else [cell.strip().strip("\"'") for cell in line.split(delimiter)]
+    )
+
+
+def lines_of(text: str) -> Lines:
+    """Return the lines of a table without comments and empty lines.
+
+    The last comment before the first row is kept if it is a header. A text of comments alone is
+    returned whole.
+    """
+    filled_lines = [
+        (number, line) for number, line in enumerate(text.splitlines(), start=1) if line.strip()
+    ]
+    rows = [(number, line) for number, line in filled_lines if not line.lstrip().startswith("#")]
+    rows = rows or filled_lines
+    first_row, first_line = rows[0]
+    delimiter = delimiter_of(first_line)
+    comments_above = [
+        (number, cells_of(line.lstrip("# \t"), delimiter))
+        for number, line in filled_lines
+        if number < first_row
+    ]
+    header = [(number, cells) for number, cells in comments_above[-1:] if columns_of(cells)]
+    return [*header, *((number, cells_of(line, delimiter)) for number, line in rows)]
+
+
+def delimiter_of(line: str) -> str:
+    """Return the delimiter of a line: ";", tab, "," or " "."""
+    return next(
+        (
+            each
+            for each in ";\t,"
+            if each in line and not (each == "," and _all_commas_decimal(line))
+        ),
+        " ",
+    )
+
+
+def _all_commas_decimal(line: str) -> bool:
+    """Return whether all commas of a line are decimal commas of cells separated by blanks."""
+    cells = line.split()
+    return (
+        len(cells) >= 3
+        and all(_COMMA.match(cell) for cell in cells if "," in cell)
+        and sum("," in cell for cell in cells) >= 2
+    )
+
+
+def _is_number(cell: str) -> bool:
+    return math.isfinite(_number(cell))
+
+
+def _number(value: Any) -> float:
+    """Return the finite number of a cell or value, else NaN; a decimal comma is permitted."""
+    if isinstance(value, bool) or not isinstance(value, (int, float, str)):
+        return math.nan
+    text = (
+        value.strip().replace(",", ".")
+        if isinstance(value, str) and _COMMA.match(value.strip())
+        else value
+    )
+    try:
+        number = float(text)
+    except (ValueError, OverflowError):
+        return math.nan
+    return number if math.isfinite(number) else math.nan
+
+
+def read_table(lines: Lines) -> list[Entry] | None:
+    """Return the entries of a table; None for an unknown header or form.
+
+    A table without a header needs an id and three numbers in each line. Raises InputError.
+
+    lines : line numbers and cells
+    """
+    (number, header), rest = lines[0], lines[1:]
+    columns = columns_of(header)
+    if columns is None:
+        if all(map(_is_number, lines[0][1])):
+            return _without_header(lines)
+        return None
+    if columns.name is None:
+        raise InputError(
+            f"line {number}: columns x, y and z are recognized, and no column with the ids of "
+            "the anchors; add one named 'id'."
+        )
+    if not rest:
+        raise InputError("holds no anchor; add lines 'id,x,y,z' in metres.")
+    return [_row(number, cells, columns, len(header)) for number, cells in rest]
+
+
+def _without_header(lines: Lines) -> list[Entry]:
+    number, cells = lines[0]
+    if len(cells) == 3:
+        raise InputError(
+            f"line {number}: three numbers are recognized as a position, and no id; put the "
+            "id of each anchor before its position, "
+            "and 'id,x,y,z' in the first line."
+        )
+    if len(cells) != 4:
+        raise InputError(
+            f"line {number}: {len(cells)} numbers and no header: what they mean is not known; "
+            "put 'id,x,y,z' in the first line, "
+            "and other names for what is more."
+        )
+    return [
+        _row(number, cells, Columns(0, (1, 2, 3), (1.0, 1.0, 1.0)), 4) for number, cells in lines
+    ]
+
+
+def _row(number: int, cells: list[str], columns: Columns, count: int) -> Entry:
+    """Return the Entry of line `number`; count : cells of the header, at least 4.
+
+    Anchors checks the quaternion.
+    """
+    assert columns.name is not None
+    fewest = max(*columns.axes, columns.name, *columns.turn) + 1
+    if not fewest <= len(cells) <= max(count, 4):
+        hint = "; decimal commas need ';' between the cells" if len(cells) == 2 * count - 1 else ""
+        raise InputError(
+            f"line {number}: {','.join(cells)[:60]!r} has {len(cells)} cells, the header "
+            f"{count}{hint}."
+        )
+    values = [_number(cells[place]) for place in columns.axes]
+    if not all(map(math.isfinite, values)):
+        raise InputError(
+            f"line {number}: {','.join(cells)[:60]!r} is not 'id,x,y,z' with finite metres."
+        )
+    turn = [_number(cells[place]) for place in columns.turn] or NOT_SURVEYED
+    position = [value * length for value, length in zip(values, columns.lengths)]
+    return Entry(cells[columns.name], position, turn, f"line {number}")
+
+
+def read_tree(text: str, path: str | Path) -> tuple[list[Entry], str]:
+    """Return the entries of YAML or JSON, and the name of the world frame.
+
+    Raises InputError that names key and remedy.
+    """
+    opencv = bool(_OPENCV.search(text)) or "!!opencv-matrix" in text
+    content = parse_yaml(
+        _OPENCV.sub("", text).replace("!!opencv-matrix", "") if opencv else text, path
+    )
+    frame = "map"
+    for _ in range(8):  # levels around the anchors: parameter file, and "anchors"
+        if not isinstance(content, dict):
+            break
+        given = content.get("frame", content.get("frame_id", frame))
+        if not isinstance(given, str):
+            raise InputError(
+                f"{path}: frame: {given!r} is no name; write the name of the world frame, e.g. map."
+            )
+        frame = given
+        inner = next(
+            (
+                key
+                for key in content
+                if str(key).lower()
+                in ("anchors", "anchor_positions", "ros__parameters", "/**", "beacons")
+            ),
+            None,
+        )
+        if inner is None or not isinstance(content[inner], (dict, list)):
+            break
+        content = content[inner]
+    try:
+        entries = list(_entries(content))
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from error
+    if not entries:
+        raise InputError(f"{path}: no anchor is recognized; {WRITE}.")
+    return entries, frame
+
+
+WRITE = "write 'anchors: {0: {position: [x, y, z]}, 1: ...}', in metres"
+
+
+def _entries(content: Any) -> Iterator[Entry]:
+    """Yield the entries of a list or mapping; raise ValueError with key, value and remedy."""
+    if isinstance(content, list):
+        for place, item in enumerate(content):
+            yield _of_list(item, f"anchors[{place}]")
+        return
+    if not isinstance(content, dict):
+        return
+    matrices = [
+        (key, value)
+        for key, value in content.items()
+        if isinstance(value, dict) and value.keys() >= {"rows", "cols", "data"}
+    ]
+    if matrices:
+        yield from _of_matrix(*matrices[0])
+        return
+    numbered = {key: _NUMBERED.match(str(key)) for key in content}
+    if any(numbered.values()) and all(
+        isinstance(content[key], (list, dict)) for key, found in numbered.items() if found
+    ):
+        yield from (
+            _of_value(found[1], content[key], str(key)) for key, found in numbered.items() if found
+        )
+        return
+    for key, value in content.items():
+        if isinstance(value, (dict, list)):
+            yield _of_value(str(key), value, str(key))
+        elif (
+            not str(key)
+            .lower()
+            .startswith(
+                ("n_", "num", "count", "frame", "unit", "name", "version", "type", "description")
+            )
+        ):
+            raise ValueError(f"{key}: {value!r} is no position; {WRITE}.")
+
+
+def _of_matrix(key: Any, value: dict[str, Any]) -> Iterator[Entry]:
+    """Yield the rows of an OpenCV matrix as anchors 0, 1, 2, ...; it has no place for ids."""
+    rows, columns, data = value["rows"], value["cols"], value["data"]
+    if (
+        columns != 3
+        or not isinstance(data, list)
+        or not isinstance(rows, int)
+        or len(data) != 3 * rows
+    ):
+        raise ValueError(
+            f"{key}: a matrix of {rows} x {columns} is recognized; it must have a row x, y, z "
+            "for each anchor, so 3 columns."
+        )
+    for row in range(rows):
+        yield Entry(
+            str(row),
+            _three(data[3 * row : 3 * row + 3], f"{key}, row {row}"),
+            NOT_SURVEYED,
+            f"{key}, row {row}",
+        )
+
+
+def _of_list(item: Any, where: str) -> Entry:
+    if isinstance(item, list):
+        if len(item) == 4:
+            return Entry(_text(item[0]), _three(item[1:], where), NOT_SURVEYED, where)
+        three = len(item) == 3
+        what = (
+            "a position is recognized, and no id" if three else f"{len(item)} values are no anchor"
+        )
+        raise ValueError(f"{where}: {what}; write '- {{id: 0, position: [x, y, z]}}'.")
+    if not isinstance(item, dict):
+        raise ValueError(
+            f"{where}: {item!r} is no anchor; write '- {{id: 0, position: [x, y, z]}}'."
+        )
+    named = [
+        key
+        for key in item
+        if " ".join(str(key).lower().split("_")) in IDS and not isinstance(item[key], (dict, list))
+    ]
+    if not named:
+        raise ValueError(
+            f"{where}: no id is recognized among {', '.join(map(str, item))}; write 'id: 0'."
+        )
+    return _of_value(
+        _text(item[named[0]]), {key: value for key, value in item.items() if key != named[0]}, where
+    )
+
+
+def _text(name: Any) -> str:
+    return str(int(name)) if isinstance(name, float) and name.is_integer() else str(name)
+
+
+def _of_value(name: str, value: Any, where: str) -> Entry:
+    """Return the anchor `name` of its value.
+
+    value : list of three numbers, or mapping with a position, or with x, y and z
+    """
+    if isinstance(value, list):
+        return Entry(name, _three(value, where), NOT_SURVEYED, where)
+    keys = {str(key).lower(): key for key in value}
+    turn = next((value[keys[key]] for key in TURNED if key in keys), None)
+    nested = next((key for key in NESTED if key in keys), None)
+    if nested is not None:
+        inner = value[keys[nested]]
+        if isinstance(inner, dict):
+            within = _of_value(name, inner, f"{where}: {keys[nested]}")
+            return within._replace(orientation=_turn(turn, where)) if turn is not None else within
+        return Entry(name, _three(inner, f"{where}: {keys[nested]}"), _turn(turn, where), where)
+    columns = columns_of([str(key) for key in value])
+    if columns is None:
+        raise ValueError(
+            f"{where}: no position is recognized among {', '.join(map(str, value))[:80]}; {WRITE}."
+        )
+    values = list(value.values())
+    numbers = _three([values[place] for place in columns.axes], where)
+    return Entry(
+        name,
+        [number * length for number, length in zip(numbers, columns.lengths)],
+        _turn(turn, where),
+        where,
+    )
+
+
+def _three(value: Any, where: str) -> list[float]:
+    numbers = [_number(each) for each in value] if isinstance(value, list) else []
+    if len(numbers) == 6:
+        raise ValueError(
+            f"{where}: 6 numbers stand where 3 belong, as decimal commas make it; write "
+            "decimal points, [-3.1, 4.0, 0.2]."
+        )
+    if len(numbers) != 3 or not np.isfinite(numbers).all():
+        raise ValueError(f"{where}: {str(value)[:60]} is not 3 numbers x, y, z in metres.")
+    return numbers
+
+
+def _turn(value: Any, where: str) -> list[float]:
+    if value is None:
+        return NOT_SURVEYED
+    if isinstance(value, dict):
+        value = [value.get(key, value.get(f"q{key}")) for key in "xyzw"]
+    numbers = [_number(each) for each in value] if isinstance(value, list) else []
+    if len(numbers) != 4 or not np.isfinite(numbers).all():
+        raise ValueError(f"{where}: orientation is {str(value)[:60]}, not 4 numbers x, y, z, w.")
+    return numbers
+
 
 SAME_PLACE = 0.001  # m; two antennas are at least some cm apart
 # m. A UWB radio reaches at most 300 m, and a tag must receive several anchors at once. An anchor with
@@ -189,11 +652,11 @@ def read_entries(path: str | Path) -> tuple[list[Entry], str]:
         ) from error
     if not text.strip():
         raise InputError(f"{path}: is empty; give a survey file (.txt, .csv, .yaml or .json).")
-    if not survey_forms.is_table(text):
-        return survey_forms.read_tree(text, path)
-    lines = survey_forms.lines_of(text)
+    if not is_table(text):
+        return read_tree(text, path)
+    lines = lines_of(text)
     try:
-        entries = survey_forms.read_table(lines)
+        entries = read_table(lines)
         return (_total_station(path, lines) if entries is None else entries), "map"
     except InputError as error:
         message = str(error)
@@ -295,7 +758,7 @@ def _orientation(
     """
     found = [tips[anchor, k] for k in (1, 2, 3) if (anchor, k) in tips]
     if not found:
-        return survey_forms.NOT_SURVEYED
+        return NOT_SURVEYED
     if len(found) < 3:
         raise InputError(
             f"{path}: anchor {anchor} has {len(found)} of 3 arm tips; survey all three or "

@@ -13,8 +13,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.robust_loss import LOSSES
 from uwb_tdoa_bias.common.safe_yaml import read_yaml
 from uwb_tdoa_bias.common.sensors import SENSORS
-from uwb_tdoa_bias.common.sensors.returned import mistake
-from uwb_tdoa_bias.common.sensors.sensor import parameter
+from uwb_tdoa_bias.common.sensors.sensor import mistake, parameter
 
 ROBUST = ("innovation", "gate", "m_estimation")
 SIDES = "unknown", "below", "above", "-x", "+x", "-y", "+y"

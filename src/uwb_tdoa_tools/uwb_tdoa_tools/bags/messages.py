@@ -19,8 +19,7 @@ from rosbags.interfaces import Nodetype
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Imu, Tdoas, Truth
 from uwb_tdoa_bias.common.sensors import Sensor, Stream
-from uwb_tdoa_bias.common.sensors.returned import mistake
-from uwb_tdoa_bias.common.sensors.sensor import LARGEST_NUMBER
+from uwb_tdoa_bias.common.sensors.sensor import LARGEST_NUMBER, mistake
 from uwb_tdoa_ekf.results import Odometry, pose_and_twist
 
 if TYPE_CHECKING:

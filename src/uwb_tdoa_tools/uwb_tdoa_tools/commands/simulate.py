@@ -231,9 +231,9 @@ def config_of(args: Namespace) -> SimulationConfig:
     """Return the SimulationConfig of the options; most have the names of its fields."""
     from uwb_tdoa_bias.common.survey import read_survey, refuse_faulty
 
-    from .readers.tables import read_numbers
-    from .simulation.config import NO_IMU_ERRORS, ImuErrors, SimulationConfig
-    from .simulation.rooms import Walls
+    from ..readers.tables import read_numbers
+    from ..simulation.config import NO_IMU_ERRORS, ImuErrors, SimulationConfig
+    from ..simulation.rooms import Walls
 
     values = {
         field.name: getattr(args, field.name)

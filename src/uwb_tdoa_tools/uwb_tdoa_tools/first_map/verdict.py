@@ -386,11 +386,12 @@ def as_text(found: FirstMap) -> str:
 
 def picture(found: FirstMap, path: str | Path) -> None:
     """Draw the map from above and from the side, with ellipses of 95 % and other maps."""
-    from matplotlib.figure import Figure  # takes a second to import
-    from matplotlib.patches import Ellipse
+    from matplotlib.patches import Ellipse  # takes a second to import
 
-    figure = Figure(figsize=(11.0, 5.0), layout="constrained")
-    for ax, axes in zip(figure.subplots(1, 2), ([0, 1], [0, 2])):
+    from ..scoring.plots import two_views
+
+    figure, views = two_views()
+    for ax, axes in views:
         for other in found.others:
             ax.plot(*other[:, axes].T, "x", color="tab:red", ms=7)
         for row, i in enumerate(found.ids):
@@ -403,15 +404,7 @@ def picture(found: FirstMap, path: str | Path) -> None:
                 Ellipse(tuple(place), width, height, angle=angle, fc="none", ec="tab:blue")
             )
             ax.plot(*place, "s" if found.trusted[row].all() else "o", color="tab:blue", ms=5)
-            ax.annotate(str(i), place, textcoords="offset points", xytext=(6, 6))
-        side = axes[1] == 2
-        ax.set(
-            xlabel="x [m]",
-            ylabel="z [m]" if side else "y [m]",
-            title="from the side" if side else "from above",
-        )
-        ax.set_aspect("equal", adjustable="datalim")
-        ax.grid(alpha=0.25)
+            ax.annotate(str(i), (place[0], place[1]), textcoords="offset points", xytext=(6, 6))
     state = f"not accepted; red: {len(found.others)} other maps" if found.why_not else "accepted"
     figure.suptitle(f"first map: {state}; squares: trusted; ellipses: 95 %")
     write_filled(path, partial(figure.savefig, dpi=110))

@@ -33,7 +33,7 @@ from rosbags.interfaces import (
 )
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.ros.process import refusal
+from uwb_tdoa_bias.ros.node import refusal
 
 KNOWN = frozenset(  # packages of message types: the usual ones of ROS, and ours
     """actionlib_msgs action_msgs builtin_interfaces diagnostic_msgs geometry_msgs lifecycle_msgs nav_msgs rcl_interfaces rosgraph_msgs

@@ -31,7 +31,7 @@ from ..checking.watch import OF_ANCHORS
 from ..estimate import FlightEstimator
 from ..readers.inputs import Reading
 from ..scoring.metrics import LOST, has_innovation, nis, radio_residuals
-from . import pictures, residuals
+from . import pictures
 
 GOOD, DOUBTFUL, BAD = "good", "doubtful", "bad"
 # standard deviations that contain the 3D position for 95 % of the time; 1.6 to 2.0 by its shape
@@ -124,7 +124,7 @@ def assess(
         reasons.append(f"the filter found no place that explains the {_measured(figures)}")
         return Assessment(BAD, figures, [], tuple(reasons), tuple(remedies))
     figures |= _deviation(odometry)
-    figures["explained"] = float(residuals.explained(left)[there].mean())
+    figures["explained"] = float(pictures.explained(left)[there].mean())
     figures["nis"] = float(nis(left).mean())
     lost = lost_spans(left.t, odometry)
     figures["lost"] = float(sum(end - begin for begin, end in lost))
@@ -361,11 +361,11 @@ class Localizer:
         if self.bag and len(odometry):
             write_odometry(odometry, flight.anchors, path(".bag"), force=True)
         if self.residuals:
-            residuals.write_residuals(path("_residuals.csv"), left)
-            residuals.draw_residuals(path("_residuals.png"), left, name)
-        if self.zones is not None and (found := residuals.zones_of(odometry, left, self.zones)):
-            residuals.write_zones(path("_zones.csv"), found)
-            residuals.draw_zones(
+            pictures.write_residuals(path("_residuals.csv"), left)
+            pictures.draw_residuals(path("_residuals.png"), left, name)
+        if self.zones is not None and (found := pictures.zones_of(odometry, left, self.zones)):
+            pictures.write_zones(path("_zones.csv"), found)
+            pictures.draw_zones(
                 path("_zones.png"),
                 found,
                 flight.anchors,

@@ -20,11 +20,10 @@ from uwb_tdoa_bias.common.flight import Flight
 from ..bags import is_bag, is_ros_1
 from ..command_lines import suggest_line
 from .by_profile import read_by_profile
+from .logs import MAGIC, is_util_csv, read_usd_log, read_util_csv
 from .names import read_survey
 from .profile import load_profile
 from .tables import GZIP_MAGIC, is_ulog
-from .usd_log import MAGIC, read_usd_log
-from .util_csv import is_util_csv, read_util_csv
 
 
 def reader_of(path: Path) -> Callable[[Path, Anchors, bool, bool], Flight]:

@@ -17,8 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Flight
-from uwb_tdoa_bias.common.survey import refuse_faulty
-from uwb_tdoa_bias.common.survey_forms import Entry
+from uwb_tdoa_bias.common.survey import Entry, refuse_faulty
 
 from ..bags import is_bag, is_ros_1
 from .names import NamedAnchors, named_anchors
@@ -29,6 +28,7 @@ from .profile import (
     MOST_SKIPPED,
     RADIO,
     STREAMS,
+    Columns,
     Profile,
     Source,
     as_text,
@@ -162,7 +162,7 @@ def read_by_profile(
         remarks: list[str] = []
         requests = _requests(tables, profile, files[0], namespace, remarks)
         named = survey or _recorded_anchors(tables, requests, files[0], remarks)
-        _take(tables, [one for one in requests if not one.is_survey], named, tag)
+        _take(tables, [one for one in requests if one.gives != {SURVEY}], named, tag)
         streams: Streams = {}
         parts: dict[str, dict[str, dict[str, np.ndarray]]] = {}
         for request in requests:
@@ -205,6 +205,7 @@ class _Request:
 
     Attributes
     ----------
+    gives : names of the streams of the source.
     tags : {tag: records}.
     positions : {name of an anchor: position, m, in the axes of the source}.
     moved : {name of an anchor: largest change of a coordinate, m}.
@@ -217,20 +218,12 @@ class _Request:
         # Then a comma in a cell may be a thousands separator.
         self._between_commas = isinstance(tables, CsvFiles) and tables.delimiters[table] == ","
         default = tables.time_of(table)
-        self._wanted: dict[str, dict[str, tuple[str, float]]] = {}
-        for stream, known in STREAMS.items():
-            mine = {name: source.columns[name] for name in known if name in source.columns}
-            if not mine:
-                continue
-            time = time_column(stream, source.columns) or default
-            if stream != SURVEY:
-                if time is None:
-                    raise InputError(
-                        f"{table}: the profile names no column with the time; write time: COLUMN."
-                    )
-                mine["t"] = time
-            self._wanted[stream] = mine
-        self.is_survey = set(self._wanted) == {SURVEY}
+        self._wanted = _wanted(source, default)
+        self.gives = {*self._wanted}
+        if any("t" not in mine for stream, mine in self._wanted.items() if stream != SURVEY):
+            raise InputError(
+                f"{table}: the profile names no column with the time; write time: COLUMN."
+            )
         self._values: dict[str, dict[str, array[float]]] = {
             stream: {name: array("d") for name in mine} for stream, mine in self._wanted.items()
         }
@@ -244,16 +237,6 @@ class _Request:
         self._by_stamp = default is not None and any(
             mine.get("t") == default for mine in self._wanted.values()
         )
-
-    @property
-    def has_survey(self) -> bool:
-        """Return whether the source gives positions of anchors."""
-        return SURVEY in self._wanted
-
-    @property
-    def has_radio(self) -> bool:
-        """Return whether the source gives TDOAs or ranges."""
-        return bool({*RADIO} & {*self._wanted})
 
     def take(self, record: Record, place: str, named: NamedAnchors | None, tag: str) -> None:
         """Add the records of a message; with `named` None only positions of anchors."""
@@ -293,7 +276,8 @@ class _Request:
                     raw[name] = value(path)
                 except IndexError:
                     raw[name] = ""
-            if all(_is_empty(each) for name, each in raw.items() if name != "t"):
+            values = [each for name, each in raw.items() if name != "t"]
+            if all(isinstance(each, str) and each.lower() in EMPTY for each in values):
                 continue
             self._keep(stream, raw, place, named)
 
@@ -450,7 +434,7 @@ def _requests(
         if len(found) > 1 and not any(found.values()):
             found = _in_namespace(path, found, namespace)
         requests += [_Request(table, source, names, tables) for table, names in found.items()]
-    if not any(request.has_radio for request in requests):
+    if not any(request.gives & {*RADIO} for request in requests):
         raise InputError(
             f"{path}: has nothing that the profile {profile.name} takes TDOAs or ranges from; it "
             f"has {', '.join(sorted(tables.types)) or 'nothing'}."
@@ -478,15 +462,8 @@ def _csv_with_columns(tables: CsvFiles, source: Source) -> str:
     Raises InputError for several files. If none has all columns, the error names a file that lacks
     the fewest.
     """
-    wanted = {
-        path
-        for path in (
-            *(column for column, _ in _used(source).values()),
-            *(condition.path for condition in source.where),
-            source.tag,
-        )
-        if path
-    }
+    columns = {path for mine in _wanted(source).values() for path, _ in mine.values()}
+    wanted = columns | source.conditions
     having = [table for table in tables.types if wanted <= {*tables.fields(table)}]
     if len(having) == 1:
         return having[0]
@@ -501,16 +478,15 @@ def _csv_with_columns(tables: CsvFiles, source: Source) -> str:
     )
 
 
-def _used(source: Source) -> dict[str, tuple[str, float]]:
-    """Return the columns of a source with the times that its streams use."""
-    used: dict[str, tuple[str, float]] = {}
+def _wanted(source: Source, default: tuple[str, float] | None = None) -> dict[str, Columns]:
+    """Return {stream: columns of a source, "t" with the time, or with `default` if it has none}."""
+    wanted: dict[str, Columns] = {}
     for stream, known in STREAMS.items():
         mine = {name: source.columns[name] for name in known if name in source.columns}
-        time = time_column(stream, source.columns)
-        if mine and time and stream != SURVEY:
-            mine["t"] = time
-        used |= {f"{stream} {name}": column for name, column in mine.items()}
-    return used
+        time = time_column(stream, source.columns) or default
+        if mine:
+            wanted[stream] = mine | ({"t": time} if time and stream != SURVEY else {})
+    return wanted
 
 
 def _take(
@@ -529,7 +505,7 @@ def _recorded_anchors(
     tables: Foreign, requests: Sequence[_Request], path: Path, remarks: list[str]
 ) -> NamedAnchors:
     """Return the anchors in the recording. Raises InputError."""
-    sources = [request for request in requests if request.has_survey]
+    sources = [request for request in requests if SURVEY in request.gives]
     _take(tables, sources, None, "")
     places: dict[str, np.ndarray] = {}
     for request in sources:
@@ -604,8 +580,7 @@ def _unread(tables: Foreign, requests: Sequence[_Request]) -> list[str]:
             if request.table == table
             for path in (
                 *(path for path, _ in request.source.columns.values()),
-                *(condition.path for condition in request.source.where),
-                request.source.tag,
+                *request.source.conditions,
             )
         }
         left = [name for name in tables.fields(table) if name and name not in used]
@@ -614,10 +589,6 @@ def _unread(tables: Foreign, requests: Sequence[_Request]) -> list[str]:
             more = f" and {len(left) - MOST_LISTED} more" if len(left) > MOST_LISTED else ""
             out.append(f"{table}: columns {listed}{more}, which the profile does not name")
     return out
-
-
-def _is_empty(value: Any) -> bool:
-    return isinstance(value, str) and value.lower() in EMPTY
 
 
 def as_number(value: Any) -> float | None:

@@ -53,13 +53,9 @@ def read_named_anchors(path: str | Path) -> NamedAnchors:
     Names that all end with different numbers get these as ids. Other names get their line number in
     the survey, from 0. Raises InputError, also for a survey that is certainly wrong.
     """
-    named = _read_named(path)
+    named = named_anchors(path, *survey.read_entries(path))
     refuse_faulty(named.anchors, str(path))
     return named
-
-
-def _read_named(path: str | Path) -> NamedAnchors:
-    return named_anchors(path, *survey.read_entries(path))
 
 
 def named_anchors(path: str | Path, entries: list[survey.Entry], frame: str) -> NamedAnchors:

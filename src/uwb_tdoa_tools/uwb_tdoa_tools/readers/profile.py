@@ -219,6 +219,11 @@ class Source:
     body: str = BODY[0]
     world: str = WORLD[0]
 
+    @property
+    def conditions(self) -> set[str]:
+        """Return the paths of the fields that decide which records count."""
+        return {condition.path for condition in self.where} | ({self.tag} - {""})
+
     def match(self, table: str, kind: str) -> dict[str, str] | None:
         """Return {name: text} of the names in `topic`; None if another table is meant.
 

@@ -41,6 +41,17 @@ ACCEL = r"(.*(acc|linear_acceleration|lin_acc).*?|a|.*[._]a)[._]?([xyz]|\[[012]\
 PLACE = r"(.*(position|translation|location|pos|pose|p)[._])?([xyz]|\[[012]\])"
 TRUTH = r"truth|mocap|vicon|vive|optitrack|qualisys|vrpn|gt_"
 POSE = r"pose|tag_pos"  # of ground truth, or of an estimate
+MISSING = {  # streams: lines on what to do without any of them
+    RADIO: (
+        "Missing: TDOAs or ranges. Write a source with topic and columns: anchor_a, anchor_b and",
+        "tdoa, or anchor and range. If they are in an array of the message, add each: ARRAY.",
+    ),
+    ("gyro", "acc"): (
+        "Missing: gyroscope and accelerometer. An estimate is possible without them.",
+    ),
+    ("pose",): ("Missing: ground truth. Only errors need it.",),
+    ("anchors",): ("Missing: positions of the anchors. Give a survey with --survey.",),
+}
 
 
 @dataclass(frozen=True)
@@ -108,7 +119,8 @@ def suggest(paths: Sequence[Path], salvage: bool = False) -> tuple[str, list[str
                 found |= set() if one.doubtful else streams
             if not suggestions:
                 left.append(_unrecognized(tables, table))
-        lines += [*_missing(found), *left]
+        missing = [MISSING[streams] for streams in MISSING if not found & {*streams}]
+        lines += [*(f"# {line}" for some in missing for line in some), *left]
     return "".join(f"{printable(line)}\n" for line in lines), fitting
 
 
@@ -142,25 +154,6 @@ def _unrecognized(tables: Foreign, table: str) -> str:
     names = tables.fields(table)
     listed = ", ".join(names[:SHOWN]) + (", ..." if len(names) > SHOWN else "")
     return f"# Not recognized: {table}, {tables.types[table]}, with {listed or 'unknown fields'}."
-
-
-def _missing(found: set[str]) -> list[str]:
-    """Return comments on streams that no table seems to hold."""
-    lines = []
-    if not found & {*RADIO}:
-        lines += [
-            "# Missing: TDOAs or ranges. Write a source with topic and columns: anchor_a, anchor_b and",
-            "# tdoa, or anchor and range. If they are in an array of the message, add each: ARRAY.",
-        ]
-    if not {"gyro", "acc"} <= found:
-        lines.append(
-            "# Missing: gyroscope and accelerometer. An estimate is possible without them."
-        )
-    if "pose" not in found:
-        lines.append("# Missing: ground truth. Only errors need it.")
-    if "anchors" not in found:
-        lines.append("# Missing: positions of the anchors. Give a survey with --survey.")
-    return lines
 
 
 def _suggestions(tables: Foreign, table: str) -> list[Suggestion]:

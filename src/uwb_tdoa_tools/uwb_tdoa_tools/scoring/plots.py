@@ -104,6 +104,17 @@ def error_figure(score: Score, odometry: Estimate, truth: Truth) -> Figure:
     return figure
 
 
+def two_views() -> tuple[Figure, list[tuple[Axes, tuple[int, int]]]]:
+    """Return a Figure, and [(axes, the two coordinates)] for a map from above and from the side."""
+    figure = Figure(figsize=(11.0, 5.0), layout="constrained")
+    views = list(zip(figure.subplots(1, 2), ((0, 1), (0, 2))))
+    for (ax, (u, v)), title in zip(views, ("from above", "from the side")):
+        ax.set(xlabel=f"{'xyz'[u]} [m]", ylabel=f"{'xyz'[v]} [m]", title=title)
+        ax.set_aspect("equal", adjustable="datalim")
+        ax.grid(alpha=0.25)
+    return figure, views
+
+
 def labels(ids: Sequence[int], places: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
     """Yield (label, (2,) m) of ids at places (n, 2) m; labels that would overlap become one."""
     left = list(range(len(ids)))

@@ -167,11 +167,11 @@ def as_text(found: SelfCalibration) -> str:
 
 def picture(found: SelfCalibration, path: str | Path) -> None:
     """Draw given and surveyed anchors, from above and from the side, with 95 % intervals."""
-    from matplotlib.figure import Figure  # takes a second to import
+    from ..scoring.plots import two_views  # takes a second to import
 
-    figure = Figure(figsize=(11.0, 5.0), layout="constrained")
+    figure, views = two_views()
     surveyed = found.surveyed.positions
-    for ax, (u, v) in zip(figure.subplots(1, 2), ((0, 1), (0, 2))):
+    for ax, (u, v) in views:
         ax.errorbar(
             surveyed[:, u],
             surveyed[:, v],
@@ -192,14 +192,12 @@ def picture(found: SelfCalibration, path: str | Path) -> None:
             label="given",
         )
         for row, i in enumerate(found.given.ids):
-            ax.annotate(str(i), surveyed[row, [u, v]], textcoords="offset points", xytext=(7, 7))
-        ax.set(
-            xlabel=f"{'xyz'[u]} [m]",
-            ylabel=f"{'xyz'[v]} [m]",
-            title="from above" if v == 1 else "from the side",
-        )
-        ax.set_aspect("equal", adjustable="datalim")
-        ax.grid(alpha=0.25)
+            ax.annotate(
+                str(i),
+                (surveyed[row, u], surveyed[row, v]),
+                textcoords="offset points",
+                xytext=(7, 7),
+            )
     figure.axes[0].legend()
     write_filled(path, partial(figure.savefig, dpi=110))
 

@@ -15,8 +15,7 @@ import re
 from typing import Any
 
 from ..errors import InputError
-from .returned import PAGE, mistake
-from .sensor import Sensor, Stream
+from .sensor import PAGE, Sensor, Stream, mistake
 
 NAME = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")
 MESSAGE = re.compile(r"\w+/msg/\w+")
