@@ -13,8 +13,7 @@ import numpy as np
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Flight
-from uwb_tdoa_bias.common.survey import refuse_faulty
-from uwb_tdoa_bias.common.survey_forms import Entry
+from uwb_tdoa_bias.common.survey import Entry, refuse_faulty
 
 from .names import NamedAnchors, named_anchors, read_named_anchors
 from .profile import (
