@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_tools.bags.bag import read_odometry, write_bag
-from uwb_tdoa_tools.bags.files import messages, open_bag
+from uwb_tdoa_tools.bags.files import open_bag
 from uwb_tdoa_tools.live.run import accounts, run_live
 
 from .figures import Figure
@@ -56,5 +56,5 @@ def measure(
 def speed(recorded: str | Path) -> float:
     """Seconds of flight per second of recording, of a bag with odometry."""
     with open_bag(recorded) as reader:
-        arrived = [stamp for _, stamp, _ in messages(recorded, reader, list(reader.connections))]
+        arrived = [stamp for _, stamp, _ in reader.messages()]
     return float(np.ptp(read_odometry(recorded).t) / (1e-9 * np.ptp(arrived)))

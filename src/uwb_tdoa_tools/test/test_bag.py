@@ -14,7 +14,6 @@ from recordings import ANCHORS, differences, small_flight
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.rosbag2 import Reader, Writer
-import yaml
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
@@ -205,22 +204,6 @@ def test_qos_and_type_hashes_are_recorded(tmp_path, storage):
             assert connection.digest.startswith("RIHS01_") and len(connection.digest) == 71
 
 
-@BOTH
-@pytest.mark.parametrize("told", ["other", "none"])
-def test_metadata_may_tell_another_qos_than_the_data_file(tmp_path, storage, told):
-    flight = small_flight(0.05)
-    write_bag(flight, tmp_path / "flight", storage)
-    file = tmp_path / "flight" / "metadata.yaml"
-    content = yaml.safe_load(file.read_text())
-    for entry in content["rosbag2_bagfile_information"]["topics_with_message_count"]:
-        (qos,) = entry["topic_metadata"]["offered_qos_profiles"]
-        entry["topic_metadata"]["offered_qos_profiles"] = (
-            [] if told == "none" else [{**qos, "reliability": "best_effort"}]
-        )
-    file.write_text(yaml.safe_dump(content))
-    assert differences(flight, read_bag(tmp_path / "flight")) == []
-
-
 def test_existing_output(tmp_path):
     out = tmp_path / "flight"
     write_bag(small_flight(0.05), out)
@@ -383,14 +366,6 @@ def test_odometry(tmp_path):
     np.testing.assert_array_equal(odometry.covariance[0], 2 * covariance.reshape(6, 6))
     with pytest.raises(InputError, match="no message on /tag1/odometry"):
         read_odometry(tmp_path / "bag", namespace="tag1")
-
-
-@pytest.mark.parametrize("metadata", ["", "rosbag2_bagfile_information: 3", "{", "a: b"])
-def test_damaged_metadata(tmp_path, metadata):
-    write_bag(small_flight(0.05), tmp_path / "flight")
-    (tmp_path / "flight" / "metadata.yaml").write_text(metadata)
-    with pytest.raises(InputError, match="cut or damaged|is no YAML"):
-        read_bag(tmp_path / "flight")
 
 
 def test_not_a_bag(tmp_path):

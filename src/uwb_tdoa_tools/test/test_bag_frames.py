@@ -20,7 +20,7 @@ from uwb_tdoa_ekf.frames import ImuMount
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.bags import bag
 from uwb_tdoa_tools.bags.bag import read_bag
-from uwb_tdoa_tools.bags.files import messages, new_bag, open_bag
+from uwb_tdoa_tools.bags.files import new_bag, open_bag
 from uwb_tdoa_tools.bags.message_types import typestore
 from uwb_tdoa_tools.bags.messages import header_of, pose_of, tdoa_messages, transforms_message
 from uwb_tdoa_tools.checking import recording_rules
@@ -75,7 +75,7 @@ def mounted(flight, path, *static, robot=""):
         for rows in static:
             message = store.serialize_cdr(transforms(store, *rows), "tf2_msgs/msg/TFMessage")
             writer.write(to["/tf_static"], 0, message)
-        for connection, stamp, data in messages(path, reader, reader.connections):
+        for connection, stamp, data in reader.messages():
             if connection.topic in frames:
                 message = store.deserialize_cdr(data, connection.msgtype)
                 message.header.frame_id = frames[connection.topic]

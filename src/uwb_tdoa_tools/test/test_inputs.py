@@ -16,7 +16,7 @@ from uwb_tdoa_bias.common.limits import FOLDER_DEPTH, TooMuch
 from uwb_tdoa_bias.common.safe_yaml import read_yaml
 from uwb_tdoa_bias.common.survey import read_survey
 from uwb_tdoa_tools.bags.bag import write_bag
-from uwb_tdoa_tools.bags.files import messages, new_bag, open_bag
+from uwb_tdoa_tools.bags.files import new_bag, open_bag
 from uwb_tdoa_tools.bags.message_types import typestore
 from uwb_tdoa_tools.readers import inputs, read_flight
 from uwb_tdoa_tools.readers.inputs import Reading, find_flights, require_tdoas, survey_for
@@ -169,7 +169,7 @@ def test_a_bag_without_anchors_takes_the_survey_that_is_given(tmp_path):
         to = {
             c.topic: writer.add_connection(c.topic, c.msgtype, typestore=typestore()) for c in there
         }
-        for connection, stamp, data in messages(tmp_path / "whole", reader, there):
+        for connection, stamp, data in reader.messages(there):
             writer.write(to[connection.topic], stamp, data)
     (tmp_path / "survey.csv").write_text(SURVEY)
     reading = Reading(tmp_path / "survey.csv")
@@ -210,7 +210,7 @@ def test_topics_of_bags_are_refused_where_there_is_no_bag(tmp_path, given):
 
 def test_a_bag_that_was_not_closed_is_one(tmp_path):
     make(tmp_path, "bag/bag_0.mcap")
-    with pytest.raises(InputError, match="bag is cut or damaged"):
+    with pytest.raises(InputError, match="bag: holds no message that can be read"):
         Reading(namespace="tag1").one(tmp_path / "bag")
 
 

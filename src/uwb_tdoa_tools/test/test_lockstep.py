@@ -21,7 +21,7 @@ import known_answer  # noqa: E402
 from uwb_tdoa_bias.correction.network import load_network  # noqa: E402
 from uwb_tdoa_ekf.core.memory import USED  # noqa: E402
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag  # noqa: E402
-from uwb_tdoa_tools.bags.files import messages, new_bag, open_bag  # noqa: E402
+from uwb_tdoa_tools.bags.files import new_bag, open_bag  # noqa: E402
 from uwb_tdoa_tools.bags.message_types import typestore  # noqa: E402
 from uwb_tdoa_tools.calibrating import between  # noqa: E402
 from uwb_tdoa_tools.live.follow import SILENCE  # noqa: E402
@@ -207,9 +207,7 @@ def delayed(bag, out, count=10, delay=1_000_000_000):
             )
             for c in reader.connections
         }
-        found = [
-            (stamp, c.topic, data) for c, stamp, data in messages(bag, reader, reader.connections)
-        ]
+        found = [(stamp, c.topic, data) for c, stamp, data in reader.messages()]
         tdoas = [number for number, (_, topic, _) in enumerate(found) if topic == "/uwb/tdoa"]
         for number in tdoas[len(tdoas) // 2 :][:count]:
             stamp, topic, data = found[number]

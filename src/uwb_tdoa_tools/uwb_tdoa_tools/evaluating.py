@@ -190,8 +190,8 @@ class Evaluator:
         return late_tdoas(self.odometry, *self._where) if self.odometry else 0
 
     @property
-    def _where(self) -> tuple[str, bool, dict[str, str]]:
-        return self.reading.namespace, self.reading.salvage, self.reading.topics
+    def _where(self) -> tuple[str, dict[str, str]]:
+        return self.reading.namespace, self.reading.topics
 
 
 def head_line() -> str:

@@ -64,7 +64,7 @@ READING = (
     option(
         "--salvage",
         action="store_true",
-        help="read cut or damaged recordings as far as they are sound, with a remark",
+        help="leave out invalid numbers, and read logs and CSV files up to where they are cut",
     ),
 )
 PARAMETERS = option(

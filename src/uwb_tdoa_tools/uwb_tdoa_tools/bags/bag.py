@@ -42,8 +42,6 @@ from ..clock import sentences
 from . import frames, messages as bag_messages
 from .files import BagReader, check_output, connections_of, new_bag, open_bag, readable, remarks_of
 from .frames import recorded_anchors
-from .integrity import metadata
-from .mcap import Damaged
 from .message_types import typestore
 from .topics import (
     LATCHED_QOS,
@@ -240,14 +238,14 @@ def read_bag(
     topics : {our name of a topic: its name in the bag}, e.g. {"uwb/tdoa": "/my/tdoa"}. Relative
         names are in the namespace.
     anchors : Anchors to use instead of the recorded uwb/anchors, or None.
-    salvage : read a damaged bag up to the damage, without invalid messages; see `meta["remarks"]`.
+    salvage : leave out invalid messages; see `meta["remarks"]`.
     truth : read ground_truth/pose, if it exists.
 
-    Raises InputError for a damaged bag, without uwb/tdoa, without any anchors, and for numbers that
-    are not finite.
+    A bag is read up to where it is cut, see `meta["remarks"]`. Raises InputError without uwb/tdoa,
+    without any anchors, and for numbers that are not finite.
     """
-    with open_bag(path, salvage) as reader:
-        about = _about(path)
+    with open_bag(path) as reader:
+        about = _about(path, reader.custom)
         meta = {**about["meta"], "bag": str(path)}
         remarks, name_of = list[str](), Names(namespace, topics)
         kinds = (
@@ -351,15 +349,14 @@ def _unread(reader: BagReader, name_of: Names) -> list[str]:
 def read_odometry(
     path: str | Path,
     namespace: str = "",
-    salvage: bool = False,
     topics: dict[str, str] | None = None,
 ) -> RecordedOdometry:
     """Read a nav_msgs/Odometry topic in order of header stamps.
 
     The velocity is rotated from the child frame to the world frame. Estimates may be NaN.
-    `namespace`, `salvage`, `topics` : see `read_bag`. Raises InputError.
+    `namespace`, `topics` : see `read_bag`. Raises InputError.
     """
-    with open_bag(path, salvage) as reader:
+    with open_bag(path) as reader:
         topic = Names(namespace, topics)("odometry")
         names = [connection.topic for connection in reader.connections]
         t, rows, _ = read_topic(
@@ -387,7 +384,6 @@ def read_odometry(
 def late_tdoas(
     path: str | Path,
     namespace: str = "",
-    salvage: bool = False,
     topics: dict[str, str] | None = None,
 ) -> int:
     """Return the number of TDOAs that came too late for the recorded odometry.
@@ -396,17 +392,16 @@ def late_tdoas(
     InputError.
     """
     beside = Names(namespace, topics)("odometry").rpartition("/")[0]
-    with open_bag(path, salvage) as reader:
+    with open_bag(path) as reader:
         found = connections_of(
             path, reader, f"{beside}/uwb/residual", "uwb_tdoa_msgs/msg/TdoaResidual"
         )
         return sum(
-            residual.verdict == residual.VERDICT_LATE
-            for _, _, residual in readable(path, reader, found)
+            residual.verdict == residual.VERDICT_LATE for _, _, residual in readable(reader, found)
         )
 
 
-def _about(path: str | Path) -> dict[str, Any]:
+def _about(path: str | Path, custom: dict[str, Any]) -> dict[str, Any]:
     """Return {"name", "meta"} of the flight from the custom data of `write_bag`.
 
     Only _PRINTED texts are used. A bag of other software gives the name of the file and an empty
@@ -414,8 +409,8 @@ def _about(path: str | Path) -> dict[str, Any]:
     """
     out = {"name": Path(path).stem, "meta": {}}
     try:
-        about = json.loads(metadata(Path(path))["custom_data"].get(_FLIGHT_KEY, "{}"))
-    except (InputError, Damaged, TypeError, ValueError, RecursionError):
+        about = json.loads(custom.get(_FLIGHT_KEY, "{}"))
+    except (TypeError, ValueError, AttributeError, RecursionError):
         return out
     if isinstance(about, dict):
         name, meta = about.get("name"), about.get("meta")

@@ -5,75 +5,220 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
-import math
+from heapq import heappop, heappush
 from pathlib import Path
-import re
 import shutil
-import sys
 import tempfile
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rosbags.interfaces import Connection
-from rosbags.rosbag1 import Reader as Ros1Reader
-from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+from rosbags.rosbag2 import StoragePlugin, Writer
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import refuse_output, temporary_folder
-from uwb_tdoa_bias.common.limits import READ_BYTES, TooMuch, most_unpacked
+from uwb_tdoa_bias.common.limits import (
+    MESSAGE_BYTES,
+    READ_BYTES,
+    Budget,
+    TooMuch,
+    most_unpacked,
+)
+from uwb_tdoa_bias.common.safe_yaml import read_yaml
 from uwb_tdoa_bias.common.stamps import LARGEST_STEP_BACK
 
 from ..choices import STORAGES
-from ..command_lines import SALVAGE
-from . import is_bag, is_ros_1, mcap, write_ahead
-from .completion import completed
-from .integrity import (
-    CHECKSUM_KEY,
-    NO_CHECKSUM,
-    check as check_whole,
-    data_files,
-    is_mcap,
-    metadata,
-    sqlite_messages,
-    write_checksums,
-)
-from .mcap import Damaged, zstd
+from . import METADATA, ZSTD, data_files, is_bag, repair
 from .message_types import check_type, typestore
-from .salvage import as_written, salvage as write_sound_part
+from .repair import Damaged, zstd
+
+if TYPE_CHECKING:
+    from .foreign import Ros1Bag
 
 PLUGINS = dict(zip(STORAGES, (StoragePlugin.MCAP, StoragePlugin.SQLITE3)))
 
 
-class BagReader(Reader):
-    """A Reader that records which parts of a bag cannot be read.
+class BagReader:
+    """A bag of ROS 2: the messages in its data files, up to where they are cut.
 
     Attributes
     ----------
-    remarks : sentences on the missing parts of a damaged bag
-    data : its data files
-    packed : whether each message is compressed
-    falls_back : whether the times of the messages fall back, in the order of writing
+    connections : topics with messages, numbered, with counts
+    custom : custom data of metadata.yaml
+    start_time, end_time : ns, of the first and the last message
+    remarks : sentences on what is missing
     unreadable : {topic: number of messages that do not fit its type}
-    most : limit of the bytes of all messages together
     """
 
-    remarks: list[str]
-    data: list[Path]
-    packed: bool
-    falls_back: bool
-    unreadable: Counter[str]
-    most: int
+    def __init__(self, path: Path, folder: Path) -> None:
+        """Find the topics of a bag.
 
+        folder : an empty one, for copies of files that are packed, or that the recorder did not close
 
-class Ros1Bag(Ros1Reader):
-    """A bag of ROS 1, for `files.messages`."""
-
-    def __init__(self, path: Path) -> None:
-        """Limit what all messages together may hold."""
-        super().__init__(path)
-        self.most = most_unpacked(path.stat().st_size)
+        Raises InputError if no message can be read.
+        """
         self.remarks, self.unreadable = list[str](), Counter[str]()
+        stated = _stated(path, self.remarks) if path.is_dir() else {}
+        self.custom: dict[str, Any] = stated.get("custom_data") or {}
+        files = _listed(path, stated, self.remarks) if path.is_dir() else [path]
+        self._path, budget = path, Budget(path)
+        self._most = most_unpacked(sum(file.stat().st_size for file in files))
+        self._files = {}
+        for file in files:
+            if _is_packed(file):
+                whole = _unpacked(file, folder, budget, self._most)
+            else:
+                whole = repair.merged(file, folder, self.remarks)
+            self._files[file] = whole
+        self._scan()
+        count = sum(connection.msgcount for connection in self.connections)
+        if not count and (self.remarks or not files):
+            raise InputError(
+                f"{path}: holds no message that can be read; copy it again, or record it again "
+                f"({' '.join(self.remarks)})."
+            )
+        if stated and stated.get("message_count") != count:
+            self.remarks.append(
+                f"metadata.yaml states {stated.get('message_count')!r} messages. The files hold "
+                f"{count}, which are read."
+            )
+
+    def messages(
+        self, connections: Collection[Connection] | None = None
+    ) -> Iterator[tuple[Connection, int, bytes]]:
+        """Yield (connection, stamp ns, bytes) of the given connections, default all.
+
+        They come by stamp, or as they were written where the clock of the recorder was set back. Raises
+        TooMuch.
+        """
+        chosen = self.connections if connections is None else connections
+        wanted = {(one.topic, one.msgtype): one for one in chosen}
+        room = self._most
+        for file in self._files.values() if wanted else ():
+            found = (
+                (wanted[topic.topic, topic.msgtype], stamp, data)
+                for topic, stamp, data in _intact(file)
+                if topic is not None and (topic.topic, topic.msgtype) in wanted
+            )
+            for connection, stamp, data in _by_stamp(found):
+                if data.startswith(ZSTD):  # of rosbag2's compression mode "message"
+                    try:
+                        data = zstd.ZstdDecompressor().decompress(data, MESSAGE_BYTES)
+                    except zstd.ZstdError:
+                        self.unreadable[connection.topic] += 1
+                        continue
+                room -= len(data)
+                if room < 0:
+                    raise TooMuch(
+                        f"{self._path}: has more than {self._most} bytes of messages; give another "
+                        "file, or split it."
+                    )
+                yield connection, stamp, data
+
+    def _scan(self) -> None:
+        """Set the topics, and the first and the last stamp; add remarks on what is lost."""
+        topics: dict[tuple[str, str], Connection] = {}
+        counts, self.start_time, self.end_time = Counter[tuple[str, str]](), 2**63 - 1, 0
+        for file, whole in self._files.items():
+            read, lost = counts.total(), 0
+            try:
+                for topic, stamp, _ in repair.rows(whole):
+                    if topic is None:
+                        lost += 1
+                        continue
+                    topics.setdefault((topic.topic, topic.msgtype), topic)
+                    counts[topic.topic, topic.msgtype] += 1
+                    self.start_time = min(self.start_time, stamp)
+                    self.end_time = max(self.end_time, stamp)
+            except Damaged as damage:
+                self.remarks.append(
+                    f"{file.name} is cut or damaged ({damage}). The {counts.total() - read} messages "
+                    f"before that are read. This may find more: {repair.remedy(file)}"
+                )
+            if lost:
+                self.remarks.append(f"{file.name}: {lost} messages cannot be read: left out.")
+        self.connections = [
+            topic._replace(id=number, msgcount=counts[key])
+            for number, (key, topic) in enumerate(topics.items(), start=1)
+        ]
+
+
+def _stated(folder: Path, remarks: list[str]) -> dict[str, Any]:
+    """Return the content of metadata.yaml; an empty dict, and a remark, if it is of no use."""
+    try:
+        stated = read_yaml(folder / METADATA)["rosbag2_bagfile_information"]
+        if isinstance(stated["relative_file_paths"], list):
+            return dict(stated)
+    except (InputError, TypeError, KeyError, ValueError):
+        pass
+    what = "is of no use" if (folder / METADATA).exists() else "is missing"
+    remarks.append(f"metadata.yaml {what}. The bag is read without it.")
+    return {}
+
+
+def _listed(folder: Path, stated: dict[str, Any], remarks: list[str]) -> list[Path]:
+    """Return the data files in a folder: those of metadata.yaml, packed or not, if all are there."""
+    there = {file.name: file for file in data_files(folder)}
+    files = dict[Path, None]()
+    for name in (Path(str(name)).name for name in stated.get("relative_file_paths", ())):
+        found = [one for one in (name, f"{name}.zstd", name.removesuffix(".zstd")) if one in there]
+        if not found:
+            remarks.append(
+                f"metadata.yaml names {name}, which is not there. Read: {' and '.join(there)}."
+            )
+            return list(there.values())
+        files[there[found[0]]] = None
+    return list(files or there.values())
+
+
+def _is_packed(file: Path) -> bool:
+    with file.open("rb") as opened:
+        return opened.read(len(ZSTD)) == ZSTD
+
+
+def _unpacked(file: Path, folder: Path, budget: Budget, most: int) -> Path:
+    """Unpack a file that rosbag2 has packed into a folder, up to where it is cut; return the new file.
+
+    Raises TooMuch if all files of the budget together have more than `most` bytes.
+    """
+    with zstd.open(file, "rb") as source, open(folder / file.name, "wb") as target:
+        with suppress(zstd.ZstdError, EOFError):  # `repair.rows` names the place
+            while block := source.read1(1 << 20):
+                budget.spend("bytes when its files are unpacked", len(block), most)
+                target.write(block)
+    return folder / file.name
+
+
+def _intact(file: Path) -> Iterator[repair.Row]:
+    """Yield the messages of a data file up to where it is cut."""
+    try:
+        yield from repair.rows(file)
+    except Damaged:
+        return
+
+
+def _by_stamp(
+    found: Iterator[tuple[Connection, int, bytes]],
+) -> Iterator[tuple[Connection, int, bytes]]:
+    """Yield (connection, stamp ns, bytes) by stamp.
+
+    What follows a fall of more than LARGEST_STEP_BACK follows: the clock of the recorder, or of the
+    recorded system, was set.
+    """
+    held: list[tuple[int, int, Connection, bytes]] = []
+    largest, newest = round(1e9 * LARGEST_STEP_BACK), 0
+    for number, (connection, stamp, data) in enumerate(found):
+        newest = max(newest, stamp)
+        was_set = stamp < newest - largest
+        while held and (was_set or held[0][0] < newest - largest):
+            earlier, _, of, content = heappop(held)
+            yield of, earlier, content
+        newest = stamp if was_set else newest
+        heappush(held, (stamp, number, connection, data))
+    while held:
+        earlier, _, of, content = heappop(held)
+        yield of, earlier, content
 
 
 @contextmanager
@@ -97,9 +242,7 @@ def new_bag(out: str | Path, storage: str = "mcap", force: bool = False) -> Iter
         with Writer(
             scratch / out.name, version=Writer.VERSION_LATEST, storage_plugin=PLUGINS[storage]
         ) as writer:
-            writer.set_custom_data(CHECKSUM_KEY, NO_CHECKSUM)
             yield writer
-        write_checksums(scratch / out.name)
         if out.exists():
             check_output(out, force)
             out.rename(scratch / "replaced")
@@ -121,20 +264,17 @@ def check_output(out: str | Path, force: bool = False) -> None:
         return
     if not force:
         raise InputError(f"{out}: exists already; choose another name, or --force to replace it.")
-    if not (out / "metadata.yaml").is_file():
+    if not (out / METADATA).is_file():
         raise InputError(
             f"{out}: exists and is not a bag, so --force does not replace it; choose another name."
         )
 
 
 @contextmanager
-def open_bag(path: str | Path, salvage: bool = False) -> Iterator[BagReader]:
-    """Yield an open BagReader of a bag directory or of one .mcap or .db3 file.
+def open_bag(path: str | Path) -> Iterator[BagReader]:
+    """Yield the BagReader of a bag directory or of one .mcap or .db3 file.
 
-    Raises InputError if the path is no bag, or a damaged one without `salvage`. What must be
-    unpacked, completed or repaired is copied to a temporary folder first.
-
-    salvage : read the intact messages of a cut or damaged bag; `remarks` lists what is missing
+    Raises InputError if the path is no bag, or holds no message that can be read.
     """
     path = Path(path)
     if not is_bag(path):
@@ -143,198 +283,22 @@ def open_bag(path: str | Path, salvage: bool = False) -> Iterator[BagReader]:
             ".db3 file."
         )
     with temporary_folder() as folder:
-        reader = _opened(path, folder, salvage)
-        try:
-            yield reader
-        finally:
-            with suppress(Exception):  # errors of rosbags on faulty content
-                reader.close()
-
-
-def _opened(path: Path, folder: Path, salvage: bool) -> BagReader:
-    given, remarks = path, list[str]()
-    try:
-        if files := write_ahead.unclosed(path):
-            (folder / "closed").mkdir()
-            path, lost = write_ahead.merged_copy(path, folder / "closed")
-            if lost and not salvage:
-                raise Damaged("; ".join(lost))
-            names = " and ".join(file.name for file in files)
-            remarks.append(
-                f"the recorder did not close {names}: what it left in the -wal or -journal file "
-                "beside it is read, too."
-            )
-            remarks += [f"{sentence}." for sentence in lost]
-        try:
-            (folder / "completed").mkdir()
-            path, more = completed(path, folder / "completed")
-            remarks += more
-        except (Damaged, InputError):
-            if not salvage:
-                raise
-        readable = path
-        if salvage:
-            readable = folder / "sound"
-            remarks += write_sound_part(path, readable)
-        else:
-            check_whole(path)
-        reader = BagReader(readable)
-        with _closing_second_connections(reader):
-            reader.open()
-        _align_qos_with_metadata(reader)
-        information = metadata(readable) if readable.is_dir() else {"compression_mode": ""}
-        reader.data = data_files(readable, information) if readable.is_dir() else [readable]
-        reader.packed = information["compression_mode"] == "message"
-        reader.falls_back = any(_falls_back(file) for file in reader.data)
-        reader.remarks, reader.unreadable = remarks, Counter()
-        reader.most = most_unpacked(
-            sum(file.stat().st_size for file in (path, *path.glob("*")) if file.is_file())
-        )
-        for connection in reader.connections:
-            if not re.fullmatch(r"[/\w]+", connection.topic) or not re.fullmatch(
-                r"\w+/\w+/\w+", connection.msgtype
-            ):
-                raise Damaged(f"topic {connection.topic!r} of type {connection.msgtype!r} is none")
-    except InputError:
-        raise
-    except Exception as error:  # rosbags raises whatever its parsers run into
-        raise damaged(given, error) from error
-    return reader
-
-
-@contextmanager
-def _closing_second_connections(reader: Reader) -> Iterator[None]:
-    """Close the second connection of rosbags to each SQLite file.
-
-    rosbags opens each file twice and closes it once. Otherwise every file would stay open.
-    """
-    before = {*map(id, _connections())}
-    yield
-    used = {
-        id(getattr(one, "dbconn", None))
-        for one in (reader.storage, *getattr(reader.storage, "storages", ()))
-    }
-    for connection in _connections():
-        if id(connection) not in before | used:
-            connection.close(True)
-
-
-def _connections() -> list[Any]:
-    """Return all open connections to SQLite files of rosbags."""
-    return sys.modules["apsw"].connections() if "apsw" in sys.modules else []
-
-
-def _align_qos_with_metadata(reader: Reader) -> None:
-    """Set the QoS of each topic in the data files of an open Reader to that in metadata.yaml.
-
-    rosbags compares both as text. Where they differ it drops the messages without a word, as with a
-    metadata.yaml of another version of the recorder. A single file has no metadata.yaml.
-    """
-    recorded = {
-        (topic.topic, topic.msgtype): topic.ext.offered_qos_profiles  # type: ignore[union-attr]  # always a bag of ROS 2
-        for topic in reader.connections
-    }
-    for file in getattr(reader.storage, "storages", ()):
-        for k, topic in enumerate(file.connections):
-            qos = recorded.get((topic.topic, topic.msgtype), topic.ext.offered_qos_profiles)
-            file.connections[k] = topic._replace(ext=topic.ext._replace(offered_qos_profiles=qos))
-
-
-def _as_written(
-    reader: BagReader, connections: list[Connection]
-) -> Iterator[tuple[Connection, int, bytes]]:
-    """Yield (connection, stamp ns, bytes) of the given connections in the order of writing."""
-    wanted = {(connection.topic, connection.msgtype): connection for connection in connections}
-    for file in reader.data:
-        for written, stamp, data in as_written(file, Counter()):
-            if (connection := wanted.get((written.topic, written.msgtype))) is not None:
-                yield connection, stamp, zstd.decompress(data) if reader.packed else data
-
-
-def _falls_back(file: Path) -> bool:
-    """Return whether the times of a data file fall by more than LARGEST_STEP_BACK.
-
-    Then the clock of the recorder, or of the recorded system, was set.
-    """
-    newest = -math.inf
-    if is_mcap(file):
-        times: Iterator[int] = (
-            int.from_bytes(content[6:14], "little")
-            for kind, content in mcap.intact_records(file)
-            if kind == mcap.MESSAGE and len(content) >= 14
-        )
-    else:
-        times = (stamp for _, _, stamp, _ in sqlite_messages(file))
-    for stamp in times:
-        if stamp < newest - 1e9 * LARGEST_STEP_BACK:
-            return True
-        newest = max(newest, stamp)
-    return False
-
-
-def messages(
-    path: str | Path,
-    reader: BagReader | Ros1Bag,
-    connections: list[Connection],
-    written: bool = False,
-) -> Iterator[tuple[Connection, int, bytes]]:
-    """Yield (connection, stamp ns, bytes) of the given connections, of a bag of ROS 1 or ROS 2.
-
-    Raises InputError for another number of messages than the bag states, or for more bytes than
-    `reader.most`.
-
-    written : use the order of writing if the times fall back; default: the bag's order
-    """
-    found: Iterator[tuple[Connection, int, bytes]] = iter(())
-    if connections:
-        found = (
-            _as_written(reader, connections)
-            if written and isinstance(reader, BagReader) and reader.falls_back
-            else reader.messages(connections=connections)
-        )
-    left = {(connection.topic, connection.msgtype): 0 for connection in connections}
-    for connection in connections:
-        left[connection.topic, connection.msgtype] += connection.msgcount
-    room = reader.most
-    while True:
-        try:
-            connection, stamp, data = next(found)
-        except StopIteration:
-            break
-        except InputError:
-            raise
-        except Exception as error:  # as in _opened
-            raise damaged(path, error) from error
-        left[connection.topic, connection.msgtype] -= 1
-        room -= len(data)
-        if room < 0:
-            raise TooMuch(
-                f"{path}: has more than {reader.most} bytes of messages; give another file, "
-                "or split it."
-            )
-        yield connection, stamp, data
-    for (topic, _), count in left.items():
-        if count:
-            what = (
-                f"{count} messages are missing" if count > 0 else f"{-count} messages are too many"
-            )
-            raise damaged(path, f"{what} on {topic}")
+        yield BagReader(path, folder)
 
 
 def readable(
-    path: str | Path, reader: BagReader, connections: list[Connection]
+    reader: BagReader, connections: list[Connection]
 ) -> Iterator[tuple[Connection, int, Any]]:
     """Yield (connection, stamp ns, message) of the given connections.
 
-    Messages that cannot be decoded, e.g. of a faulty publisher, are counted too. If the times of the
-    bag fall back, the order of writing holds.
+    Messages that cannot be decoded, e.g. of a faulty publisher, are counted in the reader.
     """
-    for connection, stamp, data in messages(path, reader, connections, written=True):
+    for connection, stamp, data in reader.messages(connections):
         try:
             if len(data) > READ_BYTES:
                 raise ValueError
             message = typestore().deserialize_cdr(data, connection.msgtype)
-        except Exception:  # as in _opened
+        except Exception:  # rosbags raises whatever its parsers run into
             reader.unreadable[connection.topic] += 1
             continue
         yield connection, stamp, message
@@ -363,16 +327,3 @@ def remarks_of(reader: BagReader | Ros1Bag) -> list[str]:
             for topic, count in reader.unreadable.items()
         ),
     ]
-
-
-def damaged(path: str | Path, error: Exception | str) -> InputError:
-    """Return the error of a bag that cannot be read, with the remedy."""
-    said = " ".join(str(error).split()) or type(error).__name__
-    if is_ros_1(path):
-        return InputError(
-            f"{path}: this bag of ROS 1 is cut or damaged ({said}); copy it again, or repair it "
-            f"with rosbag reindex {Path(path).name}."
-        )
-    return InputError(
-        f"{path}: the bag is cut or damaged ({said}); copy it again, record it again, or {SALVAGE}."
-    )

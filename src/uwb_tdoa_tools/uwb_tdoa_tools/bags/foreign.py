@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import bz2
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from functools import lru_cache, partial
 from pathlib import Path
@@ -33,9 +33,9 @@ from uwb_tdoa_bias.common.limits import (
 )
 
 from . import is_ros_1
-from .files import BagReader, Ros1Bag, damaged, messages, open_bag, remarks_of
+from .files import BagReader, open_bag, remarks_of
 from .frames import Recorded, recorded_anchors
-from .mcap import Damaged
+from .repair import Damaged
 
 Path_ = tuple[str | int, ...]  # parsed path of a field
 
@@ -229,15 +229,12 @@ def _entry(value: Any, index: int | None) -> Any:
 
 
 @contextmanager
-def open_foreign(
-    paths: Sequence[Path], definitions: Mapping[str, str], salvage: bool = False
-) -> Iterator[ForeignBag]:
+def open_foreign(paths: Sequence[Path], definitions: Mapping[str, str]) -> Iterator[ForeignBag]:
     """Yield the ForeignBag of bags that are one recording.
 
     Parameters
     ----------
     definitions : {type: text of its .msg file}, for bags that have no definitions.
-    salvage : read a damaged bag of ROS 2 up to the damage.
 
     Raises InputError.
     """
@@ -246,9 +243,10 @@ def open_foreign(
         for path in paths:
             reader: BagReader | Ros1Bag
             if is_ros_1(path):
-                reader = stack.enter_context(_ros_1(path))
+                reader = Ros1Bag(path)
+                stack.callback(reader.close)
             else:
-                reader = stack.enter_context(open_bag(path, salvage))
+                reader = stack.enter_context(open_bag(path))
             bag.add(_Part(path, reader, definitions))
         bag.check_parts()
         yield bag
@@ -272,7 +270,6 @@ class _Part:
         self.span = reader.start_time, reader.end_time
         self._reader, self._definitions = reader, definitions
         self._stores: dict[str, Typestore] = {}
-        self._unreadable: Counter[str] = Counter()
 
     def fields(self, connection: Connection) -> list[str]:
         """Return the names of the fields of a topic."""
@@ -282,7 +279,7 @@ class _Part:
         """Yield (topic, ns of recording, message)."""
         wanted = [connection for connection in self.connections if connection.topic in topics]
         stores = {connection.id: self._store(connection) for connection in wanted}
-        for connection, received, data in messages(self.path, self._reader, wanted, written=True):
+        for connection, received, data in self._reader.messages(wanted) if wanted else ():
             store = stores[connection.id]
             is_ros_1 = isinstance(self._reader, Ros1Bag)
             decode = store.deserialize_ros1 if is_ros_1 else store.deserialize_cdr
@@ -291,19 +288,13 @@ class _Part:
                     raise ValueError
                 message = decode(data, connection.msgtype)
             except Exception:  # parsers of rosbags raise many types
-                self._unreadable[connection.topic] += 1
+                self._reader.unreadable[connection.topic] += 1
                 continue
             yield connection.topic, received, message
 
     def remarks(self) -> list[str]:
         """Return sentences on missing messages."""
-        return [
-            *remarks_of(self._reader),
-            *(
-                f"{topic}: {count} messages left out, they do not fit to their type."
-                for topic, count in self._unreadable.items()
-            ),
-        ]
+        return remarks_of(self._reader)
 
     def anchors(self) -> Recorded | None:
         """Return the anchors in frames or markers, or None."""
@@ -354,20 +345,49 @@ def _types(connection: Connection) -> Any:
     return types
 
 
-@contextmanager
-def _ros_1(path: Path) -> Iterator[Ros1Bag]:
-    reader = Ros1Bag(path)
-    try:
-        reader.open()
-        _check_counts(reader)
-        _limit_and_cache_unpacking(reader, path)
-    except Exception as error:  # rosbags raises whatever its parsers run into
-        raise damaged(path, error) from error
-    try:
-        yield reader
-    finally:
-        with suppress(Exception):
-            reader.close()
+class Ros1Bag(Ros1Reader):
+    """A bag of ROS 1 with the attributes of a BagReader."""
+
+    def __init__(self, path: Path) -> None:
+        """Open a bag. Raises InputError."""
+        super().__init__(path)
+        self._file = path
+        self.remarks, self.unreadable = list[str](), Counter[str]()
+        try:
+            self.open()
+            _check_counts(self)
+            _limit_and_cache_unpacking(self, path)
+        except Exception as error:  # rosbags raises whatever its parsers run into
+            raise self._damaged(error) from error
+
+    def messages(
+        self,
+        connections: Collection[Connection] = (),
+        start: int | None = None,
+        stop: int | None = None,
+    ) -> Generator[tuple[Connection, int, bytes], None, None]:
+        """Yield (connection, stamp ns, bytes) as the parent does. Raises InputError."""
+        room = most = most_unpacked(self._file.stat().st_size)
+        try:
+            for connection, stamp, data in super().messages(connections, start, stop):
+                room -= len(data)
+                if room < 0:
+                    raise TooMuch(
+                        f"{self.path}: has more than {most} bytes of messages; give another file, "
+                        "or split it."
+                    )
+                yield connection, stamp, data
+        except InputError:
+            raise
+        except Exception as error:  # as above
+            raise self._damaged(error) from error
+
+    def _damaged(self, error: Exception) -> InputError:
+        said = " ".join(str(error).split()) or type(error).__name__
+        return InputError(
+            f"{self.path}: this bag of ROS 1 is cut or damaged ({said}); copy it again, or repair "
+            f"it with rosbag reindex {self._file.name}."
+        )
 
 
 def _check_counts(reader: Ros1Reader) -> None:

@@ -51,7 +51,7 @@ def _static_transforms(path: str | Path, reader: BagReader) -> Iterator[Any]:
     ]
     for connection in connections:
         check_type(path, connection)
-    for _, _, message in readable(path, reader, connections):
+    for _, _, message in readable(reader, connections):
         yield from message.transforms
 
 
@@ -145,7 +145,7 @@ def recorded_anchors(path: str | Path, reader: BagReader, topic: str) -> Recorde
     contains "anchor"; the marker ids become anchor ids. Raises InputError.
     """
     last = None
-    for _, _, last in readable(path, reader, connections_of(path, reader, topic, ANCHORS)):
+    for _, _, last in readable(reader, connections_of(path, reader, topic, ANCHORS)):
         pass
     if last is None:
         return _of_frames(path, reader) or _of_markers(path, reader)
@@ -173,7 +173,7 @@ def _of_markers(path: str | Path, reader: BagReader) -> Recorded | None:
     for connection in [one for one in reader.connections if one.msgtype == MARKERS]:
         check_type(path, connection)
         by_frame: dict[str, dict[int, list[float]]] = defaultdict(dict)
-        for _, _, message in readable(path, reader, [connection]):
+        for _, _, message in readable(reader, [connection]):
             for marker in message.markers:
                 if (
                     marker.action == ADD

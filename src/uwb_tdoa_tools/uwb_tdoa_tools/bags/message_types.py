@@ -7,13 +7,22 @@ from __future__ import annotations
 from functools import lru_cache
 import os
 from pathlib import Path
+import re
 
-from rosbags.interfaces import Connection, MessageDefinitionFormat, Nodetype
+from rosbags.interfaces import (
+    Connection,
+    ConnectionExtRosbag2,
+    MessageDefinition,
+    MessageDefinitionFormat,
+    Nodetype,
+)
+from rosbags.rosbag2.metadata import parse_qos
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.limits import DEFINITION_BYTES
+from uwb_tdoa_bias.common.safe_yaml import parse_yaml
 from uwb_tdoa_bias.common.sensors import SENSORS
 
 OUR_PACKAGE = "uwb_tdoa_msgs"
@@ -30,6 +39,7 @@ OUR_TYPES = (
         if of.message.startswith(OUR_PACKAGE)
     ),
 )
+_FORMATS = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinitionFormat.IDL}
 # where folders of message packages are besides installed ones: in a wheel, and in the sources
 _OURS = Path(__file__).parent, Path(__file__).resolve().parents[3]
 
@@ -57,41 +67,51 @@ def add_type(store: Typestore, msgtype: str) -> None:
                 add_type(store, field[1])
 
 
+def recorded_topic(
+    topic: str, msgtype: str, encoding: str, definition: str, qos: str
+) -> Connection | None:
+    """Return a topic of a bag, without id and count; None if the names are none.
+
+    Parameters
+    ----------
+    topic, msgtype : str
+    encoding, definition : str
+        "ros2msg" or "ros2idl", and the text that defines the type. May be empty.
+    qos : str
+        Offered QoS, YAML.
+    """
+    if not re.fullmatch(r"[/\w]+", topic) or not re.fullmatch(r"\w+/\w+/\w+", msgtype):
+        return None
+    kind = _FORMATS.get(encoding) if definition else None
+    described = MessageDefinition(kind or MessageDefinitionFormat.NONE, definition)
+    try:
+        offered = parse_qos(parse_yaml(qos, topic))
+    except Exception:  # rosbags raises whatever its parsers run into
+        offered = []
+    return Connection(
+        0, topic, msgtype, described, "", 0, ConnectionExtRosbag2("cdr", offered), None
+    )
+
+
 def check_type(path: str | Path, connection: Connection) -> None:
-    """Raise InputError unless the type of a topic is known in the recorded version."""
-    store = typestore()
+    """Raise InputError unless the type of a topic is known in the recorded version.
+
+    A definition that is missing, or that cannot be read, states no version.
+    """
+    store, definition = typestore(), connection.msgdef
     add_type(store, connection.msgtype)
-    recorded = _recorded_hash(path, connection)
-    if recorded and recorded != store.hash_rihs01(connection.msgtype):
+    if definition.format != MessageDefinitionFormat.MSG or len(definition.data) > DEFINITION_BYTES:
+        return
+    try:
+        recorded = _hash_of(definition.data, connection.msgtype)
+    except Exception:  # rosbags raises whatever its parsers run into
+        return
+    if recorded != store.hash_rihs01(connection.msgtype):
         raise InputError(
             f"{path}: {connection.topic} was recorded with another version of "
             f"{connection.msgtype}; use the version of "
             "this software that recorded it."
         )
-
-
-def _recorded_hash(path: str | Path, connection: Connection) -> str:
-    """Return the hash of the recorded type of a topic; empty if the bag does not contain it.
-
-    Raises InputError.
-    """
-    recorded = connection.digest
-    if (
-        not recorded and connection.msgdef.format == MessageDefinitionFormat.MSG
-    ):  # a data file without metadata.yaml
-        if len(connection.msgdef.data) > DEFINITION_BYTES:
-            raise InputError(
-                f"{path}: the definition of {connection.msgtype} in the bag has more than "
-                f"{DEFINITION_BYTES} bytes; record it again."
-            )
-        try:
-            recorded = _hash_of(connection.msgdef.data, connection.msgtype)
-        except Exception as error:  # rosbags raises whatever its parsers run into
-            raise InputError(
-                f"{path}: the definition of {connection.msgtype} in the bag cannot be read "
-                f"({error!r}); record it again."
-            ) from error
-    return recorded
 
 
 @lru_cache(maxsize=64)

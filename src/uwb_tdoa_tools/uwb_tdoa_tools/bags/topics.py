@@ -162,9 +162,7 @@ def read_topic(
     than `msgtype`.
     """
     arrived, rows, frames = [], [], Counter[str]()
-    for _, received, message in readable(
-        path, reader, connections_of(path, reader, topic, msgtype)
-    ):
+    for _, received, message in readable(reader, connections_of(path, reader, topic, msgtype)):
         arrived.append(received)
         rows.append(row(message))
         frames[message.header.frame_id] += 1

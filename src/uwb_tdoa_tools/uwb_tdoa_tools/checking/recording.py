@@ -186,7 +186,7 @@ def of_flight(flight: Flight) -> Recording:
 
 def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Recording:
     name_of = Names(reading.namespace, reading.topics)
-    with open_bag(path, reading.salvage) as reader:
+    with open_bag(path) as reader:
         topics = {connection.topic: connection.msgtype for connection in reader.connections}
         kinds = {"tdoa": (TDOA, *_ROWS[TDOA]), "imu": (IMU, *_ROWS[IMU])}
         found = {

@@ -26,7 +26,7 @@ from rosgraph_msgs.msg import Clock
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.sensors import SENSORS
 
-from ..bags.files import BagReader, messages, open_bag
+from ..bags.files import BagReader, open_bag
 from ..choices import WAIT
 from .follow import Follower, Nodes, is_stamped, stamp_of
 from .session import Stop, message_class, parameter_of, publisher_qos, session, wait_for_names
@@ -390,7 +390,7 @@ def replay(
         say(f"playing {count} messages, {length:.1f} s at rate {options.rate:g}")
         began = time.perf_counter()
         while not stop:
-            with closing(read_ahead(messages(bag, reader, connections))) as recorded:
+            with closing(read_ahead(reader.messages(connections))) as recorded:
                 player.play(recorded)
             if not options.loop:
                 break

@@ -103,7 +103,7 @@ def open_recording(
     if bags:
         from ..bags.foreign import open_foreign  # only bags need the rosbags library
 
-        with open_foreign(bags, types or {}, salvage) as bag:
+        with open_foreign(bags, types or {}) as bag:
             yield bag
     elif is_ulog(files[0]):
         yield ULogFile(files, salvage)

@@ -19,8 +19,7 @@ from uwb_tdoa_bias.common.sensors import LOCATING
 from uwb_tdoa_bias.common.text import printable
 
 from .. import parallel
-from ..bags import is_bag, is_one_bag
-from ..bags.write_ahead import BESIDE
+from ..bags import BESIDE, is_bag, is_one_bag
 from ..clock import apart, sentence_on
 from . import read_by_profile, read_flight
 from .names import read_named_anchors
