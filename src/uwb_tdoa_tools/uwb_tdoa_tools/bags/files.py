@@ -11,7 +11,7 @@ from heapq import heappop, heappush
 from pathlib import Path
 import shutil
 import tempfile
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import StoragePlugin, Writer
@@ -33,13 +33,23 @@ from . import METADATA, ZSTD, data_files, is_bag, repair
 from .message_types import check_type, typestore
 from .repair import Damaged, zstd
 
-if TYPE_CHECKING:
-    from .foreign import Ros1Bag
-
 PLUGINS = dict(zip(STORAGES, (StoragePlugin.MCAP, StoragePlugin.SQLITE3)))
 
 
-class BagReader:
+class Incomplete:
+    """A bag that may lack messages.
+
+    Attributes
+    ----------
+    remarks : sentences on what is missing
+    unreadable : {topic: number of messages that do not fit its type}
+    """
+
+    remarks: list[str]
+    unreadable: Counter[str]
+
+
+class BagReader(Incomplete):
     """A bag of ROS 2: the messages in its data files, up to where they are cut.
 
     Attributes
@@ -47,8 +57,6 @@ class BagReader:
     connections : topics with messages, numbered, with counts
     custom : custom data of metadata.yaml
     start_time, end_time : ns, of the first and the last message
-    remarks : sentences on what is missing
-    unreadable : {topic: number of messages that do not fit its type}
     """
 
     def __init__(self, path: Path, folder: Path) -> None:
@@ -58,7 +66,7 @@ class BagReader:
 
         Raises InputError if no message can be read.
         """
-        self.remarks, self.unreadable = list[str](), Counter[str]()
+        self.remarks, self.unreadable = [], Counter()
         stated = _stated(path, self.remarks) if path.is_dir() else {}
         self.custom: dict[str, Any] = stated.get("custom_data") or {}
         files = _listed(path, stated, self.remarks) if path.is_dir() else [path]
@@ -318,7 +326,7 @@ def connections_of(
     return found
 
 
-def remarks_of(reader: BagReader | Ros1Bag) -> list[str]:
+def remarks_of(reader: Incomplete) -> list[str]:
     """Return sentences on all missing parts found so far."""
     return [
         *reader.remarks,

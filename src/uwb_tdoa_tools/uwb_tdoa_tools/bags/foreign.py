@@ -33,7 +33,7 @@ from uwb_tdoa_bias.common.limits import (
 )
 
 from . import is_ros_1
-from .files import BagReader, open_bag, remarks_of
+from .files import BagReader, Incomplete, open_bag, remarks_of
 from .frames import Recorded, recorded_anchors
 from .repair import Damaged
 
@@ -345,14 +345,14 @@ def _types(connection: Connection) -> Any:
     return types
 
 
-class Ros1Bag(Ros1Reader):
+class Ros1Bag(Ros1Reader, Incomplete):
     """A bag of ROS 1 with the attributes of a BagReader."""
 
     def __init__(self, path: Path) -> None:
         """Open a bag. Raises InputError."""
         super().__init__(path)
         self._file = path
-        self.remarks, self.unreadable = list[str](), Counter[str]()
+        self.remarks, self.unreadable = [], Counter()
         try:
             self.open()
             _check_counts(self)
