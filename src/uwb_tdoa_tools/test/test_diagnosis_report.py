@@ -602,6 +602,19 @@ def test_the_numbers_of_findings_are_those_of_effects_yaml(result, page, tmp_pat
     assert f"3 = {value}" in screen and value in text
 
 
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Leave the pictures of pages empty: to draw them takes seconds."""
+
+    def instead(figure, alt, caption=""):
+        pictures.plt.close(figure)
+        return pictures.Picture(alt, "", caption)
+
+    for module in (curves, maps):
+        monkeypatch.setattr(module, "embedded", instead)
+
+
+@pytest.mark.usefixtures("undrawn")
 def test_what_all_flights_share_is_said_once(result):
     alike, other = ((Share("a", first, 0.1), Share("b", 2.0 - first, 0.1)) for first in (1.0, 1.7))
 
@@ -621,6 +634,7 @@ def test_what_all_flights_share_is_said_once(result):
         assert "in all flights" not in text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_causes_that_functions_share_are_said_once(result):
     functions = [
         SmoothTerm(
