@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fixtures and hooks that the tests of all packages share."""
 
-from collections import deque
+from collections import Counter, deque
 from functools import cache
 import gc
 import os
@@ -72,6 +72,44 @@ def pytest_collection_modifyitems(items):
     """Run the longest files first, so that all workers finish at about the same time."""
     place = {f"test_{name}": k for k, name in enumerate(LONGEST)}
     items.sort(key=lambda item: place.get(item.path.stem, len(place)))
+
+
+class ProcessorTimes:
+    """Processor time of each test file, with that of ended child processes.
+
+    Each report of a test carries the time since the last one, also from a worker of xdist.
+    """
+
+    NAME = "processor_time"
+
+    def __init__(self):
+        self.last = 0.0  # s, of this process at the last report
+        self.of_files = Counter()  # s
+
+    def pytest_runtest_logstart(self):
+        """Leave out what happened between two tests."""
+        self.last = sum(os.times()[:4])
+
+    @pytest.hookimpl(hookwrapper=True)
+    def pytest_runtest_makereport(self):
+        outcome = yield
+        now = sum(os.times()[:4])
+        outcome.get_result().user_properties.append((self.NAME, now - self.last))
+        self.last = now
+
+    def pytest_runtest_logreport(self, report):
+        file = report.nodeid.partition("::")[0]
+        self.of_files[file] += dict(report.user_properties).get(self.NAME, 0.0)
+
+    def pytest_terminal_summary(self, terminalreporter):
+        terminalreporter.section("processor time of each file, s")
+        for file, seconds in self.of_files.most_common():
+            terminalreporter.write_line(f"{seconds:8.1f} {file}")
+        terminalreporter.write_line(f"{sum(self.of_files.values()):8.1f} in all")
+
+
+def pytest_configure(config):
+    config.pluginmanager.register(ProcessorTimes())
 
 
 def pytest_collection_finish():
