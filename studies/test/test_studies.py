@@ -7,7 +7,7 @@ import json
 from types import SimpleNamespace
 
 from checking_flights import QUICK
-from documented import PAGES, commands
+from documented import of_pages
 import numpy as np
 from output_attacks import attack, outputs, place, unknown  # noqa: F401
 import pytest
@@ -32,14 +32,10 @@ OUTPUTS = [(name, action) for name, parser in PARSERS.items() for action in outp
 
 
 @pytest.fixture(scope="module")
-def documented(tmp_path_factory):
+def documented():
     """[(page, words)] of the studies in the documentation."""
-    shown = [
-        found for page in PAGES for found in commands(page, (), tmp_path_factory.mktemp(page.stem))
-    ]
-    return [
-        (page, words[2:]) for page, words in shown if words[:2] == ["./dev", "study"] and words[2:]
-    ]
+    shown = ((page, words) for page, words in of_pages() if words[:2] == ["./dev", "study"])
+    return [(page, words[2:]) for page, words in shown if words[2:]]
 
 
 def test_the_list_has_every_study_and_its_help_its_options(capsys):

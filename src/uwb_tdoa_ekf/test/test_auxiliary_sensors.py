@@ -323,10 +323,20 @@ def test_two_measurements_of_one_stamp_leave_a_finite_state(name):
     )
 
 
-def test_a_sensor_without_a_branch_in_the_filter_is_refused_at_the_start():
-    run = subprocess.run([sys.executable, "-c", UNKNOWN_SENSOR], capture_output=True, text=True)
-    assert run.returncode == 1
-    assert "NotImplementedError: the filter has no branch for sonar of SENSORS" in run.stderr
+@pytest.mark.parametrize(
+    "parameter, message",
+    [
+        ("use_sonar", "NotImplementedError: the filter has no branch for sonar of SENSORS"),
+        (
+            "gyro_noise",
+            "InputError: sensor sonar, `parameters`: the filter has gyro_noise already",
+        ),
+    ],
+)
+def test_a_sensor_that_does_not_fit_the_filter_is_refused_at_the_start(parameter, message):
+    script = UNKNOWN_SENSOR.replace('{"use_sonar"', f'{{"{parameter}"')
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert run.returncode == 1 and message in run.stderr
 
 
 def test_an_update_that_compiled_code_cannot_call_is_named():
@@ -338,13 +348,6 @@ def test_an_update_that_compiled_code_cannot_call_is_named():
         with pytest.raises(NotImplementedError, match="`observe` of core.sonar must be @compiled"):
             sensors._check("core.sonar", wrong)
     sensors._check("core.sonar", height.observe)
-
-
-def test_a_parameter_that_the_filter_has_already_is_named():
-    script = UNKNOWN_SENSOR.replace('{"use_sonar"', '{"gyro_noise"')
-    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert run.returncode == 1
-    assert "InputError: sensor sonar, `parameters`: the filter has gyro_noise already" in run.stderr
 
 
 def test_a_kind_without_a_branch_raises():

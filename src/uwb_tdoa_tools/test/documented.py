@@ -1,69 +1,100 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Find the commands that the documentation shows.
+"""The pages of the documentation, their code blocks, and the commands that a shell makes of them.
 
-A shell runs the code blocks of a page. Its PATH holds only stubs that log their arguments. The
-shell expands braces, variables and loops.
+The shell expands braces, variables and loops. Every program is a function that notes its words.
 """
 
+from importlib import import_module
 from pathlib import Path
 import re
 import shutil
 import subprocess
+from tempfile import TemporaryDirectory
 
 ROOT = Path(__file__).resolve().parents[3]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
-LISTED = ("ls", "grep")  # real programs that the blocks need
-BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+NODES = {
+    "anchors_node": "uwb_tdoa_bias.anchors_node",
+    "autopilot_node": "uwb_tdoa_tools.autopilot_node",
+    "bias_node": "uwb_tdoa_bias.bias_node",
+    "debias_node": "uwb_tdoa_ekf.debias_node",
+    "ekf_node": "uwb_tdoa_ekf.ekf_node",
+    "localization_node": "uwb_tdoa_ekf.localization_node",
+    "vehicle_node": "uwb_tdoa_tools.vehicle_node",
+}
+TOOLS = {
+    path.stem: f"uwb_tdoa_tools.commands.{path.stem}"
+    for path in sorted((ROOT / "src/uwb_tdoa_tools/uwb_tdoa_tools/commands").glob("[a-z]*.py"))
+}
+EXECUTABLES = {**NODES, **TOOLS, "compile_nodes": "uwb_tdoa_ekf.compile_nodes"}
+FENCED = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"`((?:\./dev|ros2|uwb-tdoa) [^`]+)`")
 PLACEHOLDERS = ("PACKAGE NAME", "PKG EXE", "NAME ARGS")
+DATA = "DATA=DATA; S='--survey DATA/surveys'; F=DATA/flights\n"  # variables of the pages
+# of each program; a list of files, as `ls | grep` makes it, is one file
+NOTE = r"""exec 3>&1 >/dev/null
+note() { printf '%s\0' "$@" >&3; echo >&3; }
+ls() { :; }
+grep() { echo FILE; }
+"""
 
 
-def commands(page, names, folder):
-    """Return [(page, [word, ...])] of the commands on a page.
+def section(page, heading):
+    """Return the text below a heading of a page of docs/."""
+    text = (ROOT / "docs" / page).read_text()
+    level = re.search(rf"^(#+) {re.escape(heading)}$", text, re.MULTILINE).group(1)
+    below = text.partition(f"{level} {heading}\n")[2]
+    return re.split(rf"^#{{2,{max(2, len(level))}}} ", below, flags=re.MULTILINE)[0]
 
-    The first word is ./dev, ros2, uwb-tdoa or in `names`.
 
-    folder : an empty working directory; it gets stubs, ./dev and a DATA like the measured flights
+def blocks(text, *languages):
+    """Return the contents of the fenced blocks of some languages, or of those without one."""
+    return [content for name, content in FENCED.findall(text) if name in (languages or ("",))]
+
+
+def commands(script):
+    """Return [[program, word, ...]] of the programs that a script runs.
+
+    The program is ./dev, ros2, uwb-tdoa, or one of ours. Other programs do not run.
     """
-    text = page.read_text()
-    scripts = [
-        block
-        for language, block in BLOCK.findall(text)
-        if language in ("", "sh", "bash") and _is_shell(block, names)
-    ]
-    scripts += [
-        line for line in INLINE.findall(text) if not any(word in line for word in PLACEHOLDERS)
-    ]
-    notes = folder / "notes"
-    notes.touch()
-    stubs = folder / "stubs"
-    _write_stubs(stubs, ["ros2", "uwb-tdoa", *names], notes)
-    shutil.copy(stubs / "ros2", folder / "dev")
-    _write_stub(folder / "dev", "./dev", notes)
-    _write_data(folder / "DATA")
-    script = "DATA=DATA; S='--survey DATA/surveys'; F=DATA/flights\n" + "\n".join(
-        map(_without_brackets, scripts)
-    )
-    bash = shutil.which("bash")
-    done = subprocess.run(
-        [bash, "-c", script],
-        cwd=folder,
-        env={"PATH": str(stubs)},
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    names = {"dev": "./dev", **{name: name for name in ("ros2", "uwb-tdoa", *EXECUTABLES)}}
+    names.pop("export")  # in a shell, this is its own command
+    functions = [f'{name}() {{ note {told} "$@"; }}\n' for name, told in names.items()]
+    lines = NOTE + "".join(functions) + script.replace("./dev ", "dev ")
+    with TemporaryDirectory() as folder:  # some scripts write files
+        done = subprocess.run(
+            [shutil.which("bash"), "-c", lines],
+            cwd=folder,
+            env={"PATH": "/nowhere"},
+            capture_output=True,
+            text=True,
+            timeout=60,
+        )
     assert "syntax error" not in done.stderr, done.stderr
-    found = [line.split("\0")[:-1] for line in notes.read_text().split("\n")[:-1]]
-    return [(page.name, words) for words in found]
+    return [line.split("\0")[:-1] for line in done.stdout.split("\n")[:-1]]
 
 
-def _is_shell(block, names):
-    first = [
-        line.split()[0] for line in block.splitlines() if line.strip() and not line.startswith(" ")
-    ]
-    return any(word in ("./dev", "ros2", "uwb-tdoa", "for", *names) for word in first)
+def of_pages():
+    """Return [(path of a page, [program, word, ...])] of the commands on all pages."""
+    scripts = [DATA]
+    for page in PAGES:
+        text = page.read_text()
+        lines = [one for one in INLINE.findall(text) if not any(p in one for p in PLACEHOLDERS)]
+        shell = [one for one in blocks(text, "", "sh", "bash") if _is_shell(one)]
+        scripts += [f"note --page {page.relative_to(ROOT)}", *map(_without_brackets, shell + lines)]
+    found = []
+    for first, *words in commands("\n".join(scripts)):
+        if first == "--page":
+            page = words[0]
+        else:
+            found.append((page, [first, *words]))
+    return found
+
+
+def _is_shell(block):
+    first = {line.split()[0] for line in block.splitlines() if re.match(r"\S", line)}
+    return bool(first & {"./dev", "ros2", "uwb-tdoa", "for", *EXECUTABLES})
 
 
 def _without_brackets(script):
@@ -71,31 +102,17 @@ def _without_brackets(script):
     return re.sub(r"\[(--[^\]]+)\]", r"\1", script)
 
 
-def _write_stubs(folder, names, notes):
-    folder.mkdir()
-    for name in names:
-        _write_stub(folder / name, name, notes)
-    for name in LISTED:
-        (folder / name).symlink_to(shutil.which(name))
+def tools(script):
+    """Return [(executable, arguments)] of the lines `./dev run ...` of a script."""
+    return [(words[3], words[4:]) for words in commands(script) if words[1] == "run"]
 
 
-def _write_stub(path, name, notes):
-    path.write_text(
-        f'#!{shutil.which("bash")}\nprintf "%s\\0" {name} "$@" >> {notes}\necho >> {notes}\n'
-    )
-    path.chmod(0o755)
+def main(name, words):
+    """Run an executable in this process and return its exit code."""
+    return import_module(EXECUTABLES[name]).main(words)
 
 
-def _write_data(folder):
-    for name in (
-        "flights/0425/TDOA2",
-        "flights/0425/TDOA3",
-        "flights/0426",
-        "flights/0422",
-        "flights/0607",
-        "surveys",
-    ):
-        (folder / name).mkdir(parents=True)
-    (folder / "util").mkdir()
-    for number in (1, 3, 4):
-        (folder / "util" / f"const{number}-trial1-tdoa2.csv.gz").touch()
+def run(script, codes=(0,)):
+    """Run the commands of a script in this process. Each must end with one of the exit codes."""
+    for name, words in tools(script):
+        assert main(name, words) in codes, (name, words)

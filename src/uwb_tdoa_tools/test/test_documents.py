@@ -1,32 +1,33 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Rules for every page of the documentation.
+"""Every page: links lead somewhere, lists of pages are complete, and sentences are short."""
 
-Links lead somewhere, pages stay short, and the reference lists every topic.
-"""
-
-import ast
-from pathlib import Path
 import re
 
+from documented import PAGES, ROOT
 import pytest
 
-from uwb_tdoa_bias.common.sensors import SENSORS
-
-ROOT = Path(__file__).resolve().parents[3]
-PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
 LINK = re.compile(r"\]\(([^)\s]+)\)|(?:src|href)=\"([^\"]+)\"")
-LONGEST = 150  # lines of a page for continuous reading
-# Lines of longer pages. They may only become shorter.
-LONGER = {
-    "architecture.md": 386,
-    "effects.md": 488,
-    "symptoms.md": 167,
-}
-
-MAKERS = ("create_publisher", "create_subscription", "create_service", "Input", "StreamInput")
-MAKERS += ("StreamOutput",)  # of topics and services
-TOPIC = re.compile(r"/?(uwb|imu|odometry|plan|ground_truth|velocity)/[a-z_]+(/[a-z_]+)?")
+GUIDE = [page for page in PAGES if page.parent.name != "notebook"]
+GUIDE += [ROOT / "CONTRIBUTING.md", ROOT / "SECURITY.md"]
+LONGEST = 25  # words of a sentence
+MOST = 0.05  # share of the sentences of a page that may be longer, or have a habit
+FEW = 30  # with fewer sentences, two may
+HABITS = re.compile(  # that confused readers
+    r"\b(told|tells?|telling|[Nn]obody|[Ss]omebody|anew|alike|beforehand|thereby|bears? out"
+    r"|borne out|for want of|of its own|goes on|go on|(are|is) said|[Ww]hat (is|was|are|were|has)"
+    r"|that of|those of|of what|of which|[Oo]ne (that|who|of))\b"
+)
+# Code, tables, headings, pictures and equations are not prose. Links count by their text. Code in
+# a sentence, equations, titles, file names and numbers count as one word.
+NO_PROSE = re.compile(
+    r"^```.*?^```$|\$\$.*?\$\$|^\s*\|[^\n]*$|^#[^\n]*$|!\[[^\]]*\]\([^)]*\)|\*\*"
+    r"|\bet al\.|\beqs?\.|\bch\.|\bS\. ",
+    re.MULTILINE | re.DOTALL,
+)
+WORD = re.compile(
+    r"`[^`]*`|\$[^$\n]+\$|\*[^*\n]+(\n[^*\n]+)?\*|\b\w+\.(md|py|yaml|cff)\b|\d+(\.\d+)+|\be\.g\."
+)
 
 
 def slug(heading):
@@ -35,37 +36,42 @@ def slug(heading):
     return re.sub(r"[^\w\- ]", "", text).replace(" ", "-")
 
 
-def prose(page):
-    """Return the text of a page without its code blocks."""
+def without_code(page):
     return re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
 
 
 def anchors(page):
-    """Return the anchors of a page."""
-    return {slug(heading) for heading in re.findall(r"^#+ (.*)$", prose(page), re.MULTILINE)}
+    return {slug(heading) for heading in re.findall(r"^#+ (.*)$", without_code(page), re.MULTILINE)}
+
+
+def links(page):
+    """Return [(link, target file, anchor)] of the links of a page inside the repository."""
+    found = [one or other for one, other in LINK.findall(without_code(page))]
+    parts = [(link, *link.partition("#")[::2]) for link in found if not re.match("[a-z]+:", link)]
+    return [(link, (page.parent / path if path else page).resolve(), a) for link, path, a in parts]
 
 
 def broken(page):
     """Return the links of a page that lead nowhere."""
-    for link in (one or other for one, other in LINK.findall(prose(page))):
-        if re.match(r"[a-z]+:", link):
-            continue
-        path, _, anchor = link.partition("#")
-        target = (page.parent / path).resolve() if path else page
-        if not target.exists() or (anchor and anchor not in anchors(target)):
-            yield link
+    return [
+        link
+        for link, target, anchor in links(page)
+        if not target.exists() or (anchor and anchor not in anchors(target))
+    ]
+
+
+def hard(text):
+    """Return the sentences of a page, and those that are too long or have a habit."""
+    text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", NO_PROSE.sub("", text))
+    text = WORD.sub("word", text)
+    blocks = [" ".join(one.split()) for one in re.split(r"\n\s*\n|\n\s*(?:[-*]|\d+\.) ", text)]
+    sentences = [one for block in blocks for one in re.split(r"(?<=[.:;!?])\s+", block) if one]
+    return sentences, [one for one in sentences if len(one.split()) > LONGEST or HABITS.search(one)]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_every_link_leads_to_a_file_and_a_heading(page):
-    assert list(broken(page)) == []
-
-
-def test_a_page_to_read_is_short_and_a_long_one_becomes_no_longer():
-    pages = [page for page in PAGES if page.parent.name != "notebook"]
-    lines = {page.name: len(page.read_text().splitlines()) for page in pages}
-    most = {name: LONGER.get(name, LONGEST) for name in lines}
-    assert {name: count for name, count in lines.items() if count > most[name]} == {}
+    assert broken(page) == []
 
 
 @pytest.mark.parametrize(
@@ -73,47 +79,20 @@ def test_a_page_to_read_is_short_and_a_long_one_becomes_no_longer():
 )
 def test_the_list_of_pages_has_every_page(folder, index):
     """The list is also the navigation of the site."""
-    start = (ROOT / index).parent
-    linked = {
-        (start / link.partition("#")[0]).resolve() for link, _ in LINK.findall(prose(ROOT / index))
-    }
+    linked = {target for _, target, _ in links(ROOT / index)}
     assert {*(ROOT / folder).glob("*.md")} - {ROOT / index} - linked == set()
 
 
-def test_a_link_that_leads_nowhere_is_found(tmp_path):
+@pytest.mark.parametrize("page", GUIDE, ids=lambda page: str(page.relative_to(ROOT)))
+def test_few_sentences_are_hard(page):
+    sentences, found = hard(page.read_text())
+    assert len(found) <= max(MOST * len(sentences), 2 if len(sentences) < FEW else 0), found
+
+
+def test_broken_links_and_hard_sentences_are_found(tmp_path):
     page = tmp_path / "page.md"
     page.write_text("# A `b` c\n\n[one](#a-b-c) [two](#no) [three](no.md) [four](https://x.y)\n")
-    assert list(broken(page)) == ["#no", "no.md"]
-
-
-def topics():
-    """Return the topics and services of the packages.
-
-    They come from calls in nodes, and from texts that look like a topic.
-    """
-    found = {topic for sensor in SENSORS.values() for topic, _ in sensor.topics}
-    for path in ROOT.glob("src/uwb_tdoa_*/uwb_tdoa_*/**/*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Constant) and TOPIC.fullmatch(str(node.value)):
-                found.add(node.value)
-            elif isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] in MAKERS:
-                found |= {one.value for one in node.args if isinstance(one, ast.Constant)}
-    return {str(one).replace("~", "ekf_node").strip("/") for one in found if isinstance(one, str)}
-
-
-@pytest.mark.slow
-def test_the_reference_has_every_topic_and_service():
-    text = (ROOT / "docs" / "reference.md").read_text()
-    section = text.partition("\n## Topics\n")[2].partition("\n## ")[0]
-    listed = {name.strip("/") for name in re.findall(r"`([\w/]+)`", section)}
-    missing = topics() - listed
-    assert len(topics()) > 20
-    assert not missing, f"add rows to Topics of docs/reference.md: {', '.join(sorted(missing))}"
-
-
-def test_a_page_with_commands_shows_how_they_run_without_ros():
-    for page in PAGES:
-        text = page.read_text()
-        shown = re.findall(r"^\./dev run uwb_tdoa_tools (?!\w+_node|replay)", text, re.MULTILINE)
-        if page.parent.name != "notebook" and len(shown) > 1:
-            assert "`uwb-tdoa " in text, page.name
+    assert broken(page) == ["#no", "no.md"]
+    long = ("word " * 26).strip()
+    text = f"# What is it\n\n{long}.\n\nNobody reads `what is` this. It is read.\n\n| told |\n"
+    assert hard(text)[1] == [f"{long}.", "Nobody reads word this."]

@@ -9,9 +9,9 @@ import subprocess
 
 import c_programs as c
 from c_programs import ANCHORS, GCC, by_numpy, cases, chosen, on_board, on_host, write
+from documented import blocks, section
 import numpy as np
 import pytest
-from walking import blocks, section
 
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet

@@ -10,6 +10,7 @@ import dataclasses
 import sqlite3
 import sys
 
+from documented import blocks, section
 from foreign_recordings import (
     BEGIN,
     cf_msgs,
@@ -31,7 +32,6 @@ import pytest
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 import uwb_tdoa
-from walking import blocks, section
 import yaml
 
 from uwb_tdoa_bias.common.errors import InputError

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Names and defaults that options show, for parsers that import nothing else.
 
-The modules that implement the names take them from here where they can. `test_choices.py` compares the
+The modules that implement the names take them from here where they can. `test_commands.py` compares the
 others: registries of functions and classes.
 """
 

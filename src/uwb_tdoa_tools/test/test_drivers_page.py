@@ -14,6 +14,7 @@ import subprocess
 import sys
 import time
 
+from documented import blocks, section
 import numpy as np
 import pytest
 
@@ -22,11 +23,8 @@ pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
 from sensor_msgs.msg import Imu  # noqa: E402
-from walking import blocks, section  # noqa: E402
 
 from uwb_tdoa_bias.common.anchors import Anchors  # noqa: E402
-from uwb_tdoa_ekf.monitoring.finding import ERROR
-from uwb_tdoa_ekf.monitoring.stream_rules import StreamRules  # noqa: E402
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa  # noqa: E402
 
 pytestmark = pytest.mark.slow  # starts publishers
@@ -51,32 +49,6 @@ struct Node {
 """
 
 
-ENOUGH = 1200  # IMU samples that the rules need
-
-
-def findings_of(anchors, imu, tdoas):
-    """Return [Finding] of the rules on streams of messages, as in `check` and ekf_node."""
-
-    def seconds(messages):
-        return np.array(
-            [message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec for message in messages]
-        )
-
-    rules, t = StreamRules(anchors), seconds(imu)
-    gyro, force = (
-        [[v.x, v.y, v.z] for v in vectors]
-        for vectors in zip(*((m.angular_velocity, m.linear_acceleration) for m in imu))
-    )
-    rules.feed_imu(t, np.full(len(t), np.nan), np.array(gyro), np.array(force))
-    a, b, d = (
-        np.array([getattr(message, name) for message in tdoas])
-        for name in ("anchor_a", "anchor_b", "distance_difference")
-    )
-    rules.feed_tdoa(seconds(tdoas), np.full(len(tdoas), np.nan), a, b, d)
-    rules.finish()
-    return rules.findings()
-
-
 @pytest.fixture
 def listener():
     rclpy.init()
@@ -99,12 +71,8 @@ def test_the_publisher_in_python(tmp_path, listener):
         listener.create_subscription(Imu, "imu/data", imu.append, reliable)
         listener.create_subscription(Tdoa, "uwb/tdoa", tdoas.append, reliable)
         end = time.monotonic() + 180.0
-        while not (len(imu) > ENOUGH and len(tdoas) > 8 and surveys):
-            if (
-                tdoas
-                and not surveys
-                and len(listener.get_subscriptions_info_by_topic("uwb/anchors")) == 0
-            ):
+        while not (len(imu) > 100 and len(tdoas) > 8 and surveys):
+            if tdoas and not listener.get_subscriptions_info_by_topic("uwb/anchors"):
                 listener.create_subscription(AnchorArray, "uwb/anchors", surveys.append, once)
             assert process.poll() is None and time.monotonic() < end, process.poll()
             rclpy.spin_once(listener, timeout_sec=0.1)
@@ -114,14 +82,9 @@ def test_the_publisher_in_python(tmp_path, listener):
     anchors = Anchors.from_message(surveys[0])
     assert len(anchors) == 4 and anchors.frame == "map" and np.isnan(anchors.orientations).all()
     assert all(message.linear_acceleration.z == pytest.approx(9.81, abs=0.2) for message in imu)
-    assert [
-        finding.cause for finding in findings_of(anchors, imu, tdoas) if finding.severity == ERROR
-    ] == []
     for message in tdoas:
-        to_a, to_b = (
-            np.linalg.norm([3.0, 4.0, 1.0] - anchors.positions[anchors.row(k)])
-            for k in (message.anchor_a, message.anchor_b)
-        )
+        ends = [anchors.positions[anchors.row(k)] for k in (message.anchor_a, message.anchor_b)]
+        to_a, to_b = np.linalg.norm([3.0, 4.0, 1.0] - np.array(ends), axis=1)
         assert message.distance_difference == pytest.approx(to_b - to_a, abs=0.4)
 
 
@@ -148,24 +111,6 @@ def test_the_publisher_in_cpp(tmp_path):
         for folder in Path(prefix, "include").glob("*/")
     }
     paths = [word for folder in sorted(folders) for word in ("-I", folder)]
-    done = subprocess.run(
-        [
-            "g++",
-            "-std=c++17",
-            "-fsyntax-only",
-            "-Wall",
-            "-I",
-            tmp_path,
-            *paths,
-            tmp_path / "driver.cpp",
-        ],
-        capture_output=True,
-        text=True,
-    )
+    command = ["g++", "-std=c++17", "-fsyntax-only", "-Wall", "-I", tmp_path, *paths]
+    done = subprocess.run([*command, tmp_path / "driver.cpp"], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[:2000]
-    broken = code.replace("distance_difference", "tdoa")
-    (tmp_path / "driver.cpp").write_text(broken)
-    assert subprocess.run(
-        ["g++", "-std=c++17", "-fsyntax-only", "-I", tmp_path, *paths, tmp_path / "driver.cpp"],
-        capture_output=True,
-    ).returncode  # the headers match the messages

@@ -1,0 +1,60 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
+"""Package files: one version everywhere, valid by REP 149, and all that a package installs."""
+
+import re
+import runpy
+from xml.etree import ElementTree
+
+from documented import ROOT
+import pytest
+import setuptools
+import yaml
+
+from uwb_tdoa_bias.common.text import version, written_by
+from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_tools import cli
+
+PACKAGES = sorted(path.parent for path in (ROOT / "src").glob("*/package.xml"))
+PYTHON = [folder for folder in PACKAGES if (folder / "setup.py").exists()]
+
+
+@pytest.mark.parametrize("folder", PACKAGES, ids=lambda folder: folder.name)
+def test_package_xml_and_changelog_are_read_by_catkin(folder):
+    """The version replaces "Forthcoming", as after catkin_prepare_release."""
+    package = pytest.importorskip("catkin_pkg.package")
+    changelog = pytest.importorskip("catkin_pkg.changelog")
+    remarks = []
+    parsed = package.parse_package(folder / "package.xml", warnings=remarks)
+    assert remarks == [] and parsed.package_format == 3 and parsed.licenses == ["Apache-2.0"]
+    released = f"{version()} (2026-01-01)"
+    text = (folder / "CHANGELOG.rst").read_text()
+    text = text.replace("Forthcoming\n-----------", f"{released}\n{'-' * len(released)}")
+    found = changelog.Changelog(folder.name)
+    changelog.populate_changelog_from_rst(found, text)
+    assert found.get_content_of_version(version())
+
+
+@pytest.mark.parametrize("folder", PYTHON, ids=lambda folder: folder.name)
+def test_setup_installs_models_and_templates_and_has_tests(folder, monkeypatch):
+    """colcon searches for tests by its own rule."""
+    kept = {}
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(setuptools, "setup", lambda **given: kept.update(given))
+    runpy.run_path("setup.py")
+    assert kept["version"] == version() and "pytest" in str(kept["extras_require"])
+    package = folder / folder.name
+    patterns = kept.get("package_data", {}).get(folder.name, [])
+    files = {path for path in package.rglob("[!.]*.*") if path.suffix not in (".py", ".pyc")}
+    files = {path for path in files if not path.parent.name.startswith(".")}
+    assert files == {path for pattern in patterns for path in package.glob(pattern)}
+
+
+def test_one_version_everywhere(tmp_path):
+    found = {ElementTree.parse(folder / "package.xml").findtext("version") for folder in PACKAGES}
+    found.add(yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"])
+    found.add(re.search(r"^## ([\d.]+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)[1])
+    assert found == {version()} and written_by() == f"uwb_tdoa {version()}"
+    EffectSet().to_yaml(tmp_path / "effects.yaml")
+    cli.write_json(tmp_path / "figures.json", {"a": 1})
+    assert all(written_by() in path.read_text() for path in tmp_path.iterdir())
