@@ -28,8 +28,6 @@ pytestmark = pytest.mark.slow  # starts nodes
 DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "architecture.md"
 FILE = re.compile(r"`([\w/]+\.py)`")
 OURS = re.compile(r".*/(?:uwb_tdoa_bias|uwb_tdoa_ekf)/(?!test/)(.*\.py)")
-MOST_FILES = 15  # files of the walk
-MOST_PASSED = 23  # including the files beside the walk
 SETTLED = 100  # odometry messages until both nodes have the pose and correct TDOAs
 TRACED = 10  # TDOAs
 PATIENCE = 30.0  # s
@@ -101,4 +99,4 @@ def test_a_tdoa_passes_the_files_that_are_documented(nodes):
     # Some monitors run once a second.
     watching = {file for file in passed if file.startswith("monitoring/")}
     assert watching and passed - watching == (walk - compiled) | looking_up
-    assert len(walk) <= MOST_FILES and len(walk | looking_up) <= MOST_PASSED
+    assert len(walk) <= 15 and len(walk | looking_up) <= 23

@@ -82,7 +82,8 @@ def of_pages():
         text = page.read_text()
         lines = [one for one in INLINE.findall(text) if not any(p in one for p in PLACEHOLDERS)]
         shell = [one for one in blocks(text, "", "sh", "bash") if _is_shell(one)]
-        scripts += [f"note --page {page.relative_to(ROOT)}", *map(_without_brackets, shell + lines)]
+        shown = "\n".join([f"note --page {page.relative_to(ROOT)}", *shell, *lines])
+        scripts.append(re.sub(r"\[(--[^\]]+)\]", r"\1", shown))  # with optional arguments
     found = []
     for first, *words in commands("\n".join(scripts)):
         if first == "--page":
@@ -95,11 +96,6 @@ def of_pages():
 def _is_shell(block):
     first = {line.split()[0] for line in block.splitlines() if re.match(r"\S", line)}
     return bool(first & {"./dev", "ros2", "uwb-tdoa", "for", *EXECUTABLES})
-
-
-def _without_brackets(script):
-    """Keep optional arguments: [--option value] becomes --option value."""
-    return re.sub(r"\[(--[^\]]+)\]", r"\1", script)
 
 
 def tools(script):
