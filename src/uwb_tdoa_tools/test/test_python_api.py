@@ -116,6 +116,7 @@ def numbers(pattern, text):
 @pytest.mark.parametrize("program", EXAMPLES, ids=lambda path: path.stem)
 def test_an_example_does_what_it_says(program, own, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", [str(program)])
     runpy.run_path(str(program), run_name="__main__")
     told = capsys.readouterr().out
     written = {path.name for path in tmp_path.iterdir()}
