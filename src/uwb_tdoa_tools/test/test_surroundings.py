@@ -135,7 +135,8 @@ def test_an_executable_takes_no_module_and_no_profile_there(tmp_path, protected)
     kept = {name: value for name, value in os.environ.items() if name != "SKIP_DEFAULT_XML_FILE"}
     kept.pop("PYTHONSAFEPATH", None)  # a user's shell does not set it
     code = START if protected else "import starts_ros; starts_ros.main([])"
-    command = (sys.executable, "-c", code, "starts_ros")
+    (tmp_path / "modules" / "start.py").write_text(code)
+    command = (sys.executable, tmp_path / "modules" / "start.py", "starts_ros")
     done = run(*command, folder=tmp_path, **{**kept, "PYTHONPATH": ":".join(paths)})
     assert done.returncode == 0 and "of the present folder" not in done.stdout, done.stderr
     assert ((tmp_path / "victim").read_text() == "precious\n") == protected
