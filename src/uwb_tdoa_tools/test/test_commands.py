@@ -21,7 +21,6 @@ import yaml
 from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_bias.common.text import written_by
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
-from uwb_tdoa_ekf.debias import INTERPOLATORS
 from uwb_tdoa_tools import choices, cli, command_lines, main as uwb_tdoa
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.bags.files import PLUGINS
@@ -108,7 +107,6 @@ def test_help_and_usage_errors_import_nothing_heavy():
     [
         (choices.STORAGES, PLUGINS),
         (choices.REFERENCES, REFERENCES),
-        (choices.INTERPOLATORS, INTERPOLATORS),
         (choices.TRAJECTORIES, TRAJECTORIES),
         (choices.CARRIERS, VEHICLE_DEFAULTS),
         (choices.WORLDS, WORLDS),
