@@ -163,12 +163,6 @@ def samples_of(some):
     )
 
 
-def missing():
-    """Return the executables that `cost_of` needs but that are not installed."""
-    needed = {"gcc": GCC, "arm-none-eabi-gcc": ARM_GCC, "qemu-system-arm": QEMU}
-    return [name for name, path in needed.items() if path is None]
-
-
 def _libm(name):
     function = getattr(ctypes.CDLL("libm.so.6"), name)
     function.restype = ctypes.c_float

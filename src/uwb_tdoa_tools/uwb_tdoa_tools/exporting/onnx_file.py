@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 import json
 from pathlib import Path
 from typing import Any
@@ -96,23 +96,18 @@ class GraphBuilder:
         """Sum along each row: (n, 1)."""
         return self.op("ReduceSum", value, self.constant([1], np.int64), keepdims=1)
 
-    def model(self, width: int, outputs: Sequence[str], meta: Mapping[str, Any]) -> ModelProto:
-        """Return the ONNX model.
+    def model(self, width: int, outputs: int, meta: Mapping[str, Any]) -> ModelProto:
+        """Return the ONNX model whose last operator gives the output, (n, outputs).
 
         Parameters
         ----------
         width : int
             Number of input columns.
-        outputs : sequence of str
-            Tensors (n, 1) that are concatenated as output.
+        outputs : int
+            Number of output columns.
         meta : mapping
             Metadata, stored as JSON.
         """
-        self._nodes.append(helper.make_node("Concat", outputs, [self._output], axis=1))
-        return self.whole(width, len(outputs), meta)
-
-    def whole(self, width: int, outputs: int, meta: Mapping[str, Any]) -> ModelProto:
-        """Return the ONNX model whose last operator gives the output, (n, outputs)."""
         self._nodes[-1].output[:] = [self._output]
         graph = helper.make_graph(
             self._nodes,
@@ -220,7 +215,7 @@ class _Printer:
         together = graph.op("Concat", *columns, axis=1)
         off = graph.row_sum(graph.op("Sub", together, together))  # NaN unless all are finite
         graph.op("Where", graph.op("And", known, graph.op("Equal", off, [0.0])), together, [0.0])
-        return graph.whole(len(INPUTS), len(OUTPUTS), self._traced.meta())
+        return graph.model(len(INPUTS), len(OUTPUTS), self._traced.meta())
 
     def _find_anchors(self, nodes: list[Node]) -> str:
         """Look up the constants of both anchors; return whether they are two known ones, (n, 1)."""

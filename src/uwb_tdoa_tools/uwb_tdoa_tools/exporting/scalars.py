@@ -25,6 +25,8 @@ import numpy as np
 import onnx
 from onnx import numpy_helper
 
+from uwb_tdoa_bias.common.errors import InputError
+
 from .graph import COMPARISONS, ELEMENTWISE, LOGICAL, Node, ordered
 
 ACTIVATIONS = ("Relu",)
@@ -46,10 +48,6 @@ class Scalar(NamedTuple):
         return self.kind in (*COMPARISONS, *LOGICAL)
 
 
-class Unsupported(ValueError):
-    """The network is not a chain of dense layers."""
-
-
 class Dense:
     """Layers of a network: y = activation(weights^T x + biases).
 
@@ -60,7 +58,7 @@ class Dense:
     """
 
     def __init__(self, content: bytes) -> None:
-        """Read an ONNX file; raise Unsupported."""
+        """Read an ONNX file; raise InputError if it is not a chain of dense layers."""
         graph = onnx.load_from_string(content).graph
         known = {one.name: numpy_helper.to_array(one) for one in graph.initializer}
         self.layers: list[tuple[np.ndarray, np.ndarray, str]] = []
@@ -84,9 +82,9 @@ class Dense:
                 self.constants = [constant[name] for name in others]
                 chain = node.output[0]
             else:
-                raise Unsupported(f"it has the operator {node.op_type}")
+                raise _no_chain(f"it has the operator {node.op_type}")
         if not self.layers or chain != graph.output[0].name:
-            raise Unsupported("it is no chain of layers")
+            raise _no_chain("it is no chain of layers")
 
     @property
     def widest(self) -> int:
@@ -94,9 +92,16 @@ class Dense:
         return max(len(biases) for _, biases, _ in self.layers)
 
 
+def _no_chain(why: str) -> InputError:
+    return InputError(
+        f"--model: C holds networks of dense layers, and of this one not: {why}; train "
+        "--model paper, or write it by --onnx."
+    )
+
+
 @lru_cache(maxsize=8)
 def dense(content: bytes) -> Dense:
-    """Return the network of an ONNX file; the same object for the same content. Raises Unsupported."""
+    """Return the network of an ONNX file; the same object for the same content. Raises InputError."""
     return Dense(content)
 
 

@@ -26,7 +26,7 @@ from uwb_tdoa_bias.effects.effect_set import REACH
 from . import crazyflie
 from .c_code import Printer, number
 from .correction import LeftOut, TracedCorrection, left_out
-from .scalars import Program, Unsupported
+from .scalars import Program
 from .tracing import nodes_of, samples_of
 
 MEMBERS = {  # of the state, by the names of inputs
@@ -231,7 +231,7 @@ def vehicle_code(
 ) -> VehicleCode:
     """Return the C of a correction.
 
-    Raises Unsupported if the network is not a chain of dense layers.
+    Raises InputError if the network is not a chain of dense layers.
     """
     samples = replace(samples_of(anchors, motion=True), yaw_std=None)
     corrector = Corrector(anchors, effects, network)
@@ -311,7 +311,8 @@ def _in_comment(text: str) -> str:
 
 def write_c(folder: Path, traced: TracedCorrection) -> None:
     """Write uwb_bias.h and uwb_bias.c of a TracedCorrection. Raises InputError."""
-    _write(folder, _code(traced, traced.effects).files)
+    code = vehicle_code(traced.anchors, traced.effects, traced.network)
+    _write(folder, code.files)
 
 
 def write_crazyflie(folder: Path, traced: TracedCorrection) -> tuple[LeftOut, ...]:
@@ -329,22 +330,13 @@ def write_crazyflie(folder: Path, traced: TracedCorrection) -> tuple[LeftOut, ..
     held = traced.effects.where(
         lambda effect: not vehicle_code(anchors, EffectSet((effect,))).reads_rates
     )
-    _write(folder, crazyflie.files(_code(traced, held).files, anchors))
+    code = vehicle_code(anchors, held, traced.network)
+    _write(folder, crazyflie.files(code.files, anchors))
     return tuple(
         replace(left_out(effect, anchors), why=NOT_ESTIMATED)
         for effect in traced.effects
         if effect not in held.effects
     )
-
-
-def _code(traced: TracedCorrection, effects: EffectSet) -> VehicleCode:
-    try:
-        return vehicle_code(traced.anchors, effects, traced.network)
-    except Unsupported as error:
-        raise InputError(
-            f"--model: C holds networks of dense layers, and of this one not: {error}; train "
-            "--model paper, or write it by --onnx."
-        ) from error
 
 
 def _write(folder: Path, texts: dict[str, str]) -> None:
