@@ -87,7 +87,7 @@ def merged(file: Path, folder: Path, remarks: list[str]) -> Path:
     there = (log.stat().st_size - 32) // (24 + page_size)  # behind headers
     remarks.append(
         f"The recorder did not close {file.name}. {max(read, 0)} of {there} pages in {log.name} are "
-        "read, too: others are not finished, damaged or older."
+        "read, too. Any others are not finished, damaged or older."
     )
     return copy
 
