@@ -11,10 +11,12 @@ import pytest
 rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
+from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
 
 from uwb_tdoa_bias.bias_node import MEASURED, BiasNode  # noqa: E402
 from uwb_tdoa_bias.common.anchors import Anchors  # noqa: E402
+from uwb_tdoa_bias.effects import EFFECTS, EffectSet  # noqa: E402
 from uwb_tdoa_bias.ros.cdr import CdrCodec  # noqa: E402
 from uwb_tdoa_msgs.msg import Tdoa  # noqa: E402
 
@@ -84,3 +86,15 @@ def test_tdoas_of_two_antennas_are_corrected_each_by_its_own_place_and_none_is_d
         ("right", 0.6),
     }
     assert [frame for frame, _ in sent] == [("left", "right")[k % 2] for k in range(len(sent))]
+
+
+def test_an_effect_that_needs_orientations_of_anchors_is_named_where_there_are_none(node):
+    node._anchors.anchors = Anchors.from_positions(np.eye(3))
+    node._effects = EffectSet((EFFECTS["antenna_pattern"]({"anchor": 0.1}),))
+    node._body_antenna.name_of_status = dict.fromkeys(range(4), "antenna_pattern")
+    node._poses.take_all([0.0])
+    level, text = node._health(1.0, 0)
+    assert level == DiagnosticStatus.WARN
+    assert text.startswith("antenna_pattern needs orientations of anchors, and the survey has none")
+    node._effects = EffectSet()
+    assert node._health(1.0, 0) == (DiagnosticStatus.OK, "correcting with antenna_pattern")

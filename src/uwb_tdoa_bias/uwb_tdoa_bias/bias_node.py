@@ -28,7 +28,14 @@ from uwb_tdoa_msgs.msg import Tdoa, TdoaCorrected
 from .common.anchors import Anchors
 from .common.errors import InputError
 from .common.stamps import LARGEST_STEP_BACK, PoseQueue, StampGate
-from .correction.corrector import Correction, Corrector, Poses, parts_of, warm_up
+from .correction.corrector import (
+    Correction,
+    Corrector,
+    Poses,
+    orientation_remarks,
+    parts_of,
+    warm_up,
+)
 from .correction.model import EFFECTS, FADED, NETWORK, PASSED
 from .correction.network import load_network
 from .effects import EffectSet, LabelEffect
@@ -517,6 +524,8 @@ class BiasNode(StreamNode):
                 DiagnosticStatus.WARN,
                 "odometry is late: TDOAs leave before their pose; check the load of ekf_node",
             )
+        for remark in orientation_remarks(self._anchors.anchors, self._effects, self._model):
+            return DiagnosticStatus.WARN, remark
         return DiagnosticStatus.OK, f"correcting with {self._model_name}"
 
 

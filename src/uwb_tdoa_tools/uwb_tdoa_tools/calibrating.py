@@ -150,6 +150,8 @@ def usable_paths(
             line = command_lines.survey_line(path, survey, effects)
             result = check(recording, (), estimator, line)
             cli.show(report.text(result))
+            for remark in estimator.remarks(recording.anchors):
+                cli.say("calibrate", f"{recording.name}: {remark}")
             errors = blocking_errors(recording, result.findings, std)
             if errors:
                 named = "; ".join(f"{finding.cause} ({finding.rule})" for finding in errors)

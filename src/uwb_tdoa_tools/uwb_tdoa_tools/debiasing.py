@@ -18,7 +18,7 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import read_head
 from uwb_tdoa_bias.common.flight import Flight
-from uwb_tdoa_bias.correction.corrector import Corrector
+from uwb_tdoa_bias.correction.corrector import Corrector, orientation_remarks
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.debias import BiasMap, Part, fit
@@ -27,7 +27,7 @@ from uwb_tdoa_ekf.results import Odometry
 
 from .choices import NONE
 from .readers import read_survey
-from .readers.inputs import Reading
+from .readers.inputs import Reading, report_remarks
 from .readers.tables import read_numbers
 from .scoring.evaluation import corrected_truth, evaluate, with_aligned_truth
 from .scoring.gains import SHARES, Shrinkage, best_share, change_in_words, gain, gain_in_words
@@ -101,7 +101,9 @@ class PositionEstimator:
 
     def __call__(self, recording: tuple[Path, str | Path | None]) -> Scored:
         """Return the result of `estimate_flight` for (path, survey)."""
-        return estimate_flight(self.reading.read(recording), self.config, self.effects, self.align)
+        flight = self.reading.read(recording)
+        report_remarks(flight.name, orientation_remarks(flight.anchors, self.effects))
+        return estimate_flight(flight, self.config, self.effects, self.align)
 
 
 def require_anchors(flown: Iterable[Scored], bias_map: BiasMap) -> Iterator[Scored]:

@@ -4,8 +4,9 @@
 
 from dataclasses import dataclass
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.flight import Flight
-from uwb_tdoa_bias.correction.corrector import Corrector
+from uwb_tdoa_bias.correction.corrector import Corrector, orientation_remarks
 from uwb_tdoa_bias.correction.model import Model
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.tag import TagLeverArm
@@ -41,6 +42,10 @@ class FlightEstimator:
             self.network.require(flight.anchors)
         effects = with_antenna(self.effects, flight, self.network)
         return engine(flight, self.config, Corrector(flight.anchors, effects, self.network))
+
+    def remarks(self, anchors: Anchors) -> list[str]:
+        """Return a sentence if a part of the correction needs more than the Anchors hold, else []."""
+        return orientation_remarks(anchors, self.effects, self.network)
 
     @property
     def correction(self) -> str:

@@ -102,7 +102,9 @@ class Evaluator:
         """
         flight = self.reading.read(recording)
         require_truth(flight, self.align == NONE)
-        survey_sentences = [] if self.odometry else list(survey_remarks(flight))
+        survey_sentences = []
+        if not self.odometry:
+            survey_sentences = [*survey_remarks(flight), *self.estimator.remarks(flight.anchors)]
         report_remarks(flight.name, survey_sentences)
         odometry: Odometry | RecordedOdometry
         residuals: Residuals | None

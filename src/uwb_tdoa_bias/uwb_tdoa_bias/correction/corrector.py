@@ -16,6 +16,7 @@ from ..common.anchors import Anchors
 from ..common.compiled import compiled
 from ..common.errors import InputError
 from ..effects import EffectSet, Samples
+from ..effects.base import counted, listed
 from ..effects.samples import N_STATES, POSE_LAG, Motion, motion_at, precede
 from .model import EFFECTS, FADED, NETWORK, PASSED, Model, Prediction
 
@@ -330,6 +331,23 @@ class FixedPoseCorrector(Corrector):
 
     def samples(self, t: np.ndarray, a: np.ndarray, b: np.ndarray) -> Samples:
         return self._fixed.shared(super().samples(t, a, b))
+
+
+def orientation_remarks(
+    anchors: Anchors, effects: EffectSet | None, model: Model | None = None
+) -> list[str]:
+    """Return a sentence on what needs orientations that the Anchors lack; [] if nothing does."""
+    parts = [*(effects or ()), *([model] if model else [])]
+    names = sorted({part.name for part in parts if part.uses_orientations})
+    lacking = np.isnan(anchors.orientations).any(axis=1)
+    if not names or not lacking.any():
+        return []
+    need = f"{listed(names)} need{'s' if len(names) == 1 else ''}"
+    of = "" if lacking.all() else f" of {counted(map(str, anchors.ids[lacking]), 'anchor')}"
+    return [
+        f"{need} orientations of anchors, and the survey has none{of}: what depends on them is not "
+        "corrected. Survey the stands, or diagnose without it."
+    ]
 
 
 def _joined(*names: str) -> str:

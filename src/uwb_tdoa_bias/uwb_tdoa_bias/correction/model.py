@@ -53,6 +53,7 @@ class Model:
     holds : labels of the effects that the file itself corrects; nothing else may correct them
     of_effects : their names, joined by '+', or ""
     needs_motion : whether it depends on more than poses
+    uses_orientations : whether it reads the orientations of anchors
     """
 
     NEEDS: ClassVar[str]  # what the metadata must hold, for messages
@@ -61,6 +62,7 @@ class Model:
     holds: tuple[str, ...] = ()
     of_effects: str = ""
     needs_motion: bool = False
+    uses_orientations: bool = False
 
     def __init__(self, path: str | Path, session: Session | None = None) -> None:
         """Load a file; raise InputError if it is no model or has unsuitable metadata.

@@ -112,6 +112,7 @@ class Network(Model):
         self._largest_yaw_std = float(json.loads(meta.get("largest_yaw_std", "Infinity")))
         self.share = float(json.loads(meta.get("share", "1.0")))
         self._inputs = np.array([_COLUMN[name] for name in names], dtype=int)
+        self.uses_orientations = any("_A_" in name for name in names)
         limited = np.array([_COLUMN[name] for name in limits], dtype=int)
         lower, upper, margin = np.array([*limits.values()], dtype=float).reshape(-1, 3).T
         self._validity = Validity(limited, lower, upper, margin)

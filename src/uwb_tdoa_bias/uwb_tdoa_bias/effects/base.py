@@ -262,6 +262,7 @@ class Effect:
     needs_motion: ClassVar[bool] = False  # True: depends on more than the pose of the tag
     uses_pose: ClassVar[bool] = True  # False: its bias is a constant of each pair of anchors
     uses_attitude: ClassVar[bool] = False  # True: its bias depends on the attitude of the tag
+    uses_orientations: ClassVar[bool] = False  # True: on the orientations of anchors, too
     periodic: ClassVar[bool] = False  # True: it recurs in time, and goes on beyond its domain
 
     def __init_subclass__(cls) -> None:

@@ -211,6 +211,10 @@ class SmoothTerm(Effect):
         return any(name.endswith("_in_tag") or name == "tilt" for name in self.arguments)
 
     @property
+    def uses_orientations(self) -> bool:  # type: ignore[override]  # of a term
+        return any(name.endswith("_in_anchor") for name in self.arguments)
+
+    @property
     def periodic(self) -> bool:  # type: ignore[override]  # of a term
         return self.covariate == "time" and self.shape in ("wave", "pulse")
 

@@ -181,6 +181,7 @@ class ReceivedPowerBias(ArrivalEffect):
         shown=("", 1.0),
     )
     uses_attitude = True
+    uses_orientations = True
 
     def delay_regressors(
         self, samples: Samples, rows: np.ndarray, keys: Sequence[str]
@@ -233,6 +234,10 @@ class AntennaPattern(ArrivalEffect):
     )
     parameters = ("tag", "anchor")
     uses_attitude = True
+
+    @property
+    def uses_orientations(self) -> bool:  # type: ignore[override]  # of its values
+        return self.values.get("anchor", 0.0) != 0.0
 
     def delay_regressors(
         self, samples: Samples, rows: np.ndarray, keys: Sequence[str]

@@ -82,6 +82,8 @@ def _check(args: Namespace) -> int:
     reports, recordings = [], []
     for recording, path, survey in _recordings(args, reading, alone):
         recordings.append(recording)
+        for remark in estimator.remarks(recording.anchors):
+            cli.say("check", f"{recording.name}: {remark}")
         line = command_lines.survey_line(path, survey, args.effects) if path else None
         reports.append(check(recording, others, estimator, line))
         cli.show(report.text(reports[-1]))

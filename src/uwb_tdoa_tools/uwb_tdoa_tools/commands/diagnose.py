@@ -179,6 +179,8 @@ def _diagnose(args: Namespace) -> int:
         [its_survey for _, its_survey in (*found, *reading.find(args.holdout))],
     ):
         cli.say("diagnose", remark)
+    for remark in judge.remarks(flights[0].anchors):
+        cli.say("diagnose", remark)
     for name in ("marks", "odometry"):
         if args.reference == name and getattr(args, name) is None:
             raise InputError(f"--reference {name}: --{name} says which, and is missing.")

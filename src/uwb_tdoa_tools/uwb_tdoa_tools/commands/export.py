@@ -64,6 +64,7 @@ def parser() -> ArgumentParser:
 
 
 def _export(args: Namespace) -> None:
+    from uwb_tdoa_bias.correction.corrector import orientation_remarks
     from uwb_tdoa_bias.effects import EffectSet
 
     from ..readers import read_survey
@@ -86,7 +87,7 @@ def _export(args: Namespace) -> None:
         if args.c:
             write_c(args.c, traced)
         not_flown = write_crazyflie(args.crazyflie, traced) if args.crazyflie else ()
-    for omitted in traced.left_out:
+    for omitted in (*orientation_remarks(*given), *traced.left_out):
         say(str(omitted))
     for omitted in not_flown:
         say(f"{args.crazyflie}: {omitted}")

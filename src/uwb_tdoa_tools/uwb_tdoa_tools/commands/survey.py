@@ -74,12 +74,12 @@ def _survey(args: Namespace) -> int:
     out = args.out
     config, effects = options.filter_of(args)
     base, tape = effects or EffectSet(), options.tape_of(args, effects)
-    reading = options.reading_of(args)
+    reading, judge = options.reading_of(args), FlightEstimator(config, base)
     if not args.unknown and not nothing_comes_first(
         "survey",
         reading,
         args.flights,
-        FlightEstimator(config, base),
+        judge,
         max(tape.std, tape.height_std or 0.0),
     ):
         return 1
@@ -87,6 +87,8 @@ def _survey(args: Namespace) -> int:
     over = partial(parallel.over, jobs=jobs, dask=dask, unit=None)  # only Progress prints a line
     flights = reading.flights(args.flights, None, jobs, dask)
     for remark in remark_on_surveys([its for _, its in reading.find(args.flights)], flights):
+        cli.say("survey", remark)
+    for remark in judge.remarks(flights[0].anchors):
         cli.say("survey", remark)
     known = options.known_of(args, flights)
     with Progress("survey") as progress:

@@ -134,6 +134,7 @@ def assess(
         level = BAD
     elif moved or doubts:
         level = DOUBTFUL
+    remedies += estimator.remarks(flight.anchors)
     remedies += _remedies(flight, left, figures, estimator.effects is not None)
     return Assessment(level, figures, lost, tuple(reasons + doubts), tuple(remedies))
 
