@@ -9,15 +9,18 @@ from number_faults import FAULTS
 import numpy as np
 import pytest
 from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.common.flight import Truth
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import Imu, Truth
 from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, true_samples
 from uwb_tdoa_tools.checking import motion_rules, pair_rules
 from uwb_tdoa_tools.checking.flight_rules import judge_against_truth, judge_flight, judge_truth
-from uwb_tdoa_tools.checking.motion_rules import TrueMotion
+from uwb_tdoa_tools.checking.motion_rules import TrueMotion, judge_imu, truth_unit
 from uwb_tdoa_tools.checking.pair_rules import KnownPath, repairs
 from uwb_tdoa_tools.checking.time_rules import delays, wrong_stamps
+from uwb_tdoa_tools.scoring.alignment import require_truth
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 # --- checking flight rules ---
@@ -26,6 +29,24 @@ from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 @pytest.fixture(scope="module")
 def flight():
     return clean_flight(100, 30.0)
+
+
+@pytest.mark.parametrize("unit, factor", [("mm", 1000.0), ("cm", 100.0)])
+def test_a_ground_truth_in_another_unit_is_named_and_not_judged_against(flight, unit, factor):
+    truth = replace(flight.truth, p=factor * flight.truth.p)
+    (finding,) = truth_unit(flight.replaced(truth=truth))
+    assert finding.rule == "truth_unit" and f"is in {unit}," in finding.cause
+    with pytest.raises(InputError, match=f"the ground truth is in {unit}, and is read as metres"):
+        require_truth(flight.replaced(truth=truth))
+    assert not [*truth_unit(flight)] and not [*truth_unit(flight.replaced(truth=None))]
+
+
+@pytest.mark.parametrize("turn", [("z", 90), ("z", 180), ("x", 180)])
+def test_a_mounting_that_the_recorded_attitude_contradicts_is_named_by_check(flight, turn):
+    by, imu = Rotation.from_euler(*turn, degrees=True), flight.imu
+    turned = flight.replaced(imu=Imu(imu.t, by.apply(imu.gyro), by.apply(imu.accel)))
+    assert judge_imu(turned, stamps=False) and not judge_imu(flight, stamps=False)
+    assert judge_imu(turned.replaced(truth=None)) == []
 
 
 def test_holes_and_jumps_of_the_truth_are_found(flight):
@@ -317,13 +338,13 @@ def with_imu(flight, **columns):
 
 
 def said(flight):
-    motion = TrueMotion(flight)
+    motion = TrueMotion(flight.imu, flight.truth)
     rules = motion_rules.wrong_axes, motion_rules.low_passes, motion_rules.wrong_stamps
     return {finding.rule: finding for rule in rules for finding in rule(motion)}
 
 
 def test_what_is_measured_is_what_the_truth_does(flight):
-    motion = TrueMotion(flight)
+    motion = TrueMotion(flight.imu, flight.truth)
     for sensor, noise in (("gyro", 0.05), ("accel", 0.3)):
         left = motion.measured[sensor] - motion.at(motion.true[sensor])
         assert np.std(left, axis=0).max() < noise

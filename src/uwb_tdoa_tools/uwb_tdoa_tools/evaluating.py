@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
 from pathlib import Path
@@ -20,6 +20,7 @@ from uwb_tdoa_ekf.results import Odometry, Residuals
 from .bags.bag import RecordedOdometry, late_tdoas, read_odometry
 from .checking.check import check
 from .checking.flight_rules import judge_truth
+from .checking.motion_rules import judge_imu
 from .checking.recording import of_flight
 from .checking.report import survey_remarks
 from .checking.watch import BEFORE_TRUTH
@@ -105,6 +106,9 @@ class Evaluator:
         survey_sentences = []
         if not self.odometry:
             survey_sentences = [*survey_remarks(flight), *self.estimator.remarks(flight.anchors)]
+        survey_sentences += [
+            f"{one.cause}: {one.evidence}; {one.remedy}." for one in judge_imu(flight, stamps=False)
+        ]
         report_remarks(flight.name, survey_sentences)
         odometry: Odometry | RecordedOdometry
         residuals: Residuals | None
@@ -249,6 +253,20 @@ def lines_of_alignment(aligned: dict[str, Any], means: dict[str, float]) -> Iter
     figures = [f"{error:.3f} m --align {how}" for how, error in means.items() if np.isfinite(error)]
     if figures:
         yield f"{'3D RMSE' if aligned else 'mean 3D RMSE of the runs'}: {', '.join(figures)}"
+
+
+def lines_of_attitude(attitudes: Mapping[str, tuple[float, ...]]) -> Iterator[str]:
+    """Yield lines on the errors of attitude of runs, {flight: ATTITUDE}; none if unknown."""
+    if not attitudes:
+        return
+    roll, pitch, yaw, stated, nees = np.sqrt(np.mean(np.square([*attitudes.values()]), axis=0))
+    yield (
+        f"attitude, degrees (RMS): roll {roll:.1f}, pitch {pitch:.1f}, yaw {yaw:.1f} "
+        f"({stated:.1f} stated); NEES {nees:.2f}, honest is 3"
+    )
+    worst = max(attitudes, key=lambda name: attitudes[name][2])
+    if len(attitudes) > 1:
+        yield f"largest yaw: {attitudes[worst][2]:.1f} degrees in {worst}"
 
 
 def lines_of_phases(phases: dict[str, dict[str, Any]]) -> list[str]:

@@ -22,7 +22,7 @@ from uwb_tdoa_ekf.monitoring.stream_rules import StreamRules
 
 from ..estimate import FlightEstimator
 from ..readers.streams import protocol
-from . import coverage, imu_rules, recording_rules, tdoa_rules
+from . import coverage, imu_rules, motion_rules, recording_rules, tdoa_rules
 from .ordered import OrderedRecording, SurveyFit, differences, displacement
 from .tdoa_rules import SAME, largest_displacement
 from .watch import found_by_monitor, together
@@ -51,6 +51,8 @@ NOTHING_TO_TRY = {
     "anchor_scale",
 }
 WITHOUT_IMU = {"imu_silent", "imu_no_gravity", "imu_axis_dead", "imu_tilted", "imu_clipped"}
+# After one of these findings the recorded attitude shows nothing else.
+OF_IMU = {*WITHOUT_IMU, "imu_axes", "imu_rate_unit", "imu_force_unit", "imu_turned", "stamps_apart"}
 OTHER_SURVEY = (
     "give --survey a folder of all surveys: check says which one fits; or survey the anchors again"
 )
@@ -124,6 +126,9 @@ def check(
         found = _with_trials(recording, streams, found, others, estimator, line)
     else:
         found += _tried_with_ranges(recording, found)
+    if not OF_IMU & {finding.rule for finding in found}:
+        found += motion_rules.judge_imu(recording, stamps=False)
+    found += motion_rules.truth_unit(recording)
     return Report(
         recording.name, most_severe_first(found), _facts(recording, streams), recording.ends
     )

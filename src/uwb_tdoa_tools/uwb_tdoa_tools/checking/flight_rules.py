@@ -18,7 +18,6 @@ from uwb_tdoa_ekf.monitoring.finding import NOTE, WARNING, Finding, most_severe_
 
 from . import coverage, imu_rules, motion_rules, pair_rules, time_rules
 from .check import processed_streams
-from .motion_rules import TrueMotion
 from .pair_rules import KnownPath, least_height, repairs_of
 from .recording import of_flight
 
@@ -30,7 +29,7 @@ def judge_against_truth(flight: Flight) -> list[Finding]:
     """Return the findings of a Flight against its ground truth; none without ground truth."""
     if flight.truth is None or len(flight.truth) < 2:
         return []
-    return [*judge_truth(flight), *_of_tdoas(KnownPath(flight)), *_of_imu(flight)]
+    return [*judge_truth(flight), *_of_tdoas(KnownPath(flight)), *motion_rules.judge_imu(flight)]
 
 
 def _of_tdoas(path: KnownPath) -> list[Finding]:
@@ -43,18 +42,6 @@ def _of_tdoas(path: KnownPath) -> list[Finding]:
     if not any(finding.rule.startswith(("ids", "tdoa")) for finding in found):
         found += time_rules.wrong_stamps(path)
     return found
-
-
-def _of_imu(flight: Flight) -> list[Finding]:
-    assert flight.truth is not None
-    known = np.isfinite(flight.truth.q).all(axis=1)
-    if flight.imu is None or known.sum() < 2:
-        return []
-    motion = TrueMotion(flight)
-    if len(motion) < motion_rules.FEWEST:
-        return []
-    found = list(motion_rules.wrong_axes(motion))
-    return found or [*motion_rules.low_passes(motion), *motion_rules.wrong_stamps(motion)]
 
 
 def judge_truth(flight: Flight) -> Iterator[Finding]:

@@ -9,11 +9,14 @@ removal of constant biases and slow changes.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Protocol
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from uwb_tdoa_bias.common.flight import Flight
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.flight import Imu, Tdoas, Truth
+from uwb_tdoa_bias.common.geometry import tdoa as predicted_tdoa
 from uwb_tdoa_ekf.monitoring.finding import ERROR, Finding
 
 from .imu_rules import ARRANGEMENTS, SCALES, is_smooth, scale_of, signed_axis
@@ -22,6 +25,8 @@ from .time_rules import BLOCK, LONGEST, Delays, delays, drift_or_jump
 CELL, HALF = 0.05, 0.1  # s between cells, and half the time over which a cell is averaged
 BEYOND = round(LONGEST / CELL)  # further cells at both ends, to try delays
 FEWEST = 200  # cells in the air
+# m; and the largest ratio of the residuals with another unit and with metres (healthy: above 4)
+LENGTHS, FITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}, 0.5
 LIMIT = 4.0  # robust standard deviations at which a difference is clipped
 GRAVITY = 9.81  # m/s^2
 # Largest power after a change of axes, over the power before, that counts as a mistake. In healthy
@@ -61,10 +66,8 @@ class TrueMotion:
         {sensor: whether it changes too evenly for a sensor that vibrates}.
     """
 
-    def __init__(self, flight: Flight) -> None:
-        """Average the samples over cells. The ground truth of the Flight needs attitudes."""
-        assert flight.imu is not None and flight.truth is not None
-        imu, truth = flight.imu, flight.truth
+    def __init__(self, imu: Imu, truth: Truth) -> None:
+        """Average the samples over cells. The ground truth needs attitudes."""
         known = np.isfinite(truth.q).all(axis=1)
         self._t, first = np.unique(truth.t[known], return_index=True)
         self._p, self._q = truth.p[known][first], truth.q[known][first]
@@ -173,6 +176,61 @@ def _triangle(t: np.ndarray, values: np.ndarray, when: np.ndarray) -> np.ndarray
     total = _integral(t, _integral(t, values - values.mean(axis=0)))
     second = _at(t, total, when + HALF) - 2.0 * _at(t, total, when) + _at(t, total, when - HALF)
     return second / HALF**2 + values.mean(axis=0)
+
+
+class WithTruth(Protocol):
+    """A Flight or a Recording."""
+
+    @property
+    def anchors(self) -> Anchors: ...
+    @property
+    def tdoa(self) -> Tdoas: ...
+    @property
+    def imu(self) -> Imu | None: ...
+    @property
+    def truth(self) -> Truth | None: ...
+
+
+def truth_unit(recording: WithTruth) -> Iterator[Finding]:
+    """Yield a finding if the TDOAs fit to the ground truth in another unit of length only."""
+    truth, tdoa, anchors = recording.truth, recording.tdoa, recording.anchors
+    if truth is None or len(truth) < 2:
+        return
+    rows = np.stack([anchors.index(tdoa.a), anchors.index(tdoa.b)])
+    inside = (tdoa.t > truth.t[0]) & (tdoa.t < truth.t[-1]) & (rows >= 0).all(axis=0)
+    if inside.sum() < FEWEST:
+        return
+    a, b = anchors.positions[rows[:, inside]]
+    p = np.stack([np.interp(tdoa.t[inside], truth.t, column) for column in truth.p.T], axis=1)
+    left = {
+        unit: float(np.median(np.abs(predicted_tdoa(factor * p, a, b) - tdoa.d[inside])))
+        for unit, factor in LENGTHS.items()
+    }
+    unit = min(left, key=left.__getitem__)
+    if left[unit] < FITS * left["m"]:
+        yield Finding(
+            "truth_unit",
+            ERROR,
+            cause=f"the ground truth is in {unit}, and is read as metres",
+            evidence=f"TDOAs are {left[unit]:.2f} m off it then, {left['m']:.2f} m as it is (median)",
+            remedy=f"divide its positions by {1.0 / LENGTHS[unit]:g}, or give the unit ({unit})",
+            value=LENGTHS[unit],
+        )
+
+
+def judge_imu(recording: WithTruth, stamps: bool = True) -> list[Finding]:
+    """Return findings on an IMU against the recorded attitude; none without one.
+
+    stamps : whether to judge its filter and its stamps, too
+    """
+    imu, truth = recording.imu, recording.truth
+    if imu is None or truth is None or np.isfinite(truth.q).all(axis=1).sum() < 2:
+        return []
+    motion = TrueMotion(imu, truth)
+    if len(motion) < FEWEST:
+        return []
+    found = list(wrong_axes(motion))
+    return found or ([*low_passes(motion), *wrong_stamps(motion)] if stamps else [])
 
 
 def wrong_axes(motion: TrueMotion) -> Iterator[Finding]:

@@ -13,14 +13,22 @@ import numpy as np
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import temporary_folder
-from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas
+from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
 from uwb_tdoa_bias.common.sensors import LOCATING, SENSORS
 from uwb_tdoa_bias.common.survey import refuse_faulty
 
 from ..bags import frames, is_bag, messages as bag_messages
 from ..bags.files import open_bag, remarks_of
 from ..bags.frames import TF_STATIC, Place, recorded_anchors
-from ..bags.topics import Names, TopicMessages, arrivals, on_one_clock, read_sensor, read_topic
+from ..bags.topics import (
+    STREAMS,
+    Names,
+    TopicMessages,
+    arrivals,
+    on_one_clock,
+    read_sensor,
+    read_topic,
+)
 from ..command_lines import suggest_line
 from ..readers import read_survey
 
@@ -44,7 +52,7 @@ _ROWS = {
 
 @dataclass(frozen=True)
 class Recording:
-    """Streams of a recording, not sorted and without ground truth.
+    """Streams of a recording, not sorted.
 
     Stamps are on one continuous time (see `clock.straightened`).
 
@@ -78,6 +86,8 @@ class Recording:
         Publishers and subscriptions of live topics.
     sensors : dict
         {name: Stream} of the SENSORS.
+    truth : Truth or None
+        Ground truth; only rules that name it use it.
     jumps : tuple of Jump
         Jumps of the clock, which are corrected.
     outliers : dict
@@ -101,6 +111,7 @@ class Recording:
     remarks: tuple[str, ...] = ()
     ends: tuple[End, ...] = ()
     sensors: dict[str, Stream] = field(default_factory=dict)
+    truth: Truth | None = None
     jumps: tuple[Jump, ...] = ()
     outliers: dict[str, int] = field(default_factory=dict)
     losses: tuple[tuple[str, str, str], ...] = ()
@@ -178,6 +189,7 @@ def of_flight(flight: Flight) -> Recording:
         *streams,
         falls=falls,
         sensors=sensors,
+        truth=flight.truth,
         jumps=jumps,
         outliers=outliers,
         losses=losses,
@@ -196,6 +208,8 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
         found |= {
             name: read_sensor(path, reader, sensor, name_of) for name, sensor in SENSORS.items()
         }
+        pose = STREAMS["pose"]
+        poses = read_topic(path, reader, name_of(pose.topic), pose.message, pose.row)
         arrival = arrivals(found)
         found, clock = on_one_clock(found)
         tdoa, imu = found["tdoa"], found["imu"]
@@ -255,9 +269,17 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
         recorded=recorded and recorded.anchors,
         remarks=remarks,
         sensors=sensors,
+        truth=None if clock.jumps else _truth_of(poses),
         jumps=clock.jumps,
         outliers=clock.outliers,
     )
+
+
+def _truth_of(found: TopicMessages) -> Truth | None:
+    """Return the ground truth of a bag, without messages that are no numbers."""
+    stamps, rows, _ = found.in_order()
+    known = STREAMS["pose"].valid(rows).all(axis=1) if len(stamps) else np.zeros(0, bool)
+    return bag_messages.truth_of(stamps[known], rows[known]) if known.any() else None
 
 
 def _stream_of(found: TopicMessages, sensor: Sensor) -> Stream:

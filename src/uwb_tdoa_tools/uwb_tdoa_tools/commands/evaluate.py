@@ -128,6 +128,7 @@ def _evaluate(args: Namespace) -> int:
     cli.show(
         "", *evaluating.lines_of_alignment(result.aligned if len(found) == 1 else {}, pool.aligned)
     )
+    cli.show(*evaluating.lines_of_attitude(pool.attitudes))
     if args.json:
         cli.write_json(
             args.json, {"runs": [one.as_json() for one in kept], "pooled": as_json(together)}

@@ -25,7 +25,7 @@ from uwb_tdoa_bias.common.flight import Flight, Truth
 from uwb_tdoa_bias.effects.samples import PoseColumns
 
 from ..checking.imu_rules import ARRANGEMENTS, signed_axis
-from ..checking.motion_rules import FEWEST, TrueMotion
+from ..checking.motion_rules import FEWEST, TrueMotion, truth_unit
 from ..checking.pair_rules import KnownPath
 from ..checking.time_rules import Delays, delays_of_tdoas
 from ..choices import NONE, TIME
@@ -186,12 +186,14 @@ class Alignment:
 
 
 def require_truth(flight: Flight, one_clock: bool = True) -> None:
-    """Raise InputError if the Flight has no ground truth to compare with.
+    """Raise InputError if the Flight has no ground truth to compare with, or one in another unit.
 
     If `one_clock`, a ground truth on another clock than the TDOAs is refused too.
     """
     if flight.truth is None or len(flight.truth) < 2:
         raise InputError(f"{flight.name}: it holds no ground truth to compare with.")
+    for finding in truth_unit(flight):
+        raise InputError(f"{flight.name}: {finding.cause}: {finding.evidence}; {finding.remedy}.")
     if one_clock and on_another_clock(flight):
         truth, tdoa = flight.truth.t, flight.tdoa.t
         raise InputError(
@@ -331,7 +333,7 @@ def _inertial(flight: Flight) -> Delays | None:
         or np.isfinite(flight.truth.q).all(axis=1).sum() < 2
     ):
         return None
-    motion = TrueMotion(flight)
+    motion = TrueMotion(flight.imu, flight.truth)
     if len(motion) < FEWEST:
         return None
     found = motion.delays()

@@ -9,6 +9,7 @@ import math
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
 
 from uwb_tdoa_bias.common.sensors import LOCATING
 from uwb_tdoa_bias.effects.samples import PoseColumns
@@ -16,7 +17,7 @@ from uwb_tdoa_ekf.core.memory import COMPENSATED, REJECTED, USED
 from uwb_tdoa_ekf.results import Residuals, concatenated, rows_of
 
 from .phases import in_the_air, motion, phases
-from .pooling import COVERAGE, Distribution, Pool, Result, or_nan
+from .pooling import ATTITUDE, COVERAGE, Distribution, Pool, Result, or_nan
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -133,6 +134,40 @@ def nees(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     solved = np.linalg.solve(covariance[usable], error[usable, :, None])[:, :, 0]
     out[usable] = np.einsum("ni,ni->n", error[usable], solved)
     return out
+
+
+def attitude_figures(
+    odometry: Estimate, truth: Truth, first: float, last: float
+) -> dict[str, float]:
+    """Return the errors of roll, pitch and yaw from `first` to `last`, s; NaN without true attitudes.
+
+    Returns
+    -------
+    dict
+        "rmse_roll", "rmse_pitch", "rmse_yaw": degrees, intrinsic z-y-x. "std_yaw": the stated
+        deviation about the vertical of the body, RMS, degrees. "nees_attitude": mean of e' P^-1 e
+        of the rotation, 3 if the covariance is honest.
+    """
+    known = np.isfinite(truth.q).all(axis=1) & (np.abs(truth.q).max(axis=1) > 0.0)
+    t, rows = np.unique(truth.t[known], return_index=True)
+    if len(t) < 2:
+        return dict.fromkeys(ATTITUDE, math.nan)
+    chosen = (odometry.t >= max(first, t[0])) & (odometry.t <= min(last, t[-1]))
+    chosen &= ~_in_holes(odometry.t, t)
+    if not chosen.any():
+        return dict.fromkeys(ATTITUDE, math.nan)
+    true = Slerp(t, Rotation.from_quat(truth.q[known][rows]))(odometry.t[chosen])
+    estimated = Rotation.from_quat(odometry.q[chosen])
+    apart = (estimated.as_euler("ZYX") - true.as_euler("ZYX"))[:, ::-1]  # roll, pitch, yaw
+    degrees = np.rad2deg((apart + np.pi) % (2.0 * np.pi) - np.pi)
+    covariance = odometry.covariance[chosen, -3:, -3:]
+    if odometry.covariance.shape[1] == 6:  # of a message: about the axes of the world
+        rotated = (estimated * true.inv()).as_rotvec()
+    else:
+        rotated = (true.inv() * estimated).as_rotvec()
+    stated = np.rad2deg(np.sqrt(np.maximum(covariance[:, 2, 2], 0.0)))
+    values = *(rms(degrees[:, k]) for k in range(3)), rms(stated)
+    return dict(zip(ATTITUDE, (*values, or_nan(np.nanmean, nees(rotated, covariance)))))
 
 
 def radio_residuals(flight: Flight, run: Run) -> Residuals:
@@ -332,6 +367,7 @@ class Score:
         out["diverged"], out["late_start"] = bool(lost or late), bool(late and not lost)
         out["start_delay"] = float(max(0.0, self.t[0] - self.first)) if len(self.t) else math.inf
         out["ready_delay"] = self._ready_delay()
+        out |= attitude_figures(*self._whole, self.first, self.last)
         return {**out, **coverage(self.error, self.covariance)}
 
     def _ready_delay(self) -> float:

@@ -20,6 +20,8 @@ RATIO = 1.01  # ratio of the limits of a bin
 SMALLEST = 1e-9  # smaller samples count as this
 WHOLE = ("duration", "count", "without_estimate", "without_truth")  # sums over runs
 ROOTS = ("rmse_x", "rmse_y", "rmse_z", "rmse_3d", "std_3d")  # root mean squares
+# degrees, but the last
+ATTITUDE = "rmse_roll", "rmse_pitch", "rmse_yaw", "std_yaw", "nees_attitude"
 COVERAGE = ("coverage_3sigma_x", "coverage_3sigma_y", "coverage_3sigma_z")
 
 
@@ -147,11 +149,15 @@ class Pool:
         self._distributions = {name: Distribution.of([]) for name in ("distance", "nees", "nis")}
         self._phases: dict[str, PooledErrors] = defaultdict(PooledErrors)
         self._aligned: dict[str, Any] = Counter()
+        self.attitudes: dict[str, tuple[float, ...]] = {}  # {flight: ATTITUDE} where it is known
 
     def add(self, result: Result) -> None:
         """Count the Result of one run."""
         for name in ("rmse_3d", "start_delay", "ready_delay", "diverged", "late_start"):
             self._rows[name].append(result.row[name])
+        attitude = tuple(result.row[name] for name in ATTITUDE)
+        if not math.isnan(attitude[2]):
+            self.attitudes[result.row["flight"]] = attitude
         self._sums.update(result.sums)
         for name, part in result.distributions.items():
             self._distributions[name] += part
