@@ -10,10 +10,16 @@ from hand_made import flown, truth_of
 from hypothesis import given, strategies as st
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.flight import Truth
 from uwb_tdoa_ekf.core.memory import INVALID, LATE, REJECTED, STARTUP, USED
-from uwb_tdoa_tools.evaluating import line_of_run, lines_of_phases, markdown_of
+from uwb_tdoa_tools.evaluating import (
+    line_of_run,
+    lines_of_attitude,
+    lines_of_phases,
+    markdown_of,
+)
 from uwb_tdoa_tools.scoring.gains import LOSS, clear_change
 from uwb_tdoa_tools.scoring.metrics import (
     Score,
@@ -26,7 +32,7 @@ from uwb_tdoa_tools.scoring.metrics import (
     summary,
 )
 from uwb_tdoa_tools.scoring.phases import TITLES, in_the_air, motion, phases
-from uwb_tdoa_tools.scoring.pooling import Pool
+from uwb_tdoa_tools.scoring.pooling import ATTITUDE, Pool
 
 # --- metrics ---
 
@@ -55,6 +61,11 @@ def estimate(truth, error, low=0.0, high=10.0, std=0.1, rate=100.0):
     return SimpleNamespace(
         t=t, p=true + error(t), q=np.tile(UPRIGHT, (len(t), 1)), covariance=covariance
     )
+
+
+def part_of(poses, rows):
+    """Return some rows of hand-made poses."""
+    return SimpleNamespace(**{name: values[rows] for name, values in vars(poses).items()})
 
 
 def constant(x, y, z):
@@ -389,7 +400,10 @@ def odometry_of(truth, error, low=-np.inf, high=np.inf, rate=100.0, std=STD):
     t = t[(t >= low) & (t <= high)]
     true = np.stack([np.interp(t, truth.t, truth.p[:, k]) for k in range(3)], axis=1)
     return SimpleNamespace(
-        t=t, p=true + error(t), covariance=np.tile(np.diag([std**2] * 3), (len(t), 1, 1))
+        t=t,
+        p=true + error(t),
+        q=np.tile(UPRIGHT, (len(t), 1)),
+        covariance=np.tile(np.diag([std**2] * 3), (len(t), 1, 1)),
     )
 
 
@@ -441,7 +455,7 @@ def test_time_without_an_estimate_is_told_where_it_is():
     truth = flown()  # take-off at 5.07 s
     made = odometry_of(truth, lambda t: np.zeros((len(t), 3)), low=4.0)
     keep = (made.t < 10.0) | (made.t > 12.0)
-    made = SimpleNamespace(t=made.t[keep], p=made.p[keep], covariance=made.covariance[keep])
+    made = part_of(made, keep)
     found = Score("flight", made, truth).phases()
     assert found["at_rest_earlier"]["without_estimate"] == pytest.approx(
         found["at_rest_earlier"]["duration"]
@@ -468,7 +482,7 @@ def test_a_slow_odometry_has_no_gaps_and_an_end_is_one():
 def test_time_without_truth_is_told():
     truth = flown()
     known = (truth.t < 8.0) | (truth.t > 10.0)
-    truth = SimpleNamespace(t=truth.t[known], p=truth.p[known])
+    truth = part_of(truth, known)
     found = Score("flight", odometry_of(truth, lambda t: np.zeros((len(t), 3))), truth).phases()
     assert (
         found["in_the_air"]["without_truth"]
@@ -604,3 +618,23 @@ def test_a_gain_counts_if_a_loss_is_unlikely(expected, std):
         counts = sure or expected > LOSS and loss < 0.025
         assert (clear_change(1.0, 1.0 - expected, interval) > 0) == counts
         assert (clear_change(1.0, 1.0 - expected, interval) < 0) == (expected / std < -1.96)
+
+
+def test_errors_of_attitude_and_their_covariance():
+    """The estimate is turned by 10 degrees about the vertical, with 5 degrees stated."""
+    truth, std = flown(), np.deg2rad(5.0)
+    made = odometry_of(truth, constant(0.0, 0.0, 0.0))
+    made.covariance = np.tile(np.diag([1.0] * 6 + [std**2] * 3), (len(made.t), 1, 1))
+    yaw = Rotation.from_euler("z", 10.0, degrees=True)
+    made.q = (yaw * Rotation.from_quat(np.tile(UPRIGHT, (len(made.t), 1)))).as_quat()
+    known = Truth(truth.t, truth.p, np.tile(UPRIGHT, (len(truth.t), 1)))
+    row = Score("flight", made, known).row()
+    assert [row[name] for name in ATTITUDE] == pytest.approx([0.0, 0.0, 10.0, 5.0, 4.0], abs=1e-6)
+    unknown = Truth(truth.t, truth.p, np.full((len(truth.t), 4), np.nan))
+    assert np.isnan([Score("flight", made, unknown).row()[name] for name in ATTITUDE]).all()
+    pool = Pool()
+    pool.add(Score("flight", made, known).result())
+    pool.add(Score("other", made, unknown).result())
+    assert [*pool.attitudes] == ["flight"]
+    (line,) = lines_of_attitude(pool.attitudes)
+    assert "yaw 10.0 (5.0 stated); NEES 4.00" in line and not [*lines_of_attitude({})]
