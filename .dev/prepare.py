@@ -225,7 +225,7 @@ def build(done, compiled):
         path = os.pathsep.join(filter(None, [str(site), os.environ.get("PYTHONPATH")]))
         running.append(
             start(
-                "compile the nodes",
+                "compile the nodes, which is done once and takes about a minute",
                 "compile",
                 [PYTHON, "-m", "uwb_tdoa_ekf.compile_nodes"],
                 PYTHONPATH=path,
@@ -345,7 +345,7 @@ def finish(*steps):
                         f"{log.relative_to(ROOT)}."
                     )
                 say(f"{title} ... {time.monotonic() - started:.0f} s")
-            if running and time.monotonic() - said > (1.0 if live else 5.0):
+            if running and time.monotonic() - said > (1.0 if live else 10.0):
                 said = time.monotonic()
                 say(
                     "; ".join(

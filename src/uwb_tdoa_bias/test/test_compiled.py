@@ -9,6 +9,7 @@ import os
 from pathlib import Path
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 
@@ -220,6 +221,35 @@ def test_a_function_of_another_folder_that_changed_is_compiled_anew(tmp_path):
         ["2.0", "2.0", "2.0", "1"],
         ["3.0", "3.0", "5.0", "0"],
     ]
+
+
+@pytest.fixture
+def listener(tmp_path, monkeypatch):
+    """Return a _Listener with an empty cache that prints whenever it may."""
+    monkeypatch.setattr(compiled, "_place", lambda _: tmp_path)
+    monkeypatch.setattr(compiled, "SAY_EVERY", -1.0)
+    return compiled._Listener()
+
+
+@pytest.mark.parametrize("kept", [False, True])
+def test_an_empty_cache_is_announced_before_the_first_compilation(listener, tmp_path, capsys, kept):
+    if kept:
+        (tmp_path / "function.nbi").touch()
+    for _ in range(2):
+        listener.on_start(None)
+        listener.on_end(None)
+    printed = capsys.readouterr().err.splitlines()
+    assert ("about a minute" in printed[0]) != kept
+    assert sum("about a minute" in line for line in printed) == (not kept)
+
+
+def test_the_printed_share_never_falls(listener, capsys, monkeypatch):
+    done, open_ = SimpleNamespace(signatures=[1]), SimpleNamespace(signatures=[])
+    for functions in ([done, open_], [done, open_, open_], [done, done, open_]):
+        monkeypatch.setattr(compiled, "_FUNCTIONS", functions)
+        listener._tell()
+    shares = [line.split()[5] for line in capsys.readouterr().err.splitlines()]
+    assert shares == ["50%,", "50%,", "67%,"]
 
 
 def test_garbage_is_collected_as_before_after_a_compilation():

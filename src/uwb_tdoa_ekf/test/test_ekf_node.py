@@ -12,6 +12,7 @@ import json  # noqa: E402
 import math  # noqa: E402
 from pathlib import Path  # noqa: E402
 import re  # noqa: E402
+from types import SimpleNamespace  # noqa: E402
 
 from builtin_interfaces.msg import Time  # noqa: E402
 from geometry_msgs.msg import PoseWithCovarianceStamped  # noqa: E402
@@ -167,8 +168,8 @@ def odometry(t, p, yaw, tilt=0.0):
     return Odometry(t, p, zeros, q, zeros, zeros, covariance, np.zeros((n, 3, 3)))
 
 
-def publish(out, estimates, held=False):
-    out.publish_odometry(estimates, held)
+def publish(out, estimates, held=False, turns=False):
+    out.publish_odometry(estimates, np.full(len(estimates), turns), held)
 
 
 def test_world_to_odom_stays_while_the_position_is_unsure(monkeypatch):
@@ -198,6 +199,26 @@ def test_the_first_transform_is_not_held(monkeypatch):
     )
     (_, turn, _) = node.tf.sent[0]
     assert turn.as_euler("ZYX")[0] == pytest.approx(0.4)
+
+
+def test_no_transform_while_the_yaw_may_turn(monkeypatch):
+    node = Stub()
+    out = made(monkeypatch, node, False)
+    t = np.array([1.0, 1.1])
+    estimates = odometry(t, np.ones((2, 3)), np.zeros(2))
+    publish(out, estimates, turns=True)
+    assert not node.tf.sent and out.published == 2 and out.stamp.sec == 101
+    publish(out, estimates)
+    assert len(node.tf.sent) == 2
+
+
+@pytest.mark.parametrize(("imu", "velocity"), [(0, 0), (3, 0), (0, 3)])
+def test_without_imu_and_velocities_the_yaw_stays(imu, velocity):
+    estimator = SimpleNamespace(counts={"imu_used": imu, "velocity_used": velocity})
+    estimates = odometry(np.array([1.0, 1.1]), np.ones((2, 3)), np.zeros(2))
+    estimates.covariance[0, 8, 8] = 4.0  # rad^2
+    turns = EkfNode._yaw_may_turn(SimpleNamespace(_estimator=estimator), estimates)
+    assert turns.tolist() == [imu + velocity > 0, False]
 
 
 @pytest.mark.parametrize("planar", [False, True])

@@ -30,6 +30,7 @@ from uwb_tdoa_bias.effects import EffectSet, SmoothTerm  # noqa: E402
 from uwb_tdoa_bias.effects.sensor import AccelBias  # noqa: E402
 from uwb_tdoa_bias.effects.tag import TagLeverArm  # noqa: E402
 from uwb_tdoa_bias.ros.frames import TF_QOS, TF_STATIC_QOS  # noqa: E402
+from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_ekf.offline import run_offline  # noqa: E402
 from uwb_tdoa_msgs.msg import AnchorArray  # noqa: E402
 
@@ -90,7 +91,10 @@ def test_sensors_in_frames_of_their_own_among_frames_that_move(make_rig, tmp_pat
         transform("base_link", "uwb", ARM),
     ]
     static.publish(TFMessage(transforms=arms))
-    rig.start("bias_node", "ekf_node", bias_node=file, ekf_node=[*file, "-p", "publish_tf:=odom"])
+    config = FilterConfig(initial_yaw=0.2, initial_yaw_std=0.3)  # a known yaw, for transforms
+    told = "publish_tf:=odom", "initial_yaw:=0.2", "initial_yaw_std:=0.3"
+    of_ekf = [*file, *(word for value in told for word in ("-p", value))]
+    rig.start("bias_node", "ekf_node", bias_node=file, ekf_node=of_ekf)
     rig.wait(
         lambda: static.get_subscription_count() == 2 and moving.get_subscription_count() >= 1,
         "TF to be heard",
@@ -125,7 +129,7 @@ def test_sensors_in_frames_of_their_own_among_frames_that_move(make_rig, tmp_pat
     assert {entry.key: entry.value for entry in rig.fresh_status("bias_node").values}[
         "model"
     ] == effects.name
-    expected = run_offline(flight, None, Corrector(flight.anchors, effects)).odometry
+    expected = run_offline(flight, config, Corrector(flight.anchors, effects)).odometry
     place = np.searchsorted(expected.t, [seconds_of(m.header.stamp) for m in rig.odometry])
     apart = np.linalg.norm(positions(rig.odometry) - expected.p[place], axis=1)
     assert len(apart) > 300 and apart.max() < 0.01

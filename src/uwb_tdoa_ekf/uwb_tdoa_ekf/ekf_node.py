@@ -33,6 +33,7 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flyable import FlyableVolume
 from uwb_tdoa_bias.common.sensors import SENSORS
+from uwb_tdoa_bias.correction.corrector import LARGEST_YAW_STD
 from uwb_tdoa_bias.effects import EffectSet, ImuCorrector, StreamCorrector
 from uwb_tdoa_bias.effects.tag import TagLeverArm
 from uwb_tdoa_bias.ros.anchors import AnchorsInput
@@ -56,7 +57,7 @@ from .monitoring.status import FAULT, Status, status_of, with_fault_covariance, 
 from .monitoring.stream_rules import FEW_ANCHORS, StreamWatch
 from .outputs import Outputs, StatusOutput
 from .reorder_buffer import STREAMS
-from .results import VERDICTS, Odometry, Residuals, rotation_std
+from .results import VERDICTS, Odometry, Residuals, poses_of, rotation_std
 
 # Topic, message type and fields to read, for each stream.
 TOPICS = {
@@ -434,14 +435,24 @@ class EkfNode(StreamNode):
         # Publish odometry and residuals. While a fault holds, the covariance is that of an unknown
         # pose.
         if len(odometry.t):
+            turns = self._yaw_may_turn(odometry)
             if self._fault:
                 odometry = with_fault_covariance(odometry, self._estimator.workspace)
-            self.outputs.publish_odometry(odometry, self._estimator.unsure is not None)
+            self.outputs.publish_odometry(odometry, turns, self._estimator.unsure is not None)
             self._health.last_odometry = time.monotonic()
             self._health.last_position = odometry.p[-1], odometry.covariance[-1, :3, :3]
             self._attitude = odometry.q[-1:], odometry.covariance[-1:]
         if len(residuals.t):
             self.outputs.publish_residuals(residuals)
+
+    def _yaw_may_turn(self, odometry: Odometry) -> np.ndarray:
+        """Return whether the filter follows several yaws, (n,) bool.
+
+        Without inertial samples and velocities nothing shows the yaw, and it stays.
+        """
+        counts = self._estimator.counts
+        shown = counts["imu_used"] + counts["velocity_used"] > 0
+        return (poses_of(odometry)[-1] > LARGEST_YAW_STD) & shown
 
     def _arrived(self, arrival: np.ndarray) -> np.ndarray:
         """Return the arrival times of messages on the node's clock, (n,) s; NaN without a time."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry as OdometryMessage
+import numpy as np
 from tf2_msgs.msg import TFMessage
 
 from uwb_tdoa_bias.common.lazy import rotations
@@ -24,8 +25,6 @@ from .ekf_parameters import NONE, ODOM
 from .results import Odometry, Residuals, pose_and_twist
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from uwb_tdoa_bias.common.transforms import Frames
     from uwb_tdoa_bias.ros.node import StreamNode
 
@@ -173,13 +172,15 @@ class Outputs:
             rows[name] = column
         self.residual.publish(self.world, self._residual, rows)
 
-    def publish_odometry(self, odometry: Odometry, held: bool = False) -> None:
+    def publish_odometry(self, odometry: Odometry, turns: np.ndarray, held: bool = False) -> None:
         """Publish Odometry and its transforms.
 
         Parameters
         ----------
         odometry : Odometry
             n estimates.
+        turns : (n,) bool
+            The yaw may turn by 90 degrees: publish no transform.
         held : bool
             Keep the last world -> odom transform.
         """
@@ -192,7 +193,7 @@ class Outputs:
             self._odom or self._tf_publisher.get_subscription_count()
         )
         self.odometry.publish(self.world, self._odometry, rows)
-        for k in range(n) if transformed else ():
+        for k in np.flatnonzero(~turns).tolist() if transformed else ():
             self.stamp = self._epoch.stamp(odometry.t[k].item())
             self._publish_transform(
                 odometry.t[k], odometry.p[k].tolist(), odometry.q[k].tolist(), held

@@ -18,7 +18,7 @@ from uwb_tdoa_tools.bags.bag import read_odometry  # noqa: E402
 from uwb_tdoa_tools.commands import calibrate, check, demo, localize  # noqa: E402
 from uwb_tdoa_tools.diagnosis import diagnose  # noqa: E402
 from uwb_tdoa_tools.estimate import FlightEstimator  # noqa: E402
-from uwb_tdoa_tools.flying import loop  # noqa: E402
+from uwb_tdoa_tools.flying import demo as flown, loop  # noqa: E402
 from uwb_tdoa_tools.flying.demo import (  # noqa: E402
     change_of_scores,
     correction_in_words,
@@ -205,6 +205,31 @@ def test_a_seed_draws_one_effect_and_seeds_draw_all_kinds():
     drawn = [inject.hidden_effect(seed, corners()) for seed in range(1, 101)]
     assert drawn[3] == inject.hidden_effect(4, corners())
     assert len({effect.label.rpartition(" over ")[2] for effect in drawn}) == len(inject.KINDS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", ["the loop", "a given flight"])
+def test_no_error_is_printed_if_messages_were_lost(
+    recorded, diagnosis, tmp_path, capsys, monkeypatch, command
+):
+    outcome = {"used": 10, "waiting": 0, "late": 1, "lost": 917, "imu_late": 0, "imu_lost": 0}
+    monkeypatch.setattr(flown, "through_nodes", lambda *_: flown.LivePass(outcome, None))
+    monkeypatch.setattr(loop, "record", lambda *_: recorded)
+    monkeypatch.setattr(flown, "diagnose", lambda *_, **__: diagnosis)
+    figures = tmp_path / "demo.json"
+    words = {
+        "the loop": ["--seed", str(LATE), "--json", str(figures)],
+        "a given flight": ["--flight", str(recorded[2]), "--rate", "0.6"],
+    }[command]
+    assert demo.main([*words, "--out", str(tmp_path)]) == 1
+    printed, suggested = capsys.readouterr(), {"the loop": "0.5", "a given flight": "0.3"}[command]
+    text = "none: the machine is too slow: 918 messages were lost or late; try --rate "
+    assert lines_of(printed, "error") == [f"error      {text}{suggested}"]
+    assert "RMSE" not in printed.out and not list(tmp_path.glob("*.png"))
+    if command == "the loop":
+        content = json.loads(figures.read_text())
+        assert content["errors"] is content["residual_rms"] is None
+        assert content["outcomes"] == [outcome]
 
 
 def lines_of(printed, title):

@@ -60,9 +60,29 @@ def speaker(node):
     return Speaker(node, "imu/late")
 
 
+class FedNodes:
+    """A stand-in for the nodes that a replay feeds.
+
+    idle : whether they have nothing to do
+    """
+
+    lag, idle = follow.LAG, False
+
+    def watch(self):
+        pass
+
+    def are_idle(self):
+        return self.idle
+
+
 @pytest.fixture
-def follower(node, speaker):
-    follower = Follower(node, "imu/late")
+def nodes():
+    return FedNodes()
+
+
+@pytest.fixture
+def follower(node, speaker, nodes):
+    follower = Follower(node, "imu/late", nodes)
     speaker.matched()
     return follower
 
@@ -74,8 +94,7 @@ def waits(follower, stamp):
     return stop.came
 
 
-def test_the_replay_waits_for_a_topic_that_is_behind(follower, speaker, monkeypatch):
-    monkeypatch.setattr(follow, "SILENCE", 1000.0)
+def test_the_replay_waits_for_a_topic_that_is_behind(follower, speaker):
     assert follower.wait(100 * SECOND, False) == 0.0
     assert not waits(follower, 100 * SECOND + LEAD)
     assert waits(follower, 101 * SECOND + LEAD)  # 100.0 was the start
@@ -86,11 +105,11 @@ def test_the_replay_waits_for_a_topic_that_is_behind(follower, speaker, monkeypa
     assert follower.wait(101 * SECOND + LEAD, False) == 0.0
 
 
-def test_a_topic_that_has_gone_silent_is_not_waited_for(follower, speaker, monkeypatch):
-    monkeypatch.setattr(follow, "SILENCE", 0.2)
+def test_a_topic_that_has_gone_silent_is_not_waited_for(follower, speaker, nodes):
+    nodes.idle = True
     follower.wait(0, False)
-    assert follower.wait(5 * SECOND, False) > 0.2
-    monkeypatch.setattr(follow, "SILENCE", 1000.0)
+    assert follower.wait(5 * SECOND, False) > 0.0
+    nodes.idle = False
     assert not waits(follower, 10 * SECOND)
     speaker.say(9)
     until = time.monotonic() + 60.0
@@ -98,20 +117,19 @@ def test_a_topic_that_has_gone_silent_is_not_waited_for(follower, speaker, monke
         assert time.monotonic() < until
 
 
-def test_a_signal_ends_the_wait(follower, monkeypatch):
-    monkeypatch.setattr(follow, "SILENCE", 100.0)
+def test_a_signal_ends_the_wait(follower):
     follower.wait(0, False)
     assert follower.wait(9 * SECOND, True) < 90.0
 
 
-def test_topics_that_cannot_be_followed_are_named(node):
+def test_topics_that_cannot_be_followed_are_named(node, nodes):
     with pytest.raises(InputError, match="nobody publishes /odometry"):
-        Follower(node, "odometry")
+        Follower(node, "odometry", nodes)
     node.create_publisher(Float64, "number", 1)
     with pytest.raises(
         InputError, match="std_msgs/msg/Float64: not installed, or without a header"
     ):
-        Follower(node, "/number")
+        Follower(node, "/number", nodes)
 
 
 def test_stamps_are_read_from_the_bytes():
@@ -128,10 +146,10 @@ def test_stamps_are_read_from_the_bytes():
 
 
 @pytest.fixture
-def starting(node, speaker):
+def starting(node, speaker, nodes):
     """Return (Follower that also follows TDOAs, Speaker of the output of the filter)."""
     residuals = Speaker(node, "uwb/residual", TdoaResidual)
-    follower = Follower(node, "imu/late")
+    follower = Follower(node, "imu/late", nodes)
     speaker.matched()
     residuals.matched()
     return follower, residuals
@@ -187,13 +205,13 @@ def test_the_replay_waits_for_tdoas_in_the_filter(filtered):
     assert play(follower, STAMPS[15:]) == 94
 
 
-def test_steps_are_shorter_until_bias_node_has_poses(starting, speaker, monkeypatch):
+def test_steps_are_shorter_until_bias_node_has_poses(starting, speaker, nodes):
     follower, residuals = starting
     assert play(follower, STAMPS) == 5
     residuals.say(*STAMPS[:2])
     speaker.say(10.01)
     assert play(follower, STAMPS[5:]) == 2
-    monkeypatch.setattr(follow, "SILENCE", 0.1)
+    nodes.idle = True
     assert play(follower, STAMPS[7:18]) == 11  # the IMU of the recording is too far behind to wait
 
 
@@ -220,11 +238,47 @@ def test_a_recording_that_starts_again_is_followed_again(filtered):
     assert play(follower, [stamp - 5.0 for stamp in STAMPS]) == 5  # as at a start
 
 
-def test_a_filter_that_has_gone_silent_is_not_waited_for(filtered, monkeypatch):
-    monkeypatch.setattr(follow, "SILENCE", 0.1)
+def test_a_filter_that_has_gone_silent_is_not_waited_for(filtered, nodes):
+    nodes.idle = True
     follower, residuals = filtered
     residuals.say(10.0)
     assert play(follower, STAMPS) == 200
+
+
+class Reports:
+    """A stand-in for the diagnostics of nodes.
+
+    unchanged : {node: number of reports with unchanged counters}
+    """
+
+    def __init__(self):
+        self.unchanged = {}
+
+    def forget(self):
+        self.unchanged.clear()
+
+    def poll(self):
+        pass
+
+    def repeated(self, name):
+        return self.unchanged.get(name, 0)
+
+
+def test_a_node_that_does_not_report_is_waited_for_while_it_is_there(monkeypatch):
+    monkeypatch.setattr(follow, "LOOK", 0.0)
+    nodes, said, there = object.__new__(follow.Nodes), [], ["bias_node", "ekf_node"]
+    nodes._names = {name: f"/{name}" for name in there}
+    nodes._diagnostics, nodes._say = Reports(), said.append
+    nodes._is_there = there.__contains__
+    nodes.watch()
+    nodes._diagnostics.unchanged |= {"ekf_node": 9, "bias_node": 1}
+    assert not nodes.are_idle() and said == ["waiting for bias_node"]
+    nodes._diagnostics.unchanged["bias_node"] = 2
+    assert nodes.are_idle()
+    nodes.watch()
+    assert not nodes.are_idle() and said[-1] == "waiting for bias_node and ekf_node"
+    there.clear()
+    assert nodes.are_idle()
 
 
 def test_the_constants_are_those_of_the_filter():

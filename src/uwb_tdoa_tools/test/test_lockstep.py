@@ -6,9 +6,13 @@ The nodes have their default parameters and best-effort connections.
 """
 
 from dataclasses import replace
+import os
 import re
+import signal
 import subprocess
 import sys
+import threading
+import time
 
 import numpy as np
 import pytest
@@ -27,6 +31,7 @@ from uwb_tdoa_tools.calibrating import between  # noqa: E402
 from uwb_tdoa_tools.live.follow import SILENCE  # noqa: E402
 from uwb_tdoa_tools.live.processes import DiagnosticsListener, Processes, own_domain, wait  # noqa: E402
 from uwb_tdoa_tools.live.record import recorded_odometry  # noqa: E402
+from uwb_tdoa_tools.live.run import _parameters  # noqa: E402
 from uwb_tdoa_tools.live.session import session  # noqa: E402
 from uwb_tdoa_tools.readers import read_flight  # noqa: E402
 from uwb_tdoa_tools.scoring.evaluation import evaluate  # noqa: E402
@@ -60,11 +65,11 @@ def load():
     end()
 
 
-def replayed(bag, folder, *options, nodes=(), begin=lambda: None, end=lambda: None):
+def replayed(bag, folder, *options, nodes=(), begin=lambda processes: None, end=lambda: None):
     """Replay a bag in step with the odometry of the nodes.
 
     nodes : {node: arguments}
-    begin : callable, called when the nodes are ready, before the replay
+    begin : callable of (Processes), called when the nodes are ready, before the replay
     end : callable, called after the replay and before the nodes are asked what they received
 
     Returns (exit code, output, diagnostics {node: {key: text}}, recorded bag).
@@ -94,7 +99,7 @@ def replayed(bag, folder, *options, nodes=(), begin=lambda: None, end=lambda: No
             node,
             lambda: node.count_subscribers("/odometry") == 2,
         )
-        begin()
+        begin(processes)
         command = ("uwb_tdoa_tools", "replay", bag, "--follow", "odometry", *options)
         replay = processes.start(*command, may_end_with=(0, 1, 2))
         wait(None, None, processes, node, lambda: replay.poll() is not None)
@@ -145,11 +150,49 @@ def test_a_measured_flight_beside_three_busy_processes(shared_data, tmp_path, lo
     flight = read_flight(log, survey)
     write_bag(between(flight, -np.inf, flight.imu.t[0] + 16.0), tmp_path / "flight.bag")
     code, said, told, recorded = replayed(
-        tmp_path / "flight.bag", tmp_path, "--rate", 4, begin=lambda: load(3), end=load.end
+        tmp_path / "flight.bag", tmp_path, "--rate", 4, begin=lambda _: load(3), end=load.end
     )
     assert code == 0, said
     offline = assert_equal_to_offline(read_bag(tmp_path / "flight.bag"), told, recorded)
     assert offline.row()["rmse_3d"] < 0.35
+
+
+def test_a_node_without_processor_time_is_waited_for(tmp_path):
+    """bias_node gets none for 8 s in the middle of the replay. The result is that of the bag.
+
+    The nodes have the parameters of `demo`: reliable connections, which DDS repairs afterwards.
+    """
+    bag = tmp_path / "flight.bag"
+    write_bag(simulate(SimulationConfig(seed=3, duration=8.0, start_in_air=True)), bag)
+    stopped = []
+
+    def starve(processes):
+        def run():
+            log, pid = processes.file("replay"), processes.pid("bias_node")
+            while not (log.exists() and "playing" in log.read_text()):
+                time.sleep(0.05)
+            time.sleep(3.0)
+            for number, pause in ((signal.SIGSTOP, 8.0), (signal.SIGCONT, 0.0)):
+                os.kill(pid, number)
+                stopped.append(number)
+                time.sleep(pause)
+
+        threading.Thread(target=run, daemon=True).start()
+
+    nodes = {
+        "bias_node": _parameters("bias_node", {"model_file": str(known_answer.write(tmp_path))}),
+        "ekf_node": _parameters("ekf_node", None),
+    }
+    code, said, told, recorded = replayed(bag, tmp_path, nodes=nodes, begin=starve)
+    assert code == 0, said
+    assert len(stopped) == 2 and float(re.search(r"waited ([\d.]+) s for", said)[1]) > 7.0
+    assert_equal_to_offline(read_bag(bag), told, recorded)
+    assert told["ekf_node"]["imu_late"] == "0"
+    _, run = evaluate(read_bag(bag), network=load_network(tmp_path / "known_answer.onnx"))
+    live, offline = read_odometry(recorded), run.odometry
+    rows = np.searchsorted(offline.t, live.t)
+    np.testing.assert_array_equal(live.t, offline.t[rows])
+    np.testing.assert_allclose(live.p, offline.p[rows], atol=1e-6)
 
 
 def test_nodes_that_do_not_wait_long_enough_are_not_followed(tmp_path):

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""No command is silent: it prints a message within 2 s, and then at least every 5 s.
+"""No command is silent: it prints a message within 2 s, and then at least every 10 s.
 
 Only the computing time of the command counts. If it has to wait for a core, other processes use the
 same cores. Then it may take twice as long to compute.
@@ -25,7 +25,7 @@ from uwb_tdoa_tools.simulation.rooms import corners
 
 # s, limits of the first message and of each silence; then the computing time that is measured if
 # the command is silent, also on a busy machine
-FIRST, EVERY = 2.0, 5.0
+FIRST, EVERY = 2.0, 11.0
 LONG_ENOUGH = 2.0 * (FIRST + EVERY)
 PATIENCE = 120.0  # s, limit for a command to end after an interrupt
 # share of time waiting for a core above which the machine counts as busy

@@ -30,7 +30,7 @@ from uwb_tdoa_bias.common.executable import outside_present_folder
 
 Item = TypeVar("Item")
 
-FIRST, EVERY = 0.5, 4.0  # s until the first line where there is no terminal, and between two
+FIRST, EVERY = 0.5, 10.0  # s until the first line where there is no terminal, and between two
 OFTEN = 0.5  # s between two changes of the line on a terminal
 # flights; what fewer gain by other processes, these take to start (docs/notebook/speed.md)
 FEW = 20

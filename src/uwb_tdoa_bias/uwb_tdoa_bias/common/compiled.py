@@ -57,7 +57,7 @@ with _hidden("scipy", "coverage"):
     from . import callees
 
 _FUNCTIONS: list[Any] = []  # all compiled functions; numba compiles at the first call
-SAY_EVERY = 4.0  # s
+SAY_EVERY = 10.0  # s
 # Machine code also depends on these. numba names the version of Python in its files.
 VERSIONS = f"{numba.__version__} {np.__version__}"
 PACKAGES = __name__.partition("_bias")[0]  # how the names of our packages begin
@@ -129,7 +129,7 @@ def compiled(function: Function) -> Function:
 
 
 class _Listener(event.Listener):
-    """Print the progress of compilation to stderr every SAY_EVERY seconds.
+    """Print to stderr that a compilation begins, and its progress every SAY_EVERY seconds.
 
     With an empty cache, compilation takes one to two minutes. The printed share counts the functions
     of all imported modules; the filter needs nearly all of them.
@@ -137,10 +137,13 @@ class _Listener(event.Listener):
 
     def __init__(self) -> None:
         self._compiled, self._depth, self._began = 0.0, 0, 0.0  # s
+        self._announced = False
+        self._share = 0.0  # printed last; more modules make it smaller, which would irritate
         self._collect = gc.get_threshold()
 
     def on_start(self, event: Event) -> None:
         if not self._depth:
+            self._announce()
             self._collect = gc.get_threshold()
             gc.set_threshold(*executable.COLLECT)
         self._began = self._began if self._depth else time.monotonic()
@@ -153,13 +156,20 @@ class _Listener(event.Listener):
         if not self._depth:
             gc.set_threshold(*self._collect)
 
+    def _announce(self) -> None:
+        first, self._announced = not self._announced, True
+        if first and not any(_place("code").rglob("*.nbi")):
+            text = "compiling the filter, which is done once and takes about a minute"
+            print(text, file=sys.stderr, flush=True)
+
     def _tell(self) -> None:
         now = time.monotonic()
         if now - self._began > SAY_EVERY:
             self._compiled, self._began = self._compiled + now - self._began, now
             share = sum(bool(each.signatures) for each in _FUNCTIONS) / len(_FUNCTIONS)
+            self._share = max(self._share, share)
             print(
-                f"compiling, which is done once: {share:.0%}, {self._compiled:.0f} s",
+                f"compiling, which is done once: {self._share:.0%}, {self._compiled:.0f} s",
                 file=sys.stderr,
                 flush=True,
             )

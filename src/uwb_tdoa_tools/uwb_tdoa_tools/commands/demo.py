@@ -25,7 +25,7 @@ bias.onnx and with it. At the end the demo says what was really in the simulatio
 
 With --flight a measured flight goes through both nodes. It is corrected with what --effects and --model give, and with
 nothing else: what helped other flights may harm it. "raw" is the same filter without any correction, run without ROS.
-The exit code is 1 if the estimate diverged, or messages were lost or late.
+The exit code is 1 if the estimate diverged, or messages were lost or late. Then no error is printed.
 """
 WIDTH, INDENT = 120, 11  # characters of a line, and before its text
 SEED, RATES = 1, {"simulated": 20.0, "measured": 1.0}  # times as fast as flown
@@ -106,7 +106,7 @@ def _loop(args: Namespace) -> int:
     result, figures = demo.close_loop(
         args.seed or SEED, args.out, args.rate, _show, partial(cli.say, "demo")
     )
-    if args.rerun is not None:
+    if args.rerun is not None and not result.missing:
         result.show(args.rerun)
     if args.json is not None:
         cli.write_json(args.json, figures)
@@ -148,7 +148,8 @@ def _measured(args: Namespace) -> int:
     live, scores = demo.fly(flight, correction, files, args.out, args.rate, args.rerun, _progress)
     _show("nodes", demo.arrivals_in_words(flight, live.outcome))
     if live.missing:
-        cli.say("demo", f"messages lost or late: too much load for --rate {args.rate:g}; try less.")
+        _show("error", [demo.too_slow_in_words(live.missing, args.rate)])
+        return 1
     cli.show(*lines_of_errors(scores), demo.change_of_scores(scores))
     residuals = [loop.residuals_of(flight, by) for by in (None, correction)[: len(scores) - 1]]
     loop.draw(args.out / "error.png", flight, residuals, scores[:-1])
@@ -157,7 +158,7 @@ def _measured(args: Namespace) -> int:
         cli.show(f"rerun      {args.rerun}")
     cli.show(f"took {time.monotonic() - started:.0f} s")
     _show("next", demo.next_steps(args.flight, args.survey), keep=True)
-    return int(scores[-2].row()["diverged"] or live.missing > 0)  # of the nodes
+    return int(scores[-2].row()["diverged"])  # of the nodes
 
 
 main = cli.executable(_demo, parser)

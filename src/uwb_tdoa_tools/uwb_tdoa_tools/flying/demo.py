@@ -32,6 +32,7 @@ from . import loop
 
 CORRECTION = "bias.onnx"  # file of the correction of a simulated hall
 MISSING = ("lost", "late", "imu_late", "imu_lost")  # outcomes of messages
+SLOW = 0.5  # times as fast as flown: the rate that is suggested first
 
 
 def corrector_of(
@@ -151,6 +152,7 @@ def fly(
     LivePass
     list of Score
         With a correction: filter without it, nodes, filter with it. Without: nodes and filter.
+        Empty if messages were lost or late: such an error is that of the machine.
 
     Raises
     ------
@@ -161,6 +163,8 @@ def fly(
     bag = folder / "flight.bag"
     write_bag(flight, bag, force=True)
     live = through_nodes(flight, bag, folder, rate, files, say)
+    if live.missing:
+        return live, []
     raw = run_offline(flight)
     estimates: dict[str, Estimate] = {"nodes": live.odometry, "without ROS": raw.odometry}
     offline = raw
@@ -220,11 +224,11 @@ class LoopResult:
     ----------
     flight : Flight
     passes : list of LivePass
-        Without the model, and with it. Only the first if there is no model.
+        Without the model, and with it. Only the first if there is no model, or if it lost messages.
     scores : list of Score
-        Of each pass.
+        Of each pass without lost or late messages.
     residuals : list of PairResiduals
-        Of the TDOAs of each pass.
+        Of the TDOAs of these passes.
     """
 
     flight: Flight
@@ -240,16 +244,15 @@ class LoopResult:
     @property
     def failed(self) -> bool:
         """Return whether the last pass diverged, or messages were lost or late."""
-        return bool(self.scores[-1].row()["diverged"] or self.missing)
+        return bool(self.missing or self.scores[-1].row()["diverged"])
 
     def arrived_in_words(self) -> str:
         """Return how many messages went through both nodes, and how many did not."""
         times = "without bias.onnx, then with it" if len(self.passes) > 1 else "without a model"
         lost = f"{self.missing} messages" if self.missing else "no message"
-        remedy = "; the machine has too much to do: give a lower --rate" if self.missing else ""
         return (
             f"{self.flight.name} through both nodes, {times}: {len(self.flight.tdoa)} TDOAs, "
-            f"{lost} lost or late{remedy}"
+            f"{lost} lost or late"
         )
 
     def error_in_words(self) -> str:
@@ -264,13 +267,18 @@ class LoopResult:
         )
 
     def figures(self, seed: int, diagnosis: Diagnosis, clock: Stopwatch) -> dict[str, Any]:
-        """Return all figures for JSON."""
+        """Return all figures for JSON; those of the third flight are None if it lost messages."""
+        residuals, errors = (
+            (None, None)
+            if self.missing
+            else ([one.size for one in self.residuals], [score.row() for score in self.scores])
+        )
         return as_json(
             {
                 "seed": seed,
-                "residual_rms": [one.size for one in self.residuals],
+                "residual_rms": residuals,
                 "found": loop.found_in_words(diagnosis),
-                "errors": [score.row() for score in self.scores],
+                "errors": errors,
                 "outcomes": [one.outcome for one in self.passes],
                 "really": loop.truth_in_words(seed, self.flight),
                 "seconds": clock.laps,
@@ -321,6 +329,8 @@ def fly_both(
             flight, bag, bag.parent / name, rate, files, partial(_titled, say, title)
         )
         passes.append(live)
+        if live.missing:
+            break
         scores.append(Score(title, live.odometry, flight.truth))
         residuals.append(loop.residuals_of(flight, corrector_of(flight, None, file)))
     return LoopResult(flight, passes, scores, residuals)
@@ -376,11 +386,14 @@ def close_loop(
     result = fly_both(bags[2], onnx if correction else None, rate, say)
     clock.lap("both nodes, twice" if correction else "both nodes")
     show("flown", [result.arrived_in_words()])
-    show("error", [result.error_in_words()])
-    loop.draw(picture, result.flight, result.residuals, result.scores)
+    if result.missing:
+        show("error", [too_slow_in_words(result.missing, rate)])
+    else:
+        show("error", [result.error_in_words()])
+        loop.draw(picture, result.flight, result.residuals, result.scores)
+        show("picture", [str(picture)])
     clock.lap("picture")
     show("really", [loop.truth_in_words(seed, result.flight)])
-    show("picture", [str(picture)])
     show("took", [clock.in_words()])
     return result, result.figures(seed, diagnosis, clock)
 
@@ -388,6 +401,14 @@ def close_loop(
 def _titled(say: Callable[[str], object], title: str, text: str) -> None:
     """Say a line of progress of one pass."""
     say(f"{title}: {text}")
+
+
+def too_slow_in_words(missing: int, rate: float) -> str:
+    """Return why a flight has no error: lost or late messages, and what to do."""
+    return (
+        f"none: the machine is too slow: {missing} messages were lost or late; try --rate "
+        f"{min(SLOW, rate / 2.0):g}"
+    )
 
 
 def change_of_scores(scores: Sequence[Score]) -> str:

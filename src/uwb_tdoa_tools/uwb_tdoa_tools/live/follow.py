@@ -47,7 +47,9 @@ SENSOR_SHARE = (
     0.5  # of `lag`: how long ekf_node holds TDOAs back for a sensor: reorder_buffer.OF_SENSORS
 )
 LAG = 0.25  # s, default of `lag`
-SILENCE = 5.0  # s without a message after which the replay waits for a topic no longer
+IDLE = 2  # reports of a node with unchanged counters after which it has nothing to do
+SILENCE = 5.0  # s without a message after which a topic of other nodes is silent
+LOOK = 10.0  # s between two looks at the nodes that are waited for
 POLL_PERIOD = 0.001  # s
 RESIDUAL = "uwb/residual"
 LEARNED = 20  # TDOAs from which the shift of stamps by bias_node is estimated
@@ -59,7 +61,7 @@ class Follower:
     If uwb/residual has a publisher, each TDOA is followed too (`add_tdoa`).
     """
 
-    def __init__(self, node: Node, topic: str, lag: float = LAG) -> None:
+    def __init__(self, node: Node, topic: str, nodes: Nodes) -> None:
         """Subscribe to the topic.
 
         Parameters
@@ -68,8 +70,8 @@ class Follower:
             It does not spin: messages are polled.
         topic : str
             Name, relative to the namespace of the node or absolute.
-        lag : float
-            Parameter `lag` of ekf_node, s.
+        nodes : Nodes
+            The nodes that are fed.
 
         Raises
         ------
@@ -86,11 +88,11 @@ class Follower:
                 f"--follow: messages on {topic} are {types[0]}: not installed, or without a header."
             )
         qos = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-        self._topic = _Topic(node, cls, topic, qos)
+        self._topic = _Topic(node, cls, topic, qos, nodes)
         self._newest: int | None = None  # ns, stamp of the newest message on the topic
         self._last_look: int | None = None  # ns, stamp of the replay at the last look
         self._started: int | None = None  # ns, stamp of the first message on the topic
-        self._tdoas = _Tdoas(node, round(1e9 * SENSOR_SHARE * lag))
+        self._tdoas = _Tdoas(node, nodes)
 
     def add_tdoa(self, stamp: int) -> None:
         """Note that a TDOA with this stamp, ns, was published."""
@@ -146,16 +148,17 @@ class Follower:
 
 
 class _Topic:
-    """Poll a topic, and wait for its messages unless none came for SILENCE.
+    """Poll a topic, and wait for its messages unless the nodes are idle.
 
     Attributes
     ----------
     silent : bool
-        Whether the last wait ended because no message came.
+        Whether the last wait ended because the nodes had nothing to do.
     """
 
-    def __init__(self, node: Node, cls: Any, topic: str, qos: QoSProfile) -> None:
+    def __init__(self, node: Node, cls: Any, topic: str, qos: QoSProfile, nodes: Nodes) -> None:
         self._subscription = node.create_subscription(cls, topic, lambda _: None, qos, raw=True)
+        self._nodes = nodes
         self.silent = False
 
     def stamps(self) -> list[int]:
@@ -168,14 +171,15 @@ class _Topic:
         self, hear: Callable[[list[int]], object], in_step: Callable[[], bool], stop: Stop
     ) -> float:
         """Call hear(stamps) until in_step(), silence or `stop`. Return how long that took, s."""
-        began = heard = time.monotonic()
+        began = time.monotonic()
+        self._nodes.watch()
         while not stop:
             if stamps := self.stamps():
-                heard = time.monotonic()
+                self._nodes.watch()
             hear(stamps)
             if in_step() or self.silent:
                 break
-            self.silent = time.monotonic() - heard > SILENCE
+            self.silent = self._nodes.are_idle()
             time.sleep(POLL_PERIOD)
         return time.monotonic() - began
 
@@ -183,15 +187,15 @@ class _Topic:
 class _Tdoas:
     """Count how far the published TDOAs have left the filter, in the order of their stamps."""
 
-    def __init__(self, node: Node, sensor_wait: int) -> None:
+    def __init__(self, node: Node, nodes: Nodes) -> None:
         self._topic: _Topic | None = None
-        self._sensor_wait = sensor_wait
+        self._sensor_wait = round(1e9 * SENSOR_SHARE * nodes.lag)
         publishers = node.get_publishers_info_by_topic(node.resolve_topic_name(RESIDUAL))
         cls = message_class(publishers[0].topic_type) if publishers else None
         if cls is not None:
             qos = subscription_qos([publisher.qos_profile for publisher in publishers])
             qos.depth = 10 * READER_DEPTH
-            self._topic = _Topic(node, cls, RESIDUAL, qos)
+            self._topic = _Topic(node, cls, RESIDUAL, qos, nodes)
         self._start_over()
 
     def _start_over(self) -> None:
@@ -277,7 +281,7 @@ RECEIVED = {  # {node: {key in its diagnostics: what it counts}}
 
 
 class Nodes:
-    """Compare the counters of bias_node and ekf_node in our namespace before and after a replay.
+    """Read the counters of bias_node and ekf_node in our namespace, while a replay feeds them.
 
     Attributes
     ----------
@@ -287,20 +291,27 @@ class Nodes:
 
     lag = LAG
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, say: Callable[[str], object] = print) -> None:
         """Find the nodes and read their counters.
+
+        Parameters
+        ----------
+        node : Node
+            Our node.
+        say : callable
+            Called with a sentence if the replay waits for long.
 
         Raises
         ------
         InputError
             If their parameters end a wait too early, or a node publishes no /diagnostics.
         """
-        self._node, self._diagnostics = node, DiagnosticsListener(node)
+        self._node, self._diagnostics, self._say = node, DiagnosticsListener(node), say
+        self._watched = self._looked = 0.0  # s, beginning of the watch, and last look at the graph
         space = node.get_namespace()
         wait_for_names(node)
-        there = node.get_node_names_and_namespaces()
         self._names = {
-            name: f"{space.rstrip('/')}/{name}" for name in TROUBLE if (name, space) in there
+            name: f"{space.rstrip('/')}/{name}" for name in TROUBLE if self._is_there(name)
         }
         if len(self._names) == len(TROUBLE):
             self._check_patience()
@@ -311,6 +322,34 @@ class Nodes:
                     f"--follow: {self._names[name]} says nothing on /diagnostics for "
                     f"{SETTLE_LIMIT:g} s; start it again."
                 )
+
+    def _is_there(self, name: str) -> bool:
+        return (name, self._node.get_namespace()) in self._node.get_node_names_and_namespaces()
+
+    def watch(self) -> None:
+        """Start to watch whether the nodes have nothing to do."""
+        self._diagnostics.forget()
+        self._watched = self._looked = time.monotonic()
+
+    def are_idle(self) -> bool:
+        """Return whether no node has anything to do: each has reported unchanged counters.
+
+        A node that does not report gets no processor time: it has something to do until it leaves
+        the graph. Without our nodes, SILENCE decides.
+        """
+        self._diagnostics.poll()
+        now = time.monotonic()
+        if not self._names:
+            return now > self._watched + SILENCE
+        busy = [
+            name
+            for name, full in self._names.items()
+            if self._diagnostics.repeated(full.strip("/")) < IDLE
+        ]
+        if busy and now > self._looked + LOOK:
+            self._looked, busy = now, [name for name in busy if self._is_there(name)]
+            self._say(f"waiting for {' and '.join(busy) or 'nodes that have ended'}")
+        return not busy
 
     def faults(self, count_played: Callable[[str], int], stop: Stop) -> dict[str, int]:
         """Return {fault since the start: count}, once the diagnostics have settled or on `stop`.

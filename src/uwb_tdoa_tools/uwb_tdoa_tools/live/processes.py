@@ -18,6 +18,7 @@ from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 from diagnostic_msgs.msg import DiagnosticArray
 from domain_coordinator import domain_id
 import rclpy
+from rclpy.serialization import deserialize_message
 
 from uwb_tdoa_bias.common.errors import Failure
 from uwb_tdoa_bias.common.files import refuse_output
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from .session import Stop
 
 STOP_LIMIT, PATIENCE = 10.0, 60.0  # s from SIGINT to SIGKILL; the latter if it must end well
-LOOK = 5.0  # s between two checks of the processes, and between two lines about them
+LOOK = 10.0  # s between two checks of the processes, and between two lines about them
 READY = re.compile(r"\]: ready\b")  # in the log of a node
 TAIL = 8192  # bytes of a log that are looked at
 BUSY = 0.2  # share of the time beyond which a process computes; nodes that wait take 0.02
@@ -137,6 +138,15 @@ class DiagnosticsListener:
             same = bool(before) and all(before.get(key) == value for key, value in counts.items())
             self._repeated[name] = self._repeated.get(name, 0) + 1 if same else 0
             self._newest[name] = values
+
+    def poll(self) -> None:
+        """Take the messages that have arrived, of a node that is not spun."""
+        for data, _ in taken(self._subscription):
+            self._take(deserialize_message(data, DiagnosticArray))
+
+    def repeated(self, name: str) -> int:
+        """Return how often a node has reported unchanged counters since `forget`."""
+        return self._repeated.get(name, 0)
 
     def newest(self, name: str) -> dict[str, str]:
         """Return {key: text} of a node; empty before its first status."""

@@ -71,7 +71,7 @@ RCLError = rclpy_implementation.RCLError
 LARGEST_CATCH_UP = 0.1  # s; a longer delay shifts all later messages: a burst overruns queues
 LATCHED_LIMIT = 5.0  # s for the acknowledgement of latched messages
 LONGEST_SLEEP = 0.05  # s until a signal is seen
-PROGRESS = 5.0  # s between two lines on the progress
+PROGRESS = 10.0  # s between two lines on the progress
 ACKNOWLEDGE_LIMIT = 30.0  # s; longer than the 20 s after which DDS forgets a subscription that died
 
 
@@ -383,9 +383,9 @@ def replay(
         length = (reader.end_time - reader.start_time) / 1e9
         tell = partial(_tell_progress, length, options.follow, say)
         player = Player(node, publishers, options.rate, options.clock_rate, stop, tell)
-        nodes = Nodes(node) if options.follow else None
+        nodes = Nodes(node, say) if options.follow else None
         player.follower = (
-            Follower(node, options.follow, nodes.lag) if options.follow and nodes else None
+            Follower(node, options.follow, nodes) if options.follow and nodes else None
         )
         say(f"playing {count} messages, {length:.1f} s at rate {options.rate:g}")
         began = time.perf_counter()
