@@ -215,6 +215,34 @@ def test_the_rows_of_an_opencv_matrix_are_numbered(tmp_path):
     np.testing.assert_allclose(anchors.positions, list(PLACES.values()))
 
 
+FEET = "[-10.191, -13.134, 0.601]"  # anchor 0
+STATED = {
+    "of the file": f"unit: ft\nanchors:\n  0: {{position: {FEET}}}\n",
+    "of the anchors": f"anchors:\n  units: Feet\n  0: {FEET}\n",
+    "of JSON": f'{{"units": "ft", "anchors": [{{"id": 0, "pos": {FEET}}}]}}',
+    "of parameters": f"/**:\n  ros__parameters:\n    length_unit: foot\n    anchor0_pos: {FEET}\n",
+    "of one anchor": "unit: m\n0: {unit: cm, x: -310.62, y: -400.31, z: 18.32}\n",
+    "of a position": "0: {position: {x: -310.62, y: -400.31, z: 18.32, unit: centimetre}}\n",
+    "of an axis": "unit: mm\n0: {x_cm: -310.62, y_cm: -400.31, z: 183.2}\n",
+    "of a matrix": f"units: ft\nm: {{rows: 1, cols: 3, data: {FEET}}}\n",
+    "of a row": "id,x,y,z,unit\n0,-122.291,-157.602,7.213,in\n",
+    "of a comment": "# Units: [ft]\n" + "id,x,y,z\n0,-10.191,-13.134,0.601\n",
+    "of a total station": "# unit = inches\n" + "anchorAnt0,-122.291,-157.602,7.213\n",
+}
+
+
+@pytest.mark.parametrize("form", STATED)
+def test_a_stated_unit_is_converted_or_refused_by_its_name(tmp_path, form):
+    file = tmp_path / "anchors"
+    file.write_text(STATED[form])
+    np.testing.assert_allclose(read_survey(file).positions, [PLACES[0]], atol=2e-4)
+    unit = re.compile(r"(?<=[:=,\[\" ])(ft|Feet|foot|cm|centimetre|in|inches)(?=[\]\",}\n])")
+    file.write_text(unit.sub("furlong", STATED[form], count=1))
+    if form != "of an axis":
+        with pytest.raises(InputError, match="unit 'furlong' is not known"):
+            read_survey(file)
+
+
 def test_orientations_are_read_where_they_stand(tmp_path):
     turn = np.array([0.0, 0.0, 0.6, 0.8])
     tables = (

@@ -10,7 +10,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_tools.commands.convert import main
 from uwb_tdoa_tools.readers import read_by_profile, read_flight, read_survey
 from uwb_tdoa_tools.readers.names import NamedAnchors, read_named_anchors
-from uwb_tdoa_tools.readers.profile import TIME, UNITS, Profile, parse_columns
+from uwb_tdoa_tools.readers.profile import TIME, UNITS, Profile, Source, parse_columns
 
 NAMED = NamedAnchors(ANCHORS)
 TDOA = "time=t_ms:ms,anchor_a=from,anchor_b=to,tdoa=diff:mm"
@@ -265,6 +265,39 @@ def test_names_of_a_survey(files, survey, ids):
     named = read_named_anchors("named.yaml")
     assert read_survey("named.yaml").ids.tolist() == named.anchors.ids.tolist()  # as in every tool
     assert named.ids == ids and (not ids or set(named.anchors.ids) == set(ids.values()))
+
+
+IDS = ["151B", "1E10", "0012", "0E07"]  # hexadecimal; three of them look like numbers
+
+
+@pytest.mark.parametrize(
+    "survey",
+    [
+        "id,x,y,z\n" + "".join(f"{name},{k},0,{k % 2}\n" for k, name in enumerate(IDS)),
+        "anchors:\n" + "".join(f"  {name}: [{k}, 0, {k % 2}]\n" for k, name in enumerate(IDS)),
+        "anchors:\n"
+        + "".join(f"- {{id: {name}, x: {k}, y: 0, z: {k % 2}}}\n" for k, name in enumerate(IDS)),
+    ],
+)
+def test_ids_that_look_like_numbers_are_texts(files, survey):
+    (files / "hex").write_text(survey)
+    named = read_named_anchors("hex")
+    assert [named.id_of(name) for name in IDS] == [0, 1, 2, 3] == list(named.ids.values())
+    rows = "".join(f"{k},{name},5,{name}\n" for k, name in enumerate(IDS))
+    (files / "ranges.csv").write_text(f"t,anchor,d,tag\n{rows}")
+    flight = read_columns(["ranges.csv"], parse_columns("time=t,anchor=anchor,range=d"), named)
+    assert flight.range.anchor.tolist() == [0, 1, 2, 3] and "remarks" not in flight.meta
+    source = Source(parse_columns("time=t,anchor=anchor,range=d"), tag="tag")
+    for number, tag in enumerate(IDS):
+        flight = read_by_profile(["ranges.csv"], Profile("tags", (source,)), named, tag)
+        assert flight.range.anchor.tolist() == [number]
+
+
+def test_an_id_of_exponential_form_is_no_other_anchor(files):
+    for text in ("0E07", "1E1", "1e00"):
+        assert NAMED.id_of(text) is None
+    for value in ("1", "1.0", "1.000000e+00", 1, 1.0, "0x1", "01"):  # numpy writes the third
+        assert NAMED.id_of(value) == 1
 
 
 def test_gaps_are_skipped_and_counted_and_too_many_are_refused(files, capsys):

@@ -41,8 +41,11 @@ def read_yaml(path: str | Path) -> Any:
     return parse_yaml(data, path)
 
 
-def parse_yaml(data: bytes | str, name: str | Path) -> Any:
-    """Return the content of YAML text or bytes, as `read_yaml`; name : for messages."""
+def parse_yaml(data: bytes | str, name: str | Path, float_texts: bool = False) -> Any:
+    """Return the content of YAML text or bytes, as `read_yaml`.
+
+    name : for messages; float_texts : return a number that is not whole as text: an id 1E10 is none
+    """
     try:
         text = data.decode("utf-8-sig") if isinstance(data, bytes) else data
     except UnicodeDecodeError as error:
@@ -50,7 +53,7 @@ def parse_yaml(data: bytes | str, name: str | Path) -> Any:
             f"{name}: byte {error.start} is not UTF-8; save the file as UTF-8 text."
         ) from error
     try:
-        loader = _Loader(text, Budget(name, len(text)))
+        loader = _Loader(text, Budget(name, len(text)), float_texts)
         try:
             return loader.get_single_data()
         finally:
@@ -100,9 +103,9 @@ _Base: Any = _WithLibyaml if yaml.__with_libyaml__ else yaml.SafeLoader
 class _Loader(_Base):
     yaml_implicit_resolvers: dict = {}  # YAML 1.1 would read 1:30 as 90, and 1e-3 as text
 
-    def __init__(self, text: str, budget: Budget) -> None:
+    def __init__(self, text: str, budget: Budget, float_texts: bool) -> None:
         super().__init__(text)
-        self._budget, self._depth = budget, 0
+        self._budget, self._depth, self._float_texts = budget, 0, float_texts
 
     def compose_node(self, parent: CollectionNode | None, index: int | ScalarNode | None) -> Node:
         event = self.peek_event()
@@ -128,7 +131,8 @@ class _Loader(_Base):
                     key_node.start_mark,
                     "a list or mapping is used as a key; use a text or a number.",
                 )
-            key = self.construct_object(key_node)
+            is_float = key_node.tag == f"{_TAG}float"  # 1E10 is a name
+            key = key_node.value if is_float else self.construct_object(key_node)
             if key in content:
                 raise _Refused(key_node.start_mark, f"{key_node.value!r} is there twice; keep one.")
             content[key] = self.construct_object(value_node, deep)
@@ -143,11 +147,11 @@ class _Loader(_Base):
             )
         return int(node.value)
 
-    def construct_yaml_float(self, node: ScalarNode) -> float:
+    def construct_yaml_float(self, node: ScalarNode) -> float | str:
         value = float(re.sub(r"\.(nan|inf)$", r"\1", node.value.lower()))
         if not math.isfinite(value):
             raise _Refused(node.start_mark, f"{node.value[:40]} is not finite; give a number.")
-        return value
+        return node.value if self._float_texts else value
 
 
 _TAG = "tag:yaml.org,2002:"

@@ -40,23 +40,34 @@ IDS = (
     "#",
     "index",
 )
-LENGTHS = {"": 1.0, "m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "ft": 0.3048, "in": 0.0254}  # m
+LENGTHS = {  # of units, m
+    "": 1.0,
+    "m": 1.0,
+    "metre": 1.0,
+    "meter": 1.0,
+    "dm": 0.1,
+    "decimetre": 0.1,
+    "decimeter": 0.1,
+    "cm": 0.01,
+    "centimetre": 0.01,
+    "centimeter": 0.01,
+    "mm": 0.001,
+    "millimetre": 0.001,
+    "millimeter": 0.001,
+    "ft": 0.3048,
+    "foot": 0.3048,
+    "feet": 0.3048,
+    "in": 0.0254,
+    "inch": 0.0254,
+    "inches": 0.0254,
+}
+LENGTHS |= {f"{unit}s": length for unit, length in LENGTHS.items() if unit.endswith(("re", "er"))}
 # keys that hold a position
 NESTED = ("position", "pos", "pose", "translation", "location", "coordinates", "xyz", "point")
 TURNED = ("orientation", "rotation", "quaternion")
-_UNIT = re.compile(
-    r"^(.*?)[ (\[]+(m|dm|cm|mm|ft|in|metres|meters|metre|meter|feet|foot|inch|inches)[)\]]?$"
-)
-_SPELT = {
-    "metres": "m",
-    "meters": "m",
-    "metre": "m",
-    "meter": "m",
-    "feet": "ft",
-    "foot": "ft",
-    "inch": "in",
-    "inches": "in",
-}
+_UNIT = re.compile(rf"^(.*?)[ (\[]+({'|'.join(filter(None, LENGTHS))})[)\]]?$")
+_UNIT_KEY = re.compile(r"(?:(?:length|distance|position|coordinate|coordinates)[ _-]?)?units?")
+_UNIT_COMMENT = re.compile(r"^\s*#.*?\bunits?\s*[:=]\W*(\w*)", re.IGNORECASE | re.MULTILINE)
 _NUMBERED = re.compile(
     r"^(?:anchor|anc|a|beacon|node)[ _-]?([0-9]{1,5})(?:[ _-]?(?:pos|position|xyz))?$",
     re.IGNORECASE,
@@ -89,14 +100,16 @@ class Columns(NamedTuple):
     ----------
     name : place of the id or name, or None
     axes : places of x, y and z
-    lengths : units of x, y and z, m
+    units : names of the units of x, y and z, "" where the header names none
     turn : places of the quaternion x, y, z, w, or ()
+    unit : place of the unit, or None
     """
 
     name: int | None
     axes: tuple[int, int, int]
-    lengths: tuple[float, float, float]
+    units: tuple[str, str, str] = ("", "", "")
     turn: tuple[int, ...] = ()
+    unit: int | None = None
 
 
 def columns_of(header: Sequence[str]) -> Columns | None:
@@ -105,11 +118,11 @@ def columns_of(header: Sequence[str]) -> Columns | None:
     Names may be in upper or lower case, with or without a unit.
     """
     roles: dict[str, int] = {}
-    lengths: dict[str, float] = {}
+    units: dict[str, str] = {}
     for place, cell in enumerate(header):
-        role, length = _role(cell)
+        role, unit = _role(cell)
         if role and role not in roles:
-            roles[role], lengths[role] = place, length
+            roles[role], units[role] = place, unit
     if not roles.keys() >= {"x", "y", "z"}:
         return None
     turn = tuple(roles[name] for name in ("qx", "qy", "qz", "qw") if name in roles)
@@ -117,25 +130,54 @@ def columns_of(header: Sequence[str]) -> Columns | None:
     return Columns(
         roles.get("name"),
         (x, y, z),
-        (lengths["x"], lengths["y"], lengths["z"]),
+        (units["x"], units["y"], units["z"]),
         turn if len(turn) == 4 else (),
+        roles.get("unit"),
     )
 
 
-def _role(cell: str) -> tuple[str, float]:
-    """Return ("x", "y", "z", "name", "qx" ... or "", unit in m) of a header cell."""
+def _role(cell: str) -> tuple[str, str]:
+    """Return ("x", "y", "z", "name", "unit", "qx" ... or "", name of the unit) of a header cell."""
     text = " ".join(re.split(r"[\s_.]+", cell.strip().lower())).strip()
+    if _UNIT_KEY.fullmatch(text):
+        return "unit", ""
     found = _UNIT.match(text)
     text, unit = (found[1].strip(), found[2]) if found else (text, "")
     words = [word for word in text.split() if word not in (*NESTED, "p", "anchor")]
     if len(words) == 1 and words[0] in ("x", "y", "z", "px", "py", "pz", "tx", "ty", "tz"):
-        return words[0][-1], LENGTHS[_SPELT.get(unit, unit)]
+        return words[0][-1], unit
     words = [word for word in text.split() if word not in TURNED]
     if len(words) == 1 and words[0] in ("qx", "qy", "qz", "qw"):
-        return words[0], 1.0
+        return words[0], ""
     if len(words) == 1 and len(words[0]) == 1 and words[0] in "xyzw" and text.split()[0] in TURNED:
-        return f"q{words[0]}", 1.0
-    return ("name", 1.0) if text in ("", *IDS) else ("", 1.0)
+        return f"q{words[0]}", ""
+    return ("name", "") if text in ("", *IDS) else ("", "")
+
+
+def _unit(value: Any, where: str) -> str:
+    """Return the name of a unit of length; raise InputError for another unit."""
+    name = str(value).strip().lower()
+    if name not in LENGTHS:
+        raise InputError(
+            f"{where}: unit {str(value)[:40]!r} is not known; give m, cm, mm, ft or in."
+        )
+    return name
+
+
+def _unit_of(content: dict[Any, Any], unit: str, where: str) -> str:
+    """Return the name of the unit that a mapping states; default : unit."""
+    stated = [value for key, value in content.items() if _UNIT_KEY.fullmatch(str(key).lower())]
+    return _unit(stated[0], where) if stated else unit
+
+
+def name_of(value: Any) -> str:
+    """Return the name of an anchor or tag: a text as it is, but 1 for 1.0.
+
+    A text without a point is no number: 12E3 and 0012 are ids.
+    """
+    text = str(value).strip()
+    number = _number(text) if "." in text else math.nan
+    return str(int(number)) if number.is_integer() else text
 
 
 _YAML_KEY = re.compile(r"^\s*(?:- *)?[{\s]*[\"']?[\w /*.-]+[\"']?\s*:(?:\s|$)")
@@ -230,18 +272,18 @@ def _number(value: Any) -> float:
     return number if math.isfinite(number) else math.nan
 
 
-def read_table(lines: Lines) -> list[Entry] | None:
+def read_table(lines: Lines, unit: str = "") -> list[Entry] | None:
     """Return the entries of a table; None for an unknown header or form.
 
     A table without a header needs an id and three numbers in each line. Raises InputError.
 
-    lines : line numbers and cells
+    lines : line numbers and cells; unit : of cells whose unit the header does not name
     """
     (number, header), rest = lines[0], lines[1:]
     columns = columns_of(header)
     if columns is None:
         if all(map(_is_number, lines[0][1])):
-            return _without_header(lines)
+            return _without_header(lines, unit)
         return None
     if columns.name is None:
         raise InputError(
@@ -250,10 +292,10 @@ def read_table(lines: Lines) -> list[Entry] | None:
         )
     if not rest:
         raise InputError("holds no anchor; add lines 'id,x,y,z' in metres.")
-    return [_row(number, cells, columns, len(header)) for number, cells in rest]
+    return [_row(number, cells, columns, len(header), unit) for number, cells in rest]
 
 
-def _without_header(lines: Lines) -> list[Entry]:
+def _without_header(lines: Lines, unit: str) -> list[Entry]:
     number, cells = lines[0]
     if len(cells) == 3:
         raise InputError(
@@ -267,32 +309,32 @@ def _without_header(lines: Lines) -> list[Entry]:
             "put 'id,x,y,z' in the first line, "
             "and other names for what is more."
         )
-    return [
-        _row(number, cells, Columns(0, (1, 2, 3), (1.0, 1.0, 1.0)), 4) for number, cells in lines
-    ]
+    return [_row(number, cells, Columns(0, (1, 2, 3)), 4, unit) for number, cells in lines]
 
 
-def _row(number: int, cells: list[str], columns: Columns, count: int) -> Entry:
+def _row(number: int, cells: list[str], columns: Columns, count: int, unit: str) -> Entry:
     """Return the Entry of line `number`; count : cells of the header, at least 4.
 
     Anchors checks the quaternion.
     """
     assert columns.name is not None
-    fewest = max(*columns.axes, columns.name, *columns.turn) + 1
+    fewest = max(*columns.axes, columns.name, *columns.turn, columns.unit or 0) + 1
     if not fewest <= len(cells) <= max(count, 4):
         hint = "; decimal commas need ';' between the cells" if len(cells) == 2 * count - 1 else ""
         raise InputError(
             f"line {number}: {','.join(cells)[:60]!r} has {len(cells)} cells, the header "
             f"{count}{hint}."
         )
+    if columns.unit is not None:
+        unit = _unit(cells[columns.unit], f"line {number}")
     values = [_number(cells[place]) for place in columns.axes]
     if not all(map(math.isfinite, values)):
         raise InputError(
             f"line {number}: {','.join(cells)[:60]!r} is not 'id,x,y,z' with finite metres."
         )
     turn = [_number(cells[place]) for place in columns.turn] or NOT_SURVEYED
-    position = [value * length for value, length in zip(values, columns.lengths)]
-    return Entry(cells[columns.name], position, turn, f"line {number}")
+    position = _in_metres(values, unit, columns.units)
+    return Entry(name_of(cells[columns.name]), position, turn, f"line {number}")
 
 
 def read_tree(text: str, path: str | Path) -> tuple[list[Entry], str]:
@@ -302,9 +344,11 @@ def read_tree(text: str, path: str | Path) -> tuple[list[Entry], str]:
     """
     opencv = bool(_OPENCV.search(text)) or "!!opencv-matrix" in text
     content = parse_yaml(
-        _OPENCV.sub("", text).replace("!!opencv-matrix", "") if opencv else text, path
+        _OPENCV.sub("", text).replace("!!opencv-matrix", "") if opencv else text,
+        path,
+        float_texts=True,
     )
-    frame = "map"
+    frame, unit = "map", ""
     for _ in range(8):  # levels around the anchors: parameter file, and "anchors"
         if not isinstance(content, dict):
             break
@@ -313,7 +357,7 @@ def read_tree(text: str, path: str | Path) -> tuple[list[Entry], str]:
             raise InputError(
                 f"{path}: frame: {given!r} is no name; write the name of the world frame, e.g. map."
             )
-        frame = given
+        frame, unit = given, _unit_of(content, unit, str(path))
         inner = next(
             (
                 key
@@ -327,7 +371,7 @@ def read_tree(text: str, path: str | Path) -> tuple[list[Entry], str]:
             break
         content = content[inner]
     try:
-        entries = list(_entries(content))
+        entries = list(_entries(content, unit))
     except ValueError as error:
         raise InputError(f"{path}: {error}") from error
     if not entries:
@@ -338,11 +382,11 @@ def read_tree(text: str, path: str | Path) -> tuple[list[Entry], str]:
 WRITE = "write 'anchors: {0: {position: [x, y, z]}, 1: ...}', in metres"
 
 
-def _entries(content: Any) -> Iterator[Entry]:
+def _entries(content: Any, unit: str) -> Iterator[Entry]:
     """Yield the entries of a list or mapping; raise ValueError with key, value and remedy."""
     if isinstance(content, list):
         for place, item in enumerate(content):
-            yield _of_list(item, f"anchors[{place}]")
+            yield _of_list(item, f"anchors[{place}]", unit)
         return
     if not isinstance(content, dict):
         return
@@ -352,19 +396,21 @@ def _entries(content: Any) -> Iterator[Entry]:
         if isinstance(value, dict) and value.keys() >= {"rows", "cols", "data"}
     ]
     if matrices:
-        yield from _of_matrix(*matrices[0])
+        yield from _of_matrix(*matrices[0], unit)
         return
     numbered = {key: _NUMBERED.match(str(key)) for key in content}
     if any(numbered.values()) and all(
         isinstance(content[key], (list, dict)) for key, found in numbered.items() if found
     ):
         yield from (
-            _of_value(found[1], content[key], str(key)) for key, found in numbered.items() if found
+            _of_value(found[1], content[key], str(key), unit)
+            for key, found in numbered.items()
+            if found
         )
         return
     for key, value in content.items():
         if isinstance(value, (dict, list)):
-            yield _of_value(str(key), value, str(key))
+            yield _of_value(name_of(key), value, str(key), unit)
         elif (
             not str(key)
             .lower()
@@ -375,7 +421,7 @@ def _entries(content: Any) -> Iterator[Entry]:
             raise ValueError(f"{key}: {value!r} is no position; {WRITE}.")
 
 
-def _of_matrix(key: Any, value: dict[str, Any]) -> Iterator[Entry]:
+def _of_matrix(key: Any, value: dict[str, Any], unit: str) -> Iterator[Entry]:
     """Yield the rows of an OpenCV matrix as anchors 0, 1, 2, ...; it has no place for ids."""
     rows, columns, data = value["rows"], value["cols"], value["data"]
     if (
@@ -391,16 +437,16 @@ def _of_matrix(key: Any, value: dict[str, Any]) -> Iterator[Entry]:
     for row in range(rows):
         yield Entry(
             str(row),
-            _three(data[3 * row : 3 * row + 3], f"{key}, row {row}"),
+            _three(data[3 * row : 3 * row + 3], f"{key}, row {row}", unit),
             NOT_SURVEYED,
             f"{key}, row {row}",
         )
 
 
-def _of_list(item: Any, where: str) -> Entry:
+def _of_list(item: Any, where: str, unit: str) -> Entry:
     if isinstance(item, list):
         if len(item) == 4:
-            return Entry(_text(item[0]), _three(item[1:], where), NOT_SURVEYED, where)
+            return Entry(name_of(item[0]), _three(item[1:], where, unit), NOT_SURVEYED, where)
         three = len(item) == 3
         what = (
             "a position is recognized, and no id" if three else f"{len(item)} values are no anchor"
@@ -419,47 +465,48 @@ def _of_list(item: Any, where: str) -> Entry:
         raise ValueError(
             f"{where}: no id is recognized among {', '.join(map(str, item))}; write 'id: 0'."
         )
-    return _of_value(
-        _text(item[named[0]]), {key: value for key, value in item.items() if key != named[0]}, where
-    )
+    rest = {key: value for key, value in item.items() if key != named[0]}
+    return _of_value(name_of(item[named[0]]), rest, where, unit)
 
 
-def _text(name: Any) -> str:
-    return str(int(name)) if isinstance(name, float) and name.is_integer() else str(name)
-
-
-def _of_value(name: str, value: Any, where: str) -> Entry:
+def _of_value(name: str, value: Any, where: str, unit: str) -> Entry:
     """Return the anchor `name` of its value.
 
-    value : list of three numbers, or mapping with a position, or with x, y and z
+    value : list of three numbers, or mapping with a position, or with x, y and z; unit : of numbers
+    whose unit is not given beside them
     """
     if isinstance(value, list):
-        return Entry(name, _three(value, where), NOT_SURVEYED, where)
+        return Entry(name, _three(value, where, unit), NOT_SURVEYED, where)
+    unit = _unit_of(value, unit, where)
     keys = {str(key).lower(): key for key in value}
     turn = next((value[keys[key]] for key in TURNED if key in keys), None)
     nested = next((key for key in NESTED if key in keys), None)
     if nested is not None:
         inner = value[keys[nested]]
         if isinstance(inner, dict):
-            within = _of_value(name, inner, f"{where}: {keys[nested]}")
+            within = _of_value(name, inner, f"{where}: {keys[nested]}", unit)
             return within._replace(orientation=_turn(turn, where)) if turn is not None else within
-        return Entry(name, _three(inner, f"{where}: {keys[nested]}"), _turn(turn, where), where)
+        return Entry(
+            name, _three(inner, f"{where}: {keys[nested]}", unit), _turn(turn, where), where
+        )
     columns = columns_of([str(key) for key in value])
     if columns is None:
         raise ValueError(
             f"{where}: no position is recognized among {', '.join(map(str, value))[:80]}; {WRITE}."
         )
     values = list(value.values())
-    numbers = _three([values[place] for place in columns.axes], where)
-    return Entry(
-        name,
-        [number * length for number, length in zip(numbers, columns.lengths)],
-        _turn(turn, where),
-        where,
-    )
+    position = _three([values[place] for place in columns.axes], where, unit, columns.units)
+    return Entry(name, position, _turn(turn, where), where)
 
 
-def _three(value: Any, where: str) -> list[float]:
+def _in_metres(
+    numbers: Sequence[float], unit: str, own: Sequence[str] = ("", "", "")
+) -> list[float]:
+    """Return three numbers in m; unit : of those without a unit of their own."""
+    return [number * LENGTHS[each or unit] for number, each in zip(numbers, own)]
+
+
+def _three(value: Any, where: str, unit: str, own: Sequence[str] = ("", "", "")) -> list[float]:
     numbers = [_number(each) for each in value] if isinstance(value, list) else []
     if len(numbers) == 6:
         raise ValueError(
@@ -468,7 +515,7 @@ def _three(value: Any, where: str) -> list[float]:
         )
     if len(numbers) != 3 or not np.isfinite(numbers).all():
         raise ValueError(f"{where}: {str(value)[:60]} is not 3 numbers x, y, z in metres.")
-    return numbers
+    return _in_metres(numbers, unit, own)
 
 
 def _turn(value: Any, where: str) -> list[float]:
@@ -635,10 +682,12 @@ def read_entries(path: str | Path) -> tuple[list[Entry], str]:
       `anchorN_1/_2/_3` are the arm tips of its stand (up, left, forward), which give the
       orientation; other names are ignored;
     - a table: commas, semicolons, tabs or blanks between its cells; a header names id, x, y and z in
-      any usual way, with or without units; without a header each line is an id and three numbers;
+      any usual way, with or without units; a column `unit`, or a comment `# unit: ft`, gives it too;
+      without a header each line is an id and three numbers;
     - YAML or JSON: `anchors: {0: {position: [x, y, z], orientation: [x, y, z, w]}}`, the same as a
       list, `0: {x:, y:, z:}` of the Crazyflie client, `anchor0_pos: [x, y, z]` of lps-ros, parameter
-      files of ROS, an OpenCV matrix with a row for each anchor.
+      files of ROS, an OpenCV matrix with a row for each anchor. `unit: ft` holds where it stands and
+      below.
 
     Orientation: antenna stand to world; x forward, z up the stand, y completes a right-handed
     frame. NaN if not surveyed. Raises InputError.
@@ -656,8 +705,10 @@ def read_entries(path: str | Path) -> tuple[list[Entry], str]:
         return read_tree(text, path)
     lines = lines_of(text)
     try:
-        entries = read_table(lines)
-        return (_total_station(path, lines) if entries is None else entries), "map"
+        comment = _UNIT_COMMENT.search(text)
+        unit = _unit(comment[1], f"comment {comment[0].strip()[:60]!r}") if comment else ""
+        entries = read_table(lines, unit)
+        return (_total_station(path, lines, unit) if entries is None else entries), "map"
     except InputError as error:
         message = str(error)
         raise InputError(
@@ -686,13 +737,13 @@ def orientation_from_tips(tips: np.ndarray) -> tuple[np.ndarray, float]:
     )
 
 
-def _total_station(path: str | Path, lines: Lines) -> list[Entry]:
+def _total_station(path: str | Path, lines: Lines, unit: str) -> list[Entry]:
     antennas: dict[Any, list[float]] = {}
     tips: dict[Any, list[float]] = {}
     key: Any
     for number, cells in lines:
         antenna, tip = _ANTENNA.match(cells[0]), _TIP.match(cells[0])
-        point = _point(path, number, cells)
+        point = _in_metres(_point(path, number, cells), unit)
         if antenna:
             points, key = antennas, int(antenna[1])
         elif tip:

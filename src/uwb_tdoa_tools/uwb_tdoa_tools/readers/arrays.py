@@ -13,14 +13,13 @@ import numpy as np
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Flight
-from uwb_tdoa_bias.common.survey import Entry, refuse_faulty
+from uwb_tdoa_bias.common.survey import Entry, name_of, refuse_faulty
 
 from .names import NamedAnchors, named_anchors, read_named_anchors
 from .profile import (
     ANCHORS,
     STREAMS,
     Columns,
-    as_text,
     check_columns,
     parse_column,
     time_column,
@@ -80,7 +79,7 @@ def _anchors_of(anchors: Any) -> NamedAnchors:
             raise InputError(
                 f"anchors: {key} has {position.size} coordinates; give x, y and z in m."
             )
-        entries.append(Entry(as_text(key), position.tolist(), [np.nan] * 4, f"anchor {key}"))
+        entries.append(Entry(name_of(key), position.tolist(), [np.nan] * 4, f"anchor {key}"))
     named = named_anchors("anchors", entries, "map")
     refuse_faulty(named.anchors, "anchors")
     return named
@@ -151,7 +150,7 @@ def _numbers(title: str, name: str, values: Any) -> np.ndarray:
 
 def _ids(title: str, name: str, values: Any, named: NamedAnchors) -> np.ndarray:
     """Return the ids (n,) of anchors by id or name."""
-    texts, rows = np.unique([as_text(value) for value in np.asarray(values)], return_inverse=True)
+    texts, rows = np.unique([name_of(value) for value in np.asarray(values)], return_inverse=True)
     ids = [named.id_of(str(text)) for text in texts]
     if None in ids:
         unknown = str(texts[ids.index(None)])

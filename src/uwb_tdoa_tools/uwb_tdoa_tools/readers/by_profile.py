@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Flight
-from uwb_tdoa_bias.common.survey import Entry, refuse_faulty
+from uwb_tdoa_bias.common.survey import Entry, name_of, refuse_faulty
 
 from ..bags import is_bag, is_ros_1
 from .names import NamedAnchors, named_anchors
@@ -31,7 +31,6 @@ from .profile import (
     Columns,
     Profile,
     Source,
-    as_text,
     time_column,
 )
 from .streams import Streams, make_flight
@@ -263,7 +262,7 @@ class _Request:
             self._take_anchor(value, place)
             return
         if self.source.tag:
-            of = as_text(value(self.source.tag))
+            of = name_of(value(self.source.tag))
             self.tags[of] += 1
             if tag and of != tag:
                 return
@@ -284,7 +283,7 @@ class _Request:
     def _keep(self, stream: str, raw: dict[str, Any], place: str, named: NamedAnchors) -> None:
         record = {
             name: (
-                named.id_of(as_text(each))
+                named.id_of(each)
                 if name in ANCHORS
                 else self._number(each, self._wanted[stream][name][0], place)
             )
@@ -327,7 +326,7 @@ class _Request:
             return
         factors = [self._wanted[SURVEY][f"anchor_{axis}"][1] for axis in "xyz"]
         at = [each * factor for each, factor in zip(numbers, factors) if each is not None]
-        name = as_text(anchor)
+        name = name_of(anchor)
         last = self.positions.get(name)
         if last is not None and not any(at):
             return  # drivers write zeros where they do not know the position

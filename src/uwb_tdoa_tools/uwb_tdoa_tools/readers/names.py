@@ -7,6 +7,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 import re
+from typing import Any
 
 from uwb_tdoa_bias.common import survey
 from uwb_tdoa_bias.common.anchors import Anchors
@@ -29,11 +30,12 @@ class NamedAnchors:
     anchors: Anchors
     ids: dict[str, int] = field(default_factory=dict)
 
-    def id_of(self, text: str) -> int | None:
+    def id_of(self, value: Any) -> int | None:
         """Return the id of an anchor from its name or id (decimal or 0x1A2B); None if unknown.
 
-        Where anchors have names, an id counts if the name ends with it.
+        Names come first. Where anchors have names, an id counts if the name ends with it.
         """
+        text = survey.name_of(value)
         if text in self.ids:
             return self.ids[text]
         folded = [number for name, number in self.ids.items() if name.casefold() == text.casefold()]
@@ -87,8 +89,5 @@ def read_survey(path: str | Path) -> Anchors:
 
 def _whole(text: str) -> int | None:
     """Return a whole number 0 ... 65535, decimal or 0x1A2B, or None."""
-    try:
-        value = float(int(text, 16)) if text[:2] in ("0x", "0X") else float(text)
-    except (ValueError, OverflowError):
-        return None
-    return int(value) if 0 <= value <= LARGEST_ID and value == int(value) else None
+    text = _decimal(text)
+    return int(text) if survey.is_id(text) and int(text) <= LARGEST_ID else None

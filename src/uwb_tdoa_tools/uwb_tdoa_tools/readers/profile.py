@@ -21,6 +21,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.limits import DEFINITION_BYTES
 from uwb_tdoa_bias.common.radio import SPEED_OF_LIGHT, TICK
 from uwb_tdoa_bias.common.safe_yaml import read_yaml
+from uwb_tdoa_bias.common.survey import name_of
 from uwb_tdoa_bias.common.text import sanitize
 
 from .streams import GRAVITY
@@ -391,7 +392,4 @@ def _antenna(path: Path, content: Any) -> dict[str, tuple[float, ...]]:
     )
     if not good:
         raise InputError(f"{path}: antenna must be [x, y, z], or {{TAG: [x, y, z]}}, in m.")
-    return {
-        as_text(tag) if tag != "" else "": tuple(map(float, place))
-        for tag, place in antenna.items()
-    }
+    return {name_of(tag): tuple(map(float, place)) for tag, place in antenna.items()}
