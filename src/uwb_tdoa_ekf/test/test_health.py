@@ -55,6 +55,14 @@ LOST = SimpleNamespace(running=False, lost="the tag is lost")
 NO_SIDE = SimpleNamespace(running=True, side_unknown="set tag_side to below or above")
 
 
+def test_a_dead_sensor_is_named_beside_wrong_wiring(judge):
+    wiring = ("2 publish on odometry",)
+    for heard in range(1, 8):
+        judge.received["height"] = 25 * min(heard, 3)
+        level, text, _ = judge.second(NO_SIDE, wrong=(None, wiring, ()), used=400)
+    assert level == WARN and wiring[0] in text and "no messages on height any more" in text
+
+
 @pytest.mark.parametrize(
     ("estimator", "options", "level", "words"),
     [

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_ekf.monitoring.finding import ERROR, WARNING, Finding
+from uwb_tdoa_ekf.monitoring.health import off_the_clock
 from uwb_tdoa_ekf.monitoring.status import (
     FAULT,
     LOST,
@@ -166,6 +167,17 @@ def test_a_yaw_that_is_known_is_known_to_who_hears_status():
         serialization.serialize_message(sent[0]), messages.EstimatorStatus
     )
     assert heard.yaw_known and heard.status == RUNNING
+
+
+@pytest.mark.parametrize("behind, said", [(3.0, "3.0 s behind"), (-2.0, "2.0 s ahead")])
+def test_an_odometry_of_another_time_than_now_is_not_to_be_flown_by(behind, said):
+    status = status_of(RUNS, KNOWN, 0.01, used(), off_the_clock=off_the_clock(behind))
+    assert status.status == RUNNING and said in status.why
+
+
+@pytest.mark.parametrize("behind", [None, 0.2, 1e9])
+def test_a_recording_of_another_day_is_not_old(behind):
+    assert off_the_clock(behind) is None
 
 
 def test_without_odometry_nothing_goes_by_the_imu_alone():

@@ -52,7 +52,7 @@ from .ekf_parameters import ODOM, declare_parameters, follow_changes
 from .estimator import Estimator
 from .frames import ImuMount, pose_from_message
 from .monitoring.finding import Finding, most_severe_first
-from .monitoring.health import OK, WARN, Health, together
+from .monitoring.health import OK, WARN, Health, off_the_clock, together
 from .monitoring.status import FAULT, Status, status_of, with_fault_covariance, yaw_in_words
 from .monitoring.stream_rules import FEW_ANCHORS, StreamWatch
 from .outputs import Outputs, StatusOutput
@@ -520,6 +520,7 @@ class EkfNode(StreamNode):
             self._health.use,
             self._findings,
             self._anchors.refused,
+            off_the_clock(self._behind()),
         )
         self._fault = status.status == FAULT
         return status

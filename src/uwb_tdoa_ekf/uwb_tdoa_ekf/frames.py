@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 # s, time constant of the low-pass filter whose slope is the angular acceleration
 SLOW = 0.02
-LONGEST_STEP = 0.1  # s between samples above which the angular acceleration is taken as 0
+LONGEST_STEP = 0.1  # s between samples, either way, above which the angular acceleration is 0
 
 
 class ImuMount:
@@ -78,10 +78,10 @@ class ImuMount:
     def _angular_acceleration(self, t: float, gyro: np.ndarray) -> np.ndarray:
         """Return the slope of the low-pass filtered rate, (3,) rad/s^2."""
         dt = np.inf if self._t is None else t - self._t
-        if dt <= 0.0:
+        if -LONGEST_STEP < dt <= 0.0:
             return np.zeros(3)
         before, self._t = self._slow, t
-        if dt > LONGEST_STEP:
+        if abs(dt) > LONGEST_STEP:  # a gap, or the stamps start again
             self._slow = gyro
             return np.zeros(3)
         self._slow = before + min(1.0, dt / SLOW) * (gyro - before)

@@ -84,6 +84,15 @@ def mounted(flight, path, *static, robot=""):
     return path
 
 
+def test_a_recording_that_is_played_again_is_moved_to_the_body_as_the_first_time():
+    """The stamps fall by the length of the recording."""
+    rng, t = np.random.default_rng(0), np.arange(200) / 100.0
+    gyro, accel = rng.standard_normal((2, 200, 3))
+    mount = ImuMount(TURN, ARM)
+    first = mount.in_body(t, gyro, accel)
+    np.testing.assert_array_equal(mount.in_body(t, gyro, accel), first)
+
+
 @pytest.mark.parametrize("robot", ["", "tag1/"])
 def test_sensors_are_taken_to_the_body(flight, tmp_path, robot):
     body, plate = f"{robot}base_link", f"{robot}plate"

@@ -131,14 +131,15 @@ class Health:
         at_position: dict[str, str] = {}
         if estimator is not None and running and self.last_position is not None:
             outside, at_position = flyability(self._volume, estimator.anchors, *self.last_position)
+        troubles: list[str] = []
+        if estimator is not None and running:
+            troubles = [*filter(None, self._troubles(estimator, counts, outside))]
         if missing:
             level, text = ERROR, missing
-        elif wiring or findings:
-            level, text = _worst(wiring, findings)
-        elif estimator is not None and running:
-            troubles = self._troubles(estimator, counts, outside)
-            trouble = next(filter(None, troubles), None)
-            level, text = (WARN, trouble) if trouble else (OK, "running")
+        elif wiring or findings or troubles:
+            level, text = _worst([*wiring, *troubles], findings)
+        elif running:
+            level, text = OK, "running"
         else:
             level, text = self._not_running(estimator, now)
         state = "running" if running else "starting"
@@ -214,13 +215,7 @@ class Health:
         yield self._trouble_of_sensors(counts)
         yield estimator.side_unknown
         yield outside
-        behind = self.behind or 0.0
-        if BEHIND[0] < behind < BEHIND[1]:
-            reason = "this machine is too slow for all it receives, or clocks differ"
-            yield f"the odometry is {behind:.1f} s behind: {reason}"
-        if BEHIND[0] < -behind < BEHIND[1]:
-            remedy = "correct the stamps, or the clock"
-            yield f"the odometry is {-behind:.1f} s ahead of the clock: {remedy}"
+        yield off_the_clock(self.behind)
 
     def _trouble_of_sensors(self, counts: Mapping[str, int]) -> str | None:
         """Return a sentence on a sensor that went silent or whose messages are mostly not used."""
@@ -253,6 +248,19 @@ class Health:
                     trouble = f"more than half of the messages on {topic} {words}"
         self._received_before, self._counts_before = Counter(self.received), Counter(counts)
         return trouble
+
+
+def off_the_clock(behind: float | None) -> str | None:
+    """Return a sentence on an odometry that is too old or in the future, or None.
+
+    behind : s from the stamp of the newest odometry to the current time; None without odometry
+    """
+    if behind is None or not BEHIND[0] < abs(behind) < BEHIND[1]:
+        return None
+    if behind > 0.0:
+        reason = "this machine is too slow, the data come late, or clocks differ"
+        return f"the odometry is {behind:.1f} s behind the clock: {reason}"
+    return f"the odometry is {-behind:.1f} s ahead of the clock: correct the stamps, or the clock"
 
 
 def _worst(wiring: Sequence[str], findings: Sequence[Finding]) -> tuple[bytes, str]:

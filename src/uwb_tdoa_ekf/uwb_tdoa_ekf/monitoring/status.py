@@ -273,6 +273,7 @@ def status_of(
     use: Use,
     findings: Sequence[Finding] = (),
     refused_anchors: str | None = None,
+    off_the_clock: str | None = None,
 ) -> Status:
     """Return the Status of an Estimator.
 
@@ -290,6 +291,8 @@ def status_of(
         Findings that hold now, the most severe first.
     refused_anchors : str or None
         Reason why the last anchors were refused.
+    off_the_clock : str or None
+        Sentence on the age of the odometry by its stamp.
     """
     if estimator is None:
         missing = "there are no anchors yet: publish them on uwb/anchors, or set anchors_file"
@@ -317,7 +320,8 @@ def status_of(
     if odometry_age > SILENT:
         why = "neither TDOAs nor inertial samples are used: there is no odometry; see /diagnostics"
         return Status(WAITING, False, why)
-    return Status(RUNNING, yaw_known, _reason_against_flying(estimator, use, yaw_known, findings))
+    why = off_the_clock or _reason_against_flying(estimator, use, yaw_known, findings)
+    return Status(RUNNING, yaw_known, why)
 
 
 def _reason_against_flying(
