@@ -5,8 +5,8 @@ other.
 
 Compiled code is kept in the folder that NUMBA_CACHE_DIR names, by default ~/.cache/uwb_tdoa, and
 used until the sources, numba or the processor change. `./dev build` and `./dev demo` call this;
-after a `colcon build` call it as the user who starts the nodes. What a bias network needs is
-compiled at the first start of `bias_node` with one.
+after a `colcon build` call it as the user who starts the nodes. What a learned network needs is
+compiled at the first start of `bias_node` with one, before it is ready.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ import numpy as np
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_bias.correction import corrector
-from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_bias.effects import EffectSet, SmoothTerm
+from uwb_tdoa_bias.effects.covariates import ImuFeatures
 from uwb_tdoa_bias.effects.tag import TagLeverArm
 
 from .estimator import Estimator
@@ -60,6 +61,7 @@ def warm_up() -> None:
                 ),
             )
         odometry, _ = estimator.advance()
+    ImuFeatures()(t, none, none)
     pose_and_twist(odometry, odometry.rate, odometry.rate_variance)
     rotation_std(odometry.q[-1:], odometry.covariance[-1:])
     watch.findings()
@@ -101,9 +103,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         return int(ended.code or 0)
     began = time.monotonic()
     warm_up()
-    corrector.warm_up(EffectSet(), model=None)
-    # A transform on /tf_static adds this effect while the node runs.
-    corrector.warm_up(EffectSet((TagLeverArm(values={"z": 0.1}),)), model=None)
+    # one effect for each input of a correction: the attitude, and the motion
+    of_motion = SmoothTerm(
+        form="common", covariate="speed", shape="line", knots=(0.0, 1.0), values={"c1": 0.1}
+    )
+    corrector.warm_up(EffectSet((TagLeverArm(values={"z": 0.1}), of_motion)), model=None)
     print(f"ekf_node and bias_node are compiled; {time.monotonic() - began:.0f} s")
     return 0
 

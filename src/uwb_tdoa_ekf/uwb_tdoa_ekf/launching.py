@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Decide which nodes the launch files start, in which namespace and with which parameters.
 
-This module does not import launch.
+This module does not import launch: `./dev launch` starts the nodes without it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 import json
@@ -73,6 +73,28 @@ WHO = {
     ),
     "SYSTEM_DEFAULT": "whom the settings of the middleware let through",
 }
+# Launch arguments: {name: (default or None, text, allowed values or None)}
+Arguments = Mapping[str, tuple[str | None, str, Sequence[str] | None]]
+COMMON: Arguments = {  # of both launch files
+    "log_level": ("info", "debug, info, warn, error", None),
+    "rviz": ("false", "true opens RViz with the frames, the covariance and the anchors", None),
+    **RESPAWN,
+    **NETWORK,
+}
+# parameters of the nodes of one tag; one that is not given is what the files say, or the node's default
+OF_A_TAG = {
+    "anchors_file": "survey of the anchors; without it they come on uwb/anchors",
+    "effects_file": "effects.yaml that diagnose wrote",
+    "model_file": "ONNX bias model",
+    "map": "map.npz that debias wrote; starts debias_node",
+    "world_frame": "frame of the odometry",
+    "body_frame": "frame of the robot",
+    "publish_tf": "none, base (map -> base_link) or odom (map -> odom, REP 105)",
+    "odom_frame": "frame of the robot's own odometry, for publish_tf odom",
+    "use_sim_time": "true for bags that are played with --clock",
+    "frozen": FROZEN,
+}
+OF_ALL_TAGS = {name: OF_A_TAG[name] for name in ("use_sim_time", "frozen")}
 AUTO = "auto"  # value of `processes`: one process for each core
 # s until a node is started again after a crash; doubled each time
 FIRST, LONGEST = (1.0, 30.0)
@@ -258,7 +280,7 @@ def start(
 
 def tag(
     namespace: str,
-    values: dict[str, bool | str | float],
+    values: Mapping[str, bool | str | float],
     files: dict | None = None,
     log_level: str = "info",
 ) -> list[Start]:
@@ -268,7 +290,7 @@ def tag(
     ----------
     namespace : str
         Namespace of the tag.
-    values : dict
+    values : mapping
         {parameter: value} for all nodes.
     files : dict or None
         {executable: [paths of parameter files]}.
@@ -415,7 +437,7 @@ def pooled(starts: list[Start], processes: int | str) -> list[Start]:
     return out
 
 
-def refuse_unknown(values: dict[str, bool | str | float], *executables: str) -> None:
+def refuse_unknown(values: Mapping[str, bool | str | float], *executables: str) -> None:
     """Raise InputError for a parameter that no executable has, or whose value is missing."""
     known = set().union(*(NODES[name][1] for name in executables))
     for name, value in values.items():
@@ -459,3 +481,68 @@ def _beside(path: str | Path, file: object) -> str:
     if not isinstance(file, str):
         raise InputError(f"{file!r} is no path; write a text.")
     return str(Path(path).parent / file)
+
+
+def _one_tag(given: Mapping[str, str]) -> list[Start]:
+    """Return the Starts of tdoa.launch.py."""
+    values = typed({name: given[name] for name in OF_A_TAG})
+    namespace, log_level = given["namespace"], given["log_level"]
+    files = {
+        node: [given[key]]
+        for node, key in (("bias_node", "bias_params"), ("ekf_node", "ekf_params"))
+        if given[key]
+    }
+    starts = tag(namespace, values, files, log_level)
+    if "anchors_file" in values:
+        starts.append(start("anchors_node", namespace, values, (), log_level))
+    return starts
+
+
+def _several_tags(given: Mapping[str, str]) -> list[Start]:
+    """Return the Starts of tags.launch.py."""
+    values = typed({name: given[name] for name in OF_ALL_TAGS})
+    return tags(given["tags"], values, given["log_level"], given["processes"])
+
+
+@dataclass(frozen=True)
+class LaunchFile:
+    """Describe a launch file.
+
+    Attributes
+    ----------
+    arguments : Arguments
+    starts : callable
+        Returns the Starts for {name: value} of all arguments.
+    """
+
+    arguments: Arguments
+    starts: Callable[[Mapping[str, str]], list[Start]]
+
+
+LAUNCH_FILES = {
+    "tdoa.launch.py": LaunchFile(
+        {
+            **{name: ("", text, None) for name, text in OF_A_TAG.items()},
+            "namespace": ("", "one per tag; the topics are relative to it", None),
+            "bias_params": ("", "parameter file of bias_node, overridden by the above", None),
+            "ekf_params": ("", "parameter file of ekf_node, overridden by the above", None),
+            **COMMON,
+        },
+        _one_tag,
+    ),
+    "tags.launch.py": LaunchFile(
+        {
+            "tags": (None, "YAML file of the tags", None),
+            **{name: ("", text, None) for name, text in OF_ALL_TAGS.items()},
+            "processes": (
+                "",
+                "localization_nodes that share the tags: a number, or auto, one for each core; "
+                "default: as the file says, or two nodes for each tag",
+                None,
+            ),
+            **COMMON,
+            "on_exit": ("stay", *RESPAWN["on_exit"][1:]),  # one tag does not take the others along
+        },
+        _several_tags,
+    ),
+}

@@ -9,14 +9,16 @@ import time
 from typing import TYPE_CHECKING
 
 from ament_index_python.packages import get_package_share_directory
-from launch.actions import LogInfo, OpaqueFunction, TimerAction
+from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction, TimerAction
+from launch.launch_description import LaunchDescription
 import launch.logging
+from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.executable import leave_present_folder_out
 
-from .launching import Lives, Start, discovery, network
+from .launching import LAUNCH_FILES, Lives, Start, discovery, network
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -24,6 +26,23 @@ if TYPE_CHECKING:
     from launch.action import Action
     from launch.events.process import ProcessExited
     from launch.launch_context import LaunchContext
+
+
+def description(name: str) -> LaunchDescription:
+    """Return the LaunchDescription of one of the LAUNCH_FILES."""
+    file = LAUNCH_FILES[name]
+
+    def nodes(context: LaunchContext) -> list[Action]:
+        given = {name: LaunchConfiguration(name).perform(context) for name in file.arguments}
+        used = {name: given[name] for name in ("respawn", "on_exit", "discovery_range", "rviz")}
+        simulated = given["use_sim_time"] or "false"
+        return actions(file.starts(given), **used, use_sim_time=simulated)
+
+    arguments = [
+        DeclareLaunchArgument(name, default_value=default, description=text, choices=choices)
+        for name, (default, text, choices) in file.arguments.items()
+    ]
+    return LaunchDescription([*arguments, OpaqueFunction(function=nodes)])
 
 
 def actions(
