@@ -79,8 +79,10 @@ def test_a_node_that_refuses_what_it_is_given_ends_everything(run):
 
 
 def test_a_node_that_crashes_is_started_again(run, tmp_path):
-    node = run(f"echo started >> {tmp_path}/log; exit 3")
-    until(lambda: node.look() and (tmp_path / "log").read_text().count("started") > 1)
+    log = tmp_path / "log"
+    log.touch()
+    node = run(f"echo started >> {log}; exit 3")
+    until(lambda: node.look() and log.read_text().count("started") > 1)
 
 
 @pytest.mark.slow
