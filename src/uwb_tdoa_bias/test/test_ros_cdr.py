@@ -60,7 +60,7 @@ def test_the_definition_fits_the_types_of_our_topics():
         (TwistWithCovarianceStamped, "twist.twist.linear", "twist.covariance"),
         (Path,),
     ):
-        assert CdrCodec(kind, *fields).fits, kind
+        assert CdrCodec(kind, *fields).fits and CdrCodec(kind, *fields, of_twist=True).fits, kind
 
 
 def test_messages_are_read_in_order_in_runs_of_one_frame(way):
@@ -74,6 +74,14 @@ def test_messages_are_read_in_order_in_runs_of_one_frame(way):
     assert [row for _, rows, _ in parts for row in rows[names].tolist()] == [
         (m.header.stamp.sec, m.header.stamp.nanosec, m.corrected, m.anchor_b, 2) for m in messages
     ]
+
+
+def test_the_frame_of_a_twist_is_that_of_the_child(way):
+    message = Odometry(child_frame_id="camera")
+    message.header.frame_id = "odom"
+    for of_twist, frame in ((False, "odom"), (True, "camera")):
+        codec = CdrCodec(Odometry, "twist.covariance", of_twist=of_twist)
+        assert codec.read([serialize_message(message)])[0][0] == frame
 
 
 def test_vectors_and_arrays_are_columns(way):

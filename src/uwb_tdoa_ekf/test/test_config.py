@@ -1,13 +1,13 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_ekf.core.config import CHOICES, PARAMETERS, FilterConfig
+from uwb_tdoa_ekf.core.config import CHOICES, PARAMETERS, PLANAR_HEIGHT_STD, FilterConfig
 
 # 0 switches the term off
 WITHOUT = [
@@ -44,6 +44,13 @@ def test_defaults_are_valid_and_reach_the_core_under_the_same_names():
         if name not in CHOICES:
             assert parameters[name] == getattr(config, name), name
     assert PARAMETERS.names == tuple(field.name for field in fields(FilterConfig))
+
+
+def test_the_height_of_a_planar_vehicle_is_known_only_while_it_is_planar():
+    planar = FilterConfig(planar=True)
+    assert planar.parameters()["fixed_height_std"] == planar.known_height_std == PLANAR_HEIGHT_STD
+    flying = replace(planar, planar=False)
+    assert flying.parameters()["fixed_height_std"] == flying.known_height_std == 0.0
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf"), "fast", None])

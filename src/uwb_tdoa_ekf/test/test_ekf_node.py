@@ -56,6 +56,29 @@ def test_every_parameter_is_in_the_parameter_file_with_its_default(node):
     assert comments == {name: node.describe_parameter(name).description for name in declared}
 
 
+def test_a_velocity_is_turned_into_the_body_by_its_frame(node):
+    taken, turn = [], Rotation.from_euler("z", 90.0, degrees=True)
+    node._estimator = SimpleNamespace(add=lambda name, stream: taken.append(stream))
+    node._frames.frames.set("base_link", "camera", turn.as_quat(), [0.0, 0.0, 0.0])
+    rows = {
+        "twist.twist.linear": np.array([[1.0, 0.0, 0.0]]),
+        "twist.twist.angular": np.array([[0.0, 0.0, 0.5]]),
+        "twist.covariance": np.diag([0.01, 0.04, 0.09, 1.0, 1.0, 1.0]).reshape(1, 36),
+    }
+    for frame, v, std in (
+        ("camera", [0.0, 1.0, 0.0], [0.2, 0.1, 0.3]),
+        ("base_link", [1.0, 0.0, 0.0], [0.1, 0.2, 0.3]),
+        ("unknown", [1.0, 0.0, 0.0], [0.1, 0.2, 0.3]),
+    ):
+        node._take_sensor("velocity", frame, np.zeros(1), rows, np.zeros(1))
+        np.testing.assert_allclose(taken[-1].v, [v], atol=1e-12)
+        np.testing.assert_allclose(taken[-1].std, [std], atol=1e-12)
+        assert taken[-1].yaw_rate == pytest.approx(0.5)
+    assert "is in frame 'unknown'" in node._places["unknown"][1] and not node._places["camera"][1]
+    node._on_frames()
+    assert not node._places  # a new transform counts from now on
+
+
 # --- pose message ---
 
 

@@ -497,6 +497,22 @@ def test_a_pose_of_another_clock_that_comes_before_the_first_measurement_is_drop
     assert estimator.refused_pose is None
 
 
+@pytest.mark.parametrize(
+    "covariance", [np.zeros((3, 3)), 1e-13 * np.eye(3), np.full((3, 3), 0.01)], ids=str
+)
+@pytest.mark.parametrize("t", [0.05, 1.0])
+def test_a_pose_that_is_told_as_exact_leaves_the_filter_sound(t, covariance):
+    flight = fly(duration=2.0)
+    yaw = Rotation.from_quat(flight.truth.q[0]).as_euler("ZYX")[0]
+    estimator = Estimator(flight.anchors)
+    t, p, *_ = pose_at(flight, t)
+    estimator.set_pose(t, p, covariance, yaw, 0.0)
+    odometry, _ = feed(estimator, flight)
+    assert np.isfinite(odometry.p).all() and np.isfinite(odometry.covariance).all()
+    error = np.linalg.norm(odometry.p - position_at(flight, odometry.t), axis=1)
+    assert error[odometry.t > t].max() < 0.35
+
+
 def test_coordinates_that_are_not_told_stay():
     flight = fly(duration=3.0)
     estimator, plain = Estimator(flight.anchors), Estimator(flight.anchors)

@@ -33,6 +33,7 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flyable import FlyableVolume
 from uwb_tdoa_bias.common.sensors import SENSORS
+from uwb_tdoa_bias.common.transforms import Place
 from uwb_tdoa_bias.correction.corrector import LARGEST_YAW_STD
 from uwb_tdoa_bias.effects import EffectSet, ImuCorrector, StreamCorrector
 from uwb_tdoa_bias.effects.tag import TagLeverArm
@@ -157,6 +158,8 @@ class EkfNode(StreamNode):
             # by frame of the IMU, in order of arrival: ImuMount (None for the body frame), and the
             # problem with it
         ] = {}
+        # by frame of another sensor: its place, and the problem with it
+        self._places: dict[str, tuple[Place | None, str | None]] = {}
         self._remark_height()
         self._health = Health(
             self._config, self._lag, FlyableVolume.load(volume) if volume else None
@@ -200,7 +203,7 @@ class EkfNode(StreamNode):
             if isinstance(effect, TagLeverArm)
         )
         if (
-            self._config.fixed_height_std > 0.0
+            self._config.known_height_std > 0.0
             and abs(arm) > MAST
             and abs(self._config.fixed_height - arm) < 0.5 * MAST
         ):
@@ -226,9 +229,8 @@ class EkfNode(StreamNode):
             if stream in SENSORS and not getattr(self._config, f"use_{stream}"):
                 continue
             for topic, kind, *fields in topics:
-                streams.add(
-                    CdrCodec(kind, *fields), topic, partial(self._receive, stream), topic in handed
-                )
+                codec = CdrCodec(kind, *fields, of_twist=stream in SENSORS)
+                streams.add(codec, topic, partial(self._receive, stream), topic in handed)
         streams.wait_for("uwb/tdoa_corrected", self.due)
         return streams
 
@@ -263,7 +265,7 @@ class EkfNode(StreamNode):
 
     def _new_watch(self, anchors: Anchors) -> StreamWatch:
         return StreamWatch(
-            anchors, self._lag, [FEW_ANCHORS] if self._config.fixed_height_std > 0.0 else []
+            anchors, self._lag, [FEW_ANCHORS] if self._config.known_height_std > 0.0 else []
         )
 
     def _on_config(self, config: FilterConfig) -> None:
@@ -303,7 +305,7 @@ class EkfNode(StreamNode):
 
     def _on_frames(self) -> None:
         """Place all IMU frames again after a static transform was added or changed."""
-        before, self._placed = self._placed, {}
+        before, self._placed, self._places = self._placed, {}, {}
         for frame in before:
             self._place_imu(frame, say=False)
         moved = [frame for frame in before if before[frame] != self._placed[frame]]
@@ -339,6 +341,19 @@ class EkfNode(StreamNode):
         if len(self._placed) < MOST_FRAMES:
             self._placed[frame] = mount, trouble
         return mount
+
+    def _place(self, name: str, frame: str) -> Place | None:
+        """Return (Rotation, arm (3,) m) of a sensor in SENSORS; None in the body frame, or unknown."""
+        if frame in ("", self._body):
+            return None
+        if frame not in self._places:
+            place = self._frames.frames.between(self._body, frame)
+            trouble = None if place else unknown_frame(name, frame, self._body)
+            if trouble:
+                self.get_logger().warning(trouble)
+            if len(self._places) < MOST_FRAMES:
+                self._places[frame] = place, trouble
+        return self._places.get(frame, (None, None))[0]
 
     def _frame_troubles(self) -> list[str]:
         """Return sentences on problems with the frames of the IMU."""
@@ -419,7 +434,10 @@ class EkfNode(StreamNode):
     ) -> None:
         """Pass messages of a sensor in SENSORS to the filter."""
         sensor = SENSORS[name]
-        stream = sensor.read(t, {field: rows[field] for field in sensor.fields})
+        fields = {field: rows[field] for field in sensor.fields}
+        if sensor.in_body is not None and (place := self._place(name, frame)):
+            fields = sensor.in_body(fields, *place)
+        stream = sensor.read(t, fields)
         if sensor.assumed is not None:
             self._assumed[name] = sensor.assumed(stream)
         self._estimator.add(name, self._stream_corrector.correct(name, stream))
@@ -573,7 +591,8 @@ class EkfNode(StreamNode):
             (None, None) if estimator is None else (estimator.refused_pose, estimator.unsure)
         )
         heard = ", ".join(self._lately[:MOST_NAMED])
-        frames = [*self._frame_troubles(), self._frames.trouble]
+        of_sensors = (trouble for _, trouble in self._places.values())
+        frames = [*self._frame_troubles(), *of_sensors, self._frames.trouble]
         others = [*filter(None, [*frames, self.outputs.trouble, refused, unsure, *alarms])]
         if level == OK and others:
             level, text = WARN, together(others)

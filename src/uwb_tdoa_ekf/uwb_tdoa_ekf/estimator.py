@@ -40,6 +40,7 @@ from .results import VERDICTS, Odometry, Residuals, concatenated
 # s, largest lead of a pose that the user sets over the newest measurement
 LARGEST_POSE_AHEAD = 10.0
 RESTART_NAMED = 10.0  # s of stamps for which /diagnostics reports a restart
+LEAST_POSE_STD = 1e-3  # m, and rad; the covariance of the filter must stay positive definite
 MOST_POSES = 100  # poses that may wait for their stamp
 NOTHING = (
     Odometry.from_rows(np.empty(0, ODOMETRY)),
@@ -141,7 +142,7 @@ class Estimator:
         ekf = self._ekf
         if not ekf.running:
             return None
-        known = self.config.fixed_height_std > 0.0 or ekf.t - ekf.height.used < height.MEMORY
+        known = self.config.known_height_std > 0.0 or ekf.t - ekf.height.used < height.MEMORY
         places = {
             h // N_YAWS for h in np.flatnonzero(ekf.hypotheses["log_weight"] > -np.inf).tolist()
         }
@@ -347,9 +348,9 @@ class Estimator:
         p : (3,) array
             Position in the world frame, in m; NaN for an unknown coordinate.
         covariance : (3, 3) array
-            Covariance of the position, in m^2.
+            Covariance of the position, in m^2; smaller deviations than LEAST_POSE_STD count as that.
         yaw, yaw_std : float
-            Yaw and its standard deviation, in rad; NaN if unknown.
+            Yaw and its standard deviation, in rad, at least LEAST_POSE_STD; NaN if unknown.
 
         Raises
         ------
@@ -369,6 +370,10 @@ class Estimator:
             )
         if len(self._poses) >= MOST_POSES:
             raise InputError(f"pose: {MOST_POSES} wait for their time already; give fewer.")
+        known = np.isfinite(p)
+        given = np.where(np.outer(known, known), covariance, np.eye(3))
+        missing = max(0.0, LEAST_POSE_STD**2 - float(np.linalg.eigvalsh(given)[0]))
+        covariance, yaw_std = given + missing * np.eye(3), max(yaw_std, LEAST_POSE_STD)
         self._poses.append(
             np.array([(max(t, self._buffer.used_until), p, covariance, yaw, yaw_std)], POSE)
         )

@@ -259,6 +259,12 @@ def upside_down_survey(recording, rng, other):
     return _moved(recording, recording.anchors.positions * [1.0, -1.0, -1.0])
 
 
+@mistake("survey with y up", "survey_upside_down", needs="imu", alone=True)
+def y_up_survey(recording, rng, other):
+    x, y, z = recording.anchors.positions.T
+    return _moved(recording, np.column_stack([x, z, -y]))
+
+
 # The inertial sensor
 
 

@@ -124,6 +124,54 @@ def test_sensors_are_taken_to_the_body(flight, tmp_path, robot):
     np.testing.assert_allclose(evaluate(read, effects=given)[1].odometry.p, expected.p, atol=1e-9)
 
 
+def test_transforms_in_the_namespace_of_the_robot_are_used(flight, tmp_path):
+    place = [("base_link", "imu_link", [0.0, 0.0, 0.0], TURN.as_quat())]
+    plain, store = mounted(flight, tmp_path / "m.bag", place), typestore()
+    with open_bag(plain) as reader, new_bag(tmp_path / "robot.bag") as writer:
+        to = {
+            one.topic: writer.add_connection(f"/robot1{one.topic}", one.msgtype, typestore=store)
+            for one in reader.connections
+        }
+        for connection, stamp, data in reader.messages():
+            writer.write(to[connection.topic], stamp, data)
+    read = bag.read_bag(tmp_path / "robot.bag", namespace="robot1")
+    np.testing.assert_allclose(read.imu.gyro, flight.imu.gyro, atol=1e-9)
+    checked = read_recording(Reading(namespace="robot1"), tmp_path / "robot.bag")
+    np.testing.assert_allclose(checked.imu.gyro, flight.imu.gyro, atol=1e-9)
+    assert not any("tf_static: " in sentence for sentence in read.meta.get("unread", ()))
+
+
+@pytest.mark.parametrize("every", [3, 1])
+def test_samples_that_are_not_measured_are_left_out_as_in_the_node(flight, tmp_path, every):
+    """A covariance of -1 means that (REP 145); the values are zeros."""
+    bag.write_bag(flight, tmp_path / "plain.bag")
+    store, path, count = typestore(), tmp_path / "some.bag", 0
+    with open_bag(tmp_path / "plain.bag") as reader, new_bag(path) as writer:
+        to = {
+            one.topic: writer.add_connection(one.topic, one.msgtype, typestore=store)
+            for one in reader.connections
+        }
+        for connection, stamp, data in reader.messages():
+            if connection.topic == "/imu/data":
+                count += 1
+                message = store.deserialize_cdr(data, connection.msgtype)
+                if count % every == 0:
+                    message.angular_velocity_covariance = np.array([-1.0, *np.zeros(8)])
+                    message.angular_velocity.x = 0.0
+                data = store.serialize_cdr(message, connection.msgtype)
+            writer.write(to[connection.topic], stamp, data)
+    read, left = bag.read_bag(path), np.arange(1, count + 1) % every != 0
+    said = f"/imu/data: {np.count_nonzero(~left)} messages left out"
+    assert any(remark.startswith(said) for remark in read.meta["remarks"])
+    checked = read_recording(Reading(), path)
+    assert any(remark.startswith(said) for remark in checked.remarks)
+    for imu in (read.imu, checked.imu):
+        if every == 1:
+            assert imu is None
+        else:
+            np.testing.assert_array_equal(imu.gyro, flight.imu.gyro[left])
+
+
 def test_a_frame_that_is_not_connected_is_taken_as_the_body_and_said(flight, tmp_path):
     read = bag.read_bag(
         mounted(flight, tmp_path / "m.bag", [("map", "imu_link", ARM, [0, 0, 0, 0])])

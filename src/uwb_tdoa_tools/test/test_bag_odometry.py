@@ -10,6 +10,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
+from scipy.spatial.transform import Rotation
+from test_bag_frames import transforms
 
 from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_tools.bags.bag import read_bag, write_bag
@@ -76,6 +78,45 @@ def test_velocities_are_the_same_on_each_topic_that_the_node_hears(
     recording = read_recording(Reading(topics=renamed), path)
     np.testing.assert_array_equal(recording.sensors["velocity"].v, flight.velocity.v)
     assert not list(recording_rules.odometry_unread(recording))
+
+
+@pytest.mark.parametrize("frame", ["camera", "unknown"])
+def test_a_twist_is_turned_into_the_body_by_its_frame(flight, tmp_path, frame):
+    """The frame is the child of Odometry, and optical: z forward, x right, y down."""
+    turn, arm = Rotation.from_matrix([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.array([0.2, 0.1, 0.3])
+    path = bag_of(flight, tmp_path, ("/velocity/odometry", ODOMETRY, flight.velocity))
+    store, moved = typestore(), tmp_path / "moved"
+    with AnyReader([path]) as reader, new_bag(moved, "mcap", False) as writer:
+        to = {
+            one.topic: writer.add_connection(one.topic, one.msgtype, typestore=store)
+            for one in reader.connections
+        }
+        rows = transforms(store, ("base_link", "camera", arm, turn.as_quat()))
+        writer.write(to["/tf_static"], 0, store.serialize_cdr(rows, "tf2_msgs/msg/TFMessage"))
+        for connection, stamp, data in reader.messages():
+            if connection.topic == "/velocity/odometry":
+                message = store.deserialize_cdr(data, ODOMETRY)
+                message.header.frame_id, message.child_frame_id = "odom", frame
+                linear, angular = message.twist.twist.linear, message.twist.twist.angular
+                of_body = np.array([linear.x, linear.y, linear.z]), np.array([0.0, 0.0, angular.z])
+                v = turn.inv().apply(of_body[0] + np.cross(of_body[1], arm))
+                linear.x, linear.y, linear.z = v
+                angular.x, angular.y, angular.z = turn.inv().apply(of_body[1])
+                both = np.kron(np.eye(2), turn.as_matrix().T)
+                covariance = both @ message.twist.covariance.reshape(6, 6) @ both.T
+                message.twist.covariance = covariance.ravel()
+                data = store.serialize_cdr(message, ODOMETRY)
+            writer.write(to[connection.topic], stamp, data)
+    read, recording = read_bag(moved), read_recording(Reading(), moved)
+    for velocity in (read.velocity, recording.sensors["velocity"]):
+        for column, expected in zip(velocity.columns, flight.velocity.columns):
+            same = np.allclose(column, expected, rtol=1e-6, atol=1e-9, equal_nan=True)
+            assert same or (frame == "unknown" and len(column) == len(expected))
+    for remarks in (read.meta["remarks"], recording.remarks):
+        (said,) = (remark for remark in remarks if "velocity/odometry" in remark)
+        assert ("taken as that" in said) == (frame == "unknown") and f"frame '{frame}'" in said
+    if frame == "unknown":
+        assert np.abs(read.velocity.v - flight.velocity.v).max() > 0.1
 
 
 def test_odometry_that_nothing_reads_is_named(flight, tmp_path):

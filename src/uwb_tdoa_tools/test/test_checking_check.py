@@ -40,7 +40,7 @@ OTHER_ROOM = constellation("random-5")
 NO_TDOAS = Tdoas(*(np.empty(0, kind) for kind in (float, int, int, float)))
 # named by trials, which take longer than the rules of streams
 TRIED = """sign order pair swapped from_one another_room another_room_alone typing_error mirrored_survey
-    upside_down_survey minus_gravity gyro_sign left_handed gyro_exchanged""".split()
+    upside_down_survey y_up_survey minus_gravity gyro_sign left_handed gyro_exchanged""".split()
 LONGER = {"mirrored_survey": {"duration": 30.0}}  # visible once the yaw is known
 RATE = 200.0  # TDOAs a second: half of what a tag hears, and trials take half of the time
 HARMLESS = "clipped_accel"  # a smooth simulated flight does not reach the limits

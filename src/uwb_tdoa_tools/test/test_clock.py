@@ -6,7 +6,17 @@ from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
 
-from uwb_tdoa_tools.clock import FEW, RESTART, SET, SILENCE, WRAP, WRAPS, sentences, straightened
+from uwb_tdoa_tools.clock import (
+    FEW,
+    RESTART,
+    SET,
+    SILENCE,
+    WRAP,
+    WRAPS,
+    is_grouped,
+    sentences,
+    straightened,
+)
 
 YEARS = 55 * 365.25 * 86400.0
 RATES = {"imu": 100.0, "tdoa": 50.0, "height": 10.0}
@@ -242,6 +252,18 @@ def test_a_healthy_recording_is_not_changed(rate, seed, drop, late, pauses):
     stamps = {"tdoa": t[order], "imu": np.arange(t[0], t[-1], 0.05)} if len(t) else {"tdoa": t}
     found = straightened(stamps)
     assert not found.shifts and not found.kept and not found.restarts and not found.jumps
+
+
+def test_tables_in_the_order_of_anchors_are_no_restarts():
+    t = np.arange(0.0, 20.0, 0.1)
+    a, b = np.arange(200) % 4, np.arange(200) % 3
+    for keys in ((t, a), (t, b, a), (t, a, b)):  # the last key counts most
+        order = np.lexsort(keys)
+        assert is_grouped(t[order], a[order], b[order])
+    assert not is_grouped(t, a, b)
+    restarted = np.concatenate([t[:100], t[:100]])
+    assert not is_grouped(restarted, a) and not is_grouped(restarted, a, b)
+    assert not is_grouped(restarted, np.zeros(200), b)  # one reference
 
 
 def test_empty_recordings_are_not_changed():

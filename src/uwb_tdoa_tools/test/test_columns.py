@@ -179,6 +179,41 @@ def test_columns_in_two_files_are_refused(files):
         read_columns(["ranging.csv", "again.csv"], parse_columns(TDOA), NAMED)
 
 
+ROWS = [(0.1 * k, k % 4, 5.0 + 0.01 * k) for k in range(240)]
+RANGES = parse_columns("time=t,anchor=anchor,range=d")
+
+
+def written(path, rows):
+    path.write_text("t,anchor,d\n" + "".join("{:.1f},{},{:.2f}\n".format(*row) for row in rows))
+
+
+def test_rows_that_are_grouped_by_anchor_are_read_in_the_order_of_time(files):
+    written(files / "ordered.csv", ROWS)
+    written(files / "grouped.csv", sorted(ROWS, key=lambda row: (row[1], row[0])))
+    expected = read_columns(["ordered.csv"], RANGES, NAMED).range
+    flight = read_columns(["grouped.csv"], RANGES, NAMED)
+    np.testing.assert_array_equal(flight.range.t, expected.t)
+    np.testing.assert_array_equal(flight.range.d, expected.d)
+    assert not flight.restarts and "grouped by anchor" in flight.meta["remarks"][0]
+
+
+def test_files_of_one_shape_for_each_anchor_are_read_together(files):
+    written(files / "ordered.csv", ROWS)
+    names = [f"A{anchor}.csv" for anchor in range(4)]
+    for anchor, name in enumerate(names):
+        written(files / name, [row for row in ROWS if row[1] == anchor])
+    expected = read_columns(["ordered.csv"], RANGES, NAMED).range
+    by_name = Profile("by name", (Source(RANGES | {"anchor": ("n", 1.0)}, topic="A{n}.csv"),))
+    for profile in (Profile.of_columns(RANGES), by_name):
+        ranges = read_by_profile(names, profile, NAMED).range
+        np.testing.assert_array_equal(ranges.t, expected.t)
+        np.testing.assert_array_equal(ranges.anchor, expected.anchor)
+    with pytest.raises(InputError, match=r"ordered.csv: has the columns and anchors that A0.csv"):
+        read_columns([*names, "ordered.csv"], RANGES, NAMED)
+    with pytest.raises(InputError, match="where each anchor has a file, write a profile"):
+        parse_columns("time=t,range=d")
+
+
 def test_the_command_writes_a_bag_that_every_tool_reads(files, capsys):
     words = [
         "ranging.csv",

@@ -164,6 +164,25 @@ def straightened(
     return Straightened(shifts, kept, tuple(done), tuple(sorted(set(restarts))))
 
 
+def is_grouped(t: np.ndarray, *ids: np.ndarray) -> bool:
+    """Return whether the rows of a table are in the order of anchors, then of time.
+
+    Time then falls back at most changes of the anchor, or of the pair, and nowhere else. A clock that
+    restarts falls once while the anchors take turns.
+
+    Parameters
+    ----------
+    t : (n,) s, in the order of the file
+    ids : (n,) each, of the anchor, or of both anchors of the pair
+    """
+    falls = np.diff(t) < -LARGEST_STEP_BACK
+    changes = [np.diff(column) != 0 for column in ids]
+    return bool(falls.any()) and any(
+        changed[falls].all() and 2 * falls.sum() >= changed.sum()
+        for changed in (*changes, np.any(changes, axis=0))
+    )
+
+
 @dataclass
 class _Break:
     """Place where the time of a stream jumps.

@@ -7,7 +7,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections import deque
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -28,6 +28,8 @@ SHORTEST, LONGEST = 1e-3, 1e3  # norm of a quaternion, nominally 1
 SAME_PLACE, SAME_TURN = (1e-3, 1e-3)
 FARTHEST = 1e8  # m; squares of larger offsets times rates may overflow
 
+# of a frame in another one, e.g. of a sensor in the body: its turn, and its arm (3,) m
+Place: TypeAlias = "tuple[Rotation, np.ndarray]"
 _Moved = tuple[float, tuple[float, ...], tuple[float, ...]]  # t, q and p
 
 
@@ -118,9 +120,7 @@ class Frames:
                 f"{parent} -> {child}: there are {most} frames already; publish fewer."
             )
 
-    def between(
-        self, target: str, source: str, t: float | None = None
-    ) -> tuple[Rotation, np.ndarray] | None:
+    def between(self, target: str, source: str, t: float | None = None) -> Place | None:
         """Return (Rotation, p (3,) m) with x_target = R x_source + p; None if unknown.
 
         t : stamp, s, for frames that move

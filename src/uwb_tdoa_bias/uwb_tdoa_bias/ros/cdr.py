@@ -29,6 +29,7 @@ from rosidl_parser.definition import AbstractString, Array, BasicType, Namespace
 Message = TypeVar("Message")
 Leaves = list[tuple[str, str, int]]  # names, codes and counts, see `_leaves`
 STAMP, FRAME = ("sec", "nanosec"), "header.frame_id"
+CHILD = "child_frame_id"  # of nav_msgs/Odometry: the frame of its twist
 ENCAPSULATION = b"\x00\x01\x00\x00"  # plain CDR, little endian
 # Plain CDR in big and little endian. The fourth byte holds options.
 KNOWN_ENCAPSULATIONS = (b"\x00\x00\x00", b"\x00\x01\x00")
@@ -73,19 +74,22 @@ class CdrCodec:
         message, e.g. "pose.pose.position": (3,) of float, "pose.covariance": (36,)
     """
 
-    def __init__(self, kind: type, *fields: str) -> None:
+    def __init__(self, kind: type, *fields: str, of_twist: bool = False) -> None:
         """Prepare the fields.
 
         Parameters
         ----------
         kind : class of the messages
         fields : names of fields that are numbers, or contain only numbers of one type
+        of_twist : read the frame of a twist: CHILD, if the type has it
         """
         self.kind = kind
         paths = {name: f"header.stamp.{name}" for name in STAMP} | {
             field: field for field in fields
         }
         self._leaves, self._whole = _leaves(kind)
+        has_child = any(leaf == CHILD for leaf, *_ in self._leaves)
+        self._frame = CHILD if of_twist and has_child else FRAME
         self._paths = {
             name: [leaf for leaf, *_ in self._leaves if f"{leaf}.".startswith(f"{path}.")]
             for name, path in paths.items()
@@ -147,7 +151,7 @@ class CdrCodec:
             places[leaf] = place
             if code == TEXT:
                 texts.append((place, end, data[place:end]))
-        frame, _ = read_text(data, places[FRAME], FRAME)
+        frame, _ = read_text(data, places[self._frame], self._frame)
         check_length(data, end, self.kind, exactly=self._whole)
         formats = [self.dtype[name] for name in self._paths]
         offsets = [places[leaves[0]] for leaves in self._paths.values()]
@@ -176,15 +180,17 @@ class CdrCodec:
         row = np.empty(1, self.dtype)
         for name, leaves in self._paths.items():
             row[name] = np.concatenate([np.atleast_1d(_get(message, leaf)) for leaf in leaves])
-        frame = message.header.frame_id
+        frame = _get(message, self._frame)
         if "\ufffd" in frame:  # the type support's replacement of bytes that are not UTF-8
-            raise Unreadable(f"{FRAME} is no UTF-8")
+            raise Unreadable(f"{self._frame} is no UTF-8")
         return frame, row
 
     def _agrees(self) -> bool:
         """Return whether the middleware lays messages out as the definition says."""
         message = self.kind()
         message.header.frame_id = "a frame"
+        if self._frame == CHILD:
+            message.child_frame_id = "a frame"
         for k, (leaf, code, count) in enumerate(self._leaves):
             if code != TEXT:
                 _set(message, leaf, (np.arange(count) + k % 100).astype(code))

@@ -232,8 +232,11 @@ class FilterConfig(_SensorParameters):
                     raise InputError(f"{name}: {value!r} must be true or false.")
             else:
                 object.__setattr__(self, name, _number(each, value))
-        if self.planar and self.fixed_height_std == 0.0:
-            object.__setattr__(self, "fixed_height_std", PLANAR_HEIGHT_STD)
+
+    @property
+    def known_height_std(self) -> float:
+        """Return the standard deviation of fixed_height, m; 0.0 for a tag that does not stay there."""
+        return self.fixed_height_std or (PLANAR_HEIGHT_STD if self.planar else 0.0)
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> "FilterConfig":
@@ -258,9 +261,11 @@ class FilterConfig(_SensorParameters):
 
         A choice becomes its index in CHOICES.
         """
-        values = ((each.name, getattr(self, each.name)) for each in fields(self))
+        values = {each.name: getattr(self, each.name) for each in fields(self)}
+        values["fixed_height_std"] = self.known_height_std
         places = (
-            CHOICES[name].index(value) if name in CHOICES else value for name, value in values
+            CHOICES[name].index(value) if name in CHOICES else value
+            for name, value in values.items()
         )
         return np.array([tuple(places)], PARAMETERS)
 

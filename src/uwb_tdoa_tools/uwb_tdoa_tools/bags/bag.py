@@ -228,8 +228,8 @@ def read_bag(
     """Read the Flight in a bag from `ros2 bag record` or from these tools.
 
     Other topics are ignored. Stamps are header stamps on a continuous time (`meta["clock"]`: [Jump] and {stream: outliers},
-    see `clock.straightened`). Messages are sorted by stamp (`meta["reordered"]`). IMU samples are
-    transformed to the body frame with /tf_static. `meta["antenna"]` is the position of the antenna
+    see `clock.straightened`). Messages are sorted by stamp (`meta["reordered"]`). IMU samples and velocities
+    are transformed to the body frame with /tf_static and that of the namespace. `meta["antenna"]` is the position of the antenna
     in the body, (3,) m. `meta["unread"]` has sentences on other topics.
 
     Parameters
@@ -256,9 +256,12 @@ def read_bag(
             name: read_topic(path, reader, name_of(kind.topic), kind.message, kind.row)
             for name, kind in own.items()
         }
+        tree = frames.read_frames(path, reader, name_of)
         found |= {
-            name: read_sensor(path, reader, sensor, name_of) for name, sensor in SENSORS.items()
+            name: read_sensor(path, reader, sensor, name_of, tree)
+            for name, sensor in SENSORS.items()
         }
+        remarks += [remark for of in found.values() for remark in of.remarks]
         found, clock = on_one_clock(found)
         if clock.jumps or clock.kept:
             meta["clock"] = clock.jumps, clock.outliers
@@ -311,7 +314,6 @@ def read_bag(
             anchors = refuse_faulty(recorded.anchors, f"{path}: {recorded.source}")
             remarks += recorded.remarks(name_of("uwb/anchors"))
         imu = stream("imu")
-        tree = frames.read_frames(path, reader)
         # the antenna is that of the TDOAs, or of ranges without any
         radio = ["tdoa"] if len(tdoa) else [name for name in LOCATING if sensors[name] is not None]
         places = {
@@ -338,7 +340,7 @@ def read_bag(
 def _unread(reader: BagReader, name_of: Names) -> list[str]:
     """Return sentences on topics of an open bag that no stream takes."""
     read = {name_of(topic) for name in STREAMS for topic, _ in topics_of(name)}
-    read |= {name_of("uwb/anchors"), frames.TF_STATIC}
+    read |= {name_of("uwb/anchors"), name_of("tf_static"), frames.TF_STATIC}
     return [
         f"{one.topic}: {one.msgcount} messages of {one.msgtype}, which no stream takes"
         for one in reader.connections

@@ -8,25 +8,23 @@ Sensors outside of the body frame are transformed as in the nodes.
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from itertools import chain
 from pathlib import Path
 import re
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Imu
-from uwb_tdoa_bias.common.transforms import Frames
+from uwb_tdoa_bias.common.transforms import Frames, Place
 from uwb_tdoa_ekf.frames import ImuMount
 
 from .files import BagReader, connections_of, readable
 from .message_types import check_type
 from .messages import BODY_FRAME
-
-Place = tuple[Rotation, np.ndarray]  # of a sensor in the body: its turn, and its arm (3,) m
 
 TF_STATIC = "/tf_static"
 ANCHORS, TRANSFORMS, MARKERS = (
@@ -44,10 +42,12 @@ def is_body(frame: str) -> bool:
     return frame.rpartition("/")[2] in (BODY_FRAME, "")
 
 
-def _static_transforms(path: str | Path, reader: BagReader) -> Iterator[Any]:
-    """Yield the transforms on /tf_static of an open bag. Raise InputError."""
+def _static_transforms(
+    path: str | Path, reader: BagReader, topic: str = TF_STATIC
+) -> Iterator[Any]:
+    """Yield the transforms on /tf_static, or another topic, of an open bag. Raise InputError."""
     connections = [
-        one for one in reader.connections if one.topic == TF_STATIC and one.msgtype == TRANSFORMS
+        one for one in reader.connections if one.topic == topic and one.msgtype == TRANSFORMS
     ]
     for connection in connections:
         check_type(path, connection)
@@ -55,10 +55,14 @@ def _static_transforms(path: str | Path, reader: BagReader) -> Iterator[Any]:
         yield from message.transforms
 
 
-def read_frames(path: str | Path, reader: BagReader) -> Frames:
-    """Read the Frames of all messages on /tf_static of an open bag. Raise InputError."""
+def read_frames(path: str | Path, reader: BagReader, name_of: Callable[[str], str]) -> Frames:
+    """Read the Frames of /tf_static, then of tf_static in the namespace, of an open bag.
+
+    name_of : Names of the topics. Raises InputError.
+    """
     frames = Frames()
-    for each in _static_transforms(path, reader):
+    topics = dict.fromkeys((TF_STATIC, name_of("tf_static")))
+    for each in chain(*(_static_transforms(path, reader, topic) for topic in topics)):
         q, p = each.transform.rotation, each.transform.translation
         q, p = (q.x, q.y, q.z, q.w), (p.x, p.y, p.z)
         if any(q) and np.isfinite([*q, *p]).all():

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.common.anchors import Anchors
 
     # A message has no type here: rosbags makes the classes while it runs.
-    RowOfMessage = Callable[[Any], tuple[float, ...]]
+    RowOfMessage = Callable[[Any], tuple[float, ...] | None]
     StreamOfRows = Callable[[np.ndarray, np.ndarray], Stream]  # of stamps (n,) s and rows (n, k)
     Validity = Callable[[np.ndarray], np.ndarray]  # of rows (n, k): (n, k) bool
 
@@ -80,9 +80,14 @@ def imu_messages(imu: Imu, store: Typestore) -> Iterator[tuple[int, Any]]:
         )
 
 
-def imu_row(message: Any) -> tuple[float, ...]:
-    """Return stamp ns, rates (3) rad/s and specific force (3) m/s^2 of a sensor_msgs/Imu."""
+def imu_row(message: Any) -> tuple[float, ...] | None:
+    """Return stamp ns, rates (3) rad/s and specific force (3) m/s^2 of a sensor_msgs/Imu.
+
+    None if one of both is not measured, as a covariance of -1 states (REP 145).
+    """
     rate, force = message.angular_velocity, message.linear_acceleration
+    if -1.0 in (message.angular_velocity_covariance[0], message.linear_acceleration_covariance[0]):
+        return None
     return stamp_of(message.header), rate.x, rate.y, rate.z, force.x, force.y, force.z
 
 

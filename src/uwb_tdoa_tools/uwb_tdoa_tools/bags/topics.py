@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,11 +21,13 @@ from rosbags.interfaces import (
 )
 
 from uwb_tdoa_bias.common.sensors import SENSORS, Sensor
+from uwb_tdoa_bias.common.transforms import Frames
 
 from ..clock import Straightened, straightened
 from ..command_lines import suggest_line
 from . import messages as bag_messages
 from .files import BagReader, connections_of, readable
+from .frames import sensor_place
 from .message_types import typestore
 
 
@@ -65,7 +67,7 @@ class StreamKind(NamedTuple):
 
     topic: str
     message: str
-    row: Callable[[Any], tuple[float, ...]]
+    row: bag_messages.RowOfMessage
     make: Callable[[np.ndarray, np.ndarray], Any]
     valid: Callable[[np.ndarray], np.ndarray] = bag_messages.valid
 
@@ -110,13 +112,15 @@ class TopicMessages:
     ----------
     stamps, arrived : (n,) int ns, of the headers and of the recording.
     rows : (n, k), further numbers of each message.
-    frames : {frame_id: messages}.
+    frames : {frame_id: messages}; of Odometry the frames of the twist.
+    remarks : sentences on what was left out or assumed.
     """
 
     stamps: np.ndarray
     arrived: np.ndarray
     rows: np.ndarray
     frames: Counter[str]
+    remarks: tuple[str, ...] = ()
 
     def in_order(self) -> tuple[np.ndarray, np.ndarray, int]:
         """Return (stamps (n,) s, rows (n, k)) in order of the stamps, and how often they fall."""
@@ -145,7 +149,7 @@ def on_one_clock(
     for name in {*clock.shifts, *clock.kept}:
         of, kept = found[name], clock.kept.get(name, slice(None))
         stamps = of.stamps + np.round(1e9 * clock.shifts.get(name, np.zeros(1))).astype(np.int64)
-        out[name] = TopicMessages(stamps[kept], of.arrived[kept], of.rows[kept], of.frames)
+        out[name] = replace(of, stamps=stamps[kept], arrived=of.arrived[kept], rows=of.rows[kept])
     return out, clock
 
 
@@ -154,23 +158,29 @@ def read_topic(
     reader: BagReader,
     topic: str,
     msgtype: str,
-    row: Callable[[Any], tuple[float, ...]],
+    row: bag_messages.RowOfMessage,
 ) -> TopicMessages:
     """Read the messages of a topic; empty if the topic does not exist.
 
-    `row(message)` returns the stamp, ns, and k further numbers. Raises InputError for another type
+    `row(message)` returns the stamp, ns, and k further numbers, or None without a measurement. Raises InputError for another type
     than `msgtype`.
     """
     arrived, rows, frames = [], [], Counter[str]()
     for _, received, message in readable(reader, connections_of(path, reader, topic, msgtype)):
-        arrived.append(received)
-        rows.append(row(message))
-        frames[message.header.frame_id] += 1
+        frames[getattr(message, "child_frame_id", message.header.frame_id)] += 1
+        if (values := row(message)) is not None:
+            arrived.append(received)
+            rows.append(values)
     stamps, table = (
         np.array([values[0] for values in rows], dtype=np.int64),
         np.array([values[1:] for values in rows], dtype=float),
     )
-    return TopicMessages(stamps, np.array(arrived, dtype=np.int64), table, frames)
+    remarks: tuple[str, ...] = ()
+    if left_out := sum(frames.values()) - len(rows):
+        remarks = (
+            f"{topic}: {left_out} messages left out: their covariance of -1 means unmeasured.",
+        )
+    return TopicMessages(stamps, np.array(arrived, dtype=np.int64), table, frames, remarks)
 
 
 def topics_of(name: str) -> tuple[tuple[str, str], ...]:
@@ -181,15 +191,20 @@ def topics_of(name: str) -> tuple[tuple[str, str], ...]:
 
 
 def read_sensor(
-    path: str | Path, reader: BagReader, sensor: Sensor, name_of: Names
+    path: str | Path, reader: BagReader, sensor: Sensor, name_of: Names, tree: Frames
 ) -> TopicMessages:
-    """Read all topics of a Sensor as a node receives them: in order of arrival.
+    """Read all topics of a Sensor as a node receives them: in order of arrival, in the body frame.
 
     Raises InputError as `read_topic`.
     """
     bag_messages.check_messages(sensor, typestore())
     row, _, _ = bag_messages.of_sensor(sensor)
     parts = [read_topic(path, reader, name_of(topic), kind, row) for topic, kind in sensor.topics]
+    if sensor.in_body is not None:
+        parts = [
+            _in_body(part, sensor, name_of(topic), tree)
+            for part, (topic, _) in zip(parts, sensor.topics)
+        ]
     filled = [part for part in parts if len(part.stamps)]
     if len(filled) < 2:
         return filled[0] if filled else parts[0]
@@ -198,7 +213,20 @@ def read_sensor(
         np.concatenate([getattr(part, name) for part in filled])[order]
         for name in ("stamps", "arrived", "rows")
     )
-    return TopicMessages(stamps, arrived, rows, sum((part.frames for part in filled), Counter()))
+    frames = sum((part.frames for part in filled), Counter[str]())
+    remarks = tuple(remark for part in filled for remark in part.remarks)
+    return TopicMessages(stamps, arrived, rows, frames, remarks)
+
+
+def _in_body(part: TopicMessages, sensor: Sensor, topic: str, tree: Frames) -> TopicMessages:
+    """Return the messages of a Sensor in the body frame, with a remark on the frame."""
+    place, remark = sensor_place(tree, topic, part.frames)
+    if remark is not None:
+        part = replace(part, remarks=(*part.remarks, remark))
+    if place is None or sensor.in_body is None:
+        return part
+    turned = sensor.in_body(sensor.split(part.rows), *place)
+    return replace(part, rows=np.column_stack([turned[field] for field in sensor.fields]))
 
 
 def other_namespaces(path: str | Path, reader: BagReader, namespace: str) -> str:

@@ -99,8 +99,26 @@ STEADY = 0.02  # share of the specific force by which it varies at rest
 TURNED = 0.3  # rad, least rotation in motion
 TIE = 0.03  # ratios this close are equal: the simplest arrangement is taken
 CHOSEN = 8  # arrangements that are tried on the longer part
-# The survey upside down: a second fault, e.g. a useless gyroscope, may explain a little more.
-OVER, NEARLY = np.diag([1.0, -1.0, -1.0]), 2.0 * TIE
+# Surveys whose z is not up: what z is, the remedy, and the matrix behind the positions that undoes it.
+SURVEYS = (
+    (
+        "is upside down: z points down",
+        "y, x, -z  # of every anchor; in a profile: world: ned",
+        np.diag([1.0, -1.0, -1.0]),
+    ),
+    (
+        "has y up, not z",
+        "x, -z, y  # of every anchor",
+        np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
+    ),
+    (
+        "has y down, and z is not up",
+        "x, z, -y  # of every anchor",
+        np.eye(3)[[0, 2, 1]] * [1.0, 1.0, -1.0],
+    ),
+    ("has y up, not z, and left-handed axes", "x, z, y  # of every anchor", np.eye(3)[[0, 2, 1]]),
+)
+NEARLY = 2.0 * TIE  # a second fault, e.g. a useless gyroscope, may explain a little more
 UPRIGHT, MIRROR = np.eye(3), np.diag([1.0, -1.0, 1.0])
 # Axes that are exchanged or mirrored, as (3, 3) matrices that undo it; the first is as it is.
 ARRANGEMENTS = [
@@ -159,11 +177,9 @@ def find_imu_mistake(recording: OrderedRecording) -> Finding | None:
     base = _unexplained(brief)
     trials = [_tried(base, brief, accel, gyro) for accel, gyro in USUAL]
     best = min(trials, key=_ratio)
-    if not best.ratio < RATIO:
-        return None
-    upside_down = _upside_down(base, brief, best.ratio)
-    if upside_down is not None:
-        return upside_down
+    turned = _turned_survey(base, brief, best.ratio)
+    if turned is not None or not best.ratio < RATIO:
+        return turned
     if abs(scale_of(best.gyro) - 1.0) < 0.03:  # the unit of the rates is right: an axis is wrong
         trials += _all(brief, base)
     least = min(trials, key=_ratio).ratio
@@ -177,26 +193,30 @@ def find_imu_mistake(recording: OrderedRecording) -> Finding | None:
     return _finding(simplest, evidence)
 
 
-def _upside_down(base: Unexplained, recording: OrderedRecording, least: float) -> Finding | None:
-    """Return the Finding that the survey is upside down, or None.
+def _turned_survey(base: Unexplained, recording: OrderedRecording, least: float) -> Finding | None:
+    """Return the Finding that z of the survey is not up, or None.
 
     Systems that survey their own anchors lay the plane z = 0 through three of them, not on the
-    floor.
+    floor. Motion capture and game engines have y up.
 
     least : ratio of the best arrangement of the inertial sensor
     """
-    turned = recording.anchors.at(recording.anchors.positions @ OVER)
-    ratio, z = compare(base, _unexplained(replace(recording, anchors=turned), RATIO * base.mean))
-    if not (ratio < min(RATIO, least + NEARLY) and z > DEVIATIONS):
+    places = recording.anchors.positions
+    better = []
+    for axes, positions, matrix in SURVEYS:
+        turned = replace(recording, anchors=recording.anchors.at(places @ matrix))
+        ratio, z = compare(base, _unexplained(turned, RATIO * base.mean))
+        if ratio < min(RATIO, least + NEARLY) and z > DEVIATIONS:
+            better.append((ratio, z, axes, positions))
+    if not better:
         return None
+    ratio, z, axes, positions = min(better)
     return Finding(
         "survey_upside_down",
         ERROR,
-        cause=(
-            "the survey is upside down: z points down, and the inertial sensor measures where up is"
-        ),
+        cause=f"the survey {axes}, and the inertial sensor measures where up is",
         evidence=in_words(ratio, z),
-        remedy="x, y, z = y, x, -z  # of every anchor; in a profile: world: ned",
+        remedy=f"x, y, z = {positions}",
         value=ratio,
     )
 

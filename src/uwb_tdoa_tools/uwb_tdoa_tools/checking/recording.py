@@ -19,7 +19,7 @@ from uwb_tdoa_bias.common.survey import refuse_faulty
 
 from ..bags import frames, is_bag, messages as bag_messages
 from ..bags.files import open_bag, remarks_of
-from ..bags.frames import TF_STATIC, Place, recorded_anchors
+from ..bags.frames import TF_STATIC, recorded_anchors
 from ..bags.topics import (
     STREAMS,
     Names,
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from uwb_tdoa_bias.common.sensors.sensor import Sensor, Stream
+    from uwb_tdoa_bias.common.transforms import Place
 
     from ..clock import Jump
     from ..live.record import End
@@ -155,7 +156,8 @@ def read_live(
     name_of = Names(reading.namespace, reading.topics)
     with temporary_folder() as folder:
         bag = folder / "live"
-        topics, ends = listen([*map(name_of, HEARD), TF_STATIC], bag, seconds, say)
+        heard = dict.fromkeys([*map(name_of, (*HEARD, "tf_static")), TF_STATIC])
+        topics, ends = listen([*heard], bag, seconds, say)
         try:
             recording = _read_bag(reading, bag, survey)
         except InputError as error:
@@ -205,8 +207,10 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
             name: read_topic(path, reader, name_of(topic), kind, row)
             for name, (topic, kind, row) in kinds.items()
         }
+        tree = frames.read_frames(path, reader, name_of)
         found |= {
-            name: read_sensor(path, reader, sensor, name_of) for name, sensor in SENSORS.items()
+            name: read_sensor(path, reader, sensor, name_of, tree)
+            for name, sensor in SENSORS.items()
         }
         pose = STREAMS["pose"]
         poses = read_topic(path, reader, name_of(pose.topic), pose.message, pose.row)
@@ -222,8 +226,7 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
             if len(found[name].stamps)
         }
         recorded = recorded_anchors(path, reader, name_of("uwb/anchors"))
-        tree = frames.read_frames(path, reader)
-        remarks = tuple(remarks_of(reader))
+        remarks = (*remarks_of(reader), *(each for of in found.values() for each in of.remarks))
     if not len(tdoa.stamps) and not sensors.keys() & set(LOCATING):
         there = sorted(
             topic

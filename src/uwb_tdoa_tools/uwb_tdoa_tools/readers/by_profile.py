@@ -33,7 +33,7 @@ from .profile import (
     Source,
     time_column,
 )
-from .streams import Streams, make_flight
+from .streams import Streams, by_time, make_flight
 from .tables import CsvFiles, ULogFile, is_ulog, table_of
 
 SURVEY = "anchors"  # stream of positions
@@ -174,6 +174,8 @@ def read_by_profile(
                     f"{files[0]}: {' and '.join(by_table)} both give {stream}, which is of one "
                     "sensor; leave one of them out of the profile."
                 )
+            if isinstance(tables, CsvFiles) and not any(source.topic for source in profile.sources):
+                _refuse_same_anchors(by_table)
             streams[stream] = _joined([*by_table.values()])
         remarks += tables.remarks
         meta: dict[str, Any] = {
@@ -419,7 +421,8 @@ def _requests(
     requests = []
     for number, source in enumerate(profile.sources, start=1):
         if isinstance(tables, CsvFiles) and not source.topic:
-            requests.append(_Request(_csv_with_columns(tables, source), source, {}, tables))
+            files = _csv_with_columns(tables, source)
+            requests += [_Request(table, source, {}, tables) for table in files]
             continue
         found: dict[str, dict[str, str]] = {}
         for table, kind in tables.types.items() if source.topic or source.type else ():
@@ -455,21 +458,22 @@ def _in_namespace(
     )
 
 
-def _csv_with_columns(tables: CsvFiles, source: Source) -> str:
-    """Return the path of the single CSV file that has all columns of a source.
+def _csv_with_columns(tables: CsvFiles, source: Source) -> list[str]:
+    """Return the paths of the CSV files that have all columns of a source: one, or all of one shape.
 
-    Raises InputError for several files. If none has all columns, the error names a file that lacks
+    Raises InputError for several shapes. If none has all columns, the error names a file that lacks
     the fewest.
     """
     columns = {path for mine in _wanted(source).values() for path, _ in mine.values()}
     wanted = columns | source.conditions
     having = [table for table in tables.types if wanted <= {*tables.fields(table)}]
-    if len(having) == 1:
-        return having[0]
-    if having:
+    other = next((one for one in having if tables.fields(one) != tables.fields(having[0])), None)
+    if other:
         raise InputError(
-            f"{having[1]}: has column {min(wanted)!r} as {having[0]} has; give one of them."
+            f"{other}: has column {min(wanted)!r} as {having[0]} has; give one of them."
         )
+    if having:
+        return having
     table = min(tables.types, key=lambda each: len(wanted - {*tables.fields(each)}))
     names = tables.fields(table)
     raise InputError(
@@ -533,6 +537,19 @@ def _recorded_anchors(
     )
 
 
+def _refuse_same_anchors(by_table: dict[str, dict[str, np.ndarray]]) -> None:
+    """Raise InputError if several files of one shape hold the same anchor (pair): two recordings."""
+    holder: dict[tuple[float, ...], str] = {}
+    for table, columns in by_table.items():
+        ids = [columns[name].tolist() for name in ("a", "b", "anchor") if name in columns]
+        for anchors in dict.fromkeys(zip(*ids)):
+            if holder.setdefault(anchors, table) != table:
+                raise InputError(
+                    f"{table}: has the columns and anchors that {holder[anchors]} has, as another "
+                    "recording; give one of them."
+                )
+
+
 def _check_tag(path: Path, requests: Sequence[_Request], tag: str) -> None:
     """Raise InputError if the tag is not there, or is one of several and not named."""
     tags: Counter[str] = sum((request.tags for request in requests), Counter())
@@ -556,10 +573,7 @@ def _joined(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     """
     names = set.intersection(*({*part} for part in parts))
     joined = {name: np.concatenate([part[name] for part in parts]) for name in sorted(names)}
-    if len(parts) > 1:
-        order = np.argsort(joined["t"], kind="stable")
-        joined = {name: values[order] for name, values in joined.items()}
-    return joined
+    return by_time(joined) if len(parts) > 1 else joined
 
 
 def _unread(tables: Foreign, requests: Sequence[_Request]) -> list[str]:

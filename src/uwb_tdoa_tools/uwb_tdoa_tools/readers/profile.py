@@ -138,8 +138,10 @@ def check_columns(where: str, columns: Columns, time: bool = True) -> None:
     for stream in used if {*RADIO} & {*used} or not time else ["tdoa", *used]:
         needed = [*(name for name in STREAMS[stream] if name not in OPTIONAL)]
         if missing := [name for name in needed if name not in columns]:
+            per_file = "; where each anchor has a file, write a profile with topic: 'A{anchor}.csv'"
             raise InputError(
-                f"{where}: {missing[0]} is missing; {', '.join(needed)} belong together."
+                f"{where}: {missing[0]} is missing; {', '.join(needed)} belong together"
+                f"{per_file if missing == ['anchor'] else ''}."
             )
         if time and stream != "anchors" and not {*TIMES[stream], "time"} & columns.keys():
             raise InputError(

@@ -18,7 +18,7 @@ from uwb_tdoa_bias.common.sensors.pressure import pressure_at
 from uwb_tdoa_bias.common.sensors.ranges import Ranges
 from uwb_tdoa_bias.common.sensors.sensor import LARGEST_NUMBER
 
-from ..clock import sentences, straightened
+from ..clock import is_grouped, sentences, straightened
 
 Columns = dict[str, np.ndarray]  # of a stream, each (n,)
 Streams = dict[str, Columns]
@@ -89,6 +89,15 @@ def make_flight(
     _refuse_other_unit_of_time(
         meta["source"], {key: np.asarray(columns["t"], float) for key, columns in wanted.items()}
     )
+    for key in {"tdoa", "range"} & wanted.keys():
+        columns = wanted[key]
+        if is_grouped(
+            columns["t"], *(columns[name] for name in ("a", "b", "anchor") if name in columns)
+        ):
+            wanted[key] = by_time(columns)
+            meta["remarks"].append(
+                f"{key}: the rows are grouped by anchor: read in the order of time."
+            )
     clock = straightened({key: columns["t"] for key, columns in (extra | wanted).items()})
     wanted, extra = (
         {key: clock.columns(key, columns) for key, columns in group.items()}
@@ -149,11 +158,15 @@ def _in_order(streams: Streams, reordered: dict[str, int]) -> Streams:
             continue
         falls = int((np.diff(columns["t"]) < 0).sum())
         if falls:
-            order = np.argsort(columns["t"], kind="stable")
-            columns = {column: values[order] for column, values in columns.items()}
-            reordered[key] = falls
+            columns, reordered[key] = by_time(columns), falls
         out[key] = columns
     return out
+
+
+def by_time(columns: Columns) -> Columns:
+    """Return the columns of a stream in the order of time."""
+    order = np.argsort(columns["t"], kind="stable")
+    return {name: values[order] for name, values in columns.items()}
 
 
 def _inertial(streams: Streams, meta: dict[str, Any]) -> Imu | None:

@@ -354,6 +354,8 @@ class Sensor:
     others : ((topic, message), ...) of other topics with the same fields
     assumed : callable of a Stream -> names of the parameters used for messages that state no standard
         deviation; None: all messages state one
+    in_body : callable of ({field: (n,) or (n, k)}, Rotation, arm (3,) m) -> the same in the body, of a
+        sensor that is turned and off center; None: its frame does not matter
     """
 
     name: str
@@ -378,6 +380,7 @@ class Sensor:
     rules: tuple = ()
     others: tuple = ()
     assumed: Callable | None = None
+    in_body: Callable | None = None
 
     @property
     def topics(self) -> tuple:

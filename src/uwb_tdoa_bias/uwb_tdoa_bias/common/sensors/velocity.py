@@ -103,6 +103,21 @@ def _columns(fields: dict) -> tuple:
     )
 
 
+def _in_body(fields: dict, turn: Any, arm: np.ndarray) -> dict:
+    """Return the fields in the body: v = R v - (R w) x arm, and both blocks of the covariance turned."""
+    matrix = turn.as_matrix()
+    rates = fields["twist.twist.angular"] @ matrix.T
+    covariance = fields["twist.covariance"].reshape(-1, 6, 6).copy()
+    diagonal = np.einsum("nii->ni", covariance)
+    diagonal[diagonal < 0.0] = UNKNOWN_VARIANCE
+    both = np.kron(np.eye(2), matrix)
+    return {
+        "twist.twist.linear": fields["twist.twist.linear"] @ matrix.T - np.cross(rates, arm),
+        "twist.twist.angular": rates,
+        "twist.covariance": (both @ covariance @ both.T).reshape(-1, 36),
+    }
+
+
 def _content(velocity: Velocity) -> dict:
     variance = np.full((len(velocity), 6), UNKNOWN_VARIANCE)  # rates about x and y are not measured
     variance[:, :3] = np.minimum(velocity.std**2, UNKNOWN_VARIANCE)
@@ -217,4 +232,5 @@ SENSOR = Sensor(
     },
     others=(("velocity/odometry", "nav_msgs/msg/Odometry"),),
     assumed=_assumed,
+    in_body=_in_body,
 )
