@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -106,6 +107,29 @@ def test_from_yaml_takes_what_tunes_the_filter_and_passes_over_the_rest(tmp_path
     assert FilterConfig.from_yaml(write(tmp_path, text)) == FilterConfig(
         tdoa_std=0.5, loss="huber", use_imu=False
     )
+
+
+def test_from_yaml_reads_a_file_of_several_nodes(tmp_path):
+    text = (
+        "ekf_node: {ros__parameters: {tdoa_std: 0.4}}\nbias_node: {ros__parameters: {tdoa_std: 9.0}}\n"
+        "/**: {ros__parameters: {tdoa_std: 0.3, gate: 4.0}}\n"
+    )
+    path = write(tmp_path, text)
+    assert FilterConfig.from_yaml(path) == FilterConfig(tdoa_std=0.4, gate=4.0)
+    two = text.replace("bias_node", "/other/ekf_node")
+    with pytest.raises(InputError, match="of one ekf_node"):
+        FilterConfig.from_yaml(write(tmp_path, two))
+
+
+def test_from_yaml_names_the_parameter_that_a_mistyped_one_means(tmp_path):
+    path = write(tmp_path, "ekf_node: {ros__parameters: {tdoa_sdt: 0.4}}")
+    with pytest.raises(InputError, match="tdoa_sdt: is no parameter of the filter; write tdoa_std"):
+        FilterConfig.from_yaml(path)
+
+
+@pytest.mark.parametrize("file", sorted(Path(__file__).parents[2].glob("*/config/*_node.yaml")))
+def test_no_parameter_of_a_node_is_taken_for_a_mistyped_one(file):
+    assert FilterConfig.from_yaml(file) == FilterConfig()
 
 
 @pytest.mark.parametrize(

@@ -180,6 +180,14 @@ def name_of(value: Any) -> str:
     return str(int(number)) if number.is_integer() else text
 
 
+# of a table id,latitude,longitude,height; the length of a degree is that of the WGS 84 ellipsoid
+GEODETIC = (
+    "latitude and longitude in degrees; give metres, x to the east and y to the north. For a file with "
+    """id,latitude,longitude,height: awk -F, 'NR==1 {print "id,x,y,z"; next} NR==2 {a=$2; o=$3; """
+    """r=a*0.01745329} {printf "%s,%.3f,%.3f,%s\\n", $1, ($3-o)*(111413*cos(r)-93.5*cos(3*r)), """
+    """($2-a)*(111133-559.8*cos(2*r)), $4}' FILE > metres.csv"""
+)
+SMALL, MANY_TIMES = 0.01, 1000.0  # degrees, of a room; and how often it goes into the coordinates
 _YAML_KEY = re.compile(r"^\s*(?:- *)?[{\s]*[\"']?[\w /*.-]+[\"']?\s*:(?:\s|$)")
 
 
@@ -282,6 +290,8 @@ def read_table(lines: Lines, unit: str = "") -> list[Entry] | None:
     (number, header), rest = lines[0], lines[1:]
     columns = columns_of(header)
     if columns is None:
+        if any(re.match("lat(itude)?\\b", cell.strip(), re.IGNORECASE) for cell in header):
+            raise InputError(f"line {number}: {', '.join(header)} are {GEODETIC}")
         if all(map(_is_number, lines[0][1])):
             return _without_header(lines, unit)
         return None
@@ -550,6 +560,14 @@ def survey_fault(anchors: Anchors) -> str:
     """Return what is certainly wrong with Anchors: cause, evidence and remedy; "" for a usable survey."""
     if len(anchors) < 2:
         return ""
+    level = anchors.positions[:, :2]
+    spread = np.ptp(level, axis=0)
+    if (
+        (spread > 0.0).all()
+        and (MANY_TIMES * spread < np.abs(level)).all()
+        and spread.max() < SMALL
+    ):
+        return f"x and y are the same within {spread.max():.1g}, as are {GEODETIC}"
     cells = np.round(anchors.positions / SAME_PLACE)
     _, group, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     together = np.flatnonzero(counts > 1)

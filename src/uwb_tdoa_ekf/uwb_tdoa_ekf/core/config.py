@@ -3,6 +3,7 @@
 """Tuning parameters of the filter, with unit and reason."""
 
 from dataclasses import Field, dataclass, fields, make_dataclass
+from difflib import get_close_matches
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +20,7 @@ ROBUST = ("innovation", "gate", "m_estimation")
 SIDES = "unknown", "below", "above", "-x", "+x", "-y", "+y"
 # parameters with a fixed set of names
 CHOICES = {"robust": ROBUST, "loss": LOSSES, "tag_side": SIDES}
+NEAR = 0.8  # similarity of two names, above which one is taken for a mistyped other
 PLANAR_HEIGHT_STD = 0.02  # m
 
 
@@ -240,20 +242,29 @@ class FilterConfig(_SensorParameters):
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> "FilterConfig":
-        """Read the ros__parameters of a node's parameter file.
+        """Read the parameters of ekf_node in a parameter file of ROS.
 
-        Parameters that do not tune the filter are ignored. Raises InputError.
+        In a file of several nodes those of `/**` and of ekf_node count. Parameters that do not tune the
+        filter are ignored. Raises InputError, also for a name that nearly is one of the filter.
         """
-        content = read_yaml(path)
+        content, names = read_yaml(path), {each.name for each in fields(cls)}
         try:
-            (node,) = content.values()
-            given = node["ros__parameters"]
-            return cls(**{f.name: given[f.name] for f in fields(cls) if f.name in given})
+            own = [key for key in map(str, content) if key.rpartition("/")[2] in ("**", "ekf_node")]
+            if not own or sum(key.endswith("ekf_node") for key in own) > 1:
+                own = [*content]
+                (_,) = own  # the parameters of one node
+            given: dict[str, Any] = {}
+            for key in sorted(own, key=len):  # /** is the shortest; the others override it
+                given |= content[key]["ros__parameters"]
+            for name in sorted(map(str, given.keys() - names)):
+                if near := get_close_matches(name, names, n=1, cutoff=NEAR):
+                    raise InputError(f"{name}: is no parameter of the filter; write {near[0]}.")
+            return cls(**{name: given[name] for name in given.keys() & names})
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise InputError(
-                f"{path}: expected one node's 'ros__parameters' mapping, as in ekf_node.yaml."
+                f"{path}: expected the 'ros__parameters' of one ekf_node, as in ekf_node.yaml."
             ) from error
 
     def parameters(self) -> np.ndarray:

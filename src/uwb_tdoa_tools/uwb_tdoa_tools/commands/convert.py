@@ -36,6 +36,8 @@ that the survey has for them). Records with empty cells are left out and counted
 The new bag has imu/data, uwb/tdoa, uwb/anchors, ground_truth/pose and /tf_static. It appears only when it is complete.
 """
 
+YOUR_SURVEY = "anchors.yaml"  # in a line to copy
+
 
 def parser() -> ArgumentParser:
     """Its options."""
@@ -133,12 +135,18 @@ def _suggest(args: Namespace) -> None:
     from ..readers.profile import load_profile
     from ..readers.suggest import suggest
 
-    text, fitting = suggest([Path(path) for path in args.input], args.salvage)
+    text, fitting, problem, has_anchors = suggest([Path(path) for path in args.input], args.salvage)
     write_text(args.suggest, text)
+    if problem:
+        raise InputError(f"{args.suggest}: is written, and cannot be used yet: {problem}")
     for name in fitting:
         cli.show(f"the shipped profile {name} fits: {load_profile(name).about}")
     words = [*args.input, "--profile", fitting[0] if fitting else args.suggest]
+    if args.survey or not has_anchors:
+        words += ["--survey", args.survey or YOUR_SURVEY]
     cli.show(f"  -> {args.suggest}", f"next: {tool('convert', *words, '--out', 'our.bag')}")
+    if YOUR_SURVEY in words:
+        cli.show(f"{YOUR_SURVEY} is the file with the positions of your anchors (docs/csv.md)")
 
 
 def _offsets(texts: Iterable[str]) -> dict[str, float]:

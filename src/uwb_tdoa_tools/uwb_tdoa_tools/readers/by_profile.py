@@ -8,6 +8,7 @@ from array import array
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from datetime import datetime, timezone
 from pathlib import Path
 import re
 from typing import Any, Protocol
@@ -31,6 +32,7 @@ from .profile import (
     Columns,
     Profile,
     Source,
+    parts_of,
     time_column,
 )
 from .streams import Streams, by_time, make_flight
@@ -41,6 +43,10 @@ SINGLE = "gyro", "acc", "pose", "tof", "baro", "flow"  # streams of one sensor e
 MOST_LISTED = 8  # columns in a sentence
 THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}")  # as 1,000
 MOVED = 0.1  # m that the recorded position of an anchor changes, above which it is reported
+_MOMENT = re.compile(
+    r"(?=\d)(?:(\d{4})[-/](\d\d?)[-/](\d\d?))?[T ]*(?:(\d\d?):(\d\d):(\d\d(?:[.,]\d+)?))?"
+    r"\s*(?:Z|UTC|([-+]\d\d):?(\d\d))?"
+)
 ENU_OF_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 FLU_OF_FRD = np.diag([1.0, -1.0, -1.0])
 
@@ -163,20 +169,20 @@ def read_by_profile(
         named = survey or _recorded_anchors(tables, requests, files[0], remarks)
         _take(tables, [one for one in requests if one.gives != {SURVEY}], named, tag)
         streams: Streams = {}
-        parts: dict[str, dict[str, dict[str, np.ndarray]]] = {}
+        parts: dict[str, list[tuple[str, dict[str, np.ndarray]]]] = {}
         for request in requests:
             for stream, columns in request.streams(remarks, salvage).items():
-                parts.setdefault(stream, {})[request.table] = columns
+                parts.setdefault(stream, []).append((request.table, columns))
         _check_tag(files[0], requests, tag)
-        for stream, by_table in parts.items():
-            if stream in SINGLE and len(by_table) > 1:
+        for stream, found in parts.items():
+            if stream in SINGLE and len(found) > 1:
                 raise InputError(
-                    f"{files[0]}: {' and '.join(by_table)} both give {stream}, which is of one "
+                    f"{files[0]}: {' and '.join(table for table, _ in found)} both give {stream}, which is of one "
                     "sensor; leave one of them out of the profile."
                 )
             if isinstance(tables, CsvFiles) and not any(source.topic for source in profile.sources):
-                _refuse_same_anchors(by_table)
-            streams[stream] = _joined([*by_table.values()])
+                _refuse_same_anchors(found)
+            streams[stream] = _joined([columns for _, columns in found])
         remarks += tables.remarks
         meta: dict[str, Any] = {
             "source": ", ".join(map(str, paths)),
@@ -213,8 +219,19 @@ class _Request:
     unstamped : messages without a stamp.
     """
 
-    def __init__(self, table: str, source: Source, names: dict[str, str], tables: Foreign) -> None:
-        self.table, self.source, self._names = table, source, names
+    def __init__(
+        self,
+        table: str,
+        source: Source,
+        names: dict[str, str],
+        tables: Foreign,
+        held: bool = False,
+    ) -> None:
+        """Prepare to read a source of a table.
+
+        names : {name in a pattern: text}; held : leave out records that repeat the last one.
+        """
+        self.table, self.source, self._names, self._held = table, source, names, held
         self._fields = tables.fields(table)
         # Then a comma in a cell may be a thousands separator.
         self._between_commas = isinstance(tables, CsvFiles) and tables.delimiters[table] == ","
@@ -228,13 +245,16 @@ class _Request:
         self._values: dict[str, dict[str, array[float]]] = {
             stream: {name: array("d") for name in mine} for stream, mine in self._wanted.items()
         }
+        times = [mine["t"][0] for mine in self._wanted.values() if "t" in mine]
+        self._sums = {path: parts_of(path) for path in times if len(parts_of(path)) > 1}
         self._first: dict[str, str] = {}
         self._skipped: Counter[str] = Counter()
         self.tags: Counter[str] = Counter()
         self.positions: dict[str, tuple[float, float, float]] = {}
         self.moved: dict[str, float] = {}
         self._left_out = 0
-        self.unstamped = 0
+        self.unstamped = self._repeats = 0
+        self._last: list[Any] = []
         self._by_stamp = default is not None and any(
             mine.get("t") == default for mine in self._wanted.values()
         )
@@ -255,6 +275,10 @@ class _Request:
         self, record: Record, index: int | None, place: str, named: NamedAnchors | None, tag: str
     ) -> None:
         def value(path: str) -> Any:
+            if path in self._sums:
+                times = [(as_time(record.value(part, index)), f) for part, f in self._sums[path]]
+                known = [t * f for t, f in times if t is not None]
+                return sum(known) if len(known) == len(times) else ""
             return self._names[path] if path in self._names else record.value(path, index)
 
         if not all(condition.met(value(condition.path)) for condition in self.source.where):
@@ -280,6 +304,10 @@ class _Request:
             values = [each for name, each in raw.items() if name != "t"]
             if all(isinstance(each, str) and each.lower() in EMPTY for each in values):
                 continue
+            if self._held and values == self._last:
+                self._repeats += 1
+                continue
+            self._last = values
             self._keep(stream, raw, place, named)
 
     def _keep(self, stream: str, raw: dict[str, Any], place: str, named: NamedAnchors) -> None:
@@ -287,6 +315,8 @@ class _Request:
             name: (
                 named.id_of(each)
                 if name in ANCHORS
+                else as_time(each)
+                if name == "t"
                 else self._number(each, self._wanted[stream][name][0], place)
             )
             for name, each in raw.items()
@@ -368,6 +398,7 @@ class _Request:
 
     def sentences(self) -> Iterator[str]:
         """Yield what was read, with counts and seconds."""
+        of = self._names.values() if self._held else ()
         for stream, values in self._values.items():
             if stream == SURVEY:
                 if self.positions:
@@ -375,7 +406,9 @@ class _Request:
                 continue
             t = np.array(values["t"]) * self._wanted[stream]["t"][1]
             span = f", {t.min():.1f} to {t.max():.1f} s" if len(t) else ""
-            yield f"{self.table}: {len(t)} records of {stream}{span}"
+            yield f"{self.table}: {len(t)} records of {' '.join([stream, *of])}{span}"
+        if self._repeats:
+            yield f"{self.table}: {self._repeats} values of {' '.join(of)} repeat the last one"
         if self.unstamped and self._by_stamp:
             yield f"{self.table}: {self.unstamped} messages without a stamp: the time of recording counts"
         if self._left_out:
@@ -420,22 +453,25 @@ def _requests(
     """Return the requests of all sources. Raises InputError."""
     requests = []
     for number, source in enumerate(profile.sources, start=1):
-        if isinstance(tables, CsvFiles) and not source.topic:
-            files = _csv_with_columns(tables, source)
-            requests += [_Request(table, source, {}, tables) for table in files]
-            continue
         found: dict[str, dict[str, str]] = {}
-        for table, kind in tables.types.items() if source.topic or source.type else ():
-            name = table_of(table) if isinstance(tables, CsvFiles) else table
-            names = source.match(name, kind)
-            if names is not None:
-                found[table] = names
-        if not found:
-            what = source.topic or source.type
-            remarks.append(f"the recording has no {what}, source {number} of the profile.")
-        if len(found) > 1 and not any(found.values()):
-            found = _in_namespace(path, found, namespace)
-        requests += [_Request(table, source, names, tables) for table, names in found.items()]
+        if isinstance(tables, CsvFiles) and not source.topic:
+            found = {table: {} for table in _csv_with_columns(tables, source)}
+        else:
+            for table, kind in tables.types.items() if source.topic or source.type else ():
+                name = table_of(table) if isinstance(tables, CsvFiles) else table
+                names = source.match(name, kind)
+                if names is not None:
+                    found[table] = names
+            if not found:
+                what = source.topic or source.type
+                remarks.append(f"the recording has no {what}, source {number} of the profile.")
+            if len(found) > 1 and not any(found.values()):
+                found = _in_namespace(path, found, namespace)
+        requests += [
+            _Request(table, one, names | more, tables, bool(more))
+            for table, names in found.items()
+            for one, more in source.over(tables.fields(table))
+        ]
     if not any(request.gives & {*RADIO} for request in requests):
         raise InputError(
             f"{path}: has nothing that the profile {profile.name} takes TDOAs or ranges from; it "
@@ -464,21 +500,33 @@ def _csv_with_columns(tables: CsvFiles, source: Source) -> list[str]:
     Raises InputError for several shapes. If none has all columns, the error names a file that lacks
     the fewest.
     """
-    columns = {path for mine in _wanted(source).values() for path, _ in mine.values()}
-    wanted = columns | source.conditions
-    having = [table for table in tables.types if wanted <= {*tables.fields(table)}]
+    lacking = {table: _lacking(source, tables.fields(table)) for table in tables.types}
+    having = [table for table, columns in lacking.items() if not columns]
     other = next((one for one in having if tables.fields(one) != tables.fields(having[0])), None)
     if other:
         raise InputError(
-            f"{other}: has column {min(wanted)!r} as {having[0]} has; give one of them."
+            f"{other}: has column {min(_paths(source))!r} as {having[0]} has; give one of them."
         )
     if having:
         return having
-    table = min(tables.types, key=lambda each: len(wanted - {*tables.fields(each)}))
-    names = tables.fields(table)
+    table = min(lacking, key=lambda each: len(lacking[each]))
     raise InputError(
-        f"{table}: has no column {min(wanted - {*names})!r}; its columns are {', '.join(names)}."
+        f"{table}: has no column {min(lacking[table])!r}; its columns are "
+        f"{', '.join(tables.fields(table))}."
     )
+
+
+def _lacking(source: Source, fields: Sequence[str]) -> set[str]:
+    """Return the columns of a source that are not among the fields of a file."""
+    fitting = source.over(fields)
+    one, names = fitting[0] if fitting else (source, {})
+    return _paths(one) - {*fields} - {*names}
+
+
+def _paths(source: Source) -> set[str]:
+    """Return the columns that are read, also to decide which records count."""
+    paths = {path for mine in _wanted(source).values() for path, _ in mine.values()}
+    return {part for path in paths for part, _ in parts_of(path)} | source.conditions
 
 
 def _wanted(source: Source, default: tuple[str, float] | None = None) -> dict[str, Columns]:
@@ -537,10 +585,10 @@ def _recorded_anchors(
     )
 
 
-def _refuse_same_anchors(by_table: dict[str, dict[str, np.ndarray]]) -> None:
+def _refuse_same_anchors(found: Sequence[tuple[str, dict[str, np.ndarray]]]) -> None:
     """Raise InputError if several files of one shape hold the same anchor (pair): two recordings."""
     holder: dict[tuple[float, ...], str] = {}
-    for table, columns in by_table.items():
+    for table, columns in found:
         ids = [columns[name].tolist() for name in ("a", "b", "anchor") if name in columns]
         for anchors in dict.fromkeys(zip(*ids)):
             if holder.setdefault(anchors, table) != table:
@@ -591,10 +639,7 @@ def _unread(tables: Foreign, requests: Sequence[_Request]) -> list[str]:
             path
             for request in requests
             if request.table == table
-            for path in (
-                *(path for path, _ in request.source.columns.values()),
-                *request.source.conditions,
-            )
+            for path in _paths(request.source)
         }
         left = [name for name in tables.fields(table) if name and name not in used]
         if left:
@@ -602,6 +647,25 @@ def _unread(tables: Foreign, requests: Sequence[_Request]) -> list[str]:
             more = f" and {len(left) - MOST_LISTED} more" if len(left) > MOST_LISTED else ""
             out.append(f"{table}: columns {listed}{more}, which the profile does not name")
     return out
+
+
+def as_time(value: Any) -> float | None:
+    """Return `as_number`, or the seconds of a date and time of ISO 8601; None if a value is neither.
+
+    Without a date they count from midnight, without a zone the time is UTC.
+    """
+    number = as_number(value)
+    moment = _MOMENT.fullmatch(value.strip()) if isinstance(value, str) else None
+    if number is not None or moment is None:
+        return number
+    year, month, day, hour, minute, second, east, more = moment.groups(default="0")
+    try:
+        midnight = datetime(int(year) or 1970, int(month) or 1, int(day) or 1, tzinfo=timezone.utc)
+    except ValueError:
+        return None
+    of_zone = int(east) * 3600 + int(f"{east[0]}{more}") * 60 if moment[7] else 0
+    clock = int(hour) * 3600 + int(minute) * 60 + float(second.replace(",", "."))
+    return midnight.timestamp() + clock - of_zone
 
 
 def as_number(value: Any) -> float | None:

@@ -8,8 +8,8 @@ profile = Profile.of_columns(parse_columns("time=t_ms:ms,anchor=id,range=dist:mm
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 import math
 from pathlib import Path
 import re
@@ -38,7 +38,7 @@ LENGTH = {
 }
 # As `make_flight` takes them, from a Crazyflie: deg/s and g.
 RATE = {"rad/s": 180.0 / np.pi, "deg/s": 1.0}
-FORCE = {"m/s^2": 1.0 / GRAVITY, "g": 1.0}
+FORCE = {"m/s^2": 1.0 / GRAVITY, "g": 1.0, "mg": 1e-3, "mm/s^2": 1e-3 / GRAVITY}
 NUMBER = {"": 1.0}
 HEIGHT = {unit: 1e3 * factor for unit, factor in LENGTH.items() if unit in ("m", "cm", "mm")}
 # stream: {our column: (column of the stream, {unit: factor}, the first is the default)}
@@ -112,6 +112,8 @@ def parse_column(where: str, ours: str, theirs: str) -> tuple[str, float]:
     units = UNITS[ours]
     if not colon:
         name, unit = theirs.strip(), next(iter(units))
+    if units is TIME and len(parts_of(theirs)) > 1:
+        name, unit = theirs.strip(), "s"
     sign = -1.0 if name.startswith("-") else 1.0
     name = name.removeprefix("-").strip()
     if not name:
@@ -120,6 +122,13 @@ def parse_column(where: str, ours: str, theirs: str) -> tuple[str, float]:
         usual = " or ".join(filter(None, units)) or "none"
         raise InputError(f"{where}: {entry!r}: {unit!r} is no unit of {ours}; use {usual}.")
     return name, sign * units[unit]
+
+
+def parts_of(path: str) -> list[tuple[str, float]]:
+    """Return [(column, factor)] whose sum is a time in s: "sec:s+nanosec:ns" has two."""
+    units = "|".join(TIME)
+    found = re.fullmatch(rf"(.+):({units})\+(.+):({units})", path.strip())
+    return [(found[1], TIME[found[2]]), (found[3], TIME[found[4]])] if found else [(path, 1.0)]
 
 
 def _unknown(where: str, entry: str) -> InputError:
@@ -203,7 +212,8 @@ class Source:
 
     Attributes
     ----------
-    columns : {our column: (path of the field, factor to our unit)}.
+    columns : {our column: (path of the field, factor to our unit)}. `{name}` in a path stands for
+        a part of it and is a field, as in `topic`: each field that fits is a source.
     topic : pattern of a topic, or of the name of a CSV file; "" for any file that has the columns.
         `{name}` stands for a part of the topic and is a field, `*` for anything.
     type : pattern of the type of the messages; "" for any.
@@ -226,6 +236,30 @@ class Source:
     def conditions(self) -> set[str]:
         """Return the paths of the fields that decide which records count."""
         return {condition.path for condition in self.where} | ({self.tag} - {""})
+
+    def over(self, fields: Iterable[str]) -> list[tuple[Source, dict[str, str]]]:
+        """Return [(Source, {name: text})] for each field of a pattern such as "d{a}-{b}".
+
+        Without a pattern among its columns it is the source itself, without names.
+        """
+        pattern = next((path for path, _ in self.columns.values() if _NAME.search(path)), "")
+        if not pattern:
+            return [(self, {})]
+        fitting = (re.fullmatch(_expression(pattern), each) for each in fields)
+        found = [fit.groupdict() for fit in fitting if fit]
+        return [
+            (
+                replace(
+                    self,
+                    columns={
+                        ours: (_NAME.sub(lambda name: names.get(name[1], name[0]), path), factor)
+                        for ours, (path, factor) in self.columns.items()
+                    },
+                ),
+                names,
+            )
+            for names in found
+        ]
 
     def match(self, table: str, kind: str) -> dict[str, str] | None:
         """Return {name: text} of the names in `topic`; None if another table is meant.

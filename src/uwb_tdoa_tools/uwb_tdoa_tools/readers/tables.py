@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""CSV tables with a header line, and CSV files of other tools as one foreign recording.
+"""CSV tables, and CSV files and JSON lines of other tools as one foreign recording.
 
 Rows are read one by one, because the cells of a large file as text exceed the memory.
 """
@@ -13,8 +13,12 @@ from collections.abc import Iterator, Sequence
 import csv
 from gzip import GzipFile
 import io
+from itertools import chain, dropwhile, islice, takewhile
+import json
 import math
+import operator
 from pathlib import Path
+import re
 from typing import Any
 import zlib
 
@@ -34,6 +38,11 @@ from ..command_lines import SALVAGE
 
 GZIP_MAGIC = b"\x1f\x8b"
 _BLOCK = 1 << 20  # bytes that are unpacked at once
+_NUMBER = re.compile(r"\s*[-+]?\.?\d[\d.,eE+-]*\s*")
+
+
+def _is_comment(text: str) -> bool:
+    return text.startswith(("#", "%"))
 
 
 class CsvRows:
@@ -74,8 +83,9 @@ class CsvTable:
 
     Attributes
     ----------
-    names : columns of the file.
-    delimiter : the most frequent of comma, semicolon and tab in the header.
+    names : columns of the file; "1", "2", ... without a header. It may stand behind # or %. JSON
+        lines have the paths of their values, as "stamp.sec" and "d[0]".
+    delimiter : the most frequent of comma, semicolon and tab in the first row; a blank without any.
     """
 
     def __init__(
@@ -104,11 +114,20 @@ class CsvTable:
                     f"{path}: the gzip data is cut or damaged ({problem}); copy the file again."
                 )
             Budget(path).spend("bytes of text", len(content), TABLE_BYTES)
-        header = content[:ROW_CHARACTERS].lstrip().split(b"\n", 1)[0]
-        self.delimiter = max(",;\t", key=lambda each: header.count(each.encode()))
-        self._rows = CsvRows(path, content, skipinitialspace=True, delimiter=self.delimiter)
-        self._cells = self._each()
-        self.names = [name.strip() for name in next(self._cells, [])]
+        self._added = content.lstrip()[:1] in (b"{", b"[")  # lines above the first one of the file
+        if self._added:
+            content = _as_csv(path, content, most)
+        lines = content[:ROW_CHARACTERS].decode("utf-8-sig", "replace").strip().splitlines()
+        above = [*takewhile(_is_comment, lines)]
+        first = "".join(lines[len(above) : len(above) + 1])
+        self.delimiter = max(",;\t", key=first.count)
+        if self.delimiter not in first and " " in first:
+            self.delimiter = " "
+        form = {"skipinitialspace": True, "delimiter": self.delimiter}
+        self._rows = CsvRows(path, content, **form)
+        self._cells = dropwhile(lambda row: _is_comment(row[1][0]), self._each())
+        comment = [line.strip("#% ") for line in above[-1:]]
+        self.names = self._header(next(csv.reader(comment, **form), []))
         self._columns = columns if columns is not None else [name for name in self.names if name]
         if missing := [name for name in self._columns if name not in self.names]:
             raise InputError(
@@ -120,30 +139,75 @@ class CsvTable:
             {name: self.names.index(name) for name in self._columns},
             Budget(self._path, TABLE_BYTES),
         )
-        for cells in self._cells:
+        for line, cells in self._cells:
             budget.spend("cells", len(cells), self._most)
             short = len(cells) <= max(names.values(), default=0)
             if short and self._complete:
                 raise InputError(
-                    f"{self._path}: line {self._rows.line}: has fewer cells than the header; "
-                    "complete it."
+                    f"{self._path}: line {line}: has fewer cells than the header; complete it."
                 )
             yield (
-                self._rows.line,
+                line,
                 {
                     name: cells[place] if not short or place < len(cells) else ""
                     for name, place in names.items()
                 },
             )
 
-    def _each(self) -> Iterator[list[str]]:
-        """Yield the rows that are not empty."""
+    def _header(self, comment: list[str]) -> list[str]:
+        """Return the names of the columns; the next row is then the first with values.
+
+        comment : cells of the last comment above the table.
+        """
+        rows = [*islice(self._cells, 2)]
+        cells, below = ([cells for _, cells in rows] + [[], []])[:2]
+        numeric, numeric_below = (
+            [_NUMBER.fullmatch(cell) is not None for cell in row] for row in (cells, below)
+        )
+        begins = not numeric[:1] == [True] and any(map(operator.lt, numeric, numeric_below))
+        is_header = begins or not any(numeric)
+        self._cells = chain(rows[1:] if is_header else rows, self._cells)
+        numbers = [f"{k + 1}" for k in range(max(len(cells), len(below)))]
+        names = cells if is_header else comment if len(comment) == len(cells) else numbers
+        return [name.strip() for name in names]
+
+    def _each(self) -> Iterator[tuple[int, list[str]]]:
+        """Yield (line, cells) of the rows that are not empty."""
         try:
-            yield from filter(None, self._rows)
+            yield from ((self._rows.line - self._added, cells) for cells in self._rows if cells)
         except csv.Error as error:
             raise InputError(
                 f"{self._path}: line {self._rows.line}: is no CSV ({error}); correct it there."
             ) from error
+
+
+def _as_csv(path: str | Path, content: bytes, most: int) -> bytes:
+    """Return JSON lines as CSV with a column for each path of a value. Raises InputError."""
+    check_text(path, content)
+    lines = [line.strip(" ,[]\t") for line in content.decode("utf-8-sig").splitlines()]
+    try:
+        rows = [dict(_leaves(json.loads(line or "{}"), "")) for line in lines]
+    except (ValueError, RecursionError) as error:
+        raise InputError(
+            f"{path}: is no JSON with one record on each line ({error}); write it so, as "
+            "jq -c '.[]' does."
+        ) from error
+    names = dict.fromkeys(name for row in rows for name in row)
+    Budget(path).spend("cells", len(names) * len(rows), most)
+    out = io.StringIO()
+    table = csv.DictWriter(out, names)
+    table.writeheader()
+    table.writerows(rows)
+    return out.getvalue().encode()
+
+
+def _leaves(value: Any, path: str) -> Iterator[tuple[str, Any]]:
+    """Yield (path, number or text) of a JSON value, as ("stamp.sec", 3); 1 for true."""
+    if not isinstance(value, (dict, list)):
+        yield path.lstrip("."), int(value) if isinstance(value, bool) else value
+        return
+    for key, each in value.items() if isinstance(value, dict) else enumerate(value):
+        yield from _leaves(each, f"{path}.{key}" if isinstance(value, dict) else f"{path}[{key}]")
 
 
 def unpacked(path: str | Path, content: bytes, most: int) -> tuple[bytes, str]:
@@ -204,17 +268,18 @@ class CsvFiles:
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
-        self._tables: dict[str, CsvTable] = {
-            str(path): CsvTable(path, most=TABLE_CELLS, complete=False) for path in paths
-        }
-        self.types = dict.fromkeys(self._tables, "CSV")
-        self.delimiters = {path: table.delimiter for path, table in self._tables.items()}
+        self._names: dict[str, list[str]] = {}
+        self.delimiters: dict[str, str] = {}
+        for path in map(str, paths):
+            table = CsvTable(path, most=TABLE_CELLS, complete=False)
+            self._names[path], self.delimiters[path] = table.names, table.delimiter
+        self.types = dict.fromkeys(self._names, "CSV")
         self.counts: Counter[str] = Counter()
         self.remarks: list[str] = []
 
     def fields(self, table: str) -> list[str]:
         """Return the columns of a file."""
-        return self._tables[table].names
+        return self._names[table]
 
     def time_of(self, table: str) -> None:
         """Return None: a profile names the column with the time."""
@@ -222,7 +287,8 @@ class CsvFiles:
     def messages(self, tables: Sequence[str]) -> Iterator[tuple[str, str, Row]]:
         """Yield (path, place in the file, Row). Raises InputError."""
         for path in tables:
-            for line, cells in self._tables[path]:
+            # anew, as a second pass reads the anchors
+            for line, cells in CsvTable(path, most=TABLE_CELLS, complete=False):
                 self.counts[path] += 1
                 yield path, f"line {line}", Row(cells)
             if not self.counts[path]:
