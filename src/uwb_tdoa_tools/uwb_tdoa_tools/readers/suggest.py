@@ -70,12 +70,13 @@ NO_TIME = (
     "no column with the time is recognized; write time: COLUMN:UNIT (s, ms, us or ns) under columns. "
     "A text such as 2024-03-31 01:59:45.123 is in s."
 )
-NO_RADIO = (
-    "no TDOAs or ranges are recognized; write under columns which column is anchor_a, anchor_b and "
-    "tdoa, or anchor and range"
-)
+WRITE_RADIO = "under columns which column is anchor_a, anchor_b and tdoa, or anchor and range."
+NO_RADIO = f"no TDOAs or ranges are recognized; write {WRITE_RADIO}"
 MISSING = {  # streams: lines on what to do without any of them
-    RADIO: (f"Missing: {NO_RADIO}.", "If they are in an array of the message, add each: ARRAY."),
+    RADIO: (
+        f"Missing: TDOAs or ranges. Write {WRITE_RADIO}",
+        "If they are in an array of the message, add each: ARRAY.",
+    ),
     ("gyro", "acc"): (
         "Missing: gyroscope and accelerometer. An estimate is possible without them.",
     ),

@@ -123,9 +123,11 @@ class CsvTable:
         self.delimiter = max(",;\t", key=first.count)
         if self.delimiter not in first and " " in first:
             self.delimiter = " "
-        form = {"skipinitialspace": True, "delimiter": self.delimiter}
+        form: dict[str, Any] = {"skipinitialspace": True, "delimiter": self.delimiter}
         self._rows = CsvRows(path, content, **form)
-        self._cells = dropwhile(lambda row: _is_comment(row[1][0]), self._each())
+        self._cells: Iterator[tuple[int, list[str]]] = dropwhile(
+            lambda row: _is_comment(row[1][0]), self._each()
+        )
         comment = [line.strip("#% ") for line in above[-1:]]
         self.names = self._header(next(csv.reader(comment, **form), []))
         self._columns = columns if columns is not None else [name for name in self.names if name]
