@@ -158,8 +158,8 @@ class EkfNode(StreamNode):
             # by frame of the IMU, in order of arrival: ImuMount (None for the body frame), and the
             # problem with it
         ] = {}
-        # by frame of another sensor: its place, and the problem with it
-        self._places: dict[str, tuple[Place | None, str | None]] = {}
+        # by sensor in SENSORS: the sentence on its unknown frame
+        self._unplaced: dict[str, str] = {}
         self._remark_height()
         self._health = Health(
             self._config, self._lag, FlyableVolume.load(volume) if volume else None
@@ -305,7 +305,7 @@ class EkfNode(StreamNode):
 
     def _on_frames(self) -> None:
         """Place all IMU frames again after a static transform was added or changed."""
-        before, self._placed, self._places = self._placed, {}, {}
+        before, self._placed = self._placed, {}
         for frame in before:
             self._place_imu(frame, say=False)
         moved = [frame for frame in before if before[frame] != self._placed[frame]]
@@ -344,16 +344,14 @@ class EkfNode(StreamNode):
 
     def _place(self, name: str, frame: str) -> Place | None:
         """Return (Rotation, arm (3,) m) of a sensor in SENSORS; None in the body frame, or unknown."""
-        if frame in ("", self._body):
-            return None
-        if frame not in self._places:
-            place = self._frames.frames.between(self._body, frame)
-            trouble = None if place else unknown_frame(name, frame, self._body)
-            if trouble:
-                self.get_logger().warning(trouble)
-            if len(self._places) < MOST_FRAMES:
-                self._places[frame] = place, trouble
-        return self._places.get(frame, (None, None))[0]
+        in_body = frame in ("", self._body)
+        place = None if in_body else self._frames.frames.between(self._body, frame)
+        if in_body or place:
+            self._unplaced.pop(name, None)
+        else:
+            self._unplaced[name] = unknown_frame(name, frame, self._body)
+            self.warn_at_times(f"frame of {name}", self._unplaced[name])
+        return place
 
     def _frame_troubles(self) -> list[str]:
         """Return sentences on problems with the frames of the IMU."""
@@ -591,8 +589,7 @@ class EkfNode(StreamNode):
             (None, None) if estimator is None else (estimator.refused_pose, estimator.unsure)
         )
         heard = ", ".join(self._lately[:MOST_NAMED])
-        of_sensors = (trouble for _, trouble in self._places.values())
-        frames = [*self._frame_troubles(), *of_sensors, self._frames.trouble]
+        frames = [*self._frame_troubles(), *self._unplaced.values(), self._frames.trouble]
         others = [*filter(None, [*frames, self.outputs.trouble, refused, unsure, *alarms])]
         if level == OK and others:
             level, text = WARN, together(others)

@@ -844,10 +844,7 @@ def _orientation(
 
 
 def _point(path: str | Path, number: int, cells: list[str]) -> list[float]:
-    try:
-        point = [float(cell) for cell in cells[1:]]
-    except ValueError:
-        point = []
+    point = [_number(cell) for cell in cells[1:]]
     if len(point) != 3 or not (np.abs(point) <= FARTHEST).all():
         raise InputError(
             f"{path}: line {number}: {','.join(cells)[:60]!r} is not 'name,x,y,z' with finite "

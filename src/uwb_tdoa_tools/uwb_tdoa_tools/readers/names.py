@@ -41,7 +41,8 @@ class NamedAnchors:
         folded = [number for name, number in self.ids.items() if name.casefold() == text.casefold()]
         if len(folded) == 1:
             return folded[0]
-        number = _whole(text)
+        decimal = _decimal(text)
+        number = int(decimal) if survey.is_id(decimal) and int(decimal) <= LARGEST_ID else None
         if self.ids and not any(
             of == number and name.endswith(str(number)) for name, of in self.ids.items()
         ):
@@ -85,9 +86,3 @@ def _decimal(name: str) -> str:
 def read_survey(path: str | Path) -> Anchors:
     """Read the Anchors of a survey file, see `read_named_anchors`."""
     return read_named_anchors(path).anchors
-
-
-def _whole(text: str) -> int | None:
-    """Return a whole number 0 ... 65535, decimal or 0x1A2B, or None."""
-    text = _decimal(text)
-    return int(text) if survey.is_id(text) and int(text) <= LARGEST_ID else None
