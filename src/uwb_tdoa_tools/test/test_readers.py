@@ -56,6 +56,7 @@ def test_bag_brings_its_anchors_unless_others_are_given(tmp_path, survey):
         (b"#ROSBAG V2.0\n", "is a bag of ROS 1; it needs a profile .*convert .*--suggest"),
         (b"ULog\x01\x12\x35\x01", "is a ULog of PX4; it needs a profile"),
         (b"time,value\n1,2\n", "is a CSV file of another tool; it needs a profile"),
+        (b"17.5,3,base_link\r\n", "is a CSV file of another tool; it needs a profile"),
         (b"\x1f\x8bnothing that unpacks", "gzip data is damaged"),
         (gzip.compress(b"time,value\n", mtime=0), "is a CSV file of another tool"),
     ],

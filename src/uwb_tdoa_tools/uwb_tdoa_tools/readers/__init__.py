@@ -60,8 +60,8 @@ def _foreign_kind(path: Path, first: str) -> str:
         return "a bag of ROS 1"
     if is_ulog(path):
         return "a ULog of PX4"
-    names = [name for name in re.split("[,;\t]", first) if re.search("[A-Za-z]", name)]
-    return "a CSV file of another tool" if len(names) > 1 and first.isprintable() else ""
+    cells = re.split("[,;\t]", first)  # a table may lack a header
+    return "a CSV file of another tool" if len(cells) > 1 and first.strip().isprintable() else ""
 
 
 __all__ = [
