@@ -2,6 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Properties that every sensor of the registry has. Other tests check each sensor in detail."""
 
+from collections import Counter
+from dataclasses import Field, fields
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,16 +14,29 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Flight, Tdoas
 from uwb_tdoa_bias.common.sensors import (
+    LISTED,
     SENSORS,
     STREAM_OF,
     Height,
     Ranges,
     Velocity,
 )
-from uwb_tdoa_bias.common.sensors.sensor import Stream, check_values
+from uwb_tdoa_bias.common.sensors.sensor import Stream
 
 N = 5
 T = np.arange(N) / 25.0
+# Topics that the nodes use for other data.
+TAKEN_TOPICS = {
+    "imu/data",
+    "initialpose",
+    "odometry",
+    "status",
+    "uwb/anchors",
+    "uwb/residual",
+    "uwb/tdoa",
+    "uwb/tdoa_corrected",
+}
+ROW_WIDTHS = {"value": 4, "std": 4, "anchor": 1}  # the most numbers of fields of a SENSOR_ROW
 ANCHORS = Anchors([2, 7], [[0.0, 0.0, 0.0], [6.0, 8.0, 0.0]], [[np.nan] * 4] * 2)
 
 
@@ -33,7 +49,7 @@ def simulated(sensor):
     turn = Rotation.from_euler("xyz", np.full((N, 3), 0.1))
     room = SimpleNamespace(lower=np.zeros(3))
     columns = sensor.simulated(config, room, motion, turn, lambda *shape: np.zeros((N, *shape)))
-    return sensor.stream_of("simulated", T, columns)
+    return sensor.stream(T, *columns)
 
 
 STREAMS = {name: simulated(sensor) for name, sensor in SENSORS.items()} | {
@@ -64,6 +80,39 @@ def test_a_flight_has_a_stream_of_each():
     )
 
 
+def test_names_topics_and_parameters_are_used_once():
+    other_fields = {each.name for each in fields(Flight)} - SENSORS.keys()
+    names = Counter([*other_fields, *(sensor.name for sensor in LISTED)])
+    topics = Counter([*TAKEN_TOPICS, *(topic for of in LISTED for topic, _ in of.topics)])
+    parameters = Counter(parameter for sensor in LISTED for parameter in sensor.parameters)
+    for counts in (names, topics, parameters):
+        assert [name for name, count in counts.items() if count > 1] == []
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_a_definition_has_the_form_that_all_code_expects(name):
+    sensor = SENSORS[name]
+    assert re.fullmatch(r"[a-z][a-z0-9]*(_[a-z0-9]+)*", name), "small letters, and _ between words"
+    assert all(re.fullmatch(r"\w+/msg/\w+", message) for _, message in sensor.topics)
+    unit, words, size = sensor.noise
+    assert isinstance(unit, str) and isinstance(words, str) and size > 0.0 and sensor.rate > 0.0
+    stream = sensor.stream
+    assert next(iter(stream.__annotations__)) == "t", "the first array must be t"
+    assert stream.__dataclass_params__.frozen and "__dataclass_fields__" in vars(stream)
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_parameters_have_the_form_that_the_filter_expects(name):
+    parameters = SENSORS[name].parameters
+    assert next(iter(parameters)) == f"use_{name}", "use_<name> is the first parameter"
+    for key, made in parameters.items():
+        assert isinstance(made, Field) and "text" in made.metadata, f"make {key} with `parameter`"
+        if not isinstance(made.default, bool | str):
+            low, high, with_low = (made.metadata[part] for part in ("low", "high", "with_low"))
+            assert made.default > low or (with_low and made.default == low), key
+            assert high is None or made.default <= high, key
+
+
 @pytest.mark.parametrize("name", SENSORS)
 def test_what_is_written_is_read(name):
     sensor, stream = SENSORS[name], STREAMS[name]
@@ -82,15 +131,16 @@ def test_what_is_written_is_read(name):
     for one, other in zip(sensor.read(T, sensor.split(table)).columns, stream.columns):
         np.testing.assert_array_equal(one, other)
     assert all(values.all() for values in sensor.sound(fields).values())
-    assert next(iter(sensor.parameters)) == f"use_{name}", "use_<name> is the first parameter"
 
 
 @pytest.mark.parametrize("name", SENSORS)
 def test_values_that_effects_change(name):
     stream = STREAMS[name]
-    check_values(name, stream)
-    assert stream.values.shape[1] in (1, 3), "effects and channels expect 1 or 3 `values`"
+    assert stream.values.shape in ((N, 1), (N, 3)), "effects and channels expect 1 or 3 `values`"
     assert len(stream) == N
+    assert isinstance(stream.with_values(stream.values), type(stream)), (
+        "return `replace(self, ...)`"
+    )
     np.testing.assert_allclose(stream.with_values(stream.values + 0.1).values, stream.values + 0.1)
     assert stream.sensed(stream.values).t is stream.t
 
@@ -98,8 +148,13 @@ def test_values_that_effects_change(name):
 @pytest.mark.parametrize("name", SENSORS)
 def test_what_the_filter_gets(name):
     sensor = SENSORS[name]
-    rows, usable = sensor.rows(STREAMS[name])  # checks names and shapes
-    _, simulated_usable = sensor.rows(simulated(sensor))
+    rows, usable = sensor.measured(STREAMS[name])
+    assert rows.keys() <= ROW_WIDTHS.keys() and "value" in rows, "fields of a SENSOR_ROW"
+    for field, numbers in rows.items():
+        width = ROW_WIDTHS[field]
+        assert numbers.shape == (N,) if width == 1 else numbers.shape[1:] <= (width,), field
+    _, simulated_usable = sensor.measured(simulated(sensor))
+    assert usable.shape == (N,) and usable.dtype == bool
     assert simulated_usable.all(), "`measured` refuses what `simulated` returns: units differ"
     assert usable.all() and np.isfinite(rows["value"]).all()
     # NaN is not a measurement, in any column.

@@ -129,7 +129,6 @@ def write_bag(
         )
     for name, sensor in SENSORS.items():
         if (stream := getattr(flight, name)) is not None:
-            bag_messages.check_messages(sensor, store)
             topics[f"/{sensor.topics[0][0]}"] = (
                 sensor.message,
                 STREAM_QOS,

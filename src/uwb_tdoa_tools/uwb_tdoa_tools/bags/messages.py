@@ -19,7 +19,7 @@ from rosbags.interfaces import Nodetype
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Imu, Tdoas, Truth
 from uwb_tdoa_bias.common.sensors import Sensor, Stream
-from uwb_tdoa_bias.common.sensors.sensor import LARGEST_NUMBER, mistake
+from uwb_tdoa_bias.common.sensors.sensor import LARGEST_NUMBER
 from uwb_tdoa_ekf.results import Odometry, pose_and_twist
 
 if TYPE_CHECKING:
@@ -108,10 +108,6 @@ def sensor_messages(
         field: np.broadcast_to(values, (len(stream), *np.shape(values)[1:]))
         for field, values in sensor.content(stream).items()
     }
-    for field, values in content.items():
-        _check_field(
-            sensor, "content", sensor.message, field, int(np.prod(values.shape[1:])), store
-        )
     for k, stamp in enumerate(nanoseconds(sensor.name, stream.t).tolist()):
         message = _blank(store, sensor.message)
         message.header = header_of(store, stamp, frame)
@@ -119,47 +115,6 @@ def sensor_messages(
             *way, last = field.split(".")
             _set(reduce(getattr, way, message), last, values[k])
         yield stamp, message
-
-
-def check_messages(sensor: Sensor, store: Typestore) -> None:
-    """Raise an InputError if messages of a Sensor have no header or lack one of its fields."""
-    for _, kind in sensor.topics:
-        if kind not in store.types:
-            raise mistake(sensor.name, "message", f"there is no type {kind}. Check its spelling.")
-        if "header" not in _parts(_blank(store, kind)):
-            raise mistake(
-                sensor.name, "message", f"{kind} has no header, so no stamp. Use a stamped type."
-            )
-        for field, count in sensor.fields.items():
-            _check_field(sensor, "fields", kind, field, count, store)
-
-
-def _check_field(
-    sensor: Sensor, attribute: str, kind: str, field: str, count: int, store: Typestore
-) -> None:
-    """Raise an InputError if a field of a message type does not hold `count` numbers."""
-    value = _blank(store, kind)
-    for part in field.split("."):
-        parts = _parts(value)
-        if part not in parts:
-            has = (
-                f"{part!r} is none of {', '.join(parts)}"
-                if parts
-                else f"no field is before {part!r}"
-            )
-            raise mistake(sensor.name, attribute, f"{kind} has no field {field}: {has}.")
-        value = getattr(value, part)
-    numbers = _numbers(value)
-    if not all(isinstance(number, int | float) for number in numbers):
-        raise mistake(
-            sensor.name,
-            attribute,
-            f"{field} of {kind} does not hold numbers alone. Name a part of it.",
-        )
-    if len(numbers) != count:
-        raise mistake(
-            sensor.name, attribute, f"{field} of {kind} holds {len(numbers)} numbers, not {count}."
-        )
 
 
 def _blank(store: Typestore, kind: str) -> Any:

@@ -28,7 +28,6 @@ from ..command_lines import suggest_line
 from . import messages as bag_messages
 from .files import BagReader, connections_of, readable
 from .frames import sensor_place
-from .message_types import typestore
 
 
 def _qos(durability: QosDurability, depth: int) -> Qos:
@@ -197,7 +196,6 @@ def read_sensor(
 
     Raises InputError as `read_topic`.
     """
-    bag_messages.check_messages(sensor, typestore())
     row, _, _ = bag_messages.of_sensor(sensor)
     parts = [read_topic(path, reader, name_of(topic), kind, row) for topic, kind in sensor.topics]
     if sensor.in_body is not None:

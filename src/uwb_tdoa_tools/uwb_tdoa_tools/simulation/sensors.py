@@ -82,8 +82,7 @@ def measure_sensors(config: SimulationConfig, room: Room, trajectory: Flyable) -
             Rotation.from_quat(motion.q),
             lambda *shape: random.standard_normal((len(t), *shape)),
         )
-        stream = sensor.stream_of("simulated", t, columns)
-        sensor.check_simulated(stream)
+        stream: Stream = sensor.stream(t, *columns)
         out[name] = _of_wheels(stream, config, motion.body_rates[:, 2]) if wheels else stream
     return out
 

@@ -9,9 +9,9 @@ docs/add_sensor.md.
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib import import_module
 from typing import Any
 
-from .definition import load
 from .height import Height
 from .pressure import Pressure
 from .ranges import Ranges
@@ -21,7 +21,8 @@ from .velocity import Velocity
 # One file each, in the filter's order of kinds: append new ones.
 MODULES = "height", "pressure", "velocity", "ranges"
 
-SENSORS: dict[Any, Any] = load(__name__, MODULES)  # by name, in the order of MODULES
+LISTED = [import_module(f"{__name__}.{module}").SENSOR for module in MODULES]
+SENSORS: dict[Any, Any] = {sensor.name: sensor for sensor in LISTED}  # in the order of MODULES
 
 LOCATING = tuple(
     name for name, sensor in SENSORS.items() if sensor.locates
@@ -59,6 +60,7 @@ __all__ = [
     "BY_POSE",
     "COMPARED",
     "DIAGNOSED",
+    "LISTED",
     "LOCATING",
     "SENSORS",
     "STREAM_OF",
