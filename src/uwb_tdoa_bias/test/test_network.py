@@ -91,15 +91,15 @@ def changed(tmp_path, **meta):
         ({"scale": "[1.0, 1.0, 1.0]"}, "3 scales"),
         ({"scale": "[0.0, 4.0]"}, "no scale may be 0"),
         ({"validity": '{"distance": [0, 1, 1]}', "fade_std": "0.3"}, "distance"),
-        ({"validity": '{"x": [0, 1, 0]}', "fade_std": "0.3"}, "margin above 0"),
-        ({"validity": '{"x": [0, 1, 1]}'}, "fade_std"),
+        ({"validity": '{"dx_a": [0, 1, 0]}', "fade_std": "0.3"}, "margin above 0"),
+        ({"validity": '{"dx_a": [0, 1, 1]}'}, "fade_std"),
         ({"largest_yaw_std": '"wide"'}, "wide"),
         ({"share": "1.5"}, "share must be between 0 and 1"),
         ({"offset": "[NaN, 0.0]"}, "finite"),
         ({"clip": "-1"}, "clip must be above 0"),
         ({"clip": "NaN"}, "clip must be above 0"),
         ({"validity": "[1]", "fade_std": "1"}, "metadata"),
-        ({"validity": '{"x": [0, 1, 1]}', "fade_std": "Infinity"}, "fade_std"),
+        ({"validity": '{"dx_a": [0, 1, 1]}', "fade_std": "Infinity"}, "fade_std"),
         ({"offset": "[" * 10_000}, "metadata"),
     ],
 )
@@ -134,7 +134,9 @@ def test_takes_out_the_share_that_is_borne_out_and_counts_the_rest_as_uncertaint
 def test_fades_beyond_what_it_knows(network_file, tmp_path):
     network = Network(
         changed(
-            tmp_path, validity='{"z": [0.0, 2.0, 1.0], "up_x": [-0.2, 0.2, 0.5]}', fade_std="0.3"
+            tmp_path,
+            validity='{"dz_a": [-1.0, 1.0, 1.0], "up_x": [-0.2, 0.2, 0.5]}',
+            fade_std="0.3",
         )
     )
     tilted = [0.0, np.sin(0.25), 0.0, np.cos(0.25)]  # up_x = sin(0.5)

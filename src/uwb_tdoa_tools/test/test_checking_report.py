@@ -3,7 +3,6 @@
 """Each tool that estimates reports an impossible survey, like `check`."""
 
 from dataclasses import replace
-import json
 
 import numpy as np
 import pytest
@@ -124,21 +123,3 @@ def test_inject_refuses_an_anchor_that_is_not_there(flight, tmp_path, name, key,
     assert inject.main(words) == 2
     assert "has no anchor 33; it has 0, 1, 2" in capsys.readouterr().err
     assert not (tmp_path / "late.bag").exists()
-
-
-@pytest.mark.slow
-def test_a_model_without_its_effects_is_reported(flight, tmp_path, capsys):
-    onnx = pytest.importorskip("onnx")
-    import known_answer
-
-    model = known_answer.make()
-    properties = {entry.key: entry.value for entry in model.metadata_props}
-    onnx.helper.set_model_props(model, properties | {"trained_with": json.dumps(["anchor_delay"])})
-    (tmp_path / "model.onnx").write_bytes(model.SerializeToString())
-    write_bag(flight, tmp_path / "f.bag")
-    (tmp_path / "effects.yaml").write_text("effects: {anchor_delay: {values: {0: 0.1}}}")
-    words = [str(tmp_path / "f.bag"), "--jobs", "1", "--model", str(tmp_path / "model.onnx")]
-    assert evaluate.main(words) == 0
-    assert "was trained with anchor_delay taken out" in capsys.readouterr().err
-    assert evaluate.main([*words, "--effects", str(tmp_path / "effects.yaml")]) == 0
-    assert "trained with" not in capsys.readouterr().err

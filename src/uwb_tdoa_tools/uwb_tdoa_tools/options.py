@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
     from uwb_tdoa_bias.common.flight import Flight
-    from uwb_tdoa_bias.correction.model import Model
     from uwb_tdoa_bias.effects import EffectSet
     from uwb_tdoa_ekf.core.config import FilterConfig
 
@@ -277,38 +276,16 @@ def filter_of(args: Namespace) -> tuple[FilterConfig, EffectSet | None]:
     return config, EffectSet.from_yaml(args.effects) if args.effects else None
 
 
-def estimator_of(args: Namespace, say: Callable[[str], object]) -> FlightEstimator:
-    """Return the FlightEstimator for these options. Raises InputError.
+def estimator_of(args: Namespace) -> FlightEstimator:
+    """Return the FlightEstimator for these options. Raises InputError."""
+    from uwb_tdoa_bias.correction.network import load_network
 
-    say(sentence) is called if the network was trained with effects that --effects lacks.
-    """
     from .estimate import FlightEstimator
 
     config, effects = filter_of(args)
     if args.no_bias:
         return FlightEstimator(config, smoothed=args.smooth)
-    return FlightEstimator(config, effects, model_of(args, effects, say), args.smooth)
-
-
-def model_of(
-    args: Namespace, effects: EffectSet | None, say: Callable[[str], object]
-) -> Model | None:
-    """Return the Model of --model, or None. Raises InputError.
-
-    say(sentence) is called if it was trained with effects that `effects` lacks.
-    """
-    from uwb_tdoa_bias.correction.network import load_network
-
-    model = load_network(args.model)
-    given = {effect.name for effect in effects.effects} if effects else set()
-    lacking = sorted(set(model.trained_with) - given) if model else []
-    if lacking:
-        say(
-            f"{args.model} was trained with {', '.join(lacking)} taken out, which no "
-            "--effects gives; give the effects.yaml that was "
-            "written beside it."
-        )
-    return model
+    return FlightEstimator(config, effects, load_network(args.model), args.smooth)
 
 
 def given(args: Namespace, name: str) -> bool:

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Input features of a network: the 14 features of Zhao et al., and places.
+"""Features of a network: the 14 inputs of Zhao et al., and the attitude, which limits its use.
 
 Source: Zhao et al. (RA-L 2021), section III.
 """
@@ -41,28 +41,8 @@ FEATURES = (
     "elevation_T_b",
 )
 
-# Position of the tag, m, world; horizontal parts of the body's x and z axes; ids and positions,
-# m, world, of both anchors. With these features a model recognizes a place.
-PLACE = (
-    "x",
-    "y",
-    "z",
-    "forward_x",
-    "forward_y",
-    "up_x",
-    "up_y",
-    "id_a",
-    "x_a",
-    "y_a",
-    "z_a",
-    "id_b",
-    "x_b",
-    "y_b",
-    "z_b",
-)
-
-
-NAMES = FEATURES + PLACE
+ATTITUDE = "forward_x", "forward_y", "up_x", "up_y"  # horizontal parts of the body's x and z axes
+NAMES = FEATURES + ATTITUDE
 
 
 def columns(samples: Samples, names: Iterable[str]) -> np.ndarray:
@@ -74,41 +54,13 @@ def columns(samples: Samples, names: Iterable[str]) -> np.ndarray:
 
 
 def everything(samples: Samples) -> np.ndarray:
-    """Return all features of a batch, (n, 29) float, in the order of NAMES.
+    """Return all features of a batch, (n, 18) float, in the order of NAMES.
 
     They are NaN where they need an unknown pose.
     """
     n, anchors = len(samples), samples.anchors
     ends = samples.p, samples.q, samples.a, samples.b
-    return np.concatenate(
-        [
-            filled(_fill, (n, len(FEATURES)), *ends, anchors.positions, anchors.orientations),
-            filled(_fill_place, (n, len(PLACE)), *ends, anchors.ids, anchors.positions),
-        ],
-        axis=1,
-    )
-
-
-@compiled
-def _fill_place(
-    p: np.ndarray,
-    q: np.ndarray,
-    a: np.ndarray,
-    b: np.ndarray,
-    ids: np.ndarray,
-    positions: np.ndarray,
-    out: np.ndarray,
-) -> None:
-    for i in range(len(a)):
-        x, y, z, w = q[i]
-        out[i, 0], out[i, 1], out[i, 2] = p[i]
-        out[i, 3], out[i, 4] = 1 - 2 * (y * y + z * z), 2 * (x * y + z * w)
-        out[i, 5], out[i, 6] = 2 * (x * z + y * w), 2 * (y * z - x * w)
-        for side in range(2):
-            anchor = a[i] if side == 0 else b[i]
-            out[i, 7 + 4 * side] = ids[anchor]
-            for k in range(3):
-                out[i, 8 + 4 * side + k] = positions[anchor, k]
+    return filled(_fill, (n, len(NAMES)), *ends, anchors.positions, anchors.orientations)
 
 
 @compiled
@@ -140,6 +92,9 @@ def _fill(
             rotate(inverse, delta, seen)
             out[i, 6 + side] = math.atan2(seen[1], seen[0])
             out[i, 10 + side] = math.atan2(seen[2], math.hypot(seen[0], seen[1]))
+        x, y, z, w = q[i]
+        out[i, 14], out[i, 15] = 1 - 2 * (y * y + z * z), 2 * (x * y + z * w)
+        out[i, 16], out[i, 17] = 2 * (x * z + y * w), 2 * (y * z - x * w)
 
 
 @compiled

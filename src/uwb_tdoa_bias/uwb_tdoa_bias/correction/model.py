@@ -48,8 +48,6 @@ class Model:
     ----------
     meta : all its metadata, dict of str
     name : name in messages
-    trained_with : names of the effects that were corrected before the training; they must be
-        corrected in use, too
     holds : labels of the effects that the file itself corrects; nothing else may correct them
     of_effects : their names, joined by '+', or ""
     needs_motion : whether it depends on more than poses
@@ -58,7 +56,6 @@ class Model:
 
     NEEDS: ClassVar[str]  # what the metadata must hold, for messages
     name: str
-    trained_with: tuple[str, ...] = ()
     holds: tuple[str, ...] = ()
     of_effects: str = ""
     needs_motion: bool = False

@@ -3,7 +3,7 @@
 """A bias network in an ONNX file with its own inputs, limits and validity.
 
 Metadata of the model (all values JSON text):
-    features  list of names out of features.FEATURES and features.PLACE: the input columns
+    features  list of names out of features.FEATURES and features.ATTITUDE: the input columns
     offset, scale  lists as long as features: the network input is (feature - offset) / scale
     clip      number, metres: the output is limited to +-clip
     name      short name, goes into every message
@@ -16,8 +16,7 @@ Metadata of the model (all values JSON text):
     share     optional: number 0 ... 1: share of the prediction that is corrected, found by cross-validation over the
               flights of the training; the rest counts as uncertainty
 Input: one float tensor (n, number of features), of any name. Output: one float tensor. (n, 1): bias
-in metres. (n, 2): bias and its standard deviation in metres. (n, 3): in addition the share 0 ... 1
-of the possible knowledge that the network has; then bias and deviation are already faded.
+in metres. (n, 2): bias and its standard deviation in metres.
 """
 
 from __future__ import annotations
@@ -94,10 +93,10 @@ class Network(Model):
                 "and no scale may be 0."
             )
         out = self._model.run(np.zeros((1, n)))
-        if out.shape[1] > 3 or not np.isfinite(out).all():
+        if out.shape[1] > 2 or not np.isfinite(out).all():
             raise InputError(
                 f"model: {path}: gives (n, {out.shape[1]}), or no finite numbers; the output "
-                "must be (n, 1), (n, 2) or (n, 3)."
+                "must be (n, 1) or (n, 2)."
             )
 
     def _read(self, meta: dict[str, str]) -> None:
@@ -106,7 +105,6 @@ class Network(Model):
         self._scale = np.array(json.loads(meta["scale"]), dtype=float)
         self.clip = float(json.loads(meta["clip"]))
         self.name = sanitize(json.loads(meta["name"]))
-        self.trained_with = tuple(map(sanitize, json.loads(meta.get("trained_with", "[]"))))
         limits = json.loads(meta.get("validity", "{}"))
         self._fade_std = float(json.loads(meta["fade_std"])) if limits else 0.0
         self._largest_yaw_std = float(json.loads(meta.get("largest_yaw_std", "Infinity")))
@@ -158,7 +156,7 @@ def _limit(
 ) -> None:
     """Write bias, m, std, m, and known share, (n, 3), to found; compiled.
 
-    out : (n, 1 to 3), output of the network; table : (n, 29), as of `everything`
+    out : (n, 1 or 2), output of the network; table : (n, 18), as of `everything`
     limits : clip, m, fade_std, m, share, largest_yaw_std, rad; yaw_std : (n,) rad, or empty
     """
     columns, lower, upper, margin = (
@@ -174,8 +172,6 @@ def _limit(
             bias = math.copysign(clip, bias)
         if out.shape[1] > 1:
             std = out[i, 1]
-        if out.shape[1] > 2:
-            known = out[i, 2]
         if len(columns):
             beyond = 0.0
             for k in range(len(columns)):

@@ -93,7 +93,7 @@ def _evaluate(args: Namespace) -> int:
             NOT_OF_ODOMETRY,
             "has no part in an odometry that was recorded, which is judged as it is (--odometry)",
         )
-    estimator = options.estimator_of(args, partial(cli.say, "evaluate"))
+    estimator = options.estimator_of(args)
     reading = options.reading_of(args)
     found = (replace(reading, topics={}, namespace="") if args.odometry else reading).find(
         args.flights, bool(args.dask)

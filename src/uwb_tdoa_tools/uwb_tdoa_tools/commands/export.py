@@ -9,7 +9,7 @@ from functools import partial
 
 from uwb_tdoa_bias.common.errors import InputError
 
-from .. import cli, options
+from .. import cli
 from ..cli import option
 from ..outputs import OutputFile, OutputFolder
 from ..parallel import Progress
@@ -65,6 +65,7 @@ def parser() -> ArgumentParser:
 
 def _export(args: Namespace) -> None:
     from uwb_tdoa_bias.correction.corrector import orientation_remarks
+    from uwb_tdoa_bias.correction.network import load_network
     from uwb_tdoa_bias.effects import EffectSet
 
     from ..readers import read_survey
@@ -80,7 +81,7 @@ def _export(args: Namespace) -> None:
     say = partial(cli.say, "export")
     anchors = read_survey(args.survey)
     effects = EffectSet.from_yaml(args.effects) if args.effects else None
-    model = options.model_of(args, effects, say)
+    model = load_network(args.model)
     given = anchors, effects, model
     with Progress("export", what="writing the equations"):
         traced = write_onnx(args.onnx, *given) if args.onnx else trace(*given)

@@ -72,7 +72,7 @@ def _localize(args: Namespace) -> int:
             f"--zones: {args.zones:g} m is no size of a square; give one above 0, e.g. 20."
         )
     say = partial(cli.say, "localize")
-    estimator = options.estimator_of(args, say)
+    estimator = options.estimator_of(args)
     reading = options.reading_of(args, truth=False)
     found = reading.find(args.flights, bool(args.dask))
     check_names(found)

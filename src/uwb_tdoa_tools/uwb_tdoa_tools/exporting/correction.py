@@ -147,7 +147,7 @@ class TracedCorrection:
 
 
 # Keys of a network's metadata that say what it was made of
-PROVENANCE = ("name", "kind", "data", "trained_on", "validated_on", "trained_with")
+PROVENANCE = ("name", "kind", "data", "trained_on", "validated_on")
 
 
 def trace(

@@ -16,7 +16,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_bytes, write_filled
 from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.correction.corrector import LARGEST_YAW_STD
-from uwb_tdoa_bias.correction.features import FEATURES, columns
+from uwb_tdoa_bias.correction.features import ATTITUDE, FEATURES, columns
 from uwb_tdoa_bias.effects import EffectSet
 
 from ..choices import MODELS
@@ -36,7 +36,6 @@ SLACK = 0.2
 SMALLEST_STD = 0.01  # m, least standard deviation of the remaining error
 POINTS = 4  # of a learning curve over flights
 HEADINGS = 1.0  # range of the forward axis in training, from which a model depends on the heading
-_ATTITUDE = ("forward_x", "forward_y", "up_x", "up_y")
 
 
 class Recipe(NamedTuple):
@@ -169,7 +168,7 @@ def _limits(
 ) -> dict[str, Any]:
     """Return the metadata that bound the use of a network."""
     validity = {}
-    for names, more in ((_ATTITUDE, SLACK), (model.validity_features, 0.0)):
+    for names, more in ((ATTITUDE, SLACK), (model.validity_features, 0.0)):
         table = np.concatenate([columns(one.samples, names) for one in training])
         for name, low, high in zip(names, table.min(axis=0) - more, table.max(axis=0) + more):
             validity[name] = [round(float(low), 3), round(float(high), 3), MARGINS[name[0]]]
