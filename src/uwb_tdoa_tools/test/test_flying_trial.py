@@ -7,13 +7,15 @@ from dataclasses import replace
 import known_answer
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.flight import Imu, Tdoas
 from uwb_tdoa_bias.common.radio import arrival_bias
 from uwb_tdoa_bias.common.sensors import SENSORS
+from uwb_tdoa_bias.common.sensors.pressure import SITE
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_tools.flying.mission import DONE, Circles, Rules
-from uwb_tdoa_tools.flying.sensors import SENSOR_NAMES, InertialErrors, OtherSensor, Radio, gusts
+from uwb_tdoa_tools.flying.sensors import AuxiliarySensor, InertialErrors, Radio, gusts
 from uwb_tdoa_tools.flying.simulator import IMU_RATE, Transport
 from uwb_tdoa_tools.flying.trial import Task, fly
 from uwb_tdoa_tools.flying.verdict import verdict_of
@@ -145,45 +147,28 @@ def test_gusts_are_as_strong_as_asked_for_and_slow():
 
 
 def test_other_sensors_say_what_is_true_but_for_their_noise():
-    world, rows = HALL, slice(0, 100)
-    p, q, v = (
-        np.tile(HIGH, (100, 1)),
-        np.tile([np.sin(0.1), 0.0, 0.0, np.cos(0.1)], (100, 1)),
-        np.ones((100, 3)),
-    )
-    sensors = {name: kind(world, 0, 10.0) for name, kind in SENSOR_NAMES.items()}
-    (height,) = sensors["height"].measured(rows, p, q, v, p[:, 2] - 0.2)
-    assert height.mean() == pytest.approx(
-        1.0 / np.cos(0.2), abs=0.005
-    ) and height.std() == pytest.approx(0.01, rel=0.3)
-    assert np.isinf(sensors["height"].measured(rows, p, q, v, p[:, 2] + 4.0)[0]).all()
-    speed, std = sensors["velocity"].measured(rows, p, q, v, p[:, 2])
-    np.testing.assert_allclose(speed.mean(axis=0), 1.0, atol=0.02)
-    assert (std == 0.05).all()
-    assert len(sensors["height"].t) == 200 and len(sensors["pressure"].t) == 250
-    ids, d, variance = sensors["range"].measured(slice(50, 150), p, q, v, p[:, 2])
-    assert (
-        len(sensors["range"].t) == 1000
-        and ids.tolist() == np.resize(world.anchors.ids, 150)[50:].tolist()
-        and not variance.any()
-    )
-    off = d - np.linalg.norm(p - world.anchors.positions[world.anchors.index(ids)], axis=1)
-    assert abs(off.mean()) < 0.04 and off.std() == pytest.approx(0.1, rel=0.3)
-
-
-@pytest.mark.parametrize("name", SENSORS)
-def test_a_sensor_without_a_class_of_its_own_measures_by_its_record(name):
-    n, up = 100, 0.2  # rows, and height of the ground below, m
+    n, ground = 100, 0.2  # rows; m
     p, v = np.tile(HIGH, (n, 1)), np.tile([0.5, 0.0, 0.1], (n, 1))
-    q = np.tile([0.0, 0.0, np.sin(0.1), np.cos(0.1)], (n, 1))
-    at = slice(0, n), p, q, v, p[:, 2] - up
-    sensor, own = OtherSensor(name, HALL, 0, 10.0), SENSOR_NAMES[name](HALL, 0, 10.0)
-    assert len(sensor.t) == int(10.0 * SENSORS[name].rate)
-    one, other = (SENSORS[name].stream(sensor.t[:n], *each.measured(*at)) for each in (sensor, own))
-    off = one.values - other.values
-    assert (np.abs(off.mean(axis=0)) < 4.0 * 2**0.5 * SENSORS[name].noise[2] / n**0.5).all()
-    none = slice(0, 0), p[:0], q[:0], v[:0], p[:0, 2]
-    assert len(SENSORS[name].stream(sensor.t[:0], *sensor.measured(*none)).values) == 0
+    q = np.tile([np.sin(0.1), 0.0, 0.0, np.cos(0.1)], (n, 1))
+    sensors = {name: AuxiliarySensor(name, HALL, 0, 10.0) for name in SENSORS}
+    found = {name: one.measured(slice(50, 150), p, q, v, ground) for name, one in sensors.items()}
+    ranges = found["range"]
+    assert ranges.anchor.tolist() == np.resize(HALL.anchors.ids, 150)[50:].tolist()
+    distance = np.linalg.norm(HIGH - HALL.anchors.positions, axis=1)
+    true = {
+        "height": [(HIGH[2] - ground) / np.cos(0.2)],
+        "pressure": [SITE + HIGH[2]],
+        "velocity": Rotation.from_quat(q[0]).inv().apply(v[0]),
+        "range": distance[HALL.anchors.index(ranges.anchor)][:, None],
+    }
+    for name, stream in found.items():
+        std = SENSORS[name].noise[2]
+        off = stream.values - true[name]
+        assert np.abs(off.mean(axis=0)).max() < 4.0 * std / n**0.5, name
+        np.testing.assert_allclose(off.std(axis=0), std, rtol=0.3, err_msg=name)
+        assert len(sensors[name].t) == int(10.0 * SENSORS[name].rate)
+        none = sensors[name].measured(slice(9, 9), p[:0], q[:0], v[:0], ground)
+        assert len(none) == 0 and type(none) is type(stream)
 
 
 def test_what_takes_its_time_arrives_in_order_and_whole():

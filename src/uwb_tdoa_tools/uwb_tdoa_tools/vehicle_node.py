@@ -24,6 +24,7 @@ from rclpy.duration import Duration
 from std_msgs.msg import String
 
 from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import SENSOR_NAMES
 from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS
 from uwb_tdoa_bias.ros.node import StreamNode, StreamPoller, run
 from uwb_tdoa_bias.ros.parameters import (
@@ -41,7 +42,6 @@ from .flying import rover
 from .flying.mission import Circles, Waypoints
 from .flying.over_topics import Lockstep, OverTopics, RealTime
 from .flying.pilot import Pilot
-from .flying.sensors import SENSOR_NAMES
 from .flying.trial import Task, Trial
 from .flying.verdict import reached, sentence, verdict_of
 from .flying.world import WORLDS, world_of

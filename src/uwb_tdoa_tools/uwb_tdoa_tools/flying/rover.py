@@ -12,14 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from uwb_tdoa_bias.common.sensors import SENSORS
-from uwb_tdoa_bias.common.sensors.sensor import Stream
+from uwb_tdoa_bias.common.sensors import Stream, Velocity
 
 from ..simulation.config import WHEELS_RATE
 from ..simulation.sensors import YAW_RATE_STD, slips
 from .mission import LOST, Journey, Polyline, Pose, Rules, Waypoints, yaw_of
 from .sensors import AuxiliarySensor, random
-from .simulator import Simulator
+from .simulator import TICK, Simulator
 from .trial import REST_AFTER, Task, Trial, TrialResult
 from .vehicle import GRAVITY, IMU_RATE
 from .world import World
@@ -58,7 +57,26 @@ class Steering:
 class Wheels(AuxiliarySensor):
     """Simulate the encoders of both wheels."""
 
-    rate, width = WHEELS_RATE, 2
+    def __init__(self, simulator: RoverSimulator, seed: int, duration: float) -> None:
+        """Draw stamps and noise for `duration`, s."""
+        self._simulator = simulator
+        self.t = np.arange(0.5, duration * WHEELS_RATE) / WHEELS_RATE
+        self._noise = random(seed, "Wheels").standard_normal((len(self.t), 2))
+
+    def measured(
+        self, rows: slice, p: np.ndarray, q: np.ndarray, v: np.ndarray, ground: float
+    ) -> Stream:
+        t, of = self.t[rows], self._simulator
+        lately = slice(of.done - TICK, of.done + 1)
+        wheels = np.column_stack(
+            [np.interp(t, of.times[lately], column) for column in of.wheels[lately].T]
+        )
+        turns = wheels.any(axis=1)
+        speed, turning = _unicycle(wheels.T)
+        v, std = np.zeros((len(t), 3)), np.full((len(t), 3), WHEEL_STD)
+        v[:, 0] = speed + WHEEL_STD * turns * self._noise[rows, 0]
+        turning = turning + YAW_RATE_STD * turns * self._noise[rows, 1]
+        return Velocity(t, v, std, turning, np.full(len(t), YAW_RATE_STD))
 
 
 class RoverSimulator(Simulator):
@@ -81,7 +99,7 @@ class RoverSimulator(Simulator):
         self._scale = 1.0 + rng.uniform(-SCALE, SCALE) + UNEQUAL * rng.standard_normal(2)
         slipping = np.column_stack([slips(self.times, rng) for _ in range(2)])
         self._per_turn = 1.0 / (self._scale * (1.0 + SLIP * slipping))
-        self._sensors = {"velocity": Wheels(world, seed, duration)}
+        self._sensors = {"velocity": Wheels(self, seed, duration)}
         self.wheels = np.zeros((len(self.times), 2))
 
     def _move(self, controller: Steering, rows: slice) -> None:
@@ -107,19 +125,6 @@ class RoverSimulator(Simulator):
                 sample[3:] += self._inertial.shaking[i]
             self.wheels[i], self.states[i], self.samples[i] = wheels, state, sample
             self.contact[i] = 2.0
-
-    def _sensor_measured(self, name: str, sensor: AuxiliarySensor, lately: slice) -> Stream:
-        new, _, _ = self._poses(name, sensor.t, lately)
-        t = sensor.t[new]
-        wheels = np.column_stack(
-            [np.interp(t, self.times[lately], column) for column in self.wheels[lately].T]
-        )
-        turns = wheels.any(axis=1)
-        speed, turning = _unicycle(wheels.T)
-        v, std = np.zeros((len(t), 3)), np.full((len(t), 3), WHEEL_STD)
-        v[:, 0] = speed + WHEEL_STD * turns * sensor.noise[new, 0]
-        turning = turning + YAW_RATE_STD * turns * sensor.noise[new, 1]
-        return SENSORS[name].stream(t, v, std, turning, np.full(len(t), YAW_RATE_STD))
 
 
 def _unicycle(wheels: Any) -> tuple[Any, Any]:

@@ -7,23 +7,18 @@ Errors that do not depend on the path are drawn in advance, by seed.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
 import math
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.compiled import compiled
 from uwb_tdoa_bias.common.radio import arrival_bias
-from uwb_tdoa_bias.common.sensors import SENSORS
-from uwb_tdoa_bias.common.sensors.pressure import SITE, pressure_at
-from uwb_tdoa_bias.common.sensors.sensor import RATE
-from uwb_tdoa_bias.common.sensors.velocity import LEAST_STD
+from uwb_tdoa_bias.common.sensors import SENSORS, Stream
 from uwb_tdoa_bias.effects import Samples
 from uwb_tdoa_bias.effects.floor import FloorMultipath
+from uwb_tdoa_ekf.results import rows_of
 
 from ..simulation.tdoas import make_schedule, outliers, tag_link, tdoa_noise
 from .vehicle import IMU_RATE
@@ -37,8 +32,6 @@ GUST_TIME = 1.0  # s, correlation time of gusts
 PERSON = 0.25, 1.8, 1.0  # m, radius and height of a person; m/s
 # m, delay behind a person; s, between draws of it
 BLOCKED, BLOCK_TIME = ((0.2, 2.0), 0.5)
-STD = {name: sensor.noise[2] for name, sensor in SENSORS.items()}  # of the noise of each sensor
-HIGHEST = 4.0  # m, largest distance of the range finder
 NEVER = np.inf, np.inf
 
 
@@ -289,7 +282,7 @@ def gusts(world: World, seed: int, duration: float) -> np.ndarray:
 
 
 class AuxiliarySensor:
-    """Simulate a further sensor of one flight.
+    """Simulate a further sensor of one flight by the simulation of its record in SENSORS.
 
     Attributes
     ----------
@@ -297,123 +290,48 @@ class AuxiliarySensor:
         Stamps (n,), s.
     """
 
-    rate, width = RATE, 1  # Hz; numbers per measurement
-
-    def __init__(self, world: World, seed: int, duration: float) -> None:
-        """Draw stamps and noise for `duration`, s."""
-        self.world = world
-        self.t = np.arange(0.5, duration * self.rate) / self.rate
-        self.noise = random(seed, type(self).__name__).standard_normal((len(self.t), self.width))
+    def __init__(self, name: str, world: World, seed: int, duration: float) -> None:
+        """Draw stamps for `duration`, s; `name` is that of the sensor."""
+        self._sensor, self._anchors = SENSORS[name], world.anchors
+        self.t = np.arange(0.5, duration * self._sensor.rate) / self._sensor.rate
+        self._random = random(seed, name)
 
     def measured(
-        self, rows: slice, p: np.ndarray, q: np.ndarray, v: np.ndarray, height: np.ndarray
-    ) -> tuple[np.ndarray, ...]:
-        """Return the columns of the measurements in a slice of rows.
+        self, rows: slice, p: np.ndarray, q: np.ndarray, v: np.ndarray, ground: float
+    ) -> Stream:
+        """Return the measurements in a slice of rows.
 
         Parameters
         ----------
         rows : slice
             Rows of `t`.
         p, q, v : numpy.ndarray
-            Position (k, 3) m, attitude (k, 4) x y z w, and velocity (k, 3) m/s in the body frame.
-        height : numpy.ndarray
-            Height above the ground or table (k,), m.
+            Position (k, 3) m, attitude (k, 4) x y z w, and velocity (k, 3) m/s, world frame.
+        ground : float
+            Height of the ground or table, m.
         """
-        raise NotImplementedError
-
-
-class RangeFinder(AuxiliarySensor):
-    """Simulate a range finder along -z of the body, m, with inf beyond its range."""
-
-    rate = 20.0
-
-    def measured(
-        self, rows: slice, p: np.ndarray, q: np.ndarray, v: np.ndarray, height: np.ndarray
-    ) -> tuple[np.ndarray, ...]:
-        up = 1.0 - 2.0 * (q[:, 0] ** 2 + q[:, 1] ** 2)
-        seen = height / np.maximum(up, 1e-3) + STD["height"] * self.noise[rows, 0]
-        return (np.where((up > 0.0) & (seen <= HIGHEST), np.maximum(seen, 0.0), np.inf),)
-
-
-class Barometer(AuxiliarySensor):
-    """Simulate a barometer, Pa."""
-
-    def measured(
-        self, rows: slice, p: np.ndarray, q: np.ndarray, v: np.ndarray, height: np.ndarray
-    ) -> tuple[np.ndarray, ...]:
-        return (pressure_at(SITE + p[:, 2] + STD["pressure"] * self.noise[rows, 0]),)
-
-
-class Speedometer(AuxiliarySensor):
-    """Simulate a velocity sensor: velocity in the body frame and its standard deviation, m/s."""
-
-    width = 3
-
-    def measured(
-        self, rows: slice, p: np.ndarray, q: np.ndarray, v: np.ndarray, height: np.ndarray
-    ) -> tuple[np.ndarray, ...]:
-        std = STD["velocity"]
-        return v + std * self.noise[rows], np.full(v.shape, max(std, LEAST_STD))
-
-
-class TwoWayRanging(AuxiliarySensor):
-    """Simulate distances to the anchors in turn: ids, m, and an unknown variance of 0.
-
-    No obstacle blocks them.
-    """
-
-    rate = SENSORS["range"].rate
-
-    def measured(
-        self, rows: slice, p: np.ndarray, q: np.ndarray, v: np.ndarray, height: np.ndarray
-    ) -> tuple[np.ndarray, ...]:
-        anchors = self.world.anchors
-        row = np.arange(rows.start, rows.stop) % len(anchors)
-        d = np.linalg.norm(p - anchors.positions[row], axis=1) + STD["range"] * self.noise[rows, 0]
-        return anchors.ids[row], np.maximum(d, 0.0), np.zeros(len(d))
-
-
-class OtherSensor(AuxiliarySensor):
-    """Simulate any other sensor of SENSORS by the simulation of its record."""
-
-    def __init__(self, name: str, world: World, seed: int, duration: float) -> None:
-        """Draw stamps for `duration`, s; `name` is that of the sensor."""
-        self.rate = SENSORS[name].rate
-        super().__init__(world, seed, duration)
-        self._simulated, self._random = SENSORS[name].simulated, random(seed, name)
-        noises: dict[str, Any] = {f"{each}_noise": std for each, std in STD.items()}
-        self._config = SimpleNamespace(anchors=world.anchors, tag_lever_arm=np.zeros(3), **noises)
-
-    def measured(
-        self, rows: slice, p: np.ndarray, q: np.ndarray, v: np.ndarray, height: np.ndarray
-    ) -> tuple[np.ndarray, ...]:
-        n = len(p)
-        if not n:  # the columns of one measurement, without it
+        if rows.start == rows.stop:  # the stream of one measurement, without it
             one = np.zeros((1, 3))
-            columns = self._columns(one, np.array([[0.0, 0.0, 0.0, 1.0]]), one, np.zeros(1))
-            return tuple(column[:0] for column in columns)
-        return self._columns(p, q, v, height)
+            whole = self._stream(slice(0, 1), one, np.array([[0.0, 0.0, 0.0, 1.0]]), one, ground)
+            empty: Stream = rows_of(whole, slice(0, 0))
+            return empty
+        return self._stream(rows, p, q, v, ground)
 
-    def _columns(
-        self, p: np.ndarray, q: np.ndarray, v: np.ndarray, height: np.ndarray
-    ) -> tuple[np.ndarray, ...]:
-        turn = Rotation.from_quat(q)
-        motion = SimpleNamespace(p=p, v=turn.apply(v), q=q)
-        room = SimpleNamespace(lower=np.array([-np.inf, -np.inf, p[0, 2] - height[0]]))
-        columns: tuple[np.ndarray, ...] = self._simulated(
-            self._config,
-            room,
-            motion,
-            turn,
+    def _stream(
+        self, rows: slice, p: np.ndarray, q: np.ndarray, v: np.ndarray, ground: float
+    ) -> Stream:
+        in_turn = np.roll(np.arange(len(self._anchors)), -rows.start)  # distances go on in turn
+        config = SimpleNamespace(
+            anchors=self._anchors.only(in_turn),
+            tag_lever_arm=np.zeros(3),
+            **{f"{self._sensor.name}_noise": self._sensor.noise[2]},
+        )
+        columns = self._sensor.simulated(
+            config,
+            SimpleNamespace(lower=np.array([-np.inf, -np.inf, ground])),
+            SimpleNamespace(p=p, v=v, q=q),
+            Rotation.from_quat(q),
             lambda *shape: self._random.standard_normal((len(p), *shape)),
         )
-        return columns
-
-
-_OWN: dict[str, Callable[..., AuxiliarySensor]] = {
-    "height": RangeFinder,
-    "pressure": Barometer,
-    "velocity": Speedometer,
-    "range": TwoWayRanging,
-}
-SENSOR_NAMES = {name: _OWN.get(name, partial(OtherSensor, name)) for name in SENSORS}
+        stream: Stream = self._sensor.stream(self.t[rows], *columns)
+        return stream

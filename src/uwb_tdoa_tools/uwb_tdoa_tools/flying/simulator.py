@@ -12,12 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.compiled import compiled
 from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
-from uwb_tdoa_bias.common.sensors import SENSORS
-from uwb_tdoa_bias.common.sensors.sensor import Stream
 from uwb_tdoa_ekf.results import concatenated, rows_of
 
 from .controller import inner
-from .sensors import SENSOR_NAMES, AuxiliarySensor, InertialErrors, Radio, gusts, random
+from .sensors import AuxiliarySensor, InertialErrors, Radio, gusts, random
 from .vehicle import (
     ATTITUDE,
     GRAVITY,
@@ -183,7 +181,9 @@ class Simulator:
         self._record, self._nominal_record = self.vehicle.record(), self.nominal.record()
         self.radio = Radio(world, seed, duration)
         self._inertial = InertialErrors(world, seed, duration)
-        self._sensors = {name: SENSOR_NAMES[name](world, seed, duration) for name in world.sensors}
+        self._sensors = {
+            name: AuxiliarySensor(name, world, seed, duration) for name in world.sensors
+        }
         self._wind, self._rng = gusts(world, seed, duration), random(seed, "effects")
         n = len(self._wind)
         self.times = np.arange(n) / IMU_RATE
@@ -243,7 +243,9 @@ class Simulator:
         )
         streams: Streams = {"imu": imu, "tdoa": tdoa}
         for name, sensor in self._sensors.items():
-            streams[name] = self._sensor_measured(name, sensor, lately)
+            new, p, q = self._poses(name, sensor.t, lately)
+            v = np.broadcast_to(self.state[VELOCITY], p.shape)
+            streams[name] = sensor.measured(new, p, q, v, self.ground)
         return self._with_effects(streams)
 
     def _move(self, controller: Any, rows: slice) -> None:
@@ -307,15 +309,6 @@ class Simulator:
         poses_at(t[new], self.times[lately], self.states[lately], p, q)
         self._heard[stream] = new.stop
         return new, p, q
-
-    def _sensor_measured(self, name: str, sensor: AuxiliarySensor, lately: slice) -> Stream:
-        """Return the new measurements of one sensor."""
-        new, p, q = self._poses(name, sensor.t, lately)
-        v = np.broadcast_to(self.state[VELOCITY], p.shape)
-        inside = Rotation.from_quat(q).inv().apply(v) if len(q) else v
-        return SENSORS[name].stream(
-            sensor.t[new], *sensor.measured(new, p, q, inside, p[:, 2] - self.ground)
-        )
 
     def _with_effects(self, streams: Streams) -> Streams:
         """Return the samples with the effects of the world added by `Effect.inject`."""
