@@ -50,14 +50,11 @@ CASE = np.dtype([("a", np.int32), ("b", np.int32), ("state", STATE)])
 RESULT = np.dtype(
     [
         ("wrong", np.int32),
-        ("wrong_jacobian", np.int32),
         ("bias", np.float32),
         ("std", np.float32),
-        ("jacobian", np.float32, 6),
-        ("curved", np.float32),
     ]
 )
-COUNTS = "ticks", "most", "ticks_jacobian", "stack", "cases"
+COUNTS = "ticks", "most", "stack", "cases"
 COST = np.dtype([(name, np.uint32) for name in COUNTS])
 
 RNG = np.random.default_rng(7)
@@ -196,11 +193,7 @@ def by_numpy(code, some):
         values = some["state"][field]
         columns[name] = values[:, int(place[0])] if place else values
     rows = {end: ANCHORS.index(some[end]) for end in "ab"}
-    bias, std = _outputs(code.level, columns, rows)
-    for program in code.steep.values():
-        (more,) = _outputs(program, columns, rows)
-        bias = bias + more
-    return bias, std
+    return _outputs(code.program, columns, rows)
 
 
 def _outputs(program, columns, rows):
@@ -286,14 +279,14 @@ def on_host(folder, some, flags=STRICT):
     return _results(folder, ["./host"], some)
 
 
-def linked(folder, flags=FIRMWARE, name="board.elf"):
+def linked(folder, flags=FIRMWARE):
     """Compile the test program for the board and return its size in flash, bytes."""
     sources = [HERE / "main.c", HERE / "board.c", "uwb_bias.c"]
     options = ["-nostartfiles", "-T", HERE / "netduinoplus2.ld", "-Wl,--gc-sections"]
-    options += ["--specs=nano.specs", "--specs=nosys.specs", "-lm", "-o", name]
+    options += ["--specs=nano.specs", "--specs=nosys.specs", "-lm", "-o", "board.elf"]
     command = [ARM_GCC, *PROCESSOR, *flags, f"-I{HERE}", "-I.", *sources, *options]
     subprocess.run(command, cwd=folder, check=True)
-    return sum(_size(folder, name)[:2])
+    return sum(_size(folder, "board.elf")[:2])
 
 
 def on_board(folder, some, flags=FIRMWARE):
@@ -323,15 +316,14 @@ def cost_of(folder, code, n=320):
     """Return the cost of a correction on the board.
 
     instructions, most : instructions per TDOA, mean and maximum
-    jacobian : instructions per Jacobian
     own : bytes of flash of the correction alone
     flash : bytes of flash, including functions of libm
     ram : bytes of RAM
     """
     write(folder, code)
-    whole = linked(folder, (*FIRMWARE, "-DWITHOUT_JACOBIAN"), "without.elf")
+    whole = linked(folder)
     write(folder / "without", replace(code, files={**code.files, "uwb_bias.c": STUB}))
-    empty = linked(folder / "without", (*FIRMWARE, "-DWITHOUT_JACOBIAN"))
+    empty = linked(folder / "without")
     symbols = [ARM_GCC, *PROCESSOR, *FIRMWARE, "-c", "uwb_bias.c", "-o", "own.o"]
     subprocess.run(symbols, cwd=folder, check=True)
     own = _own_flash(folder)
@@ -340,7 +332,6 @@ def cost_of(folder, code, n=320):
     return {
         "instructions": float(cost["ticks"][0] * per_case),
         "most": float(cost["most"][0] * 1e9 / CLOCK),
-        "jacobian": float(cost["ticks_jacobian"][0] * per_case),
         "own": own,
         "flash": whole - empty,
         "ram": sum(_size(folder, "own.o")[1:]) + int(cost["stack"][0]) + STATE.itemsize,
@@ -358,8 +349,8 @@ int uwb_bias(int a, int b, const uwb_bias_state *state, float *bias, float *std)
 
 
 def _own_flash(folder):
-    """Return the bytes of uwb_bias.c that remain in a program without the Jacobian."""
-    command = ["arm-none-eabi-nm", "-S", "--defined-only", "without.elf"]
+    """Return the bytes of uwb_bias.c that remain in the test program."""
+    command = ["arm-none-eabi-nm", "-S", "--defined-only", "board.elf"]
     out = subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
     kept = {
         line.split()[-1]: int(line.split()[1], 16)

@@ -8,12 +8,12 @@ typedef struct {
 } test_case;
 
 typedef struct {
-    int32_t wrong, wrong_jacobian;
-    float bias, std, jacobian[6], curved;
+    int32_t wrong;
+    float bias, std;
 } test_result;
 
 typedef struct {
-    uint32_t ticks, most, ticks_jacobian, stack, cases; /* of uwb_bias, of the Jacobian, bytes */
+    uint32_t ticks, most, stack, cases; /* of uwb_bias, bytes */
 } test_cost;
 
 enum { BLOCK = 32 };
@@ -22,7 +22,7 @@ static test_case cases[BLOCK];
 static test_result results[BLOCK];
 
 int main(void) {
-    test_cost cost = {0, 0, 0, 0, 0};
+    test_cost cost = {0, 0, 0, 0};
     const int from = board_open("cases.bin", 0), to = board_open("results.bin", 1);
     size_t n;
     while ((n = board_read(from, cases, sizeof cases) / sizeof *cases) > 0) {
@@ -37,15 +37,6 @@ int main(void) {
             if (ticks > cost.most) cost.most = ticks;
         }
         if (board_stack_used() > cost.stack) cost.stack = (uint32_t)board_stack_used();
-#ifndef WITHOUT_JACOBIAN
-        board_timer_start();
-        for (size_t k = 0; k < n; k++) {
-            test_result *one = &results[k];
-            one->wrong_jacobian = uwb_bias_jacobian(cases[k].a, cases[k].b, &cases[k].state,
-                                                    one->jacobian, &one->curved);
-        }
-        cost.ticks_jacobian += board_timer_ticks();
-#endif
         cost.cases += (uint32_t)n;
         board_write(to, results, n * sizeof *results);
     }

@@ -2,9 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A correction as C for a vehicle: what is printed, its interface, and the folders with it.
 
-The bias at one state has two parts: of effects that the filter differentiates by its state, and of
-everything else. Only the first part is computed again for the Jacobian, at states to both sides, as
-`EffectSet.bias_jacobian` does.
+The standard deviation is that at the state of the filter. It leaves out how far the bias is from its
+linearization.
 """
 
 from __future__ import annotations
@@ -21,10 +20,9 @@ from uwb_tdoa_bias.common.text import version
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_bias.effects.effect_set import REACH
 
 from . import crazyflie
-from .c_code import Printer, number
+from .c_code import Printer
 from .correction import LeftOut, TracedCorrection, left_out
 from .scalars import Program
 from .tracing import nodes_of, samples_of
@@ -84,11 +82,6 @@ int uwb_bias_row(int id);
    error that stays, m. */
 int uwb_bias(int a, int b, const uwb_bias_state *state, float *bias, float *std);
 
-/* Compute the derivative of the bias by position, 1, and by velocity, s, world. It is a difference
-   over {reach} m and {reach} m/s to both sides. `curved`, m, is the standard deviation of the
-   distance of the bias from this line. */
-int uwb_bias_jacobian(int a, int b, const uwb_bias_state *state, float jacobian[6], float *curved);
-
 #ifdef __cplusplus
 }}
 #endif
@@ -104,7 +97,7 @@ SOURCE = """\
 static const unsigned short ids[UWB_BIAS_ANCHORS] = {{{ids}}};
 {helpers}
 {tables}
-{functions}
+{function}
 static int is_finite(float x) {{ return x - x == 0.0f; }}
 
 static int usable(const uwb_bias_state *s) {{
@@ -137,69 +130,14 @@ int uwb_bias(int a, int b, const uwb_bias_state *state, float *bias, float *std)
     if (wrong) {{
         return wrong;
     }}
-    level(a, b, state, out);
-    float sum = out[0];
-    const float noise = out[1];
-{steep}    if (!is_finite(sum) || !is_finite(noise)) {{
+    correction(a, b, state, out);
+    if (!is_finite(out[0]) || !is_finite(out[1])) {{
         return UWB_BIAS_NOT_FINITE;
     }}
-    *bias = sum;
-    *std = noise;
+    *bias = out[0];
+    *std = out[1];
     return 0;
 }}
-
-int uwb_bias_jacobian(int a, int b, const uwb_bias_state *state, float jacobian[6],
-                      float *curved) {{
-    for (int k = 0; k < 6; k++) {{
-        jacobian[k] = 0.0f;
-    }}
-    *curved = 0.0f;
-    const int wrong = rows_of(&a, &b, state);
-    if (wrong) {{
-        return wrong;
-    }}
-{slopes}    return 0;
-}}
-"""
-
-SLOPES = """\
-/* Write the differences of a function over the states first ... last - 1 of position and velocity,
-   and return their power, m^2. */
-static float slopes(void (*function)(int, int, const uwb_bias_state *, float *), int a, int b,
-                    const uwb_bias_state *state, int first, int last, float *jacobian) {{
-    float here, low, high, power = 0.0f;
-    uwb_bias_state moved = *state;
-    function(a, b, state, &here);
-    for (int k = first; k < last; k++) {{
-        float *one = k < 3 ? &moved.position[k] : &moved.velocity[k - 3];
-        const float middle = *one;
-        *one = middle - {reach};
-        function(a, b, &moved, &low);
-        *one = middle + {reach};
-        function(a, b, &moved, &high);
-        *one = middle;
-        jacobian[k] += (high - low) / {twice};
-        const float off = 0.5f * (high + low) - here;
-        power += 2.0f * (off * off);
-    }}
-    return power;
-}}
-"""
-
-JACOBIAN = """\
-    float power = 0.0f;
-{calls}    *curved = sqrtf(power);
-    int finite = is_finite(*curved);
-    for (int k = 0; k < 6; k++) {{
-        finite = finite && is_finite(jacobian[k]);
-    }}
-    if (!finite) {{
-        for (int k = 0; k < 6; k++) {{
-            jacobian[k] = 0.0f;
-        }}
-        *curved = 0.0f;
-        return UWB_BIAS_NOT_FINITE;
-    }}
 """
 
 
@@ -211,14 +149,12 @@ class VehicleCode:
     ----------
     files : {name: text} of uwb_bias.h and uwb_bias.c
     inputs : names of the inputs that are read
-    level : Program of (bias, standard deviation) of what the filter does not differentiate
-    steep : {states: Program of the bias of the effects that are differentiated by them}
+    program : Program of (bias, standard deviation)
     """
 
     files: dict[str, str]
     inputs: tuple[str, ...]
-    level: Program
-    steep: dict[tuple[int, ...], Program]
+    program: Program
 
     @property
     def reads_rates(self) -> bool:
@@ -236,53 +172,30 @@ def vehicle_code(
     samples = replace(samples_of(anchors, motion=True), yaw_std=None)
     corrector = Corrector(anchors, effects, network)
     known = corrector.effects
-    count = len(anchors)
     level = Corrector(anchors, known.state_independent, network).prediction(samples)
     bias, std = level.bias, level.std
     if len(known.state_dependent):
+        bias = bias + known.state_dependent.bias(samples)
         std = np.hypot(std, known.state_dependent.noise_std(samples))
-    level_program = Program([nodes_of(samples, bias), nodes_of(samples, std)], count)
-    steep = {
-        states: Program([nodes_of(samples, group.bias(samples))], count)
-        for states, group in _by_states(known.state_dependent).items()
-    }
+    program = Program([nodes_of(samples, bias), nodes_of(samples, std)], len(anchors))
     printer = Printer(MEMBERS)
-    functions = [printer.function("level", level_program)]
-    functions += [printer.function(f"steep_{k}", one) for k, one in enumerate(steep.values())]
-    if steep:
-        texts = {"reach": number(REACH), "twice": number(2.0 * np.float32(REACH))}
-        functions.append(SLOPES.format(**texts))
+    function = printer.function("correction", program)
     inputs = tuple(name for name in MEMBERS if name in printer.inputs)
     made = {
         "version": version(),
         "effects": _in_comment(known.name),
         "network": _in_comment(network.name if network else "none"),
-        "count": count,
+        "count": len(anchors),
         "ids": ", ".join(map(str, anchors.ids.tolist())),
-        "reach": f"{REACH:g}",
         "rates": int(not RATES.isdisjoint(inputs)),
         "inputs": ", ".join(MEMBERS[name] for name in inputs) or "none",
         "helpers": printer.helpers(),
-        "tables": printer.tables(count),
-        "functions": "\n".join(functions),
+        "tables": printer.tables(len(anchors)),
+        "function": function,
         "usable": _usable(inputs),
-        "steep": "".join(
-            f"    steep_{k}(a, b, state, out);\n    sum += out[0];\n" for k in range(len(steep))
-        ),
-        "slopes": _slopes(steep),
     }
     files = {"uwb_bias.h": HEADER.format(**made), "uwb_bias.c": SOURCE.format(**made)}
-    return VehicleCode(files, inputs, level_program, steep)
-
-
-def _by_states(effects: EffectSet) -> dict[tuple[int, ...], EffectSet]:
-    """Return {states: effects that are differentiated by them}."""
-    groups: dict[tuple[int, ...], EffectSet] = {}
-    for states in dict.fromkeys(effect.jacobian_states for effect in effects):
-        groups[states] = EffectSet(
-            tuple(effect for effect in effects if effect.jacobian_states == states)
-        )
-    return groups
+    return VehicleCode(files, inputs, program)
 
 
 def _usable(inputs: tuple[str, ...]) -> str:
@@ -291,17 +204,6 @@ def _usable(inputs: tuple[str, ...]) -> str:
         return "(void)s, 1"
     terms = [f"(s->{MEMBERS[name]} - s->{MEMBERS[name]})" for name in inputs]
     return " +\n           ".join(terms) + " == 0.0f"
-
-
-def _slopes(steep: dict[tuple[int, ...], Program]) -> str:
-    """Return the statements that fill in the Jacobian."""
-    if not steep:
-        return ""
-    calls = ""
-    for k, states in enumerate(steep):
-        ends = f"{states[0]}, {states[-1] + 1}"
-        calls += f"    power += slopes(steep_{k}, a, b, state, {ends}, jacobian);\n"
-    return JACOBIAN.format(calls=calls)
 
 
 def _in_comment(text: str) -> str:
