@@ -18,16 +18,13 @@ from documented import EXECUTABLES, NODES, ROOT, TOOLS, commands, main, of_pages
 import pytest
 import yaml
 
-from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_bias.common.text import written_by
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_tools import choices, cli, command_lines, main as uwb_tdoa
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.bags.files import PLUGINS
 from uwb_tdoa_tools.diagnosis.references import REFERENCES
-from uwb_tdoa_tools.flying.sensors import SENSOR_NAMES
 from uwb_tdoa_tools.flying.world import WORLDS
-from uwb_tdoa_tools.planning.installation import PARTS
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.config import VEHICLE_DEFAULTS
 from uwb_tdoa_tools.simulation.paths import TRAJECTORIES
@@ -110,8 +107,6 @@ def test_help_and_usage_errors_import_nothing_heavy():
         (choices.TRAJECTORIES, TRAJECTORIES),
         (choices.CARRIERS, VEHICLE_DEFAULTS),
         (choices.WORLDS, WORLDS),
-        (choices.PAIRINGS[:5], PARTS),
-        (tuple(SENSORS), SENSOR_NAMES),
     ],
 )
 def test_options_offer_what_there_is(offered, known):

@@ -2,13 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 from dataclasses import replace
-from functools import partial
 import json
-import os
-import signal
-import subprocess
-import sys
-import time
 
 import numpy as np
 import pytest
@@ -152,7 +146,7 @@ def test_options_change_the_bound(anchors, tmp_path):
         return report(tmp_path / "o")["map"]["bound_in_hull"]["median"]
 
     base = median()
-    assert median("--protocol", "tdoa3") == pytest.approx(median("--covariance", "all_pairs"))
+    assert median("--protocol", "tdoa3") != pytest.approx(base, rel=1e-3)
     (tmp_path / "weak.yaml").write_text(
         "azimuth: [0,0,0,0]\nelevation_1: [0,0,0,0]\nelevation_2: [0,0,0,0]\ngain_offset: -20\n"
     )
@@ -161,8 +155,6 @@ def test_options_change_the_bound(anchors, tmp_path):
     assert median("--temperature", "60") > 1.2 * base and median("--voltage", "3.5") < 0.95 * base
     assert median("--link-noise", "0.1") > 1.2 * base
     assert median("--noise", "0.01") < 0.2 * base
-    assert median("--covariance", "common_reference") == pytest.approx(base)
-    assert median("--covariance", "ring_uncorrelated") != pytest.approx(base, rel=1e-3)
 
 
 @pytest.mark.slow
@@ -227,11 +219,8 @@ def test_where_no_anchor_helps_it_says_so(anchors, tmp_path, capsys, monkeypatch
 
 @pytest.mark.slow
 @pytest.mark.parametrize("turned", [True, False], ids=["orientations surveyed", "not surveyed"])
-@pytest.mark.parametrize("how", ["add", "move"])
 @pytest.mark.usefixtures("without_advice")
-def test_improve(how, turned, tmp_path, monkeypatch, capsys):
-    few = partial(optimisation.scores_of_one_more, count=100)
-    monkeypatch.setattr(optimisation, "scores_of_one_more", few)
+def test_improve(turned, tmp_path, capsys):
     poor = corners()
     ids, orientations = (
         [7, 3, 12, 5, 1],
@@ -249,16 +238,13 @@ def test_improve(how, turned, tmp_path, monkeypatch, capsys):
                 "1",
                 *options,
                 "--improve",
-                how,
                 "--out",
                 str(out),
             ]
         )
         == 0
     )
-    assert {path.name for path in out.iterdir()} == FILES | {"improved.yaml", "layout.png"} | (
-        {"places.png"} if how == "add" else set()
-    )
+    assert {path.name for path in out.iterdir()} == FILES | {"improved.yaml", "layout.png"}
     found, text = report(out)["improve"], capsys.readouterr().out
     assert found["after"]["worst"] < found["before"]["worst"]
     assert found["before"]["flyable_share"] == report(out)["map"]["flyable_share"]
@@ -266,13 +252,9 @@ def test_improve(how, turned, tmp_path, monkeypatch, capsys):
         line for line in text.splitlines() if line.startswith("flyable, %")
     )
     better = read_survey(out / "improved.yaml")
-    assert set(better.ids) == set(ids) | ({0} if how == "add" else set()) and better.frame == "hall"
-    np.testing.assert_allclose(
-        better.positions, better.positions.round(2), atol=1e-4 if how == "add" else 1e-12
-    )
+    assert set(better.ids) == set(ids) and better.frame == "hall"
+    np.testing.assert_allclose(better.positions, better.positions.round(2), atol=1e-12)
     assert np.isfinite(better.orientations).all() if turned else np.isnan(better.orientations).all()
-    if how == "add":
-        np.testing.assert_array_equal(better.positions[better.index(ids)], before.positions)
     assert [
         int(line.split()[1].strip(":")) for line in text.splitlines() if line.startswith("anchor ")
     ] == [one["id"] for one in found["placed"]]
@@ -288,13 +270,13 @@ def test_improve(how, turned, tmp_path, monkeypatch, capsys):
         (["--noise", "0"], "noise: 0"),
         (["--antenna", "none.yaml"], "none.yaml"),
         (["--voltage", "12"], "voltage: 12"),
-        (["--covariance", "eq8"], "invalid choice: 'eq8'"),
+        (["--protocol", "eq8"], "invalid choice: 'eq8'"),
         (["--flights", "nowhere"], "nowhere"),
         (["--planar", "--flights", "nowhere"], "flights: "),
-        (["--improve", "add", "--places", "none.yaml"], "none.yaml"),
-        (["--improve", "move", "--count", "3"], "count: 3"),
-        (["--starts", "0", "--improve", "move"], "starts: 0"),
-        (["--fly", "1", "0", "0", "1", "0", "1", "--improve", "add"], "is empty"),
+        (["--improve", "--places", "none.yaml"], "none.yaml"),
+        (["--improve", "--count", "3"], "count: 3"),
+        (["--starts", "0", "--improve"], "starts: 0"),
+        (["--fly", "1", "0", "0", "1", "0", "1", "--improve"], "is empty"),
         (["--height", "1", "--volume"], "not allowed with"),
         (["--planar", "--volume"], "planar: "),
     ],
@@ -305,54 +287,6 @@ def test_bad_input_is_told_in_one_sentence(options, says, anchors, tmp_path, mon
     err = capsys.readouterr().err
     assert says in err and "Traceback" not in err
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.slow
-def test_maps_are_published_to_late_subscribers(anchors, tmp_path):
-    rclpy = pytest.importorskip("rclpy")
-    pytest.importorskip("uwb_tdoa_msgs")
-    from nav_msgs.msg import OccupancyGrid
-    from rclpy.qos import DurabilityPolicy, QoSProfile
-    from visualization_msgs.msg import MarkerArray
-
-    command = [
-        sys.executable,
-        "-m",
-        "uwb_tdoa_tools.commands",
-        "plan",
-        anchors,
-        *COARSE,
-        "--out",
-        str(tmp_path / "out"),
-        "--publish",
-    ]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ)
-    context, got = rclpy.Context(), {}
-    context.init()
-    try:
-        while "publishing" not in process.stdout.readline():
-            assert process.poll() is None
-        node = rclpy.create_node("viewer", context=context)
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        for kind, topic in ((OccupancyGrid, "plan/flyable"), (MarkerArray, "plan/markers")):
-            node.create_subscription(
-                kind, topic, lambda message, topic=topic: got.setdefault(topic, message), latched
-            )
-        executor = rclpy.executors.SingleThreadedExecutor(context=context)
-        executor.add_node(node)
-        until = time.monotonic() + 120.0
-        while len(got) < 2 and time.monotonic() < until:
-            executor.spin_once(timeout_sec=0.1)
-        process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=120) == 0
-    finally:
-        process.kill()
-        process.stdout.close()
-        context.try_shutdown()
-    assert (
-        set(np.unique(got["plan/flyable"].data)) <= {0, 50, 75, 100}
-        and len(got["plan/markers"].markers) == 10
-    )
 
 
 @pytest.mark.usefixtures("without_advice", "without_pictures")

@@ -142,7 +142,7 @@ def test_a_hall_whose_anchors_all_hang_at_one_height_needs_a_side(tmp_path, caps
 def test_what_a_hall_does_not_have_is_refused(tmp_path, capsys):
     anchors_of(6, 5).to_yaml(tmp_path / "hall.yaml")
     command = [str(tmp_path / "hall.yaml"), "--radio-reach", "15", "--out", str(tmp_path / "out")]
-    assert main([*command, "--improve", "add"]) == 2
+    assert main([*command, "--improve"]) == 2
     assert "leave out --improve" in capsys.readouterr().err
     assert (
         main([command[0], *command[3:], "--walls", "walls.yaml"]) == 2

@@ -10,8 +10,8 @@ from scipy.linalg import cho_factor, cho_solve
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.radio import DWM1000_AZIMUTH, Antenna
-from uwb_tdoa_tools.choices import PAIRINGS
 from uwb_tdoa_tools.planning.installation import (
+    PARTS,
     FixedNoise,
     Installation,
     Pairing,
@@ -243,8 +243,7 @@ def numerical_information(point, installation, pairing, step=1e-3):
     return -pairing.times * hessian
 
 
-CASES = [(name, 0.0) for name in PAIRINGS if "+" not in name]
-CASES += [("ring", 0.2), ("every_range", 0.2)]
+CASES = [(name, link_std) for name in PARTS for link_std in (0.0, 0.2)]
 
 
 @pytest.mark.parametrize("dimensions", [2, 3])

@@ -78,15 +78,6 @@ WORLDS = (
 MOMENTS = "rest", "lift-off", "circle", "landing", "anywhere"
 
 # Planning
-PAIRINGS = (
-    "ring",
-    "ring_uncorrelated",
-    "common_reference",
-    "all_pairs",
-    "every_range",
-    "ring+every_range",
-    "all_pairs+every_range",
-)
 OF_PROTOCOL = {
     "tdoa2": "ring",
     "tdoa3": "all_pairs",

@@ -16,7 +16,6 @@ from ..choices import (
     CRITERIA,
     OBJECTIVES,
     OF_PROTOCOL,
-    PAIRINGS,
     TEMPERATURE,
     VOLTAGE,
 )
@@ -46,7 +45,7 @@ def parser() -> ArgumentParser:
         "plan survey.txt --volume --room -3 4 -4 4 0 3 --protocol tdoa3 --out plan/",
         "plan square.yaml --planar --height 0.2 --out plan/",
         "plan survey.txt --volume --with height --flights flights/0425 --out plan/",
-        "plan survey.txt --volume --improve add --out plan/",
+        "plan survey.txt --volume --improve --out plan/",
         "plan survey.txt --volume --protocol tdoa2+ranges --noise 0.1 --out plan/",
         (
             "plan --hall --room 0 120 0 60 0 8 --height 1.2 --radio-reach 25 --accuracy 0.5 "
@@ -70,11 +69,6 @@ def parser() -> ArgumentParser:
                 help="where to write; replaces what an earlier plan left there",
             ),
             option("--json", metavar="FILE", type=OutputFile, help="write the figures here too"),
-            option(
-                "--publish",
-                action="store_true",
-                help="publish the maps on ROS topics plan/... until Ctrl-C",
-            ),
             group(
                 "where",
                 option(
@@ -108,11 +102,6 @@ def parser() -> ArgumentParser:
             group(
                 "measurements",
                 option("--protocol", choices=OF_PROTOCOL, default="tdoa2", help=ROUND),
-                option(
-                    "--covariance",
-                    choices=PAIRINGS,
-                    help="what a round holds, and what its TDOAs share (default: as --protocol says)",
-                ),
                 option(
                     "--antenna",
                     metavar="FILE",
@@ -215,16 +204,12 @@ def parser() -> ArgumentParser:
                     help=f"measured accuracy beside the bound; {choices.RECORDINGS}",
                 ),
                 options.JOBS,
-                option(
-                    "--improve",
-                    choices=("move", "add"),
-                    help="better places: move all anchors, or add one",
-                ),
+                option("--improve", action="store_true", help="better places for all anchors"),
                 option(
                     "--count",
                     metavar="N",
                     type=int,
-                    help="with --improve move: how many anchors (default: as there are)",
+                    help="with --improve: how many anchors (default: as there are)",
                 ),
                 option(
                     "--objective",

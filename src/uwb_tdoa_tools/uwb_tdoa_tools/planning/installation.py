@@ -203,19 +203,9 @@ class Pairing:
         return matrix
 
 
-def ring(n: int, shared: bool = True) -> Pairing:
+def ring(n: int) -> Pairing:
     """Return the N TDOAs of TDOA2: each anchor with the next one, and the last with the first."""
-    return Pairing(np.arange(n), (np.arange(n) + 1) % n, shared)
-
-
-def ring_uncorrelated(n: int) -> Pairing:
-    """Return the N TDOAs of TDOA2 with independent errors."""
-    return ring(n, shared=False)
-
-
-def common_reference(n: int) -> Pairing:
-    """Return the N - 1 TDOAs of each anchor with anchor 0: the case of eq. A18."""
-    return Pairing(np.zeros(n - 1, int), np.arange(1, n), True)
+    return Pairing(np.arange(n), (np.arange(n) + 1) % n, True)
 
 
 def all_pairs(n: int) -> Pairing:
@@ -232,11 +222,9 @@ def every_range(n: int) -> Pairing:
     return Pairing(np.arange(n), np.arange(n), False, ranges=True)
 
 
-# Parts of a round, by the words of choices.PAIRINGS
+# Parts of a round, by the words of choices.OF_PROTOCOL
 PARTS: dict[str, Callable[[int], Pairing]] = {
     "ring": ring,
-    "ring_uncorrelated": ring_uncorrelated,
-    "common_reference": common_reference,
     "all_pairs": all_pairs,
     "every_range": every_range,
 }
@@ -255,7 +243,7 @@ class Installation:
     ----------
     anchors : Anchors
     noise : RadioNoise or FixedNoise of a reception
-    pairing : what one round holds, of choices.PAIRINGS (default: the ring of TDOA2)
+    pairing : what one round holds, of choices.OF_PROTOCOL (default: the ring of TDOA2)
     link_std : m, additional error of each TDOA (default 0)
     dimensions : 3, or 2 for a tag at a known height
     height_std : m, of a height sensor on the tag, used with each round; inf for none (default)

@@ -194,14 +194,13 @@ class Layout:
     x holds for each anchor the numbers of AnchorPlaces, times their length over an arm, then a
     rotation vector, rad.
 
-    count : anchors to place; fixed : Anchors that stay, or None; target : (3,) m, which new antennas
-    face, with their axis upright, before the rotation; turned : False if antennas radiate alike in
-    all directions, like anchors without a surveyed orientation.
+    count : anchors to place; target : (3,) m, which antennas face, with their axis upright, before
+    the rotation; turned : False if antennas radiate alike in all directions, like anchors without a
+    surveyed orientation.
     """
 
     places: AnchorPlaces
     count: int
-    fixed: Anchors | None
     target: np.ndarray
     turned: bool = True
 
@@ -224,43 +223,29 @@ class Layout:
         return np.hstack([placed, np.zeros((self.count, 3 * self.turned))]).ravel()
 
     def anchors(self, x: np.ndarray) -> Anchors:
-        """Return the Anchors of x, after the fixed ones."""
-        positions, orientations = self._placed(np.reshape(x, (self.count, self.width)))
-        if self.fixed is None:
-            return Anchors(np.arange(self.count), positions, orientations)
-        return Anchors(
-            np.append(self.fixed.ids, free_ids(self.fixed.ids, self.count)),
-            np.vstack([self.fixed.positions, positions]),
-            np.vstack([self.fixed.orientations, orientations]),
-            self.fixed.frame,
-        )
+        """Return the Anchors of x."""
+        placed = self._placed(np.reshape(x, (self.count, self.width)))
+        return Anchors(np.arange(self.count), *placed)
 
     def nudged(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return all anchors, and the free ones again after a small step of each number.
+        """Return all anchors, and again after a small step of each number.
 
-        Returns positions (F + (1 + width) count, 3) m, orientations likewise, and steps (len(x),).
+        Returns positions ((1 + width) count, 3) m, orientations likewise, and steps (len(x),).
         """
         rows = np.reshape(x, (self.count, self.width))
         upper = np.reshape(self.bounds, (self.count, self.width, 2))[:, :, 1]
         steps = np.where(rows > 0.5 * upper, -_STEP, _STEP)  # not over the upper end of a place
         moved = np.concatenate([rows[None], rows + steps * np.eye(self.width)[:, None]])
-        positions, orientations = self._placed(moved.reshape(-1, self.width))
-        if self.fixed is not None:
-            positions = np.vstack([self.fixed.positions, positions])
-            orientations = np.vstack([self.fixed.orientations, orientations])
-        return positions, orientations, steps.ravel()
+        return *self._placed(moved.reshape(-1, self.width)), steps.ravel()
 
     def columns(self) -> np.ndarray:
         """Return the rows of `nudged` of each layout: (1 + len(x), N).
 
         The first layout is x, then x after the step of each number.
         """
-        fixed = 0 if self.fixed is None else len(self.fixed)
-        chosen = np.tile(np.arange(fixed + self.count), (1 + self.count * self.width, 1))
+        chosen = np.tile(np.arange(self.count), (1 + self.count * self.width, 1))
         anchor, number = np.divmod(np.arange(self.count * self.width), self.width)
-        chosen[1 + np.arange(len(anchor)), fixed + anchor] = (
-            fixed + self.count * (1 + number) + anchor
-        )
+        chosen[1 + np.arange(len(anchor)), anchor] = self.count * (1 + number) + anchor
         return chosen
 
     def _placed(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

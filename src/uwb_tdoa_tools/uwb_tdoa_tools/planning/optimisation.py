@@ -118,21 +118,19 @@ def optimise(
     goal: Goal,
     places: AnchorPlaces,
     count: int,
-    fixed: Anchors | None = None,
     start: np.ndarray | None = None,
     starts: int = 16,
     progress: Wrap = iter,
 ) -> Anchors:
     """Return Anchors at the `count` best places, in the best directions.
 
-    goal : Goal; places : AnchorPlaces; fixed : Anchors that stay, which come first; start : (count, 3) m, a layout to
-    begin with besides the quasi-random ones; starts : number of these; progress : wraps the starts.
+    goal : Goal; places : AnchorPlaces; start : (count, 3) m, a layout to begin with besides the
+    quasi-random ones; starts : number of these; progress : wraps the starts.
     Each start descends at a few of the goal's points. The best ends descend again, with the worst
     points added. The best score at all points wins.
     """
-    layout = Layout(
-        places, count, fixed, goal.points.mean(axis=0), are_turned(goal.installation.anchors)
-    )
+    turned = are_turned(goal.installation.anchors)
+    layout = Layout(places, count, goal.points.mean(axis=0), turned)
     rows = _some(goal, ROUGH)
     looked_at = replace(goal, points=goal.points[rows])
     from scipy.stats import qmc  # takes a second to import
@@ -146,26 +144,10 @@ def optimise(
     ends.sort(key=lambda x: goal.score(layout.anchors(x)))
     ends = [_refined(goal, layout, x, rows) for x in ends[:FINALISTS]]
     found = [layout.anchors(x) for x in ends]
-    best = min([each for each in found if not _beside(each, count)] or found, key=goal.score)
+    best = min([each for each in found if not _beside(each)] or found, key=goal.score)
     if goal.score(best) >= UNUSABLE:
         raise InputError("places: no layout of these anchors locates a tag; allow more places.")
     return best
-
-
-def scores_of_one_more(
-    goal: Goal, anchors: Anchors, places: AnchorPlaces, count: int = 400
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return places for one more anchor and their scores: (n, places.numbers), (n,) m.
-
-    The places are evenly spread, at least BESIDE from other anchors. The anchor faces the points.
-    """
-    layout = Layout(places, 1, anchors, goal.points.mean(axis=0), are_turned(anchors))
-    numbers = places.grid(count)
-    away = np.linalg.norm(places.positions(numbers)[:, None] - anchors.positions, axis=2).min(
-        axis=1
-    )
-    numbers = numbers[away >= BESIDE]
-    return numbers, np.array([goal.score(layout.anchors(layout.start(x))) for x in numbers])
 
 
 def are_turned(anchors: Anchors) -> bool:
@@ -239,12 +221,12 @@ def _moved(better: Anchors, before: Anchors) -> np.ndarray:
     return (rows < 0) | (np.linalg.norm(better.positions - before.positions[rows], axis=1) > 1e-3)
 
 
-def _beside(anchors: Anchors, count: int) -> bool:
-    """Return whether one of the last `count` Anchors is nearer than BESIDE to another."""
+def _beside(anchors: Anchors) -> bool:
+    """Return whether two Anchors are nearer than BESIDE."""
     away = np.linalg.norm(
         anchors.positions[:, None] - anchors.positions, axis=2
     ) + 2.0 * BESIDE * np.eye(len(anchors))
-    return bool((away[-count:] < BESIDE).any())
+    return bool((away < BESIDE).any())
 
 
 def _some(goal: Goal, count: int) -> np.ndarray:

@@ -35,7 +35,6 @@ if TYPE_CHECKING:
 
     from ..simulation.rooms import Walls
     from .installation import Installation
-    from .layout import AnchorPlaces
 
 WIDTH, DPI = 7.0, 100  # inches, pixels an inch
 STATES = {  # of a cell: what it is called, and its colour
@@ -286,60 +285,6 @@ def plot_layouts(
         [(ax, installation.anchors) for ax, (_, installation, _) in zip(axes, charts)],
         path,
     )
-
-
-def plot_places(
-    places: AnchorPlaces,
-    numbers: np.ndarray,
-    scores: np.ndarray,
-    objective: str,
-    path: str | Path,
-) -> None:
-    """Draw the scores of one more anchor, with the walls side by side.
-
-    numbers : (n, places.numbers) of AnchorPlaces; scores : (n,) m, of `Goal.score`; objective :
-    of the Goal.
-    """
-    figure, ax = plt.subplots(figsize=(WIDTH, 3.6), layout="constrained")
-    at = places.positions(numbers)
-    along, height = numbers[:, 0] * places.ends[-1], at[:, 2]
-    scale = _scale(100.0 * scores[np.isfinite(scores)])
-    dots = ax.scatter(
-        along,
-        height,
-        c=100.0 * scores,
-        cmap=COLOURS,
-        s=60,
-        vmin=scale[0],
-        vmax=scale[1],
-        edgecolors="0.4",
-        linewidths=0.3,
-    )
-    _bar([ax], dots, f"score: {objective} bound, cm", _beyond(100.0 * scores, scale))
-    for number, (start, end) in enumerate(zip(places.starts, places.ends)):
-        ax.axvline(end, color="0.6", lw=0.8)
-        ax.text(
-            0.5 * (start + end),
-            ax.get_ylim()[1],
-            f"place {number + 1}",
-            ha="center",
-            va="bottom",
-            fontsize=9,
-        )
-    best = int(np.argmin(scores))
-    ax.plot(
-        along[best],
-        height[best],
-        "o",
-        mfc="none",
-        mec="r",
-        ms=13,
-        mew=1.6,
-        label=f"best: ({', '.join(f'{v:.2f}' for v in at[best])})",
-    )
-    ax.set(xlabel="along the walls, one after the other, m", ylabel="z, m")
-    title = "One more anchor: the bound that is flown, times 1 to 2 for what cannot be flown"
-    _finish(figure, title, ax.get_legend_handles_labels()[0], [], path)
 
 
 def _layers(grid: Grid) -> list[int]:

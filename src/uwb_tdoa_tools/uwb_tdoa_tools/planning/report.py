@@ -315,25 +315,6 @@ def write_messages(found: dict[str, Any], path: str | Path) -> None:
             writer.write(connection, 0, store.serialize_cdr(message, TOPICS[topic]))
 
 
-def publish_messages(found: dict[str, Any]) -> None:
-    """Publish `map_messages`, transient local, until SIGINT or SIGTERM. Needs rclpy."""
-    import rclpy
-    from rclpy.serialization import deserialize_message
-
-    from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS
-
-    from ..live.session import message_class, session
-
-    store = typestore()
-    with session("plan", []) as (node, stop):
-        for topic, message in found.items():
-            kind = message_class(TOPICS[topic])
-            data = bytes(store.serialize_cdr(message, TOPICS[topic]))
-            node.create_publisher(kind, topic, ANCHORS_QOS).publish(deserialize_message(data, kind))
-        while not stop:
-            rclpy.spin_once(node, timeout_sec=0.2)
-
-
 def _occupancy(store: Typestore, grid: Grid, values: np.ndarray, k: int, frame: str) -> Any:
     """Return the layer k of values (n,), -1 to 100, as an OccupancyGrid at its height."""
     types, (nx, ny, _) = store.types, grid.shape

@@ -82,7 +82,7 @@ def plan(args: Namespace) -> bool:
     if demand.criterion == "round":
         figures["addition"] = advice(args, whole, found)
         report.print_addition(figures["addition"], about["flyable_share"])
-    outgoing = draw_map(whole, found, args.out)
+    draw_map(whole, found, args.out)
     if recordings:
         read = partial(flight_errors, reading, tuple(args.sensors))
         flown = parallel.over(read, recordings, args.jobs, args.dask)
@@ -90,9 +90,9 @@ def plan(args: Namespace) -> bool:
         figures["flights"] = evaluate_flights(flown, installation, room, step, args.out)
         report.print_flights(figures["flights"])
     if aim:
-        figures["improve"] = improve(found, aim, args.improve, args.starts, args.out)
+        figures["improve"] = improve(found, aim, args.starts, args.out)
         report.print_improvement(figures["improve"])
-    end(args, figures, outgoing)
+    end(args, figures)
     return bool(found.flyable.mean() >= args.share) or not args.hall
 
 
@@ -137,7 +137,7 @@ def installation_of(args: Namespace, anchors: Anchors) -> Installation:
     return Installation(
         anchors,
         noise,
-        args.covariance or OF_PROTOCOL[args.protocol],
+        OF_PROTOCOL[args.protocol],
         args.link_noise,
         2 if args.planar else 3,
         height_std,
@@ -311,19 +311,16 @@ def advice(args: Namespace, whole: Hall, found: Chart) -> dict[str, Any] | None:
         return optimisation.best_addition(whole, found, tried, progress)
 
 
-def end(args: Namespace, figures: dict[str, Any], outgoing: dict[str, Any]) -> None:
-    """Write the figures, print the names of the files, and publish the messages if asked for."""
+def end(args: Namespace, figures: dict[str, Any]) -> None:
+    """Write the figures, and print the names of the files."""
     for path in (args.out / "plan.json", args.json):
         if path is not None:
             cli.write_json(path, figures)
     cli.show(f"wrote {', '.join(sorted(path.name for path in args.out.iterdir()))} in {args.out}")
-    if args.publish:
-        cli.show(f"publishing {', '.join(outgoing)} until Ctrl-C")
-        report.publish_messages(outgoing)
 
 
-def draw_map(whole: Hall, found: Chart, out: Path) -> dict[str, Any]:
-    """Write the pictures, flyable volume and bag of a Chart. Return {topic: message}.
+def draw_map(whole: Hall, found: Chart, out: Path) -> None:
+    """Write the pictures, flyable volume and bag of a Chart.
 
     With the criterion "pairings" the curves of each choice of anchors are drawn.
     """
@@ -332,9 +329,7 @@ def draw_map(whole: Hall, found: Chart, out: Path) -> dict[str, Any]:
     plots.plot_precision(anchors, found, out / "precision.png", whole.walls)
     plots.plot_flyable(anchors, found, out / "flyable.png", whole.walls, pairings)
     found.volume(anchors, installation.dimensions).save(out / "flyable.npz")
-    outgoing = report.map_messages(found, anchors)
-    report.write_messages(outgoing, out / "plan.bag")
-    return outgoing
+    report.write_messages(report.map_messages(found, anchors), out / "plan.bag")
 
 
 def flight_errors(
@@ -375,29 +370,18 @@ def evaluate_flights(
     return rows
 
 
-def improve(before: Chart, aim: Aim, how: str, starts: int, out: Path) -> dict[str, Any]:
+def improve(before: Chart, aim: Aim, starts: int, out: Path) -> dict[str, Any]:
     """Search better places for the anchors, and write improved.yaml.
 
-    before : Chart with the anchors as they are; aim : Aim; how : "move" or "add".
+    before : Chart with the anchors as they are; aim : Aim.
     """
     goal, places, installation = aim.goal, aim.places, aim.goal.installation
     anchors = installation.anchors
     with Progress("plan") as progress:
-        search: dict[str, Any] = {
-            "starts": starts,
-            "progress": partial(progress.over, what="layouts"),
-        }
-        if how == "add":
-            numbers, scores = optimisation.scores_of_one_more(goal, anchors, places)
-            plots.plot_places(places, numbers, scores, goal.objective, out / "places.png")
-            start: np.ndarray | None = places.positions(numbers[[np.argmin(scores)]])
-            better = optimisation.optimise(goal, places, 1, anchors, start, **search)
-        else:
-            start = anchors.positions if aim.count == len(anchors) else None
-            better = optimisation.with_old_ids(
-                optimisation.optimise(goal, places, aim.count, None, start, **search), anchors
-            )
-        better = optimisation.rounded(better, anchors)
+        start = anchors.positions if aim.count == len(anchors) else None
+        over = partial(progress.over, what="layouts")
+        found = optimisation.optimise(goal, places, aim.count, start, starts, over)
+        better = optimisation.rounded(optimisation.with_old_ids(found, anchors), anchors)
         better.to_yaml(out / "improved.yaml")
         after = Hall(replace(installation, anchors=better), goal.demand)
         charted = after.chart(before.grid)
