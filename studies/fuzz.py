@@ -37,7 +37,6 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.debias import BiasMap
 from uwb_tdoa_tools import cli
 from uwb_tdoa_tools.bags.bag import read_bag
-from uwb_tdoa_tools.evaluating import read_others
 from uwb_tdoa_tools.outputs import OutputFolder
 from uwb_tdoa_tools.planning.installation import antenna_from_yaml
 from uwb_tdoa_tools.planning.layout import AnchorPlaces
@@ -99,7 +98,6 @@ TARGETS = {  # {kind: reads a file}
     "marks": lambda path: read_marks(path, [Flight("monday", ANCHORS, MINUTE)]),
     "distances": lambda path: read_distances(path, ANCHORS),
     "tags": lambda path: launching.tags(path, {}),
-    "peers": read_others,
     "flyable": FlyableVolume.load,
     "bias_map": BiasMap.load,
     "model": Network,
@@ -117,7 +115,7 @@ NAMES = {  # of the file, where the name matters
 FLIGHTS = "log", "csv", "bag", "columns"  # beginnings of kinds whose readers return a Flight
 TEXTS = (
     *("yaml", "effects", "config", "antenna", "places", "walls", "survey", "csv", "csv_salvaged"),
-    *("bag_metadata", "columns", "profile", "marks", "distances", "tags", "peers"),
+    *("bag_metadata", "columns", "profile", "marks", "distances", "tags"),
 )
 WORDS = (
     *("nan", "inf", "-inf", "1e308", "-1e308", "1e-320", "0", "-0", "-1", "1e400", "9" * 400),

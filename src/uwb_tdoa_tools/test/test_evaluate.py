@@ -126,21 +126,21 @@ def test_report_of_the_phases_of_one_flight_and_of_several(bag, tmp_path, capsys
     )
     assert 0.0 < one["ready_delay"] < 1.0
     capsys.readouterr()
-    told = report([bag, bag, "--no-bias", "--markdown", tmp_path / "table.md"], tmp_path)
+    told = report([bag, bag, "--no-bias"], tmp_path)
     assert [run["phases"] for run in told["runs"]] == [one["phases"]] * 2
     for name, figures in told["pooled"]["phases"].items():
         assert figures["runs"] == 2 and figures["rmse_3d"] == pytest.approx(
             one["phases"][name]["rmse_3d"]
         ), name
-    for text in (capsys.readouterr().out, (tmp_path / "table.md").read_text()):
-        for title in (
-            "at rest before, 2 s",
-            "first 3 s",
-            "last 3 s",
-            "at rest after",
-            "whole recording",
-        ):
-            assert title in text
+    text = capsys.readouterr().out
+    for title in (
+        "at rest before, 2 s",
+        "first 3 s",
+        "last 3 s",
+        "at rest after",
+        "whole recording",
+    ):
+        assert title in text
 
 
 @pytest.mark.slow
@@ -243,30 +243,6 @@ def test_a_run_that_never_starts_has_a_picture_and_a_report_in_strict_json(fligh
     assert found["runs"][0]["diverged"] is True
 
 
-@pytest.mark.slow
-def test_table_beside_others(flight, bag, tmp_path):
-    peers = tmp_path / "peers.csv"
-    peers.write_text(
-        "flight,peer,mode,rmse_x,rmse_y,rmse_z,rmse_3d,frac_gt_1m,diverged\n"
-        f"{flight.name},firmware,std,0.1,0.1,0.1,0.1734,0.0,False\n"
-        f"{flight.name},firmware,robust,9,9,9,15.6,0.9,True\n"
-        "other,firmware,std,0.1,0.1,0.1,0.5,0.0,False\n"
-    )
-    assert main([str(bag), "--markdown", str(tmp_path / "table.md"), "--beside", str(peers)]) == 0
-    header, rule, row = (
-        line.strip("| ").split(" | ")
-        for line in (tmp_path / "table.md").read_text().splitlines()[:3]
-    )
-    assert (
-        header[0] == "flight"
-        and header[-2:] == ["firmware std", "firmware robust"]
-        and len(rule) == len(header)
-    )
-    assert row[0] == flight.name and row[-2:] == ["0.173", "diverged"]
-    peers.write_text("name,error\nx,1\n")
-    assert main([str(bag), "--markdown", str(tmp_path / "table.md"), "--beside", str(peers)]) == 2
-
-
 def test_bad_usage(bag, tmp_path, capsys):
     assert main([]) == 2
     assert main([str(tmp_path / "nowhere")]) == 2
@@ -304,7 +280,7 @@ def test_smoothing_is_better(bag, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_name_is_no_command_to_picture_table_or_terminal(flight, tmp_path, capsys):
+def test_a_name_is_no_command_to_picture_or_terminal(flight, tmp_path, capsys):
     name, folder = "$\\frac$ <b>|\x1b[31m", tmp_path / "\x1b[2Jflights"
     folder.mkdir()
     write_bag(flight, folder / "bag")
@@ -314,20 +290,8 @@ def test_a_name_is_no_command_to_picture_table_or_terminal(flight, tmp_path, cap
         {"name": name}
     )
     file.write_text(yaml.safe_dump(content))
-    peers = tmp_path / "peers.csv"
-    peers.write_text("flight,peer,mode,rmse_3d,diverged\nx,<script>,a|b,0.1,False\n")
-    options = [
-        "--plot",
-        tmp_path / "error.png",
-        "--markdown",
-        tmp_path / "table.md",
-        "--beside",
-        peers,
-    ]
-    assert main([*map(str, [folder / "bag", *options])]) == 0
+    assert main([*map(str, [folder / "bag", "--plot", tmp_path / "error.png"])]) == 0
     assert (tmp_path / "error.png").stat().st_size > 10_000
-    table = (tmp_path / "table.md").read_text()
-    assert "| __frac_ _b____31m |" in table and "| _script_ a_b |" in table and "<" not in table
     assert main([str(folder / "none")]) == 2
     said = capsys.readouterr()
     assert (

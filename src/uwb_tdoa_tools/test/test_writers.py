@@ -130,10 +130,10 @@ def read(path):
 
 @pytest.mark.slow
 def test_evaluate_writes_its_files_in_an_ascii_locale(bag, tmp_path):
-    words = ("--json", "é.json", "--markdown", "é.md", "--plot", "é è.png", "--tum", "ü ü")
+    words = ("--json", "é.json", "--plot", "é è.png", "--tum", "ü ü")
     in_ascii(tmp_path, "evaluate", bag, *words, encoding="latin-1")
     assert list((tmp_path / "ü ü").glob("*.tum")) and (tmp_path / "é è.png").stat().st_size > 1000
-    assert "flüge" in read(tmp_path / "é.md") and read(tmp_path / "é.json")["runs"]
+    assert read(tmp_path / "é.json")["runs"][0]["flight"].startswith("flüge")
 
 
 @pytest.mark.slow

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from uwb_tdoa_bias.common.flight import Flight
-from uwb_tdoa_bias.common.text import sanitize
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf.results import Odometry, Residuals
 
@@ -30,12 +29,11 @@ from .localizing.localize import write_tum
 from .localizing.pictures import write_rerun
 from .outputs import file_name
 from .readers.inputs import Reading, Recording, report_remarks
-from .readers.tables import CsvTable, number
 from .scoring.alignment import Alignment, estimate_alignment, require_truth
 from .scoring.evaluation import corrected_truth, delays_fit
 from .scoring.metrics import Score, radio_residuals
-from .scoring.phases import NEAR_THE_FLOOR, TITLES
-from .scoring.pooling import Pool, Result
+from .scoring.phases import TITLES
+from .scoring.pooling import Result
 
 COLUMNS = {
     "rmse_x": "x",
@@ -66,7 +64,6 @@ OF_RUNS = {
     "rmse_3d_max_of_runs": "largest",
     "nees_mean_max_of_runs": "largest NEES",
 }
-SHORT = {"rmse_3d": "3D", "max_3d": "max", "nees_mean": "NEES", "without_estimate": "without, s"}
 ERRORS = ("rmse_x", "rmse_y", "rmse_z", "rmse_3d", "median_3d", "max_3d")
 
 
@@ -223,17 +220,6 @@ def lines_of_errors(scores: Sequence[Score]) -> list[str]:
     return [f"{'error, m':28s}{titles}", *rows]
 
 
-def markdown(rows: Sequence[dict[str, Any]], others: dict[str, dict[str, str]]) -> str:
-    """Return the table of rows, in metres, with one column per other estimator of `read_others`."""
-    table = [["flight", *COLUMNS.values(), *others]]
-    for row in rows:
-        cells = [f"{row[key]:.3f}" for key in COLUMNS] + [
-            peer.get(row["flight"], "") for peer in others.values()
-        ]
-        table.append([row["flight"], *cells])
-    return _as_markdown(table)
-
-
 def lines_of_alignment(aligned: dict[str, Any], means: dict[str, float]) -> Iterator[str]:
     """Yield lines on the alignment of ground truth and estimates.
 
@@ -281,34 +267,6 @@ def lines_of_phases(phases: dict[str, dict[str, Any]]) -> list[str]:
     ]
 
 
-def markdown_of(results: Sequence[Result], pool: Pool, others: dict[str, dict[str, str]]) -> str:
-    """Return all tables of Results and their Pool: errors, phases of all, and phases of each."""
-    rows = [result.row for result in results]
-    if len(results) == 1:
-        return f"{markdown(rows, others)}\n{_as_markdown(_table_of_phases(results[0].phases))}"
-    together = pool.figures()
-    of_all, of_each = _table_of_phases(together["phases"]), _table_of_runs(results)
-    return f"{markdown([*rows, together], others)}\n{_as_markdown(of_all)}\n{_as_markdown(of_each)}"
-
-
-def _table_of_runs(results: Sequence[Result]) -> list[list[str]]:
-    titles = [
-        f"{TITLES[name]}: {first}" if first == "3D" else first
-        for name in NEAR_THE_FLOOR
-        for first in SHORT.values()
-    ]
-    table = [["flight", *titles, "step until z > 0.3 m", "ready, s"]]
-    for result in results:
-        cells = [
-            _cell(result.phases.get(phase, {}).get(key))
-            for phase in NEAR_THE_FLOOR
-            for key in SHORT
-        ]
-        step = result.phases.get("to_0.3_m", {}).get("step")
-        table.append([result.row["flight"], *cells, _cell(step), _cell(result.row["ready_delay"])])
-    return table
-
-
 def _table_of_phases(phases: dict[str, dict[str, Any]]) -> list[list[str]]:
     columns = PHASE | (OF_RUNS if any("runs" in figures for figures in phases.values()) else {})
     rows = [
@@ -325,28 +283,6 @@ def _cell(value: float | None) -> str:
         if value is None or math.isnan(value)
         else f"{value:.{1 if abs(value) >= 100.0 else 2 if abs(value) >= 10.0 else 3}f}"
     )
-
-
-def _as_markdown(table: Sequence[Sequence[str]]) -> str:
-    """Return a table with its heading first; its first column is text."""
-    ruled = [table[0], ["---"] + ["---:"] * (len(table[0]) - 1), *table[1:]]
-    return "".join("| " + " | ".join(cells) + " |\n" for cells in ruled)
-
-
-def read_others(path: str | Path) -> dict[str, dict[str, str]]:
-    """Return {peer and mode: {flight: 3D RMSE as text, or "diverged"}} of a CSV file.
-
-    Raises InputError.
-    """
-    others: dict[str, dict[str, str]] = {}
-    for line, row in CsvTable(path, ("flight", "peer", "mode", "rmse_3d", "diverged")):
-        cell = (
-            "diverged" if row["diverged"] == "True" else f"{number(path, line, row, 'rmse_3d'):.3f}"
-        )
-        others.setdefault(sanitize(f"{row['peer']} {row['mode']}"), {})[sanitize(row["flight"])] = (
-            cell
-        )
-    return others
 
 
 def _cells(first: str, cells: Iterable[str]) -> str:

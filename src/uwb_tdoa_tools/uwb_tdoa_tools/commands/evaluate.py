@@ -9,7 +9,6 @@ from dataclasses import replace
 from functools import partial
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.files import write_text
 
 from .. import cli, options, parallel
 from ..cli import option
@@ -52,17 +51,6 @@ def parser() -> ArgumentParser:
             ),
             option(
                 "--json", metavar="FILE", type=OutputFile, help="write all figures: runs, pooled"
-            ),
-            option(
-                "--markdown", metavar="FILE", type=OutputFile, help="write the table as Markdown"
-            ),
-            option(
-                "--beside",
-                metavar="CSV",
-                help=(
-                    "add the 3D RMSE that others reach to that table: columns flight, peer, mode, "
-                    "rmse_3d, diverged"
-                ),
             ),
             option(
                 "--plot",
@@ -113,7 +101,7 @@ def _evaluate(args: Namespace) -> int:
     for result in parallel.over(evaluator, found, args.jobs, args.dask):
         pool.add(result)
         # else nothing grows with the number of flights
-        kept += [result] if args.json or args.markdown else []
+        kept += [result] if args.json else []
         cli.show(evaluating.line_of_run(result.row))
     together = pool.figures()
     if len(found) > 1:
@@ -133,9 +121,6 @@ def _evaluate(args: Namespace) -> int:
         cli.write_json(
             args.json, {"runs": [one.as_json() for one in kept], "pooled": as_json(together)}
         )
-    if args.markdown:
-        others = evaluating.read_others(args.beside) if args.beside else {}
-        write_text(args.markdown, evaluating.markdown_of(kept, pool, others))
     if late := evaluator.late_tdoas():
         cli.say(
             "evaluate",
