@@ -73,8 +73,8 @@ WIDE_ROOM = np.array([-4.0, -4.5, 0.0]), np.array([4.0, 4.5, 3.0])
 POINTS = lattice((-3.2, -3.1, 0.5), (2.9, 3.3, 2), 1.6)
 
 
-def case(pairing="ring", link_std=0.0, dimensions=3, depth=0.0):
-    installation = Installation(corners(), RadioNoise(), pairing, link_std, dimensions)
+def case(pairing="ring", dimensions=3, depth=0.0):
+    installation = Installation(corners(), RadioNoise(), pairing, dimensions)
     places = AnchorPlaces.walls(*WIDE_ROOM, depth=depth)
     layout = Layout(places, 6, np.array([0.0, 0.0, 1.5]))
     x = layout.start(places.nearest(corners().positions[-6:]))
@@ -85,7 +85,6 @@ def case(pairing="ring", link_std=0.0, dimensions=3, depth=0.0):
 CASES = [
     {},
     {"pairing": "all_pairs", "depth": 0.5},
-    {"link_std": 0.05},
     {"dimensions": 2},
 ]
 
@@ -113,9 +112,9 @@ def test_anchors_that_locate_nothing_have_no_slopes():
     assert (errors == UNUSABLE).all() and not slopes.any()
 
 
-def goal(installation, criterion="pairings", objective="worst"):
+def goal(installation, criterion="pairings"):
     points = lattice((1, 1, 0.5), (5, 4, 2), 1.5)
-    return Goal(points, installation, objective, Demand(criterion=criterion))
+    return Goal(points, installation, Demand(criterion=criterion))
 
 
 def bad_anchors():
@@ -125,12 +124,11 @@ def bad_anchors():
     )
 
 
-@pytest.mark.parametrize("objective", ["worst", "mean"])
-def test_a_layout_gets_better(objective):
-    aim = goal(Installation(bad_anchors()), "round", objective)
+def test_a_layout_gets_better():
+    aim = goal(Installation(bad_anchors()), "round")
     better = optimise(aim, AnchorPlaces.walls(*ROOM), 5, starts=2)
     before, after = aim.figures(bad_anchors()), aim.figures(better)
-    assert after[objective] < 0.7 * before[objective] and after["failing"] <= before["failing"]
+    assert after["worst"] < 0.7 * before["worst"] and after["failing"] <= before["failing"]
     p = better.positions
     assert (np.isin(p[:, 0], (0.0, 6.0)) | np.isin(p[:, 1], (0.0, 5.0))).all()
     assert np.isfinite(better.orientations).all() and len(set(better.ids)) == 5

@@ -85,9 +85,7 @@ OF_PROTOCOL = {
     "tdoa2+ranges": "ring+every_range",
     "tdoa3+ranges": "all_pairs+every_range",
 }
-OBJECTIVES = "worst", "mean"
 ACCURACY = 0.5  # m, of the bound of one round
-TEMPERATURE, VOLTAGE = 25.0, 3.3  # degrees Celsius and V, of anchors
 CRITERIA = {
     "round": "a whole round of all that is heard has one solution",
     "pairings": (

@@ -14,10 +14,7 @@ from .. import choices, cli, options
 from ..choices import (
     ACCURACY,
     CRITERIA,
-    OBJECTIVES,
     OF_PROTOCOL,
-    TEMPERATURE,
-    VOLTAGE,
 )
 from ..cli import exclusive, group, option
 from ..outputs import OutputFile, OutputFolder
@@ -112,34 +109,13 @@ def parser() -> ArgumentParser:
                     metavar="DBM",
                     type=float,
                     default=RadioLink.tx_power_dbm,
-                    help=f"at 25 C, 3.3 V {DEFAULT}",
-                ),
-                option(
-                    "--temperature",
-                    metavar="C",
-                    type=float,
-                    default=TEMPERATURE,
-                    help=f"of the anchors {DEFAULT}",
-                ),
-                option(
-                    "--voltage",
-                    metavar="V",
-                    type=float,
-                    default=VOLTAGE,
-                    help=f"supply of the anchors {DEFAULT}",
+                    help=f"into the antenna of an anchor {DEFAULT}",
                 ),
                 option(
                     "--noise",
                     metavar="M",
                     type=float,
                     help="standard deviation of every reception, instead of the radio's",
-                ),
-                option(
-                    "--link-noise",
-                    metavar="M",
-                    type=float,
-                    default=0.0,
-                    help="error that every TDOA has of its own besides (default: 0)",
                 ),
                 option(
                     "--with",
@@ -210,12 +186,6 @@ def parser() -> ArgumentParser:
                     metavar="N",
                     type=int,
                     help="with --improve: how many anchors (default: as there are)",
-                ),
-                option(
-                    "--objective",
-                    choices=OBJECTIVES,
-                    default="worst",
-                    help="what to improve where it flies (default: worst)",
                 ),
                 option(
                     "--fly",

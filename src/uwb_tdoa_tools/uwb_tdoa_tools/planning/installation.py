@@ -18,10 +18,9 @@ from uwb_tdoa_bias.common.radio import SPEED_OF_LIGHT, Antenna, RadioLink, recei
 from uwb_tdoa_bias.common.safe_yaml import read_yaml
 
 from ..checking.coverage import sides_of, to_copy
-from ..choices import TEMPERATURE, VOLTAGE
 
 BOLTZMANN = 1.380649e-23  # J/K
-ZERO_CELSIUS = 273.15  # K
+ROOM_TEMPERATURE = 298.15  # K
 _ANY_ATTITUDE = (0.0, 0.0, 0.0, 1.0)  # the tag's antenna is taken as omnidirectional
 _STEP = 1e-5  # m, for numerical derivatives
 
@@ -41,54 +40,33 @@ class Omnidirectional:
 class RadioNoise:
     """Noise from the link budget: Friis, thermal noise and the anchors' radiation pattern.
 
-    Source: eqs. 9 - 14 of Grasso et al. (Sensors 2022, 22, 9136). The gain of the receiving antenna
+    Source: eqs. 9 - 12 of Grasso et al. (Sensors 2022, 22, 9136). The gain of the receiving antenna
     is left out, as there.
 
     Attributes
     ----------
     antenna : Antenna of the anchors (default DWM1000-like). An anchor without orientation radiates
         the mean of the azimuth cut in all directions.
-    tx_power_dbm : into the antenna, at the reference temperature and voltage, dBm (default: that of
-        RadioLink)
-    temperature : degrees Celsius, of transmitter and thermal noise (default 25)
-    voltage : supply of the transmitter, V (default 3.3)
-    tx_power_per_degree, tx_power_per_volt : dB (default: typical of the DW1000 data sheet, channel
-        2)
+    tx_power_dbm : into the antenna, dBm (default: that of RadioLink)
     bandwidth : Hz (default 499.2e6, channels 1, 2, 3 and 5)
     full_strength : m, r_0 of eq. 9: nearer than this the noise does not fall (default 1.0)
     """
 
     antenna: Antenna = field(default_factory=Antenna)
     tx_power_dbm: float = RadioLink.tx_power_dbm
-    temperature: float = TEMPERATURE
-    voltage: float = VOLTAGE
-    tx_power_per_degree: float = -0.05
-    tx_power_per_volt: float = 2.73
     bandwidth: float = 499.2e6
     full_strength: float = 1.0
 
     def __post_init__(self) -> None:
-        for name, low, high in (
-            ("tx_power_dbm", -60, 30),
-            ("temperature", -40, 85),
-            ("voltage", 2.8, 3.6),
-        ):
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise InputError(
-                    f"{name}: {value!r} is outside {low} ... {high}, the range of a DW1000."
-                )
-
-    @property
-    def transmitted_dbm(self) -> float:
-        """Transmitted power at this temperature and voltage, dBm: eq. 13."""
-        warmer, more = self.temperature - 25.0, self.voltage - 3.3
-        return self.tx_power_dbm + self.tx_power_per_degree * warmer + self.tx_power_per_volt * more
+        if not -60.0 <= self.tx_power_dbm <= 30.0:
+            raise InputError(
+                f"tx_power_dbm: {self.tx_power_dbm!r} is outside -60 ... 30, the range of a DW1000."
+            )
 
     @property
     def thermal_noise_dbm(self) -> float:
         """Power of thermal noise in the bandwidth, dBm."""
-        return 10.0 * np.log10(BOLTZMANN * (self.temperature + ZERO_CELSIUS) * self.bandwidth * 1e3)
+        return 10.0 * np.log10(BOLTZMANN * ROOM_TEMPERATURE * self.bandwidth * 1e3)
 
     def variance(self, points: np.ndarray, anchors: Anchors) -> np.ndarray:
         """Return the variance of the range of one reception: (n, N) m^2.
@@ -111,7 +89,7 @@ class RadioNoise:
                 link = RadioLink(
                     antenna,  # type: ignore[arg-type]  # has `gain`
                     Omnidirectional(),  # type: ignore[arg-type]  # has `gain`
-                    tx_power_dbm=self.transmitted_dbm,
+                    tx_power_dbm=self.tx_power_dbm,
                 )
                 q = np.where(turned[rows, None], anchors.orientations[rows], _ANY_ATTITUDE)
                 power[:, rows] = received_power_dbm(
@@ -195,13 +173,6 @@ class Pairing:
     times: float = 1.0
     ranges: bool = False
 
-    def incidence(self) -> np.ndarray:
-        """Return the (M, N) matrix with -1 at a and +1 at b; the identity for ranges."""
-        rows = np.arange(len(self.a))
-        matrix = np.zeros((len(rows), 1 + max(self.a.max(), self.b.max())))
-        matrix[rows, self.a], matrix[rows, self.b] = -1.0, 1.0
-        return matrix
-
 
 def ring(n: int) -> Pairing:
     """Return the N TDOAs of TDOA2: each anchor with the next one, and the last with the first."""
@@ -244,7 +215,6 @@ class Installation:
     anchors : Anchors
     noise : RadioNoise or FixedNoise of a reception
     pairing : what one round holds, of choices.OF_PROTOCOL (default: the ring of TDOA2)
-    link_std : m, additional error of each TDOA (default 0)
     dimensions : 3, or 2 for a tag at a known height
     height_std : m, of a height sensor on the tag, used with each round; inf for none (default)
     hall : True if each place hears only a part of the anchors (default False). The part may be
@@ -254,7 +224,6 @@ class Installation:
     anchors: Anchors
     noise: RadioNoise | FixedNoise = field(default_factory=RadioNoise)
     pairing: str = "ring"
-    link_std: float = 0.0
     dimensions: int = 3
     height_std: float = np.inf
     hall: bool = False
@@ -268,11 +237,6 @@ class Installation:
             )
         if not self.hall:
             check_anchors(self.anchors, self.unknowns)
-        if not 0.0 <= self.link_std < 100.0:
-            raise InputError(
-                f"link noise: {self.link_std!r} m is not a standard deviation; give 0 or "
-                "more, e.g. 0.05."
-            )
 
     def with_anchors(self, anchors: Anchors) -> Installation:
         """Return a copy for a hall with other Anchors."""

@@ -146,13 +146,11 @@ UNUSABLE = 100.0
 class Goal:
     """Score of a layout of anchors.
 
-    points : (n, 3) m, to be located; installation : everything but the anchors; objective : "worst"
-    or "mean" bound over the points; demand : Demand
+    points : (n, 3) m, to be located; installation : everything but the anchors; demand : Demand
     """
 
     points: np.ndarray
     installation: Installation
-    objective: str = "worst"
     demand: Demand = field(default_factory=Demand)
 
     def errors(self, anchors: Anchors) -> np.ndarray:
@@ -175,12 +173,12 @@ class Goal:
         }
 
     def score(self, anchors: Anchors) -> float:
-        """Return the objective in m, times 1 to 2 for the share of points that fail."""
+        """Return the worst bound in m, times 1 to 2 for the share of points that fail."""
         try:
             found = self.figures(anchors)
         except InputError:
             return 2.0 * UNUSABLE
-        return found[self.objective] * (1.0 + found["failing"])
+        return found["worst"] * (1.0 + found["failing"])
 
 
 _ARM = 3.0  # m; to move an anchor so far changes about as much as to turn it by 1 rad

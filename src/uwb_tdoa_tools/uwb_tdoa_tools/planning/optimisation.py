@@ -22,7 +22,7 @@ from .maps import Chart, Judged, Wrap
 from .precision import bound, position_error, round_weights, weigh
 from .report import quantiles
 
-LEAST_GAIN = 1e-4  # of the objective: a step that gains less is the last
+LEAST_GAIN = 1e-4  # of the log of the bound: a step that gains less is the last
 _CHUNK = 1_000_000  # numbers in the largest array of one step
 
 
@@ -77,10 +77,6 @@ def descend(
             seen[key] = errors_and_slopes(goal, layout, x, points)
         return seen[key]
 
-    def mean(x: np.ndarray) -> tuple[float, np.ndarray]:
-        errors, slopes = at(x)
-        return np.log(errors.mean()), slopes.mean(axis=0) / errors.mean()
-
     def below(z: np.ndarray) -> np.ndarray:
         return z[size] - np.log(at(z[:size])[0])
 
@@ -94,12 +90,9 @@ def descend(
     x = np.clip(x, low, high)
     options: dict[str, Any] = {"jac": True, "method": "SLSQP"}
     options["options"] = {"maxiter": sweeps, "ftol": LEAST_GAIN}
-    if goal.objective == "mean":
-        found = minimize(mean, x, bounds=layout.bounds, **options)
-    else:
-        z, bounds = np.append(x, np.log(at(x)[0].max())), [*layout.bounds, (None, None)]
-        constraint = {"type": "ineq", "fun": below, "jac": below_slopes}
-        found = minimize(worst, z, bounds=bounds, constraints=[constraint], **options)
+    z, bounds = np.append(x, np.log(at(x)[0].max())), [*layout.bounds, (None, None)]
+    constraint = {"type": "ineq", "fun": below, "jac": below_slopes}
+    found = minimize(worst, z, bounds=bounds, constraints=[constraint], **options)
     return np.clip(np.nan_to_num(found.x[:size]), low, high)
 
 
@@ -131,7 +124,7 @@ def optimise(
     """
     turned = are_turned(goal.installation.anchors)
     layout = Layout(places, count, goal.points.mean(axis=0), turned)
-    rows = _some(goal, ROUGH)
+    rows = spread(goal.points, ROUGH)
     looked_at = replace(goal, points=goal.points[rows])
     from scipy.stats import qmc  # takes a second to import
 
@@ -229,13 +222,6 @@ def _beside(anchors: Anchors) -> bool:
     return bool((away < BESIDE).any())
 
 
-def _some(goal: Goal, count: int) -> np.ndarray:
-    """Return the rows of some of the goal's points."""
-    if goal.objective == "worst":
-        return spread(goal.points, count)
-    return np.random.default_rng(SEED).permutation(len(goal.points))[:count]
-
-
 def _refined(goal: Goal, layout: Layout, x: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Return x after descents at these rows of the goal's points and at the worst others.
 
@@ -247,7 +233,7 @@ def _refined(goal: Goal, layout: Layout, x: np.ndarray, rows: np.ndarray) -> np.
             errors = goal.errors(layout.anchors(x))
         except InputError:  # two anchors have met
             break
-        if goal.objective == "worst" and errors.max() <= CLOSE * errors[rows].max():
+        if errors.max() <= CLOSE * errors[rows].max():
             break
         worst = np.argsort(-errors)[: 1 + len(errors) // 20]
         rows = np.union1d(rows, worst[spread(goal.points[worst], ADDED)])

@@ -48,7 +48,7 @@ def information(
 def _information(
     points: np.ndarray, installation: Installation, correction: bool, columns: np.ndarray
 ) -> np.ndarray:
-    anchors, k, link_std = installation.anchors, installation.dimensions, installation.link_std
+    anchors, k = installation.anchors, installation.dimensions
     variances = installation.noise.variance(points, anchors)
     variance = np.take_along_axis(variances, columns, axis=1)
     unit = ranges(points[:, None, :], anchors.positions[columns])[1][..., :k]
@@ -58,7 +58,7 @@ def _information(
         gradient = np.take_along_axis(gradient, columns[..., None], axis=1)
     total = np.zeros((len(points), k, k))
     for part in installation.round(columns.shape[1]):
-        weights = range_weights(variance, part, link_std)
+        weights = range_weights(variance, part)
         total += weigh(unit, weights)
         if correction:
             total += 0.5 * weigh(gradient, _weights_of_sizes(weights, part))
@@ -77,13 +77,13 @@ def weigh(change: np.ndarray, weights: np.ndarray) -> np.ndarray:
 def round_weights(variance: np.ndarray, installation: Installation) -> np.ndarray:
     """Return the weights of the ranges in a whole round: (n, N, N) 1/m^2. variance : (n, N) m^2."""
     parts = installation.round(variance.shape[1])
-    return np.sum([range_weights(variance, part, installation.link_std) for part in parts], axis=0)
+    return np.sum([range_weights(variance, part) for part in parts], axis=0)
 
 
-def range_weights(variance: np.ndarray, part: Pairing, link_std: float) -> np.ndarray:
+def range_weights(variance: np.ndarray, part: Pairing) -> np.ndarray:
     """Return D' F^-1 D, the weights of the ranges in a part of a round: (n, N, N) 1/m^2.
 
-    D (M, N) has -1 at anchor a and +1 at anchor b of each pair; it is the identity for ranges. F = D S D' + link_std^2 I
+    D (M, N) has -1 at anchor a and +1 at anchor b of each pair; it is the identity for ranges. F = D S D'
     is the covariance of the measurements, S = diag(variance).
 
     If the anchors share one reception each and the pairs connect all of them, the result does not
@@ -91,24 +91,17 @@ def range_weights(variance: np.ndarray, part: Pairing, link_std: float) -> np.nd
     That is the information of N ranges with one unknown offset, the tag's clock. A closed ring,
     whose D S D' is singular, has the same information. Only independent TDOAs have `times`.
 
-    variance : (n, N) m^2, of the receptions; part : Pairing; link_std : m, additional error of each
-    TDOA. It includes the anchor's reception of the other anchor's packet.
+    variance : (n, N) m^2, of the receptions; part : Pairing
     Source: eqs. 4 and 5 of Grasso et al. (Sensors 2022, 22, 9136); A18 for a common reference.
     """
     each = np.eye(variance.shape[1])
     if part.ranges:
-        return each / (variance + link_std**2)[:, None]
-    if part.shared and link_std > 0.0:
-        d = part.incidence()
-        covariance = (d * variance[:, None, :]) @ d.T + link_std**2 * np.eye(len(d))
-        return d.T @ np.linalg.inv(covariance) @ d
+        return each / variance[:, None]
     if part.shared:
         w = 1.0 / variance
         return each * w[:, None] - w[:, :, None] * (w / w.sum(axis=1, keepdims=True))[:, None]
     between = np.zeros((len(variance), *each.shape))
-    between[:, part.a, part.b] = part.times / (
-        variance[:, part.a] + variance[:, part.b] + link_std**2
-    )
+    between[:, part.a, part.b] = part.times / (variance[:, part.a] + variance[:, part.b])
     between += between.swapaxes(1, 2)
     return each * between.sum(axis=1)[:, None] - between
 
@@ -154,7 +147,6 @@ def dilution(points: np.ndarray, installation: Installation) -> np.ndarray:
     unit_noise = replace(
         installation,
         noise=FixedNoise(1.0),
-        link_std=0.0,
         dimensions=installation.unknowns,
         height_std=np.inf,
     )

@@ -132,13 +132,12 @@ def installation_of(args: Namespace, anchors: Anchors) -> Installation:
         noise = FixedNoise(args.noise)
     else:
         antenna = antenna_from_yaml(args.antenna) if args.antenna else Antenna()
-        noise = RadioNoise(antenna, args.tx_power, args.temperature, args.voltage)
+        noise = RadioNoise(antenna, args.tx_power)
     height_std = args.height_std if "height" in args.sensors else np.inf
     return Installation(
         anchors,
         noise,
         OF_PROTOCOL[args.protocol],
-        args.link_noise,
         2 if args.planar else 3,
         height_std,
         args.hall or args.radio_reach is not None,
@@ -249,7 +248,7 @@ def aim_of(args: Namespace, installation: Installation, demand: Demand, height: 
     step = max(0.1, (np.prod((upper - lower)[:k]) / FLOWN_CELLS) ** (1.0 / k))
 
     def goal(step: float) -> Goal:
-        return Goal(lattice(lower, upper, step), installation, args.objective, demand)
+        return Goal(lattice(lower, upper, step), installation, demand)
 
     return Aim(goal(step), goal(0.4 * step), places_of(args, demand.room), count)
 
