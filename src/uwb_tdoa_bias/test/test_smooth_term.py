@@ -379,30 +379,37 @@ RANGES, BEARINGS, ELEVATIONS = (2.0, 4.75, 4.94, 7.0), (-1.0, 0.925, 0.969, 2.0)
 FARTHER = "anchor 6 seems 0.824 ± 0.018 m farther where "
 
 
+def test_knots_are_rounded_to_centimetres_and_whole_degrees():
+    term = of_two("y", (-1.0, -0.000404, 0.0962, 1.0), "tilt", (0.0, 0.0346, 0.0686, 0.1))
+    assert "y is between 0 m and 0.1 m, while tilt is between 2 degrees and 4 degrees" in described(
+        term, "6"
+    )
+
+
 @pytest.mark.parametrize(
     "found, words",
     [
         (
             of_two("range", RANGES, "bearing", BEARINGS),
-            "range is between 4.75 m and 4.94 m, while bearing is between 53 degrees and 55.5 degrees "
+            "range is between 4.75 m and 4.94 m, while bearing is between 53 degrees and 56 degrees "
             "(seen from 2 m to 7 m): there the tag is -2.8 m in x and -3.9 m in y from the anchor, at "
             "most",
         ),
         (
             of_two("elevation", ELEVATIONS, "range", RANGES),
-            "elevation is between 28.6 degrees and 34.4 degrees, while range is between 4.75 m and "
-            "4.94 m (seen from 0 degrees to 57.3 degrees): there the tag is -2.5 m in z and 4.1 m "
+            "elevation is between 29 degrees and 34 degrees, while range is between 4.75 m and "
+            "4.94 m (seen from 0 degrees to 57 degrees): there the tag is -2.5 m in z and 4.1 m "
             "level from the anchor",
         ),
         (
             of_two("bearing", BEARINGS, "elevation", ELEVATIONS),
-            "bearing is between 53 degrees and 55.5 degrees, while elevation is between 28.6 degrees "
-            "and 34.4 degrees (seen from -57.3 degrees to 115 degrees): there the tag is in the "
+            "bearing is between 53 degrees and 56 degrees, while elevation is between 29 degrees "
+            "and 34 degrees (seen from -57 degrees to 115 degrees): there the tag is in the "
             "direction (-0.50, -0.69, -0.52) from the anchor",
         ),
         (
             of_two("range", (1.0, 2.0, 6.0, 7.0), "bearing", BEARINGS),
-            "range is between 2 m and 6 m, while bearing is between 53 degrees and 55.5 degrees "
+            "range is between 2 m and 6 m, while bearing is between 53 degrees and 56 degrees "
             "(seen from 1 m to 7 m)",
         ),
     ],

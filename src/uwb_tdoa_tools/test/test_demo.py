@@ -26,6 +26,7 @@ from uwb_tdoa_tools.flying.demo import (  # noqa: E402
     next_steps,
 )
 from uwb_tdoa_tools.scoring.evaluation import score_of  # noqa: E402
+from uwb_tdoa_tools.scoring.pairs import residuals_of  # noqa: E402
 from uwb_tdoa_tools.simulation import inject, simulate  # noqa: E402
 from uwb_tdoa_tools.simulation.rooms import corners
 
@@ -162,7 +163,7 @@ def test_the_correction_takes_the_residual_of_the_third_flight_away(recorded, di
     (third,) = loop.read(recorded[2:])
     model = load_network(tmp_path / "bias.onnx")
     corrector = corrector_of(third, None, tmp_path / "bias.onnx")
-    before, after = loop.residuals_of(third), loop.residuals_of(third, corrector)
+    before, after = residuals_of(third), residuals_of(third, corrector)
     ((anchor, late),) = inject.hidden_effect(LATE, third.anchors).values.items()
     assert all(anchor in pair.split("-") for pair in before.largest(2))
     assert before.constant == pytest.approx(late * np.sqrt(2 / 8), rel=0.1)  # 2 of 8 pairs

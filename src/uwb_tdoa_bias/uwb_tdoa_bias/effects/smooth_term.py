@@ -689,9 +689,12 @@ def described(term: SmoothTerm, part: str = "") -> str:
 
 
 def _in_words(covariate: str, values: Iterable[float]) -> list[str]:
-    """Return values of a covariate with its unit, for people."""
+    """Return values of a covariate with its unit, for people: whole degrees, whole centimetres."""
     unit, factor = shown_in(covariate)
-    return [f"{rounded(factor * value)} {unit}".strip() for value in values]
+    decimals = {"degrees": 0, "m": 2, "s": 2, "m/s": 2}.get(unit)
+    if decimals is None:
+        return [f"{rounded(factor * value)} {unit}".strip() for value in values]
+    return [f"{round(factor * value, decimals) + 0.0:g} {unit}" for value in values]
 
 
 def _place(term: SmoothTerm) -> str:

@@ -132,6 +132,7 @@ def _measured(args: Namespace) -> int:
     from ..evaluating import lines_of_errors
     from ..flying import demo, loop
     from ..scoring.alignment import require_truth
+    from ..scoring.pairs import residuals_of
 
     started = time.monotonic()
     flight = options.reading_of(args).one(args.flight)
@@ -151,7 +152,7 @@ def _measured(args: Namespace) -> int:
         _show("error", [demo.too_slow_in_words(live.missing, args.rate)])
         return 1
     cli.show(*lines_of_errors(scores), demo.change_of_scores(scores))
-    residuals = [loop.residuals_of(flight, by) for by in (None, correction)[: len(scores) - 1]]
+    residuals = [residuals_of(flight, by) for by in (None, correction)[: len(scores) - 1]]
     loop.draw(args.out / "error.png", flight, residuals, scores[:-1])
     cli.show(f"plot       {args.out / 'error.png'}")
     if args.rerun is not None:

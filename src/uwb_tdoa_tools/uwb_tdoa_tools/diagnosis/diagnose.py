@@ -145,6 +145,7 @@ def diagnose(
         judge_truth=judge_truth,
         cases=tuple(outcome.cases),
         share=outcome.share,
+        base=base,
     )
 
 

@@ -4,22 +4,19 @@
 
 from __future__ import annotations
 
-from operator import methodcaller
 import textwrap
 from typing import Any
 
 import numpy as np
 
 from uwb_tdoa_bias.effects import SmoothTerm
-from uwb_tdoa_bias.effects.base import listed
 
 from .. import outputs
 from .findings import EffectFinding, prefixes_of
 from .over_flights import course
-from .report.entries import agreement, doubts, entries, worth_in_words
-from .report.tables import ANCHORS, SURE, anchors, basis, by_reason, tasks
-from .report.unclear import by_remedy, undetermined
-from .report.verdict import cause, faults_in_words, truth_in_words, verdict
+from .report.entries import entries
+from .report.unclear import undetermined
+from .report.verdict import faults_in_words, truth_in_words, verdict
 from .result import Diagnosis
 
 WIDTH, LABEL = 120, 10  # characters of a line on the screen, and of its label
@@ -30,9 +27,12 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
 
     docs/diagnosis_report.md describes its keys.
     """
+    found = verdict(diagnosis)
     return outputs.as_json(
         {
-            "verdict": verdict(diagnosis).sentences,
+            "verdict": found.sentences,
+            "apply": found.applies,
+            "details": found.details,
             "flights": [flight.name for flight in diagnosis.flights],
             "rests_on": diagnosis.reference.words,
             "findings": [_finding(finding) for finding in diagnosis.findings if finding.declared],
@@ -69,51 +69,17 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
 
 
 def as_text(diagnosis: Diagnosis) -> str:
-    """Return the lines for the screen.
-
-    They are the verdict, advice, findings with their worth, undetermined parameters, and commands.
-    """
-    found = entries(diagnosis)
-    lines = [
-        ("" if k else "verdict", sentence)
-        for k, sentence in enumerate(verdict(diagnosis).sentences)
-    ]
+    """Return the lines for the screen: the verdict, and faults of the numbers."""
+    found = verdict(diagnosis)
+    lines = [("verdict", found.headline), ("cause", found.cause)]
     lines += [("truth", sentence) for sentence in truth_in_words(diagnosis)]
     lines += [("numbers", sentence) for sentence in faults_in_words(diagnosis)]
     lines += [
         ("changed", f"since the last calibration, {sentence}") for sentence in diagnosis.changes
     ]
-    for task in tasks([entry for entry in found if entry.matters], methodcaller("advice")):
-        sentences = [sentence for _, several in task for sentence in several]
-        lines += [("" if k else "do", sentence) for k, sentence in enumerate(sentences)]
-    added = [entry for entry in found if entry.added]
-    others = doubts(added)
-    for entry in added:
-        what = f"{entry.title}: {entry.values}" if entry.findings[0].declared else cause(entry)
-        label = "found" if entry.findings[0].declared else "no name"
-        lines.append((label, f"{what}; worth {worth_in_words(entry)}."))
-        lines += [
-            ("", sentence) for sentence in (entry.differing, *others[entry.title]) if sentence
-        ]
-    if agreement(added):
-        lines.append(("", agreement(added)))
-    for remedy, several in by_remedy(undetermined(diagnosis)).items():
-        lines.append(("not told", f"{listed(several)}; what would tell: {remedy}."))
-    if added:
-        lines += [("apply", command) for command, _ in diagnosis.applying]
-    if diagnosis.next_flight:
-        first, *others_of_it = diagnosis.next_flight.sentences
-        lines += [("fly", first), *(("", sentence) for sentence in others_of_it)]
-    left_out = [(entry.title, entry.why_not) for entry in found if not entry.added]
-    not_added = by_reason(left_out).rows
-    lines += [("not added", "{1}: {0}.".format(*row)) for row in not_added]
-    lines += [("", f"({basis(not_added)})")] if basis(not_added) else []
-    text = [_wrapped(*line) for line in lines]
-    values = anchors(diagnosis)
-    if values.rows:
-        text.append(f"{ANCHORS} (? less than {SURE:g} standard deviations):")
-        text += ["".join(f"{cell:>12s}" for cell in row) for row in (values.head, *values.rows)]
-    return "\n".join(text)
+    lines += [("" if k else "do", sentence) for k, sentence in enumerate(found.actions)]
+    lines += [("fly", found.fly), ("apply", found.apply)]
+    return "\n".join(_wrapped(*line) for line in lines)
 
 
 def _wrapped(label: str, text: str) -> str:

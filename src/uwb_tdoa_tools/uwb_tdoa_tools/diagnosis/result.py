@@ -45,6 +45,7 @@ class Diagnosis:
     cases : (ValidationCase, ...) that `after` is of
     share : of the fitted values that is applied, because few flights support less
     tdoa_std : m, noise for the filter beside these effects, None if it was not measured
+    base : EffectSet of the model before
     next_flight : NextFlight that settles what is left open, None if none was asked for
     written : as `after`, with this noise too: what the written files give; None if not judged
     """
@@ -69,4 +70,5 @@ class Diagnosis:
     share: float = 1.0
     tdoa_std: float | None = None
     written: dict[str, Any] | None = None
+    base: EffectSet = EffectSet()
     next_flight: NextFlight | None = None

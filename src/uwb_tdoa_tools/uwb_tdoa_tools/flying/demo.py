@@ -28,6 +28,7 @@ from ..outputs import as_json
 from ..parallel import Progress
 from ..scoring.gains import change_in_words
 from ..scoring.metrics import Estimate, Score
+from ..scoring.pairs import PairResiduals, residuals_of
 from . import loop
 
 CORRECTION = "bias.onnx"  # file of the correction of a simulated hall
@@ -234,7 +235,7 @@ class LoopResult:
     flight: Flight
     passes: list[LivePass]
     scores: list[Score]
-    residuals: list[loop.PairResiduals]
+    residuals: list[PairResiduals]
 
     @property
     def missing(self) -> int:
@@ -332,7 +333,7 @@ def fly_both(
         if live.missing:
             break
         scores.append(Score(title, live.odometry, flight.truth))
-        residuals.append(loop.residuals_of(flight, corrector_of(flight, None, file)))
+        residuals.append(residuals_of(flight, corrector_of(flight, None, file)))
     return LoopResult(flight, passes, scores, residuals)
 
 
@@ -376,7 +377,7 @@ def close_loop(
         bags = loop.record(seed, folder)
         flights = loop.read(bags[:2])
         show("recorded", [loop.recordings_in_words(flights, seed)])
-        show("residual", loop.residuals_of(flights[0]).sentences())
+        show("residual", residuals_of(flights[0]).sentences())
         clock.lap("flying")
         diagnosis = diagnose(flights, progress=progress)
         show("traced to", loop.found_in_words(diagnosis) or ["nothing that helps"])

@@ -8,21 +8,19 @@ that reads the recordings only: no file, no argument and no stream declares the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.common.files import write_filled
-from uwb_tdoa_bias.common.geometry import tdoa
-from uwb_tdoa_bias.effects import true_samples
 from uwb_tdoa_bias.effects.base import listed, rounded
 
 from ..bags.bag import write_bag
 from ..diagnosis.report.entries import entries, worth_in_words
 from ..readers.inputs import Reading
-from ..scoring.metrics import Score, position_at, rms, scored_phase
+from ..scoring.metrics import Score, position_at
 from ..simulation import SimulationConfig, simulate
 from ..simulation.inject import hidden_effect
 
@@ -33,23 +31,19 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from uwb_tdoa_bias.common.flight import Flight
-    from uwb_tdoa_bias.correction.corrector import Corrector
 
     from ..diagnosis.result import Diagnosis
     from ..exporting.correction import TracedCorrection
+    from ..scoring.pairs import PairResiduals
 
 # Effects of `simulate` are off: what the residuals show is the drawn effect, noise and outliers.
 HALL = SimulationConfig(
     duration=40.0, speed=1.2, imu_rate=200.0, truth_rate=100.0, bias=False, multipath=False
 )
 YAWS = ("along_track", "rotating", "along_track")  # of the flights
-PERIOD = 1.0  # s, of one residual of a pair
-FEWEST = 3  # TDOAs of a pair in it
 CM = 100.0  # cm per metre
-LARGEST = 2  # pairs that are named
 COLOURS = ("tab:red", "tab:blue")  # of a flight without and with the correction
 SIZE = 14  # points: legible if the picture is shrunk to 700 pixels
-NAMED = 8  # pairs in the legend: those with the largest residuals
 ROOM = 1.3  # of the largest error, the end of the axis: the legend covers no line
 
 
@@ -87,82 +81,6 @@ def write_correction(path: Path, diagnosis: Diagnosis) -> TracedCorrection | Non
     if not len(diagnosis.effects.where(lambda effect: "tdoa" in effect.channels)):
         return None
     return write_onnx(path, diagnosis.flights[0].anchors, diagnosis.effects)
-
-
-@dataclass(frozen=True, eq=False)
-class PairResiduals:
-    """Residuals of TDOAs at the true place: medians over PERIOD, of each pair of anchors.
-
-    Attributes
-    ----------
-    t : (n,) s since take-off
-    median : {pair "a-b": (n,) m}, NaN where a pair has fewer than FEWEST TDOAs
-    """
-
-    t: np.ndarray
-    median: dict[str, np.ndarray]
-
-    @property
-    def size(self) -> float:
-        """Return the root mean square, m."""
-        return _known_rms(*self.median.values())
-
-    @property
-    def constant(self) -> float:
-        """Return the root mean square of the mean of each pair, m: what the path does not change."""
-        return rms(np.array([np.nanmean(values) for values in self.median.values()]))
-
-    @property
-    def changing(self) -> float:
-        """Return the root mean square around the mean of each pair, m."""
-        return _known_rms(*(values - np.nanmean(values) for values in self.median.values()))
-
-    def largest(self, count: int) -> list[str]:
-        """Return the pairs with the largest residuals."""
-        sizes = {pair: _known_rms(values) for pair, values in self.median.items()}
-        return sorted(sizes, key=lambda pair: -sizes[pair])[:count]
-
-    def sentences(self) -> list[str]:
-        """Return the residuals in words: their size, and over what they change."""
-        named = listed(
-            f"{pair} ({_signed_cm(self.median[pair])})" for pair in self.largest(LARGEST)
-        )
-        return [
-            f"TDOAs are {CM * self.size:.1f} cm off (RMS over pairs of anchors and seconds)",
-            f"{CM * self.constant:.1f} cm of it stays the same for a pair, "
-            f"{CM * self.changing:.1f} cm changes along the path; largest for pairs {named}",
-        ]
-
-
-def _known_rms(*parts: np.ndarray) -> float:
-    """Return the root mean square of all values that are known."""
-    together = np.concatenate([*parts, []])
-    return rms(together[np.isfinite(together)])
-
-
-def _signed_cm(values: np.ndarray) -> str:
-    low, high = (CM * value for value in np.nanquantile(values, [0.1, 0.9]))
-    return f"{low:+.0f} to {high:+.0f} cm"
-
-
-def residuals_of(flight: Flight, corrector: Corrector | None = None) -> PairResiduals:
-    """Return the PairResiduals of a Flight with ground truth in the air, corrected if asked."""
-    assert flight.truth is not None
-    samples, rows = true_samples(flight)
-    off = flight.tdoa.d[rows] - tdoa(samples.p, samples.position_a, samples.position_b)
-    if corrector is not None:
-        off = off - corrector.prediction(samples).bias
-    _, first, last = scored_phase(flight.truth)
-    number = np.floor((samples.t - first) / PERIOD).astype(int)
-    count = int((last - first) / PERIOD)
-    ids, found = flight.anchors.ids, {}
-    for a, b in np.unique(np.column_stack([samples.a, samples.b]), axis=0):
-        of_pair = (samples.a == a) & (samples.b == b)
-        parts = [off[of_pair & (number == k)] for k in range(count)]
-        medians = [np.median(part) if len(part) >= FEWEST else np.nan for part in parts]
-        if np.isfinite(medians).any():
-            found[f"{ids[a]}-{ids[b]}"] = np.array(medians)
-    return PairResiduals(PERIOD * (np.arange(count) + 0.5), found)
 
 
 def found_in_words(diagnosis: Diagnosis) -> list[str]:
@@ -232,23 +150,13 @@ def draw(
     with rc_context({"font.size": SIZE, "axes.titlesize": SIZE, "legend.fontsize": SIZE - 2}):
         figure = Figure(figsize=(12, 9.5), layout="constrained")
         axes = figure.subplots(2, 2)
-        values = np.abs(np.concatenate([*residuals[0].median.values(), [0.0]]))
-        limit = 1.1 * CM * max(float(np.nanmax(values)), 0.05)
         for ax, one, score in zip(axes[0], residuals, scores):
-            _residuals(ax, one)
-            ax.set(title=f"TDOAs {score.name}: {CM * one.size:.1f} cm off", ylim=(-limit, limit))
+            one.draw(ax, residuals[0].limit)
+            ax.set_title(f"TDOAs {score.name}: {CM * one.size:.1f} cm off")
         ax.legend(title="pair of anchors", ncols=4, loc="lower center", handlelength=1.0)
         _path(axes[1, 0], flight, scores)
         _error(axes[1, 1], scores)
         write_filled(path, partial(figure.savefig, dpi=100))
-
-
-def _residuals(ax: Axes, residuals: PairResiduals) -> None:
-    named = residuals.largest(NAMED)
-    for pair, values in residuals.median.items():
-        ax.plot(residuals.t, CM * values, lw=1.8, label=pair if pair in named else None)
-    ax.set(xlabel="time in the air [s]", ylabel="residual [cm]")
-    ax.grid(alpha=0.3)
 
 
 def _path(ax: Axes, flight: Flight, scores: Sequence[Score]) -> None:

@@ -6,11 +6,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import SmoothTerm
 from uwb_tdoa_bias.effects.base import listed
 from uwb_tdoa_bias.effects.covariates import shown_in
 from uwb_tdoa_bias.effects.smooth_term import described
 
+from ...scoring.pairs import residuals_of
 from ..channels import CHANNELS, ChannelResiduals
 from ..findings import prefixes_of
 from ..result import Diagnosis
@@ -26,6 +28,35 @@ GRID = 120  # values of each covariate in the picture of a product
 POINTS = 3000  # largest number of drawn points of a residual series
 # position of a legend above the axes
 ABOVE = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "ncols": 2}
+
+
+def residuals_of_pairs(diagnosis: Diagnosis) -> list[Picture]:
+    """Draw the residuals of each pair in the first judged flight, before and after.
+
+    returns : [] without TDOAs, or if the reference does not know all of the path
+    """
+    if not (diagnosis.cases and all(diagnosis.reference.positions_known)):
+        return []
+    flight = diagnosis.cases[0].flight
+    if flight.truth is None or not len(flight.tdoa):
+        return []
+    sides = {"before": diagnosis.base}
+    if changed(diagnosis):
+        sides["after"] = diagnosis.cases[0].effects
+    found = {
+        title: residuals_of(effects.correct_streams(flight), Corrector(flight.anchors, effects))
+        for title, effects in sides.items()
+    }
+    out = []
+    for title, residuals in found.items():
+        figure, ax = drawing(2.8)
+        residuals.draw(ax, found["before"].limit)
+        size = f"{CM * residuals.size:.1f} cm"
+        ax.set_title(f"{title.capitalize()}: TDOAs are {size} off", loc="left", fontsize=10)
+        figure.legend(loc="outside lower center", ncols=4, fontsize=8, title="pair of anchors")
+        alt = f"Residuals of the TDOAs of each pair of anchors {title}, {flight.name}: {size}"
+        out.append(embedded(figure, alt))
+    return out
 
 
 def errors_over_time(diagnosis: Diagnosis) -> tuple[list[Picture], int]:

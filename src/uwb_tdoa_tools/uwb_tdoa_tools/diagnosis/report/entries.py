@@ -5,12 +5,13 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from uwb_tdoa_bias.effects import LabelEffect
-from uwb_tdoa_bias.effects.base import listed, measured
+from uwb_tdoa_bias.effects import Effect, LabelEffect
+from uwb_tdoa_bias.effects.base import SIGNIFICANT, listed, measured
+from uwb_tdoa_ekf.evidence import DELAY
 
 from ..findings import EffectFinding, Refused
 from ..over_flights import ALL, course, in_words
@@ -19,12 +20,11 @@ from ..result import Diagnosis
 from ..validation import LEAST_WORTH
 
 CM = 100.0  # cm per metre
-WORTH_DOING = 0.005  # m, smallest gain in position that is worth an action
+WORTH_DOING = 0.01  # m, smallest gain in position that is worth an action
+SMALLEST_DELAY = 0.03  # m; an anchor whose delay differs by less from the others is not named
 DEGREES = float(np.degrees(1.0))  # degrees per radian
 FORMS = {"arrival": " (of each arrival)", "anchor": " (by anchor)"}
 SHOWN = 6  # largest number of shown values
-NAMED = 3  # largest number of entries that are named as alike
-LONGEST = 8.0  # em, longest bar
 
 
 @dataclass(frozen=True)
@@ -59,11 +59,15 @@ class Entry:
     def matters(self) -> bool:
         """Return whether a user should act: for a fault, or if the position gains.
 
-        An unknown gain counts as a gain.
+        An unknown gain counts as a gain, except near the floor, where no error in the air shows it.
         """
-        # a fault is corrected whatever its worth
-        fault = any(isinstance(finding.effect, LabelEffect) for finding in self.findings)
-        return self.added and (fault or self.worth is None or self.worth >= WORTH_DOING)
+        if any(isinstance(finding.effect, LabelEffect) for finding in self.findings):
+            return self.added  # a fault is corrected whatever its worth
+        if not any(finding.effect.significant() for finding in self.findings):
+            return False
+        if self.worth is None:
+            return self.added and not self.findings[0].on_floor
+        return self.added and self.worth >= WORTH_DOING
 
     @property
     def physics(self) -> str:
@@ -81,14 +85,10 @@ class Entry:
         return tuple(dict.fromkeys(said))
 
     @property
-    def alike(self) -> bool:
-        """Return whether all flights show the same of it."""
-        return course(self.findings[0].shares) == ALL
-
-    @property
     def differing(self) -> str:
         """Return in a few words how flights differ; "" if they do not, or are one."""
-        return "" if self.alike else in_words(self.findings[0].shares)
+        shares = self.findings[0].shares
+        return "" if course(shares) == ALL else in_words(shares)
 
     @property
     def alternatives(self) -> list[Alternative]:
@@ -109,7 +109,7 @@ def entries(diagnosis: Diagnosis) -> list[Entry]:
     Without a known worth the most prominent comes first.
     """
     groups: dict[Hashable, list[EffectFinding]] = {}
-    for finding in diagnosis.findings:
+    for finding in findings_of(diagnosis):
         key = finding.key if finding.declared or not finding.candidates else finding.candidates[0]
         groups.setdefault(key, []).append(finding)
     out = [
@@ -129,6 +129,44 @@ def entries(diagnosis: Diagnosis) -> list[Entry]:
     return sorted(out, key=place)
 
 
+def findings_of(diagnosis: Diagnosis) -> list[EffectFinding]:
+    """Return the findings of a Diagnosis as reports show them, see `without_common_part`."""
+    if any(flight.range is not None for flight in diagnosis.flights):
+        return diagnosis.findings  # ranges show the common part of the delays
+    ids = diagnosis.flights[0].anchors.ids.tolist()
+    return [
+        replace(finding, effect=without_common_part(finding.effect, ids))
+        for finding in diagnosis.findings
+    ]
+
+
+def without_common_part(effect: Effect, anchors: Iterable[int]) -> Effect:
+    """Return delays of anchors relative to their weighted median; other Effects as they are.
+
+    TDOAs show differences of delays only. Anchors that differ by less than SMALLEST_DELAY, or two
+    standard deviations, are left out. An anchor without a value has the delay 0.
+    """
+    if effect.name != DELAY:
+        return effect
+    names = list(dict.fromkeys([*map(str, anchors), *effect.values]))
+    values = np.array([effect.values.get(name, 0.0) for name in names])
+    std = np.array([effect.std.get(name) or np.nan for name in names])
+    weight = np.nan_to_num(std, nan=np.nanmedian(std) if np.isfinite(std).any() else 1.0) ** -2.0
+    order = np.argsort(values)
+    share = np.cumsum(weight[order])
+    off = values - values[order][np.searchsorted(share, 0.5 * share[-1])]
+    named = {
+        name: float(value)
+        for name, value, its_std in zip(names, off, np.nan_to_num(std))
+        if abs(value) > max(SMALLEST_DELAY, SIGNIFICANT * its_std)
+    }
+    return replace(
+        effect,
+        values=named,
+        std={name: known for name, known in effect.std.items() if name in named},
+    )
+
+
 def worth_in_words(entry: Entry) -> str:
     """Return the worth in words, such as "1.5 cm"."""
     if entry.worth is None:
@@ -140,8 +178,15 @@ def worth_in_words(entry: Entry) -> str:
 
 
 def doubt_in_words(entry: Entry) -> list[str]:
-    """Return sentences on all alternatives, and flights that would decide."""
+    """Return sentences on all alternatives, and flights that would decide.
+
+    There is none on an entry that was compared with the catalogue, and that nothing else explains.
+    """
+    first = entry.findings[0]
     imitators = [other for other in entry.alternatives if other.gap is None]
+    if not entry.alternatives and not first.candidates:
+        like = first.effect.confounded_with
+        return [f"not compared; like {listed(like, 'or')}" if like else "not compared"]
     return [
         *_doubts("Could as well be {}; to tell: {}.", entry.undecided),
         *_doubts("Could be imitated by {}, less plausibly; to tell: {}.", imitators),
@@ -154,59 +199,6 @@ def _doubts(sentence: str, alternatives: Iterable[Alternative]) -> list[str]:
     for other in alternatives:
         groups.setdefault(other.tell_apart, []).append(other.effect)
     return [sentence.format(listed(names, "or"), flight) for flight, names in groups.items()]
-
-
-def agreement(found: Sequence[Entry]) -> str:
-    """Return which entries all flights show alike, as a sentence; "" for none."""
-    alike = [entry.title for entry in found if entry.alike]
-    if not alike:
-        return ""
-    if len(alike) == len(found) > 1:
-        return "All of it is the same in all flights."
-    several = listed(alike) if len(alike) <= NAMED else f"{len(alike)} of {len(found)} findings"
-    return f"The same in all flights: {several}."
-
-
-def doubts(found: Iterable[Entry]) -> dict[str, list[str]]:
-    """Return {title: what else an entry could be}; a repeated doubt refers to the first entry.
-
-    Nothing stands for an entry that was compared with the catalogue, and that nothing else explains.
-    """
-    out: dict[str, list[str]] = {}
-    first: dict[str, str] = {}
-    for entry in found:
-        sentences = doubt_in_words(entry)
-        if not sentences and not entry.findings[0].candidates:
-            like = entry.findings[0].effect.confounded_with
-            sentences = [f"not compared; like {listed(like, 'or')}" if like else "not compared"]
-        told = [f"as {first[one]}" if one in first else one for one in sentences]
-        out[entry.title] = list(dict.fromkeys(told))
-        for sentence in sentences:
-            first.setdefault(sentence, entry.title)
-    return out
-
-
-def known_with(entry: Entry) -> list[str]:
-    """Return sentences that qualify its advice: worth and doubt."""
-    together = ", together" if len(entry.advice) > 1 + len(entry.causes) else ""
-    out = []
-    if entry.worth is not None:
-        out.append(f"Worth {worth_in_words(entry)} of position{together}.")
-    doubt = " ".join(_doubts("could as well be {}; to tell: {}.", entry.undecided))
-    if doubt:
-        out.append(f"Make sure first: this {doubt}")
-    return out
-
-
-def bar(entry: Entry, found: Iterable[Entry]) -> float:
-    """Return the length of the bar of its worth, em; 0 for none.
-
-    The largest worth of the added entries has length LONGEST.
-    """
-    largest = max((other.worth or 0.0 for other in found if other.added), default=0.0)
-    if not entry.worth or entry.worth < LEAST_WORTH or largest <= 0.0:
-        return 0.0
-    return LONGEST * entry.worth / largest
 
 
 def for_people(unit: str) -> tuple[str, float]:
@@ -229,6 +221,8 @@ def _title(findings: Sequence[EffectFinding]) -> str:
 
 def _values(finding: EffectFinding) -> str:
     effect = finding.effect
+    if not effect.values:
+        return "no anchor differs significantly from the others"
     if finding.function:
         return f"a function without a name ({finding.function.shape})"
     significant = effect.significant() if effect.significant_sizes() else {}

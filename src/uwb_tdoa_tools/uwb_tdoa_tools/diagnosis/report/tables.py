@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 import re
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ from uwb_tdoa_ekf.evidence import OF_ANCHORS
 
 from ...scoring.phases import TITLES
 from ..result import Diagnosis
-from .entries import CM, Entry
+from .entries import CM, Entry, findings_of
 from .unclear import by_remedy, undetermined
 
 ANCHORS = "Values that make these data fit; measure again before you move an anchor"
@@ -69,7 +69,7 @@ def anchors(diagnosis: Diagnosis) -> Table:
     The values fit the data. They do not replace a survey.
     """
     found: dict[str, dict[str, str]] = {}
-    for finding in diagnosis.findings:
+    for finding in findings_of(diagnosis):
         effect = finding.effect
         if effect.name not in OF_ANCHORS or finding.on_floor or finding.flight is not None:
             continue
@@ -100,22 +100,18 @@ def advice(effect: Effect) -> Sequence[str]:
     what, _, its_values = sentences[0].partition(": ")
     _, _, after = its_values.partition(". ")
     rest = [after] if after else []
-    return [f"{what}: the table of anchors has the values.", *rest, *sentences[1:]]
+    return [f"{what}: the table of anchors in report.html has the values.", *rest, *sentences[1:]]
 
 
-def tasks(
-    found: Iterable[Entry], advice_on: Callable[[Effect], Sequence[str]] = advice
-) -> list[list[tuple[Entry, list[str]]]]:
+def tasks(found: Iterable[Entry]) -> list[list[tuple[Entry, list[str]]]]:
     """Return what to do: entries with the same causes together, each with its sentences.
 
     Only the first one of them states the causes.
-
-    advice_on : returns the sentences on an Effect
     """
     out: dict[Hashable, list[tuple[Entry, list[str]]]] = {}
     for entry in found:
         task = out.setdefault(entry.causes or entry.title, [])
-        said = [sentence for one in entry.findings for sentence in advice_on(one.effect)]
+        said = [sentence for one in entry.findings for sentence in advice(one.effect)]
         known = entry.causes if task else ()
         task.append((entry, [one for one in dict.fromkeys(said) if one not in known]))
     return list(out.values())

@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""State the verdict: the error before and after, why, where errors remain, and the uncertainty."""
+"""State the verdict: the error before and after, why, what to do, and what to fly next."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ from uwb_tdoa_bias.effects.base import listed, measured
 from uwb_tdoa_bias.effects.smooth_term import causes, described
 from uwb_tdoa_ekf.monitoring.finding import Finding as NumbersFinding
 
-from ...scoring.gains import LOSS, NO_DIFFERENCE, clear_change
-from ...scoring.phases import TITLES
+from ...readers.streams import protocol
+from ...scoring.gains import LOSS, NO_DIFFERENCE, clear_change, gain
+from ...scoring.phases import NEAR_THE_FLOOR, TITLES
 from ..channels import ChannelResidual
 from ..channels.figures import rows_by_value
 from ..findings import prefixes_of
@@ -25,8 +26,10 @@ from ..result import Diagnosis
 from ..self_calibration.solve import CLEARLY, CLEARLY_OF_RANGES, LEFT
 from ..validation import LEAST_WORTH, SELECTED_ON
 from .entries import CM, WORTH_DOING, Entry, entries, for_people
+from .tables import tasks
 
-MOST_NAMES = 6  # largest number of named flights
+MOST_NAMES = 3  # largest number of named flights
+MOST_ACTIONS = 3  # largest number of actions
 NAMED = 3  # largest number of named reasons, and of named places
 WHOLE = 0.995  # share of the values from which it rounds to 100 %
 # What other flights show of a diagnosis of FEW flights, measured (docs/notebook/diagnosis.md): their
@@ -39,34 +42,204 @@ LARGE, ABOVE = (0.15, 3.0)
 FEWEST = 3  # fewest rows of such a pair
 ERROR = "The position error (3D RMSE)"
 NOTHING_FOUND = "Nothing was found: what the model leaves of the measurements looks like noise."
-UNKNOWN = "Without ground truth nobody knows the position error, neither before nor after."
+UNKNOWN = "Without ground truth, the position error is not known."
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """The verdict of a diagnosis.
+    """The verdict of a diagnosis, for the person who has to act.
 
-    headline : one sentence; more : sentences that qualify it
+    headline : the position error before and after, and on which flights
+    cause : what is wrong, and how sure that is
+    actions : at most MOST_ACTIONS sentences, the most worth first
+    fly : what to fly next
+    apply : whether to apply effects.yaml; applies : the same as bool
+    details : sentences that qualify it
     kind : "better", "unsure" (chance is possible), "same" (nothing added in the air), "nothing" (no
         finding) or "unknown" (no ground truth)
     """
 
     headline: str
-    more: tuple[str, ...]
+    cause: str
+    actions: tuple[str, ...]
+    fly: str
+    apply: str
+    applies: bool
+    details: tuple[str, ...]
     kind: str
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """Return the headline and the other sentences."""
-        return (self.headline, *self.more)
+        """Return all sentences but the details."""
+        return (self.headline, self.cause, *self.actions, self.fly, self.apply)
 
 
 def verdict(diagnosis: Diagnosis) -> Verdict:
     """Return the Verdict of a Diagnosis."""
-    added = any(finding.added for finding in diagnosis.findings)
+    found = entries(diagnosis)
+    added = [entry for entry in found if entry.added]
+    kind = _kind(diagnosis, found)
     if diagnosis.after["pooled"].get("rmse_3d") is None:
-        return _without_truth(diagnosis, added)
-    return _with_errors(diagnosis) if added else _nothing_added(diagnosis)
+        headline, details = _without_truth(diagnosis, kind, bool(added))
+    else:
+        headline, details = _headline(diagnosis, kind), _details(diagnosis, bool(added))
+    applies, apply = _application(diagnosis, kind, added)
+    return Verdict(
+        headline,
+        _cause_and_doubt(diagnosis, found),
+        _actions(found),
+        _next_flight(diagnosis, added, applies),
+        apply,
+        applies,
+        details,
+        kind,
+    )
+
+
+def _kind(diagnosis: Diagnosis, found: Sequence[Entry]) -> str:
+    """Return the kind of a Verdict."""
+    before, after = (side["pooled"].get("rmse_3d") for side in (diagnosis.before, diagnosis.after))
+    if not found:
+        return "nothing"
+    if after is None:
+        return "unknown"
+    if all(entry.findings[0].on_floor for entry in found if entry.added):
+        return "same"
+    interval = diagnosis.after["pooled"].get("rmse_3d_gain_ci")
+    falls = interval and clear_change(before, after, interval) > 0
+    return "better" if falls else "unsure"
+
+
+def _headline(diagnosis: Diagnosis, kind: str) -> str:
+    """Return the position error before and after, and on which flights."""
+    before, after = (side["pooled"]["rmse_3d"] for side in (diagnosis.before, diagnosis.after))
+    interval = diagnosis.after["pooled"].get("rmse_3d_gain_ci")
+    on = f"on {_judged(diagnosis)}"
+    change = f"from {CM * before:.1f} to {centimetres(after)}"
+    if kind in ("same", "nothing"):
+        return f"{ERROR} stays {centimetres(after)} {on}."
+    if kind == "better":
+        share = f"{100 * gain(before, after):.0f} % (95 % interval {percent(interval)})"
+        return f"{ERROR} falls {change}, by {share}, {on}."
+    if interval and interval[1] < 0.0:
+        return f"{ERROR} rises {change} {on}."
+    return f"There is {NO_DIFFERENCE}: the position error (3D RMSE) goes {change} {on}."
+
+
+def _judged(diagnosis: Diagnosis) -> str:
+    """Return the names of the judged and of the fitted flights."""
+    fitted = [flight.name for flight in diagnosis.flights]
+    names = _names(diagnosis)
+    if not set(names).isdisjoint(fitted):
+        return f"{_few(names)}, each part corrected with values of the others"
+    flights = "hold-out flights" if len(names) > 1 else "the hold-out flight"
+    return f"{flights} {_few(names)}, fitted to {_few(fitted)}"
+
+
+def _few(names: Sequence[str]) -> str:
+    """Return the first few of many names."""
+    rest = len(names) - MOST_NAMES
+    return listed(names) if rest <= 0 else f"{', '.join(names[:MOST_NAMES])} and {rest} more"
+
+
+def _cause_and_doubt(diagnosis: Diagnosis, found: Sequence[Entry]) -> str:
+    """Return what is wrong, and how sure that is."""
+    added = [entry for entry in found if entry.added]
+    if not found:
+        return NOTHING_FOUND
+    if not added:
+        what = "What was found is" if len(found) > 1 else f"{found[0].title} was found. It is"
+        return f"{what} not added to the model: {found[0].why_not}."
+    first, *others = added
+    told = (side["pooled"].get("rmse_3d") for side in (diagnosis.before, diagnosis.after))
+    before, after = (error or 0.0 for error in told)
+    sentence = f"{cause(first)}."
+    if first.worth is not None and first.worth >= LEAST_WORTH:
+        sentence = _share_of_gain(first, before - after)
+    more = sum((entry.worth or 0.0) >= WORTH_DOING for entry in others)
+    rest = f" Another {more} of 1 cm or more." if more else ""
+    return f"{sentence[0].upper()}{sentence[1:]} {_doubt(first)}{rest}"
+
+
+def _doubt(entry: Entry) -> str:
+    """Return how sure the cause of an Entry is."""
+    effect = entry.findings[0].effect
+    if not entry.findings[0].declared:
+        return f"Not sure why.{_causes(entry)}"
+    if entry.undecided:
+        others = [other.effect for other in entry.undecided[:NAMED]]
+        return f"Not sure: {listed(others, 'or')} explains these flights as well."
+    if not entry.findings[0].candidates and not entry.alternatives:
+        return "It was not compared with other causes."
+    if not effect.significant_sizes():
+        return "Not sure: no value is twice its standard deviation."
+    deviations = max(
+        abs(value) / (effect.std.get(key) or np.inf)
+        for key, value in effect.significant_sizes().items()
+    )
+    by = f"{deviations:.2g} standard deviations, and " if deviations else ""
+    return f"Sure: {by}no other effect explains these flights as well."
+
+
+def _actions(found: Sequence[Entry]) -> tuple[str, ...]:
+    """Return what to do in the hall, the most worth first."""
+    out = []
+    for task in tasks(entry for entry in found if entry.matters and entry.advice)[:MOST_ACTIONS]:
+        said = [sentence for _, sentences in task for sentence in sentences]
+        worth = task[0][0].worth
+        out.append(" ".join([*said, *([f"Worth {centimetres(worth)}."] if worth else [])]))
+    return tuple(out)
+
+
+def _next_flight(diagnosis: Diagnosis, added: Sequence[Entry], applies: bool) -> str:
+    """Return what to fly next, as a sentence."""
+    if diagnosis.next_flight:
+        return diagnosis.next_flight.sentences[0]
+    modes = [f"TDoA{protocol(one.tdoa)[4:]}" for one in diagnosis.flights if len(one.tdoa)]
+    alone = sorted(mode for mode in set(modes) if modes.count(mode) == 1)
+    if not applies and len(alone) > 1:
+        return (
+            f"Fly again in {listed(alone, 'or')}, and diagnose all flights together: a flight in "
+            "each mode cannot confirm what the other shows."
+        )
+    for entry in added:
+        for rival in entry.undecided[:1]:
+            fly = f"{rival.tell_apart[0].upper()}{rival.tell_apart[1:]}"
+            return f"{fly}: it distinguishes {entry.title} from {rival.effect}."
+    if len(diagnosis.flights) == 1:
+        return (
+            "Fly once more, and diagnose both flights together: flights differ in what they show."
+        )
+    if not set(_names(diagnosis)).isdisjoint(flight.name for flight in diagnosis.flights):
+        return "Fly once more for --holdout: that flight judges a correction not chosen on it."
+    return "Nothing more. After a change in the hall, fly and diagnose again."
+
+
+def _application(diagnosis: Diagnosis, kind: str, added: Sequence[Entry]) -> tuple[bool, str]:
+    """Return (whether to apply effects.yaml, the same as a sentence)."""
+    if not added:
+        return False, "Do not apply effects.yaml: it corrects nothing that was not given."
+    if kind == "unknown":
+        return True, "Apply effects.yaml: innovations fall. The position error is not known."
+    if kind == "better":
+        worse = "; ".join(worse_phases(diagnosis.before["pooled"], diagnosis.after["pooled"]))
+        return True, f"Apply effects.yaml{f'. It makes worse: {worse}' if worse else ''}."
+    if kind == "unsure":
+        return False, "Do not apply effects.yaml: these flights do not show that it helps."
+    changes, words = [], []
+    for name in NEAR_THE_FLOOR:
+        errors = [
+            side["pooled"].get("phases", {}).get(name, {}).get("rmse_3d")
+            for side in (diagnosis.before, diagnosis.after)
+        ]
+        if None not in errors and (change := clear_change(*errors)):
+            changes.append(change)
+            words.append(f"{TITLES[name]} {CM * errors[0]:.1f} to {centimetres(errors[1])}")
+    figures = f" ({'; '.join(words)})" if words else ""
+    floor = f"it affects the floor only{figures}"
+    if min(changes, default=0) > 0:
+        return True, f"Apply effects.yaml to ekf_node: {floor}."
+    return False, f"Do not apply effects.yaml: {floor}, and the error there does not fall."
 
 
 def faults_in_words(diagnosis: Diagnosis) -> list[str]:
@@ -104,99 +277,39 @@ def percent(interval: Sequence[float]) -> str:
     return f"{interval[0] * 100:.0f} to {interval[1] * 100:.0f} %"
 
 
-def _bounds(pooled: dict[str, Any]) -> str:
-    """Return the 95 % interval of the 3D RMSE as text."""
-    interval = pooled["rmse_3d_ci"]
-    return f"{interval[0] * CM:.1f} to {interval[1] * CM:.1f}" if interval else "unknown"
-
-
-def _with_errors(diagnosis: Diagnosis) -> Verdict:
-    before, after = diagnosis.before["pooled"], diagnosis.after["pooled"]
-    interval = after.get("rmse_3d_gain_ci")
-    share = f"{100 * (1.0 - after['rmse_3d'] / before['rmse_3d']):.0f} %"
-    sure = f"; gain {share} ({percent(interval)})" if interval else ""
-    more = (
-        f"95 % intervals: {_bounds(before)} cm before, {_bounds(after)} cm after{sure}.",
-        f"Judged on {diagnosis.judged_on}: {_flights(diagnosis)}; {_named(diagnosis)}.",
-        *reasons(diagnosis),
-        *_worse_phases(diagnosis),
+def _details(diagnosis: Diagnosis, added: bool) -> tuple[str, ...]:
+    """Return the sentences that qualify the errors."""
+    before, after = (side["pooled"]["rmse_3d"] for side in (diagnosis.before, diagnosis.after))
+    interval = diagnosis.after["pooled"].get("rmse_3d_gain_ci")
+    risk = interval and interval[0] <= 0.0 < clear_change(before, after, interval)
+    return (
+        f"Judged on {diagnosis.judged_on}.",
+        *([f"A loss above {100 * LOSS:.0f} % has a probability below 2.5 %."] if risk else []),
+        *(f"Not added: {item.why}." for item in diagnosis.refused if item.what == "all"),
         *_with_noise(diagnosis),
-        *_over_phases(diagnosis),
         *_shared(diagnosis),
-        *_caveats(diagnosis),
+        *(_caveats(diagnosis) if added else []),
         *_worse_runs(diagnosis),
         *_diverged(diagnosis),
         *left_over(diagnosis),
     )
-    change = f"from {centimetres(before['rmse_3d'])} to {centimetres(after['rmse_3d'])}"
-    if all(finding.on_floor for finding in diagnosis.findings if finding.added):
-        headline = (
-            f"{ERROR} stays {centimetres(after['rmse_3d'])}: what is added acts near the floor "
-            "alone, where the filter weighs it."
-        )
-        return Verdict(headline, more, "same")
-    if interval and interval[0] > 0.0:
-        return Verdict(f"{ERROR} falls {change}: {share} of it is gone.", more, "better")
-    # The interval includes zero, but a loss above LOSS is improbable.
-    if interval and clear_change(before["rmse_3d"], after["rmse_3d"], interval) > 0:
-        headline = (
-            f"{ERROR} falls {change}: {share} of it is gone. A loss above {100 * LOSS:.0f} % has a "
-            "probability below 2.5 %."
-        )
-        return Verdict(headline, more, "better")
-    unsure = (
-        "More flights to judge on (--holdout) make that certain; until then compare before "
-        "relying on effects.yaml."
-    )
-    headline = f"There is {NO_DIFFERENCE}: the position error (3D RMSE) goes {change}."
-    if interval and interval[1] < 0.0:
-        headline = f"{ERROR} rises {change}."
-    return Verdict(headline, (*more, unsure), "unsure")
 
 
-def _nothing_added(diagnosis: Diagnosis) -> Verdict:
-    pooled = diagnosis.before["pooled"]
-    error = f"{centimetres(pooled['rmse_3d'])}, 95 % interval {_bounds(pooled)} cm"
-    more = (
-        f"{ERROR} is {error}: {_flights(diagnosis)}; {_named(diagnosis)}.",
-        *(f"Not added: {item.why}." for item in diagnosis.refused if item.what == "all"),
-        *_with_noise(diagnosis),
-        *_over_phases(diagnosis),
-        *_shared(diagnosis),
-        *_diverged(diagnosis),
-        *left_over(diagnosis),
-    )
-    found = len({finding.key for finding in diagnosis.findings})
-    if not found:
-        return Verdict(NOTHING_FOUND, more, "nothing")
-    what = "One effect was found, but taking it out does"
-    if found > 1:
-        what = f"{found} effects were found, but taking them out does"
-    return Verdict(
-        f"{what} not make the position better; nothing is added to the model.", more, "same"
-    )
-
-
-def _without_truth(diagnosis: Diagnosis, added: bool) -> Verdict:
+def _without_truth(diagnosis: Diagnosis, kind: str, added: bool) -> tuple[str, tuple[str, ...]]:
+    """Return (headline, details) where errors of the position are not known."""
     before, after = (
         side["pooled"]["residual_spread"] for side in (diagnosis.before, diagnosis.after)
     )
     stream = "TDOAs" if any(len(flight.tdoa) for flight in diagnosis.flights) else "ranges"
     scatter = f"Innovations (measured minus predicted {stream}) scatter by {centimetres(before)}"
-    if not diagnosis.findings:
-        return Verdict(NOTHING_FOUND, (UNKNOWN, f"{scatter}."), "nothing")
+    if kind == "nothing":
+        return UNKNOWN, (f"{scatter}.",)
     if not added:
-        headline = (
-            "Nothing of what was found is added to the model: nobody can tell whether it would "
-            "help the position."
-        )
         decided = diagnosis.refused[len(diagnosis.attribution.refused) :]
-        why = (f"Not added, {item.what}: {item.why}." for item in decided)
-        return Verdict(headline, (UNKNOWN, *why, f"{scatter}."), "unknown")
-    headline = (
-        "What was found makes measurements agree better; what that is worth for the position is "
-        "unknown."
-    )
+        return UNKNOWN, (
+            *(f"Not added, {item.what}: {item.why}." for item in decided),
+            f"{scatter}.",
+        )
     limit = (
         f"{CLEARLY_OF_RANGES:g} times smaller than it was, a limit that was set on simulated "
         "flights"
@@ -211,7 +324,7 @@ def _without_truth(diagnosis: Diagnosis, added: bool) -> Verdict:
         f"{limit}."
     )
     change = f"{scatter} before and {centimetres(after)} after, on {diagnosis.judged_on}."
-    return Verdict(headline, (UNKNOWN, validated, change), "unknown")
+    return f"{change} {UNKNOWN}", (validated,)
 
 
 def _names(diagnosis: Diagnosis) -> list[str]:
@@ -219,49 +332,13 @@ def _names(diagnosis: Diagnosis) -> list[str]:
     return list(dict.fromkeys(run["flight"] for run in diagnosis.before["runs"]))
 
 
-def _flights(diagnosis: Diagnosis) -> str:
-    # first and last stamp per flight, since judged parts of a flight alternate
-    ends: dict[str, list[float]] = {}
-    for score in diagnosis.before["scores"]:
-        ends.setdefault(score.name, []).extend([score.first, score.last])
-    count = len(_names(diagnosis))
-    seconds = sum(max(of) - min(of) for of in ends.values())
-    parts = " or ".join(sorted({TITLES[score.part] for score in diagnosis.before["scores"]}))
-    return f"{count} flight{'s' if count > 1 else ''}, {seconds:.0f} s {parts}"
-
-
-def _named(diagnosis: Diagnosis) -> str:
-    """Return the names of the judged flights, the first few of many."""
-    names = _names(diagnosis)
-    rest = len(names) - MOST_NAMES
-    return listed(names) if rest <= 0 else f"{', '.join(names[:MOST_NAMES])} and {rest} more"
-
-
-def _worse_phases(diagnosis: Diagnosis) -> list[str]:
-    """Return a sentence on phases in which the error grows."""
-    worse = "; ".join(_worse(diagnosis).values())
-    return [f"Worse: {worse}."] if worse else []
-
-
-def _worse(diagnosis: Diagnosis) -> dict[str, str]:
-    """Return {phase: clause} of the phases in which the error grows; {} if nothing is added."""
-    if not any(finding.added for finding in diagnosis.findings):
-        return {}
-    return _of_worse_phases(diagnosis.before["pooled"], diagnosis.after["pooled"])
-
-
 def _with_noise(diagnosis: Diagnosis) -> list[str]:
     """Return a sentence on the error with all files as they are written."""
     if diagnosis.written is None or diagnosis.tdoa_std is None:
         refused = (item for item in diagnosis.refused if item.what.startswith("tdoa_std"))
         return [f"{item.what} is not written to ekf_node.yaml: {item.why}." for item in refused]
-    after, said = diagnosis.written["pooled"], _worse(diagnosis)
-    phases = after.get("phases", {}), diagnosis.after["pooled"].get("phases", {})
-    worse = "; ".join(
-        clause
-        for name, clause in _of_worse_phases(diagnosis.before["pooled"], after).items()
-        if name not in said or clear_change(*(side[name]["rmse_3d"] for side in phases))
-    )
+    after = diagnosis.written["pooled"]
+    worse = "; ".join(worse_phases(diagnosis.after["pooled"], after))
     also = f"; worse: {worse}" if worse else ""
     return [
         f"With tdoa_std {diagnosis.tdoa_std:.3f} m of ekf_node.yaml too it is "
@@ -269,36 +346,18 @@ def _with_noise(diagnosis: Diagnosis) -> list[str]:
     ]
 
 
-def _over_phases(diagnosis: Diagnosis) -> list[str]:
-    """Return a sentence on errors in the other phases, which the first sentence leaves out."""
-    before, after = (
-        side["pooled"].get("phases", {}) for side in (diagnosis.before, diagnosis.after)
-    )
-    said = {score.part for score in diagnosis.before["scores"]} | set(_worse(diagnosis))
-    parts = []
-    for name in (name for name in TITLES if name in before and name not in said):
-        sides = [_of_phase(side[name]) for side in (before, after)]
-        parts.append(f"{TITLES[name]} {' to '.join(dict.fromkeys(sides))}")
-    return [f"Outside of that, before and after: {'; '.join(parts)}."] if parts else []
-
-
-def worse_phases(before: dict[str, Any], after: dict[str, Any]) -> Iterator[str]:
-    """Yield one clause per phase in which the error grows.
+def worse_phases(before: dict[str, Any], after: dict[str, Any]) -> list[str]:
+    """Return one clause per phase in which the error grows.
 
     before, after : pooled figures of a side of `compare`
     """
-    yield from _of_worse_phases(before, after).values()
-
-
-def _of_worse_phases(before: dict[str, Any], after: dict[str, Any]) -> dict[str, str]:
-    """Return {phase: clause} as of `worse_phases`."""
-    out = {}
+    out = []
     sides = before.get("phases", {}), after.get("phases", {})
     for name in (name for name in TITLES if name in sides[0] and name in sides[1]):
         first, second = (side[name] for side in sides)
         known = first["rmse_3d"] is not None and second["rmse_3d"] is not None
         if known and clear_change(first["rmse_3d"], second["rmse_3d"]) < 0:  # it rises
-            out[name] = f"{TITLES[name]} from {_of_phase(first)} to {_of_phase(second)}"
+            out.append(f"{TITLES[name]} from {_of_phase(first)} to {_of_phase(second)}")
     return out
 
 
@@ -367,25 +426,6 @@ def _diverged(diagnosis: Diagnosis) -> list[str]:
     return [f"Of {len(diagnosis.before['runs'])} runs, {before} diverged before and {after} after."]
 
 
-def reasons(diagnosis: Diagnosis) -> list[str]:
-    """Return sentences on the added effects that make the error before, the largest worth first.
-
-    There are NAMED at most. The worth is in m of 3D RMSE, so ground truth is needed: without it the
-    result is []. A fitted function, which is no declared effect, is described by its largest part,
-    with its most likely causes, unless these are said already.
-    """
-    before, after = (side["pooled"]["rmse_3d"] for side in (diagnosis.before, diagnosis.after))
-    out: list[str] = []
-    said: set[str] = set()
-    for entry in entries(diagnosis):
-        worth = entry.worth or 0.0
-        if len(out) < NAMED and entry.added and worth >= (WORTH_DOING if out else LEAST_WORTH):
-            sentence, likely = _sentence(entry, len(out), before - after), _causes(entry)
-            out.append(sentence if likely in said else f"{sentence}{likely}")
-            said.add(likely)
-    return out
-
-
 def _causes(entry: Entry) -> str:
     """Return the most likely causes of a function without a name, after a space; "" for others."""
     if entry.findings[0].declared:
@@ -394,15 +434,12 @@ def _causes(entry: Entry) -> str:
     return f" Likely causes: {listed([causes(_largest(entry)[0])[0], *others], 'or')}."
 
 
-def _sentence(entry: Entry, place: int, gain: float) -> str:
+def _share_of_gain(entry: Entry, gained: float) -> str:
+    """Return the cause of an Entry with its worth, as a sentence; gained : m, by all effects."""
     worth = entry.worth or 0.0
-    begin = "Then" if place else "Mostly" if worth >= MOST * gain > 0.0 else "In part"
-    much = f"{CM * worth:.1f} cm"
-    if worth > gain:
-        much += " beside the others"
-    elif not place:
-        much = f"{CM * worth:.1f} of {CM * gain:.1f} cm"
-    return f"{begin} {cause(entry)}, worth {much}."
+    begin = "Mostly" if worth >= MOST * gained > 0.0 else "In part"
+    of = f" of {CM * gained:.1f}" if worth <= gained else ""
+    return f"{begin} {cause(entry)}, worth {CM * worth:.1f}{of} cm."
 
 
 def cause(entry: Entry) -> str:
