@@ -43,7 +43,7 @@ WORDS = {  # command: its arguments
     "inject": "flight.bag --effect anchor_delay --value 3=0.3 --out late.bag",
     "localize": "flight.bag --smooth --residuals --out localized",
     "map_anchors": "flight.bag --survey two.yaml --out map",
-    "plan": "anchors.yaml --improve move --out maps",
+    "plan": "anchors.yaml --improve --out maps",
     "simulate": "--duration 300 --out long.bag",
     "survey": "flight.bag --out surveyed",
     "train": "flight.bag --model paper --out model",
