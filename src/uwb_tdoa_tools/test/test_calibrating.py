@@ -371,7 +371,7 @@ def test_different_surveys_of_one_installation_are_named(room, flights, monkeypa
 def test_it_stops_where_check_finds_an_error(room, flights, monkeypatch, capsys):
     for name in ("with_truth", "without_truth"):
         monkeypatch.setattr(library, name, lambda *_: pytest.fail("it went on"))
-    flight = beginning(flights[0], 20.0)
+    flight = beginning(flights[0], 40.0)
     wrong = replace(flight, tdoa=replace(flight.tdoa, d=-flight.tdoa.d))
     write_bag(wrong, "wrong.bag")
     assert calibrate.main(["wrong.bag", "--out", "out"]) == 1
