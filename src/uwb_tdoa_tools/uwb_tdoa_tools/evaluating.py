@@ -245,9 +245,9 @@ def lines_of_attitude(attitudes: Mapping[str, tuple[float, ...]]) -> Iterator[st
     """Yield lines on the errors of attitude of runs, {flight: ATTITUDE}; none if unknown."""
     if not attitudes:
         return
-    roll, pitch, yaw, stated, nees = np.sqrt(np.mean(np.square([*attitudes.values()]), axis=0))
+    roll, pitch, yaw, stated, nees = np.mean([*attitudes.values()], axis=0)
     yield (
-        f"attitude, degrees (RMS): roll {roll:.1f}, pitch {pitch:.1f}, yaw {yaw:.1f} "
+        f"attitude, degrees (median): roll {roll:.1f}, pitch {pitch:.1f}, yaw {yaw:.1f} "
         f"({stated:.1f} stated); NEES {nees:.2f}, honest is 3"
     )
     worst = max(attitudes, key=lambda name: attitudes[name][2])

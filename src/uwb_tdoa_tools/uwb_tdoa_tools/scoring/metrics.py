@@ -144,9 +144,10 @@ def attitude_figures(
     Returns
     -------
     dict
-        "rmse_roll", "rmse_pitch", "rmse_yaw": degrees, intrinsic z-y-x. "std_yaw": the stated
-        deviation about the vertical of the body, RMS, degrees. "nees_attitude": mean of e' P^-1 e
-        of the rotation, 3 if the covariance is honest.
+        "median_roll", "median_pitch", "median_yaw": of the magnitude, degrees, intrinsic z-y-x;
+        large errors before the yaw is known do not count. "std_yaw": the stated deviation about the
+        vertical of the body, median, degrees. "nees_attitude": mean of e' P^-1 e of the rotation, 3
+        if the covariance is honest.
     """
     known = np.isfinite(truth.q).all(axis=1) & (np.abs(truth.q).max(axis=1) > 0.0)
     t, rows = np.unique(truth.t[known], return_index=True)
@@ -166,7 +167,7 @@ def attitude_figures(
     else:
         rotated = (true.inv() * estimated).as_rotvec()
     stated = np.rad2deg(np.sqrt(np.maximum(covariance[:, 2, 2], 0.0)))
-    values = *(rms(degrees[:, k]) for k in range(3)), rms(stated)
+    values = *np.median(np.abs(degrees), axis=0).tolist(), float(np.median(stated))
     return dict(zip(ATTITUDE, (*values, or_nan(np.nanmean, nees(rotated, covariance)))))
 
 

@@ -21,7 +21,7 @@ SMALLEST = 1e-9  # smaller samples count as this
 WHOLE = ("duration", "count", "without_estimate", "without_truth")  # sums over runs
 ROOTS = ("rmse_x", "rmse_y", "rmse_z", "rmse_3d", "std_3d")  # root mean squares
 # degrees, but the last
-ATTITUDE = "rmse_roll", "rmse_pitch", "rmse_yaw", "std_yaw", "nees_attitude"
+ATTITUDE = "median_roll", "median_pitch", "median_yaw", "std_yaw", "nees_attitude"
 COVERAGE = ("coverage_3sigma_x", "coverage_3sigma_y", "coverage_3sigma_z")
 
 

@@ -177,7 +177,7 @@ def _doubt(entry: Entry) -> str:
         abs(value) / (effect.std.get(key) or np.inf)
         for key, value in effect.significant_sizes().items()
     )
-    by = f"{deviations:.2g} standard deviations, and " if deviations else ""
+    by = f"{deviations:.0f} standard deviations, and " if deviations else ""
     return f"Sure: {by}no other effect explains these flights as well."
 
 
