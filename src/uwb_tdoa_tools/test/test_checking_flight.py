@@ -41,6 +41,13 @@ def test_a_ground_truth_in_another_unit_is_named_and_not_judged_against(flight, 
     assert not [*truth_unit(flight)] and not [*truth_unit(flight.replaced(truth=None))]
 
 
+@pytest.mark.parametrize("shift", [(3.0, 0.0, 0.0), (-40.0, 5.0, 0.0), (1e5, 4e6, 0.0)])
+@pytest.mark.parametrize("turn", [0.0, 90.0, 180.0])
+def test_a_ground_truth_in_another_frame_is_in_no_other_unit(flight, shift, turn):
+    p = Rotation.from_euler("z", turn, degrees=True).apply(flight.truth.p) + shift
+    assert not [*truth_unit(flight.replaced(truth=replace(flight.truth, p=p)))]
+
+
 @pytest.mark.parametrize("turn", [("z", 90), ("z", 180), ("x", 180)])
 def test_a_mounting_that_the_recorded_attitude_contradicts_is_named_by_check(flight, turn):
     by, imu = Rotation.from_euler(*turn, degrees=True), flight.imu

@@ -202,12 +202,15 @@ def truth_unit(recording: WithTruth) -> Iterator[Finding]:
         return
     a, b = anchors.positions[rows[:, inside]]
     p = np.stack([np.interp(tdoa.t[inside], truth.t, column) for column in truth.p.T], axis=1)
-    left = {
-        unit: float(np.median(np.abs(predicted_tdoa(factor * p, a, b) - tdoa.d[inside])))
-        for unit, factor in LENGTHS.items()
-    }
+
+    def residual(path: np.ndarray) -> float:
+        return float(np.median(np.abs(predicted_tdoa(path, a, b) - tdoa.d[inside])))
+
+    left = {unit: residual(factor * p) for unit, factor in LENGTHS.items()}
     unit = min(left, key=left.__getitem__)
-    if left[unit] < FITS * left["m"]:
+    # a path in another frame shrinks to a point, which may fit better than it does
+    still = residual(np.tile(LENGTHS[unit] * p.mean(axis=0), (len(p), 1)))
+    if left[unit] < FITS * min(left["m"], still):
         yield Finding(
             "truth_unit",
             ERROR,
