@@ -443,8 +443,8 @@ def test_angles_are_in_degrees_and_narrow_intervals_name_the_place(found, words)
             "elevation",
             (0.0, 1.5),
             "line",
-            "where elevation is 85.9 degrees than where it is 0 degrees (seen from 0 degrees to "
-            "85.9 degrees)",
+            "where elevation is 86 degrees than where it is 0 degrees (seen from 0 degrees to "
+            "86 degrees)",
         ),
     ],
 )

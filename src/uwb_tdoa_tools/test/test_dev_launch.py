@@ -98,10 +98,8 @@ def test_an_interrupt_ends_all_nodes(tmp_path):
             until(lambda: node.count_publishers("/tag1/odometry"))
             until(lambda: node.count_publishers("/tag1/uwb/anchors"))
             assert parameter_of(node, "/tag1/ekf_node", "body_frame") == "drone"
-            names = {
-                name for name, space in node.get_node_names_and_namespaces() if space == "/tag1"
-            }
-            assert names == {"anchors_node", "bias_node", "ekf_node"}
+            expected = {(name, "/tag1") for name in ("anchors_node", "bias_node", "ekf_node")}
+            until(lambda: expected <= {*node.get_node_names_and_namespaces()})
         finally:
             launched.send_signal(signal.SIGINT)
             said, _ = launched.communicate(timeout=PATIENCE)

@@ -146,7 +146,7 @@ def test_what_is_found_is_written_and_takes_the_error_out(diagnosed, tmp_path, c
     assert (
         main([str(tmp_path / "late"), "--holdout", str(tmp_path / "other"), "--out", str(out)]) == 0
     )
-    assert "found     anchor_delay" in capsys.readouterr().out
+    assert "(anchor_delay" in capsys.readouterr().out
     content = json.loads((out / "diagnosis.json").read_text())
     assert {finding["effect"] for finding in content["findings"] if finding["added"]} == {
         "anchor_delay",

@@ -103,7 +103,7 @@ def test_demo_writes_what_the_nodes_said(flight, viewer, tmp_path, monkeypatch):
     pytest.importorskip("rclpy")
     from uwb_tdoa_tools.flying import demo
 
-    nodes = demo.LivePass({}, FlightEstimator()(flight).odometry)
+    nodes = demo.LivePass(dict.fromkeys(demo.MISSING, 0), FlightEstimator()(flight).odometry)
     monkeypatch.setattr(demo, "through_nodes", lambda *_: nodes)
     correction = Corrector(flight.anchors, EffectSet())
     demo.fly(flight, correction, {}, tmp_path, 1.0, tmp_path / "flight.rrd")
