@@ -431,8 +431,8 @@ class Poses:
         yaw_std : (k,) rad
         """
         parts: Any = (t, p, q, v, yaw_std) if np.ndim(t) else ([t], [p], [q], [v], [yaw_std])
-        # writable, because numba compiles a function once more for arrays that are not
-        new = PoseArrays(*(np.require(part, float, ["C", "W"]) for part in parts))
+        # copies, because numba compiles a function once more for arrays that cannot be written
+        new = PoseArrays(*(np.array(part, dtype=float, order="C") for part in parts))
         self._count = _append(self._count, self._columns, new)
         if self._count and self.begin == math.inf:
             self.begin = float(self._columns.t[0]) + self._start

@@ -339,6 +339,11 @@ class Score:
         """Return the NEES of each error: (n,)."""
         return nees(self.error, self.covariance)
 
+    @cached_property
+    def attitude(self) -> dict[str, float]:
+        """Return the errors of the attitude in the scored phase, see `attitude_figures`."""
+        return attitude_figures(*self._whole, self.first, self.last)
+
     @property
     def rmse_3d(self) -> float:
         """Return the 3D RMSE, m, as in `row`."""
@@ -368,7 +373,7 @@ class Score:
         out["diverged"], out["late_start"] = bool(lost or late), bool(late and not lost)
         out["start_delay"] = float(max(0.0, self.t[0] - self.first)) if len(self.t) else math.inf
         out["ready_delay"] = self._ready_delay()
-        out |= attitude_figures(*self._whole, self.first, self.last)
+        out |= self.attitude
         return {**out, **coverage(self.error, self.covariance)}
 
     def _ready_delay(self) -> float:
