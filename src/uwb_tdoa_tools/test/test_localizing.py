@@ -15,7 +15,15 @@ from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag
 from uwb_tdoa_tools.commands import evaluate, localize
 from uwb_tdoa_tools.estimate import FlightEstimator
 from uwb_tdoa_tools.localizing import pictures
-from uwb_tdoa_tools.localizing.localize import BAD, GOOD, assess, check_names, name_of, write_tum
+from uwb_tdoa_tools.localizing.localize import (
+    BAD,
+    GOOD,
+    assess,
+    check_names,
+    lost_spans,
+    name_of,
+    write_tum,
+)
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 CLEAN = dict(
@@ -214,6 +222,18 @@ def test_ranges_that_contradict_each_other_are_not_good(ranged):
     far = replace(ranged.range, d=ranged.range.d + 20.0 * (ranged.range.anchor % 3))
     found = assessed(replace(ranged, range=far))
     assert found.level != GOOD and "ranges" in " ".join(found.reasons)
+
+
+@pytest.mark.parametrize(("step", "lost"), [(0.01, [(5.0, 8.0)]), (2.0, [])])
+def test_a_tag_that_is_heard_seldom_is_not_lost_in_between(step, lost):
+    t = np.arange(0.0, 20.0, step)
+    t = t[(t <= 5.0) | (t >= 8.0)]
+    n = len(t)
+    known = np.tile(1e-4 * np.eye(9), (n, 1, 1))
+    odometry = Odometry(
+        t, *np.zeros((2, n, 3)), np.zeros((n, 4)), *np.zeros((2, n, 3)), known, known
+    )
+    assert np.ravel(lost_spans(t, odometry)) == pytest.approx(np.ravel(lost), abs=0.02)
 
 
 @pytest.mark.parametrize("stream", ["tdoa", "range"])

@@ -24,6 +24,7 @@ from ..estimate import FlightEstimator
 from ..readers.streams import protocol
 from . import coverage, imu_rules, motion_rules, recording_rules, tdoa_rules
 from .ordered import OrderedRecording, SurveyFit, differences, displacement
+from .sensor_rules import judge_sensors
 from .tdoa_rules import SAME, largest_displacement
 from .watch import found_by_monitor, together
 
@@ -125,7 +126,7 @@ def check(
     if len(recording.tdoa):
         found = _with_trials(recording, streams, found, others, estimator, line)
     else:
-        found += _tried_with_ranges(recording, found)
+        found += _tried_with_ranges(recording, found, estimator)
     if not OF_IMU & {finding.rule for finding in found}:
         found += motion_rules.judge_imu(recording, stamps=False)
     found += motion_rules.truth_unit(recording)
@@ -134,8 +135,10 @@ def check(
     )
 
 
-def _tried_with_ranges(recording: Recording, found: list[Finding]) -> list[Finding]:
-    """Return the finding about inertial sensor and survey of a Recording without TDOAs, or none.
+def _tried_with_ranges(
+    recording: Recording, found: list[Finding], estimator: FlightEstimator
+) -> list[Finding]:
+    """Return findings about inertial sensor, survey and ranges of a Recording without TDOAs.
 
     Two successive ranges make a TDOA. Other corrections cannot be tried with ranges alone.
 
@@ -146,10 +149,14 @@ def _tried_with_ranges(recording: Recording, found: list[Finding]) -> list[Findi
     if not isinstance(ranges, Ranges) or names & (NOTHING_TO_TRY | WITHOUT_IMU):
         return []
     paired = OrderedRecording.of(replace(recording, tdoa=differences(ranges, recording.anchors)))
-    if len(paired.tdoa) < FEWEST_PAIRS or paired.imu is None:
+    flight = replace(paired, tdoa=recording.tdoa).flight().replaced(**recording.sensors)
+    if len(paired.tdoa) >= FEWEST_PAIRS and paired.imu is not None:
+        finding = imu_rules.find_imu_mistake(_without_stream_mistakes(paired, found))
+        if finding is not None:
+            return [finding]
+    if any(finding.severity == ERROR for finding in found):
         return []
-    finding = imu_rules.find_imu_mistake(_without_stream_mistakes(paired, found))
-    return [] if finding is None else [finding]
+    return list(judge_sensors(flight, estimator(flight), estimator))
 
 
 def _with_trials(
@@ -179,12 +186,15 @@ def _with_trials(
         ordered = _without_stream_mistakes(OrderedRecording.of(recording), found)
         tried, places = _try_corrections(ordered, names, others)
         flight = ordered.flight().replaced(**recording.sensors)
-        run = replace(estimator, smoothed=False)(flight)
+        estimator = replace(estimator, smoothed=False)
+        run = estimator(flight)
         track = run.odometry.t, run.odometry.p
         events = found_by_monitor(flight, run, estimator)
         tried = together(ordered, tried, events, line)
         explained = explained_by(tried, EXPLAINS)
         found = _without(found, explained) + tried
+        if not any(finding.severity == ERROR for finding in found):
+            found += judge_sensors(flight, run, estimator)
     if "survey_scale" in names:  # of a room of another size
         places = np.empty((0, 3))
     view = coverage.CoverageView(

@@ -27,6 +27,7 @@ from .. import command_lines
 from ..bags.bag import write_odometry
 from ..checking.check import check
 from ..checking.recording import of_flight
+from ..checking.sensor_rules import OF_SENSORS
 from ..checking.watch import OF_ANCHORS
 from ..estimate import FlightEstimator
 from ..readers.inputs import Reading
@@ -37,7 +38,8 @@ GOOD, DOUBTFUL, BAD = "good", "doubtful", "bad"
 # standard deviations that contain the 3D position for 95 % of the time; 1.6 to 2.0 by its shape
 SIGMAS = 2.0
 LOCATING = (("tdoas", "TDOAs"), ("ranges", "ranges"))  # figures that count measurements, in words
-GAP = 1.0  # s without an estimate: the tag is lost
+# s, and median times between measurements, without an estimate: the tag is lost
+GAP, MISSED = 1.0, 3.0
 LARGEST_LOST_SHARE = 0.05  # largest share of lost time in a good estimate
 SMALLEST_EXPLAINED_SHARE = 0.9  # smallest share of explained TDOAs in a good estimate
 # ratio of the deviation of z to x and y that makes the height the weakest coordinate
@@ -115,11 +117,13 @@ def assess(
         figures["range_offset"] = run.range_offset[0]
     found = check(of_flight(flight), (), estimator, line).findings
     faults = [finding for finding in found if finding.severity == ERROR]
-    moved = [
-        finding for finding in found if finding.severity != ERROR and finding.rule in OF_ANCHORS
+    warned = [
+        finding
+        for finding in found
+        if finding.severity != ERROR and finding.rule in (*OF_ANCHORS, *OF_SENSORS)
     ]
-    reasons = [f"check: {finding.cause} ({finding.evidence})" for finding in faults + moved]
-    remedies = [f"{finding.cause}: {finding.remedy}" for finding in faults + moved]
+    reasons = [f"check: {finding.cause} ({finding.evidence})" for finding in faults + warned]
+    remedies = [f"{finding.cause}: {finding.remedy}" for finding in faults + warned]
     if not len(odometry) or not there.any():
         reasons.append(f"the filter found no place that explains the {_measured(figures)}")
         return Assessment(BAD, figures, [], tuple(reasons), tuple(remedies))
@@ -132,7 +136,7 @@ def assess(
     level = GOOD
     if faults or figures["lost"] > 0.5 * figures["seconds"]:
         level = BAD
-    elif moved or doubts:
+    elif warned or doubts:
         level = DOUBTFUL
     remedies += estimator.remarks(flight.anchors)
     remedies += _remedies(flight, left, figures, estimator.effects is not None)
@@ -153,15 +157,17 @@ def _counted(figures: Mapping[str, Any]) -> str:
 def lost_spans(heard: np.ndarray, odometry: Odometry) -> list[tuple[float, float]]:
     """Return [(begin, end)] s, spans in which the tag is lost.
 
-    The tag is lost without an estimate for GAP, or with a deviation above LOST. Spans closer than
-    GAP are joined. They end with the last stamp in `heard` (n,) s.
+    The tag is lost with a deviation above LOST, or without an estimate for GAP, or longer where it is
+    heard less often. Spans closer than that are joined. They end with the last stamp in `heard` (n,) s.
     """
+    steps = np.diff(np.unique(heard))
+    gap = max(GAP, MISSED * float(np.median(steps))) if len(steps) else GAP
     t, std = odometry.t, np.sqrt(np.einsum("nii->n", odometry.covariance[:, :3, :3]))
     ends = np.append(t[1:], max(t[-1], heard.max(initial=-math.inf)))
-    wide = (std > LOST) | (ends - t > GAP)
+    wide = (std > LOST) | (ends - t > gap)
     spans: list[tuple[float, float]] = []
     for begin, end in zip(t[wide].tolist(), ends[wide].tolist()):
-        if spans and begin - spans[-1][1] < GAP:
+        if spans and begin - spans[-1][1] < gap:
             spans[-1] = spans[-1][0], end
         else:
             spans.append((begin, end))
