@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_tools.readers.tables import CsvTable, number, read_numbers
+from uwb_tdoa_tools.readers.tables import number, read_numbers, read_rows
 
 
 @pytest.fixture
@@ -22,7 +22,7 @@ def write(tmp_path):
 
 def test_columns_by_name(write):
     file = write(b"\xef\xbb\xbfb, a,c\r\n1, 2,3\r\n\r\n4,5,6\r\n")
-    rows = list(CsvTable(file, ("a", "b")))
+    rows = list(read_rows(file, ("a", "b")))
     assert [row for _, row in rows] == [{"a": "2", "b": "1"}, {"a": "5", "b": "4"}]
     assert number(file, *rows[1], "a") == 5.0
 
@@ -48,13 +48,13 @@ def test_columns_by_name(write):
 )
 def test_refused_with_the_line(write, content, said):
     with pytest.raises(InputError, match=f"table.csv: .*{said}"):
-        list(CsvTable(write(content), ("a", "b")))
+        list(read_rows(write(content), ("a", "b")))
 
 
 @pytest.mark.parametrize("cell", [b"nan", b"-inf", b"one", b""])
 def test_a_cell_that_is_no_number(write, cell):
     file = write(b"a\n" + cell + b"\n0\n")
-    line, row = next(iter(CsvTable(file, ("a",))), (2, {"a": ""}))
+    line, row = next(iter(read_rows(file, ("a",))), (2, {"a": ""}))
     if row["a"] != "0":
         with pytest.raises(InputError, match="line 2: a is .* finite number"):
             number(file, line, row, "a")

@@ -11,7 +11,7 @@ from recordings import ANCHORS, FULL_HEADER, FULL_ROWS, csv_text
 
 from uwb_tdoa_bias.common import limits
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_tools.readers import logs, read_util_csv
+from uwb_tdoa_tools.readers import read_util_csv, tables
 
 SUBSET = "t_tdoa,idA,idB,tdoa_meas,t_pose,pose_x,pose_y,pose_z"
 
@@ -55,7 +55,9 @@ def test_windows_lines_byte_order_mark_and_foreign_columns(read):
     text = csv_text("t_tdoa,idA,idB,tdoa_meas,note", ["0.1,0,1,0.5,good"]).replace("\n", "\r\n")
     flight = read(b"\xef\xbb\xbf" + text.encode())
     assert len(flight.tdoa) == 1
-    assert flight.meta["unread"] == ["columns note: the UTIL schema has no such"]
+    assert [
+        "columns note, which the profile does not name" in line for line in flight.meta["unread"]
+    ]
 
 
 def test_stamps_that_fall_are_sorted_and_counted(read):
@@ -71,21 +73,23 @@ TDOA = "t_tdoa,idA,idB,tdoa_meas"
     "text, sentence",
     [
         ("", "empty"),
-        ("\n\n", "no text"),
-        ("a,b\n1,2\n", "column t_tdoa is missing"),
-        (csv_text("t_tdoa,idA,idB", ["1,0,1"]), "column tdoa_meas is missing"),
-        (csv_text(TDOA + ",t_acc,acc_x,acc_y", ["1,0,1,1,1,0,0"]), "columns of acc but not acc_z"),
+        ("\n\n", "has no column t_tdoa"),
+        (
+            "a,b\n1,2\n",
+            "has no column t_tdoa; a UTIL CSV file has at least t_tdoa, idA, idB, tdoa_meas",
+        ),
+        (csv_text("t_tdoa,idA,idB", ["1,0,1"]), "has no column tdoa_meas"),
+        (csv_text(TDOA + ",t_acc,acc_x,acc_y", ["1,0,1,1,1,0,0"]), "header: accel_z is missing"),
         (csv_text(TDOA + ",idA", ["1,0,1,1,0"]), "'idA' is there twice"),
-        (csv_text(TDOA, []), "no TDOA"),
-        (csv_text(TDOA, ["1,0,1,1", "2,0,1"]), "line 3 has 3 cells, the header has 4"),
-        (csv_text(TDOA, ["1,0,1,1"])[:-1], "line 2 has no line end"),
+        (csv_text(TDOA, []), "no row below its header"),
+        (csv_text(TDOA, ["1,0,1,1", "2,0,1"]), "line 3: tdoa_meas is ''"),
+        (csv_text(TDOA, ["1,0,1,1"])[:-1], "the last line has no line end"),
         (csv_text(TDOA, ["1,0,1,one"]), "line 2: tdoa_meas is 'one'"),
         (csv_text(TDOA, ["1,0,1,1", "2,0,1,nan"]), "line 3: tdoa_meas is 'nan'"),
         (csv_text(TDOA, ["inf,0,1,1"]), "line 2: t_tdoa is 'inf'"),
-        (csv_text(TDOA, ["1,0.5,1,1"]), "line 2: idA is 0.5"),
-        (csv_text(TDOA, ["1,0,-1,1"]), "line 2: idB is -1"),
-        (csv_text(TDOA, ["1,0,1,1", ",,,", "3,0,1,1"]), "line 4: t_tdoa is filled although"),
-        (csv_text(TDOA, ["1,0,1,1", "2,0,,1"]), "line 3: t_tdoa is filled although"),
+        (csv_text(TDOA, ["1,0.5,1,1"]), "line 2: idA is '0.5'"),
+        (csv_text(TDOA, ["1,0,-1,1"]), "line 2: idB is '-1'"),
+        (csv_text(TDOA, ["1,0,1,1", "2,0,,1"]), "line 3: idB is ''"),
     ],
 )
 def test_refused_with_the_line(read, text, sentence):
@@ -134,15 +138,10 @@ def test_every_kind_of_line_end(read, end):
 @pytest.mark.parametrize(
     ("text", "count", "said"),
     [
-        (csv_text(TDOA, ["1,0,1,1", "2,0,1,2"])[:-3], 1, "line 3 is cut"),
-        (csv_text(TDOA, ["1,0,1,1", "2,0", "3,0,1,1"]), 1, "line 3 has 2 cells"),
-        (csv_text(TDOA, ["1,0,1,1", "2,0,1,nan", "3,0,1,1"]), 2, "tdoa: 1 of 3 records left out"),
-        (csv_text(TDOA, ["1,0,1,1", "2,0,1,one", "3,0,1,1"]), 2, "tdoa: 1 of 3 records left out"),
-        (
-            csv_text(TDOA + ",t_baro,baro", ["1,0,1,1,1,99.5", "2,0,1,2,2,nan"]),
-            2,
-            "baro: 1 of 2 records left out",
-        ),
+        (csv_text(TDOA, ["1,0,1,1", "2,0,1,2"])[:-3], 1, "1 of 2 records left out, line 3"),
+        (csv_text(TDOA, ["1,0,1,1", "2,0", "3,0,1,1"]), 2, "line 3: idB is ''"),
+        (csv_text(TDOA, ["1,0,1,1", "2,0,1,nan", "3,0,1,1"]), 2, "1 of 3 records left out"),
+        (csv_text(TDOA, ["1,0,1,1", "2,0,1,one", "3,0,1,1"]), 2, "1 of 3 records left out"),
         (
             csv_text(TDOA + ",t_baro,baro", ["1,0,1,1e31,1,99.5", "2,0,1,2,2,99"]),
             1,
@@ -180,7 +179,7 @@ def test_two_members_and_padding_are_one_file(read):
 
 @pytest.mark.slow
 def test_a_gzip_that_unfolds_without_end_is_refused(read, monkeypatch):
-    monkeypatch.setattr(logs, "CSV_BYTES", 2_000_000)
+    monkeypatch.setattr(tables, "TABLE_BYTES", 2_000_000)
     packed = gzip.compress(csv_text(TDOA, ["1,0,1,1"]).encode() + b"\n" * 500_000_000, 1)
     tracemalloc.start()
     with pytest.raises(InputError, match="more than 2000000 bytes of text"):
@@ -200,14 +199,14 @@ def test_short_cells_take_less_memory_than_their_text_would(read):
 
 
 def test_a_row_without_end_is_refused(read):
-    with pytest.raises(InputError, match="line 1 has a row of more than 100000 characters"):
+    with pytest.raises(InputError, match="line 1: .*a row of more than 100000 characters"):
         read(TDOA + "\n" + "1," * 100_000 + "\n")
     with pytest.raises(InputError, match="a row of more than 100000 characters"):
         read(TDOA + "\n" + '"\n",' * 100_000 + "\n")
 
 
 def test_more_cells_than_a_flight_has_are_refused(read, monkeypatch):
-    monkeypatch.setattr(logs, "CSV_CELLS", 40_000)
+    monkeypatch.setattr(tables, "TABLE_CELLS", 40_000)
     content = csv_text(TDOA, ["1,1,0,1"] * 20_000)
     with pytest.raises(InputError, match="has more than 40000 cells"):
         read(content)
@@ -218,13 +217,10 @@ def test_sensors_of_different_length(read):
     flight = read(csv_text(TDOA + ",t_baro,baro", rows))
     np.testing.assert_array_equal(flight.tdoa.d, range(7))
     np.testing.assert_array_equal(flight.pressure.t, range(3))
-    with pytest.raises(
-        InputError,
-        match="line 8: baro is filled although t_baro, baro ended with an empty cell at line 5",
-    ):
-        read(csv_text(TDOA + ",t_baro,baro", [*rows[:6], "6,0,1,6,,9"]))
-    with pytest.raises(InputError, match="line 8: tdoa_meas is 'x'; it must be a finite number"):
-        read(csv_text(TDOA + ",t_baro,baro", [*rows[:6], "6,0,1,x,,"]))
+    holed = read(csv_text(TDOA + ",t_baro,baro", [*rows[:6], "6,0,1,6,7,99"]))
+    np.testing.assert_array_equal(holed.pressure.t, [0, 1, 2, 7])
+    with pytest.raises(InputError, match="line 4: tdoa_meas is 'x'; it must be a finite number"):
+        read(csv_text(TDOA + ",t_baro,baro", [*rows[:2], "6,0,1,x,,"]))
 
 
 def test_a_million_empty_members_of_gzip_take_no_time(read):

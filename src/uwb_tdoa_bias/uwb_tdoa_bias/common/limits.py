@@ -22,10 +22,8 @@ SECONDS, SECONDS_PER_BYTE = 4.0, 2e-6
 
 # Whole files, bytes.
 RECORDING_BYTES = 1 << 30  # micro-SD log, or CSV on the disc
-CSV_BYTES = 200_000_000  # text of a recording; ten minutes of the full UTIL schema
-CSV_CELLS = 16_000_000  # cells of such a text
-TABLE_BYTES = 50_000_000  # CSV of other tools
-TABLE_CELLS = 8_000_000  # of a recording in such a CSV: 15 min at 1 kHz
+TABLE_BYTES = 200_000_000  # text of a CSV; ten minutes of the full UTIL schema
+TABLE_CELLS = 16_000_000  # cells of a recording in such a text
 SMALL_TABLE_CELLS = 400_000  # of other tables, whose rows become objects
 ROW_CHARACTERS = 100_000  # one row of any CSV
 SURVEY_BYTES = YAML_BYTES = 2_000_000  # 10 000 anchors with orientations have 1 200 000

@@ -4,14 +4,13 @@
 
 from __future__ import annotations
 
-from array import array
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime, timezone
 from pathlib import Path
 import re
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -36,12 +35,13 @@ from .profile import (
     time_column,
 )
 from .streams import Streams, by_time, make_flight
-from .tables import CsvFiles, ULogFile, is_ulog, table_of
+from .tables import Block, CsvFiles, Foreign, ULogFile, Wanted, is_ulog, table_of
 
 SURVEY = "anchors"  # stream of positions
 SINGLE = "gyro", "acc", "pose", "tof", "baro", "flow"  # streams of one sensor each
 MOST_LISTED = 8  # columns in a sentence
 THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}")  # as 1,000
+AN_ANCHOR = "an anchor of the survey, by its name, or an id 0 ... 65535"
 MOVED = 0.1  # m that the recorded position of an anchor changes, above which it is reported
 _MOMENT = re.compile(
     r"(?=\d)(?:(\d{4})[-/](\d\d?)[-/](\d\d?))?[T ]*(?:(\d\d?):(\d\d):(\d\d(?:[.,]\d+)?))?"
@@ -49,43 +49,6 @@ _MOMENT = re.compile(
 )
 ENU_OF_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 FLU_OF_FRD = np.diag([1.0, -1.0, -1.0])
-
-
-class Record(Protocol):
-    """A message, or a row of a table.
-
-    A `path` names a field of a message, as "pose.x", or a column.
-    """
-
-    def length(self, path: str) -> int:
-        """Return the length of an array. Raises KeyError."""
-
-    def value(self, path: str, index: int | None = None) -> Any:
-        """Return the value of a field. Raises KeyError; IndexError where an array is shorter."""
-
-
-class Foreign(Protocol):
-    """Tables of a recording: topics of a bag, CSV files, messages of a ULog.
-
-    Attributes
-    ----------
-    types : {table: type}.
-    counts : {table: messages}.
-    remarks : sentences on what is missing, after reading.
-    """
-
-    types: dict[str, str]
-    counts: Counter[str]
-    remarks: list[str]
-
-    def fields(self, table: str) -> list[str]:
-        """Return the fields of a table."""
-
-    def time_of(self, table: str) -> tuple[str, float] | None:
-        """Return the field with the time and its unit in s, if tables of this kind have one."""
-
-    def messages(self, tables: Sequence[str]) -> Iterator[tuple[str, str, Record]]:
-        """Yield (table, place in its file for messages to the user, Record)."""
 
 
 @contextmanager
@@ -106,14 +69,14 @@ def open_recording(
         other = next(path for path in files if path not in bags)
         raise InputError(f"{other}: is no bag, as {bags[0]} is; give recordings of one kind.")
     if bags:
-        from ..bags.foreign import open_foreign  # only bags need the rosbags library
+        from .foreign_bags import open_foreign  # only bags need the rosbags library
 
         with open_foreign(bags, types or {}) as bag:
             yield bag
     elif is_ulog(files[0]):
         yield ULogFile(files, salvage)
     else:
-        yield CsvFiles(files)
+        yield CsvFiles(files, salvage)
 
 
 def files_of(paths: Sequence[Path]) -> list[Path]:
@@ -165,13 +128,15 @@ def read_by_profile(
     files = [Path(path) for path in paths]
     with open_recording(files, profile.types, salvage) as tables:
         remarks: list[str] = []
-        requests = _requests(tables, profile, files[0], namespace, remarks)
-        named = survey or _recorded_anchors(tables, requests, files[0], remarks)
-        _take(tables, [one for one in requests if one.gives != {SURVEY}], named, tag)
+        requests = _requests(tables, profile, files[0], namespace, remarks, survey is not None)
+        wanted = [one for one in requests if one.gives]
+        for block in tables.blocks([one.wanted for one in wanted]):
+            wanted[block.number].take(block, tag)
+        named = survey or _recorded_anchors(tables, wanted, files[0], remarks)
         streams: Streams = {}
         parts: dict[str, list[tuple[str, dict[str, np.ndarray]]]] = {}
-        for request in requests:
-            for stream, columns in request.streams(remarks, salvage).items():
+        for request in wanted:
+            for stream, columns in request.streams(named, remarks, salvage).items():
                 parts.setdefault(stream, []).append((request.table, columns))
         _check_tag(files[0], requests, tag)
         for stream, found in parts.items():
@@ -188,7 +153,7 @@ def read_by_profile(
             "source": ", ".join(map(str, paths)),
             "format": profile.name,
             "remarks": remarks,
-            "read": [sentence for request in requests for sentence in request.sentences()],
+            "read": [sentence for request in wanted for sentence in request.sentences(tables)],
             "unread": _unread(tables, requests),
         }
     antenna = profile.antenna.get(tag) or profile.antenna.get("")
@@ -196,8 +161,6 @@ def read_by_profile(
         meta["antenna"] = list(antenna)
     if named.ids:
         meta["anchor_ids"] = named.ids
-    for ids in (streams.get("tdoa", {}), streams.get("range", {})):
-        ids.update({name: ids[name].astype(np.int64) for name in ids.keys() & {"a", "b", "anchor"}})
     name = _name(files[0]) + (f"_tag{tag}" if tag else "")
     return make_flight(name, named.anchors, streams, {}, meta, salvage, truth)
 
@@ -212,11 +175,9 @@ class _Request:
 
     Attributes
     ----------
+    wanted : the fields to read.
     gives : names of the streams of the source.
     tags : {tag: records}.
-    positions : {name of an anchor: position, m, in the axes of the source}.
-    moved : {name of an anchor: largest change of a coordinate, m}.
-    unstamped : messages without a stamp.
     """
 
     def __init__(
@@ -225,193 +186,202 @@ class _Request:
         source: Source,
         names: dict[str, str],
         tables: Foreign,
-        held: bool = False,
+        held: bool,
+        has_survey: bool,
     ) -> None:
         """Prepare to read a source of a table.
 
-        names : {name in a pattern: text}; held : leave out records that repeat the last one.
+        Parameters
+        ----------
+        names : {name in a pattern: text}.
+        held : leave out records that repeat the last one.
+        has_survey : leave out positions of anchors.
         """
         self.table, self.source, self._names, self._held = table, source, names, held
-        self._fields = tables.fields(table)
+        self._place, default = tables.place, tables.time_of(table)
         # Then a comma in a cell may be a thousands separator.
         self._between_commas = isinstance(tables, CsvFiles) and tables.delimiters[table] == ","
-        default = tables.time_of(table)
-        self._wanted = _wanted(source, default)
-        self.gives = {*self._wanted}
-        if any("t" not in mine for stream, mine in self._wanted.items() if stream != SURVEY):
+        self._columns = _wanted(source, default)
+        if has_survey:
+            self._columns.pop(SURVEY, None)
+        self.gives = {*self._columns}
+        if any("t" not in mine for stream, mine in self._columns.items() if stream != SURVEY):
             raise InputError(
                 f"{table}: the profile names no column with the time; write time: COLUMN."
             )
-        self._values: dict[str, dict[str, array[float]]] = {
-            stream: {name: array("d") for name in mine} for stream, mine in self._wanted.items()
+        self.wanted = Wanted(
+            table, source.each, tuple(_paths(source, self._columns.values()) - {*names})
+        )
+        self._by_stamp = default in [mine.get("t", ()) for mine in self._columns.values()]
+        self._ids: dict[str, int] = {}  # {name of an anchor: its number in the columns of ids}
+        self._read: dict[str, list[dict[str, np.ndarray]]] = {
+            stream: [] for stream in self._columns
         }
-        times = [mine["t"][0] for mine in self._wanted.values() if "t" in mine]
-        self._sums = {path: parts_of(path) for path in times if len(parts_of(path)) > 1}
-        self._first: dict[str, str] = {}
-        self._skipped: Counter[str] = Counter()
+        self._wrong: dict[tuple[str, str], Any] = {}  # {(stream, column): first that is no number}
+        self._stamps: dict[str, np.ndarray] = {}
+        self._last: dict[str, tuple[Any, ...]] = {}
         self.tags: Counter[str] = Counter()
-        self.positions: dict[str, tuple[float, float, float]] = {}
-        self.moved: dict[str, float] = {}
-        self._left_out = 0
-        self.unstamped = self._repeats = 0
-        self._last: list[Any] = []
-        self._by_stamp = default is not None and any(
-            mine.get("t") == default for mine in self._wanted.values()
-        )
+        self._left_out = self._repeats = 0
 
-    def take(self, record: Record, place: str, named: NamedAnchors | None, tag: str) -> None:
-        """Add the records of a message; with `named` None only positions of anchors."""
-        each = self.source.each
-        try:
-            for index in range(record.length(each)) if each else (None,):
-                self._take_one(record, index, place, named, tag)
-        except KeyError as error:
-            raise InputError(
-                f"{self.table}: has no field {error.args[0]!r}; its fields are "
-                f"{', '.join(self._fields)}."
-            ) from error
-
-    def _take_one(
-        self, record: Record, index: int | None, place: str, named: NamedAnchors | None, tag: str
-    ) -> None:
-        def value(path: str) -> Any:
-            if path in self._sums:
-                times = [(as_time(record.value(part, index)), f) for part, f in self._sums[path]]
-                known = [t * f for t, f in times if t is not None]
-                return sum(known) if len(known) == len(times) else ""
-            return self._names[path] if path in self._names else record.value(path, index)
-
-        if not all(condition.met(value(condition.path)) for condition in self.source.where):
-            self._left_out += named is not None
-            return
-        if named is None:
-            self._take_anchor(value, place)
-            return
+    def take(self, block: Block, tag: str) -> None:
+        """Add the records of a block; of a recording with several tags, those of one."""
+        met = np.ones(len(block.places), bool)
+        for condition in self.source.where:
+            values = self._column(block, condition.path)
+            met &= np.array([condition.met(value) for value in values], bool)
+        self._left_out += len(met) - np.count_nonzero(met)
+        of_tag = met
         if self.source.tag:
-            of = name_of(value(self.source.tag))
-            self.tags[of] += 1
-            if tag and of != tag:
-                return
-        for stream, mine in self._wanted.items():
-            if stream == SURVEY:
-                continue
-            raw: dict[str, Any] = {}
-            for name, (path, _) in mine.items():
-                try:
-                    raw[name] = value(path)
-                except IndexError:
-                    raw[name] = ""
-            values = [each for name, each in raw.items() if name != "t"]
-            if all(isinstance(each, str) and each.lower() in EMPTY for each in values):
-                continue
-            if self._held and values == self._last:
-                self._repeats += 1
-                continue
-            self._last = values
-            self._keep(stream, raw, place, named)
+            values = self._column(block, self.source.tag)
+            tags = np.array([name_of(value) for value in values], str)
+            self.tags.update(tags[met].tolist())
+            of_tag = met & (tags == tag) if tag else met
+        for stream, mine in self._columns.items():
+            raw = {name: self._column(block, path) for name, (path, _) in mine.items()}
+            records = [*zip(*(column for name, column in raw.items() if name != "t"))]
+            rows = np.flatnonzero(met if stream == SURVEY else of_tag).tolist()
+            kept = [k for k in rows if self._counts(stream, records[k])]
+            columns = {"place": np.array([block.places[k] for k in kept], np.int64)}
+            for name, column in raw.items():
+                cells = [column[k] for k in kept]
+                if name in ANCHORS:
+                    numbers = [self._ids.setdefault(name_of(c), len(self._ids)) for c in cells]
+                    columns[name] = np.array(numbers, np.int64)
+                else:
+                    columns[name] = self._numbers(stream, name, cells, columns["place"])
+            self._read[stream].append(columns)
 
-    def _keep(self, stream: str, raw: dict[str, Any], place: str, named: NamedAnchors) -> None:
-        record = {
-            name: (
-                named.id_of(each)
-                if name in ANCHORS
-                else as_time(each)
-                if name == "t"
-                else self._number(each, self._wanted[stream][name][0], place)
-            )
-            for name, each in raw.items()
-        }
-        wrong = next((name for name, number in record.items() if number is None), None)
-        if wrong is None:
-            for name, number in record.items():
-                self._values[stream][name].append(number)  # type: ignore[arg-type]  # none is None
-            return
-        self._skipped[stream] += 1
-        what = (
-            "an anchor of the survey, by its name, or an id 0 ... 65535"
-            if wrong in ANCHORS
-            else "a finite number"
-        )
-        column = self._wanted[stream][wrong][0]
-        self._first.setdefault(
-            stream, f"{place}: {column} is {str(raw[wrong])[:40]!r}; it must be {what}"
-        )
+    def _column(self, block: Block, path: str) -> Sequence[Any]:
+        """Return the values at a path; sums of times in s, "" where a part is none."""
+        if path in self._names:
+            return [self._names[path]] * len(block.places)
+        parts = parts_of(path)
+        if len(parts) == 1:
+            return block.columns[path]
+        times = [[as_time(value) for value in block.columns[part]] for part, _ in parts]
+        factors = [factor for _, factor in parts]
+        return [
+            "" if None in each else sum(t * factor for t, factor in zip(each, factors))
+            for each in zip(*times)
+        ]
 
-    def _number(self, value: Any, column: str, place: str) -> float | None:
-        """Return `as_number`; raise InputError if a comma may be a thousands separator."""
-        if self._between_commas and isinstance(value, str) and THOUSANDS.fullmatch(value):
-            raise InputError(
-                f"{self.table}: {place}: {column} is {value!r}, with a thousands separator or a "
-                "decimal comma; write a decimal point, or put semicolons between the cells."
-            )
-        return as_number(value)
+    def _counts(self, stream: str, values: tuple[Any, ...]) -> bool:
+        """Return whether a record has a filled cell and, where a value is held, differs from the last one."""
+        if all(isinstance(each, str) and each.lower() in EMPTY for each in values):
+            return False
+        if self._held and values == self._last.get(stream):
+            self._repeats += 1
+            return False
+        self._last[stream] = values
+        return True
 
-    def _take_anchor(self, value: Callable[[str], Any], place: str) -> None:
-        """Store the position of an anchor, and by how much it differs from the one before.
+    def _numbers(
+        self, stream: str, name: str, cells: Sequence[Any], places: np.ndarray
+    ) -> np.ndarray:
+        """Return numbers, NaN for other cells. Raises InputError if a comma may be a thousands separator."""
+        parse = as_time if name == "t" else as_number
+        try:
+            numbers = np.array(cells, float)
+        except (TypeError, ValueError):
+            for cell, place in zip(cells, places) if self._between_commas and name != "t" else ():
+                if THOUSANDS.fullmatch(cell):
+                    column = self._columns[stream][name][0]
+                    raise InputError(
+                        f"{self.table}: line {place}: {column} is {cell!r}, with a thousands separator or a "
+                        "decimal comma; write a decimal point, or put semicolons between the cells."
+                    ) from None
+            numbers = np.array([parse(cell) for cell in cells], float)
+        wrong = ~np.isfinite(numbers)
+        if wrong.any():
+            self._wrong.setdefault((stream, name), cells[int(np.argmax(wrong))])
+        return np.where(wrong, np.nan, numbers)
 
-        `value` returns the value of the record at a path.
-        """
-        paths = [self._wanted[SURVEY][name][0] for name in STREAMS[SURVEY]]
-        anchor = value(paths[0])
-        numbers = [self._number(value(path), path, place) for path in paths[1:]]
-        if None in numbers:
-            return
-        factors = [self._wanted[SURVEY][f"anchor_{axis}"][1] for axis in "xyz"]
-        at = [each * factor for each, factor in zip(numbers, factors) if each is not None]
-        name = name_of(anchor)
-        last = self.positions.get(name)
-        if last is not None and not any(at):
-            return  # drivers write zeros where they do not know the position
-        if last is not None and any(last):
-            shift = float(np.abs(np.subtract(at, last)).max())
-            self.moved[name] = max(self.moved.get(name, 0.0), shift)
-        self.positions[name] = (at[0], at[1], at[2])
+    def surveyed(self, remarks: list[str]) -> dict[str, np.ndarray]:
+        """Return {name of an anchor: (3,) m} in our axes: the last position, and report changes."""
+        columns, out = self._all(SURVEY), {}
+        if not columns:
+            return {}
+        factors = [self._columns[SURVEY][f"anchor_{axis}"][1] for axis in "xyz"]
+        places = np.stack([columns[f"anchor_{axis}"] for axis in "xyz"], axis=1) * factors
+        known, names = np.isfinite(places).all(axis=1), [*self._ids]
+        for number in dict.fromkeys(columns["anchor_id"][known].tolist()):
+            mine = places[known & (columns["anchor_id"] == number)]
+            placed = mine[
+                mine.any(axis=1)
+            ]  # drivers write zeros where they do not know the position
+            out[names[number]] = _axes_of_world(self.source) @ (placed if len(placed) else mine)[-1]
+            shift = np.abs(np.diff(placed, axis=0)).max(initial=0.0)
+            if shift > MOVED:
+                remarks.append(
+                    f"{self.table}: the position of anchor {names[number]} changes by {shift:.2f} m; "
+                    "the last one counts."
+                )
+        return out
 
-    def surveyed(self) -> dict[str, np.ndarray]:
-        """Return {name of an anchor: (3,) m} in our axes."""
-        turned = _axes_of_world(self.source)
-        return {name: turned @ np.array(place) for name, place in self.positions.items()}
+    def _all(self, stream: str) -> dict[str, np.ndarray]:
+        """Return {column: (n,) numbers} of all records of a stream, without units."""
+        parts = self._read.get(stream, [])
+        return {name: np.concatenate([part[name] for part in parts]) for name in (parts or [{}])[0]}
 
-    def streams(self, remarks: list[str], salvage: bool) -> Streams:
+    def streams(self, named: NamedAnchors, remarks: list[str], salvage: bool) -> Streams:
         """Return {stream: {column: (n,) array}} in the units of `make_flight`.
 
         Raises InputError for more than MOST_SKIPPED invalid records.
         """
         out: Streams = {}
-        for stream, count in self._skipped.items():
-            n = count + len(self._values[stream]["t"])
-            names = ", ".join(name for name in self._wanted[stream] if name != "t")
-            if count > MOST_SKIPPED * n and not salvage:
-                raise InputError(
-                    f"{self.table}: {self._first[stream]} ({count} of {n} records of {names} are "
-                    "like that: more than a gap)."
+        ids = np.array([named.id_of(text) for text in self._ids], float)  # NaN: unknown
+        for stream in self._columns:
+            if stream == SURVEY:
+                continue
+            columns = self._all(stream)
+            places = columns.pop("place", np.zeros(0))
+            numbers = {
+                name: ids[values] if name in ANCHORS else values for name, values in columns.items()
+            }
+            bad = np.any([np.isnan(values) for values in numbers.values()], axis=0)
+            if np.any(bad):
+                row, n, count = int(np.argmax(bad)), len(bad), np.count_nonzero(bad)
+                wrong = next(name for name in numbers if np.isnan(numbers[name][row]))
+                is_id = wrong in ANCHORS
+                cell = [*self._ids][columns[wrong][row]] if is_id else self._wrong[stream, wrong]
+                first = (
+                    f"{self._place} {places[row]}: {self._columns[stream][wrong][0]} is "
+                    f"{str(cell)[:40]!r}; it must be {AN_ANCHOR if is_id else 'a finite number'}"
                 )
-            remarks.append(f"{self.table}: {count} of {n} records left out, {self._first[stream]}.")
-        for stream, values in self._values.items():
-            if stream != SURVEY and len(values["t"]):
-                arrays = {
-                    name: np.array(column) * self._wanted[stream][name][1]
-                    for name, column in values.items()
-                }
+                if count > MOST_SKIPPED * n and not salvage:
+                    raise InputError(
+                        f"{self.table}: {first} ({count} of {n} records of "
+                        f"{', '.join(name for name in numbers if name != 't')} are like that: more "
+                        "than a gap)."
+                    )
+                remarks.append(f"{self.table}: {count} of {n} records left out, {first}.")
+            arrays = {
+                name: values[~bad] * self._columns[stream][name][1]
+                for name, values in numbers.items()
+            }
+            arrays |= {name: arrays[name].astype(np.int64) for name in {*ANCHORS} & arrays.keys()}
+            self._stamps[stream] = arrays.get("t", np.zeros(0))
+            if len(self._stamps[stream]):
                 out[stream] = _in_our_axes(stream, arrays, self.source)
         return out
 
-    def sentences(self) -> Iterator[str]:
+    def sentences(self, tables: Foreign) -> Iterator[str]:
         """Yield what was read, with counts and seconds."""
         of = self._names.values() if self._held else ()
-        for stream, values in self._values.items():
-            if stream == SURVEY:
-                if self.positions:
-                    yield f"{self.table}: positions of {len(self.positions)} anchors"
-                continue
-            t = np.array(values["t"]) * self._wanted[stream]["t"][1]
-            span = f", {t.min():.1f} to {t.max():.1f} s" if len(t) else ""
-            yield f"{self.table}: {len(t)} records of {' '.join([stream, *of])}{span}"
+        for stream in self._columns:
+            if stream in self._stamps:
+                t = self._stamps[stream]
+                span = f", {t.min():.1f} to {t.max():.1f} s" if len(t) else ""
+                yield f"{self.table}: {len(t)} records of {' '.join([stream, *of])}{span}"
+            elif columns := self._all(stream):
+                count = len(np.unique(columns["anchor_id"]))
+                yield f"{self.table}: positions of {count} anchors"
         if self._repeats:
             yield f"{self.table}: {self._repeats} values of {' '.join(of)} repeat the last one"
-        if self.unstamped and self._by_stamp:
-            yield f"{self.table}: {self.unstamped} messages without a stamp: the time of recording counts"
-        if self._left_out:
+        unstamped = tables.unstamped[self.table]
+        if unstamped and self._by_stamp:
+            yield f"{self.table}: {unstamped} messages without a stamp: the time of recording counts"
+        if self._left_out and self._stamps:
             paths = ", ".join(condition.path for condition in self.source.where)
             yield f"{self.table}: {self._left_out} records do not meet the condition on {paths}"
 
@@ -425,20 +395,17 @@ def _in_our_axes(
     }
     if stream in ("gyro", "acc") and source.body == "frd":
         out["y"], out["z"] = -out["y"], -out["z"]
-    if stream == "pose":
-        turned = _axes_of_world(source)
-        place = np.stack([out[axis] for axis in "xyz"])
-        out.update(zip("xyz", turned @ place))
-        if ATTITUDE <= arrays.keys():
-            q = np.stack([out[f"q{k}"] for k in "xyzw"], axis=1)
-            known = np.isfinite(q).all(axis=1) & (np.abs(q).max(axis=1) > 0.0)
+    if stream == "pose" and source.world == "ned":
+        out.update(zip("xyz", ENU_OF_NED @ np.stack([out[axis] for axis in "xyz"])))
+    if stream == "pose" and ATTITUDE <= arrays.keys():
+        q = np.stack([out[f"q{k}"] for k in "xyzw"], axis=1)
+        known = np.isfinite(q).all(axis=1) & (np.abs(q).max(axis=1) > 0.0)
+        if source.world == "ned" or source.body == "frd":
             body = FLU_OF_FRD if source.body == "frd" else np.eye(3)
             safe = np.where(known[:, None], q, [0.0, 0.0, 0.0, 1.0])
-            matrices = turned @ Rotation.from_quat(safe).as_matrix() @ body
-            ours = Rotation.from_matrix(matrices).as_quat()
-            changed = source.world == "ned" or source.body == "frd"
-            q = np.where(known[:, None], ours if changed else q, np.nan)
-            out.update(zip((f"q{k}" for k in "xyzw"), q.T))
+            matrices = _axes_of_world(source) @ Rotation.from_quat(safe).as_matrix() @ body
+            q = Rotation.from_matrix(matrices).as_quat()
+        out.update(zip((f"q{k}" for k in "xyzw"), np.where(known[:, None], q, np.nan).T))
     return out
 
 
@@ -448,7 +415,12 @@ def _axes_of_world(source: Source) -> np.ndarray:
 
 
 def _requests(
-    tables: Foreign, profile: Profile, path: Path, namespace: str, remarks: list[str]
+    tables: Foreign,
+    profile: Profile,
+    path: Path,
+    namespace: str,
+    remarks: list[str],
+    has_survey: bool,
 ) -> list[_Request]:
     """Return the requests of all sources. Raises InputError."""
     requests = []
@@ -468,7 +440,7 @@ def _requests(
             if len(found) > 1 and not any(found.values()):
                 found = _in_namespace(path, found, namespace)
         requests += [
-            _Request(table, one, names | more, tables, bool(more))
+            _Request(table, one, names | more, tables, bool(more), has_survey)
             for table, names in found.items()
             for one, more in source.over(tables.fields(table))
         ]
@@ -523,9 +495,10 @@ def _lacking(source: Source, fields: Sequence[str]) -> set[str]:
     return _paths(one) - {*fields} - {*names}
 
 
-def _paths(source: Source) -> set[str]:
+def _paths(source: Source, columns: Iterable[Columns] | None = None) -> set[str]:
     """Return the columns that are read, also to decide which records count."""
-    paths = {path for mine in _wanted(source).values() for path, _ in mine.values()}
+    read = _wanted(source).values() if columns is None else columns
+    paths = {path for mine in read for path, _ in mine.values()}
     return {part for path in paths for part, _ in parts_of(path)} | source.conditions
 
 
@@ -540,33 +513,13 @@ def _wanted(source: Source, default: tuple[str, float] | None = None) -> dict[st
     return wanted
 
 
-def _take(
-    tables: Foreign, requests: Sequence[_Request], named: NamedAnchors | None, tag: str
-) -> None:
-    by_table: dict[str, list[_Request]] = {}
-    for request in requests:
-        by_table.setdefault(request.table, []).append(request)
-    for table, place, record in tables.messages([*by_table]):
-        for request in by_table[table]:
-            request.take(record, place, named, tag)
-            request.unstamped += not getattr(record, "is_stamped", True)
-
-
 def _recorded_anchors(
     tables: Foreign, requests: Sequence[_Request], path: Path, remarks: list[str]
 ) -> NamedAnchors:
     """Return the anchors in the recording. Raises InputError."""
-    sources = [request for request in requests if SURVEY in request.gives]
-    _take(tables, sources, None, "")
     places: dict[str, np.ndarray] = {}
-    for request in sources:
-        places |= request.surveyed()
-        remarks += [
-            f"{request.table}: the position of anchor {name} changes by {shift:.2f} m; the last "
-            "one counts."
-            for name, shift in request.moved.items()
-            if shift > MOVED
-        ]
+    for request in requests:
+        places |= request.surveyed(remarks)
     if places:
         entries = [
             Entry(name, list(place), [np.nan] * 4, f"anchor {name}")
@@ -575,7 +528,7 @@ def _recorded_anchors(
         named = named_anchors(path, entries, "map")
         refuse_faulty(named.anchors, str(path))
         return named
-    recorded = getattr(tables, "recorded_anchors", lambda: None)()
+    recorded = tables.recorded_anchors()
     if recorded is not None:
         refuse_faulty(recorded.anchors, f"{path}: {recorded.source}")
         remarks.append(f"the {len(recorded.anchors)} anchors are those of {recorded.source}.")

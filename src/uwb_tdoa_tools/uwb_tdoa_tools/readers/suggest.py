@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import islice
 from pathlib import Path
 import re
 import shlex
@@ -19,12 +18,11 @@ from uwb_tdoa_bias.common.files import read_head
 from uwb_tdoa_bias.common.text import printable
 
 from ..command_lines import suggest_line
-from .by_profile import SINGLE, Foreign, as_time, files_of, open_recording
+from .by_profile import SINGLE, as_time, files_of, open_recording
 from .profile import LENGTH, RADIO, STREAMS, TIME, UNITS, Source, as_text, load_profile, shipped
-from .tables import CsvFiles, table_of
+from .tables import CsvFiles, Foreign, table_of
 
 SAMPLE = 3000  # messages of each table that are looked at
-ENTRIES = 8  # of an array in each of them
 LONGEST = 200  # characters of a path; longer ones are no name
 SHOWN = 12  # fields of a table that is not recognized
 MOST_ANCHORS = 64  # different ids in a column of a table without names
@@ -198,9 +196,7 @@ def suggest(paths: Sequence[Path], salvage: bool = False) -> tuple[str, list[str
                 found |= set() if one.doubtful else streams
             if not suggestions:
                 left.append(_unrecognized(tables, table))
-        if getattr(tables, "recorded_anchors", lambda: None)() or (
-            fitting and _fits(fitting[0], tables, {"anchors"})
-        ):
+        if tables.recorded_anchors() or (fitting and _fits(fitting[0], tables, {"anchors"})):
             found.add("anchors")
         missing = [MISSING[streams] for streams in MISSING if not found & {*streams}]
         lines += [*(f"# {line}" for some in missing for line in some), *left]
@@ -257,12 +253,12 @@ def _unrecognized(tables: Foreign, table: str) -> str:
 def _suggestions(tables: Foreign, table: str) -> list[Suggestion]:
     """Return the sources that a table seems to have."""
     try:
-        records = [record for _, _, record in islice(tables.messages([table]), SAMPLE)]
+        sample = tables.sample(table, SAMPLE)
     except InputError:
         return []
-    if not records:
+    fields = [_field(*key, values) for key, values in sample.items() if len(key[0]) <= LONGEST]
+    if not fields:
         return []
-    fields = _fields(records, tables.fields(table))
     is_csv = isinstance(tables, CsvFiles)
     nameless = is_csv and all(one.path.isdecimal() for one in fields)
     if nameless:
@@ -278,26 +274,11 @@ def _suggestions(tables: Foreign, table: str) -> list[Suggestion]:
     return made
 
 
-def _fields(records: Sequence[Any], names: Sequence[str]) -> list[Field]:
-    """Return the fields of a table with their values in some records."""
-    paths: dict[str, str] = {}
-    for record in records:  # an array may be empty in the first
-        paths |= record.paths() if hasattr(record, "paths") else dict.fromkeys(names, "")
-    out = []
-    for path, each in paths.items():
-        if len(path) > LONGEST:
-            continue
-        found = []
-        for record in records:
-            for index in range(ENTRIES) if each else (None,):
-                try:
-                    found.append(record.value(path, index))
-                except (KeyError, IndexError):
-                    break
-        numbers = [as_time(value) for value in found]
-        values = np.array([np.nan if number is None else number for number in numbers])
-        out.append(Field(path, each, values, [*map(as_text, found)]))
-    return out
+def _field(path: str, each: str, found: Sequence[Any]) -> Field:
+    """Return a field with its values in some records."""
+    return Field(
+        path, each, np.array([as_time(value) for value in found], float), [*map(as_text, found)]
+    )
 
 
 def _with_aliases(fields: Sequence[Field]) -> list[Field]:

@@ -1,25 +1,24 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""CSV tables, and CSV files and JSON lines of other tools as one foreign recording.
+"""Tables of recordings: the interface to all kinds, CSV files, JSON lines, ULog files of PX4.
 
-Rows are read one by one, because the cells of a large file as text exceed the memory.
+Rows are read in blocks, because the cells of a large file as text exceed the memory.
 """
 
 from __future__ import annotations
 
-from array import array
 from collections import Counter
 from collections.abc import Iterator, Sequence
 import csv
 from gzip import GzipFile
 import io
-from itertools import chain, dropwhile, islice, takewhile
+from itertools import chain, dropwhile, islice, takewhile, zip_longest
 import json
 import math
 import operator
 from pathlib import Path
 import re
-from typing import Any
+from typing import Any, NamedTuple
 import zlib
 
 import numpy as np
@@ -32,88 +31,127 @@ from uwb_tdoa_bias.common.limits import (
     TABLE_BYTES,
     TABLE_CELLS,
     Budget,
+    most_unpacked,
 )
 
 from ..command_lines import SALVAGE
 
 GZIP_MAGIC = b"\x1f\x8b"
-_BLOCK = 1 << 20  # bytes that are unpacked at once
+BLOCK = 4096  # records that are read at once
+_BLOCK_BYTES = 1 << 20  # that are unpacked at once
 _NUMBER = re.compile(r"\s*[-+]?\.?\d[\d.,eE+-]*\s*")
+
+
+class Wanted(NamedTuple):
+    """Fields of a table to read.
+
+    Attributes
+    ----------
+    table : its name.
+    each : path of an array, each entry of which is a record; "" for one record per message or row.
+    paths : names of fields, as "pose.x", or of columns.
+    """
+
+    table: str
+    each: str
+    paths: tuple[str, ...]
+
+
+class Block(NamedTuple):
+    """Some records of one Wanted.
+
+    Attributes
+    ----------
+    number : of the Wanted, from 0.
+    places : numbers of the messages or lines, from 1.
+    columns : {path: values}, as many as places.
+    """
+
+    number: int
+    places: list[int]
+    columns: dict[str, list[Any]]
+
+
+class Foreign:
+    """Tables of a recording: topics of a bag, CSV files, messages of a ULog.
+
+    Attributes
+    ----------
+    types : {table: type}.
+    counts, unstamped : {table: messages}, {table: messages without a stamp}.
+    remarks : sentences on what is missing, after reading.
+    place : word for the place of a record.
+    """
+
+    place = "message"
+
+    def __init__(self) -> None:
+        self.types: dict[str, str] = {}
+        self.counts: Counter[str] = Counter()
+        self.unstamped: Counter[str] = Counter()
+        self.remarks: list[str] = []
+
+    def fields(self, table: str) -> list[str]:
+        """Return the fields of a table."""
+        raise NotImplementedError
+
+    def time_of(self, table: str) -> tuple[str, float] | None:
+        """Return the field with the time and its unit in s, if tables of this kind have one."""
+
+    def recorded_anchors(self) -> Any:
+        """Return the anchors in a bag (`bags.frames.Recorded`), or None. Raises InputError."""
+
+    def blocks(self, wanted: Sequence[Wanted]) -> Iterator[Block]:
+        """Yield the records of tables. Raises InputError for a field that a table lacks."""
+        raise NotImplementedError
+
+    def sample(self, table: str, most: int) -> dict[tuple[str, str], list[Any]]:
+        """Return {(path, array that it lies in, or ""): values} of the first messages or rows."""
+        wanted = [Wanted(table, "", tuple(self.fields(table)))]
+        columns = next((block.columns for block in self.blocks(wanted)), {})
+        return {(path, ""): values[:most] for path, values in columns.items()}
+
+    def lacks(self, table: str, path: str) -> InputError:
+        """Return the InputError of a field that a table does not have."""
+        listed = ", ".join(self.fields(table))
+        return InputError(f"{table}: has no field {path!r}; its fields are {listed}.")
 
 
 def _is_comment(text: str) -> bool:
     return text.startswith(("#", "%"))
 
 
-class CsvRows:
-    """Iterate over the rows of CSV content (bytes), as lists of cells.
-
-    Raises csv.Error for invalid CSV, and InputError for bytes that are not text.
-    """
-
-    def __init__(self, path: str | Path, content: bytes, **options: Any) -> None:
-        self._path, self._content, self._read = path, content, 0
-        self._file = io.TextIOWrapper(io.BytesIO(content), "utf-8-sig", newline="")
-        self._reader = csv.reader(self._lines(), **options)
-
-    @property
-    def line(self) -> int:
-        """Return the number of lines read so far."""
-        return self._reader.line_num
-
-    def __iter__(self) -> Iterator[list]:
-        try:
-            for row in self._reader:
-                self._read = 0
-                yield row
-        except UnicodeDecodeError:
-            check_text(self._path, self._content)
-            raise
-
-    def _lines(self) -> Iterator[str]:
-        while line := self._file.readline(ROW_CHARACTERS):
-            self._read += len(line)  # a row goes over several lines where cells do
-            if self._read >= ROW_CHARACTERS:
-                raise csv.Error(f"has a row of more than {ROW_CHARACTERS} characters")
-            yield line
-
-
 class CsvTable:
-    """Iterate over (line, {column: text}) of the rows of a CSV file. Raises InputError.
+    """Iterate over (line, cells) of the rows of a CSV file. Raises InputError.
 
     Attributes
     ----------
     names : columns of the file; "1", "2", ... without a header. It may stand behind # or %. JSON
         lines have the paths of their values, as "stamp.sec" and "d[0]".
     delimiter : the most frequent of comma, semicolon and tab in the first row; a blank without any.
+    remark : sentence on a damaged file, or "".
     """
 
     def __init__(
         self,
         path: str | Path,
-        columns: Sequence[str] | None = None,
         most: int = SMALL_TABLE_CELLS,
-        complete: bool = True,
+        what: str = "CSV file",
+        salvage: bool = False,
     ) -> None:
-        """Read the header of a file that has at least the columns; default: all of its columns.
+        """Read the header.
 
         Parameters
         ----------
         most : largest number of cells.
-        complete : refuse rows with fewer cells than the header; otherwise missing cells are empty.
+        what : words for the expected file.
+        salvage : read gzip data up to the damage.
 
         Raises InputError, also during the iteration.
         """
-        self._path, self._most, self._complete = path, most, complete
-        named = f" with columns {', '.join(columns)}" if columns else ""
-        content = read_bytes(path, TABLE_BYTES, f"CSV file{named}")
-        if content.startswith(GZIP_MAGIC):
-            content, problem = unpacked(path, content, TABLE_BYTES)
-            if problem:
-                raise InputError(
-                    f"{path}: the gzip data is cut or damaged ({problem}); copy the file again."
-                )
-            Budget(path).spend("bytes of text", len(content), TABLE_BYTES)
+        self._path, self._most = path, most
+        content, self.remark = _content(path, what, salvage)
+        self._size = len(content)
         self._added = content.lstrip()[:1] in (b"{", b"[")  # lines above the first one of the file
         if self._added:
             content = _as_csv(path, content, most)
@@ -124,37 +162,29 @@ class CsvTable:
         if self.delimiter not in first and " " in first:
             self.delimiter = " "
         form: dict[str, Any] = {"skipinitialspace": True, "delimiter": self.delimiter}
-        self._rows = CsvRows(path, content, **form)
+        rows = self._rows(content, form)
         self._cells: Iterator[tuple[int, list[str]]] = dropwhile(
-            lambda row: _is_comment(row[1][0]), self._each()
+            lambda row: _is_comment(row[1][0]), rows
         )
         comment = [line.strip("#% ") for line in above[-1:]]
         self.names = self._header(next(csv.reader(comment, **form), []))
-        self._columns = columns if columns is not None else [name for name in self.names if name]
-        if missing := [name for name in self._columns if name not in self.names]:
-            raise InputError(
-                f"{path}: has no column {missing[0]}; it needs columns {', '.join(self._columns)}."
-            )
 
-    def __iter__(self) -> Iterator[tuple[int, dict[str, str]]]:
-        names, budget = (
-            {name: self.names.index(name) for name in self._columns},
-            Budget(self._path, TABLE_BYTES),
-        )
+    def __iter__(self) -> Iterator[tuple[int, list[str]]]:
+        budget = Budget(self._path, self._size)
         for line, cells in self._cells:
             budget.spend("cells", len(cells), self._most)
-            short = len(cells) <= max(names.values(), default=0)
-            if short and self._complete:
-                raise InputError(
-                    f"{self._path}: line {line}: has fewer cells than the header; complete it."
-                )
-            yield (
-                line,
-                {
-                    name: cells[place] if not short or place < len(cells) else ""
-                    for name, place in names.items()
-                },
+            yield line, cells
+
+    def place_of(self, name: str) -> int:
+        """Return the place of a column. Raises InputError unless it is there once."""
+        if name not in self.names:
+            listed = ", ".join(self.names)
+            raise InputError(f"{self._path}: has no column {name!r}; its columns are {listed}.")
+        if self.names.count(name) > 1:
+            raise InputError(
+                f"{self._path}: column {name!r} is there twice; every column must be there once."
             )
+        return self.names.index(name)
 
     def _header(self, comment: list[str]) -> list[str]:
         """Return the names of the columns; the next row is then the first with values.
@@ -173,14 +203,51 @@ class CsvTable:
         names = cells if is_header else comment if len(comment) == len(cells) else numbers
         return [name.strip() for name in names]
 
-    def _each(self) -> Iterator[tuple[int, list[str]]]:
-        """Yield (line, cells) of the rows that are not empty."""
+    def _rows(self, content: bytes, form: dict[str, Any]) -> Iterator[tuple[int, list[str]]]:
+        """Yield (line, cells) of the rows that are not empty. `form` : options of csv.reader."""
+        file, length = io.TextIOWrapper(io.BytesIO(content), "utf-8-sig", newline=""), 0
+
+        def lines() -> Iterator[str]:
+            nonlocal length
+            while line := file.readline(ROW_CHARACTERS):
+                length += len(line)  # a row goes over several lines where cells do
+                if length >= ROW_CHARACTERS:
+                    raise csv.Error(f"has a row of more than {ROW_CHARACTERS} characters")
+                yield line
+
+        reader = csv.reader(lines(), **form)
         try:
-            yield from ((self._rows.line - self._added, cells) for cells in self._rows if cells)
+            for cells in reader:
+                length = 0
+                if cells:
+                    yield reader.line_num - self._added, cells
+        except UnicodeDecodeError:
+            check_text(self._path, content)
+            raise
         except csv.Error as error:
             raise InputError(
-                f"{self._path}: line {self._rows.line}: is no CSV ({error}); correct it there."
+                f"{self._path}: line {reader.line_num}: is no CSV ({error}); correct it there."
             ) from error
+
+
+def _content(path: str | Path, what: str, salvage: bool) -> tuple[bytes, str]:
+    """Return the unpacked text of a file, and a sentence on damage that is left out, or ""."""
+    content, most = read_bytes(path, TABLE_BYTES, what), TABLE_BYTES
+    problem = ""
+    if content.startswith(GZIP_MAGIC):
+        most = most_unpacked(len(content), TABLE_BYTES)
+        content, problem = _unpacked(path, content, most)
+        Budget(path).spend("bytes of text", len(content), most)
+    if problem and not salvage:
+        raise InputError(
+            f"{path}: the gzip data is cut or damaged ({problem}); copy the file again, or {SALVAGE}."
+        )
+    if b"\0" in content:
+        place = content.index(0)
+        raise InputError(f"{path}: byte {place} is 0, not text; write the file in UTF-8.")
+    return content, f"the gzip data is cut or damaged ({problem}): read up to there." * bool(
+        problem
+    )
 
 
 def _as_csv(path: str | Path, content: bytes, most: int) -> bytes:
@@ -212,7 +279,7 @@ def _leaves(value: Any, path: str) -> Iterator[tuple[str, Any]]:
         yield from _leaves(each, f"{path}.{key}" if isinstance(value, dict) else f"{path}[{key}]")
 
 
-def unpacked(path: str | Path, content: bytes, most: int) -> tuple[bytes, str]:
+def _unpacked(path: str | Path, content: bytes, most: int) -> tuple[bytes, str]:
     """Return the content of gzip data, and why it ends early, or "".
 
     It is limited to little more than `most` bytes: the header of gzip data does not contain the size.
@@ -221,7 +288,7 @@ def unpacked(path: str | Path, content: bytes, most: int) -> tuple[bytes, str]:
     # a file may have a million members: no copy of the rest for each
     with GzipFile(fileobj=io.BytesIO(content)) as file:
         try:
-            while out.tell() <= most and (block := file.read1(_BLOCK)):
+            while out.tell() <= most and (block := file.read1(_BLOCK_BYTES)):
                 out.write(block)
                 budget.check_time()
         except (EOFError, OSError, zlib.error) as error:
@@ -229,12 +296,30 @@ def unpacked(path: str | Path, content: bytes, most: int) -> tuple[bytes, str]:
     return out.getvalue(), problem
 
 
+def read_rows(
+    path: str | Path, columns: Sequence[str], most: int = SMALL_TABLE_CELLS
+) -> Iterator[tuple[int, dict[str, str]]]:
+    """Yield (line, {column: text}) of a CSV file of ours, at most so many cells. Raises InputError."""
+    listed = ", ".join(columns)
+    table = CsvTable(path, most, f"CSV file with columns {listed}")
+    for name in columns:
+        if name not in table.names:
+            raise InputError(f"{path}: has no column {name}; it needs columns {listed}.")
+    places = {name: table.place_of(name) for name in columns}
+    for line, cells in table:
+        if len(cells) <= max(places.values()):
+            raise InputError(f"{path}: line {line}: has fewer cells than the header; complete it.")
+        yield line, {name: cells[place] for name, place in places.items()}
+
+
 def read_numbers(path: str | Path, columns: Sequence[str]) -> np.ndarray:
     """Return the columns of a CSV file as finite numbers: (n, k). Raise InputError."""
-    out = array("d")
-    for line, row in CsvTable(path, columns, TABLE_CELLS):
-        out.extend(number(path, line, row, name) for name in columns)
-    return np.array(out).reshape(-1, len(columns))
+    numbers = (
+        number(path, line, row, name)
+        for line, row in read_rows(path, columns, TABLE_CELLS)
+        for name in columns
+    )
+    return np.fromiter(numbers, float).reshape(-1, len(columns))
 
 
 def number(path: str | Path, line: int, row: dict[str, str], column: str) -> float:
@@ -258,66 +343,57 @@ def check_text(path: str | Path, content: bytes) -> None:
         raise InputError(f"{path}: byte {error.start} is not text; give a CSV file.") from error
 
 
-class CsvFiles:
-    """Tables of CSV files, plain or gzip, with the interface of a `ForeignBag`.
+class CsvFiles(Foreign):
+    """Tables of CSV files, plain or gzip: {path: "CSV"}.
 
     Attributes
     ----------
-    types : {path: "CSV"}.
     delimiters : {path: delimiter of the cells}.
-    counts : {path: rows that were read}.
-    remarks : always empty.
     """
 
-    def __init__(self, paths: Sequence[Path]) -> None:
+    place = "line"
+
+    def __init__(self, paths: Sequence[Path], salvage: bool = False) -> None:
+        """Read the headers. `salvage` : see CsvTable. Raises InputError."""
+        super().__init__()
+        self._salvage = salvage
         self._names: dict[str, list[str]] = {}
         self.delimiters: dict[str, str] = {}
         for path in map(str, paths):
-            table = CsvTable(path, most=TABLE_CELLS, complete=False)
+            table = CsvTable(path, TABLE_CELLS, salvage=salvage)
             self._names[path], self.delimiters[path] = table.names, table.delimiter
+            self.remarks += filter(None, [table.remark])
         self.types = dict.fromkeys(self._names, "CSV")
-        self.counts: Counter[str] = Counter()
-        self.remarks: list[str] = []
 
     def fields(self, table: str) -> list[str]:
         """Return the columns of a file."""
         return self._names[table]
 
-    def time_of(self, table: str) -> None:
-        """Return None: a profile names the column with the time."""
-
-    def messages(self, tables: Sequence[str]) -> Iterator[tuple[str, str, Row]]:
-        """Yield (path, place in the file, Row). Raises InputError."""
-        for path in tables:
-            # anew, as a second pass reads the anchors
-            for line, cells in CsvTable(path, most=TABLE_CELLS, complete=False):
-                self.counts[path] += 1
-                yield path, f"line {line}", Row(cells)
+    def blocks(self, wanted: Sequence[Wanted]) -> Iterator[Block]:
+        """Yield the records of files. Raises InputError."""
+        for path in dict.fromkeys(one.table for one in wanted):
+            rows = CsvTable(path, TABLE_CELLS, salvage=self._salvage)
+            mine = [(number, one) for number, one in enumerate(wanted) if one.table == path]
+            for _, one in mine:
+                if lacking := {*one.paths, one.each} - {*rows.names, ""}:
+                    raise self.lacks(path, min(lacking))
+            places = {name: rows.place_of(name) for _, one in mine for name in one.paths}
+            each = iter(rows)
+            while block := [*islice(each, BLOCK)]:
+                self.counts[path] += len(block)
+                lines, cells = zip(*block)
+                columns = [*zip_longest(*cells, fillvalue="")]
+                columns += [("",) * len(block)] * (len(rows.names) - len(columns))
+                known = {name: list(map(str.strip, columns[k])) for name, k in places.items()}
+                for number, one in mine:
+                    yield Block(number, [*lines], {name: known[name] for name in one.paths})
             if not self.counts[path]:
                 raise InputError(f"{path}: has no row below its header; record the flight again.")
-
-
-class Row:
-    """A row of a CSV file."""
-
-    def __init__(self, cells: dict[str, str]) -> None:
-        self._cells = cells
-
-    def length(self, path: str) -> int:
-        """Raise KeyError: a cell is no array."""
-        raise KeyError(path)
-
-    def value(self, path: str, index: int | None = None) -> str:
-        """Return the text of a cell. Raises KeyError."""
-        return self._cells[path].strip()
 
 
 def table_of(table: str) -> str:
     """Return the name of a file that the topic of a profile is compared with."""
     return Path(table).name
-
-
-# ULog files of PX4 as a foreign recording. pyulog, an optional extra, parses them.
 
 
 MAGIC = b"ULog\x01\x12\x35"
@@ -329,17 +405,12 @@ def is_ulog(path: Path) -> bool:
     return path.is_file() and path.stat().st_size > 0 and read_head(path, 16).startswith(MAGIC)
 
 
-class ULogFile:
-    """Messages of one ULog file, with the interface of a `ForeignBag`.
-
-    Attributes
-    ----------
-    types, counts : {message: the same}, {message: number}. Instances but the first are called NAME.1, NAME.2, ...
-    remarks : sentences on what the autopilot could not log.
-    """
+class ULogFile(Foreign):
+    """Messages of one ULog file: {message: the same}. Instances but the first are called NAME.1, NAME.2, ..."""
 
     def __init__(self, paths: Sequence[Path], salvage: bool = False) -> None:
-        """Read a file. Raises InputError."""
+        """Read a file by pyulog, an optional extra. Raises InputError."""
+        super().__init__()
         path, *more = paths
         if more:
             raise InputError(f"{more[0]}: a ULog is one recording; convert one by one.")
@@ -361,8 +432,7 @@ class ULogFile:
             for each in log.data_list
         }
         self.types = {name: name for name in self._data}
-        self.counts = Counter({name: len(data[_TIME]) for name, data in self._data.items()})
-        self.remarks: list[str] = []
+        self.counts.update({name: len(data[_TIME]) for name, data in self._data.items()})
         if log.file_corruption:
             self.remarks.append("the log is damaged: read what fits.")
         if log.dropouts:
@@ -379,34 +449,21 @@ class ULogFile:
         """Return the field with the time, and its unit in s."""
         return _TIME, 1e-6
 
-    def messages(self, tables: Sequence[str]) -> Iterator[tuple[str, str, ULogRow]]:
-        """Yield (message, its place, ULogRow)."""
-        for table in tables:
-            for number in range(self.counts[table]):
-                yield table, f"message {number + 1}", ULogRow(self._data[table], number)
-
-
-class ULogRow:
-    """One message of a ULog."""
-
-    def __init__(self, data: dict[str, np.ndarray], number: int) -> None:
-        self._data, self._number = data, number
-
-    def length(self, path: str) -> int:
-        """Return the length of an array. Raises KeyError."""
-        length = 0
-        while f"{path}[{length}]" in self._data:
-            length += 1
-        if not length:
-            raise KeyError(path)
-        return length
-
-    def value(self, path: str, index: int | None = None) -> Any:
-        """Return the number of a field; raise KeyError if there is none."""
-        if path == "index":
-            return index
-        entry = f"{path}[{index}]"
-        return self._data[entry if entry in self._data else path][self._number]
+    def blocks(self, wanted: Sequence[Wanted]) -> Iterator[Block]:
+        """Yield the messages, of each Wanted at once. Raises InputError."""
+        for number, (table, each, paths) in enumerate(wanted):
+            data, count = self._data[table], self.counts[table]
+            length = sum(name.startswith(f"{each}[") for name in data) if each else 1
+            if not length:
+                raise self.lacks(table, each)
+            columns = {"index": [*range(length)] * count}
+            for path in {*paths} - {"index"}:
+                names = [f"{path}[{k}]" for k in range(length)] if each else [path]
+                parts: list[Any] = [data.get(name, data.get(path)) for name in names]
+                if parts[0] is None:
+                    raise self.lacks(table, path)
+                columns[path] = [*np.stack(parts, axis=1).ravel()]
+            yield Block(number, np.repeat(np.arange(1, count + 1), length).tolist(), columns)
 
 
 def _damaged(path: Path, said: str) -> InputError:

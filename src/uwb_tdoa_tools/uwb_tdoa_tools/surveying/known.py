@@ -20,7 +20,7 @@ from uwb_tdoa_bias.common.safe_yaml import read_yaml
 from ..bags.bag import read_odometry
 from ..choices import DRIFT
 from ..diagnosis.constraints import Distance, Mark, OdometryPath
-from ..readers.tables import CsvTable, number
+from ..readers.tables import number, read_rows
 
 MARK_KEYS = ("flight", "from", "to", "position", "std")
 MARK_EXAMPLE = "{flight: monday, from: 12.0, to: 14.0, position: [1.0, -2.0, 0.5], std: 0.05}"
@@ -81,7 +81,7 @@ def read_distances(path: str | Path, anchors: Anchors | None = None) -> list[Dis
     anchors : None allows any ids. Raises InputError.
     """
     out, known = [], "" if anchors is None else ", ".join(str(i) for i in anchors.ids)
-    for line, row in CsvTable(path, DISTANCE_COLUMNS):
+    for line, row in read_rows(path, DISTANCE_COLUMNS):
         a, b, distance, std = (number(path, line, row, name) for name in DISTANCE_COLUMNS)
         if anchors is None:
             _check_id(path, line, a)
@@ -111,7 +111,7 @@ def read_coordinates(path: str | Path) -> list[tuple[int, int, float, float]]:
     Returns (id, axis 0 to 2, value m, std m) of each line; in the file axes are x, y, z. Raises InputError.
     """
     out = []
-    for line, row in CsvTable(path, COORDINATE_COLUMNS):
+    for line, row in read_rows(path, COORDINATE_COLUMNS):
         anchor, value, std = (number(path, line, row, n) for n in ("anchor", "value", "std"))
         _check_id(path, line, anchor)
         axis = row["axis"].strip().lower()
@@ -161,7 +161,7 @@ def read_paths(
 
 def _of_table(path: str, flights: Sequence[Flight], drift: float) -> list[OdometryPath]:
     rows = {flight.name: array("d") for flight in flights}
-    for line, row in CsvTable(path, ("flight", *PATH_COLUMNS), TABLE_CELLS):
+    for line, row in read_rows(path, ("flight", *PATH_COLUMNS), TABLE_CELLS):
         if row["flight"] in rows:
             rows[row["flight"]].extend(number(path, line, row, name) for name in PATH_COLUMNS)
     out = []

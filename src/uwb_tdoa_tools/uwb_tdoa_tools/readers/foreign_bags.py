@@ -12,6 +12,7 @@ from collections import Counter, OrderedDict
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from functools import lru_cache, partial
+from itertools import islice
 from pathlib import Path
 import re
 from typing import Any
@@ -32,16 +33,18 @@ from uwb_tdoa_bias.common.limits import (
     most_unpacked,
 )
 
-from . import is_ros_1
-from .files import BagReader, Incomplete, open_bag, remarks_of
-from .frames import Recorded, recorded_anchors
-from .repair import Damaged
+from ..bags import is_ros_1
+from ..bags.files import BagReader, Incomplete, open_bag, remarks_of
+from ..bags.frames import Recorded, recorded_anchors
+from ..bags.repair import Damaged
+from .tables import BLOCK, Block, Foreign, Wanted
 
 Path_ = tuple[str | int, ...]  # parsed path of a field
 
 # Paths of no field: the time of recording, the place in the array, and the stamp of the header or of the field
 # `stamp`. Where that is zero or missing, the time of recording counts.
 RECEIVED, INDEX, STAMP = "received", "index", "stamp"
+ENTRIES = 8  # of an array in each message of a sample
 SHORT = 4  # numbers of an array that are fields of their own
 LONGEST_GAP, SHORTEST_OVERLAP = 60.0, 1.0  # s between the parts of a recording
 KEPT_BYTES = 64 << 20  # of unpacked chunks of ROS 1
@@ -55,20 +58,11 @@ _STEP = re.compile(r"([A-Za-z]\w*)((?:\[\d+\])*)")
 _BETWEEN_TYPES = "=" * 80 + "\n"  # line between the types of a definition in IDL
 
 
-class ForeignBag:
-    """Topics of open bags that together are one recording.
-
-    Attributes
-    ----------
-    types : {topic: type}.
-    counts : {topic: messages}.
-    remarks : sentences on what is missing.
-    """
+class ForeignBag(Foreign):
+    """Topics of open bags that together are one recording: {topic: type of its messages}."""
 
     def __init__(self) -> None:
-        self.types: dict[str, str] = {}
-        self.counts: Counter[str] = Counter()
-        self.remarks: list[str] = []
+        super().__init__()
         self._parts: list[_Part] = []
 
     def add(self, part: _Part) -> None:
@@ -116,13 +110,47 @@ class ForeignBag:
         """Return the anchors in frames or markers of a bag of ROS 2, or None. Raises InputError."""
         return next(filter(None, (part.anchors() for part in self._parts)), None)
 
-    def messages(self, topics: Sequence[str]) -> Iterator[tuple[str, str, Message]]:
-        """Yield (topic, place in the bag, Message) of topics. Raises InputError."""
+    def blocks(self, wanted: Sequence[Wanted]) -> Iterator[Block]:
+        """Yield the records of topics. Raises InputError."""
+        filled = [_empty_block(number, one) for number, one in enumerate(wanted)]
+        for topic, place, message in self._messages({one.table for one in wanted}):
+            for number, one in enumerate(wanted):
+                if one.table != topic:
+                    continue
+                block = filled[number]
+                try:
+                    for index in message.rows(one.each):
+                        block.places.append(place)
+                        for path, values in block.columns.items():
+                            values.append(message.value(path, index))
+                except KeyError as error:
+                    raise self.lacks(topic, error.args[0]) from error
+                if len(block.places) >= BLOCK:
+                    yield block
+                    filled[number] = _empty_block(number, one)
+        yield from filled
+
+    def sample(self, table: str, most: int) -> dict[tuple[str, str], list[Any]]:
+        """Return {(path, array that it lies in, or ""): values} of the first messages of a topic."""
+        messages = [message for _, _, message in islice(self._messages({table}), most)]
+        found: dict[tuple[str, str], list[Any]] = {}
+        for message in messages:  # an array may be empty in the first
+            found |= {key: [] for key in message.paths()}
+        for message in messages:
+            for (path, each), values in found.items():
+                with suppress(KeyError):
+                    values += [message.value(path, row) for row in message.rows(each)[:ENTRIES]]
+        return found
+
+    def _messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, Message]]:
+        """Yield (topic, its number, Message) of topics. Raises InputError."""
         numbers: Counter[str] = Counter()
         for part in self._parts:
             for topic, received, content in part.messages(topics):
                 numbers[topic] += 1
-                yield topic, f"message {numbers[topic]}", Message(content, received)
+                message = Message(content, received)
+                self.unstamped[topic] += not message.is_stamped
+                yield topic, numbers[topic], message
             self.remarks += [each for each in part.remarks() if each not in self.remarks]
 
 
@@ -141,21 +169,23 @@ class Message:
         self.is_stamped = in_header != 0
         self._stamp = in_header or received  # ns
 
-    def paths(self) -> dict[str, str]:
-        """Return {path of a number, text or stamp: the array that it lies in, or ""}."""
-        return dict(_paths(self._content, "", ""))
+    def paths(self) -> list[tuple[str, str]]:
+        """Return [(path of a number, text or stamp, the array that it lies in, or "")]."""
+        return [*_paths(self._content, "", "")]
 
-    def length(self, path: str) -> int:
-        """Return the length of the array at a path. Raises KeyError."""
-        value = self._value(parsed(path), None)
+    def rows(self, each: str) -> Sequence[int | None]:
+        """Return the places in the array at a path; [None] for the message itself. Raises KeyError."""
+        if not each:
+            return [None]
+        value = self._value(parsed(each), None)
         if not _is_array(value):
-            raise KeyError(path)
-        return len(value)
+            raise KeyError(each)
+        return range(len(value))
 
     def value(self, path: str, index: int | None = None) -> Any:
         """Return the number, text or stamp (in s) at a path; raise KeyError if there is none.
 
-        index : place in each array that the path does not index itself.
+        index : place in each array that the path does not index itself; "" beyond the end.
         """
         if path == RECEIVED:
             return self._received / 1e9
@@ -181,6 +211,10 @@ class Message:
             except (AttributeError, IndexError, TypeError):
                 raise KeyError(".".join(map(str, steps))) from None
         return _entry(value, index)
+
+
+def _empty_block(number: int, one: Wanted) -> Block:
+    return Block(number, [], {path: [] for path in one.paths})
 
 
 def _paths(value: Any, path: str, each: str) -> Iterator[tuple[str, str]]:
@@ -223,9 +257,7 @@ def _entry(value: Any, index: int | None) -> Any:
     """Return the entry of an array, or the value itself if it is none."""
     if index is None or not _is_array(value):
         return value
-    if index >= len(value):
-        raise IndexError
-    return value[index]
+    return value[index] if index < len(value) else ""
 
 
 @contextmanager
@@ -275,7 +307,7 @@ class _Part:
         """Return the names of the fields of a topic."""
         return [name for name, _ in self._store(connection).fielddefs[connection.msgtype][1]]
 
-    def messages(self, topics: Sequence[str]) -> Iterator[tuple[str, int, Any]]:
+    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
         """Yield (topic, ns of recording, message)."""
         wanted = [connection for connection in self.connections if connection.topic in topics]
         stores = {connection.id: self._store(connection) for connection in wanted}
