@@ -17,7 +17,8 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.correction.features import FEATURES
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, Samples, SmoothTerm
 from uwb_tdoa_bias.effects.samples import Motion
-from uwb_tdoa_tools.exporting.graph import ELEMENTWISE
+from uwb_tdoa_tools.exporting.c_code import Dense
+from uwb_tdoa_tools.exporting.expressions import ELEMENTWISE
 from uwb_tdoa_tools.exporting.vehicle import MEMBERS
 from uwb_tdoa_tools.training.network import WITHOUT
 
@@ -225,25 +226,11 @@ def _value(one, inputs, columns, rows):
         table = np.frombuffer(one.value, np.float32).reshape(len(ANCHORS), len(ANCHORS))
         return table[rows["a"], rows["b"]]
     if one.kind == "network":
-        network, output = one.value
-        return _network_outputs(network, np.stack(inputs, axis=1))[:, output]
+        session, output = one.value
+        return Dense(session).run(np.stack(inputs, axis=1))[:, output]
     if one.kind == "pieces":
         return _piecewise(one.value, *inputs)
     return FUNCTIONS[one.kind](*inputs)
-
-
-def _network_outputs(network, x):
-    """Return the outputs (n, k) of a Dense for inputs (n, i).
-
-    Each sum adds its terms one by one.
-    """
-    for weights, biases, activation in network.layers:
-        total = np.tile(biases, (len(x), 1))
-        for column, row in zip(x.T, weights):
-            total = total + column[:, None] * row
-        x = np.where(total <= 0.0, np.float32(0.0), total) if activation else total
-    constants = np.tile(np.float32(network.constants), (len(x), 1))
-    return np.concatenate([x, constants], axis=1)
 
 
 def _piecewise(pieces, x):

@@ -14,7 +14,6 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_tools.commands import export
 from uwb_tdoa_tools.exporting.correction import trace
-from uwb_tdoa_tools.exporting.scalars import Dense
 from uwb_tdoa_tools.exporting.vehicle import write_c, write_crazyflie
 
 SMALL_IDS = Anchors(np.arange(8), ANCHORS.positions, ANCHORS.orientations)
@@ -47,9 +46,12 @@ def test_ids_that_the_firmware_does_not_have_are_refused(tmp_path):
 def test_a_network_that_is_no_chain_of_layers_is_refused(tmp_path, monkeypatch):
     network = c.network(tmp_path)
     traced = trace(ANCHORS, None, network)
-    monkeypatch.setattr("uwb_tdoa_tools.exporting.scalars.ACTIVATIONS", ())
-    monkeypatch.setattr("uwb_tdoa_tools.exporting.scalars.dense", Dense)  # read anew
-    with pytest.raises(InputError, match="has the operator Relu; train"):
+    monkeypatch.setattr("uwb_tdoa_tools.exporting.c_code.CHAIN", "Gemm")
+    with pytest.raises(InputError, match="has the operators Gemm Relu Gemm .*; train"):
+        write_c(tmp_path / "c", traced)
+    monkeypatch.undo()
+    monkeypatch.setattr("uwb_tdoa_tools.exporting.c_code.Dense.run", lambda self, x: np.ones(2))
+    with pytest.raises(InputError, match="its layers alone give other numbers; train"):
         write_c(tmp_path / "c", traced)
 
 

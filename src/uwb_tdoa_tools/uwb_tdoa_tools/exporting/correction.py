@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""TracedCorrection, the graph of all that a Corrector does, and what had to be left out of it."""
+"""TracedCorrection, the expressions of all that a Corrector does, and what had to be left out of it."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.effects import Effect, EffectSet, LabelEffect, SmoothTerm
 from uwb_tdoa_bias.effects.base import listed
 
-from .graph import Node
-from .tracing import nodes_of, samples_of
+from .expressions import Expression
+from .tracing import expressions_of, samples_of
 
 FARTHEST = 500.0  # m from the origin: single precision resolves 0.03 mm there
 G = 9.81  # m/s^2
@@ -105,21 +105,21 @@ def _why(effect: Effect) -> str:
 
 @dataclass(frozen=True)
 class TracedCorrection:
-    """The graph of a correction.
+    """The expressions of a correction.
 
     Attributes
     ----------
     anchors : Anchors
-    effects : EffectSet of the effects in the graph
-    network : Network in the graph, or None
-    outputs : {name: Node} of "bias" () m, "std" () m, "status" () and "slope" (6,)
+    effects : EffectSet of the recorded effects
+    network : recorded Network, or None
+    outputs : list of Expression, in the order of OUTPUTS
     left_out : tuple of LeftOut
     """
 
     anchors: Anchors
     effects: EffectSet
     network: Network | None
-    outputs: dict[str, Node]
+    outputs: list[Expression]
     left_out: tuple[LeftOut, ...]
 
     def meta(self) -> dict[str, Any]:
@@ -153,11 +153,7 @@ PROVENANCE = ("name", "kind", "data", "trained_on", "validated_on")
 def trace(
     anchors: Anchors, effects: EffectSet | None, network: Model | None = None
 ) -> TracedCorrection:
-    """Return the TracedCorrection of some Anchors; raise InputError.
-
-    The output `bias` needs neither the copies of the samples that `slope` and `std` are made of:
-    a printer that prints `bias` alone prints a small graph.
-    """
+    """Return the TracedCorrection of some Anchors; raise InputError."""
     far = np.abs(anchors.positions).max(axis=1) > FARTHEST
     if far.any():
         raise InputError(
@@ -179,8 +175,8 @@ def trace(
         )
     samples = samples_of(anchors, held.needs_motion)
     found = Corrector(anchors, held, network).prediction(samples)
-    bias, std, status, slope, _ = (nodes_of(samples, values) for values in found)
-    outputs = {"bias": bias, "std": std, "status": status, "slope": slope}
+    columns = found.bias, found.std, found.slope, found.status
+    outputs = [one for values in columns for one in expressions_of(samples, values)]
     return TracedCorrection(anchors, held, network, outputs, tuple(omitted))
 
 

@@ -4,7 +4,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 import json
 from pathlib import Path
 from typing import Any
@@ -32,7 +33,7 @@ from uwb_tdoa_bias.correction.trial import Unplayable, tried_out
 from uwb_tdoa_bias.effects import EffectSet
 
 from .correction import TracedCorrection, trace
-from .graph import Node, ordered
+from .expressions import Pieces, Program, Scalar
 
 # `trial.py` lists the operators of these versions
 OPSET, LAST_OPSET, IR_VERSION = 13, 17, 8
@@ -84,17 +85,25 @@ class GraphBuilder:
         self._nodes.extend(inside.node)
         return inside.output[0].name
 
+    def whole(self, *numbers: int) -> str:
+        """Add a constant tensor of whole numbers."""
+        return self.constant(numbers, np.int64)
+
     def take(self, value: str, columns: Iterable[int]) -> str:
         """Select columns."""
-        return self.op("Gather", value, self.constant(list(columns), np.int64), axis=1)
+        return self.op("Gather", value, self.whole(*columns), axis=1)
+
+    def joined(self, values: Sequence[str]) -> str:
+        """Join the columns of tensors."""
+        return self.op("Concat", *values, axis=1) if len(values) > 1 else values[0]
 
     def reshaped(self, value: str, *shape: int) -> str:
         """Reshape; 0 keeps the length of an axis."""
-        return self.op("Reshape", value, self.constant(shape, np.int64))
+        return self.op("Reshape", value, self.whole(*shape))
 
     def row_sum(self, value: str) -> str:
         """Sum along each row: (n, 1)."""
-        return self.op("ReduceSum", value, self.constant([1], np.int64), keepdims=1)
+        return self.op("ReduceSum", value, self.whole(1), keepdims=1)
 
     def model(self, width: int, outputs: int, meta: Mapping[str, Any]) -> ModelProto:
         """Return the ONNX model whose last operator gives the output, (n, outputs).
@@ -189,135 +198,156 @@ def printed(traced: TracedCorrection) -> ModelProto:
     return _Printer(traced).model()
 
 
-def _is_constant(table: np.ndarray, some: np.ndarray) -> np.ndarray:
-    """Return which columns of a table (N, N, k) are `some` in all rows, (k,)."""
-    same = (table == some) | (np.isnan(table) & np.isnan(some))
-    return np.asarray(same.all(axis=(0, 1)))
+def steps(scalars: Sequence[Scalar]) -> Iterator[tuple[tuple[Any, ...], list[int]]]:
+    """Yield (kind, places) of operations that are computed together, inputs before their users.
+
+    The kind of an elementwise operation is (its name,), that of others ("pieces", Pieces) or
+    ("network", Session, places of the inputs). A step takes the most common kind of those that are
+    ready: copies of an equation thus proceed in step.
+    """
+    users = defaultdict(list)
+    for place, one in enumerate(scalars):
+        for i in set(one.inputs):
+            users[i].append(place)
+    missing = [len(set(one.inputs)) for one in scalars]
+    ready: dict[tuple[Any, ...], list[int]] = {}
+    done = [place for place, one in enumerate(scalars) if not one.inputs]
+    while True:
+        for user in (user for place in done for user in users[place]):
+            missing[user] -= 1
+            if not missing[user]:
+                ready.setdefault(_kind(scalars[user]), []).append(user)
+        if not ready:
+            return
+        kind = max(ready, key=lambda one: len(ready[one]))
+        done = ready.pop(kind)
+        yield kind, done
+
+
+def _kind(one: Scalar) -> tuple[Any, ...]:
+    if one.kind == "network":
+        return one.kind, one.value[0], one.inputs
+    return (one.kind, one.value) if one.kind == "pieces" else (one.kind,)
 
 
 class _Printer:
-    """Prints the nodes of a graph in their order. Tensors are (n, *shape)."""
+    """Print the steps of a Program. The results of a step are the columns of a tensor (n, k)."""
 
     def __init__(self, traced: TracedCorrection) -> None:
         self._traced, self._count = traced, len(traced.anchors)
         self._graph = GraphBuilder("state", "correction")
-        self._names: dict[int, str] = {}
+        self._program = Program(traced.outputs, self._count)
+        self._scalars = self._program.scalars
+        self._widths: dict[str, int] = {}  # columns of the tensors
+        self._at: dict[int, tuple[str, int]] = {}  # places of Scalars: tensor and column
 
     def model(self) -> ModelProto:
-        graph, outputs = self._graph, self._traced.outputs
-        wanted = [outputs[name] for name in ("bias", "std", "slope", "status")]
-        nodes, wanted = ordered(wanted)
-        known = self._find_anchors(nodes)
-        for node in nodes:
-            if id(node) not in self._names:
-                self._names[id(node)] = self._print(node)
-        columns = [self._flat(node) for node in wanted]
-        together = graph.op("Concat", *columns, axis=1)
+        graph = self._graph
+        known = self._leaves()
+        for kind, places in steps(self._scalars):
+            inputs = zip(*(self._scalars[place].inputs for place in places))
+            if kind[0] == "network":
+                columns = [self._scalars[place].value[1] for place in places]
+                model = load_model_from_string(kind[1].content)
+                made = graph.inlined(model, self._columns(kind[2]))
+                self._keep(made, kind[1].outputs, zip(places, columns))
+                continue
+            self._keep_all(self._operation(kind, *map(self._columns, inputs)), places)
+        together = self._gathered(self._program.outputs)
         off = graph.row_sum(graph.op("Sub", together, together))  # NaN unless all are finite
         graph.op("Where", graph.op("And", known, graph.op("Equal", off, [0.0])), together, [0.0])
         return graph.model(len(INPUTS), len(OUTPUTS), self._traced.meta())
 
-    def _find_anchors(self, nodes: list[Node]) -> str:
-        """Look up the constants of both anchors; return whether they are two known ones, (n, 1)."""
-        graph, ids = self._graph, self._traced.anchors.ids.astype(float)
-        one, other = (
-            graph.op("Equal", graph.take(graph.input, [COLUMN[name]]), ids[None])
-            for name in ("anchor_a", "anchor_b")
-        )
-        hits_a = graph.op("Where", one, [1.0], [0.0])
-        hits_b = graph.op("Where", other, [1.0], [0.0])
-        constants = [node for node in nodes if node.kind == "constant" and len(node.value) > 1]
-        if constants:
-            self._name_constants(constants, hits_a, hits_b)
-        found = graph.op("Mul", graph.row_sum(hits_a), graph.row_sum(hits_b))
-        same = graph.row_sum(graph.op("Mul", hits_a, hits_b))
+    def _keep(self, tensor: str, width: int, columns: Iterable[tuple[int, int]]) -> None:
+        """Remember a tensor of some columns. columns : (place of a Scalar, its column)"""
+        self._widths[tensor] = width
+        self._at.update({place: (tensor, column) for place, column in columns})
+
+    def _columns(self, places: Sequence[int]) -> str:
+        """Return a tensor with some Scalars in its columns; of constants it has one row."""
+        some = [self._scalars[place] for place in places]
+        if all(one.kind == "constant" for one in some):
+            return self._graph.constant([[one.value for one in some]])
+        return self._gathered(places)
+
+    def _gathered(self, places: Sequence[int]) -> str:
+        """Return a tensor (n, k) with k Scalars in its columns."""
+        found = [self._at[place] for place in places]
+        tensors = list(dict.fromkeys(tensor for tensor, _ in found))
+        widths = [self._widths[tensor] for tensor in tensors]
+        starts = dict(zip(tensors, np.cumsum([0, *widths]).tolist()))
+        name = self._graph.joined(tensors)
+        index = [starts[tensor] + column for tensor, column in found]
+        return name if index == list(range(sum(widths))) else self._graph.take(name, index)
+
+    def _leaves(self) -> str:
+        """Find inputs and constants; return whether the anchors are two known ones, (n, 1)."""
+        graph, count = self._graph, self._count
+        leaves = defaultdict(list)
+        for place, one in enumerate(self._scalars):
+            if not one.inputs:
+                leaves[one.value[0] if one.kind == "anchor" else one.kind].append(place)
+        columns = [(place, COLUMN[self._scalars[place].value]) for place in leaves["input"]]
+        self._keep(graph.input, len(INPUTS), columns)
+        if leaves["constant"]:
+            row = [[self._scalars[place].value for place in leaves["constant"]]]
+            never = graph.op("Equal", graph.take(graph.input, [0]), [-1.0])
+            self._keep_all(graph.op("Where", never, row, row), leaves["constant"])
+        ids = self._traced.anchors.ids.astype(float)[None]
+        hits = {}
+        for end in "ab":
+            is_here = graph.op("Equal", graph.take(graph.input, [COLUMN[f"anchor_{end}"]]), ids)
+            hits[end] = graph.op("Where", is_here, [1.0], [0.0])
+            values = [self._scalars[place].value[1] for place in leaves[end]]
+            self._look_up(hits[end], leaves[end], values)
+        if leaves["pair"]:
+            first = graph.reshaped(hits["a"], 0, count, 1)
+            second = graph.reshaped(hits["b"], 0, 1, count)
+            both = graph.reshaped(graph.op("Mul", first, second), 0, count**2)
+            values = [self._scalars[place].value for place in leaves["pair"]]
+            self._look_up(both, leaves["pair"], values)
+        found = graph.op("Mul", *map(graph.row_sum, hits.values()))
+        same = graph.row_sum(graph.op("Mul", *hits.values()))
         return graph.op("Less", [0.5], graph.op("Sub", found, same))
 
-    def _name_constants(self, nodes: list[Node], hits_a: str, hits_b: str) -> None:
-        """Name the constants that depend on the anchors: each number has a row for one or both."""
-        graph, count = self._graph, self._count
-        values = [node.value.reshape(count, count, -1).astype(float) for node in nodes]
-        table = np.concatenate(values, axis=2)
-        of_a = _is_constant(table, table[:, :1])
-        of_b = _is_constant(table, table[:1]) & ~of_a
-        of_both = ~(of_a | of_b)
-        rows = [self._look_up(hits_a, table[:, 0, of_a])] if of_a.any() else []
-        rows += [self._look_up(hits_b, table[0][:, of_b])] if of_b.any() else []
-        if of_both.any():
-            first = graph.reshaped(hits_a, 0, count, 1)
-            second = graph.reshaped(hits_b, 0, 1, count)
-            hits = graph.reshaped(graph.op("Mul", first, second), 0, count**2)
-            rows += [self._look_up(hits, table[:, :, of_both].reshape(count**2, -1))]
-        joined = graph.op("Concat", *rows, axis=1) if len(rows) > 1 else rows[0]
-        columns = np.concatenate([np.flatnonzero(kind) for kind in (of_a, of_b, of_both)])
-        place = np.argsort(columns)
-        for node in nodes:
-            mine, place = place[: node.size], place[node.size :]
-            name = graph.take(joined, mine.tolist())
-            name = graph.op("Less", [0.5], name) if node.is_bool else name
-            self._names[id(node)] = self._shaped(name, node.shape, (node.size,))
+    def _keep_all(self, tensor: str, places: list[int]) -> None:
+        self._keep(tensor, len(places), zip(places, range(len(places))))
 
-    def _look_up(self, hits: str, values: np.ndarray) -> str:
-        """Return the row of a table that `hits` has a 1 for.
+    def _look_up(self, hits: str, places: list[int], values: list[bytes]) -> None:
+        """Look up some constants in the row of a table that `hits` has a 1 for.
 
         A sum over all rows, of which one counts, needs no index that could be wrong. A sum takes no
         NaN: these are put in afterwards.
         """
-        graph, unknown = self._graph, np.isnan(values)
-        rows = graph.op("MatMul", hits, np.where(unknown, 0.0, values))
-        if not unknown.any():
-            return rows
-        missing = graph.op("Less", [0.5], graph.op("MatMul", hits, unknown.astype(float)))
-        return graph.op("Where", missing, [np.nan], rows)
+        if not places:
+            return
+        graph, table = self._graph, np.stack([np.frombuffer(one, np.float32) for one in values]).T
+        unknown = np.isnan(table)
+        rows = graph.op("MatMul", hits, np.where(unknown, 0.0, table))
+        if unknown.any():
+            missing = graph.op("Less", [0.5], graph.op("MatMul", hits, unknown.astype(float)))
+            rows = graph.op("Where", missing, [np.nan], rows)
+        self._keep_all(rows, places)
 
-    def _print(self, node: Node) -> str:
-        graph = self._graph
-        inputs = [self._names[id(one)] for one in node.inputs]
-        if node.kind == "input":
-            return self._shaped(graph.take(graph.input, [COLUMN[node.value]]), (), (1,))
-        if node.kind == "constant":
-            return graph.constant(node.value, np.bool_ if node.is_bool else np.float32)
-        if node.kind == "pick":
-            return self._print_pick(node)
-        if node.kind == "sum":
-            axis = np.array([len(node.shape) + 1])
-            return graph.op("ReduceSum", inputs[0], graph.constant(axis, np.int64), keepdims=0)
-        if node.kind == "pieces":
-            return inputs[1]
-        if node.kind == "network":
-            return graph.inlined(load_model_from_string(node.value.content), inputs[0])
-        if node.kind == "atan2":
-            return self._print_atan2(*inputs)
-        return graph.op(OPERATORS[node.kind], *inputs)
+    def _operation(self, kind: tuple[Any, ...], *inputs: str) -> str:
+        if kind[0] == "atan2":
+            return self._atan2(*inputs)
+        if kind[0] == "pieces":
+            return self._pieces(kind[1], *inputs)
+        return self._graph.op(OPERATORS[kind[0]], *inputs)
 
-    def _print_pick(self, node: Node) -> str:
-        graph = self._graph
-        if all(one.kind == "input" for one in node.inputs):  # columns of the table
-            columns = [COLUMN[one.value] for one in node.inputs]
-            name = graph.take(graph.input, np.array(columns)[node.value.ravel()].tolist())
-            return self._shaped(name, node.shape, (node.size,))
-        flat = [self._flat(one) for one in node.inputs]
-        name = graph.op("Concat", *flat, axis=1) if len(flat) > 1 else flat[0]
-        total = sum(one.size for one in node.inputs)
-        if not np.array_equal(node.value.ravel(), np.arange(total)):
-            name = graph.take(name, node.value.ravel().tolist())
-        return self._shaped(name, node.shape, (node.size,))
+    def _pieces(self, pieces: Pieces, x: str) -> str:
+        """Return the sum of what a function gains in each of its pieces."""
+        graph, breaks = self._graph, np.array(pieces.breaks)
+        above = graph.op("Sub", graph.reshaped(x, 0, -1, 1), breaks[:-1])
+        inside = graph.op("Min", graph.op("Max", above, [0.0]), np.diff(breaks))
+        _, *first, last = np.array(pieces.table).T
+        value = graph.op("Mul", inside, last)
+        for power in first[::-1]:
+            value = graph.op("Mul", graph.op("Add", value, power), inside)
+        return graph.op("ReduceSum", value, graph.whole(2), keepdims=0)
 
-    def _flat(self, node: Node) -> str:
-        """Return a tensor (n, size)."""
-        if node.kind == "constant" and len(node.value) == 1:  # for all TDOAs alike
-            ones = self._graph.op("Equal", self._graph.take(self._graph.input, [0]), [-1.0])
-            kind: Any = np.bool_ if node.is_bool else np.float32
-            value = self._graph.constant(node.value.reshape(1, -1), kind)
-            return self._graph.op("Where", ones, value, value)
-        return self._shaped(self._names[id(node)], (node.size,), node.shape)
-
-    def _shaped(self, name: str, shape: tuple[int, ...], known: tuple[int, ...]) -> str:
-        if shape == known:
-            return name
-        return self._graph.reshaped(name, 0, *shape)
-
-    def _print_atan2(self, y: str, x: str) -> str:
+    def _atan2(self, y: str, x: str) -> str:
         """Return the angle in all quadrants; the sign of a zero counts, as in numpy."""
         graph = self._graph
         angle = graph.op("Atan", graph.op("Div", y, x))

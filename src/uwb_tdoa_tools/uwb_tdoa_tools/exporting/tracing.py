@@ -1,16 +1,17 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Record equations as graphs: run their own code with arrays of symbols.
+"""Record equations as expressions: run their own code with arrays of symbols.
 
 `Traced` stands for an array with one row per TDOA. Its rows are all pairs of anchors, in all blocks
 of copies that an equation makes of the samples. What is indexed by anchors is thus computed as
 numbers, and becomes constants by pair. What depends on the tag is recorded: numpy's functions by
-the protocols of numpy, compiled functions by `Kernel`.
+the protocols of numpy, compiled functions by a run of their Python source for one row of symbols.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from functools import partial, reduce
 import math
 from types import FunctionType, SimpleNamespace
 from typing import Any
@@ -24,7 +25,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.effects import Samples
 from uwb_tdoa_bias.effects.samples import Motion
 
-from .graph import Node, Pieces, apply, as_number, constant, joined, pick, scalar, taken, total
+from .expressions import ELEMENTWISE, Expression, Pieces, apply, constant, expressed, merged
 
 MOST_ANCHORS = 128  # constants of pairs grow with the square
 LN_10 = math.log(10.0)
@@ -46,9 +47,8 @@ def samples_of(anchors: Anchors, motion: bool) -> Samples:
     rows = np.concatenate([pairs, np.zeros(n - len(pairs), dtype=int)])
 
     def column(*names: str) -> Any:
-        each = [Node("input", (), (), name) for name in names]
-        index = np.arange(len(each)).reshape((1, -1) if len(each) > 1 else (1,))
-        return Traced(pick(each, index), n, len(pairs))
+        each = np.array([Expression("input", (), name) for name in names])
+        return Traced(each[None] if len(each) > 1 else each, n, len(pairs))
 
     moving = Motion(column("vx", "vy", "vz"), column("ax", "ay", "az"), column("wx", "wy", "wz"))
     return TracedSamples(
@@ -73,11 +73,10 @@ def _unlike_any_length(least: int) -> int:
     return n
 
 
-def nodes_of(samples: Samples, values: Any) -> Node:
-    """Return the node of an array of an equation, (n, ...): of symbols or of numbers."""
+def expressions_of(samples: Samples, values: Any) -> list[Expression]:
+    """Return the Expressions of a row of an equation: (n,) or (n, k) symbols or numbers."""
     like: Traced = samples.p  # type: ignore[assignment]  # of `samples_of`
-    node = like.lifted(values)
-    return taken(node, 0)  # the one block
+    return list(map(expressed, np.ravel(like.lifted(values)[0])))
 
 
 class TracedSamples(Samples):
@@ -88,44 +87,50 @@ class TracedSamples(Samples):
 
 
 class Traced(NDArrayOperatorsMixin, SymbolicArray):
-    """An array of symbols: (blocks * n, ...) for numpy, a node of shape (blocks, ...) in the graph.
+    """An array of symbols, for numpy of shape (blocks * n, ...).
 
     Attributes
     ----------
-    node : Node of the array.
+    elements : (blocks, ...) array of Expressions, and of numbers
     n : number of rows of a block. No other array has this length.
     pairs : only the first `pairs` rows of a block are used; the rest is padding.
     """
 
-    def __init__(self, node: Node, n: int, pairs: int) -> None:
+    def __init__(self, elements: np.ndarray, n: int, pairs: int) -> None:
         """Store the attributes."""
-        self.node, self.n, self.pairs = node, n, pairs
+        self.elements, self.n, self.pairs = elements, n, pairs
 
     @property
     def shape(self) -> tuple[int, ...]:
         """Return the shape that numpy would have."""
-        return (self.node.shape[0] * self.n, *self.node.shape[1:])
+        return (len(self.elements) * self.n, *self.elements.shape[1:])
 
     @property
     def ndim(self) -> int:
         """Return the number of axes."""
-        return len(self.node.shape)
+        return self.elements.ndim
 
     def __len__(self) -> int:
         return self.shape[0]
 
-    def _of(self, node: Node) -> Traced:
-        return Traced(node, self.n, self.pairs)
+    def of(self, elements: Any) -> Traced:
+        """Return an array of other elements, which is like this one."""
+        return Traced(elements, self.n, self.pairs)
 
-    def lifted(self, values: Any) -> Node:
-        """Return the node of an operand: of symbols, of numbers by row, or of others."""
+    def lifted(self, values: Any) -> np.ndarray:
+        """Return the elements of an operand: of symbols, of numbers by row, or of others."""
         if isinstance(values, Traced):
-            return values.node
+            return values.elements
         values = np.asarray(values)
         if not self.is_by_row(values):
-            return constant(values[None])
-        blocks = values.reshape(len(values) // self.n, self.n, *values.shape[1:])
-        return constant(np.moveaxis(blocks, 0, 1)[: self.pairs])
+            return values.astype(object)
+        blocks = np.moveaxis(
+            values.reshape(len(values) // self.n, self.n, *values.shape[1:]), 1, -1
+        )
+        out = np.empty(blocks.shape[:-1], dtype=object)
+        for place in np.ndindex(*out.shape):
+            out[place] = constant(blocks[place][: self.pairs])
+        return out
 
     def is_by_row(self, values: np.ndarray) -> bool:
         """Return whether an array of numbers has a row for each of the samples."""
@@ -145,15 +150,18 @@ class Traced(NDArrayOperatorsMixin, SymbolicArray):
             return NotImplemented
         if ufunc is np.matmul:
             values, weights = inputs
-            return self._of(total(apply("mul", values.node, constant(np.asarray(weights)[None]))))
-        if ufunc is np.power:
-            return self._of(_power(self, *inputs))
-        return self._of(_UFUNCS[ufunc](*map(self.lifted, inputs)))
+            return np.sum(values * weights, axis=-1)
+        return self.each(_FUNCTIONS[ufunc], *inputs)
+
+    def each(self, function: Callable[..., Any], *inputs: Any) -> Traced:
+        """Return a function of numbers for all elements of some operands."""
+        elements = map(self.lifted, inputs)
+        return self.of(np.frompyfunc(function, len(inputs), 1)(*elements))
 
     def __array_function__(self, function: Any, types: Any, args: Any, kwargs: Any) -> Any:
-        if function not in _FUNCTIONS:
+        if function not in _ARRAYS:
             return NotImplemented
-        return self._of(_FUNCTIONS[function](self, *args, **kwargs))
+        return _ARRAYS[function](self, *args, **kwargs)
 
     # What equations use of arrays
 
@@ -169,7 +177,7 @@ class Traced(NDArrayOperatorsMixin, SymbolicArray):
             raise TypeError(
                 f"an effect may not select single rows ({first!r}); write the equation for all rows"
             )
-        return self._of(taken(self.node, (blocks, *others)))
+        return self.of(self.elements[(blocks, *others)])
 
     def _blocks(self, rows: slice) -> slice | None:
         """Return the slice of the blocks that rows consist of; None if these are not whole blocks."""
@@ -184,83 +192,70 @@ class Traced(NDArrayOperatorsMixin, SymbolicArray):
         return [self[:, column] for column in range(self.shape[1])]
 
     def any(self) -> bool:
-        """Return True: a graph holds for all samples."""
+        """Return True: the expressions hold for all samples."""
         return True
 
     def reshape(self, *shape: int) -> Blocks:
         """Return parts of whole blocks; shape : (-1, rows of a part) or (parts, -1)."""
         parts, rows = shape
-        if rows < 0:
-            rows = len(self) // parts
-        assert self.ndim == 1 and rows % self.n == 0 and len(self) % rows == 0
-        return Blocks([self[first : first + rows] for first in range(0, len(self), rows)])
+        parts = len(self) // rows if parts < 0 else parts
+        return Blocks(map(self.of, self.elements.reshape(parts, -1)))
 
     # SymbolicArray
 
     def filled(self, kernel: Callable[..., Any], shape: tuple[int, ...], inputs: Any) -> Traced:
-        rows = len(self)
-        out = np.empty([1 if size == rows else size for size in shape], dtype=object)
-        arguments = [self._as_symbols(one) for one in inputs]
+        def run(block: int) -> np.ndarray:
+            out = np.empty((1, *shape[1:]), dtype=object)
+            _python_of(kernel)(*(self._row(one, block) for one in inputs), out)
+            return out.ravel()
 
-        def run() -> list[Any]:
-            out.fill(None)
-            _python_of(kernel)(*arguments, out)
-            return list(out.ravel())
+        blocks = len(self.elements)
+        rows = [merged(partial(run, block)) for block in range(blocks)]
+        return self.of(np.array(rows, dtype=object).reshape(blocks, *shape[1:]))
 
-        elements = [_node_of(one) for one in _merged(run)]
-        blocks = self.node.shape[0]
-        elements = [_broadcast(one, (blocks,)) for one in elements]
-        index = np.arange(len(elements) * blocks).reshape(len(elements), blocks).T
-        return self._of(pick(elements, index.reshape(blocks, *out.shape[1:])))
-
-    def _as_symbols(self, value: Any) -> Any:
-        """Return an argument of a kernel: one row of symbols in place of all rows."""
+    def _row(self, value: Any, block: int) -> Any:
+        """Return an argument of a kernel: one row of symbols in place of all rows of a block."""
         if isinstance(value, np.ndarray) and not self.is_by_row(value):
             return _Table(value)
         if not isinstance(value, (Traced, np.ndarray)):
             return value
-        node = self.lifted(value)
-        shape = node.shape[1:]
-        row = np.empty((1, *shape), dtype=object)
-        for place in np.ndindex(*shape):
-            row[(0, *place)] = Symbol(taken(node, (slice(None), *place)))
-        return row
+        return self.lifted(value)[block : block + 1]
 
     def piecewise(
         self, function: Callable[[np.ndarray], np.ndarray], breaks: np.ndarray, degree: int
     ) -> Traced:
-        breaks, blocks = np.asarray(breaks, dtype=float), self.node.shape[0]
+        breaks = np.asarray(breaks, dtype=float)
         width, share = np.diff(breaks), np.linspace(0.0, 1.0, degree + 1)
         at = (breaks[:-1, None] + width[:, None] * share).ravel()
         values: np.ndarray = function(np.repeat(at, len(self)))
-        values = values.reshape(len(at), blocks, self.n)
-        values = np.moveaxis(values, [0, 1, 2], [2, 1, 0])[: self.pairs]
-        values = values.reshape(self.pairs, blocks, len(width), degree + 1)
-        np.testing.assert_allclose(values[:, :, 1:, 0], values[:, :, :-1, -1], atol=1e-9)
+        values = values.reshape(len(width), len(share), -1, self.n)[..., : self.pairs]
+        np.testing.assert_allclose(values[1:, 0], values[:-1, -1], atol=1e-9)
         solved = np.linalg.inv(np.vander(share, increasing=True))
-        powers: np.ndarray = np.einsum("lbks,ds->dlbk", values, solved)
-        powers = powers / width ** np.arange(degree + 1).reshape(-1, 1, 1, 1)
-        if (powers == powers[:, :, :1]).all():
-            powers = powers[:, :, :1]  # the same in all blocks
-        inside = apply(
-            "max",
-            apply("sub", taken(self.node, (..., None)), constant(breaks[None, :-1])),
-            scalar(0.0),
-        )
-        inside = apply("min", inside, constant(width[None]))
-        out = constant(powers[-1])
-        for power in powers[-2:0:-1]:
-            out = apply("add", apply("mul", out, inside), constant(power))
-        gained = total(apply("mul", out, inside))
-        if gained.kind == "sum" and (powers[1:] == powers[1:, :1, :1]).all():
-            pieces = Pieces.of(breaks, powers[1:, 0, 0])
-            gained = Node("pieces", (self.node, gained), gained.shape, pieces)
-        return self._of(apply("add", gained, constant(powers[0, :, :, 0])))
+        powers: np.ndarray = np.einsum("ksbp,ds->bdkp", values, solved)
+        powers = powers / width[:, None] ** np.arange(degree + 1).reshape(-1, 1, 1)
+        pieces = [_polynomials(x, breaks, some) for x, some in zip(self.elements, powers)]
+        return self.of(np.array(pieces))
 
     def played(self, model: Any) -> Traced:
-        assert self.node.shape[0] == 1
-        node = Node("network", (taken(self.node, 0),), (model.outputs,), model)
-        return self._of(taken(node, (None,)))
+        (inputs,) = self.elements
+        row = tuple(map(expressed, inputs))
+        outputs = [Expression("network", row, (model, k)) for k in range(model.outputs)]
+        return self.of(np.array([outputs]))
+
+
+def _polynomials(x: Any, breaks: np.ndarray, powers: np.ndarray) -> Expression:
+    """Return the value at x of polynomials between breaks, of powers (degree + 1, pieces, pairs)."""
+    level, rising = powers[0, 0], powers[1:]
+    if (rising == rising[..., :1]).all() and expressed(x).kind != "constant":
+        return Expression("pieces", (x,), Pieces.of(breaks, rising[..., 0])) + constant(level)
+    gained = constant(0.0)
+    for begin, width, terms in zip(breaks, np.diff(breaks), rising.swapaxes(0, 1)):
+        inside = apply("min", apply("max", apply("sub", x, begin), 0.0), width)
+        value = constant(0.0)
+        for power in terms[::-1]:
+            value = (value + constant(power)) * inside
+        gained = gained + value
+    return gained + constant(level)
 
 
 class Blocks(list[Traced]):
@@ -272,10 +267,7 @@ class Blocks(list[Traced]):
 
     def min(self, axis: int) -> Any:
         """Return the least of all parts."""
-        least = self[0]
-        for one in self[1:]:
-            least = np.minimum(least, one)
-        return least
+        return reduce(np.minimum, list[Any](self))
 
     def mean(self, axis: int) -> Any:
         """Return the mean of all parts."""
@@ -284,254 +276,95 @@ class Blocks(list[Traced]):
     def std(self, axis: int) -> Any:
         """Return the standard deviation of all parts."""
         middle = self.mean(0)
-        return np.sqrt(Blocks([(one - middle) ** 2 for one in self]).mean(0))
+        return np.sqrt(Blocks((one - middle) ** 2 for one in self).mean(0))
 
 
-# Functions of numpy
+# Functions of numbers
 
 
-def _greater(x: Node, y: Node) -> Node:
-    return apply("lt", y, x)
+def _power(base: Any, exponent: Any) -> Expression:
+    """Return a positive whole power of a symbol, or a number to the power of a symbol."""
+    if isinstance(exponent, Expression):
+        return apply("exp", exponent * math.log(base))
+    return expressed(base) ** exponent
 
 
-def _greater_equal(x: Node, y: Node) -> Node:
-    return apply("le", y, x)
+def _hypot(x: Any, y: Any) -> Expression:
+    return apply("sqrt", x * x + y * y)
 
 
-def _is_nan(x: Node) -> Node:
+def _is_nan(x: Any) -> Expression:
     return apply("not", apply("eq", x, x))
 
 
-def _is_finite(x: Node) -> Node:
-    difference = apply("sub", x, x)
-    return apply("eq", difference, scalar(0.0))
+def _is_finite(x: Any) -> Expression:
+    return apply("eq", x - x, 0.0)
 
 
-def _square(x: Node) -> Node:
-    return apply("mul", x, x)
+def _copysign(size: Any, sign: Any) -> Expression:
+    return apply("where", apply("lt", sign, 0.0), -abs(size), abs(size))
 
 
-def _hypot(x: Node, y: Node) -> Node:
-    return apply("sqrt", apply("add", _square(x), _square(y)))
-
-
-def _log10(x: Node) -> Node:
-    return apply("mul", apply("log", x), scalar(1.0 / LN_10))
-
-
-def _remainder(x: Node, y: Node) -> Node:
-    return apply("sub", x, apply("mul", y, apply("floor", apply("div", x, y))))
-
-
-def _arcsin(x: Node) -> Node:
-    one = scalar(1.0)
-    flat = apply("mul", apply("sub", one, x), apply("add", one, x))
-    return apply("atan2", x, apply("sqrt", flat))
-
-
-def _integer_power(x: Node, exponent: int) -> Node:
-    """Return x to a positive power by repeated squares."""
-    if exponent == 1:
-        return x
-    half = _square(_integer_power(x, exponent // 2))
-    return apply("mul", half, x) if exponent % 2 else half
-
-
-def _power(like: Traced, base: Any, exponent: Any) -> Node:
-    """Return a positive whole power of symbols, or a number to the power of symbols."""
-    if isinstance(exponent, Traced):
-        scaled = apply("mul", exponent.node, scalar(math.log(base)))
-        return apply("exp", scaled)
-    if exponent != round(exponent) or exponent < 1:
-        raise TypeError(
-            f"an effect may not take the power {exponent!r}, only positive integers; write the "
-            "equation with numpy.sqrt"
-        )
-    return _integer_power(like.lifted(base), int(exponent))
-
-
-def _binary(kind: str) -> Callable[..., Node]:
-    return lambda *inputs: apply(kind, *inputs)
-
-
-_UFUNCS: dict[Any, Callable[..., Node]] = {
-    np.add: _binary("add"),
-    np.subtract: _binary("sub"),
-    np.multiply: _binary("mul"),
-    np.divide: _binary("div"),
-    np.maximum: _binary("max"),
-    np.minimum: _binary("min"),
-    np.arctan2: _binary("atan2"),
-    np.negative: _binary("neg"),
-    np.absolute: _binary("abs"),
-    np.sqrt: _binary("sqrt"),
-    np.exp: _binary("exp"),
-    np.log: _binary("log"),
-    np.sin: _binary("sin"),
-    np.cos: _binary("cos"),
-    np.floor: _binary("floor"),
-    np.less: _binary("lt"),
-    np.less_equal: _binary("le"),
-    np.equal: _binary("eq"),
-    np.logical_not: _binary("not"),
-    np.invert: _binary("not"),
-    np.logical_and: _binary("and"),
-    np.bitwise_and: _binary("and"),
-    np.logical_or: _binary("or"),
-    np.bitwise_or: _binary("or"),
-    np.greater: _greater,
-    np.greater_equal: _greater_equal,
+_FUNCTIONS: dict[Any, Callable[..., Any]] = {
+    **{function: partial(apply, kind) for kind, function in ELEMENTWISE.items()},
+    np.invert: partial(apply, "not"),
+    np.bitwise_and: partial(apply, "and"),
+    np.bitwise_or: partial(apply, "or"),
+    np.greater: lambda x, y: apply("lt", y, x),
+    np.greater_equal: lambda x, y: apply("le", y, x),
     np.isnan: _is_nan,
     np.isfinite: _is_finite,
-    np.square: _square,
+    np.square: lambda x: x * x,
+    np.power: _power,
     np.hypot: _hypot,
-    np.log10: _log10,
-    np.remainder: _remainder,
-    np.arcsin: _arcsin,
+    np.log10: lambda x: apply("log", x) * (1.0 / LN_10),
+    np.remainder: lambda x, y: x - y * apply("floor", x / y),
+    np.arcsin: lambda x: apply("atan2", x, apply("sqrt", (1.0 - x) * (1.0 + x))),
 }
 
 
-def _concatenate(like: Traced, arrays: Sequence[Any], axis: int = 0) -> Node:
-    nodes = [node for node in map(like.lifted, arrays) if node.size]
-    return joined(_of_one_type(nodes), axis)
+# Functions of arrays
 
 
-def _of_one_type(nodes: list[Node]) -> list[Node]:
-    """Return the nodes, as numbers unless all are boolean."""
-    return nodes if all(one.is_bool for one in nodes) else list(map(as_number, nodes))
+def _concatenate(like: Traced, arrays: Any, axis: int = 0) -> Traced:
+    return like.of(np.concatenate([like.lifted(one) for one in arrays], axis))
 
 
-def _stack(like: Traced, arrays: Sequence[Any], axis: int) -> Node:
-    nodes = [taken(like.lifted(one), (..., None)) for one in arrays]
-    shape = np.broadcast_shapes(*(one.shape for one in nodes))
-    assert axis in (-1, len(shape) - 1)
-    return joined(_of_one_type([_broadcast(one, shape) for one in nodes]), -1)
+def _stack(like: Traced, arrays: Any, axis: int) -> Traced:
+    return like.of(np.stack(np.broadcast_arrays(*map(like.lifted, arrays)), axis))
 
 
-def _where(like: Traced, condition: Any, one: Any, other: Any) -> Node:
-    return apply("where", *map(like.lifted, (condition, one, other)))
+def _sum(like: Traced, values: Traced, axis: int) -> Traced:
+    assert axis % values.ndim  # not over the rows
+    return like.of(values.elements.sum(axis))
 
 
-def _sum(like: Traced, values: Traced, axis: int) -> Node:
-    assert axis in (-1, values.ndim - 1)
-    return total(values.node)
+def _repeat(like: Traced, values: Traced, count: int, axis: int) -> Traced:
+    return like.of(np.repeat(values.elements, count, axis))
 
 
-def _norm(like: Traced, values: Traced, axis: int) -> Node:
-    return apply("sqrt", _sum(like, values * values, axis))
-
-
-def _clip(like: Traced, values: Any, low: float, high: float) -> Node:
-    held = apply("max", like.lifted(values), scalar(low))
-    return apply("min", held, scalar(high))
-
-
-def _nan_to_num(like: Traced, values: Traced) -> Node:
-    return apply("where", _is_nan(values.node), scalar(0.0), values.node)
-
-
-def _repeat(like: Traced, values: Traced, count: int, axis: int) -> Node:
-    assert values.node.shape[axis] == 1
-    return joined([values.node] * count, axis) if count else constant(np.zeros((1, 1, 0)))
-
-
-def _einsum(like: Traced, subscripts: str, one: Any, other: Any) -> Node:
+def _einsum(like: Traced, subscripts: str, one: Any, other: Any) -> Any:
     assert subscripts == "...k,...k->..."
-    return total(apply("mul", like.lifted(one), like.lifted(other)))
+    return np.sum(like.each(partial(apply, "mul"), one, other), axis=-1)
 
 
-def _zeros_like(like: Traced, values: Traced) -> Node:
-    return constant(np.zeros((1, *values.node.shape)))
-
-
-def _ones_like(like: Traced, values: Traced) -> Node:
-    return constant(np.ones((1, *values.node.shape)))
-
-
-_FUNCTIONS: dict[Any, Callable[..., Node]] = {
+_ARRAYS: dict[Any, Callable[..., Any]] = {
     np.concatenate: _concatenate,
-    np.hstack: lambda like, arrays: _concatenate(like, arrays, 1),
+    np.hstack: partial(_concatenate, axis=1),
     np.stack: _stack,
-    np.where: _where,
+    np.where: lambda like, *inputs: like.each(_FUNCTIONS[np.where], *inputs),
     np.sum: _sum,
-    np.linalg.norm: _norm,
-    np.clip: _clip,
-    np.nan_to_num: _nan_to_num,
+    np.linalg.norm: lambda like, values, axis: np.sqrt(np.sum(values * values, axis=axis)),
+    np.clip: lambda like, values, low, high: np.minimum(np.maximum(values, low), high),
+    np.nan_to_num: lambda like, values: np.where(np.isnan(values), 0.0, values),
     np.repeat: _repeat,
     np.einsum: _einsum,
-    np.zeros_like: _zeros_like,
-    np.ones_like: _ones_like,
+    np.zeros_like: lambda like, values: like.of(np.zeros(values.elements.shape, dtype=object)),
+    np.ones_like: lambda like, values: like.of(np.ones(values.elements.shape, dtype=object)),
 }
 
 
-def _broadcast(node: Node, shape: tuple[int, ...]) -> Node:
-    index = np.arange(node.size).reshape(node.shape)
-    return pick([node], np.broadcast_to(index, shape))
-
-
-# Compiled functions: their Python source runs for one row of symbols
-
-
-class Symbol:
-    """A number in a compiled function."""
-
-    __array_ufunc__ = None  # numpy leaves operators to this class
-
-    def __init__(self, node: Node) -> None:
-        """Set the node."""
-        self.node = node
-
-    def __bool__(self) -> bool:
-        return _PATHS[-1].choose(self.node)
-
-    def __pow__(self, exponent: int) -> Symbol:
-        return Symbol(_integer_power(self.node, exponent))
-
-    def __neg__(self) -> Symbol:
-        return Symbol(apply("neg", self.node))
-
-    def __abs__(self) -> Symbol:
-        return Symbol(apply("abs", self.node))
-
-    __hash__ = None  # type: ignore[assignment]  # == is recorded
-
-
-def _node_of(value: Any) -> Node:
-    return value.node if isinstance(value, Symbol) else scalar(value)
-
-
-def _operator(operation: Callable[[Node, Node], Node], swapped: bool = False) -> Any:
-    """Return the method of Symbol for an operator; arrays take it element by element."""
-
-    def method(self: Symbol, other: Any) -> Any:
-        if isinstance(other, np.ndarray):
-            out = np.empty(other.shape, dtype=object)
-            for place in np.ndindex(*other.shape):
-                out[place] = method(self, other[place])
-            return out
-        both = self.node, _node_of(other)
-        return Symbol(operation(*(both[::-1] if swapped else both)))
-
-    return method
-
-
-for _name, _function in {
-    "add": _binary("add"),
-    "sub": _binary("sub"),
-    "mul": _binary("mul"),
-    "truediv": _binary("div"),
-}.items():
-    setattr(Symbol, f"__{_name}__", _operator(_function))
-    setattr(Symbol, f"__r{_name}__", _operator(_function, swapped=True))
-for _name, _function in {
-    "lt": _binary("lt"),
-    "le": _binary("le"),
-    "gt": _greater,
-    "ge": _greater_equal,
-    "eq": _binary("eq"),
-    "ne": lambda x, y: apply("not", apply("eq", x, y)),
-}.items():
-    setattr(Symbol, f"__{_name}__", _operator(_function))
+# Compiled functions
 
 
 class _Table:
@@ -545,89 +378,26 @@ class _Table:
 
     def __getitem__(self, key: Any) -> Any:
         first, *others = key if isinstance(key, tuple) else (key,)
-        if not isinstance(first, Symbol):
+        if not isinstance(first, Expression):
             return self._values[key]
-        found = self._values[(first.node.value.astype(int), *others)]  # (pairs, blocks, ...)
-        shape = found.shape[2:]
-        if not shape:
-            return Symbol(constant(found))
-        out = np.empty(shape, dtype=object)
-        for place in np.ndindex(*shape):
-            out[place] = Symbol(constant(found[(..., *place)]))
-        return out
-
-
-class _Paths:
-    """The way through the branches of a compiled function: the first outcomes, then True."""
-
-    def __init__(self, outcomes: list[bool]) -> None:
-        self.outcomes, self.seen = outcomes, []  # type: tuple[list[bool], list[Node]]
-
-    def choose(self, condition: Node) -> bool:
-        """Return the outcome of a condition on this way."""
-        if condition.kind == "constant" and condition.value.size == 1:
-            return bool(condition.value.all())
-        self.seen.append(condition)
-        if len(self.seen) > len(self.outcomes):
-            self.outcomes.append(True)
-        return self.outcomes[len(self.seen) - 1]
-
-
-_PATHS: list[_Paths] = []
-
-
-def _merged(run: Callable[[], list[Any]], known: Sequence[bool] = ()) -> list[Any]:
-    """Return what run() returns over all ways through its branches, joined by `where`.
-
-    known : outcomes of the first conditions
-    """
-    _PATHS.append(_Paths(list(known)))
-    try:
-        values = run()
-    finally:
-        way = _PATHS.pop()
-    for place in reversed(range(len(known), len(way.seen))):
-        others = _merged(run, [*way.outcomes[:place], False])
-        condition = way.seen[place]
-        values = [_chosen(condition, one, other) for one, other in zip(values, others)]
-    return values
-
-
-def _chosen(condition: Node, one: Any, other: Any) -> Any:
-    if one is other or (
-        isinstance(one, Symbol) and isinstance(other, Symbol) and one.node is other.node
-    ):
-        return one
-    return Symbol(apply("where", condition, _node_of(one), _node_of(other)))
-
-
-def _one_or_two(operation: Callable[..., Node], plain: Callable[..., float]) -> Callable[..., Any]:
-    """Return a function of numbers and Symbols."""
-
-    def function(*values: Any) -> Any:
-        if any(isinstance(value, Symbol) for value in values):
-            return Symbol(operation(*map(_node_of, values)))
-        return plain(*values)
-
-    return function
-
-
-def _copysign(size: Node, sign: Node) -> Node:
-    positive = apply("abs", size)
-    return apply("where", apply("lt", sign, scalar(0.0)), apply("neg", positive), positive)
+        found = self._values[(first.value.astype(int), *others)]  # (pairs, ...)
+        out = np.empty(found.shape[1:], dtype=object)
+        for place in np.ndindex(*out.shape):
+            out[place] = constant(found[(slice(None), *place)])
+        return out[()]
 
 
 _MATH = SimpleNamespace(
-    sqrt=_one_or_two(_binary("sqrt"), math.sqrt),
-    hypot=_one_or_two(_hypot, math.hypot),
-    atan2=_one_or_two(_binary("atan2"), math.atan2),
-    isfinite=_one_or_two(_is_finite, math.isfinite),
-    copysign=_one_or_two(_copysign, math.copysign),
+    sqrt=partial(apply, "sqrt"),
+    hypot=_hypot,
+    atan2=partial(apply, "atan2"),
+    isfinite=_is_finite,
+    copysign=_copysign,
 )
 _NUMPY = SimpleNamespace(
     empty=lambda shape: np.empty(shape, dtype=object),
-    maximum=_one_or_two(_binary("max"), np.maximum),
-    minimum=_one_or_two(_binary("min"), np.minimum),
+    maximum=partial(apply, "max"),
+    minimum=partial(apply, "min"),
     inf=np.inf,
     nan=np.nan,
     ndarray=np.ndarray,

@@ -24,8 +24,8 @@ from uwb_tdoa_bias.effects import EffectSet
 from . import crazyflie
 from .c_code import Printer
 from .correction import LeftOut, TracedCorrection, left_out
-from .scalars import Program
-from .tracing import nodes_of, samples_of
+from .expressions import Program
+from .tracing import expressions_of, samples_of
 
 MEMBERS = {  # of the state, by the names of inputs
     **{name: f"position[{k}]" for k, name in enumerate(("x", "y", "z"))},
@@ -95,9 +95,7 @@ SOURCE = """\
 #include <math.h>
 
 static const unsigned short ids[UWB_BIAS_ANCHORS] = {{{ids}}};
-{helpers}
-{tables}
-{function}
+{correction}
 static int is_finite(float x) {{ return x - x == 0.0f; }}
 
 static int usable(const uwb_bias_state *s) {{
@@ -177,9 +175,9 @@ def vehicle_code(
     if len(known.state_dependent):
         bias = bias + known.state_dependent.bias(samples)
         std = np.hypot(std, known.state_dependent.noise_std(samples))
-    program = Program([nodes_of(samples, bias), nodes_of(samples, std)], len(anchors))
-    printer = Printer(MEMBERS)
-    function = printer.function("correction", program)
+    outputs = [*expressions_of(samples, bias), *expressions_of(samples, std)]
+    program = Program(outputs, len(anchors))
+    printer = Printer(program, MEMBERS, len(anchors))
     inputs = tuple(name for name in MEMBERS if name in printer.inputs)
     made = {
         "version": version(),
@@ -189,9 +187,7 @@ def vehicle_code(
         "ids": ", ".join(map(str, anchors.ids.tolist())),
         "rates": int(not RATES.isdisjoint(inputs)),
         "inputs": ", ".join(MEMBERS[name] for name in inputs) or "none",
-        "helpers": printer.helpers(),
-        "tables": printer.tables(len(anchors)),
-        "function": function,
+        "correction": printer.text,
         "usable": _usable(inputs),
     }
     files = {"uwb_bias.h": HEADER.format(**made), "uwb_bias.c": SOURCE.format(**made)}
