@@ -205,7 +205,7 @@ def with_truth(
         None,
         output.as_text(found),
         None if interval is None else (interval[0], interval[1]),
-        tuple(worse_phases(before, after)),
+        tuple(worse_phases(found.before, found.written or found.after)),
     )
     return _validated(calibration, len(found.effects) > len(base))
 

@@ -688,6 +688,16 @@ def described(term: SmoothTerm, part: str = "") -> str:
     return _off(term, part, swing, None, f" where {name} is {high} than where it is {low}{seen}")
 
 
+def in_brief(term: SmoothTerm, part: str = "") -> str:
+    """Return the size of the function of a part, and on what it depends, as a clause."""
+    prefix = f"{part}." if part else ""
+    size, std = term.values.get(f"{prefix}c1", 0.0), term.std.get(f"{prefix}c1")
+    if term.shape not in SHAPES or SHAPES[term.shape][1] > 2:  # c1 is not its size
+        size = float(np.ptp(term.curve(np.linspace(term.knots[0], term.knots[-1], 60), prefix)))
+        std = None
+    return _off(term, part, size, std, f", depending on {listed(map(_named, term.arguments))}")
+
+
 def _in_words(covariate: str, values: Iterable[float]) -> list[str]:
     """Return values of a covariate with its unit, for people: whole degrees, whole centimetres."""
     unit, factor = shown_in(covariate)

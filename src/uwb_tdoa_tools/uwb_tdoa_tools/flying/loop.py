@@ -151,7 +151,7 @@ def draw(
         figure = Figure(figsize=(12, 9.5), layout="constrained")
         axes = figure.subplots(2, 2)
         for ax, one, score in zip(axes[0], residuals, scores):
-            one.draw(ax, residuals[0].limit)
+            one.draw(ax, residuals[0])
             ax.set_title(f"TDOAs {score.name}: {CM * one.size:.1f} cm off")
         ax.legend(title="pair of anchors", ncols=4, loc="lower center", handlelength=1.0)
         _path(axes[1, 0], flight, scores)

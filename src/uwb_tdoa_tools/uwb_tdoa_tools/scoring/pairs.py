@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,9 +25,10 @@ PERIOD = 1.0  # s, of one residual of a pair
 FEWEST = 3  # TDOAs of a pair in it
 CM = 100.0  # cm per metre
 LARGEST = 2  # pairs that are named
-NAMED = 8  # pairs in the legend: those with the largest residuals
+NAMED = 8  # pairs in colours: those with the largest residuals
 DRAWN = 200  # pairs in a picture at most: those with the largest residuals
-LOWEST = 0.05  # m, smallest limit of the axis of residuals
+GREY: dict[str, Any] = {"color": "0.75", "lw": 0.8, "zorder": 1}  # of the other pairs
+LOWEST = 0.2  # m, smallest limit of the axis of residuals: noise looks small
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,14 +81,15 @@ class PairResiduals:
             f"{CM * self.changing:.1f} cm changes along the path; largest for pairs {named}",
         ]
 
-    def draw(self, ax: Axes, limit: float) -> None:
-        """Draw a line for each pair; limit : m, of the axis."""
-        named, drawn = set(self.largest(NAMED)), set(self.largest(DRAWN))
-        for pair, values in self.median.items():
-            if pair in drawn:
-                ax.plot(self.t, CM * values, lw=1.8, label=pair if pair in named else None)
+    def draw(self, ax: Axes, before: PairResiduals) -> None:
+        """Draw a line for each pair; `before` sets the axis, and which pairs have colours."""
+        for number, pair in enumerate(before.largest(DRAWN)):
+            style: dict[str, Any] = (
+                {"color": f"C{number}", "lw": 1.8, "label": pair} if number < NAMED else GREY
+            )
+            ax.plot(self.t, CM * self.median.get(pair, np.full(len(self.t), np.nan)), **style)
         ax.set(xlabel="time in the air [s]", ylabel="residual [cm]")
-        ax.set_ylim(-CM * limit, CM * limit)
+        ax.set_ylim(-CM * before.limit, CM * before.limit)
         ax.grid(alpha=0.3)
 
 

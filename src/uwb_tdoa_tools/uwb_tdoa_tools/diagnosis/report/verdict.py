@@ -4,15 +4,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from uwb_tdoa_bias.effects import SmoothTerm
-from uwb_tdoa_bias.effects.base import listed, measured
-from uwb_tdoa_bias.effects.smooth_term import causes, described
+from uwb_tdoa_bias.effects.base import SIGNIFICANT, listed, measured
+from uwb_tdoa_bias.effects.smooth_term import described, in_brief
 from uwb_tdoa_ekf.monitoring.finding import Finding as NumbersFinding
 
 from ...readers.streams import protocol
@@ -35,12 +35,13 @@ WHOLE = 0.995  # share of the values from which it rounds to 100 %
 # What other flights show of a diagnosis of FEW flights, measured (docs/notebook/diagnosis.md): their
 # gain over the promised one, and how many get worse by 5 %
 FEW, OF_OTHERS, WORSE_OF_OTHERS = 2, "0.5 to 0.9", "one in ten"
-MOST = 0.5  # share of the gain from which an effect is most of it
 POINTS = 60  # at which a function is evaluated
 # smallest RMS residual of a named pair over BLOCK s: m, and relative to the RMS of all rows
 LARGE, ABOVE = (0.15, 3.0)
 FEWEST = 3  # fewest rows of such a pair
 ERROR = "The position error (3D RMSE)"
+LITTLE = "Nothing is wrong that costs 1 cm. "
+NOTHING_MORE = "Nothing more. After a change in the hall, fly and diagnose again."
 NOTHING_FOUND = "Nothing was found: what the model leaves of the measurements looks like noise."
 UNKNOWN = "Without ground truth, the position error is not known."
 
@@ -55,8 +56,8 @@ class Verdict:
     fly : what to fly next
     apply : whether to apply effects.yaml; applies : the same as bool
     details : sentences that qualify it
-    kind : "better", "unsure" (chance is possible), "same" (nothing added in the air), "nothing" (no
-        finding) or "unknown" (no ground truth)
+    kind : "better", "little" (better by less than WORTH_DOING), "unsure" (chance is possible), "same"
+        (nothing added in the air), "nothing" (no finding) or "unknown" (no ground truth)
     """
 
     headline: str
@@ -88,7 +89,7 @@ def verdict(diagnosis: Diagnosis) -> Verdict:
         headline,
         _cause_and_doubt(diagnosis, found),
         _actions(found),
-        _next_flight(diagnosis, added, applies),
+        _next_flight(diagnosis, added, kind, applies),
         apply,
         applies,
         details,
@@ -106,8 +107,10 @@ def _kind(diagnosis: Diagnosis, found: Sequence[Entry]) -> str:
     if all(entry.findings[0].on_floor for entry in found if entry.added):
         return "same"
     interval = diagnosis.after["pooled"].get("rmse_3d_gain_ci")
-    falls = interval and clear_change(before, after, interval) > 0
-    return "better" if falls else "unsure"
+    if not interval or clear_change(before, after, interval) <= 0:
+        return "unsure"
+    little = before - after < WORTH_DOING and not any(entry.matters for entry in found)
+    return "little" if little else "better"
 
 
 def _headline(diagnosis: Diagnosis, kind: str) -> str:
@@ -118,9 +121,10 @@ def _headline(diagnosis: Diagnosis, kind: str) -> str:
     change = f"from {CM * before:.1f} to {centimetres(after)}"
     if kind in ("same", "nothing"):
         return f"{ERROR} stays {centimetres(after)} {on}."
-    if kind == "better":
+    if kind in ("better", "little"):
         share = f"{100 * gain(before, after):.0f} % (95 % interval {percent(interval)})"
-        return f"{ERROR} falls {change}, by {share}, {on}."
+        begin = LITTLE if kind == "little" else ""
+        return f"{begin}{ERROR} falls {change}, by {share}, {on}."
     if interval and interval[1] < 0.0:
         return f"{ERROR} rises {change} {on}."
     return f"There is {NO_DIFFERENCE}: the position error (3D RMSE) goes {change} {on}."
@@ -131,7 +135,8 @@ def _judged(diagnosis: Diagnosis) -> str:
     fitted = [flight.name for flight in diagnosis.flights]
     names = _names(diagnosis)
     if not set(names).isdisjoint(fitted):
-        return f"{_few(names)}, each part corrected with values of the others"
+        parts = "each flight" if len(fitted) > 1 else "every other 5 s"
+        return f"{_few(names)}, {parts} corrected with values fitted to the rest"
     flights = "hold-out flights" if len(names) > 1 else "the hold-out flight"
     return f"{flights} {_few(names)}, fitted to {_few(fitted)}"
 
@@ -153,32 +158,37 @@ def _cause_and_doubt(diagnosis: Diagnosis, found: Sequence[Entry]) -> str:
     first, *others = added
     told = (side["pooled"].get("rmse_3d") for side in (diagnosis.before, diagnosis.after))
     before, after = (error or 0.0 for error in told)
-    sentence = f"{cause(first)}."
+    what = cause(first, in_brief)
     if first.worth is not None and first.worth >= LEAST_WORTH:
-        sentence = _share_of_gain(first, before - after)
+        of = f" of {CM * (before - after):.1f}" if first.worth <= before - after else ""
+        what = f"{what}, worth {CM * first.worth:.1f}{of} cm"
     more = sum((entry.worth or 0.0) >= WORTH_DOING for entry in others)
-    rest = f" Another {more} of 1 cm or more." if more else ""
-    return f"{sentence[0].upper()}{sentence[1:]} {_doubt(first)}{rest}"
+    rest = f" More causes of 1 cm or more: {more}." if more else ""
+    return f"{what[0].upper()}{what[1:]}. {_doubt(first)}{rest}"
 
 
 def _doubt(entry: Entry) -> str:
     """Return how sure the cause of an Entry is."""
-    effect = entry.findings[0].effect
-    if not entry.findings[0].declared:
-        return f"Not sure why.{_causes(entry)}"
-    if entry.undecided:
+    first = entry.findings[0]
+    if first.declared and entry.undecided:
         others = [other.effect for other in entry.undecided[:NAMED]]
         return f"Not sure: {listed(others, 'or')} explains these flights as well."
-    if not entry.findings[0].candidates and not entry.alternatives:
+    if first.declared and not first.candidates and not entry.alternatives:
         return "It was not compared with other causes."
-    if not effect.significant_sizes():
-        return "Not sure: no value is twice its standard deviation."
     deviations = max(
-        abs(value) / (effect.std.get(key) or np.inf)
-        for key, value in effect.significant_sizes().items()
+        (
+            abs(value) / (one.effect.std.get(key) or np.inf)
+            for one in entry.findings
+            for key, value in one.effect.significant_sizes().items()
+        ),
+        default=None,
     )
-    by = f"{deviations:.0f} standard deviations, and " if deviations else ""
-    return f"Sure: {by}no other effect explains these flights as well."
+    if deviations is None:
+        return "Not sure: no value is twice its standard deviation."
+    by = f" ({deviations:.0f} standard deviations)" if deviations else ""
+    if not first.declared:
+        return f"Sure that it is there{by}, not why."
+    return f"Sure{by}: no other effect explains these flights as well."
 
 
 def _actions(found: Sequence[Entry]) -> tuple[str, ...]:
@@ -191,7 +201,7 @@ def _actions(found: Sequence[Entry]) -> tuple[str, ...]:
     return tuple(out)
 
 
-def _next_flight(diagnosis: Diagnosis, added: Sequence[Entry], applies: bool) -> str:
+def _next_flight(diagnosis: Diagnosis, added: Sequence[Entry], kind: str, applies: bool) -> str:
     """Return what to fly next, as a sentence."""
     if diagnosis.next_flight:
         return diagnosis.next_flight.sentences[0]
@@ -202,6 +212,8 @@ def _next_flight(diagnosis: Diagnosis, added: Sequence[Entry], applies: bool) ->
             f"Fly again in {listed(alone, 'or')}, and diagnose all flights together: a flight in "
             "each mode cannot confirm what the other shows."
         )
+    if kind == "little":
+        return NOTHING_MORE
     for entry in added:
         for rival in entry.undecided[:1]:
             fly = f"{rival.tell_apart[0].upper()}{rival.tell_apart[1:]}"
@@ -211,8 +223,8 @@ def _next_flight(diagnosis: Diagnosis, added: Sequence[Entry], applies: bool) ->
             "Fly once more, and diagnose both flights together: flights differ in what they show."
         )
     if not set(_names(diagnosis)).isdisjoint(flight.name for flight in diagnosis.flights):
-        return "Fly once more for --holdout: that flight judges a correction not chosen on it."
-    return "Nothing more. After a change in the hall, fly and diagnose again."
+        return "Fly once more, and give that flight with --holdout: it took no part in the choice."
+    return NOTHING_MORE
 
 
 def _application(diagnosis: Diagnosis, kind: str, added: Sequence[Entry]) -> tuple[bool, str]:
@@ -221,23 +233,17 @@ def _application(diagnosis: Diagnosis, kind: str, added: Sequence[Entry]) -> tup
         return False, "Do not apply effects.yaml: it corrects nothing that was not given."
     if kind == "unknown":
         return True, "Apply effects.yaml: innovations fall. The position error is not known."
-    if kind == "better":
-        worse = "; ".join(worse_phases(diagnosis.before["pooled"], diagnosis.after["pooled"]))
-        return True, f"Apply effects.yaml{f'. It makes worse: {worse}' if worse else ''}."
+    if kind in ("better", "little"):
+        worse = "; ".join(worse_phases(diagnosis.before, diagnosis.after))
+        or_not = ", or leave it" if kind == "little" else ""
+        return True, f"Apply effects.yaml{or_not}{f'. It makes worse: {worse}' if worse else ''}."
     if kind == "unsure":
         return False, "Do not apply effects.yaml: these flights do not show that it helps."
-    changes, words = [], []
-    for name in NEAR_THE_FLOOR:
-        errors = [
-            side["pooled"].get("phases", {}).get(name, {}).get("rmse_3d")
-            for side in (diagnosis.before, diagnosis.after)
-        ]
-        if None not in errors and (change := clear_change(*errors)):
-            changes.append(change)
-            words.append(f"{TITLES[name]} {CM * errors[0]:.1f} to {centimetres(errors[1])}")
-    figures = f" ({'; '.join(words)})" if words else ""
+    changes = _changes_of_phases(diagnosis.before, diagnosis.after)
+    near = [changes[name] for name in NEAR_THE_FLOOR if name in changes]
+    figures = f" ({'; '.join(words for _, words in near)})" if near else ""
     floor = f"it affects the floor only{figures}"
-    if min(changes, default=0) > 0:
+    if near and min(change for change, _ in near) > 0:
         return True, f"Apply effects.yaml to ekf_node: {floor}."
     return False, f"Do not apply effects.yaml: {floor}, and the error there does not fall."
 
@@ -338,7 +344,7 @@ def _with_noise(diagnosis: Diagnosis) -> list[str]:
         refused = (item for item in diagnosis.refused if item.what.startswith("tdoa_std"))
         return [f"{item.what} is not written to ekf_node.yaml: {item.why}." for item in refused]
     after = diagnosis.written["pooled"]
-    worse = "; ".join(worse_phases(diagnosis.after["pooled"], after))
+    worse = "; ".join(worse_phases(diagnosis.after, diagnosis.written))
     also = f"; worse: {worse}" if worse else ""
     return [
         f"With tdoa_std {diagnosis.tdoa_std:.3f} m of ekf_node.yaml too it is "
@@ -349,22 +355,38 @@ def _with_noise(diagnosis: Diagnosis) -> list[str]:
 def worse_phases(before: dict[str, Any], after: dict[str, Any]) -> list[str]:
     """Return one clause per phase in which the error grows.
 
-    before, after : pooled figures of a side of `compare`
+    before, after : sides of `compare`
     """
-    out = []
-    sides = before.get("phases", {}), after.get("phases", {})
-    for name in (name for name in TITLES if name in sides[0] and name in sides[1]):
-        first, second = (side[name] for side in sides)
-        known = first["rmse_3d"] is not None and second["rmse_3d"] is not None
-        if known and clear_change(first["rmse_3d"], second["rmse_3d"]) < 0:  # it rises
-            out.append(f"{TITLES[name]} from {_of_phase(first)} to {_of_phase(second)}")
-    return out
+    return [words for change, words in _changes_of_phases(before, after).values() if change < 0]
+
+
+def _changes_of_phases(
+    before: dict[str, Any], after: dict[str, Any]
+) -> dict[str, tuple[float, str]]:
+    """Return {phase: (m by which its error falls, the same in words)} of clear changes.
+
+    A change is clear from WORTH_DOING and from SIGNIFICANT standard deviations of its mean over
+    runs on. A run is one sample, because the error at rest hardly changes within it.
+
+    before, after : sides of `compare`
+    """
+    found: dict[str, tuple[float, str]] = {}
+    for name, title in TITLES.items():
+        changes, words = [], []
+        for rows in zip(*([side["pooled"], *side["runs"]] for side in (before, after))):
+            figures = [row.get("phases", {}).get(name, {}) for row in rows]
+            if None not in (errors := [each.get("rmse_3d") for each in figures]):
+                changes.append(errors[0] - errors[1])
+                words.append(f"{title} from {' to '.join(map(_of_phase, figures))}")
+        change, *of_runs = changes or [0.0]
+        std = np.std(of_runs, ddof=1) / np.sqrt(len(of_runs)) if len(of_runs) > 1 else 0.0
+        if abs(change) > max(WORTH_DOING, SIGNIFICANT * std):
+            found[name] = change, words[0]
+    return found
 
 
 def _of_phase(figures: dict[str, Any]) -> str:
     """Return the 3D RMSE and the NEES of a phase, as text."""
-    if figures["rmse_3d"] is None:
-        return "unknown"
     nees = "" if figures["nees_mean"] is None else f" (NEES {figures['nees_mean']:.1f})"
     return f"{centimetres(figures['rmse_3d'])}{nees}"
 
@@ -426,26 +448,13 @@ def _diverged(diagnosis: Diagnosis) -> list[str]:
     return [f"Of {len(diagnosis.before['runs'])} runs, {before} diverged before and {after} after."]
 
 
-def _causes(entry: Entry) -> str:
-    """Return the most likely causes of a function without a name, after a space; "" for others."""
-    if entry.findings[0].declared:
-        return ""
-    others = [other.effect for other in entry.undecided[:1]]
-    return f" Likely causes: {listed([causes(_largest(entry)[0])[0], *others], 'or')}."
+def cause(entry: Entry, describe: Callable[[SmoothTerm, str], str] = described) -> str:
+    """Return what is wrong, as a clause; for a fitted function its largest part.
 
-
-def _share_of_gain(entry: Entry, gained: float) -> str:
-    """Return the cause of an Entry with its worth, as a sentence; gained : m, by all effects."""
-    worth = entry.worth or 0.0
-    begin = "Mostly" if worth >= MOST * gained > 0.0 else "In part"
-    of = f" of {CM * gained:.1f}" if worth <= gained else ""
-    return f"{begin} {cause(entry)}, worth {CM * worth:.1f}{of} cm."
-
-
-def cause(entry: Entry) -> str:
-    """Return what is wrong, as a clause; for a fitted function its largest part."""
+    describe : `described` or `in_brief`
+    """
     if not entry.findings[0].declared:
-        said = described(*_largest(entry))
+        said = describe(*_largest(entry))
         terms = _functions(entry)
         if sum(len(prefixes_of(term)) for term in terms) == 1:
             return said
