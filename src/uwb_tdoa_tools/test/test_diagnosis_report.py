@@ -483,7 +483,7 @@ def test_what_is_on_the_floor_alone_is_not_judged_by_the_air(result):
             side["pooled"]["phases"] = {"first_3_s": {"rmse_3d": error, "nees_mean": 3.0}}
         found = verdict(changed)
         assert found.applies == applies and floor_only in found.apply
-        assert f"(first 3 s 28.8 to {100 * first:.1f} cm)" in found.apply
+        assert f"(first 3 s from 28.8 cm (NEES 3.0) to {100 * first:.1f} cm" in found.apply
     (entry,) = entries(changed)
     assert worth_in_words(entry) == "not told by errors in the air" and entry.values.startswith(
         "2.delay = 2.8 ± 0.1, "
