@@ -1,6 +1,7 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
 
+from collections import Counter
 from pathlib import Path
 import time
 
@@ -13,11 +14,15 @@ pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
+from rclpy.impl.rcutils_logger import RcutilsLogger  # noqa: E402
 
 from uwb_tdoa_bias.bias_node import MEASURED, BiasNode  # noqa: E402
 from uwb_tdoa_bias.common.anchors import Anchors  # noqa: E402
+from uwb_tdoa_bias.correction.corrector import Corrector  # noqa: E402
+from uwb_tdoa_bias.correction.model import NETWORK, Model  # noqa: E402
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet  # noqa: E402
 from uwb_tdoa_bias.ros.cdr import CdrCodec  # noqa: E402
+from uwb_tdoa_bias.ros.parameters import BURST  # noqa: E402
 from uwb_tdoa_msgs.msg import Tdoa  # noqa: E402
 
 CONFIG = Path(__file__).resolve().parents[1] / "config" / "bias_node.yaml"
@@ -40,11 +45,11 @@ def test_every_parameter_is_in_the_parameter_file_with_its_default(node):
 def test_an_ekf_node_that_runs_is_not_to_be_started(node, monkeypatch):
     monkeypatch.setattr(BiasNode, "_idle", False)
     node._anchors.anchors = Anchors.from_positions(np.eye(3))
-    text = node._health(1.0, 0)[1]
+    text = node._health(1.0, Counter())[1]
     assert text.startswith("no poses on odometry yet") and text.endswith("start ekf_node")
     odometry = node.create_publisher(Odometry, "odometry", 10)
     until = time.monotonic() + 60.0
-    while not odometry.get_subscription_count() or "runs" not in node._health(1.0, 0)[1]:
+    while not odometry.get_subscription_count() or "runs" not in node._health(1.0, Counter())[1]:
         assert time.monotonic() < until
         time.sleep(0.01)
 
@@ -93,8 +98,63 @@ def test_an_effect_that_needs_orientations_of_anchors_is_named_where_there_are_n
     node._effects = EffectSet((EFFECTS["antenna_pattern"]({"anchor": 0.1}),))
     node._body_antenna.name_of_status = dict.fromkeys(range(4), "antenna_pattern")
     node._poses.take_all([0.0])
-    level, text = node._health(1.0, 0)
+    level, text = node._health(1.0, Counter())
     assert level == DiagnosticStatus.WARN
     assert text.startswith("antenna_pattern needs orientations of anchors, and the survey has none")
     node._effects = EffectSet()
-    assert node._health(1.0, 0) == (DiagnosticStatus.OK, "correcting with antenna_pattern")
+    assert node._health(1.0, Counter()) == (DiagnosticStatus.OK, "correcting with antenna_pattern")
+
+
+def test_with_an_antenna_of_tf_static_alone_tdoas_wait_for_their_pose(node):
+    node._frames.frames.set("base_link", "mast", (0.0, 0.0, 0.0, 1.0), (0.3, 0.0, 0.0))
+    node._anchors.anchors = Anchors.from_positions([[-9.0, 0.0, 0.0], [9.0, 0.0, 0.0]])
+    node._on_anchors(node._anchors.anchors)
+    codec = CdrCodec(Tdoa, *MEASURED)
+    for stamp in (0.0, 1.0):
+        node._known_poses.add(stamp, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), 0.0)
+        node._poses.take_all([stamp])
+    for k in (110, 115):  # the pose of the second is not there yet
+        rows = codec.template(Tdoa(anchor_a=0, anchor_b=1)).rows(1)
+        rows["sec"], rows["nanosec"] = 1, 10_000_000 * (k - 100)
+        node._on_tdoa("mast", np.array([0.01 * k]), rows, np.zeros(1))
+    node._release()
+    assert node.holds == 2 and not node._counts["published"]
+
+
+@pytest.mark.parametrize("number", [np.nan, 1e9])
+def test_a_model_that_gives_no_possible_bias_corrects_nothing_and_is_named(node, number):
+    class Broken(Model):
+        name = "broken"
+
+        def __init__(self):
+            self.meta = {}
+
+        def added(self, samples, known):
+            status = np.full(len(samples), float(NETWORK))
+            return known._replace(bias=np.full(len(samples), number), status=status)
+
+    anchors = Anchors.from_positions([[-9.0, 0.0, 0.0], [9.0, 0.0, 0.0]])
+    effects = EffectSet((EFFECTS["anchor_delay"]({"0": 0.5}),))
+    known, broken = (
+        Corrector(anchors, effects, model).correct(*map(np.array, ([1.0], [0], [1], [3.0])))
+        for model in (None, Broken())
+    )
+    for one, other in zip(vars(known).values(), vars(broken).values()):
+        np.testing.assert_array_equal(one, other)
+    node._model = Broken()
+    node._body_antenna.name_of_status = dict.fromkeys(range(4), "broken")
+    node._anchors.anchors = anchors
+    node._poses.take_all([0.0])
+    sound = Counter(published=9, network=9)
+    assert node._health(1.0, sound)[0] == DiagnosticStatus.OK
+    level, text = node._health(1.0, Counter(published=9, effects=9))
+    assert level == DiagnosticStatus.WARN and text.startswith("model_file gives no possible bias")
+
+
+def test_many_warnings_of_one_kind_do_not_hide_another(node, monkeypatch):
+    lines = []
+    monkeypatch.setattr(RcutilsLogger, "warning", lambda self, text: lines.append(text))
+    for k in range(3 * BURST):
+        node.warn_at_times(f"antenna {k}", "foreign")
+    node.warn_at_times("frame of odometry", "another")
+    assert lines.count("foreign") == BURST and "another" in lines

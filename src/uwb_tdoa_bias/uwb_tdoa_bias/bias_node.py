@@ -385,12 +385,14 @@ class BiasNode(StreamNode):
 
     def _release(self) -> None:
         """Publish all TDOAs that need not wait longer."""
-        corrector = self._body_antenna.corrector
-        if corrector is None:
+        correctors = [one.corrector for one in self._all_antennas if one.corrector is not None]
+        if not correctors:
             self._counts["dropped"] += self._hold.shorten(EARLY)
             return
+        # all have the same poses; one whose effects need none is always ready
+        waiting = next((one for one in correctors if one.uses_pose), correctors[0])
         has_poses = self._poses.newest > -math.inf
-        released = self._hold.take(lambda preceding: not has_poses or corrector.ready(preceding))
+        released = self._hold.take(lambda preceding: not has_poses or waiting.ready(preceding))
         for _, of_frame in groupby(released, lambda one: one[1][FRAME]):
             self._correct_and_publish(*zip(*of_frame))
 
@@ -482,12 +484,13 @@ class BiasNode(StreamNode):
                 f"unreadable on {end.topic}": end.count for end in (*self.streams.refusals, *others)
             },
         }
-        level, text = self._health(rate, new["unready"])
+        level, text = self._health(rate, new)
         if level != DiagnosticStatus.ERROR and any(wiring):
             level, text = DiagnosticStatus.WARN, next(filter(None, wiring))
         return level, text, values
 
-    def _health(self, rate: float, unready: int) -> tuple[bytes, str]:
+    def _health(self, rate: float, new: Counter[str]) -> tuple[bytes, str]:
+        """Return (level, text); rate : Hz, of TDOAs; new : counts since the last report."""
         for antenna in self._antennas.values():
             heard, antenna.heard = antenna.heard, 0
             if antenna.trouble and heard:
@@ -519,10 +522,17 @@ class BiasNode(StreamNode):
                 DiagnosticStatus.WARN,
                 f"no poses on odometry yet: what needs one is not corrected; {remedy}",
             )
-        if unready:
+        if new["unready"]:
             return (
                 DiagnosticStatus.WARN,
                 "odometry is late: TDOAs leave before their pose; check the load of ekf_node",
+            )
+        model, judged = self._model, new["published"] - new["invalid"]
+        if model and judged > 0 and not any(new[STATUS[one]] for one in model.statuses):
+            return (
+                DiagnosticStatus.WARN,
+                "model_file gives no possible bias for any TDOA, and none is corrected by it: train "
+                "or export it again",
             )
         for remark in orientation_remarks(self._anchors.anchors, self._effects, self._model):
             return DiagnosticStatus.WARN, remark

@@ -213,7 +213,7 @@ class Corrector:
         bias, std, slope, state = self.contribution(samples)
         status = np.full(len(samples), float(EFFECTS if len(self.effects) else PASSED))
         known = Prediction(bias, std, status, slope, state)
-        return known if self.model is None else self.model.added(samples, known)
+        return known if self.model is None else self.model.possibly_added(samples, known)
 
     def contribution(
         self, samples: Samples

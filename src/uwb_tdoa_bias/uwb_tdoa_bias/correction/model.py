@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 PASSED, EFFECTS, NETWORK, FADED = range(4)
 # Share of the possible knowledge; a prediction with less counts as faded.
 FADED_BELOW = 0.5
+# m. A file that adds more is broken: the largest measured bias is 4 m.
+LARGEST_ADDED = 100.0
 
 
 class Prediction(NamedTuple):
@@ -91,9 +93,23 @@ class Model:
         """Read the metadata; raise an exception if they are unsuitable."""
         raise NotImplementedError
 
+    @property
+    def statuses(self) -> tuple[int, ...]:
+        """Return the statuses of TDOAs that it corrects."""
+        return (EFFECTS,) if self.name == self.of_effects else (NETWORK, FADED)
+
     def added(self, samples: Samples, known: Prediction) -> Prediction:
         """Return a Prediction of Samples with that of the model added."""
         raise NotImplementedError
+
+    def possibly_added(self, samples: Samples, known: Prediction) -> Prediction:
+        """Return the same; impossible or infinite biases are left out."""
+        out = self.added(samples, known)
+        possible = np.abs(out.bias - known.bias) <= LARGEST_ADDED
+        if possible.all():
+            return out
+        pairs = zip(out, known)
+        return Prediction(*(np.where(possible, one.T, other.T).T for one, other in pairs))
 
     def trouble(self, anchors: Anchors) -> str | None:
         """Return a predicate of the file if it was not made for some Anchors, or None."""

@@ -133,12 +133,14 @@ class ParameterNode(Node):
     def warn_at_times(self, kind: str, text: str) -> None:
         """Log a warning, unless one of its kind was logged less than SAY_AGAIN s ago.
 
+        The first word of the kind has a limit of its own in the Log.
+
         The throttle of rclpy takes 0.5 ms per call, more than most messages take.
         """
         now = time.monotonic()
         if now >= self._warned.get(kind, now):
             self._warned[kind] = now + SAY_AGAIN
-            self.get_logger().warning(text)
+            self.get_logger().warning(text, kind.split()[0])
 
     @property
     def frozen(self) -> bool:
@@ -332,25 +334,25 @@ BURST, REFILL = (200, 10.0)
 
 
 class Log:
-    """A logger of rclpy with printable lines of bounded length, and a limit per statement.
+    """A logger of rclpy with printable lines of bounded length, and a limit per statement and kind.
 
-    Each statement of the program writes BURST lines at once, then one per REFILL seconds. A peer that
-    triggers one statement often cannot hide the others.
+    Each statement of the program writes BURST lines of a kind at once, then one per REFILL seconds. A
+    peer that triggers one statement often cannot hide the others.
     """
 
     def __init__(self, logger: RcutilsLogger) -> None:
         self._logger = logger
-        # {statement: (lines left, s of the last line, lines left out since)}
-        self._left: dict[tuple[CodeType, int], tuple[float, float, int]] = {}
+        # {(statement, kind): (lines left, s of the last line, lines left out since)}
+        self._left: dict[tuple[CodeType, int, str], tuple[float, float, int]] = {}
 
     def info(self, text: str) -> None:
         """Log as rclpy does; each severity needs its own line of code there."""
         if line := self._line(text):
             self._logger.info(line)
 
-    def warning(self, text: str) -> None:
+    def warning(self, text: str, kind: str = "") -> None:
         """Log as rclpy does."""
-        if line := self._line(text):
+        if line := self._line(text, kind):
             self._logger.warning(line)
 
     def error(self, text: str) -> None:
@@ -361,10 +363,10 @@ class Log:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._logger, name)
 
-    def _line(self, text: str) -> str | None:
+    def _line(self, text: str, kind: str = "") -> str | None:
         """Return the line to write for a text, or None."""
         frame, now = sys._getframe(2), time.monotonic()
-        key = frame.f_code, frame.f_lineno
+        key = frame.f_code, frame.f_lineno, kind
         left, when, hidden = self._left.get(key, (BURST, now, 0))
         left = min(BURST, left + (now - when) / REFILL)
         self._left[key] = (left, now, hidden + 1) if left < 1.0 else (left - 1.0, now, 0)
