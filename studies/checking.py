@@ -11,12 +11,13 @@ from pathlib import Path
 from mistakes import MISTAKES, arriving
 import numpy as np
 
+from uwb_tdoa_bias.common.survey import read_survey
 from uwb_tdoa_ekf.monitoring.finding import ERROR
 from uwb_tdoa_tools import choices, cli
 from uwb_tdoa_tools.checking.check import check
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.checking.tdoa_rules import largest_displacement
-from uwb_tdoa_tools.readers import inputs, read_survey
+from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.readers.streams import protocol
 
 from . import table

@@ -30,6 +30,7 @@ from uwb_tdoa_bias.common.files import write_bytes
 from uwb_tdoa_bias.common.flight import Flight, Tdoas
 from uwb_tdoa_bias.common.flyable import FlyableVolume
 from uwb_tdoa_bias.common.safe_yaml import parse_yaml
+from uwb_tdoa_bias.common.survey import NamedAnchors, read_named_anchors
 from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf import launching
@@ -43,11 +44,9 @@ from uwb_tdoa_tools.planning.layout import AnchorPlaces
 from uwb_tdoa_tools.readers import (
     load_profile,
     read_by_profile,
-    read_survey,
     read_usd_log,
     read_util_csv,
 )
-from uwb_tdoa_tools.readers.names import NamedAnchors
 from uwb_tdoa_tools.readers.profile import Profile, parse_columns
 from uwb_tdoa_tools.readers.suggest import suggest
 from uwb_tdoa_tools.simulation.rooms import Walls
@@ -83,7 +82,7 @@ TARGETS = {  # {kind: reads a file}
     "antenna": lambda path: antenna_from_yaml(path).gain(np.eye(3)),
     "places": AnchorPlaces.from_yaml,
     "walls": lambda path: Walls.from_yaml(path).between(np.zeros((1, 3)), np.ones((1, 3))),
-    "survey": read_survey,
+    "survey": read_named_anchors,
     "log": lambda path: read_usd_log(path, ANCHORS),
     "log_salvaged": lambda path: read_usd_log(path, ANCHORS, salvage=True),
     "csv": lambda path: read_util_csv(path, ANCHORS),

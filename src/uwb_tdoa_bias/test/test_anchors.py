@@ -11,7 +11,8 @@ import pytest
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.survey import read_survey, refuse_faulty, survey_fault
+from uwb_tdoa_bias.common.survey import read_survey
+from uwb_tdoa_bias.common.survey_faults import refuse_faulty, survey_fault
 
 # --- anchors ---
 
@@ -284,9 +285,9 @@ REFUSED = {
         "m: !!opencv-matrix\n  rows: 3\n  cols: 2\n  data: [1, 2, 3, 4, 5, 6]\n",
         "m: a matrix of 3 x 2 is recognized",
     ),
-    "not a number": ("id x y z\n0 1 two 3\n", "line 2: '0,1,two,3' is not"),
+    "not a number": ("id x y z\n0 1 two 3\n", r"line 2: \['1', 'two', '3'\] is not 3 numbers"),
     "nothing": ("scale: 3\n", "scale: 3 is no position"),
-    "a name": ("id,x,y,z\nNE,1,2,3\n", "line 2: id is 'NE'"),
+    "a name": ("id,x,y,z\nNE,1,2,3\n", "id is 'NE'"),
     "twice": ("- [0, 1, 2, 3]\n- [0, 4, 5, 6]\n", "id 0 is given twice"),
     "an orientation of three": (
         "0: {position: [1, 2, 3], orientation: [0, 0, 1]}\n",

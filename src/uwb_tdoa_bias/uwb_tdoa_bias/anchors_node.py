@@ -21,7 +21,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from uwb_tdoa_msgs.msg import AnchorArray
 
 from .common.errors import InputError
-from .common.survey import read_survey, refuse_faulty
+from .common.survey import read_survey
 from .ros.anchors import ANCHORS_FILE, ANCHORS_QOS, anchors_to_message
 from .ros.frames import TF_STATIC_QOS
 from .ros.node import StreamNode, run
@@ -60,7 +60,7 @@ class AnchorsNode(StreamNode):
             raise InputError(
                 "anchors_file: is empty; give a survey of the anchors, e.g. anchors.yaml."
             )
-        anchors = refuse_faulty(read_survey(own["anchors_file"]), own["anchors_file"])
+        anchors = read_survey(own["anchors_file"])
         message = anchors_to_message(anchors)
         for topic, qos, content in (
             ("uwb/anchors", ANCHORS_QOS, message),

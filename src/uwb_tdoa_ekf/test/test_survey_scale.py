@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.common.geometry import tdoa
-from uwb_tdoa_bias.common.survey import UNITS
+from uwb_tdoa_bias.common.survey_faults import UNITS
 from uwb_tdoa_ekf.core import workspace
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.ground import KnownHeight

@@ -53,15 +53,27 @@ def test_lists_names_and_data_frames_are_read():
             {"tdoa": TDOA | {"tdoa": T[1:]}},
             "tdoa: the columns have different lengths (time 400, anchor_a 400, anchor_b 400, tdoa 399",
         ),
-        ({"tdoa": TDOA | {"tdoa": ["x"] * 400}}, "tdoa: tdoa holds values that are no numbers"),
-        ({"tdoa": TDOA | {"anchor_a": ["B0"] * 400}}, "anchor_a holds 'B0', which is no anchor"),
+        (
+            {"tdoa": TDOA | {"tdoa": ["x"] * 400}},
+            "tdoa: row 1: tdoa is 'x'; it must be a finite number",
+        ),
+        (
+            {"tdoa": TDOA | {"anchor_a": ["B0"] * 400}},
+            "tdoa: row 1: anchor_a is 'B0'; it must be an anchor of the survey",
+        ),
         ({"tdoa": TDOA | {"dist": T}}, "tdoa: 'dist=dist' is not OURS"),
         ({"tdoa": {"time": T, "tdoa": T}}, "tdoa: anchor_a is missing"),
-        ({"tdoa": {key: TDOA[key] for key in [*TDOA][1:]}}, "tdoa: has no column time"),
+        (
+            {"tdoa": {key: TDOA[key] for key in [*TDOA][1:]}},
+            "tdoa: names no column with the time; write time: COLUMN",
+        ),
         ({"tdoa": T}, "tdoa: has no columns"),
         ({"tdoa": TDOA, "imu": IMU | {"gyro": T}}, "imu: gyro has the shape (400,)"),
         ({"tdoa": TDOA, "units": {"tdoa": "mile"}}, "'mile' is no unit of tdoa"),
-        ({"imu": IMU}, "holds no TDOA measurement"),
+        (
+            {"imu": IMU},
+            "has nothing that the profile arrays takes TDOAs or ranges from; it has imu",
+        ),
     ],
 )
 def test_what_cannot_be_a_flight_is_one_sentence(tables, said):

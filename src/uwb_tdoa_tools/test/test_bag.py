@@ -19,11 +19,11 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
 from uwb_tdoa_bias.common.sensors import SENSORS, Height, Pressure, Velocity
-from uwb_tdoa_bias.common.survey import survey_fault
+from uwb_tdoa_bias.common.survey_faults import survey_fault
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag
 from uwb_tdoa_tools.bags.files import new_bag, open_bag
 from uwb_tdoa_tools.bags.message_types import typestore
-from uwb_tdoa_tools.bags.messages import of_sensor, sensor_messages, tdoa_messages
+from uwb_tdoa_tools.bags.topics import STREAMS, of_sensor
 from uwb_tdoa_tools.checking.recording import read_recording
 from uwb_tdoa_tools.readers.inputs import Reading
 from uwb_tdoa_tools.readers.streams import LARGEST_NUMBER
@@ -50,9 +50,9 @@ def test_a_sensor_may_have_a_quaternion_in_its_messages():
         fields={"orientation": 4, "orientation_covariance": 9, "angular_velocity": 3},
         content=lambda _: {"orientation": q, "orientation_covariance": np.full((3, 9), 0.5)},
     )
-    stream, (row, _, _) = Pressure(np.arange(3.0), np.zeros(3)), of_sensor(compass)
-    for k, (stamp, message) in enumerate(sensor_messages(compass, stream, typestore())):
-        assert row(message) == (stamp, *q[k], *[0.5] * 9, 0.0, 0.0, 0.0)
+    stream, kind = Pressure(np.arange(3.0), np.zeros(3)), of_sensor(compass)
+    for k, (stamp, message) in enumerate(kind.messages(stream, "base_link", typestore())):
+        assert kind.row(message) == (stamp, *q[k], *[0.5] * 9, 0.0, 0.0, 0.0)
 
 
 @BOTH
@@ -224,7 +224,7 @@ def test_failure_half_way_leaves_nothing(tmp_path):
     flight = small_flight(0.1)
     t = flight.truth.t.copy()
     t[-1] = np.nan  # detected when the last stream is serialized
-    with pytest.raises(InputError, match="truth: stamp 24 is nan"):
+    with pytest.raises(InputError, match="ground_truth/pose: stamp 24 is nan"):
         write_bag(
             dataclasses.replace(flight, truth=Truth(t, flight.truth.p, flight.truth.q)),
             tmp_path / "flight",
@@ -261,7 +261,7 @@ def write_topics(path, *topics):
 def test_namespace_other_topics_and_order_of_stamps(tmp_path):
     store = typestore()
     tdoa = small_flight(0.05).tdoa
-    late = list(tdoa_messages(tdoa, store))
+    late = list(STREAMS["tdoa"].messages(tdoa, "base_link", store))
     # two messages arrive in the wrong order
     late[3], late[4] = ((late[3][0], late[4][1]), (late[4][0], late[3][1]))
     text = store.types["std_msgs/msg/String"]("hello")
@@ -387,9 +387,8 @@ def test_anchors_of_no_use_are_told_with_the_bag(tmp_path):
     store = typestore()
     with new_bag(tmp_path / "bad") as writer:
         tdoa = writer.add_connection("/uwb/tdoa", "uwb_tdoa_msgs/msg/Tdoa", typestore=store)
-        ((stamp, message),) = tdoa_messages(
-            Tdoas(np.ones(1), np.zeros(1, int), np.ones(1, int), np.ones(1)), store
-        )
+        one = Tdoas(np.ones(1), np.zeros(1, int), np.ones(1, int), np.ones(1))
+        ((stamp, message),) = STREAMS["tdoa"].messages(one, "base_link", store)
         writer.write(tdoa, stamp, store.serialize_cdr(message, tdoa.msgtype))
         anchors = writer.add_connection(
             "/uwb/anchors", "uwb_tdoa_msgs/msg/AnchorArray", typestore=store

@@ -25,7 +25,7 @@ from uwb_tdoa_tools.bags import MCAP, repair
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag
 from uwb_tdoa_tools.bags.files import PLUGINS, open_bag
 from uwb_tdoa_tools.bags.message_types import typestore
-from uwb_tdoa_tools.bags.messages import _blank
+from uwb_tdoa_tools.bags.messages import messages_of
 from uwb_tdoa_tools.checking.recording import read_recording
 from uwb_tdoa_tools.estimate import with_antenna
 from uwb_tdoa_tools.readers.inputs import Reading
@@ -220,7 +220,8 @@ def test_a_message_that_is_too_long_to_be_one_of_ours(tmp_path, monkeypatch):
 
 def test_recorded_odometry_says_what_is_missing(tmp_path):
     store, kind = typestore(), "nav_msgs/msg/Odometry"
-    data = store.serialize_cdr(_blank(store, kind), kind)
+    ((_, message),) = messages_of("odometry", kind, np.zeros(1), {}, "", store)
+    data = store.serialize_cdr(message, kind)
     with Writer(tmp_path / "bag", version=9) as writer:
         connection = writer.add_connection("/odometry", kind, typestore=store)
         for stamp, content in enumerate((data, data[:30], data), start=1):

@@ -22,7 +22,8 @@ from uwb_tdoa_tools.bags import bag
 from uwb_tdoa_tools.bags.bag import read_bag
 from uwb_tdoa_tools.bags.files import new_bag, open_bag
 from uwb_tdoa_tools.bags.message_types import typestore
-from uwb_tdoa_tools.bags.messages import header_of, pose_of, tdoa_messages, transforms_message
+from uwb_tdoa_tools.bags.messages import header_of, pose_of, transforms_message
+from uwb_tdoa_tools.bags.topics import STREAMS
 from uwb_tdoa_tools.checking import recording_rules
 from uwb_tdoa_tools.checking.check import processed_streams
 from uwb_tdoa_tools.checking.recording import read_recording
@@ -215,7 +216,7 @@ def tdoas():
     return (
         "/uwb/tdoa",
         "uwb_tdoa_msgs/msg/Tdoa",
-        list(tdoa_messages(small_flight(0.05).tdoa, typestore())),
+        list(STREAMS["tdoa"].messages(small_flight(0.05).tdoa, "base_link", typestore())),
     )
 
 

@@ -5,8 +5,6 @@
 Tools read it like the node.
 """
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
@@ -17,7 +15,7 @@ from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_tools.bags.bag import read_bag, write_bag
 from uwb_tdoa_tools.bags.files import new_bag
 from uwb_tdoa_tools.bags.message_types import typestore
-from uwb_tdoa_tools.bags.messages import sensor_messages
+from uwb_tdoa_tools.bags.topics import STREAMS
 from uwb_tdoa_tools.checking import recording_rules
 from uwb_tdoa_tools.checking.recording import read_recording
 from uwb_tdoa_tools.options import TOPICS
@@ -49,7 +47,8 @@ def bag_of(flight, folder, *topics):
             writer.write(copies[connection.topic], stamp, data)
         for topic, kind, velocity in topics:
             connection = writer.add_connection(topic, kind, typestore=store)
-            for stamp, message in sensor_messages(replace(VELOCITY, message=kind), velocity, store):
+            of = STREAMS["velocity"]._replace(message=kind)
+            for stamp, message in of.messages(velocity, "base_link", store):
                 writer.write(connection, stamp, store.serialize_cdr(message, kind))
     return folder / "bag"
 

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.common.flight import Tdoas
+from uwb_tdoa_bias.common.survey import read_survey
 from uwb_tdoa_ekf.monitoring.finding import ERROR
 from uwb_tdoa_tools.bags.bag import read_bag, write_bag
 from uwb_tdoa_tools.calibrating import between
@@ -31,7 +32,7 @@ from uwb_tdoa_tools.checking.check import (
 from uwb_tdoa_tools.checking.ordered import OrderedRecording
 from uwb_tdoa_tools.checking.recording import of_flight, read_recording
 from uwb_tdoa_tools.checking.recording_rules import sensor_mistakes
-from uwb_tdoa_tools.readers import inputs, read_flight, read_survey
+from uwb_tdoa_tools.readers import inputs, read_flight
 from uwb_tdoa_tools.readers.inputs import Reading
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.rooms import constellation

@@ -18,8 +18,9 @@ from rosbags.rosbag2 import Writer
 
 from uwb_tdoa_bias.common.flight import Imu
 from uwb_tdoa_ekf.offline import run_offline
-from uwb_tdoa_tools.bags.bag import bag_messages, read_bag, typestore
+from uwb_tdoa_tools.bags.bag import read_bag, typestore
 from uwb_tdoa_tools.bags.files import PLUGINS
+from uwb_tdoa_tools.bags.topics import STREAMS
 from uwb_tdoa_tools.checking.check import check
 from uwb_tdoa_tools.checking.recording import read_recording
 from uwb_tdoa_tools.readers.inputs import Reading
@@ -51,13 +52,15 @@ def bag(path, clock, storage="mcap", arrivals=True, imu=lambda t: t):
             "/uwb/tdoa",
             "uwb_tdoa_msgs/msg/Tdoa",
             tdoa.t,
-            bag_messages.tdoa_messages(replace(tdoa, t=BASE + clock(tdoa.t)), store, None),
+            STREAMS["tdoa"].messages(replace(tdoa, t=BASE + clock(tdoa.t)), "base_link", store),
         ),
         (
             "/imu/data",
             "sensor_msgs/msg/Imu",
             samples.t,
-            bag_messages.imu_messages(replace(samples, t=BASE + clock(imu(samples.t))), store),
+            STREAMS["imu"].messages(
+                replace(samples, t=BASE + clock(imu(samples.t))), "base_link", store
+            ),
         ),
     ):
         for at, (stamp, message) in zip(true, messages):

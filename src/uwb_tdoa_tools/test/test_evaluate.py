@@ -15,7 +15,7 @@ from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.bags.files import new_bag
 from uwb_tdoa_tools.bags.message_types import typestore
-from uwb_tdoa_tools.bags.messages import odometry_messages
+from uwb_tdoa_tools.bags.messages import messages_of, odometry_content
 from uwb_tdoa_tools.commands.evaluate import main
 from uwb_tdoa_tools.scoring.evaluation import evaluate
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
@@ -69,7 +69,9 @@ def write_odometry(path, odometry, space="", verdicts=()):
     with new_bag(path) as writer:
         kind = "nav_msgs/msg/Odometry"
         connection = writer.add_connection(f"{space}/odometry", kind, typestore=store)
-        for stamp, message in odometry_messages(odometry, "map", store):
+        for stamp, message in messages_of(
+            "odometry", kind, odometry.t, odometry_content(odometry), "map", store
+        ):
             writer.write(connection, stamp, store.serialize_cdr(message, kind))
         if verdicts:
             connection = writer.add_connection(f"{space}/uwb/residual", residual, typestore=store)
@@ -230,7 +232,7 @@ def test_picture_and_trajectories(flight, bag, tmp_path):
 
 def test_a_run_that_never_starts_has_a_picture_and_a_report_in_strict_json(flight, tmp_path):
     """RFC 8259 has no NaN and no Infinity. Such a run could contain them."""
-    few = {name: getattr(flight.tdoa, name)[:5] for name in "tabd"}
+    few = {name: values[:5] for name, values in vars(flight.tdoa).items()}
     write_bag(replace(flight, tdoa=replace(flight.tdoa, **few)), tmp_path / "few")
     picture, file = tmp_path / "error.png", tmp_path / "report.json"
     assert main([str(tmp_path / "few"), "--plot", str(picture), "--json", str(file)]) == 1

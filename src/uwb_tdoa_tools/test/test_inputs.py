@@ -14,13 +14,12 @@ from uwb_tdoa_bias.common.files import read_arrays, read_bytes
 from uwb_tdoa_bias.common.flight import Tdoas
 from uwb_tdoa_bias.common.limits import FOLDER_DEPTH, TooMuch
 from uwb_tdoa_bias.common.safe_yaml import read_yaml
-from uwb_tdoa_bias.common.survey import read_survey
+from uwb_tdoa_bias.common.survey import read_named_anchors, read_survey
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.bags.files import new_bag, open_bag
 from uwb_tdoa_tools.bags.message_types import typestore
 from uwb_tdoa_tools.readers import inputs, read_flight
 from uwb_tdoa_tools.readers.inputs import Reading, find_flights, require_tdoas, survey_for
-from uwb_tdoa_tools.readers.names import read_named_anchors
 
 
 def make(folder, *names):

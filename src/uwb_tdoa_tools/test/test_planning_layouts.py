@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.survey import read_survey
 from uwb_tdoa_tools.bags.files import open_bag
 from uwb_tdoa_tools.bags.message_types import typestore
 from uwb_tdoa_tools.planning import plots
@@ -25,7 +26,6 @@ from uwb_tdoa_tools.planning.maps import (
 )
 from uwb_tdoa_tools.planning.optimisation import errors_and_slopes, optimise
 from uwb_tdoa_tools.planning.report import TOPICS, map_messages, write_messages
-from uwb_tdoa_tools.readers import read_survey
 from uwb_tdoa_tools.scoring.plots import draw_labels
 from uwb_tdoa_tools.simulation.rooms import corners, facing
 

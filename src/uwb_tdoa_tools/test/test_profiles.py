@@ -36,13 +36,13 @@ import yaml
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.limits import TooMuch, most_unpacked
+from uwb_tdoa_bias.common.survey import NamedAnchors, read_named_anchors
 from uwb_tdoa_tools.checking.check import check as judged
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.commands.check import main as check
 from uwb_tdoa_tools.commands.convert import main as convert
 from uwb_tdoa_tools.commands.localize import main as localize
 from uwb_tdoa_tools.readers import load_profile, read_by_profile, read_flight
-from uwb_tdoa_tools.readers.names import NamedAnchors, read_named_anchors
 from uwb_tdoa_tools.readers.profile import shipped
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 

@@ -12,8 +12,9 @@ import pytest
 from recordings import SURVEY
 
 from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.survey import read_survey
 from uwb_tdoa_tools.commands.convert import main as convert
-from uwb_tdoa_tools.readers import read_flight, read_survey
+from uwb_tdoa_tools.readers import read_flight
 from uwb_tdoa_tools.readers.by_profile import as_time
 
 CASES = Path(__file__).resolve().parents[4] / "shared" / "cases" / "reports"

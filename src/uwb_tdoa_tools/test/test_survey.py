@@ -7,7 +7,8 @@ from recordings import ANCHORS, SURVEY
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.survey import ARM_TIPS, UNITS, orientation_from_tips, read_survey
+from uwb_tdoa_bias.common.survey import ARM_TIPS, orientation_from_tips, read_survey
+from uwb_tdoa_bias.common.survey_faults import UNITS
 
 SOME = Rotation.from_euler("zyx", [0.7, -0.2, 3.0])  # nearly upside down
 CENTRE = np.array([3.0, -2.0, 1.5])
@@ -85,7 +86,7 @@ def test_yaml(tmp_path):
         ("landmark,1,2,3\n", "no survey that can be read"),
         ("id,x,y,z\n", "holds no anchor"),
         ("id,x,y,z\n0,1,2\n", "line 2: '0,1,2' has 3 cells, the header 4"),
-        ("id,x,y,z\none,1,2,3\n", "line 2: id is 'one'"),
+        ("id,x,y,z\none,1,2,3\n", "id is 'one'"),
         ("id,x,y,z\n0,1,2,3\n0,1,2,3\n", "id 0 is given twice"),
         ("anchorAnt0,1,2,nan\n", "line 1: 'anchorAnt0,1,2,nan' is not"),
         ("anchorAnt0,1,2,3\nanchorAnt0,1,2,3\n", "line 2: anchorAnt0 is there twice"),

@@ -129,19 +129,16 @@ def read(
         If the recording or the survey cannot be used. The message says what to do.
     """
     from uwb_tdoa_bias.common.errors import InputError
-    from uwb_tdoa_tools.readers import load_profile, read_by_profile, read_flight
-    from uwb_tdoa_tools.readers.names import NamedAnchors, read_named_anchors
+    from uwb_tdoa_tools.readers.inputs import Reading
+    from uwb_tdoa_tools.readers.profile import load_profile
 
-    if profile is None:
-        if tag:
-            raise InputError("tag: chooses a tag of a recording that is read by a profile.")
-        return read_flight(path, survey, namespace, salvage, topics)
-    known: NamedAnchors | None = None
-    if isinstance(survey, (str, Path)):
-        known = read_named_anchors(survey)
-    elif survey is not None:
-        known = NamedAnchors(survey)
-    return read_by_profile([path], load_profile(profile), known, tag, namespace, salvage)
+    if tag and profile is None:
+        raise InputError("tag: chooses a tag of a recording that is read by a profile.")
+    loaded = None if profile is None else load_profile(profile)
+    reading = Reading(
+        namespace=namespace, topics=topics or {}, salvage=salvage, profile=loaded, tag=tag
+    )
+    return reading.flight([path], survey)
 
 
 def flight(

@@ -18,6 +18,7 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import read_head
 from uwb_tdoa_bias.common.flight import Flight
+from uwb_tdoa_bias.common.survey import read_named_anchors
 from uwb_tdoa_bias.correction.corrector import Corrector, orientation_remarks
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf.core.config import FilterConfig
@@ -26,7 +27,6 @@ from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.results import Odometry
 
 from .choices import NONE
-from .readers import read_survey
 from .readers.inputs import Reading, report_remarks
 from .readers.tables import read_numbers
 from .scoring.evaluation import corrected_truth, evaluate, with_aligned_truth
@@ -361,7 +361,7 @@ def _anchors(
                 f"--survey: {', '.join(map(str, static))} holds no anchors, and a map holds "
                 "for one constellation; give the file of their survey."
             )
-        found = [read_survey(survey)]
+        found = [read_named_anchors(survey).anchors]
     first = found[0]
     if not all(other.stand_at(first.ids, first.positions, first.frame) for other in found):
         raise InputError(

@@ -1,10 +1,11 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Read anchor surveys, and find faults that a survey alone shows."""
+"""Read anchor surveys of any form, whose anchors have ids or names."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 import math
 from pathlib import Path
 import re
@@ -18,9 +19,11 @@ from .files import read_bytes
 from .lazy import rotations
 from .limits import SURVEY_BYTES
 from .safe_yaml import parse_yaml
+from .survey_faults import GEODETIC, UNITS, refuse_faulty
 
 Lines = list[tuple[int, list[str]]]  # numbers of lines, and their cells
 
+LARGEST_ID = 65535
 NOT_SURVEYED = [math.nan] * 4  # orientation without a survey
 IDS = (
     "id",
@@ -76,6 +79,10 @@ _COMMA = re.compile(r"^[-+]?[0-9]+,[0-9]+$")
 _OPENCV = re.compile(r"^%YAML:1\.0\s*$", re.MULTILINE)
 
 
+AROUND = "anchors", "anchor_positions", "ros__parameters", "/**", "beacons"  # keys around anchors
+BESIDE = "n_", "num", "count", "frame", "unit", "name", "version", "type", "description"
+
+
 class Entry(NamedTuple):
     """One anchor of a file.
 
@@ -84,56 +91,159 @@ class Entry(NamedTuple):
     name : its id as text, or a name
     position : (3,) m
     orientation : (4,) x y z w, NaN if not surveyed
-    where : the line or key, for messages
     """
 
     name: str
     position: list[float]
-    orientation: list[float]
-    where: str
+    orientation: list[float] = NOT_SURVEYED
 
 
-class Columns(NamedTuple):
-    """Meaning of the cells of a table.
+@dataclass(frozen=True)
+class NamedAnchors:
+    """Anchors, and their names in the survey.
 
     Attributes
     ----------
-    name : place of the id or name, or None
-    axes : places of x, y and z
-    units : names of the units of x, y and z, "" where the header names none
-    turn : places of the quaternion x, y, z, w, or ()
-    unit : place of the unit, or None
+    anchors : Anchors.
+    ids : {name: id}; empty if the names are the ids.
     """
 
-    name: int | None
-    axes: tuple[int, int, int]
-    units: tuple[str, str, str] = ("", "", "")
-    turn: tuple[int, ...] = ()
-    unit: int | None = None
+    anchors: Anchors
+    ids: dict[str, int] = field(default_factory=dict)
+
+    def id_of(self, value: Any) -> int | None:
+        """Return the id of an anchor from its name or id (decimal or 0x1A2B); None if unknown.
+
+        Names come first. Where anchors have names, an id counts if the name ends with it.
+        """
+        text = name_of(value)
+        if text in self.ids:
+            return self.ids[text]
+        folded = [number for name, number in self.ids.items() if name.casefold() == text.casefold()]
+        if len(folded) == 1:
+            return folded[0]
+        decimal = _decimal(text)
+        number = int(decimal) if is_id(decimal) and int(decimal) <= LARGEST_ID else None
+        if self.ids and not any(
+            of == number and name.endswith(str(number)) for name, of in self.ids.items()
+        ):
+            return None
+        return number
 
 
-def columns_of(header: Sequence[str]) -> Columns | None:
-    """Return the Columns of a header; None without x, y and z.
+def read_survey(path: str | Path) -> Anchors:
+    """Return the Anchors of a survey whose names are ids, see `read_named_anchors`. Raise InputError."""
+    named = read_named_anchors(path)
+    for name in named.ids:
+        raise InputError(f"{path}: id is {name[:40]!r}; it must be a whole number.")
+    return named.anchors
 
-    Names may be in upper or lower case, with or without a unit.
+
+def read_named_anchors(path: str | Path) -> NamedAnchors:
+    """Read a survey file of any form of `read_entries`, with ids or any names.
+
+    Names that all end with different numbers get these as ids. Other names get their line number in
+    the survey, from 0. Raises InputError, also for a survey that is certainly wrong.
     """
-    roles: dict[str, int] = {}
-    units: dict[str, str] = {}
-    for place, cell in enumerate(header):
-        role, unit = _role(cell)
-        if role and role not in roles:
-            roles[role], units[role] = place, unit
-    if not roles.keys() >= {"x", "y", "z"}:
-        return None
-    turn = tuple(roles[name] for name in ("qx", "qy", "qz", "qw") if name in roles)
-    x, y, z = (roles[axis] for axis in "xyz")
-    return Columns(
-        roles.get("name"),
-        (x, y, z),
-        (units["x"], units["y"], units["z"]),
-        turn if len(turn) == 4 else (),
-        roles.get("unit"),
+    return named_anchors(path, *read_entries(path))
+
+
+def named_anchors(path: str | Path, entries: Sequence[Entry], frame: str = "map") -> NamedAnchors:
+    """Return the NamedAnchors of entries, see `read_named_anchors`; `path` is for messages."""
+    names = [_decimal(entry.name) for entry in entries]
+    named: dict[str, int] = {}
+    if all(map(is_id, names)):
+        ids = [int(name) for name in names]
+    else:
+        if len(set(names)) < len(names):
+            raise InputError(
+                f"{path}: anchor {next(name for name in names if names.count(name) > 1)!r} is "
+                "there twice; every anchor needs its own name."
+            )
+        ends = [re.search(r"(\d{1,5})$", name) for name in names]
+        ids = [int(end[1]) for end in ends if end]
+        if len(set(ids)) < len(names) or max(ids) > LARGEST_ID:
+            ids = list(range(len(names)))
+        named = dict(zip(names, ids))
+    positions, orientations = (
+        np.array([getattr(entry, part) for entry in entries])
+        for part in ("position", "orientation")
     )
+    try:
+        anchors = Anchors(np.array(ids), positions, orientations, frame)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    return NamedAnchors(refuse_faulty(anchors, str(path)), named)
+
+
+def as_named(survey: str | Path | Anchors | None) -> NamedAnchors | None:
+    """Return the NamedAnchors of Anchors, or of a survey file; None for None. Raises InputError."""
+    if isinstance(survey, Anchors):
+        return NamedAnchors(survey)
+    return None if survey is None else read_named_anchors(survey)
+
+
+def _decimal(name: str) -> str:
+    """Return the decimal id of a name like 0x1A2B; other names as they are."""
+    return str(int(name, 16)) if re.fullmatch("0[xX][0-9A-Fa-f]{1,4}", name) else name
+
+
+def is_id(name: str) -> bool:
+    """Return whether a name is a whole number, as ids in messages are."""
+    return re.fullmatch("[0-9]{1,9}", name) is not None
+
+
+def read_entries(path: str | Path) -> tuple[list[Entry], str]:
+    """Return the entries of a survey file in its own order, and the name of the world frame.
+
+    The content determines the form:
+
+    - total station: lines `name,x,y,z` in metres; `anchorAntN` is the antenna of anchor N,
+      `anchorN_1/_2/_3` are the arm tips of its stand (up, left, forward), which give the
+      orientation; other names are ignored;
+    - a table: commas, semicolons, tabs or blanks between its cells; a header names id, x, y and z in
+      any usual way, with or without units; a column `unit`, or a comment `# unit: ft`, gives it too;
+      without a header each line is an id and three numbers;
+    - YAML or JSON: `anchors: {0: {position: [x, y, z], orientation: [x, y, z, w]}}`, the same as a
+      list, `0: {x:, y:, z:}` of the Crazyflie client, `anchor0_pos: [x, y, z]` of lps-ros, parameter
+      files of ROS, an OpenCV matrix with a row for each anchor. `unit: ft` holds where it stands and
+      below.
+
+    Orientation: antenna stand to world; x forward, z up the stand, y completes a right-handed
+    frame. NaN if not surveyed. Raises InputError.
+    """
+    try:
+        text = read_bytes(path, SURVEY_BYTES, "survey file").decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"{path}: byte {error.start} is not text; give a survey file (.txt, .csv, .yaml "
+            "or .json)."
+        ) from error
+    if not text.strip():
+        raise InputError(f"{path}: is empty; give a survey file (.txt, .csv, .yaml or .json).")
+    try:
+        return (list(_of_table(text)), "map") if is_table(text) else _of_tree(text, path)
+    except InputError as error:
+        message = str(error)
+        raise InputError(
+            message if message.startswith(f"{path}: ") else f"{path}: {message}"
+        ) from error
+
+
+def _roles(names: Sequence[Any]) -> dict[str, tuple[Any, str]]:
+    """Return {role: (name, its unit)} of the columns of a table, or the keys of a mapping.
+
+    Roles are "x", "y", "z", "name", "unit" and "qx" ... "qw". The first name of a role counts.
+    """
+    roles: dict[str, tuple[Any, str]] = {}
+    for name in names:
+        role, unit = _role(str(name))
+        roles.setdefault(role, (name, unit))
+    return roles
+
+
+def _has_axes(roles: Mapping[str, Any]) -> bool:
+    return roles.keys() >= {"x", "y", "z"}
 
 
 def _role(cell: str) -> tuple[str, str]:
@@ -166,8 +276,8 @@ def _unit(value: Any, where: str) -> str:
 
 def _unit_of(content: dict[Any, Any], unit: str, where: str) -> str:
     """Return the name of the unit that a mapping states; default : unit."""
-    stated = [value for key, value in content.items() if _UNIT_KEY.fullmatch(str(key).lower())]
-    return _unit(stated[0], where) if stated else unit
+    key, _ = _roles([*content]).get("unit", (None, ""))
+    return unit if key is None else _unit(content[key], where)
 
 
 def name_of(value: Any) -> str:
@@ -180,14 +290,6 @@ def name_of(value: Any) -> str:
     return str(int(number)) if number.is_integer() else text
 
 
-# of a table id,latitude,longitude,height; the length of a degree is that of the WGS 84 ellipsoid
-GEODETIC = (
-    "latitude and longitude in degrees; give metres, x to the east and y to the north. For a file with "
-    """id,latitude,longitude,height: awk -F, 'NR==1 {print "id,x,y,z"; next} NR==2 {a=$2; o=$3; """
-    """r=a*0.01745329} {printf "%s,%.3f,%.3f,%s\\n", $1, ($3-o)*(111413*cos(r)-93.5*cos(3*r)), """
-    """($2-a)*(111133-559.8*cos(2*r)), $4}' FILE > metres.csv"""
-)
-SMALL, MANY_TIMES = 0.01, 1000.0  # degrees, of a room; and how often it goes into the coordinates
 _YAML_KEY = re.compile(r"^\s*(?:- *)?[{\s]*[\"']?[\w /*.-]+[\"']?\s*:(?:\s|$)")
 
 
@@ -234,7 +336,7 @@ def lines_of(text: str) -> Lines:
         for number, line in filled_lines
         if number < first_row
     ]
-    header = [(number, cells) for number, cells in comments_above[-1:] if columns_of(cells)]
+    header = [(number, cells) for number, cells in comments_above[-1:] if _has_axes(_roles(cells))]
     return [*header, *((number, cells_of(line, delimiter)) for number, line in rows)]
 
 
@@ -280,74 +382,56 @@ def _number(value: Any) -> float:
     return number if math.isfinite(number) else math.nan
 
 
-def read_table(lines: Lines, unit: str = "") -> list[Entry] | None:
-    """Return the entries of a table; None for an unknown header or form.
+def _of_table(text: str) -> Iterator[Entry]:
+    """Yield the entries of a table.
 
     A table without a header needs an id and three numbers in each line. Raises InputError.
-
-    lines : line numbers and cells; unit : of cells whose unit the header does not name
     """
+    lines = lines_of(text)
     (number, header), rest = lines[0], lines[1:]
-    columns = columns_of(header)
-    if columns is None:
+    comment, roles, unit = _UNIT_COMMENT.search(text), _roles(header), ""
+    if comment:
+        unit = _unit(comment[1], f"comment {comment[0].strip()[:60]!r}")
+    if not _has_axes(roles):
         if any(re.match("lat(itude)?\\b", cell.strip(), re.IGNORECASE) for cell in header):
             raise InputError(f"line {number}: {', '.join(header)} are {GEODETIC}")
-        if all(map(_is_number, lines[0][1])):
-            return _without_header(lines, unit)
-        return None
-    if columns.name is None:
+        if not all(map(_is_number, header)):
+            yield from _total_station(lines, unit)
+            return
+        if len(header) == 3:
+            raise InputError(
+                f"line {number}: three numbers are recognized as a position, and no id; put the "
+                "id of each anchor before its position, and 'id,x,y,z' in the first line."
+            )
+        if len(header) != 4:
+            raise InputError(
+                f"line {number}: {len(header)} numbers and no header: what they mean is not known; "
+                "put 'id,x,y,z' in the first line, and other names for what is more."
+            )
+        header, rest = ["id", "x", "y", "z"], lines
+        roles = _roles(header)
+    if "name" not in roles:
         raise InputError(
             f"line {number}: columns x, y and z are recognized, and no column with the ids of "
             "the anchors; add one named 'id'."
         )
     if not rest:
         raise InputError("holds no anchor; add lines 'id,x,y,z' in metres.")
-    return [_row(number, cells, columns, len(header), unit) for number, cells in rest]
+    fewest = 1 + max(header.index(name) for role, (name, _) in roles.items() if role)
+    for number, cells in rest:
+        if not fewest <= len(cells) <= max(len(header), 4):
+            hint = "; decimal commas need ';' between the cells"
+            raise InputError(
+                f"line {number}: {','.join(cells)[:60]!r} has {len(cells)} cells, the header "
+                f"{len(header)}{hint if len(cells) == 2 * len(header) - 1 else ''}."
+            )
+        yield _of_item(dict(zip(header, cells)), f"line {number}", unit)
 
 
-def _without_header(lines: Lines, unit: str) -> list[Entry]:
-    number, cells = lines[0]
-    if len(cells) == 3:
-        raise InputError(
-            f"line {number}: three numbers are recognized as a position, and no id; put the "
-            "id of each anchor before its position, "
-            "and 'id,x,y,z' in the first line."
-        )
-    if len(cells) != 4:
-        raise InputError(
-            f"line {number}: {len(cells)} numbers and no header: what they mean is not known; "
-            "put 'id,x,y,z' in the first line, "
-            "and other names for what is more."
-        )
-    return [_row(number, cells, Columns(0, (1, 2, 3)), 4, unit) for number, cells in lines]
+WRITE = "write 'anchors: {0: {position: [x, y, z]}, 1: ...}', in metres"
 
 
-def _row(number: int, cells: list[str], columns: Columns, count: int, unit: str) -> Entry:
-    """Return the Entry of line `number`; count : cells of the header, at least 4.
-
-    Anchors checks the quaternion.
-    """
-    assert columns.name is not None
-    fewest = max(*columns.axes, columns.name, *columns.turn, columns.unit or 0) + 1
-    if not fewest <= len(cells) <= max(count, 4):
-        hint = "; decimal commas need ';' between the cells" if len(cells) == 2 * count - 1 else ""
-        raise InputError(
-            f"line {number}: {','.join(cells)[:60]!r} has {len(cells)} cells, the header "
-            f"{count}{hint}."
-        )
-    if columns.unit is not None:
-        unit = _unit(cells[columns.unit], f"line {number}")
-    values = [_number(cells[place]) for place in columns.axes]
-    if not all(map(math.isfinite, values)):
-        raise InputError(
-            f"line {number}: {','.join(cells)[:60]!r} is not 'id,x,y,z' with finite metres."
-        )
-    turn = [_number(cells[place]) for place in columns.turn] or NOT_SURVEYED
-    position = _in_metres(values, unit, columns.units)
-    return Entry(name_of(cells[columns.name]), position, turn, f"line {number}")
-
-
-def read_tree(text: str, path: str | Path) -> tuple[list[Entry], str]:
+def _of_tree(text: str, path: str | Path) -> tuple[list[Entry], str]:
     """Return the entries of YAML or JSON, and the name of the world frame.
 
     Raises InputError that names key and remedy.
@@ -365,70 +449,40 @@ def read_tree(text: str, path: str | Path) -> tuple[list[Entry], str]:
         given = content.get("frame", content.get("frame_id", frame))
         if not isinstance(given, str):
             raise InputError(
-                f"{path}: frame: {given!r} is no name; write the name of the world frame, e.g. map."
+                f"frame: {given!r} is no name; write the name of the world frame, e.g. map."
             )
-        frame, unit = given, _unit_of(content, unit, str(path))
-        inner = next(
-            (
-                key
-                for key in content
-                if str(key).lower()
-                in ("anchors", "anchor_positions", "ros__parameters", "/**", "beacons")
-            ),
-            None,
-        )
+        frame, unit = given, _unit_of(content, unit, "unit")
+        inner = next((key for key in content if str(key).lower() in AROUND), None)
         if inner is None or not isinstance(content[inner], (dict, list)):
             break
         content = content[inner]
-    try:
-        entries = list(_entries(content, unit))
-    except ValueError as error:
-        raise InputError(f"{path}: {error}") from error
+    entries = list(_entries(content, unit))
     if not entries:
-        raise InputError(f"{path}: no anchor is recognized; {WRITE}.")
+        raise InputError(f"no anchor is recognized; {WRITE}.")
     return entries, frame
 
 
-WRITE = "write 'anchors: {0: {position: [x, y, z]}, 1: ...}', in metres"
-
-
 def _entries(content: Any, unit: str) -> Iterator[Entry]:
-    """Yield the entries of a list or mapping; raise ValueError with key, value and remedy."""
+    """Yield the entries of a list or mapping. Raises InputError with key, value and remedy."""
     if isinstance(content, list):
         for place, item in enumerate(content):
-            yield _of_list(item, f"anchors[{place}]", unit)
-        return
+            yield _of_item(item, f"anchors[{place}]", unit)
     if not isinstance(content, dict):
         return
-    matrices = [
-        (key, value)
-        for key, value in content.items()
-        if isinstance(value, dict) and value.keys() >= {"rows", "cols", "data"}
-    ]
-    if matrices:
-        yield from _of_matrix(*matrices[0], unit)
-        return
-    numbered = {key: _NUMBERED.match(str(key)) for key in content}
-    if any(numbered.values()) and all(
-        isinstance(content[key], (list, dict)) for key, found in numbered.items() if found
-    ):
-        yield from (
-            _of_value(found[1], content[key], str(key), unit)
-            for key, found in numbered.items()
-            if found
-        )
+    for key, value in content.items():
+        if isinstance(value, dict) and value.keys() >= {"rows", "cols", "data"}:
+            yield from _of_matrix(key, value, unit)
+            return
+    numbered = {key: found for key in content if (found := _NUMBERED.match(str(key)))}
+    if numbered and all(isinstance(content[key], (list, dict)) for key in numbered):
+        for key, found in numbered.items():
+            yield _of_value(found[1], content[key], str(key), unit)
         return
     for key, value in content.items():
         if isinstance(value, (dict, list)):
             yield _of_value(name_of(key), value, str(key), unit)
-        elif (
-            not str(key)
-            .lower()
-            .startswith(
-                ("n_", "num", "count", "frame", "unit", "name", "version", "type", "description")
-            )
-        ):
-            raise ValueError(f"{key}: {value!r} is no position; {WRITE}.")
+        elif not str(key).lower().startswith(BESIDE):
+            raise InputError(f"{key}: {value!r} is no position; {WRITE}.")
 
 
 def _of_matrix(key: Any, value: dict[str, Any], unit: str) -> Iterator[Entry]:
@@ -440,43 +494,37 @@ def _of_matrix(key: Any, value: dict[str, Any], unit: str) -> Iterator[Entry]:
         or not isinstance(rows, int)
         or len(data) != 3 * rows
     ):
-        raise ValueError(
+        raise InputError(
             f"{key}: a matrix of {rows} x {columns} is recognized; it must have a row x, y, z "
             "for each anchor, so 3 columns."
         )
     for row in range(rows):
-        yield Entry(
-            str(row),
-            _three(data[3 * row : 3 * row + 3], f"{key}, row {row}", unit),
-            NOT_SURVEYED,
-            f"{key}, row {row}",
-        )
+        yield Entry(str(row), _three(data[3 * row : 3 * row + 3], f"{key}, row {row}", unit))
 
 
-def _of_list(item: Any, where: str, unit: str) -> Entry:
+def _of_item(item: Any, where: str, unit: str) -> Entry:
+    """Return the anchor of an item of a list, or of a row of a table: {column: cell}."""
     if isinstance(item, list):
         if len(item) == 4:
-            return Entry(name_of(item[0]), _three(item[1:], where, unit), NOT_SURVEYED, where)
+            return Entry(name_of(item[0]), _three(item[1:], where, unit))
         three = len(item) == 3
         what = (
             "a position is recognized, and no id" if three else f"{len(item)} values are no anchor"
         )
-        raise ValueError(f"{where}: {what}; write '- {{id: 0, position: [x, y, z]}}'.")
+        raise InputError(f"{where}: {what}; write '- {{id: 0, position: [x, y, z]}}'.")
     if not isinstance(item, dict):
-        raise ValueError(
+        raise InputError(
             f"{where}: {item!r} is no anchor; write '- {{id: 0, position: [x, y, z]}}'."
         )
-    named = [
-        key
-        for key in item
-        if " ".join(str(key).lower().split("_")) in IDS and not isinstance(item[key], (dict, list))
-    ]
-    if not named:
-        raise ValueError(
+    key, _ = _roles([key for key in item if not isinstance(item[key], (dict, list))]).get(
+        "name", (None, "")
+    )
+    if key is None:
+        raise InputError(
             f"{where}: no id is recognized among {', '.join(map(str, item))}; write 'id: 0'."
         )
-    rest = {key: value for key, value in item.items() if key != named[0]}
-    return _of_value(name_of(item[named[0]]), rest, where, unit)
+    rest = {other: value for other, value in item.items() if other != key}
+    return _of_value(name_of(item[key]), rest, where, unit)
 
 
 def _of_value(name: str, value: Any, where: str, unit: str) -> Entry:
@@ -486,27 +534,24 @@ def _of_value(name: str, value: Any, where: str, unit: str) -> Entry:
     whose unit is not given beside them
     """
     if isinstance(value, list):
-        return Entry(name, _three(value, where, unit), NOT_SURVEYED, where)
-    unit = _unit_of(value, unit, where)
+        return Entry(name, _three(value, where, unit))
+    unit, roles = _unit_of(value, unit, where), _roles([*value])
     keys = {str(key).lower(): key for key in value}
-    turn = next((value[keys[key]] for key in TURNED if key in keys), None)
-    nested = next((key for key in NESTED if key in keys), None)
-    if nested is not None:
-        inner = value[keys[nested]]
-        if isinstance(inner, dict):
-            within = _of_value(name, inner, f"{where}: {keys[nested]}", unit)
-            return within._replace(orientation=_turn(turn, where)) if turn is not None else within
-        return Entry(
-            name, _three(inner, f"{where}: {keys[nested]}", unit), _turn(turn, where), where
-        )
-    columns = columns_of([str(key) for key in value])
-    if columns is None:
-        raise ValueError(
+    turn = next((_turn(value[keys[key]], where) for key in TURNED if key in keys), NOT_SURVEYED)
+    if _has_axes(roles):
+        axes, own = zip(*(roles[axis] for axis in "xyz"))
+        if roles.keys() >= {"qx", "qy", "qz", "qw"}:
+            turn = [_number(value[roles[f"q{k}"][0]]) for k in "xyzw"]
+        return Entry(name, _three([value[axis] for axis in axes], where, unit, own), turn)
+    nested = next((keys[key] for key in NESTED if key in keys), None)
+    if nested is None:
+        raise InputError(
             f"{where}: no position is recognized among {', '.join(map(str, value))[:80]}; {WRITE}."
         )
-    values = list(value.values())
-    position = _three([values[place] for place in columns.axes], where, unit, columns.units)
-    return Entry(name, position, _turn(turn, where), where)
+    if isinstance(value[nested], dict):
+        within = _of_value(name, value[nested], f"{where}: {nested}", unit)
+        return within if turn is NOT_SURVEYED else within._replace(orientation=turn)
+    return Entry(name, _three(value[nested], f"{where}: {nested}", unit), turn)
 
 
 def _in_metres(
@@ -519,130 +564,22 @@ def _in_metres(
 def _three(value: Any, where: str, unit: str, own: Sequence[str] = ("", "", "")) -> list[float]:
     numbers = [_number(each) for each in value] if isinstance(value, list) else []
     if len(numbers) == 6:
-        raise ValueError(
+        raise InputError(
             f"{where}: 6 numbers stand where 3 belong, as decimal commas make it; write "
             "decimal points, [-3.1, 4.0, 0.2]."
         )
     if len(numbers) != 3 or not np.isfinite(numbers).all():
-        raise ValueError(f"{where}: {str(value)[:60]} is not 3 numbers x, y, z in metres.")
+        raise InputError(f"{where}: {str(value)[:60]} is not 3 numbers x, y, z in metres.")
     return _in_metres(numbers, unit, own)
 
 
 def _turn(value: Any, where: str) -> list[float]:
-    if value is None:
-        return NOT_SURVEYED
     if isinstance(value, dict):
         value = [value.get(key, value.get(f"q{key}")) for key in "xyzw"]
     numbers = [_number(each) for each in value] if isinstance(value, list) else []
     if len(numbers) != 4 or not np.isfinite(numbers).all():
-        raise ValueError(f"{where}: orientation is {str(value)[:60]}, not 4 numbers x, y, z, w.")
+        raise InputError(f"{where}: orientation is {str(value)[:60]}, not 4 numbers x, y, z, w.")
     return numbers
-
-
-SAME_PLACE = 0.001  # m; two antennas are at least some cm apart
-# m. A UWB radio reaches at most 300 m, and a tag must receive several anchors at once. An anchor with
-# fewer than NEIGHBOURS others within this distance is out of place.
-LONELY = 500.0
-NEIGHBOURS = 2  # required within LONELY; fewer if there are fewer anchors
-USUAL = 6.0  # m between neighbours, typical; the unit that gives the nearest value is named
-UNITS = {
-    "millimetres": 1000.0,
-    "centimetres": 100.0,
-    "inches": 1.0 / 0.0254,
-    "decimetres": 10.0,
-    "feet": 1.0 / 0.3048,
-}  # units per metre
-FARTHEST_OFF = 200  # anchors farthest from the median whose neighbours are searched
-MOST_NAMED = 10  # anchors in a sentence
-
-
-def survey_fault(anchors: Anchors) -> str:
-    """Return what is certainly wrong with Anchors: cause, evidence and remedy; "" for a usable survey."""
-    if len(anchors) < 2:
-        return ""
-    level = anchors.positions[:, :2]
-    spread = np.ptp(level, axis=0)
-    if (
-        (spread > 0.0).all()
-        and (MANY_TIMES * spread < np.abs(level)).all()
-        and spread.max() < SMALL
-    ):
-        return f"x and y are the same within {spread.max():.1g}, as are {GEODETIC}"
-    cells = np.round(anchors.positions / SAME_PLACE)
-    _, group, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    together = np.flatnonzero(counts > 1)
-    if not len(together):
-        return _far(anchors)
-    rows = np.flatnonzero(group.reshape(-1) == together[0])
-    x, y, z = anchors.positions[rows[0]]
-    place = f"at ({x:g}, {y:g}, {z:g})"
-    if len(rows) == len(anchors):
-        return (
-            f"all anchors are at one place (all {len(anchors)} are {place}); write the measured "
-            "position of each anchor."
-        )
-    more = f", and {len(together) - 1} more groups are" if len(together) > 1 else ""
-    names = _listed(anchors.ids[rows])
-    return f"anchors {names} are at one place ({place}{more}); measure each of them again."
-
-
-def refuse_faulty(anchors: Anchors, source: str = "anchors") -> Anchors:
-    """Return the Anchors unchanged; raise InputError for a survey that is certainly wrong.
-
-    source : origin of the anchors, for the message
-    """
-    fault = survey_fault(anchors)
-    if fault:
-        raise InputError(f"{source}: {fault}")
-    return anchors
-
-
-def _far(anchors: Anchors) -> str:
-    """Return the fault of anchors without neighbours within radio reach, all or single ones, or ""."""
-    positions = anchors.positions
-    off = np.abs(positions - np.median(positions, axis=0)).max(axis=1)
-    rows = np.argsort(off)[-FARTHEST_OFF:]
-    distances = np.linalg.norm(positions[rows, None] - positions, axis=2)
-    # to the second nearest other anchor, as place 0 is the anchor itself: the nearest may be misplaced
-    # with it
-    place = min(NEIGHBOURS, len(anchors) - 1)
-    nearest = np.partition(distances, place, axis=1)[:, place]
-    lonely = rows[nearest > LONELY]
-    if not len(lonely):
-        return ""
-    spacing = float(np.median(nearest[nearest > LONELY]))
-    who, looks, them = "the survey", "looks", "it"
-    if len(lonely) > 0.5 * len(rows):
-        evidence = f"neighbouring anchors are {spacing:.0f} m apart"
-        unit = min(UNITS, key=lambda name: abs(np.log(spacing / UNITS[name] / USUAL)))
-    else:
-        names = _listed(np.sort(anchors.ids[lonely]))
-        who = f"the position of anchor {names}"
-        if len(lonely) > 1:
-            who, looks, them = f"the positions of anchors {names}", "look", "them"
-        evidence = f"{spacing:.0f} m from the second nearest anchor"
-        rest = positions[np.setdiff1d(np.arange(len(anchors)), lonely)]
-        inside = {
-            name: np.linalg.norm(positions[lonely[-1]] / count - np.median(rest, axis=0))
-            for name, count in UNITS.items()
-        }
-        # the smallest divisor that puts the farthest one within two room sizes of the rest
-        room = 2.0 * np.ptp(rest, axis=0).max()
-        unit = next((name for name in reversed(UNITS) if inside[name] < room), "")
-    evidence += ", and a radio reaches 300 m"
-    # after the division the spacing must be one of anchors
-    if not unit or not 0.05 < spacing / UNITS[unit] < 0.5 * LONELY:
-        return f"{who} cannot be in metres ({evidence}); give metres, in one frame for all anchors."
-    return (
-        f"{who} {looks} like {unit} ({evidence}); give metres: divide {them} by {UNITS[unit]:.6g}."
-    )
-
-
-def _listed(ids: np.ndarray) -> str:
-    named = [str(number) for number in ids[:MOST_NAMED].tolist()] + ["..."] * (
-        len(ids) > MOST_NAMED
-    )
-    return named[0] if len(named) == 1 else f"{', '.join(named[:-1])} and {named[-1]}"
 
 
 # The tips of the three marker arms of a stand, m, in the frame of the stand. Arm 1 points up (z),
@@ -657,81 +594,6 @@ MAX_TIP_RESIDUAL = 0.010  # m RMS; measured: 0.5 ... 2.2 mm
 
 _ANTENNA = re.compile(r"anchorAnt_?([0-9]{1,9})$")
 _TIP = re.compile(r"anchor_?([0-9]{1,9})_([123])$")
-
-
-def read_survey(path: str | Path) -> Anchors:
-    """Return the Anchors of a survey file, in the frame of the survey.
-
-    The file is of a total station, or of any form of `read_entries` whose anchors have numbers as
-    names. Raises InputError with line or key, value and remedy.
-    """
-    entries, frame = read_entries(path)
-    for entry in entries:
-        if not is_id(entry.name):
-            raise InputError(
-                f"{path}: {entry.where}: id is {entry.name[:40]!r}; it must be a whole number."
-            )
-    return anchors_of(path, entries, [int(entry.name) for entry in entries], frame)
-
-
-def anchors_of(
-    path: str | Path, entries: Sequence[Entry], ids: Sequence[int], frame: str
-) -> Anchors:
-    """Return the Anchors of entries of a file, with these ids; raise InputError."""
-    positions = np.array([entry.position for entry in entries])
-    orientations = np.array([entry.orientation for entry in entries])
-    try:
-        return Anchors(np.array(ids), positions, orientations, frame)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-
-
-def is_id(name: str) -> bool:
-    """Return whether a name is a whole number, as ids in messages are."""
-    return re.fullmatch("[0-9]{1,9}", name) is not None
-
-
-def read_entries(path: str | Path) -> tuple[list[Entry], str]:
-    """Return the entries of a survey file in its own order, and the name of the world frame.
-
-    The content determines the form:
-
-    - total station: lines `name,x,y,z` in metres; `anchorAntN` is the antenna of anchor N,
-      `anchorN_1/_2/_3` are the arm tips of its stand (up, left, forward), which give the
-      orientation; other names are ignored;
-    - a table: commas, semicolons, tabs or blanks between its cells; a header names id, x, y and z in
-      any usual way, with or without units; a column `unit`, or a comment `# unit: ft`, gives it too;
-      without a header each line is an id and three numbers;
-    - YAML or JSON: `anchors: {0: {position: [x, y, z], orientation: [x, y, z, w]}}`, the same as a
-      list, `0: {x:, y:, z:}` of the Crazyflie client, `anchor0_pos: [x, y, z]` of lps-ros, parameter
-      files of ROS, an OpenCV matrix with a row for each anchor. `unit: ft` holds where it stands and
-      below.
-
-    Orientation: antenna stand to world; x forward, z up the stand, y completes a right-handed
-    frame. NaN if not surveyed. Raises InputError.
-    """
-    try:
-        text = read_bytes(path, SURVEY_BYTES, "survey file").decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(
-            f"{path}: byte {error.start} is not text; give a survey file (.txt, .csv, .yaml "
-            "or .json)."
-        ) from error
-    if not text.strip():
-        raise InputError(f"{path}: is empty; give a survey file (.txt, .csv, .yaml or .json).")
-    if not is_table(text):
-        return read_tree(text, path)
-    lines = lines_of(text)
-    try:
-        comment = _UNIT_COMMENT.search(text)
-        unit = _unit(comment[1], f"comment {comment[0].strip()[:60]!r}") if comment else ""
-        entries = read_table(lines, unit)
-        return (_total_station(path, lines, unit) if entries is None else entries), "map"
-    except InputError as error:
-        message = str(error)
-        raise InputError(
-            message if message.startswith(f"{path}: ") else f"{path}: {message}"
-        ) from error
 
 
 def orientation_from_tips(tips: np.ndarray) -> tuple[np.ndarray, float]:
@@ -755,13 +617,13 @@ def orientation_from_tips(tips: np.ndarray) -> tuple[np.ndarray, float]:
     )
 
 
-def _total_station(path: str | Path, lines: Lines, unit: str) -> list[Entry]:
+def _total_station(lines: Lines, unit: str) -> list[Entry]:
     antennas: dict[Any, list[float]] = {}
     tips: dict[Any, list[float]] = {}
     key: Any
     for number, cells in lines:
         antenna, tip = _ANTENNA.match(cells[0]), _TIP.match(cells[0])
-        point = _in_metres(_point(path, number, cells), unit)
+        point = _in_metres(_point(number, cells), unit)
         if antenna:
             points, key = antennas, int(antenna[1])
         elif tip:
@@ -769,11 +631,11 @@ def _total_station(path: str | Path, lines: Lines, unit: str) -> list[Entry]:
         else:
             continue
         if key in points:
-            raise InputError(f"{path}: line {number}: {cells[0]} is there twice; keep one.")
+            raise InputError(f"line {number}: {cells[0]} is there twice; keep one.")
         points[key] = point
     if not antennas:
         raise InputError(
-            f"{path}: is no survey that can be read: line {lines[0][0]}, "
+            f"is no survey that can be read: line {lines[0][0]}, "
             f"{','.join(lines[0][1])[:60]!r}, is neither a header with id, x, y "
             "and z, nor a line 'anchorAnt0,x,y,z' of a total station; put 'id,x,y,z' in the "
             "first line, or write YAML with 'anchors:'."
@@ -781,18 +643,13 @@ def _total_station(path: str | Path, lines: Lines, unit: str) -> list[Entry]:
     for anchor, _ in tips:
         if anchor not in antennas:
             raise InputError(
-                f"{path}: anchor {anchor} has arm tips but no line 'anchorAnt{anchor},x,y,z'; "
-                "add it."
+                f"anchor {anchor} has arm tips but no line 'anchorAnt{anchor},x,y,z'; add it."
             )
-    _refuse_unit(path, antennas, tips)
-    return [
-        Entry(str(i), antennas[i], _orientation(path, i, tips), f"anchorAnt{i}")
-        for i in sorted(antennas)
-    ]
+    _refuse_unit(antennas, tips)
+    return [Entry(str(i), antennas[i], _orientation(i, tips)) for i in sorted(antennas)]
 
 
 def _refuse_unit(
-    path: str | Path,
     antennas: dict[int, list[float]],
     tips: dict[tuple[int, int], list[float]],
 ) -> None:
@@ -813,14 +670,12 @@ def _refuse_unit(
                 who = f"the arm tips of anchor {anchor} look"
                 lines = f"the lines anchor{anchor}_1, _2 and _3"
             raise InputError(
-                f"{path}: {who} like {unit} (the arms of the stand of anchor {anchor} have their "
+                f"{who} like {unit} (the arms of the stand of anchor {anchor} have their "
                 f"lengths in {unit}); give metres: divide {lines} by {count:.6g}."
             )
 
 
-def _orientation(
-    path: str | Path, anchor: int, tips: dict[tuple[int, int], list[float]]
-) -> list[float]:
+def _orientation(anchor: int, tips: dict[tuple[int, int], list[float]]) -> list[float]:
     """Return the quaternion x y z w, stand to world, of the arm tips of an anchor; NaN without any.
 
     tips : {(anchor, arm 1 to 3): [x, y, z] m}; raises InputError for one or two tips, or a poor fit
@@ -830,24 +685,22 @@ def _orientation(
         return NOT_SURVEYED
     if len(found) < 3:
         raise InputError(
-            f"{path}: anchor {anchor} has {len(found)} of 3 arm tips; survey all three or "
-            "delete them."
+            f"anchor {anchor} has {len(found)} of 3 arm tips; survey all three or delete them."
         )
     quaternion, residual = orientation_from_tips(np.array(found))
     if residual > MAX_TIP_RESIDUAL:
         raise InputError(
-            f"{path}: the arm tips of anchor {anchor} miss the stand's shape by "
+            f"the arm tips of anchor {anchor} miss the stand's shape by "
             f"{1e3 * residual:.0f} mm (at most "
             f"{1e3 * MAX_TIP_RESIDUAL:.0f} mm expected); check lines anchor{anchor}_1, _2 and _3."
         )
     return quaternion.tolist()
 
 
-def _point(path: str | Path, number: int, cells: list[str]) -> list[float]:
+def _point(number: int, cells: list[str]) -> list[float]:
     point = [_number(cell) for cell in cells[1:]]
     if len(point) != 3 or not (np.abs(point) <= FARTHEST).all():
         raise InputError(
-            f"{path}: line {number}: {','.join(cells)[:60]!r} is not 'name,x,y,z' with finite "
-            "metres."
+            f"line {number}: {','.join(cells)[:60]!r} is not 'name,x,y,z' with finite metres."
         )
     return point

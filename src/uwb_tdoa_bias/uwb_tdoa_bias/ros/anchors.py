@@ -15,7 +15,8 @@ from uwb_tdoa_msgs.msg import Anchor, AnchorArray
 
 from ..common.anchors import SAME_PLACE, Anchors
 from ..common.errors import InputError
-from ..common.survey import read_survey, refuse_faulty
+from ..common.survey import read_survey
+from ..common.survey_faults import refuse_faulty
 from .parameters import Parameter
 from .topics import Input, Refusals, publishers_of
 
@@ -110,7 +111,7 @@ class AnchorsInput:
         self.anchors: Anchors | None = None
         self._refused: str | None = None
         self._node, self._on_change, self._file = node, on_change, file
-        self._of_file = refuse_faulty(read_survey(file), file) if file else None
+        self._of_file = read_survey(file) if file else None
         self._repeated: Input | None = None  # subscription to volatile publishers
         events = SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible)
         self._latched = Input(

@@ -20,7 +20,7 @@ import numpy as np
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.compiled import compiled
 from uwb_tdoa_bias.common.radio import SPEED_OF_LIGHT
-from uwb_tdoa_bias.common.survey import UNITS
+from uwb_tdoa_bias.common.survey_faults import UNITS
 
 from .explain import SCALE, compare_losses, in_words
 from .finding import ERROR, Finding

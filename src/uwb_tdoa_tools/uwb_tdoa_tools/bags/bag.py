@@ -34,7 +34,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.common.sensors import LOCATING, SENSORS
 from uwb_tdoa_bias.common.sensors.sensor import LARGEST_NUMBER
-from uwb_tdoa_bias.common.survey import refuse_faulty
+from uwb_tdoa_bias.common.survey_faults import refuse_faulty
 from uwb_tdoa_bias.common.text import printable, written_by
 from uwb_tdoa_ekf.results import Odometry
 
@@ -50,7 +50,7 @@ from .topics import (
     Names,
     on_one_clock,
     other_namespaces,
-    read_sensor,
+    read_stream,
     read_topic,
     topics_of,
 )
@@ -110,38 +110,25 @@ def write_bag(
     Raises InputError, also for stamps that a ROS message cannot hold.
     """
     store = typestore()
-    present = [(name, getattr(flight, name)) for name in ("tdoa", "imu", "truth", *SENSORS)]
+    present = {
+        name: stream
+        for name in ("imu", *SENSORS, "tdoa", "pose")
+        if (stream := getattr(flight, "truth" if name == "pose" else name)) is not None
+    }
     starts = [
-        bag_messages.nanoseconds(name, s.t[:1])[0]
-        for name, s in present
-        if s is not None and len(s)
+        bag_messages.nanoseconds(name, stream.t[:1])[0]
+        for name, stream in present.items()
+        if len(stream)
     ]
     if not starts:
         raise InputError(f"{flight.name}: holds no message; there is nothing to write.")
-    first = int(min(starts))
     antenna = flight.meta.get("antenna")
-    topics = _of_anchors(flight.anchors, first, store, antenna)
-    if flight.imu is not None:
-        topics["/imu/data"] = (
-            "sensor_msgs/msg/Imu",
-            STREAM_QOS,
-            bag_messages.imu_messages(flight.imu, store),
-        )
-    for name, sensor in SENSORS.items():
-        if (stream := getattr(flight, name)) is not None:
-            topics[f"/{sensor.topics[0][0]}"] = (
-                sensor.message,
-                STREAM_QOS,
-                bag_messages.sensor_messages(sensor, stream, store, antenna),
-            )
-    topics["/uwb/tdoa"] = (
-        "uwb_tdoa_msgs/msg/Tdoa",
-        STREAM_QOS,
-        bag_messages.tdoa_messages(flight.tdoa, store, antenna),
-    )
-    if flight.truth is not None:
-        poses = bag_messages.pose_messages(flight.truth, flight.anchors.frame, store)
-        topics["/ground_truth/pose"] = "geometry_msgs/msg/PoseStamped", STREAM_QOS, poses
+    topics = _of_anchors(flight.anchors, int(min(starts)), store, antenna)
+    of_radio = bag_messages.ANTENNA_FRAME if antenna else bag_messages.BODY_FRAME
+    frame_of = dict.fromkeys(("tdoa", *LOCATING), of_radio) | {"pose": flight.anchors.frame}
+    for name, stream in present.items():
+        kind, frame = STREAMS[name], frame_of.get(name, bag_messages.BODY_FRAME)
+        topics[f"/{kind.topic}"] = kind.message, STREAM_QOS, kind.messages(stream, frame, store)
 
     with new_bag(out, storage, force) as writer:
         writer.set_custom_data(_FLIGHT_KEY, _about_flight(flight))
@@ -161,11 +148,9 @@ def write_odometry(
     topics = _of_anchors(
         anchors, int(bag_messages.nanoseconds("odometry", odometry.t[:1])[0]), store
     )
-    topics["/odometry"] = (
-        "nav_msgs/msg/Odometry",
-        STREAM_QOS,
-        bag_messages.odometry_messages(odometry, anchors.frame, store),
-    )
+    kind, content = "nav_msgs/msg/Odometry", bag_messages.odometry_content(odometry)
+    made = bag_messages.messages_of("odometry", kind, odometry.t, content, anchors.frame, store)
+    topics["/odometry"] = kind, STREAM_QOS, made
     with new_bag(out, "mcap", force) as writer:
         return _write(writer, topics, store)
 
@@ -247,18 +232,11 @@ def read_bag(
         about = _about(path, reader.custom)
         meta = {**about["meta"], "bag": str(path)}
         remarks, name_of = list[str](), Names(namespace, topics)
-        kinds = (
-            STREAMS if truth else {name: kind for name, kind in STREAMS.items() if name != "pose"}
-        )
-        own = {name: kind for name, kind in kinds.items() if name not in SENSORS}
-        found = {
-            name: read_topic(path, reader, name_of(kind.topic), kind.message, kind.row)
-            for name, kind in own.items()
-        }
         tree = frames.read_frames(path, reader, name_of)
-        found |= {
-            name: read_sensor(path, reader, sensor, name_of, tree)
-            for name, sensor in SENSORS.items()
+        found = {
+            name: read_stream(path, reader, name, name_of, tree)
+            for name in STREAMS
+            if truth or name != "pose"
         }
         remarks += [remark for of in found.values() for remark in of.remarks]
         found, clock = on_one_clock(found)
@@ -269,7 +247,7 @@ def read_bag(
         def stream(name: str) -> Any:
             if name not in found:
                 return None
-            topic, make, valid = kinds[name].topic, kinds[name].make, kinds[name].valid
+            topic, make, valid = STREAMS[name].topic, STREAMS[name].make, STREAMS[name].valid
             stamps, rows, falls = found[name].in_order()
             if falls:
                 meta.setdefault("reordered", {})[topic] = falls
@@ -316,7 +294,7 @@ def read_bag(
         # the antenna is that of the TDOAs, or of ranges without any
         radio = ["tdoa"] if len(tdoa) else [name for name in LOCATING if sensors[name] is not None]
         places = {
-            name: frames.sensor_place(tree, kinds[name].topic, found[name].frames)
+            name: frames.sensor_place(tree, STREAMS[name].topic, found[name].frames)
             for name in ("imu", *radio)
         }
         remarks += [remark for _, remark in places.values() if remark]

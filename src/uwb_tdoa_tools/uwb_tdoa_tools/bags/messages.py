@@ -10,7 +10,8 @@ orientation_covariance[0] of -1, covariances of 0 for unknown.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from functools import reduce
+from functools import partial, reduce
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -49,86 +50,50 @@ def nanoseconds(name: str, t: np.ndarray) -> np.ndarray:
     return np.rint(np.asarray(t, dtype=float) * 1e9).astype(np.int64)
 
 
-def stamp_of(header: Any) -> int:
-    """Return the stamp of a header in ns.
-
-    Dividing by 1e9 restores the written float exactly.
-    """
-    return header.stamp.sec * 10**9 + header.stamp.nanosec
-
-
 def valid(rows: np.ndarray) -> np.ndarray:
     """Return which numbers of rows (n, k) are finite and in range: (n, k) bool."""
     return np.abs(rows) <= LARGEST_NUMBER  # NaN is not
 
 
-def imu_messages(imu: Imu, store: Typestore) -> Iterator[tuple[int, Any]]:
-    """Yield (stamp ns, sensor_msgs/Imu)."""
-    Message, Vector3 = store.types["sensor_msgs/msg/Imu"], store.types["geometry_msgs/msg/Vector3"]
-    no_orientation = store.types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 0.0)
-    unknown, none = np.zeros(9), np.zeros(9)
-    none[0] = -1.0
-    for stamp, rate, force in zip(
-        nanoseconds("imu", imu.t).tolist(), imu.gyro.tolist(), imu.accel.tolist()
-    ):
-        header = header_of(store, stamp, BODY_FRAME)
-        yield (
-            stamp,
-            Message(
-                header, no_orientation, none, Vector3(*rate), unknown, Vector3(*force), unknown
-            ),
-        )
-
-
-def imu_row(message: Any) -> tuple[float, ...] | None:
-    """Return stamp ns, rates (3) rad/s and specific force (3) m/s^2 of a sensor_msgs/Imu.
-
-    None if one of both is not measured, as a covariance of -1 states (REP 145).
-    """
-    rate, force = message.angular_velocity, message.linear_acceleration
-    if -1.0 in (message.angular_velocity_covariance[0], message.linear_acceleration_covariance[0]):
-        return None
-    return stamp_of(message.header), rate.x, rate.y, rate.z, force.x, force.y, force.z
-
-
-def imu_of(stamps: np.ndarray, rows: np.ndarray) -> Imu:
-    """Return the Imu of stamps (n,) s and rows (n, 6) of `imu_row` without the stamp."""
-    return Imu(stamps, rows[:, 0:3], rows[:, 3:6])
-
-
-def sensor_messages(
-    sensor: Sensor, stream: Stream, store: Typestore, antenna: Sequence[float] | None = None
+def messages_of(
+    topic: str, kind: str, t: np.ndarray, content: dict[str, Any], frame: str, store: Typestore
 ) -> Iterator[tuple[int, Any]]:
-    """Yield (stamp ns, message) of the Stream of a Sensor; other fields are 0.
+    """Yield (stamp ns, message) of a type with a header.
 
-    `antenna` is its position in the body frame, for ranges, see `transforms_message`.
+    Parameters
+    ----------
+    topic : for messages of errors.
+    t : (n,) s.
+    content : {field: values, one for all messages or (n, ...)}; other fields are 0. Fields are numbers,
+        arrays, or messages of numbers (Vector3, Quaternion), with a dot before a field of a field.
+    frame : frame_id.
     """
-    frame = ANTENNA_FRAME if antenna and sensor.locates else BODY_FRAME
-    content = {
-        field: np.broadcast_to(values, (len(stream), *np.shape(values)[1:]))
-        for field, values in sensor.content(stream).items()
+    make = _maker(store, kind)
+    columns = {
+        field: np.broadcast_to(values, (len(t), *np.shape(values)[1:]))
+        for field, values in content.items()
     }
-    for k, stamp in enumerate(nanoseconds(sensor.name, stream.t).tolist()):
-        message = _blank(store, sensor.message)
+    for k, stamp in enumerate(nanoseconds(topic, t).tolist()):
+        message = make()
         message.header = header_of(store, stamp, frame)
-        for field, values in content.items():
+        for field, values in columns.items():
             *way, last = field.split(".")
             _set(reduce(getattr, way, message), last, values[k])
         yield stamp, message
 
 
-def _blank(store: Typestore, kind: str) -> Any:
-    """Return a message of a type with all fields 0."""
-    values: dict[str, Any] = {}
+def _maker(store: Typestore, kind: str) -> Callable[[], Any]:
+    """Return a function that makes messages of a type with all fields 0."""
+    makers: list[Callable[[], Any]] = []
     fields: Any = store.get_msgdef(kind).fields  # nested, as each Nodetype says
-    for name, (node, what) in fields:
+    for _, (node, what) in fields:
         if node == Nodetype.NAME:
-            values[name] = _blank(store, what)
+            makers.append(_maker(store, what))
         elif node == Nodetype.BASE:
-            values[name] = "" if what[0] == "string" else 0
+            makers.append(str if what[0] == "string" else int)
         else:
-            values[name] = np.zeros(what[1])
-    return store.types[kind](**values)
+            makers.append(partial(np.zeros, what[1]))
+    return lambda: store.types[kind](*(make() for make in makers))
 
 
 def _set(holder: object, name: str, value: np.ndarray) -> None:
@@ -142,29 +107,63 @@ def _set(holder: object, name: str, value: np.ndarray) -> None:
         setattr(holder, name, np.ascontiguousarray(value) if np.ndim(value) else value.item())
 
 
-def of_sensor(sensor: Sensor) -> tuple[RowOfMessage, StreamOfRows, Validity]:
-    """Return how to read a Sensor: (row of a message, Stream of stamps and rows, valid numbers)."""
+def row_of(*fields: str) -> RowOfMessage:
+    """Return a function of a message -> its stamp ns, and the numbers of fields.
+
+    Dividing the stamp by 1e9 restores the written float exactly.
+    """
+    get: Callable[[Any], tuple[Any, ...]] | None = None
+    nested = False  # whether a field is an array
 
     def row(message: Any) -> tuple[float, ...]:
-        return stamp_of(message.header), *(
-            number
-            for field in sensor.fields
-            for number in _numbers(reduce(getattr, field.split("."), message))
-        )
+        nonlocal get, nested
+        if get is None:
+            leaves = [
+                f"{field}.{part}".rstrip(".")
+                for field in fields
+                for part in _parts(attrgetter(field)(message)) or [""]
+            ]
+            get = attrgetter("header.stamp", *leaves)
+            nested = any(map(np.ndim, get(message)[1:]))
+        stamp, *numbers = get(message)
+        if nested:
+            numbers = np.hstack(numbers).tolist()
+        return stamp.sec * 10**9 + stamp.nanosec, *numbers
 
-    def valid_numbers(rows: np.ndarray) -> np.ndarray:
-        return np.column_stack(list(sensor.sound(sensor.split(rows)).values()))
-
-    return row, lambda stamps, rows: sensor.read(stamps, sensor.split(rows)), valid_numbers
+    return row
 
 
-def _numbers(value: Any) -> list[float]:
-    """Return the numbers of a field that is a number, an array, or a message of numbers."""
-    parts = _parts(value)
-    numbers: list[float] = (
-        [getattr(value, part) for part in parts] if parts else np.ravel(value).tolist()
-    )
-    return numbers
+_inertial_row = row_of("angular_velocity", "linear_acceleration")
+
+
+def imu_row(message: Any) -> tuple[float, ...] | None:
+    """Return stamp ns, rates (3) rad/s and specific force (3) m/s^2 of a sensor_msgs/Imu.
+
+    None if one of both is not measured, as a covariance of -1 states (REP 145).
+    """
+    if -1.0 in (message.angular_velocity_covariance[0], message.linear_acceleration_covariance[0]):
+        return None
+    return _inertial_row(message)
+
+
+def imu_content(imu: Imu) -> dict[str, Any]:
+    """Return {field: (n, ...)} of sensor_msgs/Imu, without an orientation."""
+    no_orientation = [[-1.0, *[0.0] * 8]]
+    return {
+        "orientation_covariance": np.repeat(no_orientation, len(imu), axis=0),
+        "angular_velocity": imu.gyro,
+        "linear_acceleration": imu.accel,
+    }
+
+
+def imu_of(stamps: np.ndarray, rows: np.ndarray) -> Imu:
+    """Return the Imu of stamps (n,) s and rows (n, 6) of `imu_row` without the stamp."""
+    return Imu(stamps, rows[:, 0:3], rows[:, 3:6])
+
+
+def valid_of_sensor(sensor: Sensor, rows: np.ndarray) -> np.ndarray:
+    """Return which numbers of rows (n, k) of a Sensor a recording may hold: (n, k) bool."""
+    return np.column_stack(list(sensor.sound(sensor.split(rows)).values()))
 
 
 def _parts(value: Any) -> list[str]:
@@ -173,58 +172,31 @@ def _parts(value: Any) -> list[str]:
     return [name for name in every if not name.startswith("__")]
 
 
-def tdoa_messages(
-    tdoa: Tdoas, store: Typestore, antenna: Sequence[float] | None = None
-) -> Iterator[tuple[int, Any]]:
-    """Yield (stamp ns, uwb_tdoa_msgs/Tdoa).
-
-    `antenna` is its position in the body frame, see `transforms_message`.
-    """
-    Message, frame = store.types["uwb_tdoa_msgs/msg/Tdoa"], ANTENNA_FRAME if antenna else BODY_FRAME
-    columns = (nanoseconds("tdoa", tdoa.t), tdoa.a, tdoa.b, tdoa.d, tdoa.variance)
-    for stamp, *values in zip(*(column.tolist() for column in columns)):
-        yield stamp, Message(header_of(store, stamp, frame), *values)
-
-
-def tdoa_row(message: Any) -> tuple[float, ...]:
-    """Return stamp ns, ids a and b, d_ab m, and variance m^2 of a uwb_tdoa_msgs/Tdoa."""
-    return (
-        stamp_of(message.header),
-        message.anchor_a,
-        message.anchor_b,
-        message.distance_difference,
-        message.variance,
-    )
+def tdoa_content(tdoa: Tdoas) -> dict[str, Any]:
+    """Return {field: (n,)} of uwb_tdoa_msgs/Tdoa."""
+    return {
+        "anchor_a": tdoa.a,
+        "anchor_b": tdoa.b,
+        "distance_difference": tdoa.d,
+        "variance": tdoa.variance,
+    }
 
 
 def tdoas_of(stamps: np.ndarray, rows: np.ndarray) -> Tdoas:
-    """Return the Tdoas of stamps (n,) s and rows (n, 4) of `tdoa_row` without the stamp."""
+    """Return the Tdoas of stamps (n,) s and rows (n, 4): ids a and b, d_ab m, variance m^2."""
     return Tdoas(
         stamps, rows[:, 0].astype(np.int64), rows[:, 1].astype(np.int64), rows[:, 2], rows[:, 3]
     )
 
 
-def pose_messages(truth: Truth, frame: str, store: Typestore) -> Iterator[tuple[int, Any]]:
-    """Yield (stamp ns, geometry_msgs/PoseStamped)."""
-    Message = store.types["geometry_msgs/msg/PoseStamped"]
+def pose_content(truth: Truth) -> dict[str, Any]:
+    """Return {field: (n, ...)} of geometry_msgs/PoseStamped; an unknown quaternion is 0."""
     q_or_zero = np.where(np.isfinite(truth.q), truth.q, 0.0)
-    for stamp, p, q in zip(
-        nanoseconds("truth", truth.t).tolist(), truth.p.tolist(), q_or_zero.tolist()
-    ):
-        yield stamp, Message(header_of(store, stamp, frame), pose_of(store, p, q))
-
-
-def pose_row(message: Any) -> tuple[float, ...]:
-    """Return stamp ns, position (3) m, and quaternion x y z w of a geometry_msgs/PoseStamped."""
-    return (
-        stamp_of(message.header),
-        *_point(message.pose.position),
-        *_quaternion(message.pose.orientation),
-    )
+    return {"pose.position": truth.p, "pose.orientation": q_or_zero}
 
 
 def truth_of(stamps: np.ndarray, rows: np.ndarray) -> Truth:
-    """Return the Truth of stamps (n,) s and rows (n, 7) of `pose_row` without the stamp.
+    """Return the Truth of stamps (n,) s and rows (n, 7): position m, quaternion x y z w.
 
     A quaternion of zeros is unknown.
     """
@@ -280,37 +252,25 @@ def transforms_message(
     return stamp, types["tf2_msgs/msg/TFMessage"](transforms)
 
 
-def odometry_messages(
-    odometry: Odometry, frame: str, store: Typestore
-) -> Iterator[tuple[int, Any]]:
-    """Yield (stamp ns, nav_msgs/Odometry); the twist is in the body frame, rates are unknown."""
-    types = store.types
-    Message, Vector3 = types["nav_msgs/msg/Odometry"], types["geometry_msgs/msg/Vector3"]
-    Pose, Twist = (
-        types["geometry_msgs/msg/PoseWithCovariance"],
-        types["geometry_msgs/msg/TwistWithCovariance"],
-    )
-    n = len(odometry)
-    unknown = np.full((n, 3), np.nan)
-    numbers = pose_and_twist(odometry, unknown, unknown)
-    for stamp, of_pose, of_twist in zip(nanoseconds("odometry", odometry.t).tolist(), *numbers):
-        twist = types["geometry_msgs/msg/Twist"](Vector3(*of_twist[:3]), Vector3(*of_twist[3:6]))
-        pose = Pose(pose_of(store, of_pose[:3], of_pose[3:7]), of_pose[7:])
-        yield (
-            stamp,
-            Message(header_of(store, stamp, frame), BODY_FRAME, pose, Twist(twist, of_twist[6:])),
-        )
+def odometry_content(odometry: Odometry) -> dict[str, Any]:
+    """Return {field: (n, ...)} of nav_msgs/Odometry; the twist is in the body frame, rates are unknown."""
+    unknown = np.full((len(odometry), 3), np.nan)
+    pose, twist = map(np.array, pose_and_twist(odometry, unknown, unknown))
+    return {
+        "child_frame_id": np.full(len(odometry), BODY_FRAME),
+        "pose.pose.position": pose[:, :3],
+        "pose.pose.orientation": pose[:, 3:7],
+        "pose.covariance": pose[:, 7:],
+        "twist.twist.linear": twist[:, :3],
+        "twist.twist.angular": twist[:, 3:6],
+        "twist.covariance": twist[:, 6:],
+    }
 
 
-def odometry_row(message: Any) -> tuple[float, ...]:
-    """Return stamp, position, velocity in the child frame, quaternion, pose covariance (36)."""
-    return (
-        stamp_of(message.header),
-        *_point(message.pose.pose.position),
-        *_point(message.twist.twist.linear),
-        *_quaternion(message.pose.pose.orientation),
-        *message.pose.covariance.tolist(),
-    )
+# stamp, position, velocity in the child frame, quaternion, pose covariance (36) of nav_msgs/Odometry
+odometry_row = row_of(
+    "pose.pose.position", "twist.twist.linear", "pose.pose.orientation", "pose.covariance"
+)
 
 
 def header_of(store: Typestore, stamp: int, frame: str) -> Any:
@@ -327,11 +287,3 @@ def pose_of(
     return types["geometry_msgs/msg/Pose"](
         types["geometry_msgs/msg/Point"](*p), types["geometry_msgs/msg/Quaternion"](*q)
     )
-
-
-def _point(v: Any) -> tuple[float, float, float]:
-    return v.x, v.y, v.z
-
-
-def _quaternion(q: Any) -> tuple[float, float, float, float]:
-    return q.x, q.y, q.z, q.w

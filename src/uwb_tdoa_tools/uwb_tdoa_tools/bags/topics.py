@@ -5,8 +5,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,6 +20,7 @@ from rosbags.interfaces import (
     QosReliability,
     QosTime,
 )
+from rosbags.typesys.store import Typestore
 
 from uwb_tdoa_bias.common.sensors import SENSORS, Sensor
 from uwb_tdoa_bias.common.transforms import Frames
@@ -54,13 +56,14 @@ LATCHED_QOS = _qos(QosDurability.TRANSIENT_LOCAL, 1)
 
 
 class StreamKind(NamedTuple):
-    """How a stream of a Flight is read from a bag.
+    """How a stream of a Flight is read from a bag, and written.
 
     Attributes
     ----------
     topic, message : our topic and its type.
     row : convert a message to numbers, see `read_topic`.
     make : convert stamps s and rows to the stream.
+    content : convert a stream to the fields of messages, see `messages.messages_of`.
     valid : check which numbers of the rows are valid.
     """
 
@@ -68,23 +71,49 @@ class StreamKind(NamedTuple):
     message: str
     row: bag_messages.RowOfMessage
     make: Callable[[np.ndarray, np.ndarray], Any]
+    content: Callable[[Any], dict[str, Any]]
     valid: Callable[[np.ndarray], np.ndarray] = bag_messages.valid
+
+    def messages(self, stream: Any, frame: str, store: Typestore) -> Iterator[tuple[int, Any]]:
+        """Yield (stamp ns, message) of a stream in a frame."""
+        content = self.content(stream)
+        return bag_messages.messages_of(self.topic, self.message, stream.t, content, frame, store)
+
+
+def of_sensor(sensor: Sensor) -> StreamKind:
+    """Return the StreamKind of a Sensor."""
+    return StreamKind(
+        sensor.topics[0][0],
+        sensor.message,
+        bag_messages.row_of(*sensor.fields),
+        lambda stamps, rows: sensor.read(stamps, sensor.split(rows)),
+        sensor.content,
+        partial(bag_messages.valid_of_sensor, sensor),
+    )
 
 
 STREAMS = {
     "tdoa": StreamKind(
-        "uwb/tdoa", "uwb_tdoa_msgs/msg/Tdoa", bag_messages.tdoa_row, bag_messages.tdoas_of
+        "uwb/tdoa",
+        "uwb_tdoa_msgs/msg/Tdoa",
+        bag_messages.row_of("anchor_a", "anchor_b", "distance_difference", "variance"),
+        bag_messages.tdoas_of,
+        bag_messages.tdoa_content,
     ),
-    "imu": StreamKind("imu/data", "sensor_msgs/msg/Imu", bag_messages.imu_row, bag_messages.imu_of),
-    **{
-        name: StreamKind(of.topics[0][0], of.message, *bag_messages.of_sensor(of))
-        for name, of in SENSORS.items()
-    },
+    "imu": StreamKind(
+        "imu/data",
+        "sensor_msgs/msg/Imu",
+        bag_messages.imu_row,
+        bag_messages.imu_of,
+        bag_messages.imu_content,
+    ),
+    **{name: of_sensor(sensor) for name, sensor in SENSORS.items()},
     "pose": StreamKind(
         "ground_truth/pose",
         "geometry_msgs/msg/PoseStamped",
-        bag_messages.pose_row,
+        bag_messages.row_of("pose.position", "pose.orientation"),
         bag_messages.truth_of,
+        bag_messages.pose_content,
     ),
 }
 
@@ -189,19 +218,18 @@ def topics_of(name: str) -> tuple[tuple[str, str], ...]:
     )
 
 
-def read_sensor(
-    path: str | Path, reader: BagReader, sensor: Sensor, name_of: Names, tree: Frames
+def read_stream(
+    path: str | Path, reader: BagReader, name: str, name_of: Names, tree: Frames
 ) -> TopicMessages:
-    """Read all topics of a Sensor as a node receives them: in order of arrival, in the body frame.
+    """Read all topics of a stream as a node receives them: in order of arrival, in the body frame.
 
     Raises InputError as `read_topic`.
     """
-    row, _, _ = bag_messages.of_sensor(sensor)
-    parts = [read_topic(path, reader, name_of(topic), kind, row) for topic, kind in sensor.topics]
-    if sensor.in_body is not None:
+    topics, row, sensor = topics_of(name), STREAMS[name].row, SENSORS.get(name)
+    parts = [read_topic(path, reader, name_of(topic), kind, row) for topic, kind in topics]
+    if sensor is not None and sensor.in_body is not None:
         parts = [
-            _in_body(part, sensor, name_of(topic), tree)
-            for part, (topic, _) in zip(parts, sensor.topics)
+            _in_body(part, sensor, name_of(topic), tree) for part, (topic, _) in zip(parts, topics)
         ]
     filled = [part for part in parts if len(part.stamps)]
     if len(filled) < 2:

@@ -15,7 +15,8 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import temporary_folder
 from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
 from uwb_tdoa_bias.common.sensors import LOCATING, SENSORS
-from uwb_tdoa_bias.common.survey import refuse_faulty
+from uwb_tdoa_bias.common.survey import as_named
+from uwb_tdoa_bias.common.survey_faults import refuse_faulty
 
 from ..bags import frames, is_bag, messages as bag_messages
 from ..bags.files import open_bag, remarks_of
@@ -26,16 +27,14 @@ from ..bags.topics import (
     TopicMessages,
     arrivals,
     on_one_clock,
-    read_sensor,
-    read_topic,
+    read_stream,
 )
 from ..command_lines import suggest_line
-from ..readers import read_survey
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from uwb_tdoa_bias.common.sensors.sensor import Sensor, Stream
+    from uwb_tdoa_bias.common.sensors.sensor import Stream
     from uwb_tdoa_bias.common.transforms import Place
 
     from ..clock import Jump
@@ -45,10 +44,6 @@ if TYPE_CHECKING:
 IMU, TDOA = "imu/data", "uwb/tdoa"
 OF_SENSORS = tuple(topic for sensor in SENSORS.values() for topic, _ in sensor.topics)
 HEARD = (TDOA, IMU, "uwb/anchors", *OF_SENSORS, "uwb/tdoa_corrected", "odometry", "uwb/residual")
-_ROWS = {
-    IMU: ("sensor_msgs/msg/Imu", bag_messages.imu_row),
-    TDOA: ("uwb_tdoa_msgs/msg/Tdoa", bag_messages.tdoa_row),
-}
 
 
 @dataclass(frozen=True)
@@ -202,18 +197,9 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
     name_of = Names(reading.namespace, reading.topics)
     with open_bag(path) as reader:
         topics = {connection.topic: connection.msgtype for connection in reader.connections}
-        kinds = {"tdoa": (TDOA, *_ROWS[TDOA]), "imu": (IMU, *_ROWS[IMU])}
-        found = {
-            name: read_topic(path, reader, name_of(topic), kind, row)
-            for name, (topic, kind, row) in kinds.items()
-        }
         tree = frames.read_frames(path, reader, name_of)
-        found |= {
-            name: read_sensor(path, reader, sensor, name_of, tree)
-            for name, sensor in SENSORS.items()
-        }
-        pose = STREAMS["pose"]
-        poses = read_topic(path, reader, name_of(pose.topic), pose.message, pose.row)
+        found = {name: read_stream(path, reader, name, name_of, tree) for name in STREAMS}
+        poses = found.pop("pose")
         arrival = arrivals(found)
         found, clock = on_one_clock(found)
         tdoa, imu = found["tdoa"], found["imu"]
@@ -221,8 +207,8 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
             name: arrival[name][clock.kept.get(name, slice(None))] for name in ("tdoa", "imu")
         }
         sensors = {
-            name: _stream_of(found[name], sensor)
-            for name, sensor in SENSORS.items()
+            name: STREAMS[name].make(found[name].stamps / 1e9, found[name].rows)
+            for name in SENSORS
             if len(found[name].stamps)
         }
         recorded = recorded_anchors(path, reader, name_of("uwb/anchors"))
@@ -231,14 +217,15 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
         there = sorted(
             topic
             for topic, kind in topics.items()
-            if kind == _ROWS[TDOA][0] and topic != name_of(TDOA)
+            if kind == STREAMS["tdoa"].message and topic != name_of(TDOA)
         )
         places = " or ".join(f"--topic {TDOA}={topic}" for topic in there)
         hint = f"say where they are ({places})"
         if not there:
             hint = f"a recording of others needs a profile, which this line names: {suggest_line(path)}"
         raise InputError(f"{path}: has no message on {name_of(TDOA)}; {hint}.")
-    anchors = read_survey(survey) if survey else recorded and recorded.anchors
+    given = as_named(survey)
+    anchors = given.anchors if given else recorded and recorded.anchors
     if anchors is None:
         raise InputError(
             f"{path}: has no message on {name_of('uwb/anchors')}; give a survey file "
@@ -253,7 +240,7 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
     return Recording(
         name=path.stem,
         anchors=anchors,
-        tdoa=bag_messages.tdoas_of(tdoa.stamps / 1e9, tdoa.rows.reshape(len(tdoa.stamps), 4)),
+        tdoa=bag_messages.tdoas_of(tdoa.stamps / 1e9, tdoa.rows.reshape(-1, 4)),
         imu=samples,
         tdoa_arrival=arrival["tdoa"],
         imu_arrival=arrival["imu"],
@@ -283,11 +270,3 @@ def _truth_of(found: TopicMessages) -> Truth | None:
     stamps, rows, _ = found.in_order()
     known = STREAMS["pose"].valid(rows).all(axis=1) if len(stamps) else np.zeros(0, bool)
     return bag_messages.truth_of(stamps[known], rows[known]) if known.any() else None
-
-
-def _stream_of(found: TopicMessages, sensor: Sensor) -> Stream:
-    """Return the Stream of a Sensor."""
-    make = bag_messages.of_sensor(sensor)[1]
-    return make(
-        found.stamps / 1e9, found.rows.reshape(len(found.stamps), sum(sensor.fields.values()))
-    )

@@ -118,9 +118,11 @@ def _recordings(
 
 def _surveys(folder: Path) -> list[tuple[str, Anchors]]:
     """Return [(path, Anchors)] of a folder of surveys."""
-    from ..readers import read_survey
+    from uwb_tdoa_bias.common.survey import read_named_anchors
 
-    return [(str(path), read_survey(path)) for path in sorted(folder.glob("anchor_?*"))]
+    return [
+        (str(path), read_named_anchors(path).anchors) for path in sorted(folder.glob("anchor_?*"))
+    ]
 
 
 main = cli.executable(_check, parser)

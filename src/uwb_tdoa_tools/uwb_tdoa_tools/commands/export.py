@@ -64,11 +64,10 @@ def parser() -> ArgumentParser:
 
 
 def _export(args: Namespace) -> None:
+    from uwb_tdoa_bias.common.survey import read_named_anchors
     from uwb_tdoa_bias.correction.corrector import orientation_remarks
     from uwb_tdoa_bias.correction.network import load_network
     from uwb_tdoa_bias.effects import EffectSet
-
-    from ..readers import read_survey
 
     if not (args.effects or args.model):
         raise InputError("--effects: is missing, and so is --model; give one of them, or both.")
@@ -79,7 +78,7 @@ def _export(args: Namespace) -> None:
     from ..exporting.vehicle import write_c, write_crazyflie
 
     say = partial(cli.say, "export")
-    anchors = read_survey(args.survey)
+    anchors = read_named_anchors(args.survey).anchors
     effects = EffectSet.from_yaml(args.effects) if args.effects else None
     model = load_network(args.model)
     given = anchors, effects, model

@@ -229,7 +229,7 @@ OPTIONS = (
 
 def config_of(args: Namespace) -> SimulationConfig:
     """Return the SimulationConfig of the options; most have the names of its fields."""
-    from uwb_tdoa_bias.common.survey import read_survey, refuse_faulty
+    from uwb_tdoa_bias.common.survey import read_survey
 
     from ..readers.tables import read_numbers
     from ..simulation.config import NO_IMU_ERRORS, ImuErrors, SimulationConfig
@@ -244,11 +244,7 @@ def config_of(args: Namespace) -> SimulationConfig:
         None if args.poses is None else tuple(map(tuple, read_numbers(args.poses, POSE).tolist()))
     )
     values["walls"] = None if args.walls is None else Walls.from_yaml(args.walls)
-    values["anchors"] = (
-        None
-        if args.anchors is None
-        else refuse_faulty(read_survey(args.anchors), str(args.anchors))
-    )
+    values["anchors"] = None if args.anchors is None else read_survey(args.anchors)
     values["imu_errors"] = (
         NO_IMU_ERRORS if args.perfect_imu else ImuErrors(vibration=args.vibration)
     )

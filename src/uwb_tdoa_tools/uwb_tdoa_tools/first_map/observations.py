@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Flight, Imu
+from uwb_tdoa_bias.common.survey import read_named_anchors
 
-from ..readers.names import read_survey
 from ..surveying.known import read_coordinates, read_distances
 
 MOST = 64  # anchors of a map
@@ -102,7 +102,7 @@ def given(
     """
     if Path(survey).is_dir():
         raise InputError(f"{survey}: is a folder; give the file of the anchors that are known.")
-    known = read_survey(survey)
+    known = read_named_anchors(survey).anchors
     distances = [] if files[1] is None else read_distances(files[1])
     between = [i for one in distances for i in (one.a, one.b)]
     ids = np.union1d(heard(flights), np.array(between, np.int64))

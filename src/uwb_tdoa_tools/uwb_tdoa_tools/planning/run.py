@@ -16,11 +16,11 @@ import numpy as np
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.radio import Antenna
+from uwb_tdoa_bias.common.survey import read_named_anchors
 
 from .. import cli, parallel
 from ..choices import OF_PROTOCOL
 from ..parallel import Progress
-from ..readers import read_survey
 from ..readers.inputs import Reading, Recording
 from ..simulation.rooms import Room, Walls, room_of
 from . import maps, optimisation, plots, report
@@ -46,7 +46,7 @@ def plan(args: Namespace) -> bool:
     Returns False if --hall finds no layout with the wanted share. Raises InputError.
     """
     check_options(args)
-    anchors = None if args.hall else read_survey(args.anchors)
+    anchors = None if args.hall else read_named_anchors(args.anchors).anchors
     room = room_of_options(args, anchors)
     reach = reach_of(args, room)
     installation = installation_of(args, anchors or Anchors.from_positions([room.centre]))

@@ -16,12 +16,12 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import read_head
 from uwb_tdoa_bias.common.flight import Flight
+from uwb_tdoa_bias.common.survey import as_named
 
 from ..bags import is_bag, is_ros_1
 from ..command_lines import suggest_line
 from .by_profile import read_by_profile
 from .logs import MAGIC, is_util_csv, read_usd_log, read_util_csv
-from .names import read_survey
 from .profile import load_profile
 from .tables import GZIP_MAGIC, is_ulog
 
@@ -68,7 +68,6 @@ __all__ = [
     "load_profile",
     "read_by_profile",
     "read_flight",
-    "read_survey",
     "read_usd_log",
     "read_util_csv",
 ]
@@ -89,7 +88,7 @@ def read_flight(
     Parameters
     ----------
     path : micro-SD event log, UTIL CSV (plain or gzip), or ROS 2 bag (directory, .mcap or .db3).
-    survey : Anchors, or a survey file, see `read_survey`. Logs and CSV files need it. In a bag it
+    survey : Anchors, or a survey file, see `read_named_anchors`. Logs and CSV files need it. In a bag it
         replaces the recorded anchors.
     namespace, topics : topics of the tag in a bag, see `read_bag`.
     salvage : read a damaged recording up to the damage and skip invalid records. `meta["remarks"]`
@@ -103,20 +102,18 @@ def read_flight(
     path = Path(path)
     if not path.exists():
         raise InputError(f"{path}: does not exist; give a micro-SD log, a UTIL CSV file or a bag.")
+    named = as_named(survey)
+    anchors = None if named is None else named.anchors
     if is_bag(path):
-        return read_bag(path, namespace, _anchors(survey), salvage, topics, truth)
+        return read_bag(path, namespace, anchors, salvage, topics, truth)
     if path.is_dir():
         raise InputError(
             f"{path}: is a directory without metadata.yaml; give a bag directory or a file, or say "
             "with --profile how to read what is in it."
         )
-    reader, anchors = reader_of(path), _anchors(survey)
+    reader = reader_of(path)
     if anchors is None:
         raise InputError(
             f"{path}: does not say where the anchors are; give a survey file (--survey FILE)."
         )
     return reader(path, anchors, salvage, truth)
-
-
-def _anchors(survey: str | Path | Anchors | None) -> Anchors | None:
-    return read_survey(survey) if isinstance(survey, (str, Path)) else survey

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,18 +13,12 @@ import numpy as np
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Flight
-from uwb_tdoa_bias.common.survey import Entry, name_of, refuse_faulty
+from uwb_tdoa_bias.common.survey import Entry, NamedAnchors, as_named, name_of, named_anchors
 
-from .names import NamedAnchors, named_anchors, read_named_anchors
-from .profile import (
-    ANCHORS,
-    STREAMS,
-    Columns,
-    check_columns,
-    parse_column,
-    time_column,
-)
-from .streams import Streams, make_flight
+from .by_profile import streams_of
+from .profile import Profile, Source, check_columns, parse_column
+from .streams import make_flight
+from .tables import Block, Foreign, Wanted
 
 VECTORS = {"gyro": "xyz", "accel": "xyz", "pose": "xyz", "pose_q": "xyzw"}  # a column for each axis
 
@@ -52,21 +46,43 @@ def flight_of_arrays(
     InputError
         If a column or a unit is unknown or missing, or values are no numbers or of other lengths.
     """
-    named = _anchors_of(anchors)
-    streams: Streams = {}
+    named, read, sources = _anchors_of(anchors), {}, []
     for title, table in tables.items():
-        values = _separate(title, table)
-        columns = {column: _meaning(title, column, units or {}) for column in values}
+        read[title] = _separate(title, table)
+        columns = {column: _meaning(title, column, units or {}) for column in read[title]}
         check_columns(title, columns, time=False)
-        streams |= _streams(title, values, columns, named)
-    return make_flight(name, named.anchors, streams, {}, {"source": name, "format": "arrays"})
+        sources.append(Source(columns, topic=title))
+    profile = Profile("arrays", tuple(sources))
+    _, streams, meta = streams_of(_Arrays(read), name, profile, named)
+    meta |= {"source": name, "read": [], "unread": []}
+    return make_flight(name, named.anchors, streams, {}, meta)
+
+
+class _Arrays(Foreign):
+    """Tables of arrays: {title: "arrays"}."""
+
+    place = "row"
+
+    def __init__(self, columns: dict[str, dict[str, np.ndarray]]) -> None:
+        super().__init__()
+        self._columns, self.types = columns, dict.fromkeys(columns, "arrays")
+
+    def fields(self, table: str) -> list[str]:
+        """Return the columns of a table."""
+        return [*self._columns[table]]
+
+    def blocks(self, wanted: Sequence[Wanted]) -> Iterator[Block]:
+        """Yield the rows of tables."""
+        for number, (table, _, paths) in enumerate(wanted):
+            columns = {path: self._columns[table][path].tolist() for path in paths}
+            yield Block(number, [*range(1, 1 + len(columns[paths[0]]))], columns)
 
 
 def _anchors_of(anchors: Any) -> NamedAnchors:
-    if isinstance(anchors, Anchors):
-        return NamedAnchors(anchors)
-    if isinstance(anchors, (str, Path)):
-        return read_named_anchors(anchors)
+    if isinstance(anchors, (Anchors, str, Path)):
+        named = as_named(anchors)
+        assert named is not None
+        return named
     if not isinstance(anchors, Mapping):
         raise InputError(
             f"anchors: is {type(anchors).__name__}; give Anchors, the path of a survey, or "
@@ -79,10 +95,8 @@ def _anchors_of(anchors: Any) -> NamedAnchors:
             raise InputError(
                 f"anchors: {key} has {position.size} coordinates; give x, y and z in m."
             )
-        entries.append(Entry(name_of(key), position.tolist(), [np.nan] * 4, f"anchor {key}"))
-    named = named_anchors("anchors", entries, "map")
-    refuse_faulty(named.anchors, "anchors")
-    return named
+        entries.append(Entry(name_of(key), position.tolist()))
+    return named_anchors("anchors", entries)
 
 
 def _separate(title: str, table: Any) -> dict[str, Any]:
@@ -120,39 +134,8 @@ def _meaning(title: str, column: str, units: Mapping[str, Any]) -> tuple[str, fl
     return parse_column(title, column, column if unit is None else f"{column}:{unit}")
 
 
-def _streams(
-    title: str, values: Mapping[str, Any], columns: Columns, named: NamedAnchors
-) -> Streams:
-    """Return the streams of a table, as `make_flight` takes them."""
-    out: Streams = {}
-    for stream, known in STREAMS.items():
-        mine = {theirs: ours for ours, (theirs, _) in known.items() if ours in columns}
-        if not mine:
-            continue
-        time = time_column(stream, columns)
-        if time is None:
-            raise InputError(f"{title}: has no column time; give the stamps of its rows.")
-        out[stream] = {"t": _numbers(title, time[0], values[time[0]]) * time[1]}
-        for theirs, ours in mine.items():
-            if ours in ANCHORS:
-                out[stream][theirs] = _ids(title, ours, values[ours], named)
-            else:
-                out[stream][theirs] = _numbers(title, ours, values[ours]) * columns[ours][1]
-    return out
-
-
 def _numbers(title: str, name: str, values: Any) -> np.ndarray:
     try:
         return np.asarray(values, dtype=float)
     except (TypeError, ValueError) as error:
         raise InputError(f"{title}: {name} holds values that are no numbers ({error}).") from error
-
-
-def _ids(title: str, name: str, values: Any, named: NamedAnchors) -> np.ndarray:
-    """Return the ids (n,) of anchors by id or name."""
-    texts, rows = np.unique([name_of(value) for value in np.asarray(values)], return_inverse=True)
-    ids = [named.id_of(str(text)) for text in texts]
-    if None in ids:
-        unknown = str(texts[ids.index(None)])
-        raise InputError(f"{title}: {name} holds {unknown!r}, which is no anchor; check the ids.")
-    return np.array(ids, dtype=np.int64)[rows]

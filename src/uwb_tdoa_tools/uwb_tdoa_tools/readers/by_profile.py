@@ -17,10 +17,10 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Flight
-from uwb_tdoa_bias.common.survey import Entry, name_of, refuse_faulty
+from uwb_tdoa_bias.common.survey import Entry, NamedAnchors, name_of, named_anchors
+from uwb_tdoa_bias.common.survey_faults import refuse_faulty
 
 from ..bags import is_bag, is_ros_1
-from .names import NamedAnchors, named_anchors
 from .profile import (
     ANCHORS,
     ATTITUDE,
@@ -127,35 +127,10 @@ def read_by_profile(
     """
     files = [Path(path) for path in paths]
     with open_recording(files, profile.types, salvage) as tables:
-        remarks: list[str] = []
-        requests = _requests(tables, profile, files[0], namespace, remarks, survey is not None)
-        wanted = [one for one in requests if one.gives]
-        for block in tables.blocks([one.wanted for one in wanted]):
-            wanted[block.number].take(block, tag)
-        named = survey or _recorded_anchors(tables, wanted, files[0], remarks)
-        streams: Streams = {}
-        parts: dict[str, list[tuple[str, dict[str, np.ndarray]]]] = {}
-        for request in wanted:
-            for stream, columns in request.streams(named, remarks, salvage).items():
-                parts.setdefault(stream, []).append((request.table, columns))
-        _check_tag(files[0], requests, tag)
-        for stream, found in parts.items():
-            if stream in SINGLE and len(found) > 1:
-                raise InputError(
-                    f"{files[0]}: {' and '.join(table for table, _ in found)} both give {stream}, which is of one "
-                    "sensor; leave one of them out of the profile."
-                )
-            if isinstance(tables, CsvFiles) and not any(source.topic for source in profile.sources):
-                _refuse_same_anchors(found)
-            streams[stream] = _joined([columns for _, columns in found])
-        remarks += tables.remarks
-        meta: dict[str, Any] = {
-            "source": ", ".join(map(str, paths)),
-            "format": profile.name,
-            "remarks": remarks,
-            "read": [sentence for request in wanted for sentence in request.sentences(tables)],
-            "unread": _unread(tables, requests),
-        }
+        named, streams, meta = streams_of(
+            tables, files[0], profile, survey, tag, namespace, salvage
+        )
+    meta = {"source": ", ".join(map(str, paths)), **meta}
     antenna = profile.antenna.get(tag) or profile.antenna.get("")
     if antenna:
         meta["antenna"] = list(antenna)
@@ -163,6 +138,47 @@ def read_by_profile(
         meta["anchor_ids"] = named.ids
     name = _name(files[0]) + (f"_tag{tag}" if tag else "")
     return make_flight(name, named.anchors, streams, {}, meta, salvage, truth)
+
+
+def streams_of(
+    tables: Foreign,
+    path: str | Path,
+    profile: Profile,
+    survey: NamedAnchors | None,
+    tag: str = "",
+    namespace: str = "",
+    salvage: bool = False,
+) -> tuple[NamedAnchors, Streams, dict[str, Any]]:
+    """Return the anchors, the streams and the `meta` of tables, as `make_flight` takes them.
+
+    path : for messages; others see `read_by_profile`. Raises InputError.
+    """
+    remarks: list[str] = []
+    requests = _requests(tables, profile, path, namespace, remarks, survey is not None)
+    wanted = [one for one in requests if one.gives]
+    for block in tables.blocks([one.wanted for one in wanted]):
+        wanted[block.number].take(block, tag)
+    named = survey or _recorded_anchors(tables, wanted, path, remarks)
+    parts: dict[str, list[tuple[str, dict[str, np.ndarray]]]] = {}
+    for request in wanted:
+        for stream, columns in request.streams(named, remarks, salvage).items():
+            parts.setdefault(stream, []).append((request.table, columns))
+    _check_tag(path, requests, tag)
+    for stream, found in parts.items():
+        if stream in SINGLE and len(found) > 1:
+            raise InputError(
+                f"{path}: {' and '.join(table for table, _ in found)} both give {stream}, which is of one "
+                "sensor; leave one of them out of the profile."
+            )
+        if isinstance(tables, CsvFiles) and not any(source.topic for source in profile.sources):
+            _refuse_same_anchors(found)
+    meta: dict[str, Any] = {
+        "format": profile.name,
+        "remarks": remarks + tables.remarks,
+        "read": [sentence for request in wanted for sentence in request.sentences(tables)],
+        "unread": _unread(tables, requests),
+    }
+    return named, {name: _joined([one for _, one in found]) for name, found in parts.items()}, meta
 
 
 def _name(path: Path) -> str:
@@ -206,9 +222,7 @@ class _Request:
             self._columns.pop(SURVEY, None)
         self.gives = {*self._columns}
         if any("t" not in mine for stream, mine in self._columns.items() if stream != SURVEY):
-            raise InputError(
-                f"{table}: the profile names no column with the time; write time: COLUMN."
-            )
+            raise InputError(f"{table}: names no column with the time; write time: COLUMN.")
         self.wanted = Wanted(
             table, source.each, tuple(_paths(source, self._columns.values()) - {*names})
         )
@@ -417,7 +431,7 @@ def _axes_of_world(source: Source) -> np.ndarray:
 def _requests(
     tables: Foreign,
     profile: Profile,
-    path: Path,
+    path: str | Path,
     namespace: str,
     remarks: list[str],
     has_survey: bool,
@@ -453,7 +467,7 @@ def _requests(
 
 
 def _in_namespace(
-    path: Path, found: dict[str, dict[str, str]], namespace: str
+    path: str | Path, found: dict[str, dict[str, str]], namespace: str
 ) -> dict[str, dict[str, str]]:
     """Return the one table in a namespace. Raises InputError unless there is one."""
     prefix = f"/{namespace.strip('/')}/"
@@ -514,20 +528,14 @@ def _wanted(source: Source, default: tuple[str, float] | None = None) -> dict[st
 
 
 def _recorded_anchors(
-    tables: Foreign, requests: Sequence[_Request], path: Path, remarks: list[str]
+    tables: Foreign, requests: Sequence[_Request], path: str | Path, remarks: list[str]
 ) -> NamedAnchors:
     """Return the anchors in the recording. Raises InputError."""
     places: dict[str, np.ndarray] = {}
     for request in requests:
         places |= request.surveyed(remarks)
     if places:
-        entries = [
-            Entry(name, list(place), [np.nan] * 4, f"anchor {name}")
-            for name, place in places.items()
-        ]
-        named = named_anchors(path, entries, "map")
-        refuse_faulty(named.anchors, str(path))
-        return named
+        return named_anchors(path, [Entry(name, list(at)) for name, at in places.items()])
     recorded = tables.recorded_anchors()
     if recorded is not None:
         refuse_faulty(recorded.anchors, f"{path}: {recorded.source}")
@@ -551,7 +559,7 @@ def _refuse_same_anchors(found: Sequence[tuple[str, dict[str, np.ndarray]]]) -> 
                 )
 
 
-def _check_tag(path: Path, requests: Sequence[_Request], tag: str) -> None:
+def _check_tag(path: str | Path, requests: Sequence[_Request], tag: str) -> None:
     """Raise InputError if the tag is not there, or is one of several and not named."""
     tags: Counter[str] = sum((request.tags for request in requests), Counter())
     listed = ", ".join(f"{name} ({count} records)" for name, count in sorted(tags.items()))

@@ -12,17 +12,18 @@ import sys
 import numpy as np
 from tqdm import tqdm
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Flight
 from uwb_tdoa_bias.common.limits import FOLDER_DEPTH, FOLDER_ENTRIES, Budget
 from uwb_tdoa_bias.common.sensors import LOCATING
+from uwb_tdoa_bias.common.survey import as_named
 from uwb_tdoa_bias.common.text import printable
 
 from .. import parallel
 from ..bags import BESIDE, is_bag, is_one_bag
 from ..clock import apart, sentence_on
 from . import read_by_profile, read_flight
-from .names import read_named_anchors
 from .profile import Profile
 
 Recording = tuple[Path, str | Path | None]  # and its survey
@@ -181,12 +182,7 @@ class Reading:
         Raises InputError.
         """
         path, survey = recording
-        if self.profile:
-            flight = self._by_profile([path], self.profile, survey)
-        else:
-            flight = read_flight(
-                path, survey, self.namespace, self.salvage, self.topics, self.truth
-            )
+        flight = self.flight([path], survey)
         report_remarks(path, flight.meta.get("remarks", ()))
         beside = {
             name: stream.t
@@ -196,13 +192,17 @@ class Reading:
         report_remarks(path, (f"{sentence_on(*one)}." for one in apart(beside)))
         return flight
 
-    def _by_profile(
-        self, paths: Sequence[str | Path], profile: Profile, survey: str | Path | None
-    ) -> Flight:
-        named = read_named_anchors(survey) if survey else None
-        return read_by_profile(
-            paths, profile, named, self.tag, self.namespace, self.salvage, self.truth
-        )
+    def flight(self, paths: Sequence[str | Path], survey: str | Path | Anchors | None) -> Flight:
+        """Return the Flight of one recording; with a profile it may have several files.
+
+        Raises InputError.
+        """
+        if self.profile:
+            named = as_named(survey)
+            return read_by_profile(
+                paths, self.profile, named, self.tag, self.namespace, self.salvage, self.truth
+            )
+        return read_flight(paths[0], survey, self.namespace, self.salvage, self.topics, self.truth)
 
     def one(self, *paths: str | Path) -> Flight:
         """Read the Flight of one recording; with a profile it may have several files.
@@ -211,7 +211,7 @@ class Reading:
         """
         path = Path(paths[0])
         if self.profile:
-            return self._by_profile(paths, self.profile, survey_for(path, self.survey))
+            return self.flight(paths, survey_for(path, self.survey))
         if len(paths) > 1:
             raise InputError(
                 f"IN: {len(paths)} recordings are given; convert one by one, or name --columns "

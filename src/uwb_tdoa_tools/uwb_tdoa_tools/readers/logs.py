@@ -21,11 +21,11 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import read_bytes
 from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.common.limits import TABLE_CELLS, USD_TYPES, USD_VARIABLES, Budget
+from uwb_tdoa_bias.common.survey import NamedAnchors
 from uwb_tdoa_bias.common.text import sanitize
 
 from ..command_lines import SALVAGE
 from .by_profile import read_by_profile
-from .names import NamedAnchors
 from .profile import Profile, check_columns, parse_columns
 from .streams import Columns, make_flight
 from .tables import GZIP_MAGIC, CsvTable
