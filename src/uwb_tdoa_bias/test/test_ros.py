@@ -10,6 +10,7 @@ rclpy = pytest.importorskip("rclpy")
 
 from dataclasses import replace  # noqa: E402
 from fractions import Fraction  # noqa: E402
+from types import SimpleNamespace
 
 from builtin_interfaces.msg import Time  # noqa: E402
 from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
@@ -37,7 +38,7 @@ from uwb_tdoa_bias.ros.anchors import (  # noqa: E402
     in_words,
     same_anchors,
 )
-from uwb_tdoa_bias.ros.diagnostics import LogFilter, SimulatedClock  # noqa: E402
+from uwb_tdoa_bias.ros.diagnostics import Elapsed, LogFilter, SimulatedClock  # noqa: E402
 from uwb_tdoa_bias.ros.parameters import BURST, REFILL, Log
 from uwb_tdoa_bias.ros.topics import OUTPUT_QOS, STREAM_QOS, Epoch  # noqa: E402
 
@@ -286,3 +287,13 @@ def test_the_log_says_each_kind_of_thing_once_in_a_while():
 def test_the_time_for_a_long_number_does_not_grow_with_its_square(text):
     """A pattern that started again at each digit took 8 s for a text of a tenth of this length."""
     LogFilter().should_log(text, 0.0)
+
+
+def test_ages_follow_simulated_time_at_any_speed():
+    simulated = SimpleNamespace(nanoseconds=0)
+    clock = SimpleNamespace(ros_time_is_active=True, now=lambda: simulated)
+    elapsed = Elapsed(SimpleNamespace(get_clock=lambda: clock))
+    assert elapsed() == 0.0
+    for second, age in ((1000, 0.0), (1000.1, 0.1), (1000.1, 0.1), (900, 0.1), (900.5, 0.6)):
+        simulated.nanoseconds = int(second * 1e9)
+        assert elapsed() == pytest.approx(age, abs=1e-6)

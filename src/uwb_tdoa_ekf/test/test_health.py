@@ -32,16 +32,16 @@ class Judge(health.Health):
     """Health with time.monotonic under the control of the test."""
 
     def __init__(self, monkeypatch, config=FilterConfig(), volume=None):
-        self.now = 1000.0
-        monkeypatch.setattr("time.monotonic", lambda: self.now)
-        super().__init__(config, 0.25, volume)
+        self.wall = 1000.0
+        monkeypatch.setattr("time.monotonic", lambda: self.wall)
+        super().__init__(config, 0.25, volume, lambda: self.wall)
 
     def second(self, estimator, imu=1000, tdoa=400, wrong=(None, (), ()), **counts):
         """Let one second pass with the given numbers of messages; return (level, text, values).
 
         wrong : (refused input, wiring, findings).
         """
-        self.now += 1.0
+        self.wall += 1.0
         self.received.update(imu=imu, tdoa=tdoa)
         return self.report(wrong[0], estimator, Counter(counts), *wrong[1:])
 
@@ -124,7 +124,7 @@ def test_most_tdoas_rejected_for_seconds_is_a_warning(judge):
 def test_rates_and_age(judge):
     values = judge.second(STARTING)[2]
     assert (values["state"], values["age of last odometry"]) == ("starting", "none yet")
-    judge.last_odometry = judge.now
+    judge.last_odometry = judge.wall
     values = judge.second(RUNNING, imu=500, tdoa=20)[2]
     assert values == {
         "state": "running",

@@ -19,7 +19,6 @@ from collections.abc import Collection, Sequence
 from functools import partial
 import math
 import sys
-import time
 from typing import Any, cast
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -39,7 +38,7 @@ from uwb_tdoa_bias.effects import EffectSet, ImuCorrector, StreamCorrector
 from uwb_tdoa_bias.effects.tag import TagLeverArm
 from uwb_tdoa_bias.ros.anchors import AnchorsInput
 from uwb_tdoa_bias.ros.cdr import CdrCodec, message_class
-from uwb_tdoa_bias.ros.diagnostics import Diagnostics, Report
+from uwb_tdoa_bias.ros.diagnostics import Diagnostics, Elapsed, Report
 from uwb_tdoa_bias.ros.frames import FramesInput, unknown_frame
 from uwb_tdoa_bias.ros.node import StreamNode, StreamPoller, run
 from uwb_tdoa_bias.ros.parameters import files_of, refuse_unknown, say_unused
@@ -162,7 +161,10 @@ class EkfNode(StreamNode):
         self._unplaced: dict[str, str] = {}
         self._remark_height()
         self._health = Health(
-            self._config, self._lag, FlyableVolume.load(volume) if volume else None
+            self._config,
+            self._lag,
+            FlyableVolume.load(volume) if volume else None,
+            Elapsed(self),
         )
         refuse_unknown(self, member or ())
         self.get_logger().info(
@@ -455,7 +457,7 @@ class EkfNode(StreamNode):
             if self._fault:
                 odometry = with_fault_covariance(odometry, self._estimator.workspace)
             self.outputs.publish_odometry(odometry, turns, self._estimator.unsure is not None)
-            self._health.last_odometry = time.monotonic()
+            self._health.last_odometry = self._health.now()
             self._health.last_position = odometry.p[-1], odometry.covariance[-1, :3, :3]
             self._attitude = odometry.q[-1:], odometry.covariance[-1:]
         if len(residuals.t):
@@ -528,7 +530,7 @@ class EkfNode(StreamNode):
     def _judge(self) -> Status:
         """Return the current Status: whether a vehicle may fly by the odometry."""
         last = self._health.last_odometry
-        age = math.inf if last is None else time.monotonic() - last
+        age = math.inf if last is None else self._health.now() - last
         status = status_of(
             self._estimator,
             self._yaw_std(),

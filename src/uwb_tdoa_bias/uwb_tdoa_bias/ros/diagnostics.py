@@ -173,6 +173,26 @@ class SimulatedClock:
         return (DiagnosticStatus.OK, "paused: /clock stands still") if stands else None
 
 
+class Elapsed:
+    """Call it for the time since the start, s, by the clock of a node; it never goes back.
+
+    Ages by it are right in a simulation at any speed.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._clock: ROSClock = node.get_clock()  # type: ignore[assignment]  # nodes have this class
+        self._seconds, self._last = 0.0, 0.0
+
+    def __call__(self) -> float:
+        now = time.monotonic()
+        if self._clock.ros_time_is_active:
+            now = self._clock.now().nanoseconds * 1e-9
+        if self._last:  # simulated time is 0 before its first message
+            self._seconds += max(now - self._last, 0.0)
+        self._last = now
+        return self._seconds
+
+
 class Rate:
     """Rate of events per second of the wall clock."""
 

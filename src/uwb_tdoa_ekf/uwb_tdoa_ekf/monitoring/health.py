@@ -18,7 +18,7 @@ from .finding import ERROR as SEVERE, Finding
 from .status import LARGEST_UNUSED, Use, flyability
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from uwb_tdoa_bias.common.flyable import FlyableVolume
 
@@ -42,7 +42,11 @@ class Health:
     """Check the state of the filter once per second of wall time."""
 
     def __init__(
-        self, config: FilterConfig, lag: float, volume: FlyableVolume | None = None
+        self,
+        config: FilterConfig,
+        lag: float,
+        volume: FlyableVolume | None = None,
+        now: Callable[[], float] = time.monotonic,
     ) -> None:
         """Store the parameters and reset all counts.
 
@@ -54,10 +58,13 @@ class Health:
             Time for which the filter waits for a silent stream, in s.
         volume : FlyableVolume or None
             Volume in which the tag may fly.
+        now : callable
+            Returns the time that ages are measured by, in s.
         """
+        self.now = now
         # messages of each stream: imu, tdoa, and the SENSORS
         self.received: Counter[str] = Counter()
-        self.last_odometry: float | None = None  # time.monotonic(), s
+        self.last_odometry: float | None = None  # s, as of `now`
         # (3,) m, and its covariance (3, 3) m^2
         self.last_position: tuple[np.ndarray, np.ndarray] | None = None
         # s from the stamp of the newest odometry to the current ROS time
@@ -71,8 +78,8 @@ class Health:
         self._counts_before: Counter[str] = Counter()
         # consecutive reports in which most messages of a sensor were not used, by (sensor, reason)
         self._bad: Counter[tuple[str, str]] = Counter()
-        self._heard: dict[str, float] = {}  # by sensor: time.monotonic() of its last message, s
-        self._starting: float | None = None  # time.monotonic(), s
+        self._heard: dict[str, float] = {}  # s, by sensor: time of its last message
+        self._starting: float | None = None  # s
         self.use = Use(lag)
 
     def look(self, estimator: Estimator | None, counts: Mapping[str, int]) -> None:
@@ -86,7 +93,7 @@ class Health:
             Totals by verdict.
         """
         self.use.update(
-            time.monotonic(), self.received, counts, estimator is not None and estimator.running
+            self.now(), self.received, counts, estimator is not None and estimator.running
         )
 
     def report(
@@ -114,7 +121,7 @@ class Health:
         findings : sequence of Finding
             Findings of the rules over streams, the most severe first.
         """
-        now = time.monotonic()
+        now = self.now()
         self.look(estimator, counts)
         imu_rate = self._imu_rate.of(self.received["imu"])
         tdoa_rate = self._tdoa_rate.of(self.received["tdoa"])
@@ -185,7 +192,7 @@ class Health:
         return None
 
     def _not_running(self, estimator: Estimator | None, now: float) -> tuple[bytes, str]:
-        """Return (level, text) of a filter without a position at `now`, time.monotonic() in s."""
+        """Return (level, text) of a filter without a position at `now`, in s."""
         if estimator is not None and estimator.lost:
             return WARN, estimator.lost
         if self._starting is None or now - self._starting <= START_TIMEOUT:
@@ -219,7 +226,7 @@ class Health:
 
     def _trouble_of_sensors(self, counts: Mapping[str, int]) -> str | None:
         """Return a sentence on a sensor that went silent or whose messages are mostly not used."""
-        trouble, now = None, time.monotonic()
+        trouble, now = None, self.now()
         for stream, sensor in SENSORS.items():
             topic = sensor.topics[0][0]
             new = self.received[stream] - self._received_before[stream]

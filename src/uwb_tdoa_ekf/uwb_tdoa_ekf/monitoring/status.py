@@ -60,12 +60,12 @@ class Use:
     def __init__(self, lag: float) -> None:
         """Store the time `lag`, in s, for which the filter waits for a silent stream."""
         self._lag = lag
-        # (time.monotonic(), counts) of the last seconds
+        # (s, counts) of the last seconds
         self._looks: deque[tuple[float, dict[str, int]]] = deque()
         self._since: dict[
             str, float
-        ] = {}  # by kind: time.monotonic() of the last look that found more messages
-        self._running_since = math.inf  # time.monotonic()
+        ] = {}  # s, by kind: time of the last look that found more messages
+        self._running_since = math.inf  # s
         self._now = -math.inf
 
     def update(
@@ -76,7 +76,7 @@ class Use:
         Parameters
         ----------
         now : float
-            time.monotonic(), in s.
+            Time, in s.
         received : mapping
             Messages by stream.
         counts : mapping
