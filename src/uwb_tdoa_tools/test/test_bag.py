@@ -22,7 +22,7 @@ from uwb_tdoa_bias.common.sensors import SENSORS, Height, Pressure, Velocity
 from uwb_tdoa_bias.common.survey_faults import survey_fault
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag
 from uwb_tdoa_tools.bags.files import new_bag, open_bag
-from uwb_tdoa_tools.bags.message_types import typestore
+from uwb_tdoa_tools.bags.messages import typestore
 from uwb_tdoa_tools.bags.topics import STREAMS, of_sensor
 from uwb_tdoa_tools.checking.recording import read_recording
 from uwb_tdoa_tools.readers.inputs import Reading

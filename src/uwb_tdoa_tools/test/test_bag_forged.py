@@ -24,8 +24,7 @@ from uwb_tdoa_bias.common.sensors import Ranges
 from uwb_tdoa_tools.bags import MCAP, repair
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag
 from uwb_tdoa_tools.bags.files import PLUGINS, open_bag
-from uwb_tdoa_tools.bags.message_types import typestore
-from uwb_tdoa_tools.bags.messages import messages_of
+from uwb_tdoa_tools.bags.messages import messages_of, typestore
 from uwb_tdoa_tools.checking.recording import read_recording
 from uwb_tdoa_tools.estimate import with_antenna
 from uwb_tdoa_tools.readers.inputs import Reading

@@ -14,7 +14,7 @@ from test_bag_frames import transforms
 from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_tools.bags.bag import read_bag, write_bag
 from uwb_tdoa_tools.bags.files import new_bag
-from uwb_tdoa_tools.bags.message_types import typestore
+from uwb_tdoa_tools.bags.messages import typestore
 from uwb_tdoa_tools.bags.topics import STREAMS
 from uwb_tdoa_tools.checking import recording_rules
 from uwb_tdoa_tools.checking.recording import read_recording

@@ -14,8 +14,7 @@ from uwb_tdoa_bias.effects.stamps import shifted
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.bags.files import new_bag
-from uwb_tdoa_tools.bags.message_types import typestore
-from uwb_tdoa_tools.bags.messages import messages_of, odometry_content
+from uwb_tdoa_tools.bags.messages import messages_of, odometry_content, typestore
 from uwb_tdoa_tools.commands.evaluate import main
 from uwb_tdoa_tools.scoring.evaluation import evaluate
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate

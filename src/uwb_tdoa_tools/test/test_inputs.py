@@ -17,7 +17,7 @@ from uwb_tdoa_bias.common.safe_yaml import read_yaml
 from uwb_tdoa_bias.common.survey import read_named_anchors, read_survey
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.bags.files import new_bag, open_bag
-from uwb_tdoa_tools.bags.message_types import typestore
+from uwb_tdoa_tools.bags.messages import typestore
 from uwb_tdoa_tools.readers import inputs, read_flight
 from uwb_tdoa_tools.readers.inputs import Reading, find_flights, require_tdoas, survey_for
 

@@ -19,8 +19,8 @@ from uwb_tdoa_ekf.ekf_parameters import PARAMETERS  # noqa: E402
 from uwb_tdoa_ekf.reorder_buffer import OF_SENSORS, SILENT  # noqa: E402
 from uwb_tdoa_msgs.msg import TdoaResidual  # noqa: E402
 from uwb_tdoa_tools.commands.replay import DESCRIPTION  # noqa: E402
-from uwb_tdoa_tools.live import follow  # noqa: E402
-from uwb_tdoa_tools.live.follow import LEAD, Follower, is_stamped, stamp_of  # noqa: E402
+from uwb_tdoa_tools.live import replay as follow  # noqa: E402
+from uwb_tdoa_tools.live.replay import LEAD, Follower, is_stamped, stamp_of  # noqa: E402
 
 SECOND = 10**9
 

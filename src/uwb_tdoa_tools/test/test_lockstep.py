@@ -26,11 +26,11 @@ from uwb_tdoa_bias.correction.network import load_network  # noqa: E402
 from uwb_tdoa_ekf.core.memory import USED  # noqa: E402
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag  # noqa: E402
 from uwb_tdoa_tools.bags.files import new_bag, open_bag  # noqa: E402
-from uwb_tdoa_tools.bags.message_types import typestore  # noqa: E402
+from uwb_tdoa_tools.bags.messages import typestore  # noqa: E402
 from uwb_tdoa_tools.calibrating import between  # noqa: E402
-from uwb_tdoa_tools.live.follow import SILENCE  # noqa: E402
 from uwb_tdoa_tools.live.processes import DiagnosticsListener, Processes, own_domain, wait  # noqa: E402
 from uwb_tdoa_tools.live.record import recorded_odometry  # noqa: E402
+from uwb_tdoa_tools.live.replay import SILENCE  # noqa: E402
 from uwb_tdoa_tools.live.run import _parameters  # noqa: E402
 from uwb_tdoa_tools.live.session import session  # noqa: E402
 from uwb_tdoa_tools.readers import read_flight  # noqa: E402

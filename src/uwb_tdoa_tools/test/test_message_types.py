@@ -9,7 +9,7 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_tools.bags.message_types import OUR_TYPES, add_type, typestore
+from uwb_tdoa_tools.bags.messages import OUR_TYPES, add_type, typestore
 
 PREFIXES = [
     Path(prefix) for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if prefix

@@ -11,7 +11,7 @@ import pytest
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.survey import read_survey
 from uwb_tdoa_tools.bags.files import open_bag
-from uwb_tdoa_tools.bags.message_types import typestore
+from uwb_tdoa_tools.bags.messages import typestore
 from uwb_tdoa_tools.planning import plots
 from uwb_tdoa_tools.planning.bifurcation import Subsets
 from uwb_tdoa_tools.planning.hall import Hall

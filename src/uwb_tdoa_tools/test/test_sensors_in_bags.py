@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.common.sensors import SENSORS
-from uwb_tdoa_tools.bags.message_types import typestore
+from uwb_tdoa_tools.bags.messages import typestore
 from uwb_tdoa_tools.bags.topics import STREAMS
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 

@@ -39,19 +39,23 @@ from uwb_tdoa_bias.common.text import printable, written_by
 from uwb_tdoa_ekf.results import Odometry
 
 from ..clock import sentences
-from . import frames, messages as bag_messages
+from . import messages as bag_messages
 from .files import BagReader, check_output, connections_of, new_bag, open_bag, readable, remarks_of
-from .frames import recorded_anchors
-from .message_types import typestore
+from .messages import typestore
 from .topics import (
     LATCHED_QOS,
     STREAM_QOS,
     STREAMS,
+    TF_STATIC,
     Names,
+    imu_in_body,
     on_one_clock,
     other_namespaces,
+    read_frames,
     read_stream,
     read_topic,
+    recorded_anchors,
+    sensor_place,
     topics_of,
 )
 
@@ -232,7 +236,7 @@ def read_bag(
         about = _about(path, reader.custom)
         meta = {**about["meta"], "bag": str(path)}
         remarks, name_of = list[str](), Names(namespace, topics)
-        tree = frames.read_frames(path, reader, name_of)
+        tree = read_frames(path, reader, name_of)
         found = {
             name: read_stream(path, reader, name, name_of, tree)
             for name in STREAMS
@@ -294,7 +298,7 @@ def read_bag(
         # the antenna is that of the TDOAs, or of ranges without any
         radio = ["tdoa"] if len(tdoa) else [name for name in LOCATING if sensors[name] is not None]
         places = {
-            name: frames.sensor_place(tree, STREAMS[name].topic, found[name].frames)
+            name: sensor_place(tree, STREAMS[name].topic, found[name].frames)
             for name in ("imu", *radio)
         }
         remarks += [remark for _, remark in places.values() if remark]
@@ -302,7 +306,7 @@ def read_bag(
         unread = _unread(reader, name_of)
         poses = stream("pose")
     if imu is not None and (place := places["imu"][0]):
-        imu = frames.imu_in_body(imu, place)
+        imu = imu_in_body(imu, place)
     for name in radio:
         antenna, _ = places[name]
         if antenna is not None:
@@ -317,7 +321,7 @@ def read_bag(
 def _unread(reader: BagReader, name_of: Names) -> list[str]:
     """Return sentences on topics of an open bag that no stream takes."""
     read = {name_of(topic) for name in STREAMS for topic, _ in topics_of(name)}
-    read |= {name_of("uwb/anchors"), name_of("tf_static"), frames.TF_STATIC}
+    read |= {name_of("uwb/anchors"), name_of("tf_static"), TF_STATIC}
     return [
         f"{one.topic}: {one.msgcount} messages of {one.msgtype}, which no stream takes"
         for one in reader.connections

@@ -30,7 +30,7 @@ from uwb_tdoa_bias.common.stamps import LARGEST_STEP_BACK
 
 from ..choices import STORAGES
 from . import METADATA, ZSTD, data_files, is_bag, repair
-from .message_types import check_type, typestore
+from .messages import check_type, typestore
 from .repair import Damaged, zstd
 
 PLUGINS = dict(zip(STORAGES, (StoragePlugin.MCAP, StoragePlugin.SQLITE3)))

@@ -28,7 +28,7 @@ from uwb_tdoa_bias.common.files import temporary_folder
 from uwb_tdoa_bias.common.limits import CHUNK_BYTES, MESSAGE_BYTES, Budget, most_unpacked
 
 from . import LOG, MCAP, SQLITE
-from .message_types import recorded_topic
+from .messages import recorded_topic
 
 if sys.version_info >= (3, 14):
     from compression import zstd

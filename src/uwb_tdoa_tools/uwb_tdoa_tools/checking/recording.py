@@ -18,16 +18,21 @@ from uwb_tdoa_bias.common.sensors import LOCATING, SENSORS
 from uwb_tdoa_bias.common.survey import as_named
 from uwb_tdoa_bias.common.survey_faults import refuse_faulty
 
-from ..bags import frames, is_bag, messages as bag_messages
+from ..bags import is_bag, messages as bag_messages
 from ..bags.files import open_bag, remarks_of
-from ..bags.frames import TF_STATIC, recorded_anchors
 from ..bags.topics import (
     STREAMS,
+    TF_STATIC,
     Names,
     TopicMessages,
     arrivals,
+    imu_in_body,
     on_one_clock,
+    place_in_body,
+    read_frames,
     read_stream,
+    recorded_anchors,
+    sensor_place,
 )
 from ..command_lines import suggest_line
 
@@ -197,7 +202,7 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
     name_of = Names(reading.namespace, reading.topics)
     with open_bag(path) as reader:
         topics = {connection.topic: connection.msgtype for connection in reader.connections}
-        tree = frames.read_frames(path, reader, name_of)
+        tree = read_frames(path, reader, name_of)
         found = {name: read_stream(path, reader, name, name_of, tree) for name in STREAMS}
         poses = found.pop("pose")
         arrival = arrivals(found)
@@ -235,8 +240,8 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
         anchors, str(survey) if survey or recorded is None else f"{path}: {recorded.source}"
     )
     samples = bag_messages.imu_of(imu.stamps / 1e9, imu.rows) if len(imu.stamps) else None
-    if samples is not None and (place := frames.sensor_place(tree, IMU, imu.frames)[0]):
-        samples = frames.imu_in_body(samples, place)
+    if samples is not None and (place := sensor_place(tree, IMU, imu.frames)[0]):
+        samples = imu_in_body(samples, place)
     return Recording(
         name=path.stem,
         anchors=anchors,
@@ -252,7 +257,7 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
         places={
             frame: place
             for frame in {*tdoa.frames, *imu.frames}
-            if (place := frames.place_in_body(tree, frame))
+            if (place := place_in_body(tree, frame))
         },
         topics=topics,
         read=frozenset(map(name_of, HEARD)),

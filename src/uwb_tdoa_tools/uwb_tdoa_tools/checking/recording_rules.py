@@ -15,8 +15,8 @@ import numpy as np
 from uwb_tdoa_bias.common.sensors import SENSORS, Ranges
 from uwb_tdoa_ekf.monitoring.finding import ERROR, NOTE, WARNING, Finding
 
-from ..bags.frames import Place, is_body
 from ..bags.messages import BODY_FRAME
+from ..bags.topics import Place, is_body
 from ..clock import SET, SILENCE, WORDS, WRAP, apart, in_words
 from .recording import IMU, Recording
 from .tdoa_rules import largest_displacement, same_place

@@ -20,7 +20,7 @@ from rosbags.rosbag2 import Writer
 from uwb_tdoa_bias.common.errors import InputError
 
 from ..bags.files import new_bag
-from ..bags.message_types import add_type, typestore
+from ..bags.messages import add_type, typestore
 from .session import message_class, recorded_qos, session, subscription_qos, taken
 
 

@@ -35,8 +35,8 @@ from uwb_tdoa_bias.common.limits import (
 
 from ..bags import is_ros_1
 from ..bags.files import BagReader, Incomplete, open_bag, remarks_of
-from ..bags.frames import Recorded, recorded_anchors
 from ..bags.repair import Damaged
+from ..bags.topics import Recorded, recorded_anchors
 from .tables import BLOCK, Block, Foreign, Wanted
 
 Path_ = tuple[str | int, ...]  # parsed path of a field

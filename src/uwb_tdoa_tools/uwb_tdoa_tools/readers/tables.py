@@ -99,7 +99,7 @@ class Foreign:
         """Return the field with the time and its unit in s, if tables of this kind have one."""
 
     def recorded_anchors(self) -> Any:
-        """Return the anchors in a bag (`bags.frames.Recorded`), or None. Raises InputError."""
+        """Return the anchors in a bag (`bags.topics.Recorded`), or None. Raises InputError."""
 
     def blocks(self, wanted: Sequence[Wanted]) -> Iterator[Block]:
         """Yield the records of tables. Raises InputError for a field that a table lacks."""
