@@ -20,6 +20,8 @@ LOADED = re.compile(
     r"""|(?:url\(|@import\s+)["']?(?:https?:)?//"""
 )
 
+SCRIPTS = "iframe-worker.js", "assets/javascripts/bundle"
+
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
@@ -34,7 +36,11 @@ def site(tmp_path_factory):
         text=True,
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    paths = [path for path in folder.rglob("*") if path.suffix in (".html", ".css")]
+    paths = [
+        path
+        for path in folder.rglob("*")
+        if path.suffix in (".html", ".css") or path.name == "search_index.js"
+    ]
     return {path.relative_to(folder).as_posix(): path.read_text("utf-8") for path in paths}
 
 
@@ -42,6 +48,21 @@ def test_nothing_is_loaded_from_elsewhere(site):
     assert len(site) > 60 and LOADED.search('<img src="//x.y/z.png">')
     assert not LOADED.search('<a href="https://x.y">')
     assert [path for path, text in site.items() if LOADED.search(text)] == []
+
+
+def test_pages_that_are_opened_as_files_can_be_searched(site):
+    """A browser reads a script from a file, and no JSON; and it starts no Worker from one."""
+    assert site["search/search_index.js"].startswith("var __index = {")
+    for path in ("index.html", "notebook/speed.html"):
+        up = "../" * path.count("/")
+        shim, bundle = (site[path].index(f'<script src="{up}{name}') for name in SCRIPTS)
+        assert shim < bundle
+
+
+def test_indices_are_lowered_without_a_font_for_equations(site):
+    assert '<script src="site.js"' in site["filter.html"]
+    (name,) = re.findall(r'toggle\("([\w-]+)"', (ROOT / "docs/site.js").read_text())
+    assert f".{name} :is(msub, msubsup)" in site["site.css"]
 
 
 def test_equations_lists_and_the_reference_are_made(site):
