@@ -266,7 +266,7 @@ def _suggestions(tables: Foreign, table: str) -> list[Suggestion]:
     inertial = _inertial(fields)
     time, why = _time(fields, bool(inertial)) if is_csv else ("", "")
     fields = _with_lists(fields) if is_csv else fields
-    made = _tdoas(fields) or _ranges(fields) or (_wide(fields) if is_csv else [])
+    made = _radio(fields) or (_wide(fields) if is_csv else [])
     made += [*inertial, *_anchors(fields), *_poses(table, fields)]
     for one in made:
         one.columns = {**({"time": time} if time else {}), **one.columns}
@@ -367,29 +367,22 @@ def _beside(one: Field, other: Field) -> bool:
     return one.each == other.each and one.path.rpartition(".")[0] == other.path.rpartition(".")[0]
 
 
-def _tdoas(fields: Sequence[Field]) -> list[Suggestion]:
-    for one in _named(fields, TDOA):
-        others = [other for other in fields if other is not one and _beside(one, other)]
-        for first, second in PAIRS:
-            ids = [
-                _named(others, rf"(anchor|node|id|uwb)?_?(id)?_?{end}(_?id)?")
-                for end in (first, second)
-            ]
-            if all(ids):
-                unit, why = _length("median TDOA", one)
-                why.append(SIGN)
-                columns = {"anchor_a": ids[0][0].path, "anchor_b": ids[1][0].path}
-                return [Suggestion({**columns, "tdoa": one.path + unit}, one.each, why)]
-    return []
-
-
-def _ranges(fields: Sequence[Field]) -> list[Suggestion]:
-    for one in _named(fields, RANGE):
-        ids = [other for other in _named(fields, ID) if _beside(one, other)]
-        if ids:
-            unit, why = _length("median range", one)
-            columns = {"anchor": ids[-1].path, "range": one.path + unit}
-            return [Suggestion(columns, one.each, why)]
+def _radio(fields: Sequence[Field]) -> list[Suggestion]:
+    """Return TDOAs beside the ids of two anchors, or ranges beside the id of one."""
+    of_pairs = [[rf"(anchor|node|id|uwb)?_?(id)?_?{end}(_?id)?" for end in ends] for ends in PAIRS]
+    for what, pattern, names, ends, chosen in (
+        ("TDOA", TDOA, ("anchor_a", "anchor_b"), of_pairs, 0),
+        ("range", RANGE, ("anchor",), [[ID]], -1),
+    ):
+        for one in _named(fields, pattern):
+            beside = [other for other in fields if other is not one and _beside(one, other)]
+            for patterns in ends:
+                ids = [_named(beside, each) for each in patterns]
+                if all(ids):
+                    unit, why = _length(f"median {what}", one)
+                    columns = {name: found[chosen].path for name, found in zip(names, ids)}
+                    columns[what.lower()] = one.path + unit
+                    return [Suggestion(columns, one.each, why + [SIGN] * (what == "TDOA"))]
     return []
 
 
