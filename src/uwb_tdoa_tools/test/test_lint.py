@@ -18,7 +18,6 @@ from nav_msgs.msg import Odometry
 from std_srvs.srv import Trigger
 from uwb_tdoa_bias.common.text import version
 from uwb_tdoa_bias.ros.cdr import decode
-from uwb_tdoa_bias.ros.frames import TFMessage, read_transforms
 from uwb_tdoa_bias.ros.node import StreamNode
 from uwb_tdoa_bias.ros.topics import Input, SubscribingNode
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa, TdoaCorrected
@@ -35,12 +34,12 @@ def take_row(tdoa: Tdoa, data: bytes) -> float:
     decode(data, TdoaCorrected).distance_difference  # attr-defined
     return tdoa.header  # return-value
 
-def take_transforms(transforms: list[str]) -> None: ...
+def take_texts(texts: list[str]) -> None: ...
 
 def subscribe(node: StreamNode, other: SubscribingNode) -> None:
     Input(node, Odometry, "odometry", take, 10)
     Input(node, Tdoa, "odometry", take, 10)  # arg-type
-    Input(node, TFMessage, "/tf", take_transforms, 10, read_transforms)  # misc
+    Input(node, Odometry, "odometry", take_texts, 10, bytes)  # misc
     node.create_subscription(Odometry, "odometry", take, 10)
     node.create_subscription(Tdoa, "odometry", take, 10)  # arg-type
     other.create_subscription(Odometry, "odometry", take, 10)

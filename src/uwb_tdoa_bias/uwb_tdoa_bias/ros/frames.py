@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import struct
 from typing import TYPE_CHECKING, Any
 
 from builtin_interfaces.msg import Time
@@ -13,29 +12,16 @@ from tf2_msgs.msg import TFMessage
 
 from ..common.errors import InputError
 from ..common.transforms import Frames
-from .cdr import (
-    ENCAPSULATION,
-    LENGTH,
-    MOST_ELEMENTS,
-    Unreadable,
-    aligned,
-    check_length,
-    decode,
-    read_text,
-)
 from .parameters import MOST_QUOTED
 from .topics import Input
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from geometry_msgs.msg import TransformStamped
-
     from .node import StreamNode
 
 TF_QOS = QoSProfile(depth=100)  # as in tf2
 MOVING_QOS = QoSProfile(depth=1000)  # 2 s at 500 Hz
-STAMP, NUMBERS = struct.Struct("<iI"), struct.Struct("<7d")  # of a TransformStamped: p, then q
 TF_STATIC_QOS = QoSProfile(
     depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
@@ -74,21 +60,9 @@ class FramesInput:
         self.frames = Frames()
         self.trouble: str | None = None
         self._node, self._seconds, self._on_new = node, seconds, on_new
-        static = Input(
-            node, TFMessage, "/tf_static", self._on_static, TF_STATIC_QOS, read_transforms
-        )
+        static = Input(node, TFMessage, "/tf_static", self._on_static, TF_STATIC_QOS)
         self._moving = (
-            [
-                Input(
-                    node,
-                    TFMessage,
-                    "/tf",
-                    self._on_moving,
-                    MOVING_QOS,
-                    read_transforms,
-                    served=False,
-                )
-            ]
+            [Input(node, TFMessage, "/tf", self._on_moving, MOVING_QOS, served=False)]
             if moving
             else []
         )
@@ -99,7 +73,8 @@ class FramesInput:
         for end in self._moving:
             end.take_all()
 
-    def _on_static(self, transforms: list[Transform]) -> None:
+    def _on_static(self, message: TFMessage) -> None:
+        transforms = read_transforms(message)
         new = [self._take("/tf_static", self._set, *transform[2:]) for transform in transforms]
         if any(new):
             self._on_new()
@@ -111,8 +86,8 @@ class FramesInput:
             return False
         return self.frames.set(parent, child, q, p)
 
-    def _on_moving(self, transforms: list[Transform]) -> None:
-        for sec, nanosec, *transform in transforms:
+    def _on_moving(self, message: TFMessage) -> None:
+        for sec, nanosec, *transform in read_transforms(message):
             if sec or nanosec:
                 self._take(
                     "/tf",
@@ -130,39 +105,14 @@ class FramesInput:
             return False
 
 
-def read_transforms(data: bytes) -> list[Transform]:
-    """Return [(sec, nanosec, parent, child, q, p)] of a serialized tf2_msgs/TFMessage.
-
-    The quaternion q is x y z w, the translation p is in m. Raises Unreadable. A robot publishes
-    hundreds per second, and a message object takes ten times as long.
-    """
-    if data[:4] != ENCAPSULATION:
-        return [_of(transform) for transform in decode(data, TFMessage).transforms]
-    if len(data) < 8:
-        raise Unreadable(f"it has {len(data)} bytes")
-    (count,), place, out = LENGTH.unpack_from(data, 4), 8, []
-    if count > MOST_ELEMENTS:
-        raise Unreadable(f"it would hold {count} transforms; at most {MOST_ELEMENTS} are read")
-    for _ in range(count):
-        place = aligned(place, 4)
-        check_length(data, place + STAMP.size, TFMessage, exactly=False)
-        stamp = STAMP.unpack_from(data, place)
-        parent, place = read_text(data, place + STAMP.size, "frame_id")
-        child, place = read_text(data, aligned(place, 4), "child_frame_id")
-        place = aligned(place, 8)
-        check_length(data, place + NUMBERS.size, TFMessage, exactly=False)
-        numbers = NUMBERS.unpack_from(data, place)
-        place += NUMBERS.size
-        out.append((*stamp, parent.lstrip("/"), child.lstrip("/"), numbers[3:], numbers[:3]))
-    check_length(data, place, TFMessage)
-    return out
-
-
-def _of(message: TransformStamped) -> Transform:
-    """Return (sec, nanosec, parent, child, q, p) of a TransformStamped."""
-    q, p, stamp = message.transform.rotation, message.transform.translation, message.header.stamp
-    names = message.header.frame_id.lstrip("/"), message.child_frame_id.lstrip("/")
-    return stamp.sec, stamp.nanosec, *names, (q.x, q.y, q.z, q.w), (p.x, p.y, p.z)
+def read_transforms(message: TFMessage) -> list[Transform]:
+    """Return [(sec, nanosec, parent, child, q, p)] of a message: q x y z w, and p in m."""
+    found: list[Transform] = []
+    for each in message.transforms:
+        q, p, stamp = each.transform.rotation, each.transform.translation, each.header.stamp
+        names = each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/")
+        found.append((stamp.sec, stamp.nanosec, *names, (q.x, q.y, q.z, q.w), (p.x, p.y, p.z)))
+    return found
 
 
 def unknown_frame(topic: str, frame: str, body: str) -> str:
