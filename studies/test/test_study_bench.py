@@ -8,15 +8,14 @@ import os
 import re
 import shutil
 import subprocess
-import sys
 
 from documented import ROOT
 import numpy as np
+from programs import run, start
 import pytest
 
 from uwb_tdoa_bias.common.errors import InputError
 
-pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 from studies.__main__ import main  # noqa: E402
 from studies.bench import core, nodes, peer, recordings, soak, source, suite, usage  # noqa: E402
@@ -55,11 +54,9 @@ void tdoa_peer_position(double *out) { for (int k = 0; k < 3; k++) out[k] = wron
 def built(folder, source=SOURCE, version=peer.VERSION):
     """Compile a library and return its path."""
     (folder / "peer.c").write_text(source.replace("VERSION", str(version)))
-    subprocess.run(
-        [CC, "-O2", "-shared", "-fPIC", "-o", folder / "libpeer.so", folder / "peer.c", "-lm"],
-        check=True,
-    )
-    return folder / "libpeer.so"
+    library = folder / "libpeer.so"
+    run(CC, "-O2", "-shared", "-fPIC", "-o", library, folder / "peer.c", "-lm", check=True)
+    return library
 
 
 def test_a_figure_is_the_median_and_the_quartiles_of_what_is_known():
@@ -87,13 +84,11 @@ def test_cpu_time_and_memory_of_a_process():
         "import time; a = bytearray(50_000_000)\nwhile time.process_time() < 0.5: "
         "pass\nprint(flush=True); input()"
     )
-    with subprocess.Popen(
-        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    ) as process:
+    with start("-c", code, stdin=subprocess.PIPE) as process:
         process.stdout.readline()
         assert usage.cpu_seconds(process.pid) == pytest.approx(0.5, abs=0.1)
         assert 50e6 < usage.memory(process.pid) < 150e6
-        process.stdin.write(b"\n")
+        process.stdin.write("\n")
 
 
 def test_the_core_is_measured_per_event_and_per_sensor():
@@ -209,9 +204,8 @@ def test_the_stand_in_for_matrices_inverts_and_multiplies(tmp_path):
     )
     library = tmp_path / "inverse.so"
     include = f"-I{ROOT / 'docs' / 'peer'}"
-    subprocess.run(
-        [CC, "-shared", "-fPIC", include, "-o", library, tmp_path / "inverse.c", "-lm"], check=True
-    )
+    source = tmp_path / "inverse.c"
+    run(CC, "-shared", "-fPIC", include, "-o", library, source, "-lm", check=True)
     a = np.random.default_rng(1).normal(size=(9, 9)).astype(np.float32)
     out = np.zeros((9, 9), np.float32)
     ctypes.CDLL(str(library)).product(*(ctypes.c_void_p(x.ctypes.data) for x in (a, out)), 9)

@@ -13,6 +13,7 @@ import sys
 
 from documented import ROOT
 import numpy as np
+from programs import python
 import pytest
 
 from studies.crazyflie import BLOCKS, Link, judge, messages, streamed
@@ -107,9 +108,8 @@ def test_the_example_over_topics_gives_what_the_converter_gives(flight, tmp_path
     ours = (ROOT / "src" / "uwb_tdoa_msgs" / "package.xml").read_text()
     without = "".join(line for line in ours.splitlines(True) if "geometry_msgs" not in line)
     (package / "package.xml").write_text(without.replace("uwb_tdoa_msgs", "crazyflie_interfaces"))
-    build = [sys.executable, "-m", "colcon", "--log-base", "log", "build", "--merge-install"]
-    build += ["--cmake-args", f"-DPython3_EXECUTABLE={sys.executable}"]
-    subprocess.run(build, cwd=tmp_path, check=True, capture_output=True)
+    build = ["-m", "colcon", "--log-base", "log", "build", "--merge-install", "--cmake-args"]
+    python(*build, f"-DPython3_EXECUTABLE={sys.executable}", cwd=tmp_path, check=True)
     short, link = (
         replace(flight, tdoa=_until(flight.tdoa, 4.0), imu=_until(flight.imu, 4.0)),
         Link(),

@@ -4,9 +4,9 @@
 
 import os
 from pathlib import Path
-import subprocess
 import sys
 
+from programs import python
 import pytest
 
 from uwb_tdoa_bias.common import callees
@@ -81,12 +81,10 @@ def run(folder):
         if not file.exists():
             file.parent.mkdir(parents=True)
             file.write_text(text)
-        done = subprocess.run(
-            [sys.executable, str(file)],
+        done = python(
+            file,
             env={"PATH": "/usr/bin:/bin", "NUMBA_CACHE_DIR": str(folder / cache)}
             | {"PYTHONPATH": os.pathsep.join([str(SOURCES), *filter(None, sys.path)])},
-            capture_output=True,
-            text=True,
             check=True,
         )
         *printed, cached = done.stdout.splitlines()

@@ -7,10 +7,10 @@ import gc
 import importlib
 import os
 from pathlib import Path
-import subprocess
 import sys
 from types import SimpleNamespace
 
+from programs import python
 import pytest
 
 from uwb_tdoa_bias.common import compiled, executable
@@ -213,9 +213,8 @@ def test_a_function_of_another_folder_that_changed_is_compiled_anew(tmp_path):
     printed = []
     for shift, factor in ((1.0, 2.0), (1.0, 2.0), (4.0, 3.0)):
         (package / "code.py").write_text(CODE.format(shift=shift, factor=factor))
-        command = [sys.executable, "-c", program]
         environment = {**os.environ, **cache, "PYTHONPATH": paths}
-        printed.append(subprocess.check_output(command, env=environment, text=True).split())
+        printed.append(python("-c", program, env=environment, check=True).stdout.split())
     assert printed == [
         ["2.0", "2.0", "2.0", "0"],
         ["2.0", "2.0", "2.0", "1"],

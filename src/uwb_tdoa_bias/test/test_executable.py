@@ -4,9 +4,9 @@
 
 import os
 from signal import SIGINT
-import subprocess
 import sys
 
+from programs import python, start
 import pytest
 
 from uwb_tdoa_bias.common import executable as module
@@ -46,13 +46,6 @@ def write(tmp_path, monkeypatch):
     return lambda name, text: (tmp_path / f"{name}.py").write_text(text)
 
 
-def start(module):
-    code = START.format(module)
-    return subprocess.Popen(
-        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-
-
 def test_what_main_returns_is_returned(write):
     write("weigh", "def main(*arguments): return 3 + len(arguments)")
     assert executable("weigh")() == 3 and executable("weigh")(["heavy"]) == 4
@@ -72,7 +65,7 @@ def test_an_import_that_takes_long_is_said(write, monkeypatch, capsys):
 @pytest.mark.parametrize("module, code", [(SLOW, 130), (LOSSY, 7)])
 def test_an_interrupt_is_quiet_while_it_imports_and_then_the_affair_of_main(write, module, code):
     write("module", module)
-    process = start("module")
+    process = start("-c", START.format("module"))
     assert process.stdout.readline() == "in\n"
     process.send_signal(SIGINT)
     assert process.communicate(timeout=120) == ("", "") and process.returncode == code
@@ -133,7 +126,5 @@ def test_a_folder_of_recordings_does_not_say_how_libraries_behave(
         "    print(matplotlib.rcParams['savefig.dpi'], numba.config.DISABLE_JIT, os.getcwd())",
     )
     kept = {name: value for name, value in os.environ.items() if name != "NUMBA_DISABLE_JIT"}
-    done = subprocess.run(
-        [sys.executable, "-c", START.format("draws")], capture_output=True, text=True, env=kept
-    )
+    done = python("-c", START.format("draws"), env=kept)
     assert done.stdout == f"figure 0 {tmp_path}\n", done.stderr

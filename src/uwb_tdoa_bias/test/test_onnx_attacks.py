@@ -5,10 +5,9 @@
 import json
 import os
 import resource
-import subprocess
-import sys
 
 import numpy as np
+from programs import python
 import pytest
 
 from uwb_tdoa_bias.common.errors import InputError
@@ -198,9 +197,7 @@ def test_what_a_trial_may_take(tmp_path, work, said):
         "from uwb_tdoa_bias.correction.trial import MODEL_MEMORY, "
         f"_limit_this_process\n_limit_this_process()\n{work}"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True
-    )
+    done = python("-c", code, cwd=tmp_path)
     assert (
         (done.returncode == 1) == bool(said) and said in done.stderr and not any(tmp_path.iterdir())
     )

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 
+from programs import run
 import pytest
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -71,7 +72,7 @@ def ros2():
                 "-DBUILD_TESTING=OFF",
                 f"-DPython3_EXECUTABLE={sys.executable}",
             ]
-            made = subprocess.run(list(map(str, command)), capture_output=True, text=True, cwd=ROOT)
+            made = run(*command, cwd=ROOT)
             assert made.returncode == 0, made.stdout + made.stderr
     return [
         "bash",

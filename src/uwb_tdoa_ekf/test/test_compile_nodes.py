@@ -3,12 +3,10 @@
 """After compile_nodes, the nodes have nothing to compile when they start."""
 
 import os
-import subprocess
-import sys
 
+from programs import python
 import pytest
 
-pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from rig import make_rig  # noqa: E402, F401
@@ -88,12 +86,6 @@ def test_nothing_is_compiled_in_flight(code):
             [os.path.dirname(__file__), os.environ.get("PYTHONPATH", "")]
         ),
     }
-    ended = subprocess.run(
-        [sys.executable, "-c", code],
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=300.0,
-    )
+    ended = python("-c", code, env=environment, timeout=300.0)
     assert ended.returncode == 0, ended.stderr
     assert ended.stdout.splitlines()[-1] == "[]"

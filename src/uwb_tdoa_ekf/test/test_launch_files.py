@@ -6,14 +6,13 @@ from contextlib import contextmanager
 import os
 from pathlib import Path
 import signal
-import subprocess
 import threading
 import time
 
+from programs import run
 import pytest
 import yaml
 
-pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from nav_msgs.msg import Odometry  # noqa: E402
@@ -305,7 +304,7 @@ def param(rig, *words):
 
     def found():
         command = [*ros2(), "param", *words[:1], "--no-daemon", "--spin-time", "1", *words[1:]]
-        made.append(subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE))
+        made.append(run(*command, timeout=PATIENCE))
         return "Node not found" not in made[-1].stdout + made[-1].stderr
 
     rig.wait(found, f"ros2 param to find {words[1]}")

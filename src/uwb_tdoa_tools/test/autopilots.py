@@ -9,13 +9,13 @@ from contextlib import contextmanager
 import os
 import signal
 import subprocess
-import sys
 import threading
 import time
 
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Odometry
 import numpy as np
+from programs import start
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from scipy.spatial.transform import Rotation
@@ -87,11 +87,9 @@ class Bench:
         """Start the node. Wait until both sides have discovered each other."""
         words = ["--ros-args", *(word for value in parameters for word in ("-p", value))]
         words += ["-p", "qos_overrides./odometry.subscription.reliability:=reliable"]
-        self.process = subprocess.Popen(
-            [sys.executable, "-u", "-m", "uwb_tdoa_tools.autopilot_node", *words],
-            stdout=subprocess.PIPE,
+        self.process = start(
+            *("-u", "-m", "uwb_tdoa_tools.autopilot_node", *words),
             stderr=subprocess.STDOUT,
-            text=True,
             start_new_session=True,
         )
         self._reader = threading.Thread(target=self._collect, daemon=True)

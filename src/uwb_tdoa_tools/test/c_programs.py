@@ -7,10 +7,10 @@ from dataclasses import replace
 import math
 from pathlib import Path
 import shutil
-import subprocess
 
 from exported_states import network_of
 import numpy as np
+from programs import run
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.anchors import Anchors
@@ -262,7 +262,7 @@ def on_host(folder, some, flags=STRICT):
     """Run cases on this computer and return their RESULT (n,)."""
     sources = [HERE / "main.c", HERE / "host.c", "uwb_bias.c"]
     command = [GCC, *flags, f"-I{HERE}", "-I.", *sources, "-lm", "-o", "host"]
-    subprocess.run(command, cwd=folder, check=True)
+    run(*command, cwd=folder, check=True)
     return _results(folder, ["./host"], some)
 
 
@@ -272,7 +272,7 @@ def linked(folder, flags=FIRMWARE):
     options = ["-nostartfiles", "-T", HERE / "netduinoplus2.ld", "-Wl,--gc-sections"]
     options += ["--specs=nano.specs", "--specs=nosys.specs", "-lm", "-o", "board.elf"]
     command = [ARM_GCC, *PROCESSOR, *flags, f"-I{HERE}", "-I.", *sources, *options]
-    subprocess.run(command, cwd=folder, check=True)
+    run(*command, cwd=folder, check=True)
     return sum(_size(folder, "board.elf")[:2])
 
 
@@ -288,14 +288,13 @@ def on_board(folder, some, flags=FIRMWARE):
 
 def _results(folder, command, some):
     (folder / "cases.bin").write_bytes(some.tobytes())
-    subprocess.run(command, cwd=folder, check=True, timeout=300)
+    run(*command, cwd=folder, check=True, timeout=300)
     return np.fromfile(folder / "results.bin", RESULT)
 
 
 def _size(folder, name):
     """Return (text, data, bss) of a file, bytes."""
-    command = ["arm-none-eabi-size", name]
-    out = subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
+    out = run("arm-none-eabi-size", name, cwd=folder, check=True).stdout
     return tuple(map(int, out.splitlines()[1].split()[:3]))
 
 
@@ -312,7 +311,7 @@ def cost_of(folder, code, n=320):
     write(folder / "without", replace(code, files={**code.files, "uwb_bias.c": STUB}))
     empty = linked(folder / "without")
     symbols = [ARM_GCC, *PROCESSOR, *FIRMWARE, "-c", "uwb_bias.c", "-o", "own.o"]
-    subprocess.run(symbols, cwd=folder, check=True)
+    run(*symbols, cwd=folder, check=True)
     own = _own_flash(folder)
     _, cost = on_board(folder, cases(n))
     per_case = 1e9 / CLOCK / cost["cases"][0]
@@ -338,12 +337,11 @@ int uwb_bias(int a, int b, const uwb_bias_state *state, float *bias, float *std)
 def _own_flash(folder):
     """Return the bytes of uwb_bias.c that remain in the test program."""
     command = ["arm-none-eabi-nm", "-S", "--defined-only", "board.elf"]
-    out = subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
+    out = run(*command, cwd=folder, check=True).stdout
     kept = {
         line.split()[-1]: int(line.split()[1], 16)
         for line in out.splitlines()
         if len(line.split()) == 4
     }
-    command = ["arm-none-eabi-nm", "--defined-only", "own.o"]
-    out = subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
+    out = run("arm-none-eabi-nm", "--defined-only", "own.o", cwd=folder, check=True).stdout
     return sum(kept.get(line.split()[-1], 0) for line in out.splitlines())

@@ -9,8 +9,9 @@ from importlib import import_module
 from pathlib import Path
 import re
 import shutil
-import subprocess
 from tempfile import TemporaryDirectory
+
+from programs import run as run_program
 
 ROOT = Path(__file__).resolve().parents[3]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
@@ -63,14 +64,8 @@ def commands(script):
     functions = [f'{name}() {{ note {told} "$@"; }}\n' for name, told in names.items()]
     lines = NOTE + "".join(functions) + script.replace("./dev ", "dev ")
     with TemporaryDirectory() as folder:  # some scripts write files
-        done = subprocess.run(
-            [shutil.which("bash"), "-c", lines],
-            cwd=folder,
-            env={"PATH": "/nowhere"},
-            capture_output=True,
-            text=True,
-            timeout=60,
-        )
+        bash = shutil.which("bash")
+        done = run_program(bash, "-c", lines, cwd=folder, env={"PATH": "/nowhere"}, timeout=60)
     assert "syntax error" not in done.stderr, done.stderr
     return [line.split("\0")[:-1] for line in done.stdout.split("\n")[:-1]]
 

@@ -7,11 +7,10 @@ import json
 import signal
 import sqlite3
 import struct
-import subprocess
-import sys
 
 import lz4.frame
 import numpy as np
+from programs import start
 import pytest
 from recordings import ANCHORS, small_flight
 from rosbags.rosbag2 import Writer
@@ -362,12 +361,7 @@ def test_an_interrupt_ends_a_walk_through_a_database(tables):
         "from uwb_tdoa_bias.common.executable import executable\n"
         "sys.exit(executable('uwb_tdoa_tools.commands.check')())"
     )
-    check = subprocess.Popen(
-        [sys.executable, "-c", code, str(bag)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    check = start("-c", code, bag)
     for line in check.stdout:
         if line == "walks\n":
             break

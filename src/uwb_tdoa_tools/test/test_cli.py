@@ -3,9 +3,8 @@
 
 import errno
 import sqlite3
-import subprocess
-import sys
 
+from programs import start
 import pytest
 
 from uwb_tdoa_bias.common.errors import InputError
@@ -112,11 +111,9 @@ def test_a_closed_pipe_is_no_traceback():
         "import sys; from uwb_tdoa_tools import cli;"
         "sys.exit(cli.run(lambda args: print('line\\n' * 100000), cli.parser('talk', 'Talk.'), []))"
     )
-    talk = subprocess.Popen(
-        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    )
+    talk = start("-c", code)
     talk.stdout.read(10)
     talk.stdout.close()
     err = talk.stderr.read()
     talk.stderr.close()
-    assert (talk.wait(timeout=60), err) == (141, b"")
+    assert (talk.wait(timeout=60), err) == (141, "")

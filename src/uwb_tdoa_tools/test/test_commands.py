@@ -11,10 +11,9 @@ import runpy
 import shlex
 import shutil
 import signal
-import subprocess
-import sys
 
 from documented import EXECUTABLES, NODES, ROOT, TOOLS, commands, main, of_pages
+from programs import python, start
 import pytest
 import yaml
 
@@ -30,7 +29,6 @@ from uwb_tdoa_tools.simulation.config import VEHICLE_DEFAULTS
 from uwb_tdoa_tools.simulation.paths import TRAJECTORIES
 from uwb_tdoa_tools.simulation.rooms import corners
 
-pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
 MEMBERS = {"localization_node": ("bias_node", "ekf_node")}  # it also takes their parameters
@@ -94,7 +92,7 @@ def test_help_and_usage_errors_import_nothing_heavy():
         "        assert main(['--help']) == 0 and main(['--no-such-option']) == 2, name\n"
         f"    print(name, *sorted(set({HEAVY}) & sys.modules.keys()))\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    done = python("-c", code)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.split() == list(TOOLS)
 
@@ -250,13 +248,7 @@ def test_an_interrupt_while_it_imports_is_quiet(name, tmp_path):
         pytest.skip("the workspace is not built and sourced")
     (tmp_path / "sitecustomize.py").write_text(HALT)
     paths = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
-    process = subprocess.Popen(
-        [sys.executable, files[0]],
-        env={**os.environ, "PYTHONPATH": paths},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    process = start(files[0], env={**os.environ, "PYTHONPATH": paths})
     assert process.stdout.readline() == "importing\n"
     process.send_signal(signal.SIGINT)
     out, said = process.communicate(timeout=120)

@@ -5,11 +5,11 @@
 from importlib.util import module_from_spec, spec_from_file_location
 import os
 import shutil
-import subprocess
 import sys
 import zipfile
 
 from documented import ROOT
+from programs import run
 import pytest
 
 BASE_PYTHON = os.path.realpath(sys.executable)
@@ -39,9 +39,7 @@ def workspace(tmp_path):
 
 def dev(folder, words, **environment):
     plain = {"PATH": os.environ["PATH"], "HOME": os.environ.get("HOME", "/"), **environment}
-    done = subprocess.run(
-        [folder / "dev", *words.split()], cwd=folder, env=plain, capture_output=True, text=True
-    )
+    done = run(folder / "dev", *words.split(), cwd=folder, env=plain)
     return done.returncode, done.stdout, done.stderr
 
 

@@ -6,13 +6,12 @@ import os
 import runpy
 import signal
 import subprocess
-import sys
 import time
 
 from documented import ROOT
+from programs import start
 import pytest
 
-pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from uwb_tdoa_bias.common.errors import Failure, InputError  # noqa: E402
@@ -89,11 +88,8 @@ def test_a_node_that_crashes_is_started_again(run, tmp_path):
 def test_an_interrupt_ends_all_nodes(tmp_path):
     corners().to_yaml(tmp_path / "anchors.yaml")
     words = "namespace:=tag1", "body_frame:=drone", f"anchors_file:={tmp_path / 'anchors.yaml'}"
-    command = [sys.executable, str(FILE), "uwb_tdoa_ekf", "tdoa.launch.py", *words]
     with own_domain(), session("test", []) as (node, _):
-        launched = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-        )
+        launched = start(FILE, "uwb_tdoa_ekf", "tdoa.launch.py", *words, stderr=subprocess.STDOUT)
         try:
             until(lambda: node.count_publishers("/tag1/odometry"))
             until(lambda: node.count_publishers("/tag1/uwb/anchors"))

@@ -12,10 +12,10 @@ import os
 from pathlib import Path
 import re
 import shutil
-import subprocess
 import sys
 
 from documented import ROOT
+import programs
 import pytest
 
 from uwb_tdoa_bias.common.text import version
@@ -35,13 +35,7 @@ KEPT = ("HOME", "TMPDIR", "PIP_", "OPENBLAS_")  # beginnings of variables; BLAS 
 def run(*words, folder=None, codes=(0,)):
     """Run a program like a user without ROS, and return its output."""
     plain = {name: value for name, value in os.environ.items() if name.startswith(KEPT)}
-    done = subprocess.run(
-        list(map(str, words)),
-        cwd=folder,
-        env={**plain, "PATH": "/usr/bin:/bin"},
-        capture_output=True,
-        text=True,
-    )
+    done = programs.run(*words, cwd=folder, env={**plain, "PATH": "/usr/bin:/bin"})
     if re.search(NO_INDEX, done.stderr) and "pip" in words:
         pytest.skip("no package index can be reached")
     assert done.returncode in codes, (words, done.stdout, done.stderr)

@@ -10,12 +10,11 @@ import os
 from pathlib import Path
 import shutil
 import signal
-import subprocess
-import sys
 import time
 
 from documented import blocks, section
 import numpy as np
+from programs import run, start
 import pytest
 
 rclpy = pytest.importorskip("rclpy")
@@ -61,9 +60,7 @@ def listener():
 def test_the_publisher_in_python(tmp_path, listener):
     """Subscribe reliably, as most subscribers do, after the anchors were sent."""
     (tmp_path / "driver.py").write_text(*blocks(section("drivers.md", "In Python"), "python"))
-    process = subprocess.Popen(
-        [sys.executable, tmp_path / "driver.py"], stderr=subprocess.PIPE, text=True
-    )
+    process = start(tmp_path / "driver.py")
     try:
         imu, tdoas, surveys = [], [], []
         once = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -112,5 +109,5 @@ def test_the_publisher_in_cpp(tmp_path):
     }
     paths = [word for folder in sorted(folders) for word in ("-I", folder)]
     command = ["g++", "-std=c++17", "-fsyntax-only", "-Wall", "-I", tmp_path, *paths]
-    done = subprocess.run([*command, tmp_path / "driver.cpp"], capture_output=True, text=True)
+    done = run(*command, tmp_path / "driver.cpp")
     assert done.returncode == 0, done.stderr[:2000]

@@ -5,12 +5,11 @@
 It accepts any input, and is small on a Cortex-M4F.
 """
 
-import subprocess
-
 import c_programs as c
 from c_programs import ANCHORS, GCC, by_numpy, cases, chosen, on_board, on_host, write
 from documented import blocks, section
 import numpy as np
+from programs import run
 import pytest
 
 from uwb_tdoa_bias.correction.corrector import Corrector
@@ -153,9 +152,5 @@ def test_the_example_of_the_page_compiles(tmp_path):
     write(tmp_path, vehicle_code(ANCHORS, chosen("anchor_delay")))
     (tmp_path / "example.c").write_text(f"{code}\nint main(void) {{ return 0; }}\n")
     files = [tmp_path / "example.c", tmp_path / "uwb_bias.c"]
-    done = subprocess.run(
-        [GCC, *c.STRICT, "-I", tmp_path, *files, "-lm", "-o", tmp_path / "example"],
-        capture_output=True,
-        text=True,
-    )
+    done = run(GCC, *c.STRICT, "-I", tmp_path, *files, "-lm", "-o", tmp_path / "example")
     assert done.returncode == 0, done.stderr

@@ -7,6 +7,7 @@ import subprocess
 import c_programs as c
 from c_programs import ANCHORS, GCC, cases, chosen
 import numpy as np
+from programs import run
 import pytest
 from scipy.spatial.transform import Rotation
 import yaml
@@ -141,7 +142,7 @@ def build(folder, names):
     sources = ["src/uwb_bias.c", "src/uwb_bias_firmware.c"]
     sources += ["firmware/src/updates.c", "firmware/src/estimator_kalman.c"]
     command = [GCC, *flags, *include, *sources, "-lm", "-o", "estimator"]
-    subprocess.run(command, cwd=folder / "app", check=True, capture_output=True, text=True)
+    run(*command, cwd=folder / "app", check=True)
     return folder / "app" / "estimator"
 
 
@@ -165,7 +166,7 @@ def test_the_filter_of_the_firmware_gets_corrected_tdoas(tmp_path):
         " ".join(f"{one:.9g}" if k < 12 else f"{int(one)}" for k, one in enumerate(row)) + "\n"
         for row in zip(*columns)
     )
-    out = subprocess.run([program], input=lines, capture_output=True, text=True, check=True).stdout
+    out = run(program, input=lines, check=True).stdout
     got = np.array(out.split(), dtype=float)
     np.testing.assert_allclose(0.25 - got, chosen(*NAMES).bias(c.samples_of(some)), atol=2e-5)
 

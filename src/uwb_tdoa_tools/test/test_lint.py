@@ -4,10 +4,9 @@
 
 import ast
 import re
-import subprocess
-import sys
 
 from documented import ROOT
+from programs import python
 import pytest
 
 MOST_ARGUMENTS = 7  # arguments of a function (CONTRIBUTING.md), without self and cls
@@ -58,7 +57,7 @@ ERROR = re.compile(r"^(.*):(\d+): error: .*\[([\w-]+)\]$", re.MULTILINE)
 
 
 def run(*words):
-    done = subprocess.run([sys.executable, *words], cwd=ROOT, capture_output=True, text=True)
+    done = python(*words, cwd=ROOT)
     return done.returncode, done.stdout + done.stderr
 
 

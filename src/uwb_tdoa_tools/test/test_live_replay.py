@@ -9,12 +9,11 @@ from contextlib import contextmanager
 import queue
 import re
 import signal
-import subprocess
-import sys
 import threading
 import time
 
 import numpy as np
+from programs import start
 import pytest
 from recordings import small_flight
 
@@ -49,10 +48,7 @@ class Process:
     """A running tool of ours, with its lines on stderr."""
 
     def __init__(self, name, *arguments):
-        command = [sys.executable, "-m", "uwb_tdoa_tools.commands", name, *map(str, arguments)]
-        self.process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
+        self.process = start("-m", "uwb_tdoa_tools.commands", name, *arguments)
         self.said = []
         self._lines = queue.Queue()
         threading.Thread(target=self._listen, daemon=True).start()

@@ -9,18 +9,16 @@ from dataclasses import replace
 import os
 import re
 import signal
-import subprocess
-import sys
 import threading
 import time
 
 import numpy as np
 import pytest
 
-pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg", reason="needs the built workspace: ./dev build")
 
 import known_answer  # noqa: E402
+import programs  # noqa: E402
 
 from uwb_tdoa_bias.correction.network import load_network  # noqa: E402
 from uwb_tdoa_ekf.core.memory import USED  # noqa: E402
@@ -50,9 +48,7 @@ def load():
     running = []
 
     def start(count):
-        running.extend(
-            subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)
-        )
+        running.extend(programs.start("-c", "while True: pass") for _ in range(count))
 
     def end():
         while running:

@@ -9,12 +9,12 @@ import io
 import os
 from pathlib import Path
 import signal
-import subprocess
 import sys
 from threading import Event
 import time
 
 from joblib import cpu_count
+from programs import python, start
 import pytest
 
 from uwb_tdoa_bias.common.errors import InputError
@@ -101,20 +101,15 @@ def test_an_interrupt_ends_all_processes_silently(importable):
         "flush=True)\n"
         "sys.exit(cli.run(work, cli.parser('work', 'Work.'), []))"
     )
-    work = subprocess.Popen(
-        [sys.executable, "-c", code],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        start_new_session=True,
-    )
+    work = start("-c", code, start_new_session=True)
     for _ in range(3):
         assert (
-            work.stdout.readline() == b"done\n"
+            work.stdout.readline() == "done\n"
         )  # the first runs in this process, the others in its children
     os.killpg(work.pid, signal.SIGINT)  # as a terminal does
     _, err = work.communicate(timeout=120)  # returns when the children have closed their pipes, too
     assert work.returncode == 130 and all(
-        b" of 201 flights done, " in line for line in err.splitlines()
+        " of 201 flights done, " in line for line in err.splitlines()
     )
 
 
@@ -133,9 +128,7 @@ def test_modules_in_the_present_folder_do_not_run(tmp_path, importable):
         "from uwb_tdoa_tools import parallel\n"
         "print([*parallel.over(os.path.abspath, ['a', 'b', 'c', 'd'], 2)])\n"
     )
-    ended = subprocess.run(
-        [sys.executable, "work.py"], cwd=tmp_path, capture_output=True, text=True, timeout=100
-    )
+    ended = python("work.py", cwd=tmp_path, timeout=100)
     assert ended.stdout == f"{[str(tmp_path / name) for name in 'abcd']}\n", ended.stderr
     assert not (tmp_path / "ran").exists()
 

@@ -4,11 +4,10 @@
 
 from dataclasses import replace
 import json
-import subprocess
-import sys
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
+from programs import python
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -533,5 +532,5 @@ assert config_of(parser.parse_args(["--side-sonar-noise", "0.1"])).side_sonar_no
 
 def test_the_registry_alone_adds_a_sensor_to_recordings_parameters_simulation_and_bags():
     """It runs in another process, because importers of the registry derive their fields from it."""
-    run = subprocess.run([sys.executable, "-c", REGISTERED], capture_output=True, text=True)
-    assert run.returncode == 0, run.stderr
+    done = python("-c", REGISTERED)
+    assert done.returncode == 0, done.stderr

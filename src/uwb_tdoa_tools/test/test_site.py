@@ -4,10 +4,9 @@
 
 import os
 import re
-import subprocess
-import sys
 
 from documented import ROOT, TOOLS
+from programs import python
 import pytest
 import uwb_tdoa
 
@@ -28,13 +27,8 @@ def site(tmp_path_factory):
     """Return {path in the site: text}. A link that leads nowhere ends a strict build."""
     folder = tmp_path_factory.mktemp("site")
     offline = {"http_proxy": "http://127.0.0.1:9", "https_proxy": "http://127.0.0.1:9"}
-    done = subprocess.run(
-        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", folder],
-        cwd=ROOT,
-        env={**os.environ, **offline, "NO_MKDOCS_2_WARNING": "1"},
-        capture_output=True,
-        text=True,
-    )
+    words = ("-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", folder)
+    done = python(*words, cwd=ROOT, env={**os.environ, **offline, "NO_MKDOCS_2_WARNING": "1"})
     assert done.returncode == 0, done.stdout + done.stderr
     paths = [
         path

@@ -5,9 +5,9 @@
 import json
 from pathlib import Path
 import shlex
-import subprocess
 
 import numpy as np
+from programs import run
 import pytest
 from recordings import SURVEY
 
@@ -116,7 +116,7 @@ def test_the_output_of_a_shell_is_named_with_a_line_that_makes_a_table(folder, f
     said = capsys.readouterr().err
     assert "of a DWM1001" in said and not Path("profile.yaml").exists()
     line = said[said.index("awk ") : said.index("; then: ")]
-    subprocess.run(line, shell=True, check=True)
+    run("sh", "-c", line, check=True)
     flight = read_as_suggested("ranges.csv", capsys)
     assert len(flight.range) == 60 and len(flight.anchors) == 2  # positions are in the log
     np.testing.assert_allclose(flight.range.d[:2], [4.0, 6.0], atol=1e-6)
@@ -189,7 +189,7 @@ def test_anchors_in_degrees_are_named(tmp_path, header):
     with pytest.raises(InputError, match="are latitude and longitude in degrees") as error:
         read_survey(file)
     line = str(error.value).replace("FILE", "anchors.csv")
-    subprocess.run(line[line.index("awk ") :], shell=True, check=True, cwd=tmp_path)
+    run("sh", "-c", line[line.index("awk ") :], check=True, cwd=tmp_path)
     positions = read_survey(tmp_path / "metres.csv").positions
     np.testing.assert_allclose(np.ptp(positions, axis=0), [6.7, 7.8, 3.0], atol=0.05)
 

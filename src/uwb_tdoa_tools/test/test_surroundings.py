@@ -8,10 +8,10 @@ module, program or setting from it.
 
 import os
 import shutil
-import subprocess
 import sys
 
 from documented import ROOT
+import programs
 import pytest
 from test_layout import ROS, modules
 
@@ -64,14 +64,7 @@ built = pytest.mark.skipif(
 
 
 def run(*command, folder, **variables):
-    return subprocess.run(
-        list(map(str, command)),
-        cwd=folder,
-        env=variables,
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
+    return programs.run(*command, cwd=folder, env=variables, timeout=300)
 
 
 def empty_entries(text):

@@ -4,13 +4,12 @@
 import os
 import re
 import struct
-import subprocess
-import sys
 import tracemalloc
 import zlib
 
 from hypothesis import HealthCheck, given, settings, strategies as st
 import numpy as np
+from programs import python
 import pytest
 from recordings import ANCHORS, EVENTS, ROWS, log_bytes
 
@@ -299,10 +298,7 @@ def test_a_header_of_millions_of_variables_takes_no_memory(read, types, variable
 @pytest.mark.parametrize(
     "setting",
     [
-        "cache_dir: planted",
-        "cache_locator_classes: evil.Locator",
-        "disable_jit: 1",
-        "opt: none",
+        "cache_dir: planted\ncache_locator_classes: evil.Locator\ndisable_jit: 1\nopt: none",
         "[",
     ],
 )
@@ -325,8 +321,6 @@ def test_a_folder_of_flights_does_not_say_where_compiled_code_is(tmp_path, setti
     environment["PYTHONPATH"] = os.pathsep.join(
         [os.path.dirname(__file__), environment.get("PYTHONPATH", "")]
     )
-    ended = subprocess.run(
-        [sys.executable, "-c", reads], cwd=tmp_path, env=environment, capture_output=True, text=True
-    )
+    ended = python("-c", reads, cwd=tmp_path, env=environment)
     assert ended.returncode == 0, ended.stderr
     assert (tmp_path / "uwb_tdoa").exists() and not (tmp_path / "planted").exists()

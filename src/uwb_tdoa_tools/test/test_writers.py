@@ -6,13 +6,11 @@ import ast
 from dataclasses import replace
 import json
 import os
-from pathlib import Path
 import re
-import subprocess
-import sys
 
 from documented import ROOT
 from known_effects import clean_flight
+from programs import python
 import pytest
 
 from uwb_tdoa_tools.bags.bag import write_bag
@@ -93,61 +91,21 @@ def test_a_direct_write_is_found(tmp_path, line):
 ASCII = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
 
 
-def in_ascii(folder, command, *arguments, encoding="ascii"):
-    """Run a command in an ASCII locale and return its output.
+@pytest.mark.slow
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1"])  # of the output
+def test_evaluate_reads_and_writes_files_in_an_ascii_locale(tmp_path, encoding):
+    """The names of the flight, of its folder and of the files have non-ASCII characters.
 
-    encoding : of its output, as a user may choose it
+    The other commands write by the same functions.
     """
-    line = [
-        sys.executable,
-        "-m",
-        "uwb_tdoa_tools.commands",
-        command,
-        *map(os.fsencode, arguments),
-    ]
+    bag = tmp_path / "zwei flüge — 二" / "bag"
+    bag.parent.mkdir()
+    write_bag(replace(clean_flight(100, 16.0), name="flüge"), bag)
+    words = ("evaluate", bag, "--json", "é.json", "--plot", "é è.png", "--tum", "ü ü")
+    line = ["-m", "uwb_tdoa_tools.commands", *words]
     variables = os.environ | ASCII | {"PYTHONIOENCODING": encoding}
-    done = subprocess.run(line, cwd=folder, env=variables, capture_output=True)
-    assert done.returncode == 0 and b"Traceback" not in done.stderr, done.stderr.decode(
-        "utf-8", "replace"
-    )
-    return done.stdout.decode(encoding)
-
-
-@pytest.fixture(scope="module")
-def bag(tmp_path_factory):
-    """Write a bag of a short flight. Its name and folder have spaces and non-ASCII characters."""
-    path = tmp_path_factory.mktemp("zwei flüge — 二") / "bag"
-    write_bag(replace(clean_flight(100, 24.0), name="flüge"), path)
-    return path
-
-
-def read(path):
-    text = Path(path).read_bytes().decode("utf-8")
-    return json.loads(text) if str(path).endswith(".json") else text
-
-
-@pytest.mark.slow
-def test_evaluate_writes_its_files_in_an_ascii_locale(bag, tmp_path):
-    words = ("--json", "é.json", "--plot", "é è.png", "--tum", "ü ü")
-    in_ascii(tmp_path, "evaluate", bag, *words, encoding="latin-1")
+    done = python(*line, cwd=tmp_path, env=variables, encoding=encoding)
+    assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
     assert list((tmp_path / "ü ü").glob("*.tum")) and (tmp_path / "é è.png").stat().st_size > 1000
-    assert read(tmp_path / "é.json")["runs"][0]["flight"].startswith("flüge")
-
-
-@pytest.mark.slow
-def test_localize_writes_its_files_in_an_ascii_locale(bag, tmp_path):
-    in_ascii(tmp_path, "localize", bag, "--residuals", "--zones", "2", "--out", "wo_ü")
-    assert {path.suffix for path in (tmp_path / "wo_ü").rglob("*")} >= {".png", ".csv", ".tum"}
-    written = [
-        path
-        for path in (tmp_path / "wo_ü").rglob("*")
-        if path.suffix in (".csv", ".json", ".txt", ".md", ".tum")
-    ]
-    assert written and all(read(path) for path in written)
-
-
-@pytest.mark.slow
-def test_diagnose_writes_its_report_in_an_ascii_locale(bag, tmp_path):
-    in_ascii(tmp_path, "diagnose", bag, "--out", "out")
-    assert not read(tmp_path / "out" / "report.html").isascii()
-    assert read(tmp_path / "out" / "effects.yaml")
+    text = (tmp_path / "é.json").read_bytes().decode("utf-8")
+    assert json.loads(text)["runs"][0]["flight"].startswith("flüge")
