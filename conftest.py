@@ -31,13 +31,12 @@ except ImportError:  # without ROS: the tests of the cores need none
 # Reserved domains, oldest first. Each stays reserved until this process ends or KEPT newer follow.
 _taken = deque()
 # Test files that take half a minute or more, the longest first.
-LONGEST = """checking_check calibrating launch_files distribution surveying_known walks commands
-    moved_anchors diagnosis_self_calibration diagnosis_attribution waiting surveying
-    diagnosis_diagnose lockstep plan demo hall stream_faults diagnosis_references
-    clock_recordings vehicle_node python_api lint study_faults localizing diagnosis_validation
-    study_bench checking_report diagnosis_report diagnosis_ranging study_plans first_map
-    live_replay autopilot_flight train diagnosis_deviations alignment warehouse rerun each_node
-    profiles evaluate study_odd_messages stream_watch nodes both_nodes surroundings
+LONGEST = """checking_check calibrating launch_files distribution walks commands moved_anchors
+    diagnosis_self_calibration diagnosis_attribution diagnosis_streams diagnosis_channels
+    waiting surveying diagnosis_diagnose lockstep plan demo hall stream_faults clock_recordings
+    vehicle_node python_api lint study_faults localizing diagnosis_validation study_bench
+    checking_report diagnosis_report study_plans first_map live_replay train alignment warehouse
+    rerun profiles evaluate study_odd_messages stream_watch nodes both_nodes surroundings
     checking_trials callees""".split()
 # Number of later tests that may not reuse the domain of a test.
 # A killed node stays visible for 20 s.
@@ -66,7 +65,8 @@ def _take_domain():
 
 @cache
 def _uses_ros(path):
-    return "rclpy" in path.read_text()
+    text = path.read_text()
+    return "rclpy" in text or 'importorskip("uwb_tdoa_msgs' in text
 
 
 def pytest_collection_modifyitems(items):

@@ -4,7 +4,6 @@
 
 import pytest
 
-pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 rclpy = pytest.importorskip("rclpy")
 

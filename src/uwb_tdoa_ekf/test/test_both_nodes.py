@@ -10,7 +10,6 @@ import time
 import numpy as np
 import pytest
 
-pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from flights import position_at  # noqa: E402

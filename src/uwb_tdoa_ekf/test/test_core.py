@@ -4,15 +4,21 @@
 
 from dataclasses import replace
 
+from covariances import assert_covariance, random_covariance
+from finite_differences import numerical_jacobian
 from flights import corners, errors_of, fly, rms_error
-from hypothesis import given, strategies as st
+from hypothesis import given, settings, strategies as st
 import numpy as np
+from priors import Prior, kalman as textbook, with_offset
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.geometry import tdoa, tdoa_jacobian
+from uwb_tdoa_bias.common.robust_loss import LOSSES, weight
 from uwb_tdoa_ekf.core import noise
-from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.core.auxiliary import PRESSURE, RANGE, add_offset_jacobian
+from uwb_tdoa_ekf.core.config import PARAMETERS, ROBUST, FilterConfig
 from uwb_tdoa_ekf.core.inertial import (
     LEAST_RECTIFIED,
     PERSISTENCE,
@@ -21,7 +27,7 @@ from uwb_tdoa_ekf.core.inertial import (
     is_quiet,
     observe,
     store,
-    weigh,
+    weigh as weigh_axes,
 )
 from uwb_tdoa_ekf.core.memory import (
     FARTHEST,
@@ -34,8 +40,17 @@ from uwb_tdoa_ekf.core.memory import (
     usable_tdoas,
 )
 from uwb_tdoa_ekf.core.noise import learn
-from uwb_tdoa_ekf.core.state import GRAVITY
-from uwb_tdoa_ekf.core.update import SMALLEST, second_order_variance
+from uwb_tdoa_ekf.core.state import GRAVITY, coast, exponential, inject, predict, rotation, turn
+from uwb_tdoa_ekf.core.update import (
+    LONGEST_ROW,
+    NEGLIGIBLE,
+    SMALLEST,
+    SMALLEST_WEIGHT,
+    kalman,
+    kalman_direct,
+    second_order_variance,
+    weigh,
+)
 from uwb_tdoa_ekf.core.workspace import (
     SMALLEST as WORKSPACE_SMALLEST,
     STD as WORKSPACE_STD,
@@ -45,6 +60,8 @@ from uwb_tdoa_ekf.core.workspace import (
 )
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.results import rotation_std, to_odometry
+
+# --- core ---
 
 # --- measurements ---
 
@@ -392,7 +409,7 @@ def test_rest_is_not_believed_at_once_nor_after_a_gap():
 def test_the_more_an_axis_rectifies_the_less_it_weighs_and_the_noisier_it_is():
     vibration = np.array([0.0, 0.5, 5.0])
     imu = after((np.zeros(3), 0.0), (UP + vibration, vibration))
-    weigh(
+    weigh_axes(
         imu,
         False,
         FilterConfig(accel_prior_std=1.5, vibration_gain=4.0, accel_noise=0.1).parameters()[0],
@@ -402,9 +419,9 @@ def test_the_more_an_axis_rectifies_the_less_it_weighs_and_the_noisier_it_is():
     assert imu.accel_psd[2] == pytest.approx(
         0.1**2 + 2.0 * PERSISTENCE * three * 4.0 * 25.0, rel=0.2
     )
-    weigh(imu, False, FilterConfig(vibration_gain=0.0, accel_noise=0.1).parameters()[0])
+    weigh_axes(imu, False, FilterConfig(vibration_gain=0.0, accel_noise=0.1).parameters()[0])
     assert imu.accel_weight.tolist() == [1.0] * 3 and imu.accel_psd == pytest.approx([0.1**2] * 3)
-    weigh(imu, True, FilterConfig().parameters()[0])
+    weigh_axes(imu, True, FilterConfig().parameters()[0])
     assert imu.accel_psd == pytest.approx([QUIET_NOISE**2] * 3)
 
 
@@ -415,30 +432,30 @@ def test_an_axis_whose_mean_is_that_of_hovering_does_not_rectify_however_it_vibr
         imu = after(
             (np.zeros(3), 0.0), (UP + [offset, 0.0, 0.0], 3.0), seconds=4.0 * SHAKING_MEMORY
         )
-        weigh(imu, False, parameters)
+        weigh_axes(imu, False, parameters)
         weights[offset] = imu.accel_weight
     error = 4.0 * 3.0**2
     # The weight is the same as with an unknown mean.
     assert weights[3.0][0] == pytest.approx(1.5**2 / (1.5**2 + error), rel=0.2)
-    for weight in (weights[0.0][0], weights[3.0][1], weights[3.0][2]):
-        assert weight == pytest.approx(1.5**2 / (1.5**2 + LEAST_RECTIFIED * error), rel=0.1)
+    for one in (weights[0.0][0], weights[3.0][1], weights[3.0][2]):
+        assert one == pytest.approx(1.5**2 / (1.5**2 + LEAST_RECTIFIED * error), rel=0.1)
 
 
 def test_what_begins_to_vibrate_is_not_believed_before_it_was_seen_for_a_while():
     parameters = FilterConfig(accel_prior_std=1.5, vibration_gain=4.0).parameters()[0]
     imu = after(**STILL)
     imu = after((np.zeros(3), 0.0), (UP, 1.0), imu=imu, seconds=0.5)
-    weigh(imu, False, parameters)
+    weigh_axes(imu, False, parameters)
     early = imu.accel_weight.copy()
     imu = after((np.zeros(3), 0.0), (UP, 1.0), imu=imu, seconds=4.0 * SHAKING_MEMORY)
-    weigh(imu, False, parameters)
+    weigh_axes(imu, False, parameters)
     assert (early < 0.6).all() and (imu.accel_weight > 0.8).all()
 
 
 @pytest.mark.parametrize("force", [-UP, np.array([np.linalg.norm(UP), 0.0, 0.0])])
 def test_what_hangs_upside_down_or_lies_on_its_side_does_not_hover_however_it_shakes(force):
     imu = after((np.zeros(3), 0.0), (force, np.array([5.0, 5.0, 5.0])))
-    weigh(imu, False, FilterConfig(accel_prior_std=1.5, vibration_gain=4.0).parameters()[0])
+    weigh_axes(imu, False, FilterConfig(accel_prior_std=1.5, vibration_gain=4.0).parameters()[0])
     assert imu.accel_weight.min() > 0.75
 
 
@@ -463,7 +480,7 @@ def test_what_is_far_from_hovering_is_taken_for_what_it_is_however_it_vibrates()
     weights = {}
     for force in (1.0, 1.2, 3.0):
         imu = after((np.zeros(3), 0.0), (force * UP, 1.0))
-        weigh(imu, False, parameters)
+        weigh_axes(imu, False, parameters)
         weights[force] = imu.accel_weight[2]
     assert weights[1.2] < 0.6 < weights[1.0] and weights[3.0] > 0.95
 
@@ -511,3 +528,378 @@ def test_rotation_std_is_that_of_the_odometry():
     np.testing.assert_allclose(
         rotation_std(q, covariance), np.sqrt(converted[:, [3, 4, 5], [3, 4, 5]]), rtol=1e-12
     )
+
+
+# --- update ---
+
+# --- update ---
+seeds = st.integers(0, 2**32 - 1)
+rows = st.lists(st.integers(0, 14), min_size=1, max_size=LONGEST_ROW, unique=True)
+
+
+@given(seeds, rows)
+def test_projection_of_a_sparse_row_is_that_of_the_dense_one(seed, states):
+    prior = Prior(seed, states)
+    P, h, innovation = prior.hypothesis.P, prior.h, prior.innovation
+    np.testing.assert_allclose(innovation.cross_covariance, P @ h, atol=1e-12 * np.abs(P).max())
+    assert innovation.prior_variance == pytest.approx(h @ P @ h, rel=1e-9)
+
+
+@given(seeds, rows)
+def test_kalman_is_the_textbook_update(seed, states):
+    prior = Prior(seed, states)
+    expected = prior.textbook(prior.innovation.noise_variance)
+    prior.innovation.total_variance = (
+        prior.innovation.prior_variance + prior.innovation.noise_variance
+    )
+    kalman(prior.hypothesis, prior.innovation)
+    prior.assert_is(*expected)
+    np.testing.assert_array_equal(prior.hypothesis.P, prior.hypothesis.P.T)
+    assert_covariance(prior.hypothesis.P)
+
+
+@given(seeds, st.integers(0, 5), st.floats(0.01, 10.0))
+def test_update_directly_is_the_textbook_update_with_a_unit_row(seed, state, std):
+    prior = Prior(seed)
+    prior.h[:] = np.arange(15) == state
+    prior.innovation.value = 1.5 - prior.hypothesis.x[state]
+    expected = prior.textbook(std**2)
+    kalman_direct(prior.hypothesis, prior.innovation, state, 1.5, std)
+    prior.assert_is(*expected)
+
+
+# --- robust ---
+losses = st.sampled_from(LOSSES)
+lengths = st.floats(1.0, 8.0)
+
+
+def tuned(**config):
+    return FilterConfig(**config).parameters()[0]
+
+
+def update(prior, parameters):
+    """Weigh the innovation, then update, as the engine does."""
+    weigh(prior.hypothesis, prior.innovation, parameters)
+    if prior.innovation.weight > 0.0:
+        kalman(prior.hypothesis, prior.innovation)
+
+
+@given(seeds, lengths)
+def test_gate_judges_with_the_variance_of_one_measurement_and_leaves_all_as_it_was(seed, length):
+    prior, gate = Prior(seed, surprise=3.0), 2.0
+    innovation, before = prior.innovation, prior.hypothesis.copy()
+    expected = prior.textbook(innovation.noise_variance * length)
+    passed = abs(innovation.value) <= gate * np.sqrt(
+        innovation.prior_variance + innovation.noise_variance
+    )
+    update(prior, tuned(robust="gate", gate=gate, tdoa_correlation_length=length))
+    assert innovation.weight == passed
+    if passed:
+        prior.assert_is(*expected)
+    else:
+        assert prior.hypothesis == before and innovation.total_variance == np.inf
+
+
+@given(seeds, losses, lengths)
+def test_innovation_divides_the_variance_by_the_weight_of_what_is_whitened(seed, loss, length):
+    prior = Prior(seed, surprise=3.0)
+    innovation, before = prior.innovation, prior.hypothesis.copy()
+    whitened = innovation.value / np.sqrt(innovation.prior_variance + innovation.noise_variance)
+    w = weight(LOSSES.index(loss), whitened, 2.5)
+    expected = prior.textbook(innovation.noise_variance * length / w)
+    parameters = tuned(loss=loss, measurement_scale=2.5, tdoa_correlation_length=length)
+    update(prior, parameters)
+    assert innovation.weight == (w if w >= NEGLIGIBLE else 0.0)
+    if w >= NEGLIGIBLE:
+        prior.assert_is(*expected)
+    else:
+        assert prior.hypothesis == before
+
+
+@given(seeds, losses, lengths, st.integers(1, 6), st.floats(1.0, 4.0), st.floats(1.0, 4.0))
+def test_m_estimation_is_that_of_the_paper(seed, loss, length, iterations, state_scale, scale):
+    prior = Prior(seed, surprise=2.0)
+    scales = dict(measurement_scale=scale, state_scale=state_scale, iterations=iterations)
+    parameters = tuned(robust="m_estimation", loss=loss, tdoa_correlation_length=length, **scales)
+    noise, P = prior.innovation.noise_variance * length, prior.hypothesis.P
+    error, covariance, expected = m_estimation(prior, P, prior.h, noise, parameters)
+    posterior = prior.after(error, covariance)
+    update(prior, parameters)
+    assert prior.innovation.weight == pytest.approx(expected, rel=1e-6)
+    prior.assert_is(*posterior, rtol=1e-6)
+
+
+def m_estimation(prior, P, h, noise, parameters):
+    """Return error, covariance and weight by Eqs. 8 - 13 of Zhao et al. (RA-L 2021).
+
+    The Jacobian is taken at the prior mean. The weight of the measurement is at least
+    SMALLEST_WEIGHT.
+    """
+    S, error, value = np.linalg.cholesky(P), np.zeros(len(h)), prior.innovation.value
+    loss, state_scale, scale = (
+        parameters[name] for name in ("loss", "state_scale", "measurement_scale")
+    )
+    for _ in range(parameters["iterations"]):
+        scaled = np.linalg.solve(S, error)  # eq. 9
+        rescaled = S @ np.diag([1.0 / weight(loss, e, state_scale) for e in scaled]) @ S.T  # eq. 10
+        w = max(weight(loss, (value - h @ error) / np.sqrt(noise), scale), SMALLEST_WEIGHT)
+        error, posterior = textbook(rescaled, h, value, noise / w)  # eqs. 11, 13
+    return error, posterior, w
+
+
+# error states of a measurement, and its auxiliary state
+MEASURED = {
+    "tdoa": ((0, 1, 2), None),
+    "tdoa, slope on velocity": ((0, 1, 2, 3, 4, 5), None),
+    "height": ((2, 6, 7), None),
+    "velocity": ((3, 4, 5, 7, 8), None),
+    "barometer": ((2,), PRESSURE),
+    "range with an offset": ((0, 1, 2), RANGE),
+    "attitude": ((6, 7, 8), None),
+}
+
+
+@given(
+    seeds,
+    st.sampled_from(sorted(MEASURED)),
+    st.sampled_from(ROBUST),
+    losses,
+    st.integers(1, 4),
+    st.floats(0.0, 5.0),
+)
+def test_whatever_is_measured_the_joint_covariance_stays_one(
+    seed, name, robust, loss, iterations, surprise
+):
+    states, offset = MEASURED[name]
+    prior = Prior(seed, states, surprise)
+    joint, innovation = with_offset(prior), prior.innovation
+    if offset is not None:
+        add_offset_jacobian(prior.hypothesis, innovation, offset)
+    h = np.zeros(18)
+    h[list(states)] = prior.h[list(states)]
+    if offset is not None:
+        h[15 + offset] = 1.0
+    parameters = tuned(robust=robust, loss=loss, iterations=iterations, tdoa_correlation_length=1.0)
+    x = prior.hypothesis.offset.copy()
+    if robust == "m_estimation":
+        error, expected, _ = m_estimation(prior, joint, h, innovation.noise_variance, parameters)
+    update(prior, parameters)
+    after = np.zeros((18, 18))
+    after[:15, :15], after[15:, :15], after[15:, 15:] = (
+        prior.hypothesis.P,
+        prior.hypothesis.offset_cross,
+        prior.hypothesis.offset_P,
+    )
+    after[:15, 15:] = after[15:, :15].T
+    assert_covariance(after, tolerance=1e-8)
+    if robust == "m_estimation":
+        std = np.sqrt(np.diag(expected))
+        np.testing.assert_allclose(
+            after / np.outer(std, std), expected / np.outer(std, std), atol=1e-6
+        )
+        np.testing.assert_allclose(
+            (prior.hypothesis.offset - x) / std[15:], error[15:] / std[15:], atol=1e-6
+        )
+
+
+# --- state ---
+
+DOWN = np.array([0.0, 0.0, -GRAVITY])
+
+
+def random_state(rng):
+    q = rng.standard_normal(4)
+    return np.concatenate(
+        [rng.normal(0, 5, 3), rng.normal(0, 2, 3), q / np.linalg.norm(q), rng.normal(0, 0.2, 6)]
+    )
+
+
+def plus(x, error, gain=1.0):
+    out = x.copy()
+    inject(out, error, gain)
+    return out
+
+
+def minus(x, y):
+    """Return the error state (15,) that takes y to x."""
+    attitude = Rotation.from_quat(y[6:10]).inv() * Rotation.from_quat(x[6:10])
+    return np.concatenate([x[:6] - y[:6], attitude.as_rotvec(), x[10:] - y[10:]])
+
+
+NEW = new_state(np.zeros((1, 3)))
+
+
+def ekf_with(x, P):
+    ekf = NEW.copy().record
+    ekf.hypotheses["x"][0], ekf.hypotheses["P"][0] = x, P
+    return ekf
+
+
+def predicted(x, P, dt, gyro, accel, weight, psd=(0.0, 0.0, 0.0), rest=(0.0, 0.0, 0.0)):
+    """Return state and covariance after one prediction.
+
+    psd : of the accelerometer.
+    rest : of the gyroscope and both bias walks.
+    """
+    ekf, parameters = ekf_with(x, P), np.zeros(1, PARAMETERS)[0]
+    for name, value in zip(
+        ("gyro", "accel", "accel_weight", "accel_psd"), (gyro, accel, weight, psd)
+    ):
+        ekf.imu[name] = value
+    for name, value in zip(("gyro_noise", "accel_bias_walk", "gyro_bias_walk"), np.sqrt(rest)):
+        parameters[name] = value
+    predict(ekf.hypotheses[0], ekf.imu, parameters, dt, ekf.transition)
+    return ekf.hypotheses["x"][0], ekf.hypotheses["P"][0]
+
+
+def cross(v):
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+def random_case(seed):
+    rng = np.random.default_rng(seed)
+    weight = rng.uniform(0.0, 1.0, 3) if seed % 2 else np.ones(3)
+    return rng, random_state(rng), rng.normal(0, 2, 3), rng.normal(0, 4, 3) - DOWN, weight
+
+
+@given(seeds)
+def test_rotation_is_that_of_scipy(seed):
+    x, R = random_state(np.random.default_rng(seed)), np.empty((3, 3))
+    rotation(*x[6:10], R)
+    np.testing.assert_allclose(R, Rotation.from_quat(x[6:10]).as_matrix(), atol=1e-12)
+
+
+@given(seeds, st.sampled_from([0.0, 1e-12, 1e-8, 1e-3, 1.0, 3.2, 100.0]))
+def test_turn_is_a_rotation_vector_in_the_body_frame(seed, size):
+    rng = np.random.default_rng(seed)
+    x, r = random_state(rng), size * rng.standard_normal(3)
+    expected = Rotation.from_quat(x[6:10]) * Rotation.from_rotvec(r)
+    turn(x, *exponential(*r))
+    assert abs(np.linalg.norm(x[6:10]) - 1.0) < 1e-14
+    assert (expected.inv() * Rotation.from_quat(x[6:10])).magnitude() < 1e-12
+
+
+@given(seeds)
+def test_inject_and_minus_undo_each_other(seed):
+    rng = np.random.default_rng(seed)
+    x, error = random_state(rng), rng.uniform(-1, 1, 15)
+    np.testing.assert_allclose(minus(plus(x, error), x), error, atol=1e-12)
+    np.testing.assert_allclose(plus(x, 2 * error), plus(x, error, 2.0), atol=1e-15)
+
+
+@settings(max_examples=20)
+@given(seeds)
+def test_many_small_steps_solve_the_equations_of_motion(seed):
+    """Compare with Eq. 14 of Zhao et al. at constant rates and specific force, solved by scipy."""
+    _, x, gyro, accel, _ = random_case(seed)
+    rates, f = gyro - x[13:], accel - x[10:13]
+
+    def derivative(t, y):
+        attitude = Rotation.from_quat(x[6:10]) * Rotation.from_rotvec(rates * t)
+        return np.concatenate([y[3:], attitude.apply(f) + DOWN])
+
+    exact = solve_ivp(derivative, (0.0, 0.2), x[:6], rtol=1e-10, atol=1e-10).y[:, -1]
+    P, after = np.eye(15), x
+    for _ in range(400):
+        after, _ = predicted(after, P, 0.0005, gyro, accel, np.ones(3))
+    # The input is held over each step: first order.
+    np.testing.assert_allclose(after[:6], exact, atol=0.005)
+    attitude = Rotation.from_quat(x[6:10]) * Rotation.from_rotvec(0.2 * rates)
+    assert (attitude.inv() * Rotation.from_quat(after[6:10])).magnitude() < 1e-10
+
+
+def test_no_weight_means_hovering_thrust():
+    x = random_state(np.random.default_rng(1))
+    for accel in (np.zeros(3), np.full(3, 50.0)):
+        after, _ = predicted(x, np.eye(15), 0.01, np.zeros(3), accel, np.zeros(3))
+        thrust = Rotation.from_quat(x[6:10]).apply([0, 0, GRAVITY])
+        np.testing.assert_allclose(after[3:6] - x[3:6], 0.01 * (thrust + DOWN), atol=1e-12)
+
+
+def documented_phi(x, dt, gyro, accel, weight):
+    R = Rotation.from_quat(x[6:10]).as_matrix()
+    # `weight` is the share of the measured force, the rest is hovering.
+    f = -DOWN + weight * (accel - x[10:13] + DOWN)
+    phi = np.eye(15)
+    phi[0:3, 3:6] = dt * np.eye(3)
+    phi[3:6, 6:9] = -dt * R @ cross(f)
+    phi[3:6, 9:12] = -dt * R @ np.diag(weight)
+    phi[6:9, 6:9] = Rotation.from_rotvec(-dt * (gyro - x[13:])).as_matrix()
+    phi[6:9, 12:15] = -dt * np.eye(3)
+    return phi
+
+
+@given(seeds)
+def test_covariance_is_phi_p_phi_of_the_documented_phi(seed):
+    rng, x, gyro, accel, weight = random_case(seed)
+    dt, P = 10.0 ** rng.uniform(-4, -1.3), random_covariance(rng)
+    psd, rest = rng.uniform(0, 1, 3), rng.uniform(0, 1, 3)
+    R, phi, Q = (
+        Rotation.from_quat(x[6:10]).as_matrix(),
+        documented_phi(x, dt, gyro, accel, weight),
+        np.zeros((15, 15)),
+    )
+    Q[3:6, 3:6] = dt * R @ np.diag(psd) @ R.T
+    for first, density in zip((6, 9, 12), rest):
+        Q[first : first + 3, first : first + 3] = dt * density * np.eye(3)
+    _, after = predicted(x, P, dt, gyro, accel, weight, psd, rest)
+    expected = phi @ P @ phi.T + Q
+    np.testing.assert_allclose(after, expected, atol=1e-12 * np.abs(expected).max())
+    np.testing.assert_array_equal(after, after.T)
+    assert_covariance(after)
+
+
+@pytest.mark.slow
+@given(seeds)
+def test_covariance_follows_the_nominal_state_to_first_order_in_dt(seed):
+    """Compare with Phi from finite differences of the nominal prediction.
+
+    The difference falls with the square of dt.
+    """
+    rng, x, gyro, accel, weight = random_case(seed)
+    P, left = random_covariance(rng, spread=0.3), []
+    for dt in (1e-2, 1e-3):
+        base, after = predicted(x, P, dt, gyro, accel, weight)
+
+        def moved(error):
+            return minus(predicted(plus(x, error), P, dt, gyro, accel, weight)[0], base)
+
+        phi = numerical_jacobian(moved, np.zeros(15), 1e-5)
+        left.append(np.linalg.norm(after - phi @ P @ phi.T))
+        assert left[-1] < 0.25 * np.linalg.norm(phi @ P @ phi.T - P), (
+            "beside what the prediction changes"
+        )
+    assert left[1] < left[0] / 50.0
+
+
+def test_a_spin_about_the_vertical_leaves_the_uncertainty_of_the_tilt_as_it_was(rate=200.0):
+    x = np.zeros(16)
+    x[9] = 1.0
+    P = np.diag([1e-4] * 6 + [0.01] * 3 + [1e-12] * 6)
+    for _ in range(int(10.0 * rate)):
+        x, P = predicted(x, P, 1.0 / rate, np.array([0.0, 0.0, 3.0]), -DOWN, np.ones(3))
+    np.testing.assert_allclose([P[6, 6], P[7, 7]], 0.01, rtol=0.1)
+
+
+def coasted(x, P, dt, accel_psd, turn_psd):
+    hypotheses = ekf_with(x, P).hypotheses
+    coast(hypotheses[0], dt, accel_psd, turn_psd, turn_psd)
+    return hypotheses["x"][0], hypotheses["P"][0]
+
+
+@given(seeds)
+def test_coast_is_constant_velocity(seed):
+    rng = np.random.default_rng(seed)
+    x, P, dt = random_state(rng), random_covariance(rng), rng.uniform(0.001, 0.1)
+    base, after = coasted(x, P, dt, 2.0, 0.5)
+    np.testing.assert_allclose(base[:3], x[:3] + dt * x[3:6])
+    np.testing.assert_array_equal(base[3:], x[3:])
+
+    def moved(error):
+        return minus(coasted(plus(x, error), P, dt, 0.0, 0.0)[0], base)
+
+    phi = numerical_jacobian(moved, np.zeros(15), 1e-4)
+    Q = np.diag([0.0] * 3 + [2.0 * dt] * 3 + [0.5 * dt] * 3 + [0.0] * 6)
+    np.testing.assert_allclose(after, phi @ P @ phi.T + Q, atol=1e-7 * np.abs(P).max())
+    assert_covariance(after)
+    np.testing.assert_array_equal(after, after.T)

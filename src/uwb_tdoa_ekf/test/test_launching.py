@@ -10,7 +10,6 @@ import re
 import pytest
 import yaml
 
-pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from nav_msgs.msg import Odometry  # noqa: E402

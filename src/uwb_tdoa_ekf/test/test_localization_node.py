@@ -4,7 +4,6 @@
 
 import pytest
 
-pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402

@@ -251,7 +251,7 @@ HEALTHY = Fault("healthy")
 sizes = (
     st.floats(0.6, 3600.0)
     | st.floats(-3600.0, -0.6)
-    | st.sampled_from([-5.0, 5.0, 60.0, 2.5, -1.5])
+    | st.sampled_from([-5.0, 5.0, 60.0, 2.5, -1.5, -0.9])
 )
 kinds = st.sampled_from(
     ["offset", "drift", "lone", "each", "few", "standing", "scattered", "silent", "wrap", "burst"]

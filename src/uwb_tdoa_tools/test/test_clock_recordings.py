@@ -8,11 +8,10 @@ They are read on one continuous time, `check` names the jump, and memory does no
 from dataclasses import replace
 import os
 import resource
-import subprocess
-import sys
 
 from known_effects import sparse_flight
 import numpy as np
+from programs import python
 import pytest
 from rosbags.rosbag2 import Writer
 
@@ -40,7 +39,7 @@ KINDS = {
 }
 
 
-def bag(path, clock, storage="mcap", arrivals=True, imu=lambda t: t):
+def bag(path, clock, arrivals=True, imu=lambda t: t):
     """Write FLIGHT as recorded with a clock(t), the messages in their order.
 
     arrivals : log times come from a correct clock; otherwise they equal the stamps
@@ -73,7 +72,7 @@ def bag(path, clock, storage="mcap", arrivals=True, imu=lambda t: t):
                     store.serialize_cdr(message, kind),
                 )
             )
-    with Writer(path, version=Writer.VERSION_LATEST, storage_plugin=PLUGINS[storage]) as writer:
+    with Writer(path, version=Writer.VERSION_LATEST, storage_plugin=PLUGINS["mcap"]) as writer:
         connections = {}
         for _, received, topic, kind, data in sorted(rows, key=lambda row: row[0]):
             if topic not in connections:
@@ -82,12 +81,11 @@ def bag(path, clock, storage="mcap", arrivals=True, imu=lambda t: t):
     return path
 
 
-@pytest.mark.parametrize("storage", ["mcap", pytest.param("sqlite3", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("arrivals", [True, pytest.param(False, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", KINDS)
-def test_a_bag_is_read_on_one_time_and_check_names_the_jump(tmp_path, name, arrivals, storage):
+def test_a_bag_is_read_on_one_time_and_check_names_the_jump(tmp_path, name, arrivals):
     rule, clock = KINDS[name]
-    path = bag(tmp_path / "bag", clock, storage, arrivals)
+    path = bag(tmp_path / "bag", clock, arrivals)
     flight = read_bag(path, anchors=FLIGHT.anchors)
     for stream, true in ((flight.tdoa, FLIGHT.tdoa), (flight.imu, FLIGHT.imu)):
         assert len(stream) == len(true)
@@ -180,13 +178,14 @@ def test_a_gap_of_any_length_takes_no_more_memory():
     there = {
         name: value for name, value in os.environ.items() if name != "PYTHONSAFEPATH"
     }  # other tests set it
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, str(10 * 86400.0), str(YEARS)],
+    done = python(
+        "-c",
+        PROGRAM,
+        10 * 86400.0,
+        YEARS,
         cwd=Path(__file__).parent,
         env=there,
         preexec_fn=bound,
-        capture_output=True,
-        text=True,
         timeout=300,
     )
     assert done.returncode == 0, done.stderr[-2000:]

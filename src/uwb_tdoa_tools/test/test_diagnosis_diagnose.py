@@ -1,5 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
+"""A diagnosis as a whole: of one flight, over flights, and with repaired ids and signs."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -13,19 +14,35 @@ import pytest
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.sensors.height import Height
-from uwb_tdoa_bias.effects import EFFECTS, EffectSet
+from uwb_tdoa_bias.effects import EFFECTS, EffectSet, SmoothTerm
 from uwb_tdoa_bias.effects.stamps import shifted
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools import diagnosis, parallel
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands.diagnose import main
-from uwb_tdoa_tools.diagnosis import comparison, diagnose, output, with_noise
+from uwb_tdoa_tools.diagnosis import comparison, diagnose, output, repairing, with_noise
+from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.findings import Refused
+from uwb_tdoa_tools.diagnosis.over_flights import (
+    ALL,
+    ALONE,
+    DIFFERS,
+    GROWS,
+    Share,
+    course,
+    harm,
+    in_words,
+    shares,
+)
+from uwb_tdoa_tools.diagnosis.references import GroundTruth
+from uwb_tdoa_tools.diagnosis.refinement import OF_ONE
 from uwb_tdoa_tools.diagnosis.regression.confounding import Unobservable
 from uwb_tdoa_tools.diagnosis.regression.terms import Candidate, Term
 from uwb_tdoa_tools.diagnosis.report.page import html
 from uwb_tdoa_tools.diagnosis.report.verdict import verdict
 from uwb_tdoa_tools.diagnosis.validation import ValidatedSelection
+
+# --- diagnose ---
 
 
 @pytest.fixture(scope="module")
@@ -278,3 +295,168 @@ def test_ground_truth_of_another_epoch_is_one_sentence(flight, tmp_path, capsys)
     write_bag(shifted(flight, "truth", 1.7e9), tmp_path / "epoch")
     assert main([str(tmp_path / "epoch"), "--out", str(tmp_path / "out")]) == 2
     assert "the ground truth is on another clock than the TDOAs" in capsys.readouterr().err
+
+
+# --- over flights ---
+
+
+def several(*values, std=0.05):
+    return tuple(Share(f"flight-{k}", value, std) for k, value in enumerate(values))
+
+
+@pytest.mark.parametrize(
+    "values, kind",
+    [
+        ((1.0, 0.9, 1.1), ALL),
+        ((0.02, 2.9, 0.1), ALONE),
+        ((0.2, 0.7, 1.3, 1.9), GROWS),
+        ((1.9, 1.3, 0.7, 0.2), GROWS),
+        ((0.2, 1.9, 0.3, 1.6), DIFFERS),
+        ((1.0,), None),
+    ],
+)
+def test_what_several_flights_say(values, kind):
+    assert course(several(*values)) == kind
+
+
+def test_flights_that_tell_nothing_do_not_count():
+    assert course((*several(1.0, 1.1), Share("other", 7.0, 3.0))) == ALL
+    assert course((*several(1.0), Share("other", 7.0, 3.0))) is None
+    assert in_words((*several(1.0), Share("other", 7.0, 3.0))) == ""
+
+
+def test_words_name_the_flights():
+    assert "flight-1 alone" in in_words(several(0.0, 1.0, 0.0))
+    assert "0.2 in flight-0" in in_words(several(0.2, 1.9, 0.3, 1.6))
+    assert "all 2 flights" in in_words(several(1.0, 1.0))
+
+
+def test_shares_are_those_that_were_put_in():
+    flights = [
+        replace(effect_of("anchor_delay", True, 1), values={"2": delay}).inject(
+            clean_flight(100 + k, 30.0)
+        )
+        for k, delay in enumerate((0.1, 0.2, 0.3))
+    ]
+    attribution = attribute(flights, GroundTruth(), kinds=("anchor_delay",), undeclared=False)
+    (candidate,) = attribution.selection.chosen
+    found = shares(attribution.selection, candidate, attribution.names)
+    assert [share.share / found[1].share for share in found] == pytest.approx(
+        [0.5, 1.0, 1.5], abs=0.05
+    )
+    assert course(found) == GROWS
+
+
+@pytest.mark.slow
+def test_a_function_that_one_flight_alone_can_show_is_not_applied():
+    """Anchor 3 is late from 26 to 34 s. The other flight ends before."""
+    late = SmoothTerm(
+        {"3.c0": 0.0, "3.c1": 0.5},
+        covariate="time",
+        form="anchor",
+        knots=(0.0, 26.0, 34.0, 40.0),
+        shape="interval",
+    )
+    attribution = attribute(
+        [late.inject(clean_flight(100, 40.0)), clean_flight(101, 24.0)], GroundTruth()
+    )
+    assert not any(effect.name == late.name for effect in attribution.effects)
+    ((name, alone),) = attribution.alone
+    assert name == attribution.names[0]
+    assert {candidate.terms[0].effect.covariate for candidate in alone.chosen} == {"time"}
+    assert OF_ONE in {refused.why for refused in attribution.refused}
+
+
+def test_what_flights_show_alike_does_no_harm_and_what_one_of_three_lacks_may():
+    assert harm(several(1.0, 1.0)) < 0.06
+    assert harm(several(1.0, 1.1, 0.9)) < 0.03
+    assert harm(several(1.0, 0.2, 1.0)) > 0.25
+    assert harm(several(1.5, 0.0)) > 0.2
+    # with equal spread, more flights reduce the risk
+    assert harm(several(*[1.2, 0.8] * 3)) < harm(several(1.2, 0.8))
+
+
+def test_flights_that_do_not_determine_a_share_tell_nothing_of_harm():
+    assert harm(()) == harm(several(0.0)) == harm(several(0.0, 0.0, std=0.5)) == 0.0
+    undetermined = Share("unknown", -3.0, 0.9)
+    assert harm([*several(1.0, 1.1, 0.9), undetermined]) == harm(several(1.0, 1.1, 0.9))
+
+
+# --- repairing ---
+
+IDS, SIGN = (
+    EFFECTS["anchor_ids"]({"1": 4, "4": 1}),
+    EFFECTS["pair_sign"]({"2-3": -1.0, "5-6": -1.0}),
+)
+DELAY = EFFECTS["anchor_delay"]({"4": 0.1})
+
+
+@pytest.fixture(scope="module")
+def flights():
+    return [clean_flight(seed, 20.0) for seed in (100, 105)]
+
+
+def wrong(flight, *effects):
+    for effect in reversed(effects):
+        flight = effect.inject(flight)
+    return flight
+
+
+def found_in(flights, base=EffectSet()):
+    return [(one.effect.name, one.effect.values) for one in repairing.repaired(flights, base)]
+
+
+def test_what_all_flights_have_is_found_and_worth_something(flights):
+    found = repairing.repaired([wrong(flight, IDS, SIGN) for flight in flights], EffectSet())
+    assert [(one.effect.name, one.effect.values) for one in found] == [
+        (IDS.name, IDS.values),
+        (SIGN.name, SIGN.values),
+    ]
+    assert min(found.values()) > 0.01
+    assert all(
+        one.evidence["median_error_without"] < 0.4 * one.evidence["median_error"] for one in found
+    )
+
+
+def test_sound_flights_need_nothing_nor_do_those_whose_effects_are_known(flights):
+    assert found_in(flights) == []
+    assert (
+        found_in([wrong(flight, IDS, SIGN) for flight in flights], EffectSet((IDS, DELAY, SIGN)))
+        == []
+    )
+
+
+def test_signs_that_some_flights_have_are_left_and_so_are_other_ids(flights):
+    one, two = flights
+    half = EFFECTS["pair_sign"]({"2-3": -1.0})
+    assert found_in([wrong(one, SIGN), wrong(two, half)]) == [("pair_sign", {"2-3": -1.0})]
+    others = EFFECTS["anchor_ids"]({"1": 5, "5": 1})
+    assert found_in([wrong(one, IDS), wrong(two, others)]) == [] == found_in([wrong(one, IDS), two])
+
+
+def test_flights_are_made_sound_and_the_rest_is_left_in_the_base(flights):
+    (found,) = repairing.repaired([wrong(flights[0], IDS, SIGN)], EffectSet((IDS, DELAY)))
+    (flight,), base = repairing.sound(
+        [wrong(flights[0], IDS, SIGN)], EffectSet((IDS, DELAY)), [found]
+    )
+    assert (flight.tdoa.a == flights[0].tdoa.a).all() and (flight.tdoa.d == flights[0].tdoa.d).all()
+    assert base.effects == (DELAY,)
+
+
+@pytest.mark.slow
+def test_diagnose_offers_it_beside_physics_and_judges_both():
+    late = effect_of("anchor_delay", True, 4)
+    flights = [wrong(late.inject(clean_flight(seed, 30.0)), IDS) for seed in (100, 101)]
+    result = diagnose(flights[:1], flights[1:])
+    assert {finding.effect.name for finding in result.findings if finding.added} == {
+        IDS.name,
+        late.name,
+    }
+    worth = next(finding.worth for finding in result.findings if finding.effect.name == IDS.name)
+    before, after = (figures["pooled"]["rmse_3d"] for figures in (result.before, result.after))
+    # without the repair, the error is three times as large
+    assert worth > 2.0 * after and after < 0.3 * before
+    assert "what is called 1 is 4" in output.as_text(result) and "ids_exchanged" in str(
+        output.as_json(result)["numbers"]
+    )
+    assert repairing.repaired(flights[:1], result.effects) == {}

@@ -5,7 +5,6 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 pytest.importorskip("onnx")
 

@@ -86,7 +86,7 @@ def simulated(desk):
     true = taped(tape, 1)
     delays = 0.05 * np.random.default_rng(2).standard_normal(len(true))
     late = AnchorDelay({str(i): float(delay) for i, delay in zip(true.ids, delays)})
-    settings = dict(duration=40.0, imu_rate=100.0, truth_rate=50.0, bias=False)  # quadrotor, sines
+    settings = dict(duration=40.0, tdoa_rate=200.0, imu_rate=100.0, truth_rate=50.0, bias=False)
     flown = [
         late.inject(simulate(SimulationConfig(seed=seed, anchors=true, **settings)))
         for seed in (11, 12, 13)
