@@ -32,7 +32,7 @@ except ImportError:  # without ROS: the tests of the cores need none
 _taken = deque()
 # Test files that take half a minute or more, the longest first.
 LONGEST = """checking_check calibrating launch_files distribution walks commands moved_anchors
-    diagnosis_self_calibration diagnosis_attribution diagnosis_streams diagnosis_channels
+    diagnosis_attribution diagnosis_streams diagnosis_channels
     waiting surveying diagnosis_diagnose lockstep plan demo hall stream_faults clock_recordings
     vehicle_node python_api lint study_faults localizing diagnosis_validation study_bench
     checking_report diagnosis_report study_plans first_map live_replay train alignment warehouse

@@ -25,7 +25,7 @@ from rosgraph_msgs.msg import Clock  # noqa: E402
 from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(WHY_NOT is not None, reason=str(WHY_NOT))]
-READY = "[ekf_node]: ready"
+READY = "ekf_node]: ready"
 INTEGRATOR = """
 from launch import LaunchDescription
 from launch.actions import GroupAction, IncludeLaunchDescription
@@ -145,7 +145,7 @@ def tags_file(folder, text):
     return folder / "tags.yaml"
 
 
-def test_one_tag_on_simulated_time_from_start_to_ctrl_c(make_rig, launch, tmp_path):
+def test_one_tag_on_simulated_time_from_start_over_a_crash_to_ctrl_c(make_rig, launch, tmp_path):
     # The epoch makes these diagnostics newer than all earlier ones.
     flight, rig, epoch = (recording(2.0), make_rig(latched=False), int(time.time()) + 10**6)
     file = reliable(tmp_path / "reliable.yaml", rig.namespace)
@@ -173,10 +173,17 @@ def test_one_tag_on_simulated_time_from_start_to_ctrl_c(make_rig, launch, tmp_pa
             rig, f"/{rig.namespace}/ekf_node", "publish_tf", "use_sim_time", "world_frame"
         ) == ["odom", True, "hall: 1 # 'ä'"]
         assert rig.counts("ekf_node", TDOAs_received=len(flight.tdoa))["used"] > 0
+        # A node that crashes is started again, with its parameters.
+        os.kill(launched.pid_of("ekf_node"), signal.SIGKILL)
+        launched.wait("ekf_node has ended with exit code -9: it is started again in 1 s")
+        launched.wait(READY, 2)
+        assert values_of(rig, f"/{rig.namespace}/ekf_node", "publish_tf") == ["odom"]
     assert {message.header.frame_id for message in rig.odometry} == {"hall: 1 # 'ä'"} and len(
         rig.odometry
     ) > 200
-    ends_well(launched)
+    launched.interrupt()
+    assert launched.said.count("has died") == 1, launched.said
+    assert left_behind(launched) == []
 
 
 def test_several_tags_each_with_its_own_parameters(make_rig, launch, tmp_path):
@@ -256,19 +263,6 @@ def test_a_bag_is_played_on_its_time_and_then_all_ends(make_rig, launch, tmp_pat
     assert left_behind(launched) == []
     launched = launch("uwb_tdoa_ekf", "bag.launch.py", "bag:=/nowhere", path=[player.parent])
     assert launched.ended() == 1 and "ros2 bag play has ended with exit code 2" in launched.said
-
-
-def test_a_node_that_crashes_is_started_again(make_rig, launch):
-    rig, launched = make_rig(), launch("uwb_tdoa_ekf", "tdoa.launch.py")
-    launched.wait(READY)
-    os.kill(launched.pid_of("ekf_node"), signal.SIGKILL)
-    launched.wait("ekf_node has ended with exit code -9: it is started again in 1 s")
-    launched.wait(READY, 2)
-    # The node answers.
-    assert values_of(rig, "/ekf_node", "use_sim_time") == [False]
-    launched.interrupt()
-    assert launched.said.count("has died") == 1, launched.said
-    assert left_behind(launched) == []
 
 
 def test_a_node_that_refuses_what_it_is_given_is_not_started_again(launch):

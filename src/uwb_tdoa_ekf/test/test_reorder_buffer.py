@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import math
 
 from flights import fly, kept
-from hypothesis import Phase, given, settings, strategies as st
+from hypothesis import Phase, example, given, settings, strategies as st
 from live import IMU, TDOA, arriving, assert_same, assert_same_as_offline, feed, messages, send
 import numpy as np
 import pytest
@@ -251,7 +251,7 @@ HEALTHY = Fault("healthy")
 sizes = (
     st.floats(0.6, 3600.0)
     | st.floats(-3600.0, -0.6)
-    | st.sampled_from([-5.0, 5.0, 60.0, 2.5, -1.5, -0.9])
+    | st.sampled_from([-5.0, 5.0, 60.0, 2.5, -1.5])
 )
 kinds = st.sampled_from(
     ["offset", "drift", "lone", "each", "few", "standing", "scattered", "silent", "wrap", "burst"]
@@ -396,6 +396,7 @@ def test_a_clock_of_the_tdoas_costs_them_no_more_than_the_fault_and_a_second(kin
 @pytest.mark.slow
 @settings(max_examples=20, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
 @given(sizes, seeds)
+@example(-0.9, 0)  # time that falls back by less is late, and no restart
 def test_a_jump_of_all_clocks_starts_the_filter_anew_only_where_time_falls_back_and_costs_no_second(
     size, seed
 ):

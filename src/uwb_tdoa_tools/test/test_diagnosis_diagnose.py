@@ -334,7 +334,7 @@ def test_words_name_the_flights():
 def test_shares_are_those_that_were_put_in():
     flights = [
         replace(effect_of("anchor_delay", True, 1), values={"2": delay}).inject(
-            clean_flight(100 + k, 30.0)
+            sparse_flight(100 + k, 30.0)
         )
         for k, delay in enumerate((0.1, 0.2, 0.3))
     ]
@@ -358,7 +358,7 @@ def test_a_function_that_one_flight_alone_can_show_is_not_applied():
         shape="interval",
     )
     attribution = attribute(
-        [late.inject(clean_flight(100, 40.0)), clean_flight(101, 24.0)], GroundTruth()
+        [late.inject(sparse_flight(100, 40.0)), sparse_flight(101, 24.0)], GroundTruth()
     )
     assert not any(effect.name == late.name for effect in attribution.effects)
     ((name, alone),) = attribution.alone
@@ -446,7 +446,7 @@ def test_flights_are_made_sound_and_the_rest_is_left_in_the_base(flights):
 @pytest.mark.slow
 def test_diagnose_offers_it_beside_physics_and_judges_both():
     late = effect_of("anchor_delay", True, 4)
-    flights = [wrong(late.inject(clean_flight(seed, 30.0)), IDS) for seed in (100, 101)]
+    flights = [wrong(late.inject(sparse_flight(seed, 30.0)), IDS) for seed in (100, 101)]
     result = diagnose(flights[:1], flights[1:])
     assert {finding.effect.name for finding in result.findings if finding.added} == {
         IDS.name,

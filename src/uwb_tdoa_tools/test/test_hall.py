@@ -46,7 +46,7 @@ def sound():
             radio_reach=18.0,
             bias=False,
             protocol="tdoa3",
-            duration=80.0,
+            duration=60.0,
             speed=3.0,
             imu_rate=100.0,
             truth_rate=50.0,

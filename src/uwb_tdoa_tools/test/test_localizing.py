@@ -28,7 +28,6 @@ from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 CLEAN = dict(
     duration=14.0,
-    tdoa_rate=200.0,
     floor_time=1.0,
     imu_rate=200.0,
     bias=False,

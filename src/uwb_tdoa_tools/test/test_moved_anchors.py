@@ -22,7 +22,7 @@ from uwb_tdoa_tools.calibrating import between
 from uwb_tdoa_tools.checking import watch
 from uwb_tdoa_tools.checking.check import check
 from uwb_tdoa_tools.checking.recording import of_flight
-from uwb_tdoa_tools.commands import evaluate, survey
+from uwb_tdoa_tools.commands import diagnose, evaluate, survey
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
 from uwb_tdoa_tools.diagnosis.self_calibration.solve import AnchorChange
 from uwb_tdoa_tools.estimate import FlightEstimator
@@ -208,12 +208,13 @@ def test_with_exchanged_ids_evaluate_blames_neither_the_truth_nor_itself(
     assert "swapped" in err or "two anchors are exchanged, 2 and 5" in err
 
 
-def test_ids_are_asked_for_before_anchors(exchanged, tmp_path, capsys):
-    """`survey` moved a third anchor by 58, 56 and 91 cm. Other commands stop in the same way."""
+@pytest.mark.parametrize(("command", "options"), [(survey, ()), (diagnose, ("--no-truth",))])
+def test_ids_are_asked_for_before_anchors(exchanged, tmp_path, capsys, command, options):
+    """`survey` moved a third anchor by 58, 56 and 91 cm."""
     begin = exchanged.tdoa.t[0]
     write_bag(between(exchanged, begin, begin + 25.0), tmp_path / "flight")
     out = tmp_path / "out"
-    assert survey.main([str(tmp_path / "flight"), "--out", str(out)]) == 1
+    assert command.main([str(tmp_path / "flight"), *options, "--out", str(out)]) == 1
     said = capsys.readouterr()
     assert "swapped" in said.out and "stopped, and nothing" in said.err
     assert not (out / "anchors.yaml").exists() and not (out / "effects.yaml").exists()

@@ -80,13 +80,14 @@ def desk(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def simulated(desk):
-    """Return a Hall with displaced and late anchors."""
+def simulated(desk, request):
+    """Return a Hall with displaced and late anchors. A test may give the rate of TDOAs, Hz."""
     tape = read_survey("anchors.yaml")
     true = taped(tape, 1)
     delays = 0.05 * np.random.default_rng(2).standard_normal(len(true))
     late = AnchorDelay({str(i): float(delay) for i, delay in zip(true.ids, delays)})
-    settings = dict(duration=40.0, tdoa_rate=200.0, imu_rate=100.0, truth_rate=50.0, bias=False)
+    settings = dict(duration=40.0, imu_rate=100.0, truth_rate=50.0, bias=False)  # quadrotor, sines
+    settings["tdoa_rate"] = getattr(request, "param", None)
     flown = [
         late.inject(simulate(SimulationConfig(seed=seed, anchors=true, **settings)))
         for seed in (11, 12, 13)
@@ -136,6 +137,7 @@ def assert_better(hall, folder, said, code=0):
             assert main(name, words) in (0, 1), line
 
 
+@pytest.mark.parametrize("simulated", [200.0], indirect=True)
 def test_from_csv_to_a_diagnosed_flight(simulated, capsys):
     """The ground truth is in another frame."""
     convert, judge, *_ = blocks(WALK)
