@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from heapq import heappop, heappush
 from pathlib import Path
@@ -36,6 +36,9 @@ from .repair import Damaged, zstd
 PLUGINS = dict(zip(STORAGES, (StoragePlugin.MCAP, StoragePlugin.SQLITE3)))
 
 
+Decoder = Callable[[bytes, str], Any]  # of the bytes of a message, and its type
+
+
 class Incomplete:
     """A bag that may lack messages.
 
@@ -47,6 +50,7 @@ class Incomplete:
 
     remarks: list[str]
     unreadable: Counter[str]
+    messages: Callable[..., Iterator[tuple[Connection, int, bytes]]]
 
 
 class BagReader(Incomplete):
@@ -295,17 +299,22 @@ def open_bag(path: str | Path) -> Iterator[BagReader]:
 
 
 def readable(
-    reader: BagReader, connections: list[Connection]
+    reader: Incomplete,
+    connections: list[Connection],
+    decoders: Mapping[int, Decoder] | None = None,
 ) -> Iterator[tuple[Connection, int, Any]]:
     """Yield (connection, stamp ns, message) of the given connections.
 
     Messages that cannot be decoded, e.g. of a faulty publisher, are counted in the reader.
+
+    decoders : {id of a connection: function of (data, type)}; default: by the installed types
     """
-    for connection, stamp, data in reader.messages(connections):
+    for connection, stamp, data in reader.messages(connections) if connections else ():
+        decode = decoders[connection.id] if decoders else typestore().deserialize_cdr
         try:
             if len(data) > READ_BYTES:
                 raise ValueError
-            message = typestore().deserialize_cdr(data, connection.msgtype)
+            message = decode(data, connection.msgtype)
         except Exception:  # rosbags raises whatever its parsers run into
             reader.unreadable[connection.topic] += 1
             continue

@@ -28,13 +28,12 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.limits import (
     CHUNK_BYTES,
     DEFINITION_BYTES,
-    READ_BYTES,
     TooMuch,
     most_unpacked,
 )
 
 from ..bags import is_ros_1
-from ..bags.files import BagReader, Incomplete, open_bag, remarks_of
+from ..bags.files import BagReader, Decoder, Incomplete, open_bag, readable, remarks_of
 from ..bags.repair import Damaged
 from ..bags.topics import Recorded, recorded_anchors
 from .tables import BLOCK, Block, Foreign, Wanted
@@ -61,45 +60,25 @@ _BETWEEN_TYPES = "=" * 80 + "\n"  # line between the types of a definition in ID
 class ForeignBag(Foreign):
     """Topics of open bags that together are one recording: {topic: type of its messages}."""
 
-    def __init__(self) -> None:
+    def __init__(self, readers: Mapping[Path, Reader], definitions: Mapping[str, str]) -> None:
+        """Keep open bags; see `open_foreign`. Raises InputError."""
         super().__init__()
-        self._parts: list[_Part] = []
-
-    def add(self, part: _Part) -> None:
-        """Add one open bag."""
-        self._parts.append(part)
-        for connection in part.connections:
-            self.types[connection.topic] = connection.msgtype
-            self.counts[connection.topic] += connection.msgcount
-
-    def check_parts(self) -> None:
-        """Raise InputError unless bags that share a topic follow each other in time."""
-        parts = sorted(self._parts, key=lambda part: part.span[0])
-        for number, part in enumerate(parts):
-            topics = {connection.topic for connection in part.connections}
-            before = [
-                one
-                for one in parts[:number]
-                if any(connection.topic in topics for connection in one.connections)
-            ]
-            if not before:
-                continue
-            last = max(before, key=lambda one: one.span[1])
-            gap = (part.span[0] - last.span[1]) / 1e9
-            if not -SHORTEST_OVERLAP < gap < LONGEST_GAP:
-                what = f"{gap:.0f} s apart" if gap > 0.0 else f"over {-gap:.1f} s at the same time"
-                raise InputError(
-                    f"{part.path}: and {last.path} hold the same topics {what}: they are several "
-                    "recordings; give one."
-                )
+        self._readers, self._definitions = readers, definitions
+        self._stores: dict[tuple[Path, str], Typestore] = {}
+        for reader in readers.values():
+            for connection in reader.connections:
+                self.types[connection.topic] = connection.msgtype
+                self.counts[connection.topic] += connection.msgcount
+        _check_parts(readers)
 
     def fields(self, topic: str) -> list[str]:
         """Return the names of the fields of a topic; empty if its type is unknown."""
-        for part in self._parts:
-            for connection in part.connections:
+        for path, reader in self._readers.items():
+            for connection in reader.connections:
                 if connection.topic == topic:
                     with suppress(InputError):
-                        return part.fields(connection)
+                        store = self._store(path, connection)
+                        return [name for name, _ in store.fielddefs[connection.msgtype][1]]
         return []
 
     def time_of(self, topic: str) -> tuple[str, float]:
@@ -108,7 +87,12 @@ class ForeignBag(Foreign):
 
     def recorded_anchors(self) -> Recorded | None:
         """Return the anchors in frames or markers of a bag of ROS 2, or None. Raises InputError."""
-        return next(filter(None, (part.anchors() for part in self._parts)), None)
+        found = (
+            recorded_anchors(path, reader, "/uwb/anchors")
+            for path, reader in self._readers.items()
+            if isinstance(reader, BagReader)
+        )
+        return next(filter(None, found), None)
 
     def blocks(self, wanted: Sequence[Wanted]) -> Iterator[Block]:
         """Yield the records of topics. Raises InputError."""
@@ -145,13 +129,65 @@ class ForeignBag(Foreign):
     def _messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, Message]]:
         """Yield (topic, its number, Message) of topics. Raises InputError."""
         numbers: Counter[str] = Counter()
-        for part in self._parts:
-            for topic, received, content in part.messages(topics):
+        for path, reader in self._readers.items():
+            wanted = [each for each in reader.connections if each.topic in topics]
+            decoders = {each.id: self._decoder(path, reader, each) for each in wanted}
+            for connection, received, content in readable(reader, wanted, decoders):
+                topic, message = connection.topic, Message(content, received)
                 numbers[topic] += 1
-                message = Message(content, received)
                 self.unstamped[topic] += not message.is_stamped
                 yield topic, numbers[topic], message
-            self.remarks += [each for each in part.remarks() if each not in self.remarks]
+            self.remarks += [each for each in remarks_of(reader) if each not in self.remarks]
+
+    def _decoder(self, path: Path, reader: Reader, connection: Connection) -> Decoder:
+        store = self._store(path, connection)
+        return store.deserialize_cdr if isinstance(reader, BagReader) else store.deserialize_ros1
+
+    def _store(self, path: Path, connection: Connection) -> Typestore:
+        """Return the types of a topic: as in the bag, else of ROS or of the profile."""
+        kind, text = connection.msgtype, connection.msgdef.data
+        if (path, kind) in self._stores:
+            return self._stores[path, kind]
+        if len(text) > DEFINITION_BYTES:
+            raise InputError(
+                f"{path}: the definition of {kind} has more than {DEFINITION_BYTES} bytes; "
+                "record it again."
+            )
+        try:
+            if text:
+                store = get_typestore(Stores.EMPTY)
+                store.register(_types(connection))
+            else:
+                store = get_typestore(Stores.ROS2_JAZZY)
+                undefined = [name for name in self._definitions if name not in store.fielddefs]
+                for name in undefined:
+                    store.register(get_types_from_msg(self._definitions[name], name))
+            store.get_msgdef(kind)
+        except Exception as error:  # parsers of rosbags raise many types
+            raise InputError(
+                f"{path}: {connection.topic} has the type {kind}, whose definition is not in "
+                f"the bag; write it into the profile, under types ({error!r})."
+            ) from error
+        self._stores[path, kind] = store
+        return store
+
+
+def _check_parts(readers: Mapping[Path, Reader]) -> None:
+    """Raise InputError unless bags that share a topic follow each other in time."""
+    ends: dict[str, tuple[int, Path]] = {}  # of topics: last time so far, and its bag
+    for path, reader in sorted(readers.items(), key=lambda one: one[1].start_time):
+        topics = {connection.topic for connection in reader.connections}
+        before = [ends[topic] for topic in topics & ends.keys()]
+        end, last = max(before, default=(reader.start_time, path))
+        gap = (reader.start_time - end) / 1e9
+        if not -SHORTEST_OVERLAP < gap < LONGEST_GAP:
+            what = f"{gap:.0f} s apart" if gap > 0.0 else f"over {-gap:.1f} s at the same time"
+            raise InputError(
+                f"{path}: and {last} hold the same topics {what}: they are several recordings; "
+                "give one."
+            )
+        mine = reader.end_time, path
+        ends |= {topic: max(mine, ends.get(topic, mine)) for topic in topics}
 
 
 class Message:
@@ -270,97 +306,15 @@ def open_foreign(paths: Sequence[Path], definitions: Mapping[str, str]) -> Itera
 
     Raises InputError.
     """
-    bag = ForeignBag()
+    readers: dict[Path, Reader] = {}
     with ExitStack() as stack:
         for path in paths:
-            reader: BagReader | Ros1Bag
             if is_ros_1(path):
-                reader = Ros1Bag(path)
-                stack.callback(reader.close)
+                readers[path] = ros_1 = Ros1Bag(path)
+                stack.callback(ros_1.close)
             else:
-                reader = stack.enter_context(open_bag(path))
-            bag.add(_Part(path, reader, definitions))
-        bag.check_parts()
-        yield bag
-
-
-class _Part:
-    """One open bag.
-
-    Attributes
-    ----------
-    path : of the bag.
-    connections : its topics, with their types.
-    span : first and last time of recording, ns.
-    """
-
-    def __init__(
-        self, path: Path, reader: BagReader | Ros1Bag, definitions: Mapping[str, str]
-    ) -> None:
-        """Store an open bag; see `open_foreign` for the definitions."""
-        self.path, self.connections = path, list(reader.connections)
-        self.span = reader.start_time, reader.end_time
-        self._reader, self._definitions = reader, definitions
-        self._stores: dict[str, Typestore] = {}
-
-    def fields(self, connection: Connection) -> list[str]:
-        """Return the names of the fields of a topic."""
-        return [name for name, _ in self._store(connection).fielddefs[connection.msgtype][1]]
-
-    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
-        """Yield (topic, ns of recording, message)."""
-        wanted = [connection for connection in self.connections if connection.topic in topics]
-        stores = {connection.id: self._store(connection) for connection in wanted}
-        for connection, received, data in self._reader.messages(wanted) if wanted else ():
-            store = stores[connection.id]
-            is_ros_1 = isinstance(self._reader, Ros1Bag)
-            decode = store.deserialize_ros1 if is_ros_1 else store.deserialize_cdr
-            try:
-                if len(data) > READ_BYTES:
-                    raise ValueError
-                message = decode(data, connection.msgtype)
-            except Exception:  # parsers of rosbags raise many types
-                self._reader.unreadable[connection.topic] += 1
-                continue
-            yield connection.topic, received, message
-
-    def remarks(self) -> list[str]:
-        """Return sentences on missing messages."""
-        return remarks_of(self._reader)
-
-    def anchors(self) -> Recorded | None:
-        """Return the anchors in frames or markers, or None."""
-        if isinstance(self._reader, Ros1Bag):
-            return None
-        return recorded_anchors(self.path, self._reader, "/uwb/anchors")
-
-    def _store(self, connection: Connection) -> Typestore:
-        """Return the types of a topic: as in the bag, else of ROS or of the profile."""
-        kind, text = connection.msgtype, connection.msgdef.data
-        if kind in self._stores:
-            return self._stores[kind]
-        if len(text) > DEFINITION_BYTES:
-            raise InputError(
-                f"{self.path}: the definition of {kind} has more than {DEFINITION_BYTES} bytes; "
-                "record it again."
-            )
-        try:
-            if text:
-                store = get_typestore(Stores.EMPTY)
-                store.register(_types(connection))
-            else:
-                store = get_typestore(Stores.ROS2_JAZZY)
-                undefined = [name for name in self._definitions if name not in store.fielddefs]
-                for name in undefined:
-                    store.register(get_types_from_msg(self._definitions[name], name))
-            store.get_msgdef(kind)
-        except Exception as error:  # parsers of rosbags raise many types
-            raise InputError(
-                f"{self.path}: {connection.topic} has the type {kind}, whose definition is not in "
-                f"the bag; write it into the profile, under types ({error!r})."
-            ) from error
-        self._stores[kind] = store
-        return store
+                readers[path] = stack.enter_context(open_bag(path))
+        yield ForeignBag(readers, definitions)
 
 
 def _types(connection: Connection) -> Any:
@@ -469,3 +423,6 @@ def _limit_and_cache_unpacking(reader: Ros1Reader, path: Path) -> None:
         if function:
             of_chunk = partial(unpacked, position, function=function)
             reader.chunks[position] = chunk._replace(decompressor=of_chunk)
+
+
+Reader = BagReader | Ros1Bag
