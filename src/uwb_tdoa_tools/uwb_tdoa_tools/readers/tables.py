@@ -245,9 +245,8 @@ def _content(path: str | Path, what: str, salvage: bool) -> tuple[bytes, str]:
     if b"\0" in content:
         place = content.index(0)
         raise InputError(f"{path}: byte {place} is 0, not text; write the file in UTF-8.")
-    return content, f"the gzip data is cut or damaged ({problem}): read up to there." * bool(
-        problem
-    )
+    remark = f"the gzip data is cut or damaged ({problem}): read up to there." if problem else ""
+    return content, remark
 
 
 def _as_csv(path: str | Path, content: bytes, most: int) -> bytes:
