@@ -101,6 +101,15 @@ def with_mistake(name, seed=0):
 
 
 @pytest.mark.slow
+def test_tdoas_in_centimetres_do_not_make_the_survey_look_small():
+    healthy = checking_flights.recording(1, duration=40.0, yaw="fixed", speed=1.0)
+    centimetres = replace(healthy.tdoa, d=100.0 * healthy.tdoa.d)
+    assert "survey_scale" in rules(processed_streams(replace(healthy, tdoa=centimetres)).findings())
+    (finding,) = check(replace(healthy, tdoa=centimetres)).findings
+    assert finding.rule == "tdoa_unit" and "in centimetres, not in metres" in finding.cause
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(("protocol", "live"), [("tdoa2", False), ("tdoa3", True)])
 def test_a_healthy_flight_has_no_finding(protocol, live):
     assert check(recording(0, live=live, protocol=protocol)).findings == []

@@ -31,7 +31,7 @@ def flight():
     return clean_flight(100, 30.0)
 
 
-@pytest.mark.parametrize("unit, factor", [("mm", 1000.0), ("cm", 100.0)])
+@pytest.mark.parametrize("unit, factor", [("mm", 1000.0), ("cm", 100.0), ("feet", 1.0 / 0.3048)])
 def test_a_ground_truth_in_another_unit_is_named_and_not_judged_against(flight, unit, factor):
     truth = replace(flight.truth, p=factor * flight.truth.p)
     (finding,) = truth_unit(flight.replaced(truth=truth))

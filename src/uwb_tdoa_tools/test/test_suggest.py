@@ -63,6 +63,12 @@ TABLES = {
     "JSON list": "[\n" + lines(RECORD % START + ",") + "]\n",
     "pairs": wide([f"tdoa2.d{k}-{(k + 1) % 6}" for k in range(6)]),
     "other pairs": wide([f"ddoa_A{k}_A{(k + 1) % 6} [m]" for k in range(6)]),
+    "of another language": lines(
+        "{t:.6f};{a};{b};{d}", "Zeit [s];Anker von;Anker nach;Differenz der Strecken"
+    ),
+    "nested": lines(
+        '{{"ts": {f}, "uwb": {{"ref": {a}, "anchor": {b}, "quality": 90, "tdoa_m": {d}}}}}'
+    ),
     "mm and us": lines("{f},{a},{b},{d}", "time [us],a,b,diff_mm").replace(".", ""),
 }
 
@@ -120,6 +126,39 @@ def test_the_output_of_a_shell_is_named_with_a_line_that_makes_a_table(folder, f
     flight = read_as_suggested("ranges.csv", capsys)
     assert len(flight.range) == 60 and len(flight.anchors) == 2  # positions are in the log
     np.testing.assert_allclose(flight.range.d[:2], [4.0, 6.0], atol=1e-6)
+
+
+@pytest.mark.parametrize("prefix", ["", "q_", "rotation."])
+def test_the_attitude_of_a_ground_truth_is_suggested(folder, prefix, capsys):
+    """Whatever it is called, beside a position that is called ground truth."""
+    axes = [f"{prefix}{k}" if prefix else f"q{k}" for k in "xyzw"]
+    (folder / "log.csv").write_text(lines("{t:.6f},{a},{b},{d}", "t,from,to,d"))
+    rows = [",".join(map(str, [t, 1.0, 2.0, 3.0, 0.0, 0.0, 0.6, 0.8])) for t in T]
+    (folder / "mocap.csv").write_text("\n".join([",".join(["t", *"xyz", *axes]), *rows]) + "\n")
+    assert convert(["log.csv", "mocap.csv", "--suggest", "profile.yaml"]) == 0
+    (line,) = [each for each in capsys.readouterr().out.splitlines() if each.startswith("next: ")]
+    assert convert(shlex.split(line.partition(" convert ")[2])) == 0
+    np.testing.assert_allclose(read_flight("our.bag").truth.q[-1], [0.0, 0.0, 0.6, 0.8])
+
+
+def test_two_columns_beside_a_number_are_no_tdoas_by_their_values_alone(folder, capsys):
+    """A cell of a battery and its voltage have the form of an anchor and its range."""
+    rows = [f"{t:.3f},{k % 4},{3.7 + 0.01 * (k % 7)}" for k, t in enumerate(T)]
+    (folder / "log.csv").write_text("\n".join(["t,cell,volts", *rows]) + "\n")
+    assert convert(["log.csv", "--suggest", "profile.yaml"]) == 2
+    assert "no TDOAs or ranges are recognized" in capsys.readouterr().err
+
+
+def test_files_of_arrays_are_named(folder, capsys):
+    np.savez("log.npz", t=T, d=D)
+    np.save("log.npy", D)
+    for name, what in (
+        ("log.npz", "a zip file, as Excel and numpy"),
+        ("log.npy", "an array of numpy"),
+    ):
+        assert convert([name, "--suggest", "profile.yaml"]) == 2
+        said = capsys.readouterr().err
+        assert f"{name}: is {what}" in said and "save it as CSV, or give the arrays to" in said
 
 
 def test_a_profile_without_use_is_an_error(folder, capsys):

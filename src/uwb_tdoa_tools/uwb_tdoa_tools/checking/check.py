@@ -62,7 +62,7 @@ OTHER_SURVEY = (
 BLAMED = {"tdoa_sign", "ids_swapped", "pair_sign", "tdoa_one_sign", "anchor_moved"}
 # Findings of the streams that another finding explains.
 EXPLAINS = {
-    "tdoa_unit": {"tdoa_unit", "tdoa_large", "tdoa_outliers", "tdoa_rounded"},
+    "tdoa_unit": {"tdoa_unit", "tdoa_large", "tdoa_outliers", "tdoa_rounded", "survey_scale"},
     "ids_renumbered": {"ids_unknown", "anchor_missing"},
     "ids_swapped": {"tdoa_large", "tdoa_outliers"},
     "survey_other": {"tdoa_large", "tdoa_outliers"},
@@ -222,7 +222,7 @@ def processed_streams(recording: Recording) -> StreamRules:
 def _without_stream_mistakes(ordered: OrderedRecording, found: list[Finding]) -> OrderedRecording:
     """Return the OrderedRecording without the mistakes that the streams show directly."""
     for finding in found:
-        if finding.rule == "survey_scale":
+        if finding.rule == "survey_scale" and tdoa_rules.in_metres(ordered):
             ordered = replace(
                 ordered, anchors=ordered.anchors.at(ordered.anchors.positions / finding.value)
             )

@@ -26,7 +26,7 @@ CELL, HALF = 0.05, 0.1  # s between cells, and half the time over which a cell i
 BEYOND = round(LONGEST / CELL)  # further cells at both ends, to try delays
 FEWEST = 200  # cells in the air
 # m; and the largest ratio of the residuals with another unit and with metres (healthy: above 4)
-LENGTHS, FITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}, 0.5
+LENGTHS, FITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "feet": 0.3048, "inches": 0.0254}, 0.5
 LIMIT = 4.0  # robust standard deviations at which a difference is clipped
 GRAVITY = 9.81  # m/s^2
 # Largest power after a change of axes, over the power before, that counts as a mistake. In healthy
@@ -216,7 +216,8 @@ def truth_unit(recording: WithTruth) -> Iterator[Finding]:
             ERROR,
             cause=f"the ground truth is in {unit}, and is read as metres",
             evidence=f"TDOAs are {left[unit]:.2f} m off it then, {left['m']:.2f} m as it is (median)",
-            remedy=f"divide its positions by {1.0 / LENGTHS[unit]:g}, or give the unit ({unit})",
+            remedy=f"divide its positions by {1.0 / LENGTHS[unit]:g}"
+            + (f", or give the unit ({unit})" if len(unit) == 2 else ""),
             value=LENGTHS[unit],
         )
 

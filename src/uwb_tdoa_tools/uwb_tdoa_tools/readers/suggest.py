@@ -56,6 +56,7 @@ GYRO = r"(.*(gyro|angular_velocity|ang_vel|rate).*?|w|g|.*[._]w)[._ ]?([xyz]|\[[
 ACCEL = r"(.*(acc|linear_acceleration|lin_acc).*?|a|.*[._]a)[._ ]?([xyz]|\[[012]\])"
 TRUTH = r"truth|mocap|vicon|vive|optitrack|qualisys|vrpn|gt_"
 PLACE = rf"(.*(position|translation|location|pos|pose|p|{TRUTH})[._]|p)?([xyz]|\[[012]\])"
+ATTITUDE = r"(.*[._])?(?:q|quat|quaternion|orientation|rotation|rot)[._ ]?([xyzw])"
 POSE = r"pose|tag_pos"  # of ground truth, or of an estimate
 # Columns of `ros2 topic echo --csv` by the number of columns: our names by place
 ECHOED = {
@@ -63,7 +64,7 @@ ECHOED = {
     10: {3: "pose.x", 4: "pose.y", 5: "pose.z"},
 }
 SIGN = "Sign: distance to anchor_b minus distance to anchor_a. Otherwise write a minus."
-NO_HEADER = "No header: the columns are 1, 2, 3, ..., and their values decided. Check them."
+BY_VALUES = "The names of the columns say nothing, so their values decided. Check them."
 NO_TIME = (
     "no column with the time is recognized; write time: COLUMN:UNIT (s, ms, us or ns) under columns. "
     "A text such as 2024-03-31 01:59:45.123 is in s."
@@ -81,7 +82,14 @@ MISSING = {  # streams: lines on what to do without any of them
     ("pose",): ("Missing: ground truth. Only errors need it.",),
     ("anchors",): ("Missing: positions of the anchors. Give a survey with --survey.",),
 }
-# Texts that are no tables: what they are, their pattern, and a line that makes a table of them
+# Files of arrays, by their first bytes
+NO_TEXTS = {
+    b"PK\x03\x04": "a zip file, as Excel and numpy (.npz) write",
+    b"\x93NUMPY": "an array of numpy",
+    b"MATLAB": "a file of MATLAB",
+    b"\x89HDF": "an HDF5 file",
+    b"PAR1": "a Parquet file",
+}
 # Texts that are no tables: what they are, their pattern, and a line that makes a table of them
 _ROWS = 'BEGIN {print "t,anchor,range,anchor_x,anchor_y,anchor_z"} '
 TEXTS = {
@@ -207,7 +215,14 @@ def suggest(paths: Sequence[Path], salvage: bool = False) -> tuple[str, list[str
 
 def _refuse_text(path: Path) -> None:
     """Raise InputError for a text that is no table, with a line that makes a table of it."""
-    head = "" if path.is_dir() else read_head(path, 1 << 12).decode("utf-8", "replace")
+    start = b"" if path.is_dir() else read_head(path, 1 << 12)
+    for magic, what in NO_TEXTS.items():
+        if start.startswith(magic):
+            raise InputError(
+                f"{path}: is {what}, no text; save it as CSV, or give the arrays to uwb_tdoa.flight "
+                "(docs/python.md)."
+            )
+    head = start.decode("utf-8", "replace")
     for command, (pattern, line) in TEXTS.items():
         if re.search(pattern, head):
             raise InputError(
@@ -250,8 +265,11 @@ def _unrecognized(tables: Foreign, table: str) -> str:
     return f"# Not recognized: {table}, {tables.types[table]}, with {listed or 'unknown fields'}."
 
 
-def _suggestions(tables: Foreign, table: str) -> list[Suggestion]:
-    """Return the sources that a table seems to have."""
+def _suggestions(tables: Foreign, table: str, by_values: bool = False) -> list[Suggestion]:
+    """Return the sources that a table seems to have.
+
+    by_values : whether only the values of its columns decide
+    """
     try:
         sample = tables.sample(table, SAMPLE)
     except InputError:
@@ -260,8 +278,8 @@ def _suggestions(tables: Foreign, table: str) -> list[Suggestion]:
     if not fields:
         return []
     is_csv = isinstance(tables, CsvFiles)
-    nameless = is_csv and all(one.path.isdecimal() for one in fields)
-    if nameless:
+    by_values = by_values or is_csv and all(one.path.isdecimal() for one in fields)
+    if by_values:
         fields = _with_aliases(fields)
     inertial = _inertial(fields)
     time, why = _time(fields, bool(inertial)) if is_csv else ("", "")
@@ -270,8 +288,11 @@ def _suggestions(tables: Foreign, table: str) -> list[Suggestion]:
     made += [*inertial, *_anchors(fields), *_poses(table, fields)]
     for one in made:
         one.columns = {**({"time": time} if time else {}), **one.columns}
-        one.comments += [*filter(None, [why, NO_HEADER if nameless else ""])]
-    return made
+        one.comments += [*filter(None, [why, BY_VALUES if by_values else ""])]
+    if made or by_values or not is_csv:
+        return made
+    # an id and a number may be anything, and two ids with a signed number hardly
+    return [one for one in _suggestions(tables, table, True) if "anchor_b" in one.columns]
 
 
 def _field(path: str, each: str, found: Sequence[Any]) -> Field:
@@ -482,12 +503,9 @@ def _poses(table: str, fields: Sequence[Field]) -> list[Suggestion]:
         return []
     unit, why = _length("largest coordinate", replace(place[0], values=_values(place)), np.nanmax)
     columns = {f"pose_{axis}": f"{one.path}{unit}" for axis, one in zip("xyz", place)}
-    paths = {one.path for one in fields}
-    stem = re.sub(r"(position|translation)\.x$", "", place[0].path)
-    for part in ("orientation", "rotation"):
-        attitude = {f"pose_q{k}": f"{stem}{part}.{k}" for k in "xyzw"}
-        if {*attitude.values()} <= paths:
-            columns |= attitude
+    turned = [(re.fullmatch(ATTITUDE, one.known, re.IGNORECASE), one.path) for one in likely]
+    attitude = {f"pose_q{match[2].lower()}": path for match, path in turned if match}
+    columns |= attitude if len(attitude) == 4 else {}
     doubtful = pattern == POSE
     why.append(
         "A position that may be an estimate. Only ground truth belongs here."
