@@ -11,7 +11,7 @@ from uwb_tdoa_tools import cli
 from uwb_tdoa_tools.diagnosis import diagnose
 from uwb_tdoa_tools.diagnosis.report.entries import entries
 from uwb_tdoa_tools.estimate import FlightEstimator
-from uwb_tdoa_tools.flying import loop
+from uwb_tdoa_tools.flying import demo
 from uwb_tdoa_tools.scoring.evaluation import score_of
 from uwb_tdoa_tools.scoring.gains import gain
 from uwb_tdoa_tools.simulation.inject import hidden_effect
@@ -25,11 +25,11 @@ def looped(seed):
     """Row of a seed: true effect, effects found, errors of the third flight, m, and time, s."""
     began = time.monotonic()
     with TemporaryDirectory() as folder:
-        bags = loop.record(seed, Path(folder))
-        diagnosis = diagnose(loop.read(bags[:2]))
+        bags = demo.record(seed, Path(folder))
+        diagnosis = diagnose(demo.read(bags[:2]))
         onnx = Path(folder) / "bias.onnx"
-        written = loop.write_correction(onnx, diagnosis)
-        (third,) = loop.read(bags[2:])
+        written = demo.write_correction(onnx, diagnosis)
+        (third,) = demo.read(bags[2:])
         models = (None, load_network(onnx) if written else None)
         errors = [rmse(third, model) for model in models]
     found = [entry.title for entry in entries(diagnosis) if entry.added]

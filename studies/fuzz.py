@@ -39,8 +39,8 @@ from uwb_tdoa_ekf.debias import BiasMap
 from uwb_tdoa_tools import cli
 from uwb_tdoa_tools.bags.bag import read_bag
 from uwb_tdoa_tools.outputs import OutputFolder
-from uwb_tdoa_tools.planning.installation import antenna_from_yaml
-from uwb_tdoa_tools.planning.layout import AnchorPlaces
+from uwb_tdoa_tools.planning.optimisation import AnchorPlaces
+from uwb_tdoa_tools.planning.precision import antenna_from_yaml
 from uwb_tdoa_tools.readers import (
     load_profile,
     read_by_profile,

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from studies import moved_anchors, plans, situations
 from studies.any_path import Path, between
-from uwb_tdoa_tools.planning.installation import FixedNoise, RadioNoise
 from uwb_tdoa_tools.planning.maps import TOO_FEW
+from uwb_tdoa_tools.planning.precision import FixedNoise, RadioNoise
 from uwb_tdoa_tools.simulation.rooms import Room
 
 

@@ -18,7 +18,7 @@ from uwb_tdoa_tools.bags.bag import read_odometry  # noqa: E402
 from uwb_tdoa_tools.commands import calibrate, check, demo, localize  # noqa: E402
 from uwb_tdoa_tools.diagnosis import diagnose  # noqa: E402
 from uwb_tdoa_tools.estimate import FlightEstimator  # noqa: E402
-from uwb_tdoa_tools.flying import demo as flown, loop  # noqa: E402
+from uwb_tdoa_tools.flying import demo as flown  # noqa: E402
 from uwb_tdoa_tools.flying.demo import (  # noqa: E402
     change_of_scores,
     correction_in_words,
@@ -114,24 +114,24 @@ LATE = 17  # one anchor of the hall is late
 def _short_flights():
     """Shorten the flights of the hall; the demo flies longer."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(loop, "HALL", replace(loop.HALL, duration=26.0))
+        patch.setattr(flown, "HALL", replace(flown.HALL, duration=26.0))
         yield
 
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
     """Return the bags of a hall."""
-    return loop.record(LATE, tmp_path_factory.mktemp("recorded"))
+    return flown.record(LATE, tmp_path_factory.mktemp("recorded"))
 
 
 @pytest.fixture(scope="module")
 def diagnosis(recorded):
     """Return the Diagnosis of the first two recordings. No effect is declared."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in (inject, loop):
+        for module in (inject, flown):
             patch.delattr(module, "hidden_effect")
         patch.setattr(inject, "KINDS", {})
-        return diagnose(loop.read(recorded[:2]))
+        return diagnose(flown.read(recorded[:2]))
 
 
 @pytest.mark.slow
@@ -152,15 +152,15 @@ def test_no_recording_declares_the_effect(recorded):
     for bag in recorded:
         content = b"".join(path.read_bytes() for path in bag.rglob("*") if path.is_file())
         assert not any(word in content for word in words)
-        (flight,) = loop.read([bag])
+        (flight,) = flown.read([bag])
         assert not {"config", "parameters"} & set(flight.meta) and not flight.extra
 
 
 @pytest.mark.slow
 def test_the_correction_takes_the_residual_of_the_third_flight_away(recorded, diagnosis, tmp_path):
-    written = loop.write_correction(tmp_path / "bias.onnx", diagnosis)
+    written = flown.write_correction(tmp_path / "bias.onnx", diagnosis)
     assert [effect.name for effect in written.effects] == ["anchor_delay"]
-    (third,) = loop.read(recorded[2:])
+    (third,) = flown.read(recorded[2:])
     model = load_network(tmp_path / "bias.onnx")
     corrector = corrector_of(third, None, tmp_path / "bias.onnx")
     before, after = residuals_of(third), residuals_of(third, corrector)
@@ -177,15 +177,15 @@ def test_the_correction_takes_the_residual_of_the_third_flight_away(recorded, di
 @pytest.mark.slow
 def test_nothing_is_written_where_nothing_helps(diagnosis, tmp_path):
     nothing = replace(diagnosis, effects=EffectSet())
-    assert loop.write_correction(tmp_path / "bias.onnx", nothing) is None
+    assert flown.write_correction(tmp_path / "bias.onnx", nothing) is None
     assert not list(tmp_path.iterdir())
-    assert loop.added_in_words(tmp_path, None, nothing)[0].startswith("nothing: ")
+    assert flown.added_in_words(tmp_path, None, nothing)[0].startswith("nothing: ")
 
 
 @pytest.fixture(scope="module")
 def sound():
     """Return a flight of the hall without a hidden effect. Its error is below 5 cm."""
-    flight = simulate(replace(loop.HALL, seed=9, yaw="rotating"))
+    flight = simulate(replace(flown.HALL, seed=9, yaw="rotating"))
     assert rmse(flight) < 0.05
     return flight
 
@@ -222,7 +222,7 @@ def test_no_error_is_printed_if_messages_were_lost(
 ):
     outcome = {"used": 10, "waiting": 0, "late": 1, "lost": 917, "imu_late": 0, "imu_lost": 0}
     monkeypatch.setattr(flown, "through_nodes", lambda *_: flown.LivePass(outcome, None))
-    monkeypatch.setattr(loop, "record", lambda *_: recorded)
+    monkeypatch.setattr(flown, "record", lambda *_: recorded)
     monkeypatch.setattr(flown, "diagnose", lambda *_, **__: diagnosis)
     figures = tmp_path / "demo.json"
     words = {
@@ -256,7 +256,7 @@ def test_the_loop_through_the_real_nodes(tmp_path, capsys):
     content = json.loads(figures.read_text())
     errors = [row["rmse_3d"] for row in content["errors"]]
     assert errors[1] < 0.3 * errors[0]
-    (third,) = loop.read([tmp_path / "flight-3.bag"])
+    (third,) = flown.read([tmp_path / "flight-3.bag"])
     for name, model in (("without", None), ("with", load_network(tmp_path / "bias.onnx"))):
         live = read_odometry(tmp_path / name / "recorded.bag")
         offline = FlightEstimator(network=model)(third).odometry

@@ -20,7 +20,7 @@ from uwb_tdoa_tools.diagnosis.next_flight import Model, Rivalry, plan_flight
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.report import maps
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.simulation.rooms import Room, corners, pillars, room_of
+from uwb_tdoa_tools.simulation.rooms import Room, constellation, corners, room_of
 
 RATES = {"imu_rate": 200.0, "truth_rate": 100.0, "start_in_air": True}
 
@@ -59,7 +59,7 @@ def keeps(path, limits):
 def test_motions_stay_clear_of_walls_and_anchors_and_within_limits(lower, size, speed, most):
     room = Room(np.array(lower), np.array(lower) + size)
     limits = Limits(600.0, speed, most)
-    for anchors in (corners(), pillars()):
+    for anchors in (corners(), constellation("pillars")):
         try:
             found = motions(room, of_anchors(anchors), limits)
         except InputError:

@@ -12,7 +12,7 @@ from uwb_tdoa_bias.common.flight import Truth
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools.commands.fly import main
 from uwb_tdoa_tools.flying import rover
-from uwb_tdoa_tools.flying.mission import DONE, FLYING, LOST, REFUSED, Rules, Waypoints
+from uwb_tdoa_tools.flying.mission import DONE, FLYING, LOST, PLACES, REFUSED, Rules, Waypoints
 from uwb_tdoa_tools.flying.trial import Task
 from uwb_tdoa_tools.flying.verdict import summary, text, verdict_of
 from uwb_tdoa_tools.flying.world import HALL, WORLDS
@@ -35,13 +35,13 @@ def test_it_arrives_and_the_verdict_is_that_of_its_truth(drives):
     verdicts = [verdict_of(one) for one in drives]
     for one, verdict in zip(drives, verdicts):
         assert verdict["arrived"] and verdict["why"] == "" and one.missions[0].state == DONE
-        last = WALLS * TASK.path.shares[-1]
+        last = WALLS * PLACES[-1]
         p = one.flight.truth.p
         assert verdict["place"] == pytest.approx(np.linalg.norm(p[-1, :2] - last)) and (
             verdict["place"] < 0.3
         )
         assert verdict["tracking"] < 0.2 and verdict["farthest"] < 0.4
-        for place in WALLS * TASK.path.shares:
+        for place in WALLS * PLACES:
             assert np.linalg.norm(p[:, :2] - place, axis=1).min() < 0.5
         assert verdict["phases"]["drive"]["rmse"] < 0.2 and verdict["yaw"] < 5.0
         assert [*verdict["phases"]] == ["before", "drive", "after"]
@@ -75,7 +75,7 @@ def test_wheels_say_more_or_less_than_is_true_and_the_imu_what_is():
 
 def test_it_stands_while_it_is_lost_and_goes_on():
     path = Waypoints().starting_at(np.zeros(2), 0.4)
-    drive, steering = rover.Drive(path, 0.6, Rules(rest=0.0)), rover.Steering()
+    drive, steering = rover.Drive(path, Rules(rest=0.0)), rover.Steering()
     pose = (0.0, np.array([0.0, 0.0, 0.4]), np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
 
     def decide(t, deviation, stamp=None):

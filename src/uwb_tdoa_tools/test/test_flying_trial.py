@@ -14,7 +14,7 @@ from uwb_tdoa_bias.common.radio import arrival_bias
 from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_bias.common.sensors.pressure import SITE
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_tools.flying.mission import DONE, Circles, Rules
+from uwb_tdoa_tools.flying.mission import DONE, HEIGHT, RISE, Circles, Rules
 from uwb_tdoa_tools.flying.sensors import AuxiliarySensor, InertialErrors, Radio, gusts
 from uwb_tdoa_tools.flying.simulator import IMU_RATE, Transport
 from uwb_tdoa_tools.flying.trial import Task, fly
@@ -24,7 +24,7 @@ from uwb_tdoa_tools.scoring.metrics import position_at
 from uwb_tdoa_tools.simulation.config import NO_IMU_ERRORS
 from uwb_tdoa_tools.simulation.inject import parse_effect
 from uwb_tdoa_tools.simulation.rooms import constellation
-from uwb_tdoa_tools.simulation.tdoas import tag_link
+from uwb_tdoa_tools.simulation.sensors import tag_link
 
 # --- flying sensors ---
 
@@ -211,7 +211,7 @@ def test_it_takes_off_follows_the_path_and_lands(plain):
     assert verdict["landed"] and verdict["why"] == ""
     assert plain.missions[0].state == DONE and plain.missions[0].started == 4.0
     assert verdict["tracking"] < 0.2 and verdict["place"] < 0.1 and verdict["touchdown"] < 0.4
-    assert plain.flight.truth.p[:, 2].max() == pytest.approx(SHORT.height, abs=0.2)
+    assert plain.flight.truth.p[:, 2].max() == pytest.approx(HEIGHT, abs=0.2)
     assert [*verdict["phases"]] == ["before", "lift_off", "air", "landing", "after"]
 
 
@@ -244,7 +244,7 @@ def test_through_a_silence_and_by_late_samples_it_flies_on():
     flown = fly(Task(world, seed=3, given="place", path=SHORT))
     heard = flown.flight.tdoa.t
     gap = np.argmax(np.diff(heard))
-    began = flown.missions[0].started + SHORT.rise + 4.0
+    began = flown.missions[0].started + RISE + 4.0
     assert heard[gap : gap + 2] == pytest.approx([began, began + 3.0], abs=0.02)
     assert flown.flight.truth.t[-1] - flown.odometry.t[-1] >= 0.05 - 1e-9
     assert verdict_of(flown)["safe"]

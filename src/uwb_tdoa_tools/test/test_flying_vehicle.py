@@ -239,7 +239,7 @@ def followed(path, place=(0.3, -0.2)):
     return reference, t, reference.at(t)
 
 
-@pytest.mark.parametrize("path", [Circles(), Circles(swing=0.4), Circles(radius=0.0)])
+@pytest.mark.parametrize("path", [Circles(), Circles(radius=0.0)])
 def test_it_begins_and_ends_at_rest_in_one_place_and_then_sinks(path):
     reference, t, wanted = followed(path)
     for k, height in ((0, GROUND), (-1, GROUND + 0.4)):
@@ -275,7 +275,7 @@ class Said:
 
 @pytest.fixture
 def said():
-    return Said(Mission(Circles(), (1.0, 2.0), 0.03))
+    return Said(Mission(Circles().starting_at(np.array([1.0, 2.0]), 0.03), 0.03))
 
 
 def test_it_rests_and_takes_off_with_the_yaw_that_it_has(said):
@@ -290,7 +290,7 @@ def test_it_waits_for_an_estimate_that_knows_where_it_is_and_refuses_at_last(sai
     assert said.until(6.0, deviation=1.01) is None and said.mission.state == WAITING
     said.until(6.02, deviation=0.99)
     assert said.mission.state == FLYING and said.mission.started == pytest.approx(6.0)
-    other = Said(Mission(Circles(), (0.0, 0.0), 0.0))
+    other = Said(Mission(Circles().starting_at(np.zeros(2), 0.0), 0.0))
     other.until(14.02, stale=True)
     assert other.mission.state == REFUSED
 
@@ -311,7 +311,7 @@ def test_an_estimate_that_does_not_come_down_is_pulled_down_and_another_is_not(s
     assert (
         high == pytest.approx(-DESCENT_LEAD) and said.until(31.0)[0, 2] == high
     )  # the estimate is 0, so the command is not lower than this
-    falling = Said(Mission(Circles(), (1.0, 2.0), 0.03))
+    falling = Said(Mission(Circles().starting_at(np.array([1.0, 2.0]), 0.03), 0.03))
     falling.sinks = 0.15
     assert falling.until(30.0)[0, 2] == pytest.approx(-0.15 * 29.99, abs=1e-6)
 

@@ -13,9 +13,9 @@ from uwb_tdoa_bias.common.survey import read_survey
 from uwb_tdoa_tools.commands.plan import main
 from uwb_tdoa_tools.parallel import Progress
 from uwb_tdoa_tools.planning.hall import Hall
-from uwb_tdoa_tools.planning.installation import Installation
 from uwb_tdoa_tools.planning.maps import TOO_FEW, Demand, Grid
 from uwb_tdoa_tools.planning.optimisation import best_addition, with_one
+from uwb_tdoa_tools.planning.precision import Installation
 from uwb_tdoa_tools.planning.report import summary
 from uwb_tdoa_tools.planning.run import places_in_hall
 from uwb_tdoa_tools.simulation.rooms import Room

@@ -15,8 +15,6 @@ from uwb_tdoa_tools.bags.messages import typestore
 from uwb_tdoa_tools.planning import plots
 from uwb_tdoa_tools.planning.bifurcation import Subsets
 from uwb_tdoa_tools.planning.hall import Hall
-from uwb_tdoa_tools.planning.installation import Installation, RadioNoise
-from uwb_tdoa_tools.planning.layout import UNUSABLE, AnchorPlaces, Goal, Layout, lattice
 from uwb_tdoa_tools.planning.maps import (
     IMPRECISE,
     OUTSIDE,
@@ -24,7 +22,16 @@ from uwb_tdoa_tools.planning.maps import (
     Demand,
     Grid,
 )
-from uwb_tdoa_tools.planning.optimisation import errors_and_slopes, optimise
+from uwb_tdoa_tools.planning.optimisation import (
+    UNUSABLE,
+    AnchorPlaces,
+    Goal,
+    Layout,
+    errors_and_slopes,
+    lattice,
+    optimise,
+)
+from uwb_tdoa_tools.planning.precision import Installation, RadioNoise
 from uwb_tdoa_tools.planning.report import TOPICS, map_messages, write_messages
 from uwb_tdoa_tools.scoring.plots import draw_labels
 from uwb_tdoa_tools.simulation.rooms import corners, facing

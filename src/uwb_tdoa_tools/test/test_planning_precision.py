@@ -10,15 +10,6 @@ from scipy.linalg import cho_factor, cho_solve
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.radio import DWM1000_AZIMUTH, Antenna
-from uwb_tdoa_tools.planning.installation import (
-    PARTS,
-    FixedNoise,
-    Installation,
-    Pairing,
-    RadioNoise,
-    antenna_from_yaml,
-    variance_gradient,
-)
 from uwb_tdoa_tools.planning.maps import (
     FEWEST,
     ErrorSamples,
@@ -30,15 +21,22 @@ from uwb_tdoa_tools.planning.maps import (
 )
 from uwb_tdoa_tools.planning.precision import (
     NORMAL_99,
+    PARTS,
+    FixedNoise,
+    Installation,
+    Pairing,
+    RadioNoise,
+    antenna_from_yaml,
     bound,
     dilution,
     ellipses,
     information,
     position_error,
+    variance_gradient,
 )
 from uwb_tdoa_tools.readers import read_flight
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.simulation.rooms import constellation, corners, facing, planar
+from uwb_tdoa_tools.simulation.rooms import constellation, corners, facing
 
 # --- planning installation ---
 
@@ -78,7 +76,7 @@ def test_hull():
 
 
 def test_with_a_height_sensor_anchors_in_a_plane_are_enough_and_the_hull_is_that_from_above():
-    flat = Installation(planar(), height_std=0.02)
+    flat = Installation(constellation("planar"), height_std=0.02)
     high, low = flat.anchors.positions[:, :2].max(axis=0), flat.anchors.positions[:, :2].min(axis=0)
     points = np.array([[*(0.5 * (high + low)), 7.0], [*(high + 0.1), 1.0]])
     assert (
@@ -92,7 +90,7 @@ def test_with_a_height_sensor_anchors_in_a_plane_are_enough_and_the_hull_is_that
         {"height_std": 0.1, "dimensions": 2},
     ):
         with pytest.raises(InputError, match="height std"):
-            Installation(planar(), **options)
+            Installation(constellation("planar"), **options)
 
 
 ONE = Anchors.from_positions([[0.0, 0.0, 0.0]])  # no orientation: omnidirectional

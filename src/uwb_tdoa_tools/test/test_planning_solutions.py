@@ -20,7 +20,6 @@ from uwb_tdoa_tools.planning.bifurcation import (
     other_solutions,
 )
 from uwb_tdoa_tools.planning.hall import Hall
-from uwb_tdoa_tools.planning.installation import FixedNoise, Installation, RadioNoise
 from uwb_tdoa_tools.planning.maps import (
     IMPRECISE,
     TWO_SOLUTIONS,
@@ -28,6 +27,7 @@ from uwb_tdoa_tools.planning.maps import (
     Grid,
     judge,
 )
+from uwb_tdoa_tools.planning.precision import FixedNoise, Installation, RadioNoise
 from uwb_tdoa_tools.simulation.rooms import Room, Walls, constellation, corners
 
 # --- planning bifurcation ---

@@ -18,8 +18,8 @@ from uwb_tdoa_bias.common.radio import (
 )
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.config import PROTOCOLS
-from uwb_tdoa_tools.simulation.rooms import heard_at, pair
-from uwb_tdoa_tools.simulation.tdoas import (
+from uwb_tdoa_tools.simulation.rooms import constellation, heard_at
+from uwb_tdoa_tools.simulation.sensors import (
     floor_multipath,
     make_schedule,
     outliers,
@@ -285,7 +285,7 @@ def spin(anchors, link=RadioLink()):
 
 
 def test_figure_4_left_bias_over_a_spin_depends_on_anchor_orientation():
-    anchors = pair()
+    anchors = constellation("pair")
     curves = []
     for azimuth, elevation in ((0, 0), (90, 30), (200, 70)):
         turn = Rotation.from_euler("zy", [azimuth, elevation], degrees=True)

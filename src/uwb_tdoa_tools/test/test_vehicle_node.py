@@ -25,7 +25,7 @@ from uwb_tdoa_bias.common.sensors import SENSORS  # noqa: E402
 from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_msgs.srv import GoTo, Land, Takeoff  # noqa: E402
 from uwb_tdoa_tools.flying import rover  # noqa: E402
-from uwb_tdoa_tools.flying.mission import Waypoints  # noqa: E402
+from uwb_tdoa_tools.flying.mission import SPEED, Waypoints  # noqa: E402
 from uwb_tdoa_tools.flying.simulator import DT  # noqa: E402
 from uwb_tdoa_tools.flying.trial import Task  # noqa: E402
 from uwb_tdoa_tools.flying.verdict import verdict_of  # noqa: E402
@@ -114,6 +114,6 @@ def test_a_rover_drives_by_the_nodes_as_it_does_in_lockstep(tmp_path):
     world = replace(WORLDS["hall"], sensors=rover.SENSOR_NAMES)
     task = Task(world, 3, "place", config=FilterConfig(**rover.FILTER), path=Waypoints())
     lockstep = verdict_of(rover.drive(task))
-    one_turn = task.path.speed * DT  # m, error of odometry that comes one turn later
+    one_turn = SPEED * DT  # m, error of odometry that comes one turn later
     for name in ("tracking", "farthest", "place"):
         assert verdict[name] == pytest.approx(lockstep[name], abs=one_turn)

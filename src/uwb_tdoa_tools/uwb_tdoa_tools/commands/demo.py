@@ -130,7 +130,7 @@ def _progress(text: str) -> None:
 def _measured(args: Namespace) -> int:
     """Take a measured flight through both nodes."""
     from ..evaluating import lines_of_errors
-    from ..flying import demo, loop
+    from ..flying import demo
     from ..scoring.alignment import require_truth
     from ..scoring.pairs import residuals_of
 
@@ -153,7 +153,7 @@ def _measured(args: Namespace) -> int:
         return 1
     cli.show(*lines_of_errors(scores), demo.change_of_scores(scores))
     residuals = [residuals_of(flight, by) for by in (None, correction)[: len(scores) - 1]]
-    loop.draw(args.out / "error.png", flight, residuals, scores[:-1])
+    demo.draw(args.out / "error.png", flight, residuals, scores[:-1])
     cli.show(f"plot       {args.out / 'error.png'}")
     if args.rerun is not None:
         cli.show(f"rerun      {args.rerun}")

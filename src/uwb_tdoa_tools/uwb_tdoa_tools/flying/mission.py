@@ -24,40 +24,40 @@ SETTLE = 0.4  # m above the ground, start of the slow descent
 SINK = 0.2  # m/s
 
 
+HEIGHT = 1.2  # m, of the circles
+RISE, FALL = 3.0, 4.0  # s, of ascent and descent
+# of a rover: places in units of half the length and width of the hall, from its middle, and speed
+HALL_SIZE = np.array([6.4, 6.2])  # m
+PLACES = np.array([(0.5, 0.5), (-0.5, 0.5), (-0.5, -0.5), (0.5, -0.5), (0.5, 0.1)])
+SPEED = 0.6  # m/s
+
+
 @dataclass(frozen=True)
 class Circles:
     """Fly up, along circles, and down to the start.
 
     Parameters
     ----------
-    height, radius : float
-        m.
-    rise, fall : float
-        Durations of ascent and descent, s.
+    radius : float
+        m, 0 to hover.
     turns : int
     turn_time : float
         Duration of a turn, s.
-    swing : float
-        Amplitude of the height in each turn, m.
     """
 
-    height: float = 1.2
     radius: float = 1.0
-    rise: float = 3.0
-    fall: float = 4.0
     turns: int = 2
     turn_time: float = 8.0
-    swing: float = 0.0
 
     @property
     def duration(self) -> float:
         """Return the time from the start of the rotors to the final descent, s."""
-        return self.rise + self.turns * self.turn_time + self.fall
+        return RISE + self.turns * self.turn_time + FALL
 
     @property
     def middle(self) -> float:
         """Return a time on the circle, s after take-off."""
-        return self.rise + 4.0
+        return RISE + 4.0
 
     def starting_at(self, place: np.ndarray, ground: float) -> ReferenceTrajectory:
         """Return the trajectory from `place` (2,) m.
@@ -65,49 +65,25 @@ class Circles:
         The circle is entered at its point nearest to +x. `ground` is the height of the body at rest, m.
         """
         knots = np.arange(0.0, self.duration + KNOT, KNOT)
-        up = cruise(knots / self.rise, CLIMB)
-        down = cruise((knots - self.duration + self.fall) / self.fall, CLIMB)
+        up = cruise(knots / RISE, CLIMB)
+        down = cruise((knots - self.duration + FALL) / FALL, CLIMB)
         air = self.turns * self.turn_time
-        angle = 2.0 * np.pi * self.turns * cruise((knots - self.rise) / air, SPEED_UP / air)
-        p = np.empty((len(knots), 3))
-        p[:, 0] = place[0] + self.radius * (np.cos(angle) - 1.0)
-        p[:, 1] = place[1] + self.radius * np.sin(angle)
-        p[:, 2] = (
-            ground + self.height * up - (self.height - SETTLE) * down + self.swing * np.sin(angle)
-        )
-        return ReferenceTrajectory(p)
+        angle = 2.0 * np.pi * self.turns * cruise((knots - RISE) / air, SPEED_UP / air)
+        x = place[0] + self.radius * (np.cos(angle) - 1.0)
+        y = place[1] + self.radius * np.sin(angle)
+        z = ground + HEIGHT * up - (HEIGHT - SETTLE) * down
+        return ReferenceTrajectory(np.column_stack([x, y, z]))
 
 
-@dataclass(frozen=True)
 class Waypoints:
-    """Drive straight from place to place.
-
-    Parameters
-    ----------
-    size : tuple
-        Length and width of the hall, m.
-    shares : tuple
-        Places (n, 2) in units of half the length and width, from the middle of the hall.
-    speed : float
-        m/s.
-    """
-
-    size: tuple[float, float] = (6.4, 6.2)
-    shares: tuple[tuple[float, float], ...] = (
-        (0.5, 0.5),
-        (-0.5, 0.5),
-        (-0.5, -0.5),
-        (0.5, -0.5),
-        (0.5, 0.1),
-    )
-    speed: float = 0.6
+    """Drive straight from place to place of PLACES."""
 
     @property
     def duration(self) -> float:
         """Return the time from departure to arrival at this speed, s."""
-        places = 0.5 * np.array(self.size) * self.shares
+        places = 0.5 * HALL_SIZE * PLACES
         ways = np.linalg.norm(np.diff(places, axis=0, prepend=[[0.0, 0.0]]), axis=1)
-        return float(ways.sum()) / self.speed
+        return float(ways.sum()) / SPEED
 
     @property
     def middle(self) -> float:
@@ -116,7 +92,7 @@ class Waypoints:
 
     def starting_at(self, place: np.ndarray, ground: float) -> Polyline:
         """Return the polyline from `place` (2,) m at the height `ground`, m."""
-        return Polyline(np.vstack([place, 0.5 * np.array(self.size) * self.shares]), ground)
+        return Polyline(np.vstack([place, 0.5 * HALL_SIZE * PLACES]), ground)
 
 
 class Polyline:
@@ -177,20 +153,11 @@ class ReferenceTrajectory:
         Place of the landing (2,), m.
     """
 
-    def __init__(self, p: np.ndarray, turning: float = 0.0) -> None:
-        """Fit a spline to positions.
-
-        Parameters
-        ----------
-        p : numpy.ndarray
-            Positions (m, 3), m, every KNOT s.
-        turning : float
-            Yaw rate, rad/s.
-        """
+    def __init__(self, p: np.ndarray) -> None:
+        """Fit a spline to positions (m, 3), m, every KNOT s."""
         knots = KNOT * np.arange(len(p))
         spline = make_interp_spline(knots, p, k=5)
         self.duration, self.end, fine = knots[-1], p[-1, :2], np.arange(0.0, knots[-1], FINE)
-        self._turning = turning
         self._grid = np.stack(
             [spline(fine), spline.derivative(1)(fine), spline.derivative(2)(fine)], axis=1
         )
@@ -202,7 +169,7 @@ class ReferenceTrajectory:
 
     def yaw_offset(self, t: float) -> float:
         """Return the wanted turn since the start, rad, at t, s."""
-        return self._turning * t
+        return 0.0
 
 
 def with_descent(wanted: np.ndarray, after: np.ndarray) -> np.ndarray:
@@ -269,7 +236,7 @@ class Rules:
 
 
 class TimedPath(Protocol):
-    """Give the wanted motion from a given start, by seconds since the rotors started."""
+    """Give the wanted motion from the present place, by seconds since the rotors started."""
 
     duration: float  # s, until it begins to sink
 
@@ -282,13 +249,6 @@ class TimedPath(Protocol):
 
     def yaw_offset(self, t: float) -> float:
         """Return the wanted turn since the start, rad, at t, s."""
-
-
-class Plan(Protocol):
-    """Describe a path that can start anywhere."""
-
-    def starting_at(self, place: np.ndarray, ground: float) -> TimedPath:
-        """Return the path from `place` (2,) m with the body at rest at height `ground`, m."""
 
 
 class Journey:
@@ -374,19 +334,17 @@ class Mission(Journey):
 
     def __init__(
         self,
-        path: Plan,
-        place: np.ndarray,
+        path: TimedPath,
         ground: float,
         rules: Rules | None = None,
         begin: float = 0.0,
     ) -> None:
-        """Plan the path from the present place.
+        """Wait for the start.
 
         Parameters
         ----------
-        path : Plan
-        place : numpy.ndarray
-            (2,), m.
+        path : TimedPath
+            From the present place.
         ground : float
             Height of the body at rest, m.
         rules : Rules, optional
@@ -395,7 +353,7 @@ class Mission(Journey):
         """
         super().__init__(rules, begin)
         self.ground = ground
-        self._path = path.starting_at(place, ground)
+        self._path = path
         self.yaw = self._first_yaw = 0.0
         self._last = 0.0  # s, of the step before
         self._descent_began = 0.0  # s

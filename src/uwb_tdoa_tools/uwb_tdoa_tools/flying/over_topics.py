@@ -35,8 +35,8 @@ from uwb_tdoa_ekf.reorder_buffer import TRIAL
 from uwb_tdoa_msgs.msg import EstimatorStatus, Tdoa
 
 from ..bags.messages import BODY_FRAME
-from .estimates import EstimateSource
 from .simulator import DT, Streams
+from .trial import EstimateSource
 from .vehicle import ATTITUDE, POSITION
 from .world import World
 

@@ -54,10 +54,6 @@ class CommandedPath:
         self._goal = np.array([*p, yaw])
         self._begins, self._ways = [0.0], [_way((self._goal, STILL, STILL), self._goal, 1.0)]
 
-    def starting_at(self, place: np.ndarray, ground: float) -> CommandedPath:
-        """Return the path itself: its start is known."""
-        return self
-
     @property
     def end(self) -> np.ndarray:
         """Return the place of the landing (2,), m."""

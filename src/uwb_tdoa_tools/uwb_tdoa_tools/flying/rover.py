@@ -16,7 +16,7 @@ from uwb_tdoa_bias.common.sensors import Stream, Velocity
 
 from ..simulation.config import WHEELS_RATE
 from ..simulation.sensors import YAW_RATE_STD, slips
-from .mission import LOST, Journey, Polyline, Pose, Rules, Waypoints, yaw_of
+from .mission import LOST, SPEED, Journey, Polyline, Pose, Rules, yaw_of
 from .sensors import AuxiliarySensor, random
 from .simulator import TICK, Simulator
 from .trial import REST_AFTER, Task, Trial, TrialResult
@@ -136,24 +136,10 @@ def _unicycle(wheels: Any) -> tuple[Any, Any]:
 class Drive(Journey):
     """Run one drive along a polyline. The rover stands while its estimate is lost."""
 
-    def __init__(
-        self, path: Polyline, speed: float, rules: Rules | None = None, begin: float = 0.0
-    ) -> None:
-        """Wait for the start.
-
-        Parameters
-        ----------
-        path : Polyline
-        speed : float
-            m/s.
-        rules : Rules, optional
-        begin : float
-            Time of switching on, s.
-        """
+    def __init__(self, path: Polyline, rules: Rules | None = None, begin: float = 0.0) -> None:
+        """Wait for the start. begin : s, time of switching on"""
         super().__init__(rules, begin)
-        self.path = path
-        self.place = path.end
-        self._speed = speed
+        self.path, self.place = path, path.end
         self._last_good = begin
 
     def decide(self, t: float, pose: Pose | None, deviation: float, steering: Steering) -> None:
@@ -194,7 +180,7 @@ class Drive(Journey):
         x, y = target - p
         off = (math.atan2(y, x) - yaw_of(pose[3]) + math.pi) % (2.0 * math.pi) - math.pi
         to_go = self.path.length - along + left if along < self.path.length - LOOK_AHEAD else left
-        steering.speed = min(self._speed, APPROACH_GAIN * to_go) * max(math.cos(off), 0.0)
+        steering.speed = min(SPEED, APPROACH_GAIN * to_go) * max(math.cos(off), 0.0)
         steering.turning = min(max(TURN * off, -MAX_YAW_RATE), MAX_YAW_RATE)
 
     def wanted(self, t: np.ndarray) -> np.ndarray:
@@ -218,9 +204,9 @@ class RoverTrial(Trial):
     def _controller(self) -> Steering:
         return Steering()
 
-    def _mission(self, path: Waypoints, rules: Rules) -> Any:
-        way = path.starting_at(self.simulator.state[:2].copy(), MAST)
-        return Drive(way, path.speed, rules, self.simulator.now)
+    def _mission(self, path: Any, rules: Rules) -> Any:
+        way: Any = self.task.path.starting_at(self.simulator.state[:2].copy(), MAST)
+        return Drive(way, rules, self.simulator.now)
 
     def _control(self, mission: Any) -> None:
         source = self.source

@@ -20,7 +20,7 @@ from uwb_tdoa_bias.effects import Samples
 from uwb_tdoa_bias.effects.floor import FloorMultipath
 from uwb_tdoa_ekf.results import rows_of
 
-from ..simulation.tdoas import make_schedule, outliers, tag_link, tdoa_noise
+from ..simulation.sensors import make_schedule, outliers, tag_link, tdoa_noise
 from .vehicle import IMU_RATE
 from .world import World
 

@@ -42,8 +42,7 @@ import numpy as np
 from uwb_tdoa_bias.common.compiled import compiled
 from uwb_tdoa_bias.common.errors import InputError
 
-from .installation import Installation, principal_extents
-from .precision import round_weights
+from .precision import Installation, principal_extents, round_weights
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.common.anchors import Anchors

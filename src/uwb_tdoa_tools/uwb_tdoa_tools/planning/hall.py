@@ -26,9 +26,8 @@ from .. import parallel
 from ..checking.coverage import sides_of
 from ..parallel import Progress
 from ..simulation.rooms import Room, Walls, facing, heard_at
-from .installation import Installation
-from .layout import UNUSABLE
 from .maps import TOO_FEW, Chart, Demand, Grid, Judged, judge
+from .precision import UNUSABLE, Installation
 
 PLANE_NEAREST = 10  # anchors that are looked at for a plane through them
 JUDGED_AT_ONCE = 100_000  # times points: anchors that are judged at once, wherever they are

@@ -25,8 +25,7 @@ from ..scoring.evaluation import evaluate
 from ..scoring.metrics import position_at
 from ..simulation.rooms import Room
 from .bifurcation import CLEAR, Subsets, other_solutions
-from .installation import Installation
-from .precision import bound, information, position_error
+from .precision import Installation, bound, information, position_error
 
 # gives the same items, and prints how many are done
 Wrap = Callable[[Iterable[Any]], Iterable[Any]]

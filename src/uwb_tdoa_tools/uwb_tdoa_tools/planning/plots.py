@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.common.anchors import Anchors
 
     from ..simulation.rooms import Walls
-    from .installation import Installation
+    from .precision import Installation
 
 WIDTH, DPI = 7.0, 100  # inches, pixels an inch
 STATES = {  # of a cell: what it is called, and its colour

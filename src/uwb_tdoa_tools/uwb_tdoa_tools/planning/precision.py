@@ -7,16 +7,322 @@ Fisher information, the Cramer-Rao bound, dilution of precision and ellipses.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from scipy.spatial import Delaunay
 
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.geometry import ranges
+from uwb_tdoa_bias.common.radio import SPEED_OF_LIGHT, Antenna, RadioLink, received_power_dbm
+from uwb_tdoa_bias.common.safe_yaml import read_yaml
 
-from .installation import FixedNoise, Installation, Pairing, variance_gradient
+from ..checking.coverage import sides_of, to_copy
+
+BOLTZMANN = 1.380649e-23  # J/K
+ROOM_TEMPERATURE = 298.15  # K
+_ANY_ATTITUDE = (0.0, 0.0, 0.0, 1.0)  # the tag's antenna is taken as omnidirectional
+_STEP = 1e-5  # m, for numerical derivatives
+
+
+@dataclass(frozen=True)
+class Omnidirectional:
+    """An antenna with one gain, dBi, in all directions."""
+
+    dbi: float = 0.0
+
+    def gain(self, direction: np.ndarray) -> np.ndarray:
+        """Return the gain towards directions (..., 3): (...) dBi."""
+        return np.full(np.shape(direction)[:-1], self.dbi)
+
+
+@dataclass(frozen=True)
+class RadioNoise:
+    """Noise from the link budget: Friis, thermal noise and the anchors' radiation pattern.
+
+    Source: eqs. 9 - 12 of Grasso et al. (Sensors 2022, 22, 9136). The gain of the receiving antenna
+    is left out, as there.
+
+    Attributes
+    ----------
+    antenna : Antenna of the anchors (default DWM1000-like). An anchor without orientation radiates
+        the mean of the azimuth cut in all directions.
+    tx_power_dbm : into the antenna, dBm (default: that of RadioLink)
+    bandwidth : Hz (default 499.2e6, channels 1, 2, 3 and 5)
+    full_strength : m, r_0 of eq. 9: nearer than this the noise does not fall (default 1.0)
+    """
+
+    antenna: Antenna = field(default_factory=Antenna)
+    tx_power_dbm: float = RadioLink.tx_power_dbm
+    bandwidth: float = 499.2e6
+    full_strength: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not -60.0 <= self.tx_power_dbm <= 30.0:
+            raise InputError(
+                f"tx_power_dbm: {self.tx_power_dbm!r} is outside -60 ... 30, the range of a DW1000."
+            )
+
+    @property
+    def thermal_noise_dbm(self) -> float:
+        """Power of thermal noise in the bandwidth, dBm."""
+        return 10.0 * np.log10(BOLTZMANN * ROOM_TEMPERATURE * self.bandwidth * 1e3)
+
+    def variance(self, points: np.ndarray, anchors: Anchors) -> np.ndarray:
+        """Return the variance of the range of one reception: (n, N) m^2.
+
+        points : (n, 3) m; anchors : N Anchors. Source: eqs. 9 and 12.
+        """
+        snr_db = self._received(points, anchors) - self.thermal_noise_dbm
+        return (SPEED_OF_LIGHT / self.bandwidth) ** 2 * 10.0 ** (-0.1 * snr_db)
+
+    def _received(self, points: np.ndarray, anchors: Anchors) -> np.ndarray:
+        """Return the received power at full_strength or farther: (n, N) dBm. Source: eq. 11."""
+        away = points[:, None, :] - anchors.positions
+        distance = np.linalg.norm(away, axis=-1, keepdims=True)
+        away *= np.maximum(self.full_strength / np.maximum(distance, 1e-9), 1.0)
+        power = np.empty(away.shape[:2])
+        turned = np.isfinite(anchors.orientations).all(axis=1)
+        mean = Omnidirectional(float(np.mean(self.antenna.azimuth)) + self.antenna.gain_offset)
+        for rows, antenna in ((turned, self.antenna), (~turned, mean)):
+            if rows.any():
+                link = RadioLink(
+                    antenna,  # type: ignore[arg-type]  # has `gain`
+                    Omnidirectional(),  # type: ignore[arg-type]  # has `gain`
+                    tx_power_dbm=self.tx_power_dbm,
+                )
+                q = np.where(turned[rows, None], anchors.orientations[rows], _ANY_ATTITUDE)
+                power[:, rows] = received_power_dbm(
+                    away[:, rows], _ANY_ATTITUDE, np.zeros(3), q, link
+                )
+        return power
+
+
+@dataclass(frozen=True)
+class FixedNoise:
+    """The same noise everywhere. std : m, standard deviation of one reception."""
+
+    std: float
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.std < 100.0:
+            raise InputError(
+                f"noise: {self.std!r} m is not a standard deviation; give one above 0, e.g. 0.06."
+            )
+
+    def variance(self, points: np.ndarray, anchors: Anchors) -> np.ndarray:
+        """Return the variance of the range of one reception: (n, N) m^2."""
+        return np.full((len(points), len(anchors)), self.std**2)
+
+
+def variance_gradient(
+    noise: RadioNoise | FixedNoise,
+    points: np.ndarray,
+    anchors: Anchors,
+    variance: np.ndarray,
+    dimensions: int,
+) -> np.ndarray:
+    """Return the derivative of noise.variance along x, y (and z): (n, N, dimensions) m.
+
+    One-sided differences. variance : (n, N) m^2, noise.variance at the points.
+    """
+    steps = _STEP * np.eye(3)[:dimensions]
+    return (
+        np.stack([noise.variance(points + step, anchors) - variance for step in steps], axis=-1)
+        / _STEP
+    )
+
+
+def antenna_from_yaml(path: str | Path) -> Antenna:
+    """Read an Antenna from a YAML file. Raises InputError.
+
+    The fields are azimuth, elevation_1 and elevation_2 (dBi, around the full circle), and optionally
+    gain_offset, see `uwb_tdoa_bias.common.radio.Antenna`.
+    """
+    content = read_yaml(path)
+    try:
+        cuts: dict[str, Any] = {
+            name: tuple(content.pop(name)) for name in ("azimuth", "elevation_1", "elevation_2")
+        }
+        return Antenna(**cuts, **content)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{path}: is no antenna ({error!r}); give lists azimuth, elevation_1 and "
+            "elevation_2 of gains in dBi."
+        ) from error
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """TDOAs or ranges of one round, measured independently of its other Pairings.
+
+    Attributes
+    ----------
+    a, b : (M,) rows of the anchors, d_ab = |p - b| - |p - a|
+    shared : True if the TDOAs of a round share one reception per anchor, and its error. False if
+        their errors are independent.
+    times : number of times that each TDOA comes in a round (default 1)
+    ranges : True for distances to the anchors of `a`, once a round
+    """
+
+    a: np.ndarray
+    b: np.ndarray
+    shared: bool
+    times: float = 1.0
+    ranges: bool = False
+
+
+def ring(n: int) -> Pairing:
+    """Return the N TDOAs of TDOA2: each anchor with the next one, and the last with the first."""
+    return Pairing(np.arange(n), (np.arange(n) + 1) % n, True)
+
+
+def all_pairs(n: int) -> Pairing:
+    """Return the TDOAs of TDOA3: each anchor with each other, with independent errors.
+
+    A round counts as N TDOAs.
+    """
+    a, b = np.triu_indices(n, 1)
+    return Pairing(a, b, False, 2.0 / (n - 1))
+
+
+def every_range(n: int) -> Pairing:
+    """Return the N distances of two-way ranging."""
+    return Pairing(np.arange(n), np.arange(n), False, ranges=True)
+
+
+# Parts of a round, by the words of choices.OF_PROTOCOL
+PARTS: dict[str, Callable[[int], Pairing]] = {
+    "ring": ring,
+    "all_pairs": all_pairs,
+    "every_range": every_range,
+}
+
+
+SAME_PLACE = 0.01  # m; two anchors nearer than this are one
+# of the largest distance: so close to one plane (line), its two sides are ambiguous
+FLAT = 0.01
+
+
+@dataclass(frozen=True)
+class Installation:
+    """Anchors, their radio, and what the tag measures. Raises InputError for useless anchors.
+
+    Attributes
+    ----------
+    anchors : Anchors
+    noise : RadioNoise or FixedNoise of a reception
+    pairing : what one round holds, of choices.OF_PROTOCOL (default: the ring of TDOA2)
+    dimensions : 3, or 2 for a tag at a known height
+    height_std : m, of a height sensor on the tag, used with each round; inf for none (default)
+    hall : True if each place hears only a part of the anchors (default False). The part may be
+        small, or in a plane.
+    """
+
+    anchors: Anchors
+    noise: RadioNoise | FixedNoise = field(default_factory=RadioNoise)
+    pairing: str = "ring"
+    dimensions: int = 3
+    height_std: float = np.inf
+    hall: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.height_std > 0.0 or (self.dimensions == 2 and self.height_std < np.inf):
+            raise InputError(
+                f"height std: {self.height_std!r} m is not the standard deviation of a height "
+                "sensor; give one above 0, "
+                "e.g. 0.02, and none for a tag of known height."
+            )
+        if not self.hall:
+            check_anchors(self.anchors, self.unknowns)
+
+    def with_anchors(self, anchors: Anchors) -> Installation:
+        """Return a copy for a hall with other Anchors."""
+        return replace(self, anchors=anchors, hall=True)
+
+    def round(self, heard: int) -> list[Pairing]:
+        """Return the parts of a round of so many anchors, measured independently."""
+        return [PARTS[name](heard) for name in self.pairing.split("+")]
+
+    @property
+    def measures_ranges(self) -> bool:
+        """Whether a round holds distances: those to anchors that are not in a plane have one solution."""
+        return "every_range" in self.pairing
+
+    @property
+    def unknowns(self) -> int:
+        """Coordinates that TDOAs must determine: 2 if the height is known or measured, else 3."""
+        return 2 if self.height_std < np.inf else self.dimensions
+
+    def with_height(self, information: np.ndarray) -> np.ndarray:
+        """Return the information (n, k, k) 1/m^2 plus that of the height sensor."""
+        if self.height_std < np.inf:
+            information = information + np.diag([0.0, 0.0, self.height_std**-2])
+        return information
+
+    def inside_hull(self, points: np.ndarray) -> np.ndarray:
+        """Return whether points (n, 3) m are inside the convex hull of the anchors: (n,).
+
+        The hull is two-dimensional, seen from above, if the height is known or measured.
+        """
+        k = self.unknowns
+        hull = Delaunay(self.anchors.positions[:, :k])
+        return hull.find_simplex(points[:, :k]) >= 0
+
+
+def check_anchors(anchors: Anchors, dimensions: int) -> None:
+    """Raise InputError, with the remedy, for anchors that determine no position."""
+    what = {2: "a position at known height", 3: "a position in space"}[dimensions]
+    if len(anchors) < dimensions + 1:
+        raise InputError(
+            f"anchors: {len(anchors)} were given; {what} needs at least {dimensions + 1}."
+        )
+    away = np.linalg.norm(anchors.positions[:, None] - anchors.positions, axis=-1) + 1e9 * np.eye(
+        len(anchors)
+    )
+    i, j = np.unravel_index(np.argmin(away), away.shape)
+    if away[i, j] < SAME_PLACE:
+        raise InputError(
+            f"anchors: {anchors.ids[i]} and {anchors.ids[j]} are at the same place; move or "
+            "delete one."
+        )
+    size = principal_extents(anchors.positions[:, :dimensions])
+    if size[1] <= FLAT * size[0]:
+        seen = "seen from above " if dimensions == 2 else ""
+        raise InputError(
+            f"anchors: all are on one line {seen}to {size[1]:.3f} m; move one of them out of it."
+        )
+    if dimensions == 3 and size[2] <= FLAT * size[0]:
+        sides = sides_of(anchors.positions)
+        raise InputError(
+            f"anchors: all are in one plane to {size[2]:.3f} m, so that its two sides cannot "
+            "be told apart; move one "
+            "of them out of it, or plan for a tag of known height (--planar) or one that "
+            "measures it (--with height)"
+            f"{'; or ' + to_copy(sides) if sides else ''}."
+        )
+
+
+def principal_extents(positions: np.ndarray) -> np.ndarray:
+    """Return the extents of positions (..., N, k) m along their principal axes: (..., k) m.
+
+    The longest comes first.
+    """
+    centred = positions - positions.mean(axis=-2, keepdims=True)
+    return np.ptp(
+        centred @ np.linalg.svd(centred, full_matrices=False)[2].swapaxes(-1, -2), axis=-2
+    )
+
 
 # standard deviations of a normal variable that hold 99 %, as rounded in Grasso et al., sec. 2.2.3
 NORMAL_99 = 2.58
+UNUSABLE = 100.0  # m, stands for an infinite bound, and for a layout that determines no position
 _CHUNK = 200_000  # numbers in the largest array of one step: what a processor cache holds
 
 

@@ -19,9 +19,8 @@ from ..bags.topics import LATCHED_QOS
 from ..checking.coverage import to_copy
 from ..scoring.gains import change_in_words
 from ..simulation.rooms import Room
-from .installation import Installation
 from .maps import FLYABLE, IMPRECISE, OUTSIDE, TOO_FEW, TWO_SOLUTIONS, Chart, Grid
-from .precision import NORMAL_99, dilution
+from .precision import NORMAL_99, Installation, dilution
 
 SHARES = {
     "flyable": FLYABLE,

@@ -25,9 +25,9 @@ from ..readers.inputs import Reading, Recording
 from ..simulation.rooms import Room, Walls, room_of
 from . import maps, optimisation, plots, report
 from .hall import Hall, design, placements, step_of
-from .installation import FixedNoise, Installation, RadioNoise, antenna_from_yaml
-from .layout import AnchorPlaces, Goal, lattice
 from .maps import Chart, Demand, Grid
+from .optimisation import AnchorPlaces, Goal, lattice
+from .precision import FixedNoise, Installation, RadioNoise, antenna_from_yaml
 
 FARTHEST = 30.0  # m, size of a room from which on the radio's reach must be given
 # cells along the longest side, without --step

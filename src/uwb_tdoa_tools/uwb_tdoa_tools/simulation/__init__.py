@@ -12,7 +12,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.flight import Flight, Truth
 
-from . import sensors, tdoas
+from . import sensors
 from .config import NO_IMU_ERRORS, ImuErrors, SimulationConfig
 from .vehicles import VEHICLES, Flyable
 
@@ -47,7 +47,7 @@ def simulate(config: SimulationConfig, trajectory: Flyable | None = None) -> Fli
     )
     t_truth = np.arange(1, int(filled.duration * filled.truth_rate) + 1) / filled.truth_rate
     motion = flown.motion(t_truth)
-    tdoa, tdoa_truth, parameters = tdoas.measure_tdoas(filled, room, flown)
+    tdoa, tdoa_truth, parameters = sensors.measure_tdoas(filled, room, flown)
 
     newest = np.maximum(np.searchsorted(t_imu, t_truth + 1e-9) - 1, 0)
     state = {"t": t_truth}

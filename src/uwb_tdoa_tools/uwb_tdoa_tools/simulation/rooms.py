@@ -4,8 +4,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 import re
 from typing import Any
@@ -75,80 +76,18 @@ def corners(x: float = 7.0, y: float = 8.0, z: float = 3.0, level: bool = True) 
         (a, b, z),
         (-a, b, LOW),
     ]
-    return facing(positions, (0.0, 0.0, 0.5 * z), level, np.array(positions)[:, 2] > 0.5 * z)
+    return _around(positions, 0.5 * z, 0.5 * z, level)
 
 
-def wall_middles() -> Anchors:
-    """Place four low anchors at the middles of the walls, four high ones in the corners, 7 x 8 x 3 m."""
-    positions = [
-        (-3.5, 0, LOW),
-        (3.5, 4, 3),
-        (0, -4, LOW),
-        (-3.5, 4, 3),
-        (3.5, 0, LOW),
-        (-3.5, -4, 3),
-        (0, 4, LOW),
-        (3.5, -4, 3),
-    ]
-    return facing(positions, (0.0, 0.0, 1.5), inverted=np.array(positions)[:, 2] > 1.5)
+def _around(
+    positions: ArrayLike, height: float, inverted_above: float = np.inf, level: bool = True
+) -> Anchors:
+    """Return Anchors that face the point at a height, m, in the middle.
 
-
-def staircase() -> Anchors:
-    """Place eight upright anchors around the walls of 7 x 8 x 3 m, each higher than the previous one."""
-    x = [-3.5, 0.0, 3.5, 3.5, 3.5, 0.0, -3.5, -3.5]
-    y = [-4.0, -4.0, -4.0, 0.0, 4.0, 4.0, 4.0, 0.0]
-    return facing(
-        np.column_stack([x, y, np.linspace(LOW, 3.0, 8)[[0, 4, 1, 5, 2, 6, 3, 7]]]), (0.0, 0.0, 1.5)
-    )
-
-
-def pillars() -> Anchors:
-    """Place anchors at three heights on each of four pillars inside 7 x 8 x 3 m: 12 anchors."""
-    feet = [(-2.8, -2.6), (2.5, -3.2), (2.9, 2.7), (-2.4, 3.3)]
-    positions = [(x, y, z) for z in (0.3, 1.6, 2.9) for x, y in feet]
-    return facing(positions, (0.0, 0.0, 1.5), inverted=np.array(positions)[:, 2] > 2.0)
-
-
-def six() -> Anchors:
-    """Place three low and three high anchors on two opposite triangles in 6 x 6 x 2.8 m."""
-    angle = np.deg2rad([90, 270, 210, 30, 330, 150])
-    z = np.array([LOW, 2.8, LOW, 2.8, LOW, 2.8])
-    return facing(
-        np.column_stack([3 * np.cos(angle), 3 * np.sin(angle), z]), (0.0, 0.0, 1.4), inverted=z > 1
-    )
-
-
-def six_wide() -> Anchors:
-    """Place six anchors on the walls of 12 x 8 m, at 0.8 and 2.8 m in turn, for rovers."""
-    x = np.array([-6.0, 0.0, 6.0, 6.0, 0.0, -6.0])
-    y = np.repeat([-4.0, 4.0], 3)
-    z = np.tile([0.8, 2.8], 3)
-    return facing(np.column_stack([x, y, z]), (0.0, 0.0, 1.0), inverted=z > 1)
-
-
-def hall() -> Anchors:
-    """Place sixteen anchors along the walls of a hall of 14 x 20 x 5 m, low and high in turn."""
-    rim = [(-7, -10), (-7, -5), (-7, 0), (-7, 5), (-7, 10), (-3.5, 10), (0, 10), (3.5, 10)]
-    rim += [(-x, -y) for x, y in rim]
-    z = np.where(np.arange(16) % 2, 5.0, 0.3)
-    return facing(np.column_stack([rim, z]), (0.0, 0.0, 2.5), inverted=z > 1)
-
-
-def planar() -> Anchors:
-    """Place four anchors at the corners of 4 x 4 m, 0.2 m high, facing the centre.
-
-    Grasso et al. (Sensors 2022), section 2.1.
+    inverted_above : m, anchors higher than this hang upside down
     """
-    return facing([(-2, -2, 0.2), (2, -2, 0.2), (2, 2, 0.2), (-2, 2, 0.2)], (0.0, 0.0, 0.2))
-
-
-def pair() -> Anchors:
-    """Place two anchors 4.5 m apart at 1.25 m, facing each other.
-
-    The default place of hovering is half-way between them: the bench of Zhao et al. (RA-L 2021),
-    figure 4.
-    """
-    return facing([(-2.25, 0, 1.25), (2.25, 0, 1.25)], (0.0, 0.0, 1.25))
+    positions = np.asarray(positions, dtype=float)
+    return facing(positions, (0.0, 0.0, height), level, positions[:, 2] > inverted_above)
 
 
 def random(seed: int, count: int = 8) -> Anchors:
@@ -179,19 +118,72 @@ def random(seed: int, count: int = 8) -> Anchors:
     )
 
 
-CONSTELLATIONS = {
+_FEET = [(-2.8, -2.6), (2.5, -3.2), (2.9, 2.7), (-2.4, 3.3)]  # of pillars
+_RIM = [(-7, -10), (-7, -5), (-7, 0), (-7, 5), (-7, 10), (-3.5, 10), (0, 10), (3.5, 10)]
+_SIX = np.deg2rad([90, 270, 210, 30, 330, 150])  # directions from the middle
+CONSTELLATIONS: dict[str, Callable[[], Anchors]] = {
     "corners": corners,
-    "tilted": lambda: corners(level=False),
-    "low_ceiling": lambda: corners(6.0, 7.0, 2.4),
-    "small_room": lambda: corners(5.0, 4.5, 2.6),
-    "wall_middles": wall_middles,
-    "staircase": staircase,
-    "pillars": pillars,
-    "six": six,
-    "six_wide": six_wide,
-    "hall": hall,
-    "planar": planar,
-    "pair": pair,
+    "tilted": partial(corners, level=False),
+    "low_ceiling": partial(corners, 6.0, 7.0, 2.4),
+    "small_room": partial(corners, 5.0, 4.5, 2.6),
+    # four low anchors at the middles of the walls, four high ones in the corners, 7 x 8 x 3 m
+    "wall_middles": partial(
+        _around,
+        [
+            (-3.5, 0, LOW),
+            (3.5, 4, 3),
+            (0, -4, LOW),
+            (-3.5, 4, 3),
+            (3.5, 0, LOW),
+            (-3.5, -4, 3),
+            (0, 4, LOW),
+            (3.5, -4, 3),
+        ],
+        1.5,
+        1.5,
+    ),
+    # eight upright anchors around the walls of 7 x 8 x 3 m, each higher than the previous one
+    "staircase": partial(
+        _around,
+        np.column_stack(
+            [
+                [-3.5, 0.0, 3.5, 3.5, 3.5, 0.0, -3.5, -3.5],
+                [-4.0, -4.0, -4.0, 0.0, 4.0, 4.0, 4.0, 0.0],
+                np.linspace(LOW, 3.0, 8)[[0, 4, 1, 5, 2, 6, 3, 7]],
+            ]
+        ),
+        1.5,
+    ),
+    # anchors at three heights on each of four pillars inside 7 x 8 x 3 m
+    "pillars": partial(_around, [(*at, z) for z in (0.3, 1.6, 2.9) for at in _FEET], 1.5, 2.0),
+    # three low and three high anchors on two opposite triangles in 6 x 6 x 2.8 m
+    "six": partial(
+        _around,
+        np.column_stack([3 * np.cos(_SIX), 3 * np.sin(_SIX), np.tile([LOW, 2.8], 3)]),
+        1.4,
+        1.0,
+    ),
+    # six anchors on the walls of 12 x 8 m, at 0.8 and 2.8 m in turn, for rovers
+    "six_wide": partial(
+        _around,
+        np.column_stack(
+            [[-6.0, 0.0, 6.0, 6.0, 0.0, -6.0], np.repeat([-4.0, 4.0], 3), np.tile([0.8, 2.8], 3)]
+        ),
+        1.0,
+        1.0,
+    ),
+    # sixteen anchors along the walls of a hall of 14 x 20 x 5 m, low and high in turn
+    "hall": partial(
+        _around,
+        np.column_stack([[*_RIM, *((-x, -y) for x, y in _RIM)], np.tile([0.3, 5.0], 8)]),
+        2.5,
+        1.0,
+    ),
+    # four anchors at the corners of 4 x 4 m: Grasso et al. (Sensors 2022), section 2.1
+    "planar": partial(_around, [(-2, -2, 0.2), (2, -2, 0.2), (2, 2, 0.2), (-2, 2, 0.2)], 0.2),
+    # two anchors 4.5 m apart at 1.25 m, facing each other. The default place of hovering is half-way
+    # between them: the bench of Zhao et al. (RA-L 2021), figure 4.
+    "pair": partial(_around, [(-2.25, 0, 1.25), (2.25, 0, 1.25)], 1.25),
 }
 
 

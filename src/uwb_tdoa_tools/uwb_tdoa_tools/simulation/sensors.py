@@ -1,21 +1,333 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Simulated sensors besides TDOAs: the inertial sensor, and each of SENSORS."""
+"""Simulated sensors: TDOAs with the errors of both arrival times, the inertial sensor, and SENSORS."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.common.flight import Imu
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import Imu, Tdoas
+from uwb_tdoa_bias.common.geometry import tdoa
+from uwb_tdoa_bias.common.radio import FLAT_MOUNT, Antenna, RadioLink, arrival_bias
 from uwb_tdoa_bias.common.sensors import SENSORS, Stream, Velocity
 
 from .config import WHEELS_RATE, ImuErrors, SimulationConfig
-from .rooms import Room
+from .rooms import Room, heard_at
 from .vehicles import Flyable
+
+SLOT = 2.0e-3  # s, TDOA2: one packet per slot
+SLOT_JITTER = 1.0e-4  # s, standard deviation of a stamp around its slot
+PACKET_LOSS = 0.025  # TDOA2: share of lost packets; each costs its two pairs
+TDOA3_DEAD_TIME = 0.5e-3  # s, the shortest time between two measurements
+TDOA3_MEAN_WAIT = 3.6e-3  # s, mean of the additional exponential wait: 240 TDOAs per second
+UNIT_GAIN_SPREAD = 0.7  # dB, tag to tag
+UNIT_MOUNT_SPREAD = np.deg2rad(2.0)  # rad, tag to tag
+MULTIPATH_HEIGHT = (0.1, 0.4)  # m, full strength below the first, none above the second
+MULTIPATH_SIZE = 0.3  # m, standard deviation of the process at full strength
+MULTIPATH_TIME = 0.5  # s, correlation time
+# Outliers: share, smallest, largest size (m), of either sign. Three kinds are reported by users of
+# the Loco Positioning
+# System (crazyflie-firmware issues 277, 305, 375): about 0.5 m, 3 - 5 m, more than 20 m.
+OUTLIER_KINDS = ((0.6, 0.4, 0.6), (0.3, 3.0, 5.0), (0.1, 20.0, 250.0))
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """One row per measurement, of the ordered pair (a, b) at the arrival of b's packet.
+
+    Attributes
+    ----------
+    t : (n,) s, rising.
+    a, b : (n,) rows of the anchors.
+    heard_a, heard_b : (n,) number of the reception of each arrival time. Two measurements with the
+        same reception share its noise.
+    sender : (m,) row of the anchor of each reception.
+    """
+
+    t: np.ndarray
+    a: np.ndarray
+    b: np.ndarray
+    heard_a: np.ndarray
+    heard_b: np.ndarray
+    sender: np.ndarray
+
+
+def make_schedule(
+    protocol: str,
+    n_anchors: int,
+    duration: float,
+    rng: np.random.Generator,
+    rate: float | None = None,
+) -> Schedule:
+    """Return the Schedule of "tdoa2" or "tdoa3" from 0 to `duration`, s, for at least 2 anchors.
+
+    `rate` is TDOAs per second, by losses (tdoa2) or waits (tdoa3); default: of the protocol.
+    """
+    if protocol == "tdoa2":
+        return _tdoa2(
+            n_anchors,
+            duration,
+            rng,
+            PACKET_LOSS if rate is None else 1.0 - np.sqrt(min(rate * SLOT, 1.0)),
+        )
+    return _tdoa3(
+        n_anchors,
+        duration,
+        rng,
+        TDOA3_MEAN_WAIT if rate is None else max(1.0 / rate - TDOA3_DEAD_TIME, 0.0),
+    )
+
+
+def restrict_to_heard(
+    schedule: Schedule,
+    heard: Sequence[np.ndarray],
+    protocol: str,
+    rng: np.random.Generator,
+    cells: np.ndarray | None = None,
+) -> Schedule:
+    """Restrict a Schedule to the anchors that the tag hears.
+
+    TDOA2: the heard anchors of a cell send in turn, in the order of their rows. Cells out of reach
+    of each other use the same slots. TDOA3: any two heard anchors of a cell. The cell is drawn,
+    weighted by its number of heard anchors. With fewer than two anchors there is no measurement.
+
+    Parameters
+    ----------
+    heard : n arrays of rising rows, the heard anchors at each measurement.
+    cells : (N,) number of the cell of each anchor. Each cell has a clock, and a TDOA needs two
+        anchors of a cell. None for a single clock.
+    """
+    rows, pairs, numbers = [], [], []  # of measurements, (a, b) and their receptions
+    senders: list[int] = []  # row of the anchor of each reception
+    latest: dict[int, int] = {}  # the latest reception of each anchor
+
+    def receive(anchor: int) -> None:
+        latest[anchor] = len(senders)
+        senders.append(anchor)
+
+    chosen = rng.random((len(heard), 2))
+    if cells is not None:
+        heard = [
+            _of_one_cell(near, cells, draw) for near, draw in zip(heard, rng.random(len(heard)))
+        ]
+    for row, (near, (first, second)) in enumerate(zip(heard, chosen)):
+        if len(near) < 2:
+            continue
+        if protocol == "tdoa2":
+            b = row % len(near)
+            a = b - 1
+        else:
+            b = int(first * len(near))
+            a = (b + 1 + int(second * (len(near) - 1))) % len(near)
+        a, b = int(near[a]), int(near[b])
+        if a not in latest:
+            receive(a)
+        of_a = latest[a]
+        receive(b)
+        rows.append(row)
+        pairs.append((a, b))
+        numbers.append((of_a, latest[b]))
+    (rows_a, rows_b), (heard_a, heard_b) = (
+        np.array(each, int).reshape(-1, 2).T for each in (pairs, numbers)
+    )
+    sender = np.array(senders, int)
+    return replace(
+        schedule,
+        t=schedule.t[rows],
+        a=rows_a,
+        b=rows_b,
+        heard_a=heard_a,
+        heard_b=heard_b,
+        sender=sender,
+    )
+
+
+def _of_one_cell(near: np.ndarray, cells: np.ndarray, draw: float) -> np.ndarray:
+    """Return the rows of anchors, (k,), in the cell of the anchor that `draw`, 0 ... 1, selects."""
+    return near[cells[near] == cells[near[int(draw * len(near))]]] if len(near) else near
+
+
+def _tdoa2(n_anchors: int, duration: float, rng: np.random.Generator, loss: float) -> Schedule:
+    """Make a ring: anchors send in turn, and each packet is compared with the previous slot."""
+    n = max(int(duration / SLOT), 2)
+    sender = np.arange(n) % n_anchors
+    jitter = np.clip(SLOT_JITTER * rng.standard_normal(n), -0.4 * SLOT, 0.4 * SLOT)
+    t = (np.arange(n) + 0.5) * SLOT + jitter
+    received = rng.random(n) >= loss
+    k = 1 + np.flatnonzero(received[1:] & received[:-1])
+    return Schedule(t[k], sender[k - 1], sender[k], k - 1, k, sender)
+
+
+def _tdoa3(n_anchors: int, duration: float, rng: np.random.Generator, wait: float) -> Schedule:
+    """Make random pairs: a packet is compared with the newest packet of a random other anchor."""
+    n = int(1.3 * duration / (TDOA3_DEAD_TIME + wait)) + 50
+    t = np.cumsum(TDOA3_DEAD_TIME + rng.exponential(wait, n))
+    b = rng.integers(0, n_anchors, n)
+    a = (b + rng.integers(1, n_anchors, n)) % n_anchors
+    n = int(np.searchsorted(t, duration))
+    t, a, b = t[:n], a[:n], b[:n]
+    sender = np.concatenate([np.arange(n_anchors), b])  # all anchors are heard once at the start
+    heard_b = n_anchors + np.arange(n)
+    heard_a = np.empty(n, dtype=np.int64)
+    for anchor in range(n_anchors):
+        heard = np.flatnonzero(sender == anchor)
+        rows = np.flatnonzero(a == anchor)
+        heard_a[rows] = heard[np.searchsorted(heard, heard_b[rows]) - 1]
+    return Schedule(t, a, b, heard_a, heard_b, sender)
+
+
+def tag_link(unit: int) -> RadioLink:
+    """Return the RadioLink of a tag specimen: 0 is nominal, others differ in gain and mounting."""
+    if unit == 0:
+        return RadioLink()
+    rng = np.random.default_rng([unit, 20])
+    gain = UNIT_GAIN_SPREAD * rng.standard_normal()
+    turn = Rotation.from_rotvec(UNIT_MOUNT_SPREAD * rng.standard_normal(3))
+    mount = tuple((turn * Rotation.from_quat(FLAT_MOUNT)).as_quat().tolist())
+    return RadioLink(tag_antenna=Antenna(gain_offset=gain), tag_mount=mount)
+
+
+def measure_tdoas(
+    config: SimulationConfig, room: Room, trajectory: Flyable
+) -> tuple[Tdoas, dict[str, np.ndarray], dict[str, Any]]:
+    """Simulate all TDOAs of a flight with a complete config: (Tdoas, truth, parameters).
+
+    d_ab = (rho_b + e_b) - (rho_a + e_a) + outlier. The error e of an arrival is bias + multipath +
+    noise. Both distances are at the stamp of the measurement.
+
+    Returns
+    -------
+    truth : dict of "t" and the (n,) errors "bias", "multipath", "noise", "outlier", m.
+    parameters : the constants of the errors.
+    """
+    assert config.anchors is not None  # complete
+    anchors, random = config.anchors, config.random
+    schedule = make_schedule(
+        config.protocol, len(anchors), config.duration, random("schedule"), config.tdoa_rate
+    )
+    if config.radio_reach is not None:
+        heard = heard_at(
+            trajectory.motion(schedule.t).p, anchors.positions, config.radio_reach, config.walls
+        )
+        cells = None if config.cell_ids is None else anchors.ids // config.cell_ids
+        schedule = restrict_to_heard(schedule, heard, config.protocol, random("reach"), cells)
+        if not len(schedule.t):
+            raise InputError(
+                f"radio_reach: two anchors are nowhere heard within {config.radio_reach:g} m "
+                "of the path; give a larger one, or another place."
+            )
+    t, a, b = schedule.t, schedule.a, schedule.b
+    motion = trajectory.motion(t)
+    p_tag = motion.p + Rotation.from_quat(motion.q).apply(config.tag_lever_arm)
+
+    zero = np.zeros(len(t))
+    link = tag_link(config.tag_unit)
+    delays = config.anchor_delay_std * random("anchor delays").standard_normal(len(anchors))
+    bias = zero
+    if config.bias:
+        late_b, late_a = (
+            delays[k]
+            + arrival_bias(p_tag, motion.q, anchors.positions[k], anchors.orientations[k], link)
+            for k in (b, a)
+        )
+        bias = late_b - late_a
+    multipath = zero
+    if config.multipath:
+        late = floor_multipath(
+            t,
+            p_tag[:, 2] - room.lower[2],
+            np.stack([a, b]),
+            len(anchors),
+            random("multipath"),
+            config.duration,
+        )
+        multipath = late[1] - late[0]
+    noise = tdoa_noise(
+        schedule, np.asarray(config.anchor_noise_std), config.shared_noise, random("tdoa noise")
+    )
+    outlier = outliers(len(t), config.outlier_probability, random("outliers"))
+
+    d = tdoa(p_tag, anchors.positions[a], anchors.positions[b]) + bias + multipath + noise + outlier
+    truth = {"t": t, "bias": bias, "multipath": multipath, "noise": noise, "outlier": outlier}
+    parameters = {
+        "anchor_delays": dict(
+            zip(anchors.ids.tolist(), (delays if config.bias else 0.0 * delays).tolist())
+        ),
+        "tag_mount": list(link.tag_mount),
+        "tag_gain_offset": link.tag_antenna.gain_offset,
+    }
+    return Tdoas(t, anchors.ids[a], anchors.ids[b], d), truth, parameters
+
+
+def tdoa_noise(
+    schedule: Schedule, anchor_std: np.ndarray, shared: bool, rng: np.random.Generator
+) -> np.ndarray:
+    """Return the white noise of every measurement, (n,) m.
+
+    If `shared`, it is the difference of the noises of both receptions. Two TDOAs with the reception
+    of anchor j in common then have the covariance -std_j^2 (Grasso et al. 2022, eqs. 4 - 5).
+    """
+    if shared:
+        arrival = anchor_std[schedule.sender] * rng.standard_normal(len(schedule.sender))
+        return arrival[schedule.heard_b] - arrival[schedule.heard_a]
+    return np.hypot(anchor_std[schedule.a], anchor_std[schedule.b]) * rng.standard_normal(
+        len(schedule.t)
+    )
+
+
+def outliers(n: int, probability: float, rng: np.random.Generator) -> np.ndarray:
+    """Return errors, (n,) m, that are zero except for the given share."""
+    share, smallest, largest = np.array(OUTLIER_KINDS).T
+    hit = rng.random(n) < probability
+    kind = rng.choice(len(share), n, p=share)
+    size = rng.uniform(smallest[kind], largest[kind])
+    return np.where(hit, np.copysign(size, rng.uniform(-1.0, 1.0, n)), 0.0)
+
+
+def floor_multipath(
+    t: np.ndarray,
+    height: np.ndarray,
+    anchor: np.ndarray,
+    n_anchors: int,
+    rng: np.random.Generator,
+    duration: float,
+) -> np.ndarray:
+    """Return delays of anchors by reflection near the floor, (k, n) m, never negative.
+
+    Own model: the positive part of a Gaussian process with exponential correlation, one per anchor.
+    It fades out linearly with height.
+
+    Parameters
+    ----------
+    t : (n,) s in 0 ... duration.
+    height : (n,) m, tag above the floor.
+    anchor : (k, n) rows of k of n_anchors at each t.
+    """
+    from scipy.signal import lfilter  # takes a second to import
+
+    dt = 0.05
+    decay = np.exp(-dt / MULTIPATH_TIME)
+    white = rng.standard_normal((int(duration / dt) + 2, n_anchors))
+    white[1:] *= np.sqrt(1.0 - decay**2)
+    process = lfilter([1.0], [1.0, -decay], white, axis=0)
+    low, high = MULTIPATH_HEIGHT
+    strength = MULTIPATH_SIZE * np.clip((high - height) / (high - low), 0.0, 1.0)
+    late = np.zeros(anchor.shape)
+    near = np.flatnonzero(strength > 0.0)
+    at, which = t[near] / dt, anchor[:, near]
+    row = at.astype(int)
+    part = at - row
+    late[:, near] = strength[near] * np.maximum(
+        (1.0 - part) * process[row, which] + part * process[row + 1, which], 0.0
+    )
+    return late
+
 
 YAW_RATE_STD = 0.02  # rad/s
 SLIP_EVERY, SLIP_TIME = 10.0, 0.5  # s
