@@ -8,6 +8,7 @@ import gc
 import os
 from pathlib import Path
 import random
+import re
 import signal
 import sys
 
@@ -38,6 +39,7 @@ LONGEST = """checking_check calibrating launch_files distribution walks commands
     checking_report diagnosis_report study_plans first_map live_replay train alignment warehouse
     rerun profiles evaluate study_odd_messages stream_watch nodes both_nodes surroundings
     checking_trials callees""".split()
+USES_ROS = re.compile(r'(importorskip\("|^from |^import )(rclpy|uwb_tdoa_msgs)', re.MULTILINE)
 # Number of later tests that may not reuse the domain of a test.
 # A killed node stays visible for 20 s.
 KEPT = 3
@@ -65,8 +67,7 @@ def _take_domain():
 
 @cache
 def _uses_ros(path):
-    text = path.read_text()
-    return "rclpy" in text or 'importorskip("uwb_tdoa_msgs' in text
+    return USES_ROS.search(path.read_text())
 
 
 def pytest_collection_modifyitems(items):
