@@ -61,7 +61,6 @@ KEYS = {
     "rerun": (None, "rerun-sdk"),  # for --rerun
     "rosbags": ("python3-rosbags-pip", "rosbags"),
     "pandas": (None, "pandas"),  # optional, for tables
-    "rotorpy": (None, "rotorpy"),  # optional, a reference for tests
     "scipy": ("python3-scipy", "scipy"),
     "sklearn": ("python3-sklearn", "scikit-learn"),
     "tqdm": ("python3-tqdm", "tqdm"),
@@ -219,7 +218,7 @@ def test_pyproject_declares_what_is_imported_and_nothing_else():
     text = "dependencies =" + text.partition("[project.scripts]")[0]
     lists = re.findall(r"^\w+ = (\[.*?\])(?: #[^\n]*)?$", text, re.MULTILINE | re.DOTALL)
     names = [re.match(r"[\w.-]+", one)[0] for some in lists for one in ast.literal_eval(some)]
-    imported = set().union(*map(needed, PACKAGES)) | {"rotorpy"}  # tests without it are skipped
+    imported = set().union(*map(needed, PACKAGES))
     assert sorted(names) == sorted({KEYS[name][1] for name in imported if name in KEYS})
 
 
