@@ -12,9 +12,6 @@ import pytest
 
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
-from dataclasses import replace  # noqa: E402
-from fractions import Fraction  # noqa: E402
-from types import SimpleNamespace
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus

@@ -9,7 +9,7 @@ import subprocess
 import time
 
 from documented import ROOT
-from programs import start
+import programs
 import pytest
 
 pytest.importorskip("uwb_tdoa_msgs.msg")
@@ -89,7 +89,9 @@ def test_an_interrupt_ends_all_nodes(tmp_path):
     corners().to_yaml(tmp_path / "anchors.yaml")
     words = "namespace:=tag1", "body_frame:=drone", f"anchors_file:={tmp_path / 'anchors.yaml'}"
     with own_domain(), session("test", []) as (node, _):
-        launched = start(FILE, "uwb_tdoa_ekf", "tdoa.launch.py", *words, stderr=subprocess.STDOUT)
+        launched = programs.start(
+            FILE, "uwb_tdoa_ekf", "tdoa.launch.py", *words, stderr=subprocess.STDOUT
+        )
         try:
             until(lambda: node.count_publishers("/tag1/odometry"))
             until(lambda: node.count_publishers("/tag1/uwb/anchors"))
