@@ -196,17 +196,25 @@ def messages_of(
         arrays, or messages of numbers (Vector3, Quaternion), with a dot before a field of a field.
     frame : frame_id.
     """
-    make = _maker(store, kind)
-    columns = {
-        field: np.broadcast_to(values, (len(t), *np.shape(values)[1:]))
-        for field, values in content.items()
-    }
+    make, columns = _maker(store, kind), []
+    for field, each in content.items():
+        *way, last = field.split(".")
+        parts = _parts(attrgetter(field)(make()))
+        values = np.broadcast_to(each, (len(t), *np.shape(each)[1:]))
+        columns.append((way, last, parts, values.tolist() if parts or values.ndim == 1 else values))
     for k, stamp in enumerate(nanoseconds(topic, t).tolist()):
         message = make()
-        message.header = header_of(store, stamp, frame)
-        for field, values in columns.items():
-            *way, last = field.split(".")
-            _set(reduce(getattr, way, message), last, values[k])
+        header = message.header
+        header.frame_id = frame
+        header.stamp.sec, header.stamp.nanosec = divmod(stamp, 10**9)
+        for way, last, parts, values in columns:
+            holder = reduce(getattr, way, message)
+            if parts:
+                vector = getattr(holder, last)
+                for part, number in zip(parts, values[k], strict=True):
+                    setattr(vector, part, number)
+            else:
+                setattr(holder, last, values[k])
         yield stamp, message
 
 
@@ -221,18 +229,10 @@ def _maker(store: Typestore, kind: str) -> Callable[[], Any]:
             makers.append(str if what[0] == "string" else int)
         else:
             makers.append(partial(np.zeros, what[1]))
-    return lambda: store.types[kind](*(make() for make in makers))
-
-
-def _set(holder: object, name: str, value: np.ndarray) -> None:
-    """Write a number, an array, or the numbers of a message (Vector3, Quaternion) to a field."""
-    old = getattr(holder, name)
-    parts = _parts(old)
-    if parts:
-        for part, number in zip(parts, value.tolist(), strict=True):
-            setattr(old, part, number)
-    else:
-        setattr(holder, name, np.ascontiguousarray(value) if np.ndim(value) else value.item())
+    message = store.types[kind]
+    if {str, int} >= {*makers}:  # quick: such values need no copy
+        return partial(message, *(make() for make in makers))
+    return lambda: message(*[make() for make in makers])
 
 
 def row_of(*fields: str) -> RowOfMessage:

@@ -259,8 +259,11 @@ class _Request:
             for name, column in raw.items():
                 cells = [column[k] for k in kept]
                 if name in ANCHORS:
-                    numbers = [self._ids.setdefault(name_of(c), len(self._ids)) for c in cells]
-                    columns[name] = np.array(numbers, np.int64)
+                    known = {
+                        cell: self._ids.setdefault(name_of(cell), len(self._ids))
+                        for cell in dict.fromkeys(cells)
+                    }
+                    columns[name] = np.array([known[cell] for cell in cells], np.int64)
                 else:
                     columns[name] = self._numbers(stream, name, cells, columns["place"])
             self._read[stream].append(columns)

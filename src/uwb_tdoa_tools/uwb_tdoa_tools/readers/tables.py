@@ -122,7 +122,7 @@ def _is_comment(text: str) -> bool:
 
 
 class CsvTable:
-    """Iterate over (line, cells) of the rows of a CSV file. Raises InputError.
+    """Iterate over blocks [(line, cells)] of the rows of a CSV file. Raises InputError.
 
     Attributes
     ----------
@@ -169,11 +169,11 @@ class CsvTable:
         comment = [line.strip("#% ") for line in above[-1:]]
         self.names = self._header(next(csv.reader(comment, **form), []))
 
-    def __iter__(self) -> Iterator[tuple[int, list[str]]]:
+    def __iter__(self) -> Iterator[list[tuple[int, list[str]]]]:
         budget = Budget(self._path, self._size)
-        for line, cells in self._cells:
-            budget.spend("cells", len(cells), self._most)
-            yield line, cells
+        while block := [*islice(self._cells, BLOCK)]:
+            budget.spend("cells", sum(len(cells) for _, cells in block), self._most)
+            yield block
 
     def place_of(self, name: str) -> int:
         """Return the place of a column. Raises InputError unless it is there once."""
@@ -305,7 +305,7 @@ def read_rows(
         if name not in table.names:
             raise InputError(f"{path}: has no column {name}; it needs columns {listed}.")
     places = {name: table.place_of(name) for name in columns}
-    for line, cells in table:
+    for line, cells in chain.from_iterable(table):
         if len(cells) <= max(places.values()):
             raise InputError(f"{path}: line {line}: has fewer cells than the header; complete it.")
         yield line, {name: cells[place] for name, place in places.items()}
@@ -377,8 +377,7 @@ class CsvFiles(Foreign):
                 if lacking := {*one.paths, one.each} - {*rows.names, ""}:
                     raise self.lacks(path, min(lacking))
             places = {name: rows.place_of(name) for _, one in mine for name in one.paths}
-            each = iter(rows)
-            while block := [*islice(each, BLOCK)]:
+            for block in rows:
                 self.counts[path] += len(block)
                 lines, cells = zip(*block)
                 columns = [*zip_longest(*cells, fillvalue="")]
