@@ -149,10 +149,47 @@ def apply(kind: str, *inputs: Any) -> Expression:
     if all(one.kind == "constant" for one in known):
         with np.errstate(all="ignore"):
             return constant(ELEMENTWISE[kind](*(one.value for one in known)))
+    if kind in ("sin", "cos") and known[0].kind == "atan2":
+        return _of_angle(kind, *known[0].inputs)
     for one, other in (known, known[::-1]) if kind in NEUTRAL else ():
         if other.kind == "constant" and (other.value == NEUTRAL[kind]).all():
             return one
     return Expression(kind, known)
+
+
+def _of_angle(kind: str, y: Expression, x: Expression) -> Expression:
+    """Return the sine or cosine of the angle of (x, y), without the angle."""
+    length = apply("sqrt", x * x + y * y)
+    share = (x if kind == "cos" else y) / length
+    return apply("where", apply("eq", length, 0.0), float(kind == "cos"), share)
+
+
+def remainder(x: Any, period: Any) -> Expression:
+    """Return what numpy.remainder does.
+
+    A comparison wraps an angle that is less than a turn off. The function floor of libm is slow.
+    """
+    low, high = _bounds(expressed(x))
+    if not isinstance(period, Expression) and -period <= low and high < period:
+        return apply("where", apply("lt", x, 0.0), x + period, x)
+    return apply("sub", x, period * apply("floor", x / period))
+
+
+def _bounds(one: Expression) -> tuple[float, float]:
+    """Return bounds of an Expression, as far as angles and their sums need them."""
+    known = [_bounds(each) for each in one.inputs] if one.kind in ("atan2", "sub", "where") else []
+    if one.kind == "constant":
+        return float(one.value.min()), float(one.value.max())
+    if one.kind == "sqrt":
+        return 0.0, np.inf
+    if one.kind == "atan2":
+        largest = ANGLE if known[1][0] < 0.0 else 0.5 * ANGLE
+        return -largest, largest
+    if one.kind == "sub":
+        return known[0][0] - known[1][1], known[0][1] - known[1][0]
+    if one.kind == "where":
+        return min(known[1][0], known[2][0]), max(known[1][1], known[2][1])
+    return -np.inf, np.inf
 
 
 class _Way:
@@ -266,7 +303,6 @@ class Program:
                 inputs = (places[id(each)] for each in one.inputs)
                 places[id(one)] = self._add(one.kind, tuple(inputs), one.value)
         self.outputs = [places[id(one)] for one in outputs]
-        self._keep_used()
 
     def _constant(self, one: Expression) -> int:
         """Return the place of a constant; of booleans by pair it is a comparison."""
@@ -291,83 +327,14 @@ class Program:
         return self._add("anchor", (), (end, _bytes(values)))
 
     def _add(self, kind: str, inputs: tuple[int, ...] = (), value: Any = None) -> int:
-        """Return the place of a Scalar, which is new unless there is an equal or a simpler one."""
+        """Return the place of a Scalar, which is new unless there is an equal one."""
         if kind == "constant":
             value = np.float32(value)
-        known = [self.scalars[k] for k in inputs]
-        if kind in ("sin", "cos") and known[0].kind == "atan2":
-            return self._of_angle(kind, *known[0].inputs)
-        if kind == "sub" and known[1].kind == "mul" and self._is_wrapped(*inputs):
-            period = known[1].inputs[0]
-            below = self._add("lt", (inputs[0], self._add("constant", (), 0.0)))
-            return self._add("where", (below, self._add("add", (inputs[0], period)), inputs[0]))
         key = kind, inputs, value.tobytes() if kind == "constant" else value
         if key not in self._known:
             self._known[key] = len(self.scalars)
             self.scalars.append(Scalar(kind, inputs, value))
         return self._known[key]
-
-    def _of_angle(self, kind: str, y: int, x: int) -> int:
-        """Return the place of the sine or cosine of the angle of (x, y), without the angle."""
-        squares = self._add("mul", (x, x)), self._add("mul", (y, y))
-        length = self._add("sqrt", (self._add("add", squares),))
-        share = self._add("div", (x if kind == "cos" else y, length))
-        nowhere = self._add("eq", (length, self._add("constant", (), 0.0)))
-        return self._add("where", (nowhere, self._add("constant", (), float(kind == "cos")), share))
-
-    def _is_wrapped(self, x: int, multiple: int) -> bool:
-        """Return whether x - multiple wraps an angle that is less than a turn off.
-
-        A comparison does so, too. The function floor of libm is slow.
-
-        multiple : place of a product, period * floor(x / period) in that case
-        """
-        turn, floor = self.scalars[multiple].inputs
-        of_floor = self.scalars[floor].inputs
-        period, (low, high) = self.scalars[turn], self._range(x)
-        return (
-            self.scalars[floor].kind == "floor"
-            and self.scalars[of_floor[0]] == Scalar("div", (x, turn))
-            and period.kind == "constant"
-            and -period.value <= low
-            and high < period.value
-        )
-
-    def _range(self, place: int) -> tuple[float, float]:
-        """Return bounds of a Scalar, as far as angles and their sums need them."""
-        one = self.scalars[place]
-        if one.kind == "constant":
-            return float(one.value), float(one.value)
-        if one.kind == "sqrt":
-            return 0.0, np.inf
-        if one.kind == "atan2":
-            largest = ANGLE if self._range(one.inputs[1])[0] < 0.0 else 0.5 * ANGLE
-            return -largest, largest
-        known = [self._range(k) for k in one.inputs] if one.kind in ("sub", "where") else []
-        if one.kind == "sub":
-            return known[0][0] - known[1][1], known[0][1] - known[1][0]
-        if one.kind == "where":
-            return min(known[1][0], known[2][0]), max(known[1][1], known[2][1])
-        return -np.inf, np.inf
-
-    def _keep_used(self) -> None:
-        """Remove what no output needs."""
-        used = needed(self.scalars, self.outputs)
-        new = {old: k for k, old in enumerate(used)}
-        kept = [self.scalars[old] for old in used]
-        self.scalars = [one._replace(inputs=tuple(new[i] for i in one.inputs)) for one in kept]
-        self.outputs = [new[k] for k in self.outputs]
-
-
-def needed(scalars: Sequence[Scalar], outputs: Iterable[int]) -> list[int]:
-    """Return the places of some outputs and of all that they are computed from, rising."""
-    used, stack = set(), list(outputs)
-    while stack:
-        place = stack.pop()
-        if place not in used:
-            used.add(place)
-            stack.extend(scalars[place].inputs)
-    return sorted(used)
 
 
 def _ordered(outputs: Sequence[Expression]) -> list[Expression]:

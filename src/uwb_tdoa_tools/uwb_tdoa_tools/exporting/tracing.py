@@ -25,7 +25,16 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.effects import Samples
 from uwb_tdoa_bias.effects.samples import Motion
 
-from .expressions import ELEMENTWISE, Expression, Pieces, apply, constant, expressed, merged
+from .expressions import (
+    ELEMENTWISE,
+    Expression,
+    Pieces,
+    apply,
+    constant,
+    expressed,
+    merged,
+    remainder,
+)
 
 MOST_ANCHORS = 128  # constants of pairs grow with the square
 LN_10 = math.log(10.0)
@@ -195,6 +204,10 @@ class Traced(NDArrayOperatorsMixin, SymbolicArray):
         """Return True: the expressions hold for all samples."""
         return True
 
+    def all(self) -> bool:
+        """Return True: limits of a model that all samples keep are not recorded; readers apply them."""
+        return True
+
     def reshape(self, *shape: int) -> Blocks:
         """Return parts of whole blocks; shape : (-1, rows of a part) or (parts, -1)."""
         parts, rows = shape
@@ -318,7 +331,7 @@ _FUNCTIONS: dict[Any, Callable[..., Any]] = {
     np.power: _power,
     np.hypot: _hypot,
     np.log10: lambda x: apply("log", x) * (1.0 / LN_10),
-    np.remainder: lambda x, y: x - y * apply("floor", x / y),
+    np.remainder: remainder,
     np.arcsin: lambda x: apply("atan2", x, apply("sqrt", (1.0 - x) * (1.0 + x))),
 }
 

@@ -62,33 +62,18 @@ def plot_precision(
     """
     layers = _layers(chart.grid)
     figure, axes = _panels(chart.grid, len(layers))
-    flown = (
-        chart.error[chart.flyable] if chart.flyable.any() else chart.error[np.isfinite(chart.error)]
-    )
-    scale = _scale(100.0 * flown)
-    times = _enlarged(chart)
+    judged = chart.flyable if chart.flyable.any() else np.isfinite(chart.error)
+    scale, times = _scale(100.0 * chart.error[judged]), _enlarged(chart)
     for ax, k in zip(axes, layers):
-        mesh = _field(ax, chart.grid, 100.0 * chart.error, k, scale)
-        _room(ax, anchors, chart.grid, k, walls)
+        mesh = _field(ax, chart.grid, chart.grid.layer(100.0 * chart.error, k), *scale)
+        _room(ax, anchors, chart.grid, walls)
         _ellipses(ax, chart, k, times)
         ax.set_title(_height(chart.grid, k), fontsize=10)
-    _bar(axes, mesh, "bound of one round, cm", _beyond(100.0 * chart.error, scale))
-    ellipse = Line2D(
-        [],
-        [],
-        color="0.3",
-        marker="o",
-        mfc="none",
-        ls="",
-        label="99 % of the estimates" + (f", {times} times as large" if times > 1 else ""),
-    )
-    _finish(
-        figure,
-        "How precise one round is",
-        [_hull_line(), _anchor_mark(anchors), ellipse],
-        [(ax, anchors) for ax in axes],
-        path,
-    )
+    _bar(axes, mesh, "bound of one round, cm", 100.0 * chart.error)
+    label = "99 % of the estimates" + (f", {times} times as large" if times > 1 else "")
+    ellipse = Line2D([], [], color="0.3", marker="o", mfc="none", ls="", label=label)
+    marks = [_hull_line(), _anchor_mark(anchors), ellipse]
+    _finish(figure, "How precise one round is", marks, dict.fromkeys(axes, anchors), path)
 
 
 def plot_flyable(
@@ -105,48 +90,36 @@ def plot_flyable(
     """
     layers, codes = _layers(chart.grid), [code for code in STATES if (chart.status == code).any()]
     figure, axes = _panels(chart.grid, len(layers))
-    x, y, _ = chart.grid.axes
+    colours = ListedColormap([colour for _, colour in STATES.values()])
     for ax, k in zip(axes, layers):
         status = chart.grid.layer(chart.status, k)
-        colours = ListedColormap([colour for _, colour in STATES.values()])
-        ax.pcolormesh(
-            x,
-            y,
-            status,
-            cmap=colours,
-            vmin=-0.5,
-            vmax=len(STATES) - 0.5,
-            shading="nearest",
-            rasterized=True,
-        )
-        if pairings is not None and min(len(x), len(y)) > 1:
-            points = chart.grid.layer(chart.grid.points, k).reshape(-1, 3)
-            discriminant = (
-                Subsets(pairings.anchors, pairings.unknowns)
-                .discriminant(points)
-                .reshape(len(y), len(x), -1)
-            )
-            for q in range(discriminant.shape[2]):
-                ax.contour(x, y, discriminant[:, :, q], levels=[0.0], colors="0.45", linewidths=0.6)
-        _room(ax, anchors, chart.grid, k, walls)
-        ax.set_title(
-            _height(chart.grid, k)
-            + f": {np.mean(status == FLYABLE):.0%} can be flown".replace("%", " %"),
-            fontsize=10,
-        )
-    shares = [(STATES[code], np.mean(chart.status == code)) for code in codes]
-    marks: list[Any] = [
-        Patch(facecolor=colour, label=f"{name}: {100.0 * share:.0f} %")
-        for (name, colour), share in shares
-    ]
+        _field(ax, chart.grid, status, -0.5, len(STATES) - 0.5, cmap=colours)
+        if pairings is not None and min(status.shape) > 1:
+            _curves(ax, chart.grid, k, pairings)
+        _room(ax, anchors, chart.grid, walls)
+        share = f"{np.mean(status == FLYABLE):.0%} can be flown".replace("%", " %")
+        ax.set_title(f"{_height(chart.grid, k)}: {share}", fontsize=10)
+    marks: list[Any] = []
+    for code in codes:
+        name, colour = STATES[code]
+        label = f"{name}: {100.0 * np.mean(chart.status == code):.0f} %"
+        marks.append(Patch(facecolor=colour, label=label))
     marks += [_hull_line(), _anchor_mark(anchors)]
     if pairings is not None:
-        marks.append(
-            Line2D([], [], color="0.45", lw=0.8, label="bifurcation curve of a choice of anchors")
-        )
+        label = "bifurcation curve of a choice of anchors"
+        marks.append(Line2D([], [], color="0.45", lw=0.8, label=label))
     whole = "this slice" if chart.grid.shape[2] == 1 else "the room"
     title = f"Where it can be flown: {100.0 * chart.flyable.mean():.0f} % of {whole}"
-    _finish(figure, title, marks, [(ax, anchors) for ax in axes], path)
+    _finish(figure, title, marks, dict.fromkeys(axes, anchors), path)
+
+
+def _curves(ax: Axes, grid: Grid, k: int, pairings: Installation) -> None:
+    """Draw the bifurcation curves of all choices of anchors in the layer k."""
+    points = grid.layer(grid.points, k)
+    subsets = Subsets(pairings.anchors, pairings.unknowns)
+    for values in subsets.discriminant(points.reshape(-1, 3)).T:
+        level = values.reshape(points.shape[:2])
+        ax.contour(*grid.axes[:2], level, levels=[0.0], colors="0.45", linewidths=0.6)
 
 
 def plot_heard(
@@ -155,23 +128,15 @@ def plot_heard(
     """Draw how many anchors the middle layer hears."""
     figure, (ax,) = _panels(chart.grid, 1)
     k = chart.grid.shape[2] // 2
-    x, y, _ = chart.grid.axes
     norm = BoundaryNorm(HEARD_COLOURS, 256, extend="max")
     layer = chart.grid.layer(chart.heard.astype(float), k)
-    mesh = ax.pcolormesh(x, y, layer, cmap="viridis", norm=norm, shading="nearest", rasterized=True)
-    _bar([ax], mesh, "anchors heard", "max", HEARD_COLOURS)
-    _room(ax, anchors, chart.grid, k, walls)
-    ax.set_title(
-        _height(chart.grid, k) + f": {100.0 * np.mean(chart.heard >= 4):.0f} % hear 4 or more",
-        fontsize=10,
-    )
-    _finish(
-        figure,
-        f"How many of {len(anchors)} anchors are heard",
-        [_hull_line(), _anchor_mark(anchors)],
-        [(ax, anchors)],
-        path,
-    )
+    mesh = _field(ax, chart.grid, layer, None, None, cmap="viridis", norm=norm)
+    _bar([ax], mesh, "anchors heard")
+    _room(ax, anchors, chart.grid, walls)
+    share = f"{100.0 * np.mean(chart.heard >= 4):.0f} % hear 4 or more"
+    ax.set_title(f"{_height(chart.grid, k)}: {share}", fontsize=10)
+    title = f"How many of {len(anchors)} anchors are heard"
+    _finish(figure, title, [_hull_line(), _anchor_mark(anchors)], {ax: anchors}, path)
 
 
 def plot_accuracy(installation: Installation, found: AccuracyMap, path: str | Path) -> None:
@@ -179,56 +144,32 @@ def plot_accuracy(installation: Installation, found: AccuracyMap, path: str | Pa
 
     A square shows the root mean square over the height. All have one colour scale.
     """
-    columns = (
-        ("measured error (RMSE)", found.rmse),
-        ("its bias", found.bias),
-        ("the filter claims", found.claimed),
-        ("bound of one round", found.bound),
-    )
+    anchors, grid = installation.anchors, found.grid
+    columns = {
+        "measured error (RMSE)": found.rmse,
+        "its bias": found.bias,
+        "the filter claims": found.claimed,
+        "bound of one round": found.bound,
+    }
+    weight = np.where(np.isfinite(found.rmse[:, 0]), found.count, 0).reshape(grid.shape)
+    counted = np.where(weight.any(axis=2), weight.sum(axis=2), np.nan)
     from_above = []
-    for _, values in columns:
-        weight = np.where(np.isfinite(values[:, 0]), found.count, 0)
-        squared = (
-            np.where(weight > 0, np.nan_to_num(np.sum(values**2, axis=1)) * weight, 0.0)
-            .reshape(found.grid.shape)
-            .sum(axis=2)
-        )
-        counted = weight.reshape(found.grid.shape).sum(axis=2)
-        from_above.append(
-            100.0 * np.sqrt(np.where(counted > 0, squared, np.nan) / np.maximum(counted, 1)).T
-        )
-    every = np.concatenate([values.ravel() for values in from_above])
+    for values in columns.values():
+        squared = np.nan_to_num(np.sum(values**2, axis=1)).reshape(grid.shape) * weight
+        from_above.append(100.0 * np.sqrt(squared.sum(axis=2) / counted).T)
+    every = np.ravel(from_above)
     scale = _scale(every[np.isfinite(every)])
-    x, y, _ = found.grid.axes
-    ratio = np.ptp(y) / max(np.ptp(x), 1e-9)
-    figure, axes = plt.subplots(
-        2,
-        2,
-        figsize=(WIDTH, 1.2 + 0.85 * WIDTH * ratio),
-        layout="constrained",
-        sharex=True,
-        sharey=True,
-    )
-    for ax, (label, _), values in zip(axes.ravel(), columns, from_above):
-        mesh = ax.pcolormesh(
-            x,
-            y,
-            values,
-            cmap=COLOURS,
-            vmin=scale[0],
-            vmax=scale[1],
-            shading="nearest",
-            rasterized=True,
-        )
+    ratio = np.ptp(grid.axes[1]) / max(np.ptp(grid.axes[0]), 1e-9)
+    size = WIDTH, 1.2 + 0.85 * WIDTH * ratio
+    figure, axes = plt.subplots(2, 2, figsize=size, layout="constrained", sharex=True, sharey=True)
+    for ax, label, values in zip(axes.ravel(), columns, from_above):
+        mesh = _field(ax, grid, values, *scale)
         ax.set_title(label, fontsize=10)
-        _room(ax, installation.anchors, found.grid, None)
-    for ax in axes[0]:
-        ax.set_xlabel("")
-    for ax in axes[:, 1]:
-        ax.set_ylabel("")
-    _bar(axes.ravel(), mesh, "3D, cm", _beyond(every, scale))
-    marks = [_hull_line(), _anchor_mark(installation.anchors)]
-    _finish(figure, "Measured error beside what is claimed and what is possible", marks, [], path)
+        _room(ax, anchors, grid)
+        ax.label_outer()
+    _bar(axes.ravel(), mesh, "3D, cm", every)
+    title = "Measured error beside what is claimed and what is possible"
+    _finish(figure, title, [_hull_line(), _anchor_mark(anchors)], {}, path)
 
 
 def plot_layouts(
@@ -244,30 +185,20 @@ def plot_layouts(
     figure, axes = _panels(grid, len(charts))
     low, high = flown.min(axis=0)[:2], flown.max(axis=0)[:2]
     inside = ((grid.points[:, :2] >= low) & (grid.points[:, :2] <= high)).all(axis=1)
-    finite = np.concatenate(
-        [chart.error[inside & np.isfinite(chart.error)] for _, _, chart in charts]
-    )
-    scale = _scale(100.0 * finite)
+    errors = np.stack([100.0 * chart.error for _, _, chart in charts])
+    scale = _scale(errors[inside & np.isfinite(errors)])
     blocked = any((~chart.grid.layer(chart.flyable, k)).any() for _, _, chart in charts)
-    for ax, (title, installation, chart) in zip(axes, charts):
-        mesh = _field(ax, grid, 100.0 * chart.error, k, scale)
+    for ax, (title, installation, chart), error in zip(axes, charts, errors):
+        mesh = _field(ax, grid, grid.layer(error, k), *scale)
         _hatch(ax, chart, k)
-        _room(ax, installation.anchors, grid, k)
+        _room(ax, installation.anchors, grid)
         ax.add_patch(Rectangle(tuple(low), *(high - low).tolist(), fill=False, ec="r", lw=1.5))
-        share, median = (
-            100.0 * chart.flyable.mean(),
-            100.0 * np.median(chart.error[inside]) if inside.any() else np.nan,
-        )
+        median = np.median(error[inside]) if inside.any() else np.nan
+        share = f"{100.0 * chart.flyable.mean():.0f} % can be flown"
         ax.set_title(
-            f"{title}: {share:.0f} % can be flown; median bound where it is flown {median:.1f} cm",
-            fontsize=10,
+            f"{title}: {share}; median bound where it is flown {median:.1f} cm", fontsize=10
         )
-    _bar(
-        axes,
-        mesh,
-        "bound of one round, cm",
-        _beyond(100.0 * np.concatenate([chart.error for _, _, chart in charts]), scale),
-    )
+    _bar(axes, mesh, "bound of one round, cm", errors)
     marks: list[Any] = [
         _hull_line(),
         _anchor_mark(charts[0][1].anchors),
@@ -275,16 +206,9 @@ def plot_layouts(
     ]
     if blocked:
         marks.append(Patch(facecolor="white", edgecolor="k", hatch="////", label="cannot be flown"))
-    title = f"Before and after, {_height(grid, k)}" + (
-        "; hatched: cannot be flown" if blocked else "; all can be flown"
-    )
-    _finish(
-        figure,
-        title,
-        marks,
-        [(ax, installation.anchors) for ax, (_, installation, _) in zip(axes, charts)],
-        path,
-    )
+    hatched = "hatched: cannot be flown" if blocked else "all can be flown"
+    labelled = {ax: installation.anchors for ax, (_, installation, _) in zip(axes, charts)}
+    _finish(figure, f"Before and after, {_height(grid, k)}; {hatched}", marks, labelled, path)
 
 
 def _layers(grid: Grid) -> list[int]:
@@ -323,41 +247,34 @@ def _scale(values: np.ndarray) -> tuple[float, float]:
     return float(low), float(high if high > low else low + 1.0)
 
 
-def _beyond(values: np.ndarray, scale: tuple[float, float]) -> str:
-    """Return which ends of the colours values (n,) exceed, in matplotlib's words."""
-    values = values[np.isfinite(values)]
-    if not len(values):
-        return "neither"
-    return {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[
-        int(values.min() < scale[0]), int(values.max() > scale[1])
-    ]
+def _field(
+    ax: Axes, grid: Grid, layer: np.ndarray, low: float | None, high: float | None, **look: Any
+) -> Any:
+    """Draw the colours of a layer (ny, nx) between two values. Infinite cells are white.
 
-
-def _field(ax: Axes, grid: Grid, values: np.ndarray, k: int, scale: tuple[float, float]) -> Any:
-    """Draw the colours of the layer k of values (n,) between the ends of a scale.
-
-    Cells without a value are white.
+    look : colour map and norm, if they are others
     """
-    x, y, _ = grid.axes
-    layer = grid.layer(np.where(np.isfinite(values), values, np.nan), k)
-    return ax.pcolormesh(
-        x, y, layer, cmap=COLOURS, vmin=scale[0], vmax=scale[1], shading="nearest", rasterized=True
-    )
+    layer = np.where(np.isfinite(layer), layer, np.nan)
+    look = {"cmap": COLOURS, "vmin": low, "vmax": high, "shading": "nearest"} | look
+    return ax.pcolormesh(*grid.axes[:2], layer, rasterized=True, **look)
 
 
 def _bar(
-    axes: Sequence[Axes] | np.ndarray,
-    drawn: Any,
-    label: str,
-    extend: str,
-    ticks: Sequence[float] | None = None,
+    axes: Sequence[Axes] | np.ndarray, drawn: Any, label: str, values: np.ndarray | None = None
 ) -> None:
-    """Draw a colour scale with an arrow at each end that some values exceed."""
+    """Draw a colour scale with an arrow at each end that some values exceed.
+
+    Without values the colours have bounds, and an arrow of their own.
+    """
+    extend, (low, high) = "max", drawn.get_clim()
+    if values is not None:
+        finite = values[np.isfinite(values)]
+        beyond = bool((finite < low).any()), bool((finite > high).any())
+        extend = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[beyond]
     bar = axes[0].figure.colorbar(
         drawn, ax=list(axes), extend=extend, shrink=0.9 / len(axes) ** 0.5, pad=0.02, aspect=25
     )
-    if ticks is None:
-        low, high = drawn.get_clim()
+    if values is not None:
         even = np.linspace(low, high, 5).tolist()
         bar.set_ticks(even, labels=[f"{tick:.3g}" for tick in even])
     bar.set_label(label, fontsize=9)
@@ -382,9 +299,7 @@ def _hatch(ax: Axes, chart: Chart, k: int) -> None:
         )
 
 
-def _room(
-    ax: Axes, anchors: Anchors, grid: Grid, k: int | None, walls: Walls | None = None
-) -> None:
+def _room(ax: Axes, anchors: Anchors, grid: Grid, walls: Walls | None = None) -> None:
     """Draw the axes of a map, with walls, hull and anchors.
 
     The margin keeps anchors at the edge of the map, or a little beyond it, inside the picture.
@@ -523,29 +438,20 @@ def _finish(
     figure: Figure,
     title: str,
     marks: Sequence[Any],
-    labelled: Sequence[tuple[Axes, Anchors]],
+    labelled: dict[Axes, Anchors],
     path: str | Path,
 ) -> None:
     """Draw title and legend, then the ids of anchors, and write the picture."""
     figure.suptitle(title, fontsize=12)
-    if marks:
-        longest = max(len(str(mark.get_label())) for mark in marks)
-        figure.legend(
-            handles=marks,
-            loc="outside lower center",
-            ncols=3 if longest < 28 else 2,
-            frameon=False,
-            fontsize=9,
-        )
+    longest = max(len(str(mark.get_label())) for mark in marks)
+    columns = 3 if longest < 28 else 2
+    figure.legend(
+        handles=marks, loc="outside lower center", ncols=columns, frameon=False, fontsize=9
+    )
     figure.set_dpi(DPI)
     figure.draw_without_rendering()  # labels need the final layout
-    for ax, anchors in labelled:
+    for ax, anchors in labelled.items():
         avoided = _points_on_arrows(ax, anchors)
         draw_labels(ax, anchors.ids.tolist(), anchors.positions[:, :2], avoided, ANCHOR)
-    _save(figure, path)
-
-
-def _save(figure: Figure, path: str | Path) -> None:
-    """Write a figure to an image file, and close it."""
     write_filled(path, partial(figure.savefig, dpi=DPI))
     plt.close(figure)
