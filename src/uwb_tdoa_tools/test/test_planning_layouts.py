@@ -298,9 +298,12 @@ FLOWN = lattice((-1, -1, 0.5), (1, 1, 2), 1.0)
 def figures(monkeypatch):
     """Return [(figure, title)] of all pictures to be written."""
     made = []
-    monkeypatch.setattr(
-        plots, "_save", lambda figure, path: made.append((figure, figure.get_suptitle()))
-    )
+
+    def write(path, save):
+        figure = save.func.__self__
+        made.append((figure, figure.get_suptitle()))
+
+    monkeypatch.setattr(plots, "write_filled", write)
     return made
 
 
