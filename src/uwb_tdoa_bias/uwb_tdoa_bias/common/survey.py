@@ -645,40 +645,18 @@ def _total_station(lines: Lines, unit: str) -> list[Entry]:
             raise InputError(
                 f"anchor {anchor} has arm tips but no line 'anchorAnt{anchor},x,y,z'; add it."
             )
-    _refuse_unit(antennas, tips)
-    return [Entry(str(i), antennas[i], _orientation(i, tips)) for i in sorted(antennas)]
+    return [
+        Entry(str(i), antennas[i], _orientation(i, antennas[i], tips)) for i in sorted(antennas)
+    ]
 
 
-def _refuse_unit(
-    antennas: dict[int, list[float]],
-    tips: dict[tuple[int, int], list[float]],
-) -> None:
-    """Raise InputError if the arms of a stand have their true lengths in another unit than metres.
-
-    antennas : {anchor: [x, y, z]}; tips : {(anchor, arm 1 to 3): [x, y, z]}
-    """
-    for anchor, antenna in antennas.items():
-        found = [tips[anchor, k] for k in (1, 2, 3) if (anchor, k) in tips]
-        if len(found) < 3 or orientation_from_tips(np.array(found))[1] <= MAX_TIP_RESIDUAL:
-            continue
-        for unit, count in UNITS.items():
-            stand = np.array([antenna, *found]) / count
-            if orientation_from_tips(stand[1:])[1] > MAX_TIP_RESIDUAL:
-                continue
-            who, lines = "the survey looks", "all coordinates"
-            if np.linalg.norm(stand[0] - stand[1:].mean(axis=0)) > LARGEST_STAND:
-                who = f"the arm tips of anchor {anchor} look"
-                lines = f"the lines anchor{anchor}_1, _2 and _3"
-            raise InputError(
-                f"{who} like {unit} (the arms of the stand of anchor {anchor} have their "
-                f"lengths in {unit}); give metres: divide {lines} by {count:.6g}."
-            )
-
-
-def _orientation(anchor: int, tips: dict[tuple[int, int], list[float]]) -> list[float]:
+def _orientation(
+    anchor: int, antenna: list[float], tips: dict[tuple[int, int], list[float]]
+) -> list[float]:
     """Return the quaternion x y z w, stand to world, of the arm tips of an anchor; NaN without any.
 
-    tips : {(anchor, arm 1 to 3): [x, y, z] m}; raises InputError for one or two tips, or a poor fit
+    antenna : [x, y, z] m; tips : {(anchor, arm 1 to 3): [x, y, z] m}. Raises InputError for one or two
+    tips, for a poor fit, and for arms that have their true lengths in another unit than metres.
     """
     found = [tips[anchor, k] for k in (1, 2, 3) if (anchor, k) in tips]
     if not found:
@@ -688,13 +666,24 @@ def _orientation(anchor: int, tips: dict[tuple[int, int], list[float]]) -> list[
             f"anchor {anchor} has {len(found)} of 3 arm tips; survey all three or delete them."
         )
     quaternion, residual = orientation_from_tips(np.array(found))
-    if residual > MAX_TIP_RESIDUAL:
+    if residual <= MAX_TIP_RESIDUAL:
+        return quaternion.tolist()
+    for unit, count in UNITS.items():
+        stand = np.array([antenna, *found]) / count
+        if orientation_from_tips(stand[1:])[1] > MAX_TIP_RESIDUAL:
+            continue
+        who, lines = "the survey looks", "all coordinates"
+        if np.linalg.norm(stand[0] - stand[1:].mean(axis=0)) > LARGEST_STAND:
+            who = f"the arm tips of anchor {anchor} look"
+            lines = f"the lines anchor{anchor}_1, _2 and _3"
         raise InputError(
-            f"the arm tips of anchor {anchor} miss the stand's shape by "
-            f"{1e3 * residual:.0f} mm (at most "
-            f"{1e3 * MAX_TIP_RESIDUAL:.0f} mm expected); check lines anchor{anchor}_1, _2 and _3."
+            f"{who} like {unit} (the arms of the stand of anchor {anchor} have their "
+            f"lengths in {unit}); give metres: divide {lines} by {count:.6g}."
         )
-    return quaternion.tolist()
+    raise InputError(
+        f"the arm tips of anchor {anchor} miss the stand's shape by {1e3 * residual:.0f} mm (at most "
+        f"{1e3 * MAX_TIP_RESIDUAL:.0f} mm expected); check lines anchor{anchor}_1, _2 and _3."
+    )
 
 
 def _point(number: int, cells: list[str]) -> list[float]:
