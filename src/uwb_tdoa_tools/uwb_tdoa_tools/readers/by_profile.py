@@ -35,7 +35,7 @@ from .profile import (
     time_column,
 )
 from .streams import Streams, by_time, make_flight
-from .tables import Block, CsvFiles, Foreign, ULogFile, Wanted, is_ulog, table_of
+from .tables import Block, CsvFiles, Foreign, ULogFile, Wanted, is_ulog
 
 SURVEY = "anchors"  # stream of positions
 SINGLE = "gyro", "acc", "pose", "tof", "baro", "flow"  # streams of one sensor each
@@ -447,8 +447,7 @@ def _requests(
             found = {table: {} for table in _csv_with_columns(tables, source)}
         else:
             for table, kind in tables.types.items() if source.topic or source.type else ():
-                name = table_of(table) if isinstance(tables, CsvFiles) else table
-                names = source.match(name, kind)
+                names = source.match(tables.topic(table), kind)
                 if names is not None:
                     found[table] = names
             if not found:

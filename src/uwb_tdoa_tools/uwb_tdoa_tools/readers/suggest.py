@@ -20,7 +20,7 @@ from uwb_tdoa_bias.common.text import printable
 from ..command_lines import suggest_line
 from .by_profile import SINGLE, as_time, files_of, open_recording
 from .profile import LENGTH, RADIO, STREAMS, TIME, UNITS, Source, as_text, load_profile, shipped
-from .tables import CsvFiles, Foreign, table_of
+from .tables import CsvFiles, Foreign
 
 SAMPLE = 3000  # messages of each table that are looked at
 LONGEST = 200  # characters of a path; longer ones are no name
@@ -240,17 +240,16 @@ def _fits(name: str, tables: Foreign, streams: set[str]) -> bool:
 
 
 def _has(tables: Foreign, table: str, source: Source) -> bool:
-    if not isinstance(tables, CsvFiles):
-        return source.match(table, tables.types[table]) is not None
-    named = source.match(table_of(table), tables.types[table]) is not None
-    return named and {path for path, _ in source.columns.values()} <= {*tables.fields(table)}
+    if source.match(tables.topic(table), tables.types[table]) is None:
+        return False
+    paths = {path for path, _ in source.columns.values()}
+    return not isinstance(tables, CsvFiles) or paths <= {*tables.fields(table)}
 
 
 def _lines(tables: Foreign, table: str, one: Suggestion) -> list[str]:
     """Return the lines of a source."""
-    topic = table_of(table) if isinstance(tables, CsvFiles) else table
     lines = [
-        f'  - topic: "{topic}" # {tables.types[table]}',
+        f'  - topic: "{tables.topic(table)}" # {tables.types[table]}',
         *(f"    # {comment}" for comment in one.comments),
         *([f"    each: {one.each}"] if one.each else []),
         "    columns:",

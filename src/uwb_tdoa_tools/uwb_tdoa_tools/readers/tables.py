@@ -95,6 +95,10 @@ class Foreign:
         """Return the fields of a table."""
         raise NotImplementedError
 
+    def topic(self, table: str) -> str:
+        """Return what the topic of a profile is compared with."""
+        return table
+
     def time_of(self, table: str) -> tuple[str, float] | None:
         """Return the field with the time and its unit in s, if tables of this kind have one."""
 
@@ -368,6 +372,10 @@ class CsvFiles(Foreign):
         """Return the columns of a file."""
         return self._names[table]
 
+    def topic(self, table: str) -> str:
+        """Return the name of a file."""
+        return Path(table).name
+
     def blocks(self, wanted: Sequence[Wanted]) -> Iterator[Block]:
         """Yield the records of files. Raises InputError."""
         for path in dict.fromkeys(one.table for one in wanted):
@@ -387,11 +395,6 @@ class CsvFiles(Foreign):
                     yield Block(number, [*lines], {name: known[name] for name in one.paths})
             if not self.counts[path]:
                 raise InputError(f"{path}: has no row below its header; record the flight again.")
-
-
-def table_of(table: str) -> str:
-    """Return the name of a file that the topic of a profile is compared with."""
-    return Path(table).name
 
 
 MAGIC = b"ULog\x01\x12\x35"
