@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 import sys
 
+from numba.core.compiler import Flags
 from programs import python
 import pytest
 
@@ -155,3 +156,39 @@ def test_another_version_of_numba_compiles_as_usual(monkeypatch):
         monkeypatch.setattr(callees, "version_info", version)
         assert not callees.install()
     assert callees.dispatcher.Dispatcher.compile is usual
+
+
+def test_flags_have_the_values_of_their_options():
+    flags = Flags()
+    flags.nrt = True
+    others = flags.copy()
+    for changed in (None, "boundscheck"):
+        if changed:
+            setattr(others, changed, True)
+        for one in (flags, others):
+            assert list(one.values().items()) == [(k, getattr(one, k)) for k in one.options]
+        assert (flags == others) == (changed is None)
+    assert hash(flags) == hash(flags.copy())
+
+
+def test_a_slice_of_another_shape_is_refused(run):
+    program = """
+import numpy as np
+from uwb_tdoa_bias.common.compiled import compiled
+
+@compiled
+def assign(rows, more):
+    rows[1:] = more
+
+rows = np.zeros(4)
+assign(rows, np.arange(3.0))
+print(rows.tolist())
+try:
+    assign(rows, np.zeros(4))
+except ValueError as error:
+    print(error)
+print(sum(assign.stats.cache_hits.values()) > 0)
+"""
+    said = ["[0.0, 0.0, 1.0, 2.0]", "cannot assign slice from input of different size"]
+    for cached in (False, True):
+        assert run(program, "slices") == (said, cached)

@@ -10,6 +10,7 @@ from pathlib import Path
 import sys
 from types import SimpleNamespace
 
+import numpy as np
 from programs import python
 import pytest
 
@@ -249,6 +250,33 @@ def test_the_printed_share_never_falls(listener, capsys, monkeypatch):
         listener._tell()
     shares = [line.split()[5] for line in capsys.readouterr().err.splitlines()]
     assert shares == ["50%,", "50%,", "67%,"]
+
+
+def test_a_compilation_tells_how_long_it_takes_and_whether_the_machine_is_busy(
+    listener, capsys, monkeypatch
+):
+    """The share is that of typed functions; linking them takes the rest of the time."""
+    done, open_ = SimpleNamespace(signatures=[1]), SimpleNamespace(signatures=[])
+    monkeypatch.setattr(compiled, "_FUNCTIONS", [done, open_])
+    clocks = iter([(0.0, 0.0), (35.0, 35.0), (40.0, 40.0), (90.0, 50.0)])
+    monkeypatch.setattr(compiled, "_clocks", lambda: np.array(next(clocks)))
+    listener._since = compiled._clocks()
+    for _ in range(3):
+        listener._tell()
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "compiling, which is done once: 50%, 35 s, about 65 s left"
+    assert lines[1].endswith(", 40 s, about 60 s left")  # of 100 s
+    assert lines[2].endswith(", about 10 s left; the machine is busy and gives this 56% of a core")
+
+
+def test_lines_of_progress_show_a_compilation(listener, capsys, monkeypatch):
+    monkeypatch.setattr(executable.COMPILING, "shown", True)
+    monkeypatch.setattr(executable.COMPILING, "text", "")
+    listener.on_start(None)
+    assert executable.COMPILING.text.startswith("compiling, which is done once: ")
+    listener.on_end(None)
+    assert executable.COMPILING.text == ""
+    assert "which is done once: " not in capsys.readouterr().err
 
 
 def test_garbage_is_collected_as_before_after_a_compilation():

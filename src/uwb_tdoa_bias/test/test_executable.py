@@ -91,16 +91,15 @@ def test_a_part_of_ours_that_is_missing_is_a_defect():
         executable("uwb_tdoa_bias.nowhere")()
 
 
-@pytest.mark.parametrize("given, kept", [(None, "1"), ("3", "3")])
+@pytest.mark.parametrize("variable, usual", [("OMP_NUM_THREADS", "1"), ("NUMBA_OPT", "2")])
+@pytest.mark.parametrize("given", [None, "3"])
 @pytest.mark.parametrize("start", [executable, node_executable])
-def test_linear_algebra_takes_one_thread_unless_the_user_says_more(
-    write, monkeypatch, start, given, kept
+def test_libraries_take_one_thread_and_compile_quickly_unless_the_user_says_more(
+    write, monkeypatch, start, given, variable, usual
 ):
-    name = f"tells_{kept}_{start.__name__}"
-    write(name, "import os\nseen = os.environ['OMP_NUM_THREADS']\ndef main(): return seen")
-    monkeypatch.setenv("OMP_NUM_THREADS", given) if given else monkeypatch.delenv(
-        "OMP_NUM_THREADS", raising=False
-    )
+    name, kept = f"tells_{variable}_{given}_{start.__name__}", given or usual
+    write(name, f"import os\nseen = os.environ['{variable}']\ndef main(): return seen")
+    monkeypatch.setenv(variable, given) if given else monkeypatch.delenv(variable, raising=False)
     # The variable is set before the module is imported.
     assert start(name)() == kept
 

@@ -220,7 +220,7 @@ def test_a_seed_draws_one_effect_and_seeds_draw_all_kinds():
 def test_no_error_is_printed_if_messages_were_lost(
     recorded, diagnosis, tmp_path, capsys, monkeypatch, command
 ):
-    outcome = {"used": 10, "waiting": 0, "late": 1, "lost": 917, "imu_late": 0, "imu_lost": 0}
+    outcome = {"used": 10, **dict.fromkeys(flown.MISSING, 0), "late": 1, "lost": 917}
     monkeypatch.setattr(flown, "through_nodes", lambda *_: flown.LivePass(outcome, None))
     monkeypatch.setattr(flown, "record", lambda *_: recorded)
     monkeypatch.setattr(flown, "diagnose", lambda *_, **__: diagnosis)

@@ -252,7 +252,10 @@ class Reports:
     """
 
     def __init__(self):
-        self.unchanged = {}
+        self.unchanged, self.counted = {}, {}
+
+    def counts(self):
+        return dict(self.counted)
 
     def forget(self):
         self.unchanged.clear()
@@ -264,13 +267,35 @@ class Reports:
         return self.unchanged.get(name, 0)
 
 
-def test_a_node_that_does_not_report_is_waited_for_while_it_is_there(monkeypatch):
+def reporting(monkeypatch):
+    """Return (Nodes with Reports, what they say, the names that are there); they watch."""
     monkeypatch.setattr(follow, "LOOK", 0.0)
     nodes, said, there = object.__new__(follow.Nodes), [], ["bias_node", "ekf_node"]
     nodes._names = {name: f"/{name}" for name in there}
-    nodes._diagnostics, nodes._say = Reports(), said.append
+    nodes._diagnostics, nodes._say, nodes._counts_before = Reports(), said.append, {}
     nodes._is_there = there.__contains__
     nodes.watch()
+    return nodes, said, there
+
+
+def test_a_node_that_never_reports_is_not_waited_for_without_end(monkeypatch):
+    nodes, said, _ = reporting(monkeypatch)
+    now = [follow.time.monotonic()]
+    monkeypatch.setattr(follow.time, "monotonic", lambda: now[0])
+    for count in range(3):  # slow, and not stuck: a counter changes
+        now[0] += 0.9 * follow.STUCK
+        nodes._diagnostics.counted = {"ekf_node": {"used": str(count)}}
+        assert not nodes.are_idle()
+    now[0] += 1.1 * follow.STUCK
+    with pytest.raises(
+        InputError, match=r"bias_node and ekf_node: no progress for 120 s.* too slow"
+    ):
+        nodes.are_idle()
+    assert said == ["waiting for bias_node and ekf_node"] * 3
+
+
+def test_a_node_that_does_not_report_is_waited_for_while_it_is_there(monkeypatch):
+    nodes, said, there = reporting(monkeypatch)
     nodes._diagnostics.unchanged |= {"ekf_node": 9, "bias_node": 1}
     assert not nodes.are_idle() and said == ["waiting for bias_node"]
     nodes._diagnostics.unchanged["bias_node"] = 2

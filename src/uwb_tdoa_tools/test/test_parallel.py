@@ -17,6 +17,7 @@ from joblib import cpu_count
 from programs import python, start
 import pytest
 
+from uwb_tdoa_bias.common import executable
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_tools import cli, parallel
 from uwb_tdoa_tools.options import JOBS
@@ -254,6 +255,15 @@ def test_progress_shows_the_work_and_its_share(often):
         assert lines.full.wait(120.0)
     first, *others = lines.getvalue().splitlines()
     assert first.startswith("weigh: ") and "weigh: weighing, 1 of 8 flights done, 0 s" in others
+
+
+def test_progress_shows_what_compiles(often, monkeypatch):
+    monkeypatch.setattr(executable.COMPILING, "text", "compiling, soon done")
+    lines = Lines(2)
+    with Progress("weigh", stream=lines):
+        assert executable.COMPILING.shown and lines.full.wait(120.0)
+    assert not executable.COMPILING.shown
+    assert lines.getvalue().splitlines()[0] == "weigh: 0 s, compiling, soon done"
 
 
 def test_short_work_prints_no_progress(monkeypatch):

@@ -25,8 +25,8 @@ import time
 from typing import Any, Protocol, TextIO, TypeVar
 import warnings
 
+from uwb_tdoa_bias.common import executable
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.executable import outside_present_folder
 
 Item = TypeVar("Item")
 
@@ -100,9 +100,11 @@ class Progress:
             self._bar = tqdm(total=self._total, file=stream, leave=False, **form)
         self._thread = Thread(target=self._tell, args=(stream,), daemon=True)
         self._thread.start()
+        executable.COMPILING.shown = True
         return self
 
     def __exit__(self, *_: object) -> None:
+        executable.COMPILING.shown = False
         self._ended.set()
         self._thread.join()
         if self._bar is not None:
@@ -118,11 +120,12 @@ class Progress:
             elif self._total is None:
                 self._bar.set_description_str(self._line())
             else:
-                self._bar.refresh()
+                self._bar.set_postfix_str(executable.COMPILING.text)
 
     def _line(self) -> str:
         share = f"{self._done} of {self._total} {self._unit}s done" if self._total else ""
-        parts = filter(None, (self._what, share, f"{time.monotonic() - self._start:.0f} s"))
+        took = f"{time.monotonic() - self._start:.0f} s"
+        parts = filter(None, (self._what, share, took, executable.COMPILING.text))
         return f"{self._name}: " * bool(self._name) + ", ".join(parts)
 
 
@@ -221,7 +224,7 @@ def _results(
                 # Arrays are not mapped from files: numba compiles again for read-only arrays.
                 pool = Parallel(processes, return_as="generator", batch_size=1, max_nbytes=None)
             # joblib starts Python by -m, which looks for modules in the present folder.
-            with _children_ignore_interrupts(), outside_present_folder():
+            with _children_ignore_interrupts(), executable.outside_present_folder():
                 return pool(calls)
 
         folder = os.getcwd() if dask is None else None

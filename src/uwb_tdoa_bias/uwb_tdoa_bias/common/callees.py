@@ -8,20 +8,27 @@ calls (a callee) is only typed and lowered. A function that Python calls (a root
 below it once, optimizes them together and makes machine code. That takes 40 % of the processor
 time, and the results are equal to the bit: `docs/notebook/speed.md`.
 
-`install` replaces four methods and a class of numba, in versions in which this was tried. In others
-numba compiles as usual, which takes longer. Functions of other packages compile as usual, too.
+Three more things that a compilation spends a tenth of its time on are shortened, for the functions of
+all packages: the values of flags are read one by one for each call of a function, timers run that
+nobody reads, and the text of an error is compiled for each assignment to a slice.
+
+`install` replaces methods and a class of numba, in versions in which this was tried. In others
+numba compiles as usual, which takes longer. Functions of other packages have all callees, as usual.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import nullcontext
 import threading
 from typing import Any
 
 from numba import version_info
-from numba.core import codegen, cpu, dispatcher, sigutils
+from numba.core import codegen, cpu, dispatcher, event, sigutils, targetconfig
 from numba.core.caching import NullCache
 from numba.core.environment import lookup_environment
+from numba.extending import overload
+from numba.np import arrayobj
 
 TRIED = (0, 57), (0, 68)  # first and last version of numba
 WITHOUT_WRAPPERS = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
@@ -140,4 +147,19 @@ def install() -> bool:
     kind.add_overload = add_overload
     context.get_executable = get_executable
     codegen.JITCPUCodegen._library_class = _Library
+    flags: Any = targetconfig.TargetConfig
+    flags.values = _values
+    event.install_timer = lambda *_: nullcontext()  # type: ignore[assignment]  # it enters and does nothing
+    if hasattr(arrayobj, "ol_raise_with_shape_context_generic"):  # since numba 0.58
+        overload(_wrong_shape)(arrayobj.ol_raise_with_shape_context_generic)
+        arrayobj.raise_with_shape_context = _wrong_shape
     return True
+
+
+def _values(self: Any) -> dict[str, Any]:
+    """Return {option: its value} of numba's flags."""
+    return {name: self._values.get(name, option._default) for name, option in self.options.items()}
+
+
+def _wrong_shape(source: Any, target: Any) -> None:
+    """Raise ValueError for an assignment to a slice of another shape; of compiled code only."""

@@ -58,6 +58,9 @@ with _hidden("scipy", "coverage"):
 
 _FUNCTIONS: list[Any] = []  # all compiled functions; numba compiles at the first call
 SAY_EVERY = 10.0  # s
+# Share of the time that passes until all functions are typed; the rest links and optimizes (`check`
+# of a flight). Below BUSY of a core, other programs use the machine.
+BEFORE_LINKING, BUSY = 0.7, 0.6
 # Machine code also depends on these. numba names the version of Python in its files.
 VERSIONS = f"{numba.__version__} {np.__version__}"
 PACKAGES = __name__.partition("_bias")[0]  # how the names of our packages begin
@@ -129,24 +132,27 @@ def compiled(function: Function) -> Function:
 
 
 class _Listener(event.Listener):
-    """Print to stderr that a compilation begins, and its progress every SAY_EVERY seconds.
+    """Report that a compilation begins, its share, and about how long it still takes.
 
-    With an empty cache, compilation takes one to two minutes. The printed share counts the functions
-    of all imported modules; the filter needs nearly all of them.
+    With an empty cache, compilation takes one to two minutes. The share counts the functions of all
+    imported modules; the filter needs nearly all of them. Lines of progress show the report; without
+    any, it is printed to stderr every SAY_EVERY seconds.
     """
 
     def __init__(self) -> None:
-        self._compiled, self._depth, self._began = 0.0, 0, 0.0  # s
-        self._announced = False
-        self._share = 0.0  # printed last; more modules make it smaller, which would irritate
+        self._depth = 0
+        self._spent, self._since = np.zeros(2), _clocks()  # s: elapsed, and of the processor
+        self._said = self._whole = 0.0  # s: elapsed at the last report, and expected in all
+        self._share = 0.0  # reported last; more modules make it smaller, which would irritate
         self._collect = gc.get_threshold()
 
     def on_start(self, event: Event) -> None:
         if not self._depth:
-            self._announce()
-            self._collect = gc.get_threshold()
+            if not self._spent.any() and not any(_place("code").rglob("*.nbi")):
+                text = "compiling the filter, which is done once and takes about a minute"
+                print(text, file=sys.stderr, flush=True)
+            self._collect, self._since = gc.get_threshold(), _clocks()
             gc.set_threshold(*executable.COLLECT)
-        self._began = self._began if self._depth else time.monotonic()
         self._depth += 1
         self._tell()
 
@@ -155,24 +161,31 @@ class _Listener(event.Listener):
         self._depth -= 1
         if not self._depth:
             gc.set_threshold(*self._collect)
-
-    def _announce(self) -> None:
-        first, self._announced = not self._announced, True
-        if first and not any(_place("code").rglob("*.nbi")):
-            text = "compiling the filter, which is done once and takes about a minute"
-            print(text, file=sys.stderr, flush=True)
+            executable.COMPILING.text = ""
 
     def _tell(self) -> None:
-        now = time.monotonic()
-        if now - self._began > SAY_EVERY:
-            self._compiled, self._began = self._compiled + now - self._began, now
-            share = sum(bool(each.signatures) for each in _FUNCTIONS) / len(_FUNCTIONS)
-            self._share = max(self._share, share)
-            print(
-                f"compiling, which is done once: {self._share:.0%}, {self._compiled:.0f} s",
-                file=sys.stderr,
-                flush=True,
-            )
+        now = _clocks()
+        self._spent, self._since = self._spent + now - self._since, now
+        elapsed, used = self._spent
+        if elapsed - self._said < SAY_EVERY:
+            return
+        self._said = elapsed
+        share = sum(bool(each.signatures) for each in _FUNCTIONS) / len(_FUNCTIONS)
+        if share > self._share:
+            self._share, self._whole = share, elapsed / (BEFORE_LINKING * share)
+        left = max(self._whole - elapsed, 0.0)
+        about = f"{left / 60.0:.0f} min" if left > 120.0 else f"{left:.0f} s"
+        done = f"{self._share:.0%}, {elapsed:.0f} s, about {about} left"
+        text = f"compiling, which is done once: {done}"
+        if used < BUSY * elapsed:
+            text += f"; the machine is busy and gives this {used / elapsed:.0%} of a core"
+        executable.COMPILING.text = text
+        if not executable.COMPILING.shown:
+            print(text, file=sys.stderr, flush=True)
+
+
+def _clocks() -> np.ndarray:
+    return np.array([time.monotonic(), time.thread_time()])
 
 
 event.register("numba:compile", _Listener())

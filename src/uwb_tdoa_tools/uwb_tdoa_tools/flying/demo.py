@@ -199,7 +199,8 @@ def _error(ax: Axes, scores: Sequence[Score]) -> None:
 
 
 CORRECTION = "bias.onnx"  # file of the correction of a simulated hall
-MISSING = ("lost", "late", "imu_late", "imu_lost")  # outcomes of messages
+# outcomes of messages that change the result
+MISSING = "lost", "late", "early", "imu_late", "imu_lost", "sensors_late", "odometry_lost"
 SLOW = 0.5  # times as fast as flown: the rate that is suggested first
 
 
@@ -287,7 +288,8 @@ def through_nodes(
     # a node runs in another directory
     bias = {name: str(Path(file).resolve()) for name, file in files.items() if file}
     live = run_live(bag, folder, rate, bias, {"use_imu": flight.imu is not None}, say)
-    return LivePass(accounts(live.bias, live.ekf, flight), read_odometry(live.recorded))
+    odometry = read_odometry(live.recorded)
+    return LivePass(accounts(live.bias, live.ekf, flight, len(odometry.t)), odometry)
 
 
 def fly(
@@ -613,13 +615,12 @@ def arrivals_in_words(flight: Flight, outcome: dict[str, int]) -> list[str]:
     -------
     list of str
     """
-    counts = ", ".join(
-        f"{count} {name}" for name, count in outcome.items() if not name.startswith("imu_")
-    )
+    counts = ", ".join(f"{count} {name}" for name, count in outcome.items() if "_" not in name)
     samples = 0 if flight.imu is None else len(flight.imu)
     return [
         f"TDOAs {len(flight.tdoa)}: {counts}",
         f"IMU samples {samples}: {outcome['imu_late']} late, {outcome['imu_lost']} lost",
+        f"other sensors: {outcome['sensors_late']} late; odometry: {outcome['odometry_lost']} lost",
     ]
 
 

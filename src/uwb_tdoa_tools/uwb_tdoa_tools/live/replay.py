@@ -65,6 +65,8 @@ LAG = 0.25  # s, default of `lag`
 IDLE = 2  # reports of a node with unchanged counters after which it has nothing to do
 SILENCE = 5.0  # s without a message after which a topic of other nodes is silent
 LOOK = 10.0  # s between two looks at the nodes that are waited for
+# s without output or a change of a counter after which the nodes are stuck, on any machine
+STUCK = 120.0
 POLL_PERIOD = 0.001  # s
 RESIDUAL = "uwb/residual"
 LEARNED = 20  # TDOAs from which the shift of stamps by bias_node is estimated
@@ -322,7 +324,9 @@ class Nodes:
             If their parameters end a wait too early, or a node publishes no /diagnostics.
         """
         self._node, self._diagnostics, self._say = node, DiagnosticsListener(node), say
-        self._watched = self._looked = 0.0  # s, beginning of the watch, and last look at the graph
+        # s, beginning of the watch, last look at the graph, and last change of a counter
+        self._watched = self._looked = self._moved = 0.0
+        self._counts_before: dict[str, dict[str, str]] = {}
         space = node.get_namespace()
         wait_for_names(node)
         self._names = {
@@ -344,13 +348,18 @@ class Nodes:
     def watch(self) -> None:
         """Start to watch whether the nodes have nothing to do."""
         self._diagnostics.forget()
-        self._watched = self._looked = time.monotonic()
+        self._watched = self._looked = self._moved = time.monotonic()
 
     def are_idle(self) -> bool:
         """Return whether no node has anything to do: each has reported unchanged counters.
 
         A node that does not report gets no processor time: it has something to do until it leaves
-        the graph. Without our nodes, SILENCE decides.
+        the graph, or is STUCK. Without our nodes, SILENCE decides.
+
+        Raises
+        ------
+        InputError
+            If the nodes have done nothing for STUCK s.
         """
         self._diagnostics.poll()
         now = time.monotonic()
@@ -363,7 +372,16 @@ class Nodes:
         ]
         if busy and now > self._looked + LOOK:
             self._looked, busy = now, [name for name in busy if self._is_there(name)]
-            self._say(f"waiting for {' and '.join(busy) or 'nodes that have ended'}")
+            names = " and ".join(busy) or "nodes that have ended"
+            counts, self._counts_before = self._counts_before, self._diagnostics.counts()
+            if counts != self._counts_before:
+                self._moved = now
+            if busy and now > self._moved + STUCK:
+                raise InputError(
+                    f"--follow: {names}: no progress for {STUCK:g} s, stuck or without processor "
+                    "time; the machine is too slow: end other programs, and start again."
+                )
+            self._say(f"waiting for {names}")
         return not busy
 
     def faults(self, count_played: Callable[[str], int], stop: Stop) -> dict[str, int]:

@@ -50,7 +50,7 @@ RELIABLE = {
 }
 DEPTH = 1_000_000  # messages that may wait in a subscription
 READY_LIMIT = 60.0  # s without progress; the first start compiles the filter, which is progress
-MATCH_LIMIT = 60.0  # s
+MATCH_LIMIT = 300.0  # s; a slow machine takes long to find the nodes
 SETTLE_LIMIT = 60.0  # s without a change of the counters, while the nodes work off a fast replay
 
 
@@ -171,21 +171,33 @@ def run_live(
     return LiveRun(recorded, diagnostics.newest("bias_node"), diagnostics.newest("ekf_node"))
 
 
-def accounts(bias: dict[str, str], ekf: dict[str, str], flight: Flight) -> dict[str, int]:
+def accounts(
+    bias: dict[str, str], ekf: dict[str, str], flight: Flight, recorded: int
+) -> dict[str, int]:
     """Count the messages of a replayed Flight by outcome, from the last diagnostics of both nodes.
+
+    Parameters
+    ----------
+    recorded : int
+        Number of recorded odometries.
 
     Returns
     -------
     dict
-        {verdict: TDOAs, "waiting": TDOAs, "lost": TDOAs, "imu_late": samples, "imu_lost": samples}.
+        {verdict: TDOAs, "waiting": TDOAs, "lost": TDOAs, "early": TDOAs corrected before their pose
+        was there, "imu_late": samples, "imu_lost": samples, "sensors_late": values of the other
+        sensors, "odometry_lost": messages}.
     """
     counts = {name: int(ekf[name]) for name in (*VERDICTS.values(), "waiting")}
     counts["waiting"] += int(bias["waiting"])  # for poses, which end with the first of the streams
     counts["lost"] = len(flight.tdoa) - sum(counts.values())
     samples = 0 if flight.imu is None else len(flight.imu)
     return counts | {
+        "early": int(bias["released before their pose"]),
         "imu_late": int(ekf["imu_late"]),
         "imu_lost": samples - int(ekf["IMU samples received"]),
+        "sensors_late": sum(int(ekf.get(f"{name}_late", 0)) for name in SENSORS),
+        "odometry_lost": int(ekf["odometry published"]) - recorded,
     }
 
 
