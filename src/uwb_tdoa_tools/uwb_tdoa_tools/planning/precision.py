@@ -251,11 +251,6 @@ class Installation:
         return [PARTS[name](heard) for name in self.pairing.split("+")]
 
     @property
-    def measures_ranges(self) -> bool:
-        """Whether a round holds distances: those to anchors that are not in a plane have one solution."""
-        return "every_range" in self.pairing
-
-    @property
     def unknowns(self) -> int:
         """Coordinates that TDOAs must determine: 2 if the height is known or measured, else 3."""
         return 2 if self.height_std < np.inf else self.dimensions

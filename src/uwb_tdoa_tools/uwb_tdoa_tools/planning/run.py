@@ -50,7 +50,7 @@ def plan(args: Namespace) -> bool:
     room = room_of_options(args, anchors)
     reach = reach_of(args, room)
     installation = installation_of(args, anchors or Anchors.from_positions([room.centre]))
-    demand = demand_of(args, installation, room)
+    demand = Demand(room, args.accuracy, args.flyable)
     grid = grid_of(args, room)
     reading = Reading(args.anchors)
     recordings = reading.find(args.flights or [], bool(args.dask))
@@ -98,28 +98,63 @@ def plan(args: Namespace) -> bool:
 
 def check_options(args: Namespace) -> None:
     """Raise InputError for options that do not go together."""
-    if args.hall == (args.anchors is not None):
-        raise InputError(
-            "ANCHORS: give a file of the anchors that there are, or --hall where they are "
-            "asked for."
-        )
-    if not 0.0 < args.share <= 1.0:
-        raise InputError(
-            f"share: {args.share:g} is none; give more than 0 and at most 1, e.g. 0.95."
-        )
-    if args.walls is not None and args.radio_reach is None:
-        raise InputError(
-            "walls: are for a hall of which a tag hears a part; give --radio-reach too."
-        )
     is_hall = args.hall or args.radio_reach is not None
-    for name in ("flights", "improve"):
-        if is_hall and getattr(args, name):
-            raise InputError(
-                f"{name}: is for a room in which every anchor is heard; leave out --{name}, "
-                "or --radio-reach."
+    numbers = 0 if args.room is None else len(args.room)
+    pairings = args.flyable == "pairings"
+    for wrong, said in (
+        (
+            args.hall == (args.anchors is not None),
+            "ANCHORS: give a file of the anchors that there are, or --hall where they are asked for.",
+        ),
+        (
+            not 0.0 < args.share <= 1.0,
+            f"share: {args.share:g} is none; give more than 0 and at most 1, e.g. 0.95.",
+        ),
+        (
+            args.walls is not None and args.radio_reach is None,
+            "walls: are for a hall of which a tag hears a part; give --radio-reach too.",
+        ),
+        *(
+            (
+                is_hall and getattr(args, name),
+                f"{name}: is for a room in which every anchor is heard; leave out --{name}, or "
+                "--radio-reach.",
             )
-    if args.flights and args.planar:
-        raise InputError("flights: are judged in three dimensions; leave out --planar.")
+            for name in ("flights", "improve")
+        ),
+        (
+            args.flights and args.planar,
+            "flights: are judged in three dimensions; leave out --planar.",
+        ),
+        (
+            args.volume and args.planar,
+            "planar: with a known height there is no volume; leave out --volume, or --planar.",
+        ),
+        (
+            pairings and "ranges" in args.protocol,
+            "flyable: looks for a second solution of TDOAs, and ranges have none; leave it out, or "
+            "plan for --protocol tdoa2.",
+        ),
+        (
+            pairings and is_hall,
+            "flyable: pairings are of a room in which every anchor is heard; leave out --flyable, or "
+            "--radio-reach.",
+        ),
+        (
+            args.radio_reach is not None and not args.radio_reach > 0.0,
+            f"radio reach: {args.radio_reach} m is none; give one above 0, e.g. 18.",
+        ),
+        (
+            args.hall and numbers != 6,
+            "room: --hall needs all of it, in metres; give --room X0 X1 Y0 Y1 Z0 Z1.",
+        ),
+        (
+            numbers not in (0, 4, 6),
+            f"room: {numbers} numbers were given; give X0 X1 Y0 Y1 or X0 X1 Y0 Y1 Z0 Z1.",
+        ),
+    ):
+        if wrong:
+            raise InputError(said)
 
 
 def installation_of(args: Namespace, anchors: Anchors) -> Installation:
@@ -144,39 +179,15 @@ def installation_of(args: Namespace, anchors: Anchors) -> Installation:
     )
 
 
-def demand_of(args: Namespace, installation: Installation, room: Room) -> Demand:
-    """Return the Demand of the options in a Room.
-
-    Raises InputError for a criterion that ranges, or a hall, do not have.
-    """
-    if installation.measures_ranges and args.flyable == "pairings":
-        raise InputError(
-            "flyable: looks for a second solution of TDOAs, and ranges have none; "
-            "leave it out, or plan for --protocol tdoa2."
-        )
-    if installation.hall and args.flyable == "pairings":
-        raise InputError(
-            "flyable: pairings are of a room in which every anchor is heard; leave out "
-            "--flyable, or --radio-reach."
-        )
-    return Demand(room, args.accuracy, args.flyable)
-
-
 def reach_of(args: Namespace, room: Room) -> float:
     """Return the radio's reach, m. Raises InputError if a large Room needs it."""
-    if args.radio_reach is not None:
-        if not args.radio_reach > 0.0:
-            raise InputError(
-                f"radio reach: {args.radio_reach:g} m is none; give one above 0, e.g. 18."
-            )
-        return float(args.radio_reach)
     longest = (room.upper - room.lower).max()
-    if longest > FARTHEST:
+    if args.radio_reach is None and longest > FARTHEST:
         raise InputError(
             f"room: is {longest:.0f} m long, and a tag does not hear all of its anchors; give "
             "what your radios reach, e.g. --radio-reach 25."
         )
-    return np.inf
+    return np.inf if args.radio_reach is None else float(args.radio_reach)
 
 
 def room_of_options(args: Namespace, anchors: Anchors | None) -> Room:
@@ -185,30 +196,16 @@ def room_of_options(args: Namespace, anchors: Anchors | None) -> Room:
     anchors : None if --hall asks for them.
     """
     if anchors is None:
-        if args.room is None or len(args.room) != 6:
-            raise InputError(
-                "room: --hall needs all of it, in metres; give --room X0 X1 Y0 Y1 Z0 Z1."
-            )
         return Room.of_numbers("room", args.room)
     room = room_of(anchors)
     if args.room is None:
         return room
-    if len(args.room) not in (4, 6):
-        raise InputError(
-            f"room: {len(args.room)} numbers were given; give X0 X1 Y0 Y1 or X0 X1 Y0 Y1 Z0 Z1."
-        )
-    return Room.of_numbers(
-        "room", args.room if len(args.room) == 6 else [*args.room, room.lower[2], room.upper[2]]
-    )
+    return Room.of_numbers("room", [*args.room, room.lower[2], room.upper[2]][:6])
 
 
 def grid_of(args: Namespace, room: Room) -> Grid:
     """Return the Grid of a slice or of the Room. Raises InputError."""
     size = room.upper - room.lower
-    if args.volume and args.planar:
-        raise InputError(
-            "planar: with a known height there is no volume; leave out --volume, or --planar."
-        )
     if args.volume:
         return Grid.box(room.lower, room.upper, args.step or size.max() / CELLS_ACROSS["volume"])
     height = room.centre[2] if args.height is None else args.height

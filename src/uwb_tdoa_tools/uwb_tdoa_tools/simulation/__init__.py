@@ -37,7 +37,6 @@ def simulate(config: SimulationConfig, trajectory: Flyable | None = None) -> Fli
     Raises InputError if the parts of the config contradict each other.
     """
     filled, room = config.complete()
-    assert filled.anchors is not None
     flown: Flyable = trajectory or VEHICLES[filled.vehicle](
         filled, room, filled.random("trajectory")
     )

@@ -38,6 +38,8 @@ VEHICLE_DEFAULTS = MappingProxyType(
         "hand": {"height": 1.1, "imu_rate": 100.0, "truth_rate": 50.0, "yaw": "along_track"},
     }
 )
+# A SimulationConfig as `complete` returns it: place, height, radius and anchors are not None
+Complete = Any
 NOISES = tuple(f"{name}_noise" for name in SENSORS)
 
 
@@ -282,7 +284,7 @@ class SimulationConfig(_Noises):
                     f"area: {self.area!r} is not a lower and an upper corner, each x, y in metres."
                 )
 
-    def complete(self) -> tuple[SimulationConfig, Room]:
+    def complete(self) -> tuple[Complete, Room]:
         """Return (config, Room); place, height, radius, anchors and anchor_noise_std are filled in."""
         anchors = self.anchors if self.anchors is not None else constellation(self.constellation)
         if len(anchors) < 2:

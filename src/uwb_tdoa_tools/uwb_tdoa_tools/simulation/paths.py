@@ -19,7 +19,7 @@ from uwb_tdoa_bias.common.errors import InputError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from .config import SimulationConfig
+    from .config import Complete
     from .rooms import Room
 
 
@@ -32,13 +32,8 @@ STEP = Polynomial([0, 0, 0, 0, 0, 126, -420, 540, -315, 70])
 _RAMP = STEP.integ()
 
 
-def circle(
-    s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator
-) -> np.ndarray:
+def circle(s: np.ndarray, config: Complete, room: Room, rng: np.random.Generator) -> np.ndarray:
     """Fly a level circle around the place, radius and speed as configured."""
-    assert (
-        config.radius is not None and config.place is not None and config.height is not None
-    )  # complete
     angle = config.speed * s / config.radius
     return np.column_stack(
         [
@@ -50,10 +45,9 @@ def circle(
 
 
 def rising_circle(
-    s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator
+    s: np.ndarray, config: Complete, room: Room, rng: np.random.Generator
 ) -> np.ndarray:
     """Fly the circle with a height that rises and falls in a sine, up to 0.6 m, 0.7 times per turn."""
-    assert config.height is not None and config.radius is not None  # complete
     p = circle(s, config, room, rng)
     low, high = room.path_box
     swing = np.clip(min(high[2] - config.height, config.height - low[2]), 0.0, 0.6)
@@ -61,9 +55,7 @@ def rising_circle(
     return p
 
 
-def sines(
-    s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator
-) -> np.ndarray:
+def sines(s: np.ndarray, config: Complete, room: Room, rng: np.random.Generator) -> np.ndarray:
     """Fly products of two sines per axis, of seeded amplitude, period and phase.
 
     They fill the flyable room. `speed` is the root mean square here. Source: the training
@@ -82,33 +74,23 @@ def sines(
     return position(s * config.speed / np.sqrt(np.mean(np.sum(velocity**2, axis=1))))
 
 
-def square(
-    s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator
-) -> np.ndarray:
+def square(s: np.ndarray, config: Complete, room: Room, rng: np.random.Generator) -> np.ndarray:
     """Fly a level square around the place, its edges `radius` away, with rounded corners."""
-    assert config.radius is not None  # complete
     return _laps(s, config, [[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]], config.radius)
 
 
-def line_x(
-    s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator
-) -> np.ndarray:
+def line_x(s: np.ndarray, config: Complete, room: Room, rng: np.random.Generator) -> np.ndarray:
     """Fly back and forth along x through the place, `radius` to each side, with smooth turns."""
     return _laps(s, config, [[-1, 0], [1, 0], [-1, 0]], 0.0)
 
 
-def line_y(
-    s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator
-) -> np.ndarray:
+def line_y(s: np.ndarray, config: Complete, room: Room, rng: np.random.Generator) -> np.ndarray:
     """Fly back and forth along y in the same way."""
     return _laps(s, config, [[0, -1], [0, 1], [0, -1]], 0.0)
 
 
-def waypoints(
-    s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator
-) -> np.ndarray:
+def waypoints(s: np.ndarray, config: Complete, room: Room, rng: np.random.Generator) -> np.ndarray:
     """Fly through the points of `config.path` and back to the first, repeatedly, corners rounded."""
-    assert config.path is not None and config.height is not None  # complete
     # A point x, y is at `config.height`.
     points = np.array([(*point, config.height)[:3] for point in config.path])
     closed = np.vstack([points, points[:1]])
@@ -116,26 +98,20 @@ def waypoints(
     return _round(s, config.speed, closed, np.concatenate([[0.0], np.cumsum(lengths)]), 0.0)
 
 
-def timed(
-    s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator
-) -> np.ndarray:
+def timed(s: np.ndarray, config: Complete, room: Room, rng: np.random.Generator) -> np.ndarray:
     """Fly the timed `poses`, and stay at the last."""
-    assert config.poses is not None
     t, x, y, z, _ = np.transpose(config.poses)
     at: np.ndarray = CubicSpline(t - t[0], np.column_stack([x, y, z]))(np.minimum(s, t[-1] - t[0]))
     return at
 
 
 def _laps(
-    s: np.ndarray, config: SimulationConfig, corners: Sequence[Sequence[float]], ahead: float
+    s: np.ndarray, config: Complete, corners: Sequence[Sequence[float]], ahead: float
 ) -> np.ndarray:
     """Return positions along level corners, (n, 2) in units of the radius, equally far apart.
 
     The start is `ahead` m further.
     """
-    assert (
-        config.radius is not None and config.place is not None and config.height is not None
-    )  # complete
     ends = 2.0 * config.radius * np.arange(len(corners))
     rounded = _round(s, config.speed, config.radius * np.asarray(corners), ends, ahead)
     return np.column_stack([rounded + config.place, np.full(len(s), config.height)])
@@ -161,11 +137,8 @@ def _round(
     return rounded
 
 
-def hover(
-    s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator
-) -> np.ndarray:
+def hover(s: np.ndarray, config: Complete, room: Room, rng: np.random.Generator) -> np.ndarray:
     """Stay at the place."""
-    assert config.place is not None and config.height is not None  # complete
     return np.tile([*config.place, config.height], (len(s), 1))
 
 
@@ -181,9 +154,7 @@ TRAJECTORIES = {
 }
 
 
-def path_of(
-    s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator
-) -> np.ndarray:
+def path_of(s: np.ndarray, config: Complete, room: Room, rng: np.random.Generator) -> np.ndarray:
     """Return positions (n, 3) m at path times s (n,) s, of the waypoints or the family of a config.
 
     Raises InputError if they leave the room.
@@ -220,7 +191,7 @@ def path_time(tau: np.ndarray, rise: float, air: float) -> np.ndarray:
     )
 
 
-def yaw_along(s: np.ndarray, p: np.ndarray, config: SimulationConfig) -> np.ndarray:
+def yaw_along(s: np.ndarray, p: np.ndarray, config: Complete) -> np.ndarray:
     """Return the yaw at every knot, rad: that of the poses, or "fixed", "along_track" or "rotating"."""
     if config.poses is not None:
         t, *_, yaw = np.transpose(config.poses)

@@ -17,7 +17,7 @@ from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_bias.common.radio import FLAT_MOUNT, Antenna, RadioLink, arrival_bias
 from uwb_tdoa_bias.common.sensors import SENSORS, Stream, Velocity
 
-from .config import WHEELS_RATE, ImuErrors, SimulationConfig
+from .config import WHEELS_RATE, Complete, ImuErrors
 from .rooms import Room, heard_at
 from .vehicles import Flyable
 
@@ -194,7 +194,7 @@ def tag_link(unit: int) -> RadioLink:
 
 
 def measure_tdoas(
-    config: SimulationConfig, room: Room, trajectory: Flyable
+    config: Complete, room: Room, trajectory: Flyable
 ) -> tuple[Tdoas, dict[str, np.ndarray], dict[str, Any]]:
     """Simulate all TDOAs of a flight with a complete config: (Tdoas, truth, parameters).
 
@@ -206,7 +206,6 @@ def measure_tdoas(
     truth : dict of "t" and the (n,) errors "bias", "multipath", "noise", "outlier", m.
     parameters : the constants of the errors.
     """
-    assert config.anchors is not None  # complete
     anchors, random = config.anchors, config.random
     schedule = make_schedule(
         config.protocol, len(anchors), config.duration, random("schedule"), config.tdoa_rate
@@ -374,7 +373,7 @@ def measure_imu(
     return Imu(t, gyro, accel), gyro_bias, accel_bias
 
 
-def measure_sensors(config: SimulationConfig, room: Room, trajectory: Flyable) -> dict[str, Stream]:
+def measure_sensors(config: Complete, room: Room, trajectory: Flyable) -> dict[str, Stream]:
     """Simulate each of SENSORS that has a noise in the complete SimulationConfig: {name: Stream}.
 
     Streams have white noise; the wheels of a rover also have scale and slip.
@@ -399,7 +398,7 @@ def measure_sensors(config: SimulationConfig, room: Room, trajectory: Flyable) -
     return out
 
 
-def _of_wheels(velocity: Stream, config: SimulationConfig, turning: np.ndarray) -> Velocity:
+def _of_wheels(velocity: Stream, config: Complete, turning: np.ndarray) -> Velocity:
     """Apply the errors of two wheels to a Velocity and the true turning rate (n,) rad/s."""
     assert isinstance(velocity, Velocity)
     n, t = len(velocity), velocity.t

@@ -20,7 +20,7 @@ from .rooms import REST_HEIGHT, Room
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from .config import SimulationConfig
+    from .config import Complete
 
 
 GRAVITY = 9.81  # m/s^2
@@ -98,16 +98,13 @@ class Trajectory:
         self._yaw = make_interp_spline(t, yaw, k=7, bc_type=of_yaw)
 
     @classmethod
-    def of_config(
-        cls, config: SimulationConfig, room: Room, rng: np.random.Generator
-    ) -> Trajectory:
+    def of_config(cls, config: Complete, room: Room, rng: np.random.Generator) -> Trajectory:
         """Return the flight over 0 ... config.duration, of a complete config in a room.
 
         Around the path the vehicle takes off, speeds up, slows down and lands. `rng` draws the
         family of the path. Raises InputError if the flight does not fit the room, the time or the
         vehicle.
         """
-        assert config.height is not None  # complete
         start, end = 0.0, config.duration
         if not config.start_in_air:
             rise = max(3.0, 1.5 * config.height)
@@ -195,7 +192,7 @@ class Rover:
     stands for config.floor_time before and after.
     """
 
-    def __init__(self, config: SimulationConfig, room: Room, rng: np.random.Generator) -> None:
+    def __init__(self, config: Complete, room: Room, rng: np.random.Generator) -> None:
         """Follow the path of a complete config in a room; `rng` draws stops and the family."""
         _check_time(config)
         self._floor = float(room.lower[2])
@@ -245,7 +242,7 @@ class Rover:
         return turns
 
 
-def _path_rate(tau: np.ndarray, config: SimulationConfig, rng: np.random.Generator) -> np.ndarray:
+def _path_rate(tau: np.ndarray, config: Complete, rng: np.random.Generator) -> np.ndarray:
     """Return the rate of path time at tau (n,) s: 0 at rest and at stops, 1 between them, smooth."""
     ends = [0.0, config.floor_time]
     last = config.duration - config.floor_time - SPEED_UP
@@ -307,14 +304,13 @@ class HandHeld:
     after.
     """
 
-    def __init__(self, config: SimulationConfig, room: Room, rng: np.random.Generator) -> None:
+    def __init__(self, config: Complete, room: Room, rng: np.random.Generator) -> None:
         """Fit the splines to the path of a complete config in a room; `rng` draws the sway."""
         _check_time(config)
         tau = np.linspace(0.0, config.duration, max(int(np.ceil(config.duration / KNOT)), 8) + 1)
         s = path_time(tau, config.floor_time, config.duration)
         p = path_of(s, config, room, rng)
         if config.path is None:
-            assert config.height is not None  # complete
             p[:, 2] = config.height
         yaw = yaw_along(s, p, config)
         pace = np.gradient(s, tau)
@@ -361,7 +357,7 @@ def _without_sign_flips(q: np.ndarray) -> np.ndarray:
     return q
 
 
-def _check_time(config: SimulationConfig) -> None:
+def _check_time(config: Complete) -> None:
     shortest = 2.0 * (config.floor_time + SPEED_UP)
     if config.duration < shortest:
         raise InputError(
@@ -370,7 +366,7 @@ def _check_time(config: SimulationConfig) -> None:
         )
 
 
-VEHICLES: dict[str, Callable[[SimulationConfig, Room, np.random.Generator], Flyable]] = {
+VEHICLES: dict[str, Callable[[Complete, Room, np.random.Generator], Flyable]] = {
     "quadrotor": Trajectory.of_config,
     "rover": Rover,
     "hand": HandHeld,
