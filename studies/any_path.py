@@ -13,8 +13,7 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_tools.simulation.paths import STEP
-from uwb_tdoa_tools.simulation.vehicles import DRAG, GRAVITY, ExactMotion
+from uwb_tdoa_tools.simulation.vehicles import DRAG, GRAVITY, STEP, ExactMotion
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -21,10 +21,10 @@ from uwb_tdoa_ekf.monitoring.status import RUNNING, Use, status_of
 from uwb_tdoa_ekf.monitoring.stream_rules import StreamWatch
 from uwb_tdoa_ekf.results import concatenated, rotation_std, rows_of
 from uwb_tdoa_tools import cli
+from uwb_tdoa_tools.flying.sensors import world_of
 from uwb_tdoa_tools.flying.simulator import Streams
 from uwb_tdoa_tools.flying.trial import OwnFilter, Task, Trial
 from uwb_tdoa_tools.flying.verdict import verdict_of
-from uwb_tdoa_tools.flying.world import world_of
 
 from .. import table
 

@@ -17,10 +17,9 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.correction.features import FEATURES
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, Samples, SmoothTerm
 from uwb_tdoa_bias.effects.samples import Motion
-from uwb_tdoa_tools.exporting.c_code import Dense
+from uwb_tdoa_tools.exporting.c_code import MEMBERS, Dense
 from uwb_tdoa_tools.exporting.expressions import ELEMENTWISE
-from uwb_tdoa_tools.exporting.vehicle import MEMBERS
-from uwb_tdoa_tools.training.network import WITHOUT
+from uwb_tdoa_tools.training.models import WITHOUT
 
 HERE = Path(__file__).parent / "cortex_m"
 GCC, ARM_GCC = shutil.which("gcc"), shutil.which("arm-none-eabi-gcc")

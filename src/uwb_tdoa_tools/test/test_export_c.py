@@ -14,7 +14,7 @@ import pytest
 
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_tools.exporting.vehicle import NO_PAIR, NOT_FINITE, vehicle_code
+from uwb_tdoa_tools.exporting.c_code import NO_PAIR, NOT_FINITE, vehicle_code
 
 pytestmark = pytest.mark.skipif(GCC is None, reason="no C compiler (gcc)")
 needs_board = pytest.mark.skipif(

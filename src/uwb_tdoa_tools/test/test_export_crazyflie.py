@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 import yaml
 
 from uwb_tdoa_tools.exporting import crazyflie
-from uwb_tdoa_tools.exporting.vehicle import vehicle_code
+from uwb_tdoa_tools.exporting.c_code import vehicle_code
 
 pytestmark = pytest.mark.skipif(GCC is None, reason="no C compiler (gcc)")
 # Stand-ins for the firmware files that the build needs. This repository does not contain them.

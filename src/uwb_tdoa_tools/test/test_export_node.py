@@ -15,7 +15,7 @@ from uwb_tdoa_bias.correction.corrector import Corrector  # noqa: E402
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet  # noqa: E402
 from uwb_tdoa_ekf.offline import run_offline  # noqa: E402
 from uwb_tdoa_tools.exporting.onnx_file import write_onnx  # noqa: E402
-from uwb_tdoa_tools.training.network import WITHOUT  # noqa: E402
+from uwb_tdoa_tools.training.models import WITHOUT  # noqa: E402
 
 pytestmark = pytest.mark.slow  # starts nodes
 

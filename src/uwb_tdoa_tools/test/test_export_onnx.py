@@ -38,7 +38,7 @@ from uwb_tdoa_tools.exporting.onnx_file import printed, write_onnx  # noqa: E402
 from uwb_tdoa_tools.exporting.tracing import samples_of  # noqa: E402
 from uwb_tdoa_tools.readers import read_flight  # noqa: E402
 from uwb_tdoa_tools.scoring.evaluation import evaluate  # noqa: E402
-from uwb_tdoa_tools.training.network import FEATURES, WITHOUT  # noqa: E402
+from uwb_tdoa_tools.training.models import FEATURES, WITHOUT  # noqa: E402
 
 EQUAL = 1e-4  # m
 ANCHORS = anchors_of()

@@ -18,8 +18,8 @@ from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.commands import simulate as command
 from uwb_tdoa_tools.simulation import NO_IMU_ERRORS, ImuErrors, SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.config import PROTOCOLS, YAW_PROFILES
-from uwb_tdoa_tools.simulation.paths import TRAJECTORIES
 from uwb_tdoa_tools.simulation.rooms import CONSTELLATIONS, Walls, constellation, heard_at, room_of
+from uwb_tdoa_tools.simulation.vehicles import TRAJECTORIES
 
 # --- simulate ---
 

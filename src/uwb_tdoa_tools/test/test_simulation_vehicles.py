@@ -13,8 +13,7 @@ from uwb_tdoa_tools import simulation
 from uwb_tdoa_tools.commands import simulate as command
 from uwb_tdoa_tools.simulation import NO_IMU_ERRORS, SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.config import VEHICLE_DEFAULTS
-from uwb_tdoa_tools.simulation.paths import TRAJECTORIES
-from uwb_tdoa_tools.simulation.vehicles import GRAVITY, VEHICLES, Trajectory
+from uwb_tdoa_tools.simulation.vehicles import GRAVITY, TRAJECTORIES, VEHICLES, Trajectory
 
 CONFIG = SimulationConfig(duration=40.0, speed=1.2)
 YAWS = {"circle": "along_track", "sines": "along_track", "square": "rotating"}

@@ -15,7 +15,7 @@ from uwb_tdoa_bias.correction.features import FEATURES
 from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_tools.scoring.gains import SHARES, best_share
-from uwb_tdoa_tools.training import models, network, physics, shrinking
+from uwb_tdoa_tools.training import models, physics, shrinking
 from uwb_tdoa_tools.training.labels import labels, split, thinned, white_noise
 
 # --- labels ---
@@ -98,11 +98,11 @@ def data():
 
 
 def test_learns_stops_early_and_says_the_same_as_its_file(data, tmp_path):
-    model, (training, validation) = network.fit(*data, 1)
+    model, (training, validation) = models.fit(*data, 1)
     assert len(training) == len(validation)
     assert model.names == FEATURES and len(FEATURES) == 14
     best = int(np.argmin(validation))
-    assert len(validation) in (best + 1 + network.PATIENCE, network.MOST_EPOCHS)
+    assert len(validation) in (best + 1 + models.PATIENCE, models.MOST_EPOCHS)
     (held,) = data[1]
     error = held.error - model.mean(held.samples)
     # the best weights, not the last
@@ -129,7 +129,7 @@ def test_the_seed_decides_and_unknown_orientations_are_no_inputs(data):
         )
         for one in data[0]
     ]
-    found, curves = zip(*(network.fit(blind, data[1], seed) for seed in (0, 0, 1)))
+    found, curves = zip(*(models.fit(blind, data[1], seed) for seed in (0, 0, 1)))
     assert curves[0] == curves[1] != curves[2]
     without = ["azimuth_A_a", "azimuth_A_b", "elevation_A_a", "elevation_A_b"]
     assert [name for name in FEATURES if name not in found[0].names] == without

@@ -73,9 +73,9 @@ def _export(args: Namespace) -> None:
         raise InputError("--effects: is missing, and so is --model; give one of them, or both.")
     if not (args.onnx or args.c or args.crazyflie):
         raise InputError("--onnx, --c, --crazyflie: all are missing; name what to write.")
+    from ..exporting.c_code import write_c, write_crazyflie
     from ..exporting.correction import trace
     from ..exporting.onnx_file import write_onnx  # imports onnx
-    from ..exporting.vehicle import write_c, write_crazyflie
 
     say = partial(cli.say, "export")
     anchors = read_named_anchors(args.survey).anchors

@@ -169,11 +169,11 @@ def parser() -> argparse.ArgumentParser:
 def _fly(args: argparse.Namespace) -> int:
     from uwb_tdoa_bias.correction.network import load_network
 
-    from ..flying import fleet, rover
+    from ..flying import rover, verdict
     from ..flying.mission import Circles, Waypoints
+    from ..flying.sensors import world_of
     from ..flying.trial import Task
     from ..flying.verdict import summary, text, wording_of
-    from ..flying.world import world_of
 
     if args.record is not None:
         args.record.mkdir(parents=True, exist_ok=True)
@@ -203,20 +203,20 @@ def _fly(args: argparse.Namespace) -> int:
         )
         for seed in seeds
     ]
-    one = partial(fleet.fly_task, args.record, args.plot is not None)
+    one = partial(verdict.fly_task, args.record, args.plot is not None)
     verdicts, pictures = zip(*parallel.over(one, tasks, args.jobs, args.dask))
     summed = summary(verdicts)
     cli.show(text(summed))
     if args.json is not None:
         cli.write_json(args.json, {"summary": summed, "flights": verdicts})
     if args.plot is not None:
-        fleet.plot(pictures, world.anchors, args.plot)
+        verdict.plot(pictures, world.anchors, args.plot)
     return int(summed[wording_of(summed).goal] < args.at_least)
 
 
 def _check_rover(args: argparse.Namespace) -> None:
     """Refuse options that a rover has nothing to do with."""
-    from ..flying.world import WORLDS
+    from ..flying.sensors import WORLDS
 
     for name in NOT_OF_ROVERS:
         if getattr(args, name):

@@ -18,8 +18,8 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Flight
 
 from ..choices import PLAN_SPEED, PLAN_TIME
-from ..simulation.paths import SPEED_UP, STEP
 from ..simulation.rooms import Room
+from ..simulation.vehicles import SPEED_UP, STEP
 
 RATE = 20.0  # Hz, of planned poses
 ANCHOR_CLEARANCE = 0.8  # m, smallest distance of the path to an anchor

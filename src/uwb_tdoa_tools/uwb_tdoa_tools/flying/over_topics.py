@@ -35,10 +35,10 @@ from uwb_tdoa_ekf.reorder_buffer import TRIAL
 from uwb_tdoa_msgs.msg import EstimatorStatus, Tdoa
 
 from ..bags.messages import BODY_FRAME
+from .sensors import World
 from .simulator import DT, Streams
 from .trial import EstimateSource
 from .vehicle import ATTITUDE, POSITION
-from .world import World
 
 LARGEST_CATCH_UP = 0.1  # s: a longer delay shifts all later turns
 # s of stamps, more than the parameter `lag` of ekf_node: then the filter continues without a stream

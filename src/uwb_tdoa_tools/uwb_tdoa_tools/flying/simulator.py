@@ -15,7 +15,7 @@ from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
 from uwb_tdoa_ekf.results import concatenated, rows_of
 
 from .controller import inner
-from .sensors import AuxiliarySensor, InertialErrors, Radio, gusts, random
+from .sensors import AuxiliarySensor, InertialErrors, Radio, World, gusts, random
 from .vehicle import (
     ATTITUDE,
     GRAVITY,
@@ -30,7 +30,6 @@ from .vehicle import (
     specific_force,
     step,
 )
-from .world import World
 
 STEPS = round(1.0 / (IMU_RATE * STEP))  # of the integration, per sample
 TURNING = 50.0  # rad/s, rotor speed above which the vehicle vibrates

@@ -15,8 +15,8 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_filled
 from uwb_tdoa_bias.common.flight import Flight
 
-from .paths import TRAJECTORIES
 from .rooms import CONSTELLATIONS, constellation
+from .vehicles import TRAJECTORIES
 
 SUFFIXES = (".png", ".pdf", ".svg")
 
