@@ -26,7 +26,6 @@ from uwb_tdoa_bias.ros.cdr import CdrCodec
 from uwb_tdoa_bias.ros.diagnostics import Diagnostics, Rate
 from uwb_tdoa_bias.ros.node import StreamNode, run
 from uwb_tdoa_bias.ros.parameters import (
-    FROZEN,
     Parameter,
     declare_all,
     files_of,
@@ -80,7 +79,6 @@ PARAMETERS = {  # in the order of config/autopilot_node.yaml
         [""],
         f'log blocks of a Crazyflie to publish, of {", ".join(TOPICS)}; [""] for none',
     ),
-    "frozen": FROZEN,
 }
 
 
@@ -156,6 +154,7 @@ class AutopilotNode(StreamNode):
         if self._waiting:
             messages, now = self._waiting[:], self._now()
             self._waiting.clear()
+            self._gate.publishers = max(map(_publishers, (self._input, self._status)))
             for _, rows, some in self._codec.read(messages, self._input.refusals.add):
                 for row, data in zip(rows, messages[some]):
                     self._pass_on(row, data, now)
@@ -183,7 +182,8 @@ class AutopilotNode(StreamNode):
             "held back because": self._gate.why,
             "rate": f"{self._rate.of(self._gate.passed):.1f} Hz",
             **counts,
-            "publishers of odometry": self._input.subscription.get_publisher_count(),
+            "publishers of odometry": _publishers(self._input),
+            "publishers of status": _publishers(self._status),
             "subscribers of odometry/gated": self._publisher.get_subscription_count(),
             "unreadable on odometry": self._input.refusals.count,
             "unreadable on status": self._status.refusals.count,
@@ -206,6 +206,10 @@ class AutopilotNode(StreamNode):
         """End the link and the node."""
         self._link.close()
         super().destroy_node()
+
+
+def _publishers(topic: Input) -> int:
+    return topic.subscription.get_publisher_count()
 
 
 def main(argv: Sequence[str] | None = None) -> int:

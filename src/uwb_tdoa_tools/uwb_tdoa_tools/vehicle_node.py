@@ -28,7 +28,6 @@ from uwb_tdoa_bias.common.flight import SENSOR_NAMES
 from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS
 from uwb_tdoa_bias.ros.node import StreamNode, StreamPoller, run
 from uwb_tdoa_bias.ros.parameters import (
-    FROZEN,
     Parameter,
     declare_all,
     files_of,
@@ -74,7 +73,6 @@ PARAMETERS = {  # in the order of config/vehicle_node.yaml
         False, "publish /clock, and continue when the odometry is there; else in real time"
     ),
     "duration": Parameter(600.0, "s; how long it can be flown, without the mission", 10.0, 1800.0),
-    "frozen": FROZEN,
 }
 SETTLE = 1.0  # s from the first subscription until the other nodes have discovered each other
 

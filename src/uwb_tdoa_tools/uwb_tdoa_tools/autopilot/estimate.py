@@ -180,6 +180,7 @@ SLACK = 0.1  # share of a period by which a stamp may be early
 JUMP = np.array([0.3, 0.75, 0.2])  # m, m/s, rad
 # m/s^2, rad/s: motion between two estimates that the earlier one does not predict
 ACCELERATION, TURN_RATE = 20.0, 10.0
+CROWD = "two or more nodes publish odometry or status: stop all but one ekf_node in this namespace"
 NOT_HEARD = "nothing came on status: start ekf_node in this namespace"
 
 
@@ -194,6 +195,9 @@ class Gate:
         Number of jumps and silences that an autopilot must not take for motion.
     passed : int
         Number of estimates that were passed.
+    publishers : int
+        Number of publishers of odometry, or of status if it has more. With two, estimates of
+        different filters would alternate.
     """
 
     def __init__(self, rate: float, largest_deviation: float, needs_yaw: bool = True) -> None:
@@ -208,7 +212,7 @@ class Gate:
         needs_yaw : bool
             Whether the yaw is sent, and so must be known.
         """
-        self.why, self.resets, self.passed = NOT_HEARD, 0, 0
+        self.why, self.resets, self.passed, self.publishers = NOT_HEARD, 0, 0, 1
         self._period, self._largest, self._needs_yaw = 1e9 / rate, largest_deviation, needs_yaw
         self._closed = NOT_HEARD
         self._before: Estimate | None = None
@@ -251,6 +255,8 @@ class Gate:
 
     def _fault(self, estimate: Estimate, now: int) -> str:
         """Return why an estimate cannot be used, or ""."""
+        if self.publishers > 1:
+            return CROWD
         age = 1e-9 * (now - estimate.stamp)
         if not EARLIEST < age < OLDEST:
             return (
