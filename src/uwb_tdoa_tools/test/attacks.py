@@ -93,10 +93,15 @@ def _sources(count):
 
 
 def one_byte(port, number=30_000):
-    """Send datagrams of one byte, as many from each of 1000 ports."""
-    sources = _sources(min(number, 1000))
+    """Send datagrams of one byte, each from another port. Return the first 100 sockets."""
+    sources = []
     for k in range(number):
-        sources[k % len(sources)].sendto(b"x", (LOOPBACK, port))
+        source = socket.socket(type=socket.SOCK_DGRAM)
+        source.sendto(b"x", (LOOPBACK, port))
+        if k < 100:
+            sources.append(source)
+        else:
+            source.close()
     return sources
 
 

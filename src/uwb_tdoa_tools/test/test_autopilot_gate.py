@@ -56,6 +56,20 @@ def estimates(draw):
     return Estimate(NOW, p, draw(turns).as_quat(), v, w, covariance(), covariance())
 
 
+def test_two_publishers_hold_it_back():
+    """Half of the messages would be 50 m off, and jumps would use up all numbers."""
+    gate = Gate(50.0, 1.5)
+    gate.set_status(RUNNING, True, "")
+    assert gate.admit(estimate(0.0), NOW)
+    gate.publishers = 2
+    for k in range(1, 20):
+        there = (50.0 * (k % 2), 0.0, 0.0)
+        assert not gate.admit(estimate(0.1 * k, there), NOW + k * 10**8)
+    assert "two or more nodes publish odometry" in gate.why and gate.resets == 0
+    gate.publishers = 1
+    assert gate.admit(estimate(2.0), NOW + 2 * 10**9) and gate.resets == 1
+
+
 # --- frames ---
 
 

@@ -4,6 +4,7 @@
 
 import pathlib
 import re
+import sys
 import time
 
 import numpy as np
@@ -22,9 +23,12 @@ from autopilots import (  # noqa: E402
     numbers_of_mavlink,
     usec,
 )
+from nav_msgs.msg import Odometry  # noqa: E402
 
 from uwb_tdoa_bias.common.errors import InputError  # noqa: E402
+from uwb_tdoa_bias.ros.topics import OUTPUT_QOS  # noqa: E402
 from uwb_tdoa_msgs.msg import EstimatorStatus  # noqa: E402
+from uwb_tdoa_tools.autopilot.estimate import CROWD  # noqa: E402
 from uwb_tdoa_tools.autopilot_node import PARAMETERS, AutopilotNode  # noqa: E402
 
 CONFIG = pathlib.Path(__file__).resolve().parents[1] / "config" / "autopilot_node.yaml"
@@ -66,7 +70,7 @@ def test_a_port_that_is_not_there_is_named():
     connection = "connection:=/dev/autopilot_that_is_not_there"
     rclpy.init(args=["--ros-args", "-p", "protocol:=mavlink", "-p", connection])
     try:
-        with pytest.raises(InputError, match="cannot be opened|pip install pyserial"):
+        with pytest.raises(InputError, match="cannot be opened|pip install pymavlink pyserial"):
             AutopilotNode()
     finally:
         rclpy.shutdown()
@@ -82,7 +86,9 @@ def test_a_port_that_is_not_there_is_named():
 def test_a_package_that_is_missing_is_named_with_the_remedy(
     monkeypatch, protocol, connection, package
 ):
-    monkeypatch.setitem(__import__("sys").modules, package, None)
+    for name in [package, *sys.modules]:
+        if name.partition(".")[0] == package:
+            monkeypatch.setitem(sys.modules, name, None)
     words = ["-p", f"protocol:={protocol}", "-p", f"connection:={connection}"]
     rclpy.init(args=["--ros-args", *words])
     try:
@@ -111,6 +117,7 @@ def test_px4_gets_a_flight_and_silence_when_it_is_lost():
             _check_time(rig, px4)
             _check_jump(rig, px4)
             _check_silence(rig, px4)
+            _check_second_publisher(rig, px4)
             rig.wait(lambda: len(rig.gated) == len(px4.odometry), "odometry/gated")
             assert [usec(message) for message in rig.gated] == [m.time_usec for m in px4.odometry]
             assert rig.end() == 0
@@ -219,6 +226,37 @@ def _check_jump(rig, px4):
         after = message.x > new[0].x + 1.0
         assert message.reset_counter == (new[0].reset_counter + after) % 256
     assert new[-1].x - new[0].x == pytest.approx(2.0, abs=1e-5)
+
+
+def _check_second_publisher(rig, px4):
+    """Check that nothing is sent while two nodes publish odometry, and that it goes on with one."""
+    second = rig.node.create_publisher(Odometry, "odometry", OUTPUT_QOS)
+
+    def is_silent():
+        rig.publish(at_rest(1))
+        px4.beat()
+        return CROWD in rig.text
+
+    rig.wait(is_silent, "silence")
+    rig.settle()
+    px4.receive()
+    count, before = len(px4.odometry), px4.odometry[-1].reset_counter
+    second.publish(at_rest(1)[0])
+    rig.sent += 1
+    rig.publish(at_rest(60))
+    rig.settle()
+    px4.receive()
+    assert len(px4.odometry) == count and rig.values["publishers of odometry"] == "2"
+    rig.node.destroy_publisher(second)
+
+    def came():
+        rig.publish(at_rest(1))
+        return len(px4.odometry) > count
+
+    rig.wait(came, "ODOMETRY")
+    rig.settle()
+    px4.receive()
+    assert {message.reset_counter for message in px4.odometry[count:]} == {(before + 1) % 256}
 
 
 def _check_silence(rig, px4):
