@@ -8,7 +8,6 @@ Each becomes a trajectory with one command.
 import bz2
 import dataclasses
 import sqlite3
-import sys
 
 from documented import blocks, section
 from foreign_recordings import (
@@ -73,7 +72,6 @@ def flight():
 
 
 def ulog(path, flight):
-    pytest.importorskip("pyulog")
     return write_ulog(path, flight)
 
 
@@ -552,15 +550,7 @@ def test_a_chunk_that_unpacks_to_too_much_is_refused(flight, survey, tmp_path, f
         read_by_profile([bag], load_profile("uwb_msgs"), survey)
 
 
-def test_a_ulog_without_pyulog_names_it(flight, survey, tmp_path, monkeypatch):
-    log = write_ulog(tmp_path / "flight.ulg", flight)
-    monkeypatch.setitem(sys.modules, "pyulog.core", None)
-    with pytest.raises(InputError, match="needs pyulog; run `pip install pyulog` first"):
-        read_by_profile([log], load_profile("px4"), survey)
-
-
 def test_a_ulog_that_is_damaged_is_refused(flight, survey, tmp_path):
-    pytest.importorskip("pyulog")
     log = write_ulog(tmp_path / "flight.ulg", flight)
     content = bytearray(log.read_bytes())
     middle = len(content) // 2

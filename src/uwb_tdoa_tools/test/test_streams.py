@@ -3,6 +3,7 @@
 """Streams of readers: the TDOA protocol, and velocities from pixel counts."""
 
 from dataclasses import replace
+import tracemalloc
 
 from known_effects import clean_flight
 import numpy as np
@@ -61,6 +62,17 @@ def test_three_anchors_in_turn_and_at_random():
     a, rng = np.arange(60) % 3, np.random.default_rng(0)
     assert protocol(tdoas(a, (a + 1) % 3)) == "tdoa2"
     assert protocol(tdoas(a, (a + rng.integers(1, 3, 60)) % 3)) == "tdoa3"
+
+
+def test_many_ids_take_little_memory():
+    """Each TDOA may name two new ids. A table of all pairs of 20 000 has 400 million cells."""
+    a = np.arange(20_000)
+    tracemalloc.start()
+    for b in (np.roll(a, -1), np.random.default_rng(0).permutation(a)):
+        protocol(tdoas(a, b))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 50e6
 
 
 def test_one_reference_is_said():

@@ -268,19 +268,18 @@ def protocol(tdoas: Tdoas) -> str:
     """
     ids, rows = np.unique(np.concatenate([tdoas.a, tdoas.b]), return_inverse=True)
     n, (a, b) = len(ids), rows.reshape(2, -1)
-    directed = np.zeros((n, n))
-    np.add.at(directed, (a, b), 1.0)
-    heard = directed + directed.T
-    if n > 2 and heard.sum(axis=1).max() > REFERENCE_SHARE * len(a):
+    if n > 2 and np.bincount(rows.ravel()).max() > REFERENCE_SHARE * len(a):
         return "tdoa, one reference"
-    pairs = np.stack(np.triu_indices(n, 1), axis=1)
-    often = pairs[np.argsort(-heard[tuple(pairs.T)], kind="stable")[:n]]
-    share = heard[tuple(often.T)].sum() / max(len(a), 1)
+    # only the pairs that occur: a table of all pairs would grow with the square of n
+    pair, of_pair = np.unique(np.minimum(a, b) * n + np.maximum(a, b), return_inverse=True)
+    heard, rising = np.bincount(of_pair), np.bincount(of_pair, a < b)
+    often = np.argsort(-heard, kind="stable")[:n]
     if n < 4:
-        return (
-            "tdoa2" if np.maximum(directed, directed.T)[tuple(often.T)].sum() == len(a) else "tdoa3"
-        )
-    return "tdoa2" if share > 0.5 * (1.0 + n / len(pairs)) and _is_ring(often, n) else "tdoa3"
+        one_way = np.maximum(rising, heard - rising)[often].sum() == len(a)
+        return "tdoa2" if one_way else "tdoa3"
+    share = heard[often].sum() / len(a)
+    sides = np.stack(np.divmod(pair[often], n), axis=1)
+    return "tdoa2" if share > 0.5 * (1.0 + 2.0 / (n - 1)) and _is_ring(sides, n) else "tdoa3"
 
 
 def _is_ring(sides: np.ndarray, n: int) -> bool:

@@ -18,6 +18,7 @@ import math
 import operator
 from pathlib import Path
 import re
+import struct
 from typing import Any, NamedTuple
 import zlib
 
@@ -398,6 +399,13 @@ class CsvFiles(Foreign):
 
 
 MAGIC = b"ULog\x01\x12\x35"
+_SYNC = b"\x2f\x73\x13\x20\x25\x0c\xbb\x12"  # where a reader continues after a damage
+_MESSAGE = struct.Struct("<HB")  # size and type of a message
+_FIELD = re.compile(r"(\w+)(?:\[(\d{1,5})\])? (\w+)")
+_NUMBERS = {"bool": "i1", "char": "i1", "float": "<f4", "double": "<f8"} | {
+    f"{sign}int{8 * size}_t": f"<{sign or 'i'}{size}" for sign in ("", "u") for size in (1, 2, 4, 8)
+}
+_MOST_NAMES = 2_000_000  # characters of the names of all fields, nested ones too
 _TIME = "timestamp"  # us since the start of the autopilot
 
 
@@ -407,40 +415,104 @@ def is_ulog(path: Path) -> bool:
 
 
 class ULogFile(Foreign):
-    """Messages of one ULog file: {message: the same}. Instances but the first are called NAME.1, NAME.2, ..."""
+    """Messages of one ULog file: {message: the same}. Instances but the first are called NAME.1, NAME.2, ...
+
+    docs.px4.io, ULog file format.
+    """
 
     def __init__(self, paths: Sequence[Path], salvage: bool = False) -> None:
-        """Read a file by pyulog, an optional extra. Raises InputError."""
+        """Read a file. Raises InputError."""
         super().__init__()
         path, *more = paths
         if more:
             raise InputError(f"{more[0]}: a ULog is one recording; convert one by one.")
-        try:
-            from pyulog.core import ULog
-        except ImportError as error:
+        content = read_bytes(path)
+        self._budget, self._formats = Budget(path, len(content)), dict[str, str]()
+        # {number of a message: (name, its bytes, their layout)}
+        self._logged: dict[bytes, tuple[str, bytearray, np.dtype]] = {}
+        self._damage, self._dropouts = "", list[int]()  # ms
+        for kind, message in self._messages(content):
+            try:
+                self._take(kind, message)
+            except (KeyError, RecursionError, ValueError) as error:
+                self._damage = f"a message of type {kind}: {error!r:.80}"
+        if self._damage and not salvage:
             raise InputError(
-                f"{path}: is a ULog of PX4, which needs pyulog; run `pip install pyulog` first."
-            ) from error
-        read_bytes(path)  # limits its size
-        try:
-            log = ULog(str(path))
-        except Exception as error:  # pyulog raises whatever its parser runs into
-            raise _damaged(path, str(error)) from error
-        if log.file_corruption and not salvage:
-            raise _damaged(path, "pyulog finds messages that do not fit")
-        self._data: dict[str, dict[str, np.ndarray]] = {
-            each.name + (f".{each.multi_id}" if each.multi_id else ""): each.data
-            for each in log.data_list
-        }
-        self.types = {name: name for name in self._data}
-        self.counts.update({name: len(data[_TIME]) for name, data in self._data.items()})
-        if log.file_corruption:
-            self.remarks.append("the log is damaged: read what fits.")
-        if log.dropouts:
-            lost = sum(each.duration for each in log.dropouts)
-            self.remarks.append(
-                f"the autopilot dropped messages {len(log.dropouts)} times, {lost} ms in all."
+                f"{path}: this ULog is cut or damaged ({self._damage}); copy it from the autopilot "
+                f"again, or {SALVAGE}."
             )
+        self._data = {
+            name: {
+                field: np.frombuffer(data, layout)[field]
+                for field in layout.names or ()
+                if "_padding" not in field
+            }
+            for name, data, layout in self._logged.values()
+            if data
+        }
+        self.types = {name: name for name in sorted(self._data)}
+        self.counts.update({name: len(data[_TIME]) for name, data in self._data.items()})
+        if self._damage:
+            self.remarks.append("the log is damaged: read what fits.")
+        if self._dropouts:
+            self.remarks.append(
+                f"the autopilot dropped messages {len(self._dropouts)} times, "
+                f"{sum(self._dropouts)} ms in all."
+            )
+
+    def _messages(self, content: bytes) -> Iterator[tuple[str, bytes]]:
+        """Yield (type, content) of the messages. After a damage, continue behind the next _SYNC."""
+        at, end = 16, len(content)
+        while at + _MESSAGE.size <= end:
+            self._budget.check_time()
+            size, kind = _MESSAGE.unpack_from(content, at)
+            at += _MESSAGE.size + size
+            message = content[at - size : at]
+            if not (size and kind):
+                self._damage = f"no message begins at byte {at - size - _MESSAGE.size}"
+                mark = content.find(_SYNC, at)
+                at = mark + len(_SYNC) if mark >= 0 else end
+            elif at <= end:  # otherwise it is cut
+                yield chr(kind), message
+            if kind == ord("B"):  # what was appended after a crash is no flight
+                end = min(int.from_bytes(message[16:24], "little") or end, end)
+
+    def _take(self, kind: str, message: bytes) -> None:
+        """Take a format, a name, data or a dropout. Raises KeyError, RecursionError, ValueError."""
+        if kind == "B" and int.from_bytes(message[8:16], "little") > 1:
+            raise ValueError("flags that this reader does not know")
+        if kind == "F":
+            name, _, text = message.decode().partition(":")
+            self._formats[name] = text
+        elif kind == "A":
+            name = message[3:].decode() + (f".{message[0]}" if message[0] else "")
+            fields = [*self._fields(message[3:].decode(), "")]
+            if (_TIME, _NUMBERS["uint64_t"]) not in fields:
+                raise ValueError(f"no {_TIME}")
+            while fields[-1][0].startswith("_padding"):  # is not logged at the end
+                fields.pop()
+            self._logged.setdefault(message[1:3], (name, bytearray(), np.dtype(fields)))
+        elif kind == "D":
+            _, data, layout = self._logged[message[:2]]
+            if len(message) < 2 + layout.itemsize:
+                raise ValueError("fewer bytes than its format")
+            data += message[2 : 2 + layout.itemsize]
+        elif kind == "O":
+            self._dropouts.append(int.from_bytes(message[:2], "little"))
+
+    def _fields(self, name: str, prefix: str) -> Iterator[tuple[str, str]]:
+        """Yield (name, type of number) of the fields of a message, also of nested ones."""
+        for text in filter(None, self._formats[name].split(";")):
+            if not (found := _FIELD.fullmatch(text)):
+                raise ValueError(f"no field {text[:40]!r}")
+            kind, size, field = found.groups()
+            spent = int(size or 1) * len(f"{prefix}{field}[100]")
+            self._budget.spend("characters of names of fields", spent, _MOST_NAMES)
+            for place in [f"[{k}]" for k in range(int(size))] if size else [""]:
+                if kind in _NUMBERS:
+                    yield f"{prefix}{field}{place}", _NUMBERS[kind]
+                else:
+                    yield from self._fields(kind, f"{prefix}{field}{place}.")
 
     def fields(self, table: str) -> list[str]:
         """Return the fields of a message; entries of arrays are fields as gyro_rad[0]."""
@@ -465,9 +537,3 @@ class ULogFile(Foreign):
                     raise self.lacks(table, path)
                 columns[path] = [*np.stack(parts, axis=1).ravel()]
             yield Block(number, np.repeat(np.arange(1, count + 1), length).tolist(), columns)
-
-
-def _damaged(path: Path, said: str) -> InputError:
-    return InputError(
-        f"{path}: this ULog is cut or damaged ({said}); copy it from the autopilot again, or {SALVAGE}."
-    )
