@@ -15,7 +15,7 @@ import programs
 import pytest
 from test_layout import ROS, modules
 
-from uwb_tdoa_bias.common.executable import PATHS
+from uwb_tdoa_bias.common.executable import PATHS, leave_present_folder_out
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
@@ -67,10 +67,14 @@ def run(*command, folder, **variables):
     return programs.run(*command, cwd=folder, env=variables, timeout=300)
 
 
-def empty_entries(text):
-    """Return the variables in the output of `env` that have an entry for the present folder."""
+def relative_entries(text):
+    """Return the variables in the output of `env` that have an entry below the present folder."""
     found = dict(line.split("=", 1) for line in text.splitlines() if "=" in line)
-    return [name for name in PATHS if {"", "."} & {*found.get(name, "/").split(":")}]
+    return [
+        name
+        for name in PATHS
+        if not all(entry.startswith("/") for entry in found.get(name, "/").split(":"))
+    ]
 
 
 @pytest.fixture
@@ -87,14 +91,43 @@ def hostile(tmp_path):
     return tmp_path
 
 
+@pytest.mark.parametrize("shell", [*{"sh", *SHELLS}])
+def test_paths_keep_the_entries_that_begin_at_the_root(tmp_path, shell):
+    entries = ["", ".", "./", ".//", "./lib", "lib", "../x", "/a b", "", "/usr/bin", "/c*", "."]
+    lines = [f"export {name}='{':'.join(entries)}'" for name in PATHS]
+    lines += ["export COLCON_PREFIX_PATH=.:./", "unset CMAKE_PREFIX_PATH"]
+    lines += [f". {ROOT}/.dev/paths.sh", "/usr/bin/env"]
+    done = run(shell, "-c", "; ".join(lines), folder=tmp_path, **CLEAN)
+    found = dict(line.split("=", 1) for line in done.stdout.splitlines())
+    kept = {name: found.get(name) for name in PATHS}
+    gone = dict.fromkeys(("COLCON_PREFIX_PATH", "CMAKE_PREFIX_PATH"))
+    assert kept == dict.fromkeys(PATHS, "/a b:/usr/bin:/c*") | gone, done.stderr
+
+
+def test_an_executable_keeps_the_entries_that_begin_at_the_root(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in PATHS:
+        monkeypatch.setenv(name, ":./:.//:lib:/a:../x:/b:.")
+    monkeypatch.delenv("CMAKE_PREFIX_PATH")
+    # as Python makes of PYTHONPATH when it starts
+    below = [str(tmp_path), str(tmp_path / "lib"), str(tmp_path.parent / "x")]
+    monkeypatch.setattr(sys, "path", [*below, "/a", "/b", "/usr/lib/python"])
+    leave_present_folder_out()
+    assert sys.path == ["/a", "/b", "/usr/lib/python"]
+    kept = {name: os.environ.get(name) for name in PATHS}
+    assert kept == dict.fromkeys(PATHS, "/a:/b") | {"CMAKE_PREFIX_PATH": None}
+
+
 @built
 @pytest.mark.parametrize("shell", SHELLS)
-@pytest.mark.parametrize("given", ["unset {}", "export {}=", "export {0}=:/a::/b:.:${0}:.:.:"])
+@pytest.mark.parametrize(
+    "given", ["unset {}", "export {}=", "export {0}=:/a::/b:.:${0}:./:.//:lib:../x:"]
+)
 def test_no_entry_is_empty_after_the_setup_was_sourced(hostile, shell, given):
     lines = [given.format(name) for name in PATHS if name != "PATH" or "/a" in given]
     lines += [f"source {ROOT}/install/setup.{shell}", "env", "ls >&2"]
     done = run(shell, "-c", "; ".join(lines), folder=hostile, **CLEAN)
-    assert done.returncode == 0 and empty_entries(done.stdout) == [], done.stderr
+    assert done.returncode == 0 and relative_entries(done.stdout) == [], done.stderr
     assert "SKIP_DEFAULT_XML_FILE=1" in done.stdout and f"{ROOT}/install/lib" in done.stdout
 
 
@@ -104,12 +137,14 @@ def test_no_entry_is_empty_after_the_setup_was_sourced(hostile, shell, given):
 )
 def test_no_entry_is_empty_after_dev(hostile, words):
     """Also where the start file of the user adds some."""
-    (hostile / ".bashrc").write_text("".join(f"export {one}=:${one}:/mine:.\n" for one in PATHS))
+    (hostile / ".bashrc").write_text(
+        "".join(f"export {one}=:${one}:/mine:./:lib\n" for one in PATHS)
+    )
     given = {name: f":{CLEAN['PATH'] if name == 'PATH' else ''}:" for name in PATHS}
     given.pop("LD_LIBRARY_PATH")  # bash would load libraries from this path
     home = {"HOME": str(hostile)} if "-i" in words else {}
     done = run(ROOT / "dev", *words.split(), folder=hostile, **{**CLEAN, **given, **home})
-    assert done.returncode == 0 and empty_entries(done.stdout) == [], done.stderr
+    assert done.returncode == 0 and relative_entries(done.stdout) == [], done.stderr
     assert "has run" not in done.stdout + done.stderr
 
 
@@ -133,7 +168,7 @@ def test_an_executable_takes_no_module_and_no_profile_there(tmp_path, protected)
     done = run(*command, folder=tmp_path, **{**kept, "PYTHONPATH": ":".join(paths)})
     assert done.returncode == 0 and "of the present folder" not in done.stdout, done.stderr
     assert ((tmp_path / "victim").read_text() == "precious\n") == protected
-    assert not protected or empty_entries(done.stdout) == []
+    assert not protected or relative_entries(done.stdout) == []
 
 
 @pytest.mark.slow

@@ -37,8 +37,8 @@ COMPILING = SimpleNamespace(
     text="", shown=False
 )  # what compiles, and whether lines of progress show it
 SAID = 1.5  # s after which a line reports that the imports take long
-# Path variables in which an empty entry or a dot means the present folder. `.dev/paths.sh` has the
-# same list, for programs that a shell starts.
+# Path variables in which an entry that does not begin at the root begins in the present folder. An
+# empty one means that folder. `.dev/paths.sh` has the same list, for programs that a shell starts.
 PATHS = (
     "PATH LD_LIBRARY_PATH PYTHONPATH AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_PREFIX_PATH "
     "PKG_CONFIG_PATH"
@@ -69,15 +69,12 @@ def leave_present_folder_out() -> None:
     # Otherwise Fast DDS reads DEFAULT_FASTRTPS_PROFILES.xml in the present folder.
     os.environ["SKIP_DEFAULT_XML_FILE"] = "1"
     for name in PATHS:
-        entries = os.environ.get(name, "").split(os.pathsep)
-        others = [entry for entry in entries if entry not in ("", ".")]
-        if len(others) < len(entries) and name == "PYTHONPATH":
-            sys.path[:] = [entry for entry in sys.path if entry != os.getcwd()]
-        kept = os.pathsep.join(others)
-        if kept:
+        entries = os.environ.pop(name, "").split(os.pathsep)
+        if kept := os.pathsep.join(filter(os.path.isabs, entries)):
             os.environ[name] = kept
-        else:
-            os.environ.pop(name, None)
+        if name == "PYTHONPATH":
+            relative = {os.path.abspath(entry) for entry in entries if not os.path.isabs(entry)}
+            sys.path[:] = [entry for entry in sys.path if entry not in relative]
 
 
 @contextmanager
