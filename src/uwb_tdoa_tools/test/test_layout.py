@@ -57,11 +57,11 @@ KEYS = {
     "onnxruntime": ("python3-onnxruntime-pip", "onnxruntime"),
     "pymavlink": (None, "pymavlink"),  # for protocol mavlink
     "pytest": ("python3-pytest", "pytest"),
-    "pyulog": (None, "pyulog"),  # for logs of PX4
     "rerun": (None, "rerun-sdk"),  # for --rerun
     "rosbags": ("python3-rosbags-pip", "rosbags"),
     "pandas": (None, "pandas"),  # optional, for tables
     "scipy": ("python3-scipy", "scipy"),
+    "serial": (None, "pyserial"),  # for protocol mavlink over a serial port
     "sklearn": ("python3-sklearn", "scikit-learn"),
     "tqdm": ("python3-tqdm", "tqdm"),
     "yaml": ("python3-yaml", "PyYAML"),
