@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_bag_odometry import ODOMETRY, bag_of
+from test_bag_frames import ODOMETRY, bag_of
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.flight import Imu, Tdoas, Truth
