@@ -355,37 +355,15 @@ def fly(
     return live, scores
 
 
-class Stopwatch:
-    """Measure the parts of a run.
+def processor_time() -> float:
+    """Return the processor time of this process and of those that it ran, s."""
+    return sum(os.times()[:4])
 
-    Attributes
-    ----------
-    laps : dict
-        {part: s}.
-    """
 
-    def __init__(self) -> None:
-        self.laps: dict[str, float] = {}
-        self._last = time.monotonic()
-
-    def lap(self, name: str) -> None:
-        """End a part."""
-        now = time.monotonic()
-        self.laps[name] = now - self._last
-        self._last = now
-
-    @property
-    def processor_time(self) -> float:
-        """Return the processor time of this process and of those that it ran, s."""
-        return sum(os.times()[:4])
-
-    def in_words(self) -> str:
-        """Return the time of all parts and of each, and the processor time of all processes."""
-        parts = ", ".join(f"{name} {seconds:.0f} s" for name, seconds in self.laps.items())
-        return (
-            f"{sum(self.laps.values()):.0f} s: {parts}; {self.processor_time:.0f} s of processor "
-            "time"
-        )
+def times_in_words(laps: Mapping[str, float]) -> str:
+    """Return the time of all parts and of each, s, and the processor time of all processes."""
+    parts = ", ".join(f"{name} {seconds:.0f} s" for name, seconds in laps.items())
+    return f"{sum(laps.values()):.0f} s: {parts}; {processor_time():.0f} s of processor time"
 
 
 @dataclass(frozen=True)
@@ -438,7 +416,7 @@ class LoopResult:
             f"{change_in_words(before, after)}"
         )
 
-    def figures(self, seed: int, diagnosis: Diagnosis, clock: Stopwatch) -> dict[str, Any]:
+    def figures(self, seed: int, diagnosis: Diagnosis, laps: Mapping[str, float]) -> dict[str, Any]:
         """Return all figures for JSON; those of the third flight are None if it lost messages."""
         residuals, errors = (
             (None, None)
@@ -453,8 +431,8 @@ class LoopResult:
                 "errors": errors,
                 "outcomes": [one.outcome for one in self.passes],
                 "really": truth_in_words(seed, self.flight),
-                "seconds": clock.laps,
-                "processor_time": clock.processor_time,
+                "seconds": laps,
+                "processor_time": processor_time(),
             }
         )
 
@@ -541,7 +519,13 @@ def close_loop(
     InputError, LiveError
         If the third flight cannot be played.
     """
-    clock = Stopwatch()
+    laps: dict[str, float] = {}
+    ends = [time.monotonic()]
+
+    def lap(name: str) -> None:
+        ends.append(time.monotonic())
+        laps[name] = ends[-1] - ends[-2]
+
     onnx, picture = folder / CORRECTION, folder / "demo.png"
     with Progress("demo") as progress:
         progress("flying")
@@ -549,14 +533,14 @@ def close_loop(
         flights = read(bags[:2])
         show("recorded", [recordings_in_words(flights, seed)])
         show("residual", residuals_of(flights[0]).sentences())
-        clock.lap("flying")
+        lap("flying")
         diagnosis = diagnose(flights, progress=progress)
         show("traced to", found_in_words(diagnosis) or ["nothing that helps"])
-        clock.lap("tracing")
+        lap("tracing")
         correction = write_correction(onnx, diagnosis)
         show("added", added_in_words(onnx, correction, diagnosis))
     result = fly_both(bags[2], onnx if correction else None, rate, say)
-    clock.lap("both nodes, twice" if correction else "both nodes")
+    lap("both nodes, twice" if correction else "both nodes")
     show("flown", [result.arrived_in_words()])
     if result.missing:
         show("error", [too_slow_in_words(result.missing, rate)])
@@ -564,10 +548,10 @@ def close_loop(
         show("error", [result.error_in_words()])
         draw(picture, result.flight, result.residuals, result.scores)
         show("picture", [str(picture)])
-    clock.lap("picture")
+    lap("picture")
     show("really", [truth_in_words(seed, result.flight)])
-    show("took", [clock.in_words()])
-    return result, result.figures(seed, diagnosis, clock)
+    show("took", [times_in_words(laps)])
+    return result, result.figures(seed, diagnosis, laps)
 
 
 def _titled(say: Callable[[str], object], title: str, text: str) -> None:

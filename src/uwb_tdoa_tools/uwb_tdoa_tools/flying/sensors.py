@@ -20,7 +20,6 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.compiled import compiled
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.radio import arrival_bias
 from uwb_tdoa_bias.common.sensors import SENSORS, Stream
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, Samples
 from uwb_tdoa_bias.effects.floor import FloorMultipath
@@ -30,7 +29,7 @@ from ..choices import MOMENTS
 from ..simulation.config import ImuErrors
 from ..simulation.inject import parse_effect
 from ..simulation.rooms import corners
-from ..simulation.sensors import make_schedule, outliers, tag_link, tdoa_noise
+from ..simulation.sensors import make_schedule, outliers, tdoa_noise
 from .vehicle import IMU_RATE
 
 # of a flight; a circle of no radius is hovering
@@ -47,8 +46,6 @@ class World:
     ----------
     size : tuple
         Size of the hall. Low anchors are at 0.18 m.
-    layout : Anchors, optional
-        Anchors. The default is a low and a high anchor in each corner.
     low_first : bool
         Ids 0 to 3 are the low anchors. Otherwise low and high alternate, as in the measured flights.
     floor_effect : bool
@@ -65,8 +62,6 @@ class World:
         Standard deviation of the constant delays of anchors.
     bearing_bias : float
         Largest amplitude of a bias over the bearing, with two waves per turn.
-    antennas : bool
-        Received power and both antennas delay signals, as in `simulate`. Each flight has another tag.
     silence : tuple, optional
         (one of MOMENTS, duration) of a gap in the TDOAs.
     person : bool
@@ -93,7 +88,6 @@ class World:
     """
 
     size: tuple[float, float, float] = (6.4, 6.2, 3.0)
-    layout: Anchors | None = None
     low_first: bool = False
     floor_effect: bool = True
     protocol: str = "tdoa2"
@@ -104,7 +98,6 @@ class World:
     installation: int | None = None
     delay: float = 0.1
     bearing_bias: float = 0.12
-    antennas: bool = False
     silence: tuple[str, float] | None = None
     person: bool = False
     change: str = ""
@@ -121,9 +114,7 @@ class World:
 
     @cached_property
     def anchors(self) -> Anchors:
-        """Return the anchors."""
-        if self.layout is not None:
-            return self.layout
+        """Return the anchors: a low and a high one in each corner."""
         made = corners(*self.size)
         if not self.low_first:
             return made
@@ -285,7 +276,6 @@ class Radio:
                 for part, of in (("delay", late), ("height", height))
             }
         )
-        self._link = tag_link(seed) if world.antennas else None
         self._anchors, self._at_times = anchors, random(seed, "floor").random((len(self.t), 2))
         self._way = (
             _person_path(world, duration, random(seed, "person"))
@@ -307,25 +297,19 @@ class Radio:
         self.silent = (silent, silent + self._world.silence[1]) if self._world.silence else NEVER
         self.changed = changed
 
-    def measured(self, rows: slice, p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    def measured(self, rows: slice, p: np.ndarray) -> np.ndarray:
         """Return TDOAs (k,), m, with NaN where no TDOA is received.
 
         Parameters
         ----------
         rows : slice
             Rows of `t`.
-        p, q : numpy.ndarray
-            Tag positions (k, 3), m, and attitudes (k, 4), x y z w.
+        p : numpy.ndarray
+            Tag positions (k, 3), m.
         """
         t, a, b, d = self.t[rows], self.a[rows], self.b[rows], np.empty(len(p))
         _measure(p, a, b, self.positions, self.constants, d)
         d += self._error[rows]
-        if self._link is not None:
-            both = np.stack([b, a])
-            late = arrival_bias(
-                p, q, self.positions[both], self._anchors.orientations[both], self._link
-            )
-            d += late[0] - late[1]
         if self.floor.values and p[:, 2].min(initial=NEAR_FLOOR) < NEAR_FLOOR:
             d += self._near_floor(rows, p)
         if len(self._way):

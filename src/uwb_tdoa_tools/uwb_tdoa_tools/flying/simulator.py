@@ -233,9 +233,9 @@ class Simulator:
             self._carry(rows)
         self.done += TICK
         imu = Imu(self.times[rows], self.samples[rows, :3], self.samples[rows, 3:])
-        new, p, q = self._poses("tdoa", self.radio.t, lately)
+        new, p, _ = self._poses("tdoa", self.radio.t, lately)
         radio, ids = self.radio, self.world.anchors.ids
-        d = radio.measured(new, p, q)
+        d = radio.measured(new, p)
         heard = np.isfinite(d)
         tdoa = Tdoas(
             radio.t[new][heard], ids[radio.a[new][heard]], ids[radio.b[new][heard]], d[heard]
