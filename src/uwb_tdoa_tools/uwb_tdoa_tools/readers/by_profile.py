@@ -136,7 +136,7 @@ def read_by_profile(
         meta["antenna"] = list(antenna)
     if named.ids:
         meta["anchor_ids"] = named.ids
-    name = _name(files[0]) + (f"_tag{tag}" if tag else "")
+    name = flight_name(files[0]) + (f"_tag{tag}" if tag else "")
     return make_flight(name, named.anchors, streams, {}, meta, salvage, truth)
 
 
@@ -181,7 +181,8 @@ def streams_of(
     return named, {name: _joined([one for _, one in found]) for name, found in parts.items()}, meta
 
 
-def _name(path: Path) -> str:
+def flight_name(path: Path) -> str:
+    """Return the name of a Flight by that of its file or folder."""
     stem = path.name.removesuffix(".gz")
     return Path(stem).stem if path.is_file() else stem
 
@@ -257,7 +258,7 @@ class _Request:
             kept = [k for k in rows if self._counts(stream, records[k])]
             columns = {"place": np.array([block.places[k] for k in kept], np.int64)}
             for name, column in raw.items():
-                cells = [column[k] for k in kept]
+                cells = column if len(kept) == len(column) else [column[k] for k in kept]
                 if name in ANCHORS:
                     known = {
                         cell: self._ids.setdefault(name_of(cell), len(self._ids))

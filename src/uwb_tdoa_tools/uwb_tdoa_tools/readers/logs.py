@@ -20,15 +20,15 @@ from uwb_tdoa_bias.common.compiled import compiled
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import read_bytes
 from uwb_tdoa_bias.common.flight import Flight
-from uwb_tdoa_bias.common.limits import TABLE_CELLS, USD_TYPES, USD_VARIABLES, Budget
+from uwb_tdoa_bias.common.limits import USD_TYPES, USD_VARIABLES, Budget
 from uwb_tdoa_bias.common.survey import NamedAnchors
 from uwb_tdoa_bias.common.text import sanitize
 
 from ..command_lines import SALVAGE
-from .by_profile import read_by_profile
+from .by_profile import flight_name, streams_of
 from .profile import Profile, check_columns, parse_columns
 from .streams import Columns, make_flight
-from .tables import GZIP_MAGIC, CsvTable
+from .tables import GZIP_MAGIC, CsvFiles
 
 MAGIC = 0xBC
 _CRC_SIZE = 4
@@ -352,7 +352,8 @@ def read_util_csv(
 
     Raises InputError, see `read_by_profile`.
     """
-    names, every = CsvTable(path, TABLE_CELLS, salvage=salvage).names, parse_columns(UTIL_COLUMNS)
+    tables, every = CsvFiles([Path(path)], salvage), parse_columns(UTIL_COLUMNS)
+    names = tables.fields(str(path))
     if missing := [name for name in TDOA_COLUMNS if name not in names]:
         raise InputError(
             f"{path}: has no column {missing[0]}; a UTIL CSV file has at least {', '.join(TDOA_COLUMNS)}."
@@ -369,9 +370,10 @@ def read_util_csv(
             f"new line if it is whole, or {SALVAGE}."
         )
     profile = replace(Profile.of_columns(columns), name="UTIL CSV")
-    flight = read_by_profile([path], profile, NamedAnchors(anchors), "", "", salvage, truth)
-    del flight.meta["read"]
-    return flight
+    _, streams, meta = streams_of(tables, path, profile, NamedAnchors(anchors), salvage=salvage)
+    meta = {"source": str(path), **meta}
+    del meta["read"]
+    return make_flight(flight_name(Path(path)), anchors, streams, {}, meta, salvage, truth)
 
 
 def is_util_csv(line: str) -> bool:

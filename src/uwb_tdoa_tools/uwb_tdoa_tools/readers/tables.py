@@ -367,6 +367,7 @@ class CsvFiles(Foreign):
             table = CsvTable(path, TABLE_CELLS, salvage=salvage)
             self._names[path], self.delimiters[path] = table.names, table.delimiter
             self.remarks += filter(None, [table.remark])
+            self._open = {path: table}  # the last one: the content of all may be too much
         self.types = dict.fromkeys(self._names, "CSV")
 
     def fields(self, table: str) -> list[str]:
@@ -380,7 +381,7 @@ class CsvFiles(Foreign):
     def blocks(self, wanted: Sequence[Wanted]) -> Iterator[Block]:
         """Yield the records of files. Raises InputError."""
         for path in dict.fromkeys(one.table for one in wanted):
-            rows = CsvTable(path, TABLE_CELLS, salvage=self._salvage)
+            rows = self._open.pop(path, None) or CsvTable(path, TABLE_CELLS, salvage=self._salvage)
             mine = [(number, one) for number, one in enumerate(wanted) if one.table == path]
             for _, one in mine:
                 if lacking := {*one.paths, one.each} - {*rows.names, ""}:
