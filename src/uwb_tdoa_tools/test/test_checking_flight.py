@@ -3,6 +3,7 @@
 """Findings of `check` against ground truth: TDOAs of a pair, stamps and inertial samples."""
 
 from dataclasses import replace
+import re
 
 from known_effects import CLEAN, clean_flight
 from number_faults import FAULTS
@@ -366,6 +367,20 @@ def test_axes_of_either_sensor(flight, order, signs):
     for sensor in ("gyro", "accel"):
         values = getattr(flight.imu, sensor)[:, order] * signs
         assert f"{sensor}_axes" in said(with_imu(flight, **{sensor: values}))
+
+
+@pytest.mark.parametrize("axis, angle", [("z", 40.0), ("z", -125.0), ("x", 45.0), ("z", 3.0)])
+def test_an_imu_that_is_mounted_at_an_angle(flight, axis, angle):
+    turn = Rotation.from_euler(axis, angle, degrees=True)
+    imu = flight.imu
+    found = said(with_imu(flight, gyro=turn.apply(imu.gyro), accel=turn.apply(imu.accel)))
+    if abs(angle) < 10.0:
+        assert "imu_mounting" not in found
+        return
+    cause = found["imu_mounting"].cause
+    degrees, about = re.search(r"by (\d+) degrees about (-?[xyz])", cause).groups()
+    assert int(degrees) == pytest.approx(abs(angle), abs=5.0)
+    assert about == f"{'-' * (angle < 0.0)}{axis}" and "gyro_axes" not in found
 
 
 @pytest.mark.slow

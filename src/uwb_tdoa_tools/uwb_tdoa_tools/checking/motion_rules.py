@@ -35,6 +35,7 @@ AXES = {"gyro": 0.8, "accel": 0.75}
 # A wrong attitude of the truth is blamed if it leaves at most this times the power of the gyroscope
 # that the best change of its axes leaves.
 ATTITUDE = 1.2
+LEAST_TURN = np.radians(10.0)  # of a mounting; that of measured flights is 5 degrees at most
 # Share of the power that a low pass leaves (healthy 0.87 at least), and for a sensor that is smooth.
 FILTERED, FILTERED_SMOOTH = 0.8, 0.97
 SLOWNESS = 0.05, 0.1, 0.2, 0.4, 0.8  # s, time constants of the low pass
@@ -238,10 +239,11 @@ def judge_imu(recording: WithTruth, stamps: bool = True) -> list[Finding]:
 
 
 def wrong_axes(motion: TrueMotion) -> Iterator[Finding]:
-    """Yield a Finding for each sensor with wrong axes or units, or one for the ground truth.
+    """Yield a Finding for each sensor with wrong axes or units, or one for both, or the ground truth.
 
     A wrong attitude of the ground truth looks like wrong axes of both sensors. Then it is the only
-    Finding. `motion` must have at least FEWEST cells.
+    Finding. So is a turn of the IMU by another angle than those of the arrangements of axes. `motion`
+    must have at least FEWEST cells.
     """
     base = {sensor: motion.power(sensor, motion.true[sensor]) for sensor in SENSORS}
     best = {sensor: _best_arrangement(motion, sensor) for sensor in SENSORS}
@@ -266,6 +268,26 @@ def wrong_axes(motion: TrueMotion) -> Iterator[Finding]:
             evidence=evidence,
             remedy="write body to world, right-handed, x y z w",
             value=powers["gyro"],
+        )
+        return
+    turn = Rotation.align_vectors(motion.at(motion.true["gyro"]), motion.measured["gyro"])[0]
+    left = motion.power("gyro", motion.true["gyro"], turn.as_matrix())
+    explained = left < AXES["gyro"] * min(base["gyro"], best["gyro"][0])
+    if explained and turn.magnitude() > LEAST_TURN:
+        yield Finding(
+            "imu_mounting",
+            ERROR,
+            cause=(
+                f"the IMU is turned by {np.degrees(turn.magnitude()):.0f} degrees about "
+                f"{signed_axis(-turn.as_rotvec())}, or the body of the ground truth against it"
+            ),
+            evidence=(
+                f"{100 * (1 - left / base['gyro']):.0f} % less mean square difference of its rates "
+                "to the ground truth, turned back"
+            ),
+            remedy="mount it straight, or write in /tf_static how it is mounted; or turn the body "
+            "in the motion capture system",
+            value=float(turn.magnitude()),
         )
         return
     for sensor in wrong:
