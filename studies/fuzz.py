@@ -91,6 +91,7 @@ TARGETS = {  # {kind: reads a file}
     "bag_sqlite": read_bag,
     "bag_metadata": _metadata,
     "bag_ros_1": lambda path: _by_profile(path, load_profile("uwb_msgs")),
+    "ulog": lambda path: _by_profile(path, load_profile("px4")),
     "columns": lambda path: _by_profile(path, Profile.of_columns(parse_columns(COLUMNS))),
     "profile": lambda path: _by_profile(CORPUS / "bag_ros_1" / "plain", load_profile(path)),
     "suggestion": lambda path: suggest([path]),
