@@ -157,6 +157,31 @@ def test_another_source_is_the_peer_after_silence(served):
     other.close()
 
 
+def test_a_silent_place_is_called_anew(rig):
+    """The first socket to it may have an address that the machine no longer has."""
+    port = free_port()
+    made = rig(f"udpout:{LOOPBACK}:{port}")
+    with socket.socket(type=socket.SOCK_DGRAM) as end:
+        end.bind((LOOPBACK, port))
+        made.turns(2)
+        first = end.recvfrom(4096)[1]
+        made.turns(20)
+        end.setblocking(False)
+        *_, last = iter(lambda: _received(end), None)
+        assert last != first
+        end.connect(last)
+        autopilot = Autopilot(end)
+        made.turns(20, [autopilot])
+        assert len(autopilot.odometry) == 20 and not made.trouble
+
+
+def _received(end):
+    try:
+        return end.recvfrom(4096)[1]
+    except OSError:
+        return None
+
+
 def test_a_silent_autopilot_is_reported_and_gets_nothing(served):
     made, _, autopilot = served
     made.turns(8)

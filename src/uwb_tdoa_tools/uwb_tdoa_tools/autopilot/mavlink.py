@@ -57,9 +57,7 @@ class Port:
         self.open()
 
     def open(self) -> None:
-        """Open the port if it is closed. Raises OSError."""
-        if self._ends:
-            return
+        """Open the port. Raises OSError."""
         end: Any
         if self._form.startswith("/"):
             end = _Serial(*self._place)
@@ -73,7 +71,8 @@ class Port:
         if self._form == "udpin":
             end.bind(self._place)
         elif not self.waits:
-            end.connect_ex(self._place)  # a stream is connected later
+            with suppress(BlockingIOError):  # a stream is connected later
+                end.connect(self._place)
             self.peer = self._place
         self._ends[self._place] = end
 
@@ -114,6 +113,10 @@ class Port:
         if len(self._ends) > MOST_CALLERS + 1:
             self._ends.pop([*self._ends][1]).close()
 
+    @property
+    def is_open(self) -> bool:
+        return bool(self._ends)
+
     def write(self, data: bytes) -> None:
         """Write what the socket takes at once; `read` raises if the peer is gone."""
         if self.peer is not None:
@@ -136,7 +139,7 @@ class _Serial:
         # some versions of Linux set a rate only if it differs from that of the start
         self._port = Serial(device, 1200, timeout=0)
         self._port.baudrate, self.close = baud, self._port.close
-        self.setblocking = self.connect_ex = lambda _: None
+        self.setblocking = self.connect = lambda _: None
 
     def recvfrom(self, size: int) -> tuple[bytes, None]:
         if data := self._port.read(size):
@@ -220,18 +223,18 @@ class MavlinkLink(Link):
         """Answer TIMESYNC, note heartbeats of the autopilot, and send ours."""
         now = time.monotonic()
         try:
-            if now >= self._opened_at + AGAIN:
-                self._opened_at = now
-                self._port.open()
             for source, data in self._port.read():
                 for message in self._parse(data):
                     self._take(message, source, now)
+            silent = now > max(self._heartbeat_heard_at, self._opened_at) + SILENT
+            if silent and self._port.peer and (self._port.waits or self._port.datagrams):
+                self._port.close()  # another source may become the peer, or our address has changed
+            if now >= self._opened_at + AGAIN and not self._port.is_open:
+                self._opened_at = now
+                self._port.open()
         except OSError as error:
             self._why = f" ({error.strerror or error})"
             self._port.close()
-        silent = now > self._heartbeat_heard_at + SILENT
-        if silent and self._port.waits and self._port.peer is not None:
-            self._port.close()  # another source may become the peer
         if now >= self._heartbeat_sent_at + HEARTBEAT:
             self._heartbeat_sent_at, dialect = now, self._dialect
             self._mav.send(
