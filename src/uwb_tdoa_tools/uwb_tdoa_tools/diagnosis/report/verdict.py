@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from uwb_tdoa_bias.effects import SmoothTerm
-from uwb_tdoa_bias.effects.base import SIGNIFICANT, listed, measured
+from uwb_tdoa_bias.effects.base import SIGNIFICANT, counted, listed, measured
 from uwb_tdoa_bias.effects.smooth_term import described, in_brief
 from uwb_tdoa_ekf.monitoring.finding import Finding as NumbersFinding
 
@@ -184,7 +184,7 @@ def _doubt(entry: Entry) -> str:
         default=None,
     )
     if deviations is None:
-        return "Not sure: no value is twice its standard deviation."
+        return "Not sure."
     by = f" ({deviations:.0f} standard deviations)" if deviations else ""
     if not first.declared:
         return f"Sure that it is there{by}, not why."
@@ -195,9 +195,12 @@ def _actions(found: Sequence[Entry]) -> tuple[str, ...]:
     """Return what to do in the hall, the most worth first."""
     out = []
     for task in tasks(entry for entry in found if entry.matters and entry.advice)[:MOST_ACTIONS]:
-        said = [sentence for _, sentences in task for sentence in sentences]
-        worth = task[0][0].worth
-        out.append(" ".join([*said, *([f"Worth {centimetres(worth)}."] if worth else [])]))
+        (first, said), *others = task
+        worth = [f"Worth {centimetres(first.worth)}."] if first.worth else []
+        parts = [part for entry, _ in others for term in _functions(entry) for part in term.parts]
+        noun = "pair" if "-" in "".join(parts) else "anchor"
+        then = [f"Then the same for {counted(dict.fromkeys(parts), noun)}."] if parts else []
+        out.append(" ".join([*said, *worth, *then]))
     return tuple(out)
 
 
