@@ -494,11 +494,6 @@ class VehicleCode:
     inputs: tuple[str, ...]
     program: Program
 
-    @property
-    def reads_rates(self) -> bool:
-        """Return whether it reads acceleration or rate, which not every filter estimates."""
-        return not RATES.isdisjoint(self.inputs)
-
 
 def vehicle_code(
     anchors: Anchors, effects: EffectSet, network: Network | None = None
@@ -566,7 +561,7 @@ def write_crazyflie(folder: Path, traced: TracedCorrection) -> tuple[LeftOut, ..
             "give the anchor such an id, or leave it out of the survey."
         )
     held = traced.effects.where(
-        lambda effect: not vehicle_code(anchors, EffectSet((effect,))).reads_rates
+        lambda effect: RATES.isdisjoint(vehicle_code(anchors, EffectSet((effect,))).inputs)
     )
     code = vehicle_code(anchors, held, traced.network)
     _write(folder, crazyflie.files(code.files, anchors))

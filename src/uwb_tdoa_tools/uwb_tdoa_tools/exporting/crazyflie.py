@@ -13,12 +13,9 @@ all measurements in its own task, where an out-of-tree estimator cannot change t
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import yaml
 
-if TYPE_CHECKING:
-    from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.anchors import Anchors
 
 LARGEST_ID = 255  # of an anchor in the firmware
 

@@ -175,13 +175,6 @@ def write_onnx(
     """
     traced = trace(anchors, effects, network)
     content = printed(traced).SerializeToString()
-    _try_out(content)
-    write_bytes(path, content)
-    return traced
-
-
-def _try_out(content: bytes) -> None:
-    """Raise InputError unless the content of a file passes the trial of all models."""
     try:
         if len(content) > MODEL_BYTES:
             raise Unplayable(f"it has {len(content)} bytes, more than {MODEL_BYTES}")
@@ -191,6 +184,8 @@ def _try_out(content: bytes) -> None:
             f"effects: no node would load this correction ({error}); export fewer effects, or the "
             "anchors of one area."
         ) from error
+    write_bytes(path, content)
+    return traced
 
 
 def printed(traced: TracedCorrection) -> ModelProto:

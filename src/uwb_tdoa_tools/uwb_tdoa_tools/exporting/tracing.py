@@ -306,10 +306,6 @@ def _hypot(x: Any, y: Any) -> Expression:
     return apply("sqrt", x * x + y * y)
 
 
-def _is_nan(x: Any) -> Expression:
-    return apply("not", apply("eq", x, x))
-
-
 def _is_finite(x: Any) -> Expression:
     return apply("eq", x - x, 0.0)
 
@@ -325,7 +321,7 @@ _FUNCTIONS: dict[Any, Callable[..., Any]] = {
     np.bitwise_or: partial(apply, "or"),
     np.greater: lambda x, y: apply("lt", y, x),
     np.greater_equal: lambda x, y: apply("le", y, x),
-    np.isnan: _is_nan,
+    np.isnan: lambda x: apply("not", apply("eq", x, x)),
     np.isfinite: _is_finite,
     np.square: lambda x: x * x,
     np.power: _power,
@@ -352,10 +348,6 @@ def _sum(like: Traced, values: Traced, axis: int) -> Traced:
     return like.of(values.elements.sum(axis))
 
 
-def _repeat(like: Traced, values: Traced, count: int, axis: int) -> Traced:
-    return like.of(np.repeat(values.elements, count, axis))
-
-
 def _einsum(like: Traced, subscripts: str, one: Any, other: Any) -> Any:
     assert subscripts == "...k,...k->..."
     return np.sum(like.each(partial(apply, "mul"), one, other), axis=-1)
@@ -370,7 +362,7 @@ _ARRAYS: dict[Any, Callable[..., Any]] = {
     np.linalg.norm: lambda like, values, axis: np.sqrt(np.sum(values * values, axis=axis)),
     np.clip: lambda like, values, low, high: np.minimum(np.maximum(values, low), high),
     np.nan_to_num: lambda like, values: np.where(np.isnan(values), 0.0, values),
-    np.repeat: _repeat,
+    np.repeat: lambda like, values, count, axis: like.of(np.repeat(values.elements, count, axis)),
     np.einsum: _einsum,
     np.zeros_like: lambda like, values: like.of(np.zeros(values.elements.shape, dtype=object)),
     np.ones_like: lambda like, values: like.of(np.ones(values.elements.shape, dtype=object)),

@@ -10,10 +10,11 @@ from dataclasses import dataclass
 from functools import partial
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.files import write_filled
 from uwb_tdoa_ekf.results import Odometry, rows_of
 
@@ -23,10 +24,6 @@ from .mission import DONE, REFUSED, Journey, Mission
 from .rover import Drive, drive
 from .trial import REST_AFTER, Task, TrialResult, fly
 from .vehicle import POSITION, VELOCITY
-
-if TYPE_CHECKING:
-    from uwb_tdoa_bias.common.anchors import Anchors
-
 
 AIR = 0.3  # m above the ground, least height in the air
 UPRIGHT = math.radians(30.0)
@@ -482,7 +479,7 @@ def plot(flights: Sequence[DrawnFlight], anchors: Anchors, path: str | Path) -> 
         height.plot(one.t, one.p[:, 2], color=colour, linewidth=0.7, alpha=0.6)
     above.set(xlabel="x, m", ylabel="y, m", aspect="equal")
     height.set(xlabel="t, s", ylabel="z, m")
-    worst = max(flights, key=_error_key)
+    worst = max(flights, key=lambda one: (not reached(one.verdict), one.verdict["tracking"] or 0.0))
     right.suptitle(f"seed {worst.verdict['seed']}: {worst.verdict['why'] or goal}")
     for k, (axes, axis) in enumerate(zip(right.subplots(3, 1, sharex=True), "xyz")):
         axes.plot(worst.t, worst.wanted[:, k] - worst.p[:, k], "0.6", label="wanted - true")
@@ -498,10 +495,6 @@ def plot(flights: Sequence[DrawnFlight], anchors: Anchors, path: str | Path) -> 
     axes.set(xlabel="t, s")
     axes.legend()
     write_filled(path, partial(figure.savefig, dpi=120))
-
-
-def _error_key(one: DrawnFlight) -> tuple[bool, float]:
-    return not reached(one.verdict), one.verdict["tracking"] or 0.0
 
 
 def fly_task(

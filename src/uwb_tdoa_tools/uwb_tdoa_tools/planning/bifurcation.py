@@ -35,20 +35,15 @@ from __future__ import annotations
 
 from itertools import combinations
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.compiled import compiled
 from uwb_tdoa_bias.common.errors import InputError
 
+from ..simulation.rooms import Room
 from .precision import Installation, principal_extents, round_weights
-
-if TYPE_CHECKING:
-    from uwb_tdoa_bias.common.anchors import Anchors
-
-    from ..simulation.rooms import Room
-
 
 # thickness over length: anchors so close to a line (plane) mirror each position in it
 FLAT_SUBSET = 0.05

@@ -371,7 +371,8 @@ def optimise(
     Each start descends at a few of the goal's points. The best ends descend again, with the worst
     points added. The best score at all points wins.
     """
-    turned = are_turned(goal.installation.anchors)
+    # directions are part of a layout only if one is known
+    turned = bool(np.isfinite(goal.installation.anchors.orientations).all(axis=1).any())
     layout = Layout(places, count, goal.points.mean(axis=0), turned)
     rows = spread(goal.points, ROUGH)
     looked_at = replace(goal, points=goal.points[rows])
@@ -390,14 +391,6 @@ def optimise(
     if goal.score(best) >= UNUSABLE:
         raise InputError("places: no layout of these anchors locates a tag; allow more places.")
     return best
-
-
-def are_turned(anchors: Anchors) -> bool:
-    """Return whether any orientation of the Anchors is known.
-
-    Only then are directions part of a layout.
-    """
-    return bool(np.isfinite(anchors.orientations).all(axis=1).any())
 
 
 def with_one(anchors: Anchors, position: np.ndarray) -> Anchors:

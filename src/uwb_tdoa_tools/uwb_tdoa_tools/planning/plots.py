@@ -4,11 +4,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
+from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
 from matplotlib.colors import BoundaryNorm, ListedColormap
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.patheffects import withStroke
@@ -17,24 +21,14 @@ import numpy as np
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.files import write_filled
 
 from ..scoring.plots import draw_labels
+from ..simulation.rooms import Walls
 from .bifurcation import Subsets
 from .maps import FLYABLE, IMPRECISE, OUTSIDE, TOO_FEW, TWO_SOLUTIONS, AccuracyMap, Chart, Grid
-from .precision import ellipses
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-    from uwb_tdoa_bias.common.anchors import Anchors
-
-    from ..simulation.rooms import Walls
-    from .precision import Installation
+from .precision import Installation, ellipses
 
 WIDTH, DPI = 7.0, 100  # inches, pixels an inch
 STATES = {  # of a cell: what it is called, and its colour

@@ -67,17 +67,13 @@ class RadioNoise:
                 f"tx_power_dbm: {self.tx_power_dbm!r} is outside -60 ... 30, the range of a DW1000."
             )
 
-    @property
-    def thermal_noise_dbm(self) -> float:
-        """Power of thermal noise in the bandwidth, dBm."""
-        return 10.0 * np.log10(BOLTZMANN * ROOM_TEMPERATURE * self.bandwidth * 1e3)
-
     def variance(self, points: np.ndarray, anchors: Anchors) -> np.ndarray:
         """Return the variance of the range of one reception: (n, N) m^2.
 
         points : (n, 3) m; anchors : N Anchors. Source: eqs. 9 and 12.
         """
-        snr_db = self._received(points, anchors) - self.thermal_noise_dbm
+        thermal_noise_dbm = 10.0 * np.log10(BOLTZMANN * ROOM_TEMPERATURE * self.bandwidth * 1e3)
+        snr_db = self._received(points, anchors) - thermal_noise_dbm
         return (SPEED_OF_LIGHT / self.bandwidth) ** 2 * 10.0 ** (-0.1 * snr_db)
 
     def _received(self, points: np.ndarray, anchors: Anchors) -> np.ndarray:

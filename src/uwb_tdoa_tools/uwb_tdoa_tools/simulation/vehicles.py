@@ -8,26 +8,20 @@ time runs with the clock at cruise; vehicles slow it down at both ends.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.polynomial import Polynomial
+from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline, CubicHermiteSpline, CubicSpline, make_interp_spline
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.errors import InputError
 
+from .config import Complete
 from .rooms import REST_HEIGHT, Room
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import ArrayLike
-
-    from .config import Complete
-
 
 KNOT = 0.05  # s, spacing of the spline's knots
 SPEED_UP = 2.0  # s, from rest to cruise and back
