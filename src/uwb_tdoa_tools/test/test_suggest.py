@@ -5,6 +5,7 @@
 import json
 from pathlib import Path
 import shlex
+import tracemalloc
 
 import numpy as np
 from programs import run
@@ -200,6 +201,31 @@ def test_values_decide_the_units(folder, truth, force, units, capsys):
 )
 def test_dates_and_times(text, seconds):
     assert as_time(text) == seconds
+
+
+def nested(name, count):
+    """Return a record of values below one name."""
+    return json.dumps({name: dict.fromkeys(map(str, range(count)), 1)})
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        [nested("k" * 200_000, 20_000)],
+        [nested("k" * 500 + str(row), 500) for row in range(200)],
+        [json.dumps({"name" * 20 + str(row): 1}) for row in range(30_000)],
+    ],
+    ids=["a long path of many values", "long paths", "a name for each row"],
+)
+def test_records_with_endless_names_are_refused_in_little_memory(folder, capsys, lines):
+    """A path is repeated for each value below it: 0.5 MB unfold to 4 GB."""
+    (folder / "log.jsonl").write_text("\n".join(lines))
+    tracemalloc.start()
+    code = convert(["log.jsonl", "--suggest", "profile.yaml"])
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert code == 2 and "a row of more than 100000 characters" in capsys.readouterr().err
+    assert peak < 50e6
 
 
 def test_a_record_that_is_no_json_is_refused(folder, capsys):

@@ -258,14 +258,20 @@ def _as_csv(path: str | Path, content: bytes, most: int) -> bytes:
     """Return JSON lines as CSV with a column for each path of a value. Raises InputError."""
     check_text(path, content)
     lines = [line.strip(" ,[]\t") for line in content.decode("utf-8-sig").splitlines()]
+    names, rows, header = dict[str, None](), [], 0  # characters of all names
     try:
-        rows = [dict(_leaves(json.loads(line or "{}"), "")) for line in lines]
+        for line in lines:
+            if max(len(line), header) > ROW_CHARACTERS:
+                raise ValueError(f"a row of more than {ROW_CHARACTERS} characters")
+            rows.append(dict(_leaves(json.loads(line or "{}"), "")))
+            new = [name for name in rows[-1] if name not in names]
+            names.update(dict.fromkeys(new))
+            header += sum(map(len, new))
     except (ValueError, RecursionError) as error:
         raise InputError(
             f"{path}: is no JSON with one record on each line ({error}); write it so, as "
             "jq -c '.[]' does."
         ) from error
-    names = dict.fromkeys(name for row in rows for name in row)
     Budget(path).spend("cells", len(names) * len(rows), most)
     out = io.StringIO()
     table = csv.DictWriter(out, names)
