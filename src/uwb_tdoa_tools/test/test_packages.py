@@ -53,3 +53,31 @@ def test_one_version_everywhere():
     found.add(yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"])
     found.add(re.search(r"^## ([\d.]+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)[1])
     assert found == {version()} and written_by() == f"uwb_tdoa {version()}"
+
+
+def locked(name):
+    """Return {package: version} of a lock. Each has a hash."""
+    text = (ROOT / name).read_text()
+    found = dict(re.findall(r"^([^\s=]+)==(\S+)", text, re.M))
+    assert len(re.findall(r"^\S+==\S+ \\\n    --hash=sha256:", text, re.M)) == len(found)
+    return found
+
+
+def test_what_leads_to_other_machines_is_locked():
+    """Every optional package that has a link, and all that it needs, in the versions of the rest."""
+    optional, rest = locked(".dev/optional.lock"), locked(".dev/requirements.lock")
+    extras = (ROOT / "pyproject.toml").read_text().partition("[project.optional-dependencies]")[2]
+    for extra in ("crazyflie", "dask", "mavlink"):
+        (line,) = re.findall(rf"^{extra} = .*", extras, re.M)
+        assert {*re.findall(r'"([a-z]+)>=', line)} <= optional.keys()
+    (other,) = {name for name in optional.keys() & rest if optional[name] != rest[name]}
+    assert other == "packaging"  # cflib needs an older one
+    for name, number in locked(".ci/requirements.lock").items():
+        assert optional.get(name, number) == number or name == "packaging"
+
+
+def test_who_runs_the_container_owns_none_of_its_code():
+    lines = (ROOT / "Containerfile").read_text().splitlines()
+    code = [k for k, line in enumerate(lines) if re.search(r"^COPY|^RUN .*build|^USER", line)]
+    assert lines[code[-1]] == "USER uwb" and sum("USER" in lines[k] for k in code) == 1
+    assert not any("chown" in line or "chmod" in line for line in lines)

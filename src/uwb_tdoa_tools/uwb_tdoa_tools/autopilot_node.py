@@ -154,7 +154,9 @@ class AutopilotNode(StreamNode):
         if self._waiting:
             messages, now = self._waiting[:], self._now()
             self._waiting.clear()
-            self._gate.publishers = max(map(_publishers, (self._input, self._status)))
+            self._gate.publishers = max(
+                each.subscription.get_publisher_count() for each in (self._input, self._status)
+            )
             for _, rows, some in self._codec.read(messages, self._input.refusals.add):
                 for row, data in zip(rows, messages[some]):
                     self._pass_on(row, data, now)
@@ -182,8 +184,8 @@ class AutopilotNode(StreamNode):
             "held back because": self._gate.why,
             "rate": f"{self._rate.of(self._gate.passed):.1f} Hz",
             **counts,
-            "publishers of odometry": _publishers(self._input),
-            "publishers of status": _publishers(self._status),
+            "publishers of odometry": self._input.subscription.get_publisher_count(),
+            "publishers of status": self._status.subscription.get_publisher_count(),
             "subscribers of odometry/gated": self._publisher.get_subscription_count(),
             "unreadable on odometry": self._input.refusals.count,
             "unreadable on status": self._status.refusals.count,
@@ -206,10 +208,6 @@ class AutopilotNode(StreamNode):
         """End the link and the node."""
         self._link.close()
         super().destroy_node()
-
-
-def _publishers(topic: Input) -> int:
-    return topic.subscription.get_publisher_count()
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -119,9 +119,8 @@ class Port:
 
     def write(self, data: bytes) -> None:
         """Write what the socket takes at once; `read` raises if the peer is gone."""
-        if self.peer is not None:
-            with suppress(OSError):
-                self._ends[self.peer].send(data)
+        with suppress(KeyError, OSError):  # without a peer, there is nobody to write to
+            self._ends[self.peer].send(data)
 
     def close(self) -> None:
         """Close the port and forget the peer."""
