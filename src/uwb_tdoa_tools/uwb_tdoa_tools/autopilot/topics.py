@@ -4,8 +4,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 
+from geometry_msgs.msg import Vector3
 from rclpy.node import Node
 from rclpy.time import Time
 from sensor_msgs.msg import FluidPressure, Imu, Range
@@ -22,6 +23,17 @@ TOPICS = {
     "imu": ("imu/data", Imu),
     "height": ("height", Range),
     "pressure": ("pressure", FluidPressure),
+}
+
+
+OF_SENSOR: dict[str, Callable[[float], Range | FluidPressure]] = {  # {stream: makes a message}
+    "height": lambda value: Range(
+        radiation_type=INFRARED,
+        field_of_view=FIELD_OF_VIEW,
+        max_range=LONGEST_RANGE,
+        range=value,
+    ),
+    "pressure": lambda value: FluidPressure(fluid_pressure=value),
 }
 
 
@@ -78,19 +90,12 @@ class VehicleTopics:
             tdoa = Tdoa(anchor_a=a, anchor_b=b, distance_difference=d)
             self._publish("tdoa", tdoa, t, arrival)
         if sample is not None:
-            t, gyro, accel = sample
-            imu = Imu()
-            rates, forces = imu.angular_velocity, imu.linear_acceleration
-            rates.x, rates.y, rates.z = gyro.tolist()
-            forces.x, forces.y, forces.z = accel.tolist()
+            t, *vectors = sample
+            gyro, accel = (Vector3(**dict(zip("xyz", vector.tolist()))) for vector in vectors)
+            imu = Imu(angular_velocity=gyro, linear_acceleration=accel)
             self._publish("imu", imu, t, arrival)
         for stream, t, value in block.take_sensors(timestamp, values):
-            if stream == "height":
-                height = Range(radiation_type=INFRARED, field_of_view=FIELD_OF_VIEW)
-                height.max_range, height.range = LONGEST_RANGE, value
-                self._publish(stream, height, t, arrival)
-            else:
-                self._publish(stream, FluidPressure(fluid_pressure=value), t, arrival)
+            self._publish(stream, OF_SENSOR[stream](value), t, arrival)
 
     def _publish(
         self, stream: str, message: Tdoa | Imu | Range | FluidPressure, t: float, arrival: float
