@@ -174,10 +174,12 @@ def twice(x):
 """
 
 
-def digests(tmp_path, monkeypatch, folder, shift=1.0, factor=2.0):
-    """Return the digests of three functions that reach another folder."""
-    monkeypatch.syspath_prepend(tmp_path)
-    place = tmp_path / "uwb_tdoa_probe" / folder
+def digests(tmp_path, monkeypatch, version, shift=1.0, factor=2.0, folder="area"):
+    """Return the digests of three functions of a version, which reach another module."""
+    monkeypatch.syspath_prepend(tmp_path / version)
+    for name in [name for name in sys.modules if name.startswith("uwb_tdoa_probe")]:
+        monkeypatch.delitem(sys.modules, name)
+    place = tmp_path / version / "uwb_tdoa_probe" / folder
     place.mkdir(parents=True)
     (place / "code.py").write_text(CODE.format(shift=shift, factor=factor))
     (place / "caller.py").write_text(CALLER.format(folder=folder))
@@ -196,6 +198,9 @@ def test_the_name_of_a_cache_file_depends_on_all_that_the_function_reaches(tmp_p
     other_constant = digests(tmp_path, monkeypatch, "three", shift=2.0)
     assert [name for name in before if other_constant[name] != before[name]] == ["by_constant"]
 
+    # A file that names another module would not load.
+    moved = digests(tmp_path, monkeypatch, "moved", folder="elsewhere")
+    assert not set(moved.values()) & set(before.values())
     monkeypatch.setattr(compiled, "VERSIONS", "0.99 3.0")
     assert not set(digests(tmp_path, monkeypatch, "four").values()) & set(before.values())
 

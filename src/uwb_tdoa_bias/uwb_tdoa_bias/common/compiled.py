@@ -254,7 +254,8 @@ def _digest(function: Callable[..., Any]) -> str:
 @cache
 def _content(function: Callable[..., Any]) -> tuple[bytes, list[Callable[..., Any]]]:
     """Return a digest of the code of a function and its constants, and the functions it calls."""
-    texts = [VERSIONS, function.__qualname__, repr(function.__defaults__)]
+    # a file names modules, to load what it holds
+    texts = [VERSIONS, function.__module__, function.__qualname__, repr(function.__defaults__)]
     names, called = set[str](), []
     codes = [function.__code__]
     for code in codes:  # grows by the code of comprehensions
@@ -282,5 +283,6 @@ def _content(function: Callable[..., Any]) -> tuple[bytes, list[Callable[..., An
             texts.append(f"{name} {value.dtype} {value.shape} {value.tobytes().hex()}")
         else:  # a number, a class with fields, or a function of another package
             fields = getattr(value, "_fields", "")
-            texts.append(f"{name} {getattr(value, '__qualname__', repr(value))} {fields}")
+            kind = getattr(value, "__qualname__", repr(value))
+            texts.append(f"{name} {getattr(value, '__module__', '')} {kind} {fields}")
     return hashlib.sha256("\0".join(texts).encode()).digest(), called
