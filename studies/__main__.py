@@ -87,6 +87,11 @@ STUDIES = {  # name: (module, what it measures, page of docs/)
         "surveys with errors, corrected from flights alone",
         "notebook/calibration.md",
     ),
+    "users": (
+        "users",
+        "bodies, sensors, rates and errors of many users, beside two textbook estimators",
+        "notebook/users.md",
+    ),
     "warehouse": (
         "warehouse",
         "starts, slow tags and walks in halls, and their cost",

@@ -1,0 +1,305 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
+"""users: judge the filter for bodies, sensors, rates and errors unlike those of the measured rooms.
+
+The recordings come from a simulator in this file. Two textbook estimators run beside the filter: an
+extended Kalman filter with constant velocity, and batch least squares over the whole recording.
+Both know the noise of the TDOAs and the density of the random acceleration. The filter has its defaults.
+"""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from dataclasses import dataclass
+import math
+from typing import Any
+
+import numpy as np
+from scipy import sparse
+from scipy.interpolate import make_interp_spline
+from scipy.sparse.linalg import splu
+from scipy.spatial.transform import Rotation
+
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
+from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.offline import run_offline
+from uwb_tdoa_ekf.smoother import smooth
+from uwb_tdoa_tools import cli
+
+from . import table
+
+DURATION, SETTLED = 40.0, 5.0  # s; errors count from SETTLED on
+BEGIN = 3.0  # s until the tag has its speed
+NOISE, DELAY, SURVEY = 0.1, 0.08, 0.05  # m
+REFLECTION, CHANGES = 0.12, 0.5  # m; a reflection changes over this length
+STEP = 0.5  # m between two estimates that the motion does not explain
+KNOT = 0.1  # s between positions of the batch least squares
+GRAVITY = np.array([0.0, 0.0, 9.81])
+
+
+@dataclass(frozen=True)
+class Body:
+    """Lissajous figure of a tag: half axes (m), speed (m/s), height of steps (m), thrust tilts it."""
+
+    reach: tuple[float, float, float]
+    speed: float
+    bob: float = 0.0
+    tilts: bool = False
+
+
+BODIES = {
+    "rest": Body((2.0, 1.5, 0.0), 0.0),
+    "person": Body((2.5, 2.5, 0.0), 1.2, 0.03),
+    "runner": Body((3.0, 3.0, 0.0), 3.0, 0.05),
+    "rover": Body((2.5, 2.0, 0.0), 0.5),
+    "quadrotor": Body((2.0, 2.0, 0.6), 1.0, tilts=True),
+    "racing": Body((3.5, 3.5, 0.5), 8.0, tilts=True),
+}
+ERRORS = "white", "delays", "survey", "reflections"
+CELLS = [  # body, IMU (Hz), TDOAs/s, errors
+    ("rest", 0, 10, "white"),
+    ("rest", 100, 50, "delays"),
+    ("person", 0, 2, "white"),
+    ("person", 0, 10, "delays"),
+    ("person", 100, 50, "reflections"),
+    ("runner", 0, 5, "white"),
+    ("runner", 0, 20, "white"),
+    ("runner", 0, 20, "reflections"),
+    ("rover", 100, 20, "survey"),
+    ("rover", 100, 200, "white"),
+    ("quadrotor", 500, 5, "white"),
+    ("quadrotor", 500, 50, "white"),
+    ("quadrotor", 500, 400, "reflections"),
+    ("quadrotor", 500, 1000, "survey"),
+    ("racing", 500, 200, "white"),
+    ("racing", 0, 200, "white"),
+]
+
+
+def simulate(
+    name: str, imu_rate: float, rate: float, errors: str, seed: int
+) -> tuple[Flight, float]:
+    """Return a Flight, and the density of its random acceleration, m^2/s^3."""
+    rng, body = np.random.default_rng([seed, 73]), BODIES[name]
+    t = np.arange(-0.1, DURATION + 0.1, 1e-3)
+    ratio, phase = np.array([1.0, 1.31, 1.7]), rng.uniform(0.0, 2.0 * np.pi, 3)
+    reach = np.array(body.reach)
+    rates = body.speed / math.sqrt(0.5 * np.sum((reach * ratio) ** 2)) * ratio
+    since = np.clip(t / BEGIN, 0.0, 1.0)  # from rest to full speed over BEGIN
+    way = np.where(t < BEGIN, BEGIN * (since**3 - 0.5 * since**4), t - 0.5 * BEGIN)
+    p = [0.0, 0.0, 1.2] + reach * np.sin(way[:, None] * rates + phase)
+    p[:, 2] += body.bob * np.sin(2.0 * np.pi * 1.9 * t)
+    path = make_interp_spline(t, p, k=5)
+    v, a = path(t, 1), path(t, 2)
+    turns = body.speed and not body.tilts
+    yaw = np.unwrap(np.arctan2(v[:, 1], v[:, 0])) if turns else np.full(len(t), phase[0])
+    up = (a if body.tilts else 0.0 * a) + GRAVITY
+    up /= np.linalg.norm(up, axis=1)[:, None]
+    left = np.cross(up, np.column_stack([np.cos(yaw), np.sin(yaw), 0.0 * yaw]))
+    left /= np.linalg.norm(left, axis=1)[:, None]
+    q = Rotation.from_matrix(np.stack([np.cross(left, up), left, up], axis=2))
+    places = np.array([(x, y, z) for z in (0.2, 2.8) for x in (-4.0, 4.0) for y in (-4.0, 4.0)])
+    surveyed = places + SURVEY * (errors == "survey") * rng.normal(size=(8, 3))
+    anchors = Anchors(np.arange(8), surveyed, np.tile([0.0, 0.0, 0.0, 1.0], (8, 1)))
+    return Flight(
+        name,
+        anchors,
+        _tdoas(path, places, rate, errors, rng),
+        _imu(t, a, q, imu_rate, rng) if imu_rate else None,
+        Truth(t[::10], p[::10], q.as_quat()[::10]),
+    ), float(np.mean(np.sum((v[500:] - v[:-500]) ** 2, axis=1)) / 1.5)
+
+
+def _tdoas(path: Any, places: np.ndarray, rate: float, errors: str, rng: Any) -> Tdoas:
+    """Return the TDOAs of pairs in random order, at `rate` (1/s)."""
+    t = np.arange(0.01, DURATION, 1.0 / rate)
+    a = rng.integers(0, 8, len(t))
+    b = (a + rng.integers(1, 8, len(t))) % 8
+    p, each = path(t), DELAY * (errors == "delays") * rng.normal(size=8)
+    arrival = np.linalg.norm(p[:, None] - places, axis=2) + each
+    if errors == "reflections":
+        waves, phases = (
+            rng.normal(size=(8, 20, 3)) / CHANGES,
+            rng.uniform(0.0, 2.0 * np.pi, (8, 20)),
+        )
+        arrival += (
+            REFLECTION * np.mean(np.cos(np.einsum("nk,awk->naw", p, waves) + phases), 2) * 40**0.5
+        )
+    rows = np.arange(len(t))
+    return Tdoas(t, a, b, arrival[rows, b] - arrival[rows, a] + NOISE * rng.normal(size=len(t)))
+
+
+def _imu(t: np.ndarray, a: np.ndarray, q: Rotation, rate: float, rng: Any) -> Imu:
+    """Return inertial samples with biases and white noise."""
+    rows = np.arange(0, len(t) - 1, round(1000 / rate))
+    gyro = (q[rows].inv() * q[rows + 1]).as_rotvec() / 1e-3 + 0.005 * rng.normal(size=3)
+    accel = q[rows].inv().apply(a[rows] + GRAVITY) + 0.05 * rng.normal(size=3)
+    scatter = math.sqrt(rate) * rng.normal(size=(2, len(rows), 3))
+    return Imu(t[rows], gyro + 0.002 * scatter[0], accel + 0.02 * scatter[1])
+
+
+def _geometry(flight: Flight, rows: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return residuals (n,) and Jacobian (n, 3) of TDOAs at positions p (n, 3)."""
+    tdoa, places = flight.tdoa, flight.anchors.positions
+    to_a, to_b = p - places[tdoa.a[rows]], p - places[tdoa.b[rows]]
+    away_a, away_b = np.linalg.norm(to_a, axis=1), np.linalg.norm(to_b, axis=1)
+    H = to_b / away_b[:, None] - to_a / away_a[:, None]
+    return tdoa.d[rows] - (away_b - away_a), H
+
+
+def kalman(flight: Flight, density: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return stamps, positions and covariances of an extended iterated Kalman filter: constant velocity.
+
+    Bar-Shalom et al., Estimation with Applications to Tracking and Navigation, 2001, sections 6.2.2
+    and 10.5.2.
+    """
+    truth, t = flight.truth, flight.tdoa.t
+    assert truth is not None
+    x, P = np.append(truth.p[0], np.zeros(3)), np.diag([0.1] * 3 + [10.0] * 3)
+    places, covariances = np.empty((len(t), 3)), np.empty((len(t), 3, 3))
+    F, Q = np.eye(6), np.zeros((6, 6))
+    for k in range(len(t)):
+        dt = t[k] - t[k - 1] if k else 0.0
+        for i in range(3):
+            F[i, 3 + i] = dt
+            Q[i, i], Q[i, 3 + i], Q[3 + i, i], Q[3 + i, 3 + i] = max(density, 1e-4) * np.array(
+                [dt**3 / 3.0, dt**2 / 2.0, dt**2 / 2.0, dt]
+            )
+        x, P = F @ x, F @ P @ F.T + Q
+        prior = x
+        for _ in range(5):  # iterated: linearized anew at the updated position
+            r, H = _geometry(flight, np.array([k]), x[None, :3])
+            h = np.append(H[0], np.zeros(3))
+            gain = P @ h / (h @ P @ h + NOISE**2)
+            x = prior + gain * (r + h @ (x - prior))
+        P = P - np.outer(gain, h @ P)
+        places[k], covariances[k] = x[:3], P[:3, :3]
+    return t, places, covariances
+
+
+def least_squares(
+    flight: Flight, density: float, begin: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return stamps and positions of batch least squares: positions at knots, random acceleration.
+
+    begin : (n, 3) positions at the stamps of the TDOAs, to start from.
+    """
+    tdoa, n = flight.tdoa, int(DURATION / KNOT) + 2
+    t, p = KNOT * np.arange(n), np.empty((n, 3))
+    for k in range(3):
+        p[:, k] = np.interp(t, tdoa.t, begin[:, k])
+    before = np.minimum((tdoa.t / KNOT).astype(int), n - 2)
+    share = tdoa.t / KNOT - before
+    rows = np.arange(len(tdoa))
+    at = sparse.csr_matrix(
+        (np.append(1.0 - share, share), (np.tile(rows, 2), np.append(before, before + 1))),
+        (len(rows), n),
+    )
+    second = sparse.diags([1.0, -2.0, 1.0], [0, 1, 2], (n - 2, n))  # type: ignore[list-item]
+    smooth_by = second.T @ second / (max(density, 1e-4) * KNOT**3)
+    prior = sparse.block_diag([smooth_by] * 3) + 1e-6 * sparse.eye(3 * n)
+    for _ in range(8):
+        r, H = _geometry(flight, rows, at @ p)
+        J = sparse.hstack([sparse.diags(H[:, k]) @ at for k in range(3)]).tocsr()
+        system = J.T @ J / NOISE**2 + prior
+        p += splu(system.tocsc()).solve(J.T @ r / NOISE**2 - prior @ p.T.ravel()).reshape(3, n).T
+    return t, p
+
+
+def _judge(
+    flight: Flight, t: np.ndarray, p: np.ndarray, covariance: np.ndarray | None = None
+) -> dict[str, float]:
+    """Return RMSE and largest error (m), steps, and NEES per degree of freedom after SETTLED."""
+    truth = flight.truth
+    assert truth is not None
+    late = (t >= SETTLED) & (t <= DURATION)
+    if not late.any():
+        return {"rmse": math.nan, "max": math.nan, "steps": math.nan, "nees": math.nan}
+    t, p = t[late], p[late]
+    true = np.stack([np.interp(t, truth.t, column) for column in truth.p.T], axis=1)
+    off = p - true
+    size = np.linalg.norm(off, axis=1)
+    steps = np.linalg.norm(np.diff(off, axis=0), axis=1) > STEP
+    out = {"rmse": math.sqrt(np.mean(size**2)), "max": size.max(), "steps": float(steps.sum())}
+    if covariance is not None:
+        nees = np.einsum("ni,nij,nj->n", off, np.linalg.inv(covariance[late][:, :3, :3]), off)
+        out["nees"] = float(np.mean(nees)) / 3.0
+    return out
+
+
+def _nees_of_yaw(flight: Flight, odometry: Any) -> float:
+    """Return the mean NEES of the yaw after SETTLED."""
+    truth, late = flight.truth, odometry.t >= SETTLED
+    assert truth is not None
+    if not late.any():
+        return math.nan
+    true = np.unwrap(Rotation.from_quat(truth.q).as_euler("ZYX")[:, 0])
+    estimated = Rotation.from_quat(odometry.q[late])
+    off = estimated.as_euler("ZYX")[:, 0] - np.interp(odometry.t[late], truth.t, true)
+    z = estimated.as_matrix()[:, 2]  # vertical axis of the world, in the body
+    variance = np.einsum("ni,nij,nj->n", z, odometry.covariance[late][:, 6:9, 6:9], z)
+    return float(np.mean(np.arctan2(np.sin(off), np.cos(off)) ** 2 / variance))
+
+
+def add_options(add: Any) -> None:
+    """Add the options of the study."""
+    table.add_options(add, draws=5)
+    table.add_only(add)
+
+
+def run(args: Namespace) -> None:
+    """Simulate, and print the table."""
+    cells = {
+        f"{body}, IMU {imu} Hz, {rate} TDOAs/s, {errors}": (body, imu, rate, errors)
+        for body, imu, rate, errors in CELLS
+    }
+    cli.show(table.head("cell", *COLUMNS))
+    for name, results in table.trials(measure, table.chosen(args, list(cells)), args):
+        cli.show(table.line([name, *(_pooled(results, column) for column in COLUMNS.values())]))
+
+
+COLUMNS = {
+    "filter, RMSE m": ("filter", "rmse"),
+    "largest": ("filter", "max"),
+    "NEES": ("filter", "nees"),
+    "NEES of yaw": ("filter", "yaw"),
+    "smoother, RMSE m": ("smoother", "rmse"),
+    "largest ": ("smoother", "max"),
+    "steps": ("smoother", "steps"),
+    "NEES ": ("smoother", "nees"),
+    "EKF, RMSE m": ("kalman", "rmse"),
+    "NEES  ": ("kalman", "nees"),
+    "least squares, RMSE m": ("batch", "rmse"),
+}
+
+
+def _pooled(results: list[dict[str, dict[str, float]]], column: tuple[str, str]) -> str:
+    """Return the cell of a column, pooled over seeds."""
+    values = np.array([result[column[0]].get(column[1], math.nan) for result in results])
+    if np.isnan(values).all():
+        return ""
+    if column[1] == "rmse":
+        return f"{math.sqrt(np.mean(values**2)):.3f}"
+    if column[1] in ("max", "steps"):
+        return f"{values.max():.2f}" if column[1] == "max" else f"{values.sum():.0f}"
+    return f"{values.mean():.2f}"
+
+
+def measure(item: tuple[str, int]) -> dict[str, dict[str, float]]:
+    """Return the figures of each estimator in a cell, for (name of the cell, seed)."""
+    name, seed = item
+    body, imu, rate, errors = name.split(", ")
+    flight, density = simulate(body, float(imu.split()[1]), float(rate.split()[0]), errors, seed)
+    config = FilterConfig(use_imu=flight.imu is not None)
+    online, smoothed = run_offline(flight, config).odometry, smooth(flight, config).odometry
+    t, p, covariance = kalman(flight, density)
+    out = {
+        "filter": _judge(flight, online.t, online.p, online.covariance),
+        "smoother": _judge(flight, smoothed.t, smoothed.p, smoothed.covariance),
+        "kalman": _judge(flight, t, p, covariance),
+        "batch": _judge(flight, *least_squares(flight, density, p)),
+    }
+    if flight.imu is not None and BODIES[body].speed:
+        out["filter"]["yaw"] = _nees_of_yaw(flight, online)
+    return out
