@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """checking: put mistakes of drivers, surveys and clocks into flights, and count what `check` reports.
 
-The unchanged flights are judged, too.
+The unchanged flights are judged, too. With --healthy, recordings of ten kinds without a mistake are
+judged instead: every error, and every warning about anchors, is false.
 """
 
 from functools import partial
@@ -12,7 +13,7 @@ from mistakes import MISTAKES, arriving
 import numpy as np
 
 from uwb_tdoa_bias.common.survey import read_survey
-from uwb_tdoa_ekf.monitoring.finding import ERROR
+from uwb_tdoa_ekf.monitoring.finding import ERROR, WARNING
 from uwb_tdoa_tools import choices, cli
 from uwb_tdoa_tools.checking.check import check
 from uwb_tdoa_tools.checking.recording import of_flight
@@ -21,13 +22,24 @@ from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.readers.streams import protocol
 
 from . import table
+from .healthy import KINDS, healthy
 
+# rules of warnings that blame anchors
+OF_SINGLE = {
+    "anchor_changed",
+    "anchor_displaced",
+    "anchor_silent",
+    "anchor_missing",
+    "survey_differs",
+}
 ANOTHER = 0.3  # m that an anchor of another room is elsewhere at least
 
 
 def add_options(add):
     """add : add_argument of a parser."""
     add("flights", nargs="+", metavar="FLIGHT", help=choices.RECORDINGS)
+    words = "judge healthy recordings of ten kinds instead; FLIGHT: those that are cut to pieces"
+    add("--healthy", action="store_true", help=words)
     add("--survey", required=True, metavar="DIR", help="folder of all surveys")
     add(
         "--only",
@@ -36,13 +48,16 @@ def add_options(add):
         choices=[*MISTAKES, "nothing"],
         help=f"of {', '.join(MISTAKES)}, nothing",
     )
-    table.add_options(add)
+    table.add_options(add, draws=20)
 
 
 def run(args):
     """Print the table."""
     reading = inputs.Reading(args.survey)
     found = reading.find(args.flights)
+    if args.healthy:
+        show_healthy(found, reading, args)
+        return
     surveys = [
         (path.name, read_survey(path)) for path in sorted(Path(args.survey).glob("anchor_?*"))
     ]
@@ -54,6 +69,29 @@ def run(args):
     judge = partial(judge_flight, reading=reading, surveys=surveys, only=args.only)
     said = table.results(judge, tasks, args, unit="flight")
     cli.show(markdown([row for rows in said for row in rows]))
+
+
+def show_healthy(found, reading, args):
+    """Print false errors and false warnings about anchors, for each kind."""
+    cli.show(table.head("kind", "errors", "about anchors", "recordings", "errors", "warnings"))
+    judge = partial(judge_healthy, found=found, reading=reading)
+    for kind, said in table.trials(judge, KINDS, args):
+        errors, warnings = (
+            [rule for one in said for rule in one[severity]] for severity in (ERROR, WARNING)
+        )
+        named = (", ".join(sorted(rules)) for rules in (errors, warnings))
+        counts = (sum(bool(one[severity]) for one in said) for severity in (ERROR, WARNING))
+        cli.show(table.line([kind, *named, len(said), *counts]))
+
+
+def judge_healthy(item, found, reading):
+    """{ERROR: rules, WARNING: rules about single anchors} of (kind, seed)."""
+    findings = check(of_flight(healthy(*item, found, reading))).findings
+    said = {ERROR: [], WARNING: []}
+    for one in findings:
+        if one.severity == ERROR or (one.severity == WARNING and one.rule in OF_SINGLE):
+            said[one.severity].append(one.rule)
+    return said
 
 
 def _partner(number, found, kinds):

@@ -78,6 +78,11 @@ IMU_FAULTS = {
     "imu_tilted": lambda c, rng: put(
         c, ACCEL, c[ACCEL] @ np.array([[1, 0, 0], [0, 0.7, 0.7], [0, -0.7, 0.7]])
     ),
+    "imu_in_turns": lambda c, rng: put(
+        put(c, ACCEL, c[ACCEL] * (np.arange(len(c[ACCEL])) % 2)[:, None]),
+        GYRO,
+        c[GYRO] * (np.arange(len(c[GYRO])) % 2 == 0)[:, None],
+    ),
     "imu_silent": lambda c, rng: put(put(c, ACCEL, 0.0 * c[ACCEL]), GYRO, 0.0 * c[GYRO]),
     "imu_repeated": lambda c, rng: put(put(c, ACCEL, _held(c[ACCEL])), GYRO, _held(c[GYRO])),
     "imu_axis_dead": lambda c, rng: put(c, GYRO, c[GYRO] * [1.0, 0.0, 1.0]),

@@ -29,9 +29,9 @@ from uwb_tdoa_bias.effects.tag import TagLeverArm
 
 from .estimator import Estimator
 from .monitoring.change import YOUNGEST, ChangeDetector
+from .monitoring.judge import Judge
 from .monitoring.slices import LENGTH, Slice
 from .monitoring.stream_rules import StreamWatch
-from .monitoring.survey_scale import SurveyScale
 from .results import pose_and_twist, rotation_std
 
 
@@ -65,7 +65,7 @@ def warm_up() -> None:
     pose_and_twist(odometry, odometry.rate, odometry.rate_variance)
     rotation_std(odometry.q[-1:], odometry.covariance[-1:])
     watch.findings()
-    SurveyScale(Anchors.from_positions(np.eye(5, 3))).add(
+    Judge(Anchors.from_positions(np.eye(5, 3))).add(
         np.array([(k, (k + 1) % 5, 1.0) for k in range(5)])
     )
     detector = ChangeDetector()

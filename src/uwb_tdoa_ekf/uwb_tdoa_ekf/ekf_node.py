@@ -486,7 +486,7 @@ class EkfNode(StreamNode):
         restarts, self._restarts = self._restarts, estimator.counts["restarts"]
         if self._restarts != restarts:
             self._watch.restart()
-        found = self._watch.findings(estimator.sign_turns, self._health.use.contradicted)
+        found = self._watch.findings(estimator.sign_turns)
         return most_severe_first([*found, *estimator.findings])
 
     def _wiring(self) -> list[str]:

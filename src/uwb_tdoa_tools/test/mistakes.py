@@ -190,7 +190,7 @@ def second_tag(recording, rng, other):
 # Ids and surveys
 
 
-@mistake("ids of two anchors swapped", "ids_swapped")
+@mistake("ids of two anchors swapped", "ids_exchanged")
 def swapped(recording, rng, other):
     one, two = rng.choice(recording.anchors.ids, 2, replace=False)
     return _renamed(recording, {one: two, two: one})

@@ -205,7 +205,7 @@ def test_a_measured_flight_and_its_mistakes(shared_data):
 
 
 # wrong causes that `check` named before
-OF_ANOTHER_ROOM = {"ids_swapped", "pair_sign", "imu_rate_unit", "imu_axes", "tdoa_sign"}
+OF_ANOTHER_ROOM = {"ids_exchanged", "pair_sign", "imu_rate_unit", "imu_axes", "tdoa_sign"}
 
 
 def assert_of_another_room(flight):

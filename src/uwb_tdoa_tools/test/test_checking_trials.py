@@ -22,6 +22,7 @@ from uwb_tdoa_bias.common.sensors import Ranges
 from uwb_tdoa_ekf.results import rows_of
 from uwb_tdoa_tools.checking import imu_rules, tdoa_rules
 from uwb_tdoa_tools.checking.check import check
+from uwb_tdoa_tools.checking.coverage import sides_of
 from uwb_tdoa_tools.checking.imu_rules import clipped_axes, is_smooth
 from uwb_tdoa_tools.checking.ordered import (
     LEAST_MOTION,
@@ -65,7 +66,7 @@ def test_swapped_ids_are_found_and_undone(healthy):
     one, two = healthy.anchors.ids[[2, 5]].tolist()
     swapped = tdoa_rules.relabelled(healthy, {one: two, two: one})
     finding, undone = tdoa_rules.best_trial(swapped)
-    assert finding.rule == "ids_swapped" and finding.severity == "error"
+    assert finding.rule == "ids_exchanged" and finding.severity == "error"
     assert np.array_equal(undone.tdoa.a, healthy.tdoa.a) and np.array_equal(
         undone.tdoa.b, healthy.tdoa.b
     )
@@ -94,7 +95,7 @@ def test_surveys_of_one_room_are_named_together(healthy):
 def test_ids_are_not_tried_without_motion():
     hovering = OrderedRecording.of(recording(10, trajectory="hover"))
     assert second_principal_std(hovering.survey_fit.places) < LEAST_MOTION
-    assert list(tdoa_rules.swapped_ids(hovering)) == []
+    assert [trial.rule for trial in tdoa_rules.judged(hovering)] == ["tdoa_sign"]
 
 
 @pytest.mark.parametrize("count", [0, 1])
@@ -231,6 +232,37 @@ def test_rotation_and_translation_are_no_displacement(seed):
     assert displacement(positions, moved).max() < 1e-9
     mirrored = moved * [1.0, 1.0, -1.0]
     assert displacement(positions, mirrored).max() > 1e-3  # a mirror image is a different survey
+
+
+def test_errors_that_depend_on_the_place_are_no_moved_anchors():
+    """Each anchor is late or early by up to a metre, as a linear function of the place."""
+    t, a, b, d = measured(BOX)
+    p = [3.0, 3.5, 1.5] + np.sin(np.outer(t, [0.5, 0.7, 0.3])) * [2.0, 2.5, 1.0]
+    slopes = 0.3 * np.random.default_rng(4).normal(size=(8, 3))
+    late = (p - BOX.mean(axis=0)) @ slopes.T
+    rows = np.arange(len(t))
+    fit = SurveyFit(t, a, b, d + late[rows, b] - late[rows, a], BOX)
+    assert apparent_gain(fit) > GAIN and fit.held_out_gain > tdoa_rules.HELD
+    assert gained(fit) is None
+
+
+def test_anchors_in_a_plane_tell_nothing_of_the_survey_or_of_the_inertial_sensor():
+    level = BOX * [1.0, 1.0, 0.0] + [0.0, 0.0, 2.5]
+    assert SurveyFit(*measured(BOX), level).flat and not SurveyFit(*measured(BOX), BOX).flat
+    made = OrderedRecording.of(recording(2))
+    assert imu_rules.find_imu_mistake(replace(made, anchors=made.anchors.at(level))) is None
+
+
+def test_a_gyroscope_that_turns_as_gravity_does_not_is_no_explanation(healthy):
+    scale = max(imu_rules.SCALES)
+    assert not imu_rules._is_possible(healthy.imu, scale * np.eye(3))
+    slow = replace(healthy.imu, gyro=healthy.imu.gyro / scale)
+    assert imu_rules._is_possible(slow, scale * np.eye(3))
+
+
+def test_anchors_in_a_line_have_no_sides():
+    along = np.linspace(-4.0, 4.0, 6)
+    assert sides_of(np.column_stack([along, 0.5 * along, np.full(6, 2.8)])) == ()
 
 
 def test_few_tdoas_make_no_window():

@@ -4,10 +4,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from uwb_tdoa_bias.common.sensors import SENSORS
 
@@ -49,6 +49,7 @@ WRONG_WITH_IMU = frozenset(  # ERRORs that make the position wrong while the fil
         "gyro_axes",
         "accel_axes",
         "imu_silent",
+        "imu_in_turns",
         "imu_axis_dead",
         "stamps_apart",
     ]
@@ -112,6 +113,35 @@ class Finding:
             or self.rule.startswith(SURVEY)
             or (imu_used and self.rule in WRONG_WITH_IMU)
         )
+
+
+class Limit(NamedTuple):
+    """A rule that compares one share of the messages in windows with a limit.
+
+    Attributes
+    ----------
+    rule, severity, cause, evidence, remedy : str
+        As of the Finding; "{}" in the evidence is the share in percent.
+    limit : float
+        Largest healthy share, 0 to 1.
+    share : callable
+        share(windows) is the share.
+    """
+
+    rule: str
+    severity: str
+    cause: str
+    evidence: str
+    remedy: str
+    limit: float
+    share: Callable[[Any], float]
+
+    def __call__(self, windows: Any) -> Iterator[Finding]:
+        """Yield a Finding if the share exceeds the limit."""
+        share = self.share(windows)
+        if share > self.limit:
+            evidence = self.evidence.format(100.0 * share)
+            yield Finding(self.rule, self.severity, self.cause, evidence, self.remedy, share)
 
 
 def most_severe_first(findings: Iterable[Finding]) -> list[Finding]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..core.imu_fault_detector import AXIS, UPRIGHT
 from ..core.state import GRAVITY
-from .finding import ERROR, WARNING, Finding
+from .finding import ERROR, WARNING, Finding, Limit
 from .stamp_rules import median
 from .windows import ImuWindow
 
@@ -137,17 +137,24 @@ def dead_axis(windows: list[ImuWindow]) -> Iterator[Finding]:
         )
 
 
-def invalid(windows: list[ImuWindow]) -> Iterator[Finding]:
-    share = float(np.mean([window.invalid for window in windows]))
-    if share >= 1e-3:
-        yield Finding(
-            "imu_invalid",
-            WARNING,
-            cause="inertial samples are not finite",
-            evidence=f"{100.0 * share:.1f} %",
-            remedy="do not publish samples that are not finite",
-            value=share,
-        )
+in_turns = Limit(
+    "imu_in_turns",
+    ERROR,
+    "gyroscope and accelerometer come in turns: in each message one of them is zero",
+    "{:.0f} % of the samples have one of them alone",
+    "publish both in one message, or a covariance of -1 for what it does not have",
+    REPEATS,
+    lambda windows: median(window.halves for window in windows),
+)
+invalid = Limit(
+    "imu_invalid",
+    WARNING,
+    "inertial samples are not finite",
+    "{:.1f} %",
+    "do not publish samples that are not finite",
+    1e-3,
+    lambda windows: float(np.mean([window.invalid for window in windows])),
+)
 
 
 def no_gravity(windows: list[ImuWindow]) -> Iterator[Finding]:
@@ -355,6 +362,7 @@ def clipped(windows: list[ImuWindow]) -> Iterator[Finding]:
 
 RULES = (
     silent,
+    in_turns,
     repeated,
     dead_axis,
     invalid,

@@ -30,10 +30,10 @@ from ..core.initialization import LOST_TIME
 from ..core.memory import REJECTED
 from ..results import Odometry, Residuals, concatenated, rows_of
 from .change import Change, ChangeDetector
-from .finding import ERROR, WARNING, Finding
+from .finding import WARNING, Finding
+from .judge import exchanged
 from .reference import Displaced, SurveyComparison
-from .signs import turned
-from .slices import LENGTH, Slice, reduced
+from .slices import LENGTH, Slice, reduced, turned
 from .swap import Residuals as SwapResiduals, clear_exchange, mean_of, residuals as residuals_of
 
 # m/s, speed above which the tag is in motion; on the floor, residuals differ from those in the air
@@ -500,18 +500,7 @@ class Monitor:
 
     def _swap(self) -> Finding:
         one, other = self._anchors.ids[[*self._swapped]].tolist()
-        evidence, remedy = (
-            "each TDOA with one of them fits the place of the other",
-            "correct their ids, or their positions on uwb/anchors",
-        )
-        return Finding(
-            "ids_exchanged",
-            ERROR,
-            cause=f"two anchors are exchanged, {one} and {other}",
-            evidence=evidence,
-            remedy=remedy,
-            value=float(one),
-        )
+        return exchanged(one, other, "each TDOA with one of them fits the place of the other")
 
     def _silence(self, row: int) -> Finding:
         number = self._anchors.ids[row]

@@ -13,7 +13,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.radio import SPEED_OF_LIGHT, TICK
 
-from .finding import ERROR, NOTE, WARNING, Finding
+from .finding import ERROR, NOTE, WARNING, Finding, Limit
 from .stamp_rules import median, share_of, total
 from .windows import GRIDS, TdoaWindow
 
@@ -99,93 +99,74 @@ def impossible(windows: list[TdoaWindow]) -> Iterator[Finding]:
         )
 
 
-def of_one(windows: list[TdoaWindow]) -> Iterator[Finding]:
-    share = share_beside_known(windows, "of_one")
-    if share > 1e-3:
-        yield Finding(
-            "tdoa_of_one",
-            ERROR,
-            cause="TDOAs name one anchor twice",
-            evidence=f"{100.0 * share:.1f} %",
-            remedy="message.anchor_a, message.anchor_b = ...  # the two anchors of the difference",
-            value=share,
-        )
-
-
-def invalid(windows: list[TdoaWindow]) -> Iterator[Finding]:
-    share = share_beside_known(windows, "invalid")
-    if share > 1e-3:
-        yield Finding(
-            "tdoa_invalid",
-            WARNING,
-            cause="TDOAs are not finite",
-            evidence=f"{100.0 * share:.1f} %",
-            remedy="do not publish what is not finite",
-            value=share,
-        )
-
-
-def duplicates(windows: list[TdoaWindow]) -> Iterator[Finding]:
-    share = share_of(
+def _twice(windows: list[TdoaWindow]) -> float:
+    """Return the share of TDOAs that come twice; stamps that stand are another mistake."""
+    return share_of(
         [w for w in windows if w.stamps.same < 0.9 * w.stamps.count], "duplicates", "known"
     )
-    if share > DUPLICATES:
-        yield Finding(
-            "tdoa_twice",
-            ERROR,
-            cause="TDOAs are published twice",
-            evidence=f"{100.0 * share:.0f} % come twice with stamp and value",
-            remedy="ros2 topic info --verbose uwb/tdoa  # one publisher only",
-            value=share,
-        )
 
 
-def repeated(windows: list[TdoaWindow]) -> Iterator[Finding]:
-    share = share_of(windows, "repeated", "successive")
-    if share > REPEATS:
-        yield Finding(
-            "tdoa_repeated",
-            WARNING,
-            cause="TDOAs are sampled faster than they are measured",
-            evidence=f"{100.0 * share:.0f} % have the value that their pair had before",
-            remedy="publish a TDOA when there is a new one, not by a timer",
-            value=share,
-        )
+def _even(windows: list[TdoaWindow]) -> float:
+    """Return the share of pairs, heard in both orders, with equal signs; 0 for few of them."""
+    return share_of(windows, "even", "opposed") if total(windows, "opposed") > 20 else 0.0
 
 
-def two_tags(windows: list[TdoaWindow]) -> Iterator[Finding]:
-    share = share_of(windows, "returns", "successive")
-    if share > RETURNS:
-        yield Finding(
-            "two_tags",
-            ERROR,
-            cause="two tags share uwb/tdoa",
-            evidence=f"{100.0 * share:.0f} % leap by more than 0.5 m and back within 0.1 s",
-            remedy=(
-                "give each tag a namespace of its own: start its driver with --ros-args -r "
-                "__ns:=/tag2"
-            ),
-            value=share,
-        )
-
-
-def one_sign(windows: list[TdoaWindow]) -> Iterator[Finding]:
-    share = share_of(windows, "even", "opposed")
-    if share > EVEN and total(windows, "opposed") > 20:
-        yield Finding(
-            "tdoa_one_sign",
-            ERROR,
-            cause="the sign of the TDOAs does not follow the order of the anchors",
-            evidence=(
-                f"{100.0 * share:.0f} % of the pairs that come as (a, b) and (b, a) have the same "
-                "sign"
-            ),
-            remedy=(
-                "message.distance_difference = distance_b - distance_a  # for the anchors in this "
-                "order"
-            ),
-            value=share,
-        )
+SHARES = (
+    Limit(
+        "tdoa_of_one",
+        ERROR,
+        "TDOAs name one anchor twice",
+        "{:.1f} %",
+        "message.anchor_a, message.anchor_b = ...  # the two anchors of the difference",
+        1e-3,
+        lambda windows: share_beside_known(windows, "of_one"),
+    ),
+    Limit(
+        "tdoa_invalid",
+        WARNING,
+        "TDOAs are not finite",
+        "{:.1f} %",
+        "do not publish what is not finite",
+        1e-3,
+        lambda windows: share_beside_known(windows, "invalid"),
+    ),
+    Limit(
+        "tdoa_twice",
+        ERROR,
+        "TDOAs are published twice",
+        "{:.0f} % come twice with stamp and value",
+        "ros2 topic info --verbose uwb/tdoa  # one publisher only",
+        DUPLICATES,
+        _twice,
+    ),
+    Limit(
+        "tdoa_repeated",
+        WARNING,
+        "TDOAs are sampled faster than they are measured",
+        "{:.0f} % have the value that their pair had before",
+        "publish a TDOA when there is a new one, not by a timer",
+        REPEATS,
+        lambda windows: share_of(windows, "repeated", "successive"),
+    ),
+    Limit(
+        "two_tags",
+        ERROR,
+        "two tags share uwb/tdoa",
+        "{:.0f} % leap by more than 0.5 m and back within 0.1 s",
+        "give each tag a namespace of its own: start its driver with --ros-args -r __ns:=/tag2",
+        RETURNS,
+        lambda windows: share_of(windows, "returns", "successive"),
+    ),
+    Limit(
+        "tdoa_one_sign",
+        ERROR,
+        "the sign of the TDOAs does not follow the order of the anchors",
+        "{:.0f} % of the pairs that come as (a, b) and (b, a) have the same sign",
+        "message.distance_difference = distance_b - distance_a  # for the anchors in this order",
+        EVEN,
+        _even,
+    ),
+)
 
 
 def rounded(windows: list[TdoaWindow]) -> Iterator[Finding]:
@@ -236,12 +217,7 @@ def heard(windows: list[TdoaWindow]) -> Iterator[Finding]:
 RULES = (
     fixed_step,
     impossible,
-    of_one,
-    invalid,
-    duplicates,
-    repeated,
-    two_tags,
-    one_sign,
+    *SHARES,
     rounded,
     clipped,
     heard,

@@ -17,9 +17,8 @@ from uwb_tdoa_bias.common.anchors import Anchors
 
 from . import inertial_rules, ranging_rules, stamp_rules
 from .finding import ERROR, NOTE, Finding, Steady, explained_by, most_severe_first
-from .signs import SignWatch
+from .judge import KEPT, Judge, wrong_sign
 from .stamp_rules import median_of
-from .survey_scale import KEPT, SurveyScale
 from .windows import Cutter, ImuWindow, TdoaWindow, imu_window, tdoa_window
 
 Window = TypeVar("Window", "ImuWindow", "TdoaWindow")
@@ -27,6 +26,14 @@ Window = TypeVar("Window", "ImuWindow", "TdoaWindow")
 # Rules whose findings another finding explains: only that one is reported.
 EXPLAINS = {
     "imu_silent": {"imu_no_gravity", "imu_force_unit", "imu_turned", "imu_tilted"},
+    "imu_in_turns": {
+        "imu_no_gravity",
+        "imu_force_unit",
+        "imu_rate_unit",
+        "imu_turned",
+        "imu_tilted",
+        "imu_shaking",
+    },
     "imu_no_gravity": {"imu_force_unit", "imu_turned", "imu_tilted"},
     "tdoa_wraps": {"tdoa_large", "tdoa_outliers", "two_tags"},
     "tdoa_rounded": {"tdoa_repeated", "tdoa_clipped"},
@@ -34,6 +41,7 @@ EXPLAINS = {
     "survey_scale": {"tdoa_large", "tdoa_outliers"},
     "anchor_scale": {"tdoa_large", "tdoa_outliers"},
     "tdoa_unit": {"tdoa_large", "tdoa_outliers"},
+    "ids_exchanged": {"tdoa_large", "tdoa_outliers"},
 }
 FULL = 20  # fewest messages of a window with reliable statistics
 
@@ -41,9 +49,12 @@ IN_FLIGHT = 4  # windows of 1 s that are checked together in flight
 FEWEST = 3  # fewest of these for a finding
 LATEST = 2  # latest windows that must show a finding too, or it is over
 # Reported by `check` only: in flight, the filter already weights a vibrating accelerometer less.
-NOT_IN_FLIGHT = {"imu_shaking"}
+# The Monitor names exchanged anchors sooner.
+NOT_IN_FLIGHT = {"imu_shaking", "ids_exchanged"}
 # rule that does not hold for a tag with a fixed height, which needs three anchors
 FEW_ANCHORS = "few_anchors"
+# evidence of a sign that flips
+FLIPPED = "from one moment on, each TDOA is the negative of what the place of the tag makes it"
 SMALLEST_UNIT = 100.0  # smallest ratio of units of stamps; a smaller one is the rate of a replay
 # ratio of the latency variations of both streams above which this process was not scheduled
 ALIKE = 0.5
@@ -70,7 +81,7 @@ class StreamRules:
         self.tdoa: list[TdoaWindow] = []
         self.unknown: Counter[int] = Counter()  # ids that are not in the survey
         self._imu, self._tdoa = Cutter(), Cutter()
-        self._scale = SurveyScale(anchors, kept and KEPT)
+        self.judge = Judge(anchors, kept and KEPT)
 
     def feed_imu(
         self, t: np.ndarray, arrival: np.ndarray, gyro: np.ndarray, force: np.ndarray
@@ -115,7 +126,7 @@ class StreamRules:
     def _add_tdoa(self, columns: list[np.ndarray], own: int) -> None:
         window = tdoa_window(columns, own, self.anchors.positions)
         self._keep(self.tdoa, window)
-        self._scale.add(window.latest)
+        self.judge.add(window.latest)
 
     def finish(self) -> None:
         """Add the last, shorter windows of a recording if they have at least FULL messages."""
@@ -134,7 +145,7 @@ class StreamRules:
         """
         imu, tdoa = self.imu[-latest:], self.tdoa[-latest:]
         of_imu, of_tdoa = [window.stamps for window in imu], [window.stamps for window in tdoa]
-        found = [*filter(None, [self._scale.finding])]
+        found = [*filter(None, [self.judge.finding])]
         if imu:
             found += _found(stamp_rules.OF_ONE, "imu/data", of_imu)
             found += _found(inertial_rules.RULES, imu)
@@ -197,7 +208,7 @@ class StreamWatch:
         self._rules = StreamRules(self._anchors, IN_FLIGHT)
         self._imu: list[tuple[np.ndarray, ...]] = []
         self._tdoa: list[tuple[np.ndarray, ...]] = []
-        self._sign = SignWatch(self._anchors)
+        self._flipped: Finding | None = None  # all signs have flipped in flight
         self._turns: int | None = None  # sign flips counted by the Monitor at the last check
         self._steady = Steady()
 
@@ -233,32 +244,29 @@ class StreamWatch:
         """
         self._tdoa.append((t, arrival, a, b, d))
 
-    def findings(self, turns: int = 0, doubted: bool = False) -> list[Finding]:
+    def findings(self, turns: int = 0) -> list[Finding]:
         """Return the Findings that hold, the most severe first.
 
         Parameters
         ----------
         turns : int
             Sign flips of all TDOAs so far, from the Monitor.
-        doubted : bool
-            Whether the filter rejects most TDOAs.
         """
         imu, self._imu = self._imu, []
         tdoa, self._tdoa = self._tdoa, []
-        if self._turns is not None and turns > self._turns:
-            self._sign.turn()
-        elif doubted:
-            self._sign.doubt()
-        self._turns = turns
         rules = self._rules
+        if self._turns is not None and turns > self._turns:
+            self._flipped = None if self._flipped else wrong_sign(FLIPPED, np.nan)
+            rules.judge.forget()
+        self._turns = turns
         if imu:
             rules.feed_imu(*map(np.concatenate, zip(*imu)))
         if tdoa:
-            t, arrival, a, b, d = map(np.concatenate, zip(*tdoa))
-            rules.feed_tdoa(t, arrival, a, b, d)
-            self._sign.feed(t, a, b, d)
+            rules.feed_tdoa(*map(np.concatenate, zip(*tdoa)))
         if max(len(rules.imu), len(rules.tdoa)) < FEWEST:
             return []
+        if rules.judge.full:  # it has judged anew
+            self._flipped = None
         still, found = {finding.rule for finding in rules.findings(LATEST)}, []
         if still:
             found = [
@@ -266,7 +274,9 @@ class StreamWatch:
                 for finding in rules.findings()
                 if finding.rule in still and self._counts(finding)
             ]
-        return most_severe_first(self._steady([*found, *filter(None, [self._sign.finding])]))
+        if self._flipped and "tdoa_sign" not in still:
+            found.append(self._flipped)
+        return most_severe_first(self._steady(found))
 
     def _counts(self, finding: Finding) -> bool:
         # Return whether a finding matters in flight.

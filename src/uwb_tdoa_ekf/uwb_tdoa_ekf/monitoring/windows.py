@@ -240,6 +240,8 @@ class ImuWindow(NamedTuple):
         Value at that end.
     invalid : float
         Share of samples that are not finite.
+    halves : float
+        Share of samples of which one sensor is all zeros, in turns with the other.
     """
 
     stamps: StampWindow
@@ -251,6 +253,7 @@ class ImuWindow(NamedTuple):
     clipped: np.ndarray
     limit: np.ndarray
     invalid: float
+    halves: float = 0.0
 
 
 def imu_window(columns: list[np.ndarray], own: int) -> ImuWindow:
@@ -279,6 +282,8 @@ def imu_window(columns: list[np.ndarray], own: int) -> ImuWindow:
     low = values.min(axis=0, initial=np.inf)
     high = values.max(axis=0, initial=-np.inf)
     limit = np.where(mean - low > high - mean, low, high)
+    no_gyro, no_force = (values[:, :3] == 0.0).all(axis=1), (values[:, 3:] == 0.0).all(axis=1)
+    halves = 2 * min(np.sum(no_gyro & ~no_force), np.sum(no_force & ~no_gyro))
     return ImuWindow(
         stamps=stamp_window(t, arrival, own),
         mean=mean,
@@ -289,6 +294,7 @@ def imu_window(columns: list[np.ndarray], own: int) -> ImuWindow:
         clipped=(values == limit).sum(axis=0),
         limit=limit,
         invalid=1.0 - len(values) / (len(t) - own),
+        halves=float(halves / n),
     )
 
 

@@ -24,6 +24,7 @@ from ..estimate import FlightEstimator
 from ..readers.streams import protocol
 from . import coverage, imu_rules, motion_rules, recording_rules, tdoa_rules
 from .ordered import OrderedRecording, SurveyFit, differences, displacement
+from .pair_rules import MANY
 from .sensor_rules import judge_sensors
 from .tdoa_rules import SAME, largest_displacement
 from .watch import found_by_monitor, together
@@ -51,7 +52,14 @@ NOTHING_TO_TRY = {
     "tdoa_clipped",
     "anchor_scale",
 }
-WITHOUT_IMU = {"imu_silent", "imu_no_gravity", "imu_axis_dead", "imu_tilted", "imu_clipped"}
+WITHOUT_IMU = {
+    "imu_silent",
+    "imu_in_turns",
+    "imu_no_gravity",
+    "imu_axis_dead",
+    "imu_tilted",
+    "imu_clipped",
+}
 # After one of these findings the recorded attitude shows nothing else.
 OF_IMU = {*WITHOUT_IMU, "imu_axes", "imu_rate_unit", "imu_force_unit", "imu_turned", "stamps_apart"}
 OTHER_SURVEY = (
@@ -59,12 +67,21 @@ OTHER_SURVEY = (
 )
 # Findings that a survey of another room causes. Each explains a part, and with it undone the survey
 # still does not fit.
-BLAMED = {"tdoa_sign", "ids_swapped", "pair_sign", "tdoa_one_sign", "anchor_moved"}
+BLAMED = {
+    "tdoa_sign",
+    "ids_exchanged",
+    "pair_sign",
+    "tdoa_one_sign",
+    "anchor_moved",
+    "survey_scale",
+}
+# Findings of the streams that trials find again, in comparison with more rivals.
+JUDGED = {"tdoa_sign", "ids_exchanged"}
 # Findings of the streams that another finding explains.
 EXPLAINS = {
     "tdoa_unit": {"tdoa_unit", "tdoa_large", "tdoa_outliers", "tdoa_rounded", "survey_scale"},
     "ids_renumbered": {"ids_unknown", "anchor_missing"},
-    "ids_swapped": {"tdoa_large", "tdoa_outliers"},
+    "ids_exchanged": {"tdoa_large", "tdoa_outliers"},
     "survey_other": {"tdoa_large", "tdoa_outliers"},
     "survey_misfit": {"tdoa_large", "tdoa_outliers"},
     "tdoa_one_sign": {"tdoa_one_sign"},
@@ -183,9 +200,12 @@ def _with_trials(
             )
         )
     else:
+        found = _without(found, JUDGED)
         ordered = _without_stream_mistakes(OrderedRecording.of(recording), found)
         tried, places = _try_corrections(ordered, names, others)
         flight = ordered.flight().replaced(**recording.sensors)
+        if any(one.rule in OF_IMU for one in tried):  # it would move anchors
+            flight = flight.without("imu")
         estimator = replace(estimator, smoothed=False)
         run = estimator(flight)
         track = run.odometry.t, run.odometry.p
@@ -274,36 +294,15 @@ def _try_corrections(
         and not any(f.rule == "survey_misfit" for f in found)
     ):
         finding = imu_rules.find_imu_mistake(ordered)
-        mixed = [other for other in found if other.cause.startswith(tdoa_rules.MIXED_UP)]
-        if finding and mixed:
-            found = [other for other in found if other not in mixed] + [_other_room(mixed[0])]
-        elif finding:
-            found.append(finding)
+        found += [finding] if finding else []
     return found, fit.places
-
-
-def _other_room(mixed: Finding) -> Finding:
-    """Return the finding of another room, instead of many exchanged ids and a faulty inertial sensor.
-
-    Both are what the survey of another room looks like.
-    """
-    return Finding(
-        "survey_misfit",
-        ERROR,
-        cause=(
-            "the survey is of another room, or its ids are mixed up: with many ids exchanged it "
-            "nearly fits, and the inertial sensor does not"
-        ),
-        evidence=mixed.evidence,
-        remedy=OTHER_SURVEY,
-        value=mixed.value,
-    )
 
 
 def _misfit(fit: SurveyFit) -> Iterator[Finding]:
     """Yield a finding if the survey fits much better with several of its anchors moved."""
     gain = tdoa_rules.gained(fit)
-    if gain is None and tdoa_rules.apparent_gain(fit) > tdoa_rules.GAIN:
+    poor = fit.before > tdoa_rules.POOR and len(fit.positions) <= MANY and not fit.flat
+    if gain is None and not poor and tdoa_rules.apparent_gain(fit) > tdoa_rules.GAIN:
         evidence = (
             "with the anchors elsewhere each half of the recording fits better, and not the other "
             "half"
@@ -322,6 +321,15 @@ def _misfit(fit: SurveyFit) -> Iterator[Finding]:
                 "again"
             ),
             value=tdoa_rules.apparent_gain(fit),
+        )
+    if gain is None and poor:
+        yield Finding(
+            "survey_misfit",
+            ERROR,
+            cause="the survey does not fit: of another room, or its ids are mixed up",
+            evidence="wherever the tag is, and with any anchors moved, the TDOAs do not fit",
+            remedy=OTHER_SURVEY,
+            value=fit.before,
         )
     if gain is not None:
         heard, (_, anchors) = fit.heard, fit.all_moved

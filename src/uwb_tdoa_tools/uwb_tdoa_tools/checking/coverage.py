@@ -18,7 +18,7 @@ from uwb_tdoa_ekf.monitoring.finding import NOTE, WARNING, Finding
 from uwb_tdoa_ekf.monitoring.monitor import NEARER
 from uwb_tdoa_ekf.monitoring.windows import TdoaWindow
 
-from .ordered import LEAST_MOTION, second_principal_std
+from .ordered import FLAT_SHARE, LEAST_MOTION, second_principal_std, size_and_thickness
 from .pair_rules import MANY
 
 CEILING = 1.5  # m; anchors whose mean height is larger hang at a ceiling
@@ -39,7 +39,7 @@ def sides_of(positions: np.ndarray) -> tuple[str, ...]:
         in a line.
     """
     flat = np.ptp(positions, axis=0) < FLAT
-    if np.count_nonzero(flat) != 1:
+    if np.count_nonzero(flat) != 1 or second_principal_std(positions) < FLAT:
         return ()
     if flat[2]:
         return ("below",) if positions[:, 2].mean() > CEILING else ("above",)
@@ -60,8 +60,6 @@ def to_copy(sides: Sequence[str]) -> str:
 
 RARE = 0.2  # share of the median rate of the anchors; healthy 0.54 at least
 SILENT = 5.0  # s for which an anchor that is heard otherwise is not
-# thickness of the constellation over its size; the measured rooms have 0.2 and more
-FLAT_SHARE = 0.08
 OUTSIDE, MARGIN = 0.5, 0.5  # share of the places of the tag, and m beyond the box of the anchors
 SHORT = 10.0  # s
 FEWEST = 3  # anchors, which always lie in a plane
@@ -198,7 +196,7 @@ def flat_anchors(view: CoverageView) -> Iterator[Finding]:
     """
     p = view.anchors.positions
     together = [p[window.heard > 0] for window in view.windows] if len(p) > MANY else [p]
-    sizes = [_size_and_thickness(some) for some in together if len(some) > FEWEST]
+    sizes = [size_and_thickness(some) for some in together if len(some) > FEWEST]
     found = [(size, thickness) for size, thickness in sizes if thickness < FLAT_SHARE * size]
     if len(found) > PART * len(sizes):
         size, thickness = np.median(found, axis=0)
@@ -214,14 +212,6 @@ def flat_anchors(view: CoverageView) -> Iterator[Finding]:
             ),
             value=float(thickness),
         )
-
-
-def _size_and_thickness(positions: np.ndarray) -> tuple[float, float]:
-    """Return the largest and smallest standard deviation of positions (n, 3) along a direction, m."""
-    size, thickness = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)[
-        [0, 2]
-    ] / np.sqrt(len(positions))
-    return float(size), float(thickness)
 
 
 def unknown_side(view: CoverageView) -> Iterator[Finding]:

@@ -43,6 +43,11 @@ TAG, SPEED = 5.0, 1.0  # m and m/s, the same for the tag about its first positio
 STD, TOGETHER = 0.15, 20.0  # m, of one TDOA; most TDOAs of a window that count as independent
 ROBUST = 0.4  # m, scale of the Geman-McClure weight
 SWEEPS, STEP = 12, 1.0  # Gauss-Newton steps, and the longest of an anchor, m
+# m, standard deviation of errors of the radio, and of their change over NEAR, m, of an anchor
+RADIO, NEAR = 0.3, 2.0
+# thickness of positions over their size below which they lie in a plane; anchors of the measured
+# rooms have 0.2 and more
+FLAT_SHARE = 0.08
 # m of `second_principal_std`; measured flights 0.50 at least, also with ids swapped, a hovering tag
 # 0.16 at most
 LEAST_MOTION = 0.3
@@ -142,6 +147,16 @@ class SurveyFit:
             )
         )
 
+    @cached_property
+    def radio_loss(self) -> float:
+        """Return the loss with an error of each anchor that is a linear function of the place."""
+        return self.solve(radio=True)[0]
+
+    @property
+    def flat(self) -> bool:
+        """Return whether the anchors that are heard lie in one plane: nothing is told across it."""
+        return not len(self) or is_flat(self.positions[self.heard])
+
     def _part(self, windows: slice) -> SurveyFit:
         """Return the same fit for some of the windows."""
         part = copy(self)
@@ -156,7 +171,9 @@ class SurveyFit:
         other.positions = positions
         return other.solve([])[0]
 
-    def solve(self, free: Sequence[int] | None = None) -> tuple[float, np.ndarray]:
+    def solve(
+        self, free: Sequence[int] | None = None, radio: bool = False
+    ) -> tuple[float, np.ndarray]:
         """Move the tag, and the anchors in `free`, to the least loss.
 
         Each Gauss-Newton step eliminates the states of the tag, one per window (Schur complement).
@@ -167,31 +184,31 @@ class SurveyFit:
         ----------
         free : sequence of int or None
             Rows of the free anchors; None for all.
+        radio : bool
+            Leave the anchors where they are, and fit errors of their signals.
 
         Returns
         -------
         loss : float
             Remaining loss, 0 to 1.
         anchors : (N, 3) array
-            Positions, m, world.
+            Positions, m, world; with `radio` (N, 4) errors and their slopes, m.
         """
-        moved = (
-            np.ones(len(self.positions), dtype=bool)
-            if free is None
-            else np.isin(range(len(self.positions)), free)
-        )
-        columns = np.flatnonzero(np.repeat(moved, 3))  # free coordinates
-        anchors, start = self.positions.copy(), [x.copy() for x in self._start]
+        count = len(self.positions)
+        moved = np.ones(count, dtype=bool) if free is None else np.isin(range(count), free)
+        size, std = (4, RADIO) if radio else (3, PRIOR)
+        columns = np.flatnonzero(np.repeat(moved, size))  # free unknowns
+        unknown, start = np.zeros((count, size)), [x.copy() for x in self._start]
         # In a hall each window has few of the anchors.
-        heard = [moved & np.isin(np.arange(len(moved)), ends[1:3]) for ends in self._windows]
-        # columns of their coordinates
-        heard_columns = [np.flatnonzero(np.repeat(some[moved], 3)) for some in heard]
+        heard = [moved & np.isin(np.arange(count), ends[1:3]) for ends in self._windows]
+        # columns of their unknowns
+        heard_columns = [np.flatnonzero(np.repeat(some[moved], size)) for some in heard]
         for _ in range(SWEEPS):
-            H = np.eye(len(columns)) / PRIOR**2
-            g = (self.positions - anchors).reshape(-1)[columns] / PRIOR**2
+            H = np.eye(len(columns)) / std**2
+            g = -unknown.reshape(-1)[columns] / std**2
             eliminated = []
             for x, window, some, own in zip(start, self._windows, heard, heard_columns):
-                by_tag, by_anchors, residual = _linearised(x, window, anchors, some)
+                by_tag, by_anchors, residual = self._linearised(x, window, unknown, some)
                 weight = (
                     min(1.0, TOGETHER / len(residual))
                     / (STD * (1.0 + (residual / ROBUST) ** 2)) ** 2
@@ -208,21 +225,64 @@ class SurveyFit:
                 eliminated.append(solved)
             step = np.linalg.solve(H, g)
             step *= min(1.0, STEP / max(np.abs(step).max(initial=0.0), 1e-9))
-            anchors.reshape(-1)[columns] += step
+            unknown.reshape(-1)[columns] += step
             for x, solved, own in zip(start, eliminated, heard_columns):
                 x += np.clip(solved[:, -1] - solved[:, :-1] @ step[own], -2.0, 2.0)
-        return self._loss(start, anchors), anchors
+        return self._loss(start, unknown), unknown if radio else self.positions + unknown
 
-    def _loss(self, states: list[np.ndarray], anchors: np.ndarray) -> float:
+    def _loss(self, states: list[np.ndarray], unknown: np.ndarray) -> float:
         """Return the mean Geman-McClure loss over the windows."""
         squares = (
-            _residual(x, window, anchors)[0] ** 2 for x, window in zip(states, self._windows)
+            self._residual(x, window, unknown)[0] ** 2 for x, window in zip(states, self._windows)
         )
         return (
             float(np.mean([np.mean(square / (square + SCALE**2)) for square in squares]))
             if states
             else np.nan
         )
+
+    def _place(self, x: np.ndarray) -> np.ndarray:
+        """Return the functions of the place of which errors of the radio consist, (4,)."""
+        return np.append(1.0, (x[:3] - self.positions.mean(axis=0)) / NEAR)
+
+    def _residual(
+        self, x: np.ndarray, window: Window, unknown: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return residuals (n,) m, unit vectors (n, 3) from a and b to the tag, and times (n,) s.
+
+        The times are relative to the end of the window. `unknown` is as of `solve`, (N, 3) by which
+        the anchors are moved, or (N, 4).
+        """
+        t, a, b, d = window
+        radio = unknown.shape[1] == 4
+        anchors = self.positions if radio else self.positions + unknown
+        late = unknown @ self._place(x) if radio else np.zeros(len(unknown))
+        before = t - t[-1]
+        tag = x[:3] + before[:, None] * x[3:]
+        from_a, from_b = tag - anchors[a], tag - anchors[b]
+        ra, rb = (np.maximum(np.linalg.norm(v, axis=1), 1e-6) for v in (from_a, from_b))
+        residual = d - (rb + late[b] - ra - late[a])
+        return residual, from_a / ra[:, None], from_b / rb[:, None], before
+
+    def _linearised(
+        self, x: np.ndarray, window: Window, unknown: np.ndarray, moved: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the Jacobians of the TDOAs and the residuals (n,).
+
+        The first Jacobian (n, 6) is by position and velocity of the tag. The second (n, k size) is by
+        the unknowns of the k anchors in `moved` (N,).
+        """
+        residual, from_a, from_b, before = self._residual(x, window, unknown)
+        by_position, size = from_b - from_a, unknown.shape[1]
+        by_tag = np.column_stack([by_position, before[:, None] * by_position])
+        if size == 4:
+            from_b = np.tile(-self._place(x), (len(residual), 1))
+            from_a = from_b
+        by_anchors, number = np.zeros((len(residual), int(moved.sum()), size)), np.cumsum(moved) - 1
+        for ends, by_end in ((window[1], from_a), (window[2], -from_b)):
+            rows = np.flatnonzero(moved[ends])
+            by_anchors[rows, number[ends[rows]]] += by_end[rows]
+        return by_tag, np.asfortranarray(by_anchors.reshape(len(residual), -1)), residual
 
 
 def differences(ranges: Ranges, anchors: Anchors) -> Tdoas:
@@ -247,6 +307,20 @@ def displacement(surveyed: np.ndarray, fitted: np.ndarray) -> np.ndarray:
     return np.linalg.norm(two @ turn - one, axis=1)
 
 
+def size_and_thickness(positions: np.ndarray) -> tuple[float, float]:
+    """Return the largest and smallest standard deviation of positions (n, 3) along a direction, m."""
+    size, thickness = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)[
+        [0, 2]
+    ] / np.sqrt(len(positions))
+    return float(size), float(thickness)
+
+
+def is_flat(positions: np.ndarray) -> bool:
+    """Return whether positions (n, 3) lie in one plane."""
+    size, thickness = size_and_thickness(positions)
+    return thickness < FLAT_SHARE * size
+
+
 def second_principal_std(places: np.ndarray) -> float:
     """Return the second largest principal standard deviation of positions (k, 3) m, in m.
 
@@ -258,39 +332,6 @@ def second_principal_std(places: np.ndarray) -> float:
     return float(
         np.linalg.svd(places - places.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(places))
     )
-
-
-def _residual(
-    x: np.ndarray, window: Window, anchors: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return residuals (n,) m, unit vectors (n, 3) from a and b to the tag, and times (n,) s.
-
-    The times are relative to the end of the window.
-    """
-    t, a, b, d = window
-    before = t - t[-1]
-    tag = x[:3] + before[:, None] * x[3:]
-    from_a, from_b = tag - anchors[a], tag - anchors[b]
-    ra, rb = (np.maximum(np.linalg.norm(v, axis=1), 1e-6) for v in (from_a, from_b))
-    return d - (rb - ra), from_a / ra[:, None], from_b / rb[:, None], before
-
-
-def _linearised(
-    x: np.ndarray, window: Window, anchors: np.ndarray, moved: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the Jacobians of the TDOAs and the residuals (n,).
-
-    The first Jacobian (n, 6) is by position and velocity of the tag. The second (n, 3 k) is by the k
-    anchors in `moved` (N,).
-    """
-    residual, from_a, from_b, before = _residual(x, window, anchors)
-    by_position = from_b - from_a
-    by_anchors, number = np.zeros((len(residual), int(moved.sum()), 3)), np.cumsum(moved) - 1
-    for ends, by_end in ((window[1], from_a), (window[2], -from_b)):
-        rows = np.flatnonzero(moved[ends])
-        by_anchors[rows, number[ends[rows]]] += by_end[rows]
-    by_tag = np.column_stack([by_position, before[:, None] * by_position])
-    return by_tag, np.asfortranarray(by_anchors.reshape(len(residual), -1)), residual
 
 
 LONG, SHORT = 60.0, 14.0  # s of the recording for trials: to decide, and to choose candidates

@@ -221,49 +221,37 @@ def falling_stamps(recording: Recording) -> Iterator[Finding]:
         )
 
 
+# {kind of a jump of the clock: (rule, severity, remedy)}, and of a restart
+OF_CLOCK = {
+    SILENCE: (
+        "clock_silence",
+        WARNING,
+        "record with ros2 bag record, whose arrival times tell one from the other",
+    ),
+    WRAP: (
+        "clock_wrap",
+        ERROR,
+        "count the wraps in the driver: live, ekf_node starts anew at each of them",
+    ),
+    SET: (
+        "clock_set",
+        ERROR,
+        "set the clock before the recording begins (chronyc waitsync), or stamp with a clock that "
+        "nobody sets",
+    ),
+}
+RESTARTED = (
+    "clock_restart",
+    ERROR,
+    "record each start of the tag by itself; live, ekf_node starts anew there",
+)
+
+
 def clock_jumps(recording: Recording) -> Iterator[Finding]:
     """Yield restarts, wraps and settings of the clock, and single wrong stamps."""
     for jump in recording.jumps:
-        cause, done = in_words(jump)
-        if jump.kind == SILENCE:
-            yield Finding(
-                "clock_silence",
-                WARNING,
-                cause=cause,
-                evidence=done,
-                remedy="record with ros2 bag record, whose arrival times tell one from the other",
-                value=jump.by,
-            )
-        elif jump.kind == WRAP:
-            yield Finding(
-                "clock_wrap",
-                ERROR,
-                cause=cause,
-                evidence=done,
-                remedy="count the wraps in the driver: live, ekf_node starts anew at each of them",
-                value=jump.by,
-            )
-        elif jump.kind == SET:
-            yield Finding(
-                "clock_set",
-                ERROR,
-                cause=cause,
-                evidence=done,
-                remedy=(
-                    "set the clock before the recording begins (chronyc waitsync), or stamp with a "
-                    "clock that nobody sets"
-                ),
-                value=jump.by,
-            )
-        else:
-            yield Finding(
-                "clock_restart",
-                ERROR,
-                cause=cause,
-                evidence=done,
-                remedy="record each start of the tag by itself; live, ekf_node starts anew there",
-                value=jump.by,
-            )
+        (rule, severity, remedy), words = OF_CLOCK.get(jump.kind, RESTARTED), in_words(jump)
+        yield Finding(rule, severity, *words, remedy, jump.by)
     for name, count in recording.outliers.items():
         yield Finding(
             "stamps_wild",

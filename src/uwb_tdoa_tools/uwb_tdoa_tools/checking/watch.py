@@ -16,8 +16,8 @@ from uwb_tdoa_ekf.monitoring.monitor import SURVEYING, Event, watched
 from uwb_tdoa_ekf.offline import Run
 
 from ..estimate import FlightEstimator
-from .ordered import OrderedRecording
-from .tdoa_rules import FEWEST, POOR, gained, relabelled
+from .ordered import OrderedRecording, is_flat
+from .tdoa_rules import FEWEST, POOR, gained
 
 CHANGED, EXCHANGED, DISPLACED = "anchor_changed", "ids_exchanged", "anchor_displaced"
 OF_ANCHORS = CHANGED, EXCHANGED, DISPLACED
@@ -36,7 +36,7 @@ FIRST = {
     "survey_scale",
     "survey_other",
     "ids_renumbered",
-    "ids_swapped",
+    "ids_exchanged",
 }
 # Mistakes for which nobody should blame the ground truth, or an anchor that stands where it should.
 BEFORE_TRUTH = FIRST | {EXCHANGED, CHANGED, DISPLACED, "survey_misfit", "anchor_moved", "pair_sign"}
@@ -67,7 +67,9 @@ def found_by_monitor(flight: Flight, run: Run, estimator: FlightEstimator) -> li
     for event in events:
         rule, stands = event.finding.rule, event.until > end - STANDS
         if rule == DISPLACED:
-            stands = any(at - STANDS <= event.until <= at + STANDS for at in lasting)
+            stands = not is_flat(flight.anchors.positions) and any(
+                at - STANDS <= event.until <= at + STANDS for at in lasting
+            )
         lasts = event.until - event.since > LASTS
         if rule == CHANGED:
             stands = stands and lasts and not any(_came_and_went(other, event) for other in events)
@@ -144,22 +146,12 @@ def _remedy(one: Finding, line: str | None) -> str:
 
 
 def _explains(ordered: OrderedRecording, event: Event) -> bool:
-    """Whether the survey fits an OrderedRecording before an Event, or with two anchors exchanged
-    that were so from the start.
-    """
-    t, rule = ordered.tdoa.t, event.finding.rule
-    if rule == DISPLACED:
+    """Whether the survey fits an OrderedRecording before an Event."""
+    t = ordered.tdoa.t
+    if event.finding.rule == DISPLACED or event.since <= t[0] + LONG_ENOUGH:
         return False
-    if event.since > t[0] + LONG_ENOUGH:
-        part = ordered.with_tdoa(
-            **{name: column[t < event.since] for name, column in vars(ordered.tdoa).items()}
-        )
-    elif rule == EXCHANGED:
-        one, two = map(int, re.findall(r"\d+", event.finding.cause))
-        part = relabelled(ordered, {one: two, two: one})
-    else:
-        return False
-    fit = part.survey_fit
+    before = {name: column[t < event.since] for name, column in vars(ordered.tdoa).items()}
+    fit = ordered.with_tdoa(**before).survey_fit
     return len(fit) >= FEWEST and fit.before < POOR and gained(fit) is None
 
 

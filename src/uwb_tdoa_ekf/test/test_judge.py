@@ -1,14 +1,15 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""TDOAs show a wrong scale of the survey, before TDOAs are blamed.
+"""Snapshots of TDOAs show which mistake of the survey, or of all TDOAs, beats its rivals.
 
-A scale that they do not determine is not named.
+What they do not determine is not named.
 """
 
 from flights import corners
 import numpy as np
 import pytest
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_bias.common.survey_faults import UNITS
 from uwb_tdoa_ekf.core import workspace
@@ -49,6 +50,7 @@ def scaled(factor):
 
 
 ROOM = ANCHORS.positions
+WRONG = {"survey_scale", "anchor_scale", "tdoa_sign", "ids_exchanged", "tdoa_unit"}
 # Cases without a wrong scale: (positions of the survey, options of `flown`).
 NO_SCALE = {
     "a right survey": (ROOM, {}),
@@ -133,3 +135,50 @@ def test_the_work_of_a_start_does_not_grow_with_the_survey():
         KnownHeight(np.nan, np.nan),
         room_for(1),
     )
+
+
+def judged(positions, d_of, seconds=25.0, rate=200.0):
+    """Return {rule: Finding} of a tag among anchors at `positions` (8, 3) m as surveyed.
+
+    d_of : callable of the path (n, 3) m and both rows (n,) of the anchors; the TDOAs, m
+    """
+    t = np.arange(int(seconds * rate)) / rate
+    a = np.arange(len(t)) % len(positions)
+    b = (a + 1 + np.arange(len(t)) // len(positions) % (len(positions) - 1)) % len(positions)
+    p = [0.5, 0.3, 1.2] + np.sin(np.outer(t, [0.5, 0.7, 0.3])) * [1.8, 1.8, 0.4]
+    d = d_of(p, a, b) + RADIO * np.random.default_rng(1).normal(size=len(t))
+    rules = StreamRules(Anchors.from_positions(positions))
+    rules.feed_tdoa(t, t + 0.002, a, b, d)
+    rules.finish()
+    return {finding.rule: finding for finding in rules.findings()}
+
+
+ANGLE = 0.25 * np.pi * np.arange(8)
+DETERMINE_LITTLE = {
+    "a line": np.column_stack([np.full(6, 3.0), np.linspace(-5.0, 5.0, 6), np.full(6, 1.5)]),
+    "a ceiling": np.column_stack([5.0 * np.cos(ANGLE), 4.0 * np.sin(ANGLE), np.full(8, 2.8)]),
+}
+
+
+@pytest.mark.parametrize("name", DETERMINE_LITTLE)
+def test_anchors_that_determine_little_are_not_blamed(name):
+    places = DETERMINE_LITTLE[name]
+    assert not judged(places, lambda p, a, b: tdoa(p, places[a], places[b])).keys() & WRONG
+
+
+def test_anchors_late_behind_a_body_are_no_scale_of_the_survey():
+    room = ROOM - ROOM.mean(axis=0) + [0.0, 0.0, 1.5]
+
+    def shadowed(p, a, b):
+        ahead = np.gradient(p, axis=0)
+        late = [np.sum((room[rows] - p) * ahead, axis=1) < 0.0 for rows in (a, b)]
+        return tdoa(p, room[a], room[b]) + 0.4 * (late[1].astype(float) - late[0])
+
+    assert not judged(room, shadowed).keys() & WRONG
+
+
+def test_two_exchanged_anchors_are_named():
+    places = ROOM[[0, 6, 2, 3, 4, 5, 1, 7]]
+    found = flown(places)
+    one, two = ANCHORS.ids[[1, 6]]
+    assert found["ids_exchanged"].cause == f"two anchors are exchanged, {one} and {two}"
