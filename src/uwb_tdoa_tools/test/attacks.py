@@ -246,5 +246,7 @@ def heard_by(source):
 
 
 if __name__ == "__main__":
+    # as conftest.py does for pytest
+    sys.path.append(str(pathlib.Path(__file__).resolve().parents[2] / "uwb_tdoa_bias" / "test"))
     for row in sys.argv[1:] or ROWS:
         print(measure(row), flush=True)
