@@ -35,7 +35,8 @@ def measure(
     for rate in RATES[:1] if quick else RATES:
         progress(f"replay at rate {rate:g}")
         live = run_live(bag, folder, rate, say=lambda text: None)
-        became, reached = accounts(live.bias, live.ekf, flight), speed(live.recorded)
+        recorded, reached = len(read_odometry(live.recorded)), speed(live.recorded)
+        became = accounts(live.bias, live.ekf, flight, recorded)
         lost = became["lost"] + became["imu_lost"]
         late = became["late"] + became["imu_late"]
         yield Figure.of(

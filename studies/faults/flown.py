@@ -185,7 +185,7 @@ class FaultyFilter:
             if self._restarts != estimator.counts["restarts"]:
                 self._restarts = estimator.counts["restarts"]
                 self._watch.restart()
-            found = self._watch.findings(estimator.sign_turns, self._use.contradicted)
+            found = self._watch.findings(estimator.sign_turns)
             self._findings = most_severe_first([*found, *estimator.findings])
         yaw_std = (
             math.nan

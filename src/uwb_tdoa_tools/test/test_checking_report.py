@@ -50,7 +50,7 @@ def test_missing_anchors_are_named(flight):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("seed", "said"), [(0, "does not fit"), (2, "is of another room")])
+@pytest.mark.parametrize(("seed", "said"), [(0, "does not fit"), (2, "of another room")])
 def test_the_survey_of_another_room_is_blamed_and_no_sign(seed, said):
     """With wrong anchors, some pairs seem to have a wrong sign, and some ids seem exchanged."""
     (remark,) = survey_remarks(replace(flown(seed), anchors=constellation("staircase")))

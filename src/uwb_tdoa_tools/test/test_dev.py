@@ -39,6 +39,8 @@ def workspace(tmp_path):
 
 def dev(folder, words, **environment):
     plain = {"PATH": os.environ["PATH"], "HOME": os.environ.get("HOME", "/"), **environment}
+    if plain["PATH"] == "bin":  # a relative entry is left out
+        plain["PATH"] = str(folder / "bin")
     done = run(folder / "dev", *words.split(), cwd=folder, env=plain)
     return done.returncode, done.stdout, done.stderr
 

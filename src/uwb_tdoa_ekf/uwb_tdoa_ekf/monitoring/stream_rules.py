@@ -8,7 +8,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -53,7 +54,8 @@ LATEST = 2  # latest windows that must show a finding too, or it is over
 NOT_IN_FLIGHT = {"imu_shaking", "ids_exchanged"}
 # rule that does not hold for a tag with a fixed height, which needs three anchors
 FEW_ANCHORS = "few_anchors"
-# evidence of a sign that flips
+# cause and evidence of a sign that flips
+CHANGED = "the sign of all TDOAs has changed in flight"
 FLIPPED = "from one moment on, each TDOA is the negative of what the place of the tag makes it"
 SMALLEST_UNIT = 100.0  # smallest ratio of units of stamps; a smaller one is the rate of a replay
 # ratio of the latency variations of both streams above which this process was not scheduled
@@ -181,7 +183,7 @@ class StreamRules:
             del windows[: -self._kept]
 
 
-def _found(rules: Sequence[Callable[..., Iterator[Finding]]], *windows: Any) -> list[Finding]:
+def _found(rules: Sequence[Any], *windows: Any) -> list[Finding]:
     return [finding for rule in rules for finding in rule(*windows)]
 
 
@@ -256,7 +258,8 @@ class StreamWatch:
         tdoa, self._tdoa = self._tdoa, []
         rules = self._rules
         if self._turns is not None and turns > self._turns:
-            self._flipped = None if self._flipped else wrong_sign(FLIPPED, np.nan)
+            flipped = replace(wrong_sign(FLIPPED, np.nan), cause=CHANGED)
+            self._flipped = None if self._flipped else flipped
             rules.judge.forget()
         self._turns = turns
         if imu:

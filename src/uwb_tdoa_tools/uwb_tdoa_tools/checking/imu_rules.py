@@ -128,6 +128,7 @@ SURVEYS = (
     ),
     ("has y up, not z, and left-handed axes", "x, z, y  # of every anchor", np.eye(3)[[0, 2, 1]]),
 )
+NEARLY = 2.0 * TIE  # a second fault, e.g. a useless gyroscope, may explain a little more
 UPRIGHT, MIRROR = np.eye(3), np.diag([1.0, -1.0, 1.0])
 # Axes that are exchanged or mirrored, as (3, 3) matrices that undo it; the first is as it is.
 ARRANGEMENTS = [
@@ -195,7 +196,7 @@ def find_imu_mistake(recording: OrderedRecording) -> Finding | None:
     usual = [(accel, gyro) for accel, gyro in USUAL if _is_possible(brief.imu, gyro)]
     trials = [_tried(base, brief, accel, gyro) for accel, gyro in usual]
     best = min(trials, key=_ratio)
-    turned = _turned_survey(base, brief, min(best.ratio, most))
+    turned = _turned_survey(base, brief, min(best.ratio + NEARLY, most))
     if turned is not None or not best.ratio < RATIO:
         return turned
     if abs(scale_of(best.gyro) - 1.0) < 0.03:  # the unit of the rates is right: an axis is wrong

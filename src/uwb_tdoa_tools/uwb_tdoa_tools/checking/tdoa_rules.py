@@ -162,8 +162,9 @@ def judged(recording: OrderedRecording) -> Iterator[MistakeTrial]:
 def judge_of(recording: OrderedRecording) -> Judge:
     """Return the Judge of the part of a recording in which the tag moves most."""
     brief = recording.part(LONG)
-    many = len(recording.anchors) > MANY
-    doubtful = recording.anchors.index(_far_off(recording.part(SHORT))) if many else None
+    doubtful = None
+    if len(recording.anchors) > MANY:
+        doubtful = recording.anchors.index(_far_off(recording.part(SHORT))).tolist()
     judge, cutter, unknown = (
         Judge(brief.anchors, None, doubtful),
         Cutter(),
