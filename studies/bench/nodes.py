@@ -335,10 +335,10 @@ def _count(
     out.lost = dict.fromkeys(("TDOAs", "IMU samples", "odometry"), 0)
     for space, received in zip(namespaces, source.received):
         bias, ekf = (diagnostics.newest(_title(space, name)) for name in ("bias_node", "ekf_node"))
-        became = accounts(bias, ekf, flight)
+        became = accounts(bias, ekf, flight, len(received))
         out.lost["TDOAs"] += became["lost"]
         out.lost["IMU samples"] += became["imu_lost"]
-        out.lost["odometry"] += int(ekf["odometry published"]) - len(received)
+        out.lost["odometry"] += became["odometry_lost"]
         out.late += became["late"] + became["imu_late"]
 
 

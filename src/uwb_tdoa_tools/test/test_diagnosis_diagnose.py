@@ -456,7 +456,7 @@ def test_diagnose_offers_it_beside_physics_and_judges_both():
     before, after = (figures["pooled"]["rmse_3d"] for figures in (result.before, result.after))
     # without the repair, the error is three times as large
     assert worth > 2.0 * after and after < 0.3 * before
-    assert "anchors are exchanged, 1 and 4" in output.as_text(
-        result
-    ) and "ids_exchanged" in str(output.as_json(result)["numbers"])
+    assert "anchors are exchanged, 1 and 4" in output.as_text(result) and "ids_exchanged" in str(
+        output.as_json(result)["numbers"]
+    )
     assert repairing.repaired(flights[:1], result.effects) == {}
