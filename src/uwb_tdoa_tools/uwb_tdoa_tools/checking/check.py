@@ -135,6 +135,7 @@ def check(
     line : str or None
         Command line that surveys the anchors with the recording.
     """
+    estimator = replace(estimator, smoothed=False)
     streams = processed_streams(recording)
     found = streams.findings()
     for rule in recording_rules.RULES:
@@ -166,14 +167,14 @@ def _tried_with_ranges(
     if not isinstance(ranges, Ranges) or names & (NOTHING_TO_TRY | WITHOUT_IMU):
         return []
     paired = OrderedRecording.of(replace(recording, tdoa=differences(ranges, recording.anchors)))
-    flight = replace(paired, tdoa=recording.tdoa).flight().replaced(**recording.sensors)
     if len(paired.tdoa) >= FEWEST_PAIRS and paired.imu is not None:
         finding = imu_rules.find_imu_mistake(_without_stream_mistakes(paired, found))
         if finding is not None:
             return [finding]
     if any(finding.severity == ERROR for finding in found):
         return []
-    return list(judge_sensors(flight, estimator(flight), estimator))
+    flight = replace(paired, tdoa=recording.tdoa).flight().replaced(**recording.sensors)
+    return judge_sensors(flight, estimator(flight), estimator)
 
 
 def _with_trials(
@@ -206,7 +207,6 @@ def _with_trials(
         flight = ordered.flight().replaced(**recording.sensors)
         if any(one.rule in OF_IMU for one in tried):  # it would move anchors
             flight = flight.without("imu")
-        estimator = replace(estimator, smoothed=False)
         run = estimator(flight)
         track = run.odometry.t, run.odometry.p
         events = found_by_monitor(flight, run, estimator)

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
@@ -31,7 +30,7 @@ FEWEST = 20  # ranges of an anchor
 
 
 def judge_sensors(flight: Flight, run: Run, estimator: FlightEstimator) -> list[Finding]:
-    """Return findings on the SENSORS of a Flight; `run` is that of the estimator over it.
+    """Return findings on the SENSORS of a Flight; `run` is that of the estimator over it, not smoothed.
 
     A sensor misleads if the TDOAs fit better without it. Only the one without which they fit best is
     named, and none beside a sensor that contradicts everything.
@@ -66,10 +65,9 @@ def _contradicting(t: np.ndarray, unused: np.ndarray, sensor: Sensor) -> Iterato
 
 def _misleading(flight: Flight, run: Run, estimator: FlightEstimator) -> list[Finding]:
     """Return the finding on the sensor without which the TDOAs fit best, if much better."""
-    found = []
-    for name in run.sensors:
-        without = replace(estimator, smoothed=False)(flight.without(name))
-        ratio, z = compare(_loss(run), _loss(without))
+    found, loss = [], _loss(run)
+    for name in run.sensors if loss.blocks else ():  # each costs a run of the filter
+        ratio, z = compare(loss, _loss(estimator(flight.without(name))))
         if ratio < RATIO and z > DEVIATIONS:
             sensor = SENSORS[name]
             remedy = f"check the sensor, {sensor.remedy}; until then --without {name}"
