@@ -42,6 +42,13 @@ MODULES = {
     for name in "hypothesis joblib matplotlib numba onnx onnxruntime rosbags scipy tqdm".split()
 }
 MODULES |= {"jinja2": "Jinja2", "sklearn": "scikit-learn", "yaml": "PyYAML"}
+# s of processor time: of a set-up, and of the demo with its compilation
+SET_UP, DEMO = 200.0, 100.0
+# s: the demo takes longer than LONGEST where a process gets 3 % of a core. Its nodes would then not
+# find each other in time, so it does not begin. BUSY of a core is worth a word.
+LONGEST, BUSY = 3600.0, 0.3
+# s of processor time that show the share of a core, and at most s for them
+PROBE, PATIENCE = 0.1, 10.0
 # Jazzy is built for numpy 1.26, and a pytest plugin of its launch_testing breaks newer pytests.
 LIMITS = ["numpy<2", "pytest<8"]
 
@@ -52,9 +59,21 @@ class Failure(Exception):
     The message is one sentence that says what is missing and what to do.
     """
 
+    code = 1
+
+
+class TooSlow(Failure):
+    """Other programs leave too little of the machine."""
+
+    code = os.EX_TEMPFAIL  # 75: the same command works later
+
 
 def main(command):
     compiled = command in ("build", "demo")
+    new = read_steps().get("environment") != environment()
+    if new:
+        check_machine()
+    check_speed(SET_UP * new + DEMO * (command == "demo"))
     if is_ready(compiled):
         return
     with opened_lock() as lock:
@@ -93,7 +112,6 @@ def is_ready(compiled):
 def prepare(compiled):
     done = read_steps()
     if done.get("environment") != environment():
-        check_machine()
         make_environment()
         done = {"environment": environment()}
         write_steps(done)
@@ -146,6 +164,27 @@ def check_machine():
             f"Python.h of Python {VERSION} is missing, which the message package needs; "
             f"install it, e.g. sudo apt install python{VERSION}-dev"
         )
+
+
+def core_share():
+    """Share of a core that a busy process gets."""
+    began, used = time.monotonic(), time.process_time()
+    while time.process_time() < used + PROBE and time.monotonic() < began + PATIENCE:
+        pass
+    return (time.process_time() - used) / (time.monotonic() - began)
+
+
+def check_speed(work):
+    """Say how long `work` s of processor time take on a busy machine, before anything begins."""
+    share = core_share() if work else 1.0
+    text = (
+        f"other programs leave {share:.1%} of a core to this one, so it takes up to "
+        f"{work / share / 60.0:.0f} min; end them, or run this without nice"
+    )
+    if work / share > LONGEST:
+        raise TooSlow(f"the machine is too slow: {text}.")
+    if share < BUSY:
+        say(f"the machine is busy: {text}")
 
 
 def make_environment():
@@ -369,6 +408,8 @@ def share(log):
             if "Installing" not in text
             else ", unpacking"
         )
+    if log.name == "dev_compile.log":  # it says more than a share
+        return "".join(f", {told}" for told in re.findall("is done once: (.*)", text)[-1:])
     for done, total, percent in re.findall(r"\[(\d+)/(\d+)\]|\b(\d+) ?%", text)[-1:]:
         return f", {percent or round(100 * int(done) / int(total))} %"
     return ""
@@ -383,6 +424,7 @@ if __name__ == "__main__":
     try:
         main(*sys.argv[1:])
     except Failure as failure:
-        sys.exit(f"dev: error: {failure}")
+        print(f"dev: error: {failure}", file=sys.stderr)
+        sys.exit(failure.code)
     except KeyboardInterrupt:
         sys.exit(130)

@@ -61,6 +61,13 @@ def test_a_unit_is_found_and_undone(healthy, scale, unit):
     assert np.allclose(undone.tdoa.d, healthy.tdoa.d)
 
 
+def test_feet_are_named_beside_nanoseconds(healthy):
+    """A foot is 1.017 ns: no recording tells them apart."""
+    finding, _ = tdoa_rules.best_trial(healthy.with_tdoa(d=healthy.tdoa.d / 0.3048))
+    assert finding.cause == "TDOAs are in nanoseconds or in feet, not in metres"
+    assert finding.remedy.endswith("0.299792458  # of nanoseconds; of feet 0.3048")
+
+
 @pytest.mark.slow
 def test_swapped_ids_are_found_and_undone(healthy):
     one, two = healthy.anchors.ids[[2, 5]].tolist()

@@ -113,3 +113,29 @@ def test_a_step_that_fails_ends_those_beside_it(prepare):
     with pytest.raises(prepare.Failure, match="the step 'fail' failed; all of its output"):
         prepare.finish(long, prepare.start("fail", "fail", ["false"]))
     assert long[2].returncode is not None
+
+
+def test_a_busy_machine_is_named_before_anything_begins(prepare, monkeypatch, capsys):
+    """The demo takes 100 s of processor time: 17 minutes of a tenth of a core."""
+    assert 0.0 < prepare.core_share() < 1.1
+    for share, said in ((1.0, ""), (0.1, "[dev] the machine is busy: other programs leave 10.0% ")):
+        monkeypatch.setattr(prepare, "core_share", lambda share=share: share)
+        prepare.check_speed(prepare.DEMO)
+        err = capsys.readouterr().err
+        assert err.startswith(said) and ("takes up to 17 min" in err) == bool(said)
+
+
+def test_the_demo_does_not_begin_if_it_would_take_hours(prepare, monkeypatch):
+    """On a fresh copy the set-up counts, too: 300 s of processor time in all."""
+    monkeypatch.setattr(prepare, "core_share", lambda: 0.02)
+    monkeypatch.setattr(prepare, "check_machine", lambda: None)
+    with pytest.raises(prepare.TooSlow, match="machine is too slow: .* up to 250 min; end") as slow:
+        prepare.main("demo")
+    assert slow.value.code == 75 and not prepare.VENV.exists()
+
+
+def test_a_compilation_says_how_long_it_takes_and_not_the_share_of_a_core(prepare):
+    log = prepare.LOG / "dev_compile.log"
+    told = "40%, 200 s, about 10 min left; the machine is busy and gives this 8% of a core"
+    log.write_text(f"compiling, which is done once: {told}\n")
+    assert prepare.share(log) == f", {told}"

@@ -34,7 +34,7 @@ Survey = tuple[str, Anchors]  # its name, and what it says
 # trial
 RATIO, DEVIATIONS = 0.93, 2.5
 UNITS = {  # m in one
-    "nanoseconds": SPEED_OF_LIGHT / 1e9,
+    "nanoseconds or in feet": SPEED_OF_LIGHT / 1e9,  # a foot is 1.017 ns
     "centimetres": 0.01,
     "DW1000 ticks": TICK,
     "millimetres": 0.001,
@@ -122,10 +122,11 @@ def other_unit(recording: OrderedRecording) -> tuple[Finding, OrderedRecording] 
         ERROR,
         cause=f"TDOAs are in {name}, not in metres",
         evidence=(
-            f"successive TDOAs of a pair differ by {noise:.3g}: {scale * noise:.2f} m as {name}, "
-            f"{its * noise:.2g} m as {other}; radios have 0.05 - 0.1 m"
+            f"successive TDOAs of a pair differ by {noise:.3g}: {scale * noise:.2f} m if in {name}, "
+            f"{its * noise:.2g} m if in {other}; radios have 0.05 - 0.1 m"
         ),
-        remedy=f"message.distance_difference *= {scale:.10g}",
+        remedy=f"message.distance_difference *= {scale:.10g}"
+        + "  # of nanoseconds; of feet 0.3048" * ("feet" in name),
         value=scale,
     )
     return found, trial
