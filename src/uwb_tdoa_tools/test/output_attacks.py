@@ -8,7 +8,7 @@ import re
 
 import pytest
 
-from uwb_tdoa_tools.outputs import Output, OutputBag, OutputFile, OutputFolder
+from uwb_tdoa_tools.outputs import Output, OutputBag, OutputFile, OutputFileInFolder, OutputFolder
 
 READ = set(  # options and arguments that name inputs, or no path
     """flights flight input bag map anchors survey effects config model peer marks distances holdout odometry beside antenna
@@ -110,6 +110,7 @@ ATTACKS = {  # [(output, input or None, error message)]
         ("flights/one.log", "flights", "lies in {0}/flights, which is read"),
     ],
 }
+ATTACKS[OutputFileInFolder] = ATTACKS[OutputFile]
 
 
 def line(words, parser, attacked, out, read):

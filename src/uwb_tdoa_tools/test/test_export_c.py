@@ -13,8 +13,10 @@ from programs import run
 import pytest
 
 from uwb_tdoa_bias.correction.corrector import Corrector
+from uwb_tdoa_bias.correction.network import load_network
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_tools.exporting.c_code import NO_PAIR, NOT_FINITE, vehicle_code
+from uwb_tdoa_tools.exporting.onnx_file import write_onnx
 
 pytestmark = pytest.mark.skipif(GCC is None, reason="no C compiler (gcc)")
 needs_board = pytest.mark.skipif(
@@ -39,12 +41,9 @@ def agree(folder, effect_set, network=None):
     results = on_host(folder, some)
     same_bits(results, code, some)
     samples = c.samples_of(some)
-    known = Corrector(ANCHORS, effect_set, network)
-    expected = known.prediction(samples)
-    np.testing.assert_allclose(results["bias"], expected[0], atol=1e-5)
-    _, _, curved = effect_set.bias_jacobian(samples)
-    both = np.hypot(results["std"], curved)
-    np.testing.assert_allclose(both, expected[1], atol=1e-4)
+    expected = Corrector(ANCHORS, effect_set, network).prediction(samples)
+    np.testing.assert_allclose(results["bias"], expected.bias, atol=1e-5)
+    np.testing.assert_allclose(results["std"], expected.std, atol=1e-4)
 
 
 @pytest.mark.slow
@@ -58,6 +57,23 @@ def test_every_effect_is_equal_to_numpy_and_python(tmp_path, name):
 def test_both_networks_are_equal_to_numpy_and_python(tmp_path, orientations):
     held = chosen("anchor_delay", "tag_lever_arm")
     agree(tmp_path, held, c.network(tmp_path, orientations))
+
+
+@pytest.mark.slow
+def test_c_onnx_and_python_state_the_same_bias_and_standard_deviation(tmp_path):
+    held, network, some = chosen(*KINDS), c.network(tmp_path), cases(10_000)
+    write(tmp_path, vehicle_code(ANCHORS, held, network))
+    write_onnx(tmp_path / "bias.onnx", ANCHORS, held, network)
+    in_c, samples = on_host(tmp_path, some), c.samples_of(some)
+    in_onnx, in_python = (
+        Corrector(ANCHORS, *given).prediction(samples)
+        for given in ((None, load_network(tmp_path / "bias.onnx")), (held, network))
+    )
+    for name in ("bias", "std"):
+        expected = getattr(in_python, name)
+        np.testing.assert_allclose(in_c[name], expected, atol=1e-4)
+        np.testing.assert_allclose(getattr(in_onnx, name), expected, atol=1e-4)
+        assert np.ptp(expected) > 0.1
 
 
 @pytest.mark.parametrize("name", ["antenna_pattern", "received_power_bias"])
@@ -140,7 +156,7 @@ def test_the_board_agrees_with_the_flags_of_the_firmware(tmp_path):
 @needs_board
 def test_it_fits_a_small_vehicle(tmp_path):
     ten = c.cost_of(tmp_path / "ten", vehicle_code(ANCHORS, chosen(*c.COMMON)))
-    assert ten["most"] <= 3000 and ten["own"] <= 3072 and ten["ram"] <= 2048
+    assert ten["most"] <= 4000 and ten["own"] <= 4096 and ten["ram"] <= 2048
     network = c.network(tmp_path)
     learned = c.cost_of(tmp_path / "network", vehicle_code(ANCHORS, EffectSet(), network))
     assert learned["most"] <= 15_000 and learned["flash"] <= 13 * 1024

@@ -93,9 +93,12 @@ def test_networks(tmp_path, names):
 def test_a_file_goes_through_the_trial_of_all_models_and_through_the_checker_of_onnx(tmp_path):
     """Each row gives the same bits in every batch."""
     declared = EffectSet((EFFECTS["anchor_delay"], EFFECTS["range_bias"], EFFECTS["nlos"]))
-    path = tmp_path / "bias.onnx"
+    path = tmp_path / "made" / "bias.onnx"
     traced = write_onnx(path, ANCHORS, declared, network_of(tmp_path))
+    graph = onnx.load(path).graph
     onnx.checker.check_model(onnx.load(path), full_check=True)
+    used = {name for node in graph.node for name in node.input}
+    assert {one.name for one in graph.initializer} <= used  # else onnxruntime warns of each
     model = load_network(path)
     assert isinstance(model, ExportedCorrection) and not model._model.alone
     assert model.meta.keys() == traced.meta().keys()

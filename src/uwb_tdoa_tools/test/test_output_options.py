@@ -10,7 +10,7 @@ from output_attacks import attack, content, outputs, parsers, place, unknown  # 
 import pytest
 
 from uwb_tdoa_tools import cli
-from uwb_tdoa_tools.outputs import OutputBag, OutputFile, OutputFolder
+from uwb_tdoa_tools.outputs import OutputBag, OutputFile, OutputFileInFolder, OutputFolder
 
 PARSERS = {}
 for _name, _module in TOOLS.items():
@@ -37,10 +37,11 @@ def test_no_command_writes_through_a_link_or_over_what_it_reads(place, capsys, w
     attack(lambda line: main(words[0], line), words, PARSERS[words], action, place, capsys)
 
 
-@pytest.mark.parametrize("kind", [OutputFile, OutputFolder, OutputBag])
+@pytest.mark.parametrize("kind", [OutputFile, OutputFileInFolder, OutputFolder, OutputBag])
 def test_other_places_can_be_written(place, kind):
     inputs = [str(place / "bag"), str(place / "flights" / "one.log"), "x" * 5000, 3, None]
     outs = ["new", "flights/new", "home/new"] + ["/dev/stdout"] * (kind is OutputFile)
+    outs += ["no/new"] * (kind is OutputFileInFolder)
     for out in outs:
         parser = cli.parser("write", "Write.")
         parser.add_argument("--out", type=kind)
@@ -56,6 +57,7 @@ def test_other_places_can_be_written(place, kind):
         (OutputFolder, "file/out", "cannot be made, as .*file is a file"),
         (OutputFile, "home", "is a directory; give a file"),
         (OutputFile, "no/file", "its directory does not exist"),
+        (OutputFileInFolder, "file/no/out", "cannot be made, as .*file is a file"),
     ],
 )
 def test_a_place_that_cannot_be_written_to_is_refused_before_the_work(

@@ -35,6 +35,10 @@ class OutputFile(Output):
     """A file in an existing folder."""
 
 
+class OutputFileInFolder(OutputFile):
+    """A file in a folder, which the command makes if needed."""
+
+
 class OutputFolder(Output):
     """A folder, which the command makes if needed."""
 
@@ -60,6 +64,8 @@ def checked(args: Namespace) -> AbstractContextManager[None]:
             refuse_output(output)
             if isinstance(output, OutputFolder):
                 _check_folder(output)
+            elif isinstance(output, OutputFileInFolder) and not output.absolute().parent.exists():
+                _check_folder(output.parent)
             elif isinstance(output, OutputFile):
                 _check_file(output)
     return protected_inputs(inputs)

@@ -36,7 +36,10 @@ class Correction:
 
     Attributes
     ----------
-    bias, std : (n,) m
+    bias : (n,) m
+    std : (n,) m, of the error that remains in `corrected`. Its square adds to the variance of the TDOA.
+        It holds noise that effects add, what their domains leave, and the deviation of a bias from
+        its linearization if the state is REACH off.
     corrected : (n,) m, d - bias
     status : (n,) of PASSED, EFFECTS, NETWORK, FADED
     slope : (n, 6), Jacobian of the bias by position and velocity of the tag, world; 1 and s

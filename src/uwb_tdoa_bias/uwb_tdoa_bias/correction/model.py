@@ -167,7 +167,7 @@ INPUTS = (
 )
 OUTPUTS = (
     ("bias", "m", "to subtract from d_ab"),
-    ("std", "m", "standard deviation of the bias"),
+    ("std", "m", "of the error that remains: its square adds to the variance of d_ab"),
     ("slope_x", "1", "change of the bias with the position of the tag"),
     ("slope_y", "1", ""),
     ("slope_z", "1", ""),

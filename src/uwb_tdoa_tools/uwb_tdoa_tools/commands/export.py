@@ -11,7 +11,7 @@ from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli
 from ..cli import option
-from ..outputs import OutputFile, OutputFolder
+from ..outputs import OutputFileInFolder, OutputFolder
 from ..parallel import Progress
 
 
@@ -44,7 +44,7 @@ def parser() -> ArgumentParser:
             option(
                 "--onnx",
                 metavar="FILE",
-                type=OutputFile,
+                type=OutputFileInFolder,
                 help="write the correction as an ONNX file",
             ),
             option(

@@ -171,6 +171,7 @@ def write_onnx(
 ) -> TracedCorrection:
     """Write the correction of some Anchors as an ONNX file, and return what it holds.
 
+    Its folder is made if needed.
     Raises InputError if the correction cannot be traced, or if no node would load the file.
     """
     traced = trace(anchors, effects, network)
@@ -184,6 +185,7 @@ def write_onnx(
             f"effects: no node would load this correction ({error}); export fewer effects, or the "
             "anchors of one area."
         ) from error
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
     write_bytes(path, content)
     return traced
 
