@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What studies simulate, and how they judge it: paths, situations, rooms, and named anchors."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,6 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from studies import moved_anchors, plans, situations
 from studies.any_path import Path, between
+from studies.healthy import healthy
+from uwb_tdoa_tools.checking.check import processed_streams
+from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.planning.maps import TOO_FEW
 from uwb_tdoa_tools.planning.precision import FixedNoise, RadioNoise
 from uwb_tdoa_tools.simulation.rooms import Room
@@ -116,3 +120,10 @@ def test_a_pair_is_right_if_it_holds_the_anchor_and_stands_alone():
     wrong = [[3, 5], [4]], [[3, 4, 5]], [[3, 4]], []
     assert not any(moved_anchors._right(groups, [5]) for groups in wrong)
     assert not moved_anchors._right([[1, 2]], [1, 2])
+
+
+@pytest.mark.parametrize("unit, named", [(1.0, set()), (180.0 / np.pi, {"imu_rate_unit"})])
+def test_only_a_gyroscope_in_degrees_is_named_while_a_tilted_quadrotor_turns(unit, named):
+    flight = healthy("quadrotor, TDOA3", 8008)  # 2 rad/s, and a large radius
+    recording = of_flight(flight.replaced(imu=replace(flight.imu, gyro=unit * flight.imu.gyro)))
+    assert {one.rule for one in processed_streams(recording).findings()} == named
