@@ -260,6 +260,13 @@ def test_anchors_in_a_plane_tell_nothing_of_the_survey_or_of_the_inertial_sensor
     assert imu_rules.find_imu_mistake(replace(made, anchors=made.anchors.at(level))) is None
 
 
+def test_an_imu_of_another_tag_is_not_in_another_unit(healthy):
+    imu = OrderedRecording.of(recording(1, trajectory="square", yaw="fixed")).imu
+    late = imu.t + healthy.tdoa.t[0] - imu.t[0]
+    found = imu_rules.find_imu_mistake(replace(healthy, imu=replace(imu, t=late)))
+    assert found.rule == "imu_other_body" and found.severity == "error"
+
+
 def test_a_gyroscope_that_turns_as_gravity_does_not_is_no_explanation(healthy):
     scale = max(imu_rules.SCALES)
     assert not imu_rules._is_possible(healthy.imu, scale * np.eye(3))

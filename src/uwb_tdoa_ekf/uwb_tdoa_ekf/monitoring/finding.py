@@ -46,6 +46,7 @@ WRONG_WITH_IMU = frozenset(  # ERRORs that make the position wrong while the fil
         "imu_rate_unit",
         "imu_turned",
         "imu_axes",
+        "imu_other_body",
         "gyro_axes",
         "accel_axes",
         "imu_silent",

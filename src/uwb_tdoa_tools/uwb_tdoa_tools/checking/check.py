@@ -14,6 +14,7 @@ from uwb_tdoa_ekf.monitoring.finding import (
     ERROR,
     NOTE,
     WARNING,
+    WRONG_WITH_IMU,
     Finding,
     explained_by,
     most_severe_first,
@@ -61,7 +62,7 @@ WITHOUT_IMU = {
     "imu_clipped",
 }
 # After one of these findings the recorded attitude shows nothing else.
-OF_IMU = {*WITHOUT_IMU, "imu_axes", "imu_rate_unit", "imu_force_unit", "imu_turned", "stamps_apart"}
+OF_IMU = WITHOUT_IMU | WRONG_WITH_IMU
 OTHER_SURVEY = (
     "give --survey a folder of all surveys: check says which one fits; or survey the anchors again"
 )
