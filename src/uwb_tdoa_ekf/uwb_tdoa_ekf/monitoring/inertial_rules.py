@@ -291,7 +291,7 @@ def _averages_to_gravity(windows: list[ImuWindow]) -> bool:
 
     The rates are integrated to turn the specific force into the world.
     """
-    if not median(np.linalg.norm(window.mean[:3]) for window in windows) < FASTEST:
+    if not median(float(np.linalg.norm(window.mean[:3])) for window in windows) < FASTEST:
         return False
     spans = []
     for first in range(0, len(windows), SPAN):
