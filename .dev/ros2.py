@@ -41,7 +41,7 @@ def parser():
         "./dev ros2 topic info -v uwb/tdoa",
         "./dev ros2 topic hz imu/data",
         "./dev ros2 topic echo odometry --once",
-        "./dev ros2 bag record -o flown.bag odometry uwb/residual",
+        "./dev ros2 bag record -o flown_bag odometry uwb/residual",
         "./dev ros2 node list",
         "./dev ros2 param describe ekf_node tdoa_std",
         "./dev ros2 param set ekf_node tdoa_std 0.3",

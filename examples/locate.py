@@ -12,7 +12,7 @@ import uwb_tdoa as uwb
 
 recording, survey, *_ = *sys.argv[1:], None, None
 if recording is None:
-    recording = "circle.bag"
+    recording = "circle_bag"
     uwb.write(uwb.simulate(duration=20.0, seed=1, imu_rate=100.0), recording, force=True)
 
 flight = uwb.read(recording, survey)

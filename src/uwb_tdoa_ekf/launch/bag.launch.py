@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A bag through the nodes of one tag, on the time of the bag.
 
-ros2 launch uwb_tdoa_ekf bag.launch.py bag:=flight.bag
-ros2 launch uwb_tdoa_ekf bag.launch.py bag:=flight.bag rate:=2 anchors_file:=anchors.yaml rviz:=true
+ros2 launch uwb_tdoa_ekf bag.launch.py bag:=flight_bag
+ros2 launch uwb_tdoa_ekf bag.launch.py bag:=flight_bag rate:=2 anchors_file:=anchors.yaml rviz:=true
 """
 
 from __future__ import annotations

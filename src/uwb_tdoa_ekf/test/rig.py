@@ -157,6 +157,11 @@ class Process:
         self.reader.join(timeout=PATIENCE)
         return self.process.returncode, slept
 
+    def abort(self):
+        """End the process. Its faulthandler prints what each thread does, which explains a hang."""
+        self.process.send_signal(signal.SIGABRT)
+        self.reader.join(timeout=10.0)
+
 
 class Rig:
     """Start nodes in `namespace`, publish their inputs, and keep their outputs.
@@ -228,6 +233,8 @@ class Rig:
             command = [
                 sys.executable,
                 "-u",
+                "-X",
+                "faulthandler",
                 "-m",
                 MODULES[name],
                 "--ros-args",
@@ -356,6 +363,9 @@ class Rig:
             for name, process in self._processes.items():
                 assert process.process.poll() is None, f"{name} has ended: {''.join(process.lines)}"
             if time.monotonic() > deadline:
+                for process in self._processes.values():
+                    if isinstance(process, Process):
+                        process.abort()
                 said = "".join(
                     line for process in self._processes.values() for line in process.lines
                 )

@@ -202,19 +202,19 @@ def test_cheap_commands_of_the_pages_run(documented, tmp_path, monkeypatch, caps
     monkeypatch.chdir(tmp_path)
     corners().to_yaml("anchors.yaml")
     settings = dict(duration=18.0, imu_rate=100.0, truth_rate=50.0, start_in_air=True)
-    for speed, name in ((1.0, "flight.bag"), (0.8, "other.bag")):
+    for speed, name in ((1.0, "flight_bag"), (0.8, "other_bag")):
         config = SimulationConfig(seed=4, multipath=False, speed=speed, **settings)
         write_bag(simulate(config), name)
-    shutil.copytree("flight.bag", "FLIGHT.log")
+    shutil.copytree("flight_bag", "FLIGHT.log")
     Path("SURVEY.txt").symlink_to("anchors.yaml")
     EffectSet((EFFECTS["anchor_delay"]({"3": 0.1}),)).to_yaml("effects.yaml")
     ran = {}
     for page, name, words in documented:
-        inputs = [word for word in words if re.search(r"\.(bag|log|csv|yaml|npz|onnx)$", word)]
+        inputs = [word for word in words if re.search(r"_bag$|\.(log|csv|yaml|npz|onnx)$", word)]
         out = words[words.index("--out") + 1] if "--out" in words else "none"
         there = all(Path(word).exists() for word in inputs if word != out)
         if name in CHEAP and there and words and not OTHERS.search(f"{page} {words}"):
-            forced = [*words, "--force"] if out.endswith(".bag") else words
+            forced = [*words, "--force"] if out.endswith("_bag") else words
             line = (name, *words)
             if line not in ran:
                 ran[line] = main(name, forced)

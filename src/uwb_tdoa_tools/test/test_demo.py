@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from rosbags.highlevel import AnyReader
 
 pytest.importorskip("rclpy")
 import known_answer  # noqa: E402
@@ -122,6 +123,12 @@ def _short_flights():
 def recorded(tmp_path_factory):
     """Return the bags of a hall."""
     return flown.record(LATE, tmp_path_factory.mktemp("recorded"))
+
+
+def test_rosbags_reads_the_recordings_by_their_names(recorded):
+    """AnyReader takes a folder that is named *.bag for a bag of ROS 1."""
+    with AnyReader(recorded) as reader:
+        assert {"/uwb/tdoa", "/imu/data"} <= {each.topic for each in reader.connections}
 
 
 @pytest.fixture(scope="module")
@@ -256,9 +263,9 @@ def test_the_loop_through_the_real_nodes(tmp_path, capsys):
     content = json.loads(figures.read_text())
     errors = [row["rmse_3d"] for row in content["errors"]]
     assert errors[1] < 0.3 * errors[0]
-    (third,) = flown.read([tmp_path / "flight-3.bag"])
+    (third,) = flown.read([tmp_path / "flight-3_bag"])
     for name, model in (("without", None), ("with", load_network(tmp_path / "bias.onnx"))):
-        live = read_odometry(tmp_path / name / "recorded.bag")
+        live = read_odometry(tmp_path / name / "recorded_bag")
         offline = FlightEstimator(network=model)(third).odometry
         n = len(live.t)
         assert n > len(offline) - 5  # the nodes wait for messages after the last TDOA
@@ -289,5 +296,5 @@ def test_a_given_flight_through_the_real_nodes(recorded, diagnosis, tmp_path, ca
     assert corrected[3] < 0.6 * raw[3]  # 3D RMSE
     assert "lost or late" not in printed.err and "uwb_tdoa_tools check" in lines[-3]
     assert corrected == pytest.approx(without_ros, abs=1.01e-3)
-    for name in ("flight.bag", "recorded.bag", "error.png"):
+    for name in ("flight.bag", "recorded_bag", "error.png"):
         assert (tmp_path / "out" / name).exists()

@@ -126,10 +126,10 @@ def test_a_busy_machine_is_named_before_anything_begins(prepare, monkeypatch, ca
 
 
 def test_the_demo_does_not_begin_if_it_would_take_hours(prepare, monkeypatch):
-    """On a fresh copy the set-up counts, too: 300 s of processor time in all."""
+    """On a fresh copy the set-up counts, too: 200 s of processor time in all."""
     monkeypatch.setattr(prepare, "core_share", lambda: 0.02)
     monkeypatch.setattr(prepare, "check_machine", lambda: None)
-    with pytest.raises(prepare.TooSlow, match="machine is too slow: .* up to 250 min; end") as slow:
+    with pytest.raises(prepare.TooSlow, match="machine is too slow: .* up to 167 min; end") as slow:
         prepare.main("demo")
     assert slow.value.code == 75 and not prepare.VENV.exists()
 

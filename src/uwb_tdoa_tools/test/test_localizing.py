@@ -120,7 +120,7 @@ def test_what_is_written_says_the_same(bags, flight, tmp_path, capsys):
         np.column_stack([table[name] for name in "xyz"]), odometry.p, atol=1e-6
     )
     np.testing.assert_allclose(table["std_z"], np.sqrt(odometry.covariance[:, 2, 2]), atol=1e-6)
-    recorded = read_odometry(tmp_path / "flight.bag")
+    recorded = read_odometry(tmp_path / "flight_bag")
     np.testing.assert_allclose(recorded.p, odometry.p, atol=1e-12)
     np.testing.assert_allclose(recorded.v, odometry.v, atol=1e-9)
     np.testing.assert_allclose(
@@ -281,7 +281,7 @@ def test_residuals_of_a_pair_are_of_one_sign_of_it():
 
 
 def test_names_of_files_are_those_of_recordings_and_must_differ():
-    assert [name_of(path) for path in ("a/const1-tdoa2.csv.gz", "b/flight.bag", "0425-traj1")] == [
+    assert [name_of(path) for path in ("a/const1-tdoa2.csv.gz", "b/flight_bag", "0425-traj1")] == [
         "const1-tdoa2",
         "flight",
         "0425-traj1",

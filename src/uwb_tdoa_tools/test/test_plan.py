@@ -16,7 +16,7 @@ from uwb_tdoa_tools.planning import optimisation, run
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.rooms import corners
 
-FILES = {"flyable.png", "flyable.npz", "plan.bag", "plan.json", "precision.png"}
+FILES = {"flyable.png", "flyable.npz", "plan_bag", "plan.json", "precision.png"}
 COARSE = ["--step", "0.5"]
 
 

@@ -125,7 +125,7 @@ def test_the_command_writes_a_picture_and_says_who_hears_how_many(tmp_path, caps
         "flyable.png",
         "plan.json",
         "flyable.npz",
-        "plan.bag",
+        "plan_bag",
     } == {path.name for path in (tmp_path / "out").iterdir()}
     assert json.loads((tmp_path / "out" / "plan.json").read_text())["map"]["heard"]
 

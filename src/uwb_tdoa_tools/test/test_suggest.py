@@ -70,6 +70,7 @@ TABLES = {
     "nested": lines(
         '{{"ts": {f}, "uwb": {{"ref": {a}, "anchor": {b}, "quality": 90, "tdoa_m": {d}}}}}'
     ),
+    "milliseconds by name": lines("{ms:.3f},{a},{b},{d}", "millis,from,to,d"),
     "mm and us": lines("{f},{a},{b},{d}", "time [us],a,b,diff_mm").replace(".", ""),
 }
 
@@ -89,7 +90,7 @@ def read_as_suggested(file, capsys, *words):
     (line,) = [each for each in printed.out.splitlines() if each.startswith("next: ")]
     assert convert(shlex.split(line.partition(" convert ")[2])) == 0, capsys.readouterr().err
     capsys.readouterr()
-    return read_flight("our.bag")
+    return read_flight("our_bag")
 
 
 @pytest.mark.parametrize("kind", TABLES)
@@ -129,6 +130,27 @@ def test_the_output_of_a_shell_is_named_with_a_line_that_makes_a_table(folder, f
     np.testing.assert_allclose(flight.range.d[:2], [4.0, 6.0], atol=1e-6)
 
 
+@pytest.mark.parametrize("header", ["", "kind,t,from,to,d,ax,ay,az,gx,gy,gz"])
+@pytest.mark.parametrize("first", [True, False])
+def test_rows_of_several_kinds_are_named_with_lines_that_split_them(folder, header, first, capsys):
+    """The kind is in the first column, or behind the time."""
+    rows = [header] if header else []
+    for t, a, b, d in zip(T, A, B, D):
+        rows += [f"TDOA,{t:.6f},{a},{b},{d}{6 * ',' if header else ''}"]
+        rows += [f"IMU,{t:.6f},{3 * ',' if header else ''}0.1,0.2,9.8,0.0,0.0,0.3"]
+    if not first:
+        swapped = [row.split(",") for row in rows]
+        rows = [",".join([t, kind, *more]) for kind, t, *more in swapped]
+    (folder / "my log.csv").write_text("\n".join(rows) + "\n")
+    assert convert(["my log.csv", "--suggest", "profile.yaml"]) == 2
+    said = capsys.readouterr().err
+    assert "several kinds, TDOA, IMU" in said and not Path("profile.yaml").exists()
+    assert said.rstrip().endswith("convert tdoa.csv imu.csv --suggest profile.yaml")
+    run("sh", "-c", said[said.index("grep ") : said.index("; then: ")], check=True)
+    flight = read_as_suggested("tdoa.csv", capsys)
+    np.testing.assert_allclose(flight.tdoa.d, D, atol=1e-6)
+
+
 @pytest.mark.parametrize("prefix", ["", "q_", "rotation."])
 def test_the_attitude_of_a_ground_truth_is_suggested(folder, prefix, capsys):
     """Whatever it is called, beside a position that is called ground truth."""
@@ -139,7 +161,7 @@ def test_the_attitude_of_a_ground_truth_is_suggested(folder, prefix, capsys):
     assert convert(["log.csv", "mocap.csv", "--suggest", "profile.yaml"]) == 0
     (line,) = [each for each in capsys.readouterr().out.splitlines() if each.startswith("next: ")]
     assert convert(shlex.split(line.partition(" convert ")[2])) == 0
-    np.testing.assert_allclose(read_flight("our.bag").truth.q[-1], [0.0, 0.0, 0.6, 0.8])
+    np.testing.assert_allclose(read_flight("our_bag").truth.q[-1], [0.0, 0.0, 0.6, 0.8])
 
 
 def test_two_columns_beside_a_number_are_no_tdoas_by_their_values_alone(folder, capsys):

@@ -143,7 +143,7 @@ def test_from_csv_to_a_diagnosed_flight(simulated, capsys):
     convert, judge, *_ = blocks(WALK)
     write_tables(simulated, lambda truth: transform_truth(truth, TURNED, np.array([0.5, -0.3, 0])))
     run(convert)
-    bag = Reading(None).one("monday.bag")
+    bag = Reading(None).one("monday_bag")
     assert len(bag.anchors) == 8 and len(bag.truth) == len(simulated.flights[0].truth)
     np.testing.assert_allclose(bag.imu.gyro, simulated.flights[0].imu.gyro, atol=1e-6)
     np.testing.assert_allclose(bag.tdoa.d, simulated.flights[0].tdoa.d, atol=1e-6)
@@ -198,7 +198,7 @@ def test_the_four_steps_of_the_guide(simulated, capsys):
 def test_from_tape_to_calibrated_without_ground_truth(measured, capsys):
     """docs/calibration.md in one command."""
     for name, flight in zip(("first", "second"), measured.flights):
-        write_bag(replace(flight, truth=None), f"{name}.bag")
+        write_bag(replace(flight, truth=None), f"{name}_bag")
     _, command = tools(blocks(section("calibration.md", "In one command"))[0])
     code = main(*command)
     said = capsys.readouterr()

@@ -3,7 +3,7 @@
 """Share the look of --help, and the handling of failures, between all executables.
 
 def parser():
-    example = "convert flight.log --out flight.bag"
+    example = "convert flight.log --out flight_bag"
     return cli.parser("convert", "Convert a log to a bag.", example, options=[cli.option("log")])
 
 main = cli.executable(_convert, parser)          # _convert(args) -> exit code, None for 0

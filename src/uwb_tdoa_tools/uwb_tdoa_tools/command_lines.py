@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Make command lines to copy, as they run where the user is.
 
-tool("check", "flight.bag")          # ./dev run uwb_tdoa_tools check flight.bag, or ros2 run ...,
-                                     # or uwb-tdoa check flight.bag
+tool("check", "flight_bag")          # ./dev run uwb_tdoa_tools check flight_bag, or ros2 run ...,
+                                     # or uwb-tdoa check flight_bag
 node("ekf_node", {"effects_file": "effects.yaml"})
 """
 
@@ -34,9 +34,9 @@ def tool(name: str, *words: object) -> str:
     return " ".join([line_start(name), *([shlex.join(map(str, words))] if words else [])])
 
 
-def suggest_line(recording: str | Path) -> str:
-    """Return the line that writes a first profile of a recording of others, or names one that fits."""
-    return tool("convert", recording, "--suggest", "profile.yaml")
+def suggest_line(*recordings: str | Path) -> str:
+    """Return the line that writes a first profile of recordings of others, or names one that fits."""
+    return tool("convert", *recordings, "--suggest", "profile.yaml")
 
 
 def line_start(name: str) -> str:

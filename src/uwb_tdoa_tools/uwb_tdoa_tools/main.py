@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command `uwb-tdoa`: every tool as a subcommand, and completion for a shell.
 
-uwb-tdoa check flight.bag
+uwb-tdoa check flight_bag
 eval "$(uwb-tdoa --completion)"          # in ~/.bashrc or ~/.zshrc
 """
 

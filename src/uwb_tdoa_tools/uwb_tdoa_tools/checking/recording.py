@@ -243,7 +243,7 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
     if samples is not None and (place := sensor_place(tree, IMU, imu.frames)[0]):
         samples = imu_in_body(samples, place)
     return Recording(
-        name=path.stem,
+        name=path.stem.removesuffix("_bag"),
         anchors=anchors,
         tdoa=bag_messages.tdoas_of(tdoa.stamps / 1e9, tdoa.rows.reshape(-1, 4)),
         imu=samples,

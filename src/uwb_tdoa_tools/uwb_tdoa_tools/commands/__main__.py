@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Run a command by its name, without an installed entry point: python -m uwb_tdoa_tools.commands check flight.bag."""
+"""Run a command by its name, without an installed entry point: python -m uwb_tdoa_tools.commands check flight_bag."""
 
 from importlib import import_module
 import sys

@@ -40,17 +40,17 @@ def parser() -> ArgumentParser:
     return cli.parser(
         "calibrate",
         DESCRIPTION,
-        "calibrate flight.bag --out calibrated/",
+        "calibrate flight_bag --out calibrated/",
         (
-            "calibrate first.bag second.bag --survey tape.yaml --no-truth --std 0.1 --trusted 0 6 "
+            "calibrate first_bag second_bag --survey tape.yaml --no-truth --std 0.1 --trusted 0 6 "
             "--out calibrated/"
         ),
         "calibrate flight.log --survey anchors.yaml --holdout other.log --out calibrated/",
-        "calibrate flight.bag --quick",
-        "calibrate flight.bag --no-truth --quick",
+        "calibrate flight_bag --quick",
+        "calibrate flight_bag --no-truth --quick",
         "calibrate flights/ --survey anchors.yaml --without height --keep --out calibrated/",
         (
-            "calibrate today.bag --no-truth --survey calibrated/anchors.yaml --effects "
+            "calibrate today_bag --no-truth --survey calibrated/anchors.yaml --effects "
             "calibrated/effects.yaml --out today/"
         ),
         options=[

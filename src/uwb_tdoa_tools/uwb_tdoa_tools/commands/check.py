@@ -42,14 +42,14 @@ def parser() -> ArgumentParser:
     return cli.parser(
         "check",
         DESCRIPTION,
-        "check flight.bag",
+        "check flight_bag",
         "check 0425-traj2 --survey anchor_0425.txt",
         "check flights/ --survey surveys/",
-        "check flight.bag --survey surveyed_again.yaml --json findings.json",
-        "check today.bag --survey surveyed/anchors.yaml --effects surveyed/effects.yaml",
+        "check flight_bag --survey surveyed_again.yaml --json findings.json",
+        "check today_bag --survey surveyed/anchors.yaml --effects surveyed/effects.yaml",
         "check --live 60",
         "check --live 60 --namespace tag1 --survey anchors.yaml",
-        "check tags.bag --topic uwb/tdoa=/tag1/tdoa --topic imu/data=/tag1/imu",
+        "check tags_bag --topic uwb/tdoa=/tag1/tdoa --topic imu/data=/tag1/imu",
         options=[
             *options.recordings(nargs="*"),
             *options.filtering(

@@ -44,30 +44,30 @@ def parser() -> ArgumentParser:
     return cli.parser(
         "convert",
         DESCRIPTION,
-        "convert 0425-traj1 --survey anchor_0425.txt --out 0425-traj1.bag",
+        "convert 0425-traj1 --survey anchor_0425.txt --out 0425-traj1_bag",
         (
-            "convert const1-trial1-tdoa2.csv.gz --survey anchor_const1.csv --out const1.bag "
+            "convert const1-trial1-tdoa2.csv.gz --survey anchor_const1.csv --out const1_bag "
             "--storage sqlite3"
         ),
-        "convert flight.log --survey anchors.yaml --out flight.bag --force --json",
-        "convert cut.log --survey anchors.yaml --salvage --out flight.bag",
+        "convert flight.log --survey anchors.yaml --out flight_bag --force --json",
+        "convert cut.log --survey anchors.yaml --salvage --out flight_bag",
         (
             "convert theirs.bag --topic uwb/tdoa=/dwm/tdoa --topic imu/data=/fcu/imu --survey "
-            "anchors.yaml --out our.bag"
+            "anchors.yaml --out our_bag"
         ),
         (
             "convert ranging.csv --columns time=t_ms:ms,anchor_a=from,anchor_b=to,tdoa=diff_mm:mm "
             "--survey anchors.yaml "
-            "--out our.bag"
+            "--out our_bag"
         ),
         (
             "convert ranging.csv mocap.csv --columns "
             "time=t,anchor_a=from,anchor_b=to,tdoa=d,pose_x=x,pose_y=y,pose_z=z "
-            "--time-offset truth=-0.4 --survey anchors.csv --out our.bag"
+            "--time-offset truth=-0.4 --survey anchors.csv --out our_bag"
         ),
         "convert theirs.bag --suggest profile.yaml",
-        "convert theirs.bag --profile profile.yaml --survey anchors.yaml --out our.bag",
-        "convert theirs.bag --profile dwm1001 --tag 5722 --out our.bag",
+        "convert theirs.bag --profile profile.yaml --survey anchors.yaml --out our_bag",
+        "convert theirs.bag --profile dwm1001 --tag 5722 --out our_bag",
         options=[
             option(
                 "input",
@@ -144,7 +144,7 @@ def _suggest(args: Namespace) -> None:
     words = [*args.input, "--profile", fitting[0] if fitting else args.suggest]
     if args.survey or not has_anchors:
         words += ["--survey", args.survey or YOUR_SURVEY]
-    cli.show(f"  -> {args.suggest}", f"next: {tool('convert', *words, '--out', 'our.bag')}")
+    cli.show(f"  -> {args.suggest}", f"next: {tool('convert', *words, '--out', 'our_bag')}")
     if YOUR_SURVEY in words:
         cli.show(f"{YOUR_SURVEY} is the file with the positions of your anchors (docs/csv.md)")
 

@@ -39,8 +39,8 @@ def parser() -> ArgumentParser:
         "demo",
         "demo --seed 7 --json demo.json",
         "demo --flight 0607/tdoa2-obs-log1 --survey anchor_0607.txt --rate 4",
-        "demo --flight flight.bag --rerun out/flight.rrd",
-        "demo --flight flight.bag --effects effects.yaml --out out/corrected",
+        "demo --flight flight_bag --rerun out/flight.rrd",
+        "demo --flight flight_bag --effects effects.yaml --out out/corrected",
         options=[
             option(
                 "--flight",
@@ -110,7 +110,7 @@ def _loop(args: Namespace) -> int:
         result.show(args.rerun)
     if args.json is not None:
         cli.write_json(args.json, figures)
-    _show("next", demo.next_steps(args.out / "flight-3.bag"), keep=True)
+    _show("next", demo.next_steps(args.out / "flight-3_bag"), keep=True)
     return int(result.failed)
 
 

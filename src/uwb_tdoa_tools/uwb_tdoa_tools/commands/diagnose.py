@@ -46,21 +46,21 @@ def parser() -> ArgumentParser:
     return cli.parser(
         "diagnose",
         DESCRIPTION,
-        "diagnose flight.bag --out diagnosis/",
+        "diagnose flight_bag --out diagnosis/",
         (
             "diagnose 0425-traj1 0425-traj2 --survey anchor_0425.txt --holdout 0425-traj3 --out "
             "diagnosis/"
         ),
-        "diagnose flight.bag --effects effects.yaml --out second/",
-        "diagnose flight.bag --rerun flight.rrd --out diagnosis/",
-        "diagnose flight.bag --reference heights --out by-height/",
+        "diagnose flight_bag --effects effects.yaml --out second/",
+        "diagnose flight_bag --rerun flight.rrd --out diagnosis/",
+        "diagnose flight_bag --reference heights --out by-height/",
         (
-            "diagnose flight.bag --reference odometry --odometry /vio/odometry --marks marks.yaml "
+            "diagnose flight_bag --reference odometry --odometry /vio/odometry --marks marks.yaml "
             "--out by-odometry/"
         ),
-        "diagnose flight.bag --plan-flight -3 3 -4 4 0 3 --out diagnosis/",
-        "diagnose flight.bag --no-truth --out without/",
-        "diagnose today.bag --no-truth --effects last-week/effects.yaml --out today/",
+        "diagnose flight_bag --plan-flight -3 3 -4 4 0 3 --out diagnosis/",
+        "diagnose flight_bag --no-truth --out without/",
+        "diagnose today_bag --no-truth --effects last-week/effects.yaml --out today/",
         options=[
             *options.recordings(),
             *options.filtering(

@@ -32,11 +32,11 @@ def parser() -> ArgumentParser:
             "far as uwb/residual was recorded too),\n"
             "2 bad input."
         ),
-        "evaluate flight.bag",
+        "evaluate flight_bag",
         "evaluate 0425-traj2 --survey anchor_0425.txt --plot error.png",
         "evaluate flights/ --survey surveys/ --no-bias --json errors.json",
-        "evaluate flight.bag --odometry recorded.bag --tum out/",
-        "evaluate flight.bag --odometry tags.bag --topic odometry=/tag1/odometry",
+        "evaluate flight_bag --odometry recorded_bag --tum out/",
+        "evaluate flight_bag --odometry tags_bag --topic odometry=/tag1/odometry",
         "evaluate flights/ --survey surveys/ -p adapt_noise:=false -p loss:=huber",
         "evaluate flights/ --survey surveys/ --without height --without pressure",
         "evaluate flights/ --survey surveys/ --dask tcp://10.0.0.1:8786",

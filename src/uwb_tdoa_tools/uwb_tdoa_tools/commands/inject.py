@@ -27,10 +27,10 @@ def parser() -> ArgumentParser:
         DESCRIPTION,
         (
             "inject 0425-traj2 --survey anchor_0425.txt --effect anchor_delay --value 3=0.3 --out "
-            "late.bag"
+            "late_bag"
         ),
-        "inject flight.bag --effect tag_lever_arm --value x=0.05 z=0.1 --out arm.bag",
-        "inject flight.bag --effect nlos --value 2.delay=0.4 2.start=20 2.end=35 --out blocked.bag",
+        "inject flight_bag --effect tag_lever_arm --value x=0.05 z=0.1 --out arm_bag",
+        "inject flight_bag --effect nlos --value 2.delay=0.4 2.start=20 2.end=35 --out blocked_bag",
         "inject --list",
         options=[
             option(

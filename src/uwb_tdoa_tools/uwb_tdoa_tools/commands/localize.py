@@ -17,7 +17,7 @@ DESCRIPTION = """Where the tag was: trajectories of recordings, without ground t
 
 Runs bias correction and filter as the nodes would, or smooths. Writes for each recording to --out: NAME.tum (for evo), NAME.csv (with
 velocities and standard deviations) and NAME.png (from above, from the side, over time, with three standard deviations); with --bag
-NAME.bag (nav_msgs/Odometry), with --residuals what is left of each TDOA, as a table and as a picture per pair of anchors; with --zones
+NAME_bag (nav_msgs/Odometry), with --residuals what is left of each TDOA, as a table and as a picture per pair of anchors; with --zones
 which anchors were heard where, and how well: a table and a map.
 
 It says how far each trajectory is to be believed, and what would make it better. good: the position is within what is stated for 95 %
@@ -31,15 +31,15 @@ def parser() -> ArgumentParser:
     return cli.parser(
         "localize",
         DESCRIPTION,
-        "localize flight.bag --out out/",
+        "localize flight_bag --out out/",
         "localize flight.log --survey anchors.yaml --smooth --residuals --out out/",
         (
             "localize flights/ --survey calibrated/anchors.yaml --effects calibrated/effects.yaml "
             "--config calibrated/ekf_node.yaml --out out/"
         ),
-        "localize flight.bag --bag --json located.json --out out/",
-        "localize flight.bag --rerun flight.rrd --out out/",
-        "localize hall.bag --zones 20 --out out/",
+        "localize flight_bag --bag --json located.json --out out/",
+        "localize flight_bag --rerun flight.rrd --out out/",
+        "localize hall_bag --zones 20 --out out/",
         options=[
             *options.recordings(),
             *options.ESTIMATOR,

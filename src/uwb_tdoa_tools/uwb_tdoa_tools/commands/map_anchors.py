@@ -33,8 +33,8 @@ def parser() -> ArgumentParser:
     return cli.parser(
         "map_anchors",
         DESCRIPTION,
-        "map_anchors flight.bag --survey two.yaml --out map/",
-        "map_anchors first.bag second.bag --survey two.yaml --coordinates heights.csv --out map/",
+        "map_anchors flight_bag --survey two.yaml --out map/",
+        "map_anchors first_bag second_bag --survey two.yaml --coordinates heights.csv --out map/",
         "map_anchors --survey three.yaml --distances laser.csv --coordinates side.csv --out map/",
         "map_anchors --survey three.yaml --distances radio.csv --delay-std 0.1 --out map/",
         options=[

@@ -29,12 +29,12 @@ def parser() -> argparse.ArgumentParser:
     return cli.parser(
         "replay",
         DESCRIPTION,
-        "replay flight.bag",
-        "replay flight.bag --rate 4 --clock",
-        "replay flight.bag --rate 10 --follow odometry",
-        "replay flight.bag --wait-matched 30 --wait-topics imu/data uwb/tdoa",
-        "replay flight.bag --ros-args -r __ns:=/tag1",
-        "replay flight.bag --ros-args -r uwb/tdoa:=uwb/raw",
+        "replay flight_bag",
+        "replay flight_bag --rate 4 --clock",
+        "replay flight_bag --rate 10 --follow odometry",
+        "replay flight_bag --wait-matched 30 --wait-topics imu/data uwb/tdoa",
+        "replay flight_bag --ros-args -r __ns:=/tag1",
+        "replay flight_bag --ros-args -r uwb/tdoa:=uwb/raw",
         options=[
             option("bag", help="bag directory, or its .mcap or .db3 file"),
             option(

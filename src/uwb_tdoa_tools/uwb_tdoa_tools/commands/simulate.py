@@ -259,23 +259,23 @@ def parser() -> ArgumentParser:
             "Simulate a quadrotor, a rover or a person with a UWB tag among fixed anchors, and "
             "write it as a ROS 2 bag."
         ),
-        "simulate --out flight.bag",
+        "simulate --out flight_bag",
         (
             "simulate --trajectory circle --protocol tdoa3 --height-noise 0.01 --seed 7 --out "
-            "circle.bag --plot circle.png"
+            "circle_bag --plot circle.png"
         ),
-        "simulate --vehicle rover --duration 90 --out rover.bag",
-        'simulate --vehicle hand --path "-2,-3 2,-3 2,3 -2,3" --out walk.bag',
-        "simulate --constellation random-12-16 --duration 120 --out unseen.bag --json unseen.json",
+        "simulate --vehicle rover --duration 90 --out rover_bag",
+        'simulate --vehicle hand --path "-2,-3 2,-3 2,3 -2,3" --out walk_bag',
+        "simulate --constellation random-12-16 --duration 120 --out unseen_bag --json unseen.json",
         (
             "simulate --anchors hall.yaml --radio-reach 18 --protocol tdoa3 --duration 300 --out "
-            "hall.bag"
+            "hall_bag"
         ),
         (
             "simulate --anchors hall.yaml --radio-reach 18 --walls walls.yaml --cell-ids 256 "
-            "--protocol tdoa3 --out cells.bag"
+            "--protocol tdoa3 --out cells_bag"
         ),
-        "simulate --no-bias --no-multipath --no-outliers --noise 0 --perfect-imu --out exact.bag",
+        "simulate --no-bias --no-multipath --no-outliers --noise 0 --perfect-imu --out exact_bag",
         "simulate --list",
         options=[
             option(

@@ -34,18 +34,18 @@ def parser() -> ArgumentParser:
     return cli.parser(
         "survey",
         DESCRIPTION,
-        "survey flight.bag --survey tape.yaml --trusted 0 4 1.z 2.z --out surveyed/",
+        "survey flight_bag --survey tape.yaml --trusted 0 4 1.z 2.z --out surveyed/",
         (
-            "survey first.bag second.bag third.bag --survey tape.csv --std 0.3 --height-std 0.05 "
+            "survey first_bag second_bag third_bag --survey tape.csv --std 0.3 --height-std 0.05 "
             "--out surveyed/"
         ),
-        "survey flight.bag --survey tape.yaml --unknown 5 --out surveyed/",
+        "survey flight_bag --survey tape.yaml --unknown 5 --out surveyed/",
         (
-            "survey flight.bag --survey tape.yaml --marks marks.yaml --distances laser.csv --out "
+            "survey flight_bag --survey tape.yaml --marks marks.yaml --distances laser.csv --out "
             "surveyed/"
         ),
         (
-            "survey today.bag --survey surveyed/anchors.yaml --effects surveyed/effects.yaml "
+            "survey today_bag --survey surveyed/anchors.yaml --effects surveyed/effects.yaml "
             "--out today/"
         ),
         options=[

@@ -44,7 +44,7 @@ def parser() -> ArgumentParser:
             "           for few flights. Of several constellations, those that carry over."
         ),
         "train flights/0425 --survey surveys/ --model physics --out model/",
-        "train a.bag b.bag c.bag --validation c --model paper --out model/ --seed 1",
+        "train a_bag b_bag c_bag --validation c --model paper --out model/ --seed 1",
         options=[
             *options.recordings(),
             option("--model", choices=MODELS, required=True, help="what to train"),

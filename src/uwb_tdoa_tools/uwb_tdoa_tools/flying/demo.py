@@ -71,7 +71,7 @@ def flight_of(seed: int, number: int) -> Flight:
 
 def record(seed: int, folder: Path) -> list[Path]:
     """Fly three times in the hall of a seed, and return the bags."""
-    bags = [folder / f"flight-{number}.bag" for number in range(1, len(YAWS) + 1)]
+    bags = [folder / f"flight-{number}_bag" for number in range(1, len(YAWS) + 1)]
     for number, bag in enumerate(bags, start=1):
         write_bag(flight_of(seed, number), bag, force=True)
     return bags
@@ -332,7 +332,7 @@ def fly(
         If the flight cannot be played.
     """
     assert flight.truth is not None
-    bag = folder / "flight.bag"
+    bag = folder / "flight_bag"
     write_bag(flight, bag, force=True)
     live = through_nodes(flight, bag, folder, rate, files, say)
     if live.missing:

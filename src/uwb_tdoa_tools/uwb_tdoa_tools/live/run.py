@@ -88,7 +88,7 @@ def run_live(
     bag : path
         The bag to replay.
     folder : path
-        Where `recorded.bag` and the output of the processes (`*.log`) go.
+        Where `recorded_bag` and the output of the processes (`*.log`) go.
     rate : float
         Times as fast as recorded.
     bias_parameters, ekf_parameters : dict or None
@@ -115,7 +115,7 @@ def run_live(
             if connection.topic == "/uwb/tdoa"
         )
     inputs = [topic for topic in INPUTS if topic in present]
-    recorded = Path(folder) / "recorded.bag"
+    recorded = Path(folder) / "recorded_bag"
     if recorded.exists():
         shutil.rmtree(recorded)
     with (

@@ -366,7 +366,7 @@ class Localizer:
         title = f"{name}: {assessment.sentences()[0].partition(';')[0]}"
         pictures.draw_estimate(path(".png"), odometry, flight.anchors, assessment.lost, title)
         if self.bag and len(odometry):
-            write_odometry(odometry, flight.anchors, path(".bag"), force=True)
+            write_odometry(odometry, flight.anchors, path("_bag"), force=True)
         if self.residuals:
             pictures.write_residuals(path("_residuals.csv"), left)
             pictures.draw_residuals(path("_residuals.png"), left, name)
@@ -390,7 +390,7 @@ def name_of(path: str | Path) -> str:
     name = Path(path).name
     while Path(name).suffix in SUFFIXES:
         name = Path(name).stem
-    return name
+    return name.removesuffix("_bag")
 
 
 def check_names(recordings: Sequence[tuple[Path, str | Path | None]]) -> None:

@@ -325,7 +325,7 @@ def draw_map(whole: Hall, found: Chart, out: Path) -> None:
     plots.plot_precision(anchors, found, out / "precision.png", whole.walls)
     plots.plot_flyable(anchors, found, out / "flyable.png", whole.walls, pairings)
     found.volume(anchors, installation.dimensions).save(out / "flyable.npz")
-    report.write_messages(report.map_messages(found, anchors), out / "plan.bag")
+    report.write_messages(report.map_messages(found, anchors), out / "plan_bag")
 
 
 def flight_errors(

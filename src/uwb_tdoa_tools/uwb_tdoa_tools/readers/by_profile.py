@@ -38,6 +38,7 @@ from .streams import Streams, by_time, make_flight
 from .tables import Block, CsvFiles, Foreign, ULogFile, Wanted, is_ulog
 
 SURVEY = "anchors"  # stream of positions
+ENDS = ".csv", ".csv.gz", ".bag", ".ulg"  # of names of recordings
 SINGLE = "gyro", "acc", "pose", "tof", "baro", "flow"  # streams of one sensor each
 MOST_LISTED = 8  # columns in a sentence
 THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}")  # as 1,000
@@ -85,18 +86,14 @@ def files_of(paths: Sequence[Path]) -> list[Path]:
     for path in paths:
         if not path.exists():
             raise InputError(f"{path}: does not exist; give a recording.")
+        inside = [path]
         if path.is_dir() and not is_bag(path):
-            inside = [each for each in sorted(path.iterdir()) if _may_be_recording(each)]
-            if not inside:
-                raise InputError(f"{path}: holds no CSV file, bag or ULog; give a recording.")
-            found += inside
-        else:
-            found.append(path)
+            files = sorted(path.iterdir())
+            inside = [file for file in files if file.name.endswith(ENDS) or is_bag(file)]
+        if not inside:
+            raise InputError(f"{path}: holds no CSV file, bag or ULog; give a recording.")
+        found += inside
     return found
-
-
-def _may_be_recording(path: Path) -> bool:
-    return path.name.endswith((".csv", ".csv.gz", ".bag", ".ulg")) or is_bag(path)
 
 
 def read_by_profile(
@@ -131,12 +128,11 @@ def read_by_profile(
             tables, files[0], profile, survey, tag, namespace, salvage
         )
     meta = {"source": ", ".join(map(str, paths)), **meta}
-    antenna = profile.antenna.get(tag) or profile.antenna.get("")
-    if antenna:
+    if antenna := profile.antenna.get(tag) or profile.antenna.get(""):
         meta["antenna"] = list(antenna)
     if named.ids:
         meta["anchor_ids"] = named.ids
-    name = flight_name(files[0]) + (f"_tag{tag}" if tag else "")
+    name = flight_name(files[0]) + f"_tag{tag}" * bool(tag)
     return make_flight(name, named.anchors, streams, {}, meta, salvage, truth)
 
 

@@ -125,14 +125,18 @@ def make_flight(
     imu = _inertial(streams, meta)
     if not meta["remarks"]:
         del meta["remarks"]
-    sensors = _sensors(streams, imu)
-    return Flight(name, anchors, tdoas, imu, poses, extra, meta, clock.restarts, **sensors)
+    return Flight(
+        name, anchors, tdoas, imu, poses, extra, meta, clock.restarts, **_sensors(streams, imu)
+    )
 
 
 def _refuse_other_unit_of_time(source: str, stamps: dict[str, np.ndarray]) -> None:
     """Raise InputError if a stream is 1000 times as long as another, or has an impossible rate."""
-    spans = {key: float(np.ptp(t)) for key, t in stamps.items() if len(t) >= MANY}
-    spans = {key: span for key, span in spans.items() if 0.0 < span < np.inf}
+    spans = {
+        key: span
+        for key, t in stamps.items()
+        if len(t) >= MANY and 0.0 < (span := float(np.ptp(t))) < np.inf
+    }
     remedy = "give the unit of the time (s, ms, us or ns), or the column that holds it."
     for key in sorted({"tdoa", "range"} & spans.keys()):
         rate = (len(stamps[key]) - 1) / spans[key]
@@ -278,17 +282,13 @@ def protocol(tdoas: Tdoas) -> str:
         one_way = np.maximum(rising, heard - rising)[often].sum() == len(a)
         return "tdoa2" if one_way else "tdoa3"
     share = heard[often].sum() / len(a)
-    sides = np.stack(np.divmod(pair[often], n), axis=1)
-    return "tdoa2" if share > 0.5 * (1.0 + 2.0 / (n - 1)) and _is_ring(sides, n) else "tdoa3"
-
-
-def _is_ring(sides: np.ndarray, n: int) -> bool:
-    """Return whether n sides (n, 2) of n corners form one ring: two at each corner, all connected."""
-    meets = coo_array((np.ones(len(sides)), tuple(sides.T)), (n, n))
-    return bool(
-        (np.bincount(sides.ravel(), minlength=n) == 2).all()
-        and connected_components(meets, directed=False)[0] == 1
-    )
+    # a ring has two sides at each anchor, and all are connected
+    sides = np.stack(np.divmod(pair[often], n))
+    meets = coo_array((np.ones(len(often)), tuple(sides)), (n, n))
+    is_ring = (np.bincount(sides.ravel(), minlength=n) == 2).all() and connected_components(
+        meets, directed=False
+    )[0] == 1
+    return "tdoa2" if is_ring and share > 0.5 * (1.0 + 2.0 / (n - 1)) else "tdoa3"
 
 
 def _imu(gyro: Columns, acc: Columns, meta: dict[str, Any]) -> Imu:
@@ -333,15 +333,21 @@ def _imu_losses(
     ]
     evidence = f"gyroscope {rates[0]:.0f} Hz, accelerometer {rates[1]:.0f} Hz"
     if max(rates) > UNEQUAL_RATES * min(rates):
-        cause = (
-            "gyroscope and accelerometer have different rates: only the stamps of the gyroscope "
-            "are used"
-        )
-        out.append((cause, evidence, "log both at one rate, e.g. in one block of the log"))
-    if (lost := float(np.mean(~inside))) > DROPPED_SHARE:
-        cause = "samples of the gyroscope are left out: the accelerometer was not recorded then"
         out.append(
-            (cause, f"{100.0 * lost:.0f} % of them; {evidence}", "start and stop both together")
+            (
+                "gyroscope and accelerometer have different rates: only the stamps of the "
+                "gyroscope are used",
+                evidence,
+                "log both at one rate, e.g. in one block of the log",
+            )
+        )
+    if (lost := float(np.mean(~inside))) > DROPPED_SHARE:
+        out.append(
+            (
+                "samples of the gyroscope are left out: the accelerometer was not recorded then",
+                f"{100.0 * lost:.0f} % of them; {evidence}",
+                "start and stop both together",
+            )
         )
     return out
 

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 import re
 import shlex
-from typing import Any
 
 import numpy as np
 
@@ -41,7 +40,10 @@ ID = r"(anchor|to|dest|node|responder)?_?(id|addr|address)|mac_dest|uwb_id2|anch
 RANGE = r"(meas_?|raw_?)?(range|distance|dist|dis)(_?(m|cm|mm|raw|meas))?|[dr]|value"
 TDOA = r".*(tdoa|ddoa|diff|delta).*|data|d|value"
 PAIRS = ("a", "b"), ("1", "2"), ("i", "j"), ("from", "to"), ("src", "dst"), ("0", "1")
-TIME_NAME = r"(.*[_ ])?(ts?|time|stamp|timestamp|epoch|elapsed|clock|utc|secs?|seconds?|date)"
+TIME_NAME = (
+    r"(.*[_ ])?(ts?|time|stamp|timestamp|epoch|elapsed|clock|utc|[mun]?secs?|seconds?|date"
+    r"|(milli|micro|nano)s)"
+)
 # Names of whole paths.
 UNIT = r"[ _(\[]+([numk]?s|[cm]?m|ticks|m?g|deg/s|rad/s|dps|m/s\^?2)[)\]]?"  # at the end
 SECONDS = r"(.*?)_?(s|secs?|seconds?)"
@@ -51,6 +53,7 @@ PAIR, SINGLE_ANCHOR = r"(.*?)(\d+)(\D+)(\d+)", r"(.*?)(\d+)(\D*)"
 DISTANCE = (
     r"(.*[._])?(.*(range|dist|uwb|anchor).*|[dra]_?)"  # beginning of a column for each anchor
 )
+WORD = r"[A-Za-z_]{2,}"  # names a kind of rows
 DAY, CLOCK = r"\d{4}[-/]\d\d?[-/]\d\d?", r"\d\d?:\d\d:\d\d.*"
 GYRO = r"(.*(gyro|angular_velocity|ang_vel|rate).*?|w|g|.*[._]w)[._ ]?([xyz]|\[[012]\])"
 ACCEL = r"(.*(acc|linear_acceleration|lin_acc).*?|a|.*[._]a)[._ ]?([xyz]|\[[012]\])"
@@ -186,10 +189,11 @@ def suggest(paths: Sequence[Path], salvage: bool = False) -> tuple[str, list[str
     with open_recording(paths, types, salvage) as tables:
         fitting = [name for name in shipped() if _fits(name, tables, {*RADIO})]
         lines = [
-            "# A first profile. Check each line, then give it with --profile (docs/recordings.md)."
+            "# A first profile. Check each line, then give it with --profile (docs/recordings.md).",
+            *(f"# The shipped profile {name} fits: --profile {name}" for name in fitting),
+            "about: a first profile",
+            "sources:",
         ]
-        lines += [f"# The shipped profile {name} fits: --profile {name}" for name in fitting]
-        lines += ["about: a first profile", "sources:"]
         found: set[str] = set()
         left, untimed = [], False
         for table in sorted(tables.types):
@@ -230,6 +234,29 @@ def _refuse_text(path: Path) -> None:
                 f"time before each record as it is: {line} {shlex.quote(str(path))} > ranges.csv; "
                 f"then: {suggest_line('ranges.csv')}"
             )
+    for column in (0, 1):
+        _refuse_kinds(path, head.splitlines()[:-1], column)
+
+
+def _refuse_kinds(path: Path, lines: Sequence[str], column: int) -> None:
+    """Raise InputError if a word in a column of each line names one of several kinds of rows."""
+    rows = [re.split("[,;\t]", line) for line in lines]
+    words = [row[column].strip() if len(row) > column else "" for row in rows]
+    sizes = {  # of the rows of each kind: most cells that are filled
+        kind: max(sum(map(bool, row)) for row, word in zip(rows, words) if word == kind)
+        for kind in words
+        if words.count(kind) > 1
+    }
+    if len({*sizes.values()}) > 1 and all(re.fullmatch(WORD, word) for word in words):
+        header = "" if words[0] in sizes else f"-e {words[0]} "
+        split = [
+            f"grep -w {header}-e {kind} {shlex.quote(str(path))} > {kind.lower()}.csv; "
+            for kind in sizes
+        ]
+        raise InputError(
+            f"{path}: has rows of several kinds, {', '.join(sizes)}; make a file of each: "
+            f"{''.join(split)}then: " + suggest_line(*(f"{kind.lower()}.csv" for kind in sizes))
+        )
 
 
 def _fits(name: str, tables: Foreign, streams: set[str]) -> bool:
@@ -273,7 +300,11 @@ def _suggestions(tables: Foreign, table: str, by_values: bool = False) -> list[S
         sample = tables.sample(table, SAMPLE)
     except InputError:
         return []
-    fields = [_field(*key, values) for key, values in sample.items() if len(key[0]) <= LONGEST]
+    fields = [
+        Field(path, each, np.array([*map(as_time, values)], float), [*map(as_text, values)])
+        for (path, each), values in sample.items()
+        if len(path) <= LONGEST and any(map(as_text, values))
+    ]
     if not fields:
         return []
     is_csv = isinstance(tables, CsvFiles)
@@ -294,13 +325,6 @@ def _suggestions(tables: Foreign, table: str, by_values: bool = False) -> list[S
     return [one for one in _suggestions(tables, table, True) if "anchor_b" in one.columns]
 
 
-def _field(path: str, each: str, found: Sequence[Any]) -> Field:
-    """Return a field with its values in some records."""
-    return Field(
-        path, each, np.array([as_time(value) for value in found], float), [*map(as_text, found)]
-    )
-
-
 def _with_aliases(fields: Sequence[Field]) -> list[Field]:
     """Return the fields of a table without names, with aliases by their values."""
     steps = [np.diff(one.values) for one in fields]
@@ -312,8 +336,7 @@ def _with_aliases(fields: Sequence[Field]) -> list[Field]:
     for k in rising[:1]:
         part = fields[k + 1] if k + 1 < len(fields) else fields[k]
         if fields[k].is_whole and part.is_whole and not few[k + 1] and part.values.max() < 1e9:
-            alias |= {k: "sec", k + 1: "nanosec"}
-            alias |= ECHOED.get(len(fields), {})
+            alias |= {k: "sec", k + 1: "nanosec"} | ECHOED.get(len(fields), {})
     ids = [
         k for k, one in enumerate(fields) if few[k] and (one.is_whole or np.isnan(one.values).all())
     ]
@@ -359,8 +382,8 @@ def _time(fields: Sequence[Field], fast: bool) -> tuple[str, str]:
         for other, part in zip(fields, labels):
             match = re.fullmatch(FRACTION, part, re.IGNORECASE)
             unit = UNIT_OF_FRACTION[match[2].lower()] if match else "s"
-            largest = np.nanmax(other.values, initial=0.0)
-            if whole and match and whole[1] == match[1] and largest * TIME[unit] <= 1.0:
+            below_one = np.nanmax(other.values, initial=0.0) * TIME[unit] <= 1.0
+            if whole and match and whole[1] == match[1] and below_one:
                 return f"{one.path}:s+{other.path}:{unit}", "The time is in two columns."
     by_form = [
         [one.path for one in fields if one.texts and re.fullmatch(form, one.texts[0])]
@@ -378,7 +401,9 @@ def _time(fields: Sequence[Field], fast: bool) -> tuple[str, str]:
     possible = [unit for unit, factor in TIME.items() if not step * factor > LONG_STEP] or ["s"]
     dates = [unit for unit in possible if CALENDAR[0] <= level * TIME[unit] <= CALENDAR[1]]
     likely = [unit for unit in possible if step * TIME[unit] <= usual]
-    unit = one.unit if one.unit in TIME else (dates or likely or possible)[0]
+    by_value = (dates or likely or possible)[0]
+    by_name = re.fullmatch(FRACTION, one.name)  # as millis
+    unit = one.unit if one.unit in TIME else UNIT_OF_FRACTION[by_name[2]] if by_name else by_value
     return f"{one.path}:{unit}", f"The stamps are {step:.3g} apart in the median, taken as {unit}."
 
 
@@ -424,12 +449,12 @@ def _wide(fields: Sequence[Field]) -> list[Suggestion]:
             )
             what = "TDOA" if len(names) == 2 else "range"
             unit, why = _length(f"median {what}", replace(group[0], values=_values(group)))
-            why.append(
-                "A column for each; a value that repeats the last one of its column is left out."
-            )
-            why += [SIGN] if len(names) == 2 else []
-            columns = {name: name for name in names}
-            return [Suggestion({**columns, what.lower(): pattern + tail + unit}, comments=why)]
+            why += [
+                "A column for each; a value that repeats the last one of its column is left out.",
+                *([SIGN] if len(names) == 2 else []),
+            ]
+            columns = {**dict(zip(names, names)), what.lower(): pattern + tail + unit}
+            return [Suggestion(columns, comments=why)]
     return []
 
 
