@@ -30,7 +30,9 @@ setup(
         (f"share/{NAME}/config", glob("config/*.yaml")),
         (f"share/{NAME}/launch", glob("launch/*.py")),
     ],
-    package_data={NAME: ["diagnosis/report/templates/*", "readers/profiles/*"]},
+    package_data={
+        NAME: ["diagnosis/report/templates/*", "exporting/firmware/*", "readers/profiles/*"]
+    },
     zip_safe=False,  # numba keeps its cache beside the modules
     entry_points={
         "console_scripts": [

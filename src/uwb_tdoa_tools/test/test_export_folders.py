@@ -27,7 +27,7 @@ def texts(folder):
 
 def test_the_build_for_a_crazyflie_names_what_its_filter_does_not_estimate(tmp_path):
     traced = trace(SMALL_IDS, chosen("anchor_delay", "turning", "accelerating"))
-    left = write_crazyflie(tmp_path / "app", traced)
+    left = write_crazyflie(tmp_path / "app", traced, 0.4)
     assert ["turning_rate" in str(one) for one in left] == [True, False]
     assert all("estimates no acceleration and no rate" in str(one) for one in left)
     assert all(one.worth > 0.01 for one in left)
@@ -39,7 +39,7 @@ def test_the_build_for_a_crazyflie_names_what_its_filter_does_not_estimate(tmp_p
 
 def test_ids_that_the_firmware_does_not_have_are_refused(tmp_path):
     with pytest.raises(InputError, match="ids up to 255, and one is 300"):
-        write_crazyflie(tmp_path / "app", trace(ANCHORS, chosen("anchor_delay")))
+        write_crazyflie(tmp_path / "app", trace(ANCHORS, chosen("anchor_delay")), 0.4)
     assert not (tmp_path / "app").exists()
 
 

@@ -6,7 +6,7 @@ from importlib import import_module
 import re
 
 from documented import TOOLS, main
-from output_attacks import attack, content, outputs, parsers, place, unknown  # noqa: F401
+from output_attacks import ATTACKS, attack, content, outputs, parsers, place, unknown  # noqa: F401
 import pytest
 
 from uwb_tdoa_tools import cli
@@ -25,7 +25,7 @@ def test_every_option_that_takes_a_path_is_an_output_or_read(words):
 
 def test_every_writing_command_is_tested():
     assert len(OUTPUTS) > 25 and {words[0] for words, _ in OUTPUTS} == {*TOOLS} - {"replay"}
-    assert {action.type for _, action in OUTPUTS} == {OutputFile, OutputFolder, OutputBag}
+    assert {action.type for _, action in OUTPUTS} == {*ATTACKS}
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from functools import partial
+from pathlib import Path
 
 from uwb_tdoa_bias.common.errors import InputError
 
@@ -30,7 +31,7 @@ def parser() -> ArgumentParser:
         "export --survey anchors.yaml --effects effects.yaml --onnx bias.onnx",
         "export --survey anchors.yaml --effects effects.yaml --model model.onnx --onnx bias.onnx",
         "export --survey anchors.yaml --effects effects.yaml --c correction/",
-        "export --survey anchors.yaml --effects effects.yaml --crazyflie crazyflie/",
+        "export --survey anchors.yaml --effects effects.yaml --config ekf_node.yaml --crazyflie crazyflie/",
         options=[
             option(
                 "--survey", metavar="S", required=True, help="anchors .yaml or survey (.txt, .csv)"
@@ -59,6 +60,22 @@ def parser() -> ArgumentParser:
                 type=OutputFolder,
                 help="write it as an out-of-tree build of the Crazyflie firmware",
             ),
+            option(
+                "--config",
+                metavar="FILE",
+                help="ekf_node.yaml of diagnose or calibrate: the noise for --crazyflie",
+            ),
+            option(
+                "--firmware",
+                metavar="DIR",
+                help="checkout of crazyflie-firmware, to try --crazyflie on --flights with a C compiler",
+            ),
+            option(
+                "--flights",
+                metavar="FLIGHT",
+                nargs="+",
+                help="flights with IMU and ground truth that took no part in diagnose or train",
+            ),
         ],
     )
 
@@ -73,10 +90,18 @@ def _export(args: Namespace) -> None:
         raise InputError("--effects: is missing, and so is --model; give one of them, or both.")
     if not (args.onnx or args.c or args.crazyflie):
         raise InputError("--onnx, --c, --crazyflie: all are missing; name what to write.")
+    from uwb_tdoa_ekf.core.config import FilterConfig
+
+    from ..exporting import crazyflie
     from ..exporting.c_code import write_c, write_crazyflie
     from ..exporting.correction import trace
     from ..exporting.onnx_file import write_onnx  # imports onnx
+    from ..readers.inputs import Reading
 
+    if bool(args.firmware) != bool(args.flights):
+        raise InputError("--firmware and --flights: one needs the other; give both.")
+    config = FilterConfig.from_yaml(args.config) if args.config else FilterConfig()
+    stddev = crazyflie.stddev_of(config)
     say = partial(cli.say, "export")
     anchors = read_named_anchors(args.survey).anchors
     effects = EffectSet.from_yaml(args.effects) if args.effects else None
@@ -86,7 +111,7 @@ def _export(args: Namespace) -> None:
         traced = write_onnx(args.onnx, *given) if args.onnx else trace(*given)
         if args.c:
             write_c(args.c, traced)
-        not_flown = write_crazyflie(args.crazyflie, traced) if args.crazyflie else ()
+        not_flown = write_crazyflie(args.crazyflie, traced, stddev) if args.crazyflie else ()
     for omitted in (*orientation_remarks(*given), *traced.left_out):
         say(str(omitted))
     for omitted in not_flown:
@@ -94,6 +119,12 @@ def _export(args: Namespace) -> None:
     name = traced.meta()["name"]
     for made in filter(None, (args.onnx, args.c, args.crazyflie)):
         cli.show(f"{name} for {len(anchors)} anchors in frame {anchors.frame} -> {made}")
+    if args.crazyflie and args.flights:
+        flights = Reading(args.survey).flights(args.flights)
+        errors = crazyflie.comparison(args.crazyflie, Path(args.firmware), flights, stddev)
+        cli.show(crazyflie.in_words(errors, [one.name for one in flights], stddev))
+    elif args.crazyflie:
+        say(f"{args.crazyflie}: not tried on flights; give --firmware and --flights.")
 
 
 main = cli.executable(_export, parser)

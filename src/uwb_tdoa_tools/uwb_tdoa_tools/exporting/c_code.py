@@ -543,10 +543,10 @@ def write_c(folder: Path, traced: TracedCorrection) -> None:
     _write(folder, code.files)
 
 
-def write_crazyflie(folder: Path, traced: TracedCorrection) -> tuple[LeftOut, ...]:
+def write_crazyflie(folder: Path, traced: TracedCorrection, stddev: float) -> tuple[LeftOut, ...]:
     """Write an out-of-tree build of the firmware; return what it does not hold besides.
 
-    Raises InputError.
+    stddev : m, of a TDOA. Raises InputError.
     """
     anchors = traced.anchors
     high = anchors.ids[anchors.ids > crazyflie.LARGEST_ID]
@@ -559,7 +559,7 @@ def write_crazyflie(folder: Path, traced: TracedCorrection) -> tuple[LeftOut, ..
         lambda effect: RATES.isdisjoint(vehicle_code(anchors, EffectSet((effect,))).inputs)
     )
     code = vehicle_code(anchors, held, traced.network)
-    _write(folder, crazyflie.files(code.files, anchors))
+    _write(folder, crazyflie.files(code.files, anchors, stddev))
     return tuple(
         replace(left_out(effect, anchors), why=NOT_ESTIMATED)
         for effect in traced.effects
