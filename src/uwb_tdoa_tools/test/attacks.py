@@ -26,15 +26,16 @@ class Autopilot:
     answers : number of received TIMESYNC
     """
 
-    def __init__(self, end: socket.socket, system: int = 1) -> None:
-        """end : socket that is connected to the node, or sends to it."""
+    def __init__(self, end: socket.socket, system: int = 1, kind: int = 12) -> None:
+        """end : socket that is connected to the node, or sends to it; kind : MAV_AUTOPILOT."""
         from pymavlink.dialects.v20 import common
 
         self.end, self.dialect = end, common
         self.end.setblocking(False)
         self.mav = common.MAVLink(self, srcSystem=system, srcComponent=1)
         self.mav.robust_parsing = True
-        self.odometry, self.ages, self.answers = [], [], 0
+        self.odometry, self.ages, self.answers, self.kind = [], [], 0, kind
+        self.heard = {}  # {type: messages}
 
     @classmethod
     def calling(cls, port, system=1, kind=socket.SOCK_DGRAM):
@@ -50,7 +51,7 @@ class Autopilot:
             pass
 
     def beat(self):
-        self.mav.heartbeat_send(self.dialect.MAV_TYPE_QUADROTOR, 12, 0, 0, 4)
+        self.mav.heartbeat_send(self.dialect.MAV_TYPE_QUADROTOR, self.kind, 0, 0, 4)
 
     def ask(self):
         """Ask for the clock of the node."""
@@ -70,7 +71,9 @@ class Autopilot:
             for message in self.mav.parse_buffer(data) or []:
                 kind = message.get_type()
                 self.answers += kind == "TIMESYNC"
-                if kind == "ODOMETRY":
+                if kind != "ODOMETRY":
+                    self.heard.setdefault(kind, []).append(message)
+                else:
                     self.odometry.append(message)
                     self.ages.append(time.time() - 1e-6 * message.time_usec)
 

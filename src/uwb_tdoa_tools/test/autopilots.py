@@ -44,14 +44,17 @@ class Px4:
         )
         self.dialect = mavutil.mavlink
         self.address = f"127.0.0.1:{self.port.port.getsockname()[1]}"
-        self.odometry, self.beats, self.answers = [], [], []
+        self.odometry, self.beats, self.answers, self.texts = [], [], [], []
 
     def receive(self):
         while (message := self.port.recv_msg()) is not None:
             kind = message.get_type()
-            {"ODOMETRY": self.odometry, "HEARTBEAT": self.beats, "TIMESYNC": self.answers}[
-                kind
-            ].append(message)
+            {
+                "ODOMETRY": self.odometry,
+                "HEARTBEAT": self.beats,
+                "TIMESYNC": self.answers,
+                "STATUSTEXT": self.texts,
+            }[kind].append(message)
 
     def beat(self):
         self.port.mav.heartbeat_send(self.dialect.MAV_TYPE_QUADROTOR, 12, 0, 0, 4)

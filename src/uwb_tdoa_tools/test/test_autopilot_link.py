@@ -24,7 +24,7 @@ from attacks import (  # noqa: E402
 )
 
 from uwb_tdoa_tools.autopilot import mavlink  # noqa: E402
-from uwb_tdoa_tools.autopilot.estimate import FRD, Estimate  # noqa: E402
+from uwb_tdoa_tools.autopilot.estimate import FRD, NED, Estimate  # noqa: E402
 
 BEAT = 0.5  # s of the clock of the test between two turns of `Rig.turns`
 
@@ -42,15 +42,15 @@ class Clock:
 class Rig:
     """A link under test, on a clock that advances by BEAT with each turn."""
 
-    def __init__(self, connection, clock):
-        self.link = mavlink.MavlinkLink(connection, 57600, 1, FRD, time.time_ns)
+    def __init__(self, connection, clock, world=(FRD, 0.0), origin=()):
+        self.link = mavlink.MavlinkLink(connection, 57600, 1, world, origin, time.time_ns)
         self._clock, self.port = clock, connection.rpartition(":")[2]
         self._estimate = Estimate(
             time.time_ns(), np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), *np.zeros((2, 3)),
             *np.tile(0.01 * np.eye(6), (2, 1, 1)),
         )  # fmt: skip
 
-    def turns(self, count=1, beating=(), step=BEAT):
+    def turns(self, count=1, beating=(), step=BEAT, sends=True):
         """Run turns, each after a heartbeat of some autopilots, and send an estimate after each."""
         for _ in range(count):
             for autopilot in beating:
@@ -58,7 +58,8 @@ class Rig:
             time.sleep(0.002)  # loopback delivers
             self._clock.now += step
             self.link.turn()
-            self.link.send(self._estimate, 0)
+            if sends:
+                self.link.send(self._estimate, 0)
             for autopilot in beating:
                 autopilot.receive()
 
@@ -73,8 +74,8 @@ def rig(monkeypatch):
     clock, made = Clock(), []
     monkeypatch.setattr(mavlink, "time", clock)
 
-    def make(connection):
-        made.append(Rig(connection, clock))
+    def make(connection, *more):
+        made.append(Rig(connection, clock, *more))
         return made[-1]
 
     yield make
@@ -318,3 +319,53 @@ def test_a_serial_port_carries_odometry_and_never_blocks(rig):
     os.close(ours)
     made.turns(20)
     assert "no heartbeat comes" in made.trouble
+
+
+PX4, ARDUPILOT = 12, 3  # MAV_AUTOPILOT
+ACTIVE, STANDBY = 4, 3  # MAV_STATE
+LOCAL_NED, LOCAL_FRD, BODY_FRD = 1, 20, 12
+
+
+@pytest.mark.parametrize(
+    "kind, world, frame, nose",
+    [
+        (PX4, FRD, LOCAL_FRD, 0.0),
+        (PX4, NED, LOCAL_NED, np.pi / 3),
+        (ARDUPILOT, FRD, LOCAL_FRD, 0.0),
+        (ARDUPILOT, NED, LOCAL_FRD, np.pi / 3),  # it takes no other name of a frame
+    ],
+)
+def test_each_autopilot_gets_what_it_demands(rig, kind, world, frame, nose):
+    """The rows of the table of docs/autopilot.md, one by one."""
+    port = free_port()
+    made = rig(f"udpin:{LOOPBACK}:{port}", (world, np.pi / 6), (47.4, 8.5, 408.0))
+    end = socket.socket(type=socket.SOCK_DGRAM)
+    end.connect((LOOPBACK, port))
+    autopilot = Autopilot(end, kind=kind)
+    made.turns(4, [autopilot])
+    one = autopilot.odometry[-1]
+    assert (one.frame_id, one.child_frame_id, one.estimator_type) == (frame, BODY_FRD, 3)
+    assert abs(time.time() - 1e-6 * one.time_usec) < 60.0 and 1 <= one.quality <= 100
+    w, x, y, z = one.q  # scalar first, rotation of the body to the world
+    assert np.hypot(np.hypot(w, x), np.hypot(y, z)) == pytest.approx(1.0, abs=1e-6)
+    assert 2.0 * np.arctan2(z, w) == pytest.approx(nose, abs=1e-6)  # clockwise from north
+    for upper in (one.pose_covariance, one.velocity_covariance):
+        assert len(upper) == 21 and np.isfinite(upper).all()
+        assert min(upper[k] for k in (0, 6, 11, 15, 18, 20)) > 0.0  # variances
+    assert autopilot.heard["HEARTBEAT"][-1].system_status == ACTIVE
+    place = autopilot.heard["SET_GPS_GLOBAL_ORIGIN"][-1]
+    assert (place.latitude, place.longitude) == (474000000, 85000000)
+    assert (place.altitude, place.target_system) == (408000, 1)
+    autopilot.mav.gps_global_origin_send(place.latitude, place.longitude, place.altitude)
+    made.turns(2, [autopilot])
+    count = len(autopilot.heard["SET_GPS_GLOBAL_ORIGIN"])
+    reason = "nothing is sent to the autopilot: the yaw is not known yet, so fly a little"
+    for _ in range(2):
+        made.link.say(reason)
+    made.turns(4, [autopilot], sends=False)
+    texts = autopilot.heard["STATUSTEXT"]
+    assert "".join(text.text for text in texts) == reason
+    assert [text.chunk_seq for text in texts] == [0, 1] and len({text.id for text in texts}) == 1
+    assert autopilot.heard["HEARTBEAT"][-1].system_status == STANDBY
+    assert len(autopilot.heard["SET_GPS_GLOBAL_ORIGIN"]) == count
+    autopilot.close()

@@ -32,7 +32,7 @@ from uwb_tdoa_tools.autopilot.estimate import CROWD  # noqa: E402
 from uwb_tdoa_tools.autopilot_node import PARAMETERS, AutopilotNode  # noqa: E402
 
 CONFIG = pathlib.Path(__file__).resolve().parents[1] / "config" / "autopilot_node.yaml"
-LOCAL_NED, BODY_FRD, LOCAL_FRD, VIO = 1, 12, 20, 3
+BODY_FRD, LOCAL_FRD, VIO, STANDBY = 12, 20, 3, 3
 RUNNING, LOST = EstimatorStatus.STATUS_RUNNING, EstimatorStatus.STATUS_LOST
 FLIP = np.diag([1.0, -1.0, -1.0])  # forward, left, up to forward, right, down
 RATE = 50.0
@@ -49,6 +49,10 @@ def test_every_parameter_is_in_the_parameter_file_with_its_default():
         (["log:=[imu]"], "log: only a Crazyflie has log blocks; set protocol to crazyflie."),
         (["log:=[sonar]"], "log: 'sonar' is not one of tdoa, imu, height, pressure."),
         (["protocol:=mavlink"], "connection: '' is none of udpout:HOST:PORT"),
+        (
+            ["protocol:=mavlink", "connection:=udpin:127.0.0.1:1", "origin:=[95.0, 8.0, 400.0]"],
+            "origin: [95.0, 8.0, 400.0] is no latitude, longitude (deg) and altitude (m).",
+        ),
         # pymavlink would run this program, or read this file
         (["protocol:=mavlink", "connection:=/home/me/a.elf"], "'/home/me/a.elf' is none of"),
         (["protocol:=mavlink", "connection:=flight.log"], "'flight.log' is none of"),
@@ -217,11 +221,11 @@ def _check_time(rig, px4):
 def _check_jump(rig, px4):
     """Check a jump by 2 m between two messages, as from a recovery or reset of the filter."""
     count = len(px4.odometry)
-    rig.publish(at_rest(40, jump=2.0))
+    rig.publish(at_rest(20, jump=2.0))
     rig.settle()
     px4.receive()
     new = px4.odometry[count:]
-    assert len(new) in (10, 11)  # 0.2 s; plus one because a jump is sent at once
+    assert len(new) in (5, 6)  # 0.1 s; plus one because a jump is sent at once
     for message in new:
         after = message.x > new[0].x + 1.0
         assert message.reset_counter == (new[0].reset_counter + after) % 256
@@ -275,6 +279,9 @@ def _check_silence(rig, px4):
         return rig.text == "nothing is sent to the autopilot: the tag is lost"
 
     rig.wait(is_silent, "silence")
+    words = "nothing is sent to the autopilot: the tag is lost"
+    rig.wait(lambda: "".join(one.text for one in px4.texts).endswith(words), "STATUSTEXT")
+    rig.wait(lambda: px4.beats[-1].system_status == STANDBY, "heartbeat of a silent node")
     rig.settle()
     px4.receive()
     count, before = len(px4.odometry), px4.odometry[-1].reset_counter

@@ -19,6 +19,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
+import numpy as np
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS as STATUS_QOS
@@ -58,11 +59,25 @@ PARAMETERS = {  # in the order of config/autopilot_node.yaml
     "world": Parameter(
         FRD,
         (
-            "frame of ODOMETRY: frd keeps the x axis of the anchors' frame; ned if that axis points "
-            "east, and y north (PX4 alone takes ned)"
+            "frame of ODOMETRY: frd keeps the x axis of the anchors' frame; ned makes north the x axis, "
+            "by hall_yaw"
         ),
         choices=WORLDS,
     ),
+    "hall_yaw": Parameter(
+        0.0,
+        "rad; from east to the x axis of the anchors' frame, counterclockwise, for world ned",
+        -6.3,
+        6.3,
+    ),
+    "origin": Parameter(
+        [0.0],
+        (
+            "latitude and longitude, deg, and altitude, m, of the origin of the anchors' frame, for "
+            "SET_GPS_GLOBAL_ORIGIN; [0.0]: it is not sent"
+        ),
+    ),
+    "statustext": Parameter(True, "send a MAVLink STATUSTEXT with the reason if nothing is sent"),
     "content": Parameter(
         POSE,
         "what a Crazyflie gets: pose, or position, which needs no yaw",
@@ -105,7 +120,7 @@ class AutopilotNode(StreamNode):
         self._waiting: list[bytes] = []
         self._received = self._invalid = self._received_before = 0
         self._topics = VehicleTopics(self, own["log"])
-        self._link = self._open(own)
+        self._link, self._says = self._open(own), own["statustext"]
         self._publisher = publish_stream(self, Odometry, "odometry/gated")
         self._input = Input(
             self,
@@ -132,8 +147,14 @@ class AutopilotNode(StreamNode):
         if streams and protocol != CRAZYFLIE:
             raise InputError("log: only a Crazyflie has log blocks; set protocol to crazyflie.")
         if protocol == MAVLINK:
+            origin = [] if len(own["origin"]) == 1 else own["origin"]
+            if origin and not (len(origin) == 3 and (np.abs(origin) <= (90.0, 180.0, 1e5)).all()):
+                raise InputError(
+                    f"origin: {list(origin)} is no latitude, longitude (deg) and altitude (m)."
+                )
+            world = own["world"], own["hall_yaw"]
             return MavlinkLink(
-                own["connection"], own["baud"], own["system_id"], own["world"], self._now
+                own["connection"], own["baud"], own["system_id"], world, origin, self._now
             )
         if protocol == CRAZYFLIE:
             return CrazyflieLink(
@@ -200,6 +221,8 @@ class AutopilotNode(StreamNode):
             )
             or (self._gate.why and f"nothing is sent to the autopilot: {self._gate.why}")
         )
+        if self._says:
+            self._link.say(text)
         if text:
             return DiagnosticStatus.WARN, text, values
         return DiagnosticStatus.OK, "the autopilot gets odometry", values

@@ -102,15 +102,19 @@ class Estimate:
         """Return 100 less the deviation in cm, and at least 1: as MAVLink counts, in percent."""
         return max(LOWEST_QUALITY, BEST_QUALITY - round(100.0 * self.deviation))
 
-    def in_mavlink(self, world_frame: str) -> Estimate:
+    def in_mavlink(self, world_frame: str, hall_yaw: float = 0.0) -> Estimate:
         """Return the Estimate in the frames of MAVLink.
 
         Parameters
         ----------
         world_frame : str
-            FRD: x stays the x axis of the anchors' frame. NED: that frame has x east and y north.
+            FRD: x stays the x axis of the anchors' frame. NED: x is north.
+        hall_yaw : float
+            For NED: angle of the x axis of the anchors' frame from east, counterclockwise, in rad.
         """
         turn = _WORLD[world_frame]
+        if world_frame == NED:
+            turn = turn @ Rotation.from_euler("z", hall_yaw).as_matrix()
         attitude = turn @ Rotation.from_quat(self.q).as_matrix() @ _BODY
         q = Rotation.from_matrix(attitude).as_quat()
         return replace(
@@ -154,6 +158,9 @@ class Link:
             Number of jumps so far (Gate.resets).
         """
 
+    def say(self, text: str) -> None:
+        """Tell the autopilot why nothing is sent, or "" if it is; called once a second."""
+
     def turn(self) -> None:
         """Take what came from the autopilot, and answer it; called many times per second."""
 
@@ -172,7 +179,8 @@ class Link:
 
 
 RUNNING = 2  # EstimatorStatus.STATUS_RUNNING
-OLDEST, EARLIEST = 0.5, -0.1  # s before the clock that a stamp may be
+# s before the clock that a stamp may be: PX4 drops what is older than EKF2_DELAY_MAX, 0.2 s
+OLDEST, EARLIEST = 0.2, -0.1
 BREAK = 0.4  # s without an estimate after which PX4 stops and starts its fusion anew
 SLACK = 0.1  # share of a period by which a stamp may be early
 # Change of position, velocity and attitude from one estimate to the next, besides motion, that an

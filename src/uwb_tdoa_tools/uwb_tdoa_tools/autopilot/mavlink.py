@@ -11,7 +11,7 @@ hears and answers no other source.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 import os
 import re
@@ -33,6 +33,7 @@ AGAIN = 2.0  # s between two attempts to open a port
 MOST_READ, LONGEST = 100, 2048
 MOST_CALLERS = 8  # connections to tcpin without a HEARTBEAT; one more ends the oldest
 NAMES = {3: "ArduPilot", 12: "PX4"}  # MAV_AUTOPILOT
+TEXT = 50  # bytes of a STATUSTEXT
 INVALID = 8  # MAV_AUTOPILOT of a sender that is no autopilot, e.g. a ground station
 
 
@@ -153,7 +154,13 @@ class MavlinkLink(Link):
     """A link to PX4 or ArduPilot."""
 
     def __init__(
-        self, connection: str, baud: int, system: int, world_frame: str, clock: Callable[[], int]
+        self,
+        connection: str,
+        baud: int,
+        system: int,
+        world: tuple[str, float],
+        origin: Sequence[float],
+        clock: Callable[[], int],
     ) -> None:
         """Open the connection.
 
@@ -165,8 +172,10 @@ class MavlinkLink(Link):
             Of a serial port.
         system : int
             MAVLink system id of the vehicle: to send with, and the only one that is heard.
-        world_frame : str
-            Frame of ODOMETRY: FRD or NED (Estimate.in_mavlink).
+        world : tuple
+            Frame of ODOMETRY, FRD or NED, and yaw of the hall, in rad (Estimate.in_mavlink).
+        origin : sequence of float
+            Latitude and longitude, in degrees, and altitude, in m, of the origin; or empty.
         clock : callable
             Returns the time that stamps refer to, in ns since 1970.
         """
@@ -183,21 +192,24 @@ class MavlinkLink(Link):
                 f"connection: {connection} cannot be opened ({error}); connect the autopilot, or "
                 "correct the connection."
             ) from error
-        self._world_frame, self._clock, self._system = world_frame, clock, system
+        self._world, self._clock, self._system = world, clock, system
+        self._origin, self._origin_set, self._said, self._texts = tuple(origin), False, "", 0
         self._dialect = common
         self._mav = common.MAVLink(self._port, srcSystem=system, srcComponent=COMPONENT)
         self._parser: Any = None
         self._odometry_sent = self._timesync_answered = 0  # numbers of messages
         self._opened_at = time.monotonic()  # s
-        self._heartbeat_sent_at = self._heartbeat_heard_at = -SILENT  # time.monotonic(), s
+        # time.monotonic(), s
+        self._heartbeat_sent_at = self._heartbeat_heard_at = self._odometry_sent_at = -SILENT
         self._autopilot, self._why = "none", ""
 
     def send(self, estimate: Estimate, resets: int) -> None:
         """Send ODOMETRY, in the frames of MAVLink."""
         if self._port.peer is None:
             return
-        ours, dialect = estimate.in_mavlink(self._world_frame), self._dialect
-        is_frd = self._world_frame == FRD
+        ours, dialect = estimate.in_mavlink(*self._world), self._dialect
+        # ArduPilot takes the name FRD alone, and x as north
+        is_frd = self._world[0] == FRD or self._autopilot == NAMES[3]
         local = dialect.MAV_FRAME_LOCAL_FRD if is_frd else dialect.MAV_FRAME_LOCAL_NED
         x, y, z, w = ours.q.tolist()
         self._mav.send(
@@ -217,6 +229,18 @@ class MavlinkLink(Link):
             )
         )
         self._odometry_sent += 1
+        self._odometry_sent_at = time.monotonic()
+
+    def say(self, text: str) -> None:
+        """Send a STATUSTEXT if the text is another than the last one."""
+        if text == self._said or self._port.peer is None:
+            return
+        self._said, self._texts = text, self._texts % 255 + 1
+        content = (text or "odometry is sent again").encode("ascii", "replace")
+        severity = self._dialect.MAV_SEVERITY_WARNING if text else self._dialect.MAV_SEVERITY_INFO
+        for number, begin in enumerate(range(0, len(content), TEXT)):
+            part = content[begin : begin + TEXT]
+            self._mav.statustext_send(severity, part, self._texts, number)
 
     def turn(self) -> None:
         """Answer TIMESYNC, note heartbeats of the autopilot, and send ours."""
@@ -236,13 +260,20 @@ class MavlinkLink(Link):
             self._port.close()
         if now >= self._heartbeat_sent_at + HEARTBEAT:
             self._heartbeat_sent_at, dialect = now, self._dialect
+            is_active = now < self._odometry_sent_at + HEARTBEAT
+            if self._origin and not self._origin_set:
+                degrees, altitude = self._origin[:2], round(1e3 * self._origin[2])
+                place = [round(1e7 * one) for one in degrees]
+                self._mav.set_gps_global_origin_send(
+                    self._system, *place, altitude, self._clock() // 1000
+                )
             self._mav.send(
                 dialect.MAVLink_heartbeat_message(
                     dialect.MAV_TYPE_ONBOARD_CONTROLLER,
                     dialect.MAV_AUTOPILOT_INVALID,
                     0,
                     0,
-                    dialect.MAV_STATE_ACTIVE,
+                    dialect.MAV_STATE_ACTIVE if is_active else dialect.MAV_STATE_STANDBY,
                     3,
                 )
             )
@@ -267,8 +298,12 @@ class MavlinkLink(Link):
         elif is_autopilot:
             if self._port.peer is None:
                 self._port.keep(source)
+            if now > self._heartbeat_heard_at + SILENT:
+                self._origin_set, self._said = False, ""  # it may have been started anew
             self._heartbeat_heard_at, self._why = now, ""
             self._autopilot = NAMES.get(message.autopilot, f"type {message.autopilot}")
+        elif kind == "GPS_GLOBAL_ORIGIN":
+            self._origin_set = True
         elif kind == "TIMESYNC" and message.tc1 == 0 and self._port.peer is not None:
             self._mav.send(self._dialect.MAVLink_timesync_message(self._clock(), message.ts1))
             self._timesync_answered += 1

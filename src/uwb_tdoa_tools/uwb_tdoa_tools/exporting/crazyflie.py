@@ -250,11 +250,17 @@ class FirmwareFilter:
         build : as `files` describes it; firmware : a checkout; folder : for the program
         """
         (folder / "autoconf.h").touch()  # without options of Kconfig
-        sources = [REPLAY / "replay.c", *(build / "src").glob("*.c")]
+        sources: list[str | Path] = [REPLAY / "replay.c", *(build / "src").glob("*.c")]
         sources += [firmware / "src/modules/src" / name for name in CORE]
         include = [REPLAY, folder, build / "src", *(firmware / "src" / name for name in HEADERS)]
         self._program = folder / "replay"
-        command = ["cc", *FLAGS, "-iquote", build / "overrides", *(f"-I{one}" for one in include)]
+        command: list[str | Path] = [
+            "cc",
+            *FLAGS,
+            "-iquote",
+            build / "overrides",
+            *(f"-I{one}" for one in include),
+        ]
         try:
             subprocess.run(
                 [*command, *sources, "-lm", "-o", self._program], check=True, capture_output=True
