@@ -10,6 +10,9 @@ from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands import train
+from uwb_tdoa_tools.exporting.c_code import write_c
+from uwb_tdoa_tools.exporting.correction import trace
+from uwb_tdoa_tools.exporting.onnx_file import write_onnx
 
 
 @pytest.fixture(scope="module")
@@ -25,6 +28,7 @@ def folder(tmp_path_factory):
 @pytest.mark.slow
 def test_trains_on_flights_with_and_without_attitude_in_one_command(folder, tmp_path, capsys):
     options = ["--seed", "3", "--name", "hall", "--jobs", "1"]
+    anchors = flight(0).anchors
     files = {
         "physics": {"effects.yaml", "training.json", "training.png"},
         "paper": {"model.onnx", "training.json", "training.png"},  # nothing of the other is left
@@ -47,6 +51,12 @@ def test_trains_on_flights_with_and_without_attitude_in_one_command(folder, tmp_
             effects = EffectSet.from_yaml(tmp_path / "effects.yaml")
             (delay,) = (effect for effect in effects if effect.name == "anchor_delay")
             assert delay.values["3"] == pytest.approx(0.4, abs=0.06)
+            exported = anchors, effects, None
+        else:
+            exported = anchors, None, Network(tmp_path / "model.onnx")
+            assert "by a larger deviation alone it" in printed
+        write_c(tmp_path.parent / f"{model} in C", trace(*exported))
+        write_onnx(tmp_path.parent / f"{model}.onnx", *exported)
     network = Network(tmp_path / "model.onnx")
     meta = {key: json.loads(value) for key, value in network.meta.items()}
     assert network.name == "hall" and meta["fade_std"] > 0.0 and 0.0 <= meta["share"] <= 1.0

@@ -14,7 +14,7 @@ from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_bias.correction.features import FEATURES
 from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
-from uwb_tdoa_tools.scoring.gains import SHARES, best_share
+from uwb_tdoa_tools.scoring.gains import SHARES, Shrinkage, best_share
 from uwb_tdoa_tools.training import models, physics, shrinking
 from uwb_tdoa_tools.training.labels import labels, split, thinned, white_noise
 
@@ -216,6 +216,11 @@ def errors(*ratios):
 )
 def test_takes_what_gains_without_harm(ratios, share):
     assert best_share(errors(*ratios)) == share
+
+
+def test_the_gain_of_a_larger_deviation_is_stated_apart():
+    told = Shrinkage(1.0, errors((0.8, 0.7, 0.6, 0.4), (0.9, 0.8, 0.8, 0.9)))
+    assert told.parts == pytest.approx((0.15, 0.25))
 
 
 @pytest.mark.slow

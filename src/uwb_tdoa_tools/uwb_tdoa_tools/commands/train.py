@@ -90,6 +90,7 @@ def _write(
     args: Namespace, several: Sequence[Flight], over: MapFunction, progress: Progress
 ) -> None:
     """Train on several Flights, and write all results. over : as in `shrinking.train`."""
+    from ..scoring.gains import gain_in_words
     from ..training import labels as labelling, models, shrinking
 
     flights = {flight.name: flight for flight in several}
@@ -114,6 +115,11 @@ def _write(
         )
     curve = {label: x, "training": of_training, "validation": of_validation}
     cli.show(shrinkage.as_text())
+    if result.model:
+        widened, subtracted = map(gain_in_words, shrinkage.parts)
+        cli.show(
+            f"of that, by a larger deviation alone it {widened}; by what is taken out it {subtracted}"
+        )
     content = {
         **result.meta,
         "curve": curve,

@@ -89,6 +89,16 @@ class Shrinkage:
             f"with {self.share:g} of what is predicted taken out"
         )
 
+    @property
+    def parts(self) -> tuple[float, float]:
+        """Return mean gains: of the larger deviation alone, share 0, and of the subtraction beyond it."""
+        pairs = [(None, 0.0), (0.0, self.share)]
+        widened, subtracted = (
+            float(np.mean([gain(of[one], of[other]) for of in self.errors.values()]))
+            for one, other in pairs
+        )
+        return widened, subtracted
+
     def as_dict(self) -> dict[str, Any]:
         """Return the figures for JSON."""
         gains = self.gains
