@@ -128,7 +128,7 @@ def check_stationarity(
     if not (ekf.resting or calm or stationary_position.is_near_ground(best, parameters)):
         return
     count = ground.find_pairs(window, ekf.pairs)
-    motion = ground.judge_motion(ekf.pairs[:count], anchors, best.x, ekf.still_covariance)
+    motion = ground.judge_motion(ekf.pairs[:count], anchors, best.x[:3], ekf.still_covariance)
     still = motion == ground.STILL
     # too few TDOAs and a quiet IMU give no evidence
     unshown = motion == ground.UNKNOWN and ekf.quiet
