@@ -50,7 +50,14 @@ def test_units_and_names_end_at_the_border(files):
 
 @pytest.mark.parametrize(
     "unit, cell",
-    [("m", "1.5"), ("cm", "150"), ("mm", "1500"), ("ns", "5.00346143"), ("ticks", "319.7097")],
+    [
+        ("m", "1.5"),
+        ("cm", "150"),
+        ("mm", "1500"),
+        ("ft", "4.92126"),
+        ("ns", "5.00346143"),
+        ("ticks", "319.7097"),
+    ],
 )
 def test_every_unit_of_a_tdoa(files, unit, cell):
     (files / "one.csv").write_text(f"t,a,b,d\n0.5,0,1,{cell}\n")

@@ -33,6 +33,7 @@ LENGTH = {
     "m": 1.0,
     "cm": 1e-2,
     "mm": 1e-3,
+    "ft": 0.3048,
     "ticks": TICK,
     "ns": SPEED_OF_LIGHT / 1e9,
 }

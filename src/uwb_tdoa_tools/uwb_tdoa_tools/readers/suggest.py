@@ -45,7 +45,7 @@ TIME_NAME = (
     r"|(milli|micro|nano)s)"
 )
 # Names of whole paths.
-UNIT = r"[ _(\[]+([numk]?s|[cm]?m|ticks|m?g|deg/s|rad/s|dps|m/s\^?2)[)\]]?"  # at the end
+UNIT = r"[ _(\[]+([numk]?s|[cm]?m|ft|ticks|m?g|deg/s|rad/s|dps|m/s\^?2)[)\]]?"  # at the end
 SECONDS = r"(.*?)_?(s|secs?|seconds?)"
 UNIT_OF_FRACTION = {"n": "ns", "nano": "ns", "u": "us", "micro": "us", "m": "ms", "milli": "ms"}
 FRACTION = r"(.*?)_?(n|nano|u|micro|m|milli)_?(s|secs?|seconds?)"
