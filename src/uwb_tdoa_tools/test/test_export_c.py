@@ -14,8 +14,9 @@ import pytest
 
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.correction.network import load_network
-from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_tools.exporting.c_code import NO_PAIR, NOT_FINITE, vehicle_code
+from uwb_tdoa_bias.effects import EFFECTS, EffectSet
+from uwb_tdoa_tools.exporting.c_code import NO_PAIR, NOT_FINITE, vehicle_code, write_c
+from uwb_tdoa_tools.exporting.correction import trace
 from uwb_tdoa_tools.exporting.onnx_file import write_onnx
 
 pytestmark = pytest.mark.skipif(GCC is None, reason="no C compiler (gcc)")
@@ -50,6 +51,20 @@ def agree(folder, effect_set, network=None):
 @pytest.mark.parametrize("name", [*KINDS, "all"])
 def test_every_effect_is_equal_to_numpy_and_python(tmp_path, name):
     agree(tmp_path, chosen(*(KINDS if name == "all" else (name,))))
+
+
+def test_near_the_floor_low_anchors_are_noise(tmp_path):
+    """C holds the weight of floor_multipath for a filter that has none of its own."""
+    floor = EFFECTS["floor_multipath"]({"0.delay": 3.0, "0.height": 0.1, "x": 0.0, "y": 0.0})
+    traced = trace(ANCHORS, EffectSet((EFFECTS["anchor_delay"]({"1": 0.2}), floor)))
+    write_c(tmp_path, traced)
+    agree(tmp_path / "again", EffectSet((*traced.effects, *traced.floor)))
+    some = cases(4)
+    some["a"], some["b"] = [0, 0, 0, 1], [1, 1, 1, 2]
+    some["state"]["position"] = [[0, 0, 0.02], [2, 2, 0.3], [0, 0, 0.6], [0, 0, 0.02]]
+    results = on_host(tmp_path, some)
+    np.testing.assert_allclose(results["bias"], [0.2, 0.2, 0.2, -0.2], atol=1e-6)
+    np.testing.assert_allclose(results["std"], [3.0, 3.0, 0.0, 0.0], atol=1e-6)
 
 
 @pytest.mark.slow

@@ -539,7 +539,8 @@ def _in_comment(text: str) -> str:
 
 def write_c(folder: Path, traced: TracedCorrection) -> None:
     """Write uwb_bias.h and uwb_bias.c of a TracedCorrection. Raises InputError."""
-    code = vehicle_code(traced.anchors, traced.effects, traced.network)
+    held = EffectSet((*traced.effects, *traced.floor))
+    code = vehicle_code(traced.anchors, held, traced.network)
     _write(folder, code.files)
 
 
@@ -558,7 +559,7 @@ def write_crazyflie(folder: Path, traced: TracedCorrection, stddev: float) -> tu
     held = traced.effects.where(
         lambda effect: RATES.isdisjoint(vehicle_code(anchors, EffectSet((effect,))).inputs)
     )
-    code = vehicle_code(anchors, held, traced.network)
+    code = vehicle_code(anchors, EffectSet((*held, *traced.floor)), traced.network)
     _write(folder, crazyflie.files(code.files, anchors, stddev))
     return tuple(
         replace(left_out(effect, anchors), why=NOT_ESTIMATED)

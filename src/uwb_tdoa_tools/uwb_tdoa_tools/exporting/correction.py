@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import json
 from typing import Any
 
@@ -16,8 +16,10 @@ from uwb_tdoa_bias.common.text import written_by
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.correction.model import INPUTS, KIND, OUTPUTS, Model
 from uwb_tdoa_bias.correction.network import Network
-from uwb_tdoa_bias.effects import Effect, EffectSet, LabelEffect, SmoothTerm
+from uwb_tdoa_bias.effects import Effect, EffectSet, LabelEffect, Samples, SmoothTerm
 from uwb_tdoa_bias.effects.base import listed
+from uwb_tdoa_bias.effects.effect_set import REACH
+from uwb_tdoa_bias.effects.floor import FloorMultipath
 
 from .expressions import Expression
 from .tracing import expressions_of, samples_of
@@ -93,7 +95,7 @@ def _own(effect: Effect, key: str) -> float:
 
 def _why(effect: Effect) -> str:
     if effect.is_hypothesis:
-        return "the filter weighs it, and nothing corrects it"
+        return "the filter weighs it, and nothing corrects it; C holds it as noise near the floor"
     if "tdoa" not in effect.channels:
         return f"it acts on {listed(effect.channels)}, not on TDOAs"
     if effect.stamp_offset("tdoa"):
@@ -101,6 +103,26 @@ def _why(effect: Effect) -> str:
     if isinstance(effect, SmoothTerm):
         return f"no vehicle computes {effect.covariate}"
     return effect.why_unusable
+
+
+class FloorWeight(FloorMultipath):
+    """The noise of TDOAs near the floor, for a filter that does not weigh whether an anchor is late.
+
+    Nothing is corrected. Where an anchor may be late, its whole delay counts as noise, at any place.
+    The filter may be REACH too high: otherwise its first error would end the weight.
+    """
+
+    is_hypothesis = False
+    bias = Effect.bias
+
+    def noise_std(self, samples: Samples) -> np.ndarray:
+        rows = np.concatenate([samples.a, samples.b])
+        delays, _, noises = (values[rows] for values in self.of_each(samples.anchors))
+        low = replace(samples, p=samples.p - np.array([0.0, 0.0, REACH]))
+        share, _ = self._late(low, rows)
+        power: np.ndarray = np.nan_to_num((delays**2 + noises**2) * share)
+        of_a, of_b = power.reshape(2, -1)
+        return np.sqrt(of_a + of_b)
 
 
 @dataclass(frozen=True)
@@ -113,6 +135,7 @@ class TracedCorrection:
     effects : EffectSet of the recorded effects
     network : recorded Network, or None
     outputs : list of Expression, in the order of OUTPUTS
+    floor : FloorWeight of what only C holds
     left_out : tuple of LeftOut
     """
 
@@ -121,6 +144,7 @@ class TracedCorrection:
     network: Network | None
     outputs: list[Expression]
     left_out: tuple[LeftOut, ...]
+    floor: EffectSet
 
     def meta(self) -> dict[str, Any]:
         """Return the metadata of a file: what goes in, what comes out, and where it is from."""
@@ -177,7 +201,8 @@ def trace(
     found = Corrector(anchors, held, network).prediction(samples)
     columns = found.bias, found.std, found.slope, found.status
     outputs = [one for values in columns for one in expressions_of(samples, values)]
-    return TracedCorrection(anchors, held, network, outputs, tuple(omitted))
+    floor = tuple(FloorWeight(one.values) for one in effects if isinstance(one, FloorMultipath))
+    return TracedCorrection(anchors, held, network, outputs, tuple(omitted), EffectSet(floor))
 
 
 def is_traceable(effect: Effect) -> bool:

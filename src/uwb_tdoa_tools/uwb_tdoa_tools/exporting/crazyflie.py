@@ -33,9 +33,9 @@ from ..scoring.metrics import position_at, rms, scored_phase
 
 LARGEST_ID = 255  # of an anchor in the firmware
 MORE = 1.1  # error of one flight with a correction over that without it, above which it is worse
-# stddev over tdoa_std. The firmware takes each TDOA as independent, and their errors are correlated. Set on six
-# flights of 0425: with 1.0 the robust filter is lost on one of them, 2.4 costs 4 % of accuracy.
-WIDER = 1.6
+# stddev over tdoa_std, and the least stddev, m. The firmware takes each TDOA as independent, and their errors are
+# correlated. Set on six flights of 0425: with 0.25 m the robust filter is lost on one of them, 0.62 m costs 4 %.
+WIDER, LEAST = 1.6, 0.4
 STOCK = 0.15  # m, tdoa2.stddev and tdoa3.stddev of the firmware
 
 MAKEFILE = """\
@@ -170,8 +170,8 @@ Positioning deck before the Kalman filter uses it. The filter itself stays as it
 5. Fly with and without the correction: the parameter `uwbBias.enable` is 1 or 0.
 
 The correction sets the standard deviation of each TDOA, too: the root of stddev^2 + std^2. `std` is
-that of the correction at this place. `stddev` is {stddev:.3f} m, 1.6 times
-tdoa_std of ekf_node.yaml. The parameter `uwbBias.stddev` changes it; with 0 it is that
+that of the correction at this place. `stddev` is {stddev:.3f} m: 1.6
+times tdoa_std of ekf_node.yaml, and at least 0.4 m. The parameter `uwbBias.stddev` changes it; with 0 it is that
 of the firmware (`tdoa2.stddev` or `tdoa3.stddev`, 0.15 m). Without a correction, set `tdoa2.stddev`
 or `tdoa3.stddev` to {stddev:.3f}.
 
@@ -195,7 +195,7 @@ def client_yaml(anchors: Anchors) -> str:
 
 def stddev_of(config: FilterConfig) -> float:
     """Return the standard deviation of a TDOA for the filters of the firmware, m."""
-    return WIDER * config.tdoa_std
+    return max(WIDER * config.tdoa_std, LEAST)
 
 
 def files(code: dict[str, str], anchors: Anchors, stddev: float) -> dict[str, str]:
@@ -275,22 +275,20 @@ class FirmwareFilter:
     def estimate(
         self, flight: Flight, robust: bool, corrected: bool, stddev: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return stamps (n,), s, and positions (n, 3), m, after each TDOA of a Flight in the air.
+        """Return stamps (n,), s, and positions (n, 3), m, after each TDOA of a Flight.
 
-        The filter starts in the air, at the true position and yaw.
+        The filter starts at rest on the floor, at the true position and yaw.
 
         robust : kalman.robustTdoa; corrected : uwbBias.enable; stddev : m, tdoa2.stddev
         """
         require_truth(flight)
         truth, events = flight.truth, events_of(flight)
         assert truth is not None
-        _, first, last = scored_phase(truth)
-        start = int(np.searchsorted(truth.t, first))
-        yaw = Rotation.from_quat(truth.q[start]).as_euler("ZYX")[0]
-        events = events[(events["t"] >= first) & (events["t"] <= last)]
+        yaw = Rotation.from_quat(truth.q[0]).as_euler("ZYX")[0]
+        events = events[events["t"] >= truth.t[0]]
         done = subprocess.run(
             [self._program, str(int(robust)), str(int(corrected)), str(stddev)],
-            input=np.array([*truth.p[start], yaw]).tobytes() + events.tobytes(),
+            input=np.array([*truth.p[0], yaw]).tobytes() + events.tobytes(),
             capture_output=True,
             check=True,
         )
@@ -298,10 +296,12 @@ class FirmwareFilter:
         return out[:, 0], out[:, 1:]
 
     def error(self, flight: Flight, *way: Any) -> float:
-        """Return the 3D RMSE of `estimate`, m; NaN if the estimate is not finite."""
+        """Return the 3D RMSE of `estimate` in the air, m; NaN if the estimate is not finite."""
         t, p = self.estimate(flight, *way)
         assert flight.truth is not None
-        return rms(np.linalg.norm(p - position_at(t, flight.truth), axis=1))
+        _, first, last = scored_phase(flight.truth)
+        in_air = (t >= first) & (t <= last)
+        return rms(np.linalg.norm(p - position_at(t, flight.truth), axis=1)[in_air])
 
 
 def comparison(

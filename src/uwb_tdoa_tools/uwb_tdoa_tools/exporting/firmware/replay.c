@@ -2,7 +2,7 @@
 
    replay ROBUST ENABLE STDDEV: kalman.robustTdoa, uwbBias.enable, and tdoa2.stddev, m.
    Standard input: struct begin, then struct event of the whole flight. Standard output: t and x, y, z, m, of the
-   estimate after each TDOA, in double precision. It starts at the given position, in flight, level. */
+   estimate after each TDOA, in double precision. It starts at the given position, at rest, level. */
 #include <math.h>
 #include <stdint.h>
 #include <stdio.h>
@@ -40,9 +40,7 @@ int main(int argc, char **argv) {
   kalmanCoreDefaultParams(&params);
   params.initialX = at.position[0]; params.initialY = at.position[1]; params.initialZ = at.position[2];
   params.initialYaw = at.yaw;
-  params.stdDevInitialPosition_xy = params.stdDevInitialPosition_z = 0.3f;
-  params.stdDevInitialVelocity = 1.0f;
-  params.stdDevInitialAttitude_rollpitch = 0.2f;
+  params.stdDevInitialPosition_xy = params.stdDevInitialPosition_z = 0.1f;
   params.stdDevInitialAttitude_yaw = 0.1f;
   outlierFilterTdoaReset(&outliers);
   while (fread(&e, sizeof e, 1, stdin) == 1) {
