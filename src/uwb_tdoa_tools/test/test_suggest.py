@@ -130,6 +130,24 @@ def test_the_output_of_a_shell_is_named_with_a_line_that_makes_a_table(folder, f
     np.testing.assert_allclose(flight.range.d[:2], [4.0, 6.0], atol=1e-6)
 
 
+@pytest.mark.parametrize("above", ["made by me\nof a tag\n\n", "sep=;\n"])
+def test_lines_above_a_table_are_named_with_a_line_that_leaves_them_out(folder, above, capsys):
+    separator = ";" if "sep" in above else ","
+    table = lines("{t:.6f},{a},{b},{d}", "t,from,to,d").replace(",", separator)
+    (folder / "log.csv").write_text(above + table)
+    assert convert(["log.csv", "--suggest", "profile.yaml"]) == 2
+    said = capsys.readouterr().err
+    assert " lines above its table; leave them out" in said and not Path("profile.yaml").exists()
+    run("sh", "-c", said[said.index("tail ") : said.index("; then: ")], check=True)
+    np.testing.assert_allclose(read_as_suggested("table.csv", capsys).tdoa.d, D, atol=1e-6)
+
+
+def test_text_of_another_encoding_is_named(folder, capsys):
+    (folder / "log.csv").write_bytes(lines("{t:.6f};{a};{b};{d}", "Größe;a;b;d").encode("latin-1"))
+    assert convert(["log.csv", "--suggest", "profile.yaml"]) == 2
+    assert "byte 2 is no text in UTF-8; write the file in UTF-8" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("header", ["", "kind,t,from,to,d,ax,ay,az,gx,gy,gz"])
 @pytest.mark.parametrize("first", [True, False])
 def test_rows_of_several_kinds_are_named_with_lines_that_split_them(folder, header, first, capsys):

@@ -114,11 +114,10 @@ def found_in_words(diagnosis: Diagnosis) -> list[str]:
 
 def recordings_in_words(flights: Sequence[Flight], seed: int) -> str:
     """Return what was recorded, and where its ground truth is from."""
-    names = listed(flight.name for flight in flights)
-    seconds = [round(flight.end - flight.start) for flight in flights]
+    seconds = sum(round(flight.end - flight.start) for flight in flights)
     count = sum(len(flight.tdoa) for flight in flights)
     return (
-        f"{names} in hall {seed}: {sum(seconds)} s, {count} TDOAs of "
+        f"{listed(flight.name for flight in flights)} in hall {seed}: {seconds} s, {count} TDOAs of "
         f"{len(flights[0].anchors)} anchors. The simulation gives their true path"
     )
 
@@ -216,8 +215,11 @@ def corrector_of(
     """
     if not (effects or model):
         return None
-    known = EffectSet.from_yaml(effects) if effects else EffectSet()
-    return Corrector(flight.anchors, known, load_network(model))
+    return Corrector(
+        flight.anchors,
+        EffectSet.from_yaml(effects) if effects else EffectSet(),
+        load_network(model),
+    )
 
 
 def correction_in_words(corrector: Corrector | None, *files: str | Path | None) -> str:
@@ -349,9 +351,15 @@ def fly(
         }
     scores = [Score(name, one, flight.truth) for name, one in estimates.items()]
     if rerun is not None:
-        words = [change_of_scores(scores)]  # of the first two scores
-        before = None if correction is None else raw.odometry
-        write_rerun(rerun, flight, live.odometry, offline.residuals, words, flight.truth, before)
+        write_rerun(
+            rerun,
+            flight,
+            live.odometry,
+            offline.residuals,
+            [change_of_scores(scores)],  # of the first two
+            flight.truth,
+            None if correction is None else raw.odometry,
+        )
     return live, scores
 
 
@@ -440,8 +448,9 @@ class LoopResult:
         """Write a file for Rerun."""
         before, *more = (one.odometry for one in self.passes)
         estimate, raw = (more[0], before) if more else (before, None)
-        words = [self.error_in_words()]
-        write_rerun(path, self.flight, estimate, None, words, self.flight.truth, raw)
+        write_rerun(
+            path, self.flight, estimate, None, [self.error_in_words()], self.flight.truth, raw
+        )
 
 
 def fly_both(

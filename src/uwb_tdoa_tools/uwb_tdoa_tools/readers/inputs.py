@@ -198,9 +198,14 @@ class Reading:
         Raises InputError.
         """
         if self.profile:
-            named = as_named(survey)
             return read_by_profile(
-                paths, self.profile, named, self.tag, self.namespace, self.salvage, self.truth
+                paths,
+                self.profile,
+                as_named(survey),
+                self.tag,
+                self.namespace,
+                self.salvage,
+                self.truth,
             )
         return read_flight(paths[0], survey, self.namespace, self.salvage, self.topics, self.truth)
 

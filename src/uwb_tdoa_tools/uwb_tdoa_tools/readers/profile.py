@@ -278,10 +278,8 @@ def _expression(pattern: str) -> str:
     out = ""
     for part in re.split(r"(\{\w+\}|\*)", pattern):
         name = _NAME.fullmatch(part)
-        if name:
-            out += f"(?P<{name[1]}>[^/]+)"
-        else:
-            out += ".*" if part == "*" else re.escape(part)
+        text = ".*" if part == "*" else re.escape(part)
+        out += f"(?P<{name[1]}>[^/]+)" if name else text
     return out
 
 

@@ -207,6 +207,7 @@ def suggest(paths: Sequence[Path], salvage: bool = False) -> tuple[str, list[str
                 lines += _lines(tables, table, one)
                 found |= set() if one.doubtful else streams
             if not suggestions:
+                _refuse_lines_above(Path(table))
                 left.append(_unrecognized(tables, table))
         if tables.recorded_anchors() or (fitting and _fits(fitting[0], tables, {"anchors"})):
             found.add("anchors")
@@ -256,6 +257,18 @@ def _refuse_kinds(path: Path, lines: Sequence[str], column: int) -> None:
         raise InputError(
             f"{path}: has rows of several kinds, {', '.join(sizes)}; make a file of each: "
             f"{''.join(split)}then: " + suggest_line(*(f"{kind.lower()}.csv" for kind in sizes))
+        )
+
+
+def _refuse_lines_above(path: Path) -> None:
+    """Raise InputError if a table that is not recognized has titles or units above its header."""
+    text = read_head(path, 1 << 12).decode("utf-8", "replace") if path.is_file() else ""
+    widths = [len(re.split("[,;\t]", line)) for line in text.splitlines()[:-1]]
+    above = widths.index(max(widths)) if widths else 0
+    if above and {*widths[above:]} == {max(widths)}:
+        raise InputError(
+            f"{path}: has {above} lines above its table; leave them out: tail -n +{above + 1} "
+            f"{shlex.quote(str(path))} > table.csv; then: {suggest_line('table.csv')}"
         )
 
 

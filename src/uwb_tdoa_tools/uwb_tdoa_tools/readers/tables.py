@@ -350,7 +350,9 @@ def check_text(path: str | Path, content: bytes) -> None:
     try:
         content.decode()
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: byte {error.start} is not text; give a CSV file.") from error
+        raise InputError(
+            f"{path}: byte {error.start} is no text in UTF-8; write the file in UTF-8."
+        ) from error
 
 
 class CsvFiles(Foreign):
