@@ -145,7 +145,7 @@ def test_lines_above_a_table_are_named_with_a_line_that_leaves_them_out(folder, 
 def test_text_of_another_encoding_is_named(folder, capsys):
     (folder / "log.csv").write_bytes(lines("{t:.6f};{a};{b};{d}", "Größe;a;b;d").encode("latin-1"))
     assert convert(["log.csv", "--suggest", "profile.yaml"]) == 2
-    assert "byte 2 is no text in UTF-8; write the file in UTF-8" in capsys.readouterr().err
+    assert "byte 2 is not text in UTF-8; write the file in UTF-8" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("header", ["", "kind,t,from,to,d,ax,ay,az,gx,gy,gz"])

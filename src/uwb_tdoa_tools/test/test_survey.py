@@ -71,6 +71,15 @@ def test_positions_only(read):
     assert np.isnan(anchors.orientations).all()
 
 
+def test_axes_of_the_world_by_their_directions(read):
+    """East, north and up are x, y and z, in any order (REP 103)."""
+    rows = [
+        f"{k};{y};{x};{z}".replace(".", ",") for k, (x, y, z) in zip(ANCHORS.ids, ANCHORS.positions)
+    ]
+    anchors = read("\n".join(["Anchor;North;East [m];Up", *rows]))
+    np.testing.assert_array_equal(anchors.positions, ANCHORS.positions)
+
+
 def test_yaml(tmp_path):
     ANCHORS.to_yaml(tmp_path / "anchors.dat")
     anchors = read_survey(tmp_path / "anchors.dat")

@@ -216,8 +216,8 @@ def read_entries(path: str | Path) -> tuple[list[Entry], str]:
         text = read_bytes(path, SURVEY_BYTES, "survey file").decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(
-            f"{path}: byte {error.start} is not text; give a survey file (.txt, .csv, .yaml "
-            "or .json)."
+            f"{path}: byte {error.start} is not text in UTF-8; write the survey in UTF-8 (.txt, "
+            ".csv, .yaml or .json)."
         ) from error
     if not text.strip():
         raise InputError(f"{path}: is empty; give a survey file (.txt, .csv, .yaml or .json).")
@@ -228,6 +228,14 @@ def read_entries(path: str | Path) -> tuple[list[Entry], str]:
         raise InputError(
             message if message.startswith(f"{path}: ") else f"{path}: {message}"
         ) from error
+
+
+# {word of a header: axis}, in the world frame x east, y north, z up (REP 103)
+AXES = {f"{prefix}{axis}": axis for axis in "xyz" for prefix in ("", "p", "t")} | {
+    "east": "x",
+    "north": "y",
+    "up": "z",
+}
 
 
 def _roles(names: Sequence[Any]) -> dict[str, tuple[Any, str]]:
@@ -254,8 +262,8 @@ def _role(cell: str) -> tuple[str, str]:
     found = _UNIT.match(text)
     text, unit = (found[1].strip(), found[2]) if found else (text, "")
     words = [word for word in text.split() if word not in (*NESTED, "p", "anchor")]
-    if len(words) == 1 and words[0] in ("x", "y", "z", "px", "py", "pz", "tx", "ty", "tz"):
-        return words[0][-1], unit
+    if len(words) == 1 and words[0] in AXES:
+        return AXES[words[0]], unit
     words = [word for word in text.split() if word not in TURNED]
     if len(words) == 1 and words[0] in ("qx", "qy", "qz", "qw"):
         return words[0], ""
@@ -389,9 +397,8 @@ def _of_table(text: str) -> Iterator[Entry]:
     """
     lines = lines_of(text)
     (number, header), rest = lines[0], lines[1:]
-    comment, roles, unit = _UNIT_COMMENT.search(text), _roles(header), ""
-    if comment:
-        unit = _unit(comment[1], f"comment {comment[0].strip()[:60]!r}")
+    comment, roles = _UNIT_COMMENT.search(text), _roles(header)
+    unit = _unit(comment[1], f"comment {comment[0].strip()[:60]!r}") if comment else ""
     if not _has_axes(roles):
         if any(re.match("lat(itude)?\\b", cell.strip(), re.IGNORECASE) for cell in header):
             raise InputError(f"line {number}: {', '.join(header)} are {GEODETIC}")
@@ -690,6 +697,7 @@ def _point(number: int, cells: list[str]) -> list[float]:
     point = [_number(cell) for cell in cells[1:]]
     if len(point) != 3 or not (np.abs(point) <= FARTHEST).all():
         raise InputError(
-            f"line {number}: {','.join(cells)[:60]!r} is not 'name,x,y,z' with finite metres."
+            f"line {number}: {','.join(cells)[:60]!r} is not 'name,x,y,z' with finite metres; "
+            "write 'name,x,y,z' in the first line, and nothing above it."
         )
     return point

@@ -351,7 +351,7 @@ def check_text(path: str | Path, content: bytes) -> None:
         content.decode()
     except UnicodeDecodeError as error:
         raise InputError(
-            f"{path}: byte {error.start} is no text in UTF-8; write the file in UTF-8."
+            f"{path}: byte {error.start} is not text in UTF-8; write the file in UTF-8."
         ) from error
 
 
