@@ -186,6 +186,21 @@ def test_names_two_anchors_that_were_exchanged():
     )
 
 
+@pytest.mark.parametrize("step", [1, -1])
+def test_names_ids_that_were_turned_by_one(step):
+    ids = ANCHORS.ids.tolist()
+    order = np.roll(np.arange(6), -step)  # row of the place of each
+
+    def delays(t, p):
+        ranges = np.linalg.norm(p - ANCHORS.positions, axis=1)
+        return (t > 30.0) * (ranges[order] - ranges)
+
+    said = watch(delays)
+    assert not any(alarms for t, alarms in said if t <= 30.0)
+    named = ", ".join(f"{one} is {ids[at]}" for one, at in zip(ids, order))
+    assert any(f"what is called {named}" in alarm for t, of in said if t <= 36.0 for alarm in of)
+
+
 def test_names_the_axis_whose_bias_moves():
     _, alarms = watch(lambda t, p: np.zeros(6), gyro=lambda t: 0.05 * (t > 40.0))[-1]
     assert alarms == ["gyroscope z: bias moved by +0.050 rad/s since the first 15 s in motion"]
@@ -248,20 +263,23 @@ def test_does_not_depend_on_when_it_is_asked():
 
 def test_a_swap_is_named_until_something_else_has_been_true_for_a_while(monkeypatch):
     """The text once flipped between two pairs and "running" every half second."""
-    odd = [(), (3, 4), (1, 2), (), (1, 2)]
-    answers = iter([*odd, *8 * [(1, 2)], *odd, *6 * [(1, 2)], *16 * [()], *16 * [(3, 4)]])
+    one, other = ((1, 2), (2, 1)), ((3, 4), (4, 3))
+    odd = [(), other, one, (), one]
+    answers = iter([*odd, *8 * [one], *odd, *6 * [one], *16 * [()], *16 * [other]])
 
     def left(*_):
-        best = next(answers)
-        return {key: 0.1 if key == best else 1.0 for key in ((), (1, 2), (3, 4))}
+        best, orders = next(answers), ((), one, other)
+        places = dict.fromkeys(orders, np.zeros(3))
+        return {key: 0.1 if key == best else 1.0 for key in orders}, places
 
     monkeypatch.setattr("uwb_tdoa_ekf.monitoring.monitor.residuals_of", left)
+    monkeypatch.setattr("uwb_tdoa_ekf.monitoring.monitor.suspects", lambda *_: {1, 2, 3, 4})
     monitor, named = Monitor(ANCHORS), []
     for _ in range(56):
         monitor._look_for_swap(np.zeros(1, int), np.ones(1, int), np.zeros(1), np.zeros(3))
         named.append(monitor._swapped)
     kept = [pair for k, pair in enumerate(named) if k == 0 or pair != named[k - 1]]
-    assert kept == [(), (1, 2), (), (3, 4)] and named.count((1, 2)) > 12
+    assert kept == [(), one, (), other] and named.count(one) > 12
 
 
 @pytest.mark.slow

@@ -156,7 +156,7 @@ class Judge:
             return wrong_sign(evidence, left)
         ids = self._anchors.ids[list(found.rows)].tolist()
         if found.kind == EXCHANGED:
-            return exchanged(ids[0], ids[1], evidence)
+            return exchanged({ids[0]: ids[1], ids[1]: ids[0]}, evidence)
         if found.kind == ALONE:
             return Finding(
                 "anchor_scale",
@@ -251,15 +251,20 @@ def wrong_sign(evidence: str, value: float) -> Finding:
     )
 
 
-def exchanged(one: int, two: int, evidence: str) -> Finding:
-    """Return the Finding that two anchors are exchanged, ids `one` and `two`."""
+def exchanged(table: dict[int, int], evidence: str, value: float = math.nan) -> Finding:
+    """Return the Finding that ids are mixed up, {id as received: id of that anchor}."""
+    one, other = [*table][:2]
+    cause = f"two anchors are exchanged, {one} and {other}"
+    if len(table) > 2:
+        names = ", ".join(f"{wrong} is {right}" for wrong, right in table.items())
+        cause = f"the ids of anchors are mixed up: what is called {names}"
     return Finding(
         "ids_exchanged",
         ERROR,
-        cause=f"two anchors are exchanged, {one} and {two}",
+        cause=cause,
         evidence=evidence,
-        remedy=f"id = {{{one}: {two}, {two}: {one}}}.get(id, id)  # or exchange their positions",
-        value=float(one),
+        remedy=f"id = {table}.get(id, id)  # or exchange their positions",
+        value=float(one) if math.isnan(value) else value,
     )
 
 

@@ -34,7 +34,7 @@ from .finding import WARNING, Finding
 from .judge import exchanged
 from .reference import Displaced, SurveyComparison
 from .slices import LENGTH, Slice, reduced, turned
-from .swap import Residuals as SwapResiduals, clear_exchange, mean_of, residuals as residuals_of
+from .swap import Order, Piece, clear_order, residuals as residuals_of, suspects
 
 # m/s, speed above which the tag is in motion; on the floor, residuals differ from those in the air
 MOVING = 0.3
@@ -165,14 +165,17 @@ class Monitor:
         ] = {}  # {row: Changes of an anchor in flight that still hold}
         self._ever_changed: set[int] = set()  # rows of anchors that changed at any time
         self._latest_change: Change | None = None  # the newest change, whose size is refined
-        self._latest: list[SwapResiduals] = []  # residuals of the last slices with large errors
+        # the last slices with large errors, and the rows of anchors whose ids may be wrong
+        self._latest: list[tuple[Piece, set[int]]] = []
         self._slices = 0  # slices so far
         self._heard: dict[int, Heard] = {}  # by row of the anchor
         self._counts: list[int] = []  # TDOAs of the last slices
-        self._swapped: tuple[int, ...] = ()  # rows of two exchanged anchors, or ()
+        self._swapped: Order = ()  # anchors whose ids are mixed up
+        # number of the last slice with small errors or a clear order, and the position then, m
+        self._known_place = -HELD, np.zeros(3)
         self._silent: tuple[int, ...] = ()
-        # another exchange, or none, that slices suggest instead, and how many consecutive ones
-        self._instead: tuple[tuple[int, ...], int] = ((), 0)
+        # another order, or none, that slices suggest instead, and how many consecutive ones
+        self._instead: tuple[Order, int] = ((), 0)
         self._moving_since = math.nan  # s, stamp of the first motion
         # (6,) biases of gyroscope, rad/s, and accelerometer, m/s^2, body: reference, and the latest
         self._bias_reference: np.ndarray | None = None
@@ -202,7 +205,7 @@ class Monitor:
             comparison.forget(rows)
         if self._latest_change is not None and self._latest_change.row in rows:
             self._latest_change = None
-        if rows & {*self._swapped, *self._instead[0]}:
+        if rows & dict([*self._swapped, *self._instead[0]]).keys():
             self._swapped, self._instead, self._latest = (), ((), 0), []
 
     @property
@@ -361,9 +364,9 @@ class Monitor:
     def _look_for_swap(
         self, a: np.ndarray, b: np.ndarray, innovation: np.ndarray, place: np.ndarray
     ) -> bool:
-        """Return whether this slice suggests that two anchors are exchanged.
+        """Return whether this slice suggests that ids of anchors are mixed up.
 
-        An exchange is reported after several such slices. It is reported until several consecutive
+        An order is reported after several such slices. It is reported until several consecutive
         slices contradict it.
 
         Parameters
@@ -376,15 +379,21 @@ class Monitor:
             Position of the filter in the world frame, in m.
         """
         positions, named = self._anchors.positions, self._swapped
-        left = residuals_of(
-            positions, a, b, innovation + tdoa(place, positions[a], positions[b]), place, named
-        )
-        if not left:
+        d = innovation + tdoa(place, positions[a], positions[b])
+        recent = self._slices - self._known_place[0] <= HELD
+        piece = Piece(a, b, d, place, self._known_place[1] if recent else place)
+        tried = suspects(positions, piece, named)
+        if not tried:
+            self._known_place = self._slices, place
             return False
-        self._latest = [*self._latest[1 - TOGETHER :], left]
-        mean = mean_of(self._latest)
-        found = clear_exchange(mean) if len(self._latest) == TOGETHER else ()
-        if found == named or (named and not found and mean.get(named, 0.0) < mean[()]):
+        self._latest = [*self._latest[1 - TOGETHER :], (piece, tried)]
+        pieces, rows = zip(*self._latest)
+        before = self._instead[0] or named
+        left, places = residuals_of(positions, pieces, set.intersection(*rows), before)
+        found = clear_order(left, before) if len(self._latest) == TOGETHER else ()
+        if found:
+            self._known_place = self._slices, places[found]
+        if found == named or (named and not found and left.get(named, 0.0) < left[()]):
             self._instead = (), 0
             return bool(found)
         other, count = self._instead
@@ -392,9 +401,9 @@ class Monitor:
         if self._instead[1] >= (HELD if named else NAMED):
             self._swapped, self._instead = found, ((), 0)
             self._changes = {
-                row: changes for row, changes in self._changes.items() if row not in found
+                row: changes for row, changes in self._changes.items() if row not in dict(found)
             }
-            self._ever_changed |= set(found)
+            self._ever_changed |= dict(found).keys()
             self._compare_anew()
         return bool(found)
 
@@ -470,7 +479,7 @@ class Monitor:
 
     @property
     def exchanged(self) -> Finding | None:
-        """Return the Finding on two exchanged anchors, or None."""
+        """Return the Finding on ids that are mixed up, or None."""
         return self._swap() if self._swapped else None
 
     def _anchor_findings(self) -> dict[str, Finding]:
@@ -499,8 +508,9 @@ class Monitor:
         }
 
     def _swap(self) -> Finding:
-        one, other = self._anchors.ids[[*self._swapped]].tolist()
-        return exchanged(one, other, "each TDOA with one of them fits the place of the other")
+        ids = self._anchors.ids
+        table = {int(ids[one]): int(ids[at]) for one, at in self._swapped}
+        return exchanged(table, "each TDOA with one of them fits the place of another")
 
     def _silence(self, row: int) -> Finding:
         number = self._anchors.ids[row]

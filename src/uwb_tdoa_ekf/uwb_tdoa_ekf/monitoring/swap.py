@@ -1,15 +1,17 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Detect two exchanged anchors: each transmits from the surveyed position of the other.
+"""Detect ids of anchors that are mixed up: an anchor transmits from the surveyed place of another.
 
-The position of the filter may be wrong by then. Each hypothesis of an exchange therefore gets its
-own best position near the filter's position. The survey without an exchange gets one too.
+The position of the filter may be wrong by then. Each hypothesis therefore gets its own best
+position near the filter's position. Hypotheses are the survey, each exchange of two suspects, and
+the permutation of all ids that explains the TDOAs best.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,8 +19,10 @@ from uwb_tdoa_bias.common.geometry import ranges, tdoa
 
 from .slices import CLIP, FEWEST
 
-# m, mean absolute residual by rows of two exchanged anchors; () without an exchange
-Residuals = dict[tuple[int, ...], float]
+# (row of an anchor, row of its place) of each anchor with another id; () without any
+Order = tuple[tuple[int, int], ...]
+Residuals = dict[Order, float]  # m, mean absolute residual with each Order
+Places = dict[Order, np.ndarray]  # (3,) m, position of the tag in the latest Piece with each Order
 
 SUSPECTS = 8  # number of anchors with the largest innovations, whose exchanges are tested
 LARGE = 0.3  # m, smallest largest mean innovation at which exchanges are tested
@@ -26,77 +30,153 @@ PLACE_STD = 1.0  # m, standard deviation of the position of the filter
 # m, standard deviation of one TDOA; m, scale of the Geman-McClure weight; iterations for the
 # position
 STD, ROBUST, STEPS = (0.15, 0.4, 3)
-# largest ratio of the residual of an exchange to the residual of the survey, and to that of any
+ASSIGNMENTS = 6  # most steps of the search for a permutation
+# largest ratio of the residual of an order to the residual of the survey, and to that of any
 # other exchange
 SHARE, OF_OTHERS = (0.4, 0.8)
-# alternative: largest ratio to the survey if the reduction exceeds the second value, in m, and the
-# reduction by any other exchange times the third value
+# m, least median residual of the survey at which permutations are tried: delays of a few anchors
+# leave a smaller one, and a permutation might explain them
+MIXED = 0.4
+# alternative for an exchange: largest ratio to the survey if the reduction exceeds the second value,
+# in m, and the reduction by any other exchange times the third value
 MOST_LEFT, LEAST, ALONE = (0.65, 0.1, 2.5)
 
 
-def residuals(
-    positions: np.ndarray,
-    a: np.ndarray,
-    b: np.ndarray,
-    d: np.ndarray,
-    p: np.ndarray,
-    named: Sequence[int] = (),
-) -> Residuals:
-    """Return the Residuals of a slice with each exchange of two suspects, and with none.
+class Piece(NamedTuple):
+    """TDOAs that are heard while the tag is at one place.
 
-    The result is {} if all innovations are small and no exchange is already reported.
-
-    Parameters
+    Attributes
     ----------
-    positions : (N, 3) array
-        Surveyed positions in the world frame, in m.
     a, b : (n,) int array
         Rows of the anchors of each TDOA.
     d : (n,) array
         Measured TDOAs, in m.
     p : (3,) array
         Position of the filter in the world frame, in m.
-    named : sequence of int
-        Rows of two anchors that are tested in any case.
+    known : (3,) array
+        The same at which the search for a permutation begins: the filter moves away from where it
+        was right.
     """
-    rows, both = np.unique(np.concatenate([a, b]), return_inverse=True)
-    # keep only the anchors that are heard
-    a, b, positions, n = (both[: len(a)], both[len(a) :], positions[rows], len(rows))
-    if len(a) < FEWEST:
-        return {}
-    error = np.abs(d - tdoa(p, positions[a], positions[b]))
-    mean = (np.bincount(a, error, n) + np.bincount(b, error, n)) / (
-        np.bincount(a, minlength=n) + np.bincount(b, minlength=n)
-    )
-    tried = set(np.flatnonzero(np.isin(rows, named)).tolist()) if len(named) else set()
+
+    a: np.ndarray
+    b: np.ndarray
+    d: np.ndarray
+    p: np.ndarray
+    known: np.ndarray
+
+
+def suspects(positions: np.ndarray, piece: Piece, named: Order = ()) -> set[int]:
+    """Return the rows of the anchors whose ids may be wrong, with those that are `named` already.
+
+    The result is empty if all innovations are small and nothing is named.
+
+    positions : (N, 3) surveyed positions in the world frame, in m
+    """
+    ends = np.concatenate([piece.a, piece.b])
+    rows, place = np.unique(ends, return_inverse=True)
+    if len(piece.a) < FEWEST:
+        return set()
+    error = np.abs(piece.d - tdoa(piece.p, positions[piece.a], positions[piece.b]))
+    mean = np.bincount(place, np.tile(error, 2)) / np.bincount(place)
+    tried = set(rows.tolist()) & set(dict(named))
     if mean.max() >= LARGE:
-        tried |= set(np.argsort(-mean)[:SUSPECTS].tolist())
-    pairs = list(combinations(sorted(tried), 2))
-    if not pairs:
-        return {}
-    order = np.tile(np.arange(n), (len(pairs) + 1, 1))
-    for k, (one, other) in enumerate(pairs, 1):
-        order[k, [one, other]] = other, one
-    left = _left(positions[order], a, b, d, p).tolist()
-    return dict(zip([(), *((int(rows[i]), int(rows[k])) for i, k in pairs)], left))
+        tried |= set(rows[np.argsort(-mean)[:SUSPECTS]].tolist())
+    return tried
 
 
-def _left(
-    positions: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray, p: np.ndarray
-) -> np.ndarray:
-    """Return the mean absolute residual of each anchor arrangement at its best position, (m,) m.
+def residuals(
+    positions: np.ndarray, pieces: Sequence[Piece], tried: set[int], named: Order = ()
+) -> tuple[Residuals, Places]:
+    """Return Residuals and Places with each exchange of two anchors in `tried`, and with none.
 
-    Parameters
-    ----------
-    positions : (m, N, 3) array
-        Arrangements of the anchors, in m.
-    a, b : (n,) int array
-        Anchors of each TDOA.
-    d : (n,) array
-        Measured TDOAs, in m.
-    p : (3,) array
-        Position of the filter, in m.
+    The permutation that explains most is among them, and the one that is `named`, if most TDOAs
+    contradict the survey.
+
+    positions : (N, 3) surveyed positions in the world frame, in m
     """
+    rows, pieces = _heard(pieces)
+    positions, ids = positions[rows], dict(named)
+    orders = [np.arange(len(rows))]
+    for pair in combinations(np.searchsorted(rows, sorted(tried)).tolist(), 2):
+        orders.append(np.arange(len(rows)))
+        orders[-1][[*pair]] = pair[::-1]
+    found = [_located(positions[np.array(orders)], piece) for piece in pieces]
+    names = [named_order(rows, order) for order in orders]
+    left = dict(zip(names, np.mean([off.mean(axis=1) for off, _ in found], axis=0).tolist()))
+    place = dict(zip(names, found[-1][1]))
+    known, trials = [piece._replace(p=piece.known) for piece in pieces], []
+    if np.median(np.concatenate([off[0] for off, _ in found])) > MIXED:
+        trials = [best_order(positions, pieces), best_order(positions, known)]
+    if len(ids) > 2 and ids.keys() <= set(rows.tolist()):
+        at = [ids.get(row, row) for row in rows.tolist()]
+        trials.append((np.searchsorted(rows, at), known))
+    for order, located in trials:
+        found = [_located(positions[order][None], piece) for piece in located]
+        name, mean = named_order(rows, order), float(np.mean([off.mean() for off, _ in found]))
+        if mean < left.get(name, np.inf):
+            left[name], place[name] = mean, found[-1][1][0]
+    return left, place
+
+
+def named_order(rows: np.ndarray, order: np.ndarray) -> Order:
+    """Return the Order of anchors `rows` (n,) that are at the places of rows[order]."""
+    return tuple((int(one), int(at)) for one, at in zip(rows, rows[order]) if one != at)
+
+
+def _heard(pieces: Sequence[Piece]) -> tuple[np.ndarray, list[Piece]]:
+    """Return the rows of the anchors that are heard, and the Pieces with places in these rows."""
+    rows = np.unique(np.concatenate([end for piece in pieces for end in piece[:2]]))
+    return rows, [
+        piece._replace(a=np.searchsorted(rows, piece.a), b=np.searchsorted(rows, piece.b))
+        for piece in pieces
+    ]
+
+
+def best_order(positions: np.ndarray, pieces: Sequence[Piece]) -> tuple[np.ndarray, list[Piece]]:
+    """Return the row of the place of each anchor that explains Pieces best, (N,), and located Pieces.
+
+    Differences of distances determine each distance but for a constant. The assignment of these
+    distances to places, and the position of the tag, are found in turns.
+
+    positions : (N, 3) places of the anchors, all of which are heard, in m
+    """
+    count, order, pieces = len(positions), np.empty(0, int), [*pieces]
+    levels = []  # rows of the heard anchors, and their distances less the mean, in m
+    for piece in pieces:
+        ends = np.eye(count)[piece.b] - np.eye(count)[piece.a]
+        levels.append((ends.any(axis=0), np.linalg.lstsq(ends, piece.d, rcond=None)[0]))
+    for _ in range(ASSIGNMENTS):
+        cost = np.zeros((count, count))
+        for piece, (heard, level) in zip(pieces, levels):
+            away = ranges(piece.p, positions)[0]
+            off = level[heard, None] + away[order[heard] if len(order) else heard].mean() - away
+            cost[heard] += np.minimum(np.abs(off), CLIP)
+        before, order = order, _assigned(cost)
+        if np.array_equal(order, before):
+            break
+        places = [_located(positions[order][None], piece)[1][0] for piece in pieces]
+        pieces = [piece._replace(p=place) for piece, place in zip(pieces, places)]
+    return order, pieces
+
+
+def _assigned(cost: np.ndarray) -> np.ndarray:
+    """Return the column of each row, (n,), such that no exchange of two lowers the sum of costs."""
+    order = np.arange(len(cost))
+    while True:
+        of = cost[:, order]
+        gain = np.add.outer(np.diag(of), np.diag(of)) - of - of.T
+        one, other = np.unravel_index(np.argmax(gain), gain.shape)
+        if gain[one, other] < 1e-9:
+            return order
+        order[[one, other]] = order[[other, one]]
+
+
+def _located(positions: np.ndarray, piece: Piece) -> tuple[np.ndarray, np.ndarray]:
+    """Return the absolute residuals of each order at its best position, (m, n) m, and that, (m, 3).
+
+    positions : (m, N, 3) orders of the anchors, in m
+    """
+    a, b, d, p, _ = piece
     place = np.tile(p, (len(positions), 1))
     for _ in range(STEPS):
         away, towards = ranges(place[:, None], positions)
@@ -106,23 +186,18 @@ def _left(
         vector = np.einsum("knc,kn->kc", weighted, residual) - (place - p) / PLACE_STD**2
         place = place + np.linalg.solve(information, vector[:, :, None])[:, :, 0]
     away = ranges(place[:, None], positions)[0]
-    return np.asarray(np.minimum(np.abs(d - (away[:, b] - away[:, a])), CLIP).mean(axis=1))
+    return np.minimum(np.abs(d - (away[:, b] - away[:, a])), CLIP), place
 
 
-def mean_of(slices: Sequence[Residuals]) -> Residuals:
-    """Return the mean of the Residuals of several slices, for exchanges that all slices tested."""
-    return {
-        key: sum(one[key] for one in slices) / len(slices)
-        for key in slices[0]
-        if all(key in one for one in slices)
-    }
+def clear_order(left: Residuals, before: Order = ()) -> Order:
+    """Return the Order if one exchange or permutation is clearly best, else ().
 
-
-def clear_exchange(left: Residuals) -> tuple[int, ...]:
-    """Return the rows of the two exchanged anchors if one exchange is clearly best, else ()."""
-    if len(left) < 2:
-        return ()
-    best, *others = sorted((key for key in left if key), key=left.__getitem__)
+    Some rooms are nearly symmetrical: the Order that was found `before` has precedence.
+    """
+    best, *others = sorted((key for key in left if len(key) == 2), key=left.__getitem__) or [()]
+    for mixed in sorted((key for key in left if len(key) > 2), key=lambda key: key != before):
+        if left[mixed] < SHARE * left[()] and left[mixed] < OF_OTHERS * left[best]:
+            return mixed
     other = left[others[0]] if others else left[()]
     by_far = left[best] < SHARE * left[()] and left[best] < OF_OTHERS * other
     gain = left[()] - left[best]

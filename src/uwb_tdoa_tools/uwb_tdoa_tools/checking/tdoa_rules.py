@@ -156,7 +156,8 @@ def judged(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     rows = judge_of(recording).exchange
     if rows and second_principal_std(recording.survey_fit.places) >= LEAST_MOTION:
         one, two = recording.anchors.ids[list(rows)].tolist()
-        finding, other = exchanged(one, two, ""), relabelled(recording, {one: two, two: one})
+        table = {one: two, two: one}
+        finding, other = exchanged(table, ""), relabelled(recording, table)
         yield MistakeTrial(finding.rule, other, finding.cause, finding.remedy)
 
 
