@@ -510,7 +510,10 @@ class Monitor:
     def _swap(self) -> Finding:
         ids = self._anchors.ids
         table = {int(ids[one]): int(ids[at]) for one, at in self._swapped}
-        return exchanged(table, "each TDOA with one of them fits the place of another")
+        evidence = "each TDOA with one of them fits the place of another"
+        if len(table) > 2:
+            evidence += "; in a nearly symmetrical room, another order fits, too"
+        return exchanged(table, evidence)
 
     def _silence(self, row: int) -> Finding:
         number = self._anchors.ids[row]

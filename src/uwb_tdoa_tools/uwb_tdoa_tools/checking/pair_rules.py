@@ -19,6 +19,7 @@ from uwb_tdoa_bias.effects import EffectSet, LabelEffect, Track, true_samples
 from uwb_tdoa_bias.effects.anchor import AnchorIds
 from uwb_tdoa_bias.effects.pair import PairSign
 from uwb_tdoa_ekf.monitoring.finding import ERROR, Finding
+from uwb_tdoa_ekf.monitoring.judge import exchanged
 
 Fault = tuple[str, str, str, float]  # fault of the pair, evidence, remedy, deciding number
 
@@ -256,19 +257,8 @@ def exchanged_ids(path: KnownPath) -> Iterator[Finding]:
     """Yield anchors with exchanged ids."""
     table, before, after = find_exchanges(path)
     if table:
-        names = ", ".join(f"{wrong} is {right}" for wrong, right in table.items())
-        yield Finding(
-            "ids_exchanged",
-            ERROR,
-            cause=f"the ids of anchors are exchanged: what is called {names}",
-            evidence=f"median error of their TDOAs {before:.2f} m, exchanged {after:.2f} m",
-            remedy=(
-                "id = "
-                f"{{{', '.join(f'{wrong}: {right}' for wrong, right in table.items())}}}.get(id, "
-                "id)"
-            ),
-            value=after,
-        )
+        evidence = f"median error of their TDOAs {before:.2f} m, exchanged {after:.2f} m"
+        yield exchanged(table, evidence, after)
 
 
 def find_exchanges(path: KnownPath) -> tuple[dict[int, int], float, float]:
