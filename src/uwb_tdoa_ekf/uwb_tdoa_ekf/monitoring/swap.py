@@ -194,7 +194,8 @@ def clear_order(left: Residuals, before: Order = ()) -> Order:
 
     Some rooms are nearly symmetrical: the Order that was found `before` has precedence.
     """
-    best, *others = sorted((key for key in left if len(key) == 2), key=left.__getitem__) or [()]
+    pairs: list[Order] = sorted((key for key in left if len(key) == 2), key=left.__getitem__)
+    best, *others = pairs or [()]
     for mixed in sorted((key for key in left if len(key) > 2), key=lambda key: key != before):
         if left[mixed] < SHARE * left[()] and left[mixed] < OF_OTHERS * left[best]:
             return mixed
