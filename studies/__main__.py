@@ -92,6 +92,11 @@ STUDIES = {  # name: (module, what it measures, page of docs/)
         "bodies, sensors, rates and errors of many users, beside two textbook estimators",
         "notebook/users.md",
     ),
+    "vehicle": (
+        "vehicle",
+        "the filters of the Crazyflie firmware before and after a correction, on held-out flights",
+        "notebook/export.md",
+    ),
     "warehouse": (
         "warehouse",
         "starts, slow tags and walks in halls, and their cost",

@@ -21,6 +21,7 @@ from studies import (
     moved_anchors,
     surveying,
     table,
+    vehicle,
 )
 from studies.diagnosis import splits
 from uwb_tdoa_bias.common.errors import InputError
@@ -209,3 +210,41 @@ def test_ways_through_a_radio_link_are_compared(capsys, monkeypatch):
     monkeypatch.setattr(crazyflie.inputs.Reading, "find", lambda *_: [0, 1])
     assert study.main(["crazyflie", "x", "--survey", "y", "--jobs", "1"]) == 0
     assert "| link, converted | 400 | 100 | 0.200 | 0.300 |" in capsys.readouterr().out
+
+
+def test_a_correction_is_judged_on_the_other_half_of_each_survey(tmp_path, capsys, monkeypatch):
+    flights = [(f"flight-{k}", "hall.yaml") for k in range(4)]
+    made = SimpleNamespace(anchors=None, name="flown")
+    given = {way: (way, None) for way in ("effects", "network")}, SimpleNamespace()
+    fitted = []
+
+    def corrections(folder, training, survey):
+        fitted.append((folder.name, [path for path, _ in training]))
+        return given
+
+    errors = {
+        "standard": np.array([[0.4, 0.3, 0.2]] * 2),
+        "robust": np.array([[0.4, 0.3, 0.33]] * 2),
+    }
+    for name, value in (
+        ("corrections", corrections),
+        ("comparison", lambda *_: errors),
+        ("write_crazyflie", lambda *_: None),
+        ("trace", lambda *_: None),
+        ("stddev_of", lambda _: 0.4),
+    ):
+        monkeypatch.setattr(vehicle, name, value)
+    monkeypatch.setattr(vehicle.inputs.Reading, "find", lambda *_: flights)
+    monkeypatch.setattr(vehicle.inputs.Reading, "read", lambda *_: made)
+    words = ["vehicle", "x", "--survey", "y", "--firmware", "z", "--out", str(tmp_path)]
+    assert study.main(words) == 0
+    assert fitted == [
+        ("hall-0", ["flight-0", "flight-1"]),
+        ("hall-1", ["flight-2", "flight-3"]),
+    ]
+    printed = capsys.readouterr().out
+    assert "| flown | effects | standard | 0.400 | 0.300 | 0.200 |" in printed
+    assert "| mean | network | robust | 0.400 | 0.300 | 0.330 |" in printed
+    assert "| worst | effects | robust |  |  | +10% |" in printed
+    monkeypatch.setattr(vehicle.inputs.Reading, "find", lambda *_: flights[:2])
+    assert study.main(words) == 2 and "give three or more" in capsys.readouterr().err
