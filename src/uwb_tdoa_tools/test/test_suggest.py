@@ -281,8 +281,9 @@ def test_entries_of_lists_are_records(folder, capsys):
         )
         for i, t in enumerate(T)
     ]
-    (folder / "log.jsonl").write_text("\n".join(rows))
-    flight = read_as_suggested("log.jsonl", capsys)
+    (folder / "day").mkdir()
+    (folder / "day" / "log.jsonl").write_text("\n".join(rows))
+    flight = read_as_suggested("day", capsys)
     assert len(flight.range) == 2 * N and flight.range.d.min() == pytest.approx(5.0)
 
 

@@ -109,7 +109,9 @@ def described(converted: Converted) -> list[str]:
         out.append(f"  {topic}: sorted, its stamps fell {falls} times")
     if converted.tdoa_unknown_anchor:
         count = converted.tdoa_unknown_anchor
-        out.append(f"  {count} measurements name an anchor that the survey does not have")
+        out.append(
+            f"  {count} measurements name an anchor that the survey does not have; check lists them"
+        )
     return out
 
 

@@ -38,7 +38,7 @@ from .streams import Streams, by_time, make_flight
 from .tables import Block, CsvFiles, Foreign, ULogFile, Wanted, is_ulog
 
 SURVEY = "anchors"  # stream of positions
-ENDS = ".csv", ".csv.gz", ".bag", ".ulg"  # of names of recordings
+ENDS = ".csv", ".csv.gz", ".jsonl", ".bag", ".ulg"  # of names of recordings
 SINGLE = "gyro", "acc", "pose", "tof", "baro", "flow"  # streams of one sensor each
 MOST_LISTED = 8  # columns in a sentence
 THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}")  # as 1,000
@@ -91,7 +91,9 @@ def files_of(paths: Sequence[Path]) -> list[Path]:
             files = sorted(path.iterdir())
             inside = [file for file in files if file.name.endswith(ENDS) or is_bag(file)]
         if not inside:
-            raise InputError(f"{path}: holds no CSV file, bag or ULog; give a recording.")
+            raise InputError(
+                f"{path}: holds no CSV file, JSON lines, bag or ULog; give the files themselves."
+            )
         found += inside
     return found
 
