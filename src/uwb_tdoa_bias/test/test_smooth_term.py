@@ -305,19 +305,19 @@ def found_term(values, covariate, form, knots, shape, channel="tdoa"):
         (
             found_term({"2.c0": 0.0, "2.c1": 0.64}, "range", "anchor", (1.0, 5.0, 8.0), "step"),
             "2",
-            "anchor 2 seems 0.64 ± 0.02 m farther where range is above 5 m (seen from 1 m to 8 m)",
+            "anchor 2 seems 0.64 ± 0.02 m farther where range is above 5 m (seen: range from 1 m to 8 m)",
         ),
         (
             found_term(
                 {"0-1.c0": 0.0, "0-1.c1": -0.3}, "time", "pair", (0.0, 10.0, 20.0, 30.0), "interval"
             ),
             "0-1",
-            "the TDOA of 0-1 is 0.30 ± 0.02 m smaller from 10 s to 20 s (seen from 0 s to 30 s)",
+            "the TDOA of 0-1 is 0.30 ± 0.02 m smaller from 10 s to 20 s (seen: time from 0 s to 30 s)",
         ),
         (
             found_term({"c0": 0.0, "c1": 0.4}, "height", "common", (1.0, 3.0), "line"),
             "",
-            "every TDOA is 0.20 ± 0.01 m larger for each m more of height (seen from 1 m to 3 m)",
+            "every TDOA is 0.20 ± 0.01 m larger for each m more of height (seen: height from 1 m to 3 m)",
         ),
         (
             found_term(
@@ -326,13 +326,13 @@ def found_term(values, covariate, form, knots, shape, channel="tdoa"):
             "",
             "the gyroscope reads 0.20 ± 0.01 rad/s too little about y for each m/s^2 more of "
             "accel z, below 10 m/s^2 "
-            "(seen from 8 m/s^2 to 12 m/s^2)",
+            "(seen: accel z from 8 m/s^2 to 12 m/s^2)",
         ),
         (
             found_term({"c0": 0.0, "c1": 0.4}, "time", "common", (0.0, 4.0), "line", "yaw_rate"),
             "",
             "each value of yaw_rate is 0.100 ± 0.005 rad/s larger for each s more of time "
-            "(seen from 0 s to 4 s)",
+            "(seen: time from 0 s to 4 s)",
         ),
         (
             found_term({"2.c0": 0.0, "2.c1": 0.4}, "time", "anchor", (3.0, 5.0, 11.0), "pulse"),
@@ -353,7 +353,7 @@ def found_term(values, covariate, form, knots, shape, channel="tdoa"):
             ),
             "2",
             "anchor 2 seems 0.8 m farther where speed is above 1.5 m/s, while height is above 2 m "
-            "(seen from 0 m/s to 3 m/s)",
+            "(seen: speed from 0 m/s to 3 m/s)",
         ),
     ],
 )
@@ -392,25 +392,25 @@ def test_knots_are_rounded_to_centimetres_and_whole_degrees():
         (
             of_two("range", RANGES, "bearing", BEARINGS),
             "range is between 4.75 m and 4.94 m, while bearing is between 53 degrees and 56 degrees "
-            "(seen from 2 m to 7 m): there the tag is -2.8 m in x and -3.9 m in y from the anchor, at "
+            "(seen: range from 2 m to 7 m): there the tag is -2.8 m in x and -3.9 m in y from the anchor, at "
             "most",
         ),
         (
             of_two("elevation", ELEVATIONS, "range", RANGES),
             "elevation is between 29 degrees and 34 degrees, while range is between 4.75 m and "
-            "4.94 m (seen from 0 degrees to 57 degrees): there the tag is -2.5 m in z and 4.1 m "
+            "4.94 m (seen: elevation from 0 degrees to 57 degrees): there the tag is -2.5 m in z and 4.1 m "
             "level from the anchor",
         ),
         (
             of_two("bearing", BEARINGS, "elevation", ELEVATIONS),
             "bearing is between 53 degrees and 56 degrees, while elevation is between 29 degrees "
-            "and 34 degrees (seen from -57 degrees to 115 degrees): there the tag is in the "
+            "and 34 degrees (seen: bearing from -57 degrees to 115 degrees): there the tag is in the "
             "direction (-0.50, -0.69, -0.52) from the anchor",
         ),
         (
             of_two("range", (1.0, 2.0, 6.0, 7.0), "bearing", BEARINGS),
             "range is between 2 m and 6 m, while bearing is between 53 degrees and 56 degrees "
-            "(seen from 1 m to 7 m)",
+            "(seen: range from 1 m to 7 m)",
         ),
     ],
 )
@@ -425,25 +425,25 @@ def test_angles_are_in_degrees_and_narrow_intervals_name_the_place(found, words)
             "y",
             (-1.54, -1.4, 1.0),
             "below",
-            "where y is -1.54 m than where it is -1.4 m or more (seen from -1.54 m to 1 m)",
+            "where y is -1.54 m than where it is -1.4 m or more (seen: y from -1.54 m to 1 m)",
         ),
         (
             "y",
             (-1.0, 1.4, 1.54),
             "beyond",
-            "where y is 1.54 m than where it is 1.4 m or less (seen from -1 m to 1.54 m)",
+            "where y is 1.54 m than where it is 1.4 m or less (seen: y from -1 m to 1.54 m)",
         ),
         (
             "height",
             (1.0, 1.5),
             "line",
-            "where height is 1.5 m than where it is 1 m (seen from 1 m to 1.5 m)",
+            "where height is 1.5 m than where it is 1 m (seen: height from 1 m to 1.5 m)",
         ),
         (
             "elevation",
             (0.0, 1.5),
             "line",
-            "where elevation is 86 degrees than where it is 0 degrees (seen from 0 degrees to "
+            "where elevation is 86 degrees than where it is 0 degrees (seen: elevation from 0 degrees to "
             "86 degrees)",
         ),
     ],

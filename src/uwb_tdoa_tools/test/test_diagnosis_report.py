@@ -230,7 +230,7 @@ def test_effects_are_applied_only_if_the_judged_flights_become_better(
 def test_what_to_fly_next_is_one_sentence(result):
     sides = {"one": 0.3}, {"one": 0.3}, [-0.1, 0.1]
     fly = verdict(judged(result, {"one": 0.3}, {"one": 0.1}, [0.5, 0.8])).fly
-    assert fly.startswith("Fly once more, and diagnose both flights together")
+    assert fly.startswith("Fly once more, where you will fly later, and diagnose both")
     doubtful = [finding(delay(), alternatives=(AS_WELL,))]
     fly = verdict(judged(result, *sides, findings=doubtful)).fly
     assert fly == "A flight on several sides: it distinguishes anchor_delay from anchor_position."
@@ -273,14 +273,14 @@ def test_a_phase_that_becomes_worse_is_in_the_verdict_with_the_flights_by_name(r
     written = {**changed.after, "pooled": {**changed.after["pooled"], "rmse_3d": 0.19}}
     found = verdict(replace(changed, written=written, tdoa_std=0.12))
     more = found.details
-    worse = "until z > 0.3 m from 33.9 cm (NEES 4.1) to 41.0 cm (NEES 4.1)"
+    worse = "until z > 0.3 m, from 33.9 cm (NEES 4.1) to 41.0 cm (NEES 4.1)"
     assert found.apply == f"Apply effects.yaml. It makes worse: {worse}."
     # the same again is said once, other figures are said
     assert "With tdoa_std 0.120 m of ekf_node.yaml too it is 19.0 cm." in more
     until = {"rmse_3d": 0.45, "nees_mean": 4.1}
     written["pooled"]["phases"] = {**written["pooled"]["phases"], "to_0.3_m": until}
     more = verdict(replace(changed, written=written, tdoa_std=0.12)).details
-    worse = "until z > 0.3 m from 41.0 cm (NEES 4.1) to 45.0 cm (NEES 4.1)"
+    worse = "until z > 0.3 m, from 41.0 cm (NEES 4.1) to 45.0 cm (NEES 4.1)"
     assert f"With tdoa_std 0.120 m of ekf_node.yaml too it is 19.0 cm; worse: {worse}." in more
 
 
@@ -314,7 +314,7 @@ def test_healthy_flights_are_called_healthy_and_ask_for_nothing(result):
     sides = {"one": 0.019, "two": 0.019}, {"one": 0.016, "two": 0.016}, [0.05, 0.2]
     found = verdict(judged(result, *sides, findings=[finding(delay(), worth=0.003)]))
     assert found.headline.startswith("Nothing is wrong that costs 1 cm. The position error")
-    assert found.actions == () and found.fly.startswith("Nothing more.")
+    assert found.actions == () and found.fly.startswith("Nothing before a change")
     assert found.applies and found.apply == "Apply effects.yaml, or leave it."
     wrong = verdict(judged(result, *sides, findings=[finding(delay(), worth=0.05)]))
     assert wrong.headline.startswith("The position error") and wrong.actions
@@ -356,8 +356,8 @@ def test_the_verdict_says_why_in_words_of_the_field(result):
     assert "falls from 30.4 to 21.8 cm" in found.headline
     assert found.cause.startswith("Errors that depend on x and height, anchor by anchor")
     assert found.cause.endswith(
-        "; at most anchor 4 seems 0.3 m farther, depending on x, worth 7.3 of 8.6 cm. Sure that "
-        "it is there, not why. More causes of 1 cm or more: 1."
+        "; the largest: anchor 4 seems 0.3 m farther at most, depending on x, worth 7.3 of 8.6 "
+        "cm. Likely that it is there, but not why. Also anchor_position (1.2 cm); what they share is not counted."
     )
     assert "anchor 4 seems 0.15 m farther for each m more of x" in found.actions[0]
     assert "Likely causes: an obstacle or" in found.actions[0]
@@ -568,7 +568,7 @@ def test_what_is_on_the_floor_alone_is_not_judged_by_the_air(result):
             side["pooled"]["phases"] = {"first_3_s": {"rmse_3d": error, "nees_mean": 3.0}}
         found = verdict(changed)
         assert found.applies == applies and floor_only in found.apply
-        assert f"(first 3 s from 28.8 cm (NEES 3.0) to {100 * first:.1f} cm" in found.apply
+        assert f"(first 3 s, from 28.8 cm (NEES 3.0) to {100 * first:.1f} cm" in found.apply
     (entry,) = entries(changed)
     assert worth_in_words(entry) == "not told by errors in the air" and entry.values.startswith(
         "2.delay = 2.8 ± 0.1, "
@@ -666,13 +666,13 @@ def test_figures_of_trials_have_one_order_and_one_unit():
             "nlos",
             {"7.delay": 0.69, "7.end": 30.0, "2.delay": 0.8, "2.start": 40.0},
             {"7.delay": 0.02, "2.delay": 0.02},
-            "something between tag and anchor (nlos; largest 2.delay = 0.80 ± 0.02 m)",
+            "something between tag and anchor (nlos; largest of 2: 2.delay = 0.80 ± 0.02 m)",
         ),
         (
             "floor_multipath",
             {"x": -3.1, "y": 2.0, "0.delay": 1.5, "0.height": 0.2, "1.delay": 2.5},
             {"0.delay": 0.1, "1.delay": 0.1},
-            "(floor_multipath; largest 1.delay = 2.5 ± 0.1 m)",
+            "(floor_multipath; largest of 2: 1.delay = 2.5 ± 0.1 m)",
         ),
         (
             "floor_step",
@@ -696,13 +696,13 @@ def test_figures_of_trials_have_one_order_and_one_unit():
             "truth_frame",
             {"z": 0.16, "yaw": 0.1},
             {"z": 0.01, "yaw": 0.01},
-            "(truth_frame; largest yaw = 5.7 ± 0.6 degrees)",
+            "(truth_frame; largest of 2: yaw = 5.7 ± 0.6 degrees)",
         ),
         (
             "anchor_position",
             {"2.y": 0.9, "2.z": 0.3},
             {"2.y": 0.8, "2.z": 0.4},
-            "a fitted correction (anchor_position; largest 2.y = 0.9 ± 0.8 m): none of its 2 values is "
+            "a fitted correction (anchor_position; largest of 2: 2.y = 0.9 ± 0.8 m): none of its 2 values is "
             "twice the standard deviation, no anchor has to be moved",
         ),
     ],

@@ -178,8 +178,8 @@ def lines_of_use(
     return (
         (
             evaluate_line(recordings, survey, effects, config, truth, more),
-            "judges it; flights of the fit judge it too well",
+            "judges it; flights that it was fitted to would flatter it",
         ),
-        (bias, "in flight: takes it out of TDOAs"),
-        (ekf, "in flight: takes it out of the IMU, and assumes the noise that is left"),
+        (bias, "in flight, the first node: corrects TDOAs"),
+        (ekf, "in flight, the second node: takes these TDOAs, and corrects its other sensors"),
     )

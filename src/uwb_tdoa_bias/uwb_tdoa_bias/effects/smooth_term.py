@@ -596,12 +596,12 @@ _CAUSES = (
         ("anchor",),
         OF_PLACE,
         (
-            "an obstacle or a reflector on that side of it, its antenna's pattern (Qorvo support: "
-            "10 - 15 cm), or its place in the survey"
+            "an obstacle or a reflector on that side of it, its antenna's pattern (errors of 10 to 15 "
+            "cm, says Qorvo), or its place in the survey"
         ),
         (
             "exchange its module with that of another anchor and fly there again: what stays is "
-            "in the room"
+            "in the room or in the survey"
         ),
     ),
     (
@@ -654,7 +654,7 @@ def described(term: SmoothTerm, part: str = "") -> str:
     prefix = f"{part}." if part else ""
     name, unit = _named(term.covariate), shown_in(term.covariate)[0]
     knots = _in_words(term.covariate, term.knots)
-    seen = f"{_factor_clause(term)} (seen from {knots[0]} to {knots[-1]}){_place(term)}"
+    seen = f"{_factor_clause(term)} (seen: {name} from {knots[0]} to {knots[-1]}){_place(term)}"
     size = term.values.get(f"{prefix}c1", 0.0)
     std = term.std.get(f"{prefix}c1")
     if term.shape in ("step", "interval"):
@@ -695,7 +695,9 @@ def in_brief(term: SmoothTerm, part: str = "") -> str:
     if term.shape not in SHAPES or SHAPES[term.shape][1] > 2:  # c1 is not its size
         size = float(np.ptp(term.curve(np.linspace(term.knots[0], term.knots[-1], 60), prefix)))
         std = None
-    return _off(term, part, size, std, f", depending on {listed(map(_named, term.arguments))}")
+    return _off(
+        term, part, size, std, f" at most, depending on {listed(map(_named, term.arguments))}"
+    )
 
 
 def _in_words(covariate: str, values: Iterable[float]) -> list[str]:

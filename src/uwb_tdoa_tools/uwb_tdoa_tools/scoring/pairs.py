@@ -25,7 +25,7 @@ PERIOD = 1.0  # s, of one residual of a pair
 FEWEST = 3  # TDOAs of a pair in it
 CM = 100.0  # cm per metre
 LARGEST = 2  # pairs that are named
-NAMED = 8  # pairs in colours: those with the largest residuals
+NAMED = 7  # pairs in colours: those with the most error; an eighth would be grey
 DRAWN = 200  # pairs in a picture at most: those with the largest residuals
 GREY: dict[str, Any] = {"color": "0.75", "lw": 0.8, "zorder": 1}  # of the other pairs
 LOWEST = 0.2  # m, smallest limit of the axis of residuals: noise looks small
@@ -66,8 +66,8 @@ class PairResiduals:
         return 1.1 * max([LOWEST, *largest])
 
     def largest(self, count: int) -> list[str]:
-        """Return the pairs with the largest residuals."""
-        sizes = {pair: _known_rms(values) for pair, values in self.median.items()}
+        """Return the pairs with the largest sum of squares: one that is seldom heard counts less."""
+        sizes = {pair: np.nansum(values**2) for pair, values in self.median.items()}
         return sorted(sizes, key=lambda pair: -sizes[pair])[:count]
 
     def sentences(self) -> list[str]:

@@ -52,7 +52,7 @@ def residuals_of_pairs(diagnosis: Diagnosis) -> list[Picture]:
         figure, ax = drawing(2.8)
         residuals.draw(ax, found["before"])
         size = f"{CM * residuals.size:.1f} cm"
-        ax.set_title(f"{title.capitalize()}: TDOAs are {size} off", loc="left", fontsize=10)
+        ax.set_title(f"{title.capitalize()}: RMS {size}", loc="left", fontsize=10)
         figure.legend(loc="outside lower center", ncols=4, fontsize=8, title="pair of anchors")
         alt = f"Residuals of the TDOAs of each pair of anchors {title}, {flight.name}: {size}"
         out.append(embedded(figure, alt))

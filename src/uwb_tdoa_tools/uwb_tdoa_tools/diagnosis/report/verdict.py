@@ -31,6 +31,7 @@ from .tables import tasks
 MOST_NAMES = 3  # largest number of named flights
 MOST_ACTIONS = 3  # largest number of actions
 NAMED = 3  # largest number of named reasons, and of named places
+SURE = 5.0  # standard deviations from which a cause is called sure
 WHOLE = 0.995  # share of the values from which it rounds to 100 %
 # What other flights show of a diagnosis of FEW flights, measured (docs/notebook/diagnosis.md): their
 # gain over the promised one, and how many get worse by 5 %
@@ -41,7 +42,7 @@ LARGE, ABOVE = (0.15, 3.0)
 FEWEST = 3  # fewest rows of such a pair
 ERROR = "The position error (3D RMSE)"
 LITTLE = "Nothing is wrong that costs 1 cm. "
-NOTHING_MORE = "Nothing more. After a change in the hall, fly and diagnose again."
+NOTHING_MORE = "Nothing before a change in the hall or the survey. Then fly and diagnose again."
 NOTHING_FOUND = "Nothing was found: what the model leaves of the measurements looks like noise."
 UNKNOWN = "Without ground truth, the position error is not known."
 
@@ -162,8 +163,12 @@ def _cause_and_doubt(diagnosis: Diagnosis, found: Sequence[Entry]) -> str:
     if first.worth is not None and first.worth >= LEAST_WORTH:
         of = f" of {CM * (before - after):.1f}" if first.worth <= before - after else ""
         what = f"{what}, worth {CM * first.worth:.1f}{of} cm"
-    more = sum((entry.worth or 0.0) >= WORTH_DOING for entry in others)
-    rest = f" More causes of 1 cm or more: {more}." if more else ""
+    more = [
+        f"{entry.title} ({centimetres(entry.worth)})"
+        for entry in others
+        if entry.worth and entry.worth >= WORTH_DOING
+    ]
+    rest = f" Also {listed(more)}; what they share is not counted." if more else ""
     return f"{what[0].upper()}{what[1:]}. {_doubt(first)}{rest}"
 
 
@@ -185,10 +190,11 @@ def _doubt(entry: Entry) -> str:
     )
     if deviations is None:
         return "Not sure."
+    sure = "Sure" if deviations >= SURE else "Likely"
     by = f" ({deviations:.0f} standard deviations)" if deviations else ""
     if not first.declared:
-        return f"Sure that it is there{by}, not why."
-    return f"Sure{by}: no other effect explains these flights as well."
+        return f"{sure} that it is there{by}, but not why."
+    return f"{sure}{by}: no other effect explains these flights as well."
 
 
 def _actions(found: Sequence[Entry]) -> tuple[str, ...]:
@@ -223,7 +229,8 @@ def _next_flight(diagnosis: Diagnosis, added: Sequence[Entry], kind: str, applie
             return f"{fly}: it distinguishes {entry.title} from {rival.effect}."
     if len(diagnosis.flights) == 1:
         return (
-            "Fly once more, and diagnose both flights together: flights differ in what they show."
+            "Fly once more, where you will fly later, and diagnose both flights together: one may show "
+            "what others lack."
         )
     if not set(_names(diagnosis)).isdisjoint(flight.name for flight in diagnosis.flights):
         return "Fly once more, and give that flight with --holdout: it took no part in the choice."
@@ -300,7 +307,6 @@ def _details(diagnosis: Diagnosis, added: bool) -> tuple[str, ...]:
         *(_caveats(diagnosis) if added else []),
         *_worse_runs(diagnosis),
         *_diverged(diagnosis),
-        *left_over(diagnosis),
     )
 
 
@@ -380,7 +386,7 @@ def _changes_of_phases(
             figures = [row.get("phases", {}).get(name, {}) for row in rows]
             if None not in (errors := [each.get("rmse_3d") for each in figures]):
                 changes.append(errors[0] - errors[1])
-                words.append(f"{title} from {' to '.join(map(_of_phase, figures))}")
+                words.append(f"{title}, from {' to '.join(map(_of_phase, figures))}")
         change, *of_runs = changes or [0.0]
         std = np.std(of_runs, ddof=1) / np.sqrt(len(of_runs)) if len(of_runs) > 1 else 0.0
         if abs(change) > max(WORTH_DOING, SIGNIFICANT * std):
@@ -464,7 +470,7 @@ def cause(entry: Entry, describe: Callable[[SmoothTerm, str], str] = described) 
         covariates = listed(
             dict.fromkeys(name.replace("_", " ") for term in terms for name in term.arguments)
         )
-        return f"errors that depend on {covariates}, anchor by anchor; at most {said}"
+        return f"errors that depend on {covariates}, anchor by anchor; the largest: {said}"
     effect = entry.findings[0].effect
     what, key = effect.physics.partition(":")[0], effect.largest_size()
     if key is None:
@@ -473,7 +479,7 @@ def cause(entry: Entry, describe: Callable[[SmoothTerm, str], str] = described) 
     std = effect.std.get(key)
     largest = measured(factor * effect.values[key], std and factor * std, unit)
     sizes = sum(not effect.is_condition(name) for name in effect.values)
-    most = "largest " if sizes > 1 else ""
+    most = f"largest of {sizes}: " if sizes > 1 else ""
     if not effect.significant_sizes():
         values = f"none of its {sizes} values is" if sizes > 1 else "its value is not"
         means = f", {effect.if_undetermined}" if effect.if_undetermined else ""
