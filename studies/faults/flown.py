@@ -17,7 +17,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_ekf.monitoring.finding import most_severe_first
-from uwb_tdoa_ekf.monitoring.status import RUNNING, Use, status_of
+from uwb_tdoa_ekf.monitoring.status import FAULT, RUNNING, Use, status_of
 from uwb_tdoa_ekf.monitoring.stream_rules import StreamWatch
 from uwb_tdoa_ekf.results import concatenated, rotation_std, rows_of
 from uwb_tdoa_tools import cli
@@ -132,7 +132,7 @@ class FaultyFilter:
 
     def __init__(self, ours: OwnFilter, fault: FlownFault) -> None:
         """ours : OwnFilter; fault : FlownFault."""
-        self._ours, self._fault, self._begun = ours, fault, False
+        self._ours, self._of, self._begun, self._fault = ours, fault, False, False
         self._use, self._watch, self._findings = (
             Use(LAG),
             StreamWatch(ours.estimator.anchors, LAG),
@@ -164,7 +164,7 @@ class FaultyFilter:
             self._look()
 
     def _changed(self, name: str, part: Any) -> Any:
-        fault = self._fault
+        fault = self._of
         if name != fault.stream or not len(part.t) or not BEGIN <= self._now < BEGIN + fault.lasts:
             return part
         if not fault.once:
@@ -193,6 +193,9 @@ class FaultyFilter:
             else rotation_std(newest.q[-1:], newest.covariance[-1:])[0, 2]
         )
         status = status_of(estimator, yaw_std, self._now - self._last, self._use, self._findings)
+        if self._fault and status.status != FAULT:
+            estimator.distrust()  # as ekf_node does at the end of a fault
+        self._fault = status.status == FAULT
         self.why = "" if status.status == RUNNING else status.why
         self.said = self.said or (self.why if self._now > BEGIN else "")
 

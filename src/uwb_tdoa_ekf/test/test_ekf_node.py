@@ -26,6 +26,8 @@ from uwb_tdoa_ekf import outputs  # noqa: E402
 from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_ekf.ekf_node import EkfNode  # noqa: E402
 from uwb_tdoa_ekf.frames import pose_from_message  # noqa: E402
+from uwb_tdoa_ekf.monitoring.finding import ERROR, Finding  # noqa: E402
+from uwb_tdoa_ekf.monitoring.status import FAULT  # noqa: E402
 from uwb_tdoa_ekf.results import Odometry  # noqa: E402
 
 # --- ekf node ---
@@ -54,6 +56,28 @@ def test_every_parameter_is_in_the_parameter_file_with_its_default(node):
     assert FilterConfig.from_yaml(CONFIG) == FilterConfig()
     comments = dict(re.findall(r"^    (\w+): .*?  # (.*)$", CONFIG.read_text(), re.MULTILINE))
     assert comments == {name: node.describe_parameter(name).description for name in declared}
+
+
+def test_the_end_of_a_fault_opens_the_filter(node):
+    opened = []
+    node._estimator = SimpleNamespace(
+        running=True,
+        lost=None,
+        without_imu=None,
+        yaw_doubts=0,
+        unsure=None,
+        distrust=lambda: opened.append(True),
+    )
+    node._health.last_odometry = node._health.now()
+    node._attitude = np.array([[0.0, 0.0, 0.0, 1.0]]), 1e-4 * np.eye(9)[None]
+    assert node._judge().yaw_known
+    node._findings = [Finding("tdoa_sign", ERROR, "the sign is wrong", "", "", 1.0)]
+    assert node._judge().status == FAULT and not opened
+    node._findings = []
+    assert not node._judge().yaw_known and opened == [True]
+    node._judge()
+    assert opened == [True]
+    node._estimator = None
 
 
 def test_a_velocity_is_turned_into_the_body_by_its_frame(node):

@@ -34,7 +34,7 @@ from uwb_tdoa_ekf.core.memory import (
 from uwb_tdoa_ekf.core.startup import Places, level, locate, split
 from uwb_tdoa_ekf.core.state import ERROR_STATES
 from uwb_tdoa_ekf.core.workspace import set_bounds
-from uwb_tdoa_ekf.core.yaw_check import evidence
+from uwb_tdoa_ekf.core.yaw_check import ANGLES, MOST_AT_ONCE, YAW_KNOWN, accumulate
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.results import rotation_std
@@ -524,6 +524,18 @@ def test_a_wrong_yaw_that_is_told_is_opened_within_seconds(seed, wrong):
     assert error[odometry.t > 15.0].max() < 0.3
 
 
+@pytest.mark.parametrize(("seed", "wrong"), [(0, 60.0), (0, 90.0), (2, -60.0), (2, -90.0)])
+def test_a_wrong_yaw_of_a_slow_tag_is_opened_in_twice_the_time_in_which_an_unknown_one_settles(
+    monkeypatch, seed, wrong
+):
+    monkeypatch.setattr(flights, "Wave", Wave)
+    flight = fly(seed, 30.0, tdoa_std=0.15, **QUIET)
+    unknown = run_offline(flight, FilterConfig(initial_yaw=1.0)).odometry
+    settled = unknown.t[rotation_std(unknown.q, unknown.covariance)[:, 2] < YAW_KNOWN][0]
+    _, stamps = opened(Estimator(flight.anchors, told(flight, math.radians(wrong))), flight)
+    assert stamps and stamps[0] <= 2.0 * settled, (stamps, settled)
+
+
 @pytest.mark.parametrize(
     ("seed", "degrees"),
     [
@@ -584,10 +596,22 @@ def test_a_tag_at_rest_doubts_nothing():
     assert not opened(Estimator(flight.anchors, told(flight, math.pi)), flight)[1]
 
 
-def test_evidence_is_the_likelihood_ratio_of_the_best_angle():
+def test_evidence_is_the_likelihood_ratio_of_each_angle():
     doubt = new_state(np.zeros((4, 3))).record.yaw_test
-    assert evidence(doubt) == 0.0 and doubt.response.shape == (2, ERROR_STATES)
-    doubt.information[:] = 10.0 * np.eye(2)
+    assert accumulate(doubt, 1.0) == 0.0 and doubt.response.shape == (2, ERROR_STATES)
     # innovations of a yaw error of 270 degrees
-    doubt.vector[:] = 10.0 * np.array([math.cos(1.5 * math.pi) - 1.0, math.sin(1.5 * math.pi)])
-    assert evidence(doubt) == pytest.approx(0.5 * 10.0 * 2.0)
+    turn = np.array([math.cos(1.5 * math.pi) - 1.0, math.sin(1.5 * math.pi)])
+    for _ in range(2):
+        doubt.information[:], doubt.vector[:] = 0.1 * np.eye(2), 0.1 * turn
+        accumulate(doubt, 1.0)
+    assert not doubt.vector.any() and not doubt.information.any()
+    assert np.degrees(ANGLES[np.argmax(doubt.ratios)]) == pytest.approx(270.0)
+    assert np.max(doubt.ratios) == pytest.approx(2 * 0.5 * 0.1 * 2.0)
+
+
+def test_a_moment_of_evidence_counts_little_and_evidence_for_the_yaw_is_no_credit():
+    doubt = new_state(np.zeros((4, 3))).record.yaw_test
+    doubt.information[:] = 1e3 * np.eye(2)  # the yaw is right
+    assert accumulate(doubt, 1.0) == 0.0
+    doubt.information[:], doubt.vector[:] = 0.5 * np.eye(2), [-1.0, 0.0]
+    assert accumulate(doubt, 1.0) == MOST_AT_ONCE

@@ -456,7 +456,7 @@ class EkfNode(StreamNode):
             turns = self._yaw_may_turn(odometry)
             if self._fault:
                 odometry = with_fault_covariance(odometry, self._estimator.workspace)
-            self.outputs.publish_odometry(odometry, turns, self._estimator.unsure is not None)
+            self.outputs.publish_odometry(odometry, turns, self._estimator.rival)
             self._health.last_odometry = self._health.now()
             self._health.last_position = odometry.p[-1], odometry.covariance[-1, :3, :3]
             self._attitude = odometry.q[-1:], odometry.covariance[-1:]
@@ -528,7 +528,10 @@ class EkfNode(StreamNode):
         self._status.publish(status, yaw_std, self._health.use.tdoa_age, stamp, self.outputs.world)
 
     def _judge(self) -> Status:
-        """Return the current Status: whether a vehicle may fly by the odometry."""
+        """Return the current Status: whether a vehicle may fly by the odometry.
+
+        At the end of a fault, the filter opens what the fault has spoiled.
+        """
         last = self._health.last_odometry
         age = math.inf if last is None else self._health.now() - last
         status = status_of(
@@ -540,8 +543,13 @@ class EkfNode(StreamNode):
             self._anchors.refused,
             off_the_clock(self._behind()),
         )
-        self._fault = status.status == FAULT
-        return status
+        fault = status.status == FAULT
+        over, self._fault = self._fault and not fault, fault
+        if not over or self._estimator is None:
+            return status
+        self._estimator.distrust()
+        self._attitude = None  # it is that of the fault
+        return self._judge()
 
     def _counts(self) -> Counter[str]:
         """Return the totals over all estimators so far, by result of a message."""

@@ -19,6 +19,7 @@ from uwb_tdoa_bias.effects import EffectSet
 from .anchor_table import MOST_ROWS, AnchorTable
 from .core import height, sensors
 from .core.config import FilterConfig
+from .core.engine import INCONSISTENT
 from .core.initialization import LOST_TIME
 from .core.memory import (
     INVALID,
@@ -40,6 +41,7 @@ from .results import VERDICTS, Odometry, Residuals, concatenated
 # s, largest lead of a pose that the user sets over the newest measurement
 LARGEST_POSE_AHEAD = 10.0
 RESTART_NAMED = 10.0  # s of stamps for which /diagnostics reports a restart
+RECOVERY_NAMED = 5.0  # s of stamps for which `status` reports a recovery
 LEAST_POSE_STD = 1e-3  # m, and rad; the covariance of the filter must stay positive definite
 MOST_POSES = 100  # poses that may wait for their stamp
 NOTHING = (
@@ -168,13 +170,32 @@ class Estimator:
         The result depends on stamps only.
         """
         ekf = self._ekf
-        if not ekf.running or ekf.t >= ekf.rival_until:
+        if not ekf.running:
             return None
-        return (
-            "TDOAs agree on another place than the wheels have gone to: the position is "
-            "unsure, and follows the wheels; look for anchors that "
-            "are late or blocked"
-        )
+        if self.rival:
+            return (
+                "TDOAs agree on another place than the wheels have gone to: the position is "
+                "unsure, and follows the wheels; look for anchors that "
+                "are late or blocked"
+            )
+        if ekf.consistency < INCONSISTENT:
+            return (
+                "TDOAs contradict the filter: the position may be wrong by metres; look for what "
+                "has changed in TDOAs or IMU"
+            )
+        if ekf.t - ekf.recovered < RECOVERY_NAMED:
+            return (
+                "the filter was wrong, and has moved to where TDOAs agree: do not rely on it yet; "
+                "look for what has changed in TDOAs or IMU"
+            )
+        if ekf.t < ekf.height.ignored_until:
+            return "TDOAs contradict the range finder, and it is not used: check it, height_std"
+        return None
+
+    @property
+    def rival(self) -> bool:
+        """Return whether TDOAs agree on another place than the one to which wheels have led."""
+        return bool(self._ekf.t < self._ekf.rival_until)
 
     @property
     def workspace(self) -> np.ndarray:
@@ -378,6 +399,10 @@ class Estimator:
             np.array([(max(t, self._buffer.used_until), p, covariance, yaw, yaw_std)], POSE)
         )
         self._poses.sort(key=lambda pose: pose["t"][0])
+
+    def distrust(self) -> None:
+        """Open position, velocity, attitude and biases, because a fault has spoiled them."""
+        self._pipeline.distrust()
 
     def expect_imu(self, expected: bool) -> None:
         """Set whether the filter waits for inertial samples before the first one has come."""

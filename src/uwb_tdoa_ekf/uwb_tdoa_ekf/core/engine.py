@@ -70,8 +70,8 @@ AVERAGED = 0.25
 LINEAR_RANGE = 1.0
 
 # Most records in a history per TDOA: its update, workspace, position at rest, another hypothesis,
-# starts or recoveries, an opened yaw.
-RECORDS_OF_TDOA = 1 + 4 + 6 + 1 + 2 + 2
+# starts or recoveries with an opened attitude, an opened yaw.
+RECORDS_OF_TDOA = 1 + 4 + 6 + 1 + 3 + 2
 RECORDS_OF_REST = 3  # one per axis
 # a range has the same number; a velocity has one per component, plus an opened yaw
 RECORDS_OF_SENSOR = RECORDS_OF_TDOA
@@ -158,6 +158,21 @@ def set_pose(state: FilterState, parameters: np.ndarray, pose: np.ndarray) -> No
         New pose. It must not be earlier than measurements of the last call.
     """
     _set_pose(state, parameters, pose, history.NOTHING)
+
+
+# Compiled part of `distrust`.
+@compiled
+def _distrust(state: FilterState, parameters: np.ndarray, records: np.ndarray) -> None:
+    if state.ekf[0].running:
+        initialization.distrust(state.ekf[0], parameters[0], records)
+
+
+def distrust(state: FilterState, parameters: np.ndarray) -> None:
+    """Open what a fault of the streams has spoiled, see `initialization.distrust`.
+
+    The history does not record it. `parameters` is the tuning of the filter, (1,) PARAMETERS.
+    """
+    _distrust(state, parameters, history.NOTHING)
 
 
 def most_records(measurements: Measurements) -> int:
@@ -687,6 +702,9 @@ def _report(ekf: Record, parameters: Record, t: float, row: Record) -> None:
     row.covariance[:3, :3] += row.consider_covariance
     if t < ekf.rival_until:
         _widen(ekf, best.x, row.covariance)
+    if ekf.consistency < INCONSISTENT:
+        for k in range(3):
+            row.covariance[k, k] += initialization.reach(ekf, t) ** 2
     _report_rate(ekf, parameters, t, row)
     if parameters.planar:
         plane.flatten(row, parameters, wrong)

@@ -19,6 +19,7 @@ import numpy as np
 from uwb_tdoa_bias.common.compiled import Record, compiled
 from uwb_tdoa_bias.common.robust_loss import GEMAN_MCCLURE, weight
 
+from . import yaw_check
 from .history import add_reset, add_update
 from .hypotheses import add_log_likelihood, alive
 from .inertial import UPRIGHT
@@ -117,6 +118,8 @@ def observe(
         add_update(ekf, h, sensor.t, records)
         if h == ekf.best:
             residual.weight, residual.verdict = w, USED
+            if ekf.yaw_test.alone:
+                yaw_check.observe(ekf, inflation, False)
 
 
 @compiled
@@ -243,11 +246,11 @@ def _settle(
     if height.level != parameters.ground_height and abs(base_innovation) < min(limit, 2.0 * ALIKE):
         height.level = parameters.ground_height
         return True
-    doubted = height.ignore_time > 0.0
-    if (height.agreed >= MEMORY or doubted) and abs(value) < HIGHEST_STEP:
+    trusted = height.agreed >= MEMORY or height.ignore_time > 0.0
+    if trusted and abs(value) < HIGHEST_STEP:
         height.level -= height.disagreement
         return True
-    if doubted:
+    if trusted:  # no step is so high, and the filter was right: the range finder is wrong
         return False
     height.level, height.agreed = parameters.ground_height, 0.0
     for h in range(len(ekf.hypotheses)):

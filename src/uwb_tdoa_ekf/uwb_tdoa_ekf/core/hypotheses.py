@@ -26,6 +26,7 @@ YAW_STD = 0.6  # rad, of the yaw of each hypothesis: their yaws start 90 degrees
 # minus the log probability relative to the best, above which a hypothesis or a place is dropped
 IMPROBABLE = 8.0
 MERGED_BELOW, MERGED_WITHIN = 0.1, 0.3  # rad and m: two hypotheses that are closer are merged
+ALIKE = 0.35  # rad; hypotheses that are closer have one yaw for who uses it
 LARGEST_NIS = GATE**2  # normalized innovation squared; limits the weight of a single measurement
 
 
@@ -48,6 +49,18 @@ def followed(ekf: Record) -> int:
     for h in range(HYPOTHESES):
         count += alive(ekf.hypotheses[h])
     return count
+
+
+@compiled
+def alike(ekf: Record) -> bool:
+    """Return whether the attitudes of all hypotheses that are alive differ by less than ALIKE."""
+    best = ekf.hypotheses[ekf.best].x
+    for h in range(HYPOTHESES):
+        if alive(ekf.hypotheses[h]):
+            apart = difference(best, ekf.hypotheses[h].x)
+            if apart[6] ** 2 + apart[7] ** 2 + apart[8] ** 2 > ALIKE**2:
+                return False
+    return True
 
 
 @compiled

@@ -3,7 +3,8 @@
 """IMU fault detector: gravity is 9.81 m/s^2 long and turns as the gyroscope measures.
 
 A sensor in a wrong unit, or turned, is left out within tenths of a second. It is used again after
-CLEARED seconds without evidence against it. Samples and their stamps alone decide. The limits are
+CLEARED seconds without evidence against it. Samples and their stamps alone decide, except where the
+filter finds that TDOAs contradict the motion by the IMU (`leave_out`). The limits are
 beyond all values of 22 measured flights, including a crash. A multirotor that flips is taken for a
 fault.
 """
@@ -30,7 +31,9 @@ UPRIGHT, AXIS = (math.cos(math.radians(35.0)), math.cos(math.radians(25.0)))
 LYING = 3.0  # s for which a tag may lie on its side or its back
 CLEARED = 1.5  # s without evidence after which the samples are used again
 
-WEIGHT, TURN, RATE, TILT = range(1, 5)  # reason of a fault
+LEFT_OUT = 10.0  # s for which samples are not used after the filter has contradicted them
+
+WEIGHT, TURN, RATE, TILT, MOTION = range(1, 6)  # reason of a fault
 
 
 @compiled
@@ -100,8 +103,18 @@ def _contradict(detector: Record, force: np.ndarray, t: float, reason: int, size
     force is the specific force (3,), m/s^2, body frame. size is the impossible value in its own
     unit.
     """
-    detector.contradicted, detector.reason, detector.size = t, reason, size
+    if t >= detector.contradicted:
+        detector.contradicted, detector.reason, detector.size = t, reason, size
     detector.up[:] = force
+
+
+@compiled
+def leave_out(detector: Record, t: float, away: float) -> None:
+    """Leave the IMU out for LEFT_OUT s from stamp t (s), because TDOAs contradict its motion.
+
+    away is the distance, m, from the filter to the place on which TDOAs agree.
+    """
+    detector.contradicted, detector.reason, detector.size = t + LEFT_OUT, MOTION, away
 
 
 @compiled

@@ -14,11 +14,13 @@ from . import (
     ground,
     height,
     hypotheses,
+    imu_fault_detector,
     inertial,
     noise,
     stationary_position,
     velocity,
     workspace,
+    yaw_check,
 )
 from .ground import SPEED, KnownHeight
 from .history import add_reset
@@ -51,6 +53,9 @@ SMALLEST_STD = 0.03  # m, least standard deviation of a known height at the star
 # m, m/s, m/s^2: a recovery is limited to this distance, as a function of the time since the filter
 # agreed
 REACH, REACH_SPEED, REACH_ACCELERATION = (0.5, 0.5, 0.5)
+# s for which TDOAs must agree on a place that the IMU cannot have led to, and s between two openings of
+# the yaw: then the IMU is wrong. In 22 measured flights TDOAs contradict for 0.5 s at most.
+IMU_CONTRADICTED, TWICE = (2.0, 20.0)
 # number of late anchors that may explain TDOAs that contradict wheels: two late anchors are as
 # probable as a rover that jumps
 LATE_ANCHORS = 2
@@ -411,6 +416,7 @@ def set_pose(
             hypotheses.set_state(hypothesis, x, covariance)
             if has_yaw:
                 turn_about_vertical(hypothesis.x, pose.yaw - yaw_of(hypothesis.x))
+                yaw_check.forget(ekf.yaw_test)
                 hypotheses.set_yaw_variance(hypothesis, pose.yaw_std**2)
                 if h != ekf.best:
                     hypothesis.log_weight = -np.inf
@@ -468,6 +474,7 @@ def _begin(
             P[9 + k, 9 + k] = parameters.initial_accel_bias_std**2
             P[12 + k, 12 + k] = parameters.initial_gyro_bias_std**2
     ekf.best = 0
+    yaw_check.forget(ekf.yaw_test)
     noise.begin(ekf.information, ekf.hypotheses[0].P)
     ekf.t = ekf.last_tdoa = ekf.last_agreement = t
     ekf.consistency = 1.0
@@ -524,14 +531,20 @@ def recover(
     elif share < CLEARLY_MORE + explained:
         return
     wheels = velocity.agrees(ekf.velocity, t)
-    felt = parameters.use_imu and not ekf.imu_faulty and t - ekf.imu.t < parameters.imu_timeout
+    # an IMU shows how far the tag can be only if the yaw is known
+    felt = (
+        parameters.use_imu
+        and not ekf.imu_faulty
+        and t - ekf.imu.t < parameters.imu_timeout
+        and hypotheses.alike(ekf)
+    )
     if not anywhere and wheels and _outweighs(ekf, anchors, window, x[0], t):
         return
-    if not anywhere and (felt or wheels):
-        since = t - ekf.last_agreement
-        away = np.sum((x[0, :3] - ekf.hypotheses[ekf.best].x[:3]) ** 2)
-        if math.sqrt(away) > REACH + REACH_SPEED * since + REACH_ACCELERATION * since**2:
-            return
+    away = math.sqrt(np.sum((x[0, :3] - ekf.hypotheses[ekf.best].x[:3]) ** 2))
+    if not anywhere and (felt or wheels) and away > reach(ekf, t):
+        if felt and t - ekf.last_agreement > IMU_CONTRADICTED:
+            _leave_imu_out(ekf, t, away)
+        return
     for h in range(HYPOTHESES):
         hypothesis, place = ekf.hypotheses[h], min(h // N_YAWS, count - 1)
         if cost[place] == np.inf:
@@ -543,10 +556,42 @@ def recover(
     ekf.rival_since = -np.inf
     if anywhere:  # the information from before the silence belongs to another place
         noise.begin(ekf.information, ekf.hypotheses[ekf.best].P)
+    else:
+        ekf.recovered = t
+        if felt:  # what led to a wrong place has spoiled velocity, attitude and biases, too
+            open_yaw(ekf, parameters, history)
     ekf.consistency, ekf.late_as_known = 1.0, False
     ekf.rest_since = t
     ekf.recoveries += 1
     add_reset(ekf, t, history)
+
+
+@compiled
+def _leave_imu_out(ekf: Record, t: float, away: float) -> None:
+    """Leave the IMU out from stamp t (s), because TDOAs agree on a place that is `away` (m) from it.
+
+    Without an IMU that is right, the yaw is unknown.
+    """
+    imu_fault_detector.leave_out(ekf.imu_fault_detector, t, away)
+    for h in range(HYPOTHESES):
+        hypotheses.set_yaw_variance(ekf.hypotheses[h], ANY_YAW**2)
+
+
+@compiled
+def reach(ekf: Record, t: float) -> float:
+    """Return how far the tag can be from the filter, m, at stamp t (s), since TDOAs agreed last."""
+    since = t - ekf.last_agreement
+    return REACH + REACH_SPEED * since + REACH_ACCELERATION * since**2
+
+
+@compiled
+def distrust(ekf: Record, parameters: Record, history: np.ndarray) -> None:
+    """Open what a fault of the streams has spoiled: position, velocity, attitude and biases."""
+    widen(ekf, history)
+    if parameters.use_imu:
+        reset_attitude(ekf, parameters, YAW_SEARCH_STD, history)
+    for h in range(HYPOTHESES if not parameters.use_imu else 0):
+        hypotheses.set_yaw_variance(ekf.hypotheses[h], ANY_YAW**2)
 
 
 @compiled
@@ -634,9 +679,13 @@ def reset_attitude(ekf: Record, parameters: Record, yaw_std: float, history: np.
 def open_yaw(ekf: Record, parameters: Record, history: np.ndarray) -> None:
     """Follow four yaws again after the yaw was found wrong.
 
-    The integrated motion was wrong too, so the covariance of position and velocity is widened.
+    The integrated motion was wrong too, so the covariance of position and velocity is widened. A
+    yaw that is found wrong twice shows that the IMU is wrong.
     """
+    if ekf.t - ekf.yaw_test.opened < TWICE:
+        _leave_imu_out(ekf, ekf.t, 0.0)
     ekf.yaw_test.count += 1
+    ekf.yaw_test.opened = ekf.t
     widen(ekf, history)
     reset_attitude(ekf, parameters, YAW_SEARCH_STD, history)
 

@@ -36,6 +36,7 @@ N_YAWS, N_PLACES = (4, 2)  # numbers of yaws and places that a start follows in 
 HYPOTHESES = N_YAWS * N_PLACES
 Floor = tuple[np.ndarray, np.ndarray, np.ndarray]  # as in EffectSet.on_floor
 WINDOW = 512  # TDOAs kept for a start
+YAW_ERRORS = 19  # that the test of the yaw compares
 
 # Limits of what can be a measurement; nothing is tuned.
 MAX_RATE, MAX_ACCEL = 100.0, 1000.0  # rad/s and m/s^2, beyond the range of any inertial sensor
@@ -176,13 +177,14 @@ VELOCITY = _record(
 YAW_TEST = _record(
     # responses of the error state to cos(psi) - 1 and sin(psi), for a yaw error psi
     ("response", float, (2, ERROR_STATES)),
-    ("vector", float, 2),  # right side of the least squares of recent innovations by both responses
+    # right side of the least squares of innovations since the last test by both responses
+    ("vector", float, 2),
     ("information", float, (2, 2)),  # upper triangle of its matrix
     ("alone", bool),  # a single hypothesis is left
-    ("evidence", float),  # log likelihood ratio at the last test
-    ("t", float),  # s, stamp of the last test
+    ("ratios", float, YAW_ERRORS),  # log likelihood ratio of each yaw error to none
     ("next_look", float),  # s, stamp of the next test
     ("count", int),  # number of times that the yaw was opened again
+    ("opened", float),  # s, stamp of the last time
 )
 
 # State of the filter, except its anchors.
@@ -244,6 +246,7 @@ EKF = _record(
     ("search_waits_until", float),  # s, stamp until which TDOAs wait for a search
     ("consistency", float),  # share of recent TDOAs that agree with the best hypothesis
     ("recoveries", int),  # number of recoveries
+    ("recovered", float),  # s, stamp of the last recovery from a contradiction
     ("first_tdoa", float),  # s, stamp of the first TDOA since the filter stopped
     ("last_tdoa", float),  # s, stamp of the last TDOA or range
     ("next_search", float),  # s, stamp of the next search
@@ -337,6 +340,7 @@ NEVER = (
     "next_look",
     "next_workspace",
     "next_floor",
+    "recovered",
     "last_agreement",
     "position_unknown_until",
     "search_waits_until",
@@ -371,7 +375,7 @@ def new_state(
         (ekf.barometer, ("heard", "agreed")),
         (ekf.velocity, ("heard", "changed", "agreed")),
         (ekf.ranged, ("t",)),
-        (ekf.yaw_test, ("t", "next_look")),
+        (ekf.yaw_test, ("next_look", "opened")),
     ):
         for stamp in stamps:
             record[stamp] = -np.inf

@@ -118,7 +118,7 @@ def kalman_robust(
     """
     prior, noise = innovation.prior_variance, innovation.noise_variance
     w = weight(GEMAN_MCCLURE, innovation.value / math.sqrt(prior + noise), gate)
-    innovation.total_variance = prior + noise * variance_inflation / w
+    innovation.weight, innovation.total_variance = w, prior + noise * variance_inflation / w
     kalman(hypothesis, innovation)
     return w
 

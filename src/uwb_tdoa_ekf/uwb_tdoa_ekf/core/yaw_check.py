@@ -4,9 +4,10 @@
 
 A yaw error psi turns each predicted change of velocity. The resulting error of the state is linear
 in cos(psi) - 1 and sin(psi). The predictions and updates of the filter propagate it, as two
-responses of the error state. A generalized likelihood ratio (Willsky and Jones, IEEE Trans.
-Automatic Control 1976) tests recent innovations against both responses, for any psi. The test
-changes the filter only if the evidence suffices.
+responses of the error state. They give the log likelihood ratio of each yaw error to none
+(Willsky and Jones, IEEE Trans. Automatic Control 1976). Its sum over time never falls below zero
+(Page, Biometrika 1954): a yaw that was right for long is doubted as soon as one that was just
+given. The test changes the filter only if the evidence suffices.
 """
 
 from __future__ import annotations
@@ -17,24 +18,35 @@ import numpy as np
 
 from uwb_tdoa_bias.common.compiled import Record, compiled
 
+from .memory import YAW_ERRORS
 from .state import CHECK_PERIOD, ERROR_STATES, propagate_vector
+from .update import GATE
 
-MEMORY = 6.0  # s over which innovations count
 YAW_KNOWN = math.radians(20.0)  # rad, standard deviation below which the yaw counts as known
-# Log likelihood ratio above which the yaw is opened again. It trades false alarms against late
-# detection. Of 22 measured flights the largest ratio is 3.5; the worst flight has 9.9 without its
-# range finder. See docs/notebook/reliability.md.
-EVIDENCE = 12.0
-ANGLES = 2.0 * math.pi * np.arange(1, 24) / 24.0  # rad, yaw errors to test
+# Log likelihood ratio above which the yaw is opened again, and most of it that the innovations of
+# CHECK_PERIOD can add, unless a quarter of it is more. Both trade false alarms against late detection:
+# a moment of bad TDOAs must not suffice. See docs/notebook/reliability.md for the ratios of 22 measured flights.
+EVIDENCE, MOST_AT_ONCE = (6.0, 0.4)
+# s over which evidence counts while velocities are used. Their scale looks like a yaw, so three times the
+# evidence is needed then.
+MEMORY = 6.0
+ANGLES = math.pi * np.arange(3, 3 + YAW_ERRORS) / 12.0  # rad, yaw errors to test: 45 to 315 degrees
 COSINES, SINES = (np.cos(ANGLES) - 1.0, np.sin(ANGLES))  # the error of the state is linear in both
 
 
 @compiled
 def clear(doubt: Record) -> None:
-    """Clear all evidence of a YAW_TEST, because the state was replaced."""
+    """Clear the responses of a YAW_TEST, because position and velocity were replaced."""
     doubt.response[:] = 0.0
+
+
+@compiled
+def forget(doubt: Record) -> None:
+    """Clear a YAW_TEST, because the yaw was replaced."""
+    clear(doubt)
     doubt.vector[:] = 0.0
     doubt.information[:] = 0.0
+    doubt.ratios[:] = 0.0
 
 
 @compiled
@@ -77,8 +89,10 @@ def observe(ekf: Record, correlation_length: float, shows: bool) -> None:
     if shows:
         variance = innovation.prior_variance + innovation.noise_variance * correlation_length
         per_variance = 1.0 / variance
-        doubt.vector[0] += cosine * innovation.value * per_variance
-        doubt.vector[1] += sine * innovation.value * per_variance
+        largest = GATE * math.sqrt(variance)
+        value = min(max(innovation.value, -largest), largest) * per_variance
+        doubt.vector[0] += cosine * value
+        doubt.vector[1] += sine * value
         doubt.information[0, 0] += cosine * cosine * per_variance
         doubt.information[0, 1] += cosine * sine * per_variance
         doubt.information[1, 1] += sine * sine * per_variance
@@ -92,27 +106,23 @@ def observe(ekf: Record, correlation_length: float, shows: bool) -> None:
 
 
 @compiled
-def _forget(doubt: Record, dt: float) -> None:
-    """Discount the evidence of a YAW_TEST over dt (s)."""
-    kept = math.exp(-dt / MEMORY)
-    for i in range(2):
-        doubt.vector[i] *= kept
-        for j in range(i, 2):
-            doubt.information[i, j] *= kept
+def accumulate(doubt: Record, kept: float) -> float:
+    """Add recent innovations to the log likelihood ratio of each yaw error; return the largest.
 
-
-@compiled
-def evidence(doubt: Record) -> float:
-    """Return the log likelihood ratio of the best other yaw."""
+    kept is the share, 0 to 1, of the earlier evidence that still counts.
+    """
     v, J = doubt.vector, doubt.information
-    best = 0.0
     for k in range(len(ANGLES)):
         c, s = COSINES[k], SINES[k]
-        best = max(
-            best,
-            c * v[0] + s * v[1] - 0.5 * (c * c * J[0, 0] + 2.0 * c * s * J[0, 1] + s * s * J[1, 1]),
+        gained = (
+            c * v[0] + s * v[1] - 0.5 * (c * c * J[0, 0] + 2.0 * c * s * J[0, 1] + s * s * J[1, 1])
         )
-    return best
+        doubt.ratios[k] = max(
+            0.0, kept * doubt.ratios[k] + min(gained, max(MOST_AT_ONCE, 0.25 * gained))
+        )
+    v[:] = 0.0
+    J[:] = 0.0
+    return float(np.max(doubt.ratios))
 
 
 @compiled
@@ -124,10 +134,12 @@ def contradicts(ekf: Record, t: float) -> bool:
     doubt = ekf.yaw_test
     if t < doubt.next_look:
         return False
-    _forget(doubt, max(t - doubt.t, 0.0))
-    doubt.t, doubt.next_look = t, t + CHECK_PERIOD
-    doubt.evidence = evidence(doubt)
-    return doubt.evidence > EVIDENCE and _yaw_variance(ekf.hypotheses[ekf.best]) < YAW_KNOWN**2
+    doubt.next_look = t + CHECK_PERIOD
+    measured = t - ekf.velocity.heard < MEMORY and not ekf.velocity.refused
+    kept, needed = (1.0 - CHECK_PERIOD / MEMORY, 3.0 * EVIDENCE) if measured else (1.0, EVIDENCE)
+    return (
+        accumulate(doubt, kept) > needed and _yaw_variance(ekf.hypotheses[ekf.best]) < YAW_KNOWN**2
+    )
 
 
 @compiled

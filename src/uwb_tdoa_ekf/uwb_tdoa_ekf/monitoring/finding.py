@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from uwb_tdoa_bias.common.sensors import SENSORS
 
-from ..core.imu_fault_detector import RATE, TILT, TURN, WEIGHT
+from ..core.imu_fault_detector import MOTION, RATE, TILT, TURN, WEIGHT
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.common.compiled import Record
@@ -263,6 +263,11 @@ SAID = {
         "the gyroscope turns as nothing does",
         "{:.0f} rad/s",
         "angular_velocity = ...  # in rad/s",
+    ),
+    MOTION: (
+        "TDOAs contradict the motion that the IMU measures",
+        "they agree on a place {:.1f} m away, or on another yaw, again and again",
+        "angular_velocity, linear_acceleration = ...  # check axes, signs, scales and offsets",
     ),
     TILT: (
         "the IMU is turned, or the tag lies on its side",
