@@ -61,6 +61,22 @@ def test_a_unit_is_found_and_undone(healthy, scale, unit):
     assert np.allclose(undone.tdoa.d, healthy.tdoa.d)
 
 
+class Fit(list):
+    """A survey that does not fit in ten windows."""
+
+    before, all_moved, radio_loss, positions, flat = 0.48, (0.21, None), 1.0, [0] * 8, False
+
+    def __init__(self, seconds):
+        super().__init__(range(10))
+        self.seconds = seconds
+
+
+@pytest.mark.parametrize(("seconds", "gain"), [(1.2, None), (3.0, pytest.approx(0.27))])
+def test_no_survey_is_judged_by_a_second(seconds, gain):
+    """Windows that overlap show one place of the room."""
+    assert tdoa_rules.gained(Fit(seconds)) == gain
+
+
 def test_feet_are_named_beside_nanoseconds(healthy):
     """A foot is 1.017 ns: no recording tells them apart."""
     finding, _ = tdoa_rules.best_trial(healthy.with_tdoa(d=healthy.tdoa.d / 0.3048))

@@ -302,12 +302,9 @@ def _try_corrections(
 def _misfit(fit: SurveyFit) -> Iterator[Finding]:
     """Yield a finding if the survey fits much better with several of its anchors moved."""
     gain = tdoa_rules.gained(fit)
-    poor = fit.before > tdoa_rules.POOR and len(fit.positions) <= MANY and not fit.flat
+    enough = fit.seconds >= tdoa_rules.SHORTEST and len(fit.positions) <= MANY and not fit.flat
+    poor = enough and fit.before > tdoa_rules.POOR
     if gain is None and not poor and tdoa_rules.apparent_gain(fit) > tdoa_rules.GAIN:
-        evidence = (
-            "with the anchors elsewhere each half of the recording fits better, and not the other "
-            "half"
-        )
         yield Finding(
             "misfit_unclear",
             NOTE,
@@ -316,7 +313,10 @@ def _misfit(fit: SurveyFit) -> Iterator[Finding]:
                 "determine "
                 "why"
             ),
-            evidence=evidence,
+            evidence=(
+                "with the anchors elsewhere each half of the recording fits better, and not the "
+                "other half"
+            ),
             remedy=(
                 "record a minute in which the tag is carried through the whole room, and check "
                 "again"
