@@ -17,10 +17,10 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.floor import FloorMultipath
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools import choices, cli
-from uwb_tdoa_tools.commands import diagnose, train
 from uwb_tdoa_tools.exporting.c_code import write_crazyflie
 from uwb_tdoa_tools.exporting.correction import trace
 from uwb_tdoa_tools.exporting.crazyflie import comparison, stddev_of
+from uwb_tdoa_tools.main import main
 from uwb_tdoa_tools.outputs import OutputFolder
 from uwb_tdoa_tools.readers import inputs
 
@@ -54,9 +54,9 @@ def corrections(folder, training, survey):
     given = [*(str(path) for path, _ in training), "--survey", str(survey)]
     effects, model = folder / "diagnosis", folder / "network"
     if not (effects / "effects.yaml").exists():
-        diagnose.main([*given, "--out", str(effects)])
+        main(["diagnose", *given, "--out", str(effects)])
     if not (model / "model.onnx").exists():
-        train.main([*given, "--model", "paper", "--out", str(model)])
+        main(["train", *given, "--model", "paper", "--out", str(model)])
     found = EffectSet.from_yaml(effects / "effects.yaml")
     floor = found.where(lambda effect: isinstance(effect, FloorMultipath))
     ways = {"effects": (found, None), "network": (floor, load_network(model / "model.onnx"))}
