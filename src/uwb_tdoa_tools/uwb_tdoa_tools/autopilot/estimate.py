@@ -269,7 +269,7 @@ class Gate:
         if not EARLIEST < age < OLDEST:
             return (
                 f"odometry is stamped {abs(age):.1f} s {'before' if age > 0.0 else 'after'} the clock "
-                "of this node: set the clocks alike, or use_sim_time for a recording"
+                "of this node: set the clocks alike, use_sim_time for a recording, or shorten the delay"
             )
         if estimate.deviation > self._largest:
             return (
