@@ -169,6 +169,19 @@ def test_rows_of_several_kinds_are_named_with_lines_that_split_them(folder, head
     np.testing.assert_allclose(flight.tdoa.d, D, atol=1e-6)
 
 
+def test_kinds_of_rows_of_one_shape_are_named_by_their_words(folder, capsys):
+    """Their values would be mixed; names of anchors are no kinds."""
+    rows = [
+        f"TDOA,{t:.6f},{a},{b},{d}\nRSSI,{t:.6f},{a},{b},-80.5" for t, a, b, d in zip(T, A, B, D)
+    ]
+    (folder / "log.csv").write_text("\n".join(rows) + "\n")
+    assert convert(["log.csv", "--suggest", "profile.yaml"]) == 2
+    assert "several kinds, TDOA, RSSI" in capsys.readouterr().err
+    names = [f"{('left', 'right')[k % 2]},{t:.6f},{3.0 + 0.01 * k}" for k, t in enumerate(T)]
+    (folder / "log.csv").write_text("\n".join(["anchor,t,range", *names]) + "\n")
+    assert convert(["log.csv", "--suggest", "profile.yaml"]) == 0
+
+
 @pytest.mark.parametrize("prefix", ["", "q_", "rotation."])
 def test_the_attitude_of_a_ground_truth_is_suggested(folder, prefix, capsys):
     """Whatever it is called, beside a position that is called ground truth."""

@@ -107,8 +107,7 @@ def described(converted: Converted) -> list[str]:
         out.append(f"  {name}: {count} events left out, a bag has no place for them")
     for topic, falls in meta.get("reordered", {}).items():
         out.append(f"  {topic}: sorted, its stamps fell {falls} times")
-    if converted.tdoa_unknown_anchor:
-        count = converted.tdoa_unknown_anchor
+    if count := converted.tdoa_unknown_anchor:
         out.append(
             f"  {count} measurements name an anchor that the survey does not have; check lists them"
         )

@@ -53,7 +53,8 @@ PAIR, SINGLE_ANCHOR = r"(.*?)(\d+)(\D+)(\d+)", r"(.*?)(\d+)(\D*)"
 DISTANCE = (
     r"(.*[._])?(.*(range|dist|uwb|anchor).*|[dra]_?)"  # beginning of a column for each anchor
 )
-WORD = r"[A-Za-z_]{2,}"  # names a kind of rows
+# A word that may name a kind of rows, and a word that does
+WORD, SENSOR = r"[A-Za-z_]{2,}", r"tdoa|imu|gyro|acc|range|twr|rssi|baro|pose|mag|uwb"
 DAY, CLOCK = r"\d{4}[-/]\d\d?[-/]\d\d?", r"\d\d?:\d\d:\d\d.*"
 GYRO = r"(.*(gyro|angular_velocity|ang_vel|rate).*?|w|g|.*[._]w)[._ ]?([xyz]|\[[012]\])"
 ACCEL = r"(.*(acc|linear_acceleration|lin_acc).*?|a|.*[._]a)[._ ]?([xyz]|\[[012]\])"
@@ -248,7 +249,8 @@ def _refuse_kinds(path: Path, lines: Sequence[str], column: int) -> None:
         for kind in words
         if words.count(kind) > 1
     }
-    if len({*sizes.values()}) > 1 and all(re.fullmatch(WORD, word) for word in words):
+    differ = len({*sizes.values()}) > 1 or re.search(SENSOR, " ".join(sizes), re.IGNORECASE)
+    if len(sizes) > 1 and differ and all(re.fullmatch(WORD, word) for word in words):
         header = "" if words[0] in sizes else f"-e {words[0]} "
         split = [
             f"grep -w {header}-e {kind} {shlex.quote(str(path))} > {kind.lower()}.csv; "
