@@ -536,13 +536,13 @@ def close_loop(
         laps[name] = ends[-1] - ends[-2]
 
     onnx, picture = folder / CORRECTION, folder / "demo.png"
-    with Progress("demo") as progress:
-        progress("flying")
+    with Progress("demo", what="flying") as progress:
         bags = record(seed, folder)
         flights = read(bags[:2])
         show("recorded", [recordings_in_words(flights, seed)])
         show("residual", residuals_of(flights[0]).sentences())
         lap("flying")
+        progress("tracing residuals to effects")
         diagnosis = diagnose(flights, progress=progress)
         show("traced to", found_in_words(diagnosis) or ["nothing that helps"])
         lap("tracing")
