@@ -122,7 +122,7 @@ def test_an_example_does_what_it_says(program, own, tmp_path, monkeypatch, capsy
     written = {path.name for path in tmp_path.iterdir()}
     rmse = numbers(r"RMSE ([\d.]+)", told)
     if program.stem == "locate":
-        assert "estimates, the first at x =" in told and "circle.png" in written
+        assert "estimates, the first at x =" in told and "circle_bag.png" in written
     elif program.stem in ("compare", "calibrate"):
         assert rmse[1] < rmse[0] and (program.stem == "calibrate" or "errors.png" in written)
     elif program.stem == "find_error":
