@@ -6,8 +6,8 @@ A rover drives for 90 s among six anchors in 12 x 8 m. It has wheels (50 Hz, 2 %
 IMU (100 Hz) and 100 TDOAs a second. The TDOAs have a noise of 0.1 m and antenna delays of 5 cm;
 both make up `tdoa_std`. The antenna is on a mast 0.4 m above base_link, which is on the floor.
 
-The filter assumes persistent errors, as in measured data. `tdoa_correlation_length: 1.0` states
-that they are white, as here. Rows of a hall have the errors of real halls, and the default
+The filter learns how far errors persist. `adapt_noise: false` states that they are white, as here.
+ Rows of a hall have the errors of real halls, and the default
 `tdoa_std`. There, anchors are surveyed to 3 cm, have delays of 10 cm, and errors by received power
 and by both antennas. 3 % of the TDOAs are outliers, and each of four places blocks one anchor.
 """
@@ -192,7 +192,7 @@ def _figures(flight, seed, streams, config, is_late):
 
 BLOCKS = {  # {beginning of a row's name: (what makes its drives, parameters)}
     "": (drive, {}),
-    "white noise stated: ": (drive, {"tdoa_correlation_length": 1.0}),
+    "white noise stated: ": (drive, {"adapt_noise": False}),
     "hall: ": (drive_of_hall, {"tdoa_std": FilterConfig().tdoa_std}),
 }
 

@@ -54,8 +54,8 @@ from uwb_tdoa_ekf.core.update import (
 from uwb_tdoa_ekf.core.workspace import (
     SMALLEST as WORKSPACE_SMALLEST,
     STD as WORKSPACE_STD,
+    admits,
     constrain,
-    contains,
     set_bounds,
 )
 from uwb_tdoa_ekf.offline import run_offline
@@ -228,11 +228,11 @@ def informed(p, seconds=5.0, rate=400.0, heard=range(8), state=None, begin=0.0):
     return state
 
 
-def stated(state, P, correlation_length=np.inf, height_std=0.0):
+def stated(state, P, share=noise.SHARE, height_std=0.0):
     covariance = np.full((3, 3), np.nan)
     whole = np.zeros((15, 15))
     whole[:3, :3] = P
-    noise.fill(state.record.information, whole, correlation_length, height_std, covariance)
+    noise.fill(state.record.information, whole, share, height_std, covariance)
     return covariance
 
 
@@ -267,8 +267,8 @@ def test_what_is_not_heard_any_more_is_forgotten_but_silence_is_not_taken_for_th
 
 def test_of_white_noise_nothing_persists():
     state, P = informed([3.0, 4.0, 1.5]), np.eye(3)
-    assert not stated(state, P, 1.0).any()
-    assert 0.5 < np.trace(stated(state, P, 6.0)) / np.trace(stated(state, P)) < 1.0
+    assert not stated(state, P, 0.0).any()
+    assert 0.5 < np.trace(stated(state, P, 0.8 * noise.SHARE)) / np.trace(stated(state, P)) < 1.0
 
 
 def test_it_is_bounded_by_what_the_filter_knows():
@@ -311,29 +311,63 @@ def test_it_ends_a_margin_beyond_the_anchors_and_is_never_flat():
     for k in range(3):
         x = middle.copy()
         x[k] += half[k] - 0.01
-        assert contains(bounds, x)
+        assert admits(bounds, x, np.eye(3))
         x[k] += 0.02
-        assert not contains(bounds, x)
+        assert not admits(bounds, x, np.eye(3))
 
 
-@pytest.mark.parametrize("axis, off", [(0, -2.0), (1, 0.7), (2, 5.0)])
-def test_a_tag_outside_is_drawn_back_by_as_much_as_it_is_uncertain(axis, off):
-    bounds, ekf = (
-        bounds_of(np.array(corners().positions)),
-        new_state(np.array(corners().positions)).record,
-    )
+@pytest.mark.parametrize(
+    ("off", "std", "admitted"),
+    [
+        ((4.0, 0.0, 0.0), 2.0, True),
+        ((4.0, 0.0, 0.0), 3.0, False),
+        ((0.0, -0.3, 0.0), 0.1, True),
+        ((0.0, 0.0, 8.0), 0.1, False),
+        ((4.0, 0.0, 8.0), 0.1, False),
+        ((np.nan, 0.0, 0.0), 0.1, False),
+    ],
+)
+def test_tdoas_may_place_a_tag_beside_the_workspace_but_not_above_it(off, std, admitted):
+    bounds = bounds_of(np.array(corners().positions))
+    x = np.where(np.array(off) < 0.0, bounds[0], bounds[1]) + off
+    x[np.array(off) == 0.0] = 1.0
+    assert admits(bounds, x, std**2 * np.eye(3)) == admitted
+
+
+@pytest.mark.parametrize(
+    ("axis", "off", "std"), [(0, -2.0, 4.0), (1, 0.7, 2.0), (2, 5.0, 1.8), (2, -0.4, 1.1)]
+)
+def test_a_tag_outside_is_drawn_back_by_as_much_as_it_is_uncertain(axis, off, std):
+    """Beside the anchors the prior is as wide as the tag is far away, above and below it is not."""
+    before, after = drawn_back(axis, off, std)
+    gain = std**2 / (std**2 + (WORKSPACE_STD + (abs(off) if axis < 2 else 0.0)) ** 2)
+    assert after.x[axis] == pytest.approx(before[axis] - gain * off)
+    assert after.P[axis, axis] == pytest.approx((1.0 - gain) * std**2)
+    assert np.delete(after.x, axis) == pytest.approx(np.delete(before, axis))
+
+
+@pytest.mark.parametrize(
+    ("axis", "off", "std"), [(0, 10.0, 5.0), (1, -3.0, 3.9), (2, 0.5, 0.9), (0, -0.1, 1.0)]
+)
+def test_a_tag_that_tdoas_place_outside_is_outside(axis, off, std):
+    before, after = drawn_back(axis, off, std)
+    np.testing.assert_array_equal(after.x, before)
+    assert after.P[axis, axis] == std**2
+
+
+def drawn_back(axis, off, std):
+    """Return the state before and the HYPOTHESIS after the prior, for a tag outside on an axis."""
+    positions = np.array(corners().positions)
+    bounds, ekf = bounds_of(positions), new_state(positions).record
     hypothesis = ekf.hypotheses[0]
     hypothesis.x[:3] = 0.5 * (bounds[0] + bounds[1])
     hypothesis.x[axis] = bounds[int(off > 0.0), axis] + off
-    hypothesis.P[axis, axis] = 3.0
+    hypothesis.P[axis, axis] = std**2
     before = hypothesis.x.copy()
-    assert [constrain(hypothesis, ekf.innovation, bounds, k) for k in range(3)] == [
-        k == axis for k in range(3)
-    ]
-    gain = 3.0 / (3.0 + WORKSPACE_STD**2)
-    assert hypothesis.x[axis] == pytest.approx(before[axis] - gain * off)
-    assert hypothesis.P[axis, axis] == pytest.approx((1.0 - gain) * 3.0)
-    assert np.delete(hypothesis.x, axis) == pytest.approx(np.delete(before, axis))
+    for k in range(3):
+        changed = constrain(hypothesis, ekf.innovation, bounds, k)
+        assert changed == (hypothesis.x[k] != before[k])
+    return before, hypothesis
 
 
 @pytest.mark.parametrize("beyond", [1.0, 3.0])
@@ -592,7 +626,8 @@ def test_gate_judges_with_the_variance_of_one_measurement_and_leaves_all_as_it_w
     passed = abs(innovation.value) <= gate * np.sqrt(
         innovation.prior_variance + innovation.noise_variance
     )
-    update(prior, tuned(robust="gate", gate=gate, tdoa_correlation_length=length))
+    innovation.variance_inflation = length
+    update(prior, tuned(robust="gate", gate=gate))
     assert innovation.weight == passed
     if passed:
         prior.assert_is(*expected)
@@ -607,8 +642,8 @@ def test_innovation_divides_the_variance_by_the_weight_of_what_is_whitened(seed,
     whitened = innovation.value / np.sqrt(innovation.prior_variance + innovation.noise_variance)
     w = weight(LOSSES.index(loss), whitened, 2.5)
     expected = prior.textbook(innovation.noise_variance * length / w)
-    parameters = tuned(loss=loss, measurement_scale=2.5, tdoa_correlation_length=length)
-    update(prior, parameters)
+    innovation.variance_inflation = length
+    update(prior, tuned(loss=loss, measurement_scale=2.5))
     assert innovation.weight == (w if w >= NEGLIGIBLE else 0.0)
     if w >= NEGLIGIBLE:
         prior.assert_is(*expected)
@@ -620,7 +655,8 @@ def test_innovation_divides_the_variance_by_the_weight_of_what_is_whitened(seed,
 def test_m_estimation_is_that_of_the_paper(seed, loss, length, iterations, state_scale, scale):
     prior = Prior(seed, surprise=2.0)
     scales = dict(measurement_scale=scale, state_scale=state_scale, iterations=iterations)
-    parameters = tuned(robust="m_estimation", loss=loss, tdoa_correlation_length=length, **scales)
+    parameters = tuned(robust="m_estimation", loss=loss, **scales)
+    prior.innovation.variance_inflation = length
     noise, P = prior.innovation.noise_variance * length, prior.hypothesis.P
     error, covariance, expected = m_estimation(prior, P, prior.h, noise, parameters)
     posterior = prior.after(error, covariance)
@@ -679,7 +715,7 @@ def test_whatever_is_measured_the_joint_covariance_stays_one(
     h[list(states)] = prior.h[list(states)]
     if offset is not None:
         h[15 + offset] = 1.0
-    parameters = tuned(robust=robust, loss=loss, iterations=iterations, tdoa_correlation_length=1.0)
+    parameters = tuned(robust=robust, loss=loss, iterations=iterations)
     x = prior.hypothesis.offset.copy()
     if robust == "m_estimation":
         error, expected, _ = m_estimation(prior, joint, h, innovation.noise_variance, parameters)

@@ -103,7 +103,7 @@ def test_residuals_are_innovation_and_its_variance():
     """
     flight = fly(7, 2.0, imu_rate=1000.0)
     odometry, residuals = drive(
-        flight, FilterConfig(odometry_rate=1e6, tdoa_std=0.2, tdoa_correlation_length=1.0)
+        flight, FilterConfig(odometry_rate=1e6, tdoa_std=0.2, adapt_noise=False)
     )
     tested = 0
     for k in np.flatnonzero(residuals.verdict == USED)[50:150]:
@@ -610,7 +610,6 @@ def consistency(
         robust=robust,
         loss=loss,
         tdoa_std=tdoa_std,
-        tdoa_correlation_length=1.0,
         gate=1e6,
         initial_accel_bias_std=0.1,
         initial_gyro_bias_std=0.01,
@@ -673,7 +672,7 @@ def test_robust_updates_are_cautious_but_not_overconfident(robust, loss):
 
     Therefore, the covariance may only be too large.
     """
-    nees, nis, count = consistency(robust, loss)
+    nees, nis, count = consistency(robust, loss, adapt_noise=False)
     shares_inside(nees, nis, count, f"{robust}, {loss}")
     high = chi2.ppf(0.975, 3 * len(nees)) / len(nees)
     assert np.mean(nees.mean(axis=0) < high) >= 0.9 and nees.mean() > 1.0

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.flight import Flight, Tdoas, Truth
 from uwb_tdoa_bias.common.sensors import Ranges
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
@@ -245,3 +246,40 @@ def test_what_comes_at_once_and_one_by_one_is_corrected_alike():
     one_by_one = [measured(t[k : k + 1], np.ones(1, int), np.full(1, 4.0)) for k in range(400)]
     found = corrected(whole, [given])
     assert len(found) == 400 and len(set(found)) == 80 and found == corrected(single, one_by_one)
+
+
+def test_four_anchors_on_a_car_locate_a_person_far_away():
+    """Ranges at 36/s, without IMU, to anchors that are 2 m apart: they place the tag outside.
+
+    A prior that it is near the anchors must not keep it there, nor make the smoother certain.
+    """
+    flights = [walk_from_a_car(seed) for seed in range(4)]
+    config, found = FilterConfig(use_imu=False), []
+    for run in (run_offline, smooth):
+        of_each = [errors_of(flight, run(flight, config).odometry, 5.0) for flight in flights]
+        rmse = np.sqrt(np.mean([np.mean(np.sum(off[:, :2] ** 2, axis=1)) for off, _ in of_each]))
+        found.append((rmse, np.mean([nees.mean() for _, nees in of_each])))
+    (online, nees), (smoothed, nees_smoothed) = found
+    assert smoothed < online < 0.5 and nees < 5.0 and nees_smoothed < 5.0
+
+
+def walk_from_a_car(seed):
+    """Return a Flight with ranges alone: a walk from 4 m to 30 m and back, 1.4 m/s at most."""
+    rng = np.random.default_rng([seed, 739])
+    places = np.array([(0.0, 0.9, 0.5), (2.2, 0.2, 1.8), (-0.3, -0.5, 2.0), (0.7, -0.9, 0.6)])
+    t = np.arange(0.0, 60.0, 0.02)
+    away, bearing = 4.0 + 26.0 * np.sin(np.pi * t / 60.0), 0.3 * np.sin(0.1 * t)
+    bearing += rng.uniform(-np.pi, np.pi)
+    p = np.column_stack([away * np.cos(bearing), away * np.sin(bearing), np.full(len(t), 1.0)])
+    stamps = np.arange(0.1, 59.9, 1.0 / 36.0)
+    to = np.arange(len(stamps)) % 4
+    own = np.column_stack([np.interp(stamps, t, column) for column in p.T])
+    d = np.linalg.norm(own - places[to], axis=1) + 0.05 * rng.standard_normal(len(to))
+    return Flight(
+        "walk",
+        Anchors(np.arange(4), places, np.tile([0.0, 0.0, 0.0, 1.0], (4, 1))),
+        Tdoas(*np.empty((4, 0))),
+        None,
+        Truth(t, p, np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1))),
+        range=Ranges(stamps, to, d, np.zeros(len(to))),
+    )

@@ -19,7 +19,7 @@ from uwb_tdoa_bias.common.flight import Flight, Truth
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import RADIO, EffectSet, true_samples
 
-from .core import auxiliary, plane
+from .core import auxiliary, noise, plane
 from .core.config import FilterConfig
 from .core.history import RESET
 from .core.hypotheses import YAW_STD
@@ -32,6 +32,7 @@ RANGE = "range"
 LAGS = 64  # most ranges of one anchor over which their errors are compared
 FEWEST_RANGES = 4 * LAGS  # of one anchor; fewer show no correlation
 OUTLIER = 3.0  # standard deviations to which a residual is limited
+ANY_DISTANCE = 1000.0  # m, and s: longer than errors of ranges stay alike
 
 
 def smooth(
@@ -69,8 +70,11 @@ def smooth(
     if nearer.range is not None and not len(nearer.tdoa) and len(run.odometry):
         corrector = corrector or Corrector(flight.anchors)
         length = correlation_length(nearer, run.odometry, corrector.effects)
-        if length > config.tdoa_correlation_length:
-            config = replace(config, tdoa_correlation_length=length)
+        seconds = alike(length, nearer.range.t)
+        if seconds > config.tdoa_correlation_time and config.adapt_noise:
+            config = replace(
+                config, tdoa_correlation_time=seconds, tdoa_correlation_distance=ANY_DISTANCE
+            )
             run = _smoothed_run(nearer, config, corrector)
     if offset is None:
         return run
@@ -78,6 +82,15 @@ def smooth(
     return replace(
         run, odometry=_with_common_error(run.odometry, beside.odometry), range_offset=offset
     )
+
+
+def alike(length: float, t: np.ndarray) -> float:
+    """Return the tdoa_correlation_time, s, at which `length` ranges with stamps t count as one.
+
+    It inverts the variance inflation of a range in a filter that has learned nothing from TDOAs.
+    """
+    period = (t[-1] - t[0]) / max(len(t) - 1, 1)
+    return float(min((2.0 * max(length - 1.0, 0.0) / noise.SHARE) ** 2 * period, ANY_DISTANCE))
 
 
 def correlation_length(flight: Flight, odometry: Odometry, effects: EffectSet) -> float:

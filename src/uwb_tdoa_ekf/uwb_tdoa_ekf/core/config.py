@@ -32,13 +32,18 @@ class _FilterParameters:
         "m; deviation of a TDOA from its prediction, uncorrected systematic part included",
         high=100.0,
     )
-    tdoa_correlation_length: float = parameter(
-        6.0,
-        "n successive TDOAs tell as much as n / this independent ones; 1.0 for white noise",
-        high=1000.0,
+    tdoa_correlation_time: float = parameter(
+        5.0, "s; longest time for which errors of TDOAs stay alike while the tag moves", high=1000.0
+    )
+    tdoa_correlation_distance: float = parameter(
+        5.0, "m; longest way over which errors of TDOAs stay alike", high=1000.0
     )
     adapt_noise: bool = parameter(
-        True, "learn the noise of each anchor beyond tdoa_std from the innovations"
+        True,
+        (
+            "learn from the innovations how large the errors of TDOAs are, and how alike; false: "
+            "white noise of tdoa_std"
+        ),
     )
     noise_memory: float = parameter(0.5, "s over which it is learned", high=1000.0)
     robust: str = parameter(
@@ -63,7 +68,12 @@ class _FilterParameters:
         fixed=True,
     )
     motion_noise: float = parameter(
-        1.5, "m/s^2/sqrt(Hz); random acceleration of the tag while no IMU says better", high=1000.0
+        1.5,
+        (
+            "m/s^2/sqrt(Hz); random acceleration of the tag while no IMU says better; learned from "
+            "the innovations, from here on"
+        ),
+        high=1000.0,
     )
     turn_noise: float = parameter(
         0.5,

@@ -66,6 +66,9 @@ UNSURE_TIME = 0.5  # s of TDOAs after a silence in which the filter searches for
 MAX_STEP = 0.05  # s, longest single prediction
 # s of inertial samples that determine the initial attitude if the IMU starts after the filter
 AVERAGED = 0.25
+ITERATIONS = 3  # of an update with an uncertain position
+# least number of TDOAs that count as one in the choice between hypotheses: outliers must not decide
+LEAST_LENGTH = 3.0
 # m or m/s from the linearization point, within which the slope of a bias is used
 LINEAR_RANGE = 1.0
 
@@ -299,12 +302,14 @@ def _on_range(
         return
     _prepare(ekf, anchors, parameters, t, records)
     anchor, innovation = anchors[sensor.anchor], ekf.innovation
+    # a range shares the error of one anchor with others, a TDOA those of two
+    inflation = 0.5 * (1.0 + noise.variance_inflation(ekf, parameters, t))
     for h in range(HYPOTHESES):
         hypothesis = ekf.hypotheses[h]
         if not hypotheses.alive(hypothesis):
             continue
         ranges.compare(hypothesis, anchor.position, sensor, parameters, innovation)
-        innovation.variance_inflation, innovation.curvature = stationarity.repetition(ekf, t), 0.0
+        innovation.variance_inflation, innovation.curvature = inflation, 0.0
         _update_hypothesis(ekf, h, parameters, t, residual, records, False)
         if h == ekf.best:
             ranges.keep_offset(ekf, hypothesis)
@@ -328,6 +333,7 @@ def _prepare(
             stationarity.check_stationarity(ekf, anchors, parameters, window, t, records)
         if not parameters.use_imu or t - ekf.imu.t > parameters.imu_timeout:
             stationarity.update_zero_velocity(ekf, t, records)
+    ekf.tdoa_rate += 1.0 - min(1.0, t - ekf.last_tdoa) * ekf.tdoa_rate
     if t >= ekf.next_workspace:
         initialization.update_workspace(ekf, anchors, parameters, t)
     if t - ekf.last_tdoa > parameters.start_window and initialization.is_unsure(ekf):
@@ -494,7 +500,7 @@ def _coast(ekf: Record, hypothesis: Record, parameters: Record, dt: float) -> No
     if not parameters.use_imu and hypothesis.P[8, 8] > initialization.ANY_YAW**2:
         yaw_psd = 0.0
     tilt_psd = turn_psd if parameters.use_imu else 0.0
-    coast(hypothesis, dt, parameters.motion_noise**2, tilt_psd, yaw_psd)
+    coast(hypothesis, dt, ekf.motion_ratio * parameters.motion_noise**2, tilt_psd, yaw_psd)
     if driven:
         turn_about_vertical(hypothesis.x, wheels.yaw_rate * dt)
         for k in range(2):
@@ -549,18 +555,25 @@ def _update(
     if tdoa.t < ekf.rival_until and _is_of_rival(ekf, a, b, tdoa, known):
         _reject(residual, innovation)
         return False
+    inflation = noise.variance_inflation(ekf, parameters, tdoa.t)
     for h in range(HYPOTHESES):
         hypothesis = ekf.hypotheses[h]
         if not hypotheses.alive(hypothesis):
             continue
         _compare(hypothesis, a, b, tdoa, known, innovation)
-        innovation.variance_inflation = stationarity.repetition(ekf, tdoa.t)
+        if innovation.curvature > 0.0:
+            _iterate(hypothesis, a, b, tdoa, known, inflation, innovation)
+        innovation.variance_inflation = inflation
         _update_hypothesis(ekf, h, parameters, tdoa.t, residual, records, True)
         if h == ekf.best:
             noise.observe(ekf.information, a, b, innovation, tdoa.t, ekf.last_tdoa)
             height.update_pull(ekf.height, parameters, innovation, tdoa.t)
             if parameters.adapt_noise:
                 noise.learn(a, b, tdoa.t, innovation, parameters)
+            if parameters.adapt_noise and ekf.heard > noise.FREE:
+                last = b.innovation - a.innovation
+                b.innovation = noise.learn_persistence(ekf, last, tdoa.t, innovation)
+                a.innovation = -b.innovation
     return False
 
 
@@ -633,6 +646,37 @@ def _compare(
 
 
 @compiled
+def _iterate(
+    hypothesis: Record,
+    a: Record,
+    b: Record,
+    tdoa: Record,
+    known: float,
+    inflation: float,
+    innovation: Record,
+) -> None:
+    """Linearize the INNOVATION of a TDOA anew, at the position that an update with it gives.
+
+    This is the iterated Kalman filter (Bar-Shalom et al., section 10.5.2). It matters if the position
+    is uncertain, because a TDOA is then far from linear. The parameters are those of `_compare`, and
+    the inflation of the noise. The slope of a bias stays out, because the position is uncertain.
+    """
+    x, P, row, at = hypothesis.x, hypothesis.P, innovation.row, hypothesis.x[:3].copy()
+    curvature, value = innovation.curvature, innovation.value
+    for _ in range(ITERATIONS):
+        project(P, innovation)
+        total = innovation.prior_variance + curvature + innovation.noise_variance * inflation
+        for i in range(3):
+            at[i] = x[i] + innovation.cross_covariance[i] * value / total
+        value = tdoa.d - known - linearized_tdoa(at, a.position, b.position, row)
+        for i in range(3):
+            value += row[i] * (at[i] - x[i])
+    innovation.entries, innovation.value = 3, value
+    project(P, innovation)
+    innovation.prior_variance += curvature
+
+
+@compiled
 def _update_hypothesis(
     ekf: Record,
     h: int,
@@ -648,7 +692,7 @@ def _update_hypothesis(
     evidence for the yaw. Ranges are not: their common offset looks the same as a wrong yaw.
     """
     hypothesis, innovation = ekf.hypotheses[h], ekf.innovation
-    correlation_length = parameters.tdoa_correlation_length * innovation.variance_inflation
+    correlation_length = max(innovation.variance_inflation, LEAST_LENGTH)
     hypotheses.add_log_likelihood(hypothesis, innovation, correlation_length)
     update.weigh(hypothesis, innovation, parameters)
     if innovation.weight > 0.0:
@@ -659,6 +703,8 @@ def _update_hypothesis(
         _reject(residual, innovation)
         if innovation.weight > 0.0:
             residual.weight, residual.verdict = innovation.weight, USED
+            if of_tdoa and parameters.adapt_noise and not ekf.sensed:
+                noise.learn_motion(ekf, t, innovation)
             history.add_update(ekf, h, t, records)
 
 
@@ -695,7 +741,7 @@ def _report(ekf: Record, parameters: Record, t: float, row: Record) -> None:
     noise.fill(
         ekf.information,
         best.P,
-        parameters.tdoa_correlation_length,
+        noise.persisting_share(ekf, parameters),
         parameters.fixed_height_std,
         row.consider_covariance,
     )

@@ -42,6 +42,7 @@ STEP_TIME, STEP_COUNT = 0.25, 7  # s and number of consistent ranges that show a
 HIGHEST_STEP = 1.5  # m, of the ground
 PULL_SCALE = 3.0  # m, scale of the loss that weighs the innovations of TDOAs
 PULL_LIMIT = 0.45  # m by which TDOAs disagree
+EXPLAINED = 0.5  # of tdoa_std, root mean square that errors of all TDOAs may have in common
 # s of disagreement after which the range finder is ignored, for as long the first time, and at most
 IGNORE_TIME, LONGEST_IGNORED = (3.0, 60.0)
 
@@ -304,7 +305,9 @@ def contradiction(height: Record, parameters: Record, t: float) -> float:
     """Return by how much TDOAs place the tag above its fixed height, in m.
 
     The result is 0 without a fixed height, or if errors of TDOAs alone can explain the difference.
-    The difference must last for MEMORY: low among the anchors, noise alone causes short ones.
+    The difference must last for MEMORY: low among the anchors, noise alone causes short ones. It must
+    change TDOAs by more than EXPLAINED, because delays alone look like such a height where TDOAs hardly
+    depend on it.
 
     Parameters
     ----------
@@ -320,6 +323,7 @@ def contradiction(height: Record, parameters: Record, t: float) -> float:
         parameters.fixed_height_std == 0.0
         or moment
         or abs(height.pull) <= PULL_LIMIT * height.pull_information
+        or height.pull**2 <= EXPLAINED**2 * parameters.tdoa_std**2 * height.pull_information
     ):
         return 0.0
     return height.pull / height.pull_information

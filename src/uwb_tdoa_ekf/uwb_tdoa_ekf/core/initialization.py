@@ -168,7 +168,11 @@ def start(
     )
     still = ground.judge_motion(pairs, anchors, rest_x, ekf.still_covariance) == ground.STILL
     on_ground = ground_log_odds > (0.0 if still else stationary_position.DECISIVE)
-    accepted = still if on_ground else share >= AGREE and workspace.contains(ekf.workspace, x[0])
+    accepted = (
+        still
+        if on_ground
+        else share >= AGREE and workspace.admits(ekf.workspace, x[0], covariance[0])
+    )
     if not (accepted or timed_out):
         return
     if still or on_ground or not (accepted or cost[1] < np.inf):
@@ -217,7 +221,8 @@ def start_slowly(
     places = room_for(N_PLACES)
     share = _search(ekf, anchors, parameters, t, window, places)
     stationary_position.sort_places(places, ekf, parameters)
-    if not (enough or (share >= AGREE and workspace.contains(ekf.workspace, places.x[0]))):
+    admitted = workspace.admits(ekf.workspace, places.x[0], places.covariance[0])
+    if not (enough or (share >= AGREE and admitted)):
         return
     if np.trace(places.covariance[0, :3, :3]) > APART**2:
         split(places)
@@ -310,7 +315,7 @@ def relocate(
     if (
         share < AGREE
         or variance > BETTER * np.trace(best.P[:3, :3])
-        or not workspace.contains(ekf.workspace, x[0])
+        or not workspace.admits(ekf.workspace, x[0], covariance[0])
     ):
         return
     for h in range(HYPOTHESES):
@@ -345,12 +350,13 @@ def _find_surroundings(
 
 @compiled
 def update_workspace(ekf: Record, anchors: np.ndarray, parameters: Record, t: float) -> None:
-    """Update the workspace of a running tag from the anchors heard up to stamp t (s).
+    """Update workspace and number of heard anchors of a running tag, up to stamp t (s).
 
     The workspace thus follows the tag through a hall.
     """
     ekf.next_workspace = t + noise.MEMORY
     _find_surroundings(ekf, recent(ekf, noise.MEMORY), anchors, parameters)
+    ekf.heard = len(workspace.rows_heard(_last(ekf, t)[0]))
 
 
 @compiled
@@ -521,10 +527,9 @@ def recover(
     share = _search(ekf, anchors, parameters, t, window, places)
     x, covariance, cost = places.x, places.covariance, places.cost
     explained = np.mean(inliers(window, anchors, ekf.hypotheses[ekf.best].x[:6]))
-    if (
-        workspace.distance_outside(ekf.workspace, x[0]) > (workspace.STD if anywhere else 0.0)
-        or share < AGREE_RECOVERY
-    ):
+    near = anywhere and workspace.distance_outside(ekf.workspace, x[0]) <= workspace.STD
+    admitted = near or workspace.admits(ekf.workspace, x[0], covariance[0])
+    if share < AGREE_RECOVERY or not admitted:
         return
     if anywhere and cost[count - 1] < np.inf:
         _reopen(ekf, cost)

@@ -22,6 +22,7 @@ from uwb_tdoa_bias.effects.base import SensorFunction
 from uwb_tdoa_bias.effects.samples import N_STATES
 
 from ..anchor_table import AnchorTable
+from . import noise
 from .auxiliary import OFFSET_STATES
 from .ground import MOST_PAIRS, PAIR
 from .inertial import rows_of
@@ -120,6 +121,7 @@ ANCHOR = _record(
     ("excess_variance", float),  # m^2, of its TDOAs beyond tdoa_std, see noise.py
     ("learned", float),  # s, stamp of the last update of this variance
     ("heard", float),  # s, stamp of the last TDOA that was used
+    ("innovation", float),  # m, last innovation, as a lateness of this anchor
     ("delay", float),  # m, estimated after a change in flight
     ("delay_variance", float),  # m^2, of the delay
     # probability that it is late because tag and anchor are near the ground, see ground.py; 0: it
@@ -241,6 +243,15 @@ EKF = _record(
     ("next_workspace", float),  # s, stamp of the next update of the workspace
     # 1/m^2, of the position, by a single TDOA of each anchor heard lately, see noise.py
     ("information", float, (3, 3)),
+    ("tdoa_rate", float),  # 1/s, of TDOAs and ranges, over the last second
+    ("heard", float),  # number of anchors in the last TDOAs
+    # variance of TDOAs over the stated one; recent means of the squared innovation and of its
+    # product with the last one of the same anchor, over the stated variance; see noise.py
+    ("noise_ratio", float),
+    ("squared", float),
+    ("persistent", float),
+    ("motion_ratio", float),  # power of the random acceleration over that of motion_noise
+    ("velocity_change", float, 3),  # m/s, sum of recent corrections of the velocity
     # s, stamp until which the tag may be anywhere, because its position was uncertain before
     ("position_unknown_until", float),
     ("search_waits_until", float),  # s, stamp until which TDOAs wait for a search
@@ -391,6 +402,8 @@ def new_state(
     ekf.hypotheses["P"][:] = np.eye(ERROR_STATES)
     ekf.since_record[:] = np.eye(ERROR_STATES)
     ekf.consistency, ekf.range_offset[1] = 1.0, np.inf
+    ekf.noise_ratio = ekf.motion_ratio = ekf.squared = 1.0
+    ekf.persistent = noise.SHARE
     return state
 
 

@@ -1,11 +1,15 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Measurement noise of each anchor, and the covariance of persisting errors.
+"""Measurement noise, how alike successive errors are, and the covariance of persisting errors.
 
-The filter learns the noise of each anchor from its innovations.
+The filter learns the noise of each anchor, and of a motion without inertial sensor, from its
+innovations. Ranges alone keep the prior. The error of a TDOA is white noise plus an error that changes as the tag moves on: a
+reflection, a delay. The filter learns the sum of both variances, and the share of the second.
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
@@ -20,9 +24,20 @@ LARGEST_OUTLIER = 5.0  # standard deviations; limits the effect of an outlier
 LARGEST_STEP = 0.1
 
 # Persisting errors.
-# share of the variance of a TDOA that persists where its errors are correlated: delays and antennas
-# cause errors as large as the noise
-SHARE = 0.5
+SHARE = 0.5  # prior share of the variance of a TDOA that persists, by delays and antennas
+# s over which variance and persisting share are learned, least number of TDOAs, least variance over
+# the stated one
+LEARNED_OVER, FEWEST, LEAST_RATIO = (5.0, 20.0, 0.05)
+SLOWER = 2.0  # factor on the first two for the persisting share, which scatters more
+# a position follows the errors of so many anchors, so that innovations do not show them
+FREE = 4
+LIMIT = 3.0  # standard deviations to which an innovation is limited for the share
+
+# Motion without inertial samples: step of the logarithm of its power for a TDOA, weight of the
+# likelihood, s over which corrections of the velocity are compared, bounds of the power over that of
+# motion_noise.
+STEP, OF_LIKELIHOOD, COMPARED, LEAST_POWER, MOST_POWER = (0.1, 0.5, 0.5, 0.01, 100.0)
+LARGEST_NIS = 6.0  # normalized innovation squared; limits the effect of an outlier
 MEMORY = 1.0  # s of TDOAs that count; an anchor that was silent for longer counts as absent
 # s; limits the decay, because silence does not remove the information from anchors
 LONGEST_STEP = 0.1
@@ -69,6 +84,100 @@ def _learn_one(anchor: Record, t: float, excess: float, memory: float) -> None:
     )
     anchor.excess_variance = max(0.0, anchor.excess_variance + step * excess)
     anchor.learned = t
+
+
+@compiled
+def learn_persistence(ekf: Record, last: float, t: float, innovation: Record) -> float:
+    """Update noise_ratio, squared and persistent of the EKF, and return the limited innovation, m.
+
+    An error that persists in an anchor makes its successive innovations alike: the mean product of
+    two is its variance. An innovation tells the less, the more uncertain its prediction is.
+
+    Parameters
+    ----------
+    ekf : EKF
+        State of the filter, updated in place.
+    last : float
+        Sum of the last innovations of the anchors, each with its sign in this measurement, m.
+    t : float
+        Stamp, s.
+    innovation : INNOVATION
+        Innovation of the TDOA.
+    """
+    noise, prior, dt = innovation.noise_variance, innovation.prior_variance, t - ekf.last_tdoa
+    trust = (noise / (noise + prior)) ** 2
+    squared = min(innovation.value**2, LARGEST_OUTLIER**2 * noise)
+    step = min(1.0 / FEWEST, dt / LEARNED_OVER)
+    ekf.noise_ratio += step * trust * ((squared - prior) / noise - ekf.noise_ratio)
+    ekf.noise_ratio = min(max(ekf.noise_ratio, LEAST_RATIO), 1.0)
+    most = LIMIT * math.sqrt(noise + prior)
+    value = min(max(innovation.value, -most), most)
+    ekf.squared += step / SLOWER * (trust * value * value / noise - ekf.squared)
+    ekf.persistent += step / SLOWER * (trust * value * last / noise - ekf.persistent)
+    return value
+
+
+@compiled
+def persisting_share(ekf: Record, parameters: Record) -> float:
+    """Return the share of the stated variance of a TDOA that persists, 0 to 1."""
+    if not parameters.adapt_noise:
+        return 0.0
+    return min(1.0, max(0.0, ekf.persistent) / max(ekf.squared, 1e-6)) * ekf.noise_ratio
+
+
+@compiled
+def variance_inflation(ekf: Record, parameters: Record, t: float) -> float:
+    """Return the factor on the stated variance of a TDOA or range stamped t (s) in an update.
+
+    It is noise_ratio, plus the persisting share times a number of TDOAs with the same error. At rest
+    these are all TDOAs of the rest. In motion errors of every duration occur, up to
+    tdoa_correlation_time and tdoa_correlation_distance. Then it is the square root of the number of
+    TDOAs within both. This power was set on measured flights, at 5 to 400 TDOAs a second.
+    """
+    if not parameters.adapt_noise:
+        return 1.0
+    x = ekf.hypotheses[ekf.best].x
+    speed = math.sqrt(x[3] ** 2 + x[4] ** 2 + x[5] ** 2)
+    alike = parameters.tdoa_correlation_time
+    if alike * speed > parameters.tdoa_correlation_distance:
+        alike = parameters.tdoa_correlation_distance / speed
+    count = math.sqrt(ekf.tdoa_rate * alike)
+    if ekf.resting:
+        count = max(count, ekf.tdoa_rate * (t - ekf.rest_since))
+    return ekf.noise_ratio + persisting_share(ekf, parameters) * count
+
+
+@compiled
+def learn_motion(ekf: Record, t: float, innovation: Record) -> None:
+    """Update motion_ratio of the EKF after an update without inertial samples.
+
+    Corrections of the velocity are independent if the power of the random acceleration is right,
+    alike if it is too small, and opposite if it is too large (Mehra, IEEE Trans. Automatic Control
+    1970). The likelihood of the innovation judges it where the prediction is uncertain.
+
+    Parameters
+    ----------
+    ekf : EKF
+        State of the filter, updated in place.
+    t : float
+        Stamp, s.
+    innovation : INNOVATION
+        Innovation after the update.
+    """
+    before, kept = ekf.velocity_change, max(0.0, 1.0 - (t - ekf.last_tdoa) / COMPARED)
+    product = one = other = 0.0
+    for k in range(3):
+        change = innovation.cross_covariance[3 + k] * innovation.value / innovation.total_variance
+        product += change * before[k]
+        one += change * change
+        other += before[k] ** 2
+        before[k] = kept * before[k] + change
+    prior = innovation.prior_variance
+    total = prior + innovation.noise_variance * innovation.variance_inflation
+    slope = 0.5 * prior / total * (min(innovation.value**2 / total, LARGEST_NIS) - 1.0)
+    alike = product / math.sqrt(one * other + 1e-30)
+    power = ekf.motion_ratio * math.exp(STEP * (alike + OF_LIKELIHOOD * slope))
+    ekf.motion_ratio = min(max(power, LEAST_POWER), MOST_POWER)
 
 
 @compiled
@@ -123,14 +232,14 @@ def observe(
 def fill(
     information: np.ndarray,
     P: np.ndarray,
-    correlation_length: float,
+    share: float,
     height_std: float,
     covariance: np.ndarray,
 ) -> None:
     """Compute the covariance of the position caused by persisting errors (consider covariance).
 
-    White noise (correlation_length 1) leaves no persisting error. A held height does not follow
-    these errors, so it reduces them.
+    White noise (share 0) leaves no persisting error. A held height does not follow these errors, so it
+    reduces them.
 
     Parameters
     ----------
@@ -138,15 +247,14 @@ def fill(
         From `observe`, 1/m^2.
     P : (15, 15) array
         Covariance of the error state.
-    correlation_length : float
-        Number of successive TDOAs that count as a single independent one.
+    share : float
+        Share of the variance of a TDOA that persists, from `persisting_share`.
     height_std : float
         Standard deviation of a held height, m; 0 if no height is held.
     covariance : (3, 3) array
         Consider covariance, m^2. Filled.
     """
     covariance[:, :] = 0.0
-    share = SHARE * (1.0 - 1.0 / max(correlation_length, 1.0))
     if share == 0.0:
         return
     total = information / share + inverse(P[:3, :3]) / MOST

@@ -40,18 +40,6 @@ LIFT = 0.25  # m/s upwards; a larger change of velocity, measured by the IMU, en
 LIFT_MEMORY = 0.7  # s over which the measured acceleration is integrated
 AWAY = 1.5  # s after such an end in which no new rest begins
 SILENT = 0.5  # s without TDOAs after which a vibrating tag is not known to be at rest
-# s; TDOAs of a tag at rest have the same errors, so each such interval adds one repetition
-SAME_ERROR = 0.01
-
-
-@compiled
-def repetition(ekf: Record, t: float) -> float:
-    """Return the variance inflation of a TDOA stamped t (s) by repetition at rest.
-
-    It is the number of times that TDOAs of this rest have measured the same value, with the same
-    errors.
-    """
-    return 1.0 + (t - ekf.rest_since) / SAME_ERROR if ekf.resting else 1.0
 
 
 @compiled

@@ -6,9 +6,8 @@ Each kind of measurement fills an INNOVATION: the Jacobian row with its error st
 predicted value, and the variance of the measurement noise. `project` and `kalman` then work for all
 kinds. If the measurement may be an outlier, `weigh` comes between the two.
 
-Errors of successive TDOAs are correlated: `tdoa_correlation_length` of them give the information of
-a single independent one. The update therefore uses the variance of a single measurement times this
-length. The methods `innovation` and `gate` compute the weight with the variance of a single
+Errors of successive TDOAs are correlated. The update therefore uses the variance of a single
+measurement times `variance_inflation` (noise.py). The methods `innovation` and `gate` compute the weight with the variance of a single
 measurement, `m_estimation` with the variance that its update uses.
 """
 
@@ -50,8 +49,7 @@ INNOVATION = np.dtype(
         # entries of the Jacobian row for the auxiliary states; nonzero only for their own sensors
         ("offset_jacobian", float, OFFSET_STATES),
         ("offset_covariance", float, OFFSET_STATES),  # scratch of auxiliary.correct
-        # factor on the variance by repetition of the same error, in units of
-        # tdoa_correlation_length; 1 unless the tag is at rest
+        # factor on noise_variance in an update, because successive errors are alike; see noise.py
         ("variance_inflation", float),
         ("weight", float),  # 0 to 1, set by `weigh`
         ("total_variance", float),  # variance of the value, as the update used it
@@ -211,9 +209,7 @@ def weigh(hypothesis: Record, innovation: Record, parameters: Record) -> None:
         innovation.weight, innovation.total_variance = 0.0, np.inf
         return
     innovation.weight = w
-    innovation.total_variance = (
-        prior + noise * parameters.tdoa_correlation_length * innovation.variance_inflation / w
-    )
+    innovation.total_variance = prior + noise * innovation.variance_inflation / w
 
 
 @compiled
@@ -234,11 +230,7 @@ def _weigh_by_m_estimation(hypothesis: Record, innovation: Record, parameters: R
     columns = _columns(innovation)
     _factorize(hypothesis, innovation.factor, rows, columns)
     _scale(innovation, columns)
-    noise = (
-        innovation.noise_variance
-        * parameters.tdoa_correlation_length
-        * innovation.variance_inflation
-    )
+    noise = innovation.noise_variance * innovation.variance_inflation
     loss = parameters.loss
     e[:] = 0.0  # scaled error of the state, eq. 9
     for _ in range(parameters.iterations):

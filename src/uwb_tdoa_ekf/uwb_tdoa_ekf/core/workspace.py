@@ -23,7 +23,7 @@ SMALLEST = 3.0
 # determine the side of the tag.
 FLAT = 0.6
 BELOW, ABOVE = SIDES.index("below"), SIDES.index("above")
-STD = 1.0  # m, prior standard deviation about the bound for a tag outside
+STD = 1.0  # m, prior standard deviation about the bound for a tag just outside
 
 
 @compiled
@@ -221,9 +221,25 @@ def rows_heard(window: np.ndarray) -> np.ndarray:
 
 
 @compiled
-def contains(bounds: np.ndarray, x: np.ndarray) -> bool:
-    """Return True if position x (3,), m, is within `bounds` (2, 3), m."""
-    return distance_outside(bounds, x) <= 0.0
+def admits(bounds: np.ndarray, x: np.ndarray, covariance: np.ndarray) -> bool:
+    """Return whether a tag may be at a place that TDOAs give.
+
+    It is in the workspace, or beside it and known to better than its distance from it. Late arrivals
+    near the floor are often explained best by a place far above, so a place above or below needs
+    another source.
+
+    Parameters
+    ----------
+    bounds : (2, 3) array
+        Bounds of the workspace, m, world frame.
+    x : (k,) array
+        Place, m, world frame, in its first three entries.
+    covariance : (k, k) array
+        Covariance of x.
+    """
+    outside = distance_outside(bounds, x)
+    known = covariance[0, 0] + covariance[1, 1] < outside**2 < np.inf
+    return outside <= 0.0 or (known and bounds[0, 2] <= x[2] <= bounds[1, 2])
 
 
 @compiled
@@ -250,11 +266,13 @@ def is_filled(bounds: np.ndarray, P: np.ndarray) -> bool:
 
 @compiled
 def constrain(hypothesis: Record, innovation: Record, bounds: np.ndarray, axis: int) -> bool:
-    """Apply a soft constraint to an axis: pull a tag outside towards its workspace.
+    """Apply the prior of the workspace to an axis: pull a tag outside towards it.
 
-    The constraint applies only while the standard deviation of the axis exceeds STD. A constraint
-    that is given once must not shrink the covariance again and again. TDOAs that agree on a place
-    outside are right.
+    The prior has heavy tails beside the anchors: its standard deviation is STD plus the distance of
+    the tag from the workspace. Above and below them it is STD, because late arrivals near the floor
+    are often explained best by a place far above. It applies only while the standard deviation of the axis is larger. A prior that is
+    given once must not shrink the covariance again and again. A tag that TDOAs place outside, by more
+    than they leave open, is outside.
 
     Parameters
     ----------
@@ -273,7 +291,9 @@ def constrain(hypothesis: Record, innovation: Record, bounds: np.ndarray, axis: 
         Whether the hypothesis was updated.
     """
     x = hypothesis.x[axis]
-    if bounds[0, axis] <= x <= bounds[1, axis] or hypothesis.P[axis, axis] <= STD**2:
+    nearest = min(max(x, bounds[0, axis]), bounds[1, axis])
+    std = STD + (abs(x - nearest) if axis < 2 else 0.0)
+    if x == nearest or hypothesis.P[axis, axis] <= std**2:
         return False
-    kalman_direct(hypothesis, innovation, axis, min(max(x, bounds[0, axis]), bounds[1, axis]), STD)
+    kalman_direct(hypothesis, innovation, axis, nearest, std)
     return True

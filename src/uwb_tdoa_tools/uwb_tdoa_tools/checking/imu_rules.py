@@ -91,9 +91,9 @@ def is_smooth(t: np.ndarray, values: np.ndarray) -> bool:
 # s that are tried, to be sure and to choose; Hz to which the samples are averaged
 PART, BRIEF, RATE = 30.0, 14.0, 200.0
 SLOWEST = 50.0  # Hz; slower sensors are not judged
-# This filter relies on the IMU: TDOAs have little weight, and the bias of the accelerometer may be
-# large.
-LEANING = FilterConfig(tdoa_correlation_length=100.0, initial_accel_bias_std=0.5)
+# This filter relies on the IMU: a TDOA counts as a hundredth of one of the default tdoa_std, and the
+# bias of the accelerometer may be large.
+LEANING = FilterConfig(tdoa_std=2.5, adapt_noise=False, initial_accel_bias_std=0.5)
 # ratio of the remaining loss, and its standard errors; healthy flights: 0.98 at least in any trial
 RATIO, DEVIATIONS = 0.9, 2.5
 # Ratio of the losses of the default filter with the inertial sensor as it is and without: up to here it

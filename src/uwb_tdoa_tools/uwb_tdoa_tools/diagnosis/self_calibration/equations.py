@@ -42,6 +42,7 @@ from ..references import Nothing
 from ..regression.fit import NU, student_scale
 from .prior import Prior
 
+COUNTED = 6.0  # TDOAs that the filter counts as one on flights with some 400 TDOAs a second
 BLOCK = 3.0  # s, length of the blocks whose score sums measure the inflation
 # Divisor of the information in addition to the inflation: errors that last a flight are not noise.
 SYSTEMATIC = 12.0
@@ -136,10 +137,10 @@ class Equations:
     def tdoa_std(self, config: FilterConfig) -> float:
         """Return the tdoa_std, m, at which the filter's information matches the inflated noise.
 
-        The filter divides the information of each TDOA by tdoa_correlation_length. The data ask for
-        a division by the inflation.
+        The filter divides the information of each TDOA by about COUNTED. The data ask for a division
+        by the inflation.
         """
-        return config.tdoa_std * float(np.sqrt(self.inflation / config.tdoa_correlation_length))
+        return config.tdoa_std * float(np.sqrt(self.inflation / COUNTED))
 
 
 class Runs:
