@@ -71,6 +71,28 @@ def test_an_interrupt_is_quiet_while_it_imports_and_then_the_affair_of_main(writ
     assert process.communicate(timeout=120) == ("", "") and process.returncode == code
 
 
+COMPILES = """
+import signal
+from uwb_tdoa_bias.common.executable import interrupt
+signal.signal(signal.SIGINT, lambda number, frame: interrupt(number, frame, compiling=True))
+def work():
+    print("in", flush=True)
+    try:
+        signal.pause()
+    except BaseException as error:  # as numba does: it becomes another error
+        raise RuntimeError("lowering") from error
+work.__globals__["__name__"] = "numba.core.lowering"
+work()
+"""
+
+
+def test_an_interrupt_while_numba_compiles_for_a_node_ends_it_quietly():
+    process = start("-c", COMPILES)
+    assert process.stdout.readline() == "in\n"
+    process.send_signal(SIGINT)
+    assert process.communicate(timeout=120) == ("", "") and process.returncode == 130
+
+
 @pytest.mark.parametrize(
     ("missing", "remedy"),
     [

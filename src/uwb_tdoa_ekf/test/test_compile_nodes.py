@@ -34,6 +34,8 @@ for t in np.arange(0.0, 20.0, 0.02):
     some = (tdoa.t >= t) & (tdoa.t < t + 0.02)
     tag.add_tdoa(tdoa.t[some], tdoa.a[some], tdoa.b[some], tdoa.d[some])
     tag.advance()
+    if t > 19.0:
+        tag.distrust()
 assert tag.running
 print([function.__name__ for function, count in compiled().items() if count > before.get(function, 0)])
 """

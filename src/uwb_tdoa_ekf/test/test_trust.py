@@ -89,5 +89,5 @@ def test_what_a_fault_has_spoiled_is_opened_and_settles():
     for t, _, odometry in looks(flight, [(10.0, Estimator.distrust)]):
         known[round(t, 1)] = yaw_std(odometry) < YAW_KNOWN
         last = odometry
-    assert known[9.9] and not known[10.2] and known[24.0]
+    assert known[9.9] and not known[10.3] and known[24.0]
     assert np.linalg.norm(last.p[-1] - position_at(flight, last.t[-1:])[0]) < 0.3

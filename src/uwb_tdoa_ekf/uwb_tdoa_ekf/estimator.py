@@ -402,7 +402,7 @@ class Estimator:
 
     def distrust(self) -> None:
         """Open position, velocity, attitude and biases, because a fault has spoiled them."""
-        self._pipeline.distrust()
+        self._ekf.distrusted = True
 
     def expect_imu(self, expected: bool) -> None:
         """Set whether the filter waits for inertial samples before the first one has come."""

@@ -16,7 +16,7 @@ from uwb_tdoa_bias.effects.samples import RADIO
 
 from .anchor_table import AnchorTable
 from .core.config import FilterConfig
-from .core.engine import distrust, feed, set_pose
+from .core.engine import feed, set_pose
 from .core.memory import ODOMETRY, RESIDUAL, TDOA, FilterState, Measurements, joined, new_state
 from .core.sensors import STREAMS
 from .monitoring.monitor import Monitor
@@ -272,10 +272,6 @@ class Pipeline:
     def set_pose(self, pose: np.ndarray) -> None:
         """Set the filter to a pose, (1,) of POSE, not older than the measurements used."""
         set_pose(self.state, self._parameters, pose)
-
-    def distrust(self) -> None:
-        """Open what a fault of the streams has spoiled in the filter."""
-        distrust(self.state, self._parameters)
 
     def _feed(self, measured: Measurements) -> list[PipelineOutput]:
         # Run the filter on measurements, slice by slice if ranges are corrected.

@@ -112,18 +112,18 @@ class _ImportedElsewhere:
 sys.meta_path.insert(0, _ImportedElsewhere)
 
 
-def interrupt(number: int, frame: FrameType | None) -> None:
+def interrupt(number: int, frame: FrameType | None, compiling: bool = False) -> None:
     """Raise KeyboardInterrupt for a signal, and repeat SIGINT until the exception arrives.
 
-    During an import the process ends at once. Some imported packages answer a KeyboardInterrupt with
-    a traceback or ignore it.
+    During an import the process ends at once, and with `compiling` while numba compiles, too. Some
+    packages answer a KeyboardInterrupt with a traceback or ignore it.
 
     Callbacks from C code and destructors cannot raise. Python prints such an exception on stderr and
     continues; numba's compiler has both. From now on Python prints no such exception, including
     those of half-made objects. If the lost exception is a KeyboardInterrupt, SIGINT comes again
     after SOON seconds.
     """
-    if is_importing(frame):
+    if is_importing(frame) or (compiling and is_compiling(frame)):
         os._exit(128 + number)
 
     def on_lost(lost: sys.UnraisableHookArgs) -> None:
@@ -141,6 +141,13 @@ def interrupt(number: int, frame: FrameType | None) -> None:
 def is_importing(frame: FrameType | None) -> bool:
     """Return whether a frame of the main thread runs within an import."""
     while frame is not None and frame.f_globals.get("__name__") != "importlib._bootstrap":
+        frame = frame.f_back
+    return frame is not None
+
+
+def is_compiling(frame: FrameType | None) -> bool:
+    """Return whether a frame runs within numba."""
+    while frame is not None and not frame.f_globals.get("__name__", "").startswith("numba."):
         frame = frame.f_back
     return frame is not None
 

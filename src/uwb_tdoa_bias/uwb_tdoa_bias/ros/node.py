@@ -317,7 +317,7 @@ def run(
         if not stop.done():
             stop.set_result(number)
         if interruptible:
-            interrupt(number, frame)
+            interrupt(number, frame, compiling=True)
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, on_signal)

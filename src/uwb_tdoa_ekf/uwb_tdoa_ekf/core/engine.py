@@ -163,21 +163,6 @@ def set_pose(state: FilterState, parameters: np.ndarray, pose: np.ndarray) -> No
     _set_pose(state, parameters, pose, history.NOTHING)
 
 
-# Compiled part of `distrust`.
-@compiled
-def _distrust(state: FilterState, parameters: np.ndarray, records: np.ndarray) -> None:
-    if state.ekf[0].running:
-        initialization.distrust(state.ekf[0], parameters[0], records)
-
-
-def distrust(state: FilterState, parameters: np.ndarray) -> None:
-    """Open what a fault of the streams has spoiled, see `initialization.distrust`.
-
-    The history does not record it. `parameters` is the tuning of the filter, (1,) PARAMETERS.
-    """
-    _distrust(state, parameters, history.NOTHING)
-
-
 def most_records(measurements: Measurements) -> int:
     """Return the number of history records that a call with these Measurements can need."""
     imu, tdoa, sensor = measurements
@@ -354,6 +339,9 @@ def _select(ekf: Record, parameters: Record, t: float, records: np.ndarray) -> N
         history.add_reset(ekf, t, records)
     if alone and yaw_check.contradicts(ekf, t):
         initialization.open_yaw(ekf, parameters, records)
+        alone = False
+    if ekf.distrusted:
+        initialization.distrust(ekf, parameters, records)
         alone = False
     if not alone:
         yaw_check.clear(ekf.yaw_test)

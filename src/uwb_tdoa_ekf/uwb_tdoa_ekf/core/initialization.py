@@ -592,6 +592,7 @@ def reach(ekf: Record, t: float) -> float:
 @compiled
 def distrust(ekf: Record, parameters: Record, history: np.ndarray) -> None:
     """Open what a fault of the streams has spoiled: position, velocity, attitude and biases."""
+    ekf.distrusted = False
     widen(ekf, history)
     if parameters.use_imu:
         reset_attitude(ekf, parameters, YAW_SEARCH_STD, history)

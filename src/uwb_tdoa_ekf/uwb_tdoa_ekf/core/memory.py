@@ -256,6 +256,7 @@ EKF = _record(
     ("position_unknown_until", float),
     ("search_waits_until", float),  # s, stamp until which TDOAs wait for a search
     ("consistency", float),  # share of recent TDOAs that agree with the best hypothesis
+    ("distrusted", bool),  # a fault of the streams has spoiled the state: the next update opens it
     ("recoveries", int),  # number of recoveries
     ("recovered", float),  # s, stamp of the last recovery from a contradiction
     ("first_tdoa", float),  # s, stamp of the first TDOA since the filter stopped
