@@ -225,6 +225,12 @@ def test_a_common_error_of_ranges_is_found(ranged, by):
     assert not report.faulty and "tag_delay" in {finding.rule for finding in report.findings}
 
 
+def test_ranges_in_another_scale_are_not_called_a_delay_alone(ranged):
+    scaled = replace(ranged, range=replace(ranged.range, d=0.8 * ranged.range.d))
+    (found,) = tag_delay(of_flight(scaled))
+    assert found.severity == "warning" and "or all are 0.8" in found.cause
+
+
 def test_healthy_ranges_have_no_finding_with_a_tape_measured_survey(ranged):
     assert not [*tag_delay(of_flight(ranged))]
     shaken = ranged.anchors.positions + 0.1 * np.random.default_rng(3).standard_normal(

@@ -9,7 +9,6 @@ either loss.
 
 from __future__ import annotations
 
-from collections.abc import Generator
 from dataclasses import dataclass
 import math
 
@@ -125,31 +124,6 @@ def unexplained(
     limit : float
         If the mean loss is certain to exceed this limit, return an Unexplained without blocks.
     """
-    blocks = each_block(tdoa, positions, imu, config)
-    while True:
-        try:
-            least = next(blocks)
-        except StopIteration as end:
-            return end.value
-        if least > limit * (1.0 + 1e-9):
-            return Unexplained({})
-
-
-def each_block(
-    tdoa: np.ndarray,
-    positions: np.ndarray,
-    imu: np.ndarray = NO_IMU,
-    config: FilterConfig = CONFIG,
-) -> Generator[float, None, Unexplained]:
-    """Run the filter of `unexplained` block by block, and return the Unexplained.
-
-    The parameters are as for `unexplained`.
-
-    Yields
-    ------
-    least : float
-        Least mean loss that is possible after the blocks so far.
-    """
     t, state, parameters = tdoa["t"], new_state(positions), config.parameters()
     number = _numbers(t)
     # first row of each block, and of the rows before the first block
@@ -163,7 +137,8 @@ def each_block(
             state, tdoa[first:end], positions, imu[of_imu[k] : of_imu[k + 1]], parameters
         )
         loss += float(np.mean(_loss(out[first:end]))) if counted[k] else 0.0
-        yield loss / count
+        if loss / count > limit * (1.0 + 1e-9):
+            return Unexplained({})
     return Unexplained.of(t, out)
 
 

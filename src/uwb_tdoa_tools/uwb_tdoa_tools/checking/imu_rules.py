@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from heapq import heappop, heappush
 from itertools import permutations, product
 from typing import NamedTuple
 
@@ -24,7 +23,6 @@ from uwb_tdoa_ekf.core.memory import TDOA, imu_rows, structured
 from uwb_tdoa_ekf.monitoring.explain import (
     Unexplained,
     compare,
-    each_block,
     in_words,
     unexplained,
 )
@@ -319,16 +317,12 @@ def _all(recording: OrderedRecording, base: Unexplained) -> list[Arrangement]:
     """
     short = recording.part(BRIEF)
     arrangements = list(product((UPRIGHT, MIRROR), ARRANGEMENTS))
-    trials = [_each_block(_arranged(short, accel, gyro)) for accel, gyro in arrangements]
-    # The trial with the least loss so far continues. The first ones to end have the least loss.
-    waiting = [(0.0, k) for k in range(len(trials))]
-    chosen: list[tuple[np.ndarray, np.ndarray]] = []
-    while waiting and len(chosen) < CHOSEN:
-        _, k = heappop(waiting)
-        try:
-            heappush(waiting, (next(trials[k]), k))
-        except StopIteration:
-            chosen.append(arrangements[k])
+    losses: list[float] = []
+    for accel, gyro in arrangements:
+        least = sorted(losses)[CHOSEN - 1] if len(losses) >= CHOSEN else np.inf
+        loss = _unexplained(_arranged(short, accel, gyro), least).mean
+        losses.append(loss if np.isfinite(loss) else np.inf)
+    chosen = [arrangements[k] for k in np.argsort(losses, kind="stable")[:CHOSEN]]
     return [_tried(base, recording, accel, gyro) for accel, gyro in chosen]
 
 
@@ -361,11 +355,6 @@ def _unexplained(recording: OrderedRecording, limit: float = np.inf) -> Unexplai
     limit : see `monitoring.explain.unexplained`.
     """
     return unexplained(*_measured(recording), LEANING, limit)
-
-
-def _each_block(recording: OrderedRecording) -> Iterator[float]:
-    """Yield the least mean loss after each block, see `monitoring.explain.each_block`."""
-    return each_block(*_measured(recording), LEANING)
 
 
 def _measured(recording: OrderedRecording) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

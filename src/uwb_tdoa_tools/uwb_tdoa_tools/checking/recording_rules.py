@@ -406,7 +406,8 @@ def volatile_anchors(recording: Recording) -> Iterator[Finding]:
 
 WINDOW = 0.25  # s in which the tag hardly moves
 FEWEST_ANCHORS, FEWEST_WINDOWS, MOST_WINDOWS = 5, 10, 200
-LARGE, LARGEST = 0.1, 5.0  # m, limit of a finding, and more than any antenna delays
+LARGE, LARGEST = 0.1, 5.0  # m, limits of a finding
+DELAYS = 0.6  # m; larger than the delays of usual antennas
 AGREE = 0.8  # share of the windows with the same sign
 SCALE = 0.2  # m, beyond which a range counts less
 DILUTION = 5.0  # largest ratio of standard deviations: common error over a single range
@@ -432,12 +433,19 @@ def tag_delay(recording: Recording) -> Iterator[Finding]:
     offset = float(np.median(offsets))
     if LARGE < abs(offset) < LARGEST and np.mean(np.sign(offsets) == np.sign(offset)) > AGREE:
         low, high = np.quantile(offsets, [0.25, 0.75])
+        severity, cause = NOTE, "the antenna delay of the tag"
+        if abs(offset) > DELAYS:
+            size = float(np.nanmedian(ranges.d))
+            severity, cause = (
+                WARNING,
+                f"{cause}, or all are {size / (size - offset):.2f} times the distances",
+            )
         yield Finding(
             "tag_delay",
-            NOTE,
+            severity,
             cause=(
-                f"all ranges are too {'long' if offset > 0.0 else 'short'} by about as much: the "
-                "antenna delay of the tag"
+                f"all ranges are too {'long' if offset > 0.0 else 'short'} by about as much: "
+                f"{cause}"
             ),
             evidence=(
                 f"{offset:.2f} m in the median of {len(offsets)} windows of {WINDOW:g} s, "
