@@ -425,9 +425,9 @@ def tag_delay(recording: Recording) -> Iterator[Finding]:
     the anchors are on one side.
     """
     ranges = recording.sensors.get("range")
-    offsets = (
-        window_offsets(ranges, recording.anchors) if isinstance(ranges, Ranges) else np.empty(0)
-    )
+    if not isinstance(ranges, Ranges):
+        return
+    offsets = window_offsets(ranges, recording.anchors)
     if len(offsets) < FEWEST_WINDOWS:
         return
     offset = float(np.median(offsets))
