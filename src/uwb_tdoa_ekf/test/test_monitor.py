@@ -306,6 +306,12 @@ def test_names_an_anchor_that_was_moved_before_the_start_and_where_it_stands(row
 
 
 @pytest.mark.slow
+def test_places_outside_of_the_anchors_are_not_compared_with_the_survey():
+    monitor, low = Monitor(ANCHORS), ANCHORS.positions.min(axis=0)
+    assert monitor._is_among(ANCHORS.positions.mean(axis=0) + [0.0, 0.0, 9.0])
+    assert monitor._is_among(low) and not monitor._is_among(low - [1.0, 0.0, 0.0])
+
+
 def test_an_anchor_that_is_late_for_the_last_calibration_is_named_and_what_the_calibration_knows_counts():
     unknown, known = (
         watch(lambda t, p: only(3, 0.35), seconds=50, calibrated=of)[-1][1]

@@ -65,6 +65,7 @@ LOOK, YOUNG = (4, 40)
 # standard deviations by which an anchor must differ from the survey, in addition to SMALLEST_CHANGE.
 # Evidence for a change of x says nothing about a height that is uncertain by half a metre.
 SURE = 2.0
+MARGIN = 0.5  # m, beyond the anchors up to which slices are compared with the survey
 TURN_APART = 3.0  # s of stamps between two sign flips of all TDOAs
 # share of accepted TDOAs of a slice where the filter is right, and s since then within which a sign
 # flip must occur, because it is an event. Near a floor, TDOAs that are metres too long may
@@ -297,8 +298,16 @@ class Monitor:
             piece = reduced(end - 0.5 * LENGTH, place, positions, a, b, innovation)
             self._detector.add(piece)
             self._look_for_change(end)
-            if speed > MOVING:
+            if speed > MOVING and self._is_among(place):
                 self._compare(piece)
+
+    def _is_among(self, place: np.ndarray) -> bool:
+        """Return whether a place (3,) m is within the anchors, seen from above.
+
+        Outside of them, errors that depend on the place look like anchors elsewhere.
+        """
+        away = self._anchors.positions[:, :2] - place[:2]
+        return bool((away.min(axis=0) < MARGIN).all() and (away.max(axis=0) > -MARGIN).all())
 
     def _compare(self, piece: Slice) -> None:
         """Add a Slice to the comparisons with the survey; look at their results every LOOK slices.

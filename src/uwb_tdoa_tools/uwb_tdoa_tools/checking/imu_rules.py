@@ -102,8 +102,8 @@ FITS = 1.04
 # times as much on six measured flights. In sound recordings in which the filter leans on it wrongly,
 # others leave 1.67 times as much or more.
 AS_WITHOUT = 1.3
-# IMU of another body: least ratio of FITS, and largest ratio of the loss without the sensor. Of 23
-# exchanged pairs of flights 1.09 at least, and 0.67 at most; of 30 sound ones 1.06 at most.
+# IMU of another body: least ratio of FITS, and largest ratio of the loss without the sensor. Of 25
+# exchanged pairs of flights 1.09 at least, and 0.67 at most; of 23 sound ones 1.06 at most.
 ANOTHER, NEEDLESS = 1.1, 0.7
 MOVED = 0.3  # m, standard deviation of positions in motion; measured flights 1.2 at least
 STEADY = 0.02  # share of the specific force by which it varies at rest
