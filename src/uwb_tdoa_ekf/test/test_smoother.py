@@ -8,6 +8,7 @@ from flights import WORKSPACE, corners, errors_of, fly, kept, leaving, with_rang
 from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.flight import Tdoas
 from uwb_tdoa_bias.effects import EffectSet
@@ -312,3 +313,21 @@ def test_a_flight_too_short_to_start():
     flight = with_ranges(fly(5, 0.2))
     for short in (flight.without("range"), without_tdoas(flight)):
         assert len(smooth(short).odometry) == 0
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_before_a_restart_the_smoother_keeps_the_yaw_of_the_first_start(seed):
+    """After 33 s without data the filter starts again, with four yaws about another one.
+
+    The hypothesis that is best at the end does not belong to the first start.
+    """
+    low, high = 40.0, 73.0
+    flight = fly(seed, 85.0, **NOISE)
+    imu, tdoa = (kept(one, (one.t < low) | (one.t > high)) for one in (flight.imu, flight.tdoa))
+    flight = replace(flight, imu=imu, tdoa=tdoa)
+    smoothed = smooth(flight).odometry
+    early = rows_of(smoothed, (smoothed.t > 2.0) & (smoothed.t < low - 1.0))
+    true = [np.interp(early.t, flight.truth.t, column) for column in flight.truth.q.T]
+    turned = Rotation.from_quat(np.transpose(true)).inv() * Rotation.from_quat(early.q)
+    assert np.degrees(turned.magnitude()).max() < 30.0
+    assert np.abs(errors_of(flight, early)[0]).max() < 0.5

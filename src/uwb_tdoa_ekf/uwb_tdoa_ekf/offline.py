@@ -52,7 +52,7 @@ class Run:
     recoveries : int
         How often the filter detected divergence and initialized again.
     yaw_offset : float
-        Start of the correct yaw hypothesis minus initial_yaw, in rad.
+        Start of the correct yaw hypothesis minus initial_yaw, in rad, at the first start.
     sensors : dict
         {stream: (m,) of RESIDUAL}, one row per measurement, for the SENSORS in the flight.
     range_offset : (float, float) or None
@@ -152,7 +152,7 @@ def run_offline(
         bias,
         std,
         recoveries + int(ekf.recoveries),
-        yaw_offset(int(ekf.best)),
+        yaw_offset(int(ekf.best if ekf.first_best < 0 else ekf.first_best)),
         sensors,
         found,
     )

@@ -113,8 +113,10 @@ def _search(
 def _start_at(
     ekf: Record, parameters: Record, t: float, places: Places, resting: bool, history: np.ndarray
 ) -> None:
-    """Start the filter at Places, with the configured yaw."""
+    """Start the filter at Places, with the configured yaw; a tag may have turned before a restart."""
     yaw, yaw_std = parameters.initial_yaw, parameters.initial_yaw_std
+    if ekf.last_agreement > -np.inf:
+        yaw_std, ekf.attitude_reset = YAW_SEARCH_STD, True
     _begin(ekf, parameters, t, places, yaw, yaw_std, parameters.use_imu)
     ekf.resting, ekf.rest_since = resting, t
     add_reset(ekf, t, history)
@@ -458,6 +460,8 @@ def _begin(
         Whether a sensor measures motion in the body frame, so the yaws can be distinguished.
     """
     x, covariance, cost = places.x, places.covariance, places.cost
+    if ekf.first_best < 0 and ekf.last_agreement > -np.inf:
+        ekf.first_best = ekf.best
     accel = _mean_accel(ekf.imu, parameters)
     unknown = steered and yaw_std > hypotheses.YAW_STD
     for h in range(HYPOTHESES):
@@ -717,7 +721,9 @@ def level_first(ekf: Record, parameters: Record, history: np.ndarray) -> None:
     yaw_std = YAW_SEARCH_STD
     if hypotheses.followed(ekf) == 1:
         yaw_std = math.sqrt(ekf.hypotheses[ekf.best].P[8, 8])
+    first_best = ekf.first_best
     reset_attitude(ekf, parameters, yaw_std, history)
+    ekf.first_best = first_best  # no sample has distinguished the yaws before
 
 
 @compiled

@@ -257,6 +257,8 @@ EKF = _record(
     ("search_waits_until", float),  # s, stamp until which TDOAs wait for a search
     ("consistency", float),  # share of recent TDOAs that agree with the best hypothesis
     ("distrusted", bool),  # a fault of the streams has spoiled the state: the next update opens it
+    # best hypothesis when the yaws were opened anew for the first time; -1: they were not
+    ("first_best", int),
     ("recoveries", int),  # number of recoveries
     ("recovered", float),  # s, stamp of the last recovery from a contradiction
     ("first_tdoa", float),  # s, stamp of the first TDOA since the filter stopped
@@ -404,7 +406,7 @@ def new_state(
     ekf.since_record[:] = np.eye(ERROR_STATES)
     ekf.consistency, ekf.range_offset[1] = 1.0, np.inf
     ekf.noise_ratio = ekf.motion_ratio = ekf.squared = 1.0
-    ekf.persistent = noise.SHARE
+    ekf.persistent, ekf.first_best = noise.SHARE, -1
     return state
 
 
