@@ -296,5 +296,5 @@ def test_a_given_flight_through_the_real_nodes(recorded, diagnosis, tmp_path, ca
     assert corrected[3] < 0.6 * raw[3]  # 3D RMSE
     assert "lost or late" not in printed.err and "uwb_tdoa_tools check" in lines[-3]
     assert corrected == pytest.approx(without_ros, abs=1.01e-3)
-    for name in ("flight.bag", "recorded_bag", "error.png"):
+    for name in ("flight_bag", "recorded_bag", "error.png"):
         assert (tmp_path / "out" / name).exists()

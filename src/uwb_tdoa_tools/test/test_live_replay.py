@@ -258,7 +258,7 @@ def test_all_topics_of_a_tag_move_to_a_namespace(tmp_path, play, node):
         line.split() for line in replay.parser().epilog.splitlines() if "__ns:=/tag1" in line
     ][0]
     options = ["--wait-matched", LIMIT, "--wait-topics", *kinds]
-    assert play(*options, *command[command.index("flight.bag") + 1 :])[0] == 0
+    assert play(*options, *command[command.index("flight_bag") + 1 :])[0] == 0
     for topic, count in (("uwb/tdoa", 100), ("imu/data", 200), ("ground_truth/pose", 50)):
         take(streams[topic], lambda messages, count=count: len(messages) == count)
     take(anchors, lambda messages: messages)
