@@ -180,7 +180,8 @@ def test_a_fault_in_the_loop_changes_its_stream_while_it_lasts_and_no_other(name
 
 
 @pytest.mark.slow
-def test_a_vehicle_is_told_of_exchanged_ids_and_stays_safe():
-    sinks = flown.flown(("tdoa: two ids exchanged", 5001))
-    assert sinks["safe"] and BEGIN < sinks["reported_lost"] < BEGIN + 2.0
+def test_a_vehicle_sinks_where_the_status_says_so():
+    sinks = flown.flown(("tdoa: two ids exchanged", 5002))
+    assert not sinks["landed"] and sinks["safe"]
+    assert BEGIN < sinks["reported_lost"] < BEGIN + 2.0
     assert "two anchors are exchanged" in sinks["said"]
