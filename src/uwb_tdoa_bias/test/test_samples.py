@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Samples of TDOAs with the motion of the tag, and the inputs of a network."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 from hypothesis import given, strategies as st
@@ -20,7 +21,8 @@ from uwb_tdoa_bias.common.vibration import (
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.correction.features import ATTITUDE, FEATURES, NAMES, columns, everything
 from uwb_tdoa_bias.effects import EffectSet, Samples, SmoothTerm, samples_at
-from uwb_tdoa_bias.effects.samples import motion_at, preceding
+from uwb_tdoa_bias.effects.covariates import covariate_of
+from uwb_tdoa_bias.effects.samples import Motion, motion_at, preceding
 
 # --- samples ---
 
@@ -95,6 +97,28 @@ def test_what_is_learned_is_what_is_applied(covariate):
     np.testing.assert_allclose(applied.motion.velocity, learned.motion.velocity, atol=1e-9)
     np.testing.assert_allclose(term.bias(applied), term.bias(learned), atol=1e-9)
     assert np.abs(term.bias(applied)).min() > 0.01
+
+
+@given(seed=st.integers(0, 10**6))
+def test_covariates_of_pose_and_velocity(seed):
+    samples = random_samples(seed, 20)
+    v = np.random.default_rng(seed).standard_normal((20, 3))
+    moving = replace(samples, motion=Motion(v, v, v))
+    ends = samples.position_a, samples.position_b
+
+    def ranges(seconds):
+        p = samples.p + seconds * v
+        return np.concatenate([np.linalg.norm(p - end, axis=1) for end in ends])
+
+    rate = (ranges(1e-5) - ranges(-1e-5)) / 2e-5
+    np.testing.assert_allclose(covariate_of(moving, "range_rate"), rate, atol=1e-6)
+    assert np.isnan(covariate_of(samples, "range_rate")).all()
+    of_a, of_b = ranges(0.0).reshape(2, -1)
+    farther = np.concatenate([of_a - of_b, of_b - of_a])
+    np.testing.assert_allclose(covariate_of(samples, "range_difference"), farther)
+    yaw = Rotation.from_quat(samples.q).as_euler("ZYX")[:, 0]
+    off = np.exp(1j * covariate_of(samples, "yaw")) - np.exp(1j * yaw)
+    np.testing.assert_allclose(off, 0.0, atol=1e-9)
 
 
 def test_batches_know_what_was_heard_before():

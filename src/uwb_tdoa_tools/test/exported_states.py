@@ -33,6 +33,8 @@ RANGES = {
     "interval": (0.0, 0.02),
     "previous_anchor": (0.0, 7.0),
     "range": (0.0, 12.0),
+    "range_difference": (-8.0, 8.0),
+    "range_rate": (-3.0, 3.0),
 }
 ANGLE = (-3.0, 3.0)  # rad, range of the other covariates
 

@@ -20,7 +20,16 @@ FADE = 0.5  # share of the width of a domain; this far beyond it, exp(-1/2) of a
 CATEGORIES = ("previous_anchor",)  # values are names, not sizes
 UPWARDS = ("height", "elevation")  # change at take-off
 # of a history of poses
-OF_MOTION = ("speed", "climb_rate", "acceleration", "turning_rate", "interval", "previous_anchor")
+OF_MOTION = (
+    "speed",
+    "climb_rate",
+    "acceleration",
+    "turning_rate",
+    "interval",
+    "previous_anchor",
+    "range_rate",
+)
+ONLY_TDOA = (*OF_MOTION, "range_difference")  # ranges do not have these
 
 
 def _norm(v: np.ndarray) -> np.ndarray:
@@ -38,10 +47,15 @@ OF_TDOA: dict[str, Callable[[Any], np.ndarray | None]] = {
     "acceleration": lambda s: None if s.motion is None else _norm(s.motion.acceleration),
     "turning_rate": lambda s: None if s.motion is None else _norm(s.motion.rate),
     "tilt": lambda s: 2.0 * np.arcsin(np.minimum(np.hypot(s.q[:, 0], s.q[:, 1]), 1.0)),
+    "yaw": lambda s: _yaw(*s.q.T),
     "interval": lambda s: s.interval,
     "previous_anchor": lambda s: s.previous,
     "vibration": lambda s: s.vibration,
 }
+
+
+def _yaw(x: Any, y: Any, z: Any, w: Any) -> Any:
+    return np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
 def _to_anchor(samples: Samples, rows: np.ndarray) -> np.ndarray:
@@ -52,6 +66,19 @@ def _bearing(v: np.ndarray) -> np.ndarray:
     return np.arctan2(v[:, 1], v[:, 0])
 
 
+def _range_difference(samples: Samples, rows: np.ndarray) -> np.ndarray:
+    """Return how much farther each arrival is than the other one, (2 * n,) m."""
+    of_a, of_b = _norm(_to_anchor(samples, rows)).reshape(2, -1)
+    return np.concatenate([of_a - of_b, of_b - of_a])
+
+
+def _range_rate(samples: Samples, rows: np.ndarray) -> np.ndarray:
+    if samples.motion is None:
+        return np.full(len(rows), np.nan)
+    away, velocity = -_to_anchor(samples, rows), tile(samples, samples.motion.velocity)
+    return np.sum(away * velocity, axis=1) / _norm(away)
+
+
 def _elevation(v: np.ndarray) -> np.ndarray:
     return np.arctan2(v[:, 2], np.hypot(v[:, 0], v[:, 1]))
 
@@ -59,6 +86,8 @@ def _elevation(v: np.ndarray) -> np.ndarray:
 # One value per arrival at anchors in rows (ends * n,), with the samples repeated
 OF_ARRIVAL: dict[str, Callable[[Samples, np.ndarray], np.ndarray]] = {
     "range": lambda s, rows: np.linalg.norm(_to_anchor(s, rows), axis=1),
+    "range_difference": _range_difference,
+    "range_rate": _range_rate,
     "bearing": lambda s, rows: _bearing(_to_anchor(s, rows)),
     "elevation": lambda s, rows: _elevation(_to_anchor(s, rows)),
     "bearing_in_tag": lambda s, rows: _bearing(into_frame(tile(s, s.q), _to_anchor(s, rows))),
@@ -101,7 +130,11 @@ OF_SENSORS = (
 # States by which the filter differentiates a function of a covariate: position (0, 1, 2) and
 # velocity (3, 4, 5). Not the speed: the direction of a slow motion is unknown, and its Jacobian
 # made estimates worse.
-STATES = {**dict.fromkeys(("x", "y", "height", *OF_ARRIVAL), (0, 1, 2)), "climb_rate": (5,)}
+STATES = {
+    **dict.fromkeys(("x", "y", "height", *OF_ARRIVAL), (0, 1, 2)),
+    "climb_rate": (5,),
+    "range_rate": (0, 1, 2, 3, 4, 5),
+}
 
 # Covariates of inertial sensors that are states of the filter
 OF_STATE = ("x", "y", "height", "speed", "climb_rate")
@@ -116,11 +149,14 @@ UNITS = {
     "acceleration": "m/s^2",
     "turning_rate": "rad/s",
     "tilt": "rad",
+    "yaw": "rad",
     "interval": "s",
     "previous_anchor": "id",
     "vibration": "m/s^2",
+    **dict.fromkeys(OF_ARRIVAL, "rad"),
     "range": "m",
-    **dict.fromkeys((name for name in OF_ARRIVAL if name != "range"), "rad"),
+    "range_difference": "m",
+    "range_rate": "m/s",
     **dict.fromkeys((name for name in OF_IMU if name.startswith("rate_")), "rad/s"),
     **dict.fromkeys((name for name in OF_IMU if name.startswith("accel")), "m/s^2"),
 }

@@ -42,6 +42,7 @@ from .covariates import (
     OF_SENSORS,
     OF_STATE,
     OF_TDOA,
+    ONLY_TDOA,
     STATES,
     covariate_of,
     fade_weight,
@@ -208,7 +209,7 @@ class SmoothTerm(Effect):
 
     @property
     def uses_attitude(self) -> bool:  # type: ignore[override]  # of a term
-        return any(name.endswith("_in_tag") or name == "tilt" for name in self.arguments)
+        return any(name.endswith("_in_tag") or name in ("tilt", "yaw") for name in self.arguments)
 
     @property
     def uses_orientations(self) -> bool:  # type: ignore[override]  # of a term
@@ -481,9 +482,9 @@ def _rising(setting: str, knots: Any, shape: str) -> tuple[float, ...]:
 
 def known_covariates() -> dict[str, tuple[str, ...]]:
     """Return {channel: covariates of a SmoothTerm on it}, without further columns of logs."""
-    without_motion = (name for name in OF_TDOA if name not in OF_MOTION)
+    of_ranges = tuple(name for name in (*OF_TDOA, *OF_ARRIVAL) if name not in ONLY_TDOA)
     return {
-        **dict.fromkeys(RADIO, (*without_motion, *OF_ARRIVAL)),
+        **dict.fromkeys(RADIO, of_ranges),
         "tdoa": (*OF_TDOA, *OF_ARRIVAL),
         **dict.fromkeys(IMU_CHANNELS, tuple(dict.fromkeys((*OF_IMU, *OF_SENSORS)))),
         **dict.fromkeys(SENSOR_CHANNELS, OF_SENSORS),
@@ -537,7 +538,7 @@ OF_PLACE = (
     "bearing_in_anchor",
     "elevation_in_anchor",
 )
-OF_DIRECTION = ("bearing_in_tag", "elevation_in_tag", "tilt")
+OF_DIRECTION = ("bearing_in_tag", "elevation_in_tag", "tilt", "yaw")
 INERTIAL = ("inertial",)  # in place of the form of functions on gyroscope and accelerometer
 # (forms, covariates, causes, trial that distinguishes them); the first row that fits is used.
 _CAUSES = (
@@ -614,6 +615,12 @@ _CAUSES = (
         "turn the vehicle by hand on the spot",
     ),
     (
+        ("anchor", "arrival"),
+        ("range_difference",),
+        "a clock that runs at another rate than it says, or a TDOA that is scaled or clipped",
+        "compare the TDOAs of two known places with the tape",
+    ),
+    (
         ("arrival",),
         OF_PLACE,
         (
@@ -630,7 +637,7 @@ _CAUSES = (
     ),
     (
         None,
-        ("speed", "climb_rate", "acceleration", "turning_rate", "vibration", "tilt"),
+        ("speed", "climb_rate", "range_rate", "acceleration", "turning_rate", "vibration", "tilt"),
         "stamps that are late, the attitude of the antenna or its supply under load",
         "fly one straight line slowly and fast, level and tilted",
     ),

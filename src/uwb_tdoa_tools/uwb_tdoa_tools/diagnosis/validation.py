@@ -56,6 +56,7 @@ SAME_MOVE = 0.1
 SELECTED_ON = ", chosen on all of them (--holdout judges the choice too)"
 HELD_OUT = "flights that took no part in the fit"
 SECOND = "give a second flight with this one"
+OF_A_TIME = "it happened at times of these flights, and another one has it at other times"
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,8 +166,8 @@ def select_by_error(
     then predict the error without several of them, and candidates are dropped one by one by this
     prediction. The filter runs again with the rest, until no candidate is dropped. Detections stay
     only if the error falls with them. At most TRIAL_FLIGHTS flights are judged. Of two flights none
-    may get worse by an effect. Events at a time of a single flight are tried for their worth, but
-    not kept.
+    may get worse by an effect. Events at a time are tried for their worth, but not kept: another
+    flight does not have them at the same time.
 
     map_function : as of `attribute`; validated : Candidates that stay without another trial
     poses : of an earlier ValidatedSelection of these flights, for the first corrections
@@ -187,6 +188,8 @@ def select_by_error(
                 worth[one] = displacements.error([one]) - whole
             if alone:
                 unsure = _of_this_flight(attribution.selection, applicable)
+            elif momentary := {one: OF_A_TIME for one in applicable if _momentary(one)}:
+                unsure = momentary
             else:
                 unsure = _harmful(attribution, candidates, applicable)
                 if len(flights) == 2:
@@ -343,7 +346,7 @@ def _with_and_without(error: float, without: float) -> str:
 
 
 def _momentary(candidate: Candidate) -> bool:
-    """Return whether a Candidate is an event at a time of one flight.
+    """Return whether a Candidate is an event at a time of its flights.
 
     It is a temporary delay, or a function of the time that is not a drift.
     """

@@ -19,7 +19,7 @@ from scipy.sparse import csc_array, csr_array
 
 from uwb_tdoa_bias.common.sensors import COMPARED
 from uwb_tdoa_bias.effects import RADIO, Effect, Samples, SmoothTerm, samples_at
-from uwb_tdoa_bias.effects.covariates import CATEGORIES, EXTRA, OF_ARRIVAL, OF_MOTION, OF_TDOA
+from uwb_tdoa_bias.effects.covariates import CATEGORIES, EXTRA, OF_ARRIVAL, OF_TDOA, ONLY_TDOA
 from uwb_tdoa_bias.effects.smooth_term import OF_LINKS
 from uwb_tdoa_ekf.sensitivity import Innovations
 
@@ -279,11 +279,12 @@ class RangeResidual(RadioResidual):
 class RadioChannel(Channel[Radio]):
     """The channel of measurements between the tag and anchors.
 
-    covariates : names of its covariates that are not of an arrival
+    covariates : names of its covariates that are not of an arrival; of_arrival : of the others
     """
 
     unit: str = "m"
     covariates: tuple[str, ...]
+    of_arrival: tuple[str, ...]
 
     def by_anchor(self, covariate: str) -> bool:
         """Return whether each anchor may have a function of a covariate of its own."""
@@ -292,7 +293,7 @@ class RadioChannel(Channel[Radio]):
     def smooth_terms(self, residuals: Sequence[Radio]) -> list[SmoothTerm]:
         out = []
         extra = extra_names([part.samples for part in residuals])
-        for name in (*self.covariates, *extra, *OF_ARRIVAL):
+        for name in (*self.covariates, *extra, *self.of_arrival):
             knots = knots_of(name, [part.covariate(name) for part in residuals])
             if knots is None:
                 continue
@@ -319,8 +320,8 @@ class RadioChannel(Channel[Radio]):
                 quick[name] = np.concatenate([v[cell.chosen] for cell, v in zip(cells, known)])
             else:
                 slow[name] = np.concatenate([cell.mean(v) for cell, v in zip(cells, known)])
-        for name, function in OF_ARRIVAL.items():
-            both = [of_arrivals(function, part.samples) for part in residuals]
+        for name in self.of_arrival:
+            both = [of_arrivals(OF_ARRIVAL[name], part.samples) for part in residuals]
             means = [[cell.mean(v) for v in values] for cell, values in zip(cells, both)]
             of_arrival[name] = np.concatenate(means, axis=1)
         out = views_of_arrivals(self.name, ends, slow, of_arrival, many=many)
@@ -339,6 +340,7 @@ class Tdoa(RadioChannel[TdoaResidual]):
     negligible = 0.004
     maps = ("x", "y", "height", "range")
     covariates = tuple(OF_TDOA)
+    of_arrival = tuple(OF_ARRIVAL)
 
     def residual(self, comparison: Comparison) -> TdoaResidual | None:
         return compared(comparison, Samples, TdoaResidual)
@@ -354,7 +356,9 @@ class Ranging(RadioChannel[RangeResidual]):
     """The channel of a sensor that measures distances to anchors."""
 
     # A node corrects them without a history of the motion.
-    covariates = tuple(name for name in OF_TDOA if name not in OF_MOTION)
+    covariates, of_arrival = (
+        tuple(name for name in names if name not in ONLY_TDOA) for names in (OF_TDOA, OF_ARRIVAL)
+    )
 
     def __init__(self, name: str) -> None:
         self.name = name

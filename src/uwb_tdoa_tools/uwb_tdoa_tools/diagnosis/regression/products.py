@@ -37,6 +37,7 @@ CYCLES = tuple(np.arange(1.5, 20.01, 0.1).tolist())  # numbers of periods over t
 TIME_BINS = 240
 SHORTEST = 1.0  # s, smallest range of the time
 PHASES = 24  # places in a period where a pulse begins or ends
+SINGLE = "time", "yaw", "range_rate", "range_difference"  # of no product
 FACTOR = 5  # by how much the best wave and the best pulse are searched more finely
 LEAST_GAIN = 30.0  # smallest gain, twice a log-likelihood
 FEWEST = 60  # rows of a subset
@@ -138,9 +139,10 @@ class Products:
     def _pairs(self, names: Iterable[str]) -> list[tuple[str, str]]:
         """Return the pairs of covariates of which products are tried.
 
-        What happens at a place, but only for some time, does not recur in another flight.
+        What happens at a place, but only for some time, does not recur in another flight. The
+        covariates SINGLE follow the place and its angles in many flights.
         """
-        pairs = combinations([name for name in names if name != "time"], 2)
+        pairs = combinations([name for name in names if name not in SINGLE], 2)
         return [pair for pair in pairs if not (self._with_maps and {*pair} <= {*OF_PLACE})]
 
     def __call__(self, weights: np.ndarray, residual: np.ndarray) -> list[Proposal]:
