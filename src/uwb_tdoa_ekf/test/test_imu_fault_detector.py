@@ -106,6 +106,22 @@ def test_what_a_tag_may_do_is_no_fault():
         assert left_out(sensed(rest)[0], force[:, None] * [0.0, 0.0, 1.0]) == []
 
 
+def test_a_drone_that_races_leans_for_seconds_and_is_no_fault():
+    """Its thrust is its only force, and tilts it by up to 74 degrees at 11 m/s, with 3.5 g."""
+    rates, far = np.array([1.94, 2.54]), 4.5  # rad/s and m
+    begun = np.clip(T / 3.0, 0.0, 1.0)[:, None]
+    lean = begun * far * rates**2 * np.sin(rates * T[:, None] + [0.0, 1.0])
+    up = np.column_stack([lean, np.full(len(T), GRAVITY)])
+    angle = np.arctan2(np.hypot(up[:, 0], up[:, 1]), GRAVITY)
+    axis = np.cross([0.0, 0.0, 1.0], up)
+    axis /= np.maximum(np.linalg.norm(axis, axis=1), 1e-9)[:, None]
+    gyro, accel = sensed(
+        Rotation.from_rotvec(angle[:, None] * axis), np.column_stack([lean, 0 * T])
+    )
+    assert np.linalg.norm(accel, axis=1).max() > 3.5 * GRAVITY
+    assert left_out(gyro, accel) == []
+
+
 def test_a_tag_that_lies_on_its_back_goes_without_after_some_seconds():
     said = left_out(*sensed(Rotation.from_euler("X", np.interp(T, [3.0, 4.0], [0.0, np.pi]))))
     assert 6.0 < said[0][0] < 7.2 and said[0][1] == TILT and said[-1][0] == T[-1]
