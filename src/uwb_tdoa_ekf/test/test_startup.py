@@ -615,3 +615,17 @@ def test_a_moment_of_evidence_counts_little_and_evidence_for_the_yaw_is_no_credi
     assert accumulate(doubt, 1.0) == 0.0
     doubt.information[:], doubt.vector[:] = 0.5 * np.eye(2), [-1.0, 0.0]
     assert accumulate(doubt, 1.0) == MOST_AT_ONCE
+
+
+def test_a_measured_start_on_the_floor_is_not_above_the_anchors(shared_data):
+    readers = pytest.importorskip("uwb_tdoa_tools.readers")
+    case = shared_data.parent / "cases/recordings/floor_start"
+    if not case.exists():
+        pytest.skip("no cases in ../shared/cases")
+    flight = readers.read_flight(case, shared_data / "surveys/anchor_0426.txt")
+    o = run_offline(flight).odometry
+    truth = [np.interp(o.t, flight.truth.t, flight.truth.p[:, k]) for k in range(3)]
+    error = np.linalg.norm(o.p - np.transpose(truth), axis=1)
+    std = np.sqrt(np.trace(o.covariance[:, :3, :3], axis1=1, axis2=2))
+    assert o.t[0] < flight.tdoa.t[0] + 1.1
+    assert (error < np.maximum(0.6, 3.0 * std)).all() and error[:20].max() < 0.6

@@ -135,7 +135,8 @@ def start(
 
     There are three starts. A tag at rest on the ground starts at the most probable place there. A
     tag at rest elsewhere starts without velocity. A moving tag starts with the velocity that
-    its TDOAs give, at one or two places.
+    its TDOAs give, at one or two places. If the ground is more probable, and TDOAs are too noisy to
+    show rest, the tag waits for the timeout. Then it starts on the ground.
 
     Parameters
     ----------
@@ -168,11 +169,12 @@ def start(
     ground_log_odds = stationary_position.weigh_explanations(
         ekf, pairs, anchors, parameters, known, rest_x, rest_covariance
     )
-    still = ground.judge_motion(pairs, anchors, rest_x, ekf.still_covariance) == ground.STILL
-    on_ground = ground_log_odds > (0.0 if still else stationary_position.DECISIVE)
+    motion = ground.judge_motion(pairs, anchors, rest_x, ekf.still_covariance)
+    still, likely = motion == ground.STILL, motion != ground.MOVES and ground_log_odds > 0.0
+    on_ground = ground_log_odds > stationary_position.DECISIVE or (likely and (still or timed_out))
     accepted = (
         still
-        if on_ground
+        if on_ground or likely
         else share >= AGREE and workspace.admits(ekf.workspace, x[0], covariance[0])
     )
     if not (accepted or timed_out):
