@@ -91,3 +91,22 @@ def test_what_a_fault_has_spoiled_is_opened_and_settles():
         last = odometry
     assert known[9.9] and not known[10.3] and known[24.0]
     assert np.linalg.norm(last.p[-1] - position_at(flight, last.t[-1:])[0]) < 0.3
+
+
+@pytest.mark.parametrize("spread", [0.0, 1.0])
+def test_a_pause_of_the_link_restarts_nothing_and_keeps_the_yaw(spread):
+    """TDOAs of 3 s come together, or within 1 s. The IMU, on board, goes on."""
+    flight = fly(1, 20.0, **QUIET)
+    t, imu, estimator, deviations = flight.tdoa.t, flight.imu, Estimator(flight.anchors), []
+    paused = (t > 10.0) & (t < 13.0)
+    arrival = np.maximum.accumulate(np.where(paused, 13.0 + spread * (t - 10.0) / 3.0, t))
+    for now in np.arange(0.02, 20.0, 0.02):
+        part = (imu.t >= now - 0.02) & (imu.t < now)
+        came = (arrival >= now - 0.02) & (arrival < now)
+        estimator.add_imu(imu.t[part], imu.gyro[part], imu.accel[part])
+        estimator.add_tdoa(*(getattr(flight.tdoa, name)[came] for name in ("t", "a", "b", "d")))
+        odometry, _ = estimator.advance()
+        if now > 13.0 and len(odometry):
+            deviations.append(yaw_std(odometry))
+    assert not estimator.counts["restarts"] and max(deviations) < 2.0 * YAW_KNOWN
+    assert np.linalg.norm(odometry.p[-1] - position_at(flight, odometry.t[-1:])[0]) < 0.2

@@ -38,6 +38,9 @@ SILENT = 1.0  # s of stamps after which the buffer stops waiting for a silent st
 # share of `lag` for which the buffer waits for SENSORS; `hold` of bias_node must be much longer
 OF_SENSORS = 0.5
 TRIAL = 2.0  # s of stamps in order after which the buffer assumes that a stream stays in order
+# s of stamps of the reference that may come after a pause of the link, all at once; ratio of the paces
+# of the stamps and of the time above which the reference catches up
+LONGEST_PAUSE, CATCHING_UP = (5.0, 2.0)
 # s, largest lead of each stream over the streams it is compared with. TDOAs that arrive 2 s after
 # inertial samples of the same time are still used. Other sensors are compared with inertial samples
 # too.
@@ -400,8 +403,8 @@ class ReorderBuffer:
     def _is_overtaken(self, place: int, t: float) -> bool:
         """Return whether the reference has been far behind the used rows for a while.
 
-        Rows that were delayed and arrive all at once do not count, because the time has not
-        advanced meanwhile.
+        Rows that were delayed and arrive all at once do not count: their stamps rise faster than
+        the time. If nothing else advances the time, they count after LONGEST_PAUSE.
 
         Parameters
         ----------
@@ -418,8 +421,10 @@ class ReorderBuffer:
         seen = self._streams[self._moving].seen
         if self._overtaken is None or t < self._overtaken[0]:
             self._overtaken = t, seen
-        since, then = self._overtaken
-        return t - since >= CONTRADICTED and (seen - then >= CONTRADICTED or seen == then)
+        gone, passed = t - self._overtaken[0], seen - self._overtaken[1]
+        if not passed:
+            return gone >= LONGEST_PAUSE
+        return min(gone, passed) >= CONTRADICTED and gone <= CATCHING_UP * passed
 
     def _refuse_outliers(self, place: int, outliers: Sequence[tuple[float, np.ndarray]]) -> None:
         """Refuse rows whose stamps are far from the neighbouring stamps."""
