@@ -114,6 +114,7 @@ TDOA_FAULTS = {
     "tdoa_one_sign": lambda c, rng: _both_orders(c, 1.0),
     "tdoa_rounded": lambda c, rng: put(c, D, np.round(c[D], 1)),
     "tdoa_clipped": lambda c, rng: put(c, D, np.clip(c[D], -1.0, 1.0)),
+    "tdoa_frozen": lambda c, rng: put(c, D, standing(c, 112.0)),
     "few_anchors": lambda c, rng: put(put(c, A, np.full(len(c[D]), 10)), B, np.full(len(c[D]), 11)),
     "ids_unknown": lambda c, rng: put(c, A, np.where(c[A] == 12, 99, c[A])),
     "stamps_apart": lambda c, rng: put(c, T, c[T] + 10.0),
@@ -124,6 +125,16 @@ TDOA_FAULTS = {
 
 def _held(values):
     return values[np.arange(len(values)) // 5 * 5]
+
+
+def standing(columns, since):
+    """Return TDOAs that keep the last value of their pair from a stamp on, in s."""
+    d, pairs = columns[D].copy(), columns[A] * 1000 + columns[B]
+    for pair in np.unique(pairs):
+        rows = np.flatnonzero(pairs == pair)
+        late = columns[T][rows] >= since
+        d[rows[late]] = d[rows[~late][-1]]
+    return d
 
 
 def _bumps(t):

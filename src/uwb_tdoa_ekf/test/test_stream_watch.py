@@ -5,10 +5,10 @@
 from collections import Counter
 import re
 
-from faults import ARRIVAL, FAULTS, FLIGHT, OF_THE_CLOCK, columns_of
+from faults import ARRIVAL, FAULTS, FLIGHT, OF_THE_CLOCK, D, columns_of, put
 import numpy as np
 import pytest
-from test_stream_rules import ANCHORS, streams
+from test_stream_rules import ANCHORS, standing, streams
 
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.monitoring.status import Use
@@ -101,6 +101,22 @@ def test_few_tdoas_a_second_are_slow_and_not_clipped():
     imu, tdoa = streams(10.0)
     said = watched(imu, tuple(column[::37] for column in tdoa), 10.0)
     assert {rule for found in said for rule in found} == {"rate"}
+
+
+def clipped(columns, since):
+    return np.where(columns[0] < since, columns[D], np.clip(columns[D], -1.0, 1.0))
+
+
+@pytest.mark.parametrize(
+    ("rule", "wrong"),
+    [("tdoa_frozen", standing), ("tdoa_clipped", clipped)],
+)
+@pytest.mark.parametrize("at", [4.0, 4.5])
+def test_values_that_stand_still_or_are_clipped_are_a_fault_within_two_seconds(rule, wrong, at):
+    imu, tdoa = streams(9.0)
+    said = watched(imu, put(tdoa, D, wrong(tdoa, 100.0 + at)), 9.0)
+    assert not any(said[:4])
+    assert all(set(found) == {rule} and found[rule].position_wrong() for found in said[6:])
 
 
 def test_another_time_is_judged_anew():

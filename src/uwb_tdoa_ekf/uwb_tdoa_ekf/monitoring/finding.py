@@ -34,6 +34,7 @@ POSITION_WRONG = frozenset(
         "ids_exchanged",
         "anchor_scale",
         "tdoa_clipped",
+        "tdoa_frozen",
         "stamps_unit",
         "stamps_coarse",
     ]

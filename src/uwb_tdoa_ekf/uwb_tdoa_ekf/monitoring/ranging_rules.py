@@ -20,11 +20,14 @@ from .windows import GRIDS, TdoaWindow
 LARGE = 0.2  # share of TDOAs longer than the distance of their anchors; healthy 0.008 at most
 OUTLIERS = 0.05  # the same, from which on many TDOAs count as outliers
 DUPLICATES = 0.02  # share of TDOAs that come twice; healthy 0
-REPEATS = 0.15  # share of TDOAs that repeat the value of their pair; healthy 0.026
+# share of TDOAs that repeat the value of their pair, healthy 0.03; the same in one window, healthy
+# 0.09, from which on the values stand still
+REPEATS, FROZEN = (0.15, 0.95)
 RETURNS = 0.08  # share of TDOAs that jump by more than 0.5 m and back; healthy 0.04 at most
 EVEN = 0.6  # share of the pairs, heard in both orders, with equal signs; healthy 0.1
 ON_GRID = 0.95  # share of TDOAs on a grid; healthy 0.005
-CLIPPED = 0.02  # share of TDOAs at the largest value
+# share and number of TDOAs of a window at its largest value; healthy 0.011, and 3
+CLIPPED, HITS = (0.02, 4)
 # m, median jump; share of jumps that differ from it by less than NEAR, in m; number of jumps
 STEP, ALIKE, NEAR, FEWEST = (5.0, 0.6, 0.5, 10)
 WRAPS = {
@@ -111,6 +114,15 @@ def _even(windows: list[TdoaWindow]) -> float:
     return share_of(windows, "even", "opposed") if total(windows, "opposed") > 20 else 0.0
 
 
+def _frozen(windows: list[TdoaWindow]) -> float:
+    """Return the largest share of TDOAs of a window that repeat the value of their pair.
+
+    TDOAs at the largest value are left out: clipped TDOAs repeat it.
+    """
+    others = ((w.repeated - w.hits, w.successive - w.hits) for w in windows)
+    return max((same / count for same, count in others if count >= FEWEST), default=0.0)
+
+
 SHARES = (
     Limit(
         "tdoa_of_one",
@@ -149,6 +161,15 @@ SHARES = (
         lambda windows: share_of(windows, "repeated", "successive"),
     ),
     Limit(
+        "tdoa_frozen",
+        ERROR,
+        "the values of TDOAs stand still",
+        "{:.0f} % have the value that their pair had before",
+        "publish a TDOA only when the radio has measured it; restart its driver",
+        FROZEN,
+        _frozen,
+    ),
+    Limit(
         "two_tags",
         ERROR,
         "two tags share uwb/tdoa",
@@ -185,18 +206,16 @@ def rounded(windows: list[TdoaWindow]) -> Iterator[Finding]:
 
 
 def clipped(windows: list[TdoaWindow]) -> Iterator[Finding]:
-    ceiling = max(w.ceiling for w in windows)
-    hits = [w.hits for w in windows if w.ceiling == ceiling]
-    share = sum(hits) / max(total(windows, "known"), 1)
-    repeats = sum(hits) > len(hits)  # the largest of few values is a large share of them
-    if share > CLIPPED and repeats and ceiling > 0.0:
+    window = max(windows, key=lambda window: window.hits)
+    share = window.hits / max(window.known, 1)
+    if share > CLIPPED and window.hits >= HITS and window.ceiling > 0.0:
         yield Finding(
             "tdoa_clipped",
             ERROR,
             cause="TDOAs are clipped",
-            evidence=f"{100.0 * share:.0f} % are {ceiling:.3f} m or its negative",
+            evidence=f"{100.0 * share:.0f} % are {window.ceiling:.3f} m or its negative",
             remedy="widen the limit of the driver",
-            value=ceiling,
+            value=window.ceiling,
         )
 
 

@@ -51,6 +51,7 @@ NOTHING_TO_TRY = {
     "few_anchors",
     "senders",
     "tdoa_clipped",
+    "tdoa_frozen",
     "anchor_scale",
 }
 WITHOUT_IMU = {
