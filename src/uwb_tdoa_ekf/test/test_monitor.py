@@ -276,10 +276,23 @@ def test_a_swap_is_named_until_something_else_has_been_true_for_a_while(monkeypa
     monkeypatch.setattr("uwb_tdoa_ekf.monitoring.monitor.suspects", lambda *_: {1, 2, 3, 4})
     monitor, named = Monitor(ANCHORS), []
     for _ in range(56):
-        monitor._look_for_swap(np.zeros(1, int), np.ones(1, int), np.zeros(1), np.zeros(3))
+        monitor._look_for_swap(np.zeros(1, int), np.ones(1, int), np.zeros(1), np.zeros(3), True)
         named.append(monitor._swapped)
     kept = [pair for k, pair in enumerate(named) if k == 0 or pair != named[k - 1]]
     assert kept == [(), one, (), other] and named.count(one) > 12
+
+
+@pytest.mark.parametrize("moving", [True, False])
+def test_a_tag_at_rest_shows_no_permutation(monkeypatch, moving):
+    """After landings, where low anchors were late, a permutation of six ids was named."""
+    mixed = ((0, 1), (1, 2), (2, 0))
+    left = {(): 1.0, mixed: 0.1, ((1, 2), (2, 1)): 0.9}, dict.fromkeys([(), mixed], np.zeros(3))
+    monkeypatch.setattr("uwb_tdoa_ekf.monitoring.monitor.residuals_of", lambda *_: left)
+    monkeypatch.setattr("uwb_tdoa_ekf.monitoring.monitor.suspects", lambda *_: {0, 1, 2})
+    monitor = Monitor(ANCHORS)
+    for _ in range(12):
+        monitor._look_for_swap(np.zeros(1, int), np.ones(1, int), np.zeros(1), np.zeros(3), moving)
+    assert monitor._swapped == (mixed if moving else ())
 
 
 @pytest.mark.slow

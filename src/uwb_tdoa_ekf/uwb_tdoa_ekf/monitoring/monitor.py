@@ -293,7 +293,7 @@ class Monitor:
         if math.isnan(self._moving_since) or place is None or not len(a):
             return
         self._follow_biases(end, np.concatenate([odometry.gyro_bias[-1], odometry.accel_bias[-1]]))
-        swap = self._look_for_swap(a, b, innovation, place) or self._swapped
+        swap = self._look_for_swap(a, b, innovation, place, speed > MOVING) or self._swapped
         if not swap and accepted >= FEWEST_ACCEPTED:
             piece = reduced(end - 0.5 * LENGTH, place, positions, a, b, innovation)
             self._detector.add(piece)
@@ -371,12 +371,17 @@ class Monitor:
         return SurveyComparison(self._anchors, self._calibrated)
 
     def _look_for_swap(
-        self, a: np.ndarray, b: np.ndarray, innovation: np.ndarray, place: np.ndarray
+        self,
+        a: np.ndarray,
+        b: np.ndarray,
+        innovation: np.ndarray,
+        place: np.ndarray,
+        moving: bool,
     ) -> bool:
         """Return whether this slice suggests that ids of anchors are mixed up.
 
         An order is reported after several such slices. It is reported until several consecutive
-        slices contradict it.
+        slices contradict it. At rest on a floor, where anchors are late, some permutation fits.
 
         Parameters
         ----------
@@ -386,6 +391,8 @@ class Monitor:
             Innovations, in m.
         place : (3,) array
             Position of the filter in the world frame, in m.
+        moving : bool
+            Whether the tag moves. A tag at rest shows no permutation of more than two.
         """
         positions, named = self._anchors.positions, self._swapped
         d = innovation + tdoa(place, positions[a], positions[b])
@@ -400,6 +407,8 @@ class Monitor:
         before = self._instead[0] or named
         left, places = residuals_of(positions, pieces, set.intersection(*rows), before)
         found = clear_order(left, before) if len(self._latest) == TOGETHER else ()
+        if found != named and not moving and len(found) > 2:
+            found = ()
         if found:
             self._known_place = self._slices, places[found]
         if found == named or (named and not found and left.get(named, 0.0) < left[()]):
