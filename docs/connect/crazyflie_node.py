@@ -23,7 +23,7 @@ import sys
 import rclpy
 from rclpy.executors import ExternalShutdownException
 
-from uwb_tdoa_tools.autopilot.topics import VehicleTopics
+from uwb_tdoa_tools.autopilot.crazyflie import VehicleTopics
 from uwb_tdoa_tools.crazyflie import LogBlock
 
 try:

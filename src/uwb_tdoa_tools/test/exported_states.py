@@ -16,7 +16,7 @@ from uwb_tdoa_bias.effects import EFFECTS, Samples, SmoothTerm
 from uwb_tdoa_bias.effects.covariates import CATEGORIES, OF_ARRIVAL, OF_TDOA
 from uwb_tdoa_bias.effects.samples import Motion
 from uwb_tdoa_bias.effects.smooth_term import FACTORS, OF_LINKS, SHAPES
-from uwb_tdoa_tools.exporting.correction import is_traceable
+from uwb_tdoa_tools.exporting.tracing import is_traceable
 from uwb_tdoa_tools.training import models as training
 
 # Ranges of the covariates of a tag in `anchors_of`: (lowest, highest)

@@ -8,7 +8,7 @@ import re
 
 import pytest
 
-from uwb_tdoa_tools.outputs import Output, OutputBag, OutputFile, OutputFileInFolder, OutputFolder
+from uwb_tdoa_tools.cli import Output, OutputBag, OutputFile, OutputFileInFolder, OutputFolder
 
 READ = set(  # options and arguments that name inputs, or no path
     """flights flight input bag map anchors survey effects config model peer marks distances holdout odometry beside antenna

@@ -75,7 +75,7 @@ def process():
 def test_mistakes_of_a_live_driver_are_found(tmp_path, process, capsys, monkeypatch):
     pytest.importorskip("uwb_tdoa_msgs.msg")
     process(sys.executable, "-c", FAULTY)
-    listen = pytest.importorskip("uwb_tdoa_tools.live.record")
+    listen = pytest.importorskip("uwb_tdoa_tools.live.session")
     monkeypatch.setattr(listen, "FIRST_LIMIT", 180.0)
     out = tmp_path / "live.json"
     code = main(
@@ -111,7 +111,7 @@ def test_live_streams_equal_the_recording(tmp_path, process, monkeypatch):
     The recording is played on simulated time. The check receives the first part.
     """
     pytest.importorskip("uwb_tdoa_msgs.msg")
-    listen = pytest.importorskip("uwb_tdoa_tools.live.record")
+    listen = pytest.importorskip("uwb_tdoa_tools.live.session")
     monkeypatch.setattr(listen, "FIRST_LIMIT", 180.0)
     flight = small_flight(4.0)
     write_bag(flight, tmp_path / "flight.bag")
@@ -144,7 +144,7 @@ def test_live_streams_equal_the_recording(tmp_path, process, monkeypatch):
 
 
 def test_topics_without_a_publisher_are_an_error(capsys, monkeypatch):
-    listen = pytest.importorskip("uwb_tdoa_tools.live.record")
+    listen = pytest.importorskip("uwb_tdoa_tools.live.session")
     monkeypatch.setattr(listen, "FIRST_LIMIT", 0.3)
     assert main(["--live", "3", "--namespace", "nowhere"]) == 2
     assert "no message on /nowhere/uwb/tdoa" in capsys.readouterr().err

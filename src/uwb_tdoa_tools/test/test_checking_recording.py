@@ -18,7 +18,7 @@ from uwb_tdoa_tools.checking import coverage, recording_rules
 from uwb_tdoa_tools.checking.check import check
 from uwb_tdoa_tools.checking.recording import IMU, TDOA, of_flight, read_recording
 from uwb_tdoa_tools.checking.recording_rules import RULES, tag_delay, window_offsets
-from uwb_tdoa_tools.live.record import End
+from uwb_tdoa_tools.live.session import End
 from uwb_tdoa_tools.readers.inputs import Reading
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 

@@ -16,8 +16,8 @@ from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.correction.network import load_network
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_tools.exporting.c_code import NO_PAIR, NOT_FINITE, vehicle_code, write_c
-from uwb_tdoa_tools.exporting.correction import trace
 from uwb_tdoa_tools.exporting.onnx_file import write_onnx
+from uwb_tdoa_tools.exporting.tracing import trace
 
 pytestmark = pytest.mark.skipif(GCC is None, reason="no C compiler (gcc)")
 needs_board = pytest.mark.skipif(

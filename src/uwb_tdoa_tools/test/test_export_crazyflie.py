@@ -18,7 +18,7 @@ from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools.exporting import crazyflie
 from uwb_tdoa_tools.exporting.c_code import vehicle_code, write_crazyflie
-from uwb_tdoa_tools.exporting.correction import trace
+from uwb_tdoa_tools.exporting.tracing import trace
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 pytestmark = pytest.mark.skipif(GCC is None, reason="no C compiler (gcc)")

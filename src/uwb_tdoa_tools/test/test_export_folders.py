@@ -14,7 +14,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_tools.commands import export
 from uwb_tdoa_tools.exporting.c_code import write_c, write_crazyflie
-from uwb_tdoa_tools.exporting.correction import trace
+from uwb_tdoa_tools.exporting.tracing import trace
 
 SMALL_IDS = Anchors(np.arange(8), ANCHORS.positions, ANCHORS.orientations)
 

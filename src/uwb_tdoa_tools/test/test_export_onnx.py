@@ -33,9 +33,13 @@ from uwb_tdoa_bias.effects import (
 from uwb_tdoa_bias.effects.effect_set import REACH  # noqa: E402
 from uwb_tdoa_tools.commands import export  # noqa: E402
 from uwb_tdoa_tools.estimate import with_antenna  # noqa: E402
-from uwb_tdoa_tools.exporting.correction import is_traceable, left_out, trace  # noqa: E402
 from uwb_tdoa_tools.exporting.onnx_file import printed, write_onnx  # noqa: E402
-from uwb_tdoa_tools.exporting.tracing import samples_of  # noqa: E402
+from uwb_tdoa_tools.exporting.tracing import (
+    is_traceable,
+    left_out,
+    samples_of,  # noqa: E402
+    trace,
+)
 from uwb_tdoa_tools.readers import read_flight  # noqa: E402
 from uwb_tdoa_tools.scoring.evaluation import evaluate  # noqa: E402
 from uwb_tdoa_tools.training.models import FEATURES, WITHOUT  # noqa: E402

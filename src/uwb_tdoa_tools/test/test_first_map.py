@@ -18,11 +18,10 @@ from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands import localize
 from uwb_tdoa_tools.commands.map_anchors import main
 from uwb_tdoa_tools.first_map import map_anchors, observe
-from uwb_tdoa_tools.first_map.least_squares import Equations, Fit, Problem, Stage
+from uwb_tdoa_tools.first_map.least_squares import Equations, Fit, Problem, Stage, rigid_distance
 from uwb_tdoa_tools.first_map.observations import STEP, G, _Level
-from uwb_tdoa_tools.first_map.search import rigid_distance
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.surveying.known import read_coordinates
+from uwb_tdoa_tools.surveying.report import read_coordinates
 
 CERTAIN = 4.0  # standard deviations, limit of the coordinate errors of an accepted map
 

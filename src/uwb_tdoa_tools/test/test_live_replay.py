@@ -32,7 +32,7 @@ from tf2_msgs.msg import TFMessage  # noqa: E402
 
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa  # noqa: E402
 from uwb_tdoa_tools.commands import replay  # noqa: E402
-from uwb_tdoa_tools.live.record import recorded_odometry  # noqa: E402
+from uwb_tdoa_tools.live.session import recorded_odometry
 
 pytestmark = pytest.mark.slow  # starts players and subscriptions
 

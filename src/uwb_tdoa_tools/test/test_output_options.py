@@ -10,7 +10,7 @@ from output_attacks import ATTACKS, attack, content, outputs, parsers, place, un
 import pytest
 
 from uwb_tdoa_tools import cli
-from uwb_tdoa_tools.outputs import OutputBag, OutputFile, OutputFileInFolder, OutputFolder
+from uwb_tdoa_tools.cli import OutputBag, OutputFile, OutputFileInFolder, OutputFolder
 
 PARSERS = {}
 for _name, _module in TOOLS.items():

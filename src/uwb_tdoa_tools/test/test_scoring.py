@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.common.flight import Truth
 from uwb_tdoa_ekf.core.memory import INVALID, LATE, REJECTED, STARTUP, USED
 from uwb_tdoa_tools.evaluating import line_of_run, lines_of_attitude, lines_of_phases
-from uwb_tdoa_tools.scoring.gains import LOSS, clear_change
 from uwb_tdoa_tools.scoring.metrics import (
     Score,
     coverage,
@@ -27,7 +26,7 @@ from uwb_tdoa_tools.scoring.metrics import (
     summary,
 )
 from uwb_tdoa_tools.scoring.phases import TITLES, in_the_air, motion, phases
-from uwb_tdoa_tools.scoring.pooling import ATTITUDE, Pool
+from uwb_tdoa_tools.scoring.pooling import ATTITUDE, LOSS, Pool, clear_change
 
 # --- metrics ---
 

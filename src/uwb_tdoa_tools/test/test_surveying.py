@@ -34,8 +34,15 @@ from uwb_tdoa_tools.diagnosis.self_calibration.solve import CLEARLY, CLEARLY_OF_
 from uwb_tdoa_tools.scoring.evaluation import evaluate
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.surveying import report
-from uwb_tdoa_tools.surveying.known import read_distances, read_marks, read_paths
-from uwb_tdoa_tools.surveying.report import as_dict, as_text, with_blocked, with_large_delays
+from uwb_tdoa_tools.surveying.report import (
+    as_dict,
+    as_text,
+    read_distances,
+    read_marks,
+    read_paths,
+    with_blocked,
+    with_large_delays,
+)
 
 # --- surveying ---
 

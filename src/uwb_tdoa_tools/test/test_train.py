@@ -11,8 +11,8 @@ from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands import train
 from uwb_tdoa_tools.exporting.c_code import write_c
-from uwb_tdoa_tools.exporting.correction import trace
 from uwb_tdoa_tools.exporting.onnx_file import write_onnx
+from uwb_tdoa_tools.exporting.tracing import trace
 
 
 @pytest.fixture(scope="module")

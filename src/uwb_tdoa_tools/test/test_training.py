@@ -14,8 +14,8 @@ from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_bias.correction.features import FEATURES
 from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
-from uwb_tdoa_tools.scoring.gains import SHARES, Shrinkage, best_share
-from uwb_tdoa_tools.training import models, physics, shrinking
+from uwb_tdoa_tools.scoring.pooling import SHARES, Shrinkage, best_share
+from uwb_tdoa_tools.training import models, shrinking
 from uwb_tdoa_tools.training.labels import labels, split, thinned, white_noise
 
 # --- labels ---
@@ -152,7 +152,7 @@ def injected(flights, *effects):
 @pytest.mark.slow
 def test_finds_what_is_wrong_with_anchors_and_imu():
     flights = injected([flight(seed, **PLAIN) for seed in range(3)], DELAY, PUSHED)
-    found = physics.find_effects(flights)
+    found = models.find_effects(flights)
     values = {effect.name: effect.values for effect in found.effects}
     assert values["anchor_delay"]["2"] == pytest.approx(0.3, abs=0.03)
     assert values["accel_bias"]["x"] == pytest.approx(0.8, abs=0.1)
@@ -173,10 +173,10 @@ def test_of_several_constellations_only_what_carries_over():
         [flight(seed, **PLAIN) for seed in range(2)], EFFECTS["anchor_position"]({"5.x": 0.5})
     )
     flights += [flight(seed, "pillars", **PLAIN) for seed in (3, 4)]
-    found = physics.find_effects(injected(flights, DELAY, PUSHED))
+    found = models.find_effects(injected(flights, DELAY, PUSHED))
     names = {effect.name for effect in found.effects}
     assert "anchor_delay" in names
-    assert names <= {*physics.PORTABLE, "noise_level", "noise_correlation"}
+    assert names <= {*models.PORTABLE, "noise_level", "noise_correlation"}
 
 
 def test_an_error_that_belongs_to_a_place_is_not_taken_for_a_delay():
@@ -188,7 +188,7 @@ def test_an_error_that_belongs_to_a_place_is_not_taken_for_a_delay():
     s = known[0].samples
     blocked = 0.5 * np.exp(-0.5 * np.sum((s.p - s.p.mean(axis=0)) ** 2, axis=1))
     known[0] = replace(known[0], error=known[0].error + blocked * ((s.b == 5) * 1.0 - (s.a == 5)))
-    (found,) = physics.beside_places(delays, known)
+    (found,) = models.beside_places(delays, known)
     late = found.values["2"] - np.median([*found.values.values()])
     assert late == pytest.approx(0.3, abs=0.05)
     assert found.values["5"] - np.median([*found.values.values()]) < 0.5 * blocked.mean()

@@ -171,7 +171,7 @@ def flight(
     InputError
         If a column or a unit is unknown or missing, or values are no numbers or of other lengths.
     """
-    from uwb_tdoa_tools.readers.arrays import flight_of_arrays
+    from uwb_tdoa_tools.readers.by_profile import flight_of_arrays
 
     return flight_of_arrays(anchors, tables, units, name)
 

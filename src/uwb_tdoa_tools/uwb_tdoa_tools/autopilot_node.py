@@ -36,10 +36,9 @@ from uwb_tdoa_bias.ros.parameters import (
 from uwb_tdoa_bias.ros.topics import OVERRIDES, STREAM_QOS, Input, publish_stream
 from uwb_tdoa_msgs.msg import EstimatorStatus
 
-from .autopilot.crazyflie import POSE, POSITION, CrazyflieLink
+from .autopilot.crazyflie import POSE, POSITION, TOPICS, CrazyflieLink, VehicleTopics
 from .autopilot.estimate import FRD, WORLDS, Estimate, Gate, Link
 from .autopilot.mavlink import FORMS, MavlinkLink
-from .autopilot.topics import TOPICS, VehicleTopics
 
 REST = 0.004  # s between two turns: PX4 uses a TIMESYNC answer that took less than 10 ms
 NONE, MAVLINK, CRAZYFLIE = "none", "mavlink", "crazyflie"

@@ -24,10 +24,10 @@ from .checking.recording import of_flight
 from .checking.report import survey_remarks
 from .checking.watch import BEFORE_TRUTH
 from .choices import ALIGN, FRAME, NONE, TIME
+from .cli import file_name
 from .estimate import FlightEstimator
 from .localizing.localize import write_tum
 from .localizing.pictures import write_rerun
-from .outputs import file_name
 from .readers.inputs import Reading, Recording, report_remarks
 from .scoring.alignment import Alignment, estimate_alignment, require_truth
 from .scoring.evaluation import corrected_truth, delays_fit

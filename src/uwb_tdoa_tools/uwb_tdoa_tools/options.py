@@ -18,8 +18,7 @@ from uwb_tdoa_bias.common.sensors import SENSORS
 
 from . import choices
 from .choices import ALIGN, NONE, STORAGES
-from .cli import Option, exclusive, option
-from .outputs import OutputFile, OutputFolder
+from .cli import Option, OutputFile, OutputFolder, exclusive, option
 from .parallel import whole_number
 
 if TYPE_CHECKING:
@@ -349,7 +348,7 @@ def rerun_of(args: Namespace, count: int, say: Callable[[str], object]) -> Path 
 
 def known_of(args: Namespace, flights: Sequence[Flight]) -> tuple[Mark | Distance, ...]:
     """Return the constraints on Flights as a tuple. Raises InputError."""
-    from .surveying.known import read_distances, read_marks
+    from .surveying.report import read_distances, read_marks
 
     out: list[Mark | Distance] = []
     out += [] if args.marks is None else read_marks(args.marks, flights)

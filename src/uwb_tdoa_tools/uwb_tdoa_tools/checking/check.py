@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.common.flight import Flight
 
-    from ..live.record import End
+    from ..live.session import End
     from .recording import Recording
     from .tdoa_rules import Survey
 

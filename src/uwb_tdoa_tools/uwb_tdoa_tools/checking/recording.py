@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.common.transforms import Place
 
     from ..clock import Jump
-    from ..live.record import End
+    from ..live.session import End
     from ..readers.inputs import Reading
 
 IMU, TDOA = "imu/data", "uwb/tdoa"
@@ -151,7 +151,7 @@ def read_live(
     InputError
         If no TDOA arrives.
     """
-    from ..live.record import listen  # needs ROS
+    from ..live.session import listen
 
     name_of = Names(reading.namespace, reading.topics)
     with temporary_folder() as folder:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.common.anchors import Anchors
 
-    from ..live.record import End
+    from ..live.session import End
 
 
 WHEELS = "velocity/odometry"

@@ -14,7 +14,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.effects.base import listed
 
 from .. import cli, command_lines
-from ..outputs import as_json
+from ..cli import as_json
 from ..parallel import Progress
 from .check import Report, check, different_surveys
 from .ordered import OrderedRecording, displacement

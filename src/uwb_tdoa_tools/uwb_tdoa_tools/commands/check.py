@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli, command_lines, options
-from ..cli import option
-from ..outputs import OutputFile
+from ..cli import OutputFile, option
 from ..parallel import Progress
 
 if TYPE_CHECKING:

@@ -16,9 +16,8 @@ from uwb_tdoa_bias.common.sensors import SENSORS
 
 from .. import cli, options
 from ..choices import COLUMNS, STREAMS
-from ..cli import option
+from ..cli import OutputBag, OutputFile, option
 from ..command_lines import tool
-from ..outputs import OutputBag, OutputFile
 from ..parallel import Progress
 
 if TYPE_CHECKING:

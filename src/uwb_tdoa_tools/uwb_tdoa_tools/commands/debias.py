@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli, options, parallel
-from ..cli import option
-from ..outputs import OutputFile
+from ..cli import OutputFile, option
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace

@@ -13,8 +13,7 @@ import time
 from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli, options, parallel
-from ..cli import option
-from ..outputs import OutputFile, OutputFolder
+from ..cli import OutputFile, OutputFolder, option
 
 DESCRIPTION = """Find a systematic error of the measurements, write its correction, and fly with it.
 

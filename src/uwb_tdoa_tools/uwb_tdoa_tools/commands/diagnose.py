@@ -152,7 +152,7 @@ def _diagnose(args: Namespace) -> int:
     from ..localizing.pictures import write_diagnosis
     from ..readers import inputs
     from ..simulation.rooms import Room
-    from ..surveying.known import read_paths
+    from ..surveying.report import read_paths
 
     out = args.out
     options.refuse(

@@ -11,8 +11,7 @@ from functools import partial
 from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli, options, parallel
-from ..cli import option
-from ..outputs import OutputFile, OutputFolder, as_json
+from ..cli import OutputFile, OutputFolder, as_json, option
 
 NOT_OF_ODOMETRY = "effects", "config", "model", "no_bias", "parameters", "without", "smooth"
 

@@ -11,8 +11,7 @@ from pathlib import Path
 from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli
-from ..cli import option
-from ..outputs import OutputFileInFolder, OutputFolder
+from ..cli import OutputFileInFolder, OutputFolder, option
 from ..parallel import Progress
 
 
@@ -94,8 +93,8 @@ def _export(args: Namespace) -> None:
 
     from ..exporting import crazyflie
     from ..exporting.c_code import write_c, write_crazyflie
-    from ..exporting.correction import trace
     from ..exporting.onnx_file import write_onnx  # imports onnx
+    from ..exporting.tracing import trace
     from ..readers.inputs import Reading
 
     if bool(args.firmware) != bool(args.flights):

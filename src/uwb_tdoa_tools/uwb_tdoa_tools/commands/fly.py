@@ -14,8 +14,7 @@ from uwb_tdoa_bias.common.sensors import SENSORS
 
 from .. import cli, options, parallel
 from ..choices import FLOWN, MOMENTS, WORLDS
-from ..cli import option
-from ..outputs import OutputFile, OutputFolder
+from ..cli import OutputFile, OutputFolder, option
 
 if TYPE_CHECKING:
     from ..flying.mission import Circles, Waypoints

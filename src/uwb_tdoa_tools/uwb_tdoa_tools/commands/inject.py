@@ -9,8 +9,7 @@ from argparse import ArgumentParser, Namespace
 from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli, options
-from ..cli import option
-from ..outputs import OutputBag
+from ..cli import OutputBag, option
 from ..parallel import Progress
 
 DESCRIPTION = """Add a declared effect to a flight, and write the flight that would have been recorded with it as a

@@ -10,8 +10,7 @@ from functools import partial
 from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli, options, parallel
-from ..cli import option
-from ..outputs import OutputFile
+from ..cli import OutputFile, option
 
 DESCRIPTION = """Where the tag was: trajectories of recordings, without ground truth, which is not read.
 

@@ -16,8 +16,7 @@ from ..choices import (
     CRITERIA,
     OF_PROTOCOL,
 )
-from ..cli import exclusive, group, option
-from ..outputs import OutputFile, OutputFolder
+from ..cli import OutputFile, OutputFolder, exclusive, group, option
 
 ROUND = (
     "what a round holds: N TDOAs in a ring (tdoa2), TDOAs between any two of N anchors, each "

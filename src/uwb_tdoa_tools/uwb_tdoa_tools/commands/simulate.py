@@ -13,8 +13,7 @@ from uwb_tdoa_bias.common.sensors import SENSORS
 
 from .. import cli
 from ..choices import CARRIERS, PROTOCOLS, STORAGES, TRAJECTORIES, YAW_PROFILES
-from ..cli import exclusive, group, option
-from ..outputs import OutputBag, OutputFile
+from ..cli import OutputBag, OutputFile, exclusive, group, option
 from ..parallel import Progress
 
 if TYPE_CHECKING:

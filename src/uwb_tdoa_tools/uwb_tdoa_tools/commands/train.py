@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 from .. import cli, options, parallel
 from ..choices import MODELS
-from ..cli import option
-from ..outputs import OutputFolder
+from ..cli import OutputFolder, option
 from ..parallel import MapFunction, Progress
 
 if TYPE_CHECKING:
@@ -90,7 +89,7 @@ def _write(
     args: Namespace, several: Sequence[Flight], over: MapFunction, progress: Progress
 ) -> None:
     """Train on several Flights, and write all results. over : as in `shrinking.train`."""
-    from ..scoring.gains import gain_in_words
+    from ..scoring.pooling import gain_in_words
     from ..training import labels as labelling, models, shrinking
 
     flights = {flight.name: flight for flight in several}

@@ -24,11 +24,11 @@ from uwb_tdoa_ekf.offline import Run, run_offline
 from uwb_tdoa_ekf.results import VERDICTS
 from uwb_tdoa_ekf.sensitivity import RANGES
 
+from ..cli import as_json
 from ..clock import numbered
-from ..outputs import as_json
 from ..parallel import MapFunction
-from ..scoring.gains import NO_DIFFERENCE, clear_change
 from ..scoring.metrics import EVERYTHING, Score, nis, pooled, radio_residuals
+from ..scoring.pooling import NO_DIFFERENCE, clear_change
 from .regression.table import BLOCK
 
 Spans = tuple[tuple[float, float], ...]  # (first, last) s

@@ -11,7 +11,7 @@ import numpy as np
 
 from uwb_tdoa_bias.effects import SmoothTerm
 
-from .. import outputs
+from .. import cli
 from .findings import EffectFinding, prefixes_of
 from .over_flights import course
 from .report.entries import entries
@@ -28,7 +28,7 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
     docs/diagnosis_report.md describes its keys.
     """
     found = verdict(diagnosis)
-    return outputs.as_json(
+    return cli.as_json(
         {
             "verdict": found.sentences,
             "apply": found.applies,

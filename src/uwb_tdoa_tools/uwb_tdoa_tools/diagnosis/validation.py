@@ -20,8 +20,8 @@ from uwb_tdoa_ekf.offline import Run, run_offline
 from uwb_tdoa_ekf.results import poses_of
 
 from ..parallel import MapFunction
-from ..scoring.gains import LOSS, gain
 from ..scoring.metrics import EVERYTHING, Score, rms
+from ..scoring.pooling import LOSS, gain
 from .attribution import Attribution
 from .comparison import Baseline, ValidationCase, score
 from .detectors import Detection

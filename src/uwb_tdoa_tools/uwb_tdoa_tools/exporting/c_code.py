@@ -28,9 +28,8 @@ from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.effects import EffectSet
 
 from . import crazyflie
-from .correction import LeftOut, TracedCorrection, left_out
 from .expressions import Pieces, Program, Scalar
-from .tracing import expressions_of, samples_of
+from .tracing import LeftOut, TracedCorrection, expressions_of, left_out, samples_of
 
 OPERATORS = {
     "neg": "-{}",

@@ -3,7 +3,7 @@
 """A first map of anchors whose positions are unknown, from flights or from distances.
 
 `map_anchors` is the only entry point. Recordings and measured distances become an `Observations`.
-`search` finds the maps that explain them. `verdict` states how far the best map can be off, and
+`least_squares` finds the maps that explain them. `verdict` states how far the best map can be off, and
 accepts it or names what is missing.
 """
 

@@ -15,7 +15,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Flight, Imu
 from uwb_tdoa_bias.common.survey import read_named_anchors
 
-from ..surveying.known import read_coordinates, read_distances
+from ..surveying.report import read_coordinates, read_distances
 
 MOST = 64  # anchors of a map
 STEP = 0.2  # s, length of a time bin; the tag has one position in it

@@ -20,9 +20,19 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_filled
 
 from ..choices import MAP_ACCURACY
-from .least_squares import MOTION, Equations, Fit, Problem, Stage
+from .least_squares import (
+    MOTION,
+    SAME_MAP,
+    SAME_SHAPE,
+    Equations,
+    Fit,
+    Problem,
+    Stage,
+    minima,
+    misfit_of,
+    rigid_distance,
+)
 from .observations import Observations
-from .search import SAME_MAP, SAME_SHAPE, minima, misfit_of, rigid_distance
 
 LENGTH = 1.2  # m, of the smooth error of each anchor, as in `survey`
 DRAWS = 300  # of the errors

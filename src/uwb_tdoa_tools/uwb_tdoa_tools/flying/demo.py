@@ -29,23 +29,23 @@ from uwb_tdoa_ekf.offline import run_offline
 
 from .. import command_lines
 from ..bags.bag import RecordedOdometry, read_odometry, write_bag
+from ..cli import as_json
 from ..diagnosis import diagnose
 from ..diagnosis.report.entries import entries, worth_in_words
 from ..diagnosis.result import Diagnosis
 from ..localizing.pictures import write_rerun
-from ..outputs import as_json
 from ..parallel import Progress
 from ..readers.inputs import Reading
-from ..scoring.gains import change_in_words
 from ..scoring.metrics import Estimate, Score, position_at
 from ..scoring.pairs import PairResiduals, residuals_of
+from ..scoring.pooling import change_in_words
 from ..simulation import SimulationConfig, simulate
 from ..simulation.inject import hidden_effect
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from ..exporting.correction import TracedCorrection
+    from ..exporting.tracing import TracedCorrection
 
 
 # Effects of `simulate` are off: what the residuals show is the drawn effect, noise and outliers.
@@ -284,7 +284,7 @@ def through_nodes(
     InputError, LiveError
         If the flight cannot be played.
     """
-    from ..live.run import accounts, run_live  # needs ROS
+    from ..live.processes import accounts, run_live
 
     folder.mkdir(parents=True, exist_ok=True)
     # a node runs in another directory

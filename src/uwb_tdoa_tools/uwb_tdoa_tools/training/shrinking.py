@@ -5,7 +5,7 @@
 The flights are split into FOLDS. For each fold a model is trained on the other flights, and the filter
 runs with several shares of its prediction. Folds hold whole flights, since samples of one flight are
 correlated. Effects are applied whole, and are those found in all flights. Their values are fitted without
-the fold. `physics.find_effects` has already validated them on excluded flights.
+the fold. `models.find_effects` has already validated them on excluded flights.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from uwb_tdoa_bias.effects import EffectSet
 
 from ..parallel import MapFunction
 from ..scoring.evaluation import evaluate
-from ..scoring.gains import SHARES, Errors, Shrinkage, best_share
-from . import models, physics
+from ..scoring.pooling import SHARES, Errors, Shrinkage, best_share
+from . import models
 from .models import Recipe
 
 FOLDS = 5
@@ -33,7 +33,7 @@ FOLDS = 5
 def cross_validated(
     recipe: Recipe,
     flights: Sequence[Flight],
-    found: physics.Physics | None = None,
+    found: models.Physics | None = None,
     progress: Callable[[str], object] = lambda text: None,
     map_function: MapFunction = map,
 ) -> Shrinkage:
@@ -54,7 +54,7 @@ def cross_validated(
     count = min(FOLDS, len(flights))
     folds = [order[k::count].tolist() for k in range(count)]
     rest = [[k for k in range(len(flights)) if k not in fold] for fold in folds]
-    known = [found and physics.Physics(found.fitted_to(others)) for others in rest]
+    known = [found and models.Physics(found.fitted_to(others)) for others in rest]
     errors: Errors = {
         flight.name: {None: error} for flight, error in zip(flights, map_function(_error, flights))
     }
@@ -85,7 +85,7 @@ def train(
     found = None
     if recipe.kind == "physics":
         progress("looking for effects")
-        found = physics.find_effects(flights)
+        found = models.find_effects(flights)
     trained = models.train(recipe, training, validation, name, progress, found)
     shrinkage = cross_validated(recipe, flights, found, progress, map_function)
     if trained.model:
@@ -96,7 +96,7 @@ def train(
 def _left_out(
     recipe: Recipe,
     flights: Sequence[Flight],
-    fold: tuple[list[int], list[int], physics.Physics | None],
+    fold: tuple[list[int], list[int], models.Physics | None],
 ) -> Errors:
     """Return the Errors of the flights of a fold by share.
 
