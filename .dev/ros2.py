@@ -19,8 +19,7 @@ from uwb_tdoa_bias.common.errors import Failure
 from uwb_tdoa_bias.common.text import printable
 from uwb_tdoa_tools import cli
 from uwb_tdoa_tools.bags.files import new_bag
-from uwb_tdoa_tools.live.record import Recorder
-from uwb_tdoa_tools.live.session import message_class, session, subscription_qos
+from uwb_tdoa_tools.live.session import Recorder, message_class, session, subscription_qos
 
 SETTLED = 1.5  # s without news of the graph after which it is complete
 PATIENCE = 15.0  # s for a first topic, node or publisher to be seen, and for a node to answer

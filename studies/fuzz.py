@@ -38,7 +38,7 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.debias import BiasMap
 from uwb_tdoa_tools import cli
 from uwb_tdoa_tools.bags.bag import read_bag
-from uwb_tdoa_tools.outputs import OutputFolder
+from uwb_tdoa_tools.cli import OutputFolder
 from uwb_tdoa_tools.planning.optimisation import AnchorPlaces
 from uwb_tdoa_tools.planning.precision import antenna_from_yaml
 from uwb_tdoa_tools.readers import (
@@ -50,7 +50,7 @@ from uwb_tdoa_tools.readers import (
 from uwb_tdoa_tools.readers.profile import Profile, parse_columns
 from uwb_tdoa_tools.readers.suggest import suggest
 from uwb_tdoa_tools.simulation.rooms import Walls
-from uwb_tdoa_tools.surveying.known import read_distances, read_marks
+from uwb_tdoa_tools.surveying.report import read_distances, read_marks
 
 from . import table
 

@@ -8,7 +8,7 @@ import json
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_tools import parallel
-from uwb_tdoa_tools.outputs import OutputFile, as_json
+from uwb_tdoa_tools.cli import OutputFile, as_json
 
 
 def add_options(add, draws=None, first=0, jobs=None):

@@ -17,11 +17,11 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.floor import FloorMultipath
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools import choices, cli
+from uwb_tdoa_tools.cli import OutputFolder
 from uwb_tdoa_tools.exporting.c_code import write_crazyflie
-from uwb_tdoa_tools.exporting.correction import trace
 from uwb_tdoa_tools.exporting.crazyflie import comparison, stddev_of
+from uwb_tdoa_tools.exporting.tracing import trace
 from uwb_tdoa_tools.main import main
-from uwb_tdoa_tools.outputs import OutputFolder
 from uwb_tdoa_tools.readers import inputs
 
 from . import table

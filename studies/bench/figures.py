@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from uwb_tdoa_tools import outputs
+from uwb_tdoa_tools import cli
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -71,7 +71,7 @@ def table(figures: Iterable[Figure]) -> list[str]:
 
 def as_json(figures: Iterable[Figure]) -> list[dict[str, Any]]:
     """List of dicts; JSON has no NaN: null."""
-    return [outputs.as_json(asdict(figure) | {"met": figure.met}) for figure in figures]
+    return [cli.as_json(asdict(figure) | {"met": figure.met}) for figure in figures]
 
 
 def _cells(figure: Figure) -> tuple[str, ...]:

@@ -20,11 +20,11 @@ import numpy as np
 from uwb_tdoa_tools.live.processes import (
     DiagnosticsListener,
     Processes,
+    accounts,
     own_domain,
     variables,
     wait,
 )
-from uwb_tdoa_tools.live.run import accounts
 from uwb_tdoa_tools.live.session import session
 
 from .figures import Figure

@@ -33,7 +33,7 @@ import numpy as np
 from tqdm import tqdm
 
 from uwb_tdoa_tools import cli
-from uwb_tdoa_tools.outputs import OutputFile, OutputFolder
+from uwb_tdoa_tools.cli import OutputFile, OutputFolder
 
 from . import core, graph, nodes, peer, rates, recordings
 from .figures import as_json, table

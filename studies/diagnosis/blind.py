@@ -18,10 +18,10 @@ from uwb_tdoa_bias.effects import Effect, EffectSet
 from uwb_tdoa_bias.effects.base import SensorFunction
 from uwb_tdoa_bias.effects.covariates import OF_STATE, STATES
 from uwb_tdoa_ekf.offline import run_offline
+from uwb_tdoa_tools.cli import as_json
 from uwb_tdoa_tools.diagnosis import diagnose
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
-from uwb_tdoa_tools.outputs import as_json
 from uwb_tdoa_tools.scoring.metrics import Score
 
 from . import grammar, measured

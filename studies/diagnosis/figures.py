@@ -12,10 +12,10 @@ import time
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import SENSOR_NAMES
+from uwb_tdoa_tools.cli import OutputFolder
 from uwb_tdoa_tools.diagnosis import diagnose
 from uwb_tdoa_tools.diagnosis.references import Heights, Nothing
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
-from uwb_tdoa_tools.outputs import OutputFolder
 from uwb_tdoa_tools.surveying.report import with_blocked
 
 from .. import table

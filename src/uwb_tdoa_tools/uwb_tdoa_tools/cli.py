@@ -30,7 +30,7 @@ from uwb_tdoa_bias.common.errors import Failure, InputError
 from uwb_tdoa_bias.common.files import protected_inputs, refuse_output, write_text
 from uwb_tdoa_bias.common.text import line_of, printable, written_by
 
-from . import cli, command_lines
+from . import command_lines
 
 FULL = {
     errno.ENOSPC: "the disk is full",
@@ -128,7 +128,7 @@ def run(
         args = parser.parse_args(without_ros_arguments(arguments) if ros else arguments)
         if ros:
             args.ros_arguments = arguments
-        with cli.checked(args):
+        with checked(args):
             code = command(args) or 0
         sys.stdout.flush()
         return code

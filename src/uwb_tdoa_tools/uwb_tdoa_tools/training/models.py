@@ -41,7 +41,7 @@ from ..diagnosis.regression.fit import refit
 from ..diagnosis.regression.terms import columns_of
 from ..diagnosis.validation import select_by_error
 from ..exporting.onnx_file import GraphBuilder
-from . import labels as labelling, models
+from . import labels as labelling
 from .labels import Labels, by_constellation, labels, with_level_attitude
 
 # effects of the tag, the vehicle and the anchor modules, valid in another installation
@@ -367,7 +367,7 @@ def train(
     validation: Sequence[Flight],
     name: str,
     progress: Callable[[str], object] = lambda text: None,
-    found: models.Physics | None = None,
+    found: Physics | None = None,
 ) -> Trained:
     """Train the model of a recipe.
 
@@ -415,7 +415,7 @@ def train(
     if kind == "physics":
         if found is None:
             progress("looking for effects")
-            found = models.find_effects([*training, *validation])
+            found = find_effects([*training, *validation])
         effects = found.effects
         progress(f"effects: {effects.name}")
         curve, left = _evaluate_effects(found, first, second, seed)
@@ -468,7 +468,7 @@ def _limits(
 
 
 def _evaluate_effects(
-    found: models.Physics, training: list[Labels], validation: list[Labels], seed: int
+    found: Physics, training: list[Labels], validation: list[Labels], seed: int
 ) -> tuple[LearningCurve, list[np.ndarray]]:
     """Return (learning curve over flights, remaining errors of validation flights) of the effects.
 
